@@ -1,9 +1,7 @@
-"""C++ headers beside the kernels: whole functions in namespace `wrt`, which an editor, g++ and Clang understand by themselves.
-
-A module of Warp takes C++ for the CPU in front of its kernels (wp.ModuleBuildOptions), as text: Warp hashes it, so a changed header
-is compiled again. A native function (wp.func_native) is then one call. Numbers that Python has too come as one more header,
-`layout.h`, which Python writes (`constants`).
-"""
+"""C++ headers beside the kernels: whole functions in namespace `wrt`, which an editor, g++ and Clang can read alone.
+A module of Warp takes C++ for the CPU before its kernels (wp.ModuleBuildOptions), as text: Warp hashes it, so that a changed header is
+compiled again. A native function (wp.func_native) is then one call. Constants shared with Python are in one more header, `layout.h`, which
+Python writes (`constants`)."""
 
 import re
 from collections.abc import Mapping
@@ -18,7 +16,7 @@ LINE = re.compile(r'#include "(\w+\.h)"|#pragma once')
 
 
 def constants(numbers: Mapping[str, float], struct: str = "") -> str:
-    """Write numbers as C++ in namespace wrt, or as members of a struct of that name, which is given to templates."""
+    """Write numbers as C++ constants in namespace wrt, or as members of the struct `struct`, for templates."""
     kinds = {name: "float" if isinstance(value, float) else "unsigned" if value >= 2**31 else "int"
              for name, value in numbers.items()}
     lines = [f"constexpr {kinds[name]} {name} = {literal(value)};" for name, value in numbers.items()]
@@ -27,8 +25,8 @@ def constants(numbers: Mapping[str, float], struct: str = "") -> str:
 
 
 def text_of(*files: str, **written: str) -> str:
-    """Return the text of headers ("wide/packet.h" of this folder), each after those that it includes from its own folder.
-    written: texts of headers that are no files (layout for layout.h)."""
+    """Return the text of headers ("wide/packet.h" of this folder), each after its includes from its own folder. written: texts of headers
+    that are not files ("layout" for layout.h)."""
     out: list[str] = []
     seen: set[Path] = set()
     for file in files:
@@ -52,5 +50,5 @@ def _add(path: Path, written: Mapping[str, str], out: list[str], seen: set[Path]
 
 
 def with_headers(*files: str, **written: str) -> wp.ModuleBuildOptions:
-    """Return text_of as a module of Warp takes it ("extra_build_options"), for the CPU."""
+    """Return the headers' text as a module of Warp takes it ("extra_build_options"), for the CPU."""
     return wp.ModuleBuildOptions(extra_cpu_preamble=text_of(*files, **written))

@@ -1,4 +1,4 @@
-"""All hits of rays: one walk fills a list for each ray, then the list is put in order."""
+"""All hits of rays: a walk fills one list a ray, then the list is sorted."""
 
 from typing import Any
 
@@ -8,25 +8,19 @@ from wrt.kernels.query import HitArrays, RayArrays, direction_scale, load_ray, p
 from wrt.kernels.structs import Hit, Ray, kernel
 from wrt.kernels.units.triangle import is_crossed, seen, triangle_ray
 
-FEW = wp.constant(8)  # hits: most rays have so many at most, and so few are sorted in no time
+FEW = wp.constant(8)  # most rays have at most so many hits, and sorting them takes no time
 
 
 @wp.struct
 class HitLists:
-    """What a traversal unit with Units.lists gets in place of Surfaces.
+    """Lists of hits, which a traversal unit with Units.lists gets in place of Surfaces."""
 
-    limit: how many hits of a ray are asked for, the first ones; below 2^30. The list of ray i is rows first[i] .. first[i + 1] - 1.
-    count: of the hits in it. Where it has room for `limit` or fewer, count may be larger: then a list with room for as many, or for
-    2 `limit`, has them all. crossings: list only triangles of
-    `vertices` and `faces` that the ray crosses (units.triangle.is_crossed); without it they are not read.
-    """
-
-    limit: int
-    crossings: bool
-    vertices: wp.array(dtype=wp.vec3)
+    limit: int  # Largest number of hits asked for of a ray; below 2^30.
+    crossings: bool  # True: list only triangles that the ray crosses (units.triangle.is_crossed).
+    vertices: wp.array(dtype=wp.vec3)  # Read with `crossings` only, as `faces`.
     faces: wp.array(dtype=wp.vec3i)
-    first: wp.array(dtype=wp.int32)
-    count: wp.array(dtype=wp.int32)
+    first: wp.array(dtype=wp.int32)  # The list of ray i is rows[first[i]] .. rows[first[i + 1] - 1].
+    count: wp.array(dtype=wp.int32)  # Hits of ray i; more than fit: see list_hit.
     rows: wp.array(dtype=Hit)
 
 
@@ -37,7 +31,7 @@ def is_before(a: Hit, b: Hit) -> bool:
 
 @wp.func
 def sort_hits(rows: wp.array(dtype=Hit), first: int, count: int):
-    """By t and, where that is equal, by prim_id. Heapsort (Williams 1964, "Algorithm 232"): n log n in any order, in place."""
+    """Sort by t and, at equal t, by prim_id, in place: heapsort (Williams 1964, "Algorithm 232"), n log n for any order."""
     begin = count / 2
     end = int(count)
     while end > 1:
@@ -64,8 +58,8 @@ def sort_hits(rows: wp.array(dtype=Hit), first: int, count: int):
 
 @wp.func
 def put_in_order(rows: wp.array(dtype=Hit), first: int, count: int, limit: int) -> int:
-    """Sort a list, and keep the first hits, `limit` at most, each once: some structures hold a triangle in several leaves. Returns
-    how many are kept."""
+    """Sort a list, and keep its first hits, at most `limit`, each once; return their number. Some structures hold a triangle in several
+    leaves."""
     sort_hits(rows, first, count)
     kept = int(0)
     last = int(-1)
@@ -80,7 +74,8 @@ def put_in_order(rows: wp.array(dtype=Hit), first: int, count: int, limit: int) 
 
 @wp.func
 def list_hit(lists: HitLists, ray: Ray, hit: Hit, best: Hit) -> Hit:
-    """Put a hit into the list of its ray. The returned `best` says where the walk may end, and stays a miss."""
+    """Append a hit to the list of its ray. The returned `best` stays a miss, and limits the walk.
+    If the list is too short, count[i] exceeds its length. A list with room for count[i] hits, or for 2 limit, then has room for all."""
     if lists.crossings:
         shear = triangle_ray(ray)
         face = lists.faces[hit.prim_id]
@@ -98,14 +93,14 @@ def list_hit(lists: HitLists, ray: Ray, hit: Hit, best: Hit) -> Hit:
             n = put_in_order(lists.rows, first, n, lists.limit)
             if n == lists.limit:
                 best.t = lists.rows[first + n - 1].t
-    elif n >= 2 * lists.limit:  # in so much room no list is too short
+    elif n >= 2 * lists.limit:  # a list with room for 2 limit is never too short
         best.t = float(-wp.inf)
     lists.count[ray.slot] = n
     return best
 
 
 def make_list_hits_kernel(accel_struct: Any, traverse: Any) -> Any:
-    """Fill the list of each ray that has room. traverse: a unit made with Units.lists and accepts=list_hit."""
+    """Make the kernel that fills the list of each ray that has room; traverse: made with Units.lists and accepts=list_hit."""
 
     @kernel
     def list_hits(accel: accel_struct, rays: RayArrays, lists: HitLists, start: int):
@@ -122,7 +117,7 @@ def make_list_hits_kernel(accel_struct: Any, traverse: Any) -> Any:
 
 @kernel
 def copy_hits(rays: RayArrays, lists: HitLists, begin: wp.array(dtype=wp.int32), hits: HitArrays, start: int):
-    """The list of ray i to rows begin[i] on of `hits`, with t in the caller's units."""
+    """Copy the list of ray i to hits[begin[i]] and on, with t in the caller's units."""
     i = start + wp.tid()
     scale = direction_scale(rays.direction[i])
     for k in range(lists.count[i]):

@@ -1,14 +1,15 @@
-"""Numbers of arrays without gaps, for loops that run on one CPU thread.
+"""Access to arrays without gaps, for loops that run in lanes on one CPU thread.
 
-The compiler makes lanes of a plain Warp loop (sixteen where the CPU has them), and it takes a tenth of the time, if
+The compiler vectorises a plain Warp loop, sixteen lanes on some CPUs and a tenth of the time, if
 - it is a `while` with a counter;
-- it has no branches (wp.where is none), and calls nothing that has;
-- it reads and writes arrays by the functions here, and looks up no table at a place that it computes;
-- vectors of three are made, chosen from and normalised number by number (where_vec3, structs.unit), and there are none of two: LLVM
-  keeps two numbers together, in what it calls an instruction's vector type;
-- places in one array differ by constants, or it would have to compare too many ranges. In C++, a place that is a multiple of a
-  variable makes lanes for 1 times alone (shade/film.h).
-`-Rpass=loop-vectorize` among wp.config.cpu_compiler_flags says which loops are.
+- it has no branches (wp.where is none), and calls nothing that branches;
+- it accesses arrays by the functions here, and no table at a computed index;
+- vectors of three are made, selected and normalised by component (where_vec3, structs.unit), and there are none of two: LLVM keeps two
+  numbers together, as a vector of its own;
+- indices in one array differ by constants, or too many ranges would have to be compared. In C++, an index that is a multiple of a variable
+  is vectorised only for multiples of 1 (shade/film.h).
+
+Add `-Rpass=loop-vectorize` to wp.config.cpu_compiler_flags to see which loops are vectorised.
 """
 
 from typing import Any
@@ -18,7 +19,7 @@ import warp as wp
 
 @wp.func_native("return array.data[(long long)i][k];")
 def number_of_vec2(array: wp.array(dtype=wp.vec2), i: int, k: int) -> float:
-    """Component k."""
+    """Component k of entry i."""
 
 
 @wp.func_native("array.data[(long long)i] = value;")

@@ -1,4 +1,4 @@
-"""Kernels for rays by themselves: arrays of rays in, hits out."""
+"""Kernels of ray queries: arrays of rays in, hits out."""
 
 from typing import Any
 
@@ -7,15 +7,15 @@ import warp as wp
 from wrt.kernels.structs import Hit, Ray, Surfaces, kernel
 
 LARGEST = wp.constant(3.4028234663852886e38)  # of float32
-FARTHEST = 1e37  # of an origin's coordinates that arrays of NumPy may have: differences of such are finite
-# Directions beyond these lengths are scaled by one of these factors: see direction_scale.
+FARTHEST = 1e37  # largest coordinate of an origin in NumPy arrays: differences stay finite
+# Lengths of directions that are not scaled, and the factors for shorter and longer ones: see direction_scale.
 SHORTEST, LONGEST = 2.0**-64, 2.0**64
 LENGTHEN, SHORTEN = 2.0**96, 2.0**-64
 
 
 @wp.struct
 class RayArrays:
-    """One ray a row. t_min and t_max may have a stride of 0: one number for all."""
+    """Rays of a caller; t_min and t_max may have a stride of 0: one value for all."""
 
     origin: wp.array(dtype=wp.vec3)
     direction: wp.array(dtype=wp.vec3)
@@ -25,18 +25,18 @@ class RayArrays:
 
 @wp.struct
 class Queue:
-    """Rays of a picture, one a row, whose directions are taken as they are; exclude: as Ray.exclude_plus_one."""
+    """Rays of a picture, whose directions are used as they are."""
 
     origin: wp.array(dtype=wp.vec3)
     direction: wp.array(dtype=wp.vec3)
     t_min: wp.array(dtype=wp.float32)
     t_max: wp.array(dtype=wp.float32)
-    exclude: wp.array(dtype=wp.int32)
+    exclude: wp.array(dtype=wp.int32)  # As Ray.exclude_plus_one.
 
 
 @wp.struct
 class HitArrays:
-    """One hit a row; a miss has t = inf and prim_id = -1."""
+    """Hits; a miss has t = inf and prim_id = -1."""
 
     t: wp.array(dtype=wp.float32)
     u: wp.array(dtype=wp.float32)
@@ -46,11 +46,9 @@ class HitArrays:
 
 @wp.func
 def direction_scale(direction: wp.vec3) -> float:
-    """A power of two that brings a very short or very long direction to where 1 / d is no denormal and no infinity, else 1.
-
-    Scaling by it is exact, but for components that become denormal: they are off by 2^-150, where the longest is 1 or more.
-    What is left is between 2^-64 and 2^64, also of a direction that is denormal.
-    """
+    """Power of two that brings a very short or long direction to where 1 / d is neither denormal nor infinite, else 1. The factor is
+    exact, but components that become denormal are off by 2^-150, where the longest is at least 1. The scaled direction is between 2^-64
+    and 2^64, for denormal ones too."""
     longest = wp.abs(direction[0])
     longest = wp.where(wp.abs(direction[1]) > longest, wp.abs(direction[1]), longest)
     longest = wp.where(wp.abs(direction[2]) > longest, wp.abs(direction[2]), longest)
@@ -60,10 +58,8 @@ def direction_scale(direction: wp.vec3) -> float:
 
 @wp.func
 def scaled_ray(origin: wp.vec3, direction: wp.vec3, t_min: float, t_max: float) -> Ray:
-    """A ray in units of its scaled direction: t times `direction_scale` is in the caller's.
-
-    The segment ends where t in the caller's units would be beyond float32, so that no traversal finds what cannot be told.
-    """
+    """Make a ray with its direction scaled: its t times `direction_scale` is in the caller's units. The segment ends where t in the
+    caller's units exceeds float32, so that no traversal returns such a hit."""
     scale = direction_scale(direction)
     inverse = wp.where(scale > 1.0, wp.static(1.0 / LENGTHEN), wp.where(scale < 1.0, wp.static(1.0 / SHORTEN), 1.0))
     ray = Ray()
@@ -82,7 +78,7 @@ def load_ray(rays: RayArrays, i: int) -> Ray:
 
 
 def make_closest_hit_kernel(accel_struct: Any, traverse: Any) -> Any:
-    """rays first .. first + dim - 1 against the structure. A hit whose t is beyond float32 is a miss."""
+    """Make the kernel for rays first .. first + dim - 1; a hit whose t exceeds float32 is a miss."""
 
     @kernel
     def closest_hit(accel: accel_struct, surfaces: Surfaces, rays: RayArrays, hits: HitArrays, first: int):
@@ -95,7 +91,7 @@ def make_closest_hit_kernel(accel_struct: Any, traverse: Any) -> Any:
 
 
 def make_any_hit_kernel(accel_struct: Any, traverse: Any) -> Any:
-    """As closest_hit, but only whether there is one."""
+    """Make the kernel that stores True for each ray that hits anything."""
 
     @kernel
     def any_hit(accel: accel_struct, surfaces: Surfaces, rays: RayArrays, dark: wp.array(dtype=wp.bool), first: int):
@@ -108,15 +104,15 @@ def make_any_hit_kernel(accel_struct: Any, traverse: Any) -> Any:
 
 @wp.struct
 class Worlds:
-    """id: the world of each ray, a row each, or with a stride of 0 one for all; root: of each world's tree."""
+    """The world of each ray."""
 
-    id: wp.array(dtype=wp.int32)
-    root: wp.array(dtype=wp.int32)
+    id: wp.array(dtype=wp.int32)  # By ray; with a stride of 0, one for all.
+    root: wp.array(dtype=wp.int32)  # Root node, by world.
 
 
 @wp.func
 def load_ray_of_world(rays: RayArrays, worlds: Worlds, i: int) -> Ray:
-    """As load_ray; of a world that is none, a ray that hits nothing."""
+    """Load a ray with its world's root; a ray whose world does not exist hits nothing."""
     ray = load_ray(rays, i)
     world = worlds.id[i]
     if world >= 0 and world < worlds.root.shape[0]:
@@ -127,7 +123,7 @@ def load_ray_of_world(rays: RayArrays, worlds: Worlds, i: int) -> Ray:
 
 
 def make_worlds_kernel(accel_struct: Any, traverse: Any, any_hit: bool) -> Any:
-    """As closest_hit or any_hit, each ray in its own world. out: HitArrays, or for any hit an array of bool."""
+    """Make the kernel that traces each ray in its own world; out: HitArrays, or for any hit an array of bool."""
     out_type = wp.array(dtype=wp.bool) if any_hit else HitArrays
 
     @kernel
@@ -155,7 +151,7 @@ def queued_ray(queue: Queue, i: int) -> Ray:
 
 @wp.func
 def put_ray(queue: Queue, i: int, ray: Ray):
-    """All of a ray but t_min, which is 0 throughout a queue."""
+    """Store a ray but for t_min, which is 0 throughout a queue."""
     queue.origin[i] = ray.origin
     queue.direction[i] = ray.direction
     queue.t_max[i] = ray.t_max
@@ -174,7 +170,7 @@ def hit_at(hits: HitArrays, i: int) -> Hit:
 
 @wp.func
 def put_hit(hits: HitArrays, i: Any, hit: Any, scale: float):
-    """i: int or int64; hit: a record with the fields of a Hit; scale: what t is multiplied by."""
+    """Store a hit, with t multiplied by `scale`; i: int or int64, hit: a record with the fields of a Hit."""
     hits.t[i] = hit.t * scale
     hits.u[i] = hit.u
     hits.v[i] = hit.v
@@ -182,7 +178,7 @@ def put_hit(hits: HitArrays, i: Any, hit: Any, scale: float):
 
 
 def make_queue_kernel(accel_struct: Any, traverse: Any, any_hit: bool) -> Any:
-    """Rays first .. end - 1 of a picture's queue, one at a time. out: HitArrays, or for any hit an array of bool."""
+    """Make the kernel that traces rays first .. end - 1 of a picture's queue one at a time; out: as make_worlds_kernel."""
     out_type = wp.array(dtype=wp.bool) if any_hit else HitArrays
 
     @kernel

@@ -1,8 +1,6 @@
-"""Queries from inside a kernel of one's own: the functions, and what they take and give.
-
-They are the traversal units for one ray, with the scaling that extreme directions need: the answers have the bits of
-Accelerator.closest_hit, if the kernel is compiled without fused multiply-add (structs.kernel).
-"""
+"""Ray queries in a user's kernel: records and functions.
+The functions call the traversal units for one ray, with the scaling of extreme directions. Hits have the bits of Accelerator.closest_hit,
+if the kernel is compiled without fused multiply-add (structs.kernel)."""
 
 from typing import Any
 
@@ -14,30 +12,28 @@ from wrt.kernels.structs import Hit, Ray, Surfaces
 
 @wp.struct
 class QueryRay:
-    """origin, direction: in world space, the direction of any length; the closed segment from t_min (>= 0) to t_max, in units of
-    |direction|. What is not finite hits nothing, nor does a direction of 0."""
+    """A ray in world space, and its closed segment [t_min, t_max]. A ray that is not finite, or whose direction is 0, hits nothing."""
 
     origin: wp.vec3
-    direction: wp.vec3
-    t_min: float
+    direction: wp.vec3  # Any length.
+    t_min: float  # In units of |direction|, as t_max; >= 0.
     t_max: float
 
 
 @wp.struct
 class QueryHit:
-    """t: in units of |direction|, inf on a miss; prim_id: -1 on a miss; the point is (1 - u - v) v0 + u v1 + v v2. scaled_t: t in
-    the traversal's units, which next_hit goes on from."""
+    """A hit at (1 - u - v) v0 + u v1 + v v2, or a miss."""
 
-    t: float
+    t: float  # In units of |direction|; inf on a miss.
     u: float
     v: float
-    prim_id: int
-    scaled_t: float
+    prim_id: int  # Index of the primitive; -1 on a miss.
+    scaled_t: float  # t in the traversal's units, for next_hit.
 
 
 @wp.func
 def query_ray(origin: wp.vec3, direction: wp.vec3) -> QueryRay:
-    """From the origin to infinity."""
+    """Make a ray from the origin to infinity."""
     ray = QueryRay()
     ray.origin = origin
     ray.direction = direction
@@ -45,8 +41,8 @@ def query_ray(origin: wp.vec3, direction: wp.vec3) -> QueryRay:
     return ray
 
 
-# 1 + 2^-12 squared is 1 + 2^-11 in float32, and 2^-24 more where the subtraction is fused with it. Volatile: or the compiler, which
-# never fuses, would reckon.
+# In float32, (1 + 2^-12)^2 is 1 + 2^-11; a fused subtraction leaves 2^-24. volatile keeps the compiler, which never fuses, from folding
+# it.
 @wp.func_native("""
 #if !defined(WRT_INLINE) && !defined(__CUDA_ARCH__)
     return true;  // made by wp.kernel, without the headers of wide/
@@ -56,7 +52,7 @@ def query_ray(origin: wp.vec3, direction: wp.vec3) -> QueryRay:
     return y * y - 1.00048828125f != 0.0f;
 """)
 def fused() -> bool:
-    """Whether this kernel is compiled with fused multiply-add, with which rays would be lost at edges."""
+    """Test whether this kernel is compiled with fused multiply-add, which would lose rays at edges."""
 
 
 @wp.func_native("""
@@ -71,8 +67,7 @@ def say_once(reason: int) -> None: ...
 
 @wp.func
 def traversed(ray: QueryRay, is_other: bool) -> Ray:
-    """As the traversal units take it; a ray that hits nothing where the kernel is not compiled as it must be, and where the world
-    is another one."""
+    """Make the traversal's ray; if the kernel is not compiled as required, or the world is another one, a ray that hits nothing."""
     out = scaled_ray(ray.origin, ray.direction, ray.t_min, ray.t_max)
     if is_other or fused():
         say_once(wp.where(is_other, 1, 0))
@@ -92,33 +87,33 @@ def as_asked(hit: Hit, direction: wp.vec3) -> QueryHit:
 
 
 def make_ray_query(accel_struct: Any, closest: Any, any_of: Any, resuming: Any, kind: int) -> tuple[Any, Any, Any, Any]:
-    """World, closest_hit, any_hit, next_hit. closest, any_of, resuming: traversal units, the last one with Units.resumes; kind: a
-    number of theirs, which a World must have."""
+    """Make World, closest_hit, any_hit, next_hit from traversal units; `resuming` is made with Units.resumes. A World must have the same
+    `kind`, a number of these units."""
 
     @wp.struct
     class World:
-        """A structure and what it is over: one argument of a kernel. kind: Warp does not compare records."""
+        """A structure and its surfaces, as one argument of a kernel."""
 
-        kind: int
+        kind: int  # Compared by wrt, because Warp does not compare the types of records.
         accel: accel_struct
         surfaces: Surfaces
 
     @wp.func
     def closest_hit(world: World, ray: QueryRay) -> QueryHit:
-        """The closest hit in the segment; at equal t the lowest prim_id."""
+        """Closest hit in the segment; the lowest prim_id at equal t."""
         return as_asked(closest(world.accel, world.surfaces, traversed(ray, world.kind != kind)), ray.direction)
 
     @wp.func
     def any_hit(world: World, ray: QueryRay) -> bool:
-        """Whether there is a hit in the segment."""
+        """Return True if anything is hit in the segment."""
         hit = any_of(world.accel, world.surfaces, traversed(ray, world.kind != kind))
         return hit.prim_id >= 0
 
     @wp.func
     def next_hit(world: World, ray: QueryRay, hit: QueryHit) -> QueryHit:
-        """The first hit after one that this ray gave, in the order of t and, where that is equal, of prim_id: from the closest hit
-        on, each hit of the segment once. It walks from the root and tests again all that is hit at the same t: k hits at one t take
-        k^2 tests in all (wrt.all_hits, which has storage, takes k log k steps)."""
+        """Next hit of this ray after `hit`, in the order of t and, at equal t, of prim_id. From the closest hit on, calls return each hit
+        of the segment once. Each call walks from the root and repeats the tests at the same t: k hits at one t take k^2 tests. With
+        storage for them, `wrt.all_hits` takes k log k steps."""
         going = traversed(ray, world.kind != kind)
         going.t_min = hit.scaled_t
         going.slot = hit.prim_id + 1

@@ -1,10 +1,7 @@
 """Structs in rows, for loops that run in lanes (kernels.memory).
-
-A struct of 9 numbers takes 9 rows of a block: entry i of the block has its numbers in column i. A loop over i then reads and writes
-neighbours, which the compiler makes lanes of; in an array of structs they would be 9 numbers apart.
-
-`load` and `store` are C++ that is written from the struct's fields, a copy for each number; tests/kernels/test_rows.py shows it.
-"""
+A struct of 9 numbers takes 9 rows of a block; column i holds entry i. A loop over i then reads and writes neighbours, which the compiler
+vectorises; in an array of structs they would be 9 numbers apart. Functions `load` and `store` are C++ generated from the struct's fields,
+one copy a number; tests/kernels/test_rows.py prints it."""
 
 from functools import cache
 from typing import Any, NamedTuple
@@ -15,7 +12,7 @@ from wrt.kernels.warp_private import fields_of
 
 
 def numbers_of(dtype: Any, name: str) -> list[str]:
-    """Return the numbers of a struct, a vector or a number in C++, in their order: "name.point[0]", "name.point[1]" ..."""
+    """Return the numbers of a struct, vector or number as C++, in order: "name.point[0]", "name.point[1]" ..."""
     if hasattr(dtype, "numpy_dtype"):
         return [number for field, kind in fields_of(dtype).items() for number in numbers_of(kind, f"{name}.{field}")]
     size = wp.types.type_size(dtype)
@@ -23,13 +20,11 @@ def numbers_of(dtype: Any, name: str) -> list[str]:
 
 
 class Rows(NamedTuple):
-    """The rows of a block that hold structs (or vectors) of one type. Each number takes 4 bytes, and keeps its bits.
-
-    length: entries of the block, and numbers of a row; first: the row of the struct's first number."""
+    """The rows of a block that hold structs (or vectors) of one type, in 4 bytes a number with all bits."""
 
     dtype: Any
-    length: int
-    first: int = 0
+    length: int  # Entries of the block: numbers in a row.
+    first: int = 0  # Row of the struct's first number.
 
     @property
     def end(self) -> int:
@@ -43,18 +38,18 @@ class Rows(NamedTuple):
         return Rows(fields[name], self.length, self.first + sum(len(numbers_of(fields[each], "")) for each in before))
 
     def text(self, line: str, without: tuple[str, ...] = ()) -> str:
-        """Return that line of C++ for each {number} and its {place}, but for the numbers of the fields `without`."""
+        """Return the line of C++ for each {number} and its {place}, except in the fields `without`."""
         left_out = tuple(f"value.{name}{end}" for name in without for end in ("[", ".", ";"))
         return "".join(f"    {line}\n".format(number=number, place=f"rows.data + {row * self.length}ll + i")
                        for row, number in enumerate(numbers_of(self.dtype, "value"), self.first)
                        if not f"{number};".startswith(left_out))
 
     def load(self, *without: str) -> Any:
-        """load(rows, i) -> value: entry i. The fields `without` are 0."""
+        """Make load(rows, i) -> entry i; the fields `without` are 0."""
         return make_load(self, without)
 
     def store(self, *without: str) -> Any:
-        """store(rows, i, value): put entry i. The rows of the fields `without` stay as they are."""
+        """Make store(rows, i, value); it leaves the rows of the fields `without` as they are."""
         return make_store(self, without)
 
 

@@ -1,5 +1,5 @@
-"""What device code knows of Warp's insides. All else that wrt knows of them is in wrt/core/warp_private.py, which code of the host
-alone may import; docs/warp.md, "When Warp changes"."""
+"""What device code knows of Warp's insides.
+The rest is in wrt/core/warp_private.py, which only host code may import; see docs/warp.md, "When Warp changes"."""
 
 from typing import Any
 

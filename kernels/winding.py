@@ -1,30 +1,30 @@
-"""How often surfaces wind around points: the sum of the solid angles of all triangles, over 4 pi."""
+"""Winding numbers of surfaces around points: the sum of the solid angles of all triangles, over 4 pi."""
 
 import warp as wp
 
 from wrt.kernels.structs import Surfaces, kernel
 
-FEW, MANY = wp.constant(wp.float64(2.0**-900)), wp.constant(wp.float64(2.0**900))  # where a product is made of size 1 again
+FEW, MANY = wp.constant(wp.float64(2.0**-900)), wp.constant(wp.float64(2.0**900))  # beyond these sizes, a product is scaled to size 1
 
 
 @wp.struct
 class Turns:
-    """A sum of angles in [-pi, pi]: the product of unit-like complex numbers re + i im, and the whole turns that its argument has
-    lost. No function of the C library, whose last bits differ, is needed until the end."""
+    """A sum of angles in [-pi, pi], as a product of complex numbers; it needs no function of the C library, whose last bits differ."""
 
-    re: wp.float64
+    re: wp.float64  # Product: re + i im.
     im: wp.float64
-    whole: wp.float64
+    whole: wp.float64  # Whole turns that the product's argument has lost.
 
 
 @wp.func
 def corner(surfaces: Surfaces, vertex: int, point: wp.vec3) -> wp.vec3d:
+    """Vector from the point to a vertex, in float64."""
     return wp.vec3d(surfaces.vertices[vertex]) - wp.vec3d(point)
 
 
 @wp.func
 def turned(turns: Turns, re: wp.float64, im: wp.float64) -> Turns:
-    """With the angle of one more number added."""
+    """Add the angle of the number re + i im."""
     zero = wp.float64(0.0)
     if re == zero and im == zero:  # the point is on an edge
         return turns
@@ -45,8 +45,8 @@ def turned(turns: Turns, re: wp.float64, im: wp.float64) -> Turns:
 
 @kernel
 def wind(surfaces: Surfaces, points: wp.array(dtype=wp.vec3), turns: wp.array(dtype=wp.vec3d), first: int):
-    """re, im and whole turns of half the solid angles together. The angle of one: van Oosterom and Strackee 1983, "The Solid Angle
-    of a Plane Triangle"; a point at a corner has none of that triangle."""
+    """Store re, im and whole turns of the sum of half solid angles at each point. One angle: van Oosterom and Strackee 1983, "The Solid
+    Angle of a Plane Triangle". A triangle with a corner at the point adds 0."""
     i = first + wp.tid()
     point = points[i]
     one = wp.float64(1.0)

@@ -1,4 +1,4 @@
-"""The traversal unit without a structure: every primitive is tested. The yardstick for all others."""
+"""The traversal unit without a structure: it tests every primitive, and is the yardstick for all others."""
 
 from functools import cache
 from typing import Any
@@ -13,7 +13,7 @@ from wrt.kernels.traverse.leaf import make_leaf
 
 @cache
 def make_struct(record: Any) -> Any:
-    """The structure over records of this kind: all primitives, in the order of prim_id."""
+    """Make the structure over records of this kind: all primitives, in the order of prim_id."""
 
     @wp.struct
     class BruteForce:
@@ -24,7 +24,7 @@ def make_struct(record: Any) -> Any:
 
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """The closest hit, or any (the first that is found), among all primitives."""
+    """Make the unit for the closest hit, or for any hit, among all primitives."""
     probe_of = make_probe(units)
     visit_leaf = make_leaf(units, any_hit, accepts)
     _, _, _, finish = make_counters(units, 0)

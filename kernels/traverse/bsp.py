@@ -1,28 +1,28 @@
-"""The traversal unit of the BSP tree: planes of any orientation, visited front to back with the part of the ray in each cell.
+"""The traversal unit of the BSP tree: planes of any orientation, cells visited front to back.
 
 Ize, Wald and Parker 2008, "Ray Tracing with the BSP Tree". Planes across an axis are the fast path: one subtraction and one
 multiplication, as in a k-d tree.
 
-**Why no hit is lost.** u = 2^-24; all lengths along one axis. Let a primitive X of extent E have a hit, found by the unit at t'
-before it is held to X's box (`within_bounds`), and reported as t. Let P = origin + t' direction and D = |t'| max|direction|.
-1. P is within 8 u (D + E) of a point Q of X: t' belongs to weights that are convex to 2^-50 (products and areas are exact in
-   float64) of corners that are off by at most 7 u (D + E) after the shear, u D of it the rounding of t' itself. Spheres: nearer.
-2. |t - t'| <= reach := 2^-19 D_box / min|direction_i| over the components that are not 0, D_box being the longest distance along
-   an axis from the origin to the root box (so that D <= D_box and E <= 2 D_box): P is within 24 u D_box of X's box, the slab
-   distances carry 3 u D_box, and t' is moved no farther than to the plane that it is beyond; 27 u < 2^-19 = 32 u.
-   Nor is it moved out of the slab of X's padded box across the longest component m of the direction, which holds t' but for
-   24 u D_box, and t but for 3 u D_box and FAR_PAD's 14 u: reach <= (E_padded + 2^-18 D_box) / |direction_m|. That is what
-   counts for a ray nearly along an axis. The smaller of the two is taken, with the largest E_padded of all primitives.
-   So the segment that is walked reaches `reach` beyond t_min and the best hit at either end; it is cut by the root box, grown
-   by 2^-19 D_box.
-3. The builder lists each X, clipped to the cell, on a side that Q is in, or out of by at most node.tolerance's share of the
-   builder (`plane_tolerance`). There |plane(P)| is off from plane(Q) by |n|_1 8 u (D + E). What is computed here differs from
-   plane(P): by 4 u (sum |n_i Q_i| + |d|) + 7 u |n|_1 D through the rounding of both dot products, and by 3 u |n|_1 D through
-   that of the two distances. All that does not depend on D is in node.tolerance; the rest is 18 u |n|_1 D <= 31.2 u D, and
-   2^-19 D is taken, with the largest D of the part of the ray in this cell.
-So a plane is a slab of that half thickness, and a child is visited wherever the ray is on its side or in the slab; t' is then in
-the interval of a leaf that has X, which is visited unless it begins more than `reach` beyond the best hit. A ray along the plane
-divides by 0 or nearly so: the distances are then beyond the interval, or say nothing, and the child or both are visited.
+**Why no hit is lost.** u = 2^-24; lengths are measured along an axis. Let a primitive X of extent E have a hit, found by the unit at t'
+and reported as t after the clamp to X's box (`within_bounds`). Let P = origin + t' direction and D = |t'| max|direction|.
+
+1. P is within 8 u (D + E) of a point Q of X. The weights of t' are convex to 2^-50 (products and areas are exact in float64). They weight
+   corners that the shear moves by at most 7 u (D + E); the rounding of t' adds u D. Spheres are nearer.
+2. |t - t'| <= reach := 2^-19 D_box / min|direction_i| over the components that are not 0. D_box is the longest distance along an axis from
+   the origin to the root box, so that D <= D_box and E <= 2 D_box. P is within 24 u D_box of X's box, and the slab distances carry 3 u
+   D_box. The clamp moves t' no farther than to the plane that it is beyond, and 27 u < 2^-19 = 32 u.
+3. For a ray nearly along an axis, a second bound counts. Let m be the longest component of the direction. The slab of X's padded box
+   across m holds t' but for 24 u D_box, and t but for 3 u D_box and FAR_PAD's 14 u. So reach <= (E_padded + 2^-18 D_box) / |direction_m|.
+   The walk takes the smaller bound, with the largest E_padded of all primitives. Its segment extends `reach` beyond t_min and beyond the
+   best hit, and is cut by the root box grown by 2^-19 D_box.
+4. The builder lists each X, clipped to the cell, on every side that Q is in, or misses by at most the builder's share of node.tolerance
+   (`plane_tolerance`). There |plane(P)| differs from plane(Q) by |n|_1 8 u (D + E). The computed value differs from plane(P) by 4 u
+   (sum |n_i Q_i| + |d|) + 7 u |n|_1 D (both dot products), and by 3 u |n|_1 D (the two distances). The terms without D are in
+   node.tolerance. The others sum to 18 u |n|_1 D <= 31.2 u D; the walk takes 2^-19 D, with the largest D of the ray's part in this cell.
+
+So a plane is a slab of that half thickness, and the walk visits a child if the ray is on its side or in the slab. Then t' is in the
+interval of a leaf that lists X, and the leaf is visited unless it begins more than `reach` beyond the best hit. A ray along the plane
+divides by 0 or nearly so. Its distances lie outside the interval or are NaN, and one child or both are visited.
 """
 
 from functools import cache
@@ -37,7 +37,7 @@ from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
 from wrt.kernels.traverse.leaf import make_leaf
 from wrt.kernels.units.box import BoxRay, slab_interval
 
-# The builder keeps the depth at or below this; a path from the root pushes at most one child a level.
+# Builders keep the depth at or below this; a path from the root pushes at most one child a level.
 STACK_SIZE = 64
 REACH = wp.constant(2.0**-19)
 SMALLEST = wp.constant(2.0**-120)  # above what underflows in the derivation
@@ -47,16 +47,13 @@ INNER = -1  # count of a child that is an inner node
 
 @wp.struct
 class BspNode:
-    """A plane normal . p + offset = 0 (axis 0 to 2: across that axis, p[axis] + offset = 0), and its children below (0) and
-    above (1) it: the inner node `first` (count = -1), or the primitives first .. first + count - 1, which may be none.
-
-    tolerance: half of the plane's thickness but for what grows with the distance from the ray's origin.
-    """
+    """A plane normal . p + offset = 0 and its two children: 0 below the plane, 1 above it.
+    A child is the inner node `first` (count = INNER), or the primitives first .. first + count - 1, which may be none."""
 
     normal: wp.vec3
     offset: float
-    tolerance: float
-    axis: int
+    tolerance: float  # Half of the plane's thickness, without the part proportional to the ray's distance.
+    axis: int  # 0, 1, 2: the plane is p[axis] + offset = 0; PLANE: any.
     first_0: int
     count_0: int
     first_1: int
@@ -65,18 +62,17 @@ class BspNode:
 
 @wp.struct
 class Reach:
-    """The part of a ray that is walked, from t_0 to t_1; beyond: how far the walk goes on behind the best hit; drift: thickness
-    of a plane for each unit of t."""
+    """The part of a ray that is walked."""
 
-    t_0: float
-    t_1: float
-    beyond: float
-    drift: float
+    t_0: float  # Begin.
+    t_1: float  # End.
+    beyond: float  # Distance that the walk goes on behind the best hit.
+    drift: float  # Thickness of a plane per unit of t.
 
 
 @wp.func
 def reach_of(box: BoxRay, ray: Ray, t_max: float, lo: wp.vec3, hi: wp.vec3, extent: float) -> Reach:
-    """Set-up, once a ray (2. above). t_0 > t_1, or NaN, where the ray passes by the root box."""
+    """Compute the part of the ray to walk (2. and 3. above); t_0 > t_1, or NaN, if the ray misses the root box."""
     corner = wp.max(wp.abs(lo - ray.origin), wp.abs(hi - ray.origin))
     grow = REACH * wp.max(wp.max(corner[0], corner[1]), corner[2]) + SMALLEST
     margin = wp.vec3(grow, grow, grow)
@@ -96,14 +92,13 @@ def reach_of(box: BoxRay, ray: Ray, t_max: float, lo: wp.vec3, hi: wp.vec3, exte
 
 @cache
 def make_struct(record: Any) -> Any:
-    """lo, hi: the root box; extent: the longest side of a primitive's padded box; the root itself is the child (first, count),
-    as in a node."""
+    """Make the structure over records of this kind; the root is the child (first, count), as in a node."""
 
     @wp.struct
     class Bsp:
-        lo: wp.vec3
+        lo: wp.vec3  # The root box: lo, hi.
         hi: wp.vec3
-        extent: float
+        extent: float  # Longest side of a primitive's padded box.
         first: int
         count: int
         nodes: wp.array(dtype=BspNode)
@@ -115,21 +110,20 @@ def make_struct(record: Any) -> Any:
 
 @wp.struct
 class Sides:
-    """The children of a node in the order of a ray, whether the ray meets them, and where, at most, it leaves the nearer one and
-    enters the farther one."""
+    """The children of a node in the order of a ray."""
 
     near: Child
     far: Child
     meets_near: bool
     meets_far: bool
-    near_t_1: float
-    far_t_0: float
+    near_t_1: float  # Latest t at which the ray leaves the nearer one.
+    far_t_0: float  # Earliest t at which it enters the farther one.
 
 
 @wp.func
 def cut_by_plane(node: BspNode, box: BoxRay, direction: wp.vec3, t_0: float, t_1: float, drift: float) -> Sides:
-    """The sides for the part of a ray from t_0 to t_1. drift: of Reach."""
-    # The distance of the origin from the plane, against the normal, and one over the speed along the normal.
+    """Order and cut the part of a ray from t_0 to t_1 by a node's plane; drift: of Reach."""
+    # Distance of the origin from the plane, against the normal, and 1 / speed along the normal.
     height = float(0.0)
     inv = float(0.0)
     if node.axis < wp.static(PLANE):
@@ -146,7 +140,7 @@ def cut_by_plane(node: BspNode, box: BoxRay, direction: wp.vec3, t_0: float, t_1
     out = Sides()
     out.near = child_of(node, not up)
     out.far = child_of(node, up)
-    # Comparisons with NaN are false: it says nothing, and the child is visited.
+    # Comparisons with NaN are false: the child is visited.
     out.meets_near = out.near.count != 0 and not (t_0 > near_end)
     out.meets_far = out.far.count != 0 and not (far_begin > t_1)
     out.near_t_1 = wp.where(near_end < t_1, near_end, t_1)
@@ -155,7 +149,7 @@ def cut_by_plane(node: BspNode, box: BoxRay, direction: wp.vec3, t_0: float, t_1
 
 
 def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
-    """walk(accel, surfaces, probe, reach) -> the best hit and counts."""
+    """Make walk(accel, surfaces, probe, reach) -> best hit, counts."""
     visit_leaf = make_leaf(units, any_hit, accepts)
     fetch_node, _, push, _ = make_counters(units, size_of(BspNode))
 
@@ -200,7 +194,7 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
                     count = sides.far.count
                     t_0 = sides.far_t_0
                     continue
-            # Pop; what begins beyond the closest hit, and farther than a hit is moved, is dropped.
+            # Pop the next child that does not begin beyond the best hit and the distance that a clamp can move it.
             found = bool(False)
             while size > 0 and not found:
                 size = size - 1
@@ -217,7 +211,7 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
 
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """The closest hit, or any (the first that is found). The box test has no say: only the root has a box."""
+    """Make the unit for the closest hit, or for any hit. It needs no box test: only the root has a box."""
     probe_of = make_probe(units)
     walk = make_walk(units, any_hit, accepts)
     _, _, _, finish = make_counters(units, 0)

@@ -1,9 +1,6 @@
-"""The traversal unit of the binary BVH: front to back, with a stack, and an early stop.
-
-A node holds the volumes of both its children, so that one fetch feeds two tests. The nearer child is visited at once and the
-farther one pushed; a popped node that begins beyond the closest hit is dropped. The volumes are boxes here; other kinds
-(traverse_bvh2_sphere, traverse_bvh2_kdop) share the walk.
-"""
+"""The traversal unit of the binary BVH: front to back, with a stack.
+A node holds the volumes of both children: one fetch feeds two tests. The walk visits the nearer child at once and pushes the farther one;
+it drops a popped node that begins beyond the closest hit. Volumes are boxes here; `bvh2_sphere.py` and `bvh2_kdop.py` share the walk."""
 
 from functools import cache
 from typing import Any, NamedTuple
@@ -17,17 +14,15 @@ from wrt.kernels.traverse.leaf import make_leaf
 from wrt.kernels.traverse.stack import key_of, make_stack, reference_of, t_of
 from wrt.kernels.units.box import BoxRay
 
-# Every builder keeps the tree's depth at or below this; a path from the root pushes at most one node a level.
+# Builders keep the depth at or below this; a path from the root pushes at most one node a level.
 STACK_SIZE = 64
 ENTRY = 12  # bytes
 
 
 @wp.struct
 class Bvh2Node:
-    """Two children: box, and either a leaf's primitives first .. first + count - 1, or (count = 0) the inner node `first`.
-
-    A child that does not exist is an empty box (lo = inf, hi = -inf).
-    """
+    """Two children: a box, and either a leaf's primitives first .. first + count - 1, or (count = 0) the inner node `first`. A missing
+    child is an empty box (lo = inf, hi = -inf)."""
 
     lo_0: wp.vec3
     hi_0: wp.vec3
@@ -41,7 +36,7 @@ class Bvh2Node:
 
 @cache
 def make_struct(record: Any, node: Any = Bvh2Node) -> Any:
-    """The structure over records and nodes of these kinds: nodes[0] is the root; primitives are in the order of the leaves."""
+    """Make the structure over these kinds of records and nodes: nodes[0] is the root, primitives are in the order of the leaves."""
 
     @wp.struct
     class Bvh2:
@@ -53,20 +48,18 @@ def make_struct(record: Any, node: Any = Bvh2Node) -> Any:
 
 
 class Volumes(NamedTuple):
-    """A kind of bounding volume: struct: of the structure; node: of a node, with first_0, count_0, first_1 and count_1 as in
-    Bvh2Node; set_up(accel, probe): what the test needs of a ray; enter(what, node, t_max): the distances at which the ray enters
-    both children (vec2), inf where it misses, never beyond a hit in them; root(ray): the node that the walk begins at, where that
-    is not node 0 for all."""
+    """A kind of bounding volume."""
 
-    struct: Any
-    node: Any
-    set_up: Any
-    enter: Any
-    root: Any = None
+    struct: Any  # Of the structure.
+    node: Any  # Of a node, with first_0, count_0, first_1, count_1 as in Bvh2Node.
+    set_up: Any  # Function (accel, probe) -> the ray as `enter` reads it.
+    enter: Any  # Function (ray, node, t_max) -> entry distances of both children; inf on a miss, never beyond a hit inside.
+    root: Any = None  # Function (ray) -> the node where the walk begins; None: node 0.
 
 
 @cache
 def box_volumes(record: Any, box_test: Any) -> Volumes:
+    """Make boxes as volumes; box_test: of RAY_AABB."""
     struct = make_struct(record)
 
     @wp.func
@@ -97,19 +90,19 @@ def child_of(node: Any, second: bool) -> Child:
 
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """The closest hit, or any (the first that is found)."""
+    """Make the unit for the closest hit, or for any hit."""
     volumes = box_volumes(units.triangle_test.record, units.box_test)
     return make_binary_traversal(units, volumes, make_leaf(units, any_hit, accepts), any_hit)
 
 
 def make_binary_traversal(units: Units, volumes: Volumes, visit_leaf: Any, any_hit: bool, ordered: bool = True,
                           early: bool = True) -> Any:
-    """As make_traversal, over a tree with these volumes and leaves (kernels.traverse.leaf). ordered: the nearer child first; early:
-    nodes beyond the best hit are dropped (what either is worth is for studies to tell)."""
+    """Make a unit over a tree with these volumes and leaves (kernels.traverse.leaf). Studies switch off `ordered` (nearer child first) and
+    `early` (nodes beyond the best hit are dropped)."""
     probe_of = make_probe(units)
     struct, set_up, enter, root = volumes.struct, volumes.set_up, volumes.enter, volumes.root
     fetch_node, _, push, finish = make_counters(units, size_of(volumes.node))
-    # Where a child begins and its t, and how many primitives it has.
+    # An entry: a key (entry distance and node or first primitive) and a count of primitives.
     new_keys, shared_keys, put_key, key_at = make_stack(units.stack, STACK_SIZE, wp.uint64, ENTRY)
     new_counts, shared_counts, put_count, count_at = make_stack(units.stack, STACK_SIZE, wp.int32, ENTRY)
 
@@ -145,7 +138,7 @@ def make_binary_traversal(units: Units, volumes: Volumes, visit_leaf: Any, any_h
                 hit_0 = entry[0] < wp.inf
                 hit_1 = entry[1] < wp.inf
                 if hit_0 or hit_1:
-                    second = not hit_0  # which child is visited first
+                    second = not hit_0  # child 1 is visited first
                     if wp.static(ordered):
                         second = entry[1] < entry[0]
                     if hit_0 and hit_1:
@@ -158,7 +151,7 @@ def make_binary_traversal(units: Units, volumes: Volumes, visit_leaf: Any, any_h
                     first = near.first
                     count = near.count
                     continue
-            # Pop; what begins beyond the closest hit is dropped. Equal stays: a tie may have a lower prim_id there.
+            # Pop the next node that does not begin beyond the closest hit. Equal t stays: a tie may have a lower prim_id there.
             found = bool(False)
             while size > 0 and not found:
                 size = size - 1

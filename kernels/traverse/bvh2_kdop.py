@@ -1,4 +1,4 @@
-"""The traversal unit of the binary BVH whose volumes are 14-DOPs: boxes with their corners cut off, 56 bytes each."""
+"""The traversal unit of the binary BVH over 14-DOPs: boxes with their corners cut off, 56 bytes each."""
 
 from functools import cache
 from typing import Any
@@ -14,7 +14,7 @@ from wrt.kernels.units.kdop import KdopRay, kdop_ray, ray_kdop
 
 @wp.struct
 class KdopNode:
-    """As Bvh2Node, and the planes askew of both children: cut_lo <= project(x - middle) <= cut_hi."""
+    """A Bvh2Node with the diagonal planes of both children: cut_lo <= project(x - middle) <= cut_hi."""
 
     lo_0: wp.vec3
     hi_0: wp.vec3
@@ -32,7 +32,7 @@ class KdopNode:
 
 @cache
 def make_struct(record: Any) -> Any:
-    """middle: what the planes askew are relative to."""
+    """Make the structure over records of this kind; middle: the point to which the diagonal planes are relative."""
 
     @wp.struct
     class Bvh2Kdop:
@@ -46,6 +46,7 @@ def make_struct(record: Any) -> Any:
 
 @cache
 def kdop_volumes(record: Any) -> Volumes:
+    """Make 14-DOPs as volumes."""
     struct = make_struct(record)
 
     @wp.func
@@ -61,6 +62,6 @@ def kdop_volumes(record: Any) -> Volumes:
 
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """The closest hit, or any (the first that is found). The box test of `units` is for primitives only."""
+    """Make the unit for the closest hit, or for any hit; the box test of `units` serves primitives only."""
     volumes = kdop_volumes(units.triangle_test.record)
     return make_binary_traversal(units, volumes, make_leaf(units, any_hit, accepts), any_hit)

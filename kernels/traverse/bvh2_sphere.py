@@ -1,4 +1,4 @@
-"""The traversal unit of the binary BVH whose volumes are spheres: 16 bytes instead of a box's 24, and no corner to fit."""
+"""The traversal unit of the binary BVH over spheres: 16 bytes a volume in place of a box's 24."""
 
 from functools import cache
 from typing import Any
@@ -14,7 +14,7 @@ from wrt.kernels.units.bounding_sphere import SphereRay, ray_bounding_sphere, sp
 
 @wp.struct
 class SphereNode:
-    """As Bvh2Node, with spheres (center, radius); a child that does not exist has radius -1."""
+    """A Bvh2Node with spheres (center, radius); a missing child has radius -1."""
 
     sphere_0: wp.vec4
     sphere_1: wp.vec4
@@ -30,6 +30,7 @@ def make_struct(record: Any) -> Any:
 
 @cache
 def sphere_volumes(record: Any) -> Volumes:
+    """Make bounding spheres as volumes."""
     struct = make_struct(record)
 
     @wp.func
@@ -44,6 +45,6 @@ def sphere_volumes(record: Any) -> Volumes:
 
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """The closest hit, or any (the first that is found). The box test of `units` is for primitives only."""
+    """Make the unit for the closest hit, or for any hit; the box test of `units` serves primitives only."""
     volumes = sphere_volumes(units.triangle_test.record)
     return make_binary_traversal(units, volumes, make_leaf(units, any_hit, accepts), any_hit)

@@ -1,4 +1,4 @@
-"""What every traversal unit does with a primitive, whatever structure led to it."""
+"""The test of a primitive, shared by all traversal units."""
 
 from typing import Any, NamedTuple
 
@@ -11,19 +11,16 @@ from wrt.kernels.units.triangle import RAY_TRIANGLE, TriangleRay, triangle_ray
 
 
 class Units(NamedTuple):
-    """What a traversal unit is made of: names in RAY_TRIANGLE and RAY_AABB, whether there are spheres, whether it counts, whether
-    it walks instances (Ray.first_prim is then added to each prim_id), whether it goes on behind a hit: at t_min, only primitives
-    from Ray.slot on are hit; spheres have two hits, and cannot be gone on from. lists: whether it lists all hits
-    (kernels.hit_lists) instead of keeping the best. stack: in kernels.traverse.stack.PLACES, for those who look there."""
+    """Options of a traversal unit."""
 
-    triangle: str = "watertight"
-    box: str = "conservative"
-    spheres: bool = False
-    counters: bool = False
-    instances: bool = False
-    resumes: bool = False
-    lists: bool = False
-    stack: str = "local"
+    triangle: str = "watertight"  # Name in RAY_TRIANGLE.
+    box: str = "conservative"  # Name in RAY_AABB.
+    spheres: bool = False  # True if primitives may be spheres.
+    counters: bool = False  # True to count.
+    instances: bool = False  # True below instances: Ray.first_prim is added to each prim_id.
+    resumes: bool = False  # True to go on behind a hit: at t_min, only prim_id >= Ray.slot counts; no spheres.
+    lists: bool = False  # True to list all hits (kernels.hit_lists) in place of the best.
+    stack: str = "local"  # Place of the stack, in kernels.traverse.stack.PLACES, for units that have the choice.
 
     @property
     def triangle_test(self) -> Any:
@@ -45,12 +42,10 @@ class Probe:
 
 @wp.func
 def no_hit(ray: Ray) -> Hit:
-    """The best hit before anything is found: at the segment's end, so that a hit exactly there still counts.
-
-    A ray that is not finite has an empty segment: comparisons with NaN would let it into every box, the empty ones too.
-    """
+    """Best hit before a walk: a miss at the segment's end, so that a hit exactly there still counts. A ray that is not finite gets an
+    empty segment: comparisons with NaN would let it enter every box, empty ones too."""
     best = Hit()
-    zero = 0.0 * ray.origin + 0.0 * ray.direction  # 0, or NaN; a sum of the components could overflow
+    zero = 0.0 * ray.origin + 0.0 * ray.direction  # 0 or NaN; the components' sum could overflow
     s = zero[0] + zero[1] + zero[2]
     best.t = wp.where(s == 0.0, ray.t_max, float(-wp.inf))  # wp.isfinite would be a call
     best.prim_id = NO_HIT
@@ -58,7 +53,7 @@ def no_hit(ray: Ray) -> Hit:
 
 
 def make_probe(units: Units) -> Any:
-    """The set-up of both units, once a ray."""
+    """Make probe_of(ray) -> Probe, the set-up of both units."""
 
     @wp.func
     def probe_of(ray: Ray) -> Probe:
@@ -73,16 +68,13 @@ def make_probe(units: Units) -> Any:
 
 
 def make_better(units: Units, accepts: Any = None) -> Any:
-    """The unit that keeps the better of two hits.
-
-    accepts(surfaces, prim_id, u, v) -> bool may refuse a hit (cut-outs); None takes all. Where units.lists, it is
-    accepts(lists, ray, hit, best) -> Hit, which takes the hit and gives the next `best`; `surfaces` is what it lists them in.
-    """
+    """Make the unit that keeps the better of two hits.
+    accepts(surfaces, prim_id, u, v) -> bool may reject a hit (cut-outs); None accepts all. With units.lists, it is accepts(lists, ray,
+    hit, best) -> Hit: it stores the hit in `lists`, passed as `surfaces`, and returns the next `best`."""
 
     @wp.func
     def better(ray: Ray, surfaces: Any, hit: Hit, prim_id: int, best: Hit) -> Hit:
-        """The closer of `best` and a primitive's hit (prim_id: NO_HIT where there is none) in [t_min, best.t]; at equal t the lower
-        prim_id."""
+        """Closer of `best` and a primitive's hit in [t_min, best.t]; the lower prim_id at equal t."""
         if hit.prim_id == NO_HIT or not (hit.t >= ray.t_min and hit.t <= best.t):
             return best
         if hit.t == best.t and prim_id > best.prim_id:
@@ -109,7 +101,7 @@ def sphere_hit(probe: Probe, surfaces: Surfaces, prim_id: int) -> Hit:
 
 
 def make_intersect(units: Units, accepts: Any = None) -> Any:
-    """The unit that tests one primitive and keeps the better hit. accepts: of make_better."""
+    """Make the unit that tests one primitive and keeps the better hit; accepts: of make_better."""
     record = units.triangle_test.record
     ray_triangle = units.triangle_test.intersect
     better = make_better(units, accepts)
@@ -119,7 +111,7 @@ def make_intersect(units: Units, accepts: Any = None) -> Any:
         prim_id = primitive.prim_id
         if wp.static(units.instances):
             prim_id = primitive.prim_id + probe.ray.first_prim
-        if prim_id + 1 == probe.ray.exclude_plus_one:  # first: a ray's own triangle, at its origin, is a hard case
+        if prim_id + 1 == probe.ray.exclude_plus_one:  # before the test: a ray's own triangle, at its origin, is a hard case
             return best
         hit = Hit()
         if wp.static(units.spheres):

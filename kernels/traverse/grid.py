@@ -1,10 +1,7 @@
-"""The traversal unit of the uniform grid: from cell to cell along the ray (3D-DDA), and an early stop.
-
-Amanatides and Woo 1987, "A Fast Voxel Traversal Algorithm for Ray Tracing", made to lose no ray: the distance to every plane
-is taken afresh, so that no error adds up, and where the ray leaves a cell within rounding of an edge or a corner, all the cells
-around that it may have passed through are visited too. Exactly those cells are visited that the conservative box test would
-enter, each once.
-"""
+"""The traversal unit of the uniform grid: from cell to cell along the ray (3D-DDA).
+Amanatides and Woo 1987, "A Fast Voxel Traversal Algorithm for Ray Tracing", changed to lose no ray. The distance to every plane is
+computed from its coordinate, so that errors do not add up. A ray that leaves a cell within rounding of an edge or corner also visits the
+other cells around it. The walk visits exactly the cells that the conservative box test would enter, each once."""
 
 from functools import cache
 from typing import Any
@@ -29,7 +26,7 @@ class GridCell:
 
 @wp.struct
 class GridLayout:
-    """n cells along each axis, of one size but for rounding, from lo to hi."""
+    """Cells of equal size, but for rounding, from lo to hi; n: cells along each axis."""
 
     lo: wp.vec3
     hi: wp.vec3
@@ -39,20 +36,20 @@ class GridLayout:
 
 @wp.func
 def grid_plane(layout: GridLayout, axis: int, i: int) -> float:
-    """Plane i of the n + 1 across this axis; monotone in i. The builder and the traversal call this one function."""
+    """Coordinate of plane i of the n + 1 across this axis; monotone in i. Builder and traversal share this function."""
     return wp.where(i >= layout.n[axis], layout.hi[axis], layout.lo[axis] + float(i) * layout.size[axis])
 
 
 @wp.func
 def guessed_slab(layout: GridLayout, axis: int, x: float) -> int:
-    """About where x is: it only saves time."""
+    """Approximate slab of x, a start for exact searches."""
     guess = (x - layout.lo[axis]) / layout.size[axis]
     return int(wp.where(guess > 0.0, wp.min(guess, float(layout.n[axis] - 1)), 0.0))
 
 
 @wp.func
 def slab_of(layout: GridLayout, axis: int, x: float) -> int:
-    """The lowest slab whose upper plane is not below x; closed slabs, so that a plane is in both."""
+    """Lowest slab whose upper plane is not below x; slabs are closed, so that a plane is in both."""
     slab = guessed_slab(layout, axis, x)
     while slab < layout.n[axis] - 1 and grid_plane(layout, axis, slab + 1) < x:
         slab += 1
@@ -63,14 +60,14 @@ def slab_of(layout: GridLayout, axis: int, x: float) -> int:
 
 @wp.func
 def exit_distance(layout: GridLayout, ray: BoxRay, axis: int, cell: int) -> float:
-    """Where the ray leaves this slab of cells; inf where it is parallel to it."""
+    """Distance at which the ray leaves this slab of cells; inf if it is parallel to it."""
     plane = grid_plane(layout, axis, wp.where(ray.inv_dir[axis] < 0.0, cell, cell + 1))
     return wp.where(parallel(ray, axis), float(wp.inf), (plane - ray.origin[axis]) * ray.inv_dir[axis])
 
 
 @wp.func
 def first_slab(layout: GridLayout, ray: BoxRay, direction: wp.vec3, axis: int, t: float) -> int:
-    """The first slab along the ray that it may not have left at t; where it is parallel, the lowest that holds the origin."""
+    """First slab along the ray that it may not have left at t; for a parallel ray, the lowest that holds the origin."""
     last = layout.n[axis] - 1
     if parallel(ray, axis):
         return slab_of(layout, axis, ray.origin[axis])
@@ -86,7 +83,7 @@ def first_slab(layout: GridLayout, ray: BoxRay, direction: wp.vec3, axis: int, t
 
 @wp.func
 def slabs_left(layout: GridLayout, ray: BoxRay, axis: int, slab: int, t_exit: float, limit: float) -> int:
-    """How many slabs, from this one on, which it leaves at t_exit, the ray leaves for the next up to `limit`."""
+    """Count the slabs that the ray leaves for the next ones up to `limit`, from `slab` on, which it leaves at t_exit."""
     n = int(0)
     step = wp.where(ray.inv_dir[axis] < 0.0, -1, 1)
     while t_exit <= limit and slab + step >= 0 and slab + step < layout.n[axis]:
@@ -98,21 +95,19 @@ def slabs_left(layout: GridLayout, ray: BoxRay, axis: int, slab: int, t_exit: fl
 
 @cache
 def make_struct(record: Any) -> Any:
-    """The structure over records of this kind, in the order of prim_id. lo, hi, size, n: the GridLayout; pad, extent: the largest
-    of any triangle's box; mailbox: 1 to remember what was tested; cells: x first, then y, then z; references: indices of
-    primitives."""
+    """Make the structure over records of this kind, in the order of prim_id."""
 
     @wp.struct
     class Grid:
-        lo: wp.vec3
+        lo: wp.vec3  # The GridLayout: lo, hi, size, n.
         hi: wp.vec3
         size: wp.vec3
         n: wp.vec3i
-        pad: float
-        extent: float
-        mailbox: int
-        cells: wp.array(dtype=GridCell)
-        references: wp.array(dtype=wp.int32)
+        pad: float  # Largest pad of a triangle's box.
+        extent: float  # Largest extent of a triangle's box.
+        mailbox: int  # 1: remember tested primitives.
+        cells: wp.array(dtype=GridCell)  # In the order x, then y, then z.
+        references: wp.array(dtype=wp.int32)  # Indices of primitives.
         primitives: wp.array(dtype=record)
         recorder: Recorder
 
@@ -130,7 +125,7 @@ def layout_of(accel: Any) -> GridLayout:
 
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """The closest hit, or any (the first that is found). The box test is the walk's own, whatever `units` says."""
+    """Make the unit for the closest hit, or for any hit; the walk has a box test of its own."""
     probe_of = make_probe(units)
     visit_leaf = make_mailbox_leaf(units, any_hit, accepts)
     fetch_node, _, _, finish = make_counters(units, size_of(GridCell))
@@ -162,7 +157,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
             side = wp.where(axis == 2, 0, axis + 1)
             other = wp.where(axis == 0, 2, axis - 1)
             t_out = t_next[axis]
-            # Slabs across the two other axes that it leaves as good as at the same place: this cell and those are visited.
+            # The ray may leave slabs across the other two axes at the same place: their cells are visited with this one.
             limit = wp.where(t_out < wp.inf, later(t_out), float(-wp.inf))
             side_slabs = slabs_left(layout, probe.box, side, slab[side], t_next[side], limit)
             other_slabs = slabs_left(layout, probe.box, other, slab[other], t_next[other], limit)

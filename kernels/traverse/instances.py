@@ -1,9 +1,7 @@
-"""The traversal unit of two levels: a binary BVH over placed structures, each in a space of its own.
-
-The lower level is any traversal unit: it gets the ray in its structure's space and says what it always says, so that a closed
-mesh is as tight as it was before it was placed. The direction is not normalised, and so t is the same in both spaces. What
-is left for this level is never to pass by a structure in which a hit would have been found: see `enter`.
-"""
+"""The traversal unit of two levels: a binary BVH (TLAS) over placed structures (BLAS), each in a space of its own.
+Any traversal unit is the lower level. It gets the ray in its structure's space and returns its usual hit, so that a closed mesh stays
+watertight where it is placed. The direction is not normalised: t is the same in both spaces. This level must never pass by a structure
+that has a hit: see `enter`."""
 
 from functools import cache
 from typing import Any
@@ -19,28 +17,26 @@ from wrt.kernels.units.box import FAR_PAD, BoxRay, slab_interval
 
 @wp.struct
 class Placement:
-    """A structure in one place. bottom: which one; first_prim: what its primitives' numbers begin with in the scene;
-    local_x, local_y, local_z: the rows of the affine map from the world to the structure's space."""
+    """A placed structure."""
 
-    bottom: int
-    first_prim: int
-    local_x: wp.vec4d
+    bottom: int  # Index of the structure.
+    first_prim: int  # prim_id of its first primitive in the scene.
+    local_x: wp.vec4d  # Rows of the affine map from the world to the structure's space: local_x, local_y, local_z.
     local_y: wp.vec4d
     local_z: wp.vec4d
 
 
 @cache
 def make_struct(bottom: Any) -> Any:
-    """Two levels over structures of this kind. nodes: of a tree for each world, whose leaves are rows of `placements`; slack: see
-    `enter`; bases: where each structure begins in the space of addresses."""
+    """Make the two levels over structures of this kind."""
 
     @wp.struct
     class Instances:
-        nodes: wp.array(dtype=Bvh2Node)
+        nodes: wp.array(dtype=Bvh2Node)  # A tree for each world; leaves are ranges of placements.
         placements: wp.array(dtype=Placement)
         bottoms: wp.array(dtype=bottom)
-        bases: wp.array(dtype=wp.int64)
-        slack: float
+        bases: wp.array(dtype=wp.int64)  # Where each structure begins in the traces' address space.
+        slack: float  # Factor of the boxes' widening: see `enter`.
         recorder: Recorder
 
     return Instances
@@ -48,7 +44,7 @@ def make_struct(bottom: Any) -> Any:
 
 @wp.struct
 class WidenedRay:
-    """What `enter` needs of a ray."""
+    """The ray as `enter` reads it."""
 
     box: BoxRay
     slack: float
@@ -56,16 +52,18 @@ class WidenedRay:
 
 @wp.func
 def enter(ray: BoxRay, lo: wp.vec3, hi: wp.vec3, slack: float, t_max: float) -> float:
-    """As ray_aabb, with the box widened by slack times the distance to its farthest corner.
+    """Distance of `ray_aabb` to the box widened by slack times the distance to its farthest corner.
 
-    The ray in the structure's space is rounded to float32: its point at t is off by u (|o| + t |d|) there, per axis, and a hit
-    may be u 17 t |d| outside of its primitive's box (3 for the slabs, 14 for FAR_PAD). Taken back to the world that is at most
-    u (2 + 17) |A| |A^-1| times the distance, besides u |A| times the coordinates there, which the box has from its builder
-    (wrt.accel.instances); 4 more are for the rounding of this test. slack = 32 u max |A| |A^-1| (sums of rows) covers it, and
-    so this distance is never larger than that of a hit within: no hit is passed by, whatever the order of the visits.
+    In the structure's space the ray is rounded to float32: its point at t is off by u (|o| + t |d|), per axis. A hit may be u 17 t |d|
+    outside of its primitive's box (3 for the slabs, 14 for FAR_PAD). Mapped back to the world, with A the map, that is at most u (2 + 17)
+    |A| |A^-1| times the distance. The part u |A| times the coordinates is in the builder's box (wrt.accel.instances). The rounding of this
+    test adds 4.
+
+    slack = 32 u max |A| |A^-1| (sums of rows) covers them. So this distance never exceeds a hit's t inside: no hit is passed by, in any order
+    of visits.
     """
     if lo[0] > hi[0]:
-        return float(wp.inf)  # widened, an empty box would be no longer empty
+        return float(wp.inf)  # widened, an empty box would not be empty
     to_lo = wp.abs(lo - ray.origin)
     to_hi = wp.abs(hi - ray.origin)
     pad = slack * wp.max(wp.max(to_lo), wp.max(to_hi))
@@ -79,11 +77,11 @@ def enter(ray: BoxRay, lo: wp.vec3, hi: wp.vec3, slack: float, t_max: float) -> 
 
 @wp.func
 def power_of_two(longest: wp.float64) -> wp.float64:
-    """What brings a number > 0 to where a direction's longest component must be, between 2^-64 and 2^64; 1 for most."""
+    """Power of two that brings a number > 0 between 2^-64 and 2^64, the range of a direction's longest component; usually 1."""
     scale = wp.float64(1.0)
     x = longest
     steps = int(0)
-    while steps < 16 and (x > wp.float64(wp.static(2.0**64)) or x < wp.float64(wp.static(2.0**-64))):  # 16 do for all float64
+    while steps < 16 and (x > wp.float64(wp.static(2.0**64)) or x < wp.float64(wp.static(2.0**-64))):  # 16 steps suffice for any float64
         if x > wp.float64(wp.static(2.0**64)):
             x = x * wp.float64(wp.static(2.0**-96))
             scale = scale * wp.float64(wp.static(2.0**-96))
@@ -96,7 +94,7 @@ def power_of_two(longest: wp.float64) -> wp.float64:
 
 @wp.func
 def local_scale(place: Placement, direction: wp.vec3) -> wp.float64:
-    """The power of two by which the direction is scaled in the structure's space; t there times it is t in the world."""
+    """Power of two that scales the direction in the structure's space; t there times the scale is t in the world."""
     d = wp.vec4d(wp.float64(direction[0]), wp.float64(direction[1]), wp.float64(direction[2]), wp.float64(0.0))
     return power_of_two(
         wp.max(wp.max(wp.abs(wp.dot(place.local_x, d)), wp.abs(wp.dot(place.local_y, d))), wp.abs(wp.dot(place.local_z, d)))
@@ -105,7 +103,7 @@ def local_scale(place: Placement, direction: wp.vec3) -> wp.float64:
 
 @wp.func
 def local_ray(place: Placement, ray: Ray, scale: wp.float64) -> Ray:
-    """The ray in the structure's space: float64, rounded once. scale: `local_scale`."""
+    """Ray in the structure's space: computed in float64, rounded once; scale: `local_scale`."""
     o = wp.vec4d(wp.float64(ray.origin[0]), wp.float64(ray.origin[1]), wp.float64(ray.origin[2]), wp.float64(1.0))
     d = wp.vec4d(wp.float64(ray.direction[0]), wp.float64(ray.direction[1]), wp.float64(ray.direction[2]), wp.float64(0.0))
     out = Ray()
@@ -122,11 +120,11 @@ def local_ray(place: Placement, ray: Ray, scale: wp.float64) -> Ray:
 
 
 def make_placed_leaf(units: Units, any_hit: bool, bottom: Any, struct: Any) -> Any:
-    """The leaf of the upper level (kernels.traverse.leaf). bottom: the traversal of what is placed in it."""
+    """Make the leaf of the upper level (kernels.traverse.leaf); bottom: traversal of the placed structures."""
 
     @wp.func
     def visit(accel: struct, surfaces: Surfaces, ray: Ray, index: int, best: Hit) -> Hit:
-        """The better of `best` and the hit in one placed structure; at equal t the lower prim_id."""
+        """Better of `best` and the hit in one placed structure; the lower prim_id at equal t."""
         place = accel.placements[index]
         structure = accel.bottoms[place.bottom]
         if wp.static(units.counters):
@@ -143,7 +141,7 @@ def make_placed_leaf(units: Units, any_hit: bool, bottom: Any, struct: Any) -> A
 
     @wp.func
     def visit_leaf(accel: struct, surfaces: Surfaces, probe: Probe, first: int, count: int, best: Hit, counts: Counts):
-        if wp.static(units.counters):  # what is placed counts for itself
+        if wp.static(units.counters):  # the lower level adds its own counts
             add_counts(accel.recorder, probe.ray.slot, counts)
             counts = Counts()
         for i in range(first, first + count):
@@ -157,8 +155,8 @@ def make_placed_leaf(units: Units, any_hit: bool, bottom: Any, struct: Any) -> A
 
 
 def make_traversal(units: Units, any_hit: bool, bottom: Any, bottom_struct: Any) -> Any:
-    """The closest hit, or any, among all structures placed in the world whose root is ray.first_prim. bottom: the lower level's
-    traversal, made with these units."""
+    """Make the unit for the closest hit, or for any hit, in the world whose root is ray.first_prim. bottom: the lower level's traversal,
+    made with these units."""
     struct = make_struct(bottom_struct)
 
     @wp.func
@@ -178,6 +176,6 @@ def make_traversal(units: Units, any_hit: bool, bottom: Any, bottom_struct: Any)
         return ray.first_prim
 
     volumes = Volumes(struct, Bvh2Node, set_up, enter_both, root)
-    # The lower walk may have its stack in shared memory, and this one goes on behind it.
+    # Only the lower walk may use shared memory: this walk goes on behind it.
     visit_leaf = make_placed_leaf(units, any_hit, bottom, struct)
     return make_binary_traversal(units._replace(instances=False, stack="local"), volumes, visit_leaf, any_hit)

@@ -1,13 +1,12 @@
-"""The traversal unit of the k-d tree: cells front to back, with a stack, and an early stop.
+"""The traversal unit of the k-d tree: cells from front to back, with a stack.
 
-Havran 2000, "Heuristic Ray Shooting Algorithms", appendix C: the part of the ray inside a cell, [t_enter, t_exit], is cut by
-the splitting plane; the nearer child is visited at once and the farther one pushed with its own part. Cells do not overlap,
-so that the first one with a hit inside is the last one to visit.
+Havran 2000, "Heuristic Ray Shooting Algorithms", appendix C. The splitting plane cuts the part of the ray inside a cell, [t_enter,
+t_exit]. The walk visits the nearer child at once and pushes the farther one with its part. Cells do not overlap: the first cell with a hit
+inside ends the walk.
 
-No hit is lost to rounding: both parts are widened by what the plane's distance and the hit's own may be off by, in proportion
-to the distance; what is off in proportion to the triangle is in the leaves, whose triangles are clipped to larger cells
-(kernels.build.clip). A ray in the splitting plane has the distance 0 * inf = NaN there: comparisons that are false for NaN
-send it to both sides, whole.
+Rounding loses no hit. Both parts are widened by the error of the plane's distance and of the hit's t, which are proportional to the
+distance. Errors proportional to the triangle are in the leaves: their triangles are clipped to larger cells (kernels.build.clip). A ray in
+the splitting plane has the distance 0 * inf = NaN, and comparisons that are false for NaN send it whole to both sides.
 """
 
 from functools import cache
@@ -22,10 +21,10 @@ from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
 from wrt.kernels.traverse.leaf import make_leaf
 from wrt.kernels.units.box import slab_interval
 
-# Every builder keeps the tree's depth at or below this; a path from the root pushes at most one node a level.
+# Builders keep the depth at or below this; a path from the root pushes at most one node a level.
 STACK_SIZE = 64
 
-# Node.word is 4 * (left child, or first primitive of a leaf) + this or the axis of the plane.
+# KdNode.word is 4 * (left child, or first primitive of a leaf) + LEAF, or + the axis of the plane.
 LEAF = wp.constant(3)
 
 HELD_RELATIVE = wp.constant(1.0 + 2.0**-19)
@@ -34,8 +33,8 @@ HELD_GRAZING = wp.constant(2.0**-20)
 
 @wp.struct
 class KdNode:
-    """8 bytes. Inner: split is the plane's coordinate, word = 4 left + axis; the right child is left + 1.
-    Leaf: split is the number of primitives, word = 4 first + LEAF."""
+    """An inner node: split is the plane's coordinate, word = 4 left + axis, and the right child is left + 1. 8 bytes.
+    A leaf: split is the number of primitives, word = 4 first + LEAF."""
 
     split: float
     word: int
@@ -43,15 +42,15 @@ class KdNode:
 
 @cache
 def make_struct(record: Any) -> Any:
-    """The structure over records of this kind: nodes[0] is the root, lo and hi its cell; primitives are in the order of the
-    leaves, once in each that they reach into. reach: the largest extent of a triangle that was clipped."""
+    """Make the structure over records of this kind; nodes[0] is the root, with the cell lo, hi. Primitives are in the order of the leaves,
+    once in each leaf that they reach into."""
 
     @wp.struct
     class KdTree:
         nodes: wp.array(dtype=KdNode)
         lo: wp.vec3
         hi: wp.vec3
-        reach: float
+        reach: float  # Largest extent of a clipped triangle.
         primitives: wp.array(dtype=record)
         recorder: Recorder
 
@@ -60,12 +59,10 @@ def make_struct(record: Any) -> Any:
 
 @wp.func
 def held_distance(direction: wp.vec3, inv_dir: wp.vec3, reach: float) -> float:
-    """How far the triangle unit may move a hit along the ray from where the ray is at the triangle.
-
-    A ray that passes by a triangle within rounding, 16 u of its extent, may be given a hit, with t held to the triangle's box
-    (within_bounds). Where the ray leaves the box at a shallow angle, that is a long way from the triangle, and not in the
-    leaves around. The distance is 16 u extent / |d| on the axis where |d| is least but not 0, and no more than the box is long.
-    """
+    """Distance by which the clamp to a triangle's box may move a hit along the ray.
+    A ray that misses a triangle by rounding, 16 u of its extent, may still hit, with t clamped to the triangle's box (`within_bounds`). A
+    ray that leaves the box at a shallow angle is then far from the triangle, outside the leaves around it. The distance is 16 u extent /
+    |d|, for the axis with the smallest |d| that is not 0, and at most the length of the box."""
     longest = wp.max(wp.max(wp.abs(direction[0]), wp.abs(direction[1])), wp.abs(direction[2]))
     steepest = float(0.0)
     for axis in range(3):
@@ -77,12 +74,12 @@ def held_distance(direction: wp.vec3, inv_dir: wp.vec3, reach: float) -> float:
 
 @wp.func
 def limit_of(t: float, held: float) -> float:
-    """Cells that begin beyond hold no hit that is nearer than t."""
+    """Limit behind which no cell begins that holds a hit nearer than t."""
     return t * HELD_RELATIVE + held
 
 
 def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
-    """walk(accel, surfaces, probe, part, held, counts) -> the best hit and counts. part: of the ray, (t_enter, t_exit)."""
+    """Make walk(accel, surfaces, probe, part, held, counts) -> best hit, counts; part: of the ray, (t_enter, t_exit)."""
     visit_leaf = make_leaf(units, any_hit, accepts)
     fetch_node, _, push, _ = make_counters(units, size_of(KdNode))
 
@@ -123,12 +120,12 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
                 continue
 
             counts.leaves += 1
-            counts.box_operations -= 1  # a leaf's record has no plane to test
+            counts.box_operations -= 1  # a leaf has no plane to test
             best, counts = visit_leaf(accel, surfaces, probe, first, int(node.split), best, counts)
             if wp.static(any_hit):
                 if best.prim_id != NO_HIT:
                     break
-            # Pop; what begins beyond the closest hit is dropped. Equal stays: a tie may have a lower prim_id there.
+            # Pop the next cell that does not begin beyond the closest hit. Equal t stays: a tie may have a lower prim_id there.
             limit = limit_of(best.t, held)
             found = bool(False)
             while size > 0 and not found:
@@ -144,7 +141,7 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
 
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """The closest hit, or any (the first that is found)."""
+    """Make the unit for the closest hit, or for any hit."""
     probe_of = make_probe(units)
     ray_aabb = units.box_test
     walk = make_walk(units, any_hit, accepts)
@@ -156,7 +153,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
         probe = probe_of(ray)
         best = no_hit(ray)
         counts = Counts()
-        counts.boxes += 1  # the root's cell, which comes with the structure
+        counts.boxes += 1  # the root's cell is part of the structure
         counts.box_operations += 1
         if ray_aabb(probe.box, accel.lo, accel.hi, best.t) < wp.inf:
             held = held_distance(ray.direction, probe.box.inv_dir, accel.reach)

@@ -1,10 +1,7 @@
-"""The traversal unit of the octree: from the root down to the octants that the ray meets, front to back, with an early stop.
-
-Glassner 1984, "Space Subdivision for Fast Ray Tracing"; the stack of one entry a level, with the octants that are left in a
-mask, as in Laine and Karras 2010, "Efficient Sparse Voxel Octrees". The distances to all planes are taken afresh from their
-coordinates, so that no error adds up, and an octant is entered exactly where the conservative box test would enter it. Octants
-without primitives have no record and are never looked at.
-"""
+"""The traversal unit of the octree: from the root down to the octants that the ray meets, front to back.
+Glassner 1984, "Space Subdivision for Fast Ray Tracing". The stack has one entry a level, with a mask of the pending octants, as in Laine
+and Karras 2010, "Efficient Sparse Voxel Octrees". The distance to every plane is computed from its coordinate, so that errors do not add
+up. The walk enters exactly the octants that the conservative box test would enter. Octants without primitives have no node."""
 
 from functools import cache
 from typing import Any
@@ -18,15 +15,15 @@ from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
 from wrt.kernels.traverse.leaf import Mailbox, make_mailbox_leaf
 from wrt.kernels.units.box import BoxRay, slab_interval
 
-# Corners of cells are whole numbers of the finest cell, exact in float32; the stack has one entry a level.
+# Corners of cells are multiples of the finest cell, exact in float32; the stack has one entry a level.
 MAX_LEVELS = 20
 
 
 @wp.struct
 class OctreeNode:
-    """8 bytes. A leaf (count >= 0): the references first .. first + count - 1. An inner node: -count is the mask of the octants
-    that have a record (bit 0: the lower half in x, y and z; 1, 2, 4 for the upper half in x, y, z), and these stand one after
-    another from `first` on."""
+    """A leaf (count >= 0) with the references first .. first + count - 1, or an inner node; 8 bytes. In an inner node, -count is the mask
+    of the octants that have a node; these nodes stand one after another from `first` on. Bit k of the mask is octant k; in k, bits 1, 2, 4
+    select the upper half in x, y, z."""
 
     first: int
     count: int
@@ -34,7 +31,7 @@ class OctreeNode:
 
 @wp.struct
 class OctreeLayout:
-    """The root's cell from lo to hi; 2^levels of the finest cells, cubes of this size, reach from lo to hi or beyond."""
+    """The root's cell from lo to hi, and the finest cells: cubes of edge `size`, 2^levels along each axis, up to hi or beyond."""
 
     lo: wp.vec3
     hi: wp.vec3
@@ -44,26 +41,26 @@ class OctreeLayout:
 
 @wp.func
 def octree_planes(layout: OctreeLayout, corner: wp.vec3i) -> wp.vec3:
-    """The planes of these numbers, in finest cells, across x, y and z; monotone in each, and nowhere beyond the root's cell, whose
-    last planes are hi. The builder and the traversal call this one function."""
+    """Coordinates of the planes with these indices, in finest cells, across x, y and z. Monotone, and never outside the root's cell, whose
+    last planes are hi. Builder and traversal share this function."""
     return wp.min(layout.lo + layout.size * wp.vec3(float(corner[0]), float(corner[1]), float(corner[2])), layout.hi)
 
 
 @wp.func
 def octant_corner(octant: int, half: int) -> wp.vec3i:
-    """The lowest corner of an octant, from that of the cell whose half is `half`."""
+    """Lowest corner of an octant, relative to that of its cell; half: half the cell's edge. In finest cells."""
     return half * wp.vec3i(octant & 1, (octant >> 1) & 1, (octant >> 2) & 1)
 
 
 @wp.func
 def distances(layout: OctreeLayout, ray: BoxRay, corner: wp.vec3i) -> wp.vec3:
-    """Where the ray meets these planes; NaN where it lies in one."""
+    """Distances at which the ray meets the three planes of a corner; NaN for a plane that it lies in."""
     return wp.cw_mul(octree_planes(layout, corner) - ray.origin, ray.inv_dir)
 
 
 @wp.func
 def latest(t: wp.vec3, begin: float) -> float:
-    """The largest, where NaN says nothing."""
+    """Largest of `begin` and the three distances, NaN ignored."""
     out = wp.where(t[0] > begin, t[0], begin)
     out = wp.where(t[1] > out, t[1], out)
     return wp.where(t[2] > out, t[2], out)
@@ -71,6 +68,7 @@ def latest(t: wp.vec3, begin: float) -> float:
 
 @wp.func
 def earliest(t: wp.vec3, end: float) -> float:
+    """Smallest of `end` and the three distances, NaN ignored."""
     out = wp.where(t[0] < end, t[0], end)
     out = wp.where(t[1] < out, t[1], out)
     return wp.where(t[2] < out, t[2], out)
@@ -78,7 +76,7 @@ def earliest(t: wp.vec3, end: float) -> float:
 
 @wp.func
 def in_order(mask: int, flip: int) -> int:
-    """Bit k of the result is bit k ^ flip of an 8-bit mask."""
+    """Permute an 8-bit mask: bit k of the result is bit k ^ flip."""
     out = mask
     out = wp.where((flip & 1) != 0, ((out & 0x55) << 1) | ((out >> 1) & 0x55), out)
     out = wp.where((flip & 2) != 0, ((out & 0x33) << 2) | ((out >> 2) & 0x33), out)
@@ -87,11 +85,9 @@ def in_order(mask: int, flip: int) -> int:
 
 @wp.func
 def octants_met(occupied: int, enter: float, middle: wp.vec3, leave: float) -> int:
-    """Mask of those octants that the ray meets, of a cell that it meets from `enter` to `leave` (widened).
-
-    All in the order of the ray: bit 1, 2, 4 of an octant's number is its half in x, y, z, 0 for the nearer one. An octant is met
-    unless it begins, on one axis, after it ends on another: what the box test of each octant would say, to the last bit.
-    """
+    """Mask of the occupied octants that the ray meets in a cell that it meets from `enter` to `leave` (widened).
+    Octants are in the order of the ray: bits 1, 2, 4 of an index are its half in x, y, z, 0 for the nearer one. An octant is met unless it
+    begins, on one axis, after it ends on another. The box test of each octant would say the same, to the last bit."""
     met = occupied
     x = later(middle[0])
     y = later(middle[1])
@@ -112,21 +108,19 @@ def octants_met(occupied: int, enter: float, middle: wp.vec3, leave: float) -> i
 
 @cache
 def make_struct(record: Any) -> Any:
-    """The structure over records of this kind, in the order of prim_id. nodes[0] is the root; lo, hi, size, levels: the
-    OctreeLayout; pad, extent: the largest of any triangle's box; mailbox: 1 to remember what was tested; references: indices of
-    primitives."""
+    """Make the structure over records of this kind, in the order of prim_id; nodes[0] is the root."""
 
     @wp.struct
     class Octree:
-        lo: wp.vec3
+        lo: wp.vec3  # The OctreeLayout: lo, hi, size, levels.
         hi: wp.vec3
         size: float
         levels: int
-        pad: float
-        extent: float
-        mailbox: int
+        pad: float  # Largest pad of a triangle's box.
+        extent: float  # Largest extent of a triangle's box.
+        mailbox: int  # 1: remember tested primitives.
         nodes: wp.array(dtype=OctreeNode)
-        references: wp.array(dtype=wp.int32)
+        references: wp.array(dtype=wp.int32)  # Indices of primitives.
         primitives: wp.array(dtype=record)
         recorder: Recorder
 
@@ -135,19 +129,19 @@ def make_struct(record: Any) -> Any:
 
 @wp.struct
 class OctreeRay:
-    """Set-up of the walk, once a ray. backwards: 1 on each axis that the ray runs down, else 0; flip: the same as a mask; begin:
-    where the walk begins; slack: how far it goes on behind the best hit."""
+    """The ray as the walk reads it."""
 
     layout: OctreeLayout
     box: BoxRay
-    backwards: wp.vec3i
-    flip: int
-    begin: float
-    slack: float
+    backwards: wp.vec3i  # 1 on each axis along which the direction is negative, else 0.
+    flip: int  # The same as a mask.
+    begin: float  # Distance at which the walk begins.
+    slack: float  # Distance that the walk goes on behind the best hit.
 
 
 @wp.func
 def octree_ray(accel: Any, box: BoxRay, t_min: float) -> OctreeRay:
+    """Set up a ray for the walk."""
     out = OctreeRay()
     out.layout.lo = accel.lo
     out.layout.hi = accel.hi
@@ -164,13 +158,13 @@ def octree_ray(accel: Any, box: BoxRay, t_min: float) -> OctreeRay:
 
 @wp.func
 def distance_to_cell(ray: OctreeRay, corner: wp.vec3i, size: int) -> float:
-    """Where the ray enters the cell of `size` finest cells with this lowest corner, but not before the walk begins."""
+    """Distance at which the ray enters the cell of `size` finest cells with this lowest corner, at least ray.begin."""
     return latest(distances(ray.layout, ray.box, corner + size * ray.backwards), ray.begin)
 
 
 @wp.func
 def enter_octants(ray: OctreeRay, occupied: int, corner: wp.vec3i, size: int, enter: float, limit: float) -> int:
-    """Mask, in the order of the ray, of the occupied octants that it meets up to `limit` in the cell that it meets at `enter`."""
+    """Mask, in the order of the ray, of the occupied octants that it meets up to `limit`, in the cell that it enters at `enter`."""
     forwards = wp.vec3i(1, 1, 1) - ray.backwards
     leave = later(earliest(distances(ray.layout, ray.box, corner + size * forwards), float(wp.inf)))
     half = size >> 1
@@ -179,7 +173,7 @@ def enter_octants(ray: OctreeRay, occupied: int, corner: wp.vec3i, size: int, en
 
 
 def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
-    """walk(accel, surfaces, probe, set_up, enter, counts) -> the best hit and counts. enter: where the root's cell begins."""
+    """Make walk(accel, surfaces, probe, set_up, enter, counts) -> best hit, counts; enter: where the root's cell begins."""
     visit_leaf = make_mailbox_leaf(units, any_hit, accepts)
     fetch_node, _, push, _ = make_counters(units, size_of(OctreeNode))
 
@@ -218,7 +212,7 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
                 if wp.static(any_hit):
                     if best.prim_id != NO_HIT:
                         break
-            # The first octant that was just met, or the next that is left, unless it begins where no better hit can be.
+            # Go on with the first octant of the node just met, or the next pending one that can hold a better hit.
             fresh = left != 0
             found = bool(False)
             while level > 0 and not found:
@@ -246,7 +240,7 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
 
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """The closest hit, or any (the first that is found). The box test is the walk's own, whatever `units` says."""
+    """Make the unit for the closest hit, or for any hit; the walk has a box test of its own."""
     probe_of = make_probe(units)
     walk = make_walk(units, any_hit, accepts)
     _, _, _, finish = make_counters(units, 0)
@@ -257,7 +251,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
         probe = probe_of(ray)
         best = no_hit(ray)
         counts = Counts()
-        counts.boxes += 1  # the root's cell, which comes with the structure
+        counts.boxes += 1  # the root's cell is part of the structure
         counts.box_operations += 1
         set_up = octree_ray(accel, probe.box, ray.t_min)
         interval = slab_interval(probe.box, accel.lo, accel.hi)

@@ -1,1 +1,1 @@
-"""The RT core's test units: a ray against a box, a triangle, a sphere, and other bounding volumes."""
+"""The RT core's test units: one ray against one box, triangle, sphere or other bounding volume."""

@@ -1,35 +1,33 @@
-"""The bounding sphere's unit: does a ray meet a sphere that stands around something?
-
-Not the sphere unit (sphere.py), which finds exact hits: this one only has to let every hit through, as cheaply as it can.
-A sphere is a vec4 (center, radius); a radius below 0 is an empty one.
-"""
+"""The unit for bounding spheres: the test of a ray against a sphere around a subtree.
+It lets every hit through and finds none; exact hits on spheres are `sphere.py`'s. A sphere is a vec4 (center, radius); a negative radius
+marks an empty one."""
 
 import warp as wp
 
 from wrt.kernels.structs import Ray
 
-# In units of 2^-24 of the distance and radius together: 7 for the line's distance from the center, 8 and 4 for where it is
-# nearest and for the ends of the chord, 18 for a hit, which is clamped to its primitive's padded box by distances that are
-# rounded themselves (3 errors each, and FAR_PAD). Their sum, 37, is less than 64.
+# Errors relative to distance + radius, in units of 2^-24: the line's distance from the center 7, the point nearest to it 8, the ends of
+# the chord 4. A hit is clamped to its primitive's padded box by distances that are rounded too (3 errors each, and FAR_PAD): 18. The sum,
+# 37, is below 64.
 SPHERE_PAD = wp.constant(2.0**-18)
-# Beyond it squares overflow, and below it they underflow: what is larger is always entered, what is smaller is taken as this.
+# Squares overflow above LARGEST: such a sphere is always entered. They underflow below SMALLEST, which every radius grows by.
 LARGEST = wp.constant(2.0**60)
 SMALLEST = wp.constant(2.0**-60)
 
 
 @wp.struct
 class SphereRay:
-    """What the test needs of a ray: direction has unit length, inv_length is 1 over what it was divided by."""
+    """The ray as the bounding-sphere test reads it, in the space of the spheres."""
 
     origin: wp.vec3
-    direction: wp.vec3
-    inv_length: float
+    direction: wp.vec3  # Of unit length.
+    inv_length: float  # 1 / length of the ray's own direction: t = distance * inv_length.
     t_min: float
 
 
 @wp.func
 def sphere_ray(ray: Ray) -> SphereRay:
-    """Set-up, once a ray."""
+    """Set up a ray for the test, in float64."""
     out = SphereRay()
     d = wp.vec3d(ray.direction)
     length = wp.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
@@ -42,11 +40,9 @@ def sphere_ray(ray: Ray) -> SphereRay:
 
 @wp.func
 def ray_bounding_sphere(ray: SphereRay, sphere: wp.vec4, t_max: float) -> float:
-    """Distance at which the segment [t_min, t_max] enters the sphere, or inf where it misses it.
-
-    An origin inside is a hit (entry t_min), an empty sphere never. Conservative: the radius is grown by SPHERE_PAD of the sum of
-    distance and radius, which covers what is said there; the domain is that of ray_aabb. A ray with NaN may be let in.
-    """
+    """Distance at which the segment [t_min, t_max] enters the sphere, or inf if it misses.
+    An origin inside gives t_min; an empty sphere gives inf. Conservative: the radius grows by SPHERE_PAD (distance + radius), which bounds
+    all rounding. The domain is that of `ray_aabb`. A ray with NaN may enter."""
     x = ray.origin[0] - sphere[0]
     y = ray.origin[1] - sphere[1]
     z = ray.origin[2] - sphere[2]

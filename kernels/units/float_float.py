@@ -1,10 +1,7 @@
-"""Float-float arithmetic: a number as the sum of two float32, high + low, where float64 is slow.
-
-Sums and products without error: Knuth 1969, "The Art of Computer Programming" 2, section 4.2.2; Dekker 1971, "A Floating-Point
-Technique for Extending the Available Precision". The rest: Da Graca and Defour 2006, "Implementation of float-float operators on
-graphics hardware". A pair is a vec2 (high, low), with high the float32 nearest to the sum. Bounds hold where nothing over- or
-underflows, u = 2^-24.
-"""
+"""Float-float arithmetic: a number as the sum of two float32, for GPUs, where float64 is slow.
+A pair is a vec2 (high, low); high is the float32 nearest to the sum. Error bounds hold without over- and underflow, u = 2^-24. Exact sums
+and products: Knuth 1969, "The Art of Computer Programming" 2, section 4.2.2; Dekker 1971, "A Floating-Point Technique for Extending the
+Available Precision". The rest: Da Graca and Defour 2006, "Implementation of float-float operators on graphics hardware"."""
 
 import warp as wp
 
@@ -17,12 +14,12 @@ import warp as wp
 #endif
 """)
 def product_error(a: float, b: float, product: float) -> float:
-    """a b - product, for the rounded product."""
+    """Exact rounding error of a product: a b - product."""
 
 
 @wp.func
 def exact_sum(a: float, b: float) -> wp.vec2:
-    """a + b."""
+    """Exact sum a + b."""
     total = a + b
     of_b = total - a
     return wp.vec2(total, (a - (total - of_b)) + (b - of_b))
@@ -30,21 +27,21 @@ def exact_sum(a: float, b: float) -> wp.vec2:
 
 @wp.func
 def ordered_sum(a: float, b: float) -> wp.vec2:
-    """a + b, for |a| >= |b|."""
+    """Exact sum a + b, for |a| >= |b|."""
     total = a + b
     return wp.vec2(total, b - (total - a))
 
 
 @wp.func
 def exact_product(a: float, b: float) -> wp.vec2:
-    """a b."""
+    """Exact product a b."""
     product = a * b
     return wp.vec2(product, product_error(a, b, product))
 
 
 @wp.func
 def difference_of_products(a: float, b: float, c: float, d: float) -> wp.vec2:
-    """a b - c d, within 3.1 u^2 (|a b| + |c d|)."""
+    """Difference a b - c d, within 3.1 u^2 (|a b| + |c d|)."""
     ab = exact_product(a, b)
     cd = exact_product(c, d)
     difference = exact_sum(ab[0], -cd[0])
@@ -53,21 +50,21 @@ def difference_of_products(a: float, b: float, c: float, d: float) -> wp.vec2:
 
 @wp.func
 def pair_sum(x: wp.vec2, y: wp.vec2) -> wp.vec2:
-    """x + y, within 3 u^2 (|x| + |y|)."""
+    """Sum x + y, within 3 u^2 (|x| + |y|)."""
     total = exact_sum(x[0], y[0])
     return exact_sum(total[0], total[1] + (x[1] + y[1]))
 
 
 @wp.func
 def pair_times(x: wp.vec2, y: float) -> wp.vec2:
-    """x y, within 3 u^2 |x y|."""
+    """Product x y, within 3 u^2 |x y|."""
     product = exact_product(x[0], y)
     return ordered_sum(product[0], product[1] + x[1] * y)
 
 
 @wp.func
 def pair_quotient(x: wp.vec2, y: wp.vec2, inverse: float) -> wp.vec2:
-    """x / y, within 30 u^2 |x / y|; inverse: 1 / y[0]."""
+    """Quotient x / y, within 30 u^2 |x / y|; inverse: 1 / y[0]."""
     quotient = x[0] * inverse
     back = exact_product(quotient, y[0])
     rest = ((x[0] - back[0]) - back[1]) + (x[1] - quotient * y[1])
@@ -76,6 +73,6 @@ def pair_quotient(x: wp.vec2, y: wp.vec2, inverse: float) -> wp.vec2:
 
 @wp.func
 def rounds_to_one(x: wp.vec2, error: float) -> bool:
-    """Whether every number within `error` of x rounds to the same float32, x[0] (Ziv 1991, "Fast Evaluation of Elementary
-    Mathematical Functions with Correctly Rounded Last Bit"). error: more than u^2 |x|, for the sums here; NaN is not sure."""
+    """Test that every number within `error` of x rounds to the same float32, x[0]; False for NaN.
+    Ziv 1991, "Fast Evaluation of Elementary Mathematical Functions with Correctly Rounded Last Bit". `error` must exceed u^2 |x|."""
     return x[0] + (x[1] - error) == x[0] and x[0] + (x[1] + error) == x[0]

@@ -1,44 +1,42 @@
-"""The unit of a 14-DOP: does a ray meet a box whose eight corners are cut off by planes askew?
-
-A k-DOP (Kay and Kajiya 1986, "Ray Tracing Complex Scenes"; the name is from Klosowski et al. 1998) is where k/2 slabs meet: here
-the box's three and four more, across its diagonals (1, 1, 1), (-1, 1, 1), (1, -1, 1), (1, 1, -1), which `project` takes.
-Projections are taken from a point in the middle of everything, so that their rounding does not grow with the distance from 0.
-"""
+"""The unit for 14-DOPs: the test of a ray against a box with its eight corners cut off by diagonal planes.
+A k-DOP is the intersection of k/2 slabs (Kay and Kajiya 1986, "Ray Tracing Complex Scenes"; named by Klosowski et al. 1998). Here they are
+the box's three slabs and four across the diagonals (1, 1, 1), (-1, 1, 1), (1, -1, 1), (1, 1, -1). Projections are relative to the middle
+of the scene: their rounding does not grow with its distance from 0."""
 
 import warp as wp
 
 from wrt.kernels.structs import Ray
 from wrt.kernels.units.box import FAR_PAD, PAD_SMALLEST, BoxRay, slab_interval
 
-# In units of 2^-24. What a projected plane may be off by, of the sum of the origin's coordinates: 9 for where the triangle unit
-# sees the corners along the ray (3 of the distance in each coordinate), 3 for the direction's projection, 2 for the origin's,
-# 3 for the distance to the plane and 6 for its comparison with those to the box: less than 32. And so much of the
-# primitive's own coordinates, with 33 more for its extent (5 of it in each coordinate) and its projections: less than 64.
+# Error of a projected plane in units of 2^-24, relative to the sum of the origin's absolute coordinates. Corners as the triangle unit sees
+# them along the ray: 9 (3 of the distance in each coordinate). The direction's projection: 3. The origin's: 2. The distance to the plane:
+# 3. Its comparison with the distances to the box: 6. The sum is below 32. The primitive's own coordinates bring as much, and its extent (5
+# of it in each coordinate) and projections 33 more: below 64.
 RAY_PAD = wp.constant(2.0**-19)
-# What underflows may put each of three coordinates off by box.PAD_SMALLEST, whatever their size.
+# Underflow moves each of three coordinates by up to box.PAD_SMALLEST, whatever their size.
 RAY_PAD_SMALLEST = wp.constant(4.0 * PAD_SMALLEST)
 KDOP_PAD = 2.0**-18
 
 
 @wp.struct
 class KdopRay:
-    """What the test needs of a ray: origin, inv_dir: of its projections; pad: what the planes are moved out by."""
+    """The ray as the k-DOP test reads it."""
 
     box: BoxRay
-    origin: wp.vec4
-    inv_dir: wp.vec4
-    pad: float
+    origin: wp.vec4  # Its four projections.
+    inv_dir: wp.vec4  # 1 / projections of the direction.
+    pad: float  # Distance by which the diagonal planes move outwards.
 
 
 @wp.func
 def project(v: wp.vec3) -> wp.vec4:
-    """The coordinates of v along the four diagonals, unnormalised."""
+    """Coordinates of v along the four diagonals, not normalised."""
     return wp.vec4(v[0] + v[1] + v[2], v[1] - v[0] + v[2], v[0] - v[1] + v[2], v[0] + v[1] - v[2])
 
 
 @wp.func
 def kdop_ray(ray: Ray, box: BoxRay, middle: wp.vec3) -> KdopRay:
-    """Set-up, once a ray; middle: what the planes are relative to."""
+    """Set up a ray for the test; middle: the point to which the diagonal planes are relative."""
     out = KdopRay()
     origin = ray.origin - middle
     direction = project(ray.direction)
@@ -51,11 +49,9 @@ def kdop_ray(ray: Ray, box: BoxRay, middle: wp.vec3) -> KdopRay:
 
 @wp.func
 def ray_kdop(ray: KdopRay, lo: wp.vec3, hi: wp.vec3, cut_lo: wp.vec4, cut_hi: wp.vec4, t_max: float) -> float:
-    """Distance at which the segment [t_min, t_max] enters the box lo .. hi; inf where it misses that, or the line misses the rest.
-
-    Conservative as ray_aabb. The planes askew stand around triangles, not around their boxes, and a hit's t is clamped to its box
-    only: where a ray grazes a triangle t may be before they begin. So they may say that the line passes by, but not where.
-    """
+    """Distance at which the segment [t_min, t_max] enters the box lo .. hi; inf if it misses it, or the line misses the diagonals' slabs.
+    Conservative as `ray_aabb`. The diagonal planes bound triangles, but a hit's t is clamped to the triangle's box: on a grazing ray, t
+    may lie before the diagonal slabs. So these can reject the line, and never give the distance."""
     interval = slab_interval(ray.box, lo, hi)
     near = float(interval[0])
     far = interval[1] * FAR_PAD

@@ -1,10 +1,7 @@
-"""The sphere unit: where does a ray meet an exact sphere?
-
-The form of Haines, Guenther and Akenine-Moeller 2019, "Precision Improvements for Ray/Sphere Intersection" (Ray Tracing
-Gems, chapter 7): the discriminant from the distance between the center and the line, and the root that would cancel from the
-product of the two. It is taken in float64 all the same: above a sphere that serves as the ground, the distance to it is the
-difference of two numbers near its radius.
-"""
+"""The sphere unit: the intersection of a ray with an exact sphere.
+The discriminant comes from the distance between center and line. The root that would cancel comes from the product of both. Source:
+Haines, Guenther and Akenine-Moeller 2019, "Precision Improvements for Ray/Sphere Intersection", Ray Tracing Gems, chapter 7. All in
+float64: the distance to a ground sphere is the difference of two numbers near its radius."""
 
 import warp as wp
 
@@ -15,7 +12,8 @@ from wrt.kernels.units.triangle import clamped, padded_interval
 
 @wp.func
 def ray_sphere(box: BoxRay, ray: Ray, center: wp.vec3, radius: float) -> Hit:
-    """The first of the two crossings that is >= ray.t_min; prim_id is 0 on a hit, else NO_HIT. u = v = 0."""
+    """First of the two crossings with t >= ray.t_min; prim_id is 0 on a hit, else NO_HIT. u = v = 0.
+    The center is in the ray's space. t is clamped to the interval of the sphere's padded box."""
     hit = Hit()
     hit.prim_id = NO_HIT
     hit.t = float(wp.inf)
@@ -32,12 +30,12 @@ def ray_sphere(box: BoxRay, ray: Ray, center: wp.vec3, radius: float) -> Hit:
     root = wp.sqrt(a * discriminant)
     q = half_b + wp.where(half_b < zero, -root, root)
     if q == zero:
-        return hit  # the origin is on the sphere and the line touches it there
+        return hit  # the line touches the sphere at the ray's origin
     far = float(q / a)
     near = float((wp.dot(f, f) - r * r) / q)
-    t_0 = wp.where(near <= far, near, far)  # wp.min and wp.max of 0 and -0 are another one on CUDA than on the CPU
+    t_0 = wp.where(near <= far, near, far)  # not wp.min, wp.max: for 0 and -0, CUDA and the CPU return different zeros
     t_1 = wp.where(near >= far, near, far)
-    # The corners of a small sphere's box are rounded by a good part of its radius: only the padded box surely contains it.
+    # Rounding moves the corners of a small sphere's box by a good part of its radius: only the padded box surely contains it.
     extent = wp.vec3(radius, radius, radius)
     interval = padded_interval(box, center - extent, center + extent)
     if not interval[0] <= interval[1] * FAR_PAD:
