@@ -59,8 +59,8 @@ def enter(ray: BoxRay, lo: wp.vec3, hi: wp.vec3, slack: float, t_max: float) -> 
     |A| |A^-1| times the distance. The part u |A| times the coordinates is in the builder's box (wrt.accel.instances). The rounding of this
     test adds 4.
 
-    slack = 32 u max |A| |A^-1| (sums of rows) covers them. So this distance never exceeds a hit's t inside: no hit is passed by, in any order
-    of visits.
+    slack = 32 u max |A| |A^-1| (sums of rows) covers them. So this distance never exceeds a hit's t inside: no hit is passed by, in any
+    order of visits.
     """
     if lo[0] > hi[0]:
         return float(wp.inf)  # widened, an empty box would not be empty
