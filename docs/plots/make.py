@@ -170,20 +170,18 @@ def speed_and_error() -> str:
     return drawing.svg()
 
 
-def hard_cases() -> str:
-    tests = {"watertight": "wrt default", "moeller_trumbore": "Moeller-Trumbore", "baldwin_weber": "Baldwin-Weber",
-             "plane": "plane equation", "embree_robust": "Embree robust", "embree_fast": "Embree fast", "warp": "Warp"}
-    table = read("hard_cases")
-    drawing = Drawing("Wrong rays of each group of hard cases, percent", 222 + 40 * len(table))
-    drawing.text(12, 30, "Wrong rays in each group, percent", bold=True)
-    left, top, width, height = 236, 186, 54, 40
-    for j, name in enumerate(tests.values()):
+def heat(title: str, rows: list[tuple[str, list[float]]], columns: list[str], left: float) -> str:
+    """Draw percentages as cells, the darker the larger, on a logarithmic scale from 0.01 to 40; a line without cells is a gap."""
+    top, height = 186, 40
+    drawing = Drawing(title, top + height * len(rows) + 36)
+    drawing.text(12, 30, title, bold=True)
+    width = (WIDTH - 26 - left) / len(columns)
+    for j, name in enumerate(columns):
         drawing.text(left + width * (j + 0.5) + 4, top - 10, name, turn=-50, size=18)
-    for i, row in enumerate(table):
+    for i, (label, shares) in enumerate(rows):
         y = top + height * i
-        drawing.text(12, y + 27, f"{row['group']}: {row['what'].split(',')[0]}", size=19)
-        for j, test in enumerate(tests):
-            share = 100 * int(row[test]) / int(row["peer_sample" if test in PEERS else "sample"])
+        drawing.text(12, y + 27, label, size=19)
+        for j, share in enumerate(shares):
             depth = min(max(math.log10(share / 0.01) / math.log10(40 / 0.01), 0.0), 1.0) if share else 0.0
             color = tuple(round(a + (b - a) * depth) for a, b in zip((255, 240, 226), (165, 30, 10), strict=True))
             fill = "#" + "".join(f"{each:02x}" for each in color) if share else "#dcefe3"
@@ -193,6 +191,23 @@ def hard_cases() -> str:
                          color="#fff" if depth > 0.6 else "#222", bold=not share)
     drawing.text(12, drawing.height - 10, "darker: more rays lost, invented or given to a wrong triangle", size=18)
     return drawing.svg()
+
+
+def hard_cases() -> str:
+    tests = {"watertight": "wrt default", "moeller_trumbore": "Moeller-Trumbore", "baldwin_weber": "Baldwin-Weber",
+             "plane": "plane equation", "embree_robust": "Embree robust", "embree_fast": "Embree fast", "warp": "Warp"}
+    rows = [(f"{row['group']}: {row['what'].split(',')[0]}",
+             [100 * int(row[test]) / int(row["peer_sample" if test in PEERS else "sample"]) for test in tests])
+            for row in read("hard_cases")]
+    return heat("Wrong rays in each group, percent", rows, list(tests.values()), 236)
+
+
+def libraries() -> str:
+    names = {"wrt": "wrt", "embree_robust": "Embree robust", "embree_fast": "Embree fast", "open3d": "Open3D", "warp": "Warp",
+             "mitsuba": "Mitsuba", "trimesh": "trimesh"}
+    rows = [(row["name"], [100 * int(row[name]) / int(row["trimesh_rays" if name == "trimesh" else "rays"]) for name in names])
+            for row in read("libraries")]
+    return heat("Wrong rays by library, percent", [*rows[:9], ("", []), *rows[9:]], list(names.values()), 252)
 
 
 def default_cost() -> str:
@@ -264,7 +279,7 @@ def refit() -> str:
     return drawing.svg()
 
 
-PLOTS = (speed_and_error, peers, hard_cases, default_cost, mitsuba, pictures, structures, builders, refit)
+PLOTS = (speed_and_error, peers, hard_cases, libraries, default_cost, mitsuba, pictures, structures, builders, refit)
 
 
 def main() -> None:
