@@ -1,11 +1,9 @@
 """One ray at a time: pictures on CUDA, and on a CPU where rays are counted or logged.
 
-A thread follows a camera ray with all that comes of it: it traces, shades (shade/step.py), and pushes the new paths on a small
-stack of its own. A GPU hides the waits of one thread behind thousands of others. A CPU cannot: there wave.py traces and shades the
-rays of many samples together, 1.5 to 4.3 times as fast. Both take the step and the follow-up from kernels/shade, and a sample's
-paths in one order. So their films have the same bits: tests/wrt/renderer/test_waves.py, of random scenes
-tests/test_random_scenes.py.
-"""
+A thread follows a camera ray and all its children: trace, shade (shade/step.py), push the new paths on a small stack. A GPU hides
+the latency of one thread behind thousands of others. A CPU cannot, so wave.py traces and shades the rays of many samples together.
+Both loops share the step and the follow-up, and take a sample's paths in the same order. Their films have the same bits
+(tests/wrt/renderer/test_waves.py, tests/test_random_scenes.py)."""
 
 from typing import Any
 
@@ -26,27 +24,25 @@ from wrt.kernels.structs import AovFilm, Film, Hit, Lighting, Limits, Ray, Surfa
 
 @wp.struct
 class Tile:
-    """A rectangle of pixels, and which samples of them to take. threads: that share the samples of a pixel, one or n_samples; then
-    samples[i]: of thread i, pixel by pixel."""
+    """A rectangle of pixels and the samples to add to each."""
 
     x: int
     y: int
     width: int
     first_sample: int
     n_samples: int
-    threads: int
-    samples: wp.array(dtype=Sample)
+    threads: int  # That share the samples of a pixel: 1 or n_samples.
+    samples: wp.array(dtype=Sample)  # With a thread for each sample: by thread.
 
 
 def make_direct_light(features: Features, accel_struct: Any, transmittance: Any, step: Step) -> Any:
-    """Return the function for light straight from every light (and the background) by one shadow ray each."""
+    """Return the function that traces one shadow ray to each light, and to the background if it is sampled."""
     Shaded = make_shaded(features.counting)
     light_point = make_light_points(features).point
 
     @wp.func
     def direct_light(accel: accel_struct, surfaces: Surfaces, lighting: Lighting, shaded: Shaded, index: wp.uint32) -> Shadow:
-        """As `add_surface_light` takes it. cut: shadow rays that were, and lost: what they
-        would have carried in a room of radiance 1."""
+        """Sum the unoccluded light; `cut` and `lost` count the shadow rays that MAX_TRANSPARENT ended."""
         out = Shadow()
         for i in range(lighting.count + wp.static(step.extra_lights)):
             point = light_point(lighting, shaded.key, index, i)
@@ -59,7 +55,7 @@ def make_direct_light(features: Features, accel_struct: Any, transmittance: Any,
 
 
 def make_radiance(features: Features, accel_struct: Any, closest_hit: Any, any_hit: Any) -> Any:
-    """Return the function for the whole tree of rays behind one camera ray. Paths that wait are on a stack, the next one on top."""
+    """Return the function that follows one camera ray with all its children. Waiting paths are on a stack, the next one on top."""
     Path = make_path(features.counting)
     paths, shading = make_paths(features.counting), make_shading(features)
     step, follow_up = make_step(features, shading), make_follow_up(features)
@@ -112,13 +108,14 @@ def make_radiance(features: Features, accel_struct: Any, closest_hit: Any, any_h
 
 
 def make_traversals(features: Features, structure: Any) -> Any:
-    """closest_hit and any_hit of a structure (wrt.accel.structure.Structure); with cut-outs both look at each hit's alpha."""
+    """Return closest_hit and any_hit of a structure (wrt.accel.structure.Structure), which test the alpha of cut-outs at each
+    hit."""
     accepts = make_cutout(features)
     return structure.traversal(any_hit=False, accepts=accepts), structure.traversal(any_hit=True, accepts=accepts)
 
 
 def make_camera_sample(features: Features, camera_kind: Any) -> Any:
-    """The ray of one sample of a pixel."""
+    """Return the function for the camera ray of one sample of a pixel."""
     camera_struct = camera_kind.Camera
     camera_ray = camera_kind.make_camera_ray(features)
 
@@ -135,12 +132,10 @@ def make_camera_sample(features: Features, camera_kind: Any) -> Any:
 
 
 def make_render_kernel(features: Features, structure: Any, camera_kind: Any) -> Any:
-    """Return a kernel that adds samples to the pixels of a tile, or, with a thread for each sample, writes them to tile.samples for
-    add_samples. It holds only the code that `features` asks for.
+    """Return the kernel that renders a tile with one thread a pixel, or one a sample (then add_samples adds them up).
 
-    camera_kind: a module as wrt.kernels.shade.cameras says.
-    Where features.counting is on, the structure must be a wrt.kernels.study.ray_log one, and every ray is logged.
-    """
+    The code has only what `features` asks for. `camera_kind` is a module as kernels/shade/cameras describes it. With
+    features.counting, `structure` must be one of kernels.study.ray_log, and every ray is logged."""
     accel_struct = structure.struct
     closest_hit, any_hit = make_traversals(features, structure)
     camera_struct = camera_kind.Camera
@@ -182,7 +177,7 @@ def make_render_kernel(features: Features, structure: Any, camera_kind: Any) -> 
 
 @kernel
 def add_samples(film: Film, tile: Tile):
-    """Add what a thread for each sample wrote to the pixels of a tile, in the samples' order."""
+    """Add tile.samples to the pixels of a tile, in the samples' order."""
     tid = wp.tid()
     at = (tile.y + tid / tile.width - film.y) * film.columns + tile.x + tid % tile.width - film.x
     pixel = load_pixel(film, at)
@@ -192,7 +187,7 @@ def add_samples(film: Film, tile: Tile):
 
 
 def make_aov_kernel(features: Features, structure: Any, camera_kind: Any) -> Any:
-    """What the ray through each pixel's centre (and the lens' centre) meets first."""
+    """Return the kernel that traces a ray from the lens' centre through each pixel's centre and writes its AOVs."""
     camera_struct = camera_kind.Camera
     camera_ray = camera_kind.make_camera_ray()
     accel_struct = structure.struct

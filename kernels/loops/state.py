@@ -1,8 +1,6 @@
-"""The state of a wave: a struct for each index. The host writes Task and Pixels.order, kernels the rest; wrt/renderer/waves.py
-allocates it.
+"""The state of a wave: arrays by pixel, sample, place in a queue, or hit. The host writes Task and Pixels.order, kernels the rest.
 
-A wave has room for `capacity` samples. Samples are numbered pixel by pixel: sample s is of pixel s / task.samples of the wave.
-"""
+wrt/renderer/waves.py allocates room for `capacity` samples. Sample s belongs to pixel s / task.samples of the wave."""
 
 import warp as wp
 
@@ -14,124 +12,112 @@ from wrt.kernels.shade.step import PendingLight, Sample
 
 Path = make_path(False)
 ray_of = make_paths(False).ray_of
-BLOCK = 64  # rays for which something is computed in lanes at a time
+BLOCK = 64  # Hits, or missed rays, that vectorised loops take at a time.
 
 
 @wp.struct
 class Task:
-    """The order for a wave: `samples` samples, from first_sample on, of each of the first `pixels` of Pixels.order, in a tile at
-    x, y of the picture that is `width` pixels wide."""
+    """The pixels and samples that a wave takes: those of one tile."""
 
-    x: int
-    y: int
-    width: int
-    pixels: int
-    first_sample: int
-    samples: int
+    x: int  # The tile's left column in the picture.
+    y: int  # The tile's top line.
+    width: int  # Of the tile.
+    pixels: int  # How many entries of Pixels.order.
+    first_sample: int  # Index of the first sample of each pixel.
+    samples: int  # Samples of each pixel.
 
 
 @wp.struct
 class Progress:
-    """How far a wave is. fresh: 1 while camera rays are traced, which end in the queue before place `begun`; hits: of the rays that
-    are shaded, those that hit something; queued: rays that are traced next; receivers: surfaces that ask lights."""
+    """Counts of the wave that is under way."""
 
-    fresh: int
-    begun: int
-    hits: int
-    queued: int
-    receivers: int
+    fresh: int  # 1 while camera rays are traced and shaded, then 0.
+    begun: int  # Place in the queue behind the last camera ray.
+    hits: int  # Hits among the rays that are shaded.
+    queued: int  # Rays that are traced next.
+    receivers: int  # Surfaces that wait for shadow rays.
 
 
 @wp.struct
 class Pixels:
-    """By pixel p of the wave. order: its place in the tile, row by row; key: of its samples; film_index: its place in the film."""
+    """By pixel p of the wave."""
 
-    order: wp.array(dtype=wp.int32)
-    key: wp.array(dtype=wp.uint32)
-    film_index: wp.array(dtype=wp.int32)
+    order: wp.array(dtype=wp.int32)  # Index in the tile, y * width + x.
+    key: wp.array(dtype=wp.uint32)  # Seed of the samples.
+    film_index: wp.array(dtype=wp.int32)  # Index in the film.
 
 
 @wp.struct
 class Samples:
-    """By sample s. film_point: where on the film it is, in pixels; lens_point: where on the lens, in [0, 1)^2; total: what it has
-    so far; traced_rays: its rays so far, without those to lights; pending: how many of its paths wait.
+    """By sample s of the wave. Paths are stacked: paths[level * capacity + s], level < pending, wait. At level `pending` is the
+    queued path."""
 
-    paths[level * capacity + s], for levels below pending: the paths that wait; at level `pending`: the path that is queued, unless
-    that is a camera ray.
-    """
-
-    film_point: wp.array(dtype=wp.vec2)
-    lens_point: wp.array(dtype=wp.vec2)
-    total: wp.array(dtype=Sample)
-    traced_rays: wp.array(dtype=wp.int32)
-    pending: wp.array(dtype=wp.int32)
+    film_point: wp.array(dtype=wp.vec2)  # In pixels.
+    lens_point: wp.array(dtype=wp.vec2)  # In [0, 1)^2.
+    total: wp.array(dtype=Sample)  # The light so far.
+    traced_rays: wp.array(dtype=wp.int32)  # So far, without shadow rays.
+    pending: wp.array(dtype=wp.int32)  # Paths that wait.
     paths: wp.array(dtype=Path)
 
 
 @wp.struct
 class RayQueue:
-    """By place k in the queue of rays: the sample that a ray is of, the ray, and what it hits."""
+    """By place k in the queue of rays."""
 
-    sample: wp.array(dtype=wp.int32)
+    sample: wp.array(dtype=wp.int32)  # The sample of the ray.
     rays: Queue
     hits: HitArrays
 
 
 @wp.struct
 class Outcomes:
-    """Of the rays that are shaded. hit_rays, missed_rays: their places in the queue; resumed_samples: the samples of missed rays
-    whose other paths still wait."""
+    """The queued rays by what they hit."""
 
-    hit_rays: wp.array(dtype=wp.int32)
-    missed_rays: wp.array(dtype=wp.int32)
-    resumed_samples: wp.array(dtype=wp.int32)
+    hit_rays: wp.array(dtype=wp.int32)  # Their places in the queue.
+    missed_rays: wp.array(dtype=wp.int32)  # Their places in the queue.
+    resumed_samples: wp.array(dtype=wp.int32)  # Samples of missed rays that have other paths waiting.
 
 
 @wp.struct
 class Receivers:
-    """By count a of the surfaces that ask lights. sample: theirs; pending_light; scatter: where shadows are transparent.
-    shadow[light * capacity + a]: the slot of the shadow ray, or -1."""
+    """By index a: the surfaces that wait for shadow rays. Entry light * capacity + a of `shadow` is the slot of a's shadow ray."""
 
     sample: wp.array(dtype=wp.int32)
     pending_light: wp.array(dtype=PendingLight)
-    scatter: wp.array(dtype=Scatter)
-    shadow: wp.array(dtype=wp.int32)
+    scatter: wp.array(dtype=Scatter)  # Only with transparent shadows.
+    shadow: wp.array(dtype=wp.int32)  # -1: the surface needs none for this light.
 
 
 @wp.struct
 class Shadows:
-    """By slot, light * capacity + the shadow ray's count. value: radiance that the light adds to the sample where nothing is in
-    between; walk: where shadows are transparent, how far the light is on its way."""
+    """By slot, light * capacity + index of the shadow ray."""
 
-    value: wp.array(dtype=wp.vec3)
-    walk: wp.array(dtype=ShadowWalk)
+    value: wp.array(dtype=wp.vec3)  # Radiance that the light adds if nothing is in between.
+    walk: wp.array(dtype=ShadowWalk)  # The ray's progress, with transparent shadows.
 
 
 @wp.struct
 class ShadowQueue:
-    """By place, light * capacity + count of the shadow rays that are traced: ray; occluded: whether something is in between.
-
-    Where shadows are transparent, hits in place of occluded, and slot: of the walk that the ray belongs to. Else the place is the
-    slot. count[light]: how many rays.
-    """
+    """By place, light * capacity + index: the shadow rays that are traced next. Without transparent shadows the place is the
+    slot."""
 
     rays: Queue
-    occluded: wp.array(dtype=wp.bool)
-    hits: HitArrays
-    slot: wp.array(dtype=wp.int32)
-    count: wp.array(dtype=wp.int32)
+    occluded: wp.array(dtype=wp.bool)  # Without transparent shadows.
+    hits: HitArrays  # With transparent shadows.
+    slot: wp.array(dtype=wp.int32)  # With transparent shadows.
+    count: wp.array(dtype=wp.int32)  # Shadow rays of each light.
 
 
 @wp.struct
 class Block:
-    """By place i in a block of BLOCK hits, or of rays that missed. rows: what wave_rows.py says."""
+    """Values of a block of up to BLOCK hits or missed rays; wave_rows.py has their layout."""
 
     rows: wp.array(dtype=wp.float32)
 
 
 @wp.struct
 class Wave:
-    """All of it. task, progress: one each."""
+    """The whole state. `task` and `progress` have one entry."""
 
     capacity: int
     task: wp.array(dtype=Task)
@@ -158,20 +144,21 @@ def put_fields(samples: wp.array(dtype=Sample), i: int, radiance: wp.vec3, rays:
 
 @wp.func
 def put_sample(samples: wp.array(dtype=Sample), i: int, sample: Sample):
-    """Put sample i field by field: a copy of the whole reads 16 bytes at a time what was written 4 at a time just before, and for
-    that a core waits until it is in the cache."""
+    """Store sample i field by field.
+
+    A copy of the struct would read 16 bytes at a time what was written 4 bytes at a time. The core cannot forward such stores."""
     put_fields(samples, i, sample.radiance, sample.rays, sample.cut_depth, sample.cut_throughput, sample.lost)
 
 
 @wp.func
 def push_path(samples: Samples, capacity: int, s: int, pending: int, path: Path):
-    """Let a path of sample s wait, on top of `pending` others."""
+    """Push a path of sample s on top of its `pending` waiting paths."""
     samples.paths[pending * capacity + s] = path
 
 
 @wp.func
 def queue_next(wave: Wave, k: int, s: int, pending: int):
-    """Put the last path of sample s, of which `pending` wait, to place k of the queue."""
+    """Pop the top of the `pending` waiting paths of sample s, and put its ray at place k of the queue."""
     wave.samples.pending[s] = pending - 1
     wave.queue.sample[k] = s
     put_ray(wave.queue.rays, k, ray_of(wave.samples.paths[(pending - 1) * wave.capacity + s]))

@@ -1,22 +1,20 @@
-"""Many camera samples at a time, for one CPU thread: pictures on a CPU, where no rays are counted.
+"""Waves: pictures on a CPU, one thread a tile, many samples at a time.
 
-A wavefront (Laine, Karras and Aila 2013, "Megakernels Considered Harmful"). The pending rays of a wave of samples wait in one queue
-(state.py); one launch traces all of them, and the next shades all hits. So packets of rays share their way through a structure,
-and what has no branches is computed in lanes. one_ray.py does the same for one sample at a time, for CUDA and where rays are
-counted; it says why there are two. Each sample goes through its own paths in the order of one_ray.py and adds up its light in that
-order. So pictures have the same bits: tests/wrt/renderer/test_waves.py, and of random scenes tests/test_random_scenes.py.
+This is a wavefront tracer (Laine, Karras and Aila 2013, "Megakernels Considered Harmful"). The pending rays of a wave of samples
+wait in one queue (state.py). One launch traces them all, in packets; the next shades all hits, and vectorises what has no branches.
+Each sample takes its paths and adds its light in the order of one_ray.py, so that the pictures have the same bits.
 
-trace_wave is a single launch to Python. In a wave it launches, in this order:
-1. for FRESH camera rays at a time, while they are in the cache: begin_wave (wave_begin.py), closest_hit (wide/batch.py, or query.py
-   where a structure has no batches), and shade_wave (wave_shade.py), whose push_paths puts new paths and shadow rays aside;
-2. until no path waits: the shadow rays to each light, and `add_direct_light` for what they let through; closest_hit and
-   shade_wave of one path of each sample.
-Then the samples go to the film. Each kernel but query.py's is one thread with a loop over its queue: it counts without atomics, and
-reads its arguments once. Traversal and shading are kernels of their own: another scene compiles no traversal.
+trace_wave is a single launch for Python. It launches:
+1. For FRESH camera rays at a time, while they are in the cache: begin_wave (wave_begin.py), closest_hit, and shade_wave
+   (wave_shade.py), which pushes new paths and requests shadow rays.
+2. Until no path waits: the shadow rays to each light, whose light add_direct_light adds; then closest_hit and shade_wave for the
+   top path of each sample.
+3. add_to_film for the finished samples.
 
-For many hits at a time, surfaces are in wave_surfaces.py, textures in wave_textures.py, normals in wave_normals.py, random numbers
-in wave_numbers.py, and lights in wave_lights.py; wave_rows.py has what they hand to each other.
-"""
+Each kernel is one thread that loops over its queue, so it counts without atomics. Only where a structure has no batches is
+closest_hit a thread a ray (query.py). Traversal and shading are separate kernels: another scene compiles no traversal again. The
+vectorised parts are in wave_surfaces.py, wave_textures.py, wave_normals.py, wave_numbers.py and wave_lights.py. They pass their
+results in the rows of wave_rows.py."""
 
 from functools import cache
 from typing import Any
@@ -35,17 +33,17 @@ from wrt.kernels.shade.shadows import Shadow, make_advance_shadow
 from wrt.kernels.shade.step import Sample, add_light, add_surface_light
 from wrt.kernels.structs import AovFilm, Film, Surfaces, kernel
 
-FRESH = 2048  # camera rays that are made, traced and shaded at a time, while they are in the cache
+FRESH = 2048  # Camera rays that are made, traced and shaded at a time, while they are in the cache.
 
 
 @wp.func
 def film_index(task: Task, at: int, x: int, y: int, columns: int) -> int:
-    """Return where the pixel `at` of a tile is in a film that begins at x, y."""
+    """Return the index of the tile's pixel `at` in a film whose first pixel is x, y."""
     return (task.y + at / task.width - y) * columns + task.x + at % task.width - x
 
 
 def make_shadow_kernel(features: Features) -> Any:
-    """Return the kernel for shadow rays to one light that have met the closest surface on their way."""
+    """Return the kernel that advances the shadow rays to one light past the surface that each has hit."""
     advance_shadow = make_advance_shadow(features, make_shading(features))
 
     @kernel
@@ -66,13 +64,13 @@ def make_shadow_kernel(features: Features) -> Any:
 
 
 def make_add_direct_light(transparent_shadows: bool) -> Any:
-    """Return the function that adds what the lights send to the receivers."""
+    """Return the function that adds the unoccluded light of all lights to the receivers' samples."""
 
     @wp.func
     def add_direct_light(wave: Wave, lights: int):
         for a in range(wave.progress[0].receivers):
             direct = Shadow()
-            light = wp.vec3()  # a struct that changes in a loop is written and read back
+            light = wp.vec3()  # A local: Warp stores and reloads a struct that changes in a loop.
             rays = int(0)
             for i in range(lights):
                 slot = wave.receivers.shadow[i * wave.capacity + a]
@@ -97,7 +95,7 @@ def make_add_direct_light(transparent_shadows: bool) -> Any:
 
 @wp.func_native("wrt::add_sample(film, pixels.data + (long long)p, done.data + (long long)p * samples, samples);")
 def add_to_pixels(film: Film, pixels: wp.array(dtype=wp.int32), done: wp.array(dtype=Sample), p: int, samples: int) -> None:
-    """As add_sample, to the LANES entries of the film from pixels[p] on: done[p * samples] and what follows it."""
+    """Call add_sample for LANES entries of the film, from pixels[p] on, with done[p * samples] and the following."""
 
 
 @wp.func
@@ -120,7 +118,8 @@ def add_to_film(wave: Wave, film: Film):
 
 @wp.struct
 class WaveLaunches:
-    """Those of a wave. shadow_any_hit: any hit; shadow_closest_hit: the closest one, with which advance_shadow goes on."""
+    """The launches of a wave, recorded by the host. Transparent shadows take shadow_closest_hit and advance_shadow in place of
+    shadow_any_hit."""
 
     begin: Launch
     closest_hit: Launch
@@ -132,12 +131,12 @@ class WaveLaunches:
 
 @cache
 def make_loop_kernel(transparent_shadows: bool) -> Any:
-    """Return the kernel for all of a wave, from its camera rays to the film."""
+    """Return the kernel that takes a wave from its camera rays to the film."""
     add_direct_light = make_add_direct_light(transparent_shadows)
 
     @wp.func
     def trace_shadows(wave: Wave, launches: WaveLaunches, lights: int):
-        """Trace all shadow rays, and add what the lights send."""
+        """Trace all shadow rays, and add the light that arrives."""
         for light in range(lights):
             first = light * wave.capacity
             if wp.static(transparent_shadows):
@@ -175,7 +174,7 @@ def make_loop_kernel(transparent_shadows: bool) -> Any:
 
 
 def make_aov_kernel(features: Features) -> Any:
-    """Return the kernel for what the rays of an AOV film meet."""
+    """Return the kernel that writes what the rays of an AOV film hit."""
     write_aovs = make_write_aovs(features)
 
     @kernel

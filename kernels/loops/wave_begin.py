@@ -1,4 +1,4 @@
-"""How a wave begins: its samples, and their camera rays."""
+"""The beginning of a wave: its samples and their camera rays."""
 
 from typing import Any
 
@@ -16,8 +16,8 @@ from wrt.kernels.structs import AovFilm, Film, Limits, kernel
 
 
 def make_place_samples(features: Features) -> Any:
-    """Return place_samples(wave, film, limits, first, end), for the samples of the pixels
-    first .. end - 1: where they are on the film (in pixels) and the lens. And the pixels' keys."""
+    """Return place_samples(wave, film, limits, first, end): set the keys of the pixels first .. end - 1, and place their samples on
+    film (in pixels) and lens."""
     draw = make_draw(features)
 
     @wp.func
@@ -57,8 +57,9 @@ def make_place_samples(features: Features) -> Any:
 
 
 def make_queue_camera_rays(features: Features, camera_kind: Any) -> Any:
-    """Return queue_camera_rays(wave, camera, film, first, end) -> int: queue the camera rays of the samples first .. end - 1, each
-    at its sample's place, vectorised; return the number of rays without length."""
+    """Return queue_camera_rays(wave, camera, film, first, end) -> int: queue the camera rays of those samples, vectorised.
+
+    Each ray is at its sample's place. The result counts the rays without length, where the film gets no light."""
     camera_struct = camera_kind.Camera
     camera_ray = camera_kind.make_camera_ray(features)
 
@@ -93,8 +94,9 @@ def make_queue_camera_rays(features: Features, camera_kind: Any) -> Any:
 
 @wp.func
 def without_dead(wave: Wave, first: int, end: int, queued: int) -> int:
-    """Leave the camera rays of the samples first .. end - 1 in the queue from place `queued` on, but for those without length,
-    whose samples are done: black. Return the place behind the last one."""
+    """Close the gaps that camera rays without length leave in the queue; their samples are black.
+
+    The rays of the samples first .. end - 1 move to the places from `queued` on. Return the place behind the last one."""
     place = queued
     for s in range(first, end):
         ray = queued_ray(wave.queue.rays, s)
@@ -109,13 +111,13 @@ def without_dead(wave: Wave, first: int, end: int, queued: int) -> int:
 
 
 def make_begin_kernel(features: Features, camera_kind: Any) -> Any:
-    """Return the kernel for the camera rays of a wave."""
+    """Return the kernel that queues the camera rays of a wave."""
     camera_struct = camera_kind.Camera
     place_samples, queue_camera_rays = make_place_samples(features), make_queue_camera_rays(features, camera_kind)
 
     @lanes_kernel
     def begin_wave(wave: Wave, camera: camera_struct, limits: Limits, film: Film, first_pixel: int, end_pixel: int):
-        """Of the pixels first_pixel .. end_pixel - 1, from the place of their first sample in the queue on."""
+        """Queue the samples of the pixels first_pixel .. end_pixel - 1, from the place of their first sample on."""
         samples = wave.task[0].samples
         queued = first_pixel * samples
         first = int(first_pixel)
@@ -133,7 +135,7 @@ def make_begin_kernel(features: Features, camera_kind: Any) -> Any:
 
 
 def make_begin_aov_kernel(camera_kind: Any) -> Any:
-    """Return the kernel for a ray through the middle of each pixel; where there is none, it has no length."""
+    """Return the kernel for the rays through the pixels' centres. A ray has no length where the film gets no light."""
     camera_struct = camera_kind.Camera
     camera_ray = camera_kind.make_camera_ray()
 

@@ -1,4 +1,4 @@
-"""Samples of lights for a wave's hits, many at a time: what needs no branches is computed in lanes (kernels.memory)."""
+"""Light samples for a wave's hits: what has no branches is vectorised."""
 
 from typing import Any, NamedTuple
 
@@ -29,21 +29,19 @@ def first_is_mesh(lighting: Lighting) -> bool:
 
 
 class BlockSamples:
-    """Which samples are computed before they are asked for: mesh: of the first light, where it is one; sky: of a background that is
-    sampled by the cosine; points: of that, where normals are computed one by one (wave_normals.py), only what places them. normals:
-    the rows of those that are not."""
+    """Which light samples are computed for a whole block before they are needed."""
 
     def __init__(self, features: Features) -> None:
         kind = BACKGROUNDS[features.background]
         by_cosine = features.sky_light and kind.sample is None and kind.make_block_radiance is None
-        self.normals: Rows | None = normal_rows(features)
-        self.mesh = "mesh" in features.lights and not features.instances
-        self.sky = by_cosine and self.normals is not None
-        self.points = by_cosine and self.normals is None
+        self.normals: Rows | None = normal_rows(features)  # None: normals are computed one by one.
+        self.mesh = "mesh" in features.lights and not features.instances  # Of the first light, if it is a mesh.
+        self.sky = by_cosine and self.normals is not None  # Of the background.
+        self.points = by_cosine and self.normals is None  # Only the points that place the sky's samples.
 
 
 def make_store_spheres(features: Features, sampled: BlockSamples, shading: Shading, hit_surface: Any) -> Any:
-    """store_spheres(wave, surfaces, first, end): what of the rows is needed here, for hits on spheres."""
+    """Return store_spheres(wave, surfaces, first, end): complete the rows that light samples read, for hits on spheres."""
     store_point, store_normal = SURFACES.field("point").store(), (sampled.normals or SURFACES.field("shading")).store()
     look_up, shading_normal = shading.look_up, shading.shading_normal
 
@@ -62,7 +60,7 @@ def make_store_spheres(features: Features, sampled: BlockSamples, shading: Shadi
 
 
 def make_sample_sky(features: Features, sampled: BlockSamples) -> Any:
-    """sample_sky(wave, lighting, count): put samples of the sky to the rows SKY, or what places them to SKY_POINTS."""
+    """Return sample_sky(wave, lighting, count): store samples of the sky in the rows SKY, or only their points in SKY_POINTS."""
     sky_point, sky_sample, light_numbers = make_sky_point(features), make_sky_sample(features), make_light_points(features).numbers
     load_key, load_normal = KEYS.load(), (sampled.normals or SURFACES.field("shading")).load()
     store_point, store_sample = SKY_POINTS.store(), SKY.store("end", "distant", "area")
@@ -86,8 +84,9 @@ def make_sample_sky(features: Features, sampled: BlockSamples) -> Any:
 
 
 def make_sample_mesh(features: Features) -> Any:
-    """sample_mesh(wave, surfaces, lighting, count): put mesh_light with the first light to the rows LIGHTS. Emitters are chosen and
-    gathered in between, one by one."""
+    """Return sample_mesh(wave, surfaces, lighting, count): store samples of the first light, a mesh, in the rows LIGHTS.
+
+    Emitters are chosen and loaded one by one in between."""
     light_numbers = make_light_points(features).numbers
     load_key, load_xi, store_xi = KEYS.load(), EMITTERS.field("xi").load(), EMITTERS.field("xi").store()
     load_emitter, store_emitter = (make("emitter.material", "emitter.instance") for make in (EMITTERS.load, EMITTERS.store))
@@ -134,15 +133,15 @@ def make_sample_mesh(features: Features) -> Any:
 
 @wp.struct
 class Vertex:
-    """A surface that asks lights, at place i of its block, and what its numbers are made from."""
+    """A surface that requests shadow rays, and the seed of its light samples."""
 
     surface: Surface
     key: Key
-    i: int
+    i: int  # Its place in the block.
 
 
 def make_light_at(features: Features, sampled: BlockSamples, choose_light: Any) -> Any:
-    """light_at(wave, surfaces, lighting, vertex, light) -> LightSample: what was computed before, or by choose_light (of
+    """Return light_at(wave, surfaces, lighting, vertex, light) -> LightSample: load it if computed, else call choose_light (of
     make_step)."""
     light_point = make_light_points(features).point
     load_light, load_sky, load_point = LIGHTS.load("distant", "area"), SKY.load("end", "distant", "area"), SKY_POINTS.load()
@@ -170,16 +169,15 @@ def make_light_at(features: Features, sampled: BlockSamples, choose_light: Any) 
 
 
 class WaveLights(NamedTuple):
-    """sample(wave, surfaces, lighting, first, end): for the hits first .. end - 1, at most BLOCK, whose surfaces are found; at: of
-    make_light_at. needs_keys: whether keys must be put before (wave_numbers.py)."""
+    """The functions for the light samples of a block."""
 
-    sample: Any
-    at: Any
-    needs_keys: bool
+    sample: Any  # (wave, surfaces, lighting, first, end): for hits with surfaces, at most BLOCK.
+    at: Any  # From make_light_at.
+    needs_keys: bool  # Keys must be stored before (wave_numbers.py).
 
 
 def make_wave_lights(features: Features, shading: Shading, hit_surface: Any, choose_light: Any) -> WaveLights:
-    """hit_surface: of make_wave_surfaces; choose_light: `choose` of make_step."""
+    """Return the WaveLights of a scene. `hit_surface` comes from make_wave_surfaces, choose_light is `choose` of make_step."""
     sampled = BlockSamples(features)
     store_spheres = make_store_spheres(features, sampled, shading, hit_surface)
     sample_sky, sample_mesh = make_sample_sky(features, sampled), make_sample_mesh(features)

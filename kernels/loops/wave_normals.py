@@ -1,4 +1,4 @@
-"""Shading normals at a wave's hits, as the eye and lights see them, many at a time (kernels.memory)."""
+"""Shading normals at a wave's hits, on the viewer's side, vectorised."""
 
 from typing import Any
 
@@ -16,14 +16,14 @@ from wrt.kernels.structs import Surfaces
 
 
 def normal_rows(features: Features) -> Rows | None:
-    """Return the rows where they are; None: they are computed one by one."""
+    """Return the rows that hold the normals; None if they are computed one by one."""
     if features.instances or (features.normal_maps and not textures_vectorised(features)):
         return None
     return NORMALS if features.smooth or features.normal_maps else SURFACES.field("shading")
 
 
 def make_compute_normals(features: Features) -> Any:
-    """Return compute_normals(rows, count): write the normals of a block's first `count` hits, from their surfaces and texels."""
+    """Return compute_normals(rows, count): compute the normals of a block's first hits from their surfaces and texels."""
     load_hit, load_surface, load_normal = HITS.load(), SURFACES.load(), TEXELS.field("normal").load()
     store_normal = NORMALS.store()
 
@@ -43,8 +43,9 @@ def make_compute_normals(features: Features) -> Any:
 
 
 def make_wave_normals(features: Features, shading_normal: Any) -> tuple[Any, Any]:
-    """Return compute_normals and normal_at(wave, surfaces, surface, texels, wo, i): of the i-th hit of a block, what was
-    computed before, or by `shading_normal` (of make_shading)."""
+    """Return compute_normals, and normal_at(wave, surfaces, surface, texels, wo, i) for hit i of the block.
+
+    normal_at loads what compute_normals computed, or calls `shading_normal` (of make_shading)."""
     vectorised = normal_rows(features) == NORMALS
     load_normal = NORMALS.load()
 

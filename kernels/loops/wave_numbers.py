@@ -1,4 +1,4 @@
-"""Random numbers for a wave's hits, many at a time (kernels.memory)."""
+"""Random numbers for a wave's hits, vectorised."""
 
 from typing import Any
 
@@ -20,7 +20,7 @@ def key_at(wave: Wave, s: int) -> wp.uint32:
 
 @wp.func
 def put_keys(wave: Wave, first: int, end: int):
-    """Put the keys of the hits first .. end - 1, at most BLOCK, to the rows KEYS."""
+    """Store the keys of the hits first .. end - 1, at most BLOCK, in the rows KEYS."""
     task = wave.task[0]
     for j in range(first, end):
         s = wave.queue.sample[wave.outcomes.hit_rays[j]]
@@ -31,7 +31,7 @@ def put_keys(wave: Wave, first: int, end: int):
 
 
 def make_sample_facets(choose_facet: Any) -> Any:
-    """sample_facets(wave, count): put choose_facet (of make_step) of each hit of a block, whose keys are put, to FACETS."""
+    """Return sample_facets(wave, count): store choose_facet of each hit of a block, from its key, in the rows FACETS."""
     load_key, store_facet = KEYS.load(), FACETS.store()
 
     @wp.func

@@ -1,4 +1,4 @@
-"""The rows of a block: what is gathered and computed for BLOCK hits of a wave at a time, each struct in rows of its own."""
+"""The layout of a block: the structs that vectorised loops load and store for BLOCK hits, each in rows of its own."""
 
 import warp as wp
 
@@ -12,21 +12,20 @@ from wrt.kernels.structs import Emitter
 
 @wp.struct
 class TriangleHit:
-    """What a surface is computed from: its triangle, the hit's barycentrics, the ray's direction, and the material: -1 where a
-    sphere is hit. is_mapped: 1 where the material has a normal map."""
+    """The inputs of a surface."""
 
     triangle: Triangle
-    u: float
+    u: float  # Barycentrics of the hit.
     v: float
-    direction: wp.vec3
-    material: int
-    is_mapped: int
+    direction: wp.vec3  # Of the ray.
+    material: int  # -1 if a sphere was hit.
+    is_mapped: int  # 1 if the material has a normal map.
     normal_scale: float
 
 
 @wp.struct
 class Key:
-    """What a hit's numbers are made from: of its path's vertex, and of its sample."""
+    """The seed of a hit's random numbers: its path's key, and its sample's index."""
 
     key: wp.uint32
     index: wp.uint32
@@ -34,24 +33,24 @@ class Key:
 
 @wp.struct
 class EmitterPoint:
-    """A point on an emitter. emission, two_sided: of its material; xi: what places it, in [0, 1)."""
+    """A sampled point on an emitter."""
 
     emitter: Emitter
-    emission: wp.vec3
+    emission: wp.vec3  # Of its material.
     two_sided: int
-    xi: wp.vec2
+    xi: wp.vec2  # Places the point on the emitter, in [0, 1)^2.
 
 
 HITS = Rows(TriangleHit, BLOCK)
 SURFACES = Rows(Surface, BLOCK, HITS.end)
 TEXELS = Rows(Texels, BLOCK, SURFACES.end)
-NORMALS = Rows(wp.vec3, BLOCK, TEXELS.end)  # the shading normal as lights see it
+NORMALS = Rows(wp.vec3, BLOCK, TEXELS.end)  # Shading normals on the viewer's side.
 KEYS = Rows(Key, BLOCK, NORMALS.end)
-FACETS = Rows(wp.vec3, BLOCK, KEYS.end)  # what chooses a microfacet
+FACETS = Rows(wp.vec3, BLOCK, KEYS.end)  # Choose the microfacet.
 EMITTERS = Rows(EmitterPoint, BLOCK, FACETS.end)
-LIGHTS = Rows(LightSample, BLOCK, EMITTERS.end)  # of the first light
+LIGHTS = Rows(LightSample, BLOCK, EMITTERS.end)  # For the first light.
 SKY = Rows(LightSample, BLOCK, LIGHTS.end)
-SKY_POINTS = Rows(wp.vec3, BLOCK, SKY.end)  # what places a sample on the sky (sky_point)
-MISS_DIRECTIONS = Rows(wp.vec3, BLOCK, SKY_POINTS.end)  # directions of a block of the rays that missed
-MISS_COLORS = Rows(wp.vec3, BLOCK, MISS_DIRECTIONS.end)  # and the background's colours there
+SKY_POINTS = Rows(wp.vec3, BLOCK, SKY.end)  # Place the samples on the sky (sky_point).
+MISS_DIRECTIONS = Rows(wp.vec3, BLOCK, SKY_POINTS.end)  # Of missed rays.
+MISS_COLORS = Rows(wp.vec3, BLOCK, MISS_DIRECTIONS.end)  # The background there.
 ROWS = MISS_COLORS.end

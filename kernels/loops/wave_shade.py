@@ -29,22 +29,22 @@ camera_path = make_paths(False).camera_path
 
 @wp.struct
 class WaveHit:
-    """A ray that has hit something. j: its count among the hits; k: its place in the queue; sample: its sample, of which `pending`
-    paths wait, and `traced` rays have been traced with this one; total: what the sample has so far."""
+    """A queued ray that has hit something."""
 
-    j: int
-    k: int
+    j: int  # Index among the hits.
+    k: int  # Place in the queue.
     sample: int
-    pending: int
-    traced: int
+    pending: int  # Waiting paths of the sample.
+    traced: int  # Rays of the sample so far, this one included.
     path: Path
-    total: Sample
+    total: Sample  # The sample's light so far.
 
 
 @wp.func
 def partition(queue: RayQueue, outcomes: Outcomes, first: int, end: int) -> int:
-    """Sort the rays first .. end - 1 into outcomes.hit_rays and outcomes.missed_rays; return how many hit. There are
-    no branches, which would be mispredicted here, at each line that is called in, and where a ray is shaded."""
+    """Sort the rays first .. end - 1 into outcomes.hit_rays and outcomes.missed_rays; return the number of hits.
+
+    It is branch-free: hits and misses alternate unpredictably."""
     hits = int(0)
     missed = int(0)
     for k in range(first, end):
@@ -58,7 +58,7 @@ def partition(queue: RayQueue, outcomes: Outcomes, first: int, end: int) -> int:
 
 @wp.func
 def load_wave_hit(wave: Wave, j: int) -> WaveHit:
-    """Return hit j, with what its sample has so far."""
+    """Return hit j with the state of its sample."""
     hit = WaveHit()
     hit.j = j
     hit.k = wave.outcomes.hit_rays[j]
@@ -76,15 +76,16 @@ def load_wave_hit(wave: Wave, j: int) -> WaveHit:
 
 
 def make_add_background(features: Features) -> Any:
-    """Return add_background(wave, lighting, missed) -> int: add what the first rays of outcomes.missed_rays see to
-    their samples; return how many samples are in outcomes.resumed_samples then."""
+    """Return add_background(wave, lighting, missed) -> int: add the background to the samples of the first `missed` missed rays.
+
+    The result is the number of outcomes.resumed_samples."""
     kind = BACKGROUNDS[features.background]
     radiance, store_direction, load_color = kind.radiance, MISS_DIRECTIONS.store(), MISS_COLORS.load()
     block_radiance = kind.make_block_radiance(MISS_DIRECTIONS, MISS_COLORS) if kind.make_block_radiance else None
 
     @wp.func
     def miss_radiance(wave: Wave, lighting: Lighting, j: int, missed: int) -> wp.vec3:
-        """Return the radiance of ray j; with the first of a block, that of the others is computed."""
+        """Return the background's radiance for missed ray j. At the first ray of a block, all of the block are computed."""
         if wp.static(block_radiance is not None):
             i = j % BLOCK
             if i == 0:
@@ -123,19 +124,19 @@ def make_add_background(features: Features) -> Any:
 
 
 class BlockFunctions(NamedTuple):
-    """The functions for a block of hits. prepare(wave, surfaces, lighting, first, end): compute what runs in lanes of the hits
-    first .. end - 1, at most BLOCK; own_kernel: whether in a kernel of its own. shade(wave, surfaces, lighting,
-    hit) -> Shaded: of a hit that is prepared; light_at: of make_wave_lights."""
+    """The functions for a block of hits."""
 
-    prepare: Any
-    own_kernel: bool
-    shade: Any
-    light_at: Any
+    prepare: Any  # (wave, surfaces, lighting, first, end): compute the vectorised parts of these hits, at most BLOCK.
+    own_kernel: bool  # Whether `prepare` is a kernel of its own.
+    shade: Any  # (wave, surfaces, lighting, hit) -> Shaded, for a prepared hit.
+    light_at: Any  # From make_light_at.
 
 
 def make_block_functions(features: Features, shading: Shading, step: Step) -> BlockFunctions:
-    """Where textures, or numbers that choose a facet or a place in the sky, are computed in lanes, two cores compile two
-    kernels in 0.6 of the time; without, both together would take longer than one."""
+    """Return the BlockFunctions of a scene.
+
+    With textures, rough surfaces or block light samples, `prepare` is a kernel of its own. Two cores then compile the two kernels
+    in 0.6 of the time of one; without these, two kernels would take longer."""
     compute_surfaces, hit_surface = make_wave_surfaces(features, shading.surface_at)
     sample_textures, texels_at = make_wave_textures(features, shading.look_up)
     compute_normals, normal_at = make_wave_normals(features, shading.shading_normal)
@@ -170,8 +171,9 @@ def make_block_functions(features: Features, shading: Shading, step: Step) -> Bl
 
 
 def make_request_shadows(features: Features, step: Step, light_at: Any) -> Any:
-    """Return request_shadows(wave, surfaces, lighting, shaded, hit) -> bool: queue the shadow rays of a hit, and the
-    surface as the next receiver; return whether it has any."""
+    """Return request_shadows(wave, surfaces, lighting, shaded, hit, receiver) -> bool: queue the shadow rays of a hit.
+
+    It writes their slots as those of the receiver, and returns whether there are any."""
 
     @wp.func
     def queue_shadow(wave: Wave, light: int, request: ShadowRequest) -> int:
@@ -208,8 +210,8 @@ def make_request_shadows(features: Features, step: Step, light_at: Any) -> Any:
 
 
 def make_push_paths(features: Features) -> Any:
-    """Return push_paths(wave, hit, shaded, next) -> int: let the new paths that are followed wait; return how many of the sample's
-    paths wait then."""
+    """Return push_paths(wave, hit, shaded, next) -> int: push the new paths that are followed; return the sample's number of
+    waiting paths."""
 
     @wp.func
     def push_paths(wave: Wave, hit: WaveHit, shaded: Shaded, next: FollowUp) -> int:
@@ -232,7 +234,7 @@ def make_push_paths(features: Features) -> Any:
 
 
 def make_shade_kernels(features: Features) -> tuple[Any, Any]:
-    """Return the kernel for the step at every hit of the queue, and the kernel for a block of hits that it launches, or None."""
+    """Return the kernel that shades the queue, and the kernel that prepares a block for it, or None."""
     shading = make_shading(features)
     step, follow_up, add_background = make_step(features, shading), make_follow_up(features), make_add_background(features)
     block_functions = make_block_functions(features, shading, step)
@@ -240,8 +242,7 @@ def make_shade_kernels(features: Features) -> tuple[Any, Any]:
 
     @lanes_kernel
     def shade_wave(wave: Wave, surfaces: Surfaces, lighting: Lighting, limits: Limits, block: Launch, first: int, end: int):
-        """Of the rays first .. end - 1 of the queue. What is traced next is queued from place progress.queued on, which is not
-        behind `first`. block: of prepare_block, if there is one."""
+        """Shade the rays first .. end - 1. New rays are queued from place progress.queued on, which is at most `first`."""
         queued = int(wave.progress[0].queued)
         receivers = int(wave.progress[0].receivers)
         hits = partition(wave.queue, wave.outcomes, first, end)

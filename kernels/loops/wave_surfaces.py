@@ -1,4 +1,4 @@
-"""The surfaces at a wave's hits, many at a time: triangles are gathered, and computed in lanes (kernels.memory)."""
+"""The surfaces at a wave's hits: triangles are loaded one by one and computed vectorised."""
 
 from typing import Any
 
@@ -12,17 +12,17 @@ from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.surface import Surface, facing, make_on_sphere, make_on_triangle, make_place_of, make_triangle_at
 from wrt.kernels.structs import Surfaces
 
-FAR = 16  # hits whose triangle is prefetched before it is gathered
+FAR = 16  # Hits between the prefetch of a triangle and its load.
 
 
 @wp.func
 def hit_triangle(wave: Wave, surfaces: Surfaces, j: int) -> int:
-    """The triangle of hit j; for a sphere any valid one, whose result is ignored."""
+    """Return the triangle of hit j; for a sphere any valid one, whose result is ignored."""
     return wp.min(wave.queue.hits.prim_id[wave.outcomes.hit_rays[j]], surfaces.n_triangles - 1)
 
 
 class Attributes:
-    """Which attributes of surfaces a scene has, and which fields of the rows it leaves alone."""
+    """The attributes of surfaces that a scene has, and the fields of the rows that it leaves out."""
 
     def __init__(self, features: Features) -> None:
         self.smooth, self.tangents = features.smooth, features.normal_maps
@@ -34,14 +34,14 @@ class Attributes:
 
 
 def make_load_triangles(has: Attributes) -> Any:
-    """load_triangles(wave, surfaces, first, end, hits): put the triangles of the hits first .. end - 1 of so many to their rows."""
+    """Return load_triangles(wave, surfaces, first, end, hits): store the triangles of the hits first .. end - 1 in their rows."""
     smooth, uvs, tangents = has.smooth, has.uvs, has.tangents
     place_of, triangle_at = make_place_of(False), make_triangle_at(smooth, uvs, False)
     store_hit = HITS.store(*has.not_of_hits)
 
     @wp.func
     def prefetch_triangles(wave: Wave, surfaces: Surfaces, j: int, hits: int):
-        """Prefetch the face of a hit behind j, and the corners of one before that."""
+        """Prefetch the face of a later hit, and the corners of a nearer one."""
         prim_id = hit_triangle(wave, surfaces, wp.min(j + 2 * FAR, hits - 1))
         prefetch(surfaces.faces, prim_id)
         prefetch(surfaces.prim_material, prim_id)
@@ -74,7 +74,7 @@ def make_load_triangles(has: Attributes) -> Any:
 
 
 def make_compute_surfaces(has: Attributes) -> Any:
-    """Return compute_surfaces(wave, surfaces, first, end, hits): of the hits first .. end - 1 (at most BLOCK) of so many."""
+    """Return compute_surfaces(wave, surfaces, first, end, hits) for the hits first .. end - 1 (at most BLOCK) of `hits`."""
     load_triangles = make_load_triangles(has)
     on_triangle = make_on_triangle(has.smooth, has.uvs, has.tangents)
     load_hit, store_surface = HITS.load(*has.not_of_hits), SURFACES.store(*has.not_of_surfaces)
@@ -95,8 +95,9 @@ def make_compute_surfaces(has: Attributes) -> Any:
 
 
 def make_hit_surface(has: Attributes, spheres: bool) -> Any:
-    """hit_surface(wave, surfaces, i, k) -> Surface: of the i-th hit of those that compute_surfaces took, at place k in
-    the queue. A sphere's is computed here."""
+    """Return hit_surface(wave, surfaces, i, k) -> Surface of hit i of the block, at place k of the queue.
+
+    Triangles are loaded from compute_surfaces' rows; spheres are computed here."""
     on_sphere = make_on_sphere(has.uvs, has.tangents)
     load_surface = SURFACES.load(*has.not_of_surfaces)
 

@@ -1,4 +1,4 @@
-"""What textures say at a wave's hits, many at a time."""
+"""Texels at a wave's hits, vectorised."""
 
 from typing import Any
 
@@ -23,7 +23,7 @@ def sample_nothing(surfaces: Surfaces, rows: wp.array(dtype=wp.float32), count: 
 
 
 def make_sample_texture(name: str, texture: MaterialTexture) -> Any:
-    """Return sample_texture(surfaces, rows, count): put one texture of a block's first hits, on triangles, to the rows TEXELS."""
+    """Return sample_texture(surfaces, rows, count): store one texture at a block's first hits, on triangles, in the rows TEXELS."""
     material, u, v = (rows.first * BLOCK for rows in (HITS.field("material"), SURFACES.field("u"), SURFACES.field("v")))
     channels = sum(1 << channel for channel in texture.channels)
     to = TEXELS.field(next(iter(texture.fields))).first * BLOCK
@@ -43,7 +43,7 @@ def make_sample_texture(name: str, texture: MaterialTexture) -> Any:
 
 
 def make_link(sample: Any, sample_others: Any) -> Any:
-    """Return the function for one texture after those for the others."""
+    """Return the function that samples one texture after the others."""
 
     @wp.func
     def sample_all(surfaces: Surfaces, rows: wp.array(dtype=wp.float32), count: int):
@@ -54,8 +54,9 @@ def make_link(sample: Any, sample_others: Any) -> Any:
 
 
 def make_wave_textures(features: Features, look_up: Any) -> tuple[Any, Any]:
-    """Return sample(surfaces, rows, count), for the first hits of a block, whose surfaces are found, and texels_at(wave, surfaces,
-    surface, i) -> Texels of the i-th of them: what was computed before, or by `look_up` (of make_shading)."""
+    """Return sample(surfaces, rows, count) for the surfaces of a block, and texels_at(wave, surfaces, surface, i) -> Texels.
+
+    texels_at loads what `sample` computed for hit i, or calls `look_up` (of make_shading)."""
     textures = textures_of(features) if textures_vectorised(features) else {}
     sample = sample_nothing
     for name, texture in textures.items():
