@@ -1,33 +1,34 @@
-"""Arrays from and to others without a copy: NumPy, Warp, and whatever else speaks DLPack or has `__array__`."""
+"""Arrays shared with other libraries without a copy: NumPy, Warp, and all that have DLPack or `__array__`."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 import warp as wp
 
 from wrt.core.checks import shown
 from wrt.core.errors import InputError
+from wrt.core.types import Array, ArrayLike, Tensor, WarpArray, WarpType
 from wrt.core.warp_private import recording_tape
 
 DLPACK_CPU = 1
 REAL = "iufO"  # NumPy's kinds of real numbers, and objects such as fractions: no bool, complex, text or date
 
 
-def to_numpy(array: Any) -> np.ndarray:
-    """A NumPy array of the same memory; a copy only of what is on a GPU."""
+def to_numpy(array: ArrayLike) -> np.ndarray:
+    """Return a NumPy array of the same memory, or a copy of an array on a GPU."""
     array = taken(array, "an array", None)
     return array.numpy() if isinstance(array, wp.array) else np.asarray(array)
 
 
-def to_warp(array: Any, dtype: Any = None) -> Any:
-    """A Warp array of the same memory (of a NumPy array: on the CPU); a copy only of what cannot be written to.
+def to_warp(array: ArrayLike, dtype: WarpType = None) -> WarpArray:
+    """Return a Warp array of the same memory, or a copy of a read-only array. NumPy arrays stay on the CPU.
 
-    dtype: a Warp type, such as vec3 for arrays of three columns; None: the array's own.
+    dtype: a Warp type, such as vec3 for arrays of three columns; None is the array's own.
     """
     if not isinstance(array, np.ndarray):
         array = taken(array, "an array", dtype)
@@ -37,11 +38,11 @@ def to_warp(array: Any, dtype: Any = None) -> Any:
     return wp.array(array, dtype=dtype or wp.dtype_from_numpy(array.dtype), device="cpu", copy=not array.flags.writeable)
 
 
-def real_numbers(value: Any, name: str, shape: str) -> np.ndarray:
-    """An array of what somebody gives as real numbers: arrays and tensors of integers or floats of any size as they are, lists,
-    scalars; objects as float32; what is on a GPU is copied. Raises InputError that calls it `name`, and says that `shape` was
-    expected."""
-    if "numpy.ma" in sys.modules and isinstance(value, np.ma.MaskedArray):  # else there is none, and that module takes long
+def real_numbers(value: object, name: str, shape: str) -> np.ndarray:
+    """Return an argument as an array of real numbers: integers and floats keep their type, objects become float32.
+
+    An array on a GPU is copied. Raises InputError that names the argument and the expected shape."""
+    if "numpy.ma" in sys.modules and isinstance(value, np.ma.MaskedArray):  # np.ma takes long to import
         raise InputError(f"{name} must not be a masked array: its mask would be ignored; leave masked rows out, or fill them")
     value = taken(value, name, None)
     try:
@@ -54,13 +55,13 @@ def real_numbers(value: Any, name: str, shape: str) -> np.ndarray:
 
 
 def float32(array: np.ndarray) -> np.ndarray:
-    """Aligned and without gaps, the same array if it is so; what is beyond float32 becomes infinite."""
+    """Return a contiguous and aligned array of float32, the same one if possible. Larger values become infinite."""
     with np.errstate(over="ignore"):
         return np.require(array, np.float32, ["C", "A"])
 
 
-def check_no_gradients(what: str = "this", **arrays: Any) -> None:
-    """Raise InputError that names the Warp array in which a tape would wait for gradients of `what`, which has none."""
+def check_no_gradients(what: str = "this", **arrays: object) -> None:
+    """Raise InputError for a Warp array that requires gradients while a tape records, because `what` has none."""
     for name, array in arrays.items() if recording_tape() is not None else ():
         if isinstance(array, wp.array) and array.requires_grad:
             raise InputError(f"{name} requires gradients and a wp.Tape is recording, but {what} has none (t, u, v and point of"
@@ -68,19 +69,20 @@ def check_no_gradients(what: str = "this", **arrays: Any) -> None:
                              f" wp.clone({name}, requires_grad=False)")
 
 
-def is_tensor(value: Any) -> bool:
-    """Whether it is another library's array, which shares its memory by DLPack."""
+def is_tensor(value: object) -> TypeGuard[Tensor]:
+    """Return whether a value is another library's array, which shares its memory by DLPack."""
     return not isinstance(value, np.ndarray | wp.array) and hasattr(value, "__dlpack__")
 
 
-def on_cpu(tensor: Any) -> bool:
-    """Whether the memory of a tensor is the host's."""
+def on_cpu(tensor: Tensor) -> bool:
+    """Return whether a tensor's memory is the host's."""
     return bool(tensor.__dlpack_device__()[0] == DLPACK_CPU)
 
 
-def taken(value: Any, name: str, dtype: Any = wp.vec3) -> Any:
-    """What somebody gives for an array: tensors as an array of the same memory, NumPy's on the CPU and on a GPU Warp's of `dtype`
-    (None: the tensor's own); all else as it is. Raises InputError that calls it `name` where a tensor does not share its memory."""
+def taken(value: object, name: str, dtype: WarpType = wp.vec3) -> Any:
+    """Return a tensor as an array of the same memory: NumPy's on the CPU, Warp's on a GPU. Return any other value unchanged.
+
+    dtype: the Warp array's type; None is the tensor's own. Raises InputError that names the argument if the memory cannot be shared."""
     if not is_tensor(value):
         return value
     try:
@@ -92,18 +94,18 @@ def taken(value: Any, name: str, dtype: Any = wp.vec3) -> Any:
                          f" wrt.jax has gradients)") from error
 
 
-def returned(*given: Any) -> Callable[[Any], Any] | None:
-    """What makes an array of NumPy or Warp a tensor of the library whose tensor is the first among `given`, without a copy (one of
-    a GPU comes to the CPU if that tensor is there); None where there is no tensor, or its library is not known to make some."""
+def returned(*given: object) -> Callable[[Array], Tensor] | None:
+    """Return a function that turns an array into a tensor of the library of the first tensor in `given`, without a copy.
+
+    An array on a GPU is copied if that tensor is on the CPU. None without a tensor, or if its library has no `from_dlpack`."""
     for value in given:
         if is_tensor(value):
-            has_namespace = hasattr(value, "__array_namespace__")  # the array API's way; torch has none
-            module = type(value).__module__.partition(".")[0]
-            home: Any = value.__array_namespace__() if has_namespace else sys.modules.get(module)
+            namespace = getattr(value, "__array_namespace__", None)  # the array API's; torch has none
+            home: Any = namespace() if namespace else sys.modules.get(type(value).__module__.partition(".")[0])
             return partial(_given_to, home.from_dlpack, on_cpu(value)) if hasattr(home, "from_dlpack") else None
     return None
 
 
-def _given_to(from_dlpack: Callable[[Any], Any], to_cpu: bool, array: Any) -> Any:
-    """On the CPU an array of NumPy, which knows all of the protocol's versions."""
+def _given_to(from_dlpack: Callable[[Array], Tensor], to_cpu: bool, array: Array) -> Tensor:
+    """Pass NumPy arrays on the CPU, because NumPy has all versions of the protocol."""
     return from_dlpack(to_numpy(array) if to_cpu or not isinstance(array, wp.array) or array.device.is_cpu else array)

@@ -1,5 +1,6 @@
-"""Files of arrays that are checked when they are read: a line that says what it is, a line of JSON, the arrays' bytes one after
-another, and the SHA-256 of all that. Nothing in them is evaluated or unpickled."""
+"""Files of arrays with a checksum: a line with the kind of file, a line of JSON, the arrays' bytes, and the SHA-256 of all that.
+
+Nothing in them is evaluated or unpickled."""
 
 from __future__ import annotations
 
@@ -7,20 +8,20 @@ import json
 import os
 from collections.abc import Iterable
 from hashlib import sha256
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 
 from wrt.core.errors import InputError
 from wrt.core.files import open_regular
+from wrt.core.types import JsonObject
 
 DIGEST_BYTES = 32
 MAX_HEADER = 1 << 16
 
 
-def write_checked(file: BinaryIO, magic: bytes, header: dict[str, Any], parts: Iterable[bytes | np.ndarray]) -> None:
-    """Write it all to an open file. magic: the first line, with its end; header: at most MAX_HEADER bytes of JSON; parts: bytes,
-    or arrays, of which the values count. OSError comes through."""
+def write_checked(file: BinaryIO, magic: bytes, header: JsonObject, parts: Iterable[bytes | np.ndarray]) -> None:
+    """Write such a file to an open file. magic: the first line, with its end; header: at most MAX_HEADER bytes of JSON."""
     digest = sha256()
     for part in (magic, json.dumps(header).encode() + b"\n", *parts):
         view = part if isinstance(part, bytes) else np.ascontiguousarray(part).reshape(-1).view(np.uint8).data
@@ -29,8 +30,8 @@ def write_checked(file: BinaryIO, magic: bytes, header: dict[str, Any], parts: I
     file.write(digest.digest())
 
 
-def read_checked(path: str | os.PathLike[str], magic: bytes, what: str) -> tuple[dict[str, Any], memoryview]:
-    """The header and the bytes of the arrays. Raises InputError, which calls it `what`, where it is missing, foreign or damaged."""
+def read_checked(path: str | os.PathLike[str], magic: bytes, what: str) -> tuple[JsonObject, memoryview]:
+    """Return the header and the bytes of the arrays. Raises InputError if the file is missing, damaged, or no `what`."""
     try:
         with open_regular(path) as file:
             if file.read(len(magic)) != magic:

@@ -1,4 +1,4 @@
-"""What users give for an argument, checked and brought to one form; an InputError names the argument and what was expected."""
+"""Checks of arguments, which bring them to one form. An InputError names the argument and what was expected."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ from collections.abc import Collection, Iterable
 from itertools import islice
 from pathlib import Path
 from types import UnionType
-from typing import Any, TypeVar, Union, get_args, get_origin
+from typing import TypeVar, Union, get_args, get_origin
 
 import numpy as np
+import numpy.typing as npt
 
 from wrt.core.errors import InputError
 
 T = TypeVar("T")
-LARGEST = 1e30  # of any number in a scene: what comes near the end of float32 turns into infinities on the device
+LARGEST = 1e30  # absolute value of a number in a scene; larger ones become infinite on the device
 
 
-def as_integer(value: Any, what: str, low: int, high: int) -> int:
-    """A whole number in [low, high]: an int, or NumPy's; no float, even if whole, and no text."""
+def as_integer(value: object, what: str, low: int, high: int) -> int:
+    """Return an integer in [low, high], Python's or NumPy's. A float is no integer, even if whole."""
     try:
-        number = operator.index(value)
+        number = operator.index(value)  # type: ignore[arg-type]
     except TypeError:
         raise InputError(f"{what} must be a whole number, got {shown(value)}") from None
     if not low <= number <= high:
@@ -31,12 +32,12 @@ def as_integer(value: Any, what: str, low: int, high: int) -> int:
     return number
 
 
-def as_size(value: Any, what: str = "size", high: int = 32768) -> tuple[int, int]:
-    """Width and height in pixels from a pair, or from text such as "640x360"."""
+def as_size(value: object, what: str = "size", high: int = 32768) -> tuple[int, int]:
+    """Return width and height in pixels from a pair or a text such as "640x360"."""
     if isinstance(value, str) and (match := re.fullmatch(r"\s*([0-9]{1,9})\s*[xX]\s*([0-9]{1,9})\s*", value)):
         value = (int(match[1]), int(match[2]))
     try:
-        width, height = map(operator.index, value if not isinstance(value, str) else ())
+        width, height = map(operator.index, () if isinstance(value, str) else value)  # type: ignore[call-overload]
     except (TypeError, ValueError):
         raise InputError(f'{what} must be two whole numbers or text such as "640x360", got {shown(value)}') from None
     if not (1 <= width <= high and 1 <= height <= high):
@@ -44,8 +45,8 @@ def as_size(value: Any, what: str = "size", high: int = 32768) -> tuple[int, int
     return width, height
 
 
-def as_array(value: Any, dtype: Any, what: str) -> np.ndarray:
-    """A contiguous array; what is beyond the type's range becomes infinite."""
+def as_array(value: object, dtype: npt.DTypeLike, what: str) -> np.ndarray:
+    """Return a contiguous array. Values beyond the type's range become infinite."""
     try:
         with np.errstate(over="ignore"):
             return np.ascontiguousarray(value, dtype=dtype)
@@ -53,39 +54,40 @@ def as_array(value: Any, dtype: Any, what: str) -> np.ndarray:
         raise InputError(f"{what} must be an array of numbers, got {shown(value)}") from None
 
 
-def as_path(value: Any, what: str) -> Path:
+def as_path(value: object, what: str) -> Path:
     try:
-        return Path(os.fsdecode(value))
+        return Path(os.fsdecode(value))  # type: ignore[arg-type]
     except TypeError:
         raise InputError(f"{what} must be a path, got {shown(value)}") from None
 
 
-def as_one(value: Any, kind: type[T] | tuple[type[T], ...], what: str) -> T:
-    """The value, if it is of that type or one of those types."""
+def as_one(value: object, kind: type[T] | tuple[type[T], ...], what: str) -> T:
+    """Return the value if it is of that type, or of one of those types."""
     kinds = kind if isinstance(kind, tuple) else (kind,)
     if not isinstance(value, kinds):
         raise InputError(f"{what} must be {' or '.join(_a(each.__name__) for each in kinds)}, got {shown(value)}")
     return value
 
 
-def as_tuple(value: Any, kind: type[T] | tuple[type[T], ...], what: str) -> tuple[T, ...]:
-    """A sequence of such values; a single one stands for itself."""
+def as_tuple(value: object, kind: type[T] | tuple[type[T], ...], what: str) -> tuple[T, ...]:
+    """Return a tuple of values of that type from an iterable, or from a single one."""
     if isinstance(value, kind):
         return (value,)
     if isinstance(value, str) or not hasattr(value, "__iter__"):
         as_one(value, kind, f"{what}: each")
-    return tuple(as_one(each, kind, f"{what}[{i}]") for i, each in enumerate(value))
+    values: Iterable[object] = value  # type: ignore[assignment]
+    return tuple(as_one(each, kind, f"{what}[{i}]") for i, each in enumerate(values))
 
 
-def as_names(value: Any, what: str) -> tuple[str, ...]:
-    """Names; a single one stands for itself."""
+def as_names(value: object, what: str) -> tuple[str, ...]:
+    """Return a tuple of names from an iterable, or from a single one."""
     if not isinstance(value, Iterable):
         raise InputError(f"{what} must be a name or several, got {shown(value)}")
     return as_tuple(value, str, what)
 
 
 def as_choice(value: str, choices: Collection[str], what: str) -> str:
-    """The value, if it is one of the choices."""
+    """Return the value if it is one of the choices."""
     if value not in choices:
         hint = did_you_mean(value, choices)
         raise InputError(f"{what} must be one of {', '.join(choices)}; got {shown(value)}{'; ' if hint else ''}{hint}".rstrip())
@@ -93,13 +95,13 @@ def as_choice(value: str, choices: Collection[str], what: str) -> str:
 
 
 def require_known(name: str, known: Collection[str], what: str) -> None:
-    """Raise InputError where there is no such thing of that name."""
+    """Raise InputError if the name is not known."""
     if name not in known:
         raise InputError(f"no {what} {shown(name)}; {did_you_mean(name, known)}there is {', '.join(known) or 'none'}")
 
 
 def unknown(name: str, what: str, known: Iterable[str]) -> str:
-    """A sentence on a name that is not known, with the nearest one that is, and all of them; long names and lists are cut."""
+    """Return a message on an unknown name, with the most similar known one, and all of them; long names and lists are cut."""
     names = [str(each) for each in known]
     hint = did_you_mean(name, names)
     return f"unknown {what} {short(name)}; {hint}known are {listed(names, 100)}" if names else (
@@ -107,25 +109,25 @@ def unknown(name: str, what: str, known: Iterable[str]) -> str:
 
 
 def listed(names: Collection[str], most: int = 5) -> str:
-    """The first of the names, each short, and how many more there are."""
+    """Return the first names, each cut to 60 characters, and the number of the others."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(map(short, islice(names, most))) + more
 
 
-def did_you_mean(name: Any, known: Iterable[str]) -> str:
-    """A question with the known name that is nearest, for the middle of a message; "" where none is near."""
+def did_you_mean(name: object, known: Iterable[str]) -> str:
+    """Return a question with the most similar known name, for the middle of a message; "" if none is similar."""
     names = [each for each in islice(known, 1000) if len(each) <= 100]
     near = difflib.get_close_matches(name[:100], names, n=1) if isinstance(name, str) else []
     return f"did you mean {near[0]!r}? " if near else ""
 
 
 def at_thing(kind: str, name: str) -> str:
-    """How a message begins that is about a thing of that name, or of none."""
+    """Return the beginning of a message about a thing with a name, or without one ("")."""
     return f"{kind} {name!r}: " if name else f"{kind}: "
 
 
-def shown(value: Any) -> str:
-    """A value as a message shows it: with its type, where it does not tell that itself, and short."""
+def shown(value: object) -> str:
+    """Return a value in the form of a message: short, and as a type where the value itself would say nothing."""
     if isinstance(value, str | int | float | tuple | list) or value is None:
         return short(value)
     if isinstance(value, np.ndarray):
@@ -133,8 +135,8 @@ def shown(value: Any) -> str:
     return _a(type(value).__name__)
 
 
-def short(value: Any, most: int = 60) -> str:
-    """repr(value), cut where it is longer; of what cannot be written, its type."""
+def short(value: object, most: int = 60) -> str:
+    """Return repr(value), cut to `most` characters, or the type of a value that cannot be written."""
     try:
         text = repr(value)
     except (ValueError, RecursionError):  # an integer of thousands of digits, tables nested thousands deep
@@ -146,9 +148,10 @@ def _a(name: str) -> str:
     return f"{'an' if name[:1] in 'AEIOaeio' else 'a'} {name}"
 
 
-def accepts(kind: Any, value: Any) -> bool:
-    """Whether a value is of an annotation's type: a class, or a union of some. A whole number is a float too, and a bool is no
-    number. What is no class (a callable) is not looked at."""
+def accepts(kind: object, value: object) -> bool:
+    """Return whether a value fits an annotation: a class or a union of classes. Other annotations accept anything.
+
+    An int is a float too, and a bool is no number."""
     if get_origin(kind) in (Union, UnionType):
         return any(accepts(each, value) for each in get_args(kind))
     if not isinstance(kind, type):

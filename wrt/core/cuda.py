@@ -1,8 +1,7 @@
-"""How kernels run on CUDA. A setting changes speed alone: hits and pixels have the same bits. Why these are the defaults:
-docs/acceleration.md, "Structure and blocks on a GPU"; `wrt.tune` measures the others."""
+"""Settings of launches on CUDA. They change speed alone: hits and pixels keep their bits. `wrt.tune` measures the alternatives."""
 
 BLOCK_DIMS = (64, 32, 128, 256)
 STACKS = ("shared", "local")  # kernels.traverse.stack.PLACES
 
-block_dim = BLOCK_DIMS[0]  # threads of a block of a launch
-stack = STACKS[0]  # where bvh2 and the wide BVHs have the first entries of theirs
+block_dim = BLOCK_DIMS[0]  # threads in a block
+stack = STACKS[0]  # where bvh2 and the wide BVHs keep the first entries of their traversal stack

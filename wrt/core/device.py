@@ -1,4 +1,4 @@
-"""The way to the device: Warp's start, kernels, and the only place that uploads arrays."""
+"""Devices: starting Warp, loading and launching kernels, and copying arrays to and from a device."""
 
 from __future__ import annotations
 
@@ -15,60 +15,62 @@ from contextlib import contextmanager
 from functools import partial, wraps
 from math import prod
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from wrt.core import cuda, warp_private
 from wrt.core.errors import InputError
-from wrt.core.kernel_cache import is_whole, remove
+from wrt.core.kernel_cache import is_intact, remove
 from wrt.core.seconds import loading
 from wrt.core.threads import run_all, submit, thread_count, with_stack
+from wrt.core.types import Device, Kernel, WarpArray, WarpType
 
 MOST_ROWS = (1 << 31) - 1
-ROOM_TO_COMPILE = 16 << 20  # bytes of disk: sources and object of a kernel, with much to spare
-FILES_TO_COMPILE = 64  # likewise, files and folders
+ROOM_TO_COMPILE = 16 << 20  # bytes of disk for the sources and the object of a kernel, with a large margin
+FILES_TO_COMPILE = 64  # files and folders, likewise
 
 if wp.config.log_level == wp.LOG_INFO:  # Warp's default; another level is the user's
     wp.config.log_level = wp.LOG_WARNING
 
 
+P = ParamSpec("P")
 T = TypeVar("T")
 _making = threading.RLock()
 
 
-def made_once(make: Callable[..., T]) -> Callable[..., T]:
-    """functools.cache for what several threads may ask for first: one of them makes it, and the others wait for that one.
+def made_once(make: Callable[P, T]) -> Callable[P, T]:
+    """Cache a function's results; of several threads that call it first, one calls `make` and the others wait.
 
     Two kernels of the same code would be compiled twice, and two structs of the same fields are different types to Warp.
     """
-    known: dict[tuple[Any, ...], T] = {}
+    known: dict[tuple[object, ...], T] = {}
 
     @wraps(make)
-    def asked(*key: Any) -> T:
+    def cached(*key: Any) -> T:
         try:
             return known[key]
         except KeyError:
             pass
         with _making:
             if key not in known:
-                known[key] = make(*key)
+                known[key] = make(*key)  # type: ignore[call-arg]
             return known[key]
 
-    return asked
+    return cached  # type: ignore[return-value]
 
 
 @contextmanager
 def _stderr_without(text: bytes) -> Iterator[None]:
-    """Hold stderr back during the block, and let it out again without the lines that have `text` in them: Warp's C++ side
-    writes past Python."""
+    """Hold back stderr during the block, then write it without the lines that contain `text`: Warp's C++ writes past Python."""
     try:
         held = tempfile.TemporaryFile()
     except OSError:
         held = None
-    if held is None or sys.stderr is None:  # nowhere to write; or closed by the caller
+    if held is None or sys.stderr is None:  # no temporary file, or the caller closed stderr
         yield
         return
     sys.stderr.flush()
@@ -88,7 +90,7 @@ def _stderr_without(text: bytes) -> Iterator[None]:
 
 @made_once
 def _start_warp() -> None:
-    with _stderr_without(warp_private.NO_DRIVER), _cache_told():  # where there is no GPU, it says so each time
+    with _stderr_without(warp_private.NO_DRIVER), _cache_errors():  # Warp reports a missing GPU at each start
         if not os.environ.get("WARP_CACHE_PATH"):
             os.environ.pop("WARP_CACHE_PATH", None)  # empty: Warp would keep its kernels in the current folder
         wp.init()
@@ -96,12 +98,13 @@ def _start_warp() -> None:
 
 
 @made_once
-def start(device: str) -> Any:
-    """Start Warp and return its device of that name ("cpu", "cuda:0"). Raises InputError that lists those there are, and where the
-    kernel cache cannot be made."""
+def start(device: str) -> Device:
+    """Start Warp and return its device of that name ("cpu", "cuda:0").
+
+    Raises InputError for an unknown name, with those known, and if the kernel cache cannot be made."""
     _start_warp()
     try:
-        with _stderr_without(warp_private.CUDA_ERROR):  # told by the InputError below
+        with _stderr_without(warp_private.CUDA_ERROR):  # the InputError below reports it
             return wp.get_device(device)
     except Exception as error:  # Warp raises ValueError or RuntimeError, depending on what is wrong with the name
         known = ", ".join(str(d) for d in wp.get_devices())
@@ -109,7 +112,7 @@ def start(device: str) -> Any:
 
 
 def describe_devices() -> list[str]:
-    """One line a device: its name for `--device`, and what it is."""
+    """Return a line for each device: its name for `--device`, its hardware and its size."""
     start("cpu")
     lines = [f"cpu: {wp.get_device('cpu').name or 'CPU'}, {thread_count(None)} threads"]
     for device in wp.get_cuda_devices():
@@ -117,13 +120,13 @@ def describe_devices() -> list[str]:
     return lines
 
 
-def block_dim(device: Any) -> int:
-    """Threads of a block of a launch: on the CPU one; the module's default block size would be compiled for nothing."""
+def block_dim(device: Device) -> int:
+    """Return the threads of a launch's block; 1 on the CPU, where Warp's default would be compiled for nothing."""
     return 1 if device.is_cpu else cuda.block_dim
 
 
-def memory_of(device: Any) -> float:
-    """Bytes that a GPU has free; of the CPU, all of the machine's main memory. Infinite where the system does not tell."""
+def memory_of(device: Device) -> float:
+    """Return the free bytes of a GPU, or all bytes of main memory for the CPU; infinite if the system does not report them."""
     if device.is_cuda:
         return float(device.free_memory)
     try:
@@ -133,20 +136,20 @@ def memory_of(device: Any) -> float:
 
 
 class _Loaded:
-    """On which devices (their names) and with which blocks a kernel is loaded; Warp would look at files again each time."""
+    """The devices (names) and block sizes for which a kernel is loaded. Warp would read files again at each call."""
 
     def __init__(self) -> None:
         self.devices: set[tuple[str, int]] = set()
         self.lock = threading.Lock()
 
 
-_loaded: WeakKeyDictionary[Any, _Loaded] = WeakKeyDictionary()
+_loaded: WeakKeyDictionary[Kernel, _Loaded] = WeakKeyDictionary()
 
 
-def load_kernel(kernel: Any, device: Any) -> None:
-    """Compile a kernel, or take it from the cache, before threads launch it. One thread compiles it; others that ask wait.
+def load_kernel(kernel: Kernel, device: Device) -> None:
+    """Compile a kernel, or read it from the cache, before threads launch it. One thread compiles it; the others wait.
 
-    Raises InputError where the cache's folder has no room or cannot be written to.
+    Raises InputError if the cache's folder is full or cannot be written to.
     """
     loaded, place = _loaded.get(kernel) or _loaded.setdefault(kernel, _Loaded()), (device.alias, block_dim(device))
     if place not in loaded.devices:
@@ -157,9 +160,10 @@ def load_kernel(kernel: Any, device: Any) -> None:
 
 
 @contextmanager
-def preloading(*kernels: Any) -> Iterator[None]:
-    """Kernels for the CPU that this thread comes to in the block: those not in the cache are compiled beside each other. Errors are
-    told where it comes to them. At the end of the block all have been loaded: a process may be forked after it."""
+def preloading(*kernels: Kernel) -> Iterator[None]:
+    """Load kernels for the CPU in parallel while the block runs, which raises their errors when it needs them.
+
+    At the end of the block all of them are loaded, so that the process may be forked."""
     missing = [kernel for kernel in kernels if kernel not in _loaded]
     if not missing:
         yield
@@ -171,26 +175,26 @@ def preloading(*kernels: Any) -> Iterator[None]:
         wait(loads)
 
 
-def preload_headers(kernel: Any) -> None:
-    """Begin to precompile Warp's headers with this small kernel, where the cache is empty: beside what comes before the first
-    other kernel. For a process of wrt's own: one that was forked meanwhile would wait for ever. Errors are told where a kernel
-    cannot be compiled."""
+def preload_headers(kernel: Kernel) -> None:
+    """Start to precompile Warp's headers, by compiling this small kernel in the background, if the cache is empty.
+
+    Only for processes of wrt: a process that is forked meanwhile would wait for ever. The next kernel raises errors."""
     cpu = start("cpu")
     if not any(Path(wp.config.kernel_cache_dir).glob(warp_private.IN_CACHE)):
         submit(partial(load_kernel, kernel, cpu))
 
 
-def _load(kernel: Any, device: Any, block_dim: int) -> None:
-    """Load a kernel; what of it is damaged in the cache is compiled anew."""
-    with _cache_told():
+def _load(kernel: Kernel, device: Device, block_dim: int) -> None:
+    """Load a kernel; compile it again if its files in the cache are damaged."""
+    with _cache_errors():
         files = warp_private.cache_files(kernel, device, block_dim)
         folder, sealed = files[0].parent, warp_private.is_own(kernel)
         before = [path for path in (files if folder.is_dir() else [folder]) if os.path.lexists(path)]
-        with contextlib.suppress(Exception):  # told below, if it happens again
-            if all(is_whole(path, sealed) for path in files):
+        with contextlib.suppress(Exception):  # raised below, if it happens again
+            if all(is_intact(path, sealed) for path in files):
                 warp_private.load(kernel, device, block_dim)
                 return
-        for path in before:  # not what another process has compiled since
+        for path in before:  # but keep what another process has compiled since
             remove(path)
         folder.parent.mkdir(parents=True, exist_ok=True)
         _require_room_to_compile(folder.parent)
@@ -198,8 +202,8 @@ def _load(kernel: Any, device: Any, block_dim: int) -> None:
 
 
 @contextmanager
-def _cache_told() -> Iterator[None]:
-    """What the system refuses Warp's cache, and what Warp cannot make or load there, is told with the way out."""
+def _cache_errors() -> Iterator[None]:
+    """Turn the errors of the system and of Warp about the kernel cache into an InputError that names another way."""
     try:
         yield
     except Exception as error:
@@ -211,7 +215,7 @@ def _cache_told() -> Iterator[None]:
 
 
 def _require_room_to_compile(cache: Path) -> None:
-    """Raise OSError where there is no room for a kernel: LLVM ends the process on a full disk."""
+    """Raise OSError if there is no room for a kernel: LLVM ends the process on a full disk."""
     room = float(shutil.disk_usage(cache).free)
     with contextlib.suppress(ImportError):
         import resource
@@ -224,39 +228,40 @@ def _require_room_to_compile(cache: Path) -> None:
         raise OSError(errno.ENOSPC, f"room for {disk.f_favail} files, and {FILES_TO_COMPILE} are needed")
 
 
-def upload(array: np.ndarray, dtype: Any, device: Any) -> Any:
-    """A Warp array of `dtype` (a Warp type or struct) from rows of a NumPy array; on the CPU without a copy if it fits. Raises
-    InputError for more rows than kernels, whose indices are int32, can reach; the bytes of a row do not count."""
+def upload(array: np.ndarray, dtype: WarpType, device: Device) -> WarpArray:
+    """Return a Warp array of `dtype` with the rows of a NumPy array; on the CPU without a copy if the memory fits.
+
+    Raises InputError for more rows than the int32 indices of kernels can reach."""
     if len(array) > MOST_ROWS:
         raise InputError(f"{len(array)} rows of {dtype.__name__ if isinstance(dtype, type) else dtype.key} are more than an array"
                          f" on a device can have, 2^31 - 1; a binary tree (bvh2) has the fewest")
     if hasattr(dtype, "numpy_dtype"):  # a struct
         assert array.dtype == record_dtype(dtype)
         rows = np.ascontiguousarray(array).view(np.uint8)
-        return _seen_as(wp.array(rows, dtype=wp.uint8, device=device, copy=not rows.flags.writeable), dtype, array.shape)
+        return _view_as(wp.array(rows, dtype=wp.uint8, device=device, copy=not rows.flags.writeable), dtype, array.shape)
     array = np.ascontiguousarray(array, dtype=wp.dtype_to_numpy(warp_private.scalar_type(dtype)))
-    # A frozen NumPy array (a scene's) cannot be aliased: Warp wants to be able to write.
+    # Warp cannot share the memory of a read-only array, such as a scene's.
     return wp.array(array, dtype=dtype, device=device, copy=not array.flags.writeable)
 
 
-def on_host(array: Any) -> np.ndarray:
-    """A Warp array, also of structs, as a NumPy array: of the same memory on the CPU, a copy of what is on a GPU."""
+def on_host(array: WarpArray) -> np.ndarray:
+    """Return a Warp array, also one of structs, as a NumPy array: the same memory on the CPU, a copy from a GPU."""
     if not hasattr(array.dtype, "numpy_dtype"):
         return np.asarray(array.numpy())
     layout = record_dtype(array.dtype)
-    rows: np.ndarray = _seen_as(array, wp.uint8, (array.size * layout.itemsize,)).numpy()
+    rows: np.ndarray = _view_as(array, wp.uint8, (array.size * layout.itemsize,)).numpy()
     return rows.view(layout).reshape(array.shape)
 
 
-def _seen_as(array: Any, dtype: Any, shape: tuple[int, ...]) -> Any:
-    """A Warp array of the same memory, which it keeps."""
+def _view_as(array: WarpArray, dtype: WarpType, shape: tuple[int, ...]) -> WarpArray:
+    """Return a Warp array of the same memory, which it keeps alive."""
     out = wp.array(ptr=array.ptr, dtype=dtype, shape=shape, device=array.device)
     warp_private.keep(out, array)
     return out
 
 
-def empty_aligned(shape: int | tuple[int, ...], dtype: Any) -> np.ndarray:
-    """An array in memory that begins where a cache line does."""
+def empty_aligned(shape: int | tuple[int, ...], dtype: npt.DTypeLike) -> np.ndarray:
+    """Return an uninitialised array that begins at a cache line (64 bytes)."""
     size = (shape if isinstance(shape, int) else prod(shape)) * np.dtype(dtype).itemsize
     memory = np.empty(size + 64, np.uint8)
     first = -memory.ctypes.data % 64
@@ -264,28 +269,30 @@ def empty_aligned(shape: int | tuple[int, ...], dtype: Any) -> np.ndarray:
 
 
 @made_once
-def record_dtype(struct: Any) -> np.dtype:
-    """The memory layout of a Warp struct.
+def record_dtype(struct: WarpType) -> np.dtype:
+    """Return the memory layout of a Warp struct.
 
-    NumPy parses it by way of `ast`, and CPython 3.11 raises SystemError where two threads do so at the same time. Warp would parse
-    it again for each array: `upload` makes and `on_host` reads arrays of structs without that.
+    NumPy parses it with `ast`, and CPython 3.11 raises SystemError if two threads do so at once. Warp would parse it for each array;
+    `upload` and `on_host` do not.
     """
     return np.dtype(struct.numpy_dtype())
 
 
-def records(struct: Any, count: int) -> np.ndarray:
-    """`count` zeroed records with the memory layout of a Warp struct, as a NumPy structured array."""
+def records(struct: WarpType, count: int) -> np.ndarray:
+    """Return `count` zeroed records with the memory layout of a Warp struct, as a NumPy structured array."""
     return np.zeros(count, dtype=record_dtype(struct))
 
 
-def launch(kernel: Any, n: int, *inputs: Any, threads: int = 1, step: int = 0) -> None:
-    """As `launch_on` the CPU."""
+def launch(kernel: Kernel, n: int, *inputs: object, threads: int = 1, step: int = 0) -> None:
+    """Launch a kernel on the CPU, see `launch_on`."""
     launch_on(start("cpu"), kernel, n, *inputs, threads=threads, step=step)
 
 
-def launch_on(device: Any, kernel: Any, n: int, *inputs: Any, threads: int = 1, step: int = 0) -> None:
-    """Launch a kernel over n; with a step, on the CPU over ranges of so many, on that many threads: the first of each is the input
-    that is None. On a GPU it is one launch over all of n, in blocks of wrt.core.cuda.block_dim threads."""
+def launch_on(device: Device, kernel: Kernel, n: int, *inputs: object, threads: int = 1, step: int = 0) -> None:
+    """Launch a kernel over n elements.
+
+    With a step, the CPU launches it over ranges of `step` elements on `threads` threads, and the input None is each range's first
+    index. A GPU has one launch over all of n, in blocks of wrt.core.cuda.block_dim threads."""
     if n == 0:
         return
     load_kernel(kernel, device)

@@ -1,4 +1,4 @@
-"""The way in for files that strangers have made or named."""
+"""Reading of files that come from other people."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from wrt.core.errors import InputError
 
 
 def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
-    """A regular file, open for reading.
+    """Open a regular file for reading.
 
-    Raises InputError, without the path, for a folder, and for a pipe or a device, whose end may never come. OSError comes through.
+    Raises InputError, without the path, for a folder, a pipe or a device, which may never end; and OSError.
     """
     try:
-        # A pipe that nobody writes to would keep us waiting when it is opened.
+        # Without O_NONBLOCK, opening a pipe waits until something writes to it.
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     except ValueError as error:  # a name with a zero byte in it
         raise InputError(f"cannot be read: {error}") from None
@@ -29,7 +29,7 @@ def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
 
 
 def require_file(path: Path, what: str = "") -> None:
-    """Raise InputError where nothing is at the path, with `what` behind that, or where the system will not look for it."""
+    """Raise InputError if no file is at the path, with `what` at the end of the message, or if the system cannot look."""
     try:
         there = path.exists()
     except OSError as error:  # a name too long, a folder that may not be looked into
@@ -39,7 +39,7 @@ def require_file(path: Path, what: str = "") -> None:
 
 
 def read_file(path: str | os.PathLike[str]) -> bytes:
-    """All bytes of a regular file. Raises InputError, without the path, where it cannot be read or is no regular one."""
+    """Return all bytes of a regular file. Raises InputError, without the path, if it cannot be read."""
     try:
         with open_regular(path) as file:
             return file.read(os.fstat(file.fileno()).st_size)
@@ -48,7 +48,7 @@ def read_file(path: str | os.PathLike[str]) -> bytes:
 
 
 def utf8(text: bytes) -> bytes:
-    """The bytes of a text file without the byte order mark of UTF-8. Raises InputError, without the path, for UTF-16 and UTF-32."""
+    """Return a text file's bytes without UTF-8's byte order mark. Raises InputError, without the path, for UTF-16 and UTF-32."""
     if text.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE, codecs.BOM_UTF32_BE)):
         raise InputError("is UTF-16 or UTF-32 text; save it as UTF-8")
     return text.removeprefix(codecs.BOM_UTF8)

@@ -1,17 +1,17 @@
-"""Tables as a notebook shows them. Everything in them is escaped: names come out of files."""
+"""HTML tables for notebooks. All text in them is escaped, because names come from files."""
 
 from __future__ import annotations
 
 import html
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 T = TypeVar("T")
 SHOWN_ROWS = 200  # of one table; more make a notebook slow
 
 
-def html_table(title: str, head: Sequence[Any], rows: Iterable[Sequence[Any]], most: int | None = SHOWN_ROWS) -> str:
-    """One HTML table; beyond `most` rows it says how many are left out. title: above it, "" is none."""
+def html_table(title: str, head: Sequence[object], rows: Iterable[Sequence[object]], most: int | None = SHOWN_ROWS) -> str:
+    """Return an HTML table of the first `most` rows, and a line with the number of the others. title: "" is none."""
     rows = list(rows)
     out = [f"<b>{html.escape(title)}</b>"] if title else []
     out.append("<table>")
@@ -25,7 +25,7 @@ def html_table(title: str, head: Sequence[Any], rows: Iterable[Sequence[Any]], m
 
 
 class Rows(list[T]):
-    """The rows of a report: a list that a notebook shows as what `page` makes of it (HTML)."""
+    """A list of a report's rows, which a notebook shows as the HTML that `page` makes of them."""
 
     def __init__(self, rows: Iterable[T], page: Callable[[Sequence[T]], str]) -> None:
         super().__init__(rows)
@@ -35,12 +35,12 @@ class Rows(list[T]):
         return self._page(self)
 
 
-def number(value: Any) -> str:
-    """A number as a table shows it: integers with their thousands apart, floats with four digits; anything else as text."""
+def number(value: object) -> str:
+    """Format an integer with thousands separators and a float with four digits; anything else as text."""
     if isinstance(value, bool) or not hasattr(value, "__round__"):
         return str(value)
     return f"{value:,}" if hasattr(value, "__index__") else f"{value:.4g}"
 
 
-def _row(cells: Sequence[Any], tag: str) -> str:
+def _row(cells: Sequence[object], tag: str) -> str:
     return "<tr>" + "".join(f"<{tag}>{html.escape(number(cell))}</{tag}>" for cell in cells) + "</tr>"

@@ -1,5 +1,6 @@
-"""Ctrl-C as a question that work asks between its pieces, not as an exception in the middle of one; on the command line
-SIGTERM and SIGHUP count as Ctrl-C too, so that a batch system's or a closed terminal's end keeps the picture so far."""
+"""Ctrl-C that a render checks between its tiles, in place of an exception in the middle of one.
+
+On the command line SIGTERM and SIGHUP count as Ctrl-C, so that the picture so far survives the end of a batch job or a terminal."""
 
 from __future__ import annotations
 
@@ -7,53 +8,53 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, NoReturn
+from typing import NoReturn
 
 
 class Interrupted(KeyboardInterrupt):
-    """A KeyboardInterrupt that knows its signal's number."""
+    """A KeyboardInterrupt with its signal's number."""
 
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)
         self.number = number
 
 
-def _raise(number: int, frame: Any) -> NoReturn:
+def _raise(number: int, frame: object) -> NoReturn:
     raise Interrupted(number)
 
 
-# The signals that end a render early, and the handler of each that says so: another handler is somebody else's, and stays.
-HANDLERS: dict[int, Callable[..., Any]] = {signal.SIGINT: signal.default_int_handler} | {
+# The signals that end a render early, each with the handler that raises a KeyboardInterrupt. A user's handler stays.
+HANDLERS: dict[int, Callable[..., object]] = {signal.SIGINT: signal.default_int_handler} | {
     getattr(signal, name): _raise for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)}
 
 
 def raise_on_termination() -> None:
-    """Let SIGTERM and SIGHUP raise Interrupted where they would end the process (nohup's ignored SIGHUP stays ignored)."""
+    """Make SIGTERM and SIGHUP raise Interrupted if they would end the process. A SIGHUP that nohup ignores stays ignored."""
     for number, handler in HANDLERS.items():
         if signal.getsignal(number) is signal.SIG_DFL and handler is _raise:
             signal.signal(number, handler)
 
 
 def exit_code(number: int | None) -> int:
-    """What a shell expects of a process that this signal ended (None: Ctrl-C): 128 and its number."""
+    """Return a shell's exit code for a process that this signal ended: 128 plus its number. None: Ctrl-C."""
     return 128 + int(signal.SIGINT if number is None else number)
 
 
 @contextmanager
 def held_interrupts() -> Iterator[list[int]]:
-    """Hold Ctrl-C back during the block; the list that it yields is empty until one comes, and then has the numbers.
+    """Hold Ctrl-C back during the block; yield a list that collects the numbers of the signals that arrive.
 
-    SIGTERM and SIGHUP are held too after raise_on_termination. Where a signal raises no KeyboardInterrupt in this thread (in
-    another than the main one, or where somebody else handles or ignores it), nothing changes for it.
+    SIGTERM and SIGHUP are held too after raise_on_termination. A signal that raises no KeyboardInterrupt in this thread is not held:
+    outside the main thread, or where the user handles or ignores it.
     """
-    came: list[int] = []
+    arrived: list[int] = []
     held = []
     if threading.current_thread() is threading.main_thread():
         held = [number for number, handler in HANDLERS.items() if signal.getsignal(number) is handler]
     for number in held:
-        signal.signal(number, lambda number, frame: came.append(number))
+        signal.signal(number, lambda number, frame: arrived.append(number))
     try:
-        yield came
+        yield arrived
     finally:
         for number in held:
             signal.signal(number, HANDLERS[number])

@@ -1,4 +1,4 @@
-"""Files in the kernel cache: precompiled headers that all processes share, and objects that tell whether they are damaged."""
+"""Files in the kernel cache: precompiled headers that all processes share, and objects with checksums."""
 
 from __future__ import annotations
 
@@ -17,19 +17,18 @@ import warp as wp
 
 DAY = 86400.0  # seconds: no kernel takes so long to compile
 _lock = threading.Lock()
-_whole: set[Path] = set()  # folders of headers that this process has looked at
+_checked: set[Path] = set()  # folders of headers that this process has checked
 
 
 def shared_headers(key: str, precompile: Callable[[Path], None], leftover: re.Pattern[str]) -> Path:
-    """Return the folder of precompiled headers of that name. Raises OSError where it cannot be made.
+    """Return the folder of the precompiled headers named `key`; `precompile` writes them if needed. Raises OSError if it cannot.
 
-    All threads and processes of a user share it: Warp's headers take 1.3 s of processor time, and about six threads of a process
-    compile. precompile: writes them to a folder. Headers that nobody has used for a day are removed, and so are
-    other folders of the cache whose names match `leftover`.
+    All threads and processes of a user share the folder, because Warp's headers take 1.3 s of processor time. Folders of the cache
+    that match `leftover` and were not used for a day are removed.
     """
     folder = Path(wp.config.kernel_cache_dir) / f"precompiled-{key}"
     with _lock:
-        if folder not in _whole or not folder.is_dir():  # the first that asks, or somebody has emptied the cache
+        if folder not in _checked or not folder.is_dir():  # the first call, or the cache was emptied
             for path in folder.parent.iterdir():
                 with suppress(OSError):  # another process was faster
                     if leftover.fullmatch(path.name) and path != folder and time.time() - path.lstat().st_mtime > DAY:
@@ -37,13 +36,14 @@ def shared_headers(key: str, precompile: Callable[[Path], None], leftover: re.Pa
             if not _is_sealed(folder):
                 _make_headers(folder, precompile)
             os.utime(folder)
-            _whole.add(folder)
+            _checked.add(folder)
     return folder
 
 
 def _make_headers(folder: Path, precompile: Callable[[Path], None]) -> None:
-    """Make the folder aside, and rename it when it is whole. Threads wait for the first one; of processes that start at once each
-    makes its own, and the first one's stays: it is in use."""
+    """Make the folder under another name, and rename it when it is complete.
+
+    Threads wait for the first one. Each of several processes makes its own; the first one's stays, because it is in use."""
     aside = Path(mkdtemp(prefix=f"{folder.name}-", dir=folder.parent))
     try:
         precompile(aside)
@@ -51,7 +51,7 @@ def _make_headers(folder: Path, precompile: Callable[[Path], None]) -> None:
         try:
             aside.rename(folder)
         except OSError:
-            if not _is_sealed(folder):  # a damaged one, or what is in the way
+            if not _is_sealed(folder):  # damaged, or not a folder of headers
                 folder.rename(folder.with_name(f"{aside.name}-old"))
                 aside.rename(folder)
     finally:
@@ -71,7 +71,7 @@ def _is_sealed(folder: Path) -> bool:
 
 
 def remove(path: Path) -> None:
-    """Remove a file, a link or a folder that may be there."""
+    """Remove a file, a link or a folder, if it exists."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
@@ -79,12 +79,12 @@ def remove(path: Path) -> None:
 
 
 def seal(path: Path) -> None:
-    """Write the SHA-256 of an object file to its end, behind all that a linker reads."""
+    """Append the SHA-256 of an object file to it. Linkers ignore what follows the object."""
     with path.open("r+b") as file:
         file.write(sha256(file.read()).digest())
 
 
-def is_whole(path: Path, sealed: bool) -> bool:
-    """Whether a file is there and not empty; of an object that was sealed, whether its last bytes are the digest of the others."""
+def is_intact(path: Path, sealed: bool) -> bool:
+    """Return whether a file exists and is not empty and, for a sealed object, whether its digest fits."""
     data = path.read_bytes() if path.is_file() else b""
     return len(data) > 0 and not (sealed and path.suffix == ".o" and sha256(data[:-32]).digest() != data[-32:])

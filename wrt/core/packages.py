@@ -1,4 +1,4 @@
-"""Packages that a part of wrt needs and queries do not: imported when they are used, and their absence is told."""
+"""Optional packages: imported when they are needed, with a message that says how to install a missing one."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from contextlib import contextmanager
 
 from wrt.core.errors import InputError
 
-# Where the name that is installed is not the one that is imported.
+# The names of packages whose modules are named otherwise.
 INSTALLED_AS = {"OpenImageIO": "openimageio", "PIL": "pillow", "elftools": "pyelftools"}
 
 
 @contextmanager
 def needed_by(what: str) -> Iterator[None]:
-    """Around imports: raise InputError that says what a package is needed for, and how to get it, where it is not there."""
+    """Turn a missing module, imported in the block, into an InputError that says what needs it and how to install it."""
     try:
         yield
     except ModuleNotFoundError as error:

@@ -1,24 +1,24 @@
-"""A table of names whose entries are imported when they are first asked for: a program pays for the structure that it takes."""
+"""A table of names whose entries are imported on first use, so that a program pays only for what it uses."""
 
 from __future__ import annotations
 
 import importlib
 from collections import UserDict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, TypeVar
 
 T = TypeVar("T")
 
 
 class Registry(UserDict[str, T]):
-    """Name -> thing. A row is the thing, or "module:thing", which a lookup imports.
+    """Map a name to an entry, or to "module:attribute", which the first lookup imports.
 
-    kind: what the things are, for messages; group: the entry points under which installed packages declare further rows ("": none).
-    They are looked for when a name is not in the table or all names are wanted, and never take the place of a row.
+    kind: the word for an entry in messages. group: the entry points of installed packages that add entries ("": none). They are read
+    when a name is unknown or all names are needed, and replace no entry of the table.
     """
 
-    def __init__(self, kind: str, places: dict[str, Any], group: str = "") -> None:
-        super().__init__(places)
+    def __init__(self, kind: str, places: Mapping[str, T | str], group: str = "") -> None:
+        super().__init__(places)  # type: ignore[arg-type]
         self.kind, self.group = kind, group
 
     def __getitem__(self, name: str) -> T:
@@ -44,13 +44,13 @@ class Registry(UserDict[str, T]):
         return f"{type(self).__name__}({self.kind}: {', '.join(self)})"
 
     def check(self, name: str) -> None:
-        """Raise InputError where there is nothing of that name."""
+        """Raise InputError if the table has no such name."""
         from wrt.core.checks import require_known  # imports NumPy, for which the help of commands does not wait
 
         require_known(name, self, self.kind)
 
     def _all(self) -> dict[str, Any]:
-        """Return the rows with those of installed packages."""
+        """Return all entries, with those of installed packages."""
         if self.group:
             from importlib.metadata import entry_points
 

@@ -1,4 +1,4 @@
-"""Seconds of building without those of loading kernels."""
+"""A clock for building that leaves out the loading of kernels."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-_here = threading.local()  # loaded: seconds that this thread has spent on loading kernels
+_here = threading.local()  # loaded: seconds that this thread spent on loading kernels
 
 
 @contextmanager
 def loading() -> Iterator[None]:
-    """Around the loading of a kernel: compiling it, taking it from the cache, or waiting for another thread that does."""
+    """Mark the loading of a kernel: compiling it, reading it from the cache, or waiting for another thread that does."""
     begin = time.perf_counter()
     try:
         yield
@@ -21,5 +21,5 @@ def loading() -> Iterator[None]:
 
 
 def build_clock() -> float:
-    """Seconds of a clock that stands still while this thread loads kernels. Only differences mean something."""
+    """Return the seconds of a clock that stops while this thread loads kernels. Only differences are meaningful."""
     return time.perf_counter() - getattr(_here, "loaded", 0.0)

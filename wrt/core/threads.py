@@ -1,4 +1,4 @@
-"""Threads of the CPU: how many, the size of their stacks, and tasks on them."""
+"""CPU threads: their number, the size of their stacks, and tasks on them."""
 
 from __future__ import annotations
 
@@ -10,21 +10,20 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from functools import cache, partial
-from typing import Any, TypeVar
+from typing import ParamSpec, TypeVar
 
 from wrt.core.checks import shown
 from wrt.core.errors import InputError
 
 MOST_THREADS = 1 << 10
-# Bytes of a stack. With 256 KiB queries crash, whose kernels have arrays on it, with 512 renders, and with 768 the compiler
-# (Linux, x86-64).
+# Bytes of a stack. Queries crash with 256 KiB, since kernels have arrays on it; renders with 512; the compiler with 768 (Linux, x86-64).
 STACK = 2 << 20
+P = ParamSpec("P")
 T = TypeVar("T")
 
 
 def thread_count(threads: int | None) -> int:
-    """The number of threads to use: as given, or one a core that this process may run on. Raises InputError for what is no
-    number of threads."""
+    """Return the number of threads to use; None is one for each core that this process may run on. Raises InputError for no count."""
     if threads is not None:
         if isinstance(threads, bool) or not hasattr(threads, "__index__"):
             raise InputError(f"threads must be a whole number, got {shown(threads)}")
@@ -39,8 +38,7 @@ def thread_count(threads: int | None) -> int:
 
 @cache
 def _stack_limit() -> float:
-    """Bytes of the main thread's stack, and of a new thread's where threading.stack_size() is 0; infinite where the system has no
-    limit that is known."""
+    """Return the bytes of the main thread's stack, and of a new thread's if threading.stack_size() is 0; infinite if unknown."""
     with contextlib.suppress(ImportError):
         import resource
 
@@ -50,16 +48,17 @@ def _stack_limit() -> float:
 
 
 @cache
-def _changing_size(process: int) -> threading.Lock:
-    """A process that was forked has one that nobody holds."""
+def _stack_size_lock(process: int) -> threading.Lock:
+    """Return the lock of a process; a forked one needs its own, which no thread holds."""
     return threading.Lock()
 
 
 @contextlib.contextmanager
 def _large_stacks() -> Iterator[bool]:
-    """Threads that start in the block have stacks of STACK bytes or more; it yields whether they would have anyway. If not, threads
-    that the user starts meanwhile have them too. (threading.stack_size() cannot be asked without setting it.)"""
-    with _changing_size(os.getpid()):
+    """Give threads that start in the block stacks of STACK bytes or more; yield whether they would have them anyway.
+
+    If not, threads that the user starts meanwhile have them too: threading.stack_size() cannot be read without setting it."""
+    with _stack_size_lock(os.getpid()):
         before = threading.stack_size(STACK)
         large = (before or _stack_limit()) >= STACK
         if large:
@@ -71,11 +70,11 @@ def _large_stacks() -> Iterator[bool]:
                 threading.stack_size(before)
 
 
-_here = threading.local()  # large: whether this thread's stack is
+_here = threading.local()  # large: this thread's stack has STACK bytes
 
 
 def _has_stack() -> bool:
-    """Whether this thread's stack has STACK bytes. A thread of the user counts as having what threads have that start now."""
+    """Return whether this thread's stack has STACK bytes. A user's thread counts as having the size of threads that start now."""
     if not hasattr(_here, "large"):
         if threading.current_thread() is threading.main_thread():
             _here.large = _stack_limit() >= STACK
@@ -86,8 +85,9 @@ def _has_stack() -> bool:
 
 
 def with_stack(task: Callable[[], T]) -> T:
-    """Run a task that kernels or their compiler are part of: here, or on a thread with a large stack where this one's is small
-    (they would end the process with a segmentation fault)."""
+    """Run a task that runs or compiles kernels, on a thread with a large stack if this one's is small.
+
+    On a small stack they end the process with a segmentation fault."""
     return task() if _has_stack() else submit(task).result()
 
 
@@ -95,16 +95,16 @@ def with_stack(task: Callable[[], T]) -> T:
 
 
 class Pool(ThreadPoolExecutor):
-    """Threads with large stacks. They start when they are needed, and are kept.
+    """Threads with large stacks, which start when they are needed and stay.
 
-    The standard pool takes no tasks when Python's main thread has ended. Then each task runs at once, in the thread that submits
-    it; InputError where that one's stack is small.
+    The standard pool takes no tasks after the end of Python's main thread. Then a task runs at once in the thread that submits it;
+    InputError if that thread's stack is small.
     """
 
     def __init__(self, threads: int, name: str = "wrt") -> None:
         super().__init__(threads, name, initializer=partial(setattr, _here, "large", True))
 
-    def submit(self, task: Callable[..., T], /, *arguments: Any, **named: Any) -> Future[T]:
+    def submit(self, task: Callable[P, T], /, *arguments: P.args, **named: P.kwargs) -> Future[T]:
         if threading.main_thread().is_alive():
             with _large_stacks():
                 return super().submit(task, *arguments, **named)
@@ -120,18 +120,17 @@ class Pool(ThreadPoolExecutor):
 
 @cache
 def _pool(process: int) -> Pool:
-    """Shared by all that the process runs. A process that was forked has a pool of its own."""
+    """Return the pool of a process; a forked process needs its own."""
     return Pool(MOST_THREADS)
 
 
-def submit(task: Callable[..., T], *arguments: Any) -> Future[T]:
+def submit(task: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> Future[T]:
     """Run a task on a thread of the process's pool."""
-    return _pool(os.getpid()).submit(task, *arguments)
+    return _pool(os.getpid()).submit(task, *arguments, **named)
 
 
 def run_all(tasks: Iterable[Callable[[], None]], threads: int) -> None:
-    """Run all tasks on so many threads, this one among them; after the first error none is begun, and it is raised when those
-    that run have ended."""
+    """Run all tasks on `threads` threads, this one included. After an error no task starts; it is raised when the others have ended."""
     with_stack(partial(_run_all, list(tasks), threads))
 
 
@@ -162,19 +161,18 @@ def _run_all(jobs: list[Callable[[], None]], threads: int) -> None:
         work()
     finally:
         left.clear()
-        wait([helper for helper in helpers if not helper.cancel()])  # none that has not begun
+        wait([helper for helper in helpers if not helper.cancel()])  # not for one that has not begun
     if errors:
         raise errors.pop(min(errors))
 
 
-def run_growing(begin: Callable[[Any], tuple[Callable[[], Any], Callable[[], Iterable[Any]]]], tasks: Iterable[Any],
-                threads: int) -> None:
-    """Run all tasks, and those that come of them, on so many threads.
+def run_growing(begin: Callable[[T], tuple[Callable[[], object], Callable[[], Iterable[T]]]], tasks: Iterable[T], threads: int) -> None:
+    """Run all tasks, and the further tasks that they produce, on `threads` threads.
 
-    begin(task) gives the job to run on a thread, and what to call afterwards, which gives more tasks. Both calls are made on this
-    thread. The first error is raised after the jobs that run have ended.
+    begin(task) returns the job for a thread, and a function to call after it, which returns more tasks. Both calls run on this
+    thread. The first error is raised when all running jobs have ended.
     """
-    waiting, running = deque(tasks), dict[Future[Any], Callable[[], Iterable[Any]]]()
+    waiting, running = deque(tasks), dict[Future[object], Callable[[], Iterable[T]]]()
     try:
         while waiting or running:
             while waiting and len(running) < threads:

@@ -1,8 +1,7 @@
 """Warp's insides: private names, layouts of arguments, texts, file names, its compiler. No other file of the host names them.
 
-Device code has its own such file, kernels/warp_private.py. Everything here was read in Warp 1.19 (WORKS_WITH). `prepare` and the
-self-test in wrt.accel.queries.raw_launches refuse a Warp whose insides differ. docs/warp.md lists each assumption, its test, and the
-order of repair."""
+Device code has its own such file, kernels/warp_private.py. Everything here was read in Warp 1.19 (WORKS_WITH): `prepare` and the
+self-test in wrt.accel.queries.raw_launches refuse other insides. docs/warp.md lists each assumption and its test."""
 
 from __future__ import annotations
 

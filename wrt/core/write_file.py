@@ -1,7 +1,7 @@
-"""Write files so that a name holds a whole file at any moment: into a temporary file beside it, synced to the disk, then renamed.
+"""Writing of files through a temporary file, synced to the disk and then renamed, so that a path always holds a complete file.
 
-A link in the place of the file is replaced, never followed: in a folder that others can write to, a link of theirs could lead to
-any file of the user. A process that is killed leaves its temporary file, `.wrt-*` (docs/long_renders.md).
+A link at the path is replaced and never followed: in a shared folder, another user's link could lead to any file of this user. A
+killed process leaves its temporary file, `.wrt-*` (docs/long_renders.md).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _UNABLE = (errno.EINVAL, errno.ENOTSUP, errno.ENOSYS)  # of file systems that ca
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
-    """Raise the InputError that `replacing` this path would end in, before any work is done for it."""
+    """Raise the InputError that `replacing` this path would raise, before the work on its content."""
     with _reported(path):
         file = _temporary(_target(path))
         file.close()
@@ -35,16 +35,15 @@ def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """A new empty file in the folder of `path`, open for reading and writing; on success it is synced and renamed to `path`.
+    """Open a new file in the folder of `path` for reading and writing; after the block, sync it and rename it to `path`.
 
-    On any failure the new file is removed and an existing `path` stays as it was. Raises InputError, which names `path`, where the
-    system refuses.
+    After any failure the new file is removed and an existing `path` is unchanged. Raises InputError with `path` if the system refuses.
     """
     with _reported(path):
         target = _target(path)
         file = _temporary(target)
         try:
-            with file:  # closed before it is renamed, as Windows wants it
+            with file:  # Windows renames only closed files
                 yield file
                 file.flush()
                 os.fsync(file.fileno())
@@ -65,11 +64,11 @@ def _reported(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def _target(path: str | os.PathLike[str]) -> Path:
-    """The path, if a file can be put there; raises InputError if not."""
-    target = Path(path).absolute()  # whatever becomes the current folder meanwhile
+    """Return the absolute path. Raises InputError if a file cannot be put there."""
+    target = Path(path).absolute()  # the current folder may change
     try:
         os.access(target, os.F_OK)
-    except ValueError as error:  # a zero byte or a lone surrogate: Path.exists() says only that there is no such file
+    except ValueError as error:  # a zero byte or a lone surrogate, which Path.exists() hides
         raise InputError(f"cannot be written: {error}", path) from None
     if not target.parent.is_dir():
         raise InputError("its folder does not exist", path)
@@ -83,19 +82,20 @@ def _target(path: str | os.PathLike[str]) -> Path:
 
 
 def _temporary(target: Path) -> BinaryIO:
-    """A new file beside `target`: mode x follows no link, and gives the usual permissions (tempfile's are for the user alone). It
-    has the suffix of `target`, which tells OpenImageIO the format."""
+    """Create a file beside `target` with its suffix, from which OpenImageIO knows the format.
+
+    Mode x follows no link, and gives the usual permissions; tempfile's are for the user alone."""
     return open(target.with_name(f".wrt-{uuid.uuid4().hex}{target.suffix}"), "x+b")
 
 
 def _sync_folder(folder: Path) -> None:
-    """Sync the names in a folder: before that, a power cut can undo a rename. Windows has no call for it."""
+    """Sync a folder's names, since a power cut can undo a rename before that. Windows has no call for it."""
     if os.name == "nt":
         return
     try:
         descriptor = os.open(folder, os.O_RDONLY)
     except PermissionError:
-        return  # a folder that can be written to but not read
+        return  # the folder can be written to but not read
     try:
         os.fsync(descriptor)
     except OSError as error:

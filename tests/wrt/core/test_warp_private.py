@@ -201,12 +201,12 @@ def test_headers_are_precompiled_once_for_all_threads_and_processes(tmp_path: Pa
         Path(obj_path).write_text("object")
 
     def a_process(processor: bytes = b"a") -> None:
-        monkeypatch.setattr(kernel_cache, "_whole", set())
+        monkeypatch.setattr(kernel_cache, "_checked", set())
         build = a_compiler(build_cpu, processor, monkeypatch)
         options = {"extra_flags": "-O2", "use_precompiled_headers": True, "pch_dir": None}
         with ThreadPoolExecutor(6) as pool:
             list(pool.map(lambda i: build.build_cpu(str(tmp_path / f"{i}.o"), str((without, with_it)[i % 2]), **options), range(6)))
-        assert all(kernel_cache.is_whole(tmp_path / f"{i}.o", True) for i in range(6))
+        assert all(kernel_cache.is_intact(tmp_path / f"{i}.o", True) for i in range(6))
         build.build_cpu(str(tmp_path / "out.o"), str(with_it))  # without headers
 
     a_process()
@@ -255,7 +255,7 @@ def test_headers_of_another_process_that_was_faster_are_not_moved(there: str, tm
                 headers(others - 1)
             (folder / "made.pch").write_text("headers")
 
-        monkeypatch.setattr(kernel_cache, "_whole", set())
+        monkeypatch.setattr(kernel_cache, "_checked", set())
         monkeypatch.setattr(kernel_cache, "_lock", threading.Lock())
         given.append(kernel_cache.shared_headers("key", precompile, warp_private.LEFTOVER))
         inodes.append(given[-1].stat().st_ino)
