@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     ArrayLike: TypeAlias = npt.ArrayLike | WarpArray | Tensor  # what callers give: lists and numbers, too
     Device: TypeAlias = wp.Device  # wp.get_device("cpu"); callers give its name
     Kernel: TypeAlias = wp.Kernel
-    DeviceFunction: TypeAlias = wp.Function  # of wp.func
+    DeviceFunction: TypeAlias = wp.Function
     # Warp and readers make these while the program runs, so that no checker knows their fields:
     WarpStruct: TypeAlias = Any  # an instance of a wp.struct
     WarpType: TypeAlias = Any  # wp.float32, wp.vec3, a wp.struct
