@@ -1,20 +1,19 @@
-"""What rays see that hit nothing: one class a kind, and a row in BACKGROUNDS."""
+"""Backgrounds: the radiance of rays that hit nothing. One class and one entry of BACKGROUNDS for each kind."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
-from wrt.scene.kinds import Kind, forms, given
+from wrt.scene.kinds import Kind, Record, forms, given
 from wrt.scene.values import BLACK, LUMINANCE, WHITE, Color
 
 
 class Background(Kind):
-    """What every kind of background is; its device functions stand in kernels/shade/backgrounds.py, under the same name.
+    """Base class of backgrounds; kernels/shade/backgrounds.py has the device functions under the same kind.
 
-    An array in `record` becomes one on the device.
+    Arrays in `record` are uploaded to the device.
     """
 
     what = "background"
@@ -22,7 +21,7 @@ class Background(Kind):
 
     @property
     def is_black(self) -> bool:
-        """Whether it lights nothing: all its colours, if it has some, are black. Then it is not sampled."""
+        """True if the background has colours and all are black; then it is not sampled."""
         colors = [getattr(self, name) for name, each in forms(type(self)).items() if each.metadata["form"] == "color"]
         return bool(colors) and not np.any(colors)
 
@@ -34,27 +33,32 @@ class ConstantBackground(Background):
     kind = "constant"
     color: Color = field(default=BLACK, metadata=given("color", "from every direction", "radiance"))
 
-    def record(self) -> dict[str, Any]:
+    def record(self) -> Record:
         return {"bottom": self.color, "top": self.color}
 
 
 @dataclass(frozen=True)
 class GradientBackground(Background):
-    """Linear in the direction's y."""
+    """Radiance that is linear in y of the unit direction."""
 
     kind = "gradient"
     bottom: Color = field(default=WHITE, metadata=given("color", "from straight below (-y)", "radiance"))
     top: Color = field(default=(0.5, 0.7, 1.0), metadata=given("color", "from straight above (+y)", "radiance"))
 
-    def record(self) -> dict[str, Any]:
+    def record(self) -> Record:
         return {"bottom": self.bottom, "top": self.top}
 
 
 @dataclass(frozen=True, eq=False)
 class EnvironmentBackground(Background):
-    """An equirectangular picture: its middle column is seen along -z, its upper edge is +y.
+    """An equirectangular image: its middle column is seen along -z, its upper edge along +y.
 
-    Row 0 of `image` is the upper edge, and columns run to the right of the view along -z (towards +x).
+    Parameters
+    ----------
+    image
+        (H, W, 3) linear radiance, 0 or more. Row 0 is the upper edge; columns run to the right of a view along -z, towards +x.
+    scale, rotation
+        Factor of the image; angle about +y in radians, counter-clockwise seen from above.
     """
 
     kind = "environment"
@@ -64,10 +68,10 @@ class EnvironmentBackground(Background):
     rotation: float = field(default=0.0, metadata=given("angle", "about +y, counter-clockwise seen from above"))
     name: str = ""
 
-    def record(self) -> dict[str, Any]:
-        """With tables that choose a pixel by its brightness times its solid angle."""
-        # Bilinear look-up spreads a pixel into its neighbours: their chance must not be 0. A small share of the mean keeps
-        # dark places in reach of light that rounding leaves there.
+    def record(self) -> Record:
+        """Return the image, and the distributions that sample a pixel by its brightness times its solid angle."""
+        # Bilinear lookup spreads a pixel into its neighbours, so that their probability must not be 0. A small share of the mean
+        # keeps dark pixels above 0 despite rounding.
         height, width = self.image.shape[:2]
         brightness = self.image.astype(np.float64) @ LUMINANCE
         spread = np.maximum(np.maximum(brightness, np.roll(brightness, 1, axis=1)), np.roll(brightness, -1, axis=1))

@@ -1,4 +1,4 @@
-"""Where a picture is taken from, and how its points become rays: one class and one row of CAMERAS a kind."""
+"""Cameras: one class and one entry of CAMERAS for each kind."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ import numpy as np
 
 from wrt.core.checks import at_thing
 from wrt.core.errors import InputError
-from wrt.scene.kinds import check_fields, forms, given
+from wrt.core.types import ArrayLike
+from wrt.scene.kinds import Record, check_fields, forms, given
 from wrt.scene.values import SMALLEST, as_number, as_transform, as_vector
 
 
 @dataclass(frozen=True, eq=False)
 class CameraKind:
-    """What all cameras have: a pose, and a name.
+    """Base class of cameras: a pose and a name.
 
-    camera_to_world: (4, 4), rotation and translation; it looks along its own -z, +y is up. A kind adds its parameters as
-    fields that are each `field(metadata=given(...))`, and says where its device function is.
+    camera_to_world: (4, 4), rotation and translation; a camera looks along its own -z, +y is up. A subclass adds its parameters as
+    fields that are each `field(metadata=given(...))`.
     """
 
-    kind: ClassVar[str]  # what scene files call it
-    device: ClassVar[str]  # the module that wrt.kernels.shade.cameras describes
+    kind: ClassVar[str]  # name in scene files
+    device: ClassVar[str]  # module of its device functions, as wrt.kernels.shade.cameras describes
 
     camera_to_world: np.ndarray = field(default_factory=lambda: np.eye(4))
     name: str = field(default="", kw_only=True)
@@ -31,7 +32,7 @@ class CameraKind:
     def __post_init__(self) -> None:
         at = at_thing("camera", self.name)
         matrix = as_transform(self.camera_to_world, at + "camera_to_world").copy()
-        # Only the pose counts: scale and shear would bend the picture, and glTF says that a camera ignores them.
+        # Scale and shear are dropped: they would distort the picture, and glTF says that a camera ignores them.
         z = matrix[:3, 2]
         x = np.cross(matrix[:3, 1], z)
         if not np.linalg.norm(x) > 0.0:
@@ -43,13 +44,30 @@ class CameraKind:
         check_fields(self, at)
 
     def as_in_files(self) -> dict[str, float]:
-        """The parameters in the units of scene files."""
+        """Return the parameters in the units of scene files: angles in degrees."""
         values = {key: (getattr(self, key), each.metadata["form"]) for key, each in forms(type(self)).items()}
         return {key: math.degrees(value) if form == "angle" else value for key, (value, form) in values.items()}
 
     @classmethod
-    def look_at(cls, position: Any, target: Any, up: Any = (0.0, 1.0, 0.0), **rest: Any) -> Self:
-        """A camera at `position` that looks at `target`; `rest` are the other fields."""
+    def look_at(cls, position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 1.0, 0.0), **fields: Any) -> Self:
+        """Return a camera at `position` that looks at `target`.
+
+        Parameters
+        ----------
+        position, target, up
+            (3,) each, in world space; `up` is any vector that appears upright in the picture.
+        **fields
+            The other fields of the class, such as fov_y.
+
+        Raises
+        ------
+        InputError
+            If position and target are equal, or `up` is parallel to the viewing direction.
+
+        Examples
+        --------
+        >>> camera = wrt.Camera.look_at((0, 1, 5), (0, 0, 0), fov_y=math.radians(40))
+        """
         origin, aim, upward = (np.array(as_vector(v, n)) for v, n in ((position, "position"), (target, "target"), (up, "up")))
         z = origin - aim
         if not np.linalg.norm(z) > 0.0:
@@ -61,67 +79,74 @@ class CameraKind:
         x /= np.linalg.norm(x)
         matrix = np.eye(4)
         matrix[:3, 0], matrix[:3, 1], matrix[:3, 2], matrix[:3, 3] = x, np.cross(z, x), z, origin
-        return cls(camera_to_world=matrix, **rest)
+        return cls(camera_to_world=matrix, **fields)
 
-    def record(self, size: tuple[int, int]) -> dict[str, Any]:
-        """What the device's struct holds beside the pose, for a picture of so many pixels."""
+    def record(self, size: tuple[int, int]) -> Record:
+        """Return the fields of the device struct beside the pose, for a picture of `size` pixels."""
         return {}
 
     def switches(self) -> dict[str, bool]:
-        """The switches of wrt.renderer.features.Features that this camera decides: `lens`, where rays need a sample of a lens."""
+        """Return the Features of the kernels that this camera decides: `lens` if rays need a sample of a lens."""
         return {}
 
     def opened(self) -> Self:
-        """This camera with every switch on: a renderer made for it can show all that a viewer may set."""
+        """Return this camera with every switch on, so that a viewer can set all parameters without new kernels."""
         return self
 
 
 @dataclass(frozen=True, eq=False)
 class Camera(CameraKind):
-    """A pinhole, or a thin lens where it has an aperture.
+    """A pinhole camera, or a thin lens if the aperture is larger than 0.
 
-    fov_y: full vertical angle of view (radians). focus_distance: along the axis, from the lens to the plane that is sharp. blades:
-    0 for a round aperture, else the number of its straight sides (3 or more), turned by `blade_rotation` radians.
-    `lens` gives fov_y, aperture_radius and focus_distance for a focal length, an f-number and a sensor height.
+    `Camera.look_at` places one; `Camera.lens` computes the first three parameters from those of a real lens.
+
+    Parameters
+    ----------
+    camera_to_world
+        (4, 4) rotation and translation; the camera looks along its own -z, +y is up. Scale and shear are dropped.
+    fov_y
+        Full vertical angle of view in radians.
+    aperture_radius, focus_distance
+        Radius of the lens (0: a pinhole), and distance along the axis to the plane in focus, in scene units.
+    blades, blade_rotation
+        Number of straight sides of the aperture, 3 or more (0: round), and its rotation in radians.
     """
 
     kind = "perspective"
     device = "wrt.kernels.shade.cameras.perspective"
 
     fov_y: float = field(default=math.pi / 4.0, metadata=given("angle", "full vertical angle of view", ge=0.0005, le=179.94))
-    aperture_radius: float = field(default=0.0, metadata=given("number", "0 is a pinhole", "length", ge=0.0))
+    aperture_radius: float = field(default=0.0, metadata=given("number", "0: a pinhole", "length", ge=0.0))
     focus_distance: float = field(default=1.0, metadata=given(
-        "number", "along the axis to what is sharp (beside a target: by default as far as that)", "length", ge=SMALLEST))
-    blades: int = field(default=0, metadata=given("whole", "0: a round aperture; from 3 on its number of sides", ge=0, le=64))
-    blade_rotation: float = field(default=0.0, metadata=given("angle", "turns the aperture"))
+        "number", "along the axis to the plane in focus (default: the target's distance, if there is one)", "length", ge=SMALLEST))
+    blades: int = field(default=0, metadata=given("whole", "sides of the aperture, 3 or more; 0: round", ge=0, le=64))
+    blade_rotation: float = field(default=0.0, metadata=given("angle", "rotation of the aperture"))
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.blades in (1, 2):
             raise InputError(at_thing("camera", self.name) + f"blades must be 0 (round) or 3 to 64, got {self.blades}")
 
-    def record(self, size: tuple[int, int]) -> dict[str, Any]:
-        """Tangents of half the angles of view, and the lens."""
+    def record(self, size: tuple[int, int]) -> Record:
         tan_y = float(np.tan(0.5 * self.fov_y))
         return {"tan_y": tan_y, "tan_x": tan_y * size[0] / size[1], "focus_distance": self.focus_distance,
                 "aperture_radius": self.aperture_radius, "blades": self.blades, "blade_rotation": self.blade_rotation}
 
     def switches(self) -> dict[str, bool]:
-        """A lens where there is an aperture, and blades where it has some."""
         lens = self.aperture_radius > 0.0
         return {"lens": lens, "blades": lens and self.blades > 0}
 
     def opened(self) -> Self:
-        """With an aperture, where it has none."""
         return replace(self, aperture_radius=self.aperture_radius or 1.0)
 
     @staticmethod
     def lens(focal_length: float, focus_distance: float, sensor_height: float, *, f_number: float | None = None,
              aperture_radius: float | None = None) -> dict[str, float]:
-        """fov_y, aperture_radius and focus_distance of a real thin lens, all lengths in scene units.
+        """Return fov_y, aperture_radius and focus_distance of a real thin lens, all lengths in scene units.
 
-        The sensor stands where the lens makes `focus_distance` sharp, s' = f s / (s - f), so that focusing near narrows
-        the view a little, as in a real camera. f_number N gives the radius f / (2 N).
+        The sensor is at the image distance s' = f s / (s - f), so that focusing near narrows the view, as in a real camera. The
+        aperture's radius is f / (2 f_number). Raises InputError unless focus_distance exceeds focal_length and exactly one of
+        f_number and aperture_radius is given.
         """
         f = as_number(focal_length, "focal_length", low=SMALLEST)
         s = as_number(focus_distance, "focus_distance", low=SMALLEST)
@@ -138,51 +163,50 @@ class Camera(CameraKind):
 
 @dataclass(frozen=True, eq=False)
 class OrthographicCamera(CameraKind):
-    """Parallel rays, from the plane through the camera on.
+    """Parallel rays that start at the plane through the camera.
 
-    height: of what the picture shows, from its lower to its upper edge (scene units); its width follows from the picture's size.
+    height: extent of the view from the lower to the upper edge of the picture, in scene units; the width follows from the aspect ratio.
     """
 
     kind = "orthographic"
     device = "wrt.kernels.shade.cameras.orthographic"
 
     height: float = field(default=2.0, metadata=given(
-        "number", "of what the picture shows, from its lower to its upper edge", "length", ge=SMALLEST))
+        "number", "extent of the view from the lower to the upper edge", "length", ge=SMALLEST))
 
-    def record(self, size: tuple[int, int]) -> dict[str, Any]:
-        """Half the sides of what the picture shows."""
+    def record(self, size: tuple[int, int]) -> Record:
         return {"half_width": 0.5 * self.height * size[0] / size[1], "half_height": 0.5 * self.height}
 
 
 @dataclass(frozen=True, eq=False)
 class FisheyeCamera(CameraKind):
-    """An equidistant fisheye: angles to the axis are proportional to distances from the picture's middle; black beyond the circle.
+    """An equidistant fisheye: the angle to the axis is proportional to the distance from the centre; black beyond the image circle.
 
-    fov: full angle of view across the image circle (radians), whose diameter is the picture's shorter side.
+    fov: full angle of view across the image circle in radians; the diameter of the circle is the shorter side of the picture.
     """
 
     kind = "fisheye"
     device = "wrt.kernels.shade.cameras.fisheye"
 
     fov: float = field(default=math.pi, metadata=given(
-        "angle", "full angle of view across the image circle, which is as wide as the picture's shorter side", ge=0.0005, le=360.0))
+        "angle", "full angle of view across the image circle, whose diameter is the shorter side of the picture", ge=0.0005, le=360.0))
 
-    def record(self, size: tuple[int, int]) -> dict[str, Any]:
-        """Half the angle of view, and half the picture's sides in radii of the image circle."""
+    def record(self, size: tuple[int, int]) -> Record:
+        """Return half the angle of view, and half the sides of the picture in radii of the image circle."""
         return {"half_angle": 0.5 * self.fov, "half_width": size[0] / min(size), "half_height": size[1] / min(size)}
 
 
 @dataclass(frozen=True, eq=False)
 class PanoramaCamera(CameraKind):
-    """All directions around a point, equirectangular: the camera looks at its middle; its edges are behind, above and below.
+    """All directions around a point, equirectangular: the camera's axis is in the middle; the edges are behind, above and below.
 
-    A picture twice as wide as high is an environment as backgrounds take it.
+    A picture of aspect ratio 2:1 can serve as the image of an EnvironmentBackground.
     """
 
     kind = "panorama"
     device = "wrt.kernels.shade.cameras.panorama"
 
 
-# A kind of one's own is one more: CAMERAS[Mine.kind] = Mine.
+# To add a kind: CAMERAS[Mine.kind] = Mine.
 CAMERAS: dict[str, type[CameraKind]] = {each.kind: each for each in (Camera, OrthographicCamera, FisheyeCamera, PanoramaCamera)}
 

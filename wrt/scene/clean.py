@@ -1,4 +1,4 @@
-"""What a mesh must lose before it can be traced: faces without area, and vertices that no face uses."""
+"""Clean a mesh for tracing: faces without area and unused vertices go."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 from wrt.core.errors import InputError
 from wrt.scene.exact import whole_numbers
 
-AT_ONCE = 1 << 15  # faces whose float64 temporaries stay in the cache
-ROUNDS = 64  # of flips; each takes at least one face whose corners are on a line
+AT_ONCE = 1 << 15  # faces of one batch, whose float64 temporaries fit in the cache
+ROUNDS = 64  # largest number of rounds of flips
 
 
 class Cleaned(NamedTuple):
-    """The arrays of a mesh after `clean`; `dropped` faces are gone."""
+    """Arrays of a mesh after `clean`, and the number of dropped faces."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -26,12 +26,11 @@ class Cleaned(NamedTuple):
 
 def clean(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None = None, uvs: np.ndarray | None = None,
           face_group: np.ndarray | None = None) -> Cleaned:
-    """Flip the faces whose corners are on a line (`flip_collinear`), drop those whose area is exactly zero, then the
-    vertices that no remaining face uses.
+    """Flip collinear faces (`flip_collinear`), drop faces whose area is exactly zero, then drop unused vertices.
 
-    vertices: (V, 3), taken as float32; faces: (F, 3) integers; normals (V, 3), uvs (V, 2) and face_group (F,) or None.
-    The order of what remains is kept. A face with a NaN or an infinite corner is kept, so that whoever makes the `Mesh`
-    reports it. Raises InputError that names the first face with an index outside of [0, V).
+    vertices: (V, 3), converted to float32; faces: (F, 3) integers; normals (V, 3), uvs (V, 2) and face_group (F,) or None.
+    The order of the rest is kept. Faces with a NaN or infinite corner stay for `Mesh` to report. Raises InputError that names the
+    first face with an index outside [0, V).
     """
     vertices = np.asarray(vertices, dtype=np.float32).reshape(-1, 3)
     faces = np.asarray(faces).reshape(-1, 3)
@@ -58,8 +57,10 @@ def clean(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None = 
 
 
 def has_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(F,) bool: whether the corners of faces (F, 3) in vertices (V, 3) float32 are not on one line, exactly; True where one
-    is not finite."""
+    """Return (F,) bool, exact: True if the corners of a face are not collinear, or one is not finite.
+
+    vertices: (V, 3) float32; faces: (F, 3).
+    """
     out = np.ones(len(faces), dtype=bool)
     for first in range(0, len(faces), AT_ONCE):
         part = faces[first:first + AT_ONCE]
@@ -68,10 +69,9 @@ def has_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def corners_have_area(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """As has_area, for corners (N, 3) float32 each; best where 24 N float64 fit in the cache.
+    """Return `has_area` of triangles with corners p, q, r, (N, 3) float32 each; fastest if 24 N float64 fit in the cache.
 
-    The cross product of two edges is taken in float64 and believed where a component exceeds its rounding error; the few
-    others are taken again in whole numbers.
+    The cross product of two edges is computed in float64, and again in integers if no component exceeds its rounding error.
     """
     a, b, c = (np.array(corner.T, np.float64, order="C") for corner in (p, q, r))
     out = np.ones(len(p), dtype=bool)
@@ -80,7 +80,7 @@ def corners_have_area(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray
         e, f = b - a, c - a
         for i, j in ((1, 2), (2, 0), (0, 1)):
             left, right = e[i, unknown] * f[j, unknown], e[j, unknown] * f[i, unknown]
-            # Two roundings in each product's factors and one in itself. NaN is not below anything: has area.
+            # Error bound: two roundings in the factors of each product and one in the product. A comparison with NaN is False.
             doubt = np.flatnonzero(np.abs(left - right) <= 2.0**-50 * (np.abs(left) + np.abs(right)))
             unknown = doubt if isinstance(unknown, slice) else unknown[doubt]
             if not len(unknown):
@@ -90,7 +90,7 @@ def corners_have_area(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray
 
 
 def _has_area_exactly(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """As has_area, for corners (3, N) in float64 that hold float32 values."""
+    """Return `has_area` in integer arithmetic, for corners (3, N) float64 that hold float32 values."""
     finite = (np.isfinite(a) & np.isfinite(b) & np.isfinite(c)).all(axis=0)
     out = ~finite | ~((a == b).all(axis=0) | (b == c).all(axis=0) | (c == a).all(axis=0))
     rows = np.flatnonzero(out & finite)
@@ -102,21 +102,21 @@ def _has_area_exactly(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray
 
 
 def flip_collinear(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same surface, without faces that have their three corners on a line where a flip can take them away.
+    """Replace faces with collinear corners by flips of their longest edge; the surface stays the same.
 
-    Such a face (a, b, c), b between a and c, has no area, but it parts the edge from a to c in two. Were it only dropped, its
-    neighbour (a, c, d) would no longer have an edge with the same two ends as those on the other side, and rays could pass
-    between the roundings of the two. With it, it becomes (a, b, d) and (b, c, d): as many faces, and the same area.
+    A collinear face (a, b, c), b between a and c, has no area, but it splits the edge from a to c in two. Without it, the neighbour
+    (a, c, d) and the faces beyond b would share no edge, and rays could pass between them by rounding. The flip turns the pair into
+    (a, b, d) and (b, c, d): as many faces, and the same area.
 
-    vertices (V, 3) float32, faces (F, 3). Returns faces (F, 3) of the same type, and source (F,): of which face each one is a
-    part now, whose material and group it has. Faces with two corners in one place stay, as those whose longest edge has no
-    other face, or more than one.
+    vertices: (V, 3) float32; faces: (F, 3). Returns faces (F, 3) of the same dtype, and source (F,): the index of the face that each is
+    now a part of, with its material and group. Faces with two equal corners stay, and faces whose longest edge does not have exactly
+    one other face.
     """
     return _flipped(vertices, faces)[:2]
 
 
 def _flipped(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """As flip_collinear; and whether a face has no area still, (F,) bool."""
+    """Return faces and source of `flip_collinear`, and (F,) bool: the face still has no area."""
     faces, source = faces.copy(), np.arange(len(faces))
     suspects, without = source.copy(), ~has_area(vertices, faces)
     for _ in range(ROUNDS):
@@ -124,13 +124,13 @@ def _flipped(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nd
         if not len(flat):
             break
         neighbour = _across(faces, flat, ends, len(vertices))
-        # A neighbour that is flat itself must have the same longest edge; else its own flip comes first.
+        # A flat neighbour must have the same longest edge; otherwise its own flip comes first.
         place = np.full(len(faces), -1)
         place[flat] = np.arange(len(flat))
         other = place[neighbour]
         ready = (neighbour >= 0) & ((other < 0) | (np.sort(ends) == np.sort(ends[other])).all(axis=1))
         flat, ends, middle, neighbour = (x[ready] for x in (flat, ends, middle, neighbour))
-        # A face takes part in one flip a round: the one with the lowest number.
+        # A face takes part in one flip a round: the one of the lowest flat face.
         first = np.full(len(faces), len(faces))
         for side in (flat, neighbour):
             np.minimum.at(first, side, flat)
@@ -140,7 +140,7 @@ def _flipped(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nd
             break
         row, corners = np.arange(len(flat)), faces[neighbour]
         apex = np.argmin((corners[:, :, None] == ends[:, None, :]).any(axis=2), axis=1)
-        d, p, q = (corners[row, (apex + i) % 3] for i in range(3))  # wound as the neighbour is
+        d, p, q = (corners[row, (apex + i) % 3] for i in range(3))  # same orientation as the neighbour
         faces[flat], faces[neighbour] = np.stack([p, middle, d], axis=1), np.stack([middle, q, d], axis=1)
         source[flat] = source[neighbour]
         suspects = np.union1d(suspects[place[suspects] >= 0], neighbour)
@@ -149,9 +149,9 @@ def _flipped(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _longest_edges(vertices: np.ndarray, faces: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of faces without area, those with corners in three places; the ends (N, 2) of their longest edge; the third corner."""
+    """Return the flat faces with three distinct corners, the ends (N, 2) of their longest edge, and their third corner (N,)."""
     corners = vertices[faces[flat]].astype(np.float64)
-    edges = np.stack([corners[:, (i + 2) % 3] - corners[:, (i + 1) % 3] for i in range(3)], axis=1)  # opposite of corner i
+    edges = np.stack([corners[:, (i + 2) % 3] - corners[:, (i + 1) % 3] for i in range(3)], axis=1)  # edge opposite corner i
     apart = (edges != 0.0).any(axis=2).all(axis=1)
     flat = flat[apart]
     middle = np.argmax(np.abs(edges[apart]).max(axis=2), axis=1)
@@ -160,7 +160,7 @@ def _longest_edges(vertices: np.ndarray, faces: np.ndarray, flat: np.ndarray) ->
 
 
 def _across(faces: np.ndarray, flat: np.ndarray, ends: np.ndarray, n_vertices: int) -> np.ndarray:
-    """(N,) the one other face with each edge, or -1 where there is none or more than one."""
+    """Return (N,) the other face of each edge `ends`, or -1 unless there is exactly one."""
 
     def key(p: np.ndarray, q: np.ndarray) -> np.ndarray:
         return np.minimum(p, q).astype(np.int64) * n_vertices + np.maximum(p, q)

@@ -1,4 +1,4 @@
-"""What a scene without a camera or without light gets, so that any file of shapes makes a picture."""
+"""Default camera and lights, so that any file of shapes makes a picture."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from wrt.scene.size import require_size
 from wrt.scene.values import BLACK, LUMINANCE, SMALLEST
 
 FOV_Y = math.radians(40.0)
-_THREE_QUARTER = np.array([0.62, 0.42, 1.0])  # from the scene to the camera: glTF's front is +z, its up +y
-_MARGIN = 1.05  # of the bounding sphere's radius
+_THREE_QUARTER = np.array([0.62, 0.42, 1.0])  # direction from the scene to the camera; the front of glTF is +z, up is +y
+_MARGIN = 1.05  # factor of the bounding sphere's radius
 
-# Together they give a white surface that faces both a radiance near 1: the sky lights surfaces too.
+# Key light and sky together give a white surface that faces both a radiance near 1.
 _KEY_IRRADIANCE = 1.7
-DARK = 0.01  # radiance of what looks black beside it: 25 of 255 on a display
+DARK = 0.01  # radiance that counts as unlit: 25 of 255 on a display
 _SKY = GradientBackground(bottom=(0.22, 0.21, 0.20), top=(0.50, 0.60, 0.75))
 
 
 def bounding_sphere(scene: Scene) -> tuple[np.ndarray, float]:
-    """Centre (3,) of the scene's box and the radius of the sphere around it that holds all shapes, in world units.
+    """Return the centre (3,) of the scene's box, and the radius of the smallest sphere around it that holds all shapes.
 
-    Raises InputError where the scene has no shapes.
+    Raises InputError if the scene has no shapes.
     """
     low, high = scene.bounds()
     center = 0.5 * low + 0.5 * high
@@ -41,10 +41,10 @@ def bounding_sphere(scene: Scene) -> tuple[np.ndarray, float]:
 
 
 def frame_camera(scene: Scene, aspect: float = 16.0 / 9.0) -> Camera:
-    """A pinhole camera in three-quarter view that sees the scene's whole bounding sphere.
+    """Return a pinhole camera in three-quarter view that sees the whole bounding sphere of the scene.
 
-    aspect: width / height of the picture. The vertical angle of view is 40 degrees; the narrower of the two angles
-    decides the distance. Raises InputError where the scene has no shapes.
+    aspect: width / height of the picture. The vertical angle of view is 40 degrees; the narrower of the two angles determines the
+    distance. Raises InputError if the scene has no shapes.
     """
     center, radius = bounding_sphere(scene)
     half_angle = math.atan(math.tan(0.5 * FOV_Y) * min(aspect, 1.0))
@@ -55,8 +55,7 @@ def frame_camera(scene: Scene, aspect: float = 16.0 / 9.0) -> Camera:
 
 
 def is_lit(scene: Scene) -> bool:
-    """Whether anything lights the scene: a light, a background, or emission that would give a white sphere around the scene a
-    radiance of DARK or more."""
+    """Return True for a light, a background, ambient, or emission that gives a white sphere around the scene a radiance >= DARK."""
     if scene.lights or scene.background != ConstantBackground(BLACK) or scene.ambient != BLACK:
         return True
     power = _emitted_power(scene)
@@ -64,7 +63,7 @@ def is_lit(scene: Scene) -> bool:
 
 
 def _emitted_power(scene: Scene) -> float:
-    """Luminance times area of all surfaces that light others."""
+    """Return luminance times area, summed over all emissive surfaces that light others."""
 
     def radiance(material: Material) -> float:
         return float(LUMINANCE @ material.emission) * (1 + material.two_sided) * material.lights_others
@@ -80,17 +79,16 @@ def _emitted_power(scene: Scene) -> float:
 
 
 def emission_named(scene: Scene) -> str:
-    """The materials that light others, for a message; "" where there are none."""
+    """Name the materials that light others, for a message; "" if there are none."""
     names = [material.name for material in scene.materials if material.lights_others]
     return f"the emission of {listed(names)}" if names else ""
 
 
 def stage(scene: Scene) -> tuple[Scene, list[str]]:
-    """The scene with what it lacks to be seen, and a sentence on each thing that was added.
+    """Return the scene with a camera and lights, and a sentence on each addition.
 
-    No camera: one that frames the scene. No light, or none but weak emission (`is_lit`): a directional key light from above the
-    first camera's right shoulder, and a pale sky as the background. Raises InputError where a camera is missing and the scene
-    has no shapes, and for a scene that is too small to be rendered.
+    A missing camera is one that frames the scene. If `is_lit` is False, a key light from above the first camera's right shoulder and a
+    pale sky are added. Raises InputError for a scene without a camera and without shapes, and for one too small to be rendered.
     """
     require_size(scene)
     added = []

@@ -1,9 +1,8 @@
-"""What a scene is, as one number: the same for the same picture, whatever the file is called that it came from."""
+"""Digests of scenes and cameras: equal for equal pictures, whatever the names of files and parts."""
 
 from __future__ import annotations
 
 from hashlib import sha256
-from typing import Any
 
 import numpy as np
 
@@ -12,13 +11,13 @@ from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene
 from wrt.scene.pack import pack
 
-# What of them changes no pixel.
+# Fields that change no pixel.
 NO_PIXEL: dict[type, tuple[str, ...]] = {
     object: ("name",), Scene: ("cameras", "settings"), Mesh: ("groups", "face_group", "dropped"), Object: ("motion",)}
 
 
 def scene_digest(scene: Scene) -> str:
-    """SHA-256 of everything in a scene that can change a pixel, but for cameras and settings."""
+    """Return the SHA-256 of all that can change a pixel, except cameras and settings."""
     return _digest(scene)
 
 
@@ -26,7 +25,7 @@ def camera_digest(camera: CameraKind) -> str:
     return _digest(camera)
 
 
-def _digest(thing: Any) -> str:
+def _digest(thing: Scene | CameraKind) -> str:
     text, arrays = pack(thing, NO_PIXEL)
     out = sha256(text.encode())
     for array in arrays:

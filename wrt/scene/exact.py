@@ -1,9 +1,8 @@
-"""Where a ray's line crosses a triangle or a sphere, decided exactly.
+"""Exact crossings of lines with triangles and spheres.
 
-Every number that goes in is a float32 value held in float64, so that it is a whole number times a power of two. A sign is
-taken in float64 first and believed where it is larger than a bound on its error (a static filter: Shewchuk 1997, "Adaptive
-Precision Floating-Point Arithmetic and Fast Robust Geometric Predicates"); the few others are taken again in Python's whole
-numbers, where nothing is rounded. Nothing over- or underflows on the way: a product of three float32 is far inside float64.
+Inputs are float32 values in float64: integers times powers of two. A sign is computed in float64 and accepted if it exceeds a bound on
+its error (a static filter: Shewchuk 1997, "Adaptive Precision Floating-Point Arithmetic and Fast Robust Geometric Predicates"). The few
+others are recomputed in Python's integers, without rounding. A product of three float32 neither over- nor underflows in float64.
 
 With a, b, c = v0 - o, v1 - o, v2 - o and N = (v1 - v0) x (v2 - v0), the line o + t d meets the plane at t = a.N / d.N, with
 barycentrics w0 = d.(b x c) / d.N for v0 and so on (the scalar triple products; their sum is d.N).
@@ -19,15 +18,17 @@ from typing import Any
 import numpy as np
 
 UNIT = 2.0**-53  # unit roundoff of float64
-ACCURATE = 1e-14  # errors above this, relative in t and absolute in u and v, are worth whole numbers
+ACCURATE = 1e-14  # larger errors, relative in t and absolute in u and v, are recomputed in integers
 
-# A triple product of differences carries 8 roundings in a row, and the sum of magnitudes it is compared with loses as many.
+# A triple product of differences has 8 roundings in sequence, and so has the sum of magnitudes that it is compared with.
 TRIPLE = 10.0 * UNIT
 
 
 class Place(IntEnum):
-    """Where the ray's line meets the plane of a triangle. COPLANAR: the line lies in the plane; a line that is parallel to
-    it is OUTSIDE. DEGENERATE: the triangle has no area. Only INSIDE, EDGE and VERTEX are hits."""
+    """Location of the intersection of a line with the plane of a triangle; INSIDE, EDGE and VERTEX are hits.
+
+    COPLANAR: the line lies in the plane; a parallel line is OUTSIDE. DEGENERATE: the triangle has no area.
+    """
 
     OUTSIDE = 0
     INSIDE = 1
@@ -39,8 +40,11 @@ class Place(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Crossings:
-    """One (N,) entry a pair of line and primitive: place (int8, of Place); t, u, v (float64; inf or NaN where the line is
-    parallel or the sphere is missed); t_error: bound on |t - exact t|; slope: d.N (float64; 1 for spheres)."""
+    """Results for N pairs of line and primitive, (N,) each.
+
+    place: int8, of Place; t, u, v: float64, inf or NaN if the line is parallel or misses the sphere; t_error: bound on |t - exact t|;
+    slope: d.N, float64 (1 for spheres).
+    """
 
     place: np.ndarray
     t: np.ndarray
@@ -55,7 +59,7 @@ class Crossings:
 
 
 def _triple(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """a . (b x c) of (3, N) arrays whose entries carry at most one rounding, and a bound on its error."""
+    """Return a . (b x c) of (3, N) arrays whose entries have at most one rounding, and a bound on its error."""
     value = np.zeros(a.shape[1])
     size = np.zeros(a.shape[1])
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
@@ -71,7 +75,7 @@ def _triple_exact(a: list[Any], b: list[Any], c: list[Any]) -> Any:
 
 
 def whole_numbers(*arrays: np.ndarray) -> tuple[list[list[Any]], int]:
-    """Rows of (3, N) float32 values as object arrays of Python ints, and k: value = int * 2^k, the same for all."""
+    """Return the rows of (3, N) float32 values as object arrays of Python ints, and one k for all: value = int * 2^k."""
     parts = [np.frexp(array) for array in arrays]
     used = [exponent[mantissa != 0.0] for mantissa, exponent in parts]
     k = min((int(e.min()) for e in used if e.size), default=0) - 24
@@ -84,7 +88,7 @@ def whole_numbers(*arrays: np.ndarray) -> tuple[list[list[Any]], int]:
 
 
 def exact_plane(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, ...]) -> tuple[Any, Any, Any, int]:
-    """(w0, w1, w2) and (numerator, slope) as object arrays of ints, N as three of them, and s: t = numerator / slope * 2^s."""
+    """Return (w0, w1, w2), (numerator, slope, its power of 2), N and s in object arrays of ints: t = numerator / slope * 2^s."""
     (origin, *corners), k = whole_numbers(o, *v)
     (direction,), k_d = whole_numbers(d)
     a, b, c = ([p - q for p, q in zip(corner, origin, strict=True)] for corner in corners)
@@ -101,7 +105,7 @@ def _sign(x: Any) -> np.ndarray:
 
 
 def _resolve(rows: np.ndarray, o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, ...], out: Crossings) -> None:
-    """Overwrite these rows of `out` with what whole numbers say; t, u, v are then correctly rounded."""
+    """Overwrite entries of `out` with results in integer arithmetic; t, u, v are then correctly rounded."""
     weights, (numerator, slope, slope_power), normal, power = exact_plane(
         o[:, rows], d[:, rows], tuple(corner[:, rows] for corner in v))
     w_sign = np.stack([_sign(w) for w in weights])
@@ -125,10 +129,10 @@ def _resolve(rows: np.ndarray, o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray
 
 def triangle_crossings(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, np.ndarray, np.ndarray], *,
                        all_rows: bool = False) -> Crossings:
-    """One line against one triangle a column. o, d and the corners in v: (3, N) float64 that hold finite float32 values.
+    """Intersect line i with triangle i. o, d and the corners in v: (3, N) float64 that hold finite float32 values.
 
-    Exact: place is never wrong. On hits t is good to ACCURATE relative (its bound is t_error), u and v to ACCURATE. all_rows:
-    as good where the line passes by the triangle, COPLANAR and DEGENERATE told from OUTSIDE; without, such rows are OUTSIDE.
+    `place` is exact. For hits the relative error of t is at most ACCURATE (the bound is t_error), and so is the error of u and v.
+    all_rows: the same accuracy for misses, with COPLANAR and DEGENERATE; otherwise both are OUTSIDE.
     """
     a, b, c = (corner - o for corner in v)
     weights = np.empty((3, o.shape[1]))
@@ -165,8 +169,7 @@ def triangle_crossings(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, np.nda
 
 @dataclass(frozen=True, eq=False)
 class SphereCrossings:
-    """The line enters at t[0] and leaves at t[1] (float64 (2, N), NaN on a miss; equal where it only touches);
-    t_error: bounds on both; hit, touching: (N,) bool."""
+    """Entry t[0] and exit t[1] of N lines, float64 (2, N), NaN on a miss, equal if the line touches; t_error: bounds on both."""
 
     hit: np.ndarray
     touching: np.ndarray
@@ -175,9 +178,9 @@ class SphereCrossings:
 
 
 def sphere_crossings(o: np.ndarray, d: np.ndarray, center: np.ndarray, radius: np.ndarray) -> SphereCrossings:
-    """One line against one sphere a column; o, d, center: (3, N), radius: (N,) > 0, float64 that hold float32 values.
+    """Intersect line i with sphere i. o, d, center: (3, N), radius: (N,) > 0, float64 that hold float32 values.
 
-    The discriminant's sign is exact: a line that touches the sphere hits it. t is good to ACCURATE relative.
+    The sign of the discriminant is exact: a line that touches the sphere hits it. The relative error of t is at most ACCURATE.
     """
     f = o - center
     a, b, ff, rr = (d * d).sum(axis=0), (d * f).sum(axis=0), (f * f).sum(axis=0), radius * radius
@@ -208,7 +211,7 @@ def sphere_crossings(o: np.ndarray, d: np.ndarray, center: np.ndarray, radius: n
 
 
 def _sphere_exact(o: np.ndarray, d: np.ndarray, center: np.ndarray, radius: float) -> tuple[int, np.ndarray]:
-    """The discriminant's sign, and both roots to float64."""
+    """Return the sign of the discriminant, and both roots in float64."""
     columns = [np.array(x, dtype=np.float64).reshape(-1, 1) for x in (o, center, [radius, 0.0, 0.0])]
     (origin, middle, extent), k = whole_numbers(*columns)
     (direction,), k_d = whole_numbers(d.reshape(3, 1))
@@ -220,7 +223,7 @@ def _sphere_exact(o: np.ndarray, d: np.ndarray, center: np.ndarray, radius: floa
         return -1, np.full(2, np.nan)
     if discriminant == 0 and b == 0:
         return 0, np.zeros(2)
-    # q adds two numbers of one sign, so that 128 binary digits behind the point are plenty; the other root is the product's.
+    # q adds two numbers of equal sign, so that 128 fractional bits suffice; the other root follows from the product of the roots.
     root = math.isqrt(discriminant << 256)
     q = -(b << 128) - (root if b >= 0 else -root)
     roots = sorted((q / (a << 128), ((c - r * r) << 128) / q))

@@ -1,5 +1,4 @@
-"""Fields that say what they are, once for scenes in Python, scene files and the reference of these; and what lights and backgrounds
-have in common."""
+"""Fields that describe themselves, for scenes in Python, for scene files and for their reference; the base of lights and backgrounds."""
 
 from __future__ import annotations
 
@@ -15,7 +14,8 @@ from wrt.core.errors import InputError
 from wrt.scene.values import Color, _unit, as_number, as_vector
 
 K = TypeVar("K", bound="Kind")
-Limits = dict[str, Any]
+Limits = dict[str, Any]  # of a field, by the names that `given` takes
+Record = dict[str, Any]  # values by the field names of a device struct: scalars, tuples, arrays
 
 
 def _number(value: Any, what: str, limits: Limits, unit: float = 1.0) -> float:
@@ -33,36 +33,38 @@ def _image(value: Any, what: str, limits: Limits) -> np.ndarray:
     return image
 
 
-# What a field can be, and how it is checked.
+# The forms of a field, and the function that checks and converts a value of each.
 FORMS: dict[str, Callable[[Any, str, Limits], Any]] = {
-    "point": lambda value, what, limits: as_vector(value, what),  # in world space; it moves with the scene
-    "direction": lambda value, what, limits: _unit(as_vector(value, what), what),  # of any length, kept at 1; it turns
+    "point": lambda value, what, limits: as_vector(value, what),  # in world space; a transform moves it
+    "direction": lambda value, what, limits: _unit(as_vector(value, what), what),  # of any length, stored at 1; a transform turns it
     "color": lambda value, what, limits: as_vector(value, what, low=0.0, high=limits.get("le", math.inf)),
     "number": _number,
-    "angle": lambda value, what, limits: _number(value, what, limits, math.pi / 180.0),  # radians here, degrees in files and limits
+    "angle": lambda value, what, limits: _number(value, what, limits, math.pi / 180.0),  # radians; degrees in files and limits
     "whole": lambda value, what, limits: as_integer(value, what, limits["ge"], limits["le"]),
     "flag": lambda value, what, limits: value,
     "choice": lambda value, what, limits: as_choice(value, limits["among"], what),
     "size": lambda value, what, limits: as_size(value, what),
-    "image": _image,  # (H, W, 3) float32 linear radiance; in a file the name of an image file
+    "image": _image,  # (H, W, 3) float32 linear radiance; a scene file names an image file
     "texture": lambda value, what, limits: as_one(value, limits["among"], what),
 }
 
 
 def given(form: str, about: str, unit: str = "", **limits: Any) -> dict[str, Any]:
-    """A field's `metadata`: one of FORMS, what it is (for the reference of scene files), its unit where the form says none, and
-    its limits: of numbers, angles and colours (ge, gt, le, lt), or what it is one of (among)."""
+    """Return a field's `metadata`.
+
+    form: a key of FORMS; about: its entry in the reference of scene files; unit: unless the form implies one; limits: of numbers,
+    angles and colours (ge, gt, le, lt), or the allowed values (among).
+    """
     return {"form": form, "about": about, "unit": unit, "limits": limits}
 
 
-def forms(kind: type[Any]) -> dict[str, Field[Any]]:
-    """The fields that `given` describes, by name."""
-    return {each.name: each for each in fields(kind) if "form" in each.metadata}
+def forms(kind: type[object]) -> dict[str, Field[Any]]:
+    """Return the fields that `given` describes, by name."""
+    return {each.name: each for each in fields(kind) if "form" in each.metadata}  # type: ignore[arg-type]
 
 
-def check_fields(thing: Any, at: str) -> None:
-    """Bring each of them to its form; None stays where it is the default. Raises InputError, which begins with `at`, for a value
-    that has not that form."""
+def check_fields(thing: object, at: str) -> None:
+    """Convert each described field to its form; a default of None stays. Raises InputError, which begins with `at`."""
     for name, each in forms(type(thing)).items():
         value = getattr(thing, name)
         if value is not None or each.default is not None:
@@ -70,9 +72,9 @@ def check_fields(thing: Any, at: str) -> None:
 
 
 class Kind:
-    """A frozen dataclass whose fields are each `field(metadata=given(...))`, and `name: str = ""`.
+    """Base of frozen dataclasses whose fields are each `field(metadata=given(...))`, and `name: str = ""`.
 
-    kind: its name in scene files, in the table of kinds here and in the one of device functions; what: how messages call it.
+    kind: its name in scene files, in the table of kinds and in the table of device functions; what: its name in messages.
     """
 
     kind: ClassVar[str]
@@ -82,12 +84,12 @@ class Kind:
     def __post_init__(self) -> None:
         check_fields(self, at_thing(self.what, self.name))
 
-    def record(self) -> dict[str, Any]:
-        """What the device function reads: values by their names in the struct of kernels/structs.py."""
+    def record(self) -> Record:
+        """Return the values that the device function reads, by their names in the struct of kernels/structs.py."""
         raise NotImplementedError
 
     def moved(self: K, matrix: np.ndarray) -> K:
-        """Under a (4, 4) transform: points move, directions turn, all else stays, as in glTF."""
+        """Return a copy under a (4, 4) transform: points move, directions turn, intensities stay, as in glTF."""
         changes: dict[str, Any] = {}
         for name, each in forms(type(self)).items():
             if each.metadata["form"] == "point":
@@ -97,5 +99,5 @@ class Kind:
         return replace(self, **changes)  # type: ignore[type-var]
 
     def places(self) -> list[Color]:
-        """Its points in the world; none of what is infinitely far away."""
+        """Return its points in world space; empty if it is infinitely far away."""
         return [getattr(self, name) for name, each in forms(type(self)).items() if each.metadata["form"] == "point"]

@@ -1,4 +1,4 @@
-"""A triangle mesh: what it must hold to be traced, and its way to and from trimesh."""
+"""Triangle meshes, validated on construction, and their conversion from and to trimesh."""
 
 from __future__ import annotations
 
@@ -18,13 +18,27 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles in object space.
+    """A triangle mesh in object space.
 
-    vertices: (V, 3) float32, finite; faces: (F, 3) int32, counter-clockwise seen from outside; normals: (V, 3)
-    float32 or None (flat shading), unit length where not zero (zero: flat there); uvs: (V, 2) float32 or None, (0, 0)
-    the top left of a picture; groups: names of parts, and face_group: (F,) int32 index into them, or None. dropped:
-    how many faces were left out on loading because their area is exactly zero. Coordinates end at 1e30 (and at 1e18 in an
-    Object's world). Raises InputError that names the mesh, the array and the first place that is wrong.
+    Parameters
+    ----------
+    vertices
+        (V, 3), stored as float32; finite, at most 1e30.
+    faces
+        (F, 3) integers, stored as int32; counter-clockwise seen from outside.
+    normals
+        (V, 3) unit vectors for smooth shading, or None for flat. A zero normal is flat at that vertex.
+    uvs
+        (V, 2) texture coordinates, or None; (0, 0) is the top left of an image.
+    groups, face_group
+        Names of parts, and an index into them for each face, (F,), or None.
+    dropped
+        Number of faces that the loader left out because their area is exactly zero.
+
+    Raises
+    ------
+    InputError
+        If an array has the wrong shape, type or a value out of range; it names the first wrong element.
     """
 
     vertices: np.ndarray
@@ -76,10 +90,10 @@ class Mesh:
 
     @classmethod
     def from_trimesh(cls, mesh: trimesh.Trimesh | trimesh.Scene, smooth: bool = False) -> Mesh:
-        """The triangles of a trimesh mesh, or of all of a trimesh scene in its world: every format that trimesh reads.
+        """Return the triangles of a trimesh mesh, or of a whole trimesh scene in world space.
 
-        uvs are taken where there are some; smooth: also its vertex normals. Faces without area stay, and are never hit. Raises
-        InputError for anything else, and as Mesh does.
+        Texture coordinates are kept if there are any, vertex normals if `smooth`. Faces without area stay, and are never hit. Raises
+        InputError for any other object, and as Mesh does.
         """
         with needed_by("a mesh of trimesh"):
             import trimesh
@@ -95,8 +109,7 @@ class Mesh:
                    name=str(getattr(source, "file_name", None) or ""))
 
     def to_trimesh(self) -> trimesh.Trimesh:
-        """The same as a trimesh mesh, to repair, simplify or write in its formats: vertices and faces in the same order,
-        normals and uvs where there are some."""
+        """Return a trimesh mesh with the same vertices and faces in the same order, and with normals and uvs if there are any."""
         with needed_by("a mesh of trimesh"):
             import trimesh
 
@@ -105,7 +118,7 @@ class Mesh:
 
     @cached_property
     def reach(self) -> float:
-        """The largest coordinate of any vertex, without its sign."""
+        """Largest absolute coordinate of the vertices."""
         return float(np.abs(self.vertices).max(initial=0.0))
 
     def __repr__(self) -> str:
@@ -132,7 +145,7 @@ def _require_finite(array: np.ndarray, name: str, attribute: str) -> None:
 
 
 def unit_rows(vectors: np.ndarray) -> np.ndarray:
-    """Each row at length 1, float32; rows of zeros stay."""
+    """Return (N, 3) vectors at unit length, float32; zero vectors stay."""
     wide = vectors.astype(np.float64)
     length = np.linalg.norm(wide, axis=1, keepdims=True)
     return np.divide(wide, length, out=np.zeros_like(wide), where=length > 0.0).astype(np.float32)

@@ -1,8 +1,7 @@
-"""What a scene is: frozen descriptions in NumPy, validated when they are made.
+"""Scenes, objects and spheres: frozen NumPy data, validated on construction.
 
-Nothing here knows of Warp, of files or of acceleration structures. World space is right-handed; lengths have the
-scene's own unit; colours are linear Rec. 709 (`(3,)` floats); angles are radians. A camera looks along its -z axis with
-+y up, as in glTF.
+Nothing here knows Warp, files or acceleration structures. World space is right-handed; lengths are in the scene's own unit; colours are
+linear Rec. 709, (3,) floats; angles are radians. A camera looks along its -z axis with +y up, as in glTF.
 """
 
 from __future__ import annotations
@@ -27,16 +26,28 @@ from wrt.scene.motion import Motion
 from wrt.scene.settings import DEPTH, GLASS_DEPTH, SETTINGS, SettingChanges, Settings
 from wrt.scene.values import BLACK, MAX_REACH, SMALLEST, Color, as_number, as_transform, as_vector, require_count
 
-MANY_VERTICES = 1 << 26  # of all objects together: beyond, where a scene ends is no longer asked of each
+MANY_VERTICES = 1 << 26  # of all objects together; with more, `outlines` uses boxes of repeated meshes
 
 
 @dataclass(frozen=True, eq=False)
 class Object:
     """A mesh placed in the world.
 
-    materials: one or more; face_material: (F,) int32 index into `materials` for each face, or None for all the first.
-    transform: (4, 4), object to world. A negative determinant mirrors the mesh; its faces keep their outside outside.
-    motion: what `wrt animate` does with it; a picture by itself shows the object without.
+    Parameters
+    ----------
+    mesh, materials
+        The geometry, which objects can share, and one or more materials.
+    transform
+        (4, 4), object to world, acting on column vectors. If it mirrors, the outside of the mesh stays outside.
+    face_material
+        (F,) index into `materials` for each face. None: the first material for all.
+    motion
+        Movement in `wrt animate`; a single picture ignores it.
+
+    Raises
+    ------
+    InputError
+        If a field has the wrong type, shape or range, or the object reaches beyond 1e18.
     """
 
     mesh: Mesh
@@ -70,7 +81,7 @@ class Object:
 
 @dataclass(frozen=True, eq=False)
 class Sphere:
-    """An exact sphere. u runs around +y from -x (0 to 1), v from the top (0) to the bottom (1)."""
+    """An exact sphere in world space. u runs around +y from -x (0 to 1), v from the top (0) to the bottom (1)."""
 
     center: Color
     radius: float
@@ -86,9 +97,30 @@ class Sphere:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Everything that is rendered: shapes, lights, background, cameras (the first is the default) and settings.
+    """All that a picture is made from. A frozen dataclass: `dataclasses.replace` makes changed copies.
 
-    ambient: radiance that every diffuse surface receives from all around, unshadowed (Whitted's ambient term).
+    Parameters
+    ----------
+    objects, spheres, lights
+        Placed meshes, exact spheres, and lights without a surface.
+    cameras
+        The first is the default of `render`.
+    background
+        Radiance of rays that hit nothing; black by default.
+    ambient
+        Radiance that every diffuse surface receives from all directions, unshadowed (Whitted's ambient term).
+    settings
+        Size, samples and the like; keywords of `render` override them.
+
+    Raises
+    ------
+    InputError
+        If a field has the wrong type.
+
+    Examples
+    --------
+    >>> floor = wrt.Object(wrt.Mesh(vertices, faces), (wrt.Material(albedo=(0.7, 0.3, 0.2)),))
+    >>> scene = wrt.Scene(objects=(floor,), lights=(wrt.PointLight((0, 3, 0), (20, 20, 20)),))
     """
 
     objects: tuple[Object, ...] = ()
@@ -125,7 +157,7 @@ class Scene:
 
     @property
     def materials(self) -> tuple[Material, ...]:
-        """Every material in use, each once, in the order of first use: `material_id` counts in this order."""
+        """Every material in use, each once, in the order of first use. `material_id` of a film is an index into it."""
         used: dict[int, Material] = {}
         for thing in self.objects:
             for material in thing.materials:
@@ -135,7 +167,7 @@ class Scene:
         return tuple(used.values())
 
     def camera(self, name: str | int | None = None) -> CameraKind:
-        """The camera of that name or number (None: the first). Raises InputError that lists the names there are."""
+        """Return the camera of that name or index (None: the first). Raises InputError if there is none."""
         if not self.cameras:
             raise InputError("the scene has no camera")
         if name is None:
@@ -150,8 +182,10 @@ class Scene:
         raise InputError(f"no camera {name!r}; the scene's cameras are {known}")
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest corner (3,) float64 of all shapes in world space; raises InputError where there are none. The box of
-        more than MANY_VERTICES (`outlines`) can be larger than need be."""
+        """Return the lowest and the highest corner, (3,) float64 each, of all shapes in world space.
+
+        The box is conservative for more than 2^26 vertices, which instances reach. Raises InputError if the scene has no shapes.
+        """
         corners: list[np.ndarray] = []
         for points, transform in self.outlines():
             points = points @ transform[:3, :3].T + transform[:3, 3]
@@ -164,9 +198,11 @@ class Scene:
         return np.min(corners, axis=0), np.max(corners, axis=0)
 
     def outlines(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Of each object with faces, points (N, 3) float64 that hold it and its transform: the vertices of its mesh. Where all
-        objects together have more than MANY_VERTICES, a mesh that several show is held by the corners of its box: else many
-        small nodes of a file that show one large mesh would take hours."""
+        """Yield points, (N, 3) float64, whose convex hull holds an object, and its transform, for each object with faces.
+
+        The points are the vertices of its mesh. If all objects together have more than MANY_VERTICES, a mesh that several objects
+        share is replaced by the corners of its box: many small nodes of a file that show one large mesh would take hours.
+        """
         shown = [thing for thing in self.objects if len(thing.mesh.faces)]
         times = Counter(id(thing.mesh) for thing in shown)
         many = sum(len(thing.mesh.vertices) for thing in shown) > MANY_VERTICES
@@ -194,7 +230,7 @@ def moves(scene: Scene) -> bool:
 
 
 def scene_at(scene: Scene, time: float) -> Scene:
-    """The scene at a time in [0, 1] of its period: the same objects, faces and materials, in other places."""
+    """Return the scene at `time`, 0 to 1, of its period: the same objects, faces and materials, moved."""
     return replace(scene, objects=tuple(
         replace(thing, mesh=thing.motion.mesh(thing.mesh, time), transform=thing.transform @ thing.motion.transform(time),
                 motion=None) if thing.motion else thing for thing in scene.objects))

@@ -1,4 +1,4 @@
-"""How an object moves within one period."""
+"""Movement of an object within one period of an animation."""
 
 from __future__ import annotations
 
@@ -15,12 +15,21 @@ from wrt.scene.mesh import Mesh
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """What happens to an object in a period, from time 0 to 1.
+    """Movement of an object in a period, from time 0 to 1.
 
-    keys: (K, 3, 3) float64, K >= 2, or None: translation, rotation (degrees about x, then y, then z) and scale at times that are
-    evenly spread from 0 to 1, straight lines between them; they act before the object's transform. target: a mesh with the same
-    faces, or None: vertices go straight to their places in it and back, as (1 - cos 2 pi t) / 2.
-    Raises InputError for keys of another shape, that are not finite, or with a scale of 0.
+    Parameters
+    ----------
+    keys
+        (K, 3, 3), K >= 2: translation, rotation (degrees about x, then y, then z) and scale at K times evenly spread from 0 to 1,
+        interpolated linearly. They act before the object's transform. None: the object stays.
+    target
+        A mesh with the same faces, or None. Vertices move along lines to those of the target and back, with the weight
+        (1 - cos 2 pi t) / 2.
+
+    Raises
+    ------
+    InputError
+        If the keys have another shape, are not finite or pass through a scale of 0.
     """
 
     keys: np.ndarray | None = field(default=None, repr=False)
@@ -38,7 +47,7 @@ class Motion:
         object.__setattr__(self, "keys", keys)
 
     def check(self, mesh: Mesh) -> None:
-        """Raise InputError where `mesh` cannot become the target."""
+        """Raise InputError unless `mesh` has the faces of the target."""
         if self.target is None:
             return
         if len(self.target.vertices) != len(mesh.vertices) or not np.array_equal(self.target.faces, mesh.faces):
@@ -46,7 +55,7 @@ class Motion:
                              f"{len(self.target.faces)} faces, the mesh {len(mesh.vertices)} and {len(mesh.faces)}")
 
     def transform(self, time: float) -> np.ndarray:
-        """(4, 4) float64 at a time in [0, 1]; the identity without keys."""
+        """Return the (4, 4) float64 matrix at a time in [0, 1]; the identity without keys."""
         matrix = np.eye(4)
         if self.keys is not None:
             with needed_by("a motion"):
@@ -61,7 +70,7 @@ class Motion:
         return matrix
 
     def mesh(self, mesh: Mesh, time: float) -> Mesh:
-        """What `mesh` is at that time: itself without a target."""
+        """Return the deformed mesh at a time in [0, 1]; `mesh` itself without a target."""
         if self.target is None:
             return mesh
         share = 0.5 - 0.5 * math.cos(2.0 * math.pi * time)
@@ -72,5 +81,5 @@ class Motion:
             length = np.linalg.norm(mixed, axis=1, keepdims=True)
             normals = np.divide(mixed, length, out=np.zeros_like(mixed), where=length > 1e-6).astype(np.float32)
         elif mesh.normals is not None:
-            normals = np.zeros_like(mesh.vertices)  # flat, in a scene that has smooth meshes
+            normals = np.zeros_like(mesh.vertices)  # flat, in a kernel for smooth meshes
         return replace(mesh, vertices=vertices, normals=normals)

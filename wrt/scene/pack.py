@@ -1,4 +1,4 @@
-"""A scene as JSON text and NumPy arrays, and back: what travels to other processes. Nothing in it is code."""
+"""Scenes as JSON text and NumPy arrays, for other processes. The format holds no code."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from wrt.scene.model import Object, Scene
 from wrt.scene.settings import Settings
 
 
-def kinds() -> dict[str, type[Any]]:
-    """What travels, by the names of the classes."""
+def kinds() -> dict[str, type[object]]:
+    """Return the classes that the format can hold, by name."""
     return {kind.__name__: kind for kind in (
         Scene, Settings, Object, Mesh, scenes.Sphere, Material, Texture, Checkerboard, *CAMERAS.values(),
         *LIGHTS.values(), *BACKGROUNDS.values())}
@@ -29,10 +29,10 @@ def kinds() -> dict[str, type[Any]]:
 LEFT_OUT: dict[type, tuple[str, ...]] = {Object: ("motion",)}  # a picture shows the object without
 
 
-def pack(scene: Any, left_out: dict[type, tuple[str, ...]] = LEFT_OUT) -> tuple[str, list[np.ndarray]]:
-    """The text, and the arrays that it counts on: each once, as each mesh, material and texture is that others share.
+def pack(scene: object, left_out: dict[type, tuple[str, ...]] = LEFT_OUT) -> tuple[str, list[np.ndarray]]:
+    """Return the text, and the arrays that it refers to. Shared meshes, materials and textures are stored once.
 
-    left_out: fields by their class (object: of every class), which are None in it.
+    left_out: fields to store as None, by their class (object: of every class).
     """
     packer = _Packer(left_out)
     packer.plain(scene)
@@ -40,8 +40,10 @@ def pack(scene: Any, left_out: dict[type, tuple[str, ...]] = LEFT_OUT) -> tuple[
 
 
 def unpack(text: str, arrays: list[np.ndarray]) -> Scene:
-    """The scene, bit for bit, with what was shared shared again; its arrays are those given. Raises InputError where the text
-    is not of `pack`. Values are not checked again: a camera's pose would be rounded once more."""
+    """Return the scene, bit for bit, with the same sharing; it uses `arrays` without a copy. Raises InputError for a foreign text.
+
+    Constructors are bypassed: they would round the pose of a camera once more.
+    """
     things: list[Any] = []
     known = kinds()
 
@@ -56,7 +58,7 @@ def unpack(text: str, arrays: list[np.ndarray]) -> Scene:
     try:
         for name, content in json.loads(text):
             thing = object.__new__(known[name])
-            for each in fields(known[name]):
+            for each in fields(known[name]):  # type: ignore[arg-type]
                 object.__setattr__(thing, each.name, value(content[each.name]))
             things.append(thing)
         if not isinstance(things[-1], Scene):
@@ -67,7 +69,7 @@ def unpack(text: str, arrays: list[np.ndarray]) -> Scene:
 
 
 class _Packer:
-    """things: [kind, {field: value}], each after those that it holds."""
+    """Collects `things`, [class name, {field: value}], each after the things that it refers to, and `arrays`."""
 
     def __init__(self, left_out: dict[type, tuple[str, ...]]) -> None:
         self.left_out = left_out
@@ -75,8 +77,8 @@ class _Packer:
         self.arrays: list[np.ndarray] = []
         self.known: dict[int, dict[str, int]] = {}
 
-    def plain(self, value: Any) -> Any:
-        """As JSON has it; what is met again by identity is told by number."""
+    def plain(self, value: object) -> Any:
+        """Return a value as JSON has it, with a reference in place of each thing and array."""
         if isinstance(value, tuple):
             return {"tuple": [self.plain(each) for each in value]}
         if isinstance(value, np.generic):

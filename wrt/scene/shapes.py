@@ -1,5 +1,6 @@
-"""Meshes made by a formula. The closed ones are wound so that their outside faces out; `SHAPES` names those that a
-scene file can ask for."""
+"""Meshes made by formulas. The faces of closed shapes are counter-clockwise seen from outside.
+
+`SHAPES` names the shapes of scene files. Every function raises InputError for an argument that is out of range."""
 
 from __future__ import annotations
 
@@ -15,14 +16,13 @@ from wrt.scene.mesh import Mesh
 from wrt.scene.values import as_number, as_vector
 
 Point = Sequence[float] | np.ndarray
-MAX_FACES = 1 << 23  # of one shape: some words of a scene file must not ask for all memory, or for minutes
+MAX_FACES = 1 << 23  # of one shape: a short scene file must not take all memory, or minutes
 
 
 def quad(corner: Point = (-0.5, -0.5, 0.0), edge_u: Point = (1.0, 0.0, 0.0), edge_v: Point = (0.0, 1.0, 0.0)) -> Mesh:
-    """A parallelogram of two triangles whose front is towards cross(edge_u, edge_v).
+    """Return a parallelogram of two triangles whose front is towards cross(edge_u, edge_v).
 
-    A picture on it stands upright for who sees the front with edge_u to the right and edge_v up: uv is (0, 1) at
-    `corner`, (0, 0) at the end of edge_v. Raises InputError where the edges span no area.
+    uv is (0, 1) at `corner` and (0, 0) at the end of edge_v: an image is upright on the front with edge_u to the right and edge_v up.
     """
     origin, u, v = (np.array(as_vector(value, "quad " + name))
                     for value, name in ((corner, "corner"), (edge_u, "edge_u"), (edge_v, "edge_v")))
@@ -33,18 +33,15 @@ def quad(corner: Point = (-0.5, -0.5, 0.0), edge_u: Point = (1.0, 0.0, 0.0), edg
 
 
 def box(low: Point = (-0.5, -0.5, -0.5), high: Point = (0.5, 0.5, 0.5)) -> Mesh:
-    """A closed box with its corners at `low` and `high`; each side has uvs from 0 to 1, flat.
-
-    Raises InputError where `high` is not above `low` in every axis.
-    """
+    """Return a closed box with its corners at `low` and `high`, flat; each side has uvs from 0 to 1."""
     bottom, top = np.array(as_vector(low, "box low")), np.array(as_vector(high, "box high"))
     if not (top > bottom).all():
         raise InputError(f"box: high {top.tolist()} must be above low {bottom.tolist()} in every axis")
     return Mesh(np.where(_BOX_TOP, top, bottom), _BOX_FACES, uvs=_BOX_UVS, name="box")
 
 
-# Which of its 24 corners are at `high` in which axis: of the low and the high side across x, four each in the order of a quad's (u
-# runs back on the low one, so that it faces out), and the same across y and z.
+# For each of the 24 corners and each axis, True at `high`: four corners of the low and of the high side across x, in the order of a quad
+# (reversed on the low side, so that it faces out), then the same across y and z.
 _BOX_SIDES = np.array([[[0, 1, 0], [0, 0, 0], [0, 0, 1], [0, 1, 1]], [[1, 0, 0], [1, 1, 0], [1, 1, 1], [1, 0, 1]]], dtype=bool)
 _BOX_TOP = np.concatenate([np.roll(_BOX_SIDES, axis, axis=2) for axis in range(3)]).reshape(24, 3)
 _BOX_FACES = (np.array([[0, 1, 2], [0, 2, 3]]) + 4 * np.arange(6)[:, None, None]).reshape(12, 3).astype(np.int32)
@@ -53,13 +50,13 @@ _BOX_FACES.flags.writeable = _BOX_UVS.flags.writeable = False  # all boxes share
 
 
 def icosphere(subdivisions: int = 3, radius: float = 1.0) -> Mesh:
-    """A ball of 20 * 4^subdivisions nearly equal triangles around the origin, with exact normals and no uvs."""
+    """Return a sphere of 20 * 4^subdivisions nearly equal triangles around the origin, with exact normals and no uvs."""
     subdivisions = as_integer(subdivisions, "icosphere: subdivisions", 0, 9)
     radius = as_number(radius, "icosphere radius", low=1e-30)
     golden = 0.5 + math.sqrt(1.25)
     corner = np.array([[a, b * golden, 0.0] for a in (-1.0, 1.0) for b in (-1.0, 1.0)])
     points = np.concatenate([np.roll(corner, turn, axis=1) for turn in range(3)])
-    # The faces are the triples of corners that are 2 apart from each other.
+    # The faces are the triples of corners at the distance 2 from each other.
     near = np.isclose(np.linalg.norm(points[:, None] - points[None], axis=2), 2.0)
     faces = np.array([(i, j, k) for i in range(12) for j in range(i) for k in range(j)
                       if near[i, j] and near[j, k] and near[k, i]])
@@ -78,7 +75,7 @@ def icosphere(subdivisions: int = 3, radius: float = 1.0) -> Mesh:
 
 
 def torus(radius: float = 1.0, tube_radius: float = 0.35, segments: int = 64, tube_segments: int = 32) -> Mesh:
-    """A ring around the y axis: `radius` to the middle of the tube. u runs around the axis, v around the tube."""
+    """Return a torus around the y axis, `radius` being that of the circle inside the tube. u runs around the axis, v around the tube."""
     radius = as_number(radius, "torus radius", low=1e-30)
     tube_radius = as_number(tube_radius, "torus tube_radius", low=1e-30, high=radius)
     _require_segments("torus", segments, tube_segments)
@@ -93,14 +90,12 @@ def torus(radius: float = 1.0, tube_radius: float = 0.35, segments: int = 64, tu
 
 
 def lathe(profile: Sequence[Point], segments: int = 64) -> Mesh:
-    """A profile turned around the y axis.
+    """Return the surface of revolution of a profile around the y axis.
 
-    profile: two or more points (radius, height). With the axis on the left of the way from point to point, the
-    outside is on its right: a profile from the bottom up faces outwards. It is closed where it begins and ends on the
-    axis. A point given twice makes a sharp edge, the others are smooth. u runs around the axis, v from the profile's
-    end to its start.
+    profile: two or more points (radius, height); from the bottom up, the surface faces outwards. It is closed if both ends are on the
+    axis. A point given twice makes a sharp edge; all others are smooth. u runs around the axis, v from the end of the profile to its start.
     """
-    # In float32, as the vertices will be: points that coincide there must count as given twice.
+    # In float32, as the vertices are: points that coincide there count as given twice.
     line = np.asarray(profile, dtype=np.float32).astype(np.float64)
     well_formed = line.ndim == 2 and line.shape[1:] == (2,) and len(line) >= 2
     if not well_formed or not np.isfinite(line).all() or (line[:, 0] < 0.0).any():
@@ -110,10 +105,10 @@ def lathe(profile: Sequence[Point], segments: int = 64) -> Mesh:
     length = np.linalg.norm(step, axis=1)
     if not length.any():
         raise InputError("lathe: all points of the profile are the same")
-    # The normal of a step is its direction turned right; a point takes the mean of its two, unless it is given twice.
+    # The normal of a step is its direction turned right; a point has the mean of its two steps, unless it is given twice.
     side = np.stack([step[:, 1], -step[:, 0]], axis=1) / np.where(length > 0.0, length, 1.0)[:, None]
     normal = np.concatenate([side, side[-1:]]) + np.concatenate([side[:1], side])
-    # On the axis a smooth surface is level: only the part along the axis is left.
+    # On the axis, the normal of a smooth surface is parallel to the axis.
     on_axis = (line[:, 0] == 0.0) & (np.abs(normal[:, 1]) > 1e-6 * np.abs(normal[:, 0]))
     normal[on_axis, 0] = np.where(np.arange(len(line)) % (len(line) - 1) == 0, 0.0, normal[:, 0])[on_axis]
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
@@ -129,10 +124,7 @@ def lathe(profile: Sequence[Point], segments: int = 64) -> Mesh:
 
 
 def prism(sides: int = 3, radius: float = 1.0, length: float = 2.0) -> Mesh:
-    """A regular polygon in the x-y plane, one corner at +y, drawn out along z to both sides; closed, flat, no uvs.
-
-    radius: of the circle through the corners.
-    """
+    """Return a closed, flat prism along z, without uvs. Its base is a regular polygon with a corner at +y on a circle of `radius`."""
     sides = as_integer(sides, "prism: sides", 3, 4096)
     radius, length = as_number(radius, "prism radius", low=1e-30), as_number(length, "prism length", low=1e-30)
     angle = np.pi / 2.0 + np.arange(sides) * (2.0 * np.pi / sides)
@@ -147,9 +139,9 @@ def prism(sides: int = 3, radius: float = 1.0, length: float = 2.0) -> Mesh:
 
 
 def tube(points: Sequence[Point] | np.ndarray, radius: float | Point = 0.1, segments: int = 24) -> Mesh:
-    """A round tube along a line of points, with flat ends; `radius` is one, or one for each point.
+    """Return a round tube along a polyline, with flat ends; `radius` is one number, or one for each point.
 
-    Its rings are turned as little as possible from point to point (parallel transport). u runs around, v along.
+    Its rings turn as little as possible from point to point (parallel transport). u runs around, v along.
     """
     line = np.asarray(points, dtype=np.float64)
     if line.ndim != 2 or line.shape[1:] != (3,) or len(line) < 2 or not np.isfinite(line).all():
@@ -190,9 +182,9 @@ def tube(points: Sequence[Point] | np.ndarray, radius: float | Point = 0.1, segm
 
 
 def teapot(segments: int = 64) -> Mesh:
-    """A pot with lid, spout and handle, about 2 wide and 1 high, standing on y = 0; its closed parts overlap.
+    """Return a pot with lid, spout and handle, about 2 wide and 1 high, on y = 0. Its closed parts overlap.
 
-    The outlines are this project's own: a lathe's body and lid, and two tubes.
+    The outlines are this project's own: body and lid are lathes, spout and handle are tubes.
     """
     _require_segments("teapot", segments)
     rows = max(segments // 2, 8)
@@ -212,7 +204,7 @@ def teapot(segments: int = 64) -> Mesh:
 
 
 def merged(parts: Sequence[Mesh], name: str) -> Mesh:
-    """One mesh of several that all have normals or all have none (uvs alike)."""
+    """Return one mesh of several; it has normals if all parts do, and uvs if all parts do."""
     start = np.cumsum([0, *(len(part.vertices) for part in parts)])
     normals = [part.normals for part in parts if part.normals is not None]
     uvs = [part.uvs for part in parts if part.uvs is not None]
@@ -226,7 +218,7 @@ def merged(parts: Sequence[Mesh], name: str) -> Mesh:
 
 
 def _grid(points: np.ndarray, normals: np.ndarray, name: str) -> Mesh:
-    """A sheet of (M, N, 3) points: u runs with the first axis, v against the second; triangles without area go."""
+    """Return a sheet of (M, N, 3) points without degenerate triangles. u runs along the first axis, v against the second."""
     m, n = points.shape[:2]
     u, v = np.meshgrid(np.linspace(0.0, 1.0, m), np.linspace(1.0, 0.0, n), indexing="ij")
     i, j = np.meshgrid(np.arange(m - 1), np.arange(n - 1), indexing="ij")
@@ -237,7 +229,7 @@ def _grid(points: np.ndarray, normals: np.ndarray, name: str) -> Mesh:
 
 
 def _require_segments(shape: str, *segments: int, rows: int = 1) -> None:
-    """Raise InputError unless each number of segments is in range, and all of them times `rows` of quads are not too many."""
+    """Raise InputError unless each number of segments, and the number of triangles with `rows` of quads, is in range."""
     for count in segments:
         as_integer(count, f"{shape}: segments", 3, 4096)
     faces = 2 * rows * math.prod(segments)

@@ -1,4 +1,4 @@
-"""Scenes that are too small: what single precision cannot tell apart, or not square."""
+"""Smallest size of a scene: below it, single precision cannot represent differences of positions, or their squares."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from wrt.core.errors import InputError
 from wrt.scene.model import Scene
 from wrt.scene.values import SMALLEST
 
-# Where a light has a place in the scene, the square of its distance counts, which is a float32 with all its digits from 2^-63
-# (1.1e-19) on. So in the smallest scene all is lit rightly that is farther from the light than its ten-thousandth part.
+# The square of the distance to a light is a normal float32 from a distance of 2^-63 (1.1e-19) on: in the smallest scene, a ten-thousandth
+# of its size.
 SMALLEST_LIT = 1e-15
 FACES_AT_ONCE = 1 << 12
 
 
 def require_size(scene: Scene) -> None:
-    """Raise InputError where a scene is too small to be rendered."""
+    """Raise InputError if a scene is too small to be rendered."""
     light = _light_with_a_place(scene)
     needed = SMALLEST_LIT if light else SMALLEST
     size = _size(scene, needed)
@@ -28,7 +28,7 @@ def require_size(scene: Scene) -> None:
 
 
 def _light_with_a_place(scene: Scene) -> str:
-    """What the first light is called whose distance counts: one with a place, or a shape that lights others. "" for none."""
+    """Return the name of the first light at a finite distance, or of the first emissive shape; "" if there is none."""
     for light in scene.lights:
         if light.places():
             return at_thing("light", light.name)[:-2]
@@ -42,7 +42,7 @@ def _light_with_a_place(scene: Scene) -> str:
 
 
 def _size(scene: Scene, enough: float) -> float:
-    """The longest side of the box around all shapes and the lights that have a place, or what is known to be enough of it."""
+    """Return the longest side of the box around all shapes and lights at finite distances, or a lower bound of `enough` or more."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     size = 0.0
     for points in _points(scene):
@@ -54,7 +54,7 @@ def _size(scene: Scene, enough: float) -> float:
 
 
 def _points(scene: Scene) -> Iterator[np.ndarray]:
-    """(N, 3) float64 in world space, a part at a time."""
+    """Yield the points of the scene in world space, (N, 3) float64, in parts."""
     for light in scene.lights:
         if light.places():
             yield np.array(light.places())

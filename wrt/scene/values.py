@@ -1,9 +1,8 @@
-"""Numbers, vectors, colors and transforms of a scene, checked when they are given."""
+"""Checks of the numbers, vectors, colours and transforms of a scene."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -13,14 +12,14 @@ from wrt.core.errors import InputError
 Color = tuple[float, float, float]
 BLACK: Color = (0.0, 0.0, 0.0)
 WHITE: Color = (1.0, 1.0, 1.0)
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear Rec. 709
-SMALLEST = 1e-30  # of a length that must not be 0
-MAX_OBJECTS = 1 << 20  # and spheres, and lights: a few bytes of a file must not make any number of them
-MAX_REACH = 1e18  # of a shape from the origin, in scene units: the square of a distance must be a float32
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # weights of linear Rec. 709
+SMALLEST = 1e-30  # smallest length
+MAX_OBJECTS = 1 << 20  # of objects, of spheres and of lights: a few bytes of a file can ask for any number
+MAX_REACH = 1e18  # largest coordinate of a shape in world space: the square of a distance must be a float32
 
 
-def as_vector(value: Any, what: str, *, low: float = -math.inf, high: float = math.inf) -> Color:
-    """Three finite floats in [low, high]; a single number is taken three times. Raises InputError that names `what`."""
+def as_vector(value: object, what: str, *, low: float = -math.inf, high: float = math.inf) -> Color:
+    """Return three finite floats in [low, high]; a single number is repeated. Raises InputError that names `what`."""
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -35,10 +34,10 @@ def as_vector(value: Any, what: str, *, low: float = -math.inf, high: float = ma
     return (float(array[0]), float(array[1]), float(array[2]))
 
 
-def as_number(value: Any, what: str, *, low: float = -math.inf, high: float = math.inf) -> float:
-    """One finite float in [low, high]. Raises InputError that names `what`."""
+def as_number(value: object, what: str, *, low: float = -math.inf, high: float = math.inf) -> float:
+    """Return one finite float in [low, high]. Raises InputError that names `what`."""
     try:
-        number = float(value)
+        number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError) as error:
         raise InputError(f"{what} must be a number, got {value!r}") from error
     low, high = max(low, -LARGEST), min(high, LARGEST)
@@ -47,11 +46,10 @@ def as_number(value: Any, what: str, *, low: float = -math.inf, high: float = ma
     return number
 
 
-def as_transform(value: Any, what: str) -> np.ndarray:
-    """A (4, 4) float64 affine matrix that acts on column vectors.
+def as_transform(value: object, what: str) -> np.ndarray:
+    """Return a (4, 4) float64 affine matrix that acts on column vectors.
 
-    Raises InputError where it is not finite, not (4, 4) or not affine. A singular one is taken: it flattens what it moves,
-    and glTF files hide nodes by a scale of 0. Who cannot do with one asks himself (`Camera`, TOML scenes).
+    Raises InputError unless it is finite, (4, 4) and affine. It may be singular: glTF files hide nodes by a scale of 0.
     """
     matrix = as_array(value, np.float64, what)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
@@ -62,7 +60,7 @@ def as_transform(value: Any, what: str) -> np.ndarray:
 
 
 def require_count(count: int, what: str) -> None:
-    """Raise InputError where a scene would hold too many of something."""
+    """Raise InputError if a scene would hold more than MAX_OBJECTS of something."""
     if count > MAX_OBJECTS:
         raise InputError(f"{count} {what}; a scene holds at most {MAX_OBJECTS}")
 

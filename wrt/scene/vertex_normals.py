@@ -1,4 +1,4 @@
-"""Smooth vertex normals for meshes that come without."""
+"""Smooth vertex normals for meshes without normals."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ from wrt.scene.mesh import Mesh
 
 
 def smooth(mesh: Mesh) -> Mesh:
-    """The mesh with normals: of each position, the sum of its faces' unit normals weighted by their angle there.
+    """Return the mesh with smooth normals: the sum of the unit normals of adjacent faces, weighted by their angle at the vertex.
 
-    Vertices at exactly the same position get the same normal, so that a seam of the texture does not show. The weight
-    is that of Thuermer and Wuethrich (Computing vertex normals from polygonal facets, 1998): the normal does not
-    depend on how a surface is cut into triangles. Where the faces cancel out, the normal is zero (flat there). A mesh
-    that has normals is given back as it is.
+    Vertices at exactly the same position get the same normal, so that seams of the texture do not show. With these weights the normal
+    does not depend on the triangulation (Thuermer and Wuethrich, "Computing vertex normals from polygonal facets", 1998). If the sum
+    cancels out, the normal is zero (flat). A mesh that has normals is returned unchanged.
     """
     if mesh.normals is not None:
         return mesh

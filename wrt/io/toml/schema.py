@@ -133,7 +133,8 @@ def shape_table(kind: str) -> type[Table]:
     for name, (value, about) in SHAPE_KEYS[kind].items():
         default = parameters[name].default
         keys[name] = (value, Field(... if default is Parameter.empty else default, description=about))
-    summary = (SHAPES[kind].__doc__ or "").split("\n\n")[0]
+    summary = (SHAPES[kind].__doc__ or "").split("\n\n")[0].removeprefix("Return a ")
+    summary = summary[:1].upper() + summary[1:]
     return create_model(f"{kind.capitalize()}Shape", __base__=Table, __doc__=summary, **keys)
 
 
