@@ -16,19 +16,7 @@ import warp as wp
 from wrt.kernels.structs import on_cuda
 from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.wide.lanes import LANE_PAD, LaneRay, bits, lanes_only, row_type, value
-from wrt.kernels.wide.layout import (
-    EXIST_SHIFT,
-    EXPONENT_BITS,
-    FIRST_BYTES,
-    HI_X,
-    HI_Y,
-    HI_Z,
-    LO_X,
-    LO_Y,
-    LO_Z,
-    MANTISSA_BITS,
-    WORD,
-)
+from wrt.kernels.wide.layout import EXIST_SHIFT, EXPONENT_BITS, FIRST_BYTES, HI_X, HI_Y, HI_Z, LO_X, LO_Y, LO_Z, MANTISSA_BITS, WORD
 
 # By how much far distances are widened for the box tests that have a form in rows.
 ROW_PADS = {"conservative": LANE_PAD, "minmax": 1.0}

@@ -19,13 +19,7 @@ from typing import Any
 import numpy as np
 
 from tests.fuzz import seeds
-from tests.fuzz.mutate import (
-    BYTES,
-    INTEGERS,
-    TEXT,
-    mutate,
-    mutate_tree,
-)
+from tests.fuzz.mutate import BYTES, INTEGERS, TEXT, mutate, mutate_tree
 from tests.fuzz.seeds import Seed
 from tests.gltf_files import pack_glb
 

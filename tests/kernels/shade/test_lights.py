@@ -11,11 +11,7 @@ import warp as wp
 
 from wrt.accel.scenes.build import build
 from wrt.kernels.shade import backgrounds, lights
-from wrt.kernels.shade.backgrounds import (
-    environment,
-    make_sky_point,
-    make_sky_sample,
-)
+from wrt.kernels.shade.backgrounds import environment, make_sky_point, make_sky_sample
 from wrt.kernels.shade.direct import shadow_ray
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.lights import LightSample, make_light_sample

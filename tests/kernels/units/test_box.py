@@ -13,16 +13,7 @@ from tests.kernel_tools import floats, launch, rounded, vec3s, zeros  # isort: s
 import warp as wp
 
 from wrt.kernels.structs import Ray, kernel
-from wrt.kernels.units.box import (
-    FAR_PAD,
-    RAY_AABB,
-    box_pad,
-    box_ray,
-    padded_hi,
-    padded_lo,
-    ray_aabb,
-    slab_interval,
-)
+from wrt.kernels.units.box import FAR_PAD, RAY_AABB, box_pad, box_ray, padded_hi, padded_lo, ray_aabb, slab_interval
 
 INF = np.float32(np.inf)
 

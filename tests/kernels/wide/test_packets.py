@@ -14,19 +14,7 @@ from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hi
 from wrt.kernels.wide import packets
 from wrt.kernels.wide.batch import PACKETS, SLOTS
 from wrt.kernels.wide.lanes import LANE_PAD, row_type
-from wrt.kernels.wide.layout import (
-    BEAM,
-    COHERENT,
-    ENTRY,
-    ENTRY_RAYS,
-    LANES,
-    PACKET_SIZE,
-    ROWS,
-    SLOT_SIZE,
-    STACK_SIZE,
-    STACK_WORDS,
-    WIDTH,
-)
+from wrt.kernels.wide.layout import BEAM, COHERENT, ENTRY, ENTRY_RAYS, LANES, PACKET_SIZE, ROWS, SLOT_SIZE, STACK_SIZE, STACK_WORDS, WIDTH
 from wrt.kernels.wide.nodes import make_plain
 from wrt.kernels.wide.packets import Scratch, WideBvh, packet_kernel
 from wrt.kernels.wide.references import EMPTY

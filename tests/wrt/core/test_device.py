@@ -11,14 +11,7 @@ import numpy as np
 import pytest
 
 from tests.data import ROOT
-from wrt.core.device import (
-    _stderr_without,
-    describe_devices,
-    memory_of,
-    records,
-    start,
-    upload,
-)
+from wrt.core.device import _stderr_without, describe_devices, memory_of, records, start, upload
 
 import warp as wp  # isort: skip (after wrt.core.device, which silences Warp's banner)
 

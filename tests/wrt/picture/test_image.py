@@ -18,16 +18,7 @@ from tests.command_line import largest_file
 from tests.picture_metadata import read_metadata
 from wrt.core.errors import InputError, SceneWarning
 from wrt.picture.decode import decode_rgba8
-from wrt.picture.image import (
-    EXACT_IN_FLOAT,
-    FORMATS,
-    check_writable,
-    encode_png,
-    read_channels,
-    read_image,
-    write_exr,
-    write_image,
-)
+from wrt.picture.image import EXACT_IN_FLOAT, FORMATS, check_writable, encode_png, read_channels, read_image, write_exr, write_image
 from wrt.picture.tonemap import decode_srgb, to_codes
 
 H, W = 70, 51  # more rows than are written at a time

@@ -8,16 +8,7 @@ import numpy as np
 import pytest
 
 from wrt.core.errors import InputError
-from wrt.picture.metrics import (
-    BAR_HEIGHT,
-    NONFINITE_COLOR,
-    PIXELS_PER_DEGREE,
-    RELMSE_EPS,
-    compare,
-    difference_image,
-    failures,
-    flip_map,
-)
+from wrt.picture.metrics import BAR_HEIGHT, NONFINITE_COLOR, PIXELS_PER_DEGREE, RELMSE_EPS, compare, difference_image, failures, flip_map
 from wrt.picture.tonemap import decode_srgb
 
 H, W = 48, 64

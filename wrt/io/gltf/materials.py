@@ -16,16 +16,7 @@ import numpy as np
 from wrt.core.checks import short
 from wrt.core.errors import InputError, at
 from wrt.io.gltf.document import Document
-from wrt.io.gltf.schema import (
-    EmissiveStrength,
-    Ior,
-    TextureSource,
-    TextureTransform,
-    Transmission,
-    Unlit,
-    Volume,
-    exactly,
-)
+from wrt.io.gltf.schema import EmissiveStrength, Ior, TextureSource, TextureTransform, Transmission, Unlit, Volume, exactly
 from wrt.picture.decode import decode_rgba8
 from wrt.scene.materials import Material, Texture
 from wrt.scene.values import BLACK, Color, as_number, as_vector

@@ -21,19 +21,7 @@ from wrt.core.errors import InputError
 from wrt.kernels.shade.surface import make_surface_at, spawn_point
 from wrt.kernels.structs import Hit, Ray, Surfaces, kernel
 from wrt.lab.hard_cases import open as hard_cases_open
-from wrt.lab.hard_cases.cases import (
-    ASK,
-    HARD_CASES,
-    HIT,
-    MISS,
-    HardCase,
-    Verdict,
-    chunks,
-    generate,
-    judge,
-    judge_all_hits,
-    judge_next,
-)
+from wrt.lab.hard_cases.cases import ASK, HARD_CASES, HIT, MISS, HardCase, Verdict, chunks, generate, judge, judge_all_hits, judge_next
 from wrt.lab.hard_cases.common import sphere
 from wrt.lab.hard_cases.judge import winding_number
 from wrt.lab.oracle.oracle import Place, Reference, reference_of
