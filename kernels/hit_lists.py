@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.query import HitArrays, RayArrays, direction_scale, load_ray, put_hit
+from wrt.kernels.query import HitArrays, RayArrays, direction_scale, load_ray, store_hit
 from wrt.kernels.structs import Hit, Ray, kernel
 from wrt.kernels.units.triangle import is_crossed, seen, triangle_ray
 
@@ -121,4 +121,4 @@ def copy_hits(rays: RayArrays, lists: HitLists, begin: wp.array(dtype=wp.int32),
     i = start + wp.tid()
     scale = direction_scale(rays.direction[i])
     for k in range(lists.count[i]):
-        put_hit(hits, begin[i] + k, lists.rows[lists.first[i] + k], scale)
+        store_hit(hits, begin[i] + k, lists.rows[lists.first[i] + k], scale)

@@ -24,8 +24,8 @@ class RayArrays:
 
 
 @wp.struct
-class Queue:
-    """Rays of a picture, whose directions are used as they are."""
+class RenderRays:
+    """Rays of a picture, whose directions are used unscaled."""
 
     origin: wp.array(dtype=wp.vec3)
     direction: wp.array(dtype=wp.vec3)
@@ -85,7 +85,7 @@ def make_closest_hit_kernel(accel_struct: Any, traverse: Any) -> Any:
         i = first + wp.tid()
         scale = direction_scale(rays.direction[i])
         hit = traverse(accel, surfaces, load_ray(rays, i))
-        put_hit(hits, i, hit, scale)
+        store_hit(hits, i, hit, scale)
 
     return closest_hit
 
@@ -94,10 +94,10 @@ def make_any_hit_kernel(accel_struct: Any, traverse: Any) -> Any:
     """Make the kernel that stores True for each ray that hits anything."""
 
     @kernel
-    def any_hit(accel: accel_struct, surfaces: Surfaces, rays: RayArrays, dark: wp.array(dtype=wp.bool), first: int):
+    def any_hit(accel: accel_struct, surfaces: Surfaces, rays: RayArrays, occluded: wp.array(dtype=wp.bool), first: int):
         i = first + wp.tid()
         hit = traverse(accel, surfaces, load_ray(rays, i))
-        dark[i] = hit.prim_id >= 0
+        occluded[i] = hit.prim_id >= 0
 
     return any_hit
 
@@ -133,33 +133,33 @@ def make_worlds_kernel(accel_struct: Any, traverse: Any, any_hit: bool) -> Any:
         if wp.static(any_hit):
             out[i] = hit.prim_id >= 0
         else:
-            put_hit(out, i, hit, direction_scale(rays.direction[i]))
+            store_hit(out, i, hit, direction_scale(rays.direction[i]))
 
     return trace_worlds
 
 
 @wp.func
-def queued_ray(queue: Queue, i: int) -> Ray:
+def load_render_ray(rays: RenderRays, i: int) -> Ray:
     ray = Ray()
-    ray.origin = queue.origin[i]
-    ray.direction = queue.direction[i]
-    ray.t_min = queue.t_min[i]
-    ray.t_max = queue.t_max[i]
-    ray.exclude_plus_one = queue.exclude[i]
+    ray.origin = rays.origin[i]
+    ray.direction = rays.direction[i]
+    ray.t_min = rays.t_min[i]
+    ray.t_max = rays.t_max[i]
+    ray.exclude_plus_one = rays.exclude[i]
     return ray
 
 
 @wp.func
-def put_ray(queue: Queue, i: int, ray: Ray):
-    """Store a ray but for t_min, which is 0 throughout a queue."""
-    queue.origin[i] = ray.origin
-    queue.direction[i] = ray.direction
-    queue.t_max[i] = ray.t_max
-    queue.exclude[i] = ray.exclude_plus_one
+def store_render_ray(rays: RenderRays, i: int, ray: Ray):
+    """Store a ray but for t_min, which is 0 throughout."""
+    rays.origin[i] = ray.origin
+    rays.direction[i] = ray.direction
+    rays.t_max[i] = ray.t_max
+    rays.exclude[i] = ray.exclude_plus_one
 
 
 @wp.func
-def hit_at(hits: HitArrays, i: int) -> Hit:
+def load_hit(hits: HitArrays, i: int) -> Hit:
     hit = Hit()
     hit.t = hits.t[i]
     hit.u = hits.u[i]
@@ -169,7 +169,7 @@ def hit_at(hits: HitArrays, i: int) -> Hit:
 
 
 @wp.func
-def put_hit(hits: HitArrays, i: Any, hit: Any, scale: float):
+def store_hit(hits: HitArrays, i: Any, hit: Any, scale: float):
     """Store a hit, with t multiplied by `scale`; i: int or int64, hit: a record with the fields of a Hit."""
     hits.t[i] = hit.t * scale
     hits.u[i] = hit.u
@@ -177,17 +177,17 @@ def put_hit(hits: HitArrays, i: Any, hit: Any, scale: float):
     hits.prim_id[i] = hit.prim_id
 
 
-def make_queue_kernel(accel_struct: Any, traverse: Any, any_hit: bool) -> Any:
-    """Make the kernel that traces rays first .. end - 1 of a picture's queue one at a time; out: as make_worlds_kernel."""
+def make_render_rays_kernel(accel_struct: Any, traverse: Any, any_hit: bool) -> Any:
+    """Make the kernel that traces rays first .. end - 1 of a picture one at a time; out: as make_worlds_kernel."""
     out_type = wp.array(dtype=wp.bool) if any_hit else HitArrays
 
     @kernel
-    def trace_queue(accel: accel_struct, surfaces: Surfaces, queue: Queue, out: out_type, first: int, end: int):
+    def trace_render_rays(accel: accel_struct, surfaces: Surfaces, rays: RenderRays, out: out_type, first: int, end: int):
         i = first + wp.tid()
-        hit = traverse(accel, surfaces, queued_ray(queue, i))
+        hit = traverse(accel, surfaces, load_render_ray(rays, i))
         if wp.static(any_hit):
             out[i] = hit.prim_id >= 0
         else:
-            put_hit(out, i, hit, 1.0)
+            store_hit(out, i, hit, 1.0)
 
-    return trace_queue
+    return trace_render_rays

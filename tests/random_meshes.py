@@ -23,7 +23,7 @@ from wrt.accel.bvh.builders import BVH_BUILDERS
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.flatten import flatten
 from wrt.accel.scenes.instancing import instanced_meshes
-from wrt.kernels.query import HitArrays, RayArrays, put_hit
+from wrt.kernels.query import HitArrays, RayArrays, store_hit
 from wrt.kernels.warp_private import fields_of
 from wrt.scene import shapes
 from wrt.scene.materials import Material
@@ -325,11 +325,11 @@ def own_kernel(name: str) -> Any:
         ray.t_min = rays.t_min[i]
         ray.t_max = rays.t_max[i]
         hit = query.closest_hit(world, ray)
-        put_hit(hits, i, hit, 1.0)
+        store_hit(hits, i, hit, 1.0)
         occluded[i] = query.any_hit(world, ray)
         if hit.prim_id >= 0:
             hit = query.next_hit(world, ray, hit)
-        put_hit(later, i, hit, 1.0)
+        store_hit(later, i, hit, 1.0)
 
     return ask
 

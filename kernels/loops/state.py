@@ -4,7 +4,7 @@ wrt/renderer/waves.py allocates room for `capacity` samples. Sample s belongs to
 
 import warp as wp
 
-from wrt.kernels.query import HitArrays, Queue, put_ray
+from wrt.kernels.query import HitArrays, RenderRays, store_render_ray
 from wrt.kernels.shade.materials import Scatter
 from wrt.kernels.shade.paths import make_path, make_paths
 from wrt.kernels.shade.shadows import ShadowWalk
@@ -65,7 +65,7 @@ class RayQueue:
     """By place k in the queue of rays."""
 
     sample: wp.array(dtype=wp.int32)  # The sample of the ray.
-    rays: Queue
+    rays: RenderRays
     hits: HitArrays
 
 
@@ -101,7 +101,7 @@ class ShadowQueue:
     """By place, light * capacity + index: the shadow rays that are traced next. Without transparent shadows the place is the
     slot."""
 
-    rays: Queue
+    rays: RenderRays
     occluded: wp.array(dtype=wp.bool)  # Without transparent shadows.
     hits: HitArrays  # With transparent shadows.
     slot: wp.array(dtype=wp.int32)  # With transparent shadows.
@@ -161,4 +161,4 @@ def queue_next(wave: Wave, k: int, s: int, pending: int):
     """Pop the top of the `pending` waiting paths of sample s, and put its ray at place k of the queue."""
     wave.samples.pending[s] = pending - 1
     wave.queue.sample[k] = s
-    put_ray(wave.queue.rays, k, ray_of(wave.samples.paths[(pending - 1) * wave.capacity + s]))
+    store_render_ray(wave.queue.rays, k, ray_of(wave.samples.paths[(pending - 1) * wave.capacity + s]))

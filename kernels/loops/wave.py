@@ -23,7 +23,7 @@ import warp as wp
 
 from wrt.kernels.launches import Launch, run_range, run_with
 from wrt.kernels.loops.state import Task, Wave, put_sample
-from wrt.kernels.query import hit_at, put_ray, queued_ray
+from wrt.kernels.query import load_hit, load_render_ray, store_render_ray
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.film import add_sample, load_pixel, make_write_aovs, store_pixel
 from wrt.kernels.shade.headers import lanes_kernel
@@ -52,11 +52,11 @@ def make_shadow_kernel(features: Features) -> Any:
         left = int(0)
         for j in range(wave.shadow_queue.count[light]):
             slot = wave.shadow_queue.slot[first + j]
-            walk = advance_shadow(surfaces, wave.shadows.walk[slot], hit_at(wave.shadow_queue.hits, first + j))
+            walk = advance_shadow(surfaces, wave.shadows.walk[slot], load_hit(wave.shadow_queue.hits, first + j))
             wave.shadows.walk[slot] = walk
             if walk.done == 0:
                 wave.shadow_queue.slot[first + left] = slot
-                put_ray(wave.shadow_queue.rays, first + left, walk.ray)
+                store_render_ray(wave.shadow_queue.rays, first + left, walk.ray)
                 left += 1
         wave.shadow_queue.count[light] = left
 
@@ -182,6 +182,6 @@ def make_aov_kernel(features: Features) -> Any:
         task = wave.task[0]
         for p in range(task.pixels):
             pixel = film_index(task, wave.pixels.order[p], film.x, film.y, film.columns)
-            write_aovs(film, pixel, surfaces, queued_ray(wave.queue.rays, p), hit_at(wave.queue.hits, p))
+            write_aovs(film, pixel, surfaces, load_render_ray(wave.queue.rays, p), load_hit(wave.queue.hits, p))
 
     return aov_wave

@@ -6,7 +6,7 @@ import warp as wp
 
 from wrt.kernels.loops.state import BLOCK, Wave, put_sample
 from wrt.kernels.memory import number_of_vec2, put_in_vec2, put_in_vec3, put_int, put_number
-from wrt.kernels.query import put_ray, queued_ray
+from wrt.kernels.query import load_render_ray, store_render_ray
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.film import pixel_center
 from wrt.kernels.shade.headers import lanes_kernel
@@ -99,10 +99,10 @@ def without_dead(wave: Wave, first: int, end: int, queued: int) -> int:
     The rays of the samples first .. end - 1 move to the places from `queued` on. Return the place behind the last one."""
     place = queued
     for s in range(first, end):
-        ray = queued_ray(wave.queue.rays, s)
+        ray = load_render_ray(wave.queue.rays, s)
         if ray.t_max > 0.0:
             if place != s:
-                put_ray(wave.queue.rays, place, ray)
+                store_render_ray(wave.queue.rays, place, ray)
                 wave.queue.sample[place] = s
             place += 1
         else:
@@ -146,6 +146,6 @@ def make_begin_aov_kernel(camera_kind: Any) -> Any:
             x = task.x + wave.pixels.order[p] % task.width
             y = task.y + wave.pixels.order[p] / task.width
             ray = camera_ray(camera, pixel_center(x, y, film.width, film.height), wp.vec2(0.5, 0.5))
-            put_ray(wave.queue.rays, p, ray)
+            store_render_ray(wave.queue.rays, p, ray)
 
     return begin_aov

@@ -12,7 +12,7 @@ from wrt.kernels.loops.wave_numbers import make_sample_facets, put_keys
 from wrt.kernels.loops.wave_rows import FACETS, MISS_COLORS, MISS_DIRECTIONS
 from wrt.kernels.loops.wave_surfaces import make_wave_surfaces
 from wrt.kernels.loops.wave_textures import make_wave_textures, textures_vectorised
-from wrt.kernels.query import put_ray, queued_ray
+from wrt.kernels.query import load_render_ray, store_render_ray
 from wrt.kernels.shade.backgrounds import BACKGROUNDS
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.follow_up import FOLLOWED, FollowUp, add_cuts, make_follow_up
@@ -64,7 +64,7 @@ def load_wave_hit(wave: Wave, j: int) -> WaveHit:
     hit.k = wave.outcomes.hit_rays[j]
     hit.sample = wave.queue.sample[hit.k]
     if wave.progress[0].fresh != 0:
-        hit.path = camera_path(queued_ray(wave.queue.rays, hit.k), wave.pixels.key[hit.sample / wave.task[0].samples])
+        hit.path = camera_path(load_render_ray(wave.queue.rays, hit.k), wave.pixels.key[hit.sample / wave.task[0].samples])
         hit.traced = 1
     else:
         hit.pending = wave.samples.pending[hit.sample]
@@ -184,7 +184,7 @@ def make_request_shadows(features: Features, step: Step, light_at: Any) -> Any:
             wave.shadows.walk[slot] = begin_shadow(request.ray, request.end)
             wave.shadow_queue.slot[slot] = slot
         wave.shadows.value[slot] = request.value
-        put_ray(wave.shadow_queue.rays, slot, request.ray)
+        store_render_ray(wave.shadow_queue.rays, slot, request.ray)
         return slot
 
     @wp.func

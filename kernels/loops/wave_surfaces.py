@@ -7,7 +7,7 @@ import warp as wp
 from wrt.kernels.loops.state import Wave
 from wrt.kernels.loops.wave_rows import HITS, SURFACES, TriangleHit
 from wrt.kernels.memory import prefetch
-from wrt.kernels.query import hit_at, queued_ray
+from wrt.kernels.query import load_hit, load_render_ray
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.surface import Surface, facing, make_on_sphere, make_on_triangle, make_place_of, make_triangle_at
 from wrt.kernels.structs import Surfaces
@@ -103,10 +103,10 @@ def make_hit_surface(has: Attributes, spheres: bool) -> Any:
 
     @wp.func
     def hit_surface(wave: Wave, surfaces: Surfaces, i: int, k: int) -> Surface:
-        hit = hit_at(wave.queue.hits, k)
+        hit = load_hit(wave.queue.hits, k)
         if wp.static(spheres):
             if hit.prim_id >= surfaces.n_triangles:
-                sphere = facing(on_sphere(surfaces, queued_ray(wave.queue.rays, k), hit), wave.queue.rays.direction[k])
+                sphere = facing(on_sphere(surfaces, load_render_ray(wave.queue.rays, k), hit), wave.queue.rays.direction[k])
                 sphere.material = surfaces.prim_material[hit.prim_id]
                 return sphere
         s = load_surface(wave.block.rows, i)
@@ -126,7 +126,7 @@ def make_wave_surfaces(features: Features, surface_at: Any) -> tuple[Any, Any]:
 
     @wp.func
     def single_hit_surface(wave: Wave, surfaces: Surfaces, i: int, k: int) -> Surface:
-        return surface_at(surfaces, queued_ray(wave.queue.rays, k), hit_at(wave.queue.hits, k))
+        return surface_at(surfaces, load_render_ray(wave.queue.rays, k), load_hit(wave.queue.hits, k))
 
     if features.instances:
         return compute_no_surfaces, single_hit_surface

@@ -56,7 +56,7 @@ def flag(value: bool) -> str:
 
 @cache
 def make_set_up(rays_struct: Any) -> Any:
-    """set_up for RayArrays, or for a Queue, whose directions are taken as they are."""
+    """set_up for RayArrays, or for RenderRays, whose directions are taken as they are."""
     plain = rays_struct is RayArrays
     excludes = "nullptr" if plain else "rays.exclude.data + first"
 

@@ -17,7 +17,7 @@ from wrt.core.device import made_once, records, upload
 from wrt.kernels.launches import Launch
 from wrt.kernels.loops import state, wave, wave_begin, wave_rows, wave_shade
 from wrt.kernels.loops.state import BLOCK
-from wrt.kernels.query import HitArrays, Queue, make_queue_kernel
+from wrt.kernels.query import HitArrays, RenderRays, make_render_rays_kernel
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.materials import Scatter
 from wrt.kernels.shade.sampling import LANES
@@ -64,10 +64,10 @@ def queue_kernel(structure: Any, features: Features, any_hit: bool) -> tuple[Any
     structure = structure._replace(units=structure.units._replace(spheres=True))
     accepts = make_cutout(features)
     stream = structure.accel.stream
-    kernel = stream and stream.make_stream(structure.units, any_hit, Queue, accepts)
+    kernel = stream and stream.make_stream(structure.units, any_hit, RenderRays, accepts)
     if kernel is not None:
         return kernel, ALL
-    return make_queue_kernel(structure.struct, structure.traversal(any_hit=any_hit, accepts=accepts), any_hit), 1
+    return make_render_rays_kernel(structure.struct, structure.traversal(any_hit=any_hit, accepts=accepts), any_hit), 1
 
 
 @dataclass(frozen=True)
@@ -265,7 +265,7 @@ def room(n: int, dtype: Any) -> Any:
 
 
 def queue(n: int) -> Any:
-    out = Queue()
+    out = RenderRays()
     out.origin, out.direction, out.exclude = room(n, wp.vec3), room(n, wp.vec3), room(n, wp.int32)
     out.t_min, out.t_max = wp.zeros(n, dtype=wp.float32, device="cpu"), room(n, wp.float32)
     return out

@@ -17,7 +17,7 @@ from wrt.accel.scenes.build import build
 from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel
 from wrt.accel.structures import ACCELERATORS
 from wrt.io.mesh_file import load_mesh
-from wrt.kernels.query import HitArrays, Queue, make_queue_kernel
+from wrt.kernels.query import HitArrays, RenderRays, make_render_rays_kernel
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.wide.batch import IN_A_ROW, PACKETS, BatchTraversal
@@ -245,21 +245,21 @@ def test_a_million_rays(name):
             assert_same(accel, rays.origins, rays.directions, 0.0, rays.t_max)
 
 
-def assert_queue_as_one_ray(accel, o, d, t_max, exclude, accepts=None):
-    """A Queue's rays by the kernel for many and by the one for one ray. The closest hits' prim_id."""
-    queue = Queue()
-    queue.origin, queue.direction = vec3s(o), vec3s(d)
-    queue.t_min, queue.t_max = zeros(len(o)), wp.array(t_max.astype(np.float32), dtype=wp.float32, device=DEVICE)
-    queue.exclude = wp.array(exclude, dtype=wp.int32, device=DEVICE)
+def assert_picture_rays_as_one_ray(accel, o, d, t_max, exclude, accepts=None):
+    """Trace RenderRays by the kernel for many rays and the one for one ray; return the closest hits' prim_id."""
+    rays = RenderRays()
+    rays.origin, rays.direction = vec3s(o), vec3s(d)
+    rays.t_min, rays.t_max = zeros(len(o)), wp.array(t_max.astype(np.float32), dtype=wp.float32, device=DEVICE)
+    rays.exclude = wp.array(exclude, dtype=wp.int32, device=DEVICE)
     structure = accel.structure
     for any_hit in (True, False):
-        many = structure.accel.kernels.make_stream(structure.units, any_hit, Queue, accepts)
-        one = make_queue_kernel(structure.struct, structure.traversal(any_hit=any_hit, accepts=accepts), any_hit)
+        many = structure.accel.kernels.make_stream(structure.units, any_hit, RenderRays, accepts)
+        one = make_render_rays_kernel(structure.struct, structure.traversal(any_hit=any_hit, accepts=accepts), any_hit)
         scratch, answers = new_scratch(BatchTraversal.stream_sizes), []
         for kernel, threads, more in ((many, 1, [scratch]), (one, len(o), [])):
             hits = new_hits(len(o))
             out = zeros(len(o), wp.bool) if any_hit else hits
-            wp.launch(kernel, threads, [accel.data, accel.snapshot.surfaces, queue, out, *more, 0, len(o)], device=DEVICE)
+            wp.launch(kernel, threads, [accel.data, accel.snapshot.surfaces, rays, out, *more, 0, len(o)], device=DEVICE)
             arrays = [out] if any_hit else [hits.t, hits.u, hits.v, hits.prim_id]
             answers.append(np.concatenate([array.numpy().view(np.uint8) for array in arrays]))
         np.testing.assert_array_equal(*answers)
@@ -275,7 +275,7 @@ def test_rays_of_a_picture_leave_out_what_they_start_on():
     o, d, _, t_max = mixed_rays(4000, 3)
     first = accel.closest_hit(o, d).prim_id
     assert (first >= len(mesh.faces)).any() and (first < 0).any()
-    whole, without = (assert_queue_as_one_ray(accel, o, d, t_max, exclude) for exclude in (np.zeros_like(first), first + 1))
+    whole, without = (assert_picture_rays_as_one_ray(accel, o, d, t_max, exclude) for exclude in (np.zeros_like(first), first + 1))
     assert (whole != without).any()
 
 
@@ -292,5 +292,5 @@ def test_hits_that_are_not_accepted_are_passed():
     o, d, _, t_max = mixed_rays(4000, 4)
     nearest = accel.closest_hit(o, d).prim_id
     for exclude in (np.zeros_like(nearest), nearest + 1):
-        accepted = assert_queue_as_one_ray(accel, o, d, t_max, exclude, one_in_three)
+        accepted = assert_picture_rays_as_one_ray(accel, o, d, t_max, exclude, one_in_three)
         assert ((accepted >= 0) & (accepted != nearest)).sum() > 100
