@@ -1,4 +1,4 @@
-"""Sensors as arrays of rays, and what they see as pictures: cameras by their intrinsics, and LiDARs.
+"""Sensors as arrays of rays, and pictures of their hits: cameras by their intrinsics, and LiDARs.
 
 >>> sensor = wrt.sensors.pinhole(K, (640, 480), camera_to_world)
 >>> hits = accel.closest_hit(sensor.origins, sensor.directions)
@@ -8,49 +8,66 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from wrt.core.arrays import to_numpy
 from wrt.core.checks import as_array, as_integer, as_size, shown
 from wrt.core.errors import InputError
+from wrt.core.types import ArrayLike
 from wrt.scene.values import as_number, as_transform
+
+if TYPE_CHECKING:
+    from wrt.accel.queries.answers import Hits
 
 __all__ = ["Sensor", "pinhole", "raster_lidar", "rotating_lidar", "with_range_noise"]
 
 TURN = 2.0 * np.pi
-RIGID = 1e-5  # by which a pose's axes may miss unit length and right angles
+RIGID = 1e-5  # largest error of the rotation matrix R of a pose: R R^T - I
 
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """origins, directions: (N, 3) float32 in world space, row by row of its pictures; shape: how many rows and columns these have;
-    axis: (3,) float64, the unit direction along which it measures depth."""
+    """Rays of a sensor, and the layout of its pictures.
+
+    Parameters
+    ----------
+    origins, directions
+        (N, 3) float32 each, in world space, row by row.
+    shape
+        Rows and columns of a picture; N is their product.
+    axis
+        (3,) float64, unit direction in world space along which depth is measured.
+    """
 
     origins: np.ndarray
     directions: np.ndarray
     shape: tuple[int, int]
     axis: np.ndarray
 
-    def picture(self, values: Any) -> np.ndarray:
-        """(rows, columns, ...): one value a ray, such as hits.prim_id, hits.object, hits.instance or hits.normal. Raises InputError
-        where there are not as many."""
+    def picture(self, values: ArrayLike) -> np.ndarray:
+        """Return (rows, columns, ...) of values for each ray, (N, ...), such as hits.prim_id, hits.object or hits.normal.
+
+        Raises InputError for another number of values.
+        """
         values = to_numpy(values)
         if values.shape[:1] != (len(self.origins),):
             raise InputError(f"values must be one a ray, ({len(self.origins)}, ...), got {values.shape}")
         return values.reshape(*self.shape, *values.shape[1:])
 
-    def range(self, hits: Any) -> np.ndarray:
-        """(rows, columns) float32: distances from the sensor in scene units, inf on a miss."""
+    def range(self, hits: Hits) -> np.ndarray:
+        """Return distances from the sensor, (rows, columns) float32 in scene units; inf on a miss."""
         return self._scaled(hits, np.linalg.norm(self.directions.astype(np.float64), axis=1))
 
-    def depth(self, hits: Any) -> np.ndarray:
-        """(rows, columns) float32: distances along the sensor's axis in scene units (of a camera the z of its frame, as in depth
-        pictures), inf on a miss; below 0 behind it."""
+    def depth(self, hits: Hits) -> np.ndarray:
+        """Return distances along the sensor's axis, (rows, columns) float32 in scene units; inf on a miss, negative behind it.
+
+        For a camera this is z in its frame, as in depth images.
+        """
         return self._scaled(hits, self.directions.astype(np.float64) @ self.axis)
 
-    def _scaled(self, hits: Any, factor: np.ndarray) -> np.ndarray:
+    def _scaled(self, hits: Hits, factor: np.ndarray) -> np.ndarray:
         if not hasattr(hits, "t"):
             raise InputError(f"hits must be those of closest_hit, got {shown(hits)}")
         t = self.picture(hits.t).astype(np.float64)
@@ -58,13 +75,28 @@ class Sensor:
         return np.where(np.isfinite(t), scaled, np.inf).astype(np.float32)
 
 
-def pinhole(intrinsics: Any, size: tuple[int, int] | str, pose: Any = None) -> Sensor:
-    """A ray through the centre of each pixel, row by row from the top left.
+def pinhole(intrinsics: ArrayLike, size: tuple[int, int] | str, pose: ArrayLike | None = None) -> Sensor:
+    """Make one ray through the centre of each pixel of a pinhole camera, without lens distortion.
 
-    intrinsics: K, (3, 3) in pixels, as OpenCV has it: x to the right, y down, z forward; (0, 0) is the centre of the top left
-    pixel, and the middle of a picture is at (width - 1) / 2. The point (x, y, z) of the camera's frame is seen at K (x, y, z) / z.
-    size: width and height, or "640x480". pose: (4, 4), from the camera's frame to the world, rotation and translation. Directions
-    have z = 1 in the camera's frame: a hit's t is its depth. Lenses' distortion is not modelled. Raises InputError.
+    Parameters
+    ----------
+    intrinsics
+        K, (3, 3) in pixels, as in OpenCV: x right, y down, z forward, (0, 0) is the centre of the top left pixel. The point p of the
+        camera's frame projects to K p / z.
+    size
+        Width and height, or text such as "640x480".
+    pose
+        (4, 4), camera to world, rotation and translation. None: the identity.
+
+    Returns
+    -------
+    Sensor
+        Directions have z = 1 in the camera's frame, so that t of a hit is its depth.
+
+    Raises
+    ------
+    InputError
+        If an argument has another form, or the rays leave the range of float32.
     """
     k = as_array(intrinsics, np.float64, "intrinsics")
     if k.shape != (3, 3) or not np.isfinite(k).all() or not np.array_equal(k[2], [0.0, 0.0, 1.0]) or k[1, 0] != 0.0:
@@ -77,13 +109,31 @@ def pinhole(intrinsics: Any, size: tuple[int, int] | str, pose: Any = None) -> S
     return _sensor(np.stack(np.broadcast_arrays(x, y, 1.0), axis=-1), pose, axis=2)
 
 
-def rotating_lidar(elevations: Any, steps: int, pose: Any = None, start: float = 0.0, turn: float = TURN) -> Sensor:
-    """A ring of rays for each elevation: a picture of len(elevations) rows and `steps` columns.
+def rotating_lidar(elevations: ArrayLike, steps: int, pose: ArrayLike | None = None, start: float = 0.0, turn: float = TURN) -> Sensor:
+    """Make the rays of a rotating LiDAR: one ring of `steps` rays for each elevation.
 
-    elevations: (rows,) angles above the plane that the sensor turns in, radians. start, turn: the azimuth of the first column and
-    how far `steps` columns turn, radians, counter-clockwise seen from above; column i is at start + i turn / steps. In the sensor's
-    frame x is forward (azimuth 0), y left and z up. pose: (4, 4), from that frame to the world. Directions have unit length: t is
-    the range. Raises InputError.
+    In the sensor's frame x is forward (azimuth 0), y left and z up.
+
+    Parameters
+    ----------
+    elevations
+        (rows,) angles above the plane of rotation, in radians.
+    steps
+        Number of columns.
+    pose
+        (4, 4), sensor to world, rotation and translation. None: the identity.
+    start, turn
+        Azimuth of column i is start + i turn / steps, in radians, counter-clockwise seen from above.
+
+    Returns
+    -------
+    Sensor
+        Directions have unit length, so that t of a hit is its range.
+
+    Raises
+    ------
+    InputError
+        If an argument has another form, or the rays leave the range of float32.
     """
     rows = as_array(elevations, np.float64, "elevations")
     if rows.ndim != 1 or not len(rows) or not (np.abs(rows) <= 0.5 * np.pi).all():
@@ -93,11 +143,23 @@ def rotating_lidar(elevations: Any, steps: int, pose: Any = None, start: float =
     return _sensor(_spherical(azimuths[None, :], rows[:, None]), pose, axis=0)
 
 
-def raster_lidar(fov: tuple[float, float], size: tuple[int, int] | str, pose: Any = None) -> Sensor:
-    """A solid-state LiDAR: rays at equal steps of azimuth and of elevation, row by row from the top left.
+def raster_lidar(fov: tuple[float, float], size: tuple[int, int] | str, pose: ArrayLike | None = None) -> Sensor:
+    """Make the rays of a solid-state LiDAR: equal steps of azimuth and elevation, row by row from the top left.
 
-    fov: the angles from the first column to the last and from the first row to the last, radians; size: columns and rows, or
-    "240x80". Frame, pose and directions as of rotating_lidar. Raises InputError.
+    Frame, pose, directions and errors are as for `rotating_lidar`.
+
+    Parameters
+    ----------
+    fov
+        Angles from the first column to the last and from the first row to the last, in radians.
+    size
+        Columns and rows, or text such as "240x80".
+    pose
+        (4, 4), sensor to world.
+
+    Returns
+    -------
+    Sensor
     """
     width, height = as_size(size)
     angles = as_array(fov, np.float64, "fov")
@@ -111,12 +173,30 @@ def raster_lidar(fov: tuple[float, float], size: tuple[int, int] | str, pose: An
     return _sensor(_spherical(azimuths[None, :], elevations[:, None]), pose, axis=0)
 
 
-def with_range_noise(ranges: Any, seed: int, constant: float = 0.0, proportional: float = 0.0, dropout: float = 0.0) -> np.ndarray:
-    """Ranges as a sensor measures them, float32 of the same shape; the same for the same seed and shape.
+def with_range_noise(ranges: ArrayLike, seed: int, constant: float = 0.0, proportional: float = 0.0, dropout: float = 0.0) -> np.ndarray:
+    """Add the noise of a range sensor, independent for each element.
 
-    Each is normally distributed around the true one r, with the deviation sqrt(constant^2 + (proportional r)^2), and not below 0;
-    with probability `dropout` it is lost (inf). What is a miss (inf) stays one. Each element has noise of its own, whatever the
-    others are. constant: scene units. Raises InputError, also for ranges that are NaN or below 0.
+    A range r becomes normally distributed around r, but not below 0, with the deviation sqrt(constant^2 + (proportional r)^2).
+
+    Parameters
+    ----------
+    ranges
+        True ranges, 0 or more, of any shape; inf on a miss, which stays.
+    seed
+        The same seed and shape give the same noise.
+    constant, proportional
+        Deviation in scene units, and as a share of r.
+    dropout
+        Probability that a hit is lost (inf).
+
+    Returns
+    -------
+    float32 array of the shape of `ranges`
+
+    Raises
+    ------
+    InputError
+        If a range is NaN or negative, or an argument is out of range.
     """
     ranges, shape = as_array(ranges, np.float64, "ranges"), np.shape(ranges)
     if not (ranges >= 0.0).all():
@@ -134,13 +214,13 @@ def with_range_noise(ranges: Any, seed: int, constant: float = 0.0, proportional
 
 
 def _spherical(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
-    """(rows, columns, 3) unit vectors, x forward, y left, z up."""
+    """Return (rows, columns, 3) unit vectors, x forward, y left, z up."""
     level = np.cos(elevation)
     return np.stack(np.broadcast_arrays(level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)), axis=-1)
 
 
-def _sensor(directions: np.ndarray, pose: Any, axis: int) -> Sensor:
-    """directions: (rows, columns, 3) in the sensor's frame; axis: of that frame, along which it measures depth."""
+def _sensor(directions: np.ndarray, pose: ArrayLike | None, axis: int) -> Sensor:
+    """Place directions, (rows, columns, 3) in the sensor's frame; axis: index of the frame's axis of depth."""
     matrix = as_transform(np.eye(4) if pose is None else pose, "pose")
     rotation = matrix[:3, :3]
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID or np.linalg.det(rotation) < 0.0:

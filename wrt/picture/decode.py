@@ -1,5 +1,4 @@
-"""Pictures of display codes (PNG, JPEG and the like) from bytes, through Pillow. They may come from anybody: the size is looked at
-before anything is decoded, and only a few formats are tried."""
+"""Decode PNG, JPEG and the like with Pillow. The bytes are untrusted: few formats are allowed, and the size is checked first."""
 
 from __future__ import annotations
 
@@ -14,24 +13,23 @@ import numpy as np
 from wrt.core.errors import InputError
 from wrt.core.packages import needed_by
 
-# Pillow has others, such as EPS, that run programs or have no place here.
+# Pillow has further formats, such as EPS, which run programs.
 FORMATS = ("PNG", "JPEG", "WEBP", "AVIF", "BMP", "GIF")
 MAX_SIDE = 32768  # pixels
-MAX_PIXELS = 1 << 27  # of codes: 16384x8192
+MAX_PIXELS = 1 << 27  # 16384x8192
 
 
 def check_size(width: int, height: int, most: int = MAX_PIXELS) -> None:
-    """Raise InputError where a picture is too large to be read, with its size and the limit."""
+    """Raise InputError if a picture is too large to be read."""
     if max(width, height) > MAX_SIDE or width * height > most:
         limits = f"at most {MAX_SIDE} a side and {most} pixels are read"
         raise InputError(f"cannot be read as an image: it is {width}x{height}; {limits}")
 
 
 def decode_rgba8(data: bytes, formats: tuple[str, ...] = FORMATS) -> np.ndarray:
-    """An encoded picture as (H, W, 4) uint8 codes, row 0 on top; alpha is 255 where there is none.
+    """Decode a picture to (H, W, 4) uint8 codes, row 0 on top; without alpha it is 255.
 
-    16-bit channels keep their high byte; colour profiles are ignored. Raises InputError where it cannot be decoded, is truncated or
-    too large.
+    16-bit channels keep their high byte; colour profiles are ignored. Raises InputError for a broken, truncated or too large picture.
     """
     with _opened(data, formats) as picture:
         if picture.mode.startswith("I"):  # 16-bit grey, which Pillow would clip to 255
@@ -41,11 +39,10 @@ def decode_rgba8(data: bytes, formats: tuple[str, ...] = FORMATS) -> np.ndarray:
 
 
 def decode_png16(data: bytes) -> np.ndarray:
-    """A PNG of 16 bits a channel as (H, W, 3) uint16 codes, without its alpha. Raises InputError as decode_rgba8 does.
+    """Decode a PNG with 16 bits a channel to (H, W, 3) uint16 codes without alpha. Raises InputError as decode_rgba8 does.
 
-    Pillow keeps only one byte of each channel of a colour picture: the high one, or the low one where it is told that the file has
-    the other order. Grey with alpha has four bytes a pixel: as RGBA, they come all. (OpenImageIO keeps both, but its
-    libpng writes to stderr what is wrong with a damaged file.)
+    Pillow keeps one byte of each channel of a colour picture: the high one, or the low one if the byte order is declared as swapped.
+    Grey with alpha has four bytes a pixel, read here as RGBA. (OpenImageIO keeps all bytes, but its libpng writes errors to stderr.)
     """
     with _opened(data, ("PNG",)) as picture:
         order = picture.tile[0][3] if picture.tile else ""
@@ -67,14 +64,14 @@ def decode_png16(data: bytes) -> np.ndarray:
 
 @contextmanager
 def _opened(data: bytes, formats: tuple[str, ...]) -> Iterator[Any]:
-    """The picture, whose pixels are decoded when they are asked for."""
+    """Yield an image of Pillow, which decodes its pixels when they are read."""
     with needed_by("a picture in a file"):
         from PIL import Image, UnidentifiedImageError
 
     Image.init()
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of pictures above half of Pillow's own limit, of metadata that nobody asks for
+            warnings.simplefilter("ignore")  # about sizes above half of Pillow's own limit, and about metadata
             with Image.open(io.BytesIO(data), formats=[name for name in formats if name in Image.OPEN]) as picture:
                 check_size(*picture.size)
                 yield picture

@@ -1,4 +1,4 @@
-"""The result of a render: pixels, their variance, what the first hits were, and how to show and save it all."""
+"""Film, the result of a render: pixels, variance and AOVs, with what displays and saves them."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 
 from wrt.core.checks import as_names
 from wrt.core.errors import InputError
+from wrt.core.types import PathLike, WarpArray
 from wrt.picture.image import (
-    PathLike,
     as_half,
     check_writable,
     color_channels,
@@ -24,35 +24,46 @@ from wrt.picture.image import (
 )
 from wrt.picture.tonemap import to_codes
 
-# The letters of a layer's channels in an EXR file; a layer that is not named here has one channel, called as itself.
+# Letters of the channels of a layer in an EXR file; any other layer has one channel of its own name.
 LETTERS = {"variance": "RGB", "depth": "Z", "normal": "XYZ", "albedo": "RGB"}
 
 
 @dataclass(eq=False)
 class Film:
-    """What `render` gives back.
+    """The result of `render`.
 
-    pixels: (H, W, 3) float32, linear Rec. 709 radiance, the mean of the samples; row 0 is on top.
-    variance: (H, W, 3) float32, estimated variance of that mean (its root is the standard error); inf where it is not known:
-        one sample tells nothing of it.
-    samples: (H, W) int32, samples taken of each pixel.
-    aov: by name, of what one ray through the pixel's centre, and the middle of the lens, hits first (blended surfaces
-        count, cut-out parts do not; no filter, no mean over samples):
-        "depth" (H, W) float32: the distance from the camera to the hit along that ray, in scene units, not the distance
-            along the camera's axis; inf on a miss;
-        "normal" (H, W, 3) float32: of unit length, in world space, the one that shades (interpolated and bent by a normal
-            map where the surface has such), on the side that the ray comes from; 0 on a miss;
-        "albedo" (H, W, 3) float32: the material's, with its texture; 0 on a miss;
-        "prim_id" (H, W) int32: index of the triangle (all objects in order, then the spheres); -1 on a miss;
-        "material_id" (H, W) int32: index into `scene.materials`; -1 on a miss.
-    stats: counts and seconds of the render. stats["seconds"] has the seconds of each stage by the clock: "compile" until the last
-        kernel of the scene was there, and beside it "upload" and "build" (with kernels of the builder's own, which
-        stats["accel"]["build_seconds"] does not count); then "aov" and "trace", with those before a resume.
-        "lost_throughput_per_sample": what rays that were cut would have added in a room of radiance 1; "visibly_cut": the share
-        of the pixels that lack 5 % or more of that radiance because of max_depth.
-    metadata: what a file says about it (scene, spp, seed, seconds, version).
-    exposure (stops) and tonemap (a name in wrt.picture.tonemap.TONEMAPS): how it wants to be shown.
-    np.asarray(film), `from_dlpack(film)` of any library, film.numpy() and film.warp() are the pixels, not a copy of them.
+    `np.asarray(film)`, `from_dlpack(film)` of any library, `numpy()` and `warp()` share the memory of the pixels.
+
+    Parameters
+    ----------
+    pixels
+        (H, W, 3) float32, linear Rec. 709 radiance, the mean of the samples; row 0 is on top.
+    variance
+        (H, W, 3) float32, estimated variance of that mean: its square root is the standard error. inf for fewer than two samples.
+    samples
+        (H, W) int32, number of samples of each pixel.
+    aov
+        Layers by name, of the first hit of one ray through the centre of the pixel and of the lens: without filter, without a mean
+        over samples. Blended surfaces count, cut-out parts do not. (H, W) or (H, W, 3) each:
+
+        - "depth", float32: distance from the camera along the ray, in scene units (not along the camera's axis); inf on a miss.
+        - "normal", float32: unit shading normal in world space, on the side of the camera; 0 on a miss.
+        - "albedo", float32: albedo of the material, with its texture; 0 on a miss.
+        - "prim_id", int32: index of the triangle, all objects in order, then of the sphere; -1 on a miss.
+        - "material_id", int32: index into `scene.materials`; -1 on a miss.
+    stats
+        Counts, and `stats["seconds"]` of wall-clock time by stage: "compile", which runs beside "upload" and "build", then "aov" and
+        "trace", with the seconds before a resume. "lost_throughput_per_sample" is the radiance that rays which were cut would have
+        added in surroundings of radiance 1; "visibly_cut" is the share of pixels that lack 5 % or more of it because of max_depth.
+    metadata
+        Entries that `save` writes into files: scene, spp, seed, seconds, version ...
+    exposure, tonemap
+        Display settings in stops and by name, as in Settings.
+
+    Raises
+    ------
+    InputError
+        If the shapes of the arrays differ.
     """
 
     pixels: np.ndarray
@@ -83,19 +94,19 @@ class Film:
 
     @property
     def layers(self) -> dict[str, np.ndarray]:
-        """Everything but the colours, by name: the AOVs, variance and samples."""
+        """All layers beside the pixels, by name: the AOVs, "variance" and "samples"."""
         return {**self.aov, "variance": self.variance, "samples": self.samples}
 
     def to_srgb8(self) -> np.ndarray:
-        """As shown: exposed, tone-mapped, sRGB-encoded, (H, W, 3) uint8; NaN is black."""
+        """Return the displayed picture, (H, W, 3) uint8: exposed, tone-mapped, sRGB-encoded; NaN is black."""
         return to_codes(self.pixels, self.exposure, self.tonemap)
 
     def numpy(self) -> np.ndarray:
-        """The pixels themselves, (H, W, 3) float32."""
+        """Return the pixels, (H, W, 3) float32, without a copy."""
         return self.pixels
 
-    def warp(self) -> Any:
-        """The pixels as a Warp array, (H, W) vec3, of the same memory."""
+    def warp(self) -> WarpArray:
+        """Return the pixels as a Warp array, (H, W) vec3, without a copy."""
         import warp as wp
 
         from wrt.core.arrays import to_warp
@@ -115,13 +126,27 @@ class Film:
         return encode_png(self.to_srgb8(), self.metadata)
 
     def save(self, path: PathLike, *, bits: int | None = None, aov: str | Iterable[str] | None = None) -> list[Path]:
-        """Write the picture, and other layers with it; returns the paths written.
+        """Write the picture, and layers with it. Each file is written whole or not at all.
 
-        path: .png gets exposure and tone mapping, .exr and .hdr stay linear. bits: as in wrt.picture.image.write_image. aov:
-        names in `layers`; None is all of them for EXR and none otherwise. EXR takes them as channels (depth.Z, ...,
-        prim_id), with values as they are; next to a PNG or HDR picture each becomes a PNG to look at (AOV_VIEWS),
-        `name.depth.png` beside `name.png`. Every file is written whole or not at all. Raises InputError before anything
-        is written where a path or a name is wrong.
+        Parameters
+        ----------
+        path
+            The suffix decides: .png is exposed and tone-mapped, .exr and .hdr stay linear.
+        bits
+            Bits of a channel: 8 or 16 for PNG (default 8), 32 or 16 for EXR (default 32).
+        aov
+            Names of `layers`. EXR has all by default, with their values, as channels (depth.Z ... prim_id). For PNG and HDR the
+            default is none, and each layer becomes a PNG to look at: `name.depth.png` beside `name.png`.
+
+        Returns
+        -------
+        list of Path
+            The files written.
+
+        Raises
+        ------
+        InputError
+            If a path or a name is wrong, before anything is written, or the system refuses.
         """
         suffix, bits = output_format(path, bits)
         names = self._layer_names(aov, suffix)
@@ -151,12 +176,12 @@ class Film:
 
 
 def aov_path(path: PathLike, name: str) -> Path:
-    """Where `save` puts a layer beside a PNG or HDR picture: out.png -> out.depth.png."""
+    """Return the file of a layer beside a PNG or HDR picture: out.png -> out.depth.png."""
     return Path(path).with_suffix(f".{name}.png")
 
 
 def layer_channels(name: str, array: np.ndarray) -> dict[str, np.ndarray]:
-    """A layer's EXR channels by name: depth.Z, normal.X ..., or `name` itself for one that has no letters."""
+    """Return the EXR channels of a layer by name: depth.Z, normal.X ..., or `name` alone without LETTERS."""
     if array.ndim == 3:
         return color_channels(name, array, LETTERS.get(name, "RGB"))
     return {f"{name}.{LETTERS[name]}" if name in LETTERS else name: array}
@@ -166,7 +191,7 @@ def layer_channels(name: str, array: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _view_depth(depth: np.ndarray) -> np.ndarray:
-    """Near is white, far dark grey, a miss black; linear between the nearest and the farthest hit."""
+    """Return depth as grey, linear from the nearest hit (white) to the farthest (dark grey); a miss is black."""
     hit = np.isfinite(depth)
     near, far = (float(depth[hit].min()), float(depth[hit].max())) if hit.any() else (0.0, 0.0)
     share = (np.where(hit, depth, far) - near) / (far - near) if far > near else np.zeros(depth.shape)
@@ -174,13 +199,13 @@ def _view_depth(depth: np.ndarray) -> np.ndarray:
 
 
 def _view_normal(normal: np.ndarray) -> np.ndarray:
-    """-1 to 1 as code 0 to 255, without sRGB encoding; a miss is black."""
+    """Return -1 to 1 as codes 0 to 255, without sRGB encoding; a miss is black."""
     hit = np.abs(normal).sum(axis=-1, keepdims=True) > 0.0
     return np.rint(np.where(hit, np.clip(0.5 + 0.5 * normal, 0.0, 1.0), 0.0) * 255.0).astype(np.uint8)
 
 
 def _view_id(ids: np.ndarray) -> np.ndarray:
-    """A colour from a hash of each number, the same in every picture; a miss is black."""
+    """Return a colour from a hash of each id, the same in every picture; a miss is black."""
     value = (ids.astype(np.int64) + 1).astype(np.uint32)  # then the finaliser of MurmurHash3, modulo 2^32
     for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35), (16, 1)):
         value = (value ^ (value >> np.uint32(shift))) * np.uint32(factor)
@@ -198,15 +223,15 @@ AOV_VIEWS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "albedo": to_codes,
     "prim_id": _view_id,
     "material_id": _view_id,
-    # The standard error, on the scale of the picture itself without exposure and tone mapping; unknown is white.
+    # The standard error on the scale of the picture, without exposure and tone mapping; inf is white.
     "variance": lambda variance: to_codes(np.sqrt(np.maximum(variance, 0.0))),
-    # 0 is black, the most there are is white.
+    # From 0, black, to the largest number, white.
     "samples": lambda samples: _grey(255.0 * samples / max(int(samples.max(initial=0)), 1)),
 }
 
 
 def aov_to_srgb8(name: str, array: np.ndarray) -> np.ndarray:
-    """A layer as a picture to look at, (H, W, 3) uint8; raises InputError where AOV_VIEWS has no view of that name."""
+    """Return a layer as a picture to look at, (H, W, 3) uint8. Raises InputError if AOV_VIEWS has no view of that name."""
     if name not in AOV_VIEWS:
         raise InputError(f"AOV {name!r} has no view; there are {', '.join(AOV_VIEWS)}")
     return AOV_VIEWS[name](array)

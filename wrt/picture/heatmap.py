@@ -1,25 +1,28 @@
-"""A picture of numbers: each pixel's value as a colour, with a bar that tells which colour is how much."""
+"""Heat maps: a colour for the value of each pixel, with a colour scale."""
 
 from __future__ import annotations
 
 import math
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from wrt.core.packages import needed_by
 from wrt.picture.tonemap import encode_srgb
 
+if TYPE_CHECKING:
+    from PIL.ImageFont import FreeTypeFont, ImageFont
+
 INK, PALE = (30, 30, 30), (110, 110, 110)
 BAR, MARGIN, TITLE = 18, 14, 30  # pixels: width of the bar, around everything, height of the title
-LEAST = 480  # a picture narrower than this is shown larger, by a whole number
-BRIGHTEST = 99.0  # percentile of the values that gets the last colour: a few outliers would make all else dark
+LEAST = 480  # narrower pictures are enlarged by a whole factor
+BRIGHTEST = 99.0  # percentile of the values that gets the last colour, so that outliers do not darken all else
 
 
 @cache
 def colors() -> np.ndarray:
-    """256 colours, (256, 3) uint8, evenly darker to lighter: from black by blue, red and yellow to near white (in OKLCh)."""
+    """Return (256, 3) uint8 from black over blue, red and yellow to near white, evenly in OKLCh lightness."""
     t = np.linspace(0.0, 1.0, 256)
     lightness = 0.10 + 0.87 * t
     hue = np.radians(270.0 + 195.0 * t)
@@ -33,7 +36,7 @@ def colors() -> np.ndarray:
 
 
 def top_of(values: np.ndarray) -> float:
-    """The value that gets the last colour: a round number at or above nearly all values, 1 where all are 0."""
+    """Return the value of the last colour: a round number at or above nearly all values; 1 if all are 0."""
     most = float(np.percentile(values, BRIGHTEST) or values.max()) if values.size else 0.0
     if most <= 0.0:
         return 1.0
@@ -42,20 +45,21 @@ def top_of(values: np.ndarray) -> float:
 
 
 def step_of(top: float) -> float:
-    """The distance between marks from 0 to `top`: 1, 2 or 5 times a power of ten, 4 to 10 of them."""
+    """Return the distance of 4 to 10 marks from 0 to `top`: 1, 2 or 5 times a power of ten."""
     power = 10.0 ** math.floor(math.log10(top / 4.0))
     return next(power * factor for factor in (5.0, 2.0, 1.0) if top / (power * factor) >= 4.0 - 1e-9)
 
 
 def colored(values: np.ndarray, top: float) -> np.ndarray:
-    """Values (h, w) of 0 or more as colours, (h, w, 3) uint8; `top` and what is beyond it get the last one."""
+    """Return colours, (h, w, 3) uint8, of values (h, w) >= 0; `top` and larger values get the last colour."""
     return colors()[np.rint(np.clip(np.nan_to_num(values / top, posinf=1.0), 0.0, 1.0) * 255.0).astype(np.uint8)]
 
 
 def heatmap(values: np.ndarray, title: str, top: float | None = None) -> np.ndarray:
-    """The picture, (H, W, 3) uint8, of values (h, w) of 0 or more, row 0 on top; 0 is the first colour. What is beyond the scale
-    gets the last one, and the title tells the largest value. top: where the scale ends, so that several pictures can have one
-    (None: `top_of`)."""
+    """Draw values (h, w) >= 0, row 0 on top, as (H, W, 3) uint8 with a title and a colour scale.
+
+    top: end of the scale, which larger values share; None: `top_of`. The title gives the mean and the largest value.
+    """
     with needed_by("a heat map"):
         from PIL import Image, ImageDraw
 
@@ -82,7 +86,7 @@ def heatmap(values: np.ndarray, title: str, top: float | None = None) -> np.ndar
 
 
 def short(value: float) -> str:
-    """Three digits, thousands as k, millions as M."""
+    """Format a value with three digits, thousands as k, millions as M."""
     for factor, letter in ((1e6, "M"), (1e3, "k")):
         if value >= 10.0 * factor:
             return f"{value / factor:.3g}{letter}"
@@ -90,7 +94,7 @@ def short(value: float) -> str:
 
 
 @cache
-def font(size: int) -> Any:
-    from PIL import ImageFont
+def font(size: int) -> FreeTypeFont | ImageFont:
+    from PIL.ImageFont import load_default
 
-    return ImageFont.load_default(size)
+    return load_default(size)

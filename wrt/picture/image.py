@@ -1,8 +1,8 @@
 """Image files: PNG (8 and 16 bit), OpenEXR and Radiance HDR, each written whole or not at all.
 
-Rows run from the top down. Colours in memory are linear Rec. 709; a PNG or JPEG file holds sRGB codes. OpenImageIO
-reads and writes EXR and HDR, Pillow reads the rest (wrt.picture.decode). PNG is encoded here: Pillow writes no 16-bit RGB, and
-OpenImageIO's PNG writer spoils text outside of ASCII and reports success on a full disk.
+Row 0 is on top. Colours in memory are linear Rec. 709; a PNG or JPEG file holds sRGB codes. OpenImageIO reads and writes EXR and HDR,
+Pillow reads the rest (wrt.picture.decode). PNG is encoded here: Pillow writes no 16-bit RGB, and OpenImageIO's PNG writer damages text
+outside ASCII and reports success on a full disk.
 """
 
 from __future__ import annotations
@@ -21,30 +21,31 @@ from wrt.core import write_file
 from wrt.core.errors import InputError, at, warn
 from wrt.core.files import open_regular, read_file
 from wrt.core.packages import needed_by
+from wrt.core.types import PathLike
 from wrt.core.write_file import replacing
 from wrt.picture.decode import FORMATS as FORMATS_READ
 from wrt.picture.decode import check_size, decode_png16, decode_rgba8
 from wrt.picture.tonemap import decode_srgb, to_codes
 
-PathLike = str | os.PathLike[str]
+Metadata = Mapping[str, object]
 
-# Bits a channel that each format can be written with; the first is the default.
+# Bits per channel of the formats that are written; the first is the default.
 FORMATS: dict[str, tuple[int, ...]] = {".png": (8, 16), ".exr": (32, 16), ".hdr": (32,)}
 DISPLAY_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tga")  # read as sRGB codes
 LINEAR_SUFFIXES = (".exr", ".hdr")
-METADATA_PREFIX = "wrt:"  # what a file's text entries of ours begin with
+METADATA_PREFIX = "wrt:"  # of the names of text entries
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _MAGIC = {".exr": (b"\x76\x2f\x31\x01",), ".hdr": (b"#?RADIANCE", b"#?RGBE")}
-MAX_LINEAR_PIXELS = 1 << 28  # of an environment: 24576x10922, or 16384x16384
+MAX_LINEAR_PIXELS = 1 << 28  # an environment of 24576x10922, or 16384x16384
 HALF_MAX = 65504.0
-EXACT_IN_FLOAT = 1 << 24  # every integer up to here is a float32
+EXACT_IN_FLOAT = 1 << 24  # largest integer up to which float32 holds all
 
 
 # --- before and around writing ----------------------------------------------------------------------------------------
 
 
 def output_format(path: PathLike, bits: int | None = None) -> tuple[str, int]:
-    """The suffix and bits a channel that `path` is to be written with; raises InputError where wrt has no such."""
+    """Return the suffix and the bits per channel for `path`. Raises InputError if wrt does not write that format."""
     suffix = Path(path).suffix.lower()
     if suffix not in FORMATS:
         raise InputError(f"cannot write {suffix or 'a file without a suffix'}; use {', '.join(FORMATS)}", path)
@@ -54,7 +55,7 @@ def output_format(path: PathLike, bits: int | None = None) -> tuple[str, int]:
 
 
 def check_writable(path: PathLike, bits: int | None = None) -> None:
-    """Raise the InputError that writing an image to `path` would end in, before any work is done for it."""
+    """Raise InputError before any work if an image cannot be written to `path`."""
     output_format(path, bits)
     write_file.check_writable(path)
 
@@ -63,14 +64,15 @@ def check_writable(path: PathLike, bits: int | None = None) -> None:
 
 
 def write_image(path: PathLike, pixels: np.ndarray, *, bits: int | None = None, exposure: float = 0.0,
-                tonemap: str = "none", metadata: Mapping[str, Any] | None = None) -> None:
-    """Write one picture in the format that the suffix names.
+                tonemap: str = "none", metadata: Metadata | None = None) -> None:
+    """Write one picture in the format of the suffix.
 
-    pixels: (H, W, 3) linear. bits: a channel (FORMATS; default 8 for PNG, 32 for EXR and HDR; 16 in EXR is half). PNG
-    gets `exposure` stops and `tonemap`; EXR and HDR stay linear and get neither. metadata: goes in as text, a `wrt:key`
-    each. NaN and infinite values are kept in EXR; in PNG, NaN and -inf are black and +inf is white; HDR holds neither
-    those nor negative values (they become 0, or its brightest). What is replaced is counted in one SceneWarning. Raises
-    InputError where the file cannot be written; an existing file is then as it was.
+    pixels: (H, W, 3) linear. bits: per channel, of FORMATS (default 8 for PNG, 32 for EXR and HDR; 16 in EXR is half). `exposure` and
+    `tonemap` apply to PNG alone. metadata: text entries `wrt:key`.
+
+    EXR keeps NaN and infinite values. In PNG, NaN and -inf are black, +inf is white. HDR has 0 for NaN and negative values, and its
+    largest value for +inf. A SceneWarning counts replaced pixels. Raises InputError if the file cannot be written; an existing file
+    then stays unchanged.
     """
     pixels = np.asarray(pixels, dtype=np.float32)
     if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.size == 0:
@@ -85,23 +87,23 @@ def write_image(path: PathLike, pixels: np.ndarray, *, bits: int | None = None, 
         _write_hdr(path, pixels, metadata or {})
 
 
-def write_codes(path: PathLike, codes: np.ndarray, metadata: Mapping[str, Any] | None = None) -> None:
-    """Write display codes, (H, W, 3) uint8 or uint16, to a PNG file as they are. Raises InputError as write_image."""
+def write_codes(path: PathLike, codes: np.ndarray, metadata: Metadata | None = None) -> None:
+    """Write display codes, (H, W, 3) uint8 or uint16, to a PNG file. Raises InputError as write_image does."""
     write_file.write_bytes(path, encode_png(codes, metadata))
 
 
-def write_exr(path: PathLike, channels: Mapping[str, np.ndarray], metadata: Mapping[str, Any] | None = None) -> None:
+def write_exr(path: PathLike, channels: Mapping[str, np.ndarray], metadata: Metadata | None = None) -> None:
     """Write named channels to one OpenEXR part, ZIP-compressed.
 
-    channels: (H, W) each, all of one size; float16 is stored as half, everything else as float. Integers are exact up
-    to 2^24 (OpenEXR has integer channels, but OpenImageIO's Python binding rounds them where others are float); beyond
-    that a SceneWarning says so. Raises InputError as write_image does.
+    channels: (H, W) each, all of one size; float16 is stored as half, all else as float. Integers are exact up to 2^24; a SceneWarning
+    reports larger ones. (OpenEXR has integer channels, but OpenImageIO's Python binding rounds them beside float channels.)
+    Raises InputError as write_image does.
     """
     oiio = _oiio()
     arrays = list(channels.values())
     height, width = arrays[0].shape
     types = ["half" if array.dtype == np.float16 else "float" for array in arrays]
-    # OpenImageIO takes the types of the channels only where they differ, else that of the whole.
+    # OpenImageIO reads the types of the channels only if they differ, and the type of the whole otherwise.
     spec = oiio.ImageSpec(width, height, len(arrays), types[0])
     spec.channelnames = tuple(channels)
     spec.channelformats = tuple(oiio.TypeDesc(name) for name in types)
@@ -123,19 +125,19 @@ def _oiio() -> Any:
 
 
 def _write_oiio(path: PathLike, spec: Any, pixels: np.ndarray, header: bytes = b"") -> None:
-    """Write (H, W, C) float32; `header` is put in behind the file's first line."""
+    """Write (H, W, C) float32; `header` is inserted behind the first line of the file."""
     oiio = _oiio()
     with replacing(path) as file:
-        # By its descriptor where that has a name: whoever can rename files in the folder could put a link in the file's place.
+        # By descriptor if it has a name: another user of the folder could replace the file by a link.
         name = f"/dev/fd/{file.fileno()}" if os.path.isdir("/dev/fd") else file.name
-        out = oiio.ImageOutput.create(os.path.basename(file.name))  # takes no name of a folder that is no UTF-8
+        out = oiio.ImageOutput.create(os.path.basename(file.name))  # OpenImageIO rejects folders that are not UTF-8
         if out is None:
             raise InputError(f"cannot be written: {oiio.geterror()}", path)
         try:
             good = out.open(name, spec) and out.write_image(pixels)
         finally:
             closed = out.close()
-        # Some failures, such as a full disk, are told in the text only.
+        # Some failures, such as a full disk, appear in the text only.
         error = " ".join(out.geterror().split()).replace(name, os.fspath(path))
         if error or not (good and closed):
             raise InputError(f"cannot be written: {error or 'unknown error'}", path)
@@ -146,7 +148,7 @@ def _write_oiio(path: PathLike, spec: Any, pixels: np.ndarray, header: bytes = b
             file.write(header + rest)
 
 
-def _write_hdr(path: PathLike, pixels: np.ndarray, metadata: Mapping[str, Any]) -> None:
+def _write_hdr(path: PathLike, pixels: np.ndarray, metadata: Metadata) -> None:
     oiio = _oiio()
     _warn_replaced(path, ~(np.isfinite(pixels) & (pixels >= 0.0)), "negative, NaN or infinite, which .hdr cannot hold")
     held = np.clip(np.nan_to_num(pixels, nan=0.0, posinf=1e38, neginf=0.0), 0.0, 1e38)
@@ -156,19 +158,19 @@ def _write_hdr(path: PathLike, pixels: np.ndarray, metadata: Mapping[str, Any]) 
 
 
 def color_channels(layer: str, pixels: np.ndarray, names: str = "RGB") -> dict[str, np.ndarray]:
-    """(H, W, 3) as the EXR channels `layer.R`, `layer.G`, `layer.B` (or other letters); no dot where layer is empty."""
+    """Split (H, W, 3) into the EXR channels `layer.R`, `layer.G`, `layer.B` (or other letters); `R`, `G`, `B` without a layer."""
     return {f"{layer}.{name}" if layer else name: pixels[..., i] for i, name in enumerate(names)}
 
 
 def as_half(path: PathLike, pixels: np.ndarray) -> np.ndarray:
-    """As float16; finite values beyond +-65504 are clipped to it and counted in one SceneWarning that names `path`."""
+    """Convert to float16. Finite values beyond +-65504 are clipped and counted in one SceneWarning that names `path`."""
     beyond = np.isfinite(pixels) & (np.abs(pixels) > HALF_MAX)
     _warn_replaced(path, beyond, f"beyond {HALF_MAX:g}, the largest half, and clipped to it")
     return np.where(beyond, np.copysign(np.float32(HALF_MAX), pixels), pixels).astype(np.float16)
 
 
-def _utf8(value: Any) -> bytes:
-    """As text; lone surrogates (of file names that are no UTF-8) become "?"."""
+def _utf8(value: object) -> bytes:
+    """Encode as UTF-8; lone surrogates (of file names that are not UTF-8) become "?"."""
     return str(value).encode("utf-8", "replace")
 
 
@@ -178,8 +180,8 @@ def _warn_replaced(path: PathLike, where: np.ndarray, what: str) -> None:
         warn(f"{os.fspath(path)}: {count} pixel{'s' * (count != 1)} {what}")
 
 
-def encode_png(codes: np.ndarray, metadata: Mapping[str, Any] | None = None) -> bytes:
-    """A PNG file of (H, W, 3) uint8 or uint16 sRGB codes; metadata as iTXt (UTF-8) entries named `wrt:key`.
+def encode_png(codes: np.ndarray, metadata: Metadata | None = None) -> bytes:
+    """Encode (H, W, 3) uint8 or uint16 sRGB codes as a PNG file, with metadata in iTXt (UTF-8) entries named `wrt:key`.
 
     Source: W3C, Portable Network Graphics Specification (third edition); every row has the filter "up".
     """
@@ -190,7 +192,7 @@ def encode_png(codes: np.ndarray, metadata: Mapping[str, Any] | None = None) -> 
     filtered = np.empty((height, rows.shape[1] + 1), np.uint8)
     filtered[:, 0] = 2
     filtered[0, 1:] = rows[0]
-    filtered[1:, 1:] = rows[1:] - rows[:-1]  # modulo 256, as the filter wants it
+    filtered[1:, 1:] = rows[1:] - rows[:-1]  # modulo 256, as the filter requires
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
@@ -206,10 +208,10 @@ def encode_png(codes: np.ndarray, metadata: Mapping[str, Any] | None = None) -> 
 
 
 def read_image(path: PathLike) -> np.ndarray:
-    """The colours of an image file: (H, W, 3) float32, linear.
+    """Read the colours of an image file: (H, W, 3) float32, linear.
 
-    EXR: R, G, B, or one channel taken three times; HDR as it is; PNG, JPEG and the like decoded from sRGB, 16-bit PNG
-    in full. Alpha is left out, not applied. Raises InputError where the file is missing, truncated, too large, or no picture.
+    EXR needs channels R, G, B, or one grey channel. PNG, JPEG and the like are decoded from sRGB, 16-bit PNG at full precision. Alpha is
+    ignored. Raises InputError for a missing, truncated or too large file, and for one that is no picture.
     """
     suffix = Path(path).suffix.lower()
     if suffix in LINEAR_SUFFIXES:
@@ -219,16 +221,16 @@ def read_image(path: PathLike) -> np.ndarray:
         if suffix not in DISPLAY_SUFFIXES:
             raise InputError(f"not an image format that wrt reads ({', '.join(LINEAR_SUFFIXES + DISPLAY_SUFFIXES)})")
         deep = data[:8] == PNG_MAGIC and data[24:25] == b"\x10"
-        formats = ("TGA",) if suffix == ".tga" else FORMATS_READ  # only where the name says so, since nothing in TGA does
+        formats = ("TGA",) if suffix == ".tga" else FORMATS_READ  # by its name alone, since TGA has no magic number
         codes = decode_png16(data) if deep else decode_rgba8(data, formats)[..., :3]
     levels = np.iinfo(codes.dtype).max
     return decode_srgb(np.arange(levels + 1) / levels).astype(np.float32)[codes]
 
 
 def read_channels(path: PathLike) -> dict[str, np.ndarray]:
-    """Every channel of the first part of an EXR or HDR file by name: (H, W) float32.
+    """Read all channels of the first part of an EXR or HDR file, by name: (H, W) float32.
 
-    Raises InputError where the file is missing, truncated, too large, or no such picture.
+    Raises InputError for a missing, truncated or too large file, and for one that is no such picture.
     """
     with _opened(path) as source:
         spec = source.spec()
@@ -244,7 +246,7 @@ def read_channels(path: PathLike) -> dict[str, np.ndarray]:
 
 @contextlib.contextmanager
 def _opened(path: PathLike) -> Iterator[Any]:
-    """An EXR or HDR file in OpenImageIO. Its first bytes are looked at first: it would try all the formats that it knows."""
+    """Open an EXR or HDR file in OpenImageIO, after a check of its first bytes: OpenImageIO would try every format."""
     try:
         with at(path=path), open_regular(path) as file:
             first = file.read(16)
@@ -256,7 +258,7 @@ def _opened(path: PathLike) -> Iterator[Any]:
     oiio.attribute("try_all_readers", 0)
     try:
         source = oiio.ImageInput.open(os.fspath(path))
-    except TypeError:  # it takes UTF-8 alone
+    except TypeError:  # not UTF-8
         raise InputError("cannot be read: OpenImageIO needs a path in UTF-8", path) from None
     if source is None:
         raise InputError(f"cannot be read as an image: {_reason(oiio.geterror)}", path)
@@ -267,7 +269,7 @@ def _opened(path: PathLike) -> Iterator[Any]:
 
 
 def _reason(geterror: Callable[[], str]) -> str:
-    """What OpenImageIO tells, on one line."""
+    """Return OpenImageIO's message on one line."""
     try:
         return " ".join(geterror().split()) or "unknown error"
     except UnicodeDecodeError:  # it quotes names from the file

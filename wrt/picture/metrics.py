@@ -1,13 +1,9 @@
-"""How far one picture is from another: mean errors, FLIP, and a difference image.
-
-`a` is the picture to judge and `b` the reference; both are (H, W, 3) linear Rec. 709.
-"""
+"""Error of a picture `a` against a reference `b`, (H, W, 3) linear Rec. 709 each: mean errors, FLIP, and a difference image."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -16,26 +12,43 @@ from wrt.core.packages import needed_by
 from wrt.picture.tonemap import encode_srgb, tone_map
 
 RELMSE_EPS = 0.01
-PIXELS_PER_DEGREE = 3840 * math.pi / 180  # FLIP's default: a screen 3840 pixels wide, seen from as far as it is wide
+PIXELS_PER_DEGREE = 3840 * math.pi / 180  # FLIP's default: a screen 3840 pixels wide, at a distance of its width
 HIGHER_IS_BETTER = ("psnr",)
 
 
-def compare(a: np.ndarray, b: np.ndarray, *, exposure: float = 0.0, tonemap: str = "none") -> dict[str, Any]:
-    """The error measures of `a` against the reference `b`, as plain numbers by name.
+def compare(a: np.ndarray, b: np.ndarray, *, exposure: float = 0.0, tonemap: str = "none") -> dict[str, float]:
+    """Compute error measures of a picture against a reference.
 
-    On linear values, over all pixels and channels: mse; relmse, the mean of (a - b)^2 / (b^2 + RELMSE_EPS) (Rousselle,
-    Knaus, Zwicker, "Adaptive Sampling and Reconstruction using Greedy Error Minimization", 2011); max_abs, the largest
-    |a - b|; mean_ratio, mean(a) / mean(b). On what a display shows after `exposure` stops and `tonemap`: psnr in dB
-    between sRGB-encoded values with peak 1 (inf where equal); flip, the mean of `flip_map`.
+    Pixels with a NaN or an infinity in a or b are left out of every mean, and counted.
 
-    A pixel with a NaN or an infinity in a or b is left out of every mean and counted: nonfinite_a, nonfinite_b, and
-    nonfinite_differ, those where a and b are not the same there. All means are NaN where no pixel is left. Raises
-    InputError where the sizes differ.
+    Parameters
+    ----------
+    a, b
+        Picture and reference, (H, W, 3) linear Rec. 709.
+    exposure, tonemap
+        Display settings for psnr and flip: stops, and a name of TONEMAPS.
+
+    Returns
+    -------
+    dict of str to float
+        Of linear values over all pixels and channels: "mse"; "relmse", the mean of (a - b)^2 / (b^2 + 0.01) [1]_; "max_abs";
+        "mean_ratio", mean(a) / mean(b). Of displayed values: "psnr" in dB of sRGB codes with peak 1 (inf if equal); "flip", the mean
+        of `flip_map`. All are NaN if no pixel is finite. Counts: "pixels", "nonfinite_a", "nonfinite_b", and "nonfinite_differ",
+        nonfinite pixels at which a and b differ.
+
+    Raises
+    ------
+    InputError
+        If the sizes differ, or a picture has another shape.
+
+    References
+    ----------
+    .. [1] Rousselle, Knaus, Zwicker, "Adaptive Sampling and Reconstruction using Greedy Error Minimization", 2011.
     """
     a, b = _pair(a, b)
     finite = np.isfinite(a).all(axis=-1) & np.isfinite(b).all(axis=-1)
     equal = ((a == b) | (np.isnan(a) & np.isnan(b))).all(axis=-1)
-    result: dict[str, Any] = {
+    result: dict[str, float] = {
         "pixels": int(finite.size), **{f"nonfinite_{name}": int(np.count_nonzero(~np.isfinite(image).all(axis=-1)))
                                        for name, image in (("a", a), ("b", b))},
         "nonfinite_differ": int(np.count_nonzero(~finite & ~equal))}
@@ -55,31 +68,36 @@ def compare(a: np.ndarray, b: np.ndarray, *, exposure: float = 0.0, tonemap: str
 
 
 def _shown_errors(a: np.ndarray, b: np.ndarray, finite: np.ndarray, exposure: float, tonemap: str) -> tuple[float, float]:
-    """The mean squared error of sRGB-encoded values, and the mean of FLIP, both over finite pixels."""
-    # Pixels that are left out are black in both: FLIP, which filters over neighbours, then sees no difference there.
+    """Return the mean squared error of sRGB codes and the mean of FLIP, both over finite pixels."""
+    # Pixels that are left out are black in both, since FLIP filters over neighbours.
     a, b = (tone_map(np.where(finite[..., None], image, np.float32(0.0)), exposure, tonemap) for image in (a, b))
     flip = float(np.mean(flip_map(a, b)[finite], dtype=np.float64))
     a, b = (encode_srgb(image[finite].astype(np.float64)) for image in (a, b))
     return float(np.mean((a - b) ** 2)), flip
 
 
-def failures(result: Mapping[str, Any], limits: Mapping[str, float | None]) -> list[str]:
-    """One sentence for each limit that the result of `compare` breaks; None is no limit.
+def failures(result: Mapping[str, float], limits: Mapping[str, float | None]) -> list[str]:
+    """Return one sentence for each limit that a result of `compare` violates.
 
-    psnr has a lower limit, every other measure an upper one. Where any limit is set, pixels that are not finite and not
-    the same in both pictures are a failure too, and so is a measure that is NaN.
+    Parameters
+    ----------
+    result
+        As `compare` returns it.
+    limits
+        By name: a lower limit of psnr, upper limits of all others; None is no limit. With any limit, a measure that is NaN and pixels
+        that are not finite and differ are failures too.
     """
     active = {name: limit for name, limit in limits.items() if limit is not None}
-    told = []
+    sentences = []
     for name, limit in active.items():
         value = result[name]
         if name in HIGHER_IS_BETTER and not value >= limit:
-            told.append(f"{name} {value:.6g} is below {limit:g}")
+            sentences.append(f"{name} {value:.6g} is below {limit:g}")
         if name not in HIGHER_IS_BETTER and not value <= limit:
-            told.append(f"{name} {value:.6g} is above {limit:g}")
+            sentences.append(f"{name} {value:.6g} is above {limit:g}")
     if active and result["nonfinite_differ"]:
-        told.append(f"{result['nonfinite_differ']} pixels are NaN or infinite in one picture and differ in the other")
-    return told
+        sentences.append(f"{result['nonfinite_differ']} pixels are NaN or infinite in one picture and differ in the other")
+    return sentences
 
 
 def _ratio(a: float, b: float) -> float:
@@ -103,11 +121,23 @@ def _pair(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def flip_map(a: np.ndarray, b: np.ndarray, pixels_per_degree: float = PIXELS_PER_DEGREE) -> np.ndarray:
-    """LDR-FLIP: the difference seen when `a` and `b` alternate on a screen, (H, W) in [0, 1]; 0 is none.
+    """Compute LDR-FLIP, the difference seen when two pictures alternate on a screen, with OpenImageIO.
 
-    a, b: (H, W, 3) display-linear in [0, 1] (`tone_map`, or a decoded PNG), finite; the order does not matter.
-    pixels_per_degree: of the visual angle. Source: Andersson, Nilsson, Akenine-Moller, Oskarsson, Astrom, Fairchild, "FLIP: A
-    Difference Evaluator for Alternating Images", HPG 2020, as OpenImageIO computes it.
+    Parameters
+    ----------
+    a, b
+        (H, W, 3) display-linear in [0, 1] (`tone_map`, or a decoded PNG), finite, in any order.
+    pixels_per_degree
+        Pixels in one degree of the visual angle.
+
+    Returns
+    -------
+    (H, W) float32
+        0 (no difference) to 1.
+
+    References
+    ----------
+    Andersson, Nilsson, Akenine-Moller, Oskarsson, Astrom, Fairchild, "FLIP: A Difference Evaluator for Alternating Images", HPG 2020.
     """
     with needed_by("FLIP"):
         import OpenImageIO as oiio
@@ -130,11 +160,25 @@ BAR_HEIGHT = 24
 
 
 def difference_image(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Where and which way `a` differs from `b`: (H + 24, W, 3) uint8, with the colour scale below the picture.
+    """Draw the signed difference a - b, with the colour scale below.
 
-    Each pixel shows the linear difference of the channel that differs most: black where equal, to red, yellow and white
-    where a is brighter, to blue, cyan and white where it is darker; green where a and b are not both finite and not the
-    same. White is the 99.9th percentile of |a - b|; larger ones stay white. Raises InputError where the sizes differ.
+    Each pixel shows the linear difference of the channel that differs most. Black is equal; red, yellow and white are increasing if a is
+    brighter; blue, cyan and white if it is darker. Green: a and b differ and are not both finite. White is the 99.9th percentile of
+    |a - b| and more.
+
+    Parameters
+    ----------
+    a, b
+        Picture and reference, (H, W, 3) linear.
+
+    Returns
+    -------
+    (H + 24, W, 3) uint8
+
+    Raises
+    ------
+    InputError
+        If the sizes differ.
     """
     a, b = _pair(a, b)
     with np.errstate(invalid="ignore"):  # inf - inf
@@ -150,7 +194,7 @@ def difference_image(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _heat(share: np.ndarray) -> np.ndarray:
-    """[-1, 1] to (..., 3) uint8; beyond is clipped."""
+    """Return colours, (..., 3) uint8, of shares in [-1, 1]; others are clipped."""
     steps = np.linspace(0.0, 1.0, len(BRIGHTER))
     size = np.clip(np.abs(share), 0.0, 1.0)
     colors = [np.where(share >= 0.0, np.interp(size, steps, BRIGHTER[:, i]), np.interp(size, steps, DARKER[:, i]))
@@ -159,7 +203,7 @@ def _heat(share: np.ndarray) -> np.ndarray:
 
 
 def _bar(width: int, limit: float) -> np.ndarray:
-    """(BAR_HEIGHT, width, 3) uint8: the colours from -limit to limit over a line of numbers, where that has room."""
+    """Return the colour scale from -limit to limit, (BAR_HEIGHT, width, 3) uint8, over its numbers if they fit."""
     with needed_by("a scale"):
         from PIL import Image, ImageDraw
 

@@ -1,4 +1,4 @@
-"""From linear radiance to the codes a display shows: exposure, tone mapping, sRGB encoding.
+"""Exposure, tone mapping and sRGB encoding: linear radiance to display codes.
 
 All colours are linear Rec. 709 until `encode_srgb`. "Display-linear" is the light that the display emits, in [0, 1].
 """
@@ -11,39 +11,39 @@ import numpy as np
 
 from wrt.core.errors import InputError
 
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)  # of linear Rec. 709
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)  # weights of linear Rec. 709
 
-# Brighter than anything a curve tells apart from white, and small enough that its square fits in a float32.
+# White for every curve, and small enough that its square fits in a float32.
 BRIGHTEST = 1e9
 
 
 def encode_srgb(linear: np.ndarray) -> np.ndarray:
-    """The sRGB transfer function, exact and piecewise (IEC 61966-2-1): [0, 1] to [0, 1], any shape, NaN stays NaN."""
+    """Apply the sRGB transfer function (IEC 61966-2-1): [0, 1] to [0, 1], any shape, NaN stays NaN."""
     linear = np.asarray(linear)
     low = linear <= 0.0031308
     return np.where(low, linear * 12.92, 1.055 * np.power(np.where(low, 1.0, linear), 1.0 / 2.4) - 0.055)
 
 
 def decode_srgb(encoded: np.ndarray) -> np.ndarray:
-    """The inverse of `encode_srgb`: [0, 1] to [0, 1], any shape, NaN stays NaN."""
+    """Invert `encode_srgb`: [0, 1] to [0, 1], any shape, NaN stays NaN."""
     encoded = np.asarray(encoded)
     low = encoded <= 0.04045
     return np.where(low, encoded / 12.92, np.power((np.where(low, 1.0, encoded) + 0.055) / 1.055, 2.4))
 
 
 def luminance(linear: np.ndarray) -> np.ndarray:
-    """(..., 3) linear Rec. 709 to (...) relative luminance."""
+    """Return the relative luminance (...) of linear Rec. 709 colours (..., 3)."""
     return linear @ LUMINANCE.astype(linear.dtype)
 
 
-# --- curves: (..., 3) linear, finite and >= 0, to display-linear; `tone_map` clips what leaves [0, 1] -----------------
+# --- curves: (..., 3) linear, finite and >= 0, to display-linear; `tone_map` clips to [0, 1] ---------------------------
 
 
 REINHARD_WHITE = 4.0  # two stops above 1
 
 
 def reinhard(linear: np.ndarray) -> np.ndarray:
-    """Reinhard's extended operator on luminance: L (1 + L / W^2) / (1 + L), where W = 4 is the lowest that shows white.
+    """Apply Reinhard's extended operator to luminance: L (1 + L / W^2) / (1 + L); W = 4 is the lowest luminance that is white.
 
     Chromaticity is kept, so that a channel of a bright saturated colour can still clip.
     Source: Reinhard, Stark, Shirley, Ferwerda, "Photographic Tone Reproduction for Digital Images" (2002), equation 4.
@@ -58,7 +58,7 @@ ACES_OUT = np.array([[1.60475, -0.53108, -0.07367], [-0.10208, 1.10813, -0.00605
 
 
 def aces(linear: np.ndarray) -> np.ndarray:
-    """Stephen Hill's fit of the ACES reference rendering and sRGB output transforms, without extra exposure.
+    """Apply Stephen Hill's fit of the ACES reference rendering and sRGB output transforms, without extra exposure.
 
     Source: S. Hill, ACES.hlsl in "Baking Lab" (M. Pettineo and D. Neubelt, 2016).
     """
@@ -81,16 +81,16 @@ AGX_SLOPE, AGX_TOE_POWER, AGX_SHOULDER_POWER = 2.0, 3.0, 3.25
 
 
 def _agx_half(reach: np.ndarray, x_span: float, y_span: float, power: float) -> np.ndarray:
-    """One half of the sigmoid: from the pivot (0, 0) with the common slope to (x_span, y_span), where it ends."""
+    """Evaluate one half of the sigmoid, from the pivot (0, 0) with slope AGX_SLOPE to its end (x_span, y_span)."""
     scale = (((AGX_SLOPE * x_span / y_span) ** power - 1.0) * (AGX_SLOPE * x_span) ** -power) ** (-1.0 / power)
     term = AGX_SLOPE * reach / scale
     return scale * term / (1.0 + term**power) ** (1.0 / power)
 
 
 def agx_contrast(x: np.ndarray) -> np.ndarray:
-    """AgX's default contrast: [0, 1] (log2 of exposure) to [0, 1] (display code); mid-grey is exactly 0.5.
+    """Apply AgX's default contrast: [0, 1] (log2 of exposure) to [0, 1] (display code); mid-grey is exactly 0.5.
 
-    The sigmoid itself: the polynomials fitted to it stray by up to 0.006 and end beside 0 and 1.
+    This is the sigmoid itself; the polynomials that are often fitted to it are off by up to 0.006 and miss 0 and 1.
     """
     x_pivot, y_pivot = AGX_PIVOT
     toe = y_pivot - _agx_half(np.maximum(x_pivot - x, 0.0), x_pivot, y_pivot, AGX_TOE_POWER)
@@ -99,7 +99,7 @@ def agx_contrast(x: np.ndarray) -> np.ndarray:
 
 
 def agx(linear: np.ndarray) -> np.ndarray:
-    """Troy Sobotka's AgX, base look: inset, log2 between -10 and +6.5 stops, sigmoid, outset, 2.2 power to linear.
+    """Apply Troy Sobotka's AgX, base look: inset, log2 between -10 and +6.5 stops, sigmoid, outset, 2.2 power to linear.
 
     Sources: T. Sobotka, AgX-S2O3 (inset matrix, range, sigmoid), with the slope and powers of the NumPy version in his
     AgX repository; B. Wrensch, "Minimal AgX Implementation" (2023), for undoing the inset after the curve and for the
@@ -113,7 +113,7 @@ def agx(linear: np.ndarray) -> np.ndarray:
 
 
 TONEMAPS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "none": lambda linear: linear,  # what is brighter than 1 is clipped
+    "none": lambda linear: linear,  # clipped at 1
     "reinhard": reinhard,
     "aces": aces,
     "agx": agx,
@@ -121,21 +121,21 @@ TONEMAPS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 
 def tone_map(pixels: np.ndarray, exposure: float = 0.0, tonemap: str = "none") -> np.ndarray:
-    """Linear radiance to display-linear light.
+    """Map linear radiance to display-linear light, (..., 3) float32 in [0, 1].
 
-    pixels: (..., 3) linear; exposure: stops; tonemap: a name in TONEMAPS. Returns (..., 3) float32 in [0, 1]. Negative
-    values, -inf and NaN become black, +inf becomes as bright as the curve gets. Raises InputError on an unknown name.
+    pixels: (..., 3) linear; exposure: stops; tonemap: a name in TONEMAPS. Negative values, -inf and NaN become black, +inf the
+    brightest value of the curve. Raises InputError for an unknown name.
     """
     if tonemap not in TONEMAPS:
         raise InputError(f"tonemap must be one of {', '.join(TONEMAPS)}; got {tonemap!r}")
-    with np.errstate(over="ignore", invalid="ignore"):  # overflow is +inf and inf * 0 is NaN: both are dealt with here
+    with np.errstate(over="ignore", invalid="ignore"):  # overflow gives +inf, inf * 0 gives NaN: both are replaced below
         exposed = np.asarray(pixels, dtype=np.float32) * np.float32(2.0**exposure)
     linear = np.clip(np.nan_to_num(exposed, nan=0.0, posinf=BRIGHTEST, neginf=0.0), 0.0, BRIGHTEST)
     return np.clip(TONEMAPS[tonemap](linear), 0.0, 1.0).astype(np.float32, copy=False)
 
 
 def to_codes(pixels: np.ndarray, exposure: float = 0.0, tonemap: str = "none", bits: int = 8) -> np.ndarray:
-    """`tone_map`, sRGB-encoded and rounded to the nearest code: (..., 3) uint8 or, with bits=16, uint16."""
+    """Return `tone_map`, sRGB-encoded and rounded to the nearest code: (..., 3) uint8, or uint16 for bits=16."""
     scale = 2.0**bits - 1.0
     encoded = encode_srgb(tone_map(pixels, exposure, tonemap).astype(np.float64))
     return np.rint(encoded * scale).astype(np.uint8 if bits == 8 else np.uint16)
