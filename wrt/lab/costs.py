@@ -1,4 +1,4 @@
-"""Count the work of every pixel: the render kernel over a structure that counts, with a log of the rays before it."""
+"""Cost of every pixel: the render kernel over a structure that counts, with a log of the rays in front of it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ COUNTERS = tuple(fields_of(Counts))
 
 
 class LoggedStructure(NamedTuple):
-    """A structure with a log before it. Hashable, as Structure."""
+    """A structure with a log of the rays in front of it; hashable, as Structure."""
 
     inner: Structure
 
@@ -44,7 +44,7 @@ class LoggedStructure(NamedTuple):
 
 
 class CostCounter:
-    """A render that counts. built: the same scene prepared for pictures; the counter shares its structure and its arrays."""
+    """A render that counts. built: the same scene prepared for pictures, whose structure and arrays the counter shares."""
 
     def __init__(self, plan: Plan, device: Any, built: Prepared | None = None) -> None:
         counting = plan.structure._replace(units=plan.structure.units._replace(counters=True))
@@ -57,7 +57,7 @@ class CostCounter:
         return cls(built.plan, built.device, built)
 
     def aim(self, camera: CameraKind, angles_of: tuple[int, int] | None = None, **settings: Any) -> None:
-        """As Prepared.aimed."""
+        """Change camera and settings, as Prepared.aimed."""
         self.prepared = self.prepared.aimed(camera, angles_of, **settings)
 
     def film(self) -> DeviceFilm:
@@ -65,11 +65,11 @@ class CostCounter:
         return DeviceFilm(plan.scene.settings, plan.crop, self.prepared.device, plan.options.seed)
 
     def each(self, work: Callable[[Any], Any], items: Iterable[Any]) -> None:
-        """Call `work` with each of the items, on all threads."""
+        """Call `work` with each item, on all threads."""
         run_all([partial(work, item) for item in items], 1 if self.prepared.device.is_cuda else self.prepared.threads)
 
     def trace(self, rectangle: Rectangle, film: DeviceFilm, recorder: Any, log: Any) -> None:
-        """Take all samples of a tile into the film, the counters into a Recorder, and the rays into a RayLog."""
+        """Trace all samples of a tile into the film; write counters to a Recorder and rays to a RayLog."""
         data = copied(self.prepared.accel.data)  # since every tile has a recorder of its own
         data.recorder = recorder
         accel = self.prepared.plan.structure.struct()
@@ -80,7 +80,7 @@ class CostCounter:
         return wp.zeros(n, dtype=dtype, device=self.prepared.device)
 
     def totals(self, rectangle: Rectangle, film: DeviceFilm) -> tuple[np.ndarray, np.ndarray]:
-        """Of each pixel of a tile, row by row: how many rays it takes, and their counters together."""
+        """Return the number of rays of each pixel of a tile, row by row, and the sums of their counters."""
         n = rectangle[2] * rectangle[3]
         recorder, log = Recorder(), ray_log.RayLog()
         recorder.counts, log.used = self.zeros(n, Counts), self.zeros(n, wp.int32)
@@ -88,11 +88,10 @@ class CostCounter:
         return log.used.numpy(), on_host(recorder.counts)
 
     def costs(self, go_on: Callable[[int], bool] = lambda done: True) -> dict[str, np.ndarray] | None:
-        """COUNTERS, (H, W) int32 each: of each pixel summed over its rays (stack: the deepest).
-
-        go_on: asked after each tile, with the number of pixels that are done, and from several threads; where it says no, the
-        tiles that are left are not traced, and the result is None.
-        """
+        """Return a map of each of COUNTERS, (H, W) int32: sums over a pixel's rays (stack: the largest).
+        After each tile, `go_on` is called with the number of finished pixels, from several threads. After False no more tiles are traced,
+        and
+        the result is None."""
         film = self.film()
         x0, y0, x1, y1 = self.prepared.plan.crop
         out = {name: np.zeros((y1 - y0, x1 - x0), np.int32) for name in COUNTERS}

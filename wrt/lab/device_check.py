@@ -1,4 +1,4 @@
-"""`python -m wrt devices --check`: whether a device answers as the CPU does, to the last bit, and how fast.
+"""`python -m wrt devices --check`: compare a device's answers with the CPU's, bit for bit, and measure its speed.
 
 The CPU's answers are those of the default structure: all structures have the same."""
 
@@ -62,8 +62,7 @@ fast wrt's default structure is."""
 
 @dataclass(frozen=True)
 class Check:
-    """device: its name; scenes: files (none: those that ship with wrt); rays: of each kind, for each mesh; cases: of each hard
-    one, rays. Raises InputError."""
+    """What to check: scenes (files; none: the shipped ones), rays of each kind for each mesh, rays of each hard case (`cases`)."""
 
     device: str
     scenes: Sequence[Path] = ()
@@ -81,7 +80,7 @@ class Check:
 
 
 def built_in() -> Scene:
-    """A picture with most of what needs light and rays of several kinds."""
+    """Return a scene with most kinds of light transport, for packages without scene files."""
     glass, mirror = (Material(kind=kind, albedo=(0.9, 0.9, 0.9), name=kind) for kind in ("glass", "mirror"))
     return Scene(objects=(Object(shapes.quad((-4.0, 0.0, 4.0), (8.0, 0.0, 0.0), (0.0, 0.0, -8.0)), (Material(),)),
                           Object(shapes.teapot(16), (mirror,))),
@@ -95,7 +94,7 @@ def structures() -> list[str]:
 
 
 def rows(plan: Check, tell: Callable[[str], None]) -> Iterator[Row]:
-    """What is compared, each as it is done. tell: what is done next."""
+    """Yield the row of each comparison as it is done; `tell` gets the name of the next one."""
     tell("compiling")
     compile_all(plan)
     yield from function_rows(plan)
@@ -109,7 +108,7 @@ def rows(plan: Check, tell: Callable[[str], None]) -> Iterator[Row]:
 
 
 def compile_all(plan: Check) -> None:
-    """For the device, on all cores."""
+    """Compile all kernels for the device, on all cores."""
     device = start(plan.device)
     jobs: list[Callable[[], Any]] = [partial(compile_queries, name, plan.device) for name in structures()]
     jobs += [partial(load_kernel, kernel, device) for scene in plan.pictures.values()
@@ -118,7 +117,7 @@ def compile_all(plan: Check) -> None:
 
 
 def function_rows(plan: Check) -> Iterator[Row]:
-    """Elementary functions of numbers as shading has them, and of any bits."""
+    """Compare elementary functions on numbers that are usual in shading, and on any bits."""
     rng = np.random.default_rng(0)
     common = rng.normal(0.0, 4.0, size=(2, 50_000)).astype(np.float32)
     x, y = np.concatenate([common, rng.integers(0, 2**32, size=common.shape, dtype=np.uint32).view(np.float32)], axis=1)
@@ -137,7 +136,7 @@ def called(x: np.ndarray, y: np.ndarray, name: str) -> np.ndarray:
 
 
 def hit_rows(plan: Check) -> Iterator[Row]:
-    """A row for each structure."""
+    """Yield a row for each structure."""
     worlds = {name: Geometry.of(make()) for name, make in MESHES.items()}
     on_cpu = {name: build(geometry, device="cpu") for name, geometry in worlds.items()}
     rays = {name: ray_sets(accel, plan.rays) for name, accel in on_cpu.items()}
@@ -154,7 +153,7 @@ def hit_rows(plan: Check) -> Iterator[Row]:
 
 
 def compare(accel: Accelerator, truth: Accelerator, rays: RaySet) -> np.ndarray:
-    """Which rays have another answer."""
+    """Return which rays have another answer."""
     found, expected = (answer(each, rays, None) for each in (accel, truth))
     if not (isinstance(found, Hits) and isinstance(expected, Hits)):
         return different(np.asarray(found), np.asarray(expected))
@@ -162,13 +161,13 @@ def compare(accel: Accelerator, truth: Accelerator, rays: RaySet) -> np.ndarray:
 
 
 def different(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Which rows have other bits."""
+    """Return which rows have other bits."""
     a, b = (np.ascontiguousarray(each).reshape(len(each), -1).view(np.uint8) for each in (a, b))
     return (a != b).any(axis=1)
 
 
 def hard_row(plan: Check) -> Row:
-    """The default structure in all hard cases whose rays the host does not refuse."""
+    """Compare the default structure in all hard cases whose rays the host accepts."""
     differ, count = dict[str, np.ndarray](), 0
     for name in HARD_CASES:
         case = generate(name, plan.cases)
@@ -185,15 +184,14 @@ def picture_row(plan: Check, name: str, scene: Scene) -> Row:
 
 
 def row(part: str, what: str, count: int, differ: dict[str, np.ndarray]) -> Row:
-    """differ: which answers differ, by where; the report has their numbers."""
+    """Count the answers that differ. differ: flags, by place."""
     numbers = {place: int(each.sum()) for place, each in differ.items()}
     return Row(part=part, what=what, count=count, differ=sum(numbers.values()),
                where=[place for place, number in numbers.items() if number and place])
 
 
 def speed_rows(plan: Check) -> tuple[list[Row], str]:
-    """wrt's structures beside Warp's own query with each constructor that the device has (without any there are no rows), and
-    what was skipped and why."""
+    """Measure wrt's structures beside Warp's query with each constructor; return no rows if the device has none, and what was skipped."""
     geometry, device = Geometry.of(terrain(TIMED_CELLS)), start(plan.device)
     everybody: dict[str, Any] = {f"wrt {name}": Own(structure=name, device=plan.device) for name in structures() if name != "brute_force"}
     skipped, warps = [], dict[str, Any]()

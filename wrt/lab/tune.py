@@ -1,4 +1,4 @@
-"""`wrt.tune`: which structure is fastest on a device, and on CUDA in which blocks and with which place for the stack."""
+"""`wrt.tune`: find the fastest structure on a device, and on CUDA its best block size and place for the stack."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ from wrt.lab.bench.timing import alternate, spread
 from wrt.lab.bench.visibility import terrain
 from wrt.lab.hard_cases.contestants import Own
 
-STRUCTURES = ("bvh8", "bvh2", "bvh4", "bvh8c")  # the default first
-CELLS = 320  # a side of the terrain: 204,800 triangles, of which no GPU's first cache holds much
-KINDS = ("primary", "shadow", "diffuse")  # what a picture asks
-FAST, SLOW = 1 << 20, 1 << 15  # rays on CUDA, and on the CPU
+STRUCTURES = ("bvh8", "bvh2", "bvh4", "bvh8c")  # The default first.
+CELLS = 320  # Of a side of the terrain: 204,800 triangles, far more than a GPU's L1 holds.
+KINDS = ("primary", "shadow", "diffuse")  # Of a picture.
+FAST, SLOW = 1 << 20, 1 << 15  # Rays on CUDA, and on the CPU.
 FEWEST, MOST = 3, 100  # runs
-MARGIN = 1.03  # so much faster than the default is what is chosen instead: less may be noise
+MARGIN = 1.03  # times as fast as the default: less may be noise
 COLUMNS: Columns = {"structure": "{accel}", "block": "{block}", "stack": "{stack}", "rays": "{kind}",
                     "Mray/s": lambda row: spread(row.mrays), "times as fast as the default": "{speed:.2f}"}
 LEGEND = """\
-Rays and answers are on the device; median of the runs by turns, the middle half of them in brackets. The last column: the geometric
-mean over the kinds of rays. Block and stack are settings of wrt.core.cuda."""
+Rays and answers are on the device; median of the runs in turn, quartiles in brackets. The last column is the geometric mean over the
+kinds of rays. Block and stack are settings of wrt.core.cuda."""
 
 
 class Choice(NamedTuple):
-    """accel: a name in ACCELERATORS; block_dim, stack: settings of wrt.core.cuda."""
+    """A name in ACCELERATORS, and settings of wrt.core.cuda."""
 
     accel: str = STRUCTURES[0]
     block_dim: int = cuda.BLOCK_DIMS[0]
@@ -50,7 +50,7 @@ DEFAULT = Choice()
 
 @dataclass(frozen=True)
 class Tuning:
-    """best: the fastest choice; speeds: of every choice that was measured, over the default's; rows: the measurements."""
+    """The fastest choice (`best`), the speed of each measured choice over the default's, and the rows of measurements."""
 
     device: str
     best: Choice
@@ -60,7 +60,7 @@ class Tuning:
 
     @property
     def arguments(self) -> dict[str, str]:
-        """What `wrt.build` and `wrt.render` take."""
+        """Arguments for `wrt.build` and `wrt.render`."""
         return {"accel": self.best.accel, "device": self.device}
 
     def text(self) -> str:
@@ -76,19 +76,31 @@ class Tuning:
 
 
 def tune(device: str, seconds: float = 1.0) -> dict[str, str]:
-    """Return the arguments `accel` and `device` of the fastest structure there, for `wrt.build(mesh, **it)` and
-    `wrt.render(scene, **it)`.
+    """Find the fastest structure on a device.
 
-    The structures of STRUCTURES are measured for so many seconds in all, after compiling and building, which take longer. bvh8 is
-    chosen unless another is 3 % faster. Hits and pixels have the same bits whatever is chosen. Raises InputError where there is no
-    such device.
-    """
+    Measures bvh8, bvh2, bvh4 and bvh8c. bvh8 is returned unless another one is 3 % faster. Hits and pixels have the same bits with each.
+
+    Parameters
+    ----------
+    device : str
+        Name of the device: "cpu", "cuda:0" ...
+    seconds : float
+        Time to measure, in all. Compiling and building come before and take longer.
+
+    Returns
+    -------
+    dict
+        Arguments `accel` and `device`, for `wrt.build(mesh, **it)` and `wrt.render(scene, **it)`.
+
+    Raises
+    ------
+    InputError
+        No such device, or seconds not above 0."""
     return measured(device, seconds).arguments
 
 
 def measured(device: str, seconds: float = 1.0, clock: Callable[[], float] = time.perf_counter) -> Tuning:
-    """As `tune`, with all that was measured; on CUDA also the fastest structure in blocks of other sizes and with its stack in
-    either place."""
+    """Tune as `tune` and return all measurements; on CUDA also those of the fastest structure with each block size and stack."""
     there = start(as_one(device, str, "device"))
     if not as_one(seconds, (int, float), "seconds") > 0.0:
         raise InputError(f"seconds must be more than 0, got {seconds}")
@@ -107,7 +119,7 @@ def measured(device: str, seconds: float = 1.0, clock: Callable[[], float] = tim
 
 def measure(choices: list[Choice], geometry: Geometry, rays: Mapping[str, RaySet], device: Any, seconds: float,
             clock: Callable[[], float]) -> tuple[list[Row], dict[Choice, float]]:
-    """The first choice is the default."""
+    """Measure all choices, the default first; return the rows and each choice's speed over the default's."""
     jobs: dict[tuple[Choice, str], Callable[[], None]] = {}
     for accel in dict.fromkeys(choice.accel for choice in choices):
         own = Own(structure=accel, device=device.alias)
@@ -127,7 +139,7 @@ def measure(choices: list[Choice], geometry: Geometry, rays: Mapping[str, RaySet
 
 
 def fastest(speeds: Mapping[Choice, float]) -> Choice:
-    """speeds: over the default's."""
+    """Return the fastest choice, or the default if no other is faster by MARGIN. speeds: over the default's."""
     best = max(speeds, key=lambda choice: speeds[choice])
     return best if speeds[best] >= MARGIN else DEFAULT
 

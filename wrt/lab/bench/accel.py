@@ -1,11 +1,10 @@
-"""`python -m wrt bench accel`: every structure on the same rays. What does it cost to build, to keep and to search?"""
+"""`python -m wrt bench accel`: time to build, memory and time to search of every structure, on the same rays."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from functools import cache, partial
-from typing import Any
 
 import numpy as np
 
@@ -26,7 +25,7 @@ from wrt.lab.plans import Accel as Plan
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 
-YARDSTICK = "bvh2"  # every ray is compared with it, and as many as BRUTE_FORCE_TESTS allow with brute force
+YARDSTICK = "bvh2"  # all rays are compared with it; with brute force, as many as BRUTE_FORCE_TESTS allow
 BRUTE_FORCE_TESTS = 200_000_000
 COUNTED_RAYS = 20_000
 TITLE = "Structures"
@@ -41,16 +40,15 @@ GROWTH: Columns = {
     "structure": "{structure}", "mesh": "{mesh}", "rays": "{kind}", "cost": "{cost}",
     "triangles": lambda row: f"{vars(row)['from']} to {row.to}", "exponent": "{exponent:.3f} ± {error:.3f}", "times": "{times:.2f}"}
 LEGEND = f"""\
-build: median of the builds, all cores. B/triangle: of the whole structure, triangles included; peak B: what the process grew by
-at the first build, a triangle. SAH: expected nodes and triangles of a random line through the root, costing 1 each. refs:
-primitives in all leaves over triangles. nodes, boxes, triangles: fetched and tested, a ray (closest hit). Mray/s: median of the
-alternating runs, the middle half of them in brackets; / first: over that of the first structure of the table, run by run. differ:
-rays with another prim_id or another bit of t than {YARDSTICK}, of all; wrong: the same against brute force, of as many rays as
-2e8 tests allow. Both must be 0."""
+build: median of the builds, all cores. B/triangle: bytes of the whole structure, triangles included; peak B: growth of the process at
+the first build; both a triangle. SAH: expected nodes and triangles of a random line through the root, each of cost 1. refs: primitives
+in all leaves over triangles. nodes, boxes, triangles: fetched and tested, a ray (closest hit). Mray/s: median of the alternating runs,
+quartiles in brackets; / first: ratio to the first structure of the table, run by run. differ: rays with another prim_id or another bit
+of t than {YARDSTICK}; wrong: the same against brute force, for as many rays as 2e8 tests allow. Both must be 0."""
 
 
 def names(plan: Plan) -> list[str]:
-    """Structures in the order of the registry, each once."""
+    """Return the names of the structures, by default in the registry's order without aliases."""
     if plan.structures:
         return list(dict.fromkeys(plan.structures))
     return [name for name, cls in ACCELERATORS.items() if name == cls.name and name != "brute_force"]
@@ -69,7 +67,7 @@ def rows(plan: Plan) -> Iterator[Row]:
 
 
 def mesh_rows(plan: Plan, mesh: Mesh) -> Iterator[Row]:
-    """A row for each kind of ray and each structure, and before them one for each that refuses, with its reason in its words."""
+    """Yield a row for each structure that refuses the mesh, with its reason, and one for each kind of ray and each other structure."""
     yardstick = build(Geometry.of(mesh), YARDSTICK)
     sets = ray_sets(yardstick, plan.rays, plan.seed)
     mesh = in_stadium(mesh) if plan.stadium else mesh
@@ -77,7 +75,7 @@ def mesh_rows(plan: Plan, mesh: Mesh) -> Iterator[Row]:
     yardstick = build(geometry, YARDSTICK) if plan.stadium else yardstick
     n = len(geometry)
     built: dict[str, Accelerator] = {}
-    facts: dict[str, dict[str, Any]] = {}
+    facts: dict[str, dict[str, object]] = {}
     for name in names(plan):
         warm_up(name)
         try:
@@ -107,8 +105,8 @@ def mesh_rows(plan: Plan, mesh: Mesh) -> Iterator[Row]:
                       wrong=differing(answer(accel, few, None), exact))
 
 
-def timing(rays: int, seconds: np.ndarray, first: np.ndarray) -> dict[str, Any]:
-    """Of runs over so many rays: seconds, million rays a second, and how many times as fast as the first, run by run."""
+def timing(rays: int, seconds: np.ndarray, first: np.ndarray) -> dict[str, object]:
+    """Return seconds and million rays a second of each run, and how many times as fast as the first structure, run by run."""
     mrays = rays / seconds / 1e6
     return {"seconds": seconds.tolist(), "mrays": mrays.tolist(), "mrays_median": float(np.median(mrays)),
             "over_first": float(np.median(first / seconds))}
@@ -116,8 +114,8 @@ def timing(rays: int, seconds: np.ndarray, first: np.ndarray) -> dict[str, Any]:
 
 @cache
 def warm_up(structure: str) -> None:
-    """Build it over a small ball, so that the kernels of its builder are compiled before a build is timed."""
-    with suppress(InputError):  # where it refuses, the mesh that is asked about says why
+    """Compile the kernels of a structure's builder before a build is timed, by building over a small ball."""
+    with suppress(InputError):  # a refusal is reported for the measured mesh
         build(Geometry.of(icosphere(3)), structure)
 
 
@@ -128,29 +126,27 @@ def answer(accel: Accelerator, rays: RaySet, threads: int | None) -> Hits | np.n
 
 
 def differing(found: Hits | np.ndarray, truth: Hits | np.ndarray) -> int:
-    """Rays with another answer: prim_id or a bit of t, or where any hit was asked another yes or no."""
+    """Count the rays with another prim_id or another bit of t, or another answer to an any-hit query."""
     if isinstance(found, Hits) and isinstance(truth, Hits):
         return int(((found.prim_id != truth.prim_id) | (found.t.view(np.int32) != truth.t.view(np.int32))).sum())
     return int((np.asarray(found) != np.asarray(truth)).sum())
 
 
 def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
-    """A table for each mesh, what was refused, and how costs grow."""
+    """Return a table for each mesh, the refused structures, and the growth of costs."""
     out = [tabled(COLUMNS, group, f"{mesh}, {triangles} triangles")
            for (mesh, triangles), group in grouped(measured(rows), "mesh", "triangles").items()]
     refused, grown = [row for row in rows if "reason" in vars(row)], [Row(**each) for each in growth(rows)]
-    told = "seconds ~ n^exponent (± one standard deviation); times: last over first."
-    return [*out, *([tabled(REFUSED, refused, "Not built")] if refused else []),
-            *([tabled(GROWTH, grown, "As triangles grow", told)] if grown else [])]
+    return [*out, *([tabled(REFUSED, refused, "Not built")] if refused else []), *([tabled(
+        GROWTH, grown, "As triangles grow", "seconds ~ n^exponent (± one standard deviation); times: last over first.")] if grown else [])]
 
 
 def measured(rows: Sequence[Row]) -> list[Row]:
     return [row for row in rows if "reason" not in vars(row)]
 
 
-def growth(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """How seconds a ray and seconds of the build grow with the triangles: exponents over meshes of one name, where there are three
-    sizes or more."""
+def growth(rows: Sequence[Row]) -> list[dict[str, object]]:
+    """Return the exponents of seconds a ray and seconds of a build over the triangles of meshes of one name, from three sizes on."""
     out = []
     for (mesh, structure, kind), group in grouped(measured(rows), "mesh", "structure", "kind").items():
         sizes = [row.triangles for row in group]
@@ -173,6 +169,6 @@ def line(row: Row) -> str:
     return f"{row.mesh}: {row.structure}, {row.kind} rays: {row.mrays_median:.3g} Mray/s, {row.differ} differ"
 
 
-def facts(rows: Sequence[Row], plan: Plan) -> dict[str, Any]:
+def facts(rows: Sequence[Row], plan: Plan) -> dict[str, object]:
     return {"rows": [row.as_dict() for row in measured(rows)],
             "refused": [row.as_dict() for row in rows if "reason" in vars(row)], "growth": growth(rows)}

@@ -1,11 +1,10 @@
-"""`python -m wrt bench bvh`: builders of binary BVHs against each other, and bounding volumes around one and the same tree."""
+"""`python -m wrt bench bvh`: builders of binary BVHs, and boxes, spheres and 14-DOPs around the same tree."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from time import perf_counter, process_time
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -44,14 +43,13 @@ VOLUME: Columns = {
     "ns/test": lambda row: spread(row.test_seconds, 1e9), "/ box": lambda row: spread(row.ratios),
     "Mray/s": lambda row: spread(row.rays / np.array(row.seconds) / 1e6), "differ": "{differ}"}
 LEGEND = """\
-Rays: they start on the sphere around the root's box, inwards with a cosine distribution; those that pass by the box are left out.
-SAH: expected nodes and triangles of a random line through the root's box, costing 1 each. cost: nodes and leaves popped and
-triangles tested, a ray, where nothing that was pushed is dropped (as tinybvh counts); nodes, leaves, triangles: what wrt's own
-traversal fetches. refs: primitives in all leaves over triangles. build s: the tree alone, middle of the builds with the
-quartiles. CPU s: of all threads together, which tells less of what else the machine does. peak B: what the process grew by at the
-first build, a triangle. inner area, leaf area: surfaces of all children that are nodes or leaves, over those of the boxes.
-ns/test: of one volume, tested on one thread with nothing around it; / box: over the box's, run by run. Mray/s: one thread.
-differ: rays with another prim_id or another bit of t than bvh2."""
+Rays start on the sphere around the root's box, inwards with a cosine distribution, and meet the box. SAH: expected nodes and triangles
+of a random line through the root's box, each of cost 1. cost: nodes and leaves popped and triangles tested, a ray, if nothing that was
+pushed is dropped (as tinybvh counts); nodes, leaves, triangles: fetches of wrt's own traversal. refs: primitives in all leaves over
+triangles. build s: of the tree alone, median with quartiles. CPU s: of all threads, less sensitive to other load. peak B: growth of the
+process at the first build, a triangle. inner area, leaf area: surfaces of all children that are nodes, or leaves, over those of their
+boxes. ns/test: of one volume on one thread, with nothing around it; / box: ratio to the box, run by run. Mray/s: one thread. differ:
+rays with another prim_id or another bit of t than bvh2."""
 
 
 def rows(plan: Plan) -> Iterator[Row]:
@@ -63,7 +61,7 @@ def rows(plan: Plan) -> Iterator[Row]:
 
 
 def inward(geometry: Geometry, n: int, seed: int = 0) -> RaySet:
-    """n rays from the sphere around the geometry's box, inwards with a cosine distribution, that meet the box: uniform lines."""
+    """Return n rays that meet the geometry's box, uniform over lines: from the sphere around it, inwards with a cosine distribution."""
     lo, hi, center, radius = ball_around(geometry)
     rng = np.random.default_rng(seed)
     origins, directions = np.empty((0, 3), np.float32), np.empty((0, 3), np.float32)
@@ -77,10 +75,10 @@ def inward(geometry: Geometry, n: int, seed: int = 0) -> RaySet:
     return RaySet("inward", origins[:n], directions[:n], endless(n))
 
 
-def builder_rows(plan: Plan, geometry: Geometry, rays: RaySet) -> Iterator[dict[str, Any]]:
+def builder_rows(plan: Plan, geometry: Geometry, rays: RaySet) -> Iterator[dict[str, object]]:
     small = Geometry(geometry.vertices, geometry.faces[:64], geometry.spheres)
     for name in plan.builders or BVH_BUILDERS:
-        build_binary(small, BvhOptions(name), 1)  # the kernels are compiled
+        build_binary(small, BvhOptions(name), 1)  # compiles the kernels
         grow = partial(build_binary, geometry, BvhOptions(name), thread_count(plan.threads))
         _, peak = peak_bytes(grow)
         seconds, cpu_begin = [], process_time()
@@ -99,7 +97,7 @@ def builder_rows(plan: Plan, geometry: Geometry, rays: RaySet) -> Iterator[dict[
 
 
 def published_cost(accel: OneMesh, rays: RaySet) -> float:
-    """Nodes and leaves popped and triangles tested, a ray, as tinybvh counts."""
+    """Return the nodes and leaves popped and triangles tested, a ray, as tinybvh counts."""
     hits = accel.closest_hit(rays.origins, rays.directions)
     counts = [wp.zeros(len(rays), dtype=wp.int32, device=accel.device) for _ in range(2)]
     device_rays = rays_on(accel.device, rays_of(rays.origins, rays.directions, 0.0, rays.t_max))
@@ -109,7 +107,7 @@ def published_cost(accel: OneMesh, rays: RaySet) -> float:
 
 
 def surfaces(accel: OneMesh) -> np.ndarray:
-    """Of both children of every node, (2, N)."""
+    """Return the surfaces of both children of every node, (2, N)."""
     nodes = accel.built.arrays["nodes"]
     if accel.name == "bvh2_sphere":
         radius = np.stack([nodes["sphere_0"][:, 3], nodes["sphere_1"][:, 3]]).astype(np.float64)
@@ -119,7 +117,7 @@ def surfaces(accel: OneMesh) -> np.ndarray:
     return np.stack([2.0 * half_areas(nodes[f"lo_{side}"], nodes[f"hi_{side}"]) for side in "01"])
 
 
-def volume_rows(plan: Plan, geometry: Geometry, rays: RaySet) -> Iterator[dict[str, Any]]:
+def volume_rows(plan: Plan, geometry: Geometry, rays: RaySet) -> Iterator[dict[str, object]]:
     accels = {name: build(geometry, name) for name in VOLUMES}
     boxes, truth = surfaces(accels["bvh2"]), accels["bvh2"].closest_hit(rays.origins, rays.directions)
     nodes = accels["bvh2"].built.arrays["nodes"]
@@ -143,7 +141,7 @@ def volume_rows(plan: Plan, geometry: Geometry, rays: RaySet) -> Iterator[dict[s
 
 
 def tester_of(accel: OneMesh, rays: RaySet) -> Callable[[], int]:
-    """Tests every one of some rays against some nodes, evenly from the whole tree; gives how many tests that were."""
+    """Return a function that tests all rays against nodes from the whole tree, and returns the number of tests."""
     units = accel.structure.units
     record = units.triangle_test.record
     volumes = {"bvh2": lambda: box_volumes(record, units.box_test), "bvh2_sphere": lambda: sphere_volumes(record),
@@ -179,5 +177,5 @@ def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
             for (mesh, n), group in grouped(rows, "mesh", "n_triangles").items() for kind in (BUILDERS, VOLUME)]
 
 
-def facts(rows: Sequence[Row], plan: Plan) -> dict[str, Any]:
+def facts(rows: Sequence[Row], plan: Plan) -> dict[str, object]:
     return {name: [row.as_dict() for row in rows if columns(row) is kind] for name, kind in (("builders", BUILDERS), ("volumes", VOLUME))}

@@ -1,4 +1,4 @@
-"""`python -m wrt bench closed`: what is inside of closed meshes, and rays through their corners and edges; others beside it."""
+"""`python -m wrt bench closed`: points inside closed meshes, and rays through corners and edges, by wrt and other libraries."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import importlib.util
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 
@@ -25,18 +24,19 @@ from wrt.lab.plans import Closed as Plan
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import box, icosphere, lathe, merged, teapot, torus, tube
 
+Answer = Callable[..., np.ndarray]  # of points: which are inside; of origins and directions: numbers of hits
 CHUNK = 1 << 18
-AT_EDGE = 2.0**-23  # by which float32 may have a weight beside 0
-# Along which points are aimed at corners: the first direction of wrt.contains, trimesh's and Open3D's only one, and an axis.
-AIMS = np.array([np.random.default_rng(0).normal(size=3), [0.4395064455, 0.617598629942, 0.652231566745], [1.0, 1.0, 1.0], [0.0, 0.0, 1.0]])
+AT_EDGE = 2.0**-23  # error of a weight in float32
+AIMS = np.array([np.random.default_rng(0).normal(size=3), [0.4395064455, 0.617598629942, 0.652231566745], [1.0, 1.0, 1.0],
+                 [0.0, 0.0, 1.0]])  # the first direction of wrt.contains, the only ones of trimesh and of Open3D, and an axis
 TITLE = "Closed meshes: points inside, and crossings"
 COLUMNS: Columns = {"what": "{what}", "mesh": "{mesh}", "triangles": "{triangles}", "who": "{who}", "asked": "{asked}",
                     "wrong": "{wrong}", "touching": "{touching}", "us each": "{microseconds:.2f}"}
 LEGEND = """\
-inside: points in the mesh's box, a third of them beside a corner by one of the directions in which wrt, trimesh and Open3D ask;
-wrong: otherwise than exact arithmetic on rays that meet no edge; touching: of those, points within 1e-6 of the mesh's size of it.
-crossings: rays from outside at corners and at edges, through the mesh; wrong: an odd number. wrt: count_hits with crossings. Rays
-that touch an outline (touching) are not held against the others, who may see it once. us each: microseconds a point, or a crossing.
+inside: points in the mesh's box; from a third of them, a corner lies in a direction that wrt, trimesh or Open3D send rays in. wrong:
+another answer than exact arithmetic on rays that meet no edge; touching: wrong points within 1e-6 of the mesh's size of the surface.
+crossings: rays from outside at corners and edges, through the mesh; wrong: an odd number. wrt: count_hits with crossings. Rays that touch
+an outline (touching) do not count as wrong for other libraries, which may see one hit there. us each: microseconds a point or a crossing.
 """
 
 
@@ -52,13 +52,13 @@ def rows(plan: Plan) -> Iterator[Row]:
             answer(np.zeros((2, 3), np.float32))
             yield Row(what="inside", who=who, **known, **points_wrong(geometry, reference, answer, n, plan.seed))
         for who, n in asked(plan, plan.rays):
-            count = None if who == "wrt" else OTHERS[who][1](geometry)[1]
-            (count or own_crossings(accel))(np.full((2, 3), 9.0, np.float32), np.ones((2, 3), np.float32))
-            yield Row(what="crossings", who=who, **known, **crossed(geometry, accel, count, n, plan.seed))
+            count = partial(count_hits, accel, crossings=True) if who == "wrt" else OTHERS[who][1](geometry)[1]
+            count(np.full((2, 3), 9.0, np.float32), np.ones((2, 3), np.float32))
+            yield Row(what="crossings", who=who, **known, **crossed(geometry, accel, count, who == "wrt", n, plan.seed))
 
 
 def made() -> list[Mesh]:
-    """A box, a ball, a torus, a knot, a solid of revolution, a teapot, a ball with a hollow in it."""
+    """Return a box, a ball, a torus, a knot, a solid of revolution, a teapot, and a ball with a hollow."""
     a = np.linspace(0.0, 2.0 * np.pi, 120)
     knot = np.stack([np.sin(a) + 2.0 * np.sin(2.0 * a), np.cos(a) - 2.0 * np.cos(2.0 * a), -np.sin(3.0 * a)], axis=1)
     parts = {"box": box(), "ball": icosphere(5), "torus": torus(), "knot": tube(knot, 0.3, 16),
@@ -68,7 +68,7 @@ def made() -> list[Mesh]:
 
 
 def asked(plan: Plan, n: int) -> Iterator[tuple[str, int]]:
-    """Who, and how many: the others fewer."""
+    """Yield the name of each library and its number of queries: other libraries get fewer."""
     yield "wrt", n
     for name, (package, _) in OTHERS.items():
         most = plan.others // (100 if name == "trimesh" else 1)
@@ -76,7 +76,7 @@ def asked(plan: Plan, n: int) -> Iterator[tuple[str, int]]:
             yield name, min(n, most)
 
 
-def points_wrong(geometry: Geometry, reference: Reference, answer: Callable[[np.ndarray], np.ndarray], n: int, seed: int) -> dict[str, Any]:
+def points_wrong(geometry: Geometry, reference: Reference, answer: Answer, n: int, seed: int) -> dict[str, object]:
     rng, wrong, touching, seconds = np.random.default_rng(seed), 0, 0, 0.0
     for first in range(0, n, CHUNK):
         points = points_in(geometry, rng, min(CHUNK, n - first))
@@ -91,7 +91,7 @@ def points_wrong(geometry: Geometry, reference: Reference, answer: Callable[[np.
 
 
 def points_in(geometry: Geometry, rng: np.random.Generator, n: int) -> np.ndarray:
-    """(n, 3) float32 in the mesh's box; of every third, a ray along one of AIMS meets a corner."""
+    """Return (n, 3) float32 points in the mesh's box; from every third, a ray along one of AIMS meets a corner."""
     low, high = geometry.vertices.min(axis=0).astype(np.float64), geometry.vertices.max(axis=0)
     points = rng.uniform(low, high, (n, 3))
     aimed = np.arange(0, n, 3)
@@ -102,8 +102,8 @@ def points_in(geometry: Geometry, rng: np.random.Generator, n: int) -> np.ndarra
 
 
 def exactly_inside(reference: Reference, points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) bool: whether a ray crosses an odd number of triangles by exact arithmetic; those that meet an edge are sent again
-    elsewhere. And (N,) bool: whether the point is exactly on the surface, where either is right."""
+    """Return which points are inside, and which exactly on the surface (either answer is right there), (N,) bool each.
+    Count the crossings of a random ray by exact arithmetic; try another ray where it meets an edge."""
     inside, on_surface = np.zeros((2, len(points)), bool)
     left = np.arange(len(points))
     while len(left):
@@ -118,7 +118,7 @@ def exactly_inside(reference: Reference, points: np.ndarray, rng: np.random.Gene
 
 
 def distances(geometry: Geometry, points: np.ndarray) -> np.ndarray:
-    """(N,) to the nearest triangle, one point after another."""
+    """Return the distance from each point to the nearest triangle, (N,)."""
     from trimesh.triangles import closest_point
 
     corners = geometry.vertices[geometry.faces].astype(np.float64)
@@ -126,9 +126,9 @@ def distances(geometry: Geometry, points: np.ndarray) -> np.ndarray:
                      for point in points.astype(np.float64)])
 
 
-def crossed(geometry: Geometry, accel: Accelerator, count: Callable[..., Any] | None, n: int, seed: int) -> dict[str, Any]:
-    """All rays begin and end outside. count: how many hits another library has for each; None: wrt's crossings. Rays that touch an
-    outline are counted, and not held against others, who may see it once."""
+def crossed(geometry: Geometry, accel: Accelerator, count: Answer, own: bool, n: int, seed: int) -> dict[str, object]:
+    """Count odd numbers of crossings of rays that begin and end outside. count: hits by another library; None: wrt's crossings.
+    A ray that touches an outline is not held against the other library, which may see one hit there."""
     rng, wrong, touching, hits, seconds = np.random.default_rng(seed), 0, 0, 0, 0.0
     low, high = (bound.astype(np.float64) for bound in (geometry.vertices.min(axis=0), geometry.vertices.max(axis=0)))
     for first in range(0, n, CHUNK):
@@ -137,22 +137,18 @@ def crossed(geometry: Geometry, accel: Accelerator, count: Callable[..., Any] | 
         at = np.where(np.arange(size)[:, None] % 2 == 0, *(targets(geometry, rng, size, aim) for aim in ("vertices", "edges")))
         directions = (at - origins).astype(np.float32)
         begin = perf_counter()
-        crossings = np.asarray((count or own_crossings(accel))(origins, directions))
+        crossings = np.asarray(count(origins, directions))
         seconds, hits = seconds + perf_counter() - begin, hits + int(crossings.sum())
         touches = crossings_of(geometry, all_hits(accel, origins, directions), directions)[1] > 0
         touching += int(touches.sum())
-        wrong += int((crossings % 2 == 1)[~touches | (count is None)].sum())
+        wrong += int((crossings % 2 == 1)[~touches | own].sum())
     return {"asked": n, "wrong": wrong, "touching": touching, "hits": hits, "microseconds": 1e6 * seconds / max(hits, 1)}
 
 
-def own_crossings(accel: Accelerator) -> Callable[..., Any]:
-    return partial(count_hits, accel, crossings=True)
-
-
 def crossings_of(geometry: Geometry, found: AllHits, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) how often each ray crosses the surface, and how often it touches it. Faces that it meets at the same edge or corner are
-    a crossing where their signed angles around it make a whole turn. It meets an edge where two of its faces have it there: of one
-    weight, 1 - u - v, rounding hides whether it is 0."""
+    """Return how often each ray crosses the surface, and how often it touches it, (N,) each.
+    Faces that a ray meets at the same edge or corner are one crossing if their signed angles around it add up to a whole turn. A ray meets
+    an edge where two faces say so: rounding hides whether one weight, 1 - u - v, is 0."""
     corners = geometry.vertices[geometry.faces[found.prim_id]].astype(np.float64)
     d, ray = directions[found.ray_id].astype(np.float64), found.ray_id
     side = np.sign((np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) * d).sum(axis=1))
@@ -179,7 +175,7 @@ def crossings_of(geometry: Geometry, found: AllHits, directions: np.ndarray) -> 
 
 
 def _angles(corners: np.ndarray, d: np.ndarray, k: np.ndarray) -> np.ndarray:
-    """(M,) angle at corner k of each triangle, as the ray sees it."""
+    """Return the angle at corner k of each triangle, as seen along the ray, (M,)."""
     row = np.arange(len(k))
     d = d / np.linalg.norm(d, axis=1, keepdims=True)
     sides = [corners[row, (k + i) % 3] - corners[row, k] for i in (1, 2)]
@@ -187,8 +183,8 @@ def _angles(corners: np.ndarray, d: np.ndarray, k: np.ndarray) -> np.ndarray:
     return np.arctan2(np.linalg.norm(np.cross(e, f), axis=1), (e * f).sum(axis=1))
 
 
-def open3d_answers(geometry: Geometry) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Which points are inside, and how many hits rays have; as trimesh_answers."""
+def open3d_answers(geometry: Geometry) -> tuple[Answer, Answer]:
+    """Return Open3D's functions that decide which points are inside, and that count the hits of rays."""
     import open3d
 
     tensor = open3d.core.Tensor.from_numpy
@@ -198,7 +194,8 @@ def open3d_answers(geometry: Geometry) -> tuple[Callable[..., Any], Callable[...
             lambda origins, directions: scene.count_intersections(tensor(np.concatenate([origins, directions], axis=1))).numpy())
 
 
-def trimesh_answers(module: str, geometry: Geometry) -> tuple[Callable[..., Any], Callable[..., Any]]:
+def trimesh_answers(module: str, geometry: Geometry) -> tuple[Answer, Answer]:
+    """Return the same two functions of trimesh."""
     import trimesh
 
     mesh = trimesh.Trimesh(geometry.vertices, geometry.faces, process=False)
@@ -206,8 +203,8 @@ def trimesh_answers(module: str, geometry: Geometry) -> tuple[Callable[..., Any]
     return rays.contains_points, lambda origins, directions: np.bincount(rays.intersects_id(origins, directions)[1], minlength=len(origins))
 
 
-# By name: the package that it needs, and its answers for a geometry.
-OTHERS: dict[str, tuple[str, Callable[[Geometry], tuple[Callable[..., Any], Callable[..., Any]]]]] = {
+# By name: the package that a library needs, and its two functions for a geometry.
+OTHERS: dict[str, tuple[str, Callable[[Geometry], tuple[Answer, Answer]]]] = {
     "Open3D": ("open3d", open3d_answers), "trimesh, Embree": ("embreex", partial(trimesh_answers, "ray_pyembree")),
     "trimesh": ("rtree", partial(trimesh_answers, "ray_triangle"))}
 
@@ -217,7 +214,7 @@ def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
     for what, who in dict.fromkeys((row.what, row.who) for row in rows):
         mine = [row for row in rows if (row.what, row.who) == (what, who)]
         counts = {name: sum(getattr(row, name) for row in mine) for name in ("asked", "wrong", "touching")}
-        found = [row.hits if what == "crossings" else row.asked for row in mine]  # what the seconds are divided by
+        found = [row.hits if what == "crossings" else row.asked for row in mine]  # the seconds are divided by them
         each = sum(row.microseconds * n for row, n in zip(mine, found, strict=True)) / max(sum(found), 1)
         total.append(Row(what=what, mesh="all", triangles="", who=who, **counts, microseconds=each))
     return [tabled(COLUMNS, total, "All meshes"), tabled(COLUMNS, rows, "By mesh")]

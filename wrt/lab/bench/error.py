@@ -1,8 +1,7 @@
-"""`python -m wrt bench error`: a scene over the knobs that a user has, speed beside error.
+"""`python -m wrt bench error`: speed beside error, over the knobs of a render.
 
-Every picture is held against one reference of the same scene. A knob is turned alone, the others stay as the scene and the
-defaults have them; each setting is rendered with 1, 2, 4 ... samples a pixel and several seeds.
-"""
+Each picture is compared with one reference of the same scene. One knob at a time is turned; each value is rendered with 1, 2, 4 ...
+samples a pixel and several seeds."""
 
 from __future__ import annotations
 
@@ -38,15 +37,12 @@ from wrt.scene.settings import SAMPLERS
 
 REFERENCE_SEEDS = 8
 REFERENCE_DEPTH, REFERENCE_THROUGHPUT = 32, 1e-5
-BRUTE_FORCE_LIMIT = 5000  # primitives that it is still put to
+BRUTE_FORCE_LIMIT = 5000  # primitives
 
 
 @dataclass(frozen=True)
 class Knob:
-    """What a user can turn: a field of wrt.scene.settings.Settings or of wrt.renderer.options.Options, and the values to try.
-
-    matters: whether it changes anything in this scene.
-    """
+    """A field of Settings or Options that the study turns, the values to try, and whether it changes anything in a scene (`matters`)."""
 
     name: str
     kind: Literal["settings", "options"]
@@ -58,30 +54,23 @@ def branches(scene: Scene, features: Features) -> bool:
     return features.reflection or features.refraction or features.blend
 
 
-def has_dielectric(scene: Scene, features: Features) -> bool:
-    return any(material.uses("ior") for material in scene.materials)
-
-
-def primitives(scene: Scene) -> int:
-    return sum(len(thing.mesh.faces) for thing in scene.objects) + len(scene.spheres)
-
-
-def has_triangles(scene: Scene, features: Features) -> bool:
-    return primitives(scene) > len(scene.spheres)
+def triangles(scene: Scene) -> int:
+    return sum(len(thing.mesh.faces) for thing in scene.objects)
 
 
 def structures(scene: Scene) -> list[str]:
-    """One name a structure; brute force where it ends in a lifetime."""
+    """Return each structure's first name; brute force only for few primitives."""
     first = {cls: name for name, cls in reversed(list(ACCELERATORS.items()))}.values()
-    return [name for name in ACCELERATORS if name in first and (name != "brute_force" or primitives(scene) <= BRUTE_FORCE_LIMIT)]
+    small = triangles(scene) + len(scene.spheres) <= BRUTE_FORCE_LIMIT
+    return [name for name in ACCELERATORS if name in first and (name != "brute_force" or small)]
 
 
 KNOBS = {knob.name: knob for knob in (
     Knob("sampler", "settings", lambda scene: SAMPLERS),
     Knob("max_depth", "settings", lambda scene: (0, 1, 2, 4, 8, 16), branches),
     Knob("min_throughput", "settings", lambda scene: (0.1, 0.01, 0.001, 0.0001), branches),
-    Knob("fresnel", "settings", lambda scene: ("exact", "schlick"), has_dielectric),
-    Knob("triangle", "options", lambda scene: RAY_TRIANGLE, has_triangles),
+    Knob("fresnel", "settings", lambda scene: ("exact", "schlick"), lambda scene, _: any(m.uses("ior") for m in scene.materials)),
+    Knob("triangle", "options", lambda scene: RAY_TRIANGLE, lambda scene, _: triangles(scene) > 0),
     Knob("box", "options", lambda scene: RAY_AABB),
     Knob("accel", "options", structures),
 )}
@@ -89,7 +78,7 @@ KNOBS = {knob.name: knob for knob in (
 
 @dataclass(frozen=True)
 class Variant:
-    """One knob at one value (knob "" and value None: none is turned), ready to be rendered with."""
+    """One knob at one value (knob "", value None: nothing is turned), ready to be rendered."""
 
     knob: str
     value: Any
@@ -102,7 +91,7 @@ class Variant:
 
 
 def variants(scene: Scene, options: Options, features: Features, knobs: Sequence[str]) -> tuple[list[Variant], list[str]]:
-    """The scene as it is, then every value of every knob; and a sentence for each knob that changes nothing."""
+    """Return the scene as it is and every value of every knob, and a sentence for each knob that changes nothing."""
     found, left_out = [Variant("", None, scene, options)], []
     for name in knobs:
         knob = KNOBS[name]
@@ -117,11 +106,9 @@ def variants(scene: Scene, options: Options, features: Features, knobs: Sequence
 
 
 def make_reference(scene: Scene, options: Options, spp: int, seeds: Sequence[int], depth: int | None = None) -> Row:
-    """What counts as the truth. pixels: (H, W, 3) float64, the mean over the seeds; variance: of that mean, averaged over pixels
-    and channels; lost_throughput_per_sample: the share of light that was not followed (a bound on what its own cuts may hide).
-
-    Exact Fresnel, the even sampler, the default tests and structure, deep (REFERENCE_DEPTH at least, or just `depth`) and
-    with a low cut-off; float64 over the seeds."""
+    """Render the reference: exact Fresnel, Sobol samples, default tests, deep paths, a low cut-off; float64 mean over the seeds.
+    - pixels: (H, W, 3) float64; variance: of the mean, averaged over pixels and channels.
+    - lost_throughput_per_sample: the share of light that was not followed, a bound on what the reference's own cuts hide."""
     settings = scene.settings
     depth = max(settings.max_depth, REFERENCE_DEPTH) if depth is None else depth
     throughput = min(settings.min_throughput, REFERENCE_THROUGHPUT)
@@ -137,14 +124,14 @@ def make_reference(scene: Scene, options: Options, spp: int, seeds: Sequence[int
 
 
 def finished(film: Film) -> Film:
-    """The film, or KeyboardInterrupt where Ctrl-C ended it early."""
+    """Return the film; raise Interrupted if Ctrl-C ended it early."""
     if film.stats["interrupted"]:
         raise Interrupted(film.stats["signal"] or signal.SIGINT)
     return film
 
 
 def measure(variant: Variant, renderer: Renderer, spp: int, seeds: Sequence[int], truth: Row) -> Row:
-    """Render with every seed and compare."""
+    """Render with every seed and compare with the reference."""
     films = [finished(renderer.run(seed=seed, spp=spp)) for seed in seeds]
     n, settings = len(films), variant.scene.settings
     seconds = np.array([film.stats["seconds"]["trace"] for film in films])
@@ -173,7 +160,7 @@ def measure(variant: Variant, renderer: Renderer, spp: int, seeds: Sequence[int]
 
 
 def slope_of(rows: Sequence[Row], known: float, sampler: str) -> Row:
-    """Over the rows of one variant; known: the reference's variance."""
+    """Fit slopes over the rows of one variant. known: the reference's variance."""
 
     def fit(of: Callable[[np.ndarray], float]) -> statistics.Estimate:
         return statistics.slope([row.spp for row in rows], lambda some: [of(row.products[np.ix_(some, some)]) for row in rows],
@@ -184,17 +171,15 @@ def slope_of(rows: Sequence[Row], known: float, sampler: str) -> Row:
 
 
 def same_pixels(rows: Sequence[Row]) -> list[str]:
-    """The variants whose pictures are, bit for bit, those of the scene as it is."""
+    """Return the variants whose pictures equal those of the unchanged scene, bit for bit."""
     base = {row.spp: row._digest for row in rows if row.knob is None}
     return [variant for (variant, knob), group in grouped(rows, "variant", "knob").items()
             if knob is not None and all(row._digest == base.get(row.spp) for row in group)]
 
 
 def sweep(scene: Scene, plan: Plan, options: Options, report: Callable[[str], None] = lambda text: None) -> Sweep:
-    """Measure; `report` is told before each step. options.seed decides on all seeds.
-
-    Interrupted by Ctrl-C, it returns the rows that are done; before the first one, KeyboardInterrupt is raised.
-    """
+    """Measure all variants. `report` gets a line before each step; options.seed decides on all seeds.
+    Interrupted by Ctrl-C, return the finished rows; raise KeyboardInterrupt if there are none."""
     words = [int(word) for word in np.random.SeedSequence(options.seed).generate_state(REFERENCE_SEEDS + plan.repeats)]
     base = Renderer(scene, options)
     found, left_out = variants(scene, options, base.prepared.plan.features, plan.knobs or tuple(KNOBS))
@@ -212,7 +197,7 @@ def sweep(scene: Scene, plan: Plan, options: Options, report: Callable[[str], No
         for number, variant in enumerate(found):
             left.done = for_truth + number * for_each
             renderer = base if variant.knob == "" else Renderer(variant.scene, variant.options)
-            finished(renderer.run(spp=1))  # what a first launch costs is not the variant's
+            finished(renderer.run(spp=1))  # the first launch is not timed
             for spp in plan.levels:
                 likely = 2.0 * rows[variant.label][-1].seconds.value * plan.repeats if rows[variant.label] else 0.0
                 if likely > plan.row_limit:

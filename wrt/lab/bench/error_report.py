@@ -1,4 +1,4 @@
-"""What `bench error` finds, and what is shown of it: tables for the terminal, a report and a notebook."""
+"""Results of `bench error`, and their tables for the terminal, a report and a notebook."""
 
 from __future__ import annotations
 
@@ -8,23 +8,21 @@ from wrt.lab.bench.error_statistics import CONFIDENCE, Estimate
 from wrt.lab.bench.report import Columns, Part, Row, markdown, tabled, tables_page
 
 BASE = "as it is"
-# Of the variance. Independent samples: -1. Scrambled nets: -3 where the integrand is smooth (Owen 1997, "Scrambled Net Variance
-# for Integrals of Smooth Functions"), -1 - 1/d where an edge crosses d dimensions (He and Wang 2015, "On the Convergence Rate
-# of Randomized Quasi-Monte Carlo for Discontinuous Functions"): -1.5 here. Each pair of dimensions is a net by itself, so that
-# what depends on two pairs at once (pixel and lens, pixel and light) falls as for independent samples.
+# Slopes of the variance. Independent samples: -1. Scrambled nets: -3 if the integrand is smooth (Owen 1997, "Scrambled Net Variance for
+# Integrals of Smooth Functions"). An edge across d dimensions makes it -1 - 1/d (He and Wang 2015, "On the Convergence Rate of Randomized
+# Quasi-Monte Carlo for Discontinuous Functions"): -1.5 here. Each pair of dimensions is a net of its own. So whatever depends on two
+# pairs at once (pixel and lens, pixel and light) falls as for independent samples.
 THEORY = {"independent": "-1", "sobol": "-1 to -3"}
 
 
 class Sweep(Row):
-    """Everything that was measured, and what it was measured on.
+    """Results of a sweep over knobs.
 
-    rows: each a variant (one knob at one value; knob "": none is turned) at one number of samples. products: of the repeats'
-    errors (statistics.gram). rmse: of one picture, the reference's own error taken out; NaN where it is below that. bias, noise:
-    root mean squares over the pixels, rmse^2 = bias^2 + noise^2; bias is NaN where it cannot be told from noise, and `bias_below`
-    bounds it. efficiency: 1 / (mse x seconds). slopes: how a variant's log mse, and the log of its variance alone, fall with log
-    spp. same_pixels: variants whose pictures are, bit for bit, those of the scene as it is. interrupted: the number of the signal
-    that ended it early.
-    """
+    - rows: a variant (one knob at one value; None: nothing is turned) at one number of samples; products: statistics.gram of its repeats.
+    - rmse: of one picture, without the reference's own error; NaN below that error. rmse^2 = bias^2 + noise^2, root mean squares.
+    - bias: NaN if noise hides it; `bias_below` bounds it. efficiency: 1 / (mse x seconds).
+    - slopes: of a variant's log mse, and of the log of its variance alone, over log spp.
+    - same_pixels: variants with the pixels of the unchanged scene. interrupted: number of the signal that ended the sweep early."""
 
     def _repr_html_(self) -> str:
         return tables_page(tables(self))
@@ -35,7 +33,7 @@ def number(value: float) -> str:
 
 
 def interval(x: Estimate) -> str:
-    """The value and how far it may be off, as a percentage."""
+    """Return the value and half its confidence interval in percent."""
     if math.isnan(x.value):
         return "-"
     half = 0.5 * (x.high - x.low) / abs(x.value) if x.value else math.nan
@@ -56,7 +54,7 @@ SLOPE_COLUMNS: Columns = {"setting": "{variant}", "slope of MSE": lambda slope: 
 
 
 def notes(sweep: Sweep) -> list[str]:
-    """What must be known to read the numbers, a sentence or two each."""
+    """Return what a reader must know about the figures, a sentence or two each."""
     r, machine = sweep.reference, sweep.machine
     lines = [
         f"{sweep.size[0]}x{sweep.size[1]} pixels, {sweep.repeats} seeds each, on {machine['device']},"
@@ -64,12 +62,12 @@ def notes(sweep: Sweep) -> list[str]:
         f"Reference: the mean (float64) of {r.seeds} seeds of {r.spp_each} spp, exact Fresnel, max_depth {r.max_depth},"
         f" min_throughput {r.min_throughput:g}, in {r.seconds:.0f} s. Its standard error is {number(r.rmse)} (root mean square"
         f" over the pixels, whose mean is {number(r.mean)}); {number(r.lost_throughput_per_sample)} of the light was not followed.",
-        f"Seconds are of tracing alone. Intervals are {CONFIDENCE:.0%}, from the seeds. The reference's variance is taken out"
-        " of RMSE, bias and efficiency, not out of relMSE and FLIP. RMSE^2 = bias^2 + noise^2; < is a bias that noise hides."
-        " Efficiency is 1 / (MSE x seconds). * is on the Pareto front: nothing here is faster and as near, to 1%.",
-        "Slopes, in theory: -1 for independent samples. For scrambled nets -3 where the integrand is smooth and -1.5 where an"
-        " edge crosses it; each pair of dimensions is a net of its own, so that what depends on two pairs at once (pixel and"
-        " lens, pixel and light) falls with -1.",
+        f"Seconds are of tracing alone. Intervals are {CONFIDENCE:.0%}, from the seeds. The reference's variance is subtracted from RMSE,"
+        " bias and efficiency, not from relMSE and FLIP. RMSE^2 = bias^2 + noise^2; < is a bias that noise hides. Efficiency is"
+        " 1 / (MSE x seconds). * is on the Pareto front: nothing else is faster and as accurate, within 1%.",
+        "Slopes, in theory: -1 for independent samples. For scrambled nets -3 where the integrand is smooth and -1.5 where an edge"
+        " crosses it. Each pair of dimensions is a net of its own: light that depends on two pairs at once (pixel and lens, pixel and"
+        " light) falls with -1.",
     ]
     if sweep.same_pixels:
         lines.append(f"The same pixels as with the scene as it is, bit for bit: {', '.join(sweep.same_pixels)}.")
@@ -82,5 +80,5 @@ def tables(sweep: Sweep) -> list[Part]:
 
 
 def text(sweep: Sweep) -> str:
-    """For the terminal and a report, as Markdown."""
+    """Return the report as Markdown."""
     return markdown([*tables(sweep), Part("", "\n\n".join(notes(sweep)))]).rstrip()

@@ -1,5 +1,4 @@
-"""`python -m wrt bench peers`: wrt's structures beside Embree (robust and fast) and Warp's mesh_query_ray; the same rays by
-turns, on one thread and on all of them."""
+"""`python -m wrt bench peers`: wrt's structures beside Embree and Warp's mesh_query_ray, the same rays in turn, on one or all threads."""
 
 from __future__ import annotations
 
@@ -23,16 +22,16 @@ from wrt.lab.hard_cases.contestants import PEERS, Algorithm, Own
 from wrt.lab.plans import Peers as Plan
 from wrt.scene.shapes import icosphere
 
-SAME_T = 1e-4  # two triangles may meet a ray at the same place: another prim_id there is a tie
-PARTS = 4  # a thread: into so many are rays cut for libraries that do not share them out themselves
+SAME_T = 1e-4  # relative: two triangles at the same t are a tie
+PARTS = 4  # of the rays for each thread, if a library does not distribute them itself
 TITLE = "wrt beside others"
 COLUMNS: Columns = {"rays": "{kind}", "threads": "{threads}", "hit": "{hit:.0%}", "who": "{name}",
                     "Mray/s": lambda row: spread(row.mrays), "wrt / it": "{first_over_it:.2f}", "differ": "{differ}"}
 LEGEND = """\
-Mray/s: rays over the thread's CPU seconds (the clock's, where there are more threads), median of the runs by turns, the middle half
-of them in brackets; rays and results are in each library's own arrays, and each thread has parts of the rays where a library takes
-them on one. wrt / it: how many times as fast the first structure of the table is, run by run. differ: rays of which one says hit
-and the other miss, or another primitive at another t (more than 1e-4 of it away); any-hit rays: another yes or no."""
+Mray/s: rays over the thread's CPU seconds (wall-clock seconds for several threads), median of the runs in turn, quartiles in brackets.
+Rays and results are in each library's own arrays; each thread gets parts of the rays if a library runs on one thread. wrt / it: how
+many times as fast the first structure of the table is, run by run. differ: rays that hit in one library and miss in the other, or hit
+another primitive at a t that differs by more than 1e-4 of it; any-hit rays: another answer."""
 
 
 def rows(plan: Plan) -> Iterator[Row]:
@@ -64,9 +63,10 @@ def thread_counts(plan: Plan) -> list[int]:
     return sorted({"one": {1}, "all": {thread_count(None)}, "both": {1, thread_count(None)}}[plan.threads])
 
 
-def compared(everybody: Sequence[Algorithm], rays: RaySet, threads: int, runs: int) -> Iterator[dict[str, Any]]:
-    """What each takes for the same rays. hit: share of them that hit, as the first one says; seconds: the thread's CPU time of each
-    run, or the clock's where there are more threads; differ: rays with another answer than the first one's."""
+def compared(everybody: Sequence[Algorithm], rays: RaySet, threads: int, runs: int) -> Iterator[dict[str, object]]:
+    """Yield what each library takes for the same rays.
+    - hit: share of rays that hit, by the first library; differ: rays with another answer than the first library's.
+    - seconds: CPU time of the thread in each run, or wall-clock time if there are several threads."""
     searches = [searching(who, rays, threads) for who in everybody]
     answers = [answer(who, rays, search()) for who, search in zip(everybody, searches, strict=True)]
     hit = float(np.mean(answers[0].prim_id >= 0 if isinstance(answers[0], Hits) else answers[0]))
@@ -76,32 +76,32 @@ def compared(everybody: Sequence[Algorithm], rays: RaySet, threads: int, runs: i
                "first_over_it": float(np.median(seconds[i] / seconds[0])), "differ": differing(found, answers[0])}
 
 
-def searching(who: Algorithm, rays: RaySet, threads: int) -> Callable[[], list[Any]]:
-    """Gives the results of the parts of the rays, one after another."""
+def searching(who: Algorithm, rays: RaySet, threads: int) -> Callable[[], list[object]]:
+    """Return a function that searches all parts of the rays and returns the results of the parts."""
     count = len(rays) if who.has_threads or threads == 1 else max(-(-len(rays) // (PARTS * threads)), 1)
     searches = [who.search(rays.part(slice(first, first + count)), threads if who.has_threads else 1)
                 for first in range(0, len(rays), count)]
-    out: list[Any] = [None] * len(searches)
+    out: list[object] = [None] * len(searches)
 
     def search(i: int) -> None:
         out[i] = searches[i]()
 
-    def all_parts() -> list[Any]:
+    def all_parts() -> list[object]:
         run_all([partial(search, i) for i in range(len(searches))], threads)
         return out
 
     return all_parts
 
 
-def answer(who: Algorithm, rays: RaySet, out: list[Any]) -> Hits | np.ndarray:
-    """out: of a search. Any-hit rays are answered by yes and no."""
+def answer(who: Algorithm, rays: RaySet, out: list[object]) -> Hits | np.ndarray:
+    """Return hits, or whether each any-hit ray is occluded. out: results of a search."""
     if rays.any_hit:
         return np.concatenate([who.occluded(part) for part in out])
     return who.closest(rays.origins, rays.directions, 0.0, rays.t_max)
 
 
 def differing(found: Hits | np.ndarray, truth: Hits | np.ndarray) -> int:
-    """Rays with another answer; another primitive at the same t is none."""
+    """Count the rays with another answer; another primitive at the same t is the same answer."""
     if isinstance(found, Hits) and isinstance(truth, Hits):
         hit, expected = found.prim_id >= 0, truth.prim_id >= 0
         both = hit & expected & (found.prim_id != truth.prim_id)
@@ -126,8 +126,7 @@ def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
 
 
 def means(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
-    """Of each rival (and its threads, where they are several) and kind of ray: the geometric mean over the meshes of how many
-    times as fast the first structure is."""
+    """Return the geometric mean over the meshes of how many times as fast the first structure is, by library and kind of ray."""
     first = rows[0].name if rows else ""
     out: dict[str, dict[str, float]] = {}
     for (name, threads, kind), group in grouped([row for row in rows if row.name != first], "name", "threads", "kind").items():
@@ -136,5 +135,5 @@ def means(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     return out
 
 
-def facts(rows: Sequence[Row], plan: Plan) -> dict[str, Any]:
+def facts(rows: Sequence[Row], plan: Plan) -> dict[str, object]:
     return {"means": means(rows)}

@@ -1,4 +1,4 @@
-"""`python -m wrt bench pictures`: what waves of samples bring over the loop of one ray, in whole pictures."""
+"""`python -m wrt bench pictures`: waves of samples against one ray at a time, in whole pictures."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ COLUMNS: Columns = {
     "loop ns": lambda row: spread(row.loop), "waves ns": lambda row: spread(row.waves),
     "loop / waves": lambda row: spread(row.ratio), "differ": "{differ}"}
 LEGEND = """\
-loop: one ray at a time, as on CUDA; waves: many samples share queues, which packets trace (kernels/loops/wave.py). Nanoseconds of a
-thread's CPU time a sample: camera ray, tracing, shading and film; medians of runs by turns, in brackets their middle half; loop /
-waves run by run. rays a sample: with shadow rays. differ: pixels of another value (must be 0)."""
+loop: one ray at a time, as on CUDA; waves: many samples share queues that packets trace (kernels/loops/wave.py). Nanoseconds of a thread's
+CPU time a sample: camera ray, tracing, shading and film; medians of runs in turn, quartiles in brackets; loop / waves run by run. rays a
+sample: with shadow rays. differ: pixels with another value (must be 0)."""
 
 
 def rows(plan: Plan) -> Iterator[Row]:

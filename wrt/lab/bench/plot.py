@@ -15,10 +15,12 @@ BINS = 60
 
 
 def histograms(panels: Mapping[str, Mapping[str, np.ndarray]], title: str) -> np.ndarray:
-    """(H, W, 3) uint8: a panel for each counter, and in it a line for each kind of ray. Across: what a ray costs, from 0 to
-    where 99.9% of all rays are; upwards: the share of the kind's rays, logarithmic. Values of 0 or more."""
+    """Return (H, W, 3) uint8: a panel for each counter, and in it a line for each kind of ray.
+    Across: the cost of a ray, up to the 99.9th percentile of all rays. Upwards: the share of the kind's rays, logarithmic."""
     rows = math.ceil(len(panels) / 2)
     figure = new_figure(8.0, 0.7 + 2.4 * rows)
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     figure.suptitle(title, fontsize="medium")
     colors: dict[str, str] = {}
     for axes, (counter, kinds) in zip(figure.subplots(rows, 2, squeeze=False).flat, panels.items(), strict=False):
@@ -30,29 +32,22 @@ def histograms(panels: Mapping[str, Mapping[str, np.ndarray]], title: str) -> np
                 axes.stairs(np.histogram(values, edges)[0] / len(values), edges, color=color, label=name)
     handles = {text: handle for axes in figure.axes for handle, text in zip(*axes.get_legend_handles_labels(), strict=True)}
     figure.legend(handles.values(), handles, loc="outside lower center", ncols=max(len(handles), 1), frameon=False)
-    return pixels(figure)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
 def bins(values: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Edges of the bins: whole numbers apart, up to where nearly all values are."""
+    """Return bin edges, whole numbers apart, up to the 99.9th percentile of the values."""
     top = max((float(np.percentile(each, 99.9)) for each in values.values() if len(each)), default=1.0)
     width = max(1, math.ceil((top + 1.0) / BINS))
     return np.arange(0, math.ceil((top + 1.0) / width) + 1) * width
 
 
 def new_figure(width: float, height: float) -> Any:
-    """An empty matplotlib Figure of so many inches. Raises InputError where there is no matplotlib."""
+    """Return an empty matplotlib Figure, sizes in inches. Raise InputError without matplotlib."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise InputError(f'plots need matplotlib ({error}); pip install "wrt[plots]" installs it') from error
     return Figure(figsize=(width, height), dpi=DPI, layout="constrained")
-
-
-def pixels(figure: Any) -> np.ndarray:
-    """(H, W, 3) uint8."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()

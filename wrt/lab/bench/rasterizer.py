@@ -1,8 +1,7 @@
-"""Primary visibility in both orders: the z-buffer (for each triangle its pixels) and rays (for each pixel its triangle).
+"""Primary visibility in both orders: by z-buffer (the pixels of each triangle) and by rays (the triangle of each pixel).
 
-Both answer with the same two pictures, depth (H, W) float32 (distance along the ray through the pixel's centre, inf on a
-miss) and prim_id (H, W) int32 (-1 on a miss), and share nothing on the way to them.
-"""
+Both give depth (H, W) float32, the distance along the ray through the pixel's centre (inf on a miss), and prim_id (H, W) int32 (-1 on a
+miss). They share no code on the way."""
 
 from __future__ import annotations
 
@@ -24,31 +23,29 @@ from wrt.scene.cameras import Camera, CameraKind
 
 NOTHING = np.uint64(0x7F800000_FFFFFFFF)  # depth inf, prim_id -1
 TRIANGLES_PER_LAUNCH = 65536
-BANDS_PER_THREAD = 4  # where triangles are many differs from row to row
-ROWS_ON_CUDA = 16  # a band: one thread draws a triangle's part of it
+BANDS_PER_THREAD = 4  # rows differ in their numbers of triangles
+ROWS_ON_CUDA = 16  # of a band; one thread draws a triangle's part of it
 
 
 def as_perspective(camera: CameraKind) -> Camera:
-    """Raise InputError for another camera: straight edges must stay straight."""
+    """Raise InputError for a camera that does not keep straight edges straight."""
     if not isinstance(camera, Camera):
         raise InputError(f"z-buffer and rays are compared through a perspective camera; camera {camera.name!r} is {camera.kind}")
     return camera
 
 
 def directions_from_pixels(camera: CameraKind, size: tuple[int, int]) -> np.ndarray:
-    """(3, 3) float64 that takes (x, y, 1), in pixels from the top left corner, to the direction through that point.
-
-    From the float32 numbers that the ray units get: it is the exact value of what they compute (not yet of unit length).
-    """
+    """Return the (3, 3) float64 matrix from (x, y, 1), pixels from the top left corner, to the direction through that point.
+    It is made of the float32 numbers that the ray units get: the exact value of what they compute, before normalisation."""
     c = camera_struct(as_perspective(camera), size)
     right, up, forward = (np.array(list(v), np.float64) for v in (c.right, c.up, c.forward))
-    tan_x, tan_y = (float(np.float32(value)) for value in (c.tan_x, c.tan_y))  # the struct still holds what it was given
+    tan_x, tan_y = (float(np.float32(value)) for value in (c.tan_x, c.tan_y))  # the struct still holds float64
     across, down = 2.0 * tan_x / size[0] * right, -2.0 * tan_y / size[1] * up
     return np.column_stack([across, down, forward - tan_x * right + tan_y * up])
 
 
 def view_struct(camera: CameraKind, size: tuple[int, int], shift: tuple[float, float] = (0.0, 0.0)) -> Any:
-    """kernels.study.rasterize.View of a camera. shift: in pixels, of all centres, to the right and down."""
+    """Return the View of a camera. shift: of all pixel centres, in pixels, right and down."""
     from_pixels = directions_from_pixels(camera, size) @ np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]], [0.0, 0.0, 1.0]])
     view = kernels.View()
     view.origin = wp.vec3d(*list(camera_struct(camera, size).origin))
@@ -58,10 +55,7 @@ def view_struct(camera: CameraKind, size: tuple[int, int], shift: tuple[float, f
 
 
 class Rasterizer:
-    """A z-buffer over a geometry's triangles; `draw` as often as wanted, then `depth` and `prim_id`.
-
-    Nothing is built beforehand. Raises InputError where the geometry has spheres, which have no corners to project.
-    """
+    """A z-buffer over a geometry's triangles: call `draw`, then `depth` and `prim_id`. Nothing is built beforehand."""
 
     def __init__(self, geometry: Geometry, device: str = "cpu", threads: int | None = None) -> None:
         if len(geometry.spheres):
@@ -79,10 +73,7 @@ class Rasterizer:
             load_kernel(kernel, self.device)
 
     def draw(self, camera: CameraKind, size: tuple[int, int], shift: tuple[float, float] = (0.0, 0.0)) -> None:
-        """Draw all triangles into a picture of `size` pixels, seen from the middle of the camera's lens.
-
-        shift: sample so far, in pixels, right and down of the pixels' centres.
-        """
+        """Draw all triangles, seen from the middle of the camera's lens. shift: of the sample from the pixel's centre, in pixels."""
         width, height = size
         view = view_struct(camera, size, shift)
         if self.size != size:
@@ -108,7 +99,7 @@ class Rasterizer:
         run_all([job(first) for first in range(0, n, step)], self.threads)
 
     def _draw_bands(self, view: Any) -> None:
-        """On the CPU each band of rows is one thread's, so that no pixel is written by two; it gets its triangles only."""
+        """Give each thread a band of rows on the CPU, with the triangles in it, so that no two threads write the same pixel."""
         boxes = self.boxes.numpy()
         there = np.flatnonzero(boxes[:, 0] <= boxes[:, 2]).astype(np.int32)
         top, bottom = boxes[there, 1], boxes[there, 3]
@@ -141,15 +132,15 @@ class Rasterizer:
 
 
 class RayCaster:
-    """The same pictures by rays, one a pixel, through a structure that is built here and asked as anybody asks it."""
+    """The same pictures by one ray a pixel, through a structure that is built here."""
 
     def __init__(self, geometry: Geometry, accel: str = "bvh", device: str = "cpu", threads: int | None = None) -> None:
         ACCELERATORS.check(accel)
         self.accel, self.threads = build(geometry, accel, device, threads), threads
-        self.seen: tuple[CameraKind | None, tuple[int, int]] = None, (0, 0)  # whose rays there are
+        self.seen: tuple[CameraKind | None, tuple[int, int]] = None, (0, 0)  # camera and size of the rays
 
     def draw(self, camera: CameraKind, size: tuple[int, int]) -> None:
-        """Cast the ray through every pixel's centre, from the middle of the lens. Rays of the same camera are made once."""
+        """Cast the ray through each pixel's centre from the middle of the lens. Rays of the same camera are made once."""
         if self.seen != (camera, size):
             self.origins, self.directions = (wp.array(rays, dtype=wp.vec3, device=self.accel.device)
                                              for rays in camera_rays(as_perspective(camera), size))

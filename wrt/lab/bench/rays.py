@@ -1,5 +1,4 @@
-"""The kinds of ray that structures are measured with: what a picture asks (primary, shadow, diffuse), and what nothing prepares
-for (random)."""
+"""Rays to measure structures with: those of a picture (primary, shadow, diffuse), and incoherent ones (random)."""
 
 from __future__ import annotations
 
@@ -11,13 +10,13 @@ from wrt.accel.base import Accelerator
 from wrt.accel.geometry import Geometry
 
 RAY_KINDS = ("primary", "shadow", "diffuse", "random")
-SEEN = 0.55  # half of the picture's height, over distance: a field of view of 58 degrees
-OFFSET = 1e-4  # of the radius: how far rays start above what is seen
+SEEN = 0.55  # half of the picture's height over its distance: a field of view of 58 degrees
+OFFSET = 1e-4  # of the radius: start of rays above the visible surface
 
 
 @dataclass(frozen=True, eq=False)
 class RaySet:
-    """origins, directions: (N, 3) float32; t_max: (N,) float32; any_hit: ask for any hit (a shadow ray) instead of the closest."""
+    """Rays of one kind; t_max: (N,) float32; any_hit: a shadow ray, which asks for any hit and not for the closest."""
 
     kind: str
     origins: np.ndarray
@@ -37,7 +36,7 @@ def unit(v: np.ndarray) -> np.ndarray:
 
 
 def ball_around(geometry: Geometry) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """The lowest and highest corner of the geometry's box, float64, and the centre and radius of the sphere around it."""
+    """Return the corners of the geometry's box, float64, and the centre and radius of the sphere around it."""
     lo, hi = (bound.astype(np.float64) for bound in geometry.bounds())
     lo, hi = lo.min(axis=0), hi.max(axis=0)
     return lo, hi, 0.5 * (lo + hi), 0.5 * float(np.linalg.norm(hi - lo))
@@ -48,7 +47,7 @@ def endless(n: int) -> np.ndarray:
 
 
 def shadow(origins: np.ndarray, outward: np.ndarray, center: np.ndarray, radius: float) -> RaySet:
-    """From what the camera sees towards one point above the mesh, as far as that point: any hit."""
+    """Return any-hit rays from visible points to one point light above the mesh."""
     light = center + radius * np.array([0.8, 1.7, 0.6])
     directions = light - origins
     turned = (directions * outward).sum(axis=1) < 0.0
@@ -58,21 +57,20 @@ def shadow(origins: np.ndarray, outward: np.ndarray, center: np.ndarray, radius:
 
 
 def diffuse(origins: np.ndarray, outward: np.ndarray, rng: np.random.Generator) -> RaySet:
-    """From what the camera sees into all directions above the surface, more of them near its normal (cosine)."""
+    """Return rays from visible points into the hemisphere above the surface, with a cosine distribution."""
     directions = unit(outward + 0.999 * unit(rng.normal(size=origins.shape)))
     return RaySet("diffuse", origins.astype(np.float32), directions.astype(np.float32), endless(len(origins)))
 
 
 def random(n: int, center: np.ndarray, radius: float, rng: np.random.Generator) -> RaySet:
-    """Between two random points on the sphere around the mesh: uniform lines."""
+    """Return rays between random points on the sphere around the mesh: uniform lines."""
     a, b = (center + radius * unit(rng.normal(size=(n, 3))) for _ in range(2))
     return RaySet("random", a.astype(np.float32), unit(b - a).astype(np.float32), endless(n))
 
 
 def ray_sets(accel: Accelerator, n: int, seed: int = 0, inside: bool = False) -> dict[str, RaySet]:
-    """About n rays of every kind (the square number below it for primary ones) through the geometry of a structure, which
-    finds what the camera sees. The same for the same geometry, n and seed. inside: the camera stands in the middle of the
-    mesh's box, as in a room, and not before it."""
+    """Return about n rays of every kind (for primary rays the next lower square number), the same for the same arguments.
+    The structure finds what the camera sees. inside: the camera stands in the middle of the mesh's box, as in a room."""
     g = accel.geometry
     _, _, center, radius = ball_around(g)
     rng = np.random.default_rng(seed)
@@ -92,7 +90,7 @@ def ray_sets(accel: Accelerator, n: int, seed: int = 0, inside: bool = False) ->
     normals = np.where(((points - eye) * normals).sum(axis=1, keepdims=True) > 0.0, -normals, normals)
 
     def starts() -> tuple[np.ndarray, np.ndarray]:
-        """Points just above what is seen, as many as pixels and in their order, and the normals towards the camera."""
+        """Return points just above visible surfaces, one for each pixel and in their order, and normals towards the camera."""
         if not len(points):  # nothing is seen: the sphere's surface, inwards
             inwards = -unit(rng.normal(size=(len(seen), 3)))
             return center - radius * inwards, inwards
@@ -104,7 +102,7 @@ def ray_sets(accel: Accelerator, n: int, seed: int = 0, inside: bool = False) ->
 
 
 def _camera(eye: np.ndarray, target: np.ndarray, n: int) -> RaySet:
-    """From a camera through a square of pixels, in rows: neighbours in the array are neighbours in the picture."""
+    """Return a camera's rays through a square of pixels, in rows."""
     side = max(int(np.sqrt(n)), 1)
     forward = unit(target - eye)
     right = unit(np.cross(forward, [0.0, 1.0, 0.0]))

@@ -1,4 +1,4 @@
-"""What all measurements share: the machine, rows, tables as Markdown and as HTML."""
+"""Machine, rows, and tables as Markdown and HTML, for all measurements."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import importlib
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, is_dataclass
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,72 +17,72 @@ import numpy as np
 import wrt
 from wrt.core.device import describe_devices
 from wrt.core.html import Rows, html_table
+from wrt.core.types import JsonObject
 from wrt.lab.plans import Plan
 
 
 def machine_line(used: str = "", *more: str, device: str = "cpu") -> str:
-    """The device, the threads that are used, how busy it is, and wrt's version: without them no time means anything."""
+    """Describe the device, its load, the threads in use and wrt's version: no time means anything without them."""
     line = next((line for line in describe_devices() if line.startswith(f"{device}:")), device)
     load = f"load average {os.getloadavg()[0]:.1f} at the start" if hasattr(os, "getloadavg") else ""
     return "; ".join([", ".join(filter(None, [line, used, load])), f"wrt {wrt.__version__}", *more])
 
 
 def versions(*packages: str) -> str:
-    """Of those that are installed."""
+    """Return the versions of the packages that are installed."""
     from importlib.metadata import PackageNotFoundError, version
 
-    told = []
+    found = []
     for package in packages:
         with suppress(PackageNotFoundError):
-            told.append(f"{package} {version(package)}")
-    return ", ".join(told)
+            found.append(f"{package} {version(package)}")
+    return ", ".join(found)
 
 
 class Row(SimpleNamespace):
-    """What was measured of one thing, by name: what the names mean, the LEGEND of its study says. All of it goes into JSON but
-    NumPy's arrays, and what has a name that begins with _."""
+    """Figures of one measured thing, by name; the LEGEND of its study explains the names.
+    JSON gets all of them but NumPy's arrays, and names that begin with _."""
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> JsonObject:
         return {name: plain(value) for name, value in vars(self).items() if not (name.startswith("_") or isinstance(value, np.ndarray))}
 
 
-def plain(value: Any) -> Any:
-    """As it goes into JSON, rows within rows too."""
+def plain(value: object) -> object:
+    """Return a value as JSON takes it, rows within rows, too."""
     if isinstance(value, list):
         return [plain(each) for each in value]
     if isinstance(value, dict):
         return {name: plain(each) for name, each in value.items()}
-    return value.as_dict() if hasattr(value, "as_dict") else value
+    return value.as_dict() if hasattr(value, "as_dict") else vars(value) if is_dataclass(value) else value
 
 
-# The columns of a table: what each is called, and a row's value as a format of the row's names or as a function of the row.
+# Columns of a table by their titles: the value of a row, as a format of the row's names or as a function of the row.
 Columns = Mapping[str, str | Callable[[Any], str]]
 
 
-def cells(columns: Columns, row: Any) -> list[str]:
-    """One line of a table."""
+def cells(columns: Columns, row: object) -> list[str]:
+    """Return one line of a table."""
     return [column.format_map(vars(row)) if isinstance(column, str) else column(row) for column in columns.values()]
 
 
 def grouped(rows: Iterable[Row], *names: str) -> dict[tuple[Any, ...], list[Row]]:
-    """Rows by the values of these names, in their order."""
+    """Group rows by the values of these names, in their order."""
     out: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         out.setdefault(tuple(getattr(row, name) for name in names), []).append(row)
     return out
 
 
-def study_of(plan: Plan) -> Any:
-    """The module that measures what is planned.
+def study_of(plan: Plan) -> ModuleType:
+    """Return the module that measures a plan.
 
-    It has rows(plan), which yields each Row as it is done; parts(rows, plan), tables and text; a TITLE and a LEGEND. It may have
-    machine(plan); line(row), for the progress; facts(rows, plan), for JSON beside the rows.
-    """
+    It has rows(plan), which yields each Row as it is done, TITLE, LEGEND, and COLUMNS or parts(rows, plan): tables and text. It may have
+    machine(plan), line(row) for the progress, and facts(rows, plan) for JSON beside the rows."""
     return importlib.import_module(plan.STUDY)
 
 
 def run(plan: Plan, report: Callable[[Row], None] | None = None) -> Rows[Row]:
-    """Measure everything; `report` gets each row as it is done. Raises InputError (a file, a device)."""
+    """Measure everything; `report` gets each row as it is done."""
     out = Rows[Row]([], partial(page, plan))  # no lambda: a worker sends it back
     for row in study_of(plan).rows(plan):
         out.append(row)
@@ -108,28 +108,28 @@ def mesh_name(mesh: object) -> str:
 
 
 def line(plan: Plan, row: Row) -> str:
-    """A row, for the progress."""
+    """Return a row as a line of progress."""
     study = study_of(plan)
     if hasattr(study, "line"):
         return study.line(row)
     return "  ".join([*([row.mesh] if "mesh" in vars(row) and "mesh" not in study.COLUMNS else []), *cells(study.COLUMNS, row)])
 
 
-def data(rows: Sequence[Row], plan: Plan) -> dict[str, Any]:
-    """For JSON."""
+def data(rows: Sequence[Row], plan: Plan) -> JsonObject:
+    """Return all as JSON takes it."""
     facts: Any = getattr(study_of(plan), "facts", lambda rows, plan: {})
     return {"rows": [row.as_dict() for row in rows], **facts(rows, plan)}
 
 
 def text(rows: Sequence[Row], plan: Plan, machine: str) -> str:
-    """Everything as Markdown."""
+    """Return the report as Markdown."""
     study = study_of(plan)
     head = f"# {study.TITLE}\n\nMachine: {machine}\n\nTo repeat: `{repeating(plan)}`\n\n"
     return f"{head}{markdown(parts_of(rows, plan))}\n{study.LEGEND}"
 
 
 def repeating(plan: Plan) -> str:
-    """The command line that measures the same; of files only the names."""
+    """Return the command line that measures the same; files by their names only."""
     words = [f"python -m wrt {plan.COMMAND}"]
     for each in fields(plan):
         value, flag = getattr(plan, each.name), f"--{each.name.replace('_', '-')}"
@@ -145,7 +145,7 @@ def repeating(plan: Plan) -> str:
 
 @dataclass(frozen=True)
 class Part:
-    """A piece of a report: a heading, paragraphs, a table (head, lines)."""
+    """A piece of a report: a heading, paragraphs, and a table (head, lines)."""
 
     title: str = ""
     text: str = ""
@@ -158,7 +158,7 @@ def tables_page(parts: Iterable[Part]) -> str:
 
 
 def table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """A Markdown table whose columns are also straight as plain text; numbers to the right."""
+    """Return a Markdown table whose columns are also aligned as plain text, numbers to the right."""
     texts = [[str(cell).replace("|", "\\|") for cell in line] for line in (head, *lines)]
     width = [max(len(line[i]) for line in texts) for i in range(len(head))]
 
@@ -177,6 +177,6 @@ def markdown(parts: Iterable[Part]) -> str:
     return "\n\n".join(filter(None, pieces)) + "\n"
 
 
-def tabled(columns: Columns, rows: Iterable[Any], title: str = "", text: str = "") -> Part:
-    """A part with the table of some rows."""
+def tabled(columns: Columns, rows: Iterable[object], title: str = "", text: str = "") -> Part:
+    """Return a part with the table of some rows."""
     return Part(title, text, tuple(columns), [cells(columns, row) for row in rows])

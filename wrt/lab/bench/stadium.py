@@ -1,5 +1,6 @@
-"""The teapot in a stadium: a detailed thing in a scene a thousand times its size, which no single size of cell fits (Haines 1988,
-"Spline Surface Rendering, and What's Wrong with Octrees", Ray Tracing News 1(2))."""
+"""A detailed mesh in a scene a thousand times its size, which no single cell size fits.
+
+The teapot in a stadium: Haines 1988, "Spline Surface Rendering, and What's Wrong with Octrees", Ray Tracing News 1(2)."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ TIMES = 1000.0
 
 
 def stands(tiers: int = 50, seats: int = 400) -> Mesh:
-    """Steps around a pitch of 2 triangles at y = 0, from radius 0.6 to 1 and up to y = 0.25: 2 + 4 tiers seats triangles."""
+    """Return 2 + 4 tiers seats triangles: steps around a pitch at y = 0, from radius 0.6 to 1 and up to y = 0.25."""
     radius, height = np.linspace(0.6, 1.0, tiers + 1), np.linspace(0.0, 0.25, tiers + 1)
     r, y = np.repeat(radius, 2)[:-1], np.repeat(height, 2)[1:]
     angle = 2.0 * np.pi * np.arange(seats) / seats
@@ -27,7 +28,7 @@ def stands(tiers: int = 50, seats: int = 400) -> Mesh:
 
 
 def in_stadium(mesh: Mesh, times: float = TIMES) -> Mesh:
-    """The mesh on the pitch of a stadium `times` its size; its own faces come first."""
+    """Put the mesh on the pitch of a stadium `times` its size; its own faces come first."""
     lo, hi = mesh.vertices.min(axis=0).astype(np.float64), mesh.vertices.max(axis=0).astype(np.float64)
     around = stands()
     scale = times * 0.5 * float(np.linalg.norm(hi - lo))

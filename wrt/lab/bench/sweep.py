@@ -1,5 +1,7 @@
-"""Sweeps on the workers of an executor. What is counted may be computed anywhere; what is timed goes as whole cases: a mesh with
-all that is compared on it is measured by one worker. A process does one task of a sweep at a time."""
+"""Sweeps on the workers of an executor.
+
+Counts may come from any worker. Times compare within a worker, so one worker measures a whole case: a mesh with all that is compared on
+it."""
 
 from __future__ import annotations
 
@@ -8,7 +10,6 @@ import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import BrokenExecutor, CancelledError
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from wrt.core.errors import InputError
@@ -20,7 +21,7 @@ _alone = threading.Lock()
 
 
 def submitter(executor: Any) -> Any:
-    """An Executor as it is; for a dask.distributed.Client, its wrt.renderer.distributed.dask.Submitter."""
+    """Return an Executor as it is, and a Submitter for a dask.distributed.Client."""
     if not hasattr(executor, "get_executor"):
         return executor
     from wrt.renderer.distributed.dask import Submitter
@@ -29,7 +30,7 @@ def submitter(executor: Any) -> Any:
 
 
 def result(pool: Any, future: Any) -> Any:
-    """Of a future of the submitter. Raises what the worker raised, and InputError where it will never come."""
+    """Return the result of a future. Raise the worker's error, or InputError if the result will never come."""
     try:
         return future.result()
     except CancelledError as error:
@@ -39,7 +40,7 @@ def result(pool: Any, future: Any) -> Any:
 
 
 def cancel(pool: Any, futures: Iterable[Any]) -> None:
-    """Those of the submitter that have not begun will not."""
+    """Cancel the futures that have not begun."""
     if hasattr(pool, "cancel"):
         pool.cancel(futures)
         return
@@ -48,17 +49,16 @@ def cancel(pool: Any, futures: Iterable[Any]) -> None:
 
 
 def by_mesh(run: Callable[..., list[Any]], plan: Any, report: Callable[[Any], None], executor: Any = None) -> list[Any]:
-    """The rows of run(plan, report), where plan.meshes are measured each by one worker, which reads the file under the same
-    path; without an executor, here, one after another.
-
-    report gets the rows of a mesh together, meshes in their order. Raises InputError where there are no meshes.
-    """
+    """Return the rows of run(plan, report), each mesh measured by one worker, or all of them here without an executor.
+    A worker reads a file at the same path. `report` gets the rows of a mesh together, meshes in their order. Raise InputError if the plan
+    has no meshes."""
     if executor is None:
         return run(plan, report)
     if not plan.meshes:
         raise InputError("a cluster measures meshes, each on one worker: name some")
     pool, rows = submitter(executor), []
-    futures = [pool.submit(one_at_a_time, DIGEST, run, replace(plan, meshes=(where,))) for where in map(_found, plan.meshes)]
+    meshes = [mesh if isinstance(mesh, Mesh) else os.path.abspath(mesh) for mesh in plan.meshes]
+    futures = [pool.submit(one_at_a_time, DIGEST, run, replace(plan, meshes=(mesh,))) for mesh in meshes]
     try:
         for future in futures:
             part = result(pool, future)
@@ -70,13 +70,9 @@ def by_mesh(run: Callable[..., list[Any]], plan: Any, report: Callable[[Any], No
     return rows
 
 
-def _found(mesh: Mesh | str | Path) -> Mesh | str:
-    return mesh if isinstance(mesh, Mesh) else os.path.abspath(mesh)
-
-
 def one_at_a_time(digest: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """On a worker: two that are timed at once in a process would each slow the other down, and kernels are not made for two
-    threads at once. Raises InputError where the DIGEST of who asks is another."""
+    """Call a function on a worker, one at a time in a process: concurrent timings slow each other down.
+    Raise InputError if the worker's code has another digest."""
     if digest != DIGEST:
         raise InputError(f"worker {worker_name()} has other code of wrt, another Python, NumPy or Warp: all must have the same")
     with _alone:

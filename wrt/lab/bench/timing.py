@@ -1,5 +1,4 @@
-"""What one way costs beside another: both run by turns in one process, so that what disturbs the one disturbs the other; and how
-much memory a piece of work takes at its peak."""
+"""Times of several jobs, run in turn in one process so that disturbances hit all of them; and the peak of memory."""
 
 from __future__ import annotations
 
@@ -21,8 +20,7 @@ T = TypeVar("T")
 
 
 def alternate(jobs: Mapping[K, Callable[[], Any]], runs: int, clock: Callable[[], float] = time.perf_counter) -> dict[K, np.ndarray]:
-    """Seconds (runs,) of each job by that clock, after one run of each that is not counted. The order turns: each run begins with
-    the next job."""
+    """Return seconds (runs,) of each job, after one uncounted run of each. Each round begins with the next job."""
     seconds: dict[K, list[float]] = {name: [] for name in jobs}
     names = list(jobs)
     for job in jobs.values():
@@ -41,25 +39,23 @@ def quartiles(values: Any) -> Quartiles:
 
 
 def shown(values: Quartiles, digits: int = 3) -> str:
-    """The median, and the middle half in brackets."""
+    """Format the median, with the quartiles in brackets."""
     return f"{values[1]:.{digits}g} [{values[0]:.{digits}g}, {values[2]:.{digits}g}]"
 
 
 def spread(values: Any, scale: float = 1.0) -> str:
-    """The same of many values, times `scale`."""
+    """Format many values, times `scale`, as `shown`."""
     return shown(quartiles(scale * np.asarray(values)))
 
 
 def peak_bytes(work: Callable[[], T]) -> tuple[T, float]:
-    """What `work` gives, and by how many bytes the process grew at its peak, whoever asked for them (Linux; else NaN).
-
-    What the process had freed and kept would be used without growing: it is given back first, as far as the system can.
-    """
+    """Return the result of `work`, and the growth of the process's peak memory in bytes (Linux; else NaN).
+    Memory that was freed but kept could be used without growth: first it goes back to the system, as far as possible."""
     gc.collect()
     with suppress(AttributeError, OSError, TypeError):  # no such library, or (Windows) none without a name
         ctypes.CDLL(None).malloc_trim(0)
     try:
-        Path("/proc/self/clear_refs").write_text("5")  # the peak is what is used now
+        Path("/proc/self/clear_refs").write_text("5")  # reset the peak
     except OSError:
         return work(), math.nan
     before = _peak()

@@ -1,4 +1,4 @@
-"""`python -m wrt bench units`: what the default intersection tests cost beside the others, as ratios with their spread."""
+"""`python -m wrt bench units`: the price of the default intersection tests beside the others, as ratios with their spread."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from wrt.lab.bench.timing import alternate, quartiles, shown
 from wrt.lab.bench.visibility import terrain
 from wrt.lab.hard_cases.common import soup
 from wrt.lab.plans import Units as Plan
-from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere, teapot
 
 ALONE = 64  # triangles without a structure: the triangle unit by itself
@@ -28,15 +27,15 @@ COLUMNS: Columns = {"mesh": "{mesh}", "triangles": "{triangles}", "rays": "{rays
                     "Mray/s": lambda row: shown(row.mrays), "default's price": lambda row: shown(row.price),
                     "from": "{extremes[0]:.3g}", "to": "{extremes[1]:.3g}", "B/tri": "{bytes_per_triangle:.0f}"}
 LEGEND = """\
-One thread, runs by turns: median [quartiles], lowest and highest. The default is watertight triangles in conservative boxes; its
-price is how many times as long it takes as the unit of the row, run by run: above 1 the default is dearer."""
+One thread, runs in turn: median [quartiles], lowest and highest. The default is watertight triangles in conservative boxes. Its price is
+its time over that of the row's unit, run by run: above 1 the default is slower."""
 
 
 def rows(plan: Plan) -> Iterator[Row]:
-    """Every triangle test with the default boxes, then every box test with the default triangles; triangle tests alone last."""
+    """Yield every triangle test in the default boxes and every box test with the default triangles; last, triangle tests alone."""
     triangles = [{"triangle": name} for name in RAY_TRIANGLE]
     boxes = [{"box": name} for name in list(RAY_AABB)[1:]]
-    for mesh in meshes(plan):
+    for mesh in map(as_mesh, plan.meshes or [icosphere(6), terrain(300), teapot(64)]):
         geometry = Geometry.of(mesh)
         sets = ray_sets(build(geometry, plan.accel), plan.rays, plan.seed)
         for kind in ("primary", "random"):
@@ -47,12 +46,8 @@ def rows(plan: Plan) -> Iterator[Row]:
     yield from priced(plan, f"{ALONE} triangles, no structure", few, rays, "brute_force", triangles)
 
 
-def meshes(plan: Plan) -> Iterator[Mesh]:
-    yield from map(as_mesh, plan.meshes or [icosphere(6), terrain(300), teapot(64)])
-
-
 def priced(plan: Plan, mesh: str, geometry: Geometry, rays: RaySet, accel: str, units: Sequence[dict[str, str]]) -> Iterator[Row]:
-    """All units by turns; the first is the default."""
+    """Time all units in turn; the first is the default."""
     jobs: dict[str, Any] = {}
     sizes = {}
     for options in units:

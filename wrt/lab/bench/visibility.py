@@ -1,5 +1,4 @@
-"""`python -m wrt bench visibility`: the two classes of visibility, measured. Rasterising goes over triangles and then their
-pixels, ray casting over pixels and then, down a tree, their triangle: what does each cost as triangles and pixels grow?"""
+"""`python -m wrt bench visibility`: the cost of rasterising and of ray casting, as triangles and pixels grow."""
 
 from __future__ import annotations
 
@@ -8,7 +7,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -45,17 +43,16 @@ COLUMNS: Columns = {
 EXPONENTS: Columns = {"cost": "{cost}", "surface": lambda row: Path(row.surface).name, "n": "{sweep}",
                       "exponent": "{exponent:.3f} ± {error:.3f}", "at the end": "{last:.3f}"}
 LEGEND = """\
-covered: pixels with a triangle. raster: a z-buffer, all triangles; cast: one ray a pixel, made beforehand, through a structure
-that is there; build: of that structure. Medians of alternating runs, ratios taken run by run; in brackets the middle half of the
-runs. cast / raster above 1: rasterising is cheaper; with build: as if the structure were built for this one picture. differ:
-pixels with another prim_id, of which ties (depths agree within their bound: common edges, coincident triangles), silhouettes (the
-rays' answer is the exact one within a rounding error, some 1e-4 pixels, of the centre), and unexplained (must be 0). depth error:
-the largest relative one where prim_id agrees, and its share of the bound derived for it (must not be above 1)."""
+covered: pixels with a triangle. raster: a z-buffer, all triangles; cast: one ray a pixel, made beforehand, through a structure built
+beforehand; build: of that structure. Medians of alternating runs, quartiles in brackets, ratios run by run. cast / raster above 1:
+rasterising is cheaper; with build: as if the structure were built for this one picture. differ: pixels with another prim_id: ties
+(depths agree within their bound: common edges, coincident triangles), silhouettes (within a rounding error of the centre, some 1e-4
+pixels, the rays' answer is exact) and unexplained (must be 0). depth error: the largest relative one where prim_id agrees; of bound: its
+share of the derived bound (at most 1)."""
 
 
-def row_of(raster: Sequence[float], cast: Sequence[float], build: Sequence[float], agreement: Row, **subject: Any) -> Row:
-    """Return the row of one mesh in one picture. raster, cast: seconds of each run, run i of the one next to run i of the other;
-    build: seconds of each build of the structure, which casting needs first; subject: sweep, surface, triangles, pixels."""
+def row_of(raster: Sequence[float], cast: Sequence[float], build: Sequence[float], agreement: Row, **subject: object) -> Row:
+    """Return the row of one mesh in one picture. raster, cast: seconds of each run; build: of each build; subject: more columns."""
     ratio = [np.median((np.array(cast) + extra) / np.array(raster)) for extra in (0.0, np.median(build))]
     return Row(**subject, raster=list(raster), cast=list(cast), build=list(build), agreement=agreement,
                raster_median=float(np.median(raster)), cast_median=float(np.median(cast)), build_median=float(np.median(build)),
@@ -63,7 +60,7 @@ def row_of(raster: Sequence[float], cast: Sequence[float], build: Sequence[float
 
 
 def terrain(cells: int) -> Mesh:
-    """2 cells^2 triangles over the square from -1 to 1, hills of a fixed form: finer cells change little of the picture."""
+    """Return 2 cells^2 triangles over the square from -1 to 1: hills of a fixed form."""
     x, z = np.meshgrid(np.linspace(-1.0, 1.0, cells + 1), np.linspace(-1.0, 1.0, cells + 1), indexing="ij")
     y = sum(0.3 / k * np.sin(k * (2.1 * x + 0.7 * z) + k * k) * np.cos(k * (1.9 * z - 0.6 * x) + 2.0 * k) for k in (1, 2, 4, 8))
     i, j = np.meshgrid(np.arange(cells), np.arange(cells), indexing="ij")
@@ -74,7 +71,7 @@ def terrain(cells: int) -> Mesh:
 
 
 def subdivided(mesh: Mesh) -> Mesh:
-    """Each triangle cut into four at the middles of its sides: the same surface, but for rounding; flat-shaded."""
+    """Cut each triangle into four at the middles of its sides; the mesh is flat-shaded."""
     from trimesh.remesh import subdivide
 
     vertices, faces = subdivide(mesh.vertices.astype(np.float64), mesh.faces)
@@ -83,7 +80,7 @@ def subdivided(mesh: Mesh) -> Mesh:
 
 @dataclass(frozen=True)
 class Surface:
-    """One shape, ever finer, and the camera that sees each alike (square pictures)."""
+    """One shape at rising resolution, and the camera for it (square pictures)."""
 
     name: str
     meshes: list[Mesh]
@@ -91,7 +88,7 @@ class Surface:
 
 
 def surfaces(plan: Plan) -> Iterator[Surface]:
-    """What to see, up to plan.max_triangles (but its coarsest in any case)."""
+    """Yield surfaces of up to plan.max_triangles, and of each the coarsest mesh in any case."""
     for path in plan.meshes:
         mesh = as_mesh(path)
         finer = [replace(mesh, normals=None)]
@@ -122,7 +119,7 @@ def rows(plan: Plan) -> Iterator[Row]:
 
 
 def ready(plan: Plan, surface: Surface, geometry: Geometry) -> Callable[[str, int], Row]:
-    """One geometry, to be seen in both ways: for a sweep, in a picture of so many pixels a side."""
+    """Prepare one geometry for both methods; the result measures a picture of `side` x `side` pixels for a sweep."""
     rasterizer = Rasterizer(geometry, plan.device, plan.threads)
     caster = RayCaster(geometry, plan.accel, plan.device, plan.threads)
     again = [build(geometry, plan.accel, plan.device, plan.threads) for _ in range(min(plan.runs, MAX_BUILDS) - 1)]
@@ -139,8 +136,8 @@ def ready(plan: Plan, surface: Surface, geometry: Geometry) -> Callable[[str, in
 
 
 def fit(n: Sequence[float], seconds: Sequence[float]) -> dict[str, float]:
-    """seconds ~ n^exponent, by least squares on logarithms; error: of the exponent, one standard deviation (NaN for two
-    points); last: the exponent between the two largest n. Raises ValueError for fewer than two points."""
+    """Fit seconds ~ n^exponent by least squares on logarithms.
+    error: one standard deviation of the exponent (NaN for two points); last: the exponent between the two largest n."""
     from scipy.stats import linregress
 
     x, y = np.log(np.asarray(n, np.float64)), np.log(np.asarray(seconds, np.float64))
@@ -152,13 +149,13 @@ def fit(n: Sequence[float], seconds: Sequence[float]) -> dict[str, float]:
 
 
 def series(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
-    """Rows by (sweep, surface), in order of what grows."""
+    """Group rows by (sweep, surface), in order of the growing quantity."""
     return {(sweep, surface): sorted(group, key=lambda row: getattr(row, sweep))
             for (sweep, surface), group in grouped(rows, "sweep", "surface").items()}
 
 
-def fits(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """The exponents of every sweep that has two points or more: of rasterising, casting and, over triangles, building."""
+def fits(rows: Sequence[Row]) -> list[dict[str, object]]:
+    """Return the exponents of rasterising, casting and, over triangles, building, of every sweep with at least two points."""
     return [{"sweep": sweep, "surface": surface, "cost": cost,
              **fit([getattr(row, sweep) for row in group], [getattr(row, f"{cost}_median") for row in group])}
             for (sweep, surface), group in series(rows).items() if len(group) > 1
@@ -176,10 +173,9 @@ def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
         lines = [row for key, group in series(rows).items() if key[0] == sweep for row in group]
         out += [tabled(COLUMNS, lines, f"As {sweep} grow")] if lines else []
     found = [Row(**each) for each in fits(rows)]
-    told = "seconds ~ n^exponent over the whole sweep (± one standard deviation), and between its two last points."
-    out += [tabled(EXPONENTS, found, "Exponents", told)] if found else []
-    return out
+    note = "seconds ~ n^exponent over the whole sweep (± one standard deviation), and between its two last points."
+    return [*out, *([tabled(EXPONENTS, found, "Exponents", note)] if found else [])]
 
 
-def facts(rows: Sequence[Row], plan: Plan) -> dict[str, Any]:
+def facts(rows: Sequence[Row], plan: Plan) -> dict[str, object]:
     return {"exponents": fits(rows)}

@@ -1,4 +1,4 @@
-"""Do z-buffer and rays see the same? Every pixel where they differ is explained by rounding, or counted."""
+"""Comparison of z-buffer and rays: each pixel where they differ is explained by rounding, or counted."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from wrt.lab.bench.report import Row
 from wrt.renderer.upload import camera_struct
 from wrt.scene.cameras import Camera
 
-# How far the ray units' rounding can move the place of a corner, as a share of its distance: the direction's sum and length,
-# the offset from the origin, the shear. Each is a few units of roundoff; together they stay below this many.
+# Bound on the ray units' roundings that move a corner, in units of roundoff times its distance. The direction's sum and length, the
+# offset from the origin, and the shear take a few each.
 ROUNDINGS = 16.0
 ROUNDOFF = 2.0**-24
 AROUND = [(np.cos(a), np.sin(a)) for a in np.arange(8) * (np.pi / 4.0)]
@@ -19,21 +19,19 @@ MAX_RINGS = 8  # the last of 128 times the smallest radius
 
 
 def agreement(rasterizer: Rasterizer, caster: RayCaster, geometry: Geometry, camera: Camera, size: tuple[int, int]) -> Row:
-    """Draw the same picture with both, and `compare`. The rasterizer's picture is another one afterwards."""
+    """Draw the same picture with both and `compare`. The rasterizer holds another picture afterwards."""
     caster.draw(camera, size)
     return compare(rasterizer, caster.depth(), caster.prim_id(), geometry, camera, size)
 
 
 def compare(rasterizer: Rasterizer, depth: np.ndarray, prim_id: np.ndarray, geometry: Geometry, camera: Camera,
             size: tuple[int, int]) -> Row:
-    """Hold pictures by rays, depth (H, W) float32 and prim_id (H, W) int32, against the rasterizer's, pixel by pixel.
+    """Compare a picture by rays, depth (H, W) float32 and prim_id (H, W) int32, with the rasterizer's, pixel by pixel.
 
-    pixels, covered: all, and those where the z-buffer has a triangle. differ: another prim_id, of which: ties, where the
-    depths agree within their bound (the centre is on a common edge, or triangles coincide); silhouettes, where the rays'
-    depth is the exact one less than a rounding error (some 1e-4 pixels) beside the centre; unexplained: the rest. Where
-    prim_id is the same: depth_error, the largest relative difference of depth, and depth_share, of its bound (above 1: out
-    of bound).
-    """
+    - covered: pixels where the z-buffer has a triangle. differ: pixels with another prim_id, split into the next three.
+    - ties: depths agree within their bound: the centre is on a common edge, or triangles coincide.
+    - silhouettes: less than a rounding error (some 1e-4 pixels) beside the centre, the exact depth is that of the rays.
+    - unexplained: the rest. depth_error: largest relative difference at the same prim_id; depth_share: its share of the bound."""
     rasterizer.draw(camera, size)
     exact_depth, exact_id = rasterizer.depth(), rasterizer.prim_id()
     same = (exact_id == prim_id) & (exact_id >= 0)
@@ -61,17 +59,15 @@ def _close(a: np.ndarray, b: np.ndarray, bound: np.ndarray) -> np.ndarray:
 
 
 def _corners(geometry: Geometry, camera: Camera, size: tuple[int, int], prim_id: np.ndarray) -> np.ndarray:
-    """Offsets from the camera of the corners of the triangles that some pixels show: (N, 3 corners, 3) float64."""
+    """Return the corners of the triangles of prim_id as offsets from the camera: (N, 3 corners, 3) float64."""
     origin = np.array(list(camera_struct(camera, size).origin), np.float64)
     return geometry.vertices[geometry.faces[prim_id]].astype(np.float64) - origin
 
 
 def depth_bound(geometry: Geometry, camera: Camera, size: tuple[int, int], prim_id: np.ndarray) -> np.ndarray:
-    """How far a ray's depth can be off where it meets the triangles of `prim_id` (H, W), to first order; 0 on a miss.
-
-    Corners that are off by e move the plane by no more than e, and the hit by e / cos of the angle of incidence; nowhere by
-    more than the triangle is large.
-    """
+    """Bound the error of a ray's depth on the triangles of `prim_id` (H, W), to first order; 0 on a miss.
+    Corners that are off by e move the plane by at most e and the hit by e / cos(angle of incidence), and by no more than the triangle's
+    size."""
     row, column = np.nonzero(prim_id >= 0)
     out = np.zeros(prim_id.shape)
     corners = _corners(geometry, camera, size, prim_id[row, column])
@@ -89,8 +85,8 @@ def depth_bound(geometry: Geometry, camera: Camera, size: tuple[int, int], prim_
 
 def _beside(rasterizer: Rasterizer, depth: np.ndarray, bound: np.ndarray, reach: np.ndarray, camera: Camera,
             size: tuple[int, int], geometry: Geometry) -> np.ndarray:
-    """Where the exact picture has the rays' depth within `reach` pixels of the centre (0: not asked), looked for on rings
-    around it, of twice the radius each."""
+    """Return where the exact picture has the rays' depth within `reach` pixels of the centre (0: not looked for).
+    Look on rings around the centre, each of twice the radius."""
     found = np.zeros(depth.shape, bool)
     radius = reach[reach > 0.0].min(initial=np.inf)
     for _ in range(MAX_RINGS):
@@ -106,10 +102,8 @@ def _beside(rasterizer: Rasterizer, depth: np.ndarray, bound: np.ndarray, reach:
 
 
 def edge_reach(geometry: Geometry, camera: Camera, size: tuple[int, int], prim_id: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """How far, in pixels, rounding moves an edge of the triangles of `prim_id` (H, W) that rays meet at `depth`; 0 on a miss.
-
-    A far corner's error also counts where a near part of the triangle is seen.
-    """
+    """Bound how far rounding moves an edge of the triangles of `prim_id` (H, W) at `depth`, in pixels; 0 on a miss.
+    The error of a far corner counts where a near part of the triangle is seen, too."""
     c = camera_struct(camera, size)
     per_radian = 0.5 * max(size[0] / c.tan_x, size[1] / c.tan_y) * (1.0 + c.tan_x**2 + c.tan_y**2)
     out = np.zeros(prim_id.shape)

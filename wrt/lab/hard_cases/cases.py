@@ -1,15 +1,15 @@
-"""The hard cases: geometry and rays that lose rays, seeded, at any number; and what the answers must be.
+"""The hard cases: geometry and rays at which intersection tests fail, seeded, in any number, with what the answers must be.
 
-Names begin with the letter of their group: A dense spheres near and far from 0; B a jittered sphere; C re-intersection;
-D bad triangles; E along the axes; F slivers, edge-on and grazing; G sheets, coincident triangles, a shared vertex; H scale
-and the segment's ends; I lengths, underflow, and what is not finite.
+The first letter of a name is its group:
+- A dense spheres near and far from 0; B a jittered sphere; C re-intersection; D bad triangles; E along the axes;
+- F slivers, edge-on and grazing; G sheets, coincident triangles, a shared vertex; H scale and the segment's ends;
+- I lengths, underflow, and values that are not finite.
 
-"Aimed at" a vertex or a point p on an edge means the direction fl32(p - o): through p exactly only where p - o is a float32
-value, and else beside it by at most 2^-24 of its distance per axis.
+A ray "aimed at" a point p has the direction fl32(p - o). It meets p exactly only if p - o is a float32 value; else it passes p by at most
+2^-24 of the distance on each axis.
 
 >>> for case in chunks("A_far_vertices", 1_000_000, seed=0):
-...     verdict += judge(case, accel.closest_hit(case.origins, case.directions, case.t_min, case.t_max))
-"""
+...     verdict += judge(case, accel.closest_hit(case.origins, case.directions, case.t_min, case.t_max))"""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ COSTLY = {"G_fan": 100}  # 10,000 triangles at one vertex are all tested: so man
 
 
 def generate(name: str, n: int, seed: Seed = 0) -> HardCase:
-    """n rays of one case. Raises InputError for an unknown name."""
+    """Return n rays of one case. Raise InputError for an unknown name."""
     require_known(name, HARD_CASES, "hard case")
     make = HARD_CASES[name]
     notes = (make.func if isinstance(make, partial) else make).__doc__ or ""
@@ -75,14 +75,13 @@ def generate(name: str, n: int, seed: Seed = 0) -> HardCase:
 
 
 def chunks(name: str, n: int, seed: int = 0, chunk: int = 2**18) -> Iterator[HardCase]:
-    """n rays in parts of at most `chunk`, each with a seed of its own: some cases have another geometry in each part, the
-    others the same object."""
+    """Yield n rays in parts of at most `chunk`, each with its own seed; some cases have another geometry in each part."""
     for first in range(0, n, chunk):
         yield generate(name, min(chunk, n - first), (seed, first // chunk))
 
 
 def chosen(cases: Sequence[str]) -> list[str]:
-    """Names of cases from names and letters of groups. Raises InputError where there is none of that name."""
+    """Return the names of cases from names and letters of groups. Raise InputError for an unknown one."""
     names: list[str] = []
     for case in cases or list(HARD_CASES):
         found = [name for name in HARD_CASES if name == case or name.split("_")[0] == case]
@@ -93,5 +92,5 @@ def chosen(cases: Sequence[str]) -> list[str]:
 
 
 def fewer(name: str, rays: int) -> int:
-    """How many rays a case gets where the others get `rays`."""
+    """Return the number of rays of a case if other cases get `rays`: costly cases get fewer."""
     return max(1, rays // next((divisor for start, divisor in COSTLY.items() if name.startswith(start)), 1))

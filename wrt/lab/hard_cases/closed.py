@@ -1,13 +1,11 @@
-"""Rays that start inside a closed surface: every one of them must hit.
+"""Rays that start inside a closed surface: every one must hit.
 
-Why that is a theorem. Let the origin have winding number other than 0 with respect to the surface, as it is stored, rounded
-to float32. Then any ray meets the surface, also where triangles have lost their area. And it meets a triangle that is not
-parallel to it: shift the ray sideways by ever less, in a direction that is in none of the planes which contain it. The
-shifted rays start inside too; they are parallel to those planes and off them, so each hits some other triangle; one of the
-finitely many is hit infinitely often, and, being closed, by the ray itself. So HIT needs only an origin inside: rounding
-moves each vertex by less than the origin's distance to the surface, and a surface that never passes over the origin on the
-way keeps its winding number.
-"""
+This is a theorem. Let the origin have a winding number other than 0 with respect to the surface as stored, in float32. Then every ray
+meets the surface, even where triangles have lost their area. It also meets a triangle that is not parallel to it. Proof: shift the ray
+sideways by less and less, in a direction that lies in none of the planes that contain the ray. The shifted rays start inside and miss
+the triangles in those planes, so each hits another triangle. One of finitely many triangles is hit infinitely often. It is closed, so
+the ray itself hits it. HIT therefore needs only an origin inside. Rounding moves a vertex by less than the origin's distance to the
+surface, and a surface that never passes over the origin keeps its winding number."""
 
 from __future__ import annotations
 
@@ -38,25 +36,23 @@ def _dense(position: str) -> Geometry:
 
 
 def dense_sphere(rng: np.random.Generator, n: int, *, position: str, aim: str) -> HardCase:
-    """A: a sphere of radius 2 with 159,200 triangles. The origins are in the cube of side 2 around its centre, whose corners
-    are 0.26 from the surface; float32 moves a point 2e5 from 0 by 0.012 at most. "far", rounding leaves 2356 faces with their
-    corners on a line, which are flipped as every scene's are (wrt.scene.clean.flip_collinear)."""
+    """A: a sphere of radius 2 with 159,200 triangles, and origins in the cube of side 2 around its centre.
+    The cube's corners are 0.26 from the surface; float32 moves a point 2e5 from 0 by at most 0.012. At "far", rounding puts the corners of
+    2356 faces on a line; they are flipped as in every scene (wrt.scene.clean.flip_collinear)."""
     center = np.array(POSITIONS[position])
     return inside(_dense(position), center + rng.uniform(-1.0, 1.0, (n, 3)), rng, aim)
 
 
 def jittered_sphere(rng: np.random.Generator, n: int, *, aim: str) -> HardCase:
-    """B (pbrt-v4, shapes_test, Triangle.Watertight): 16 x 16, each vertex at a radius of 1 + 5 U, the origins in a ball of
-    0.5. Corners of a face are at most 26 degrees apart, so that no face comes closer to the centre than cos 26 = 0.89."""
+    """B (pbrt-v4, shapes_test, Triangle.Watertight): 16 x 16, each vertex at radius 1 + 5 U, origins in a ball of 0.5.
+    Corners of a face are at most 26 degrees apart, so no face is closer to the centre than cos 26 = 0.89."""
     vertices, faces = lat_long(16, 16, 1.0 + 5.0 * rng.random(2 + 16 * 15))
     return inside(surface(vertices, faces), in_ball(rng, n, 0.5), rng, aim)
 
 
 def needles(rng: np.random.Generator, n: int, *, aim: str) -> HardCase:
-    """F: a sphere squeezed by 10^-U(1.5, 4) in two axes, each its own: triangles of aspect 1e3 to 1e8 around the rays.
-
-    Coordinates are rounded relative to themselves, which squeezing does not change: origins of half the radius are inside.
-    """
+    """F: a sphere squeezed by 10^-U(1.5, 4) along two axes, each by its own factor: triangles of aspect 1e3 to 1e8.
+    Coordinates are rounded relative to themselves, which squeezing does not change: origins within half the radius are inside."""
     squeeze = np.ones(3)
     axes = rng.permutation(3)
     squeeze[axes[0]] = 10.0 ** -rng.uniform(1.5, 4.0)
@@ -89,7 +85,7 @@ def _coincident() -> Geometry:
 
 
 def coincident(rng: np.random.Generator, n: int, *, aim: str) -> HardCase:
-    """G: a sphere that is there three times, in a shuffled order: of each tie the lowest prim_id."""
+    """G: a sphere three times over, in a shuffled order: of each tie the lowest prim_id."""
     return inside(_coincident(), in_ball(rng, n, 0.9), rng, aim)
 
 
@@ -105,7 +101,7 @@ def _fan() -> Geometry:
 
 
 def shared_vertex(rng: np.random.Generator, n: int, *, aim: str) -> HardCase:
-    """G: a double cone whose apex 10,000 triangles share (as the other apex); "vertices": aimed at the two."""
+    """G: a double cone whose apexes 10,000 triangles share; "vertices": aimed at the two apexes."""
     geometry = _fan()
     origins = in_ball(rng, n, 0.5).astype(np.float32)
     directions = aimed(geometry, rng, origins, aim)
@@ -127,7 +123,7 @@ def _stadium() -> tuple[Geometry, Geometry]:
 
 
 def stadium(rng: np.random.Generator, n: int) -> HardCase:
-    """H: a teapot in a stadium 1e5 larger; rays from near the pot and from far away, at its corners and past it."""
+    """H: a teapot in a sphere 1e5 times its size; rays from near the pot and from far away, at its corners and past it."""
     pot, both = _stadium()
     origins = (in_ball(rng, n) * np.where(rng.random((n, 1)) < 0.5, 3.0, 5e4)).astype(np.float32)
     at_pot = aimed(pot, rng, origins, "vertices")
@@ -152,7 +148,7 @@ def underflowing(rng: np.random.Generator, n: int) -> HardCase:
 
 
 def denormal(rng: np.random.Generator, n: int) -> HardCase:
-    """I: all of the direction is denormal, 1e-41 to 1e-38 long; the sphere is so small that t is at most 4e37."""
+    """I: the whole direction is denormal, 1e-41 to 1e-38 long; the sphere is so small that t is at most 4e37."""
     case = inside(sphere(32, 16, 1e-4), in_ball(rng, n, 0.9e-4), rng, "uniform")
     directions = case.directions.astype(np.float64) * 10.0 ** rng.uniform(-41.0, -38.0, (n, 1))
     directions = directions.astype(np.float32)
@@ -167,9 +163,10 @@ def _grid() -> Geometry:
 
 
 def axis_parallel(rng: np.random.Generator, n: int) -> HardCase:
-    """E: along the axes, both ways, zeros of both signs, through a block of 4 x 4 x 4 unit cubes whose faces coincide: in
-    faces, along edges and through corners. They start inside or before the block, so that a face is always ahead; on the
-    block's outer faces the weight of the edge there is exactly 0, also in float32: a closed triangle is hit."""
+    """E: along the axes, both ways, zeros of both signs, through a block of 4 x 4 x 4 unit cubes whose faces coincide.
+    Rays run in faces, along edges and through corners. They start inside or before the block, so a face is always ahead. On the block's
+    outer
+    faces the weight of the edge is exactly 0, in float32, too: a closed triangle is hit."""
     row, axis = np.arange(n), rng.integers(3, size=n)
     origins = np.where(rng.random((n, 3)) < 0.7, rng.integers(0, 9, (n, 3)) / 2.0, rng.uniform(0.0, 4.0, (n, 3)).astype(np.float32))
     sign = rng.choice([-1.0, 1.0], n)

@@ -1,4 +1,4 @@
-"""What a hard case is, how rays are aimed, and the meshes that several cases share."""
+"""Type of a hard case, aiming of rays, and meshes that several cases share."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ Seed = int | Sequence[int]
 
 @dataclass(frozen=True, eq=False)
 class HardCase:
-    """Rays that are hard for a geometry, and what is known of their answers.
+    """Rays at a geometry that are hard to get right, and what is known of their answers.
 
-    origins, directions: (N, 3) float32; t_min, t_max: (N,) float32; expected: (N,) int8 of HIT, MISS, ASK. HIT is a theorem
-    about the case, not a computation: see its generator. closed: every edge has two faces with opposite directions, so that
-    no ray may pass through the surface (`judge` asks for the winding number where a nearer crossing is left out).
-    next_directions: where the ray goes on from its hit (case C), of any length, or None; on a sphere it must be turned to
-    the outside first. refused: the host must refuse these arrays with an InputError; on the device, rays that are not
-    finite miss, and nothing hangs. asked: of how many claimed hits `judge` asks the oracle whether they are the closest.
-    """
+    - origins, directions: (N, 3) float32; t_min, t_max: (N,) float32; expected: (N,) int8 of HIT, MISS, ASK. HIT is proved by the
+    generator.
+    - closed: each edge has two faces of opposite directions: no ray may pass through. `judge` then uses the winding number where a nearer
+      crossing is left out.
+    - next_directions: where the ray continues from its hit (case C), of any length, or None; on a sphere turned to the outside first.
+    - refused: the host must refuse these arrays with an InputError; on the device, rays that are not finite miss.
+    - asked: of how many reported hits `judge` asks the oracle whether they are the closest."""
 
     geometry: Geometry
     origins: np.ndarray
@@ -54,7 +54,7 @@ class HardCase:
 
 def hard_case(geometry: Geometry, origins: np.ndarray, directions: np.ndarray, expected: int | np.ndarray, *,
               t_min: float | np.ndarray = 0.0, t_max: float | np.ndarray = np.inf, closed: bool = False) -> HardCase:
-    """Everything in its type. A direction that was rounded to 0 becomes (1, 0, 0)."""
+    """Return a case with arrays of the right types. A direction that is rounded to 0 becomes (1, 0, 0)."""
     n = len(origins)
     with np.errstate(over="ignore"):
         origins, directions = (np.ascontiguousarray(x, dtype=np.float32) for x in (origins, directions))
@@ -70,7 +70,7 @@ def surface(vertices: np.ndarray, faces: np.ndarray, spheres: np.ndarray = NO_SP
 
 
 def soup(corners: np.ndarray) -> Geometry:
-    """Triangles (N, 3, 3) that share nothing."""
+    """Return triangles (N, 3, 3) that share no vertex."""
     return surface(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
 
 
@@ -81,18 +81,18 @@ def joined(*parts: Geometry) -> Geometry:
 
 
 def unit_vectors(rng: np.random.Generator, n: int) -> np.ndarray:
-    """(n, 3) float64, uniform over the sphere."""
+    """Return (n, 3) float64 vectors, uniform over the sphere."""
     x = rng.normal(size=(n, 3))
     return x / np.linalg.norm(x, axis=1, keepdims=True)
 
 
 def in_ball(rng: np.random.Generator, n: int, radius: float = 1.0) -> np.ndarray:
-    """(n, 3) float64, uniform in the ball around 0."""
+    """Return (n, 3) float64 points, uniform in the ball around 0."""
     return radius * rng.random((n, 1)) ** (1.0 / 3.0) * unit_vectors(rng, n)
 
 
 def targets(geometry: Geometry, rng: np.random.Generator, n: int, aim: str) -> np.ndarray:
-    """(n, 3) float64 points on the mesh: its vertices, or points anywhere on its edges (of random faces)."""
+    """Return (n, 3) float64 points on random faces of the mesh: vertices, or points on edges."""
     face = geometry.faces[rng.integers(len(geometry.faces), size=n)]
     corner = rng.integers(3, size=n)
     row = np.arange(n)
@@ -101,19 +101,16 @@ def targets(geometry: Geometry, rng: np.random.Generator, n: int, aim: str) -> n
 
 
 def aimed(geometry: Geometry, rng: np.random.Generator, origins: np.ndarray, aim: str) -> np.ndarray:
-    """(n, 3) float64 directions from origins (n, 3) float32. "uniform": unit vectors; else target - origin.
-
-    The device gets them rounded, fl32(target - origin): the ray passes through the target exactly only where that
-    difference is a float32 value, and else beside it by up to 2^-24 of its distance per axis: the hard part of the case.
-    """
+    """Return (n, 3) float64 directions from origins (n, 3) float32: unit vectors for "uniform", else target - origin.
+    Rounding to float32 moves the ray beside its target by up to 2^-24 of the distance on each axis: the hard part of the case."""
     if aim == "uniform":
         return unit_vectors(rng, len(origins))
     return targets(geometry, rng, len(origins), aim) - origins.astype(np.float64)
 
 
 def lat_long(slices: int, stacks: int, radii: np.ndarray | float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) float64 and faces of a closed sphere around 0, the poles on z: 2 slices (stacks - 1) triangles, wound
-    with the outside counter-clockwise. radii: one for all or one a vertex (2 + slices (stacks - 1), poles first)."""
+    """Return vertices (V, 3) float64 and faces of a closed sphere around 0: 2 slices (stacks - 1) triangles, poles on z.
+    The outside is counter-clockwise. radii: one for all, or one for each vertex (2 + slices (stacks - 1), poles first)."""
     theta = np.pi * np.arange(1, stacks) / stacks
     phi = 2.0 * np.pi * np.arange(slices) / slices
     ring = np.stack([np.sin(theta)[:, None] * np.cos(phi), np.sin(theta)[:, None] * np.sin(phi),
@@ -131,13 +128,13 @@ def lat_long(slices: int, stacks: int, radii: np.ndarray | float = 1.0) -> tuple
 
 @cache
 def sphere(slices: int, stacks: int, radius: float = 1.0, center: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Geometry:
-    """A closed lat-long sphere, rounded to float32 after it was moved."""
+    """Return a closed lat-long sphere, moved and then rounded to float32."""
     vertices, faces = lat_long(slices, stacks)
     return surface(radius * vertices + np.array(center), faces)
 
 
 def cube(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Eight vertices and twelve faces, the outside counter-clockwise."""
+    """Return eight vertices and twelve faces, the outside counter-clockwise."""
     vertices = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (high - low) + low
     quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
     return vertices, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])

@@ -61,7 +61,7 @@ def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
 
 
 def _counted(group: Sequence[Row], names: Sequence[str]) -> list[str]:
-    """How many rays there are, and how many of them each library has wrong."""
+    """Return the number of rays, and of each library the number of wrong ones."""
     mine = {name: [row for row in group if row.library == name] for name in names}
     out = [str(sum(row.rays for row in mine[names[0]]))]
     for rows in mine.values():

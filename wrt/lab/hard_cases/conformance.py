@@ -1,4 +1,4 @@
-"""The hard cases put to any library's closest hit, as a function of arrays: who loses rays, ray by ray, by the oracle."""
+"""The hard cases for any library's closest hit, as a function of arrays, judged ray by ray by the oracle."""
 
 from __future__ import annotations
 
@@ -23,10 +23,12 @@ COLUMNS: Columns = {"case": "{case}", "rays": "{rays}", "lost": "{lost}", "inven
 
 @dataclass(frozen=True)
 class Result:
-    """What a library says of one case. lost: rays that must hit and are said to miss; invented: hits of a triangle that the ray
-    passes by more than float32's rounding, or that are not on the ray; wrong_triangle: a nearer hit was left out. t_ulp: the
-    largest error of t, in float32 steps of the exact one. raised: the error, where it raised one; refused: it did so for input that
-    is not finite, which is right. examples: the first rays that are wrong, and why."""
+    """Result of one case.
+
+    - lost: rays that must hit and are reported to miss; wrong_triangle: a nearer hit was left out.
+    - invented: hits of a triangle that the ray passes by more than float32's rounding, or that are not on the ray.
+    - t_ulp: the largest error of t, in float32 steps of the exact one. examples: the first wrong rays, and why.
+    - raised: the error that the function raised; refused: it was raised for input that is not finite, which is right."""
 
     case: str
     rays: int
@@ -40,17 +42,17 @@ class Result:
 
     @property
     def wrong(self) -> int:
-        """Rays lost, invented or given to a wrong triangle."""
+        """Number of rays lost, invented or given to a wrong triangle."""
         return self.lost + self.invented + self.wrong_triangle
 
     @property
     def ok(self) -> bool:
-        """None is wrong, and nothing was raised but for input that is not finite."""
+        """True if no ray is wrong and nothing was raised, but for input that is not finite."""
         return not (self.wrong or (self.raised and not self.refused))
 
     @property
     def told(self) -> str:
-        """Of what was raised."""
+        """The error that was raised, or "refused" if that was right; "" without an error."""
         return "refused" if self.refused else self.raised
 
     def __str__(self) -> str:
@@ -69,12 +71,12 @@ class Report:
 
     @property
     def ok(self) -> bool:
-        """No ray lost, invented or given to a wrong triangle, and no error but for input that is not finite."""
+        """True if all results are."""
         return all(result.ok for result in self.results)
 
     @property
     def total(self) -> Result:
-        """The sums, and the largest error of t."""
+        """The sums over all cases, and the largest error of t."""
         counts = {name: sum(getattr(result, name) for result in self.results) for name in ("rays", "lost", "invented", "wrong_triangle")}
         return Result("all", **counts, t_ulp=max((result.t_ulp for result in self.results), default=0.0))
 
@@ -89,7 +91,7 @@ class Report:
 
 
 class Case:
-    """One hard case: meshes with rays, `rays` in all, made each time when they are asked for. name: of wrt.testing.CASES."""
+    """One hard case of wrt.testing.CASES: meshes with `rays` rays in all, made anew at each access."""
 
     def __init__(self, name: str, rays: int = 1000, seed: int = 0) -> None:
         self.name, *more = case_names([name])
@@ -99,21 +101,21 @@ class Case:
 
     @property
     def parts(self) -> Iterator[HardCase]:
-        """The meshes with their rays: geometry.vertices, geometry.faces, origins, directions; one, but for very many rays."""
+        """Yield the meshes with their rays: geometry.vertices, geometry.faces, origins, directions. Only very many rays take several."""
         return chunks(self.name, self.rays, self.seed)
 
     @property
     def about(self) -> str:
-        """What is hard in it."""
+        """What is hard in this case."""
         return generate(self.name, 1).notes
 
     def result(self, closest_hit: ClosestHit) -> Result:
-        """Ask closest_hit, which `hard_cases` describes, and judge what it says. What it raises is a part of the result."""
+        """Judge `closest_hit` (see `hard_cases`). An error that it raises is part of the result."""
         return self._judged(closest_hit, keep_errors=True)
 
     def check(self, closest_hit: ClosestHit) -> None:
-        """Raise AssertionError that shows the rays where closest_hit loses one, invents one or gives one to a wrong triangle.
-        What it raises itself goes through, but for input that is not finite, which it may refuse."""
+        """Raise AssertionError that shows the rays that `closest_hit` loses, invents or gives to a wrong triangle.
+        Its own errors pass through, except for input that is not finite, which it may refuse."""
         result = self._judged(closest_hit, keep_errors=False)
         if not result.ok:
             raise AssertionError(f"{result}\n({self.about})")
@@ -138,8 +140,7 @@ class Case:
 
 
 def case_names(cases: str | Sequence[str] = ()) -> list[str]:
-    """Those of names and letters of groups; without any, all that a closest hit on triangles can be asked. Raises InputError for a
-    name that is none of these."""
+    """Return the cases of names and letters of groups; by default all that a closest hit on triangles can answer."""
     cases = as_tuple(cases, str, "cases")
     for name in set(cases).intersection(NOT_ASKED):
         raise InputError(f"{name} is not for a closest hit on triangles without t_min")
@@ -147,7 +148,7 @@ def case_names(cases: str | Sequence[str] = ()) -> list[str]:
 
 
 def results(closest_hit: ClosestHit, cases: str | Sequence[str] = (), rays: int = 1000, seed: int = 0) -> Iterator[Result]:
-    """As `hard_cases`, each result as it is there."""
+    """Yield the results of `hard_cases` one by one."""
     for name in case_names(cases):
         yield Case(name, rays, seed).result(closest_hit)
 
@@ -179,6 +180,6 @@ def _answer(said: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _segment(part: HardCase, t: np.ndarray, prim_id: np.ndarray) -> Any:
-    """As a query with the case's t_max would have it: the closest hit, where it lies within."""
+    """Return hits as a query with the case's t_max would report them."""
     beyond = (prim_id >= 0) & (t > part.t_max)
     return replace(Hits(t, None, None, prim_id), prim_id=np.where(beyond, -1, prim_id))

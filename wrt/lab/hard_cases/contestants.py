@@ -1,4 +1,4 @@
-"""What is put to the hard cases: wrt's own tests through the BVH, and the ray queries of other libraries (peers)."""
+"""Algorithms for the hard cases: wrt's tests through its BVH, and the ray queries of other libraries (peers)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from wrt.lab.bench.rays import RaySet
 
 
 class Algorithm(ABC):
-    """A way to find closest hits. prepare() once a geometry, then closest() on one thread."""
+    """A way to find closest hits: call prepare() for each geometry, then closest() on one thread."""
 
     name: str
     bytes_per_triangle: float = float("nan")
@@ -34,18 +34,18 @@ class Algorithm(ABC):
 
     @abstractmethod
     def prepare(self, geometry: Geometry) -> bool:
-        """Build for this geometry; False where the library cannot take it (spheres)."""
+        """Build for this geometry; return False if the library cannot take it (spheres)."""
 
     @abstractmethod
     def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: Any = 0.0, t_max: Any = np.inf) -> Hits:
-        """As wrt.accel.base.Accelerator.closest_hit."""
+        """Return closest hits, as wrt.accel.base.Accelerator.closest_hit."""
 
     @abstractmethod
     def search(self, rays: RaySet, threads: int) -> Callable[[], Any]:
-        """The work that is timed, with rays and results in arrays of the library's own kind."""
+        """Return the work to time, with rays and results in the library's own arrays."""
 
     def occluded(self, out: Any) -> np.ndarray:
-        """The result of a search with any-hit rays."""
+        """Return the result of a search with any-hit rays."""
         return out.numpy().astype(bool)
 
 
@@ -79,7 +79,7 @@ class Own(Algorithm):
 
 
 class Peer(Algorithm):
-    """Another library: triangles only. Segments are cut after the query where it has no t_min."""
+    """Another library: triangles only. If it has no t_min, hits before it are removed after the query."""
 
     is_peer = True
     has_threads = False
@@ -92,11 +92,11 @@ class Peer(Algorithm):
 
     @abstractmethod
     def load(self, geometry: Geometry) -> None:
-        """Take the triangles."""
+        """Hand the triangles to the library."""
 
 
 class Embree(Peer):
-    """Embree 4 through embreex in its robust mode (RTC_SCENE_FLAG_ROBUST), which embreex also takes unasked from 4.4 on."""
+    """Embree 4 through embreex in its robust mode (RTC_SCENE_FLAG_ROBUST), embreex's default from 4.4 on."""
 
     name = "Embree robust"
     package = "embreex"
@@ -129,14 +129,14 @@ class Embree(Peer):
 
 
 class EmbreeFast(Embree):
-    """Embree 4 through embreex without its robust flag: what Embree itself does unasked, and faster. It loses rays at edges."""
+    """Embree 4 through embreex without its robust flag, Embree's own default: faster, and rays are lost at edges."""
 
     name = "Embree fast"
     robust = False
 
 
 class WarpMesh(Peer):
-    """Warp's own mesh_query_ray on wp.Mesh with one of its constructors. It says where, but not at which t below 0."""
+    """Warp's mesh_query_ray on wp.Mesh with one of its constructors. It has no t_min."""
 
     name = "Warp mesh_query_ray"
 
@@ -162,7 +162,7 @@ class WarpMesh(Peer):
         return cut((t / length).astype(np.float32), prim_id, v, 1.0 - u - v, t_min, t_max)
 
     def search(self, rays: RaySet, threads: int) -> Callable[[], Any]:
-        """Warp wants unit directions, and its any-hit query a length beside them."""
+        """Return the query with unit directions, which Warp requires, and with a length beside them for any-hit rays."""
         import warp as wp
 
         from wrt.core.device import load_kernel
@@ -218,14 +218,14 @@ class Open3D(Peer):
 
 
 def cut(t: np.ndarray, prim_id: np.ndarray, u: np.ndarray, v: np.ndarray, t_min: Any, t_max: Any) -> Hits:
-    """Hits of which those beyond the segment are none."""
+    """Remove the hits outside of the segment."""
     outside = (prim_id < 0) | ~((t >= t_min) & (t <= t_max))
     return Hits(np.where(outside, np.float32(np.inf), t), np.where(outside, 0, u), np.where(outside, 0, v),
                 np.where(outside, np.int32(-1), prim_id))
 
 
 def own_algorithms() -> list[Own]:
-    """Every triangle test with conservative boxes, and the default test with every other box test."""
+    """Return every triangle test with conservative boxes, and the default test with every other box test."""
     from wrt.kernels.units.box import RAY_AABB
     from wrt.kernels.units.triangle import RAY_TRIANGLE
 

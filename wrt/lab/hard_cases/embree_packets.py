@@ -1,4 +1,4 @@
-"""Embree in packets of sixteen: its fastest modes, which embreex does not offer, through the C library that embreex brings."""
+"""Embree in packets of 16, its fastest modes, through the C library in the embreex package."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SLACK = 16  # bytes that Embree may read behind the last vertex
 
 @cache
 def library() -> Any:
-    """Embree 4. Raises InputError where there is no embreex."""
+    """Load Embree 4. Raise InputError without embreex."""
     with needed_by("Embree"):
         from embreex import rtcore_scene
     embree = ctypes.CDLL(rtcore_scene.__file__)  # a symbol is looked for in what it is linked to, too
@@ -40,7 +40,7 @@ def library() -> Any:
 
 
 class EmbreePackets(Peer):
-    """rtcIntersect16 and rtcOccluded16 of a robust scene, with the flag for rays that go the same way."""
+    """rtcIntersect16 and rtcOccluded16 of a robust scene, with the flag for coherent rays."""
 
     name = "Embree robust, 16 coherent"
     package = "embreex"
@@ -98,7 +98,7 @@ class EmbreePackets(Peer):
 
 
 class EmbreeIncoherentPackets(EmbreePackets):
-    """The same without that flag."""
+    """The same without the flag for coherent rays."""
 
     name = "Embree robust, 16 incoherent"
     coherent = False

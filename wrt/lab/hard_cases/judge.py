@@ -1,10 +1,9 @@
-"""The verdict on what a unit says of a hard case, ray by ray, against the oracle.
+"""Verdicts on the answers of an algorithm to a hard case, ray by ray, by the oracle.
 
-Three things can be wrong whatever is meant to be allowed: a *miss* (a hit that must be found is not), a *false hit* (the
-ray passes the triangle by more than the unit's rounding, or lies outside of the segment), a *wrong prim_id* (a nearer one had
-to be found). Where the derived error bound (wrt.lab.oracle.bounds) cannot tell, nothing is wrong, but it is counted apart:
-borderline misses and hits, ties (exactly equal t) and near ties (within the bound).
-"""
+Three kinds of answers are wrong. A *miss*: a hit that must be found is not. A *false hit*: the ray passes the triangle by more than the
+algorithm's rounding, or t is outside of the segment. A *wrong prim_id*: a nearer hit had to be found. Answers that the derived error
+bound (wrt.lab.oracle.bounds) cannot settle are not wrong, but counted: borderline misses and hits, ties (exactly equal t) and near ties
+(within the bound)."""
 
 from __future__ import annotations
 
@@ -24,9 +23,10 @@ BINS_PER_OCTAVE, LOWEST_OCTAVE, N_BINS = 8, -12, 8 * 160
 
 @dataclass
 class Errors:
-    """Errors of one quantity. largest, and a histogram for percentiles (merging it loses nothing): over hits that are exact
-    ones; in float32 ulp of the exact t, for u and v in 2^-24, as they are parts of 1. largest_ratio to the derived bound, and
-    how many are over it: also over borderline hits, whose plane the ray may meet far outside of the triangle."""
+    """Errors of one quantity, in float32 ulp of the exact t, or of u and v in 2^-24.
+    - largest, histogram (for percentiles): over hits that are exact ones.
+    - largest_ratio to the derived bound, over (the bound): also over borderline hits, whose plane may be met far outside of the
+    triangle."""
 
     largest: float = 0.0
     largest_ratio: float = 0.0
@@ -34,7 +34,7 @@ class Errors:
     histogram: np.ndarray = field(default_factory=lambda: np.zeros(N_BINS, np.int64))
 
     def add(self, error: np.ndarray, unit: np.ndarray | float, bound: np.ndarray, exact_hit: np.ndarray) -> np.ndarray:
-        """Count absolute errors (NaN: infinite); returns where they are above the bound."""
+        """Count absolute errors (NaN counts as infinite); return where they exceed the bound."""
         error = np.where(np.isnan(error), np.inf, error)
         over = (error > bound) | np.isinf(error)
         ratio = np.full(len(error), np.inf)
@@ -49,7 +49,7 @@ class Errors:
         return over
 
     def percentile(self, q: float) -> float:
-        """An upper bound, within a ninth, on the q-th percentile; NaN where nothing was counted."""
+        """Return an upper bound, within a ninth, on the q-th percentile; NaN if nothing was counted."""
         total = int(self.histogram.sum())
         if not total:
             return float("nan")
@@ -70,8 +70,9 @@ class Errors:
 
 @dataclass
 class Verdict:
-    """Counts over rays; verdicts of parts of a case can be added. asked: claimed hits whose closeness the oracle checked;
-    self_hits and duplicate_hits come from judge_next and judge_all_hits; examples: the first few rays that are wrong."""
+    """Counts over rays; verdicts of parts of a case can be added.
+    - asked: reported hits that the oracle compared with the closest one; examples: the first few wrong rays.
+    - self_hits, duplicate_hits: from judge_next and judge_all_hits."""
 
     rays: int = 0
     hits: int = 0
@@ -96,7 +97,7 @@ class Verdict:
 
     @property
     def ok(self) -> bool:
-        """No ray lost, invented or given to the wrong primitive, and every error within its bound."""
+        """True if no ray is lost, invented or given to a wrong primitive, and every error is within its bound."""
         wrong = self.misses + self.false_hits + self.wrong_prim + self.self_hits + self.duplicate_hits
         return wrong + self.t.over + self.u.over + self.v.over == 0
 
@@ -106,11 +107,10 @@ class Verdict:
         return out
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain numbers, for JSON."""
         return {f.name: value.as_dict() if isinstance(value := getattr(self, f.name), Errors) else value for f in fields(Verdict)}
 
     def wrong(self, count: str, case: HardCase, rows: np.ndarray, why: str, prim_id: np.ndarray | None = None) -> None:
-        """Count these rays under the name `count`, and keep some of them."""
+        """Count these rays under the name `count`, and keep some as examples."""
         if count:
             setattr(self, count, getattr(self, count) + len(rows))
         for row in rows[: EXAMPLES - len(self.examples)].tolist():
@@ -125,15 +125,12 @@ CLAIM = np.dtype([("row", np.int64), ("t", np.float64), ("prim_id", np.int64), (
 
 
 def judge(case: HardCase, hits: Any, asked: int | None = None, *, lowest: bool = True) -> Verdict:
-    """The verdict on closest hits: t, u, v, prim_id (N,), prim_id -1 on a miss (wrt.accel.queries.answers.Hits).
+    """Judge closest hits: t, u, v, prim_id (N,), prim_id -1 on a miss (wrt.accel.queries.answers.Hits).
 
-    lowest: of triangles that are the same, the one with the lowest prim_id must be told: wrt's own rule, not a peer's. Where u
-    and v are None, errors of t are measured only: the bounds are those of wrt's test.
-
-    Every claimed hit is held against its own primitive, exactly. The oracle is asked about every ray that claims to miss
-    where it is not known to have to hit, and, whether something nearer was left out, about `asked` claimed hits (case.asked
-    if None), chosen at random, the same ones each time.
-    """
+    - Each reported hit is compared with its own primitive, exactly. The oracle looks for nearer hits of `asked` of them (None: case.asked),
+      chosen at random, always the same. It traces each ray that is reported to miss, unless the ray is known to hit.
+    - lowest: of identical triangles the lowest prim_id must be reported, which is wrt's rule. Without u and v, errors of t are only
+      measured: the bounds are those of wrt's test."""
     reference = reference_of(case.geometry)
     t, u, v, prim_id = (None if value is None else np.asarray(value) for value in (hits.t, hits.u, hits.v, hits.prim_id))
     assert t is not None and prim_id is not None
@@ -153,14 +150,14 @@ def judge(case: HardCase, hits: Any, asked: int | None = None, *, lowest: bool =
 
 
 def check(case: HardCase, hits: Any) -> Verdict:
-    """What can be said of closest hits at once, for any number of rays: those that must hit do, those that must miss do, t is
-    inside of the segment. Rays whose answer only the oracle knows (ASK) may miss. Arguments as for `judge`."""
+    """Judge without the oracle, for any number of rays: expected hits and misses, and t inside of the segment.
+    Rays whose answer only the oracle knows (ASK) may miss. Arguments as for `judge`."""
     every = np.ones(len(case.geometry), bool)
     return _plain_faults(case, np.asarray(hits.t), np.asarray(hits.prim_id), every)[0]
 
 
 def _plain_faults(case: HardCase, t: np.ndarray, prim_id: np.ndarray, finite: np.ndarray) -> tuple[Verdict, np.ndarray]:
-    """What is wrong whatever the oracle says, and which rays claim a hit that may be one. finite: the primitives that are."""
+    """Find what is wrong whatever the oracle says, and the rays whose reported hit may be one. finite: flags of the primitives."""
     reported = prim_id >= 0
     verdict = Verdict(rays=len(case), hits=int(reported.sum()))
     verdict.wrong("misses", case, np.flatnonzero(~reported & (case.expected == HIT)), "must hit, is said to miss")
@@ -174,7 +171,7 @@ def _plain_faults(case: HardCase, t: np.ndarray, prim_id: np.ndarray, finite: np
 
 
 def _claims(case: HardCase, reference: Reference, rows: np.ndarray, said: tuple[Any, ...], verdict: Verdict) -> Any:
-    """Hold claimed hits against the primitives that they name: false hits, and the errors of t, u and v."""
+    """Compare reported hits with the primitives that they name: false hits, and errors of t, u and v."""
     u, v = (None if x is None else x[rows].astype(np.float64) for x in said[1:3])
     t, prim_id = said[0][rows].astype(np.float64), said[3][rows]
     exact_t, exact_u, exact_v = np.empty((3, len(rows)))
@@ -211,7 +208,7 @@ def _claims(case: HardCase, reference: Reference, rows: np.ndarray, said: tuple[
 
 
 def _judge_closeness(case: HardCase, reference: Reference, claims: Any, verdict: Verdict, lowest: bool) -> None:
-    """Whether anything nearer than the claimed hits had to be found, and which of them are ties."""
+    """Find hits nearer than the reported ones, and ties."""
     n = len(claims.row)
     verdict.asked += n
     o, d = case.origins[claims.row], case.directions[claims.row]
@@ -241,7 +238,7 @@ def _judge_closeness(case: HardCase, reference: Reference, claims: Any, verdict:
 
 def _certain(case: HardCase, reference: Reference, found: AllHits, row: np.ndarray, o: np.ndarray,
              d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which exact hits a unit within its bounds must report, and the bounds on their t."""
+    """Return which exact hits an algorithm within its bounds must report, and the bounds on their t."""
     certain, bound = np.zeros(len(found), bool), np.full(len(found), np.inf)
     i = np.flatnonzero(found.prim_id < reference.n_triangles)
     if len(i):
@@ -259,7 +256,7 @@ def _certain(case: HardCase, reference: Reference, found: AllHits, row: np.ndarr
 
 
 def _judge_misses(case: HardCase, reference: Reference, rows: np.ndarray, verdict: Verdict) -> None:
-    """Rays that are said to miss, and nothing is known of: is there a hit that had to be found?"""
+    """Find rays that are reported to miss although a hit had to be found."""
     for first in range(0, len(rows), RAYS_AT_ONCE):
         part = rows[first:first + RAYS_AT_ONCE]
         o, d = case.origins[part], case.directions[part]
@@ -276,9 +273,10 @@ def _judge_misses(case: HardCase, reference: Reference, rows: np.ndarray, verdic
 
 
 def _leaks(case: HardCase, skipped: AllHits, bound: np.ndarray, row: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """(n,) bool for the case's rays `row`: those that pass through a closed surface by crossings that were left out. The
-    winding number behind one of them, before the next or before end[i], is not that of the segment's start. Crossings that
-    their bounds on t do not part are taken together: a ray may shave off a corner by less than the bound."""
+    """Return which of the rays `row` pass through a closed surface by crossings that were left out, (n,) bool.
+    The winding number behind such a crossing, before the next one or before end[i], differs from that at the segment's start. Crossings
+    whose
+    bounds on t overlap are taken together: a ray may cut off a corner by less than the bound."""
     leaks, rays, points = np.zeros(len(row), bool), np.unique(skipped.ray), [np.zeros((0, 3))]
     for i in rays:
         mine = skipped.ray == i
@@ -295,7 +293,7 @@ def _leaks(case: HardCase, skipped: AllHits, bound: np.ndarray, row: np.ndarray,
 
 
 def winding_number(case: HardCase, points: np.ndarray) -> np.ndarray:
-    """How often the surface goes round each point: the signed solid angle over 4 pi (van Oosterom and Strackee 1983)."""
+    """Return how often the surface winds round each point: the signed solid angle over 4 pi (van Oosterom and Strackee 1983)."""
     corners = case.geometry.vertices[case.geometry.faces].astype(np.float64)
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).any(axis=1)
     corners, out = corners[area], np.zeros(len(points))
@@ -311,8 +309,7 @@ def winding_number(case: HardCase, points: np.ndarray) -> np.ndarray:
 
 
 def _lower_twin(case: HardCase, prim_id: int, tied: np.ndarray) -> bool:
-    """Whether a lower prim_id of the tie has the same corners in the same order: then any unit finds the same t, and the
-    lower one wins."""
+    """Return True if a lower prim_id of the tie has the same corners in the same order: then t is the same, and the lower one wins."""
     faces, vertices = case.geometry.faces, case.geometry.vertices
     lower = tied[tied < min(prim_id, len(faces))]
     if prim_id >= len(faces) or not len(lower):
@@ -321,11 +318,9 @@ def _lower_twin(case: HardCase, prim_id: int, tied: np.ndarray) -> bool:
 
 
 def judge_next(case: HardCase, first_prim_id: np.ndarray, next_prim_id: np.ndarray) -> Verdict:
-    """Case C: rays that were spawned at the hits of the first (on a sphere: to its outside) must not hit the same primitive.
-
-    prim_id (N,) each, -1 on a miss; where the first misses, the next is not looked at. To be added to judge's verdict, which
-    has counted rays and hits.
-    """
+    """Judge case C: rays that start at the first hits (on a sphere: to its outside) must not hit the same primitive.
+    - prim_id: (N,) each, -1 on a miss. A miss of the first ray is ignored.
+    - Add the verdict to judge's, which counts rays and hits."""
     verdict = Verdict()
     again = np.flatnonzero((first_prim_id >= 0) & (next_prim_id == first_prim_id))
     verdict.wrong("self_hits", case, again, "hits the primitive that it starts on", next_prim_id)
@@ -333,12 +328,9 @@ def judge_next(case: HardCase, first_prim_id: np.ndarray, next_prim_id: np.ndarr
 
 
 def judge_all_hits(case: HardCase, ray: np.ndarray, prim_id: np.ndarray, t: np.ndarray) -> Verdict:
-    """The verdict on all-hits queries over triangles: one row a reported hit, in any order.
-
-    Duplicates: a primitive twice on a ray; and on a closed surface, whose crossings go in and out by turns, two in a row in
-    the same direction that are no farther apart than the bounds: one crossing of an edge, told twice. To be added to judge's
-    verdict, which has counted rays and hits.
-    """
+    """Judge all-hits queries over triangles: one row a reported hit, in any order. Add the result to judge's verdict.
+    A duplicate is a primitive twice on a ray. Crossings of a closed surface alternate between in and out. So two in a row in the same
+    direction, whose bounds on t overlap, are one crossing of an edge that was reported twice."""
     reference = reference_of(case.geometry)
     order = np.lexsort((prim_id, t, ray))
     ray, prim_id, t = ray[order], prim_id[order], t[order].astype(np.float64)

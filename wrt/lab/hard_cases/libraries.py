@@ -29,14 +29,14 @@ def own(vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray, directions
 
 
 def peer(kind: type[Peer], vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> Any:
-    """One that `bench peers` knows."""
+    """Ask a library of `bench peers`."""
     who = kind()
     who.prepare(surface(vertices, faces))
     return who.closest(origins, directions)
 
 
 def mitsuba_closest(vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> Answer:
-    """By its variant llvm_ad_rgb, which asks Embree."""
+    """Ask Mitsuba's variant llvm_ad_rgb, which uses Embree."""
     require_llvm()
     with mitsuba("llvm_ad_rgb") as mi:
         mesh = make_mesh(mi, "mesh", Triangles(vertices, faces, None, None), {})
@@ -47,7 +47,7 @@ def mitsuba_closest(vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray
 
 
 def trimesh_closest(vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> Answer:
-    """By its own class, float64 in NumPy, and not by the one that asks Embree."""
+    """Ask trimesh's own class, float64 in NumPy, not the one that uses Embree."""
     import trimesh
     from trimesh.ray.ray_triangle import RayMeshIntersector
 
@@ -64,7 +64,7 @@ def trimesh_closest(vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray
 
 @dataclass(frozen=True)
 class Library:
-    """needs: the packages that it imports."""
+    """A library's function, and the packages that it imports (`needs`)."""
 
     name: str
     closest_hit: ClosestHit
@@ -83,7 +83,7 @@ LIBRARIES = {
 
 
 def usable(name: str) -> str:
-    """Why a library cannot be asked here; empty where it can."""
+    """Return why a library cannot be used here; "" if it can."""
     missing = [package for package in LIBRARIES[name].needs if importlib.util.find_spec(package) is None]
     if missing:
         return f"not installed: {', '.join(missing)}"

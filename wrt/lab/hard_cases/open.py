@@ -1,4 +1,4 @@
-"""Rays at surfaces that are not closed, at triangles that are bad, and at spheres: mostly, the oracle knows the answer."""
+"""Rays at open surfaces, bad triangles and spheres: mostly, only the oracle knows the answer."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ TURN = np.array([[np.cos(0.4), np.sin(0.4), 0.0], [-np.sin(0.4), np.cos(0.4), 0.
 
 
 def _signed_powers(rng: np.random.Generator, shape: tuple[int, ...], low: float, high: float) -> np.ndarray:
-    """+-10^U(low, high)."""
+    """Return +-10^U(low, high)."""
     return rng.choice([-1.0, 1.0], shape) * 10.0 ** rng.uniform(low, high, shape)
 
 
 def _points(geometry: Geometry, rng: np.random.Generator, n: int, spread: float = 1.0) -> np.ndarray:
-    """(n, 3) float64 points inside random triangles; spread < 1 draws them towards the corners and edges."""
+    """Return (n, 3) float64 points inside random triangles; spread < 1 draws them towards corners and edges."""
     corners = geometry.vertices[geometry.faces[rng.integers(len(geometry.faces), size=n)]].astype(np.float64)
     return np.einsum("ni,nij->nj", rng.dirichlet([spread] * 3, n), corners)
 
@@ -33,17 +33,18 @@ def _towards(geometry: Geometry, rng: np.random.Generator, origins: np.ndarray, 
 
 
 def respawned_triangles(rng: np.random.Generator, n: int) -> HardCase:
-    """C (pbrt-v4, Triangle.Reintersect): 8 triangles with coordinates +-10^U(-8, 8), and rays at them from such places. A
-    ray from the hit along next_directions must not hit the same triangle, on whichever side of it it starts."""
+    """C (pbrt-v4, Triangle.Reintersect): 8 triangles with coordinates +-10^U(-8, 8), and rays at them from such points.
+    A ray from the hit along next_directions must not hit the same triangle, on whichever side it starts."""
     geometry = soup(_signed_powers(rng, (8, 3, 3), -8.0, 8.0))
     case = _towards(geometry, rng, _signed_powers(rng, (n, 3), -8.0, 8.0), _points(geometry, rng, n))
     return replace(case, next_directions=unit_vectors(rng, n).astype(np.float32))
 
 
 def respawned_spheres(rng: np.random.Generator, n: int) -> HardCase:
-    """C: 8 spheres of radius 10^U(-4, 4), moved by up to 1e4, but by no more than 2^22 radii: one that is smaller than the
-    float32 spacing at its centre has no side that a ray could be on. Rays at them from outside and from inside. A ray from
-    the hit, turned to the outside of the sphere, must not hit it again."""
+    """C: 8 spheres of radius 10^U(-4, 4), moved by up to 1e4, with rays at them from outside and inside.
+    A ray from the hit, turned to the outside of the sphere, must not hit it again. A sphere is moved by at most 2^22 radii: one smaller
+    than
+    the float32 spacing at its centre has no outside."""
     radius = 10.0 ** rng.uniform(-4.0, 4.0, (8, 1))
     moved = np.minimum(10.0 ** rng.uniform(-4.0, 4.0, (8, 1)), 2.0**22 * radius)
     spheres = np.concatenate([unit_vectors(rng, 8) * moved, radius], axis=1)
@@ -57,7 +58,7 @@ def respawned_spheres(rng: np.random.Generator, n: int) -> HardCase:
 
 @cache
 def _without_area() -> Geometry:
-    """Three corners on a line (small whole numbers, so that they are exactly on it), two or three of them the same."""
+    """Return triangles with three corners on a line (small whole numbers, thus exactly), two or three of them equal."""
     rng = np.random.default_rng(0)
     start, step = rng.integers(-8, 9, (2, 96, 1, 3)) / 8.0
     along = np.stack([rng.permutation(4)[:3] for _ in range(96)])[:, :, None]
@@ -68,7 +69,7 @@ def _without_area() -> Geometry:
 
 @cache
 def _line_through_zero() -> Geometry:
-    """Corners on a line through 0, up to 2^60 apart in size: float64 rounds their differences, and their products."""
+    """Return triangles with corners on a line through 0, up to 2^60 apart in size: float64 rounds their differences and products."""
     rng = np.random.default_rng(0)
     step = rng.uniform(-4.0, 4.0, (96, 1, 3)).astype(np.float32).astype(np.float64)
     return soup(2.0 ** -rng.integers(0, 60, (96, 3, 1)) * step)
@@ -119,9 +120,10 @@ def tiny(rng: np.random.Generator, n: int) -> HardCase:
 
 
 def tiny_components(rng: np.random.Generator, n: int) -> HardCase:
-    """I: triangles of size 1e-20 to 1 with corners on a lattice, and rays of which one or two components of the direction are
-    2^-20 to 2^-149 of the longest. In those axes they start exactly at their target's coordinate, which mostly is a face of the
-    triangle's box; half of them leave their target behind. Directions are 1e-15 to 1e15 long."""
+    """I: triangles of size 1e-20 to 1 with corners on a lattice, and rays with one or two tiny components of the direction.
+    They are 2^-20 to 2^-149 of the longest. On those axes the ray starts exactly at its target's coordinate, mostly a face of the
+    triangle's
+    box; half of the rays leave their target behind. Directions are 1e-15 to 1e15 long."""
     corners = rng.integers(-4, 5, (32, 3, 3)) * 10.0 ** rng.uniform(-20.0, 0.0, (32, 1, 1))
     geometry = soup(corners)
     chosen, weights = rng.integers(32, size=n), rng.dirichlet([0.3] * 3, n)
@@ -155,8 +157,8 @@ def slivers(rng: np.random.Generator, n: int) -> HardCase:
 
 
 def edge_on(rng: np.random.Generator, n: int) -> HardCase:
-    """F: rays in the plane of a triangle (half of them exactly: never hit), or out of it by 10^-U(3, 12) rad. All planes are
-    parallel, so that a ray in one of them hits none of the others."""
+    """F: rays in the plane of a triangle (half of them exactly: never hit), or out of it by 10^-U(3, 12) rad.
+    All planes are parallel, so a ray in one of them hits no other triangle."""
     axis = rng.integers(3)
     corners = rng.uniform(-1.0, 1.0, (24, 3, 3))
     corners[:, :, axis] = rng.integers(-4, 5, (24, 1)) / 4.0
@@ -173,7 +175,7 @@ def edge_on(rng: np.random.Generator, n: int) -> HardCase:
 
 
 def _square(size: float, cells: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Two coordinates of the corners of cells x cells quads over [-size, size]^2, and their triangles."""
+    """Return two coordinates of the corners of cells x cells quads over [-size, size]^2, and their triangles."""
     x = np.linspace(-size, size, cells + 1)
     i, j = np.meshgrid(x, x, indexing="ij")
     first = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).reshape(-1, 1)
@@ -188,8 +190,10 @@ def _floor(turned: bool) -> Geometry:
 
 
 def grazing(rng: np.random.Generator, n: int, *, turned: bool) -> HardCase:
-    """F: a floor of 2048 triangles, met at 10^U(-7, 0) rad. On the level one, at y = 0, the exact hit is o - d o_y / d_y:
-    where that is 1 % inside the border, the ray must hit, because all edges there have a triangle on both sides."""
+    """F: a floor of 2048 triangles, met at 10^U(-7, 0) rad.
+    On the level floor, at y = 0, the exact hit is o - d o_y / d_y. Where it is 1 % inside the border the ray must hit: all edges there have
+    a
+    triangle on both sides."""
     points = np.stack([rng.uniform(-90.0, 90.0, n), np.zeros(n), rng.uniform(-90.0, 90.0, n)], axis=1)
     angle, heading = 10.0 ** rng.uniform(-7.0, 0.0, n), rng.uniform(0.0, 2.0 * np.pi, n)
     away = np.stack([np.cos(heading) * np.cos(angle), np.sin(angle), np.sin(heading) * np.cos(angle)], axis=1)
@@ -207,14 +211,14 @@ def grazing(rng: np.random.Generator, n: int, *, turned: bool) -> HardCase:
 
 @cache
 def _plates() -> Geometry:
-    """Four plates of 8 x 8 quads over [-1, 1]^2, at z = 1, 2, 4 and 8."""
+    """Return four plates of 8 x 8 quads over [-1, 1]^2, at z = 1, 2, 4 and 8."""
     i, j, faces = _square(1.0, 8)
     return joined(*(surface(np.stack([i, j, np.full(81, z)], axis=1), faces) for z in (1, 2, 4, 8)))
 
 
 def exact_ends(rng: np.random.Generator, n: int) -> HardCase:
-    """H: t_min and t_max exactly at the hit, which still counts, and one float32 step past it, which does not. All numbers
-    are powers of two and sixteenths: no unit has anything to round."""
+    """H: t_min and t_max exactly at the hit, which still counts, and one float32 step past it, which does not.
+    All numbers are powers of two and sixteenths: no test has anything to round."""
     origins = np.concatenate([rng.integers(-15, 16, (n, 2)) / 16.0, np.zeros((n, 1))], axis=1)
     length = 2.0 ** rng.integers(-20, 21, n)
     plate = rng.integers(3, size=n)
@@ -244,7 +248,7 @@ def beside_boxes(rng: np.random.Generator, n: int) -> HardCase:
 
 
 def rays_not_finite(rng: np.random.Generator, n: int) -> HardCase:
-    """I: half of the rays have a NaN or an infinity somewhere; the others must hit all the same."""
+    """I: half of the rays have a NaN or an infinity; the others must hit all the same."""
     rows = np.concatenate([in_ball(rng, n, 0.9), unit_vectors(rng, n)], axis=1).astype(np.float32)
     bad = rng.random(n) < 0.5
     bad[:1] = True
@@ -263,6 +267,6 @@ def _sphere_not_finite() -> Geometry:
 
 
 def mesh_not_finite(rng: np.random.Generator, n: int) -> HardCase:
-    """I: a closed sphere, and 30 triangles more with a NaN or an infinity, which are never hit."""
+    """I: a closed sphere, and 30 more triangles with a NaN or an infinity, which are never hit."""
     case = hard_case(_sphere_not_finite(), in_ball(rng, n, 0.9), unit_vectors(rng, n), HIT)
     return replace(case, refused=True)

@@ -1,4 +1,4 @@
-"""What `stability` tells: tables for the terminal, and a report as Markdown."""
+"""Results of `stability`: tables for the terminal, and a report as Markdown."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ of the bound."""
 
 
 def sums(rows: Sequence[Row]) -> dict[str, Verdict]:
-    """The verdict of each algorithm over all cases, in their order."""
+    """Return the verdict of each algorithm over all cases, in their order."""
     out: dict[str, Verdict] = {}
     for row in rows:
         out[row.algorithm] = out.get(row.algorithm, Verdict()) + row.verdict
@@ -36,8 +36,8 @@ def wrong(verdict: Verdict) -> int:
 
 
 def usual_error(rows: Sequence[Row], algorithm: str) -> float:
-    """The 99.9th percentile of the error of t (ulp) in the middle one of an algorithm's cases: over all rays together it would
-    be that of the two or three cases whose triangles are seen edge-on or are denormal, which are ill-conditioned."""
+    """Return the 99.9th percentile of the error of t (ulp) in the median one of an algorithm's cases.
+    Over all rays it would be that of two or three ill-conditioned cases: triangles seen edge-on, or denormal ones."""
     errors = [row.verdict.t.percentile(99.9) for row in rows if row.algorithm == algorithm]
     return float(np.median([error for error in errors if np.isfinite(error)] or [np.nan]))
 
@@ -61,7 +61,7 @@ def _summary(result: Result) -> Part:
 
 
 def _groups(result: Result) -> Part:
-    """The default by the letters of the cases."""
+    """Sum up the default by the letters of the cases."""
     default = next(iter(result.speed))
     rows = [row for row in result.rows if row.algorithm == default]
     letters = {letter: letter for letter in sorted({row.case[0] for row in result.rows})} | {"A to H": "ABCDEFGH"}
@@ -71,7 +71,7 @@ def _groups(result: Result) -> Part:
 
 
 def text(result: Result, plan: Plan) -> str:
-    """The whole report, as Markdown."""
+    """Return the whole report as Markdown."""
     told = "\n\n".join([f"Machine: {machine(plan)}; {result.seconds:.0f} s in all.", f"To repeat: `{repeating(plan)}`",
                         LEGEND.format(sample=plan.sample), *(f"{line}." for line in _notes(result))])
     return markdown([Part("Stability of the intersection tests", told), _summary(result), _groups(result),
@@ -79,13 +79,13 @@ def text(result: Result, plan: Plan) -> str:
 
 
 def summary(result: Result) -> str:
-    """What the terminal gets when all is done."""
+    """Return what the terminal shows at the end."""
     out = [table(part.head, part.lines) for part in (_summary(result), _groups(result))]
     return "\n\n".join([*out, *_notes(result)])
 
 
 def _notes(result: Result) -> list[str]:
-    """What is not in it."""
+    """Return what is missing in the results."""
     undone = [f"Interrupted; not done, or not with all algorithms: {', '.join(result.undone)}"] if result.undone else []
     return [*undone, *(f"{name}: not installed" for name in result.not_installed)]
 

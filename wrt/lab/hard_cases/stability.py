@@ -1,4 +1,4 @@
-"""`python -m wrt stability`: the hard cases against the algorithms, speed beside error."""
+"""`python -m wrt stability`: the hard cases against the intersection tests, speed beside error."""
 
 from __future__ import annotations
 
@@ -57,8 +57,7 @@ COLUMNS: Columns = {
 
 @dataclass
 class Row:
-    """One case with one algorithm. judged: how many of the rays the oracle judged; the others have a known answer. refused: for
-    input that is not finite, whether the host said so."""
+    """One case with one algorithm. judged: rays that the oracle judged; refused: whether the host refused input that is not finite."""
 
     case: str
     algorithm: str
@@ -71,20 +70,18 @@ class Row:
 
 
 class Result(Line):
-    """rows: by case and algorithm; speed: by algorithm, see `measure_speed`; not_installed: the peers that were asked for and are
-    not; seconds that it took; interrupted: the number of the signal that ended it early; undone: the cases that it has not
-    finished."""
+    """Results of `run`: rows by case and algorithm; speed by algorithm (`measure_speed`).
+    - not_installed: missing peers; undone: the cases that are not finished; interrupted: number of the signal that ended the run early."""
 
 
 def run(plan: Plan, report: Callable[[Row], None] = lambda row: None,
         progress: Callable[[str], None] = lambda line: None, executor: Any = None) -> Result:
-    """Every case (names in HARD_CASES or letters of groups; none: all) with every algorithm, the same rays for all.
+    """Put every chosen case to every algorithm, the same rays for all.
 
-    report: called with each row as it is done; progress: now and then with a line of text, from any thread. executor: a
-    concurrent.futures.Executor or a dask.distributed.Client whose workers trace and judge the rays, for the same rows; the speed
-    is measured here all the same. Interrupted by Ctrl-C, it returns the rows that are done; before the first one,
-    KeyboardInterrupt is raised. Raises InputError for an unknown case.
-    """
+    - report: called with each finished row; progress: called now and then with a line of text, from any thread.
+    - executor: a concurrent.futures.Executor or dask.distributed.Client whose workers trace and judge. Speed is measured here.
+
+    Interrupted by Ctrl-C, return the finished rows; raise KeyboardInterrupt if there are none. Raise InputError for an unknown case."""
     begin = time.perf_counter()
     names = chosen(plan.cases)
     algorithms, peers = all_algorithms(plan), PEERS.values() if plan.peers else ()
@@ -107,13 +104,13 @@ def run(plan: Plan, report: Callable[[Row], None] = lambda row: None,
 
 
 def all_algorithms(plan: Plan) -> list[Algorithm]:
-    """Our own, the default first, and the peers that are asked for and installed."""
+    """Return wrt's tests, the default first, and the wanted peers that are installed."""
     peers = PEERS.values() if plan.peers else ()
     return [*own_algorithms(), *(peer() for peer in peers if peer.is_installed())]
 
 
 def _rows(names: list[str], algorithms: list[str], plan: Plan, progress: Callable[[str], None], pool: Any) -> Iterator[Row]:
-    """Each case with each algorithm; with a pool, each is a task, and so is each chunk of the rays beyond the sample."""
+    """Yield the row of each case with each algorithm; with a pool, each is a task, and so is each chunk of rays beyond the sample."""
     tasks = [(name, algorithm) for name in names for algorithm in algorithms]
     futures, more = {}, {}
     if pool is not None:
@@ -138,7 +135,7 @@ def _rows(names: list[str], algorithms: list[str], plan: Plan, progress: Callabl
 
 
 def case_row(name: str, algorithm: str, plan: Plan) -> Row | None:
-    """run_case of an algorithm by name. Raises InputError where it is not installed, on a worker."""
+    """Run an algorithm by name. Raise InputError if this worker does not have it."""
     known = {each.name: each for each in all_algorithms(plan)}
     if algorithm not in known:
         raise InputError(f"worker {worker_name()} has no {algorithm}, which is installed here")
@@ -146,8 +143,8 @@ def case_row(name: str, algorithm: str, plan: Plan) -> Row | None:
 
 
 def run_case(name: str, rays: int, algorithm: Algorithm, seed: int = 0) -> Row | None:
-    """One case, judged by the oracle; None where the algorithm cannot take it (peers: spheres, input not finite, and
-    segments that begin after the origin)."""
+    """Run one case, judged by the oracle; return None if the algorithm cannot take it.
+    Peers take no spheres, no input that is not finite and no segments that begin after the origin."""
     row = Row(name, algorithm.name)
     for case in chunks(name, rays, seed):
         if case.refused:
@@ -170,8 +167,7 @@ def run_case(name: str, rays: int, algorithm: Algorithm, seed: int = 0) -> Row |
 
 
 def run_more(name: str, plan: Plan, progress: Callable[[str], None]) -> Iterator[Verdict]:
-    """The verdicts on the rays of a case beyond the sample through the default units, on all threads, by what is known of them.
-    None where nothing is known of them: a case that only the oracle can judge."""
+    """Yield verdicts on the rays beyond the sample through the default tests, on all threads, without the oracle."""
     left, begin = fewer(name, plan.rays) - fewer(name, plan.sample), time.perf_counter()
     own = threading.local()  # a structure for each thread, which several parts may use
 
@@ -190,7 +186,7 @@ def run_more(name: str, plan: Plan, progress: Callable[[str], None]) -> Iterator
 
 
 def parts(name: str, plan: Plan) -> int:
-    """How many chunks of rays there are beyond the sample; none where nothing is known of them."""
+    """Return the number of chunks of rays beyond the sample; 0 for a case that only the oracle can judge."""
     left = fewer(name, plan.rays) - fewer(name, plan.sample)
     if left <= 0:
         return 0
@@ -199,7 +195,7 @@ def parts(name: str, plan: Plan) -> int:
 
 
 def more_part(name: str, plan: Plan, index: int, own: Own | None = None) -> Verdict:
-    """The verdict on one chunk of the rays beyond the sample."""
+    """Return the verdict on one chunk of the rays beyond the sample."""
     own = own or Own()
     left = fewer(name, plan.rays) - fewer(name, plan.sample)
     first = -(-fewer(name, plan.sample) // CHUNK)  # `chunks` has used the seeds below it
@@ -213,7 +209,7 @@ def more_part(name: str, plan: Plan, index: int, own: Own | None = None) -> Verd
 
 
 def _is_refused(case: HardCase, algorithm: Algorithm) -> bool:
-    """Whether input that is not finite gives an InputError: rays by the query, vertices by Mesh."""
+    """Return True if input that is not finite raises InputError: rays in the query, vertices in Mesh."""
     from wrt.scene.mesh import Mesh
 
     try:
@@ -243,7 +239,7 @@ def _respawn_kernel(structure: Structure) -> Any:
 
 
 def respawn(algorithm: Own, case: HardCase) -> tuple[np.ndarray, np.ndarray]:
-    """prim_id of each ray's hit, and of the ray that goes on from it towards case.next_directions."""
+    """Return prim_id of each ray's hit, and of the ray from the hit along case.next_directions."""
     accel, n = algorithm.accel, len(case)
     assert accel is not None and case.next_directions is not None
     kernel = _respawn_kernel(accel.structure)
@@ -257,7 +253,7 @@ def respawn(algorithm: Own, case: HardCase) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _judge_all(algorithm: Own, case: HardCase) -> Verdict:
-    """All hits along the first ALL_HITS_RAYS rays; only what concerns duplicates is added to the case's verdict."""
+    """Judge all hits of the first ALL_HITS_RAYS rays; return the duplicates only."""
     assert algorithm.accel is not None
     part = replace(case, **{name: getattr(case, name)[:ALL_HITS_RAYS] for name in ("origins", "directions", "t_min", "t_max", "expected")})
     hits = all_hits(algorithm.accel, part.origins, part.directions, part.t_min, part.t_max)
@@ -266,8 +262,8 @@ def _judge_all(algorithm: Own, case: HardCase) -> Verdict:
 
 
 def measure_speed(algorithms: Sequence[Algorithm], runs: int) -> dict[str, Line]:
-    """On one thread, by turns, on case A's sphere of 159,200 triangles: Mray/s; its share of the default's, which is the first
-    algorithm, taken run by run; bytes a triangle."""
+    """Measure all algorithms in turn on one thread, on case A's sphere of 159,200 triangles.
+    Return Mray/s, the share of the default's (the first algorithm) run by run, and bytes a triangle."""
     case = generate("A_origin_uniform", SPEED_RAYS, seed=1)
     for algorithm in algorithms:
         algorithm.prepare(case.geometry)

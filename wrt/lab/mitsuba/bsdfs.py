@@ -1,4 +1,4 @@
-"""Materials and textures for Mitsuba; what has no counterpart is refused."""
+"""Materials and textures for Mitsuba; those without a counterpart are refused."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ COLORED = {"diffuse": "reflectance", "mirror": "specular_reflectance", "glass": 
 
 
 def refuse(what: str, where: str = "") -> NoReturn:
-    """What Mitsuba cannot draw exactly: a comparison of other light says nothing."""
+    """Raise InputError for what Mitsuba cannot draw exactly: pictures of different light cannot be compared."""
     raise InputError(f"not translatable exactly: {what}", None, f"Mitsuba: {where}" if where else "Mitsuba")
 
 
 def bsdf(mi: Any, material: Material) -> dict[str, Any]:
-    """The material as a dictionary for `mitsuba.load_dict`."""
+    """Return the material as a dictionary for `mitsuba.load_dict`."""
     where = f"material {material.name!r}"
     if material.kind not in BSDFS:
         refuse(f"{material.kind} (Mitsuba's principled BSDF is another)", where)
@@ -41,7 +41,7 @@ def bsdf(mi: Any, material: Material) -> dict[str, Any]:
 
 
 def emission(mi: Any, material: Material) -> dict[str, Any]:
-    """An area emitter; one that does not light other surfaces is never sampled."""
+    """Return an area emitter; one that does not light other surfaces is never sampled."""
     if material.alpha_mode != "opaque":
         refuse("emission of a surface that is partly transparent", f"material {material.name!r}")
     radiance = _color(mi, material.emission, material.emission_texture)
@@ -49,7 +49,7 @@ def emission(mi: Any, material: Material) -> dict[str, Any]:
 
 
 def _bsdf(mi: Any, material: Material) -> dict[str, Any]:
-    """Without its back side and its opacity."""
+    """Return the material without its back side and its opacity."""
     result = dict(BSDFS[material.kind])
     if material.kind == "conductor":
         result |= {"eta": rgb(material.eta), "k": rgb(material.k)}
@@ -69,7 +69,7 @@ def rgb(color: Color) -> dict[str, Any]:
 
 
 def _color(mi: Any, factor: Color, texture: Texture | Checkerboard | None) -> dict[str, Any]:
-    """factor times the texture's RGB, linear."""
+    """Return factor times the texture's RGB, linear."""
     if texture is None:
         return rgb(factor)
     if isinstance(texture, Checkerboard):
@@ -85,13 +85,13 @@ def _checkerboard(mi: Any, factor: Color, texture: Checkerboard) -> dict[str, An
 
 
 def linear_rgb(texture: Texture) -> np.ndarray:
-    """(H, W, 3) float32 linear RGB of the texels (IEC 61966-2-1 where the texture is sRGB-encoded)."""
+    """Return (H, W, 3) float32 linear RGB of the texels (IEC 61966-2-1 if the texture is sRGB-encoded)."""
     steps = np.arange(256, dtype=np.float64) / 255.0
     return (decode_srgb(steps) if texture.srgb else steps).astype(np.float32)[texture.image[..., :3]]
 
 
 def _bitmap(mi: Any, texture: Texture, values: np.ndarray) -> dict[str, Any]:
-    """Texel values (H, W, C) float32, looked up as the texture says; row 0 is at v = 0 in both programs."""
+    """Return texels (H, W, C) float32 with the texture's filter and transform; row 0 is at v = 0 in both programs."""
     if texture.wrap[0] != texture.wrap[1]:
         refuse("wrap that differs between the axes", f"texture {texture.name!r}")
     to_uv = np.vstack([texture.uv_transform, (0.0, 0.0, 1.0)])
@@ -100,7 +100,7 @@ def _bitmap(mi: Any, texture: Texture, values: np.ndarray) -> dict[str, Any]:
 
 
 def _opacity(mi: Any, material: Material) -> Any:
-    """None where opaque; a number or a bitmap else."""
+    """Return None if opaque, else a number or a bitmap."""
     if material.alpha_mode == "opaque":
         return None
     texture = material.albedo_texture if isinstance(material.albedo_texture, Texture) else None

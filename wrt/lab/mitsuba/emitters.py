@@ -20,14 +20,14 @@ WIDEST_SPOT = math.radians(80.0)
 
 
 def light_emitter(mi: Any, light: Light) -> dict[str, Any]:
-    """A light as a dictionary for `mitsuba.load_dict`."""
+    """Return a light as a dictionary for `mitsuba.load_dict`."""
     if light.kind not in LIGHTS:
         refuse(f"light {light.name!r} of kind {light.kind!r}")
     return LIGHTS[light.kind](mi, light)
 
 
 def _spot(mi: Any, light: SpotLight) -> dict[str, Any]:
-    """Mitsuba's falloff is linear in the angle; wrt's is put into the texture that Mitsuba projects from the light."""
+    """Mitsuba's falloff is linear in the angle; put wrt's into the texture that Mitsuba projects from the light."""
     direction = np.array(light.direction)
     up = np.eye(3)[int(np.argmin(np.abs(direction)))]
     cutoff = math.degrees(light.outer)
@@ -57,8 +57,8 @@ LIGHTS: dict[str, Callable[[Any, Any], dict[str, Any]]] = {
 
 
 def background_emitter(mi: Any, background: Background) -> dict[str, Any] | None:
-    """The background as an emitter, None where it is a black constant. Raises InputError for a picture under 3 columns wide, and
-    for a kind that is not in BACKGROUNDS."""
+    """Return the background as an emitter, or None for constant black.
+    Raise InputError for a picture under 3 columns wide, and for a kind that is not in BACKGROUNDS."""
     if background.kind not in BACKGROUNDS:
         raise InputError(f"not translatable: a background of kind {background.kind!r}", None, "Mitsuba")
     return BACKGROUNDS[background.kind](mi, background)

@@ -1,10 +1,8 @@
-"""`python -m wrt bench mitsuba`: the same picture by wrt and by Mitsuba 3, to the same error; Mitsuba with both of its variants
-that run on a CPU, each in a process of its own.
+"""`python -m wrt bench mitsuba`: the same picture by wrt and Mitsuba 3 to the same error, each variant of Mitsuba in its own process.
 
-All are held against one reference. wrt renders with a given number of samples; Mitsuba gets as many as it likely needs for the
-same error, and what it really needs is taken from the error that it reaches: its samples are independent, so that its mean
-squared error falls as 1 / time. Runs alternate; each has a seed of its own. All have the same number of threads.
-"""
+All pictures are compared with one reference. wrt takes a given number of samples. Mitsuba takes about as many as the same error needs.
+The exact need follows from the error that it reaches: its samples are independent, so its mean squared error falls as 1 / time. Runs
+alternate, each with its own seed; all use the same number of threads."""
 
 from __future__ import annotations
 
@@ -38,8 +36,8 @@ SAME = 0.25  # of the squared error compared at: a squared bias beyond it means 
 
 
 def matte(scene: Scene) -> Scene:
-    """The scene with every surface diffuse, of the albedo that it has, and round apertures: what Mitsuba's "direct" draws
-    exactly. Emission that is only seen is left out."""
+    """Return the scene with diffuse surfaces and round apertures, which Mitsuba's "direct" draws exactly.
+    Albedos stay; emission that lights no other surface is left out."""
     changed = {id(m): Material(name=m.name, albedo=m.albedo, albedo_texture=m.albedo_texture, two_sided=m.two_sided,
                                emission=m.emission if m.lights_others else (0.0, 0.0, 0.0)) for m in scene.materials}
     objects = tuple(replace(thing, materials=tuple(changed[id(m)] for m in thing.materials)) for thing in scene.objects)
@@ -49,9 +47,9 @@ def matte(scene: Scene) -> Scene:
 
 
 def side_of(spp: int, runs: Sequence[tuple[float, np.ndarray]], truth: Row, prepare: float, start: float) -> Row:
-    """One renderer: samples a pixel, seconds of each picture, root mean squared error over all its pictures, and its bias
-    against the reference (NaN where it cannot be told from noise; `bias_below` bounds it). prepare_seconds: structure and
-    scene; process_seconds: a whole process at this many samples, of which `start` is all but tracing (NaN: was not timed)."""
+    """Return the figures of one renderer.
+    - rmse, bias: over all its pictures, against the reference; bias is NaN if noise hides it, `bias_below` bounds it.
+    - prepare_seconds: structure and scene; process_seconds: a whole process at this spp, `start` seconds of it without tracing."""
     seconds, films = zip(*runs, strict=True)
     products = statistics.gram(films, truth.pixels)
     bias, below = statistics.bias_with_bound(products, truth.variance)
@@ -60,7 +58,7 @@ def side_of(spp: int, runs: Sequence[tuple[float, np.ndarray]], truth: Row, prep
 
 
 class _Measured:
-    """A variant of Mitsuba that is being measured."""
+    """A variant of Mitsuba while it is measured."""
 
     def __init__(self, job: Job, process: MitsubaProcess) -> None:
         self.job, self.process = job, process
@@ -68,8 +66,8 @@ class _Measured:
         self.spp, self.start = PILOT_SPP, math.nan
 
     def choose_spp(self, seed: int, truth: Row, target: float, longest: float) -> None:
-        """As many samples as likely give the squared error `target`, in pictures that take no longer than `longest`. Kernels are
-        compiled as a picture is rendered, and others for another number of samples: the first of each is not counted."""
+        """Choose samples for the squared error `target`, within `longest` seconds a picture.
+        The first picture at each number of samples is not timed: Mitsuba compiles kernels for it."""
         self.process.render(PILOT_SPP, seed)
         seconds, film = self.process.render(PILOT_SPP, seed)
         needed = PILOT_SPP * statistics.mse_of(statistics.gram([film], truth.pixels), truth.variance) / max(target, 1e-30)
@@ -80,8 +78,7 @@ class _Measured:
         self.runs.append(self.process.render(self.spp, seed))
 
     def time_starts(self, times: int) -> None:
-        """All that a process takes but for tracing, with its first picture at 1 spp, as wrt's process is timed. (It is handed
-        the scene as arrays: reading files is not counted.)"""
+        """Time a process without tracing, with its first picture at 1 spp, as wrt's process is timed. The scene comes as arrays."""
         program = f"import mitsuba as mi; mi.set_variant({self.job.variant!r})"
         imports = process_seconds(["-c", program], times)
         rest = [self._load_and_first_picture() for _ in range(times + 1 if times else 0)]
@@ -92,8 +89,8 @@ class _Measured:
             return process.load_seconds + process.render(1, 0)[0]
 
     def result(self, ours: Row, truth: Row) -> Row:
-        """What `side_of` tells; ratio: its seconds over those of wrt at wrt's error, tracing alone; process_ratio: of whole
-        processes; same_light: whether its picture has wrt's expectation, as far as its noise at equal error can tell."""
+        """Add to `side_of` the ratios of Mitsuba's seconds to wrt's, both at wrt's error: tracing alone, and as whole processes.
+        - same_light: False if its picture has another expectation than wrt's, by more than noise at equal error explains."""
         side = side_of(self.spp, self.runs, truth, self.process.load_seconds, self.start)
         factor = (side.rmse / ours.rmse) ** 2
         side.process_seconds = self.start + factor * float(np.median(side.seconds))
@@ -102,7 +99,7 @@ class _Measured:
 
 
 class _Rivals:
-    """The variants that can be used, and why the others cannot. Raises NotAvailable where none can."""
+    """The usable variants, and why others are not. Raise NotAvailable if none is usable."""
 
     def __init__(self, jobs: list[Job], stack: ExitStack) -> None:
         self.jobs, self.stack = {job.variant: job for job in jobs}, stack
@@ -126,11 +123,9 @@ class _Rivals:
 
 def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = None,
         report: Callable[[str], None] = lambda line: None) -> Row:
-    """Measure. command: arguments of `python -m wrt` that render this scene at 1 spp: what a process takes but for tracing
-    (None: not timed). A variant of Mitsuba that cannot be used is left out, and named in the result.
-
-    Raises InputError where no variant can be used, Mitsuba is missing, or cannot draw the scene exactly.
-    """
+    """Measure. command: arguments of `python -m wrt` that render this scene at 1 spp, to time a process (None: not timed).
+    Unusable variants are left out and named in the result. Raise InputError if none is usable, or if Mitsuba cannot draw the scene
+    exactly."""
     scene = scene.with_settings(filter="box")  # the only one whose pixels Mitsuba takes by themselves
     seeds = [int(word) for word in np.random.SeedSequence(plan.seed).generate_state(REFERENCE_SEEDS + plan.repeats)]
     pictures, starts = seeds[REFERENCE_SEEDS:], plan.starts if command else 0
@@ -171,13 +166,13 @@ def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = 
 
 
 def require_error(error: float) -> None:
-    """Raise InputError where wrt's error is not above 0: the reference's own noise is taken out of it."""
+    """Raise InputError if wrt's error, without the reference's own noise, is not above 0."""
     if not error > 0.0:
         raise InputError("wrt's pictures are as exact as the reference: no error that Mitsuba could reach; try a lower --spp")
 
 
 def process_seconds(arguments: list[str], times: int) -> float:
-    """The median wall clock of a Python process; one more run, before, is not counted (kernel caches, files). NaN: no times."""
+    """Return the median wall-clock seconds of a Python process, after one uncounted run; NaN for 0 times."""
     seconds = []
     for _ in range(times + 1 if times else 0):
         begin = time.perf_counter()
@@ -203,7 +198,7 @@ COLUMNS: Columns = {
 
 
 def text(result: Row) -> str:
-    """For the terminal and for a report, as Markdown."""
+    """Return the report as Markdown."""
     sides = [Row(**vars(result.wrt), name="wrt", ratio=None, process_ratio=1.0),
              *(Row(**vars(rival), name=f"Mitsuba {variant}, {result.integrator}") for variant, rival in result.mitsuba.items())]
     width, height = result.size

@@ -1,5 +1,6 @@
-"""Mitsuba with one variant and one scene in a process of its own, so that a crash in it ends no measurement: an LLVM library that
-does not suit Mitsuba ends the whole process as soon as a picture is rendered (LLVM 15 and 16 do)."""
+"""Mitsuba with one variant and one scene in its own process, so that a crash ends no measurement.
+
+An unsuitable LLVM library (15, 16) ends the whole process at the first picture."""
 
 from __future__ import annotations
 
@@ -37,8 +38,7 @@ def require_llvm() -> None:
 
 
 class Job(NamedTuple):
-    """What a process renders: a variant (of VARIANTS), the scene, its camera (or that by name or number), an integrator of
-    wrt.lab.mitsuba.translate, and how many threads it may use."""
+    """Work of a process: a variant of VARIANTS, a scene with its camera (or the camera's name or index), an integrator, and threads."""
 
     variant: str
     scene: Scene
@@ -48,11 +48,11 @@ class Job(NamedTuple):
 
 
 class MitsubaProcess:
-    """One that is started, has loaded the scene in `load_seconds`, and renders until it is closed.
+    """A process that has loaded the scene, in `load_seconds`, and renders until it is closed.
 
-    Raises NotAvailable where the variant cannot be used here or its process has ended, InputError for a scene that Mitsuba cannot
-    draw exactly, and where Mitsuba is missing.
-    """
+    Raise NotAvailable if the variant is not usable here or the process has ended, and InputError for a scene that Mitsuba cannot draw
+    exactly
+    or if Mitsuba is missing."""
 
     def __init__(self, job: Job) -> None:
         if importlib.util.find_spec("mitsuba") is None:
@@ -74,7 +74,7 @@ class MitsubaProcess:
             raise
 
     def render(self, spp: int, seed: int) -> tuple[float, np.ndarray]:
-        """Seconds, and the picture (H, W, 3) float32."""
+        """Return seconds, and the picture (H, W, 3) float32."""
         return self._ask((spp, seed % 2**31))
 
     def _ask(self, *questions: tuple[int, int]) -> Any:
@@ -92,7 +92,7 @@ class MitsubaProcess:
         return answer
 
     def close(self) -> None:
-        """End the process; it may be asked no more."""
+        """End the process."""
         self._pipe.close()
         self._process.join(SECONDS_TO_END)
         self._process.kill()
@@ -108,7 +108,7 @@ class MitsubaProcess:
 
 
 def serve(pipe: Connection, job: Job) -> None:
-    """The child: load the scene, then render what it is asked for until nobody asks any more."""
+    """Load the scene, then render on request until the pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     os.dup2(2, 1)  # the parent's standard output may be JSON
     try:

@@ -1,4 +1,4 @@
-"""Shapes for Mitsuba: one mesh per material of an object, in world space, and exact spheres."""
+"""Shapes for Mitsuba: one mesh for each material of an object, in world space, and exact spheres."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from wrt.scene.model import Object, Sphere
 
 
 class Part(NamedTuple):
-    """What one Mitsuba shape holds. face_index: (F,) index of its faces in the object's mesh, None for a sphere."""
+    """Content of one Mitsuba shape. face_index: (F,) indices of its faces in the object's mesh, None for a sphere."""
 
     object_id: int
     face_index: np.ndarray | None
@@ -27,13 +27,13 @@ class Triangles(NamedTuple):
     uvs: np.ndarray | None
 
     def of(self, vertices: np.ndarray, faces: np.ndarray) -> Triangles:
-        """Faces of these vertices."""
+        """Return faces of these vertices."""
         normals, uvs = (None if array is None else array[vertices] for array in (self.normals, self.uvs))
         return Triangles(self.vertices[vertices], faces.reshape(-1, 3), normals, uvs)
 
 
 def object_parts(mi: Any, thing: Object, object_id: int) -> Iterator[tuple[str, Any, Part]]:
-    """(shape id, `mitsuba.Mesh`, Part) for each material that some face of the object has."""
+    """Yield (shape id, `mitsuba.Mesh`, Part) for each material that a face of the object has."""
     world = _to_world(thing)
     of_face = np.zeros(len(world.faces), np.int32) if thing.face_material is None else thing.face_material
     for index in np.unique(of_face).tolist():
@@ -48,7 +48,7 @@ def object_parts(mi: Any, thing: Object, object_id: int) -> Iterator[tuple[str, 
 
 
 def sphere_shape(mi: Any, sphere: Sphere) -> Any:
-    """Mitsuba's sphere has u around its z from its x, v down from +z: z is turned to +y and x to -x."""
+    """Return a sphere, turned: Mitsuba's u runs around z from x and its v down from +z; z becomes +y and x becomes -x."""
     pose = np.eye(4)
     pose[:3, :3] = sphere.radius * np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
     pose[:3, 3] = sphere.center
@@ -56,7 +56,7 @@ def sphere_shape(mi: Any, sphere: Sphere) -> Any:
 
 
 def _properties(mi: Any, material: Material) -> dict[str, Any]:
-    """A shape's nested plugins: its BSDF, what it emits, the medium inside."""
+    """Return a shape's nested plugins: its BSDF, its emitter, the medium inside."""
     nested: dict[str, Any] = {"bsdf": bsdf(mi, material)}
     if material.is_emissive:
         if material.two_sided:
@@ -70,7 +70,7 @@ def _properties(mi: Any, material: Material) -> dict[str, Any]:
 
 
 def _to_world(thing: Object) -> Triangles:
-    """World-space triangles: float64 arithmetic, rounded to float32 once, as wrt does it."""
+    """Return world-space triangles by float64 arithmetic, rounded to float32 once, as in wrt."""
     mesh, linear = thing.mesh, thing.transform[:3, :3]
     vertices = mesh.vertices.astype(np.float64) @ linear.T + thing.transform[:3, 3]
     # A mirroring transform turns the winding around; exchanging two corners keeps the outside outside.
@@ -92,7 +92,7 @@ def _to_world(thing: Object) -> Triangles:
 
 
 def _select(triangles: Triangles, chosen: np.ndarray) -> Triangles:
-    """The chosen faces with the vertices that they use."""
+    """Return the chosen faces with the vertices that they use."""
     if len(chosen) == len(triangles.faces):
         return triangles
     used, faces = np.unique(triangles.faces[chosen], return_inverse=True)
@@ -100,7 +100,7 @@ def _select(triangles: Triangles, chosen: np.ndarray) -> Triangles:
 
 
 def _face_normals(triangles: Triangles) -> np.ndarray:
-    """(F, 3) float32 unit normals; zero for a triangle without area."""
+    """Return (F, 3) float32 unit normals; zero for a triangle without area."""
     a, b, c = (triangles.vertices[triangles.faces[:, corner]].astype(np.float64) for corner in range(3))
     normals = np.cross(b - a, c - a)
     length = np.linalg.norm(normals, axis=1, keepdims=True)

@@ -1,17 +1,14 @@
-"""Mitsuba 3 as an independent oracle and a rival: the same scene, rays and camera, answered by someone else's code.
+"""Mitsuba 3 as an independent oracle and a rival: the same scene, rays and camera, rendered by other code.
 
-As an oracle the variant is scalar_rgb, in this process; as a rival also llvm_ad_rgb, which is faster, but ends the whole process
-where the LLVM library does not suit it (process.py gives it one of its own). Both trace with Embree, which is asked for its robust
-mode; Mitsuba unasked takes the fast one.
+The oracle is the variant scalar_rgb, in this process; the rival is also llvm_ad_rgb, in its own process (process.py). Both trace with
+Embree in its robust mode, which is requested: Mitsuba's default is the fast mode.
 
-What can be compared exactly (Mitsuba's estimate has the same expectation as wrt's picture):
+Exactly comparable (Mitsuba's estimate has the expectation of wrt's picture):
 - integrator "whitted" (whitted.py): any scene of diffuse, mirror, conductor and glass surfaces;
-- "path" and "volpath": surfaces that are all specular, under a background and emissive shapes (glass with absorption:
-  "volpath"); with diffuse surfaces they add the interreflection that a Whitted tracer leaves out;
-- "direct": diffuse surfaces, with mirrors or glass nowhere in view.
-Mitsuba never cuts rays by their throughput: compare with min_throughput = 0.
-Everything else is refused with an InputError.
-"""
+- "path" and "volpath": specular surfaces only, under a background and emissive shapes (glass with absorption: "volpath"). On diffuse
+  surfaces they add interreflection, which a Whitted tracer leaves out;
+- "direct": diffuse surfaces, with no mirror or glass in view.
+Mitsuba never cuts rays by their throughput: compare with min_throughput = 0. All else is refused with an InputError."""
 
 from __future__ import annotations
 
@@ -37,7 +34,7 @@ INTEGRATORS = ("auto", "whitted", "path", "direct", "volpath")
 
 @contextmanager
 def mitsuba(variant: str = VARIANT) -> Iterator[Any]:
-    """The module `mitsuba`, its variant set while the block runs; InputError where it is missing."""
+    """Set a variant of the module `mitsuba` while the block runs. Raise InputError if Mitsuba is missing."""
     try:
         mi = importlib.import_module("mitsuba")
     except ImportError as error:
@@ -55,18 +52,17 @@ def mitsuba(variant: str = VARIANT) -> Iterator[Any]:
 
 
 class Translation(NamedTuple):
-    """scene: the `mitsuba.Scene`; parts: shape id -> which object and faces the shape holds."""
+    """scene: the `mitsuba.Scene`; parts: shape id -> the object and faces of the shape."""
 
     scene: Any
     parts: dict[str, Part]
 
 
 def translate(mi: Any, scene: Scene, camera: CameraKind | str | int | None = None, integrator: str = "auto") -> Translation:
-    """The scene for the module `mitsuba` with the variant that it has set, with sensor, film, sampler and integrator.
+    """Return the scene for the module `mitsuba` with its current variant, with sensor, film, sampler and integrator.
 
-    camera: a camera, or that of the scene by name or number. integrator: one of INTEGRATORS; "auto" is "volpath" where something
-    absorbs or lets light through by its alpha, else "path". Raises InputError for what cannot be translated exactly.
-    """
+    camera: a camera, or the name or index of the scene's. integrator: of INTEGRATORS; "auto" is "volpath" if something absorbs or is partly
+    transparent, else "path". Raise InputError for what cannot be translated exactly."""
     as_choice(integrator, INTEGRATORS, "integrator")
     contents: dict[str, Any] = {"type": "scene", "embree_use_robust_intersections": True}
     parts: dict[str, Part] = {}
@@ -100,7 +96,7 @@ def translate(mi: Any, scene: Scene, camera: CameraKind | str | int | None = Non
 
 
 def _check_light_transport(scene: Scene, integrator: str) -> None:
-    """Features of wrt's light transport that only some integrators have."""
+    """Refuse features of wrt's light transport that the integrator does not have."""
     materials = scene.materials
     if scene.settings.fresnel == "schlick" and any(m.kind == "glass" for m in materials):
         refuse('fresnel = "schlick"')
@@ -164,7 +160,7 @@ def _sensor(mi: Any, scene: Scene, camera: CameraKind) -> dict[str, Any]:
 
 
 def _farthest(scene: Scene, camera: CameraKind) -> float:
-    """An upper bound of the distance from the camera to any shape, and to where it is focused."""
+    """Return an upper bound of the distance from the camera to any shape and to its focus."""
     focus = camera.focus_distance if isinstance(camera, Camera) else 1.0
     if not scene.objects and not scene.spheres:
         return focus

@@ -13,10 +13,9 @@ MAX_TRANSPARENT = 256  # surfaces in a row that a ray may go straight through
 class Walk:
     """Paths whose expectation is wrt's picture: direct light and ambient at diffuse surfaces, where paths end.
 
-    Reflection, refraction and transparency are followed, one of them by chance where wrt follows all. max_depth: bounces after the
-    first hit. lights: whether there is an emitter to sample. absorption: shape id -> coefficient inside it; blended: ids of shapes
-    that rays pass by their alpha, which is no bounce.
-    """
+    Reflection, refraction and transparency are followed, one of them at random where wrt follows all.
+    - max_depth: bounces after the first hit; lights: True if there is an emitter to sample.
+    - absorption: shape id -> coefficient inside; blended: ids of shapes that rays pass by their alpha, which is no bounce."""
 
     def __init__(self, mi: Any, max_depth: int, ambient: Color, lights: bool, absorption: dict[str, Color], blended: set[str]) -> None:
         flags = mi.BSDFFlags
@@ -30,7 +29,7 @@ class Walk:
         self.inside = {shape: mi.Color3f(value) for shape, value in absorption.items()}
 
     def transmittance(self, scene: Any, si: Any, light: Any) -> Any:
-        """Return the share of the light that a shadow ray keeps: solid surfaces take all, cut-outs and thin panes a part."""
+        """Return the share of the light that passes a shadow ray's surfaces: solid ones block all, cut-outs and thin panes a part."""
         share = self.mi.Color3f(1.0)
         ray = si.spawn_ray_to(light.p)
         for _ in range(MAX_TRANSPARENT):
@@ -45,7 +44,7 @@ class Walk:
         return self.mi.Color3f(0.0)
 
     def direct_light(self, scene: Any, sampler: Any, si: Any, bsdf: Any) -> Any:
-        """Sample one light once; a traced reflection finds those with an area by itself."""
+        """Sample one light once; traced reflections find lights with an area."""
         light, weight = scene.sample_emitter_direction(si, sampler.next_2d(), False)
         if light.pdf == 0.0 or not (light.delta or bsdf.flags() & self.diffuse):
             return self.mi.Color3f(0.0)
@@ -53,7 +52,7 @@ class Walk:
         return value * self.transmittance(scene, si, light) if max(value) > 0.0 else value
 
     def reflected(self, scene: Any, sampler: Any, si: Any, bsdf: Any) -> Any:
-        """Return the light of emitters and of the ambient that a surface reflects to where the path came from."""
+        """Return the light of emitters and of the ambient that a surface reflects back along the path."""
         radiance = self.mi.Color3f(0.0)
         if self.lights and bsdf.flags() & self.smooth:
             radiance += self.direct_light(scene, sampler, si, bsdf)
@@ -63,7 +62,7 @@ class Walk:
         return radiance
 
     def sample(self, scene: Any, sampler: Any, ray: Any) -> tuple[Any, bool, list[Any]]:
-        """As Mitsuba's SamplingIntegrator.sample: radiance along a ray, whether it hit anything, no AOVs."""
+        """Return radiance along a ray, whether it hit anything, and no AOVs, as Mitsuba's SamplingIntegrator.sample."""
         radiance, throughput, within = self.mi.Color3f(0.0), self.mi.Color3f(1.0), None
         depth = passed = 0
         while depth <= self.max_depth and passed <= MAX_TRANSPARENT:
@@ -95,10 +94,7 @@ class Walk:
 
 
 def whitted_integrator(mi: Any, walk: Walk) -> Any:
-    """Return an integrator that takes its samples from a Walk.
-
-    It is Python code in a scalar variant, some 10 microseconds a bounce: for small pictures.
-    """
+    """Return an integrator that samples a Walk, in Python: some 10 microseconds a bounce, for small pictures."""
 
     class Whitted(mi.SamplingIntegrator):  # its base exists only once Mitsuba's variant is set
         def __init__(self) -> None:

@@ -1,28 +1,27 @@
-"""How far a float32 unit may be off: forward error bounds of the watertight triangle test and of the sphere test.
+"""Forward error bounds of the watertight triangle test and of the sphere test in float32.
 
 u = 2^-24 is float32's unit roundoff and gamma(n) = n u / (1 - n u) bounds n roundings in a row (Higham 2002, lemma 3.1).
 
-*The triangle test* (Woop, Benthin and Wald 2013). Let z be the axis of the direction's largest component, x and y the others,
-and X, Y, Z a corner minus the origin, exact. The test shears: x' = X - S Z with S = d_x / d_z. Rounded, X carries one error
-and the last subtraction another; S, Z, their product and the subtraction make four:
+*The triangle test* (Woop, Benthin and Wald 2013). Let z be the axis of the direction's largest component, x and y the others, and X, Y, Z a
+corner minus the origin, exact. The test shears: x' = X - S Z with S = d_x / d_z. Rounded, X carries one error and the last subtraction
+another; S, Z, their product and the subtraction make four:
     |fl(x') - x'| <= e_x = gamma(2) |X| + gamma(4) |S Z| + eta,
-eta = 2^-149 (1 + |Z|) for what underflows. The signs of the areas are those of the rounded corners, exactly (they are taken
-in float64, where the products are exact). So a reported hit has weights l_i >= 0, sum 1, with sum l_i fl(x'_i) = 0, and the
-point P = sum l_i v_i *of the triangle* passes the ray at (x, y) with |x| <= delta_x = max e_x, |y| <= delta_y.
+with eta = 2^-149 (1 + |Z|) for underflow. The signs of the areas are exactly those of the rounded corners: they are taken in float64, where
+the products are exact. So a reported hit has weights l_i >= 0 with sum 1 and sum l_i fl(x'_i) = 0. The point P = sum l_i v_i *of the
+triangle* therefore passes the ray at (x, y) with |x| <= delta_x = max e_x and |y| <= delta_y.
 - `touches`: no hit may be reported unless the rectangle +-delta meets the exact sheared triangle (separating axes).
-- Weights: l is also the exact barycentric of the point (x, y), so with E the sheared edge opposite of corner i
-      |l_i - exact| <= (|E_y| delta_x + |E_x| delta_y) / |twice the sheared area|,   the area being d.N / d_z / 2.
-  A hit whose three exact weights all exceed this is found: as the corners move to their rounded places no weight can reach 0.
+- Weights: l is also the exact barycentric of (x, y). With E the sheared edge opposite of corner i and the area d.N / d_z / 2,
+      |l_i - exact| <= (|E_y| delta_x + |E_x| delta_y) / |twice the sheared area|.
+  A hit whose three exact weights exceed this is found: while the corners move to their rounded places no weight reaches 0.
 - t: P lies at t_P = sum l_i Z_i / d_z, and the plane's slope makes |t_P - exact| <= (|N_x| delta_x + |N_y| delta_y) / |d.N|.
-  The sum itself carries three errors (Z, 1 / d_z, the result), and holding t to the triangle's box, whose slabs carry three
-  and whose planes P can only leave by errors of its own, moves it by at most 7 more: gamma(10) T, where T = |t_P| if
-  all Z have one sign and max |Z| / |d_z| if not. Of those errors eta is divided by d_x, which may be tiny: where |d_x t| and S
-  are above 2^-120 it moves t by less than 2^-28 T, and elsewhere the unit lets no eta move t (kernels.units.triangle.underflowed).
-  Very short and very long directions are scaled by powers of two before and t after: that is exact, but for what underflows.
+  The sum carries three errors (Z, 1 / d_z, the result). Holding t to the triangle's box moves it by at most 7 more: the slabs carry
+  three, and P leaves their planes only by its own errors. Together that is gamma(10) T.
+  T = |t_P| if all Z have one sign, else max |Z| / |d_z|.
+- eta is divided by d_x, which may be tiny. Where |d_x t| and S are above 2^-120 it moves t by less than 2^-28 T. Elsewhere the unit lets no
+  eta move t (kernels.units.triangle.underflowed). Very short and very long directions are scaled by powers of two before, and t after.
 
-*The sphere test* is taken in float64 and rounded once; the box it is held to contains the sphere, so that only the slabs' own
-rounding counts: gamma(5) |t|. Seen at a grazing angle, float64's own error grows: see `sphere_bounds`.
-"""
+*The sphere test* runs in float64 and is rounded once. The box that t is held to contains the sphere, so only the slabs' own rounding
+counts: gamma(5) |t|. At grazing angles float64's own error grows: see `sphere_bounds`."""
 
 from __future__ import annotations
 
@@ -39,14 +38,14 @@ SLACK = 1.0 + 1e-9  # for the rounding of the bounds' own float64 arithmetic
 
 
 def gamma(n: int) -> float:
-    """n float32 roundings in a row, relative."""
+    """Bound the relative error of n float32 roundings in a row."""
     return n * UNIT_32 / (1.0 - n * UNIT_32)
 
 
 @dataclass(frozen=True, eq=False)
 class Bounds:
-    """(N,) float64 each: t, u, v: how far the unit's answer may be from the exact one (inf: it may be anything); w: (3, N),
-    the same for the weights of v0, v1, v2 before they are rounded; touches: whether a hit may be reported at all."""
+    """Bounds on the errors, float64; inf where nothing is promised.
+    - t, u, v: (N,). w: (3, N), of the weights of v0, v1, v2 before rounding. touches: (N,) bool, whether a hit may be reported at all."""
 
     t: np.ndarray
     u: np.ndarray
@@ -56,13 +55,13 @@ class Bounds:
 
 
 def sure(crossings: Crossings, bounds: Bounds) -> np.ndarray:
-    """(N,) bool: hits that the watertight test must report, because the ray is farther inside than the bound."""
+    """Return the hits that the watertight test must report, as the ray is farther inside than the bound, (N,) bool."""
     weights = np.stack([1.0 - crossings.u - crossings.v, crossings.u, crossings.v])
     return crossings.hit & (weights > bounds.w + 1e-13).all(axis=0)
 
 
 def triangle_bounds(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, np.ndarray, np.ndarray], crossings: Crossings) -> Bounds:
-    """Bounds for one ray against one triangle a column; arguments as for `triangle_crossings`, and what it returned."""
+    """Return bounds for one ray against one triangle a column; arguments and result of `triangle_crossings`."""
     column = np.arange(d.shape[1])
     kz = np.argmax(np.abs(d), axis=0)
     kx, ky = (kz + 1) % 3, (kz + 2) % 3
@@ -96,7 +95,7 @@ def triangle_bounds(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, np.ndarra
 
 
 def _normal(v: tuple[np.ndarray, np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """|N| per component, and a bound on its rounding in float64."""
+    """Return |N| by component, and a bound on its rounding in float64."""
     e1, e2 = v[1] - v[0], v[2] - v[0]
     left = np.stack([e1[j] * e2[k] for j, k in ((1, 2), (2, 0), (0, 1))])
     right = np.stack([e1[k] * e2[j] for j, k in ((1, 2), (2, 0), (0, 1))])
@@ -104,7 +103,7 @@ def _normal(v: tuple[np.ndarray, np.ndarray, np.ndarray]) -> tuple[np.ndarray, n
 
 
 def _meets_rectangle(flat: list[np.ndarray], delta: list[np.ndarray]) -> np.ndarray:
-    """Whether triangles (x, y of three corners) meet the rectangles |x| <= delta[0], |y| <= delta[1]: no axis parts them."""
+    """Return which triangles (x, y of three corners) meet the rectangles |x| <= delta[0], |y| <= delta[1], by separating axes."""
     x, y = flat
     axes = [(np.ones_like(delta[0]), np.zeros_like(delta[0])), (np.zeros_like(delta[0]), np.ones_like(delta[0]))]
     axes += [(y[j] - y[i], x[i] - x[j]) for i, j in ((0, 1), (1, 2), (2, 0))]
@@ -118,12 +117,12 @@ def _meets_rectangle(flat: list[np.ndarray], delta: list[np.ndarray]) -> np.ndar
 
 
 def sphere_bounds(o: np.ndarray, d: np.ndarray, center: np.ndarray, radius: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) bounds on the t that the sphere unit reports for the crossing at t, and whether a hit may be reported at all.
+    """Return (N,) bounds on the t that the sphere unit reports for the crossing at t, and whether a hit may be reported at all.
 
-    With f = o - center and n the point of the line nearest to the center, the unit's float64 discriminant r^2 - |n|^2 is off
-    by at most D = 2^-53 (32 |f| (r + 2^-48 |f|) + 8 r^2): by min(D / s, sqrt(D)) / |d| in t, s being half the chord; near a
-    root 0, |f|^2 - r^2 is off by 2^-50 (|f|^2 + r^2). Arguments as for `sphere_crossings`; t may be NaN on a miss.
-    """
+    - f = o - centre; n: the point of the line nearest to the centre; s: half the chord.
+    - The unit's float64 discriminant r^2 - |n|^2 is off by at most D = 2^-53 (32 |f| (r + 2^-48 |f|) + 8 r^2).
+    - t is off by min(D / s, sqrt(D)) / |d|. Near a root 0, |f|^2 - r^2 is off by 2^-50 (|f|^2 + r^2).
+    Arguments as for `sphere_crossings`; t may be NaN on a miss."""
     unit = 2.0**-53
     a, ff, rr = (d * d).sum(axis=0), ((o - center) ** 2).sum(axis=0), radius * radius
     f = o - center

@@ -1,14 +1,12 @@
-"""The oracle: what rays hit, exactly, in NumPy. Slow, clear, and independent of Warp and of every unit under test.
+"""The oracle: exact hits of rays, in NumPy. Slow, clear, and independent of Warp and of every unit under test.
 
-What counts as a hit: the ray o + t d, t in the closed segment [t_min, t_max], meets the closed triangle and is not parallel
-to its plane. So a ray that lies in the plane does not hit, and a triangle without area, or with a coordinate that is not
-finite, never does. A sphere is hit where the ray enters and where it leaves it, and where it only touches it, once.
-Both sides count. Coordinates are float32 values, taken as exact; see `wrt.scene.exact` for how signs are decided and
-`wrt.lab.oracle.bounds` for how far a float32 unit may be off.
+A hit is where the ray o + t d, with t in the closed segment [t_min, t_max], meets the closed triangle and is not parallel to its plane.
+So a ray in the plane does not hit, and a triangle without area or with a coordinate that is not finite never does. A sphere is hit where
+the ray enters and where it leaves, or once where the ray only touches it. Both sides count. Coordinates are float32 values, taken as
+exact. `wrt.scene.exact` explains how signs are decided, and `wrt.lab.oracle.bounds` how far a float32 unit may be off.
 
 >>> answer = closest(mesh, origins, directions)         # mesh: anything with vertices, faces and perhaps spheres
->>> answer.prim_id[answer.tie]                          # rays that meet several triangles at exactly the same t
-"""
+>>> answer.prim_id[answer.tie]                          # rays that meet several triangles at exactly the same t"""
 
 from __future__ import annotations
 
@@ -40,9 +38,9 @@ AllHits = Any  # np.recarray, whose stubs do not know its attributes
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """The closest hit of each ray: t (N,) float64, inf on a miss; prim_id (N,) int32, -1 on a miss, the lowest of an exact
-    tie; u, v; place (N,) int8: where on prim_id; tie (N,) bool: several primitives are hit at exactly this t, and ties has
-    all of them, ascending, by ray."""
+    """The closest hit of each ray, (N,) each.
+    - t: float64, inf on a miss; prim_id: int32, -1 on a miss, the lowest of an exact tie; place: int8 of Place, on prim_id.
+    - tie: several primitives are hit at exactly this t; ties: all of them, ascending, by ray."""
 
     t: np.ndarray
     prim_id: np.ndarray
@@ -59,7 +57,7 @@ def _hits(*columns: np.ndarray) -> AllHits:
 
 @dataclass(frozen=True, eq=False)
 class _Rays:
-    """origin, direction: (3, N) float64; the reciprocal direction, and which of a box's rows is the near plane per axis."""
+    """Rays as (3, N) float64; inverse: the reciprocal direction; near: which row of a box is the near plane, on each axis."""
 
     origin: np.ndarray
     direction: np.ndarray
@@ -83,11 +81,10 @@ class _Rays:
 
 
 class Reference:
-    """A geometry made ready to be asked: its primitives in a tree of boxes that only ever err on the safe side.
+    """A geometry prepared for queries: its primitives in a tree of conservative boxes.
 
-    geometry: vertices (V, 3), faces (F, 3) and, if it has them, spheres (S, 4) of center and radius; float32 values.
-    prim_id counts the faces first, then the spheres. finite: (N,) bool, which primitives can be hit at all.
-    """
+    - geometry: vertices (V, 3), faces (F, 3) and perhaps spheres (S, 4) of centre and radius; float32 values.
+    - prim_id counts the faces first, then the spheres. finite: (N,) bool, which primitives can be hit at all."""
 
     def __init__(self, geometry: Any) -> None:
         vertices = np.asarray(geometry.vertices, dtype=np.float32).astype(np.float64)
@@ -102,12 +99,12 @@ class Reference:
         self.leaf_prim, self.levels = _tree(*_widened(lo, hi, self.n_triangles, self.finite))
 
     def triangles(self, prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The corners of these triangles, three (3, N) float64."""
+        """Return the corners of these triangles, three (3, N) float64."""
         a, b, c = (np.take(corner, prim_id, axis=1) for corner in self.corners)
         return a, b, c
 
     def candidates(self, rays: _Rays) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Pairs (ray, prim_id) that may hit, in parts; a ray is in one part only."""
+        """Yield pairs (ray, prim_id) that may hit, in parts; a ray is in one part only."""
         n = len(rays.t_min)
         usable = np.isfinite(rays.origin).all(axis=0) & np.isfinite(rays.direction).all(axis=0) & rays.direction.any(axis=0)
         stack = [np.flatnonzero(usable[i:i + RAYS_AT_ONCE]) + i for i in reversed(range(0, n, RAYS_AT_ONCE))]
@@ -120,7 +117,7 @@ class Reference:
                 yield rows[pairs[0]], pairs[1]
 
     def _descend(self, rays: _Rays, n: int) -> tuple[np.ndarray, np.ndarray] | None:
-        """All rays down the tree, level by level; None where that takes too many pairs at once."""
+        """Trace all rays down the tree, level by level; return None if that takes too many pairs at once."""
         ray, node = np.arange(n), np.zeros(n, np.int64)
         for boxes in self.levels:
             keep = _meets(boxes, node, rays, ray)
@@ -134,15 +131,15 @@ class Reference:
         return ray, self.leaf_prim[node]
 
     def all_hits(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf) -> AllHits:
-        """Every hit of each ray in its closed segment. origins, directions: (N, 3), taken as float32; t_min, t_max: numbers
-        or (N,). Rays that are not finite, or have no direction, hit nothing."""
+        """Return every hit of each ray in its closed segment. origins, directions: (N, 3), taken as float32; t_min, t_max: numbers or (N,).
+        Rays that are not finite, or have no direction, hit nothing."""
         rays = _Rays.of(origins, directions, t_min, t_max)
         found = [self._tested(rays, ray, prim_id) for ray, prim_id in self.candidates(rays)]
         hits = np.concatenate([np.recarray(0, HIT), *found]).view(np.recarray)
         return hits[np.lexsort((hits.prim_id, hits.t, hits.ray))]
 
     def _tested(self, rays: _Rays, ray: np.ndarray, prim_id: np.ndarray) -> AllHits:
-        """The hits among these pairs."""
+        """Return the hits among these pairs."""
         triangle = prim_id < self.n_triangles
         parts = [self._tested_triangles(rays, ray[triangle], prim_id[triangle])]
         if not triangle.all():
@@ -177,11 +174,11 @@ class Reference:
         return rays.origin[:, ray], rays.direction[:, ray], self.center[:, sphere], self.radius[sphere]
 
     def closest(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf) -> Answer:
-        """The closest hit of each ray in its closed segment; arguments as for all_hits."""
+        """Return the closest hit of each ray in its closed segment; arguments as for all_hits."""
         return self.closest_of(self.all_hits(origins, directions, t_min, t_max), origins, directions)
 
     def closest_of(self, hits: AllHits, origins: Any, directions: Any) -> Answer:
-        """The closest of each ray's hits, which all_hits found for these rays."""
+        """Return the closest of each ray's hits, which all_hits found for these rays."""
         n = len(origins)
         answer = Answer(np.full(n, np.inf), np.full(n, -1, np.int32), np.zeros(n), np.zeros(n), np.zeros(n, np.int8), np.zeros(n, bool))
         if not len(hits):
@@ -202,7 +199,7 @@ class Reference:
 
     def _first_exactly(self, hits: AllHits, rows: np.ndarray, group: np.ndarray, origins: Any,
                        directions: Any) -> Iterator[tuple[int, list[int]]]:
-        """For each group among the rows: those with exactly the lowest t, by prim_id. Spheres are compared in float64."""
+        """Yield, for each group among the rows, those with exactly the lowest t, by prim_id. Spheres are compared in float64."""
         rays = _Rays.of(origins, directions, 0.0, np.inf)
         triangle = hits.prim_id[rows] < self.n_triangles
         exact: dict[int, Any] = {int(row): Fraction(float(hits.t[row])) for row in rows[~triangle]}
@@ -216,15 +213,15 @@ class Reference:
             yield int(group[part[0]]), sorted(tied, key=lambda row: int(hits.prim_id[row]))
 
     def against(self, origins: Any, directions: Any, prim_id: np.ndarray) -> tuple[Crossings, Bounds]:
-        """Ray i against triangle prim_id[i] alone, anywhere on the ray's line: the exact crossing, and how far off a
-        float32 unit may be. Rays and triangles must be finite."""
+        """Intersect ray i with triangle prim_id[i] alone, anywhere on the ray's line; all must be finite.
+        Return the exact crossings, and how far off a float32 unit may be."""
         rays = _Rays.of(origins, directions, 0.0, np.inf)
         corners = self.triangles(prim_id)
         found = triangle_crossings(rays.origin, rays.direction, corners, all_rows=True)
         return found, triangle_bounds(rays.origin, rays.direction, corners, found)
 
     def against_sphere(self, origins: Any, directions: Any, prim_id: np.ndarray) -> tuple[SphereCrossings, np.ndarray, np.ndarray]:
-        """Ray i against sphere prim_id[i]: the crossings, bounds on the two t's (2, N), and whether a hit may be told."""
+        """Return the crossings of ray i with sphere prim_id[i], bounds on the two t's (2, N), and whether a hit may be reported."""
         rays = _Rays.of(origins, directions, 0.0, np.inf)
         columns = self._sphere_columns(rays, np.arange(len(prim_id)), prim_id)
         found = sphere_crossings(*columns)
@@ -233,7 +230,7 @@ class Reference:
 
 
 def _fractions(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, ...]) -> list[Fraction]:
-    """The exact t of hits, one a column."""
+    """Return the exact t of hits, one a column."""
     if not o.shape[1]:
         return []
     _, (numerator, slope, _), _, power = exact_plane(o, d, v)
@@ -242,7 +239,8 @@ def _fractions(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, ...]) -> list[
 
 
 def _widened(lo: np.ndarray, hi: np.ndarray, n_triangles: int, finite: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Boxes (3, N) that surely contain the primitive: a sphere's are rounded; what is not finite gets an empty one."""
+    """Return boxes (3, N) that surely contain their primitives: spheres' boxes are rounded outwards; primitives that are not finite get
+    empty ones."""
     with np.errstate(invalid="ignore"):
         lo[:, n_triangles:] -= 4.0 * UNIT * np.abs(lo[:, n_triangles:])
         hi[:, n_triangles:] += 4.0 * UNIT * np.abs(hi[:, n_triangles:])
@@ -251,10 +249,8 @@ def _widened(lo: np.ndarray, hi: np.ndarray, n_triangles: int, finite: np.ndarra
 
 
 def _tree(lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """A complete tree with WIDTH children a node: the primitive of each leaf, and the boxes (6, nodes) of each level.
-
-    Ranges are halved at the median of the centroids' longest axis, all ranges of a level at once.
-    """
+    """Build a complete tree with WIDTH children a node; return the primitive of each leaf, and the boxes (6, nodes) of each level.
+    All ranges of a level are halved at once, at the median of the centroids' longest axis."""
     n = lo.shape[1]
     depth = 0
     while WIDTH**depth < n:
@@ -284,10 +280,8 @@ def _tree(lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]
 
 
 def _meets(boxes: np.ndarray, node: np.ndarray, rays: _Rays, ray: np.ndarray) -> np.ndarray:
-    """Whether each ray's segment may meet the box; only ever wrong on the safe side.
-
-    In a plane of the box and along it, 0 * inf is NaN and says nothing (fmin and fmax pass over it).
-    """
+    """Return whether each ray's segment may meet the box, conservatively.
+    In a plane of the box and along it, 0 * inf is NaN, which fmin and fmax ignore."""
     enter, leave = np.full(len(ray), -np.inf), np.full(len(ray), np.inf)
     flat = boxes.reshape(-1)
     with np.errstate(invalid="ignore", over="ignore"):
@@ -305,22 +299,22 @@ def _meets(boxes: np.ndarray, node: np.ndarray, rays: _Rays, ray: np.ndarray) ->
 
 @lru_cache(maxsize=4)
 def reference_of(geometry: Any) -> Reference:
-    """The same Reference for the same object, so that asking again does not build it again."""
+    """Return the Reference of a geometry object, built once."""
     return Reference(geometry)
 
 
 def closest(geometry: Any, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf) -> Answer:
-    """The closest hit of each ray in the closed segment [t_min, t_max]; at exactly equal t the lowest prim_id.
+    """Return the closest hit of each ray in the closed segment [t_min, t_max]; at exactly equal t the lowest prim_id.
 
-    geometry: as for `Reference`; origins, directions: (N, 3), taken as float32; t_min, t_max: numbers or (N,). t is good to
-    1e-14 relative, u and v to 1e-14. A ray that is not finite misses.
-    """
+    geometry: as for `Reference`; origins, directions: (N, 3), taken as float32; t_min, t_max: numbers or (N,). t is good to 1e-14 relative,
+    u
+    and v to 1e-14. A ray that is not finite misses."""
     return reference_of(geometry).closest(origins, directions, t_min, t_max)
 
 
 def t_bound(origins: Any, directions: Any, triangles: Any) -> np.ndarray:
-    """How far the t that the watertight test reports for ray i and triangle i may be from the exact one: (N,) float64, inf
-    where it may be anything. See `wrt.lab.oracle.bounds`."""
+    """Return how far the watertight test's t for ray i and triangle i may be from the exact one: (N,) float64, inf without a bound.
+    See `wrt.lab.oracle.bounds`."""
     rays = _Rays.of(origins, directions, 0.0, np.inf)
     a, b, c = (np.ascontiguousarray(each.T) for each in np.asarray(triangles, np.float32).astype(np.float64).transpose(1, 0, 2))
     found = triangle_crossings(rays.origin, rays.direction, (a, b, c), all_rows=True)

@@ -43,7 +43,7 @@ class Level1:
 @dataclass(frozen=True)
 class Misses:
     """Counts over all rays.
-    - accesses: to the L1s; l1, l2: misses there, each of which reads one line from below; compulsory: different lines.
+    - accesses: to the L1s; l1, l2: misses there, each one line read from below; compulsory: different lines.
     - wanted, wait_l2, wait_dram: lanes that want a line, wait for the L2, wait for DRAM. Lanes that share an access count each."""
 
     accesses: int

@@ -29,9 +29,10 @@ ARCHS = (75, 90)  # of the traversals
 REGISTERS = 65536  # of an SM, in four parts; a warp gets them in blocks of 256
 SMS = {75: (64 << 10, 16, 32), 90: (228 << 10, 32, 64)}  # by architecture: shared bytes, blocks and warps of an SM
 QUERIES = {"closest hit": closest_hit_kernel, "any hit": any_hit_kernel}
-FEW, MANY = 8, 16  # tests in a probe: the compiler keeps one body for so many, and does not unroll the loop over the grid around it
-# A kernel with a unit also adds up its results: one addition for a box, three and a selection for a triangle. A kernel that only reads
-# has an addition for each number that it reads.
+# Tests in a probe. The compiler keeps one body for so many, and does not unroll the loop over the grid around it.
+FEW, MANY = 8, 16
+# Additions of the probes. A kernel with a unit also adds up its results: one addition for a box, three and a selection for a triangle. A
+# kernel that only reads has an addition for each number that it reads.
 BOX_NUMBERS, BOX_RESULTS, TRIANGLE_RESULTS = 6, 1, 4
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -63,9 +65,9 @@ def test_from_inside_a_surface_is_crossed_once() -> None:
 def test_no_crossing_is_lost_and_a_lost_one_is_seen() -> None:
     geometry = Geometry.of(shapes.torus(segments=16, tube_segments=8))
     accel = wrt.build(geometry)
-    right = closed.crossed(geometry, accel, None, 3000, 0)
+    right = closed.crossed(geometry, accel, partial(wrt.count_hits, accel, crossings=True), True, 3000, 0)
     assert right["wrong"] == 0 and right["hits"] > 6000 and right["touching"] > 0
-    lossy = closed.crossed(geometry, accel, lambda o, d: np.minimum(wrt.count_hits(accel, o, d), 1), 3000, 0)
+    lossy = closed.crossed(geometry, accel, lambda o, d: np.minimum(wrt.count_hits(accel, o, d), 1), False, 3000, 0)
     assert 2500 < lossy["wrong"] <= 3000 - lossy["touching"]  # some rays pass the mesh
 
 

@@ -54,7 +54,7 @@ def test_each_fault_is_counted() -> None:
     assert 2000 < result.t_ulp < 20_000  # 0.001 of 2^24, and half of it for a t just below a power of two
     with pytest.raises(AssertionError, match=r"7 lost, 8 invented, 0 of a wrong triangle\n  ray 0: must hit, is") as said:
         case.check(with_faults)
-    assert "each vertex at a radius of 1 + 5 U" in str(said.value)  # what is hard in it
+    assert "each vertex at radius 1 + 5 U" in str(said.value)  # what is hard in it
 
 
 def test_the_second_hit_is_of_a_wrong_triangle() -> None:
