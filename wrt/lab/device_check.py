@@ -247,7 +247,7 @@ class Result:
 
 
 def run(plan: Check, tell: Callable[[str], None] = lambda line: None) -> Result:
-    """Raises InputError."""
+    """Compare and measure; `tell` gets lines of progress."""
     machine = machine_line(f"{thread_count(None)} threads for the CPU", f"Warp {wp.__version__}", device=plan.device)
     compared = []
     for each in rows(plan, tell):

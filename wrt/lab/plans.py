@@ -1,7 +1,6 @@
-"""What the measurements are asked for: each option is declared once, for Python and for the command line.
+"""Plans of the measurements: each option is declared once, for Python and for the command line.
 
-A field of a Plan is an option of its command. Nothing heavy is imported here: the command line reads all plans for its help.
-"""
+A field of a Plan is an option of its command. Nothing heavy is imported here: the command line reads all plans for its help."""
 
 from __future__ import annotations
 
@@ -13,33 +12,31 @@ from typing import Any, ClassVar
 STRUCTURES = ("structure", "wrt.accel.structures:ACCELERATORS")
 KINDS = ("kind of ray", "wrt.lab.bench.rays:RAY_KINDS")
 GPUS = ("GPU", "wrt.lab.rtcore.parameters:GPUS")
+THREADS = "Threads on the CPU  [default: all cores]"
+INSIDE = "The camera stands in the middle of the mesh's box, as in a room"
+MODELLED = "The GPU to model: rtx2080ti or rtx2060"
 
 
 def option(default: Any, text: str = "", between: tuple[int, int] | None = None, of: tuple[str, str] | None = None) -> Any:
-    """A field of a Plan. text: of --help, "" for an argument; between: the least and the most that it may be (None is not looked
-    at); of: what it names, and the table that has the names."""
+    """Return a field of a Plan.
+    - text: for --help, "" for an argument; between: lowest and highest value (None is always allowed).
+    - of: what the value names, and the table of names as "module:TABLE"."""
     return field(default=default, metadata={"text": text, "between": between, "of": of})
 
 
-def the_meshes(default: Any = ()) -> Any:
-    """Files, or from Python Meshes."""
+def the_meshes(default: object = ()) -> Sequence[Any]:
     return option(default)
 
 
-def the_kinds(*default: str) -> Any:
+def the_kinds(*default: str) -> Sequence[str]:
     return option(default or ("primary", "shadow", "diffuse", "random"), "Of rays: primary, shadow, diffuse, random", of=KINDS)
-
-
-def the_threads(text: str = "Threads on the CPU  [default: all cores]") -> Any:
-    return option(None, text)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Raises InputError where a number is out of its range, and where there is nothing of a name.
+    """Options of a measurement. Raises InputError for a number out of its range and for an unknown name.
 
-    COMMAND: what asks for it; STUDY: the module that measures it; QUICK: with --quick, what takes the place of a default.
-    """
+    COMMAND: its command; STUDY: the module that measures it; QUICK: values that replace defaults with --quick."""
 
     COMMAND: ClassVar[str] = ""
     STUDY: ClassVar[str] = ""
@@ -68,8 +65,7 @@ class Plan:
 class Visibility(Plan):
     """Rasterising against ray casting, as triangles and pixels grow: the cost of both, and where they differ.
 
-    MESHES: mesh files; without any, a sphere and a terrain.
-    """
+    MESHES: mesh files; without any, a sphere and a terrain."""
 
     COMMAND, STUDY = "bench visibility", "wrt.lab.bench.visibility"
     QUICK = {"size": 128, "max_size": 512, "max_triangles": 50_000, "runs": 5}
@@ -80,7 +76,7 @@ class Visibility(Plan):
     runs: int = option(7, "Runs of each kind, alternating", (1, 1000))
     accel: str = option("bvh", "Acceleration structure", of=STRUCTURES)
     device: str = option("cpu", "cpu, cuda:0, ... (see `devices`)")
-    threads: int | None = the_threads()
+    threads: int | None = option(None, THREADS)
 
     def __post_init__(self) -> None:
         from wrt.core.device import start
@@ -91,27 +87,25 @@ class Visibility(Plan):
 
 @dataclass(frozen=True)
 class Units(Plan):
-    """The default triangle and box tests beside the others: what they cost, as ratios with their spread, on one thread.
+    """The default triangle and box tests beside the others: ratios of their times with their spread, on one thread.
 
-    MESHES: mesh files; without any, a sphere, a terrain and a teapot.
-    """
+    MESHES: mesh files; without any, a sphere, a terrain and a teapot."""
 
     COMMAND, STUDY = "bench units", "wrt.lab.bench.units"
     QUICK = {"rays": 1 << 14, "runs": 5}
     meshes: Sequence[Any] = the_meshes()
     rays: int = option(2**17, "Rays of each kind", (1, 2**28))
-    runs: int = option(9, "Runs of each unit, by turns", (1, 1000))
+    runs: int = option(9, "Runs of each unit, in turn", (1, 1000))
     accel: str = option("bvh", "Acceleration structure", of=STRUCTURES)
     seed: int = option(0, "Other rays")
 
 
 @dataclass(frozen=True)
 class Peers(Plan):
-    """wrt beside Embree (robust, fast, in packets) and Warp's mesh_query_ray: the same rays by turns, on one thread and on all,
-    with ratios and answers that differ.
+    """wrt beside Embree (robust, fast, in packets) and Warp's mesh_query_ray: the same rays in turn, on one thread and on all.
+    With ratios, and answers that differ.
 
-    MESHES: mesh files; without any, a sphere.
-    """
+    MESHES: mesh files; without any, a sphere."""
 
     COMMAND, STUDY = "bench peers", "wrt.lab.bench.peers"
     QUICK = {"rays": 20_000, "runs": 5}
@@ -122,7 +116,7 @@ class Peers(Plan):
                                    of=("rival", "wrt.lab.hard_cases.contestants:PEERS"))
     kinds: Sequence[str] = the_kinds()
     rays: int = option(100_000, "Rays of each kind", (1, 2**28))
-    runs: int = option(7, "Runs of each, by turns", (1, 1000))
+    runs: int = option(7, "Runs of each, in turn", (1, 1000))
     seed: int = option(0, "Other rays")
     threads: str = option("both", "one (by its CPU time), all (by the clock) or both")
 
@@ -144,8 +138,7 @@ class Peers(Plan):
 class HardCases(Plan):
     """The hard cases against wrt and other ray libraries: rays lost, invented and given to a wrong triangle, and errors of t.
 
-    CASES: names such as E_grid, or the letters of groups; without any, all.
-    """
+    CASES: names such as E_grid, or the letters of groups; without any, all."""
 
     COMMAND, STUDY = "bench hard-cases", "wrt.lab.hard_cases.comparison"
     QUICK = {"rays": 100}
@@ -164,11 +157,10 @@ class HardCases(Plan):
 
 @dataclass(frozen=True)
 class Closed(Plan):
-    """Closed meshes: which points are inside, and rays through corners and edges, which cross them an even number of times; Open3D
-    and trimesh beside it, where installed.
+    """Closed meshes: points inside, and rays through corners and edges, which must cross an even number of times.
+    Also by Open3D and trimesh, if installed.
 
-    MESHES: closed mesh files, beside seven meshes that are made.
-    """
+    MESHES: closed mesh files, beside seven made meshes."""
 
     COMMAND, STUDY = "bench closed", "wrt.lab.bench.closed"
     QUICK = {"points": 1000, "rays": 1000, "others": 1000}
@@ -181,10 +173,9 @@ class Closed(Plan):
 
 @dataclass(frozen=True)
 class Accel(Plan):
-    """Structure against structure: time to build, memory, steps and time to search, and answers that differ (none may).
+    """All structures: time to build, memory, steps and time to search, and answers that differ (none may).
 
-    MESHES: mesh files; without any, a terrain that grows from a thousand triangles on.
-    """
+    MESHES: mesh files; without any, a terrain that grows from a thousand triangles on."""
 
     COMMAND, STUDY = "bench accel", "wrt.lab.bench.accel"
     QUICK = {"rays": 20_000, "runs": 3, "max_triangles": 20_000}
@@ -211,7 +202,7 @@ class Bvh(Plan):
     rays: int = option(2**18, "Rays into each mesh", (1, 2**26))
     builds: int = option(3, "Builds of each builder, after the first", (1, 100))
     runs: int = option(7, "Runs of each volume, alternating", (1, 1000))
-    threads: int | None = the_threads("Threads to build with  [default: all cores]")
+    threads: int | None = option(None, "Threads to build with  [default: all cores]")
     seed: int = option(0, "Other rays")
 
 
@@ -225,14 +216,14 @@ class RtCore(Plan):
     structures: Sequence[str] = option((), "Which, by name  [default: every BVH]", of=STRUCTURES)
     kinds: Sequence[str] = the_kinds("primary", "diffuse")
     rays: int = option(2**16, "Rays of each kind", (1, 2**22))
-    gpu: str = option("rtx2080ti", "What the model reckons for: rtx2080ti or rtx2060", of=GPUS)
+    gpu: str = option("rtx2080ti", MODELLED, of=GPUS)
     seed: int = option(0, "Other rays")
-    inside: bool = option(False, "The camera stands in the middle of the mesh's box, as in a room")
+    inside: bool = option(False, INSIDE)
 
 
 @dataclass(frozen=True)
 class Float64(Plan):
-    """How many triangle tests, and of how many rays, need float64 where a GPU runs the watertight test on MESHES."""
+    """How many triangle tests, and of how many rays, need float64 if a GPU runs the watertight test on MESHES."""
 
     COMMAND, STUDY = "bench float64", "wrt.lab.rtcore.hard_tests"
     QUICK = {"rays": 1 << 12}
@@ -240,20 +231,20 @@ class Float64(Plan):
     kinds: Sequence[str] = the_kinds("primary", "diffuse")
     rays: int = option(2**16, "Rays of each kind", (1, 2**22))
     seed: int = option(0, "Other rays")
-    inside: bool = option(False, "The camera stands in the middle of the mesh's box, as in a room")
+    inside: bool = option(False, INSIDE)
 
 
 @dataclass(frozen=True)
 class Pictures(Plan):
-    """SCENES by waves of samples, as the CPU makes pictures, beside the loop of one ray: nanoseconds a sample on one thread, by
-    turns, and pixels that differ (none may)."""
+    """SCENES by waves of samples, as the CPU renders, beside one ray at a time: nanoseconds a sample on one thread, in turn.
+    Also the pixels that differ (none may)."""
 
     COMMAND, STUDY = "bench pictures", "wrt.lab.bench.pictures"
     QUICK = {"size": "160x90", "spp": 4, "runs": 3}
     scenes: Sequence[Any] = option(MISSING)
     size: str = option("640x360", "Pixels of each picture")
     spp: int = option(16, "Samples a pixel", (1, 1 << 16))
-    runs: int = option(5, "Runs of each, by turns", (1, 1000))
+    runs: int = option(5, "Runs of each, in turn", (1, 1000))
     accel: str = option("bvh", "Acceleration structure", of=STRUCTURES)
 
 
@@ -261,23 +252,22 @@ class Pictures(Plan):
 class WhatIf(Plan):
     """Change one thing of the RT core's design, and count the same rays through MESH again.
 
-    STUDY: width (node width, format and volume), stack (entries, with restarts), planes (bits of a box plane), order (nearer
-    child first, early stop), sorting (of rays), rates (boxes a clock against triangles a clock).
-    """
+    STUDY: width (of nodes, their format and volume), stack (entries, with restarts), planes (bits of a box plane), order (nearer child
+    first, early stop), sorting (of rays), rates (boxes a clock against triangles a clock)."""
 
     COMMAND, STUDY = "whatif", "wrt.lab.rtcore.whatif"
     study: str = option(MISSING, of=("study", "wrt.lab.rtcore.whatif:STUDIES"))
     mesh: Any = option(MISSING)  # noqa: RUF009
     kinds: Sequence[str] = the_kinds("primary", "diffuse")
     rays: int = option(2**15, "Rays of each kind", (1, 2**22))
-    gpu: str = option("rtx2080ti", "What the model reckons for: rtx2080ti or rtx2060", of=GPUS)
+    gpu: str = option("rtx2080ti", MODELLED, of=GPUS)
     seed: int = option(0, "Other rays")
-    inside: bool = option(False, "The camera stands in the middle of the mesh's box, as in a room")
+    inside: bool = option(False, INSIDE)
 
 
 @dataclass(frozen=True)
 class Error(Plan):
-    """What to turn in a scene, and how often it is rendered."""
+    """Knobs of a scene to turn, and how often it is rendered."""
 
     QUICK = {"max_spp": 4, "repeats": 3}
     knobs: Sequence[str] = option((), "Which to turn: sampler, max_depth, triangle ... (a wrong name lists them)  [default: all]",
@@ -294,7 +284,7 @@ class Error(Plan):
 
 @dataclass(frozen=True)
 class Mitsuba(Plan):
-    """How much each renderer draws."""
+    """Samples and pictures of each renderer."""
 
     QUICK = {"spp": 8, "repeats": 3, "rival_limit": 5.0, "starts": 1}
     spp: int = option(64, "wrt's samples a pixel; its error is what Mitsuba must reach", (1, 1 << 16))
@@ -322,8 +312,7 @@ class Mitsuba(Plan):
 class Stability(Plan):
     """The hard cases against the intersection tests: rays lost and errors, with the speed beside them.
 
-    CASES: names such as E_grid, or the letters of groups; without any, all.
-    """
+    CASES: names such as E_grid, or the letters of groups; without any, all."""
 
     COMMAND = "stability"
     QUICK = {"rays": 300, "sample": 300, "runs": 3}
@@ -332,5 +321,5 @@ class Stability(Plan):
     sample: int = option(10_000, "How many of them the oracle judges, and the other tests and peers get", (1, 2**40))
     peers: bool = option(False, "Also Embree (robust, fast, in packets), Warp's mesh_query_ray and Open3D, where installed")
     seed: int = option(0, "Other rays")
-    threads: int | None = the_threads("Threads for the rays beyond the sample  [default: all cores]")
-    runs: int = option(7, "Runs of each for the speed, by turns", (1, 1000))
+    threads: int | None = option(None, "Threads for the rays beyond the sample  [default: all cores]")
+    runs: int = option(7, "Runs of each for the speed, in turn", (1, 1000))

@@ -12,16 +12,7 @@ import numpy as np
 from wrt.core.checks import as_names
 from wrt.core.errors import InputError
 from wrt.core.types import PathLike, WarpArray
-from wrt.picture.image import (
-    as_half,
-    check_writable,
-    color_channels,
-    encode_png,
-    output_format,
-    write_codes,
-    write_exr,
-    write_image,
-)
+from wrt.picture.image import as_half, check_writable, color_channels, encode_png, output_format, write_codes, write_exr, write_image
 from wrt.picture.tonemap import to_codes
 
 # Letters of the channels of a layer in an EXR file; any other layer has one channel of its own name.
