@@ -1,1 +1,1 @@
-"""What the SM does: camera, samples, surfaces, materials, lights, shadows, the integrator's step, the film."""
+"""The SM's work: camera, samples, surfaces, materials, lights, shadows, the integrator's step, the film."""

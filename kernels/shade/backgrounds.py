@@ -1,4 +1,5 @@
-"""Background kinds: what lies behind everything, and how it is sampled as a light. A function a kind, and a row in BACKGROUNDS."""
+"""Background kinds: the radiance behind all surfaces, and its samples as a light. Each kind is a function and an entry of
+BACKGROUNDS."""
 
 from typing import Any, NamedTuple
 
@@ -22,14 +23,14 @@ def constant(b: Background, direction: wp.vec3) -> wp.vec3:
 
 @wp.func
 def gradient(b: Background, direction: wp.vec3) -> wp.vec3:
-    """Linear in y."""
+    """Interpolate linearly in y."""
     return wp.lerp(b.bottom, b.top, 0.5 * (direction[1] + 1.0))
 
 
 @wp.func
 def turn_of(angle: float) -> tuple[float, float]:
-    """Its sine and cosine."""
-    sin = angle  # most pictures are not turned: sin_cos gives the same bits for 0 and -0, at each look-up
+    """Return the sine and cosine of the background's rotation."""
+    sin = angle  # Most pictures are not rotated. For 0 and -0, sin_cos has the same bits.
     cos = float(1.0)
     if angle != 0.0:
         sin, cos = sin_cos(angle)
@@ -38,7 +39,7 @@ def turn_of(angle: float) -> tuple[float, float]:
 
 @wp.func
 def turned(d: wp.vec3, sin: float, cos: float) -> wp.vec3:
-    """About +y, counter-clockwise environment_block from above, by the angle of this sine and cosine."""
+    """Rotate about +y, counter-clockwise seen from above, by the angle of this sine and cosine."""
     return wp.vec3(cos * d[0] + sin * d[2], d[1], cos * d[2] - sin * d[0])
 
 
@@ -50,14 +51,14 @@ def rotate_y(d: wp.vec3, angle: float) -> wp.vec3:
 
 @wp.func
 def environment_pixel(b: Background, column: int, row: int) -> wp.vec3:
-    """Columns go round; rows end at the poles."""
+    """Return a pixel of the picture: columns wrap around, lines end at the poles."""
     x = wp.where(column < 0, column + b.width, wp.where(column >= b.width, column - b.width, column))
     return b.pixels[wp.clamp(row, 0, b.height - 1) * b.width + x]
 
 
 @wp.func
 def environment_column(b: Background, x: float, z: float) -> float:
-    """Where a direction is in the equirectangular picture, with a fraction."""
+    """Return a direction's column in the equirectangular picture, with a fraction."""
     return (0.5 + atan2(x, -z) / TWO_PI) * float(b.width) - 0.5
 
 
@@ -68,7 +69,7 @@ def environment_row(b: Background, y: float) -> float:
 
 @wp.func
 def environment_at(b: Background, x: float, y: float) -> wp.vec3:
-    """Bilinear look-up in column x and row y."""
+    """Look up column x and line y, bilinearly."""
     column = int(wp.floor(x))
     row = int(wp.floor(y))
     fx = x - wp.floor(x)
@@ -80,7 +81,7 @@ def environment_at(b: Background, x: float, y: float) -> wp.vec3:
 
 @wp.func
 def environment(b: Background, direction: wp.vec3) -> wp.vec3:
-    """The picture's colour in a unit direction in world space."""
+    """Return the picture's radiance in a unit direction (world space)."""
     d = rotate_y(direction, -b.rotation)
     return environment_at(b, environment_column(b, d[0], d[2]), environment_row(b, d[1]))
 
@@ -90,12 +91,13 @@ def environment(b: Background, direction: wp.vec3) -> wp.vec3:
     wrt::environment_at(background, x, x + length, x + 2 * (long long)length, count);
 """)
 def environment_colors(background: Background, rows: wp.array(dtype=wp.float32), at: int, length: int, count: int) -> None:
-    """environment_at of `count` columns in the row from rows[at] on and rows in the next; red, green and blue take the place of
-    these, and a third row. length: of a row, with room for LANES - 1 more. For lanes_kernel (headers.py)."""
+    """Replace `count` columns and lines, in two rows from rows[at] on, by the colours of environment_at, in three rows.
+
+    A row has `length` entries and room for LANES - 1 more. For lanes_kernel (headers.py)."""
 
 
 def make_environment_block(directions: Rows, colors: Rows) -> Any:
-    """Return environment_block(b, rows, count): write `environment` of `count` directions to the rows `colors`, vectorised."""
+    """Return environment_block(b, rows, count): store `environment` of `count` directions in the rows `colors`, vectorised."""
     load_direction, store_place = directions.load(), colors.store()
 
     @wp.func
@@ -113,13 +115,13 @@ def make_environment_block(directions: Rows, colors: Rows) -> Any:
 
 @wp.func
 def environment_sample(b: Background, xi: wp.vec2) -> LightSample:
-    """A direction by the picture's brightness."""
+    """Sample a direction by the picture's brightness."""
     row = search_cdf(b.row_cdf, 0, b.height, xi[0])
     first = row * b.width
     column = search_cdf(b.column_cdf, first, b.width, xi[1])
     p_row = share_of_row(b.row_cdf, 0, row)
     p_column = share_of_row(b.column_cdf, first, column)
-    # Where in its cell the number fell is uniform again: it places the direction within the pixel.
+    # Its place within the cell is uniform again: it places the direction within the pixel.
     v = 1.0 - (b.row_cdf[row] - xi[0]) / p_row
     u = 1.0 - (b.column_cdf[first + column] - xi[1]) / p_column
     theta = PI * (float(row) + wp.clamp(v, 0.0, 1.0)) / float(b.height)
@@ -135,15 +137,14 @@ def environment_sample(b: Background, xi: wp.vec2) -> LightSample:
 
 
 class BackgroundKind(NamedTuple):
-    """radiance: as above; sample: (background, xi) -> LightSample with wi and weight, or None: by the cosine.
-    make_block_radiance: as make_environment_block, or None where it is not faster."""
+    """The device functions of a kind."""
 
-    radiance: Any
-    sample: Any = None
-    make_block_radiance: Any = None
+    radiance: Any  # (background, direction) -> radiance.
+    sample: Any = None  # (background, xi) -> LightSample with wi and weight. None: by the cosine.
+    make_block_radiance: Any = None  # As make_environment_block. None: it is not faster.
 
 
-# By the name in wrt.scene.backgrounds.BACKGROUNDS.
+# By the names in wrt.scene.backgrounds.BACKGROUNDS.
 BACKGROUNDS = {
     "constant": BackgroundKind(constant),
     "gradient": BackgroundKind(gradient),
@@ -155,12 +156,12 @@ BACKGROUNDS = {
 
 
 def make_background(features: Features) -> Any:
-    """Radiance from beyond all surfaces: (background, unit direction) -> radiance."""
+    """Return the function (background, unit direction) -> radiance of a scene."""
     return BACKGROUNDS[features.background].radiance
 
 
 def make_sky_point(features: Features) -> Any:
-    """sky_point(xi): the point that sky_sample takes. It has no branches, so that loops can run in lanes."""
+    """Return sky_point(xi): the point that sky_sample takes. It is branch-free, so that loops vectorise."""
     of_cosine = BACKGROUNDS[features.background].sample is None
 
     @wp.func
@@ -173,7 +174,7 @@ def make_sky_point(features: Features) -> Any:
 
 
 def make_sky_sample(features: Features) -> Any:
-    """One direction to the background. point: of sky_point."""
+    """Return the function that samples a direction to the background; `point` comes from sky_point."""
     kind = BACKGROUNDS[features.background]
     radiance, by_kind = kind.radiance, kind.sample
     of_cosine = by_kind is None

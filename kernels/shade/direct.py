@@ -1,4 +1,4 @@
-"""Direct light: one sample of one light, as what it sends to the eye and as the segment to look along."""
+"""Direct light: one sample of one light, as reflected radiance and as a shadow ray."""
 
 from typing import Any, NamedTuple
 
@@ -15,11 +15,10 @@ from wrt.kernels.structs import Lighting, Ray, Surfaces, any_positive, gamma, ma
 
 @wp.func
 def shadow_ray(s: Surface, sample: LightSample) -> Ray:
-    """The segment from a surface to a light: t = 1 is the light's end of it.
+    """Return the segment from a surface to a light, which ends at t = 1.
 
-    A light with an area ends it a little earlier: the rounding of the segment's direction and of t, some 16 steps, grows with
-    the distance, and not with the light's own error bound.
-    """
+    For a light with an area it ends a little earlier. The rounding of the segment's direction and of t, about 16 ulps, grows with
+    the distance and not with the light's own error bound."""
     ray = make_ray(spawn_point(s.point, s.error, s.geometric, sample.wi), sample.wi)
     ray.exclude_plus_one = s.exclude_plus_one
     if sample.distant == 0:
@@ -29,14 +28,14 @@ def shadow_ray(s: Surface, sample: LightSample) -> Ray:
 
 
 def make_reflected_light(features: Features) -> Any:
-    """The light that one sample sends to the eye, before shadows, and which sample that is."""
+    """Return `choose`, which samples a light, and `reflected`, the unoccluded radiance that the sample sends to the eye."""
     light_sample = make_light_sample(features)
     sky_sample = make_sky_sample(features)
     lights = bool(features.lights)
 
     @wp.func
     def choose(lighting: Lighting, surfaces: Surfaces, i: int, s: Surface, point: wp.vec3) -> LightSample:
-        """Lights are numbered; the background comes after the last one. point: of light_point."""
+        """Sample light i; the background is the light after the last one. `point` comes from light_point."""
         sample = LightSample()
         if wp.static(lights):
             if i < lighting.count:
@@ -63,15 +62,14 @@ def make_reflected_light(features: Features) -> Any:
 
 
 class LightPoints(NamedTuple):
-    """numbers(key, index, i) -> vec2: what places a sample on light i, at the path vertex `key`. point(lighting, key, index, i) ->
-    vec3: sky_point of these for the background; the two numbers and 0 for any other light."""
+    """The random points on lights."""
 
-    numbers: Any
-    point: Any
+    numbers: Any  # (key, index, i) -> vec2: place a sample on light i, at the path vertex `key`.
+    point: Any  # (lighting, key, index, i) -> vec3: sky_point of them for the background, else both and 0.
 
 
 def make_light_points(features: Features) -> LightPoints:
-    """What places a sample on a light."""
+    """Return the LightPoints of a scene."""
     sample_2d = make_sample_2d(features)
     sky_point = make_sky_point(features)
     single = {number for number, name in enumerate(LIGHTS) if name in features.lights and name in WITHOUT_AREA}

@@ -1,21 +1,23 @@
-"""Elementary functions with the same bits on every device: of sums, products, quotients and roots of float32, which IEEE 754
-defines to the last bit, and of integers. The sin and pow of a compiler or a C library are others on each machine.
+"""Elementary functions with the same bits on every device.
 
-The error is below 1.7 ulp for all arguments (`python -m tests.elementary` finds the largest); an ulp is the distance of floats at
-the exact result. A NaN is always the same one, so that its bits agree too. The methods are those of Muller, "Elementary Functions"
-(3rd ed., 2016): an argument is reduced (chapter 11), a polynomial gives the function near 0 (chapter 3), and what rounding would
-lose is carried along as a second float. A polynomial goes through its function at points where its relative error is nearly the
-least (tests/elementary.py derives them). A constant in parts is their sum: the first parts have few bits, and exact products.
-"""
+They use only operations that IEEE 754 defines to the last bit (float32 sums, products, quotients and roots) and integers. The sin
+and pow of compilers and C libraries differ between machines. The error is below 1.7 ulp for all arguments (`python -m
+tests.elementary` finds the largest); an ulp is the distance of floats at the exact result. A NaN is always the same one, so that
+its bits agree too.
+
+The methods are those of Muller, "Elementary Functions" (3rd ed., 2016). The argument is reduced (chapter 11). A polynomial gives
+the function near 0 (chapter 3). A second float carries the rounding errors along. Each polynomial interpolates its function so that
+its relative error is nearly minimal (tests/elementary.py derives them). A constant in parts is their sum: the first parts have few
+bits, and exact products."""
 
 import warp as wp
 
 from wrt.kernels.structs import noinline
 
-SHIFT = wp.constant(12582912.0)  # 1.5 * 2^23: what is added to it is rounded to an integer, a tie to the even one
+SHIFT = wp.constant(12582912.0)  # 1.5 * 2^23: a sum with it is rounded to an integer, ties to even.
 
-# sin, cos: pi / 2 in parts, the first two multiples of 2^-24, the third of 13 bits; the bits of 2 / pi behind 32 zeros.
-REDUCED_BY_PARTS = wp.constant(3000.0)  # up to here fewer than 2^11 quarter turns are taken away, exactly
+# Of sin and cos: pi / 2 in parts (the first two multiples of 2^-24, the third of 13 bits). The bits of 2 / pi after 32 zeros.
+REDUCED_BY_PARTS = wp.constant(3000.0)  # Up to here, fewer than 2^11 quarter turns are subtracted, exactly.
 TWO_OVER_PI = wp.constant(0.6366197466850281)
 QUARTER_1 = wp.constant(1.57080078125)
 QUARTER_2 = wp.constant(-4.470348358154297e-06)
@@ -25,13 +27,13 @@ TWO_OVER_PI_BITS = wp.constant(wp.types.vector(8, wp.uint32)(
     0, 0xA2F9836E, 0x4E441529, 0xFC2757D1, 0xF534DDC0, 0xDB629599, 0x3C439041, 0xFE5163AB))
 SIN_1, SIN_2, SIN_3 = wp.constant(-0.16666655242443085), wp.constant(0.008332177065312862), wp.constant(-0.0001951719168573618)
 COS_1, COS_2, COS_3 = wp.constant(0.041666656732559204), wp.constant(-0.001388773089274764), wp.constant(2.4477101760567166e-05)
-# acos, atan2: pi / 2 in two parts.
+# Of acos and atan2: pi / 2 in two parts.
 HALF_PI, HALF_PI_REST = wp.constant(1.5707963705062866), wp.constant(-4.371138828673793e-08)
 ASIN_1, ASIN_2, ASIN_3 = wp.constant(0.16666747629642487), wp.constant(0.07495515793561935), wp.constant(0.045443885028362274)
 ASIN_4, ASIN_5 = wp.constant(0.02430625818669796), wp.constant(0.04195747897028923)
 ATAN_1, ATAN_2, ATAN_3 = wp.constant(-0.3333323001861572), wp.constant(0.1999407857656479), wp.constant(-0.1417323350906372)
 ATAN_4, ATAN_5 = wp.constant(0.10151606798171997), wp.constant(-0.051188621670007706)
-# exp, power: log(2) in one part, and in two, the first of 16 bits; 2 / log(2) and a third of it, the first parts of 12 bits.
+# Of exp and power: log(2) in one part, and in two, the first of 16 bits. 2 / log(2) and a third of it, the first parts of 12 bits.
 LOG2_E, LOG_2 = wp.constant(1.4426950216293335), wp.constant(0.6931471824645996)
 LOG_2_FIRST, LOG_2_REST = wp.constant(0.693145751953125), wp.constant(1.428606765330187e-06)
 EXP_1, EXP_2, EXP_3 = wp.constant(0.5), wp.constant(0.16666577756404877), wp.constant(0.041666556149721146)
@@ -39,39 +41,39 @@ EXP_4, EXP_5 = wp.constant(0.008363173343241215), wp.constant(0.0013926175888627
 LOG_0, LOG_0_REST = wp.constant(2.8857421875), wp.constant(-0.0003521057078614831)
 LOG_1, LOG_1_REST = wp.constant(0.9619140625), wp.constant(-0.00011736857413779944)
 LOG_2ND, LOG_3RD, LOG_4TH = wp.constant(0.5770792961120605), wp.constant(0.4119340479373932), wp.constant(0.33594173192977905)
-ROOT_HALF_BITS = wp.constant(0x3F3504F3)  # of the float below sqrt(1/2)
+ROOT_HALF_BITS = wp.constant(0x3F3504F3)  # Of the float below sqrt(1/2).
 
 
 @wp.func
 def nan() -> float:
-    """By its bits: compilers and devices make different ones."""
+    """Return the NaN of these bits: compilers and devices make different ones."""
     return wp.cast(0x7FC00000, wp.float32)
 
 
 @wp.func
 def nearest(x: float) -> float:
-    """The integer next to x, for |x| < 2^22."""
+    """Round x to an integer, for |x| < 2^22."""
     return (x + SHIFT) - SHIFT
 
 
 @wp.func
 def upper(x: float) -> float:
-    """x without the lower 12 of its 24 bits: the product of two such is exact."""
+    """Clear the lower 12 of x's 24 bits: the product of two such numbers is exact."""
     return wp.cast(wp.cast(x, wp.uint32) & wp.static(wp.uint32(0xFFFFF000)), wp.float32)
 
 
 @wp.func
 def power_of_two(n: int) -> float:
-    """2^n, for -127 < n < 128."""
+    """Return 2^n, for -127 < n < 128."""
     return wp.cast((n + 127) << 23, wp.float32)
 
 
 @wp.func
 def reduced(x: float) -> wp.vec3:
-    """(r, less, n) for 2^10 < |x| < inf: |x| is r - less beyond a multiple of pi / 2, which is n modulo 4 (Payne and Hanek 1983).
+    """Return (r, less, n) for 2^10 < |x| < inf: |x| is r - less beyond a multiple of pi / 2, and n that multiple modulo 4.
 
-    |x| = m 2^e. Of the bits of 2 / pi only those matter whose product with x is no multiple of 4 and not below 2^-62.
-    """
+    The method is Payne and Hanek's (1983). With |x| = m 2^e, only those bits of 2 / pi matter whose product with x is neither a
+    multiple of 4 nor below 2^-62."""
     bits = wp.cast(wp.abs(x), wp.int32)
     m = wp.uint64((bits & 0x7FFFFF) | 0x800000)
     start = (bits >> 23) - 120  # e + 30: the first of these bits
@@ -96,9 +98,9 @@ def reduced(x: float) -> wp.vec3:
 
 @wp.func
 def sin_cos_of_parts(x: float, r: float, less: float, n: float) -> tuple[float, float]:
-    """Of x = r - less + n quarter turns."""
+    """Return sine and cosine of x = r - less + n quarter turns."""
     z = r * r
-    s = wp.where(x == 0.0, x, r - (less - r * z * (SIN_1 + z * (SIN_2 + z * SIN_3))))  # the sine of -0 is -0
+    s = wp.where(x == 0.0, x, r - (less - r * z * (SIN_1 + z * (SIN_2 + z * SIN_3))))  # sin(-0) = -0
     half = 0.5 * z
     c = 1.0 - half
     c = c + (((1.0 - c) - half) + (z * z * (COS_1 + z * (COS_2 + z * COS_3)) + r * less))
@@ -111,8 +113,9 @@ def sin_cos_of_parts(x: float, r: float, less: float, n: float) -> tuple[float, 
 
 @wp.func
 def near_sin_cos(x: float) -> tuple[float, float]:
-    """sin_cos for |x| <= REDUCED_BY_PARTS, without branches. Cody and Waite 1980; `less` is what rounding r has lost, and the last
-    part."""
+    """Return sin_cos for |x| <= REDUCED_BY_PARTS, branch-free, by Cody and Waite's reduction (1980).
+
+    The rounding error of r and the last part of pi / 2 go into `less`."""
     n = nearest(x * TWO_OVER_PI)
     rest = (x - n * QUARTER_1) - n * QUARTER_2
     part = n * QUARTER_3
@@ -123,7 +126,7 @@ def near_sin_cos(x: float) -> tuple[float, float]:
 
 @wp.func
 def sin_cos(x: float) -> tuple[float, float]:
-    """(sin x, cos x), x in radians; NaN for an infinity."""
+    """Return (sin x, cos x), x in radians; NaN for an infinity."""
     sin = nan()
     cos = nan()
     if wp.abs(x) <= REDUCED_BY_PARTS:
@@ -137,7 +140,7 @@ def sin_cos(x: float) -> tuple[float, float]:
 
 @wp.func
 def acos(x: float) -> float:
-    """In [0, pi]; NaN beyond [-1, 1]. Near the ends by acos x = 2 asin sqrt((1 - x) / 2)."""
+    """Return the angle in [0, pi]; NaN beyond [-1, 1]. Near the ends, acos x = 2 asin sqrt((1 - x) / 2)."""
     a = wp.abs(x)
     if not a <= 1.0:
         return nan()
@@ -151,15 +154,15 @@ def acos(x: float) -> float:
 
 @wp.func
 def atan2(y: float, x: float) -> float:
-    """The angle of the point (x, y), in [-pi, pi]; of zeros and infinities as IEEE 754 has it."""
+    """Return the angle of the point (x, y), in [-pi, pi]; for zeros and infinities as IEEE 754 defines it."""
     low = wp.min(wp.abs(x), wp.abs(y))
     high = wp.max(wp.abs(x), wp.abs(y))
     if not wp.abs(x) + wp.abs(y) >= 0.0:
         return nan()
-    # atan(low / high), or where 2 low > high pi / 4 + atan((low - high) / (low + high)). Without branches, for loops in lanes.
-    equal = low == high  # of zeros and infinities too
+    # atan(low / high), or where 2 low > high pi / 4 + atan((low - high) / (low + high)). Branch-free, to vectorise.
+    equal = low == high  # Also for zeros and infinities.
     middle = 2.0 * low > high
-    half = wp.where(high > 1.0, 0.5, 1.0)  # against overflow
+    half = wp.where(high > 1.0, 0.5, 1.0)  # Against overflow.
     over = wp.where(middle, half * low - half * high, low)
     under = wp.where(middle, half * low + half * high, high)
     t = wp.where(equal, 0.0, over / under)
@@ -176,7 +179,7 @@ def atan2(y: float, x: float) -> float:
 
 @wp.func
 def scaled_exp(r: float, n: float) -> float:
-    """2^n e^r, for |r| < 0.35 and |n| < 152: in two steps, so that a result below 2^-126 is rounded once."""
+    """Return 2^n e^r, for |r| < 0.35 and |n| < 152, in two steps, so that a result below 2^-126 is rounded once."""
     z = r * r
     p = 1.0 + (r + z * ((EXP_1 + r * EXP_2) + z * ((EXP_3 + r * EXP_4) + z * EXP_5)))
     first = int(n) >> 1
@@ -185,7 +188,7 @@ def scaled_exp(r: float, n: float) -> float:
 
 @wp.func
 def exp(x: float) -> float:
-    """e^x; 0 below -103.98, inf above 88.73."""
+    """Return e^x; 0 below -103.98, inf above 88.73."""
     if not wp.abs(x) < 104.0:
         return wp.where(x >= 104.0, wp.inf, wp.where(x <= -104.0, 0.0, nan()))
     n = nearest(x * LOG2_E)
@@ -194,12 +197,11 @@ def exp(x: float) -> float:
 
 @wp.func
 def power_of_positive(x: float, y: float) -> float:
-    """x^y = 2^(y log2 x), for 0 < x < inf and any y but NaN.
+    """Return x^y = 2^(y log2 x), for 0 < x < inf and any y but NaN.
 
-    x = m 2^k with m next to 1, and log2 m = (2 / log 2) atanh s = s g(s^2), s = (m - 1) / (m + 1). The result has the digits that
-    the product with y has behind the point, and there may be 8 before it: s, g, the logarithm and y are each a number of 12 bits
-    and a rest, so that the product of the first two is exact, and those with a rest are so small that their rounding does no harm.
-    """
+    Let x = m 2^k with m near 1, and s = (m - 1) / (m + 1). Then log2 m = (2 / log 2) atanh s = s g(s^2). The result's digits are
+    those behind the point of y log2 x, which may have 8 bits before the point. So s, g, the logarithm and y are each split into 12
+    bits and a rest. The product of the first parts is exact, and the rests are so small that their rounding does no harm."""
     tiny = x < wp.static(2.0**-126)
     bits = wp.cast(wp.where(tiny, x * wp.static(2.0**24), x), wp.int32) - ROOT_HALF_BITS
     k = float((bits >> 23) - wp.where(tiny, 24, 0))
@@ -239,9 +241,9 @@ def power_of_positive(x: float, y: float) -> float:
     return scaled_exp(((e1 - n) + e2) * LOG_2, n)
 
 
-@noinline  # which takes a tenth of the time to compile what shades
+@noinline  # Inlined, it would add 10 % to the compile time of a shading kernel.
 def power(x: float, y: float) -> float:
-    """x^y; NaN for x < 0 where y is no integer. Of zeros, infinities and NaN as IEEE 754 has it (`pow`)."""
+    """Return x^y as IEEE 754's `pow`: NaN if x < 0 and y is not an integer."""
     if y == 0.0 or x == 1.0:
         return 1.0
     a = wp.abs(x)
@@ -250,7 +252,7 @@ def power(x: float, y: float) -> float:
     sign = float(1.0)
     if wp.cast(x, wp.int32) < 0:
         whole = wp.floor(y) == y
-        if whole and wp.abs(y) < wp.static(2.0**24):  # all beyond are even
+        if whole and wp.abs(y) < wp.static(2.0**24):  # All larger ones are even.
             if (int(y) & 1) != 0:
                 sign = -1.0
         if not whole and a > 0.0 and a < wp.inf:

@@ -1,34 +1,27 @@
-"""The switches that a render kernel is compiled from. wrt.renderer.features says which a scene needs."""
+"""The switches that a render kernel is compiled from; wrt.renderer.features derives them from a scene."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class Features:
-    """Everything that changes the code of a kernel; what is False leaves no trace in it.
+    """Everything that changes the code of a render kernel. A switch that is False leaves no trace in it."""
 
-    camera: the module of its device function; lens, blades, filter: the camera's; independent: the samples are random numbers;
-    instances, spheres, smooth, textures, checkerboards, normal_maps, parameter_textures (of roughness and the like), cutout,
-    blend: the surfaces'; materials, lights, background: the kinds there are, by name; derived: reflection, refraction,
-    transmission, transparent_shadows, sky_light, highlight. stack_size: room for the rays that can be pending, in whole steps,
-    so that neighbouring depths share a kernel. counting: rays carry the label that a log keeps (wrt.kernels.study.ray_log).
-    """
-
-    camera: str = "wrt.kernels.shade.cameras.perspective"
+    camera: str = "wrt.kernels.shade.cameras.perspective"  # The module of its device function.
     lens: bool = False
     blades: bool = False
-    filter: bool = False
-    independent: bool = False
+    filter: bool = False  # The pixel filter is not the box.
+    independent: bool = False  # Samples are independent random numbers.
     instances: bool = False
     spheres: bool = False
     smooth: bool = False
     textures: bool = False
     checkerboards: bool = False
     normal_maps: bool = False
-    parameter_textures: bool = False
+    parameter_textures: bool = False  # Of roughness, metallic or transmission.
     cutout: bool = False
     blend: bool = False
-    materials: tuple[str, ...] = ()
+    materials: tuple[str, ...] = ()  # The kinds that the scene has.
     thin_glass: bool = False
     absorption: bool = False
     transmission: bool = False
@@ -36,18 +29,18 @@ class Features:
     highlight: bool = False
     schlick: bool = False
     emission: bool = False
-    lights: tuple[str, ...] = ()
+    lights: tuple[str, ...] = ()  # The kinds that the scene has.
     background: str = "constant"
-    sky_light: bool = False
+    sky_light: bool = False  # The background is sampled as a light.
     ambient: bool = False
     tinted_shadows: bool = False
     transparent_shadows: bool = False
     reflection: bool = False
     refraction: bool = False
-    stack_size: int = 1
-    counting: bool = False
+    stack_size: int = 1  # Room for a path's waiting rays, rounded up so that near depths share a kernel.
+    counting: bool = False  # Rays carry the label that a log keeps (wrt.kernels.study.ray_log).
 
     @property
     def direct_light(self) -> bool:
-        """Whether lights are asked for at a hit."""
+        """Lights are sampled at a hit."""
         return bool(self.lights) or self.sky_light

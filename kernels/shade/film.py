@@ -1,4 +1,4 @@
-"""The film: how samples are added to a pixel, and what an AOV film shows of a hit."""
+"""The film: samples added to a pixel, and the AOVs of a hit."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from wrt.kernels.structs import AovFilm, Film, Hit, Ray, Surfaces
 
 @wp.struct
 class Pixel:
-    """An entry of the film (Film) while samples are added to it."""
+    """A pixel of the film (structs.Film) while samples are added."""
 
     mean: wp.vec3
     m2: wp.vec3
@@ -70,17 +70,17 @@ def add_sample(before: Pixel, sample: Sample) -> Pixel:
 
 @wp.func
 def pixel_center(x: int, y: int, width: int, height: int) -> wp.vec2:
-    """Where on the film a pixel has its center."""
+    """Return the centre of a pixel on the film, in [0, 1]^2."""
     return wp.vec2((float(x) + 0.5) / float(width), (float(y) + 0.5) / float(height))
 
 
 def make_write_aovs(features: Features) -> Any:
-    """What a pixel's center shows."""
+    """Return the function that writes a pixel's AOVs."""
     surface_at, look_up, resolve, shading_normal, _, _ = make_shading(features)
 
     @wp.func
     def write_aovs(film: AovFilm, pixel: int, surfaces: Surfaces, ray: Ray, hit: Hit):
-        """hit: the closest one of `ray`, or a miss."""
+        """Write the AOVs of `hit`, the closest one of `ray` or a miss."""
         film.depth[pixel] = hit.t
         film.prim_id[pixel] = hit.prim_id
         film.material_id[pixel] = -1

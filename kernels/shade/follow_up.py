@@ -1,11 +1,8 @@
-"""The follow-up of a hit, for both loops: which new paths are followed, which are cut, and what is lost with those.
+"""The follow-up of a hit, for both loops: which new paths are followed, which are cut, and how much light the cuts lose.
 
-A path is cut behind max_depth bounces, behind MAX_TRANSPARENT surfaces in a row that it went straight through, or below
-min_throughput. So is every path of a sample that has traced MAX_RAYS: where throughput cuts nothing, a tree of 64 levels has no
-end.
-A ray that hits nothing ends in the loops (kernels/loops: one_ray.py, wave_shade.py), which add the background.
-They push the paths that are FOLLOWED, in the order onward, reflected, refracted, and trace the last one first.
-"""
+A path is cut after max_depth bounces, after MAX_TRANSPARENT surfaces in a row that it passed straight, or below min_throughput. All
+paths of a sample are cut after MAX_RAYS rays: without min_throughput, a tree of 64 levels has no end. The loops push the FOLLOWED
+paths in the order onward, reflected, refracted, and trace the last one first."""
 
 from typing import Any
 
@@ -17,25 +14,24 @@ from wrt.kernels.shade.shadows import MAX_TRANSPARENT
 from wrt.kernels.shade.step import PendingLight, Sample, make_shaded, mean3
 from wrt.kernels.structs import Limits, Surfaces
 
-MAX_RAYS = wp.constant(1 << 16)  # behind one camera ray, without those to lights: a whole tree of 15 bounces
+MAX_RAYS = wp.constant(1 << 16)  # Of one camera ray, without shadow rays: a full tree of 15 bounces.
 # Verdicts on a new path.
-NONE = wp.constant(0)  # it carries nothing
+NONE = wp.constant(0)  # Its throughput is 0.
 FOLLOWED = wp.constant(1)
-CUT_BY_DEPTH = wp.constant(2)  # or by MAX_TRANSPARENT or MAX_RAYS
+CUT_BY_DEPTH = wp.constant(2)  # Or by MAX_TRANSPARENT or MAX_RAYS.
 CUT_BY_THROUGHPUT = wp.constant(3)
 
 
 @wp.struct
 class FollowUp:
-    """onward, reflected, refracted: the verdicts on the new paths of a Shaded; cut_depth, cut_throughput: how many are cut; lost:
-    with the path onward; lit: the surface while its lights are asked."""
+    """The verdicts on the new paths of a Shaded."""
 
     onward: int
     reflected: int
     refracted: int
-    cut_depth: int
-    cut_throughput: int
-    lost: float
+    cut_depth: int  # Paths that are CUT_BY_DEPTH.
+    cut_throughput: int  # Paths that are CUT_BY_THROUGHPUT.
+    lost: float  # Of the path onward.
     pending_light: PendingLight
 
 
@@ -50,17 +46,17 @@ def add_cuts(before: Sample, next: FollowUp) -> Sample:
 
 
 def make_lost(features: Features) -> Any:
-    """Return the function for what is lost with a path, which depends on its medium."""
+    """Return the function for the light that a cut path loses."""
     Path = make_path(features.counting)
 
     @wp.func
     def lost(surfaces: Surfaces, path: Path, verdict: int) -> float:
-        """Return the radiance that a cut path would have added in a room of radiance 1; 0 for one that is not cut."""
+        """Return the radiance that a cut path would have added in a room of radiance 1; 0 for a path that is not cut."""
         if verdict < CUT_BY_DEPTH:
             return 0.0
         lost = mean3(path.throughput)
         if wp.static(features.refraction):
-            if path.medium >= 0:  # within, light is denser, and the throughput was divided by as much
+            if path.medium >= 0:  # Radiance is ior^2 times as high inside glass, and the throughput was divided by that.
                 lost = lost * surfaces.materials[path.medium].ior * surfaces.materials[path.medium].ior
         return lost
 
@@ -68,7 +64,7 @@ def make_lost(features: Features) -> Any:
 
 
 def make_follow_up(features: Features) -> Any:
-    """Return follow_up(surfaces, shaded, limits, traced) -> FollowUp. traced: the sample's rays so far, without those to lights."""
+    """Return follow_up(surfaces, shaded, limits, traced) -> FollowUp; `traced` counts the sample's rays without shadow rays."""
     Path, Shaded = make_path(features.counting), make_shaded(features.counting)
     lost = make_lost(features)
 

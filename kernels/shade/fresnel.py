@@ -1,14 +1,14 @@
-"""Fresnel's formulas: which share of light a boundary reflects."""
+"""Fresnel's formulas: the share of light that a boundary reflects."""
 
 import warp as wp
 
 
 @wp.func
 def fresnel_dielectric(cos_i: float, eta: float) -> float:
-    """Share of unpolarised light that a smooth boundary reflects; 1 at total internal reflection.
+    """Return the share of unpolarised light that a smooth boundary reflects; 1 at total internal reflection.
 
-    cos_i >= 0: angle of incidence; eta: index behind the boundary over the one in front (Born and Wolf, section 1.5).
-    """
+    Here cos_i >= 0 is the cosine of incidence, and eta the index behind the boundary over the index in front (Born and Wolf,
+    section 1.5)."""
     sin2_t = (1.0 - cos_i * cos_i) / (eta * eta)
     if sin2_t >= 1.0:
         return 1.0
@@ -20,7 +20,7 @@ def fresnel_dielectric(cos_i: float, eta: float) -> float:
 
 @wp.func
 def fresnel_schlick(cos_i: float, eta: float) -> float:
-    """Schlick 1994's approximation, with the angle on the thinner side; 1 at total internal reflection."""
+    """Return Schlick 1994's approximation, with the angle on the thinner side; 1 at total internal reflection."""
     c = cos_i
     if eta < 1.0:
         sin2_t = (1.0 - cos_i * cos_i) / (eta * eta)
@@ -34,13 +34,13 @@ def fresnel_schlick(cos_i: float, eta: float) -> float:
 
 @wp.func
 def contrast(a: float, b: float) -> float:
-    """(a - b) / (a + b); 1 where both are 0, its limit where they vanish here: at grazing incidence, or without any metal."""
+    """Return (a - b) / (a + b), or 1 if both are 0. That is the limit at grazing incidence, and without any metal."""
     return wp.where(a + b > 0.0, (a - b) / (a + b), 1.0)
 
 
 @wp.func
 def fresnel_conductor(cos_i: float, eta: float, k: float) -> float:
-    """Share that a metal of index eta + i k reflects, unpolarised (Born and Wolf, section 14.2)."""
+    """Return the share that a metal of index eta + i k reflects, unpolarised (Born and Wolf, section 14.2)."""
     c2 = cos_i * cos_i
     s2 = 1.0 - c2
     t0 = eta * eta - k * k - s2
@@ -57,6 +57,6 @@ def fresnel_conductor(cos_i: float, eta: float, k: float) -> float:
 
 @wp.func
 def fresnel_tint(cos_i: float, f0: wp.vec3) -> wp.vec3:
-    """Schlick's curve from the colour f0 at normal incidence to white at a right angle: glTF 2.0's metals."""
+    """Return Schlick's curve from the colour f0 at normal incidence to white at a right angle: glTF 2.0's metals."""
     m = 1.0 - cos_i
     return f0 + (wp.vec3(1.0, 1.0, 1.0) - f0) * (m * m * m * m * m)

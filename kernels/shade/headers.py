@@ -1,5 +1,7 @@
-"""The C++ of this folder, for kernels of the CPU that compute in lanes. Each header has functions of the Python file of its name,
-under the same names and with the same bits (tests/kernels/shade/test_twins.py)."""
+"""The C++ of this folder, for vectorised CPU kernels.
+
+Each header has functions of the Python file of the same name. They have the same names and return the same bits
+(tests/kernels/shade/test_twins.py)."""
 
 from functools import partial
 from typing import TYPE_CHECKING

@@ -1,9 +1,8 @@
-"""From hits to what is there, for rays by themselves: points with their error bounds, normals, texture coordinates, ids.
+"""Points of hits with error bounds, normals, texture coordinates and ids, for ray queries.
 
-The point is where the ray as it is given (float32) meets the triangle's plane (its corners as they are given, and for an instance
-its float64 map): float64, with a running bound of its rounding (Higham 2002, section 3.3), and rounded to float32 at the end.
-Barycentric coordinates, which kernels.shade.surface starts from, carry the error of u and v, which needles make large.
-"""
+The point is the intersection of the given float32 ray with the plane of the triangle. Corners are as given; an instance's map is
+float64. The computation is in float64, with a running error bound (Higham 2002, section 3.3), and rounded to float32 at the end.
+Barycentric coordinates, which kernels.shade.surface starts from, carry the error of u and v, which is large on needles."""
 
 import warp as wp
 
@@ -11,19 +10,18 @@ from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.shade.surface import Place, corners_at, instance_at, sphere_uv, triangle_point, triangle_uv, world_normal
 from wrt.kernels.structs import Instance, Surfaces, kernel
 
-U32 = wp.constant(wp.float64(2.0**-24))  # unit roundoffs
+U32 = wp.constant(wp.float64(2.0**-24))  # Unit roundoffs.
 U64 = wp.constant(wp.float64(2.0**-53))
-SAFETY = wp.constant(wp.float64(1.0 + 2.0**-20))  # for the rounding of the bounds themselves, to float32 at last
-SMALLEST = wp.constant(wp.float64(2.0**-149))  # of float32
+SAFETY = wp.constant(wp.float64(1.0 + 2.0**-20))  # For the rounding of the bounds themselves.
+SMALLEST = wp.constant(wp.float64(2.0**-149))  # Of float32.
 
 
 @wp.struct
 class HitPlaces:
-    """One row a hit, each array filled unless it has length 0. point, error (a bound for each axis), normal, shading: in the world;
-    a miss is NaN, and -1 among the ids."""
+    """The results, one entry a hit. An array of length 0 is not asked for. A miss is NaN, and -1 among the ids."""
 
-    point: wp.array(dtype=wp.vec3)
-    error: wp.array(dtype=wp.vec3)
+    point: wp.array(dtype=wp.vec3)  # World space, as all vectors.
+    error: wp.array(dtype=wp.vec3)  # Bound for each axis.
     normal: wp.array(dtype=wp.vec3)
     shading: wp.array(dtype=wp.vec3)
     uv: wp.array(dtype=wp.vec2)
@@ -34,15 +32,15 @@ class HitPlaces:
 
 @wp.struct
 class ObjectIds:
-    """first_prim: of each object and each sphere, in their order; instance: the number of each of Surfaces.instances."""
+    """The ids that users know."""
 
-    first_prim: wp.array(dtype=wp.int32)
-    instance: wp.array(dtype=wp.int32)
+    first_prim: wp.array(dtype=wp.int32)  # Of each object and each sphere, in their order.
+    instance: wp.array(dtype=wp.int32)  # The user's id of each of Surfaces.instances.
 
 
 @wp.struct
 class PlanePoint:
-    """A point and a bound for each axis, and the normal of its plane, of any length."""
+    """A point, its error bound per axis, and the normal of its plane, of any length."""
 
     point: wp.vec3d
     error: wp.vec3d
@@ -62,28 +60,27 @@ def to_world(i: Instance, p: wp.vec3d, w: wp.float64) -> wp.vec3d:
 
 @wp.func
 def to_world_size(i: Instance, p: wp.vec3d) -> wp.vec3d:
-    """The sums of the absolute terms of `to_world`, which its rounding is in proportion to."""
+    """Return the sums of the absolute terms of `to_world`, to which its rounding error is proportional."""
     q = wp.vec4d(wp.abs(p[0]), wp.abs(p[1]), wp.abs(p[2]), wp.float64(1.0))
     return wp.vec3d(wp.dot(wp.abs(i.world_x), q), wp.dot(wp.abs(i.world_y), q), wp.dot(wp.abs(i.world_z), q))
 
 
 @wp.func
 def cross_size(a: wp.vec3d, b: wp.vec3d) -> wp.vec3d:
-    """wp.cross with all terms added; a, b >= 0."""
+    """Add all terms of wp.cross; a, b >= 0."""
     return wp.vec3d(a[1] * b[2] + a[2] * b[1], a[2] * b[0] + a[0] * b[2], a[0] * b[1] + a[1] * b[0])
 
 
 @wp.func
 def on_plane(v0: wp.vec3d, v1: wp.vec3d, v2: wp.vec3d, off: wp.vec3d, origin: wp.vec3d, direction: wp.vec3d) -> PlanePoint:
-    """Where a line meets the plane through three corners, which are known but for `off`, per axis.
+    """Intersect a line with the plane through three corners, which are known to `off` per axis.
 
-    Where rounding leaves open whether it meets it at all, the error is infinite or NaN.
-    """
+    If rounding leaves open whether they intersect, the error is infinite or NaN."""
     out = PlanePoint()
     e1 = v1 - v0
     e2 = v2 - v0
     out.normal = wp.cross(e1, e2)
-    # An edge is off by two corners and its own rounding; a component of the normal has products of two, and three roundings.
+    # An edge is off by two corners and its own rounding. A component of the normal has two products and three roundings.
     slack = wp.float64(2.0) * off + U64 * wp.max(wp.abs(e1), wp.abs(e2))
     size = cross_size(wp.abs(e1), wp.abs(e2))
     normal_error = cross_size(slack, wp.abs(e1) + wp.abs(e2) + slack) + wp.float64(4.0) * U64 * size
@@ -108,8 +105,9 @@ def on_plane(v0: wp.vec3d, v1: wp.vec3d, v2: wp.vec3d, off: wp.vec3d, origin: wp
 
 @wp.func
 def clamped_to_triangle(found: PlanePoint, v0: wp.vec3d, v1: wp.vec3d, v2: wp.vec3d) -> PlanePoint:
-    """A point that is beside the triangle is moved onto it, and its error grows by as much: a ray that is given to one of two
-    triangles at an edge, or grazes an outline, may pass it by, to rounding, and then meet its plane far away."""
+    """Move a point beside the triangle onto it, and add the distance to its error.
+
+    A ray at an edge, or on an outline, may pass its triangle by a rounding error and then meet the plane far away."""
     e1 = v1 - v0
     e2 = v2 - v0
     way = found.point - v0
@@ -118,7 +116,7 @@ def clamped_to_triangle(found: PlanePoint, v0: wp.vec3d, v1: wp.vec3d, v2: wp.ve
     v = wp.dot(found.normal, wp.cross(e1, way)) / square
     if u >= wp.float64(0.0) and v >= wp.float64(0.0) and u + v <= wp.float64(1.0):
         return found
-    u = wp.max(wp.float64(0.0), u)  # in this order 0 comes of -0 on the CPU as on CUDA
+    u = wp.max(wp.float64(0.0), u)  # In this order -0 becomes 0 on the CPU as on CUDA.
     v = wp.max(wp.float64(0.0), v)
     over = wp.max(u + v, wp.float64(1.0))
     out = found
@@ -129,7 +127,7 @@ def clamped_to_triangle(found: PlanePoint, v0: wp.vec3d, v1: wp.vec3d, v2: wp.ve
 
 @wp.func
 def on_triangle(surfaces: Surfaces, place: Place, u: float, v: float, origin: wp.vec3d, direction: wp.vec3d) -> PlanePoint:
-    """The point on a face; its normal is on the outside, also of a mirrored instance."""
+    """Return the point on a face; its normal points outside, also on a mirrored instance."""
     t = corners_at(surfaces, place.face)
     v0 = wp.vec3d(t.v0)
     v1 = wp.vec3d(t.v1)
@@ -148,7 +146,7 @@ def on_triangle(surfaces: Surfaces, place: Place, u: float, v: float, origin: wp
         side = wp.float64(instance.handedness)
     found = clamped_to_triangle(on_plane(v0, v1, v2, off, origin, direction), v0, v1, v2)
     found.normal = side * found.normal
-    # A hit on a plane that the ray runs along, to rounding: all that is known of it is that it is on the triangle.
+    # To rounding, the ray runs along the plane: its point may be anywhere on the triangle.
     reach = wp.max(wp.max(wp.abs(v0 - middle), wp.abs(v1 - middle)), wp.abs(v2 - middle)) + off
     if not longest(found.error) <= longest(reach):
         found.point = middle
@@ -158,19 +156,19 @@ def on_triangle(surfaces: Surfaces, place: Place, u: float, v: float, origin: wp
 
 @wp.func
 def on_sphere(sphere: wp.vec4, t: float, origin: wp.vec3d, direction: wp.vec3d) -> PlanePoint:
-    """The point of the line's two that is on t's side of their middle."""
+    """Return the line's point on the sphere that is on t's side of the middle."""
     center = wp.vec3d(wp.float64(sphere[0]), wp.float64(sphere[1]), wp.float64(sphere[2]))
     radius = wp.float64(sphere[3])
     unit = direction / longest(direction)
     unit = unit / wp.length(unit)
     way = origin - center
     along = -wp.dot(way, unit)
-    foot = way + along * unit  # the line's point that is nearest to the centre
+    foot = way + along * unit  # The line's point nearest to the centre.
     foot_error = wp.float64(16.0) * U64 * wp.length(way)
     square = radius * radius - wp.dot(foot, foot)
     square_error = foot_error * (wp.float64(2.0) * wp.length(foot) + foot_error) + wp.float64(8.0) * U64 * radius * radius
     half = wp.sqrt(wp.max(square, wp.float64(0.0)))
-    # Of two roots of numbers d apart, the difference is at most sqrt(d), and at most d over either.
+    # Roots of two numbers d apart differ by at most sqrt(d), and by at most d over either root.
     half_error = wp.sqrt(square_error)
     if half > half_error:
         half_error = square_error / half
@@ -186,7 +184,7 @@ def on_sphere(sphere: wp.vec4, t: float, origin: wp.vec3d, direction: wp.vec3d) 
 
 @wp.func
 def shading_normal(surfaces: Surfaces, place: Place, u: float, v: float, geometric: wp.vec3) -> wp.vec3:
-    """Interpolated, on the outside; the geometric one where the corners have none."""
+    """Return the interpolated normal, on the outside; the geometric one if the corners have none."""
     face = surfaces.faces[place.face]
     n0 = surfaces.normals[face[0]]
     n1 = surfaces.normals[face[1]]
@@ -205,7 +203,7 @@ def shading_normal(surfaces: Surfaces, place: Place, u: float, v: float, geometr
 
 @wp.func
 def last_row(first: wp.array(dtype=wp.int32), prim_id: int) -> int:
-    """The last row that does not begin behind prim_id; rows without primitives have the next one's beginning."""
+    """Return the last entry that does not begin behind prim_id. Entries without primitives begin where the next one does."""
     low = int(0)
     high = int(first.shape[0])
     while high - low > 1:
@@ -219,7 +217,8 @@ def last_row(first: wp.array(dtype=wp.int32), prim_id: int) -> int:
 
 @wp.func
 def place_of(surfaces: Surfaces, prim_id: int) -> Place:
-    """As kernels.shade.surface.make_place_of, with instances or without (instance = -1); material -1 where there are none."""
+    """Return the data as kernels.shade.surface.make_place_of does, with or without instances (-1); material -1 without
+    materials."""
     place = Place()
     place.face = prim_id
     place.instance = -1
@@ -294,7 +293,7 @@ def put_interpolated_on_sphere(normal: wp.vec3, out: HitPlaces, i: int):
 
 @kernel
 def hit_places(surfaces: Surfaces, object_ids: ObjectIds, rays: RayArrays, hits: HitArrays, out: HitPlaces, first: int):
-    """Hits of rays first .. first + dim - 1. A prim_id that is none of the surfaces' is a miss."""
+    """Write the results of hits first .. first + dim - 1. A prim_id that is none of the surfaces' is a miss."""
     i = first + wp.tid()
     prim_id = hits.prim_id[i]
     count = surfaces.n_triangles + surfaces.spheres.shape[0]

@@ -1,5 +1,6 @@
-"""Light kinds: one sample of what arrives from a light at a surface. One function a kind, and a row in LIGHTS; what a light is
-stands in wrt/scene/lights.py. docs/extending.md, "A light", adds one."""
+"""Light kinds: one sample of a light, as seen from a surface. Each kind is a function and an entry of LIGHTS.
+
+wrt/scene/lights.py has the lights' parameters. docs/extending.md, "A light", adds a kind."""
 
 from typing import Any
 
@@ -22,27 +23,22 @@ from wrt.kernels.structs import Emitter, Light, Lighting, Surfaces
 
 @wp.struct
 class LightSample:
-    """One way from a surface to a light.
+    """A sampled point or direction of a light, as seen from a surface."""
 
-    wi: unit direction; weight: radiance over density (or irradiance at right angles, for lights without area): times BSDF
-    and cosine it is the light's share; end: where the way ends, or, if `distant`, no end. area: a ray could hit this light.
-    """
-
-    wi: wp.vec3
-    end: wp.vec3
-    distant: int
-    weight: wp.vec3
-    area: int
+    wi: wp.vec3  # Unit direction to the light.
+    end: wp.vec3  # End of the shadow ray, unless `distant`.
+    distant: int  # 1: the shadow ray has no end.
+    weight: wp.vec3  # Radiance over density, or a light without area's irradiance at normal incidence.
+    area: int  # 1 if a ray could hit this light.
 
 
 # --- the kinds --------------------------------------------------------------------------------------------------------
-# Each is (lighting, surfaces, light, surface, xi) -> sample. xi: two numbers in [0, 1) that place the sample; a weight of 0 is no
-# light. Where a ray could hit the light, the sample's `area` is 1.
+# Each is (lighting, surfaces, light, surface, xi) -> sample, placed by xi in [0, 1)^2. A weight of 0 is no light.
 
 
 @wp.func
 def point_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface, xi: wp.vec2) -> LightSample:
-    """Alike in all directions."""
+    """Sample a point light, equal in all directions."""
     sample = LightSample()
     way = light.position - s.point
     distance2 = wp.dot(way, way)
@@ -55,7 +51,7 @@ def point_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface
 
 @wp.func
 def directional_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface, xi: wp.vec2) -> LightSample:
-    """From infinity."""
+    """Sample a light at infinity."""
     sample = LightSample()
     sample.wi = -light.direction
     sample.weight = light.color
@@ -65,7 +61,7 @@ def directional_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: S
 
 @wp.func
 def spot_falloff(light: Light, cos_angle: float) -> float:
-    """1 within the inner cone, 0 beyond the outer one, the square of a linear ramp in the cosine between them."""
+    """Return 1 inside the inner cone, 0 outside the outer one, and in between the square of a linear ramp in the cosine."""
     if cos_angle <= light.cos_outer:
         return 0.0
     if cos_angle >= light.cos_inner:
@@ -76,7 +72,7 @@ def spot_falloff(light: Light, cos_angle: float) -> float:
 
 @wp.func
 def spot_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface, xi: wp.vec2) -> LightSample:
-    """A point light in a cone."""
+    """Sample a point light that shines into a cone."""
     sample = point_light(lighting, surfaces, light, s, xi)
     if wp.max(sample.weight) > 0.0:
         sample.weight = sample.weight * spot_falloff(light, -wp.dot(sample.wi, light.direction))
@@ -85,7 +81,7 @@ def spot_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface,
 
 @wp.func
 def choose_emitter(lighting: Lighting, light: Light, xi: float) -> tuple[int, float]:
-    """By power: the emitter that xi falls on, and where in its share, in [0, 1), which is uniform again."""
+    """Choose an emitter by power. Return its index, and the place of xi within its share, in [0, 1), which is uniform again."""
     chosen = search_cdf(lighting.emitter_cdf, light.first, light.count, xi)
     share = share_of_row(lighting.emitter_cdf, light.first, chosen)
     left = lighting.emitter_cdf[light.first + chosen] - xi
@@ -104,7 +100,7 @@ def emitter_corners(emitter: Emitter) -> Triangle:
 @wp.func
 def from_emitter(point: wp.vec3, error: wp.vec3, n: wp.vec3, emission: wp.vec3, two_sided: bool, pdf_area: float,
                  eye: wp.vec3) -> LightSample:
-    """What arrives at `eye` from a point of an emitter with normal n. It has no branches, so that loops can run in lanes."""
+    """Return the sample of an emitter's point, with normal n, as seen from `eye`. It is branch-free, so that loops vectorise."""
     sample = LightSample()
     way = point - eye
     distance2 = wp.dot(way, way)
@@ -112,15 +108,15 @@ def from_emitter(point: wp.vec3, error: wp.vec3, n: wp.vec3, emission: wp.vec3, 
     cos_light = -wp.dot(sample.wi, n)
     cos_light = wp.where(two_sided, wp.abs(cos_light), cos_light)
     lit = cos_light > 0.0 and distance2 > 0.0
-    sample.weight = wp.where(lit, cos_light / (distance2 * pdf_area), 0.0) * emission  # which is finite
-    # The way ends just before the light: its own surface must not shade it.
+    sample.weight = wp.where(lit, cos_light / (distance2 * pdf_area), 0.0) * emission  # The emission is finite.
+    # The shadow ray ends just before the light, whose own surface must not occlude it.
     sample.end = spawn_point(point, error, n, eye - point)
     sample.area = 1
     return sample
 
 
 def make_mesh_light(features: Features) -> Any:
-    """A point on the emitters of one light, by power and then uniformly by area."""
+    """Return the function that samples a mesh: an emitter by power, then a point uniformly by area."""
 
     @wp.func
     def mesh_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface, xi: wp.vec2) -> LightSample:
@@ -145,7 +141,8 @@ def make_mesh_light(features: Features) -> Any:
 
 @wp.func
 def is_within(light: Light, s: Surface, way: wp.vec3) -> bool:
-    """Whether a surface is inside a sphere; on the sphere itself, but for rounding, its normal decides. way: to the center."""
+    """Return whether a surface is inside a sphere light. On the sphere, to rounding, its normal decides. `way` points to the
+    centre."""
     rounding = wp.length(s.error) + wp.static(16.0 * 2.0**-24) * (light.radius + wp.length(light.position))
     distance = wp.length(way)
     if distance < light.radius - rounding:
@@ -155,7 +152,7 @@ def is_within(light: Light, s: Surface, way: wp.vec3) -> bool:
 
 @wp.func
 def sphere_light_from_within(light: Light, s: Surface, way: wp.vec3, xi: wp.vec2) -> LightSample:
-    """A direction by the cosine around the normal: every one of them meets the sphere's inside, where that emits."""
+    """Sample the normal's hemisphere by the cosine: all directions meet the inside of the sphere, if that emits."""
     sample = LightSample()
     if light.two_sided == 0:
         return sample
@@ -173,7 +170,7 @@ def sphere_light_from_within(light: Light, s: Surface, way: wp.vec3, xi: wp.vec2
 
 @wp.func
 def sphere_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface, xi: wp.vec2) -> LightSample:
-    """A direction in the cone that the sphere fills, uniformly (PBR, section 6.2.4); from within, one by the cosine."""
+    """Sample the cone that the sphere subtends, uniformly (PBR, section 6.2.4); from inside, the hemisphere by the cosine."""
     sample = LightSample()
     way = light.position - s.point
     distance2 = wp.dot(way, way)
@@ -202,8 +199,8 @@ def sphere_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surfac
     return sample
 
 
-# By the name in wrt.scene.lights.LIGHTS (mesh and sphere: the emissive surfaces): from a scene's features to the device function.
-# Light.kind is the place here.
+# By the names in wrt.scene.lights.LIGHTS, and mesh and sphere for emissive surfaces: from a scene's features to the device function.
+# Light.kind is the index here.
 LIGHTS = {
     "point": lambda features: point_light,
     "directional": lambda features: directional_light,
@@ -213,7 +210,7 @@ LIGHTS = {
 }
 
 
-# Those that have one sample alone, for which no random numbers are drawn. A kind of another module adds its name.
+# Kinds with a single sample, which takes no random numbers. A kind of another module adds its name.
 WITHOUT_AREA = {"point", "directional", "spot"}
 
 
@@ -221,7 +218,7 @@ WITHOUT_AREA = {"point", "directional", "spot"}
 
 
 def make_light_sample(features: Features) -> Any:
-    """The scene's kinds, one `if` after another, as in materials.py."""
+    """Return the function that samples a light of any kind of the scene: one `if` after another, as in materials.py."""
     light_sample = no_light
     for number, name in reversed(list(enumerate(LIGHTS))):
         if name in features.lights:
@@ -235,7 +232,7 @@ def no_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface, x
 
 
 def make_link(number: int, function: Any, others: Any) -> Any:
-    """`function` for lights of that number, and the others for all other ones."""
+    """Return the function that takes `function` for lights of kind `number`, and `others` for the rest."""
 
     @wp.func
     def light_sample(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface, xi: wp.vec2) -> LightSample:

@@ -1,4 +1,4 @@
-"""Material kinds: what a surface sends back, and where rays go on from it. One function a kind, and a row in MATERIALS."""
+"""Material kinds: how a surface scatters light, and where rays go on. Each kind is a function and an entry of MATERIALS."""
 
 from typing import Any
 
@@ -11,35 +11,29 @@ from wrt.kernels.shade.sampling import PI, ggx_normal, ggx_visible_share
 from wrt.kernels.shade.surface import Surface
 from wrt.kernels.structs import Material
 
-SMOOTH = wp.constant(1.0e-4)  # GGX's alpha: below, a facet deviates by less than a float32 direction can tell
+SMOOTH = wp.constant(1.0e-4)  # GGX's alpha. Below, facets deviate by less than a float32 direction resolves.
 
 
 @wp.struct
 class Scatter:
-    """Where rays go on from a surface; a weight of 0 means that none does.
+    """How a surface scatters light, and where rays go on. A weight of 0 means no ray."""
 
-    reflected: towards `reflection`, on the side the ray came from; transmitted: towards `refraction`, through the surface.
-    diffuse: what is left for Lambert's law; highlight and exponent: for lights that no ray can hit. traced: 1 where the highlight
-    stands for a reflection whose rays find the other lights.
-    """
-
-    reflected: wp.vec3
+    reflected: wp.vec3  # Weight towards `reflection`, on the ray's side.
     reflection: wp.vec3
-    transmitted: wp.vec3
+    transmitted: wp.vec3  # Weight towards `refraction`, through the surface.
     refraction: wp.vec3
     bends: int
-    diffuse: wp.vec3
-    highlight: wp.vec3
+    diffuse: wp.vec3  # Albedo of Lambert's law.
+    highlight: wp.vec3  # For lights that no ray can hit.
     exponent: float
-    traced: int
+    traced: int  # 1 if reflected rays find the other lights, so that the highlight leaves them out.
 
 
 @wp.func
 def blinn_phong(n: wp.vec3, wi: wp.vec3, wo: wp.vec3, exponent: float) -> float:
-    """Blinn's highlight, per steradian, scaled so that no more leaves than comes in at normal incidence.
+    """Return Blinn's highlight, per steradian, scaled so that no more light leaves than arrives at normal incidence.
 
-    (e + 2)(e + 4) / (8 pi (2^(-e/2) + e)) cos^e (Akenine-Moeller et al. 2008, "Real-Time Rendering", 3rd ed., section 7.6).
-    """
+    (e + 2)(e + 4) / (8 pi (2^(-e/2) + e)) cos^e (Akenine-Moeller et al. 2008, "Real-Time Rendering", 3rd ed., section 7.6)."""
     h = wp.normalize(wi + wo)
     scale = (exponent + 2.0) * (exponent + 4.0) / (8.0 * PI * (exp(-0.5 * LOG_2 * exponent) + exponent))
     return scale * power(wp.max(0.0, wp.dot(n, h)), exponent)
@@ -47,8 +41,7 @@ def blinn_phong(n: wp.vec3, wi: wp.vec3, wo: wp.vec3, exponent: float) -> float:
 
 @wp.func
 def with_highlight(m: Material, before: Scatter) -> Scatter:
-    """What a rough reflection makes of lights that no ray can hit: Blinn's highlight, of the same width (Walter et al. 2007,
-    eq. 41)."""
+    """Give a rough reflection a highlight of the same width, for lights that no ray can hit (Walter et al. 2007, eq. 41)."""
     out = before
     alpha = m.roughness * m.roughness
     if alpha > SMOOTH:
@@ -59,14 +52,13 @@ def with_highlight(m: Material, before: Scatter) -> Scatter:
 
 
 # --- the kinds --------------------------------------------------------------------------------------------------------
-# Each is (material, surface, n, wo, out) -> out. n: the normal to reflect at, a microfacet's where it is rough; wo: unit vector to
-# where the ray came from; out: empty, but for `reflection`, the mirrored direction. The sum of what is reflected, transmitted and
-# diffuse is at most 1 at every angle.
+# Each is (material, surface, n, wo, out) -> out. The normal n reflects: a microfacet's, if rough. The unit vector wo points to where
+# the ray came from. `out` has only `reflection`, the mirrored direction. Reflected, transmitted and diffuse add up to at most 1.
 
 
 @wp.func
 def diffuse(m: Material, s: Surface, n: wp.vec3, wo: wp.vec3, out: Scatter) -> Scatter:
-    """Lambert's law, and a highlight of its own."""
+    """Scatter by Lambert's law, with a highlight."""
     result = out
     result.diffuse = m.albedo
     result.highlight = m.specular
@@ -76,7 +68,7 @@ def diffuse(m: Material, s: Surface, n: wp.vec3, wo: wp.vec3, out: Scatter) -> S
 
 @wp.func
 def mirror(m: Material, s: Surface, n: wp.vec3, wo: wp.vec3, out: Scatter) -> Scatter:
-    """The same share at every angle."""
+    """Reflect the same share at every angle."""
     result = out
     result.reflected = m.albedo
     return result
@@ -84,7 +76,7 @@ def mirror(m: Material, s: Surface, n: wp.vec3, wo: wp.vec3, out: Scatter) -> Sc
 
 @wp.func
 def conductor(m: Material, s: Surface, n: wp.vec3, wo: wp.vec3, out: Scatter) -> Scatter:
-    """A metal, by its complex index at red, green and blue."""
+    """Reflect as a metal with the complex index m.eta + i m.k, for red, green and blue."""
     result = out
     cos_o = wp.clamp(wp.dot(n, wo), 0.0, 1.0)
     result.reflected = wp.vec3(
@@ -96,7 +88,7 @@ def conductor(m: Material, s: Surface, n: wp.vec3, wo: wp.vec3, out: Scatter) ->
 
 
 def make_glass(features: Features) -> Any:
-    """Reflection and refraction at a boundary to index m.ior, or at a thin pane of it."""
+    """Return reflection and refraction at a boundary to index m.ior, or at a thin pane."""
     fresnel = fresnel_schlick if features.schlick else fresnel_dielectric
 
     @wp.func
@@ -105,7 +97,7 @@ def make_glass(features: Features) -> Any:
         cos_o = wp.clamp(wp.dot(n, wo), 0.0, 1.0)
         if wp.static(features.thin_glass):
             if m.thin != 0:
-                # Light goes to and fro between the faces: R + T^2 R + T^2 R^3 + ... = 2 R / (1 + R).
+                # Light is reflected between the faces: R + T^2 R + T^2 R^3 + ... = 2 R / (1 + R).
                 r = fresnel(cos_o, m.ior)
                 both = 2.0 * r / (1.0 + r)
                 out.reflected = wp.vec3(both, both, both)
@@ -127,7 +119,7 @@ def make_glass(features: Features) -> Any:
 
 
 def make_metallic_roughness(features: Features) -> Any:
-    """glTF 2.0, appendix B: a metal and a coated diffuse (or clear) body, mixed by `metallic`."""
+    """Return glTF 2.0's material (appendix B): a metal and a coated diffuse or clear body, mixed by `metallic`."""
     fresnel = fresnel_schlick if features.schlick else fresnel_dielectric
     glass = make_glass(features)
 
@@ -152,7 +144,7 @@ def make_metallic_roughness(features: Features) -> Any:
     return metallic_roughness
 
 
-# By the name in wrt.scene.materials.MATERIALS: from a scene's features to the device function. Material.kind is the place here.
+# By the names in wrt.scene.materials.MATERIALS: from a scene's features to the device function. Material.kind is the index here.
 MATERIALS = {
     "diffuse": lambda features: diffuse,
     "mirror": lambda features: mirror,
@@ -166,8 +158,9 @@ MATERIALS = {
 
 
 def make_of_kind(features: Features) -> Any:
-    """The scene's kinds, one `if` after another: a table that is looked up in a device function keeps the code of before an
-    edit."""
+    """Return the function for all kinds of the scene, one `if` after another.
+
+    Warp keeps the old code of a table that a device function looks up, even after an edit."""
     of_kind = no_kind
     for number, name in reversed(list(enumerate(MATERIALS))):
         if name in features.materials:
@@ -181,7 +174,7 @@ def no_kind(m: Material, s: Surface, n: wp.vec3, wo: wp.vec3, out: Scatter) -> S
 
 
 def make_link(number: int, function: Any, others: Any) -> Any:
-    """`function` for materials of that number, and the others for all other ones."""
+    """Return the function that takes `function` for materials of kind `number`, and `others` for the rest."""
 
     @wp.func
     def of_kind(m: Material, s: Surface, n: wp.vec3, wo: wp.vec3, out: Scatter) -> Scatter:
@@ -193,12 +186,12 @@ def make_link(number: int, function: Any, others: Any) -> Any:
 
 
 def make_scatter(features: Features) -> Any:
-    """How a surface splits what arrives."""
+    """Return the function that scatters light at a surface."""
     of_kind = make_of_kind(features)
 
     @wp.func
     def scatter(m: Material, s: Surface, wo: wp.vec3, facet: wp.vec3) -> Scatter:
-        """What a ray from direction -wo turns into. facet: of cap_point, what chooses a microfacet where it is rough."""
+        """Scatter the ray from direction -wo. `facet`, from cap_point, places the microfacet of a rough surface."""
         out = Scatter()
         n = s.shading
         rough = bool(False)

@@ -1,4 +1,4 @@
-"""Paths: pending rays, and where they begin, at the camera or at a surface."""
+"""Paths: rays that wait to be traced, from the camera or from a surface."""
 
 from functools import cache
 from typing import Any, NamedTuple
@@ -9,55 +9,50 @@ from wrt.kernels.shade.sampling import hash_pair
 from wrt.kernels.shade.surface import Surface, spawn_point
 from wrt.kernels.structs import Ray, make_ray
 
-UNKNOWN = wp.constant(-2)  # the medium in which a camera ray begins: within glass, or not
-CAMERA, REFLECTED, REFRACTED, ONWARD = (wp.constant(branch) for branch in range(4))  # the branch that made a path
+UNKNOWN = wp.constant(-2)  # The medium of a camera ray: it may start inside glass.
+CAMERA, REFLECTED, REFRACTED, ONWARD = (wp.constant(branch) for branch in range(4))  # The branch that made a path.
 BRANCHES = wp.constant(4)
 
 
 @wp.func
 def label(branch: int, depth: int) -> int:
-    """Return Ray.slot of a path's ray until it is logged. A shadow ray has 0: it belongs to the path's ray before it."""
+    """Return the Ray.slot of a path's ray before it is logged. A shadow ray has 0: it belongs to the path's ray before it."""
     return 1 + branch + BRANCHES * depth
 
 
 @cache
 def make_path(counting: bool) -> Any:
-    """Return the struct Path. counting: as of Features."""
+    """Return the struct Path. `counting` as in Features."""
 
     @wp.struct
     class Path:
-        """A pending ray.
-
-        throughput: the share of its radiance that counts in the picture; depth: bounces so far; passed: surfaces in a row that it
-        went straight through; medium: the solid glass that it is in (a material, OUTSIDE or UNKNOWN); key: of its samples;
-        exclude_plus_one: 1 + the triangle that it starts on, or 0; branch, where rays are counted: CAMERA to ONWARD.
-        """
+        """A ray that waits to be traced."""
 
         origin: wp.vec3
         direction: wp.vec3
-        throughput: wp.vec3
-        depth: int
-        passed: int
-        medium: int
-        exclude_plus_one: int
-        key: wp.uint32
+        throughput: wp.vec3  # Weight of its radiance in the sample.
+        depth: int  # Bounces so far.
+        passed: int  # Surfaces in a row that it passed straight.
+        medium: int  # The solid glass around it: a material, OUTSIDE or UNKNOWN.
+        exclude_plus_one: int  # 1 + the triangle that it starts on, or 0.
+        key: wp.uint32  # Seed of its samples.
         if counting:
-            branch: int
+            branch: int  # CAMERA to ONWARD.
 
     return Path
 
 
 class Paths(NamedTuple):
-    """camera_path(ray, key) -> Path; ray_of(path) -> Ray; child(path, surface, direction, throughput, branch) -> Path."""
+    """The functions that make paths and their rays."""
 
-    camera_path: Any
-    ray_of: Any
-    child: Any
+    camera_path: Any  # (ray, key) -> Path.
+    ray_of: Any  # (path) -> Ray.
+    child: Any  # (path, surface, direction, throughput, branch) -> Path.
 
 
 @cache
 def make_paths(counting: bool) -> Paths:
-    """Return the functions that begin paths. counting: as of Features."""
+    """Return the functions that make paths. `counting` as in Features."""
     Path = make_path(counting)
 
     @wp.func

@@ -1,4 +1,4 @@
-"""The rays of a camera by themselves, and the ray that there is not."""
+"""The rays of a camera, outside of a render, and the ray without length."""
 
 from typing import Any
 
@@ -9,15 +9,16 @@ from wrt.kernels.structs import Ray, kernel, make_ray
 
 @wp.func
 def no_ray() -> Ray:
-    """Where the film gets no light: t_max < 0, and no direction."""
+    """Return the ray where the film gets no light: t_max < 0, and direction 0."""
     ray = make_ray(wp.vec3(0.0, 0.0, 0.0), wp.vec3(0.0, 0.0, 0.0))
     ray.t_max = -1.0
     return ray
 
 
 def make_camera_rays_kernel(camera_kind: Any) -> Any:
-    """camera_kind: a module as wrt.kernels.shade.cameras says. Through the middle of the lens; the direction is 0 where there is no
-    ray."""
+    """Return the kernel for the rays through the middle of the lens; the direction is 0 where there is no ray.
+
+    `camera_kind` is a module as kernels/shade/cameras describes it."""
     camera_struct = camera_kind.Camera
     camera_ray = camera_kind.make_camera_ray()
 

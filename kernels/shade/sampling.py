@@ -1,10 +1,9 @@
 """Samples: a counter-based low-discrepancy sequence, and the shapes that its points are mapped to.
 
-Every number is a function of (pixel, sample, dimension, seed) alone, so that pictures do not depend on tiles, threads or
-passes. Each pair of dimensions is the two-dimensional Sobol sequence, with its points in a shuffled order and Owen-scrambled,
-both by hashing (Burley 2020, "Practical Hash-based Owen Scrambling", JCGT 9(4)). The hash for the nested scramble has the
-constants of Vegdahl 2021 ("Building a Better LK Hash"). Independent random numbers are there to be compared with it.
-"""
+Every number depends on (pixel, sample, dimension, seed) alone, so that pictures do not depend on tiles, threads or passes. Each
+pair of dimensions is the two-dimensional Sobol sequence, its points shuffled and Owen-scrambled by hashing (Burley 2020, "Practical
+Hash-based Owen Scrambling", JCGT 9(4)). The hash of the nested scramble has the constants of Vegdahl 2021 ("Building a Better LK
+Hash"). Independent random numbers serve for comparison."""
 
 from typing import Any
 
@@ -14,21 +13,21 @@ from wrt.kernels.shade.elementary import near_sin_cos, sin_cos
 from wrt.kernels.shade.features import Features
 from wrt.kernels.structs import unit
 
-# The constants of the hash, of the scramble, and what makes the seeds of a point's two numbers differ.
+# The constants of the hash, of the scramble, and of the seeds of a point's two numbers.
 HASH_1, HASH_2 = 0x21F0AAAD, 0xD35A2D97
 LK_1, LK_2, LK_3 = 0x3D20ADEA, 0x05526C56, 0x53A22864
 SEED_X, SEED_Y = 0xA511E9B3, 0x63D83595
-# Every second bit, pair, four and eight bits; and what a number of 24 bits is multiplied by.
+# Masks of every second bit, pair, four and eight bits, and the step of a 24-bit number in [0, 1).
 BITS_1, BITS_2, BITS_4, BITS_8 = 0x55555555, 0x33333333, 0x0F0F0F0F, 0x00FF00FF
 UNIT = wp.constant(2.0**-24)
-LANES = 16  # numbers that are computed at a time on the CPU
+LANES = 16  # Numbers that vectorised code computes at a time.
 TWO_PI = wp.constant(6.283185307179586)
 PI = wp.constant(3.141592653589793)
 
 
 @wp.func
 def hash_u32(x: wp.uint32) -> wp.uint32:
-    """A bijection of 32 bits without visible pattern (two rounds of xor-shift and multiplication; Wellons 2018)."""
+    """Permute the 32-bit numbers without visible pattern, by two rounds of xor-shift and multiplication (Wellons 2018)."""
     x = x ^ (x >> wp.uint32(16))
     x = x * wp.static(wp.uint32(HASH_1))
     x = x ^ (x >> wp.uint32(15))
@@ -38,7 +37,7 @@ def hash_u32(x: wp.uint32) -> wp.uint32:
 
 @wp.func
 def hash_pair(a: wp.uint32, b: wp.uint32) -> wp.uint32:
-    """One hash of two numbers; not symmetric."""
+    """Hash two numbers; the order matters."""
     return hash_u32(a + wp.static(wp.uint32(0x9E3779B9)) * hash_u32(b + wp.static(wp.uint32(0x85EBCA6B))))
 
 
@@ -54,7 +53,7 @@ def reverse_bits(x: wp.uint32) -> wp.uint32: ...
 
 @wp.func
 def laine_karras(x: wp.uint32, seed: wp.uint32) -> wp.uint32:
-    """A permutation in which each bit depends only on itself and lower ones: on reversed bits, a nested scramble."""
+    """Permute numbers so that each bit depends only on itself and lower ones: on reversed bits, a nested scramble."""
     x = x ^ (x * wp.static(wp.uint32(LK_1)))
     x = x + seed
     x = x * ((seed >> wp.uint32(16)) | wp.uint32(1))
@@ -64,10 +63,9 @@ def laine_karras(x: wp.uint32, seed: wp.uint32) -> wp.uint32:
 
 @wp.func
 def sobol_second(index: wp.uint32) -> wp.uint32:
-    """Bits of the second Sobol dimension, lowest bit first: the Pascal matrix modulo 2.
+    """Return the bits of the second Sobol dimension, lowest bit first: the Pascal matrix modulo 2.
 
-    Entry (i, j) is odd exactly where j's bits are among i's (Lucas), so that the product is five folds.
-    """
+    Entry (i, j) is odd exactly if j's bits are among i's (Lucas), so that the product is five folds."""
     x = index
     x = x ^ ((x >> wp.uint32(1)) & wp.static(wp.uint32(BITS_1)))
     x = x ^ ((x >> wp.uint32(2)) & wp.static(wp.uint32(BITS_2)))
@@ -78,13 +76,13 @@ def sobol_second(index: wp.uint32) -> wp.uint32:
 
 @wp.func
 def unit_float(x: wp.uint32) -> float:
-    """The upper 24 bits as a number in [0, 1)."""
+    """Map the upper 24 bits to [0, 1)."""
     return float(x >> wp.uint32(8)) * UNIT
 
 
 @wp.func
 def sample_2d(key: wp.uint32, index: wp.uint32, dimension: int) -> wp.vec2:
-    """Point `index` of the sequence that belongs to (key, dimension); any 2^k-aligned block of 2^k is a (0, k, 2)-net."""
+    """Return point `index` of the sequence of (key, dimension). Any 2^k-aligned block of 2^k points is a (0, k, 2)-net."""
     seed = hash_pair(key, wp.uint32(dimension))
     i = reverse_bits(laine_karras(reverse_bits(index), seed))
     x = reverse_bits(laine_karras(i, hash_u32(seed ^ wp.static(wp.uint32(SEED_X)))))
@@ -94,7 +92,7 @@ def sample_2d(key: wp.uint32, index: wp.uint32, dimension: int) -> wp.vec2:
 
 @wp.func
 def independent_2d(key: wp.uint32, index: wp.uint32, dimension: int) -> wp.vec2:
-    """As sample_2d, but each point is drawn by itself: the plain Monte Carlo that an even sequence is measured against."""
+    """Return an independent random point in place of sample_2d: plain Monte Carlo, for comparison."""
     seed = hash_pair(key, wp.uint32(dimension))
     x = hash_pair(seed, index)
     y = hash_pair(seed ^ wp.static(wp.uint32(SEED_Y)), index)
@@ -103,30 +101,31 @@ def independent_2d(key: wp.uint32, index: wp.uint32, dimension: int) -> wp.vec2:
 
 @wp.func_native("wrt::sample_2d(seed, first, count, (float*)(out.data + (long long)at));")
 def sample_points(seed: wp.uint32, first: int, count: int, out: wp.array(dtype=wp.vec2), at: int) -> None:
-    """Points first, first + 1 ... of sample_2d's sequence to out[at], out[at + 1] ...; seed: hash_pair(key, dimension). There must
-    be room for LANES - 1 more. For lanes_kernel (headers.py)."""
+    """Store the points first, first + 1 ... of sample_2d's sequence in out[at], out[at + 1] ..., for lanes_kernel (headers.py).
+
+    `seed` is hash_pair(key, dimension). `out` must have room for LANES - 1 more."""
 
 
 @wp.func_native("wrt::quantile(icdf.data, icdf.shape[0], (float*)(points.data + (long long)first), 2 * count);")
 def quantiles(icdf: wp.array(dtype=wp.float32), points: wp.array(dtype=wp.vec2), first: int, count: int) -> None:
-    """Both numbers of each point become their `quantile`. For lanes_kernel."""
+    """Replace both numbers of each point by their `quantile`. For lanes_kernel."""
 
 
 @wp.func
 def quantile(icdf: wp.array(dtype=wp.float32), x: float) -> float:
-    """Where a distribution puts the sample x in [0, 1); icdf: its inverse, with straight lines between the entries."""
+    """Return the value of a distribution for the sample x in [0, 1); `icdf`, its inverse, is interpolated linearly."""
     position = x * float(icdf.shape[0] - 1)
     i = wp.min(int(position), icdf.shape[0] - 2)
     return wp.lerp(icdf[i], icdf[i + 1], position - float(i))
 
 
 def make_draw(features: Features) -> Any:
-    """Many numbers of a pixel at a time, for the CPU."""
+    """Return the function that draws many numbers of a pixel, for the CPU."""
     sample = make_sample_2d(features)
 
     @wp.func
     def draw(key: wp.uint32, dimension: int, first: int, count: int, out: wp.array(dtype=wp.vec2), at: int):
-        """sample_2d(key, first + i, dimension) to out[at + i], for each i below `count`; needs room as sample_points does."""
+        """Store sample_2d(key, first + i, dimension) in out[at + i], for each i below `count`; needs room as sample_points does."""
         if wp.static(features.independent):
             for i in range(count):
                 out[at + i] = sample(key, wp.uint32(first + i), dimension)
@@ -137,20 +136,20 @@ def make_draw(features: Features) -> Any:
 
 
 def make_sample_2d(features: Features) -> Any:
-    """The sampler that the scene's settings ask for."""
+    """Return the sampler of the scene's settings."""
     return independent_2d if features.independent else sample_2d
 
 
 @wp.func
 def point_at(angle: float) -> wp.vec2:
-    """Of the unit circle."""
+    """Return the point of the unit circle at this angle."""
     sin, cos = sin_cos(angle)
     return wp.vec2(cos, sin)
 
 
 @wp.func
 def disk(xi: wp.vec2) -> wp.vec2:
-    """The unit disk, uniformly, by concentric squares (Shirley and Chiu 1997)."""
+    """Map to the unit disk, uniformly, by concentric squares (Shirley and Chiu 1997)."""
     a = 2.0 * xi[0] - 1.0
     b = 2.0 * xi[1] - 1.0
     wide = wp.abs(a) > wp.abs(b)
@@ -163,7 +162,8 @@ def disk(xi: wp.vec2) -> wp.vec2:
 
 @wp.func
 def polygon(xi: wp.vec2, sides: int, rotation: float) -> wp.vec2:
-    """The regular polygon in the unit circle, uniformly: a sector by the first number, a point in its triangle by the rest."""
+    """Map to the regular polygon in the unit circle, uniformly: the first number chooses a sector, the rest a point of its
+    triangle."""
     scaled = xi[0] * float(sides)
     sector = wp.min(int(scaled), sides - 1)
     r = wp.sqrt(scaled - float(sector))
@@ -174,27 +174,27 @@ def polygon(xi: wp.vec2, sides: int, rotation: float) -> wp.vec2:
 
 @wp.func
 def triangle_numbers(x: float, y: float) -> tuple[float, float]:
-    """As `triangle`. No branches here and in search_cdf: of random numbers, every second would be mispredicted."""
+    """Return `triangle` as two numbers. It is branch-free, as search_cdf: a random branch is mispredicted half the time."""
     half = 0.5 * wp.where(y > x, x, y)
     return wp.where(y > x, half, x - half), wp.where(y > x, y - half, half)
 
 
 @wp.func
 def triangle(xi: wp.vec2) -> wp.vec2:
-    """Barycentrics (of v1, v2), uniform over a triangle, without folding or square root (Heitz 2019)."""
+    """Map to barycentrics (of v1, v2), uniformly over a triangle, without folding or square root (Heitz 2019)."""
     u, v = triangle_numbers(xi[0], xi[1])
     return wp.vec2(u, v)
 
 
 @wp.func
 def where_vec3(condition: bool, a: wp.vec3, b: wp.vec3) -> wp.vec3:
-    """a or b, component by component: wp.where of vectors does not run in lanes (kernels.memory)."""
+    """Choose a or b component by component: wp.where of vectors does not vectorise (kernels.memory)."""
     return wp.vec3(wp.where(condition, a[0], b[0]), wp.where(condition, a[1], b[1]), wp.where(condition, a[2], b[2]))
 
 
 @wp.func
 def frame_x(n: wp.vec3) -> wp.vec3:
-    """A unit vector at right angles to the unit vector n (Duff et al. 2017, "Building an Orthonormal Basis, Revisited")."""
+    """Return a unit vector perpendicular to the unit vector n (Duff et al. 2017, "Building an Orthonormal Basis, Revisited")."""
     sign = wp.where(n[2] < 0.0, -1.0, 1.0)
     a = -1.0 / (sign + n[2])
     return wp.vec3(1.0 + sign * n[0] * n[0] * a, sign * n[0] * n[1] * a, -sign * n[0])
@@ -202,35 +202,34 @@ def frame_x(n: wp.vec3) -> wp.vec3:
 
 @wp.func
 def cosine_point(xi: wp.vec2) -> wp.vec3:
-    """A direction around the z axis with density cos / pi (Malley's method)."""
+    """Map to directions around the z axis with density cos / pi (Malley's method)."""
     d = disk(xi)
     return wp.vec3(d[0], d[1], wp.sqrt(wp.max(0.0, 1.0 - d[0] * d[0] - d[1] * d[1])))
 
 
 @wp.func
 def rotated_to(point: wp.vec3, n: wp.vec3) -> wp.vec3:
-    """A direction around the z axis as one around n."""
+    """Rotate a direction around the z axis to one around n."""
     x = frame_x(n)
     return unit(point[0] * x + point[1] * wp.cross(n, x) + point[2] * n)
 
 
 @wp.func
 def cosine_hemisphere(xi: wp.vec2, n: wp.vec3) -> wp.vec3:
-    """A direction around n with density cos / pi."""
+    """Map to directions around n with density cos / pi."""
     return rotated_to(cosine_point(xi), n)
 
 
 @wp.func
 def cap_point(xi: wp.vec2) -> wp.vec3:
-    """Where on a spherical cap: a point of the unit circle, and how far down."""
+    """Map to a spherical cap: a point of the unit circle, and the depth below the pole."""
     sin, cos = near_sin_cos(TWO_PI * xi[0])
     return wp.vec3(cos, sin, xi[1])
 
 
 @wp.func
 def ggx_normal(cap: wp.vec3, n: wp.vec3, wo: wp.vec3, alpha: float) -> wp.vec3:
-    """A microfacet normal among those of the GGX surface that wo sees (Dupuy and Benyoub 2023, spherical caps); cap: of
-    cap_point."""
+    """Return a microfacet normal of the GGX surface that wo sees (Dupuy and Benyoub 2023, spherical caps); `cap` is a cap_point."""
     x = frame_x(n)
     y = wp.cross(n, x)
     w = wp.normalize(wp.vec3(alpha * wp.dot(wo, x), alpha * wp.dot(wo, y), wp.dot(wo, n)))
@@ -242,7 +241,7 @@ def ggx_normal(cap: wp.vec3, n: wp.vec3, wo: wp.vec3, alpha: float) -> wp.vec3:
 
 @wp.func
 def ggx_lambda(cos_theta: float, alpha: float) -> float:
-    """Smith's Lambda: hidden over visible microfacet area towards a direction at this angle (Heitz 2014, eq. 72)."""
+    """Return Smith's Lambda: hidden over visible microfacet area towards a direction at this angle (Heitz 2014, eq. 72)."""
     c2 = cos_theta * cos_theta
     tan2 = wp.max(0.0, 1.0 - c2) / wp.max(c2, 1.0e-12)
     return 0.5 * (wp.sqrt(1.0 + alpha * alpha * tan2) - 1.0)
@@ -250,14 +249,14 @@ def ggx_lambda(cos_theta: float, alpha: float) -> float:
 
 @wp.func
 def ggx_visible_share(cos_o: float, cos_i: float, alpha: float) -> float:
-    """G2 / G1(wo), height-correlated: what a ray reflected from a visible microfacet is worth (Heitz 2018)."""
+    """Return G2 / G1(wo), height-correlated: the weight of a ray reflected from a visible microfacet (Heitz 2018)."""
     a = ggx_lambda(cos_o, alpha)
     return (1.0 + a) / (1.0 + a + ggx_lambda(cos_i, alpha))
 
 
 @wp.func
 def search_cdf(cdf: wp.array(dtype=wp.float32), first: int, count: int, x: float) -> int:
-    """The lowest i with x < cdf[first + i]; cdf rises to 1."""
+    """Return the lowest i with x < cdf[first + i]; cdf rises to 1."""
     low = int(0)
     high = int(count - 1)
     while low < high:
@@ -270,7 +269,7 @@ def search_cdf(cdf: wp.array(dtype=wp.float32), first: int, count: int, x: float
 
 @wp.func
 def share_of_row(cdf: wp.array(dtype=wp.float32), first: int, i: int) -> float:
-    """What entry i adds to the cdf that begins at `first`."""
+    """Return the probability of entry i in the cdf that begins at `first`."""
     below = float(0.0)
     if i > 0:
         below = cdf[first + i - 1]

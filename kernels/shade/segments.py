@@ -1,4 +1,4 @@
-"""Segments between pairs of points, for rays by themselves: what is between their ends, and what lies at them."""
+"""Segments between pairs of points, for visibility queries."""
 
 import warp as wp
 
@@ -6,13 +6,15 @@ from wrt.kernels.query import RayArrays
 from wrt.kernels.shade.surface import corners_at, spawn_point, triangle_normal
 from wrt.kernels.structs import Surfaces, gamma, kernel, largest, unit
 
-END = 64.0  # roundings, see `segments`
+END = 64.0  # In roundings, see `segments`.
 
 
 @wp.func
 def lifted(surfaces: Surfaces, prim_id: int, point: wp.vec3, towards: wp.vec3) -> wp.vec3:
-    """A point of that primitive, to rounding, moved off its plane, or off the sphere, as far as rounding may have put it on the
-    other side. A face beside it in the same plane is then not met. As it is where prim_id is -1 or the face has no plane."""
+    """Move a point on a primitive off its plane, or off the sphere, by the point's rounding error.
+
+    A ray from there does not hit a neighbouring face in the same plane. A point with prim_id -1, or on a face without a plane,
+    stays."""
     if prim_id < 0:
         return point
     error = wp.vec3()
@@ -34,7 +36,7 @@ def lifted(surfaces: Surfaces, prim_id: int, point: wp.vec3, towards: wp.vec3) -
 
 @wp.func
 def is_before(p: wp.vec3, q: wp.vec3) -> bool:
-    """By x, then y, then z."""
+    """Compare by x, then y, then z."""
     if p[0] != q[0]:
         return p[0] < q[0]
     if p[1] != q[1]:
@@ -44,27 +46,27 @@ def is_before(p: wp.vec3, q: wp.vec3) -> bool:
 
 @wp.struct
 class Pairs:
-    """Pairs of points a and b, world space; on_a, on_b: the primitives that they are on, -1 for none, or nothing (length 0)."""
+    """Pairs of points in world space, and the primitives that they lie on."""
 
     a: wp.array(dtype=wp.vec3)
     b: wp.array(dtype=wp.vec3)
-    on_a: wp.array(dtype=wp.int32)
-    on_b: wp.array(dtype=wp.int32)
+    on_a: wp.array(dtype=wp.int32)  # -1: on none. Length 0: unknown for all.
+    on_b: wp.array(dtype=wp.int32)  # As on_a.
 
 
 @kernel
 def segments(surfaces: Surfaces, pairs: Pairs, size: float, rays: RayArrays, first: int):
-    """Rays between a and b, without their ends: the same ray whichever of the two is called a. size: of the largest primitive. A
-    segment that is all ends, or not finite, has a ray that hits nothing.
+    """Make the rays between a and b, without their ends.
 
-    What is left out at an end p is what rounding may do to a surface through p. Let u = 2^-24, |p| the largest coordinate of p,
-    and S the size of the primitive there. Then p is off the surface by a few u |p|. The ray begins at the end with the smaller
-    |p|. At its origin no rounding of the direction counts, and a triangle unit is off by 7 u S: corners relative to the origin
-    are rounded once, u S, and sheared, 6 u S. At the other end q the direction is off by u |q - p| <= 2 u |q|, and the unit's
-    loss grows with the distance likewise. All of it is divided by the cosine at which the ray meets the surface. So END u
-    max(|p|, S) are left out at the origin, and END u |q| at the other end, and never more at the origin than there. That suffices
-    for cosines above 0.15.
-    """
+    The ray does not depend on which of the two points is called a. `size` is that of the largest primitive. A segment that is all
+    ends, or not finite, becomes a ray that hits nothing.
+
+    An end p is shortened by the rounding error of a surface through p. Let u = 2^-24, |p| the largest coordinate of p, and S the
+    size of the primitive there. Then p is off the surface by a few u |p|. The ray begins at the end with the smaller |p|. At its
+    origin no rounding of the direction counts, and a triangle unit is off by 7 u S. Corners relative to the origin are rounded
+    once, u S, and sheared, 6 u S. At the other end q the direction is off by u |q - p| <= 2 u |q|, and so is the unit's distance.
+    The cosine at which the ray meets the surface divides all of these. So the ray is shortened by END u max(|p|, S) at the origin,
+    at most by END u |q|, and by END u |q| at the other end. That suffices for cosines above 0.15."""
     i = first + wp.tid()
     p = pairs.a[i]
     q = pairs.b[i]
@@ -90,7 +92,7 @@ def segments(surfaces: Surfaces, pairs: Pairs, size: float, rays: RayArrays, fir
 
 @kernel
 def to_visible(a: wp.array(dtype=wp.vec3), b: wp.array(dtype=wp.vec3), occluded: wp.array(dtype=wp.bool), first: int):
-    """Turn `occluded` into what is visible, which is nothing from or to a point that is not finite."""
+    """Turn `occluded` into visibility. Nothing is visible from or to a point that is not finite."""
     i = first + wp.tid()
     finite = largest(a[i]) < wp.inf and largest(b[i]) < wp.inf and wp.isfinite(a[i]) and wp.isfinite(b[i])
     occluded[i] = finite and not occluded[i]

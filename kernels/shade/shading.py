@@ -1,4 +1,4 @@
-"""What is known at a hit: the surface, its material with the textures in it, its normal, and how it scatters light."""
+"""The data at a hit: the surface, its material with textures, its shading normal, and how it scatters light."""
 
 from typing import Any, NamedTuple
 
@@ -13,13 +13,13 @@ from wrt.kernels.shade.textures import make_sample_texture
 from wrt.kernels.structs import Material, Surfaces, unit
 from wrt.kernels.warp_private import fields_of
 
-MASK = 1  # alpha modes; 0 is opaque
+MASK = 1  # Alpha modes; 0 is opaque.
 BLEND = 2
 
 
 @wp.struct
 class Texels:
-    """What a material's textures say at a point, linear; 1 where there is none, and unread where the scene has none."""
+    """A material's textures at a point, linear; 1 without a texture. Fields that the scene does not have are unread."""
 
     albedo: wp.vec3
     alpha: float
@@ -31,11 +31,10 @@ class Texels:
 
 
 class MaterialTexture(NamedTuple):
-    """fields: those of Texels that it says, which follow one another there, and the channels of its picture that they take, in the
-    order of "rgba". feature: of the scenes for which it is compiled in; "": wherever there are textures."""
+    """A texture of a material: the fields of Texels that it sets (neighbours), with their channels in the order "rgba"."""
 
     fields: dict[str, str]
-    feature: str = "parameter_textures"
+    feature: str = "parameter_textures"  # The switch that compiles it in; "" means any texture.
 
     @property
     def channels(self) -> list[int]:
@@ -43,11 +42,11 @@ class MaterialTexture(NamedTuple):
 
     @property
     def numbers(self) -> list[str]:
-        """The number of Texels that each channel goes to, in C++."""
+        """The number of Texels that each channel sets, in C++."""
         return [number for name in self.fields for number in numbers_of(fields_of(Texels)[name], f"texels.{name}")]
 
 
-# A material's textures by the field of Material that has its index. Both loops read all of them from here.
+# A material's textures, by the field of Material that has their index, for both loops.
 TEXTURES = {
     "albedo_texture": MaterialTexture({"albedo": "rgb", "alpha": "a"}, ""),
     "emission_texture": MaterialTexture({"emission": "rgb"}, ""),
@@ -58,14 +57,14 @@ TEXTURES = {
 
 
 def textures_of(features: Features) -> dict[str, MaterialTexture]:
-    """Return those that a scene has."""
+    """Return the textures that a scene has."""
     if not features.textures and not features.checkerboards:
         return {}
     return {name: texture for name, texture in TEXTURES.items() if not texture.feature or getattr(features, texture.feature)}
 
 
 def make_look_up(features: Features) -> Any:
-    """look_up(surfaces, surface) -> Texels: of all textures of a surface's material."""
+    """Return look_up(surfaces, surface) -> Texels of a surface's material."""
     sample_texture = make_sample_texture(features.textures, features.checkerboards)
     look_up = no_texels
     for name, texture in textures_of(features).items():
@@ -79,7 +78,7 @@ def no_texels(surfaces: Surfaces, s: Surface) -> Texels:
 
 
 def make_texture_link(name: str, texture: MaterialTexture, sample_texture: Any, others: Any) -> Any:
-    """look_up of one texture, after the others."""
+    """Return the look_up of one texture after the others."""
 
     @wp.func_native(f"return materials.data[(long long)material].{name};")
     def index_of(materials: wp.array(dtype=Material), material: int) -> int: ...
@@ -97,7 +96,7 @@ def make_texture_link(name: str, texture: MaterialTexture, sample_texture: Any, 
 
 
 def make_resolve(features: Features) -> Any:
-    """The material at a point: parameters times textures."""
+    """Return the function for the material at a point: parameters times textures."""
 
     @wp.func
     def resolve(surfaces: Surfaces, s: Surface, texels: Texels) -> Material:
@@ -116,8 +115,8 @@ def make_resolve(features: Features) -> Any:
 
 
 def make_cutout(features: Features) -> Any:
-    """Cut-outs: a hit on a masked texture's clear part is none. For the traversal units, which call it at every hit; None where a
-    scene has no cut-outs."""
+    """Return the function that tells traversal units to ignore hits on the clear parts of masked textures; None without
+    cut-outs."""
     if not features.cutout:
         return None
     sample_texture = make_sample_texture(features.textures, features.checkerboards)
@@ -140,7 +139,7 @@ def make_cutout(features: Features) -> Any:
 
 @wp.func
 def bump(s: Surface, scale: float, color: wp.vec3) -> wp.vec3:
-    """Normal maps: the shading normal that the picture says. No branches, for loops in lanes."""
+    """Return the shading normal of a normal map. It is branch-free, so that loops vectorise."""
     side = wp.where(s.front != 0, 1.0, -1.0)
     outward = side * s.shading
     t = s.tangent - wp.dot(s.tangent, outward) * outward
@@ -155,7 +154,7 @@ def bump(s: Surface, scale: float, color: wp.vec3) -> wp.vec3:
 
 
 def make_is_solid(features: Features) -> Any:
-    """Glass with an inside: what a ray enters at the front of a surface and leaves at its back."""
+    """Return the function that recognises solid glass, which a ray enters at a front and leaves at a back."""
 
     @wp.func
     def is_solid(m: Material) -> bool:
@@ -168,33 +167,31 @@ def make_is_solid(features: Features) -> Any:
 
 
 class Shading(NamedTuple):
-    """What is known at a hit: surface_at(surfaces, ray, hit); look_up(surfaces, surface) -> Texels; resolve(surfaces, surface,
-    texels) -> Material; shading_normal(surfaces, surface, texels, wo); scatter(material, surface, wo, facet) -> Scatter;
-    is_solid(material)."""
+    """The functions for the data at a hit."""
 
-    surface_at: Any
-    look_up: Any
-    resolve: Any
-    shading_normal: Any
-    scatter: Any
-    is_solid: Any
+    surface_at: Any  # (surfaces, ray, hit) -> Surface.
+    look_up: Any  # (surfaces, surface) -> Texels.
+    resolve: Any  # (surfaces, surface, texels) -> Material.
+    shading_normal: Any  # (surfaces, surface, texels, wo) -> vec3.
+    scatter: Any  # (material, surface, wo, facet) -> Scatter.
+    is_solid: Any  # (material) -> bool.
 
 
 def make_shading(features: Features) -> Any:
-    """Once for a kernel: the integrator's step, shadow rays and AOVs share it."""
+    """Return the functions that a kernel's step, shadow rays and AOVs share."""
     uvs = features.textures or features.checkerboards
     surface_at = make_surface_at(features.spheres, features.smooth, uvs, features.normal_maps, features.instances)
     look_up, resolve = make_look_up(features), make_resolve(features)
 
     @wp.func
     def shading_normal(surfaces: Surfaces, s: Surface, texels: Texels, wo: wp.vec3) -> wp.vec3:
-        """The interpolated or mapped normal, bent no farther than it is still seen from wo."""
+        """Return the interpolated or mapped normal, bent just so far that it is visible from wo."""
         n = s.shading
         if wp.static(features.normal_maps):
             if surfaces.materials[s.material].normal_texture >= 0:
                 n = bump(s, surfaces.materials[s.material].normal_scale, texels.normal)
         if wp.static(features.smooth or features.normal_maps):
-            if wp.dot(n, wo) < MIN_COSINE:  # seldom: what `visible_normal` does beyond this test takes a while
+            if wp.dot(n, wo) < MIN_COSINE:  # Seldom true, and the rest of `visible_normal` is slow.
                 n = visible_normal(n, wo)
         return n
 

@@ -1,4 +1,4 @@
-"""Shadow rays: what is left of a light on its way to a surface."""
+"""Shadow rays: the share of a light that reaches a surface."""
 
 from typing import Any
 
@@ -10,53 +10,46 @@ from wrt.kernels.shade.shading import BLEND, Shading
 from wrt.kernels.shade.surface import Surface, make_place_of, spawn_point
 from wrt.kernels.structs import Hit, Material, Ray, Surfaces
 
-OUTSIDE = wp.constant(-1)  # of any glass
-MAX_TRANSPARENT = wp.constant(256)  # surfaces in a row that a ray may go straight through
+OUTSIDE = wp.constant(-1)  # Of any glass.
+MAX_TRANSPARENT = wp.constant(256)  # Surfaces in a row that a ray passes straight.
 
 
 @wp.struct
 class Shadow:
-    """What is left of the light on a shadow ray, and how many rays it took to know.
-
-    cut: 1 where the ray met more than MAX_TRANSPARENT surfaces; `lost` is what it still had, and transmittance 0.
-    """
+    """The transmittance of a shadow ray, and the rays that it took."""
 
     transmittance: wp.vec3
-    lost: wp.vec3
+    lost: wp.vec3  # The transmittance where the ray was cut, else 0.
     rays: int
-    cut: int
+    cut: int  # 1 if the ray met more than MAX_TRANSPARENT surfaces.
 
 
 @wp.func
 def attenuation(surfaces: Surfaces, medium: int, distance: float) -> wp.vec3:
-    """Beer-Lambert over a distance in world units."""
+    """Return Beer-Lambert's transmittance over a distance in world units."""
     sigma = surfaces.materials[medium].absorption
     return wp.vec3(exp(-sigma[0] * distance), exp(-sigma[1] * distance), exp(-sigma[2] * distance))
 
 
 @wp.func
 def covered(coverage: float, through: wp.vec3) -> wp.vec3:
-    """What passes a thing that is there with this share, and where it is lets `through` through."""
+    """Return the transmittance of a surface that is present with share `coverage` and then lets `through` through."""
     return coverage * through + wp.vec3(1.0 - coverage, 1.0 - coverage, 1.0 - coverage)
 
 
 @wp.struct
 class Passage:
-    """Light on its way through surfaces, from the shadow ray's origin on.
+    """The light of a shadow ray along its way, from the ray's origin on."""
 
-    transmittance: of all that lies behind it; medium: the solid glass that it is in, or OUTSIDE; coverage: the share with which
-    that glass is there (its alpha where it was entered), and inside: what it has let through so far where it is.
-    """
-
-    transmittance: wp.vec3
-    medium: int
-    coverage: float
-    inside: wp.vec3
+    transmittance: wp.vec3  # Of all surfaces behind `medium`.
+    medium: int  # The solid glass around the ray, or OUTSIDE.
+    coverage: float  # The glass's alpha where it was entered.
+    inside: wp.vec3  # Transmittance within the glass so far.
 
 
 @wp.func
 def leave_glass(p: Passage) -> Passage:
-    """Out of the glass at hand, if any."""
+    """Take the passage out of its glass, if any."""
     out = Passage()
     out.transmittance = p.transmittance
     out.medium = OUTSIDE
@@ -67,33 +60,31 @@ def leave_glass(p: Passage) -> Passage:
 
 @wp.func
 def is_opaque(m: Material) -> bool:
-    """Whether no light goes straight through, whatever the textures say and wherever it comes from."""
+    """Return whether no light goes straight through, for any texture and direction."""
     return m.transmission <= 0.0 and m.alpha_mode != wp.static(BLEND)
 
 
 def make_pass_surface(features: Features, scatter: Any, is_solid: Any) -> Any:
-    """One more surface on light's way."""
+    """Return the function that takes light through one more surface."""
 
     @wp.func
     def straight_transmittance(m: Material, from_outside: Surface, wo: wp.vec3) -> wp.vec3:
-        """Share of light that goes straight on through a surface which is there (alpha = 1).
+        """Return the share of light that goes straight through a surface of alpha 1.
 
-        An unbent ray meets both sides of solid glass at its angle outside: from_outside.front must be 1, or a ray on its way
-        out would be held for totally reflected.
-        """
+        An unbent ray meets both sides of solid glass at its angle outside. So from_outside.front must be 1; otherwise a ray that
+        leaves would count as totally reflected."""
         share = scatter(m, from_outside, wo, wp.vec3())
         if share.bends == 0:
             return share.transmitted
         if wp.static(features.tinted_shadows):
-            return m.ior * m.ior * share.transmitted  # straight through, the solid angle is not squeezed
+            return m.ior * m.ior * share.transmitted  # A straight ray's solid angle does not change.
         return wp.vec3(0.0, 0.0, 0.0)
 
     @wp.func
     def pass_surface(surfaces: Surfaces, before: Passage, m: Material, s: Surface, wo: wp.vec3, distance: float) -> Passage:
-        """distance: in world units, from the last surface or the ray's origin.
+        """Take light through a surface, at `distance` (world units) behind the last surface or the ray's origin.
 
-        Blended solid glass is there as a whole or not at all, with its alpha where it is entered.
-        """
+        Blended solid glass is present as a whole, with the alpha of the point where it is entered."""
         p = before
         inward = s.front != 0
         s.front = 1
@@ -107,7 +98,7 @@ def make_pass_surface(features: Features, scatter: Any, is_solid: Any) -> Any:
         if not is_solid(m):
             p.transmittance = wp.cw_mul(p.transmittance, covered(coverage, through))
         elif inward:
-            p = leave_glass(p)  # glass within glass: each boundary is one to air
+            p = leave_glass(p)  # Glass in glass: each boundary counts as one to air.
             p.medium = s.material
             p.coverage = coverage
             p.inside = through
@@ -126,14 +117,13 @@ def make_pass_surface(features: Features, scatter: Any, is_solid: Any) -> Any:
 
 @wp.struct
 class ShadowWalk:
-    """A shadow ray on its way through surfaces. ray: what is left of it, and end: where the segment ends; surfaces: how many it has
-    met; shadow: what is known when done = 1."""
+    """A shadow ray on its way through surfaces."""
 
-    ray: Ray
-    end: wp.vec3
+    ray: Ray  # The rest of the way.
+    end: wp.vec3  # The segment's end.
     passage: Passage
-    surfaces: int
-    shadow: Shadow
+    surfaces: int  # Surfaces passed so far.
+    shadow: Shadow  # The result, once done = 1.
     done: int
 
 
@@ -148,7 +138,7 @@ def begin_shadow(ray: Ray, end: wp.vec3) -> ShadowWalk:
 
 
 def make_pass_hit(features: Features, shading: Shading) -> Any:
-    """Return pass_hit(surfaces, walk, hit) -> ShadowWalk: through the closest surface on the way, or no farther."""
+    """Return pass_hit(surfaces, walk, hit) -> ShadowWalk: go through the closest surface on the way, or stop there."""
     place_of = make_place_of(features.instances)
     pass_surface = make_pass_surface(features, shading.scatter, shading.is_solid)
 
@@ -200,7 +190,7 @@ def make_advance_shadow(features: Features, shading: Shading) -> Any:
 
     @wp.func
     def advance_shadow(surfaces: Surfaces, before: ShadowWalk, hit: Hit) -> ShadowWalk:
-        """hit: the closest one of walk.ray."""
+        """Advance the walk past `hit`, the closest one of walk.ray, or to the light after a miss."""
         walk = before
         walk.shadow.rays += 1
         if hit.prim_id < 0:
@@ -218,7 +208,9 @@ def make_advance_shadow(features: Features, shading: Shading) -> Any:
 
 
 def make_transmittance(features: Features, shading: Shading, accel_struct: Any, closest_hit: Any, any_hit: Any) -> Any:
-    """Shadow rays: one any-hit query, or where a scene lets light through surfaces, one closest hit after another."""
+    """Return the function that traces a shadow ray.
+
+    It takes one any-hit query, or one closest hit after another if the scene has transparent shadows."""
     advance_shadow = make_advance_shadow(features, shading)
 
     @wp.func

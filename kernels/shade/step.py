@@ -1,9 +1,8 @@
-"""The integrator's step: what a surface does with a path that meets it. Nothing here traces a ray.
+"""The integrator's step: what follows from a path and its hit. Nothing here traces a ray.
 
-Whitted 1980, "An Improved Illumination Model for Shaded Display", without recursion. At a hit: emission and the ambient term,
-a shadow ray asked for each light, and at most three new paths: straight on through what is partly transparent, reflected, and
-refracted. Each carries its share of the picture (throughput). follow_up.py says which of them are followed; kernels/loops traces.
-"""
+It is Whitted 1980, "An Improved Illumination Model for Shaded Display", without recursion. A hit yields emission, the ambient term,
+a shadow request for each light, and at most three new paths. They go straight on (through a partly transparent surface), are
+reflected, or are refracted. Each path carries its throughput. follow_up.py decides which are followed; kernels/loops traces."""
 
 from functools import cache
 from typing import Any, NamedTuple
@@ -21,25 +20,24 @@ from wrt.kernels.shade.shadows import OUTSIDE, Shadow, attenuation
 from wrt.kernels.shade.surface import Surface
 from wrt.kernels.structs import Lighting, Material, Ray, Surfaces, any_positive
 
-FACET = wp.constant(2)  # the dimension of what chooses a microfacet
+FACET = wp.constant(2)  # The dimension of the samples that choose a microfacet.
 
 
 @cache
 def make_shaded(counting: bool) -> Any:
-    """Return the struct Shaded, of which `shade` makes one of a path and a hit. counting: as of Features."""
+    """Return the struct Shaded, the result of `shade`. `counting` as in Features."""
     path_struct = make_path(counting)
 
     @wp.struct
     class Shaded:
-        """light: emission and the ambient term; throughput: what light from here is worth in the picture. surface, scatter, key:
-        what the lights are asked with. onward, reflected, refracted: the new paths; a throughput of 0 is none."""
+        """What follows from a path and its hit. A path of throughput 0 is none."""
 
-        light: wp.vec3
-        throughput: wp.vec3
-        surface: Surface
+        light: wp.vec3  # Emission and the ambient term.
+        throughput: wp.vec3  # Weight of this surface's light in the sample.
+        surface: Surface  # Shadow rays start here.
         scatter: Scatter
         wo: wp.vec3
-        key: wp.uint32
+        key: wp.uint32  # Seed of the light samples.
         onward: path_struct
         reflected: path_struct
         refracted: path_struct
@@ -49,26 +47,22 @@ def make_shaded(counting: bool) -> Any:
 
 @wp.struct
 class ShadowRequest:
-    """value: the light that one lamp sends to the eye by way of a surface, if nothing is between them; 0: none, and nothing to
-    trace. ray: the segment to look along, and end: where it ends."""
+    """A shadow ray, and the light that it carries if nothing is in between."""
 
-    value: wp.vec3
-    ray: Ray
-    end: wp.vec3
+    value: wp.vec3  # Radiance towards the eye, if unoccluded. 0: no ray to trace.
+    ray: Ray  # The segment to the light.
+    end: wp.vec3  # Its end.
 
 
 @wp.struct
 class Sample:
-    """The radiance along one camera ray, and what it took.
-
-    lost: what the rays that were cut would have added to it in a room of radiance 1 (ior^2 within glass), channels' mean.
-    """
+    """The radiance along one camera ray, and the rays that it took."""
 
     radiance: wp.vec3
     rays: int
     cut_depth: int
     cut_throughput: int
-    lost: float
+    lost: float  # What the cut rays would have added in a room of radiance 1 (ior^2 inside glass), mean of channels.
 
 
 @wp.func
@@ -78,7 +72,7 @@ def mean3(v: wp.vec3) -> float:
 
 @wp.func
 def absorbed(surfaces: Surfaces, throughput: wp.vec3, medium: int, distance: float) -> wp.vec3:
-    """What is left of it after so far a way (world units) in a medium, which may be none."""
+    """Return the throughput behind `distance` (world units) in a medium; a negative medium absorbs nothing."""
     if medium < 0:
         return throughput
     return wp.cw_mul(throughput, attenuation(surfaces, medium, distance))
@@ -93,24 +87,23 @@ def emitted(m: Material, s: Surface) -> wp.vec3:
 
 @wp.struct
 class PendingLight:
-    """A surface while its lights are asked: light and throughput as of Shaded; lost_reflected, lost_refracted: what is lost with
-    those of its new paths that are cut (Sample.lost)."""
+    """A surface's light before its shadow rays are traced."""
 
-    light: wp.vec3
-    throughput: wp.vec3
-    lost_reflected: float
-    lost_refracted: float
+    light: wp.vec3  # As in Shaded.
+    throughput: wp.vec3  # As in Shaded.
+    lost_reflected: float  # Sample.lost of the reflected path, if cut.
+    lost_refracted: float  # Of the refracted path.
 
 
 @wp.func
 def receives_light(scatter: Scatter) -> bool:
-    """Whether light from elsewhere can be seen on a surface."""
+    """Return whether direct light can be reflected."""
     return any_positive(scatter.diffuse) or any_positive(scatter.highlight)
 
 
 @wp.func
 def add_light(before: Shadow, value: wp.vec3, scatter: Scatter, shadow: Shadow) -> Shadow:
-    """The light of all lamps so far, and of one more, whose ShadowRequest has this value."""
+    """Add one light of this value to the direct light. In `Shadow.transmittance` stands a radiance here."""
     out = before
     out.transmittance += wp.cw_mul(value, shadow.transmittance)
     out.rays += shadow.rays
@@ -122,8 +115,7 @@ def add_light(before: Shadow, value: wp.vec3, scatter: Scatter, shadow: Shadow) 
 
 @wp.func
 def add_surface_light(before: Sample, pending: PendingLight, direct: Shadow) -> Sample:
-    """A sample with what a surface sends to the eye. direct: in `transmittance` the radiance by the lights' rays, and in `lost`
-    what was cut of it."""
+    """Add a surface's light to its sample; `direct` is the sum of add_light."""
     out = before
     out.radiance += wp.cw_mul(pending.throughput, pending.light + direct.transmittance)
     out.rays += direct.rays
@@ -136,15 +128,14 @@ def add_surface_light(before: Sample, pending: PendingLight, direct: Shadow) -> 
 
 
 def make_transparency(features: Features, is_solid: Any) -> Any:
-    """How far a blended surface is not there."""
+    """Return the function for the transparency of a blended surface."""
 
     @wp.func
     def transparency(m: Material, s: Surface, medium: int) -> float:
-        """Share of a ray for which the surface is not there: 1 - alpha.
+        """Return the share of a ray that ignores the surface: 1 - alpha.
 
-        Blended solid glass is there as a whole or not at all, which is decided where a ray enters: what did not enter it meets
-        nothing at its back, and what did meets all of it. Else a ray could go in unbent and come out with ior^2 of its light.
-        """
+        Blended solid glass is present or absent as a whole, decided where a ray enters. A ray that ignored its front ignores its
+        back, and a ray inside meets all of the back. Else a ray could enter unbent and leave with ior^2 of its light."""
         if m.alpha_mode != wp.static(BLEND):
             return 0.0
         if wp.static(features.refraction):
@@ -156,7 +147,7 @@ def make_transparency(features: Features, is_solid: Any) -> Any:
 
 
 def make_choose_facet(features: Features) -> Any:
-    """Return the function that draws a microfacet, where anything is rough."""
+    """Return the function that draws a microfacet, for rough materials."""
     sample_2d = make_sample_2d(features)
 
     @wp.func
@@ -169,13 +160,13 @@ def make_choose_facet(features: Features) -> Any:
 
 
 def make_straight_on(features: Features, is_solid: Any) -> Any:
-    """Return the function for what goes on straight through a blended surface."""
+    """Return the function for the path that goes straight through a blended surface."""
     Path = make_path(features.counting)
     child = make_paths(features.counting).child
 
     @wp.func
     def straight_on(surfaces: Surfaces, path: Path, m: Material, s: Surface, share: float, distance: float) -> Path:
-        """Return the part of a path that finds nothing at the surface. It takes no bounce."""
+        """Return the part of a path that ignores the surface. It counts as no bounce."""
         onward = child(path, s, path.direction, share * path.throughput, ONWARD)
         onward.depth = path.depth
         onward.passed = path.passed + 1
@@ -190,11 +181,11 @@ def make_straight_on(features: Features, is_solid: Any) -> Any:
 
 
 def make_medium_at(is_solid: Any) -> Any:
-    """Return the function for the medium of a ray at a surface."""
+    """Return the function for a ray's medium at a surface."""
 
     @wp.func
     def medium_at(m: Material, s: Surface, medium: int) -> int:
-        """Return the solid glass on the ray's side of a surface. A back is seen from within, whatever the path knows of."""
+        """Return the solid glass on the ray's side of a surface. A back face is always seen from inside."""
         if not is_solid(m):
             return medium
         return wp.where(s.front == 0, s.material, wp.where(medium == UNKNOWN, OUTSIDE, medium))
@@ -203,7 +194,7 @@ def make_medium_at(is_solid: Any) -> Any:
 
 
 def make_shade(features: Features, shading: Shading) -> Any:
-    """Return one device function from a path and its hit to everything that follows from them."""
+    """Return the device function from a path and its hit to everything that follows."""
     Path, Shaded = make_path(features.counting), make_shaded(features.counting)
     child = make_paths(features.counting).child
     transparency, medium_at = make_transparency(features, shading.is_solid), make_medium_at(shading.is_solid)
@@ -212,8 +203,7 @@ def make_shade(features: Features, shading: Shading) -> Any:
     @wp.func
     def shade(surfaces: Surfaces, lighting: Lighting, arriving: Path, surface: Surface, texels: Texels, t: float,
               facet: wp.vec3) -> Shaded:
-        """surface: the surface at the end of the path's ray, whose shading normal is as seen from there; its texels; t of the hit;
-        facet: of choose_facet."""
+        """Shade `surface` at distance t along the path; its shading normal faces the ray. `facet` comes from choose_facet."""
         out = Shaded()
         path = arriving
         s = surface
@@ -251,7 +241,7 @@ def make_shade(features: Features, shading: Shading) -> Any:
 
 
 def make_shadow_request(features: Features, reflected: Any) -> Any:
-    """Return the function for what a surface asks of a light. reflected: of make_reflected_light."""
+    """Return the function that requests a shadow ray; `reflected` comes from make_reflected_light."""
     Shaded = make_shaded(features.counting)
 
     @wp.func
@@ -268,20 +258,13 @@ def make_shadow_request(features: Features, reflected: Any) -> Any:
 
 
 class Step(NamedTuple):
-    """The device functions that a loop is made of.
+    """The device functions of a loop."""
 
-    choose_facet(key, index) -> vec3: the sample that chooses a microfacet at the end of a path with that key, for the sample
-    `index` of a pixel. shade(surfaces, lighting, path, surface, texels, t, facet) -> Shaded.
-    extra_lights: how many there are beside those of `lighting` (the background is one); choose(lighting, surfaces, i, surface,
-    point) -> LightSample of light i (the background comes after the last one; point: of LightPoints), and shadow_request(shaded,
-    sample) -> ShadowRequest.
-    """
-
-    choose_facet: Any
-    shade: Any
-    extra_lights: int
-    choose: Any
-    shadow_request: Any
+    choose_facet: Any  # (key, index) -> vec3: place a microfacet for sample `index` of the path `key`.
+    shade: Any  # (surfaces, lighting, path, surface, texels, t, facet) -> Shaded.
+    extra_lights: int  # 1 if the background is sampled, as the light after the last.
+    choose: Any  # (lighting, surfaces, i, surface, point) -> LightSample of light i; `point` from LightPoints.
+    shadow_request: Any  # (shaded, sample) -> ShadowRequest.
 
 
 def make_step(features: Features, shading: Shading) -> Step:

@@ -1,4 +1,4 @@
-"""From a hit to the surface there: point with error bound, normals, texture coordinates, and where new rays start."""
+"""The surface at a hit: point with error bound, normals, texture coordinates, and the origins of new rays."""
 
 from typing import Any
 
@@ -8,47 +8,39 @@ from wrt.kernels.shade.elementary import acos, atan2
 from wrt.kernels.shade.sampling import PI, TWO_PI, frame_x, where_vec3
 from wrt.kernels.structs import Hit, Instance, Ray, Surfaces, gamma, largest, lift, unit
 
-MIN_COSINE = wp.constant(1.0e-3)  # the least cosine of a shading normal with the way to the eye
+MIN_COSINE = wp.constant(1.0e-3)  # Of a shading normal and the direction to the eye.
 
 
 @wp.struct
 class Surface:
-    """A point on a surface, in world space.
-
-    error: bound on the point's rounding error, per axis; geometric: unit normal of the flat triangle (or the sphere), on the
-    ray's side; shading: the interpolated one, on that side too; front: the ray comes from outside (counter-clockwise);
-    exclude_plus_one: 1 + the triangle that rays from here need not be tested against, 0 on a sphere.
-    tangent: unit vector along growing u, not necessarily at right angles to the normal; bitangent_sign: -1 where the texture
-    is mirrored, else 1. u, v: texture coordinates, two numbers since a vector of two would not run in lanes.
-    """
+    """A point on a surface, in world space."""
 
     point: wp.vec3
-    error: wp.vec3
-    geometric: wp.vec3
-    shading: wp.vec3
-    tangent: wp.vec3
-    bitangent_sign: float
-    u: float
+    error: wp.vec3  # Bound on the point's rounding error, per axis.
+    geometric: wp.vec3  # Unit normal of the flat triangle or the sphere, on the ray's side.
+    shading: wp.vec3  # Interpolated normal, on that side too.
+    tangent: wp.vec3  # Unit vector along growing u, not always perpendicular to the normal.
+    bitangent_sign: float  # -1 if the texture is mirrored, else 1.
+    u: float  # Texture coordinates: two numbers, as a vec2 does not vectorise.
     v: float
     material: int
-    front: int
-    exclude_plus_one: int
+    front: int  # 1 if the ray comes from the outside, the counter-clockwise side.
+    exclude_plus_one: int  # 1 + the triangle that rays from here ignore, 0 on a sphere.
 
 
 @wp.func
 def next_away(x: float, direction: float) -> float:
-    """A float32 at least one step from x on the side that direction's sign says."""
+    """Return a float32 at least one step from x, on the side of direction's sign."""
     step = wp.abs(x) * wp.static(2.0**-23) + 1.0e-45
     return wp.where(direction > 0.0, x + step, wp.where(direction < 0.0, x - step, x))
 
 
 @wp.func
 def spawn_point(point: wp.vec3, error: wp.vec3, normal: wp.vec3, direction: wp.vec3) -> wp.vec3:
-    """The origin of a ray that leaves towards `direction`: outside the box of the point's error, on that side of the surface.
+    """Return the origin of a ray that leaves towards `direction`: outside the box of the point's error, on that side.
 
-    The smallest such step along the normal, rounded away (Pharr, Jakob and Humphreys 2023, "Physically Based Rendering",
-    section 6.8.6); it scales with the coordinates, which a fixed epsilon does not.
-    """
+    It is the smallest such step along the normal, rounded away (Pharr, Jakob and Humphreys 2023, "Physically Based Rendering",
+    section 6.8.6). It scales with the coordinates, unlike a fixed epsilon."""
     distance = wp.dot(wp.abs(normal), error)
     offset = wp.where(wp.dot(direction, normal) < 0.0, -distance, distance) * normal
     p = point + offset
@@ -57,16 +49,16 @@ def spawn_point(point: wp.vec3, error: wp.vec3, normal: wp.vec3, direction: wp.v
 
 @wp.struct
 class Place:
-    """Where a primitive's data are: its face in Surfaces.faces (of a sphere: unread), its material, and its instance."""
+    """The indices of a primitive's data."""
 
-    face: int
+    face: int  # In Surfaces.faces; unread for a sphere.
     material: int
     instance: int
 
 
 @wp.func
 def instance_at(surfaces: Surfaces, prim_id: int) -> int:
-    """The last instance that does not begin behind a primitive: the one that it is of."""
+    """Return the instance of a primitive: the last one that does not begin behind it."""
     low = int(0)
     high = int(surfaces.instances.shape[0])
     while high - low > 1:
@@ -80,12 +72,12 @@ def instance_at(surfaces: Surfaces, prim_id: int) -> int:
 
 @wp.func
 def sphere_uv(n: wp.vec3) -> wp.vec2:
-    """Longitude and latitude of a unit normal, in a picture that goes round the sphere once."""
+    """Return longitude and latitude of a unit normal, as coordinates of a picture that wraps around the sphere once."""
     return wp.vec2(0.5 + atan2(-n[2], n[0]) / TWO_PI, acos(wp.clamp(n[1], -1.0, 1.0)) / PI)
 
 
 def make_place_of(instances: bool) -> Any:
-    """From a prim_id to its data."""
+    """Return the function from a prim_id to its data."""
 
     @wp.func
     def place_of(surfaces: Surfaces, prim_id: int) -> Place:
@@ -106,7 +98,7 @@ def make_place_of(instances: bool) -> Any:
 
 @wp.func
 def transformed(row_x: wp.vec4d, row_y: wp.vec4d, row_z: wp.vec4d, v: wp.vec3, w: float) -> wp.vec3:
-    """A point (w = 1) or a direction (w = 0) under an affine map: float64, rounded once."""
+    """Transform a point (w = 1) or a direction (w = 0) by an affine map, in float64, rounded once."""
     p = wp.vec4d(wp.float64(v[0]), wp.float64(v[1]), wp.float64(v[2]), wp.float64(w))
     return wp.vec3(float(wp.dot(row_x, p)), float(wp.dot(row_y, p)), float(wp.dot(row_z, p)))
 
@@ -123,24 +115,22 @@ def world_direction(i: Instance, d: wp.vec3) -> wp.vec3:
 
 @wp.func
 def world_normal(i: Instance, n: wp.vec3) -> wp.vec3:
-    """Unit length; the outside stays outside, also of a mirrored instance. Zero stays zero."""
+    """Transform a normal to unit length. The outside stays outside, also of a mirrored instance; zero stays zero."""
     return wp.normalize(n[0] * i.normal_x + n[1] * i.normal_y + n[2] * i.normal_z)
 
 
 @wp.func
 def world_error(i: Instance, p: wp.vec3, error: wp.vec3, world: wp.vec3) -> wp.vec3:
-    """Bound on the error of `world`, the image of p, which is off by `error`; per axis.
+    """Bound the error per axis of `world`, the image of p, which is off by `error`.
 
-    Two more roundings in the mesh's space are for the next ray, whose origin is taken back there and rounded.
-    """
+    Two more roundings in the mesh's space are for the next ray, whose origin is transformed back there and rounded."""
     e = error + gamma(2.0) * wp.abs(p)
     return transformed(wp.abs(i.world_x), wp.abs(i.world_y), wp.abs(i.world_z), e, 0.0) + gamma(2.0) * wp.abs(world)
 
 
 @wp.struct
 class Triangle:
-    """Its corners and, where a scene has them, the normals and texture coordinates (u of the three corners, and v) there. Corners
-    are in the space of its mesh, normals in the world."""
+    """A triangle: corners in the space of its mesh; if the scene has them, normals (world space) and texture coordinates."""
 
     v0: wp.vec3
     v1: wp.vec3
@@ -148,13 +138,13 @@ class Triangle:
     n0: wp.vec3
     n1: wp.vec3
     n2: wp.vec3
-    u: wp.vec3
+    u: wp.vec3  # Of the three corners.
     v: wp.vec3
 
 
 @wp.func
 def corners_at(surfaces: Surfaces, index: int) -> Triangle:
-    """Face `index` without attributes."""
+    """Return face `index` without attributes."""
     face = surfaces.faces[index]
     triangle = Triangle()
     triangle.v0 = surfaces.vertices[face[0]]
@@ -164,7 +154,7 @@ def corners_at(surfaces: Surfaces, index: int) -> Triangle:
 
 
 def make_triangle_at(smooth: bool, uvs: bool, instances: bool) -> Any:
-    """With only those attributes that the scene has."""
+    """Return the function that loads a triangle with the attributes that the scene has."""
 
     @wp.func
     def triangle_at(surfaces: Surfaces, place: Place) -> Triangle:
@@ -174,7 +164,7 @@ def make_triangle_at(smooth: bool, uvs: bool, instances: bool) -> Any:
             triangle.n0 = surfaces.normals[face[0]]
             triangle.n1 = surfaces.normals[face[1]]
             triangle.n2 = surfaces.normals[face[2]]
-            if wp.static(instances):  # each by itself: an interpolated one would turn elsewhere
+            if wp.static(instances):  # Each corner's: an interpolated normal would turn elsewhere.
                 instance = surfaces.instances[place.instance]
                 triangle.n0 = world_normal(instance, triangle.n0)
                 triangle.n1 = world_normal(instance, triangle.n1)
@@ -192,25 +182,24 @@ def make_triangle_at(smooth: bool, uvs: bool, instances: bool) -> Any:
 
 @wp.func
 def triangle_point(t: Triangle, u: float, v: float) -> wp.vec3:
-    """The point with these barycentrics, in the space of its corners."""
+    """Return the point at these barycentrics, in the space of the corners."""
     return (1.0 - u - v) * t.v0 + u * t.v1 + v * t.v2
 
 
 @wp.func
 def triangle_uv(surfaces: Surfaces, index: int, u: float, v: float) -> wp.vec2:
-    """Texture coordinates of face `index` at these barycentrics."""
+    """Return the texture coordinates of face `index` at these barycentrics."""
     face = surfaces.faces[index]
     return (1.0 - u - v) * surfaces.uvs[face[0]] + u * surfaces.uvs[face[1]] + v * surfaces.uvs[face[2]]
 
 
 @wp.func
 def triangle_point_error(t: Triangle, u: float, v: float) -> wp.vec3:
-    """How far a ray that starts at triangle_point must stand off to be clear of the triangle's plane, per axis.
+    """Return the distance per axis at which a ray that starts at triangle_point is clear of the triangle's plane.
 
-    Two parts: the rounding of the point itself, seven roundings in a row (PBR, section 6.8.5), and that of the next ray's
-    distance to a neighbour in the same plane, which grows with the triangle's size and not with its coordinates: a floor at
-    y = 0 has none of the first.
-    """
+    It has two parts. The point itself takes seven roundings in a row (PBR, section 6.8.5). The next ray's distance to a neighbour
+    in the same plane has a rounding that grows with the triangle's size, not with its coordinates. A floor at y = 0 has only the
+    second."""
     size = gamma(8.0) * wp.max(largest(t.v1 - t.v0), largest(t.v2 - t.v0))
     point = gamma(7.0) * (wp.abs((1.0 - u - v) * t.v0) + wp.abs(u * t.v1) + wp.abs(v * t.v2))
     return point + wp.vec3(size, size, size)
@@ -218,11 +207,10 @@ def triangle_point_error(t: Triangle, u: float, v: float) -> wp.vec3:
 
 @wp.func
 def triangle_normal(t: Triangle) -> wp.vec3:
-    """Unit normal on the counter-clockwise side, in the space of its corners; 0 where there is none. wrt.renderer.upload has the
-    same in NumPy.
+    """Return the unit normal on the counter-clockwise side, in the corners' space; 0 for a degenerate triangle.
 
-    The edges are scaled to about 1 first: a triangle of size 1e-20 would otherwise have a normal of length 0.
-    """
+    The edges are scaled to about 1 first, or a triangle of size 1e-20 would have a normal of length 0. wrt.renderer.upload has the
+    same in NumPy."""
     e1 = t.v1 - t.v0
     e2 = t.v2 - t.v0
     return unit(wp.cross(e1 / largest(e1), e2 / largest(e2)))
@@ -230,7 +218,7 @@ def triangle_normal(t: Triangle) -> wp.vec3:
 
 @wp.func
 def towards_u(t: Triangle, outward: wp.vec3) -> tuple[wp.vec3, float]:
-    """Surface.tangent and bitangent_sign; outward: the normal on the outside."""
+    """Return Surface.tangent and bitangent_sign; `outward` is the normal on the outside."""
     e1 = t.v1 - t.v0
     e2 = t.v2 - t.v0
     longer = wp.min(lift(e1), lift(e2))
@@ -245,16 +233,18 @@ def towards_u(t: Triangle, outward: wp.vec3) -> tuple[wp.vec3, float]:
 
 
 def make_on_triangle(smooth: bool, uvs: bool, tangents: bool) -> Any:
-    """Where a hit is, and the normals there. Like `facing`, it has no branches, so that loops can run in lanes."""
+    """Return the function for the surface of a triangle. Like `facing`, it is branch-free, so that loops vectorise."""
 
     @wp.func
     def on_triangle(t: Triangle, u: float, v: float) -> Surface:
-        """In the space of its corners, but for the shading normal, which is in the world (0: that of the triangle)."""
+        """Return the surface at these barycentrics, in the corners' space.
+
+        Only the shading normal is in world space; 0 stands for the triangle's own."""
         s = Surface()
         s.point = triangle_point(t, u, v)
         s.error = triangle_point_error(t, u, v)
         s.geometric = triangle_normal(t)
-        if wp.static(smooth):  # corners without a normal are zero: flat there
+        if wp.static(smooth):  # Corners without a normal have 0.
             s.shading = unit((1.0 - u - v) * t.n0 + u * t.n1 + v * t.n2)
         if wp.static(uvs):
             s.u = (1.0 - u - v) * t.u[0] + u * t.u[1] + v * t.u[2]
@@ -270,11 +260,10 @@ def make_on_triangle(smooth: bool, uvs: bool, tangents: bool) -> Any:
 
 @wp.func
 def facing(surface: Surface, direction: wp.vec3) -> Surface:
-    """A surface as a ray of this direction sees it.
+    """Turn a surface to the side of a ray of this direction.
 
-    A smooth normal belongs to the outside, which the winding defines: both are turned together, and a normal that disagrees with
-    the winding by more than a right angle is brought to the winding's side.
-    """
+    The winding defines the outside. A smooth normal that disagrees with it by more than a right angle is flipped. Then both normals
+    turn together."""
     s = surface
     n = surface.geometric
     shading = where_vec3(wp.dot(surface.shading, surface.shading) > 0.0, surface.shading, n)
@@ -289,13 +278,13 @@ def facing(surface: Surface, direction: wp.vec3) -> Surface:
 
 @wp.func
 def visible_normal(n: wp.vec3, wo: wp.vec3) -> wp.vec3:
-    """A shading normal, bent no farther than it is still seen from wo."""
+    """Bend a shading normal just so far that it is visible from wo."""
     facing = wp.dot(n, wo)
     return where_vec3(facing < MIN_COSINE, unit(n + (MIN_COSINE - facing) * wo), n)
 
 
 def make_on_sphere(uvs: bool, tangents: bool) -> Any:
-    """As on_triangle, of a sphere."""
+    """Return the function for the surface of a sphere."""
 
     @wp.func
     def on_sphere(surfaces: Surfaces, ray: Ray, hit: Hit) -> Surface:
@@ -323,7 +312,7 @@ def make_on_sphere(uvs: bool, tangents: bool) -> Any:
 
 
 def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, instances: bool = False) -> Any:
-    """The surface at a hit, with only those attributes that the scene has."""
+    """Return the function for the surface at a hit, with the attributes that the scene has."""
     place_of = make_place_of(instances)
     triangle_at = make_triangle_at(smooth, uvs, instances)
     surface_of_triangle, on_sphere = make_on_triangle(smooth, uvs, tangents), make_on_sphere(uvs, tangents)
@@ -334,7 +323,7 @@ def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, inst
 
     @wp.func
     def in_world(local: Surface, instance: Instance) -> Surface:
-        """What is computed in the mesh's space is taken to the world once."""
+        """Transform a surface from the mesh's space to the world."""
         s = local
         s.point = world_point(instance, local.point)
         s.error = world_error(instance, local.point, local.error, s.point)
@@ -347,7 +336,7 @@ def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, inst
 
     @wp.func
     def surface_at(surfaces: Surfaces, ray: Ray, hit: Hit) -> Surface:
-        """The surface that `ray` meets at `hit` (which must be one: prim_id >= 0)."""
+        """Return the surface of `ray` at `hit`, which must not be a miss."""
         place = place_of(surfaces, hit.prim_id)
         s = Surface()
         if wp.static(spheres):

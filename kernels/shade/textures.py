@@ -1,4 +1,4 @@
-"""Textures: 8-bit pictures sampled bilinearly, and the checkerboard."""
+"""Textures: 8-bit pictures, sampled bilinearly, and the checkerboard."""
 
 from typing import Any
 
@@ -9,13 +9,13 @@ from wrt.kernels.structs import Surfaces, Texture
 WRAP_REPEAT = 0
 WRAP_CLAMP = 1
 WRAP_MIRROR = 2
-FARTHEST = wp.constant(2.0**30)  # texels from a picture's beginning
+FARTHEST = wp.constant(2.0**30)  # Texels from a picture's first one.
 
 
 @wp.func
 def wrapped(i: int, size: int, wrap: int) -> int:
-    """The column (or row) 0 .. size - 1 that stands for column i."""
-    if i >= 0 and i < size:  # most are, and a division takes as long as all the rest
+    """Wrap column (or line) i into 0 .. size - 1."""
+    if i >= 0 and i < size:  # True for most, and a division is as slow as all the rest.
         return i
     if wrap == wp.static(WRAP_CLAMP):
         return wp.clamp(i, 0, size - 1)
@@ -27,13 +27,13 @@ def wrapped(i: int, size: int, wrap: int) -> int:
 
 @wp.func
 def texel(surfaces: Surfaces, texture: Texture, column: int, row: int) -> wp.vec4:
-    """One texel, linear; alpha is never sRGB-encoded. Column and row are within the picture."""
+    """Return one texel, linear; alpha is never sRGB-encoded. Column and line must be within the picture."""
     packed = surfaces.texels[texture.first + row * texture.width + column]
     r = int(packed & wp.uint32(255))
     g = int((packed >> wp.uint32(8)) & wp.uint32(255))
     b = int((packed >> wp.uint32(16)) & wp.uint32(255))
     a = int(packed >> wp.uint32(24))
-    # The table's second half is the plain encoding, so that there is one look-up either way.
+    # The table's second half is the linear encoding, so that both take one look-up.
     base = wp.where(texture.srgb != 0, 0, 256)
     table = surfaces.srgb_to_linear
     return wp.vec4(table[base + r], table[base + g], table[base + b], table[256 + a])
@@ -41,14 +41,14 @@ def texel(surfaces: Surfaces, texture: Texture, column: int, row: int) -> wp.vec
 
 @wp.func
 def place_between(at: float, size: int) -> float:
-    """Of a coordinate, in texels, whose colours are at their centres."""
-    # Beyond 2^24 no digits are left for a place between texels, and beyond 2^31 each device makes another integer of it.
+    """Return a texture coordinate in texels, counted from the first texel's centre."""
+    # Beyond 2^24 float32 has no fractions, and beyond 2^31 the integer depends on the device.
     return wp.clamp(at * float(size) - 0.5, -FARTHEST, FARTHEST)
 
 
 @wp.func
 def texture_uv(texture: Texture, uv: wp.vec2) -> wp.vec2:
-    """Texture coordinates as a texture takes them."""
+    """Transform texture coordinates by the texture's matrix."""
     u = texture.row_u[0] * uv[0] + texture.row_u[1] * uv[1] + texture.row_u[2]
     v = texture.row_v[0] * uv[0] + texture.row_v[1] * uv[1] + texture.row_v[2]
     return wp.vec2(u, v)
@@ -56,7 +56,7 @@ def texture_uv(texture: Texture, uv: wp.vec2) -> wp.vec2:
 
 @wp.func
 def picture(surfaces: Surfaces, texture: Texture, u: float, v: float) -> wp.vec4:
-    """Bilinear."""
+    """Sample a picture, bilinearly."""
     x = place_between(u, texture.width)
     y = place_between(v, texture.height)
     left = wrapped(int(wp.floor(x)), texture.width, texture.wrap_u)
@@ -65,7 +65,7 @@ def picture(surfaces: Surfaces, texture: Texture, u: float, v: float) -> wp.vec4
     fy = y - wp.floor(y)
     above = wp.vec4(0.0, 0.0, 0.0, 0.0)
     here = wp.vec4(0.0, 0.0, 0.0, 0.0)
-    rows = wp.where(texture.height > 0, 2, 0)  # not a constant: the body would be compiled twice at each of a surface's textures
+    rows = wp.where(texture.height > 0, 2, 0)  # A constant would unroll the loop at each of a surface's textures.
     for i in range(rows):
         row = wrapped(int(wp.floor(y)) + i, texture.height, texture.wrap_v)
         above = here
@@ -75,18 +75,18 @@ def picture(surfaces: Surfaces, texture: Texture, u: float, v: float) -> wp.vec4
 
 @wp.func
 def checkerboard(texture: Texture, u: float, v: float) -> wp.vec4:
-    end = wp.static(2.0**24)  # from here on all floats are even
+    end = wp.static(2.0**24)  # All larger floats are even.
     parity = (int(wp.floor(wp.clamp(u, -end, end))) + int(wp.floor(wp.clamp(v, -end, end)))) & 1
     color = wp.where(parity == 0, texture.color_a, texture.color_b)
     return wp.vec4(color[0], color[1], color[2], 1.0)
 
 
 def make_sample_texture(pictures: bool, checkerboards: bool) -> Any:
-    """The look-up, with only those kinds of texture that the scene has."""
+    """Return the look-up for the kinds of texture that the scene has."""
 
     @wp.func
     def sample_texture(surfaces: Surfaces, index: int, uv: wp.vec2) -> wp.vec4:
-        """Linear RGBA of texture `index` at uv; white where there is no texture (index < 0)."""
+        """Return the linear RGBA of texture `index` at uv; white without a texture (index < 0)."""
         if index < 0:
             return wp.vec4(1.0, 1.0, 1.0, 1.0)
         texture = surfaces.textures[index]

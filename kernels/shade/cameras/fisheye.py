@@ -12,21 +12,20 @@ from wrt.kernels.structs import Ray, make_ray
 
 @wp.struct
 class Camera:
-    """half_angle: between the axis and the rays of the image circle's edge; half_width, half_height: of the picture, the circle's
-    radius being 1."""
+    """A fisheye; lengths on the film are in radii of the image circle."""
 
     origin: wp.vec3
     right: wp.vec3
     up: wp.vec3
     forward: wp.vec3
-    half_angle: float
-    half_width: float
+    half_angle: float  # Between the axis and the rays at the edge of the image circle.
+    half_width: float  # Of the picture.
     half_height: float
 
 
 @wp.func
 def camera_ray(camera: Camera, film: wp.vec2, xi: wp.vec2) -> Ray:
-    """No ray beyond the image circle."""
+    """Return the ray of a film point, or no_ray() beyond the image circle."""
     x = (2.0 * film[0] - 1.0) * camera.half_width
     y = (1.0 - 2.0 * film[1]) * camera.half_height
     radius = wp.sqrt(x * x + y * y)

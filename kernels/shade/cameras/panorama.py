@@ -1,4 +1,4 @@
-"""Everything around one point, equirectangular: columns are longitudes, rows are latitudes."""
+"""All directions around one point, equirectangular: columns are longitudes, lines are latitudes."""
 
 from typing import Any
 
@@ -19,8 +19,9 @@ class Camera:
 
 @wp.func
 def camera_ray(camera: Camera, film: wp.vec2, xi: wp.vec2) -> Ray:
-    """The middle column looks along `forward`, the right half to the right; the upper edge is `up`. An environment background of
-    the same picture is seen in the same directions."""
+    """Return a ray: the middle column looks along `forward`, the right half to the right, the upper edge to `up`.
+
+    An environment background of the same picture appears in the same directions."""
     longitude = wp.TAU * (film[0] - 0.5)
     colatitude = wp.PI * film[1]
     sin, cos = sin_cos(longitude)

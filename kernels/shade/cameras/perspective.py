@@ -27,7 +27,7 @@ class Camera:
 
 @wp.func
 def chief_ray(camera: Camera, film: wp.vec2) -> wp.vec3:
-    """The direction through the lens' centre, which no lens bends; its part along `forward` is 1."""
+    """Return the direction through the lens' centre, which no lens bends; its `forward` component is 1."""
     x = (2.0 * film[0] - 1.0) * camera.tan_x
     y = (1.0 - 2.0 * film[1]) * camera.tan_y
     return camera.forward + x * camera.right + y * camera.up
@@ -39,12 +39,11 @@ def make_camera_ray(features: Features | None = None) -> Any:
 
     @wp.func
     def camera_ray(camera: Camera, film: wp.vec2, xi: wp.vec2) -> Ray:
-        """All rays of one film point cross at one point S of the plane in focus.
+        """Return the ray through the film point and the lens sample.
 
-        S is where two rays meet that are easy to draw: the chief ray through the lens' centre, and the one that arrives
-        parallel to the axis and leaves through the focal point. By the lens equation 1/s + 1/s' = 1/f this is the point of
-        the chief ray at distance s = focus_distance along the axis. The ray then goes from the lens sample L to S.
-        """
+        All rays of one film point cross at a point S of the plane in focus. Two rays that meet at S are easy to construct: the
+        chief ray, and the ray that arrives parallel to the axis and leaves through the focal point. By the lens equation 1/s + 1/s'
+        = 1/f, S is on the chief ray at distance s = focus_distance along the axis. The ray goes from the lens sample L to S."""
         chief = chief_ray(camera, film)
         ray = make_ray(camera.origin, unit(chief))
         if wp.static(lens):
