@@ -1,4 +1,4 @@
-"""README and docs/: every command line in them is one, every piece of Python runs, and every link leads somewhere."""
+"""README and docs/: command lines parse and run, Python runs, links lead somewhere, and plots and tables agree with their data."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import shlex
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from statistics import geometric_mean
 from typing import Any
 
 import click
@@ -27,14 +28,13 @@ from wrt.io.mesh_file import load_mesh
 
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "kernels" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 NOTES = sorted((ROOT / "docs" / "lab_notes").glob("*.md"))  # commands and Python in them are of their day
-# Which CI itself runs (.ci/run), or a test of their own.
+# Commands that CI itself runs (.ci/run), or that have a test of their own.
 OTHERS = ("pip install ", "pytest", "python -m pdoc ", "dask ", "python -m tests.fuzz ", "python -m tests.virtual_gpu ",
           "openssl req ", "export DASK_", "ulimit -v ", "timeout -k ", "prlimit ")
-# What stands for something in a command line, and what it is here. The folder of each test has these files.
+# Placeholders in command lines, and the files of the test's folder that replace them.
 STANDS_FOR = {"MESH...": "model.ply", "MESH": "model.ply", "SCENE": "scenes/whitted.toml", "FILE.gif": "file.gif", "STUDY": "order",
               "bunny.ply": "model.ply", "FOLDER|FILE.gif|.png": "frames", "FOLDER": "folder"}
-# Cheap options, added behind a command's own, of the commands that are run; the others are only parsed: they take minutes, or
-# compile for minutes, and have tests of their own.
+# Options that make a command cheap, added behind its own. Commands in neither table are only parsed.
 CHEAP = {
     "render": ("--size", "32x18", "--spp", "4"), "info": (), "compile": (), "compare": (), "validate": (), "schema": (),
     "devices": (),
@@ -62,7 +62,7 @@ def page_id(path: Path) -> str:
 
 
 def command_lines(text: str) -> list[str]:
-    """What stands in shell blocks, and in the text between backquotes where it begins with the program's name."""
+    """Return the commands of shell blocks, and of text between backquotes that begins with the program's name."""
     blocks = re.findall(r"^```(?:sh|bash|console)\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
     prose = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
     spans = [re.sub(r"\s+", " ", span) for span in re.findall(r"`([^`]+)`", prose)]
@@ -72,7 +72,7 @@ def command_lines(text: str) -> list[str]:
 
 
 def arguments(line: str) -> list[str] | None:
-    """Those of `python -m wrt`; None where the line is another command."""
+    """Return the arguments of `python -m wrt`, or None if the line is another command."""
     match = re.fullmatch(r"(?:python -m )?wrt ([a-z].*)", line)
     if match is None:
         return None
@@ -111,7 +111,7 @@ def test_other_commands_are_those_of_installing_and_testing(page: str, line: str
 
 @pytest.mark.parametrize(("page", "line"), COMMANDS)
 def test_a_command_line_is_one(page: str, line: str) -> None:
-    """Its command and its options exist, and their values have the right types."""
+    """The command and its options exist, and their values have the right types."""
     words = arguments(line) or []
     name, command = command_of(words)
     try:
@@ -123,7 +123,7 @@ def test_a_command_line_is_one(page: str, line: str) -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What a reader may have beside him: the scenes, a mesh, a glTF file with three cameras, a scene, two pictures."""
+    """Return a reader's folder: the scenes, a mesh, a glTF file with three cameras, a scene, two pictures."""
     folder = tmp_path_factory.mktemp("documentation")
     shutil.copytree(ROOT / "scenes", folder / "scenes")
     shutil.copy(ROOT / "scenes" / "whitted.toml", folder / "scene.toml")
@@ -151,7 +151,7 @@ def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
 
 
 def runs(commands: dict[str, tuple[str, ...]]) -> list[tuple[str, ...]]:
-    """The distinct argument lists of lines that are complete, with the cheap options behind them."""
+    """Return the distinct argument lists of complete lines, with the cheap options behind them."""
     out = set()
     for line in {line for page, line in COMMANDS if page != "CHANGELOG.md"}:
         words = arguments(line) or []
@@ -211,7 +211,7 @@ def test_python_runs(page: str, folder: Path, tmp_path: Path, monkeypatch: pytes
 
 
 def functions_of(thing: Any) -> Iterator[tuple[str, Any]]:
-    """The public methods and properties that a class defines itself."""
+    """Yield the public methods and properties that a class defines itself."""
     for name, value in vars(thing).items():
         function = value.fget if isinstance(value, property) else getattr(value, "__func__", value)
         if not name.startswith("_") and inspect.isfunction(function):
@@ -237,19 +237,57 @@ def test_everything_public_says_what_it_is(module: str) -> None:
 
 # --- plots ------------------------------------------------------------------------------------------------------------
 
+PLOTS = ROOT / "docs" / "plots"
 
-def test_plots_show_the_data_beside_them() -> None:
-    """`python docs/plots/make.py` changes no file."""
-    namespace = runpy.run_path(str(ROOT / "docs" / "plots" / "make.py"))
-    drawn = {f"{plot.__name__}.svg": plot() for plot in namespace["PLOTS"]}
-    assert drawn == {file.name: file.read_text(encoding="utf-8") for file in (ROOT / "docs" / "plots").glob("*.svg")}
+
+@pytest.fixture(scope="module")
+def plots() -> dict[str, Any]:
+    return runpy.run_path(str(PLOTS / "make.py"))
+
+
+def test_plots_show_the_data_beside_them(plots: dict[str, Any]) -> None:
+    """`python docs/plots/make.py` changes no file, each plot stands on a page, and each CSV file says how to measure it again."""
+    drawn = {f"{plot.__name__}.svg": plot() for plot in plots["PLOTS"]}
+    assert drawn == {file.name: file.read_text(encoding="utf-8") for file in PLOTS.glob("*.svg")}
+    pages = "".join(page.read_text(encoding="utf-8") for page in PAGES)
+    assert [name for name in drawn if f"plots/{name})" not in pages] == []
+    for file in PLOTS.glob("*.csv"):
+        comments = [line for line in file.read_text(encoding="utf-8").splitlines() if line.startswith("#")]
+        assert any(re.match(r"# (command|method): ", line) for line in comments), file.name
+
+
+def cells(page: str, row: str) -> list[str]:
+    """Return the cells of the first table line of a page that begins with `row`, without stars and thousands separators."""
+    text = re.sub(r"[*,]", "", (ROOT / "docs" / page).read_text(encoding="utf-8"))
+    line = re.search(rf"^\| {re.escape(row.replace(',', ''))}\b[^|]*\|(.*)\|$", text, re.MULTILINE)
+    assert line, f"{page}: {row}"
+    return line[1].split("|")
+
+
+def test_tables_have_the_sums_and_means_of_the_data(plots: dict[str, Any]) -> None:
+    """Geometric means of speed in performance.md; wrong rays in accuracy.md and testing.md."""
+    speeds, groups, libraries = (plots["read"](name) for name in ("peers", "hard_cases", "libraries"))
+    for row, rival in (("Embree robust, best mode", "embree_best"), ("Embree robust, one", "embree_robust"),
+                       ("Embree fast", "embree_fast"), ("Warp's mesh query", "warp")):
+        means = [geometric_mean([float(line[rival]) for line in speeds if line["rays"] == kind])
+                 for kind in ("primary", "shadow", "diffuse", "random")]
+        assert [float(cell) for cell in cells("performance.md", row)] == pytest.approx(means, abs=0.006)
+    for row, test, rays in (("Moeller-Trumbore", "moeller_trumbore", "sample"), ("Embree robust", "embree_robust", "peer_sample"),
+                            ("Embree fast", "embree_fast", "peer_sample"), ("Warp's mesh query", "warp", "peer_sample")):
+        sums = [sum(int(line[name]) for line in groups if line["group"] != "I") for name in (test, rays)]
+        assert [int(cell) for cell in cells("accuracy.md", row)] == sums
+    for row, library in (("wrt", "wrt"), ("Embree robust", "embree_robust"), ("Embree fast", "embree_fast"), ("Open3D", "open3d"),
+                         ("Warp", "warp"), ("Mitsuba", "mitsuba"), ("trimesh", "trimesh")):
+        rays = "trimesh_rays" if library == "trimesh" else "rays"
+        sums = [sum(int(line[name]) for line in libraries if ": " in line["name"]) for name in (library, rays)]
+        assert [int(cell) for cell in cells("testing.md", row)][:2] == sums
 
 
 # --- links ------------------------------------------------------------------------------------------------------------
 
 
 def anchors(path: Path) -> set[str]:
-    """Of the headings, as GitHub makes them."""
+    """Return the anchors of a page's headings, as GitHub makes them."""
     text = re.sub(r"^```.*?^```", "", path.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
     titles = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
@@ -269,7 +307,7 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 @pytest.mark.parametrize("file", ["README.md", "units/triangle.py", "units/box.py", "loops/one_ray.py", "loops/wave.py"])
 def test_the_device_code_names_files_that_exist(file: str) -> None:
-    """What runs, where what is, and which test holds two forms to each other: nothing else tells a reader."""
+    """Files and tests that docstrings of device code name exist."""
     text = (ROOT / "kernels" / file).read_text(encoding="utf-8")
     if file.endswith(".py"):
         text = ast.get_docstring(ast.parse(text)) or ""

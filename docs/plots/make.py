@@ -15,7 +15,7 @@ from statistics import geometric_mean
 
 HERE = Path(__file__).resolve().parent
 WIDTH = 640
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")  # Okabe and Ito: told apart by everybody
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")  # Okabe and Ito: safe for colour-blind readers
 SHAPES = ("circle", "square", "diamond", "triangle", "circle", "square", "diamond")
 FONT = 21
 PEERS = ("embree_robust", "embree_fast", "warp")
