@@ -2,7 +2,8 @@
 
 This is a wavefront tracer (Laine, Karras and Aila 2013, "Megakernels Considered Harmful"). The pending rays of a wave of samples
 wait in one queue (state.py). One launch traces them all, in packets; the next shades all hits, and vectorises what has no branches.
-Each sample takes its paths and adds its light in the order of one_ray.py, so that the pictures have the same bits.
+Each sample takes its paths and adds its light in the order of one_ray.py, so that the pictures have the same bits
+(tests/wrt/renderer/test_waves.py).
 
 trace_wave is a single launch for Python. It launches:
 1. For FRESH camera rays at a time, while they are in the cache: begin_wave (wave_begin.py), closest_hit, and shade_wave

@@ -6,7 +6,8 @@ the table of tests.
 
 **What runs.** This file tests one box and one ray, in all structures but bvh4, bvh8 and bvh8c. Those test the children of a node together:
 `kernels/wide/nodes.py`, on a CPU `kernels/wide/box.h`. They enter every box that this file enters, at the same distance
-(tests/kernels/wide/test_lanes.py); packets have their bits (test_packets.py there). The whole table: kernels/README.md.
+(tests/kernels/wide/test_lanes.py); packets have their bits
+(tests/kernels/wide/test_packets.py). The whole table: kernels/README.md.
 """
 
 import warp as wp
