@@ -22,7 +22,7 @@ def closest_hit(accel: OneMesh, vertices: Any, origins: Any, directions: Any, t_
     given = (jnp.asarray(each) for each in (() if vertices is None else (vertices,)) + (origins, directions))
     *shape, o, d = (each.astype(np.float32) if each.dtype.kind in "iu" else each for each in given)
     if o.shape != d.shape or o.shape[1:] != (3,):
-        raise InputError(f"origins and directions must both be (N, 3), got {o.shape} and {d.shape}")
+        raise InputError(f"and directions must both be (N, 3), got {o.shape} and {d.shape}", argument="origins")
     ends = (jnp.asarray(each, np.float32) for each in (t_min, t_max))
     return _function()(accel, rebuild_at, *shape or [None], o, d, *ends)
 

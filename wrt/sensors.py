@@ -53,7 +53,7 @@ class Sensor:
         """
         values = to_numpy(values)
         if values.shape[:1] != (len(self.origins),):
-            raise InputError(f"values must be one a ray, ({len(self.origins)}, ...), got {values.shape}")
+            raise InputError(f"must be one a ray, ({len(self.origins)}, ...), got {values.shape}", argument="values")
         return values.reshape(*self.shape, *values.shape[1:])
 
     def range(self, hits: Hits) -> np.ndarray:
@@ -69,7 +69,7 @@ class Sensor:
 
     def _scaled(self, hits: Hits, factor: np.ndarray) -> np.ndarray:
         if not hasattr(hits, "t"):
-            raise InputError(f"hits must be those of closest_hit, got {shown(hits)}")
+            raise InputError(f"must be those of closest_hit, got {shown(hits)}", argument="hits")
         t = self.picture(hits.t).astype(np.float64)
         scaled = np.where(np.isfinite(t), t, 0.0) * factor.reshape(self.shape)
         return np.where(np.isfinite(t), scaled, np.inf).astype(np.float32)
@@ -100,9 +100,9 @@ def pinhole(intrinsics: ArrayLike, size: tuple[int, int] | str, pose: ArrayLike 
     """
     k = as_array(intrinsics, np.float64, "intrinsics")
     if k.shape != (3, 3) or not np.isfinite(k).all() or not np.array_equal(k[2], [0.0, 0.0, 1.0]) or k[1, 0] != 0.0:
-        raise InputError(f"intrinsics must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]], got {k.tolist()}")
+        raise InputError(f"must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]], got {k.tolist()}", argument="intrinsics")
     if not (k[0, 0] > 0.0 and k[1, 1] > 0.0):
-        raise InputError(f"intrinsics: focal lengths must be above 0, got {k[0, 0]:g} and {k[1, 1]:g}")
+        raise InputError(f"must have focal lengths above 0, got {k[0, 0]:g} and {k[1, 1]:g}", argument="intrinsics")
     width, height = as_size(size)
     y = (np.arange(height)[:, None] - k[1, 2]) / k[1, 1]
     x = (np.arange(width)[None, :] - k[0, 2] - k[0, 1] * y) / k[0, 0]
@@ -137,7 +137,7 @@ def rotating_lidar(elevations: ArrayLike, steps: int, pose: ArrayLike | None = N
     """
     rows = as_array(elevations, np.float64, "elevations")
     if rows.ndim != 1 or not len(rows) or not (np.abs(rows) <= 0.5 * np.pi).all():
-        raise InputError("elevations must be one or more angles, -pi/2 to pi/2 radians")
+        raise InputError("must be one or more angles, -pi/2 to pi/2 radians", argument="elevations")
     steps = as_integer(steps, "steps", 1, 1 << 24)
     azimuths = as_number(start, "start") + as_number(turn, "turn") * np.arange(steps) / steps
     return _sensor(_spherical(azimuths[None, :], rows[:, None]), pose, axis=0)
@@ -164,10 +164,10 @@ def raster_lidar(fov: tuple[float, float], size: tuple[int, int] | str, pose: Ar
     width, height = as_size(size)
     angles = as_array(fov, np.float64, "fov")
     if angles.shape != (2,):
-        raise InputError(f"fov must be two angles, got {shown(fov)}")
+        raise InputError(f"must be two angles, got {shown(fov)}", argument="fov")
     across, up = (as_number(angle, "fov", low=0.0) for angle in angles.tolist())
     if across > TURN or up > np.pi:
-        raise InputError(f"fov must be at most 2 pi across and pi up, got {across:g} and {up:g}")
+        raise InputError(f"must be at most 2 pi across and pi up, got {across:g} and {up:g}", argument="fov")
     azimuths, elevations = (0.5 * angle * np.linspace(1.0, -1.0, n) if n > 1 else np.zeros(1)
                             for angle, n in ((across, width), (up, height)))
     return _sensor(_spherical(azimuths[None, :], elevations[:, None]), pose, axis=0)
@@ -200,11 +200,11 @@ def with_range_noise(ranges: ArrayLike, seed: int, constant: float = 0.0, propor
     """
     ranges, shape = as_array(ranges, np.float64, "ranges"), np.shape(ranges)
     if not (ranges >= 0.0).all():
-        raise InputError(f"ranges must be 0 or more, or inf for a miss, got {ranges[~(ranges >= 0.0)][0]:g}")
+        raise InputError(f"must be 0 or more, or inf for a miss, got {ranges[~(ranges >= 0.0)][0]:g}", argument="ranges")
     constant, proportional = (as_number(value, name, low=0.0) for value, name in ((constant, "constant"),
                                                                                 (proportional, "proportional")))
     if not 0.0 <= as_number(dropout, "dropout") <= 1.0:
-        raise InputError(f"dropout must be 0 to 1, got {dropout:g}")
+        raise InputError(f"must be 0 to 1, got {dropout:g}", argument="dropout")
     rng = np.random.default_rng(as_integer(seed, "seed", 0, (1 << 63) - 1))
     normal, lost = rng.standard_normal(ranges.shape), rng.random(ranges.shape) < dropout
     there = np.isfinite(ranges) & ~lost
@@ -224,7 +224,7 @@ def _sensor(directions: np.ndarray, pose: ArrayLike | None, axis: int) -> Sensor
     matrix = as_transform(np.eye(4) if pose is None else pose, "pose")
     rotation = matrix[:3, :3]
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID or np.linalg.det(rotation) < 0.0:
-        raise InputError("pose must be a rotation and a translation")
+        raise InputError("must be a rotation and a translation", argument="pose")
     with np.errstate(over="ignore"):
         turned = (directions.reshape(-1, 3) @ rotation.T).astype(np.float32)
         origins = np.tile(matrix[:3, 3].astype(np.float32), (len(turned), 1))

@@ -124,12 +124,12 @@ class OneMesh(Accelerator, ABC):
         """The geometry with other vertices. Raises InputError for what these cannot be."""
         moved = vectors(vertices, "vertices").copy()
         if moved.shape != (self.geometry.n_vertices, 3):
-            raise InputError(f"vertices must be {(self.geometry.n_vertices, 3)}, got {moved.shape}")
+            raise InputError(f"must be {(self.geometry.n_vertices, 3)}, got {moved.shape}", argument="vertices")
         return Geometry(moved, self.geometry.faces, self.geometry.spheres)
 
     def _refit_in_place(self, points: Any) -> None:
         """As `refit`, in place."""
-        raise InputError(f"a {self.name} cannot be refitted in place; take bvh2")
+        raise InputError(f"a {self.name} cannot be refitted in place", hint="take bvh2")
 
     def refit(self, vertices: Any, rebuild_at: float = np.inf, *, in_place: bool = False) -> Refit:
         """Follow vertices that have moved, (V, 3) float32 (a tensor, too) or a Warp array (V,) of vec3, as many as before: boxes
@@ -147,7 +147,7 @@ class OneMesh(Accelerator, ABC):
         not looked at), and from structures that cannot be refitted.
         """
         if not self.can_refit:
-            raise InputError(f"a {self.name} cannot follow vertices that move; build it again, or take bvh2")
+            raise InputError(f"a {self.name} cannot follow vertices that move", hint="build it again, or take bvh2")
         vertices = taken(vertices, "vertices")
         with self._refitting:
             begin, before = build_clock(), self._snapshot

@@ -31,9 +31,9 @@ class DeviceGeometry(Geometry):
         points = self.points_of(points, "points")
         flat = isinstance(indices, wp.array) and indices.dtype == wp.int32 and indices.ndim == 1 and len(indices) % 3 == 0
         if not (flat or (isinstance(indices, wp.array) and indices.dtype == wp.vec3i and indices.ndim == 1)):
-            raise InputError(f"indices must be a Warp array (3 F,) of int32 or (F,) of vec3i, got {shown(indices)}")
+            raise InputError(f"must be a Warp array (3 F,) of int32 or (F,) of vec3i, got {shown(indices)}", argument="indices")
         if indices.device != points.device:
-            raise InputError(f"indices must be on {points.device}, as points are, not on {indices.device}")
+            raise InputError(f"must be on {points.device}, as points are, not on {indices.device}", argument="indices")
         indices = indices if indices.is_contiguous else indices.contiguous()
         if flat:
             indices = indices.reshape((len(indices) // 3, 3)).view(wp.vec3i)
@@ -41,7 +41,7 @@ class DeviceGeometry(Geometry):
         outside = wp.zeros(1, dtype=wp.int32, device=points.device)
         launch_on(points.device, count_outside, len(self), self.indices, len(points), outside, None)
         if n := int(outside.numpy()[0]):
-            raise InputError(f"indices must be 0 to {len(points) - 1}; {n} triangles have others")
+            raise InputError(f"must be 0 to {len(points) - 1}; {n} triangles have others", argument="indices")
 
     def _set(self, points: Any, indices: Any, spheres: np.ndarray) -> DeviceGeometry:
         self.__dict__.update(points=points, indices=indices, spheres=spheres)
@@ -51,7 +51,7 @@ class DeviceGeometry(Geometry):
     def points_of(array: Any, name: str) -> Any:
         """The array, without gaps. Raises InputError for what is none of points."""
         if not (isinstance(array, wp.array) and array.dtype == wp.vec3 and array.ndim == 1):
-            raise InputError(f"{name} must be a Warp array (V,) of vec3, got {shown(array)}")
+            raise InputError(f"must be a Warp array (V,) of vec3, got {shown(array)}", argument=name)
         return array if array.is_contiguous else array.contiguous()
 
     @staticmethod

@@ -89,7 +89,7 @@ class Instances(Accelerator):
                 self._kept["boxes"] = self._boxes(geometry, MOVED_BOXES)
             low, high = world_boxes(geometry, rows, self._kept["boxes"])
             if not (np.maximum(np.abs(low), np.abs(high))[low[:, 0] <= high[:, 0]] <= MAX_REACH).all():
-                raise InputError(f"matrix puts an instance farther than {MAX_REACH:g} from the origin")
+                raise InputError(f"puts an instance farther than {MAX_REACH:g} from the origin", argument="matrix")
             top, cost = refit_top(self._top, geometry, rows, low, high), before.built_cost
             growth = top.cost / cost if cost > 0.0 else 1.0
             if rebuilt := growth > rebuild_at:
@@ -125,24 +125,26 @@ def moves(row_of: np.ndarray, instance: Any, matrix: Any) -> tuple[np.ndarray, n
     the argument."""
     rows = real_numbers(instance, "instance", "a whole number, or (R,)")
     if rows.ndim > 1 or (rows.dtype.kind not in "iu" and rows.size):
-        raise InputError(f"instance must be a whole number, or (R,) of them, got {shown(instance)}")
+        raise InputError(f"must be a whole number, or (R,) of them, got {shown(instance)}", argument="instance")
     matrices = real_numbers(matrix, "matrix", f"{(*rows.shape, 4, 4)}").astype(np.float64)
     if matrices.shape not in ((*rows.shape, 4, 4), (*rows.shape, 3, 4)):
-        raise InputError(f"matrix must be {(*rows.shape, 4, 4)}, got {matrices.shape}")
+        raise InputError(f"must be {(*rows.shape, 4, 4)}, got {matrices.shape}", argument="matrix")
     if matrices.shape[-2] == 4 and (matrices[..., 3, :] != [0.0, 0.0, 0.0, 1.0]).any():
-        raise InputError("matrix must be affine: its last row 0, 0, 0, 1")
+        raise InputError("must be affine: its last row 0, 0, 0, 1", argument="matrix")
     numbers, matrices = rows.reshape(-1).astype(np.int64), matrices[..., :3, :].reshape(-1, 3, 4)
     if len(numbers) and not (numbers.min() >= 0 and numbers.max() < len(row_of)):
-        raise InputError(f"instance must be 0 to {len(row_of) - 1}")
+        raise InputError(f"must be 0 to {len(row_of) - 1}", argument="instance")
     if len(np.unique(numbers)) < len(numbers):
-        raise InputError("instance has a number twice")
+        raise InputError("has a number twice", argument="instance")
     rows = row_of[numbers]
     if (rows < 0).any():
-        raise InputError(f"instance {numbers[np.argmin(rows)]} has no place of its own: it was joined with others, or is a sphere")
+        raise InputError(f"instance {numbers[np.argmin(rows)]} has no place of its own: it was joined with others, or is a sphere",
+                         argument="instance")
     with np.errstate(all="ignore"):
         linear = matrices[:, :, :3]
         good = np.isfinite(matrices).all(axis=(1, 2)) & (np.abs(np.linalg.det(linear)) > 0.0)
         good[good] = spread_of(matrices[good], inverse_of(matrices[good])) <= MAX_SPREAD
     if not good.all():
-        raise InputError(f"matrix must be finite and flatten nothing; that of instance {numbers[np.argmin(good)]} is or does not")
+        raise InputError(f"must be finite and flatten nothing; that of instance {numbers[np.argmin(good)]} is or does not",
+                         argument="matrix")
     return rows, matrices

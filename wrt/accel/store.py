@@ -47,7 +47,7 @@ def row_type(kind: Any) -> np.dtype[Any]:
 def check_target(path: str | os.PathLike[str]) -> None:
     """Raise the InputError that saving to `path` would end in, before any work is done for it."""
     if Path(path).suffix.lower() != ".accel":
-        raise InputError("a structure is written to a .accel file", path)
+        raise InputError("a structure is written to a .accel file", path=path)
     check_writable(path)
 
 
@@ -83,8 +83,8 @@ def read(path: str | os.PathLike[str], geometry: Geometry, attributes: FlatScene
             return cls.restore(built, geometry, attributes, device, threads, units=Units(header["triangle"], header["box"]))
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         if isinstance(error, InputError):
-            raise InputError(str(error), path) from error
-        raise InputError(f"is no structure of this version ({type(error).__name__}: {error})", path) from error
+            raise error.at(path) from error
+        raise InputError(f"is no structure of this version ({type(error).__name__}: {error})", path=path) from error
 
 
 def read_arrays(cls: type[Any], header: dict[str, Any], body: memoryview) -> Built:

@@ -35,9 +35,10 @@ def options_of(name: str, options: type[T], given: dict[str, Any]) -> T:
     for option, value in given.items():
         if option not in known:
             names = [*known, "triangle", "box"]
-            raise InputError(f"{name} has no option {option!r}; {did_you_mean(option, names)}there is {', '.join(names)}")
+            raise InputError(f"is no option of {name}",
+                             argument=option, hint=f"{did_you_mean(option, names)}there is {', '.join(names)}")
         if not accepts(types[option], value):
-            raise InputError(f"{option} must be {known[option].type}, got {value!r}")
+            raise InputError(f"must be {known[option].type}, got {value!r}", argument=option)
     return options(**given)
 
 

@@ -19,7 +19,7 @@ class Structures(Registry[type[Any]]):
         kind = super().__getitem__(name)
         for field in FIELDS:
             if not hasattr(kind, field):
-                raise InputError(f"structure {name!r}: class {kind.__name__} has no field {field!r}")
+                raise InputError(f"class {kind.__name__} has no field {field!r}", place=f"structure {name!r}")
         return kind
 
 

@@ -42,4 +42,4 @@ def library(name: str, module: str = "") -> Any:
     try:
         return importlib.import_module(module or name)
     except ImportError as error:
-        raise InputError(f'wrt.{name} needs {name} ({error}): pip install "wrt[{name}]"') from error
+        raise InputError(f"wrt.{name} needs {name} ({error})", hint=f'pip install "wrt[{name}]"') from error

@@ -30,7 +30,7 @@ def animate(scene: Path, output: Path, fps: float, given: tuple[tuple[str, Any],
     from wrt.renderer.options import Options
 
     if not 0.1 <= fps <= 100.0:
-        raise InputError(f"fps must be 0.1 to 100, got {fps:g}")
+        raise InputError(f"must be 0.1 to 100, got {fps:g}", argument="fps")
     plan = animation.Animation(*(options.pop(name) for name in ("frames", "degrees", "rebuild_at")))
     settings = settings_of(given, {name: options.pop(name) for name in ("spp", "size")})
     rendering = Options(**options)

@@ -34,7 +34,7 @@ def build(mesh: Path, output: Path, accel: str, settings: tuple[tuple[str, Any],
     with warnings_reported(quiet):
         structure = wrt.build(mesh, accel, threads=threads, **options)
     if isinstance(structure, Instances):
-        raise InputError("a scene with instances has no structure in a file", mesh)
+        raise InputError("a scene with instances has no structure in a file", path=mesh)
     structure.save(output)
     if as_json:
         say_json({"output": output, "accel": structure.name, **asdict(structure.stats)})
@@ -49,6 +49,6 @@ def settled(settings: tuple[tuple[str, Any], ...]) -> dict[str, Any]:
     out: dict[str, Any] = {}
     for name, value in settings:
         if name in out or name in ("mesh", "accel", "device", "threads", "progress"):
-            raise InputError(f"--set {name}: {'set twice' if name in out else 'has a flag of its own'}")
+            raise InputError(f"{'set twice' if name in out else 'has a flag of its own'}", argument=f"--set {name}")
         out[name] = value
     return out

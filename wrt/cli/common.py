@@ -194,16 +194,17 @@ def settings_of(given: tuple[tuple[str, Any], ...], flags: dict[str, Any] | None
     values: dict[str, Any] = {}
     for name, value in given:
         if name in taken:
-            raise InputError(f"--set {name}: {taken[name]} decides on that here")
+            raise InputError(f"{taken[name]} decides on that here", argument=f"--set {name}")
         if name in values and values[name] != value:
-            raise InputError(f"--set {name}: given twice, {values[name]!r} and {value!r}")
+            raise InputError(f"given twice, {values[name]!r} and {value!r}", argument=f"--set {name}")
         values[name] = value
     if "size" in values:
         values["size"] = list(as_size(values["size"], "--set size"))
     settings = check_settings(values, "--set")
     for name, value in (flags or {}).items():
         if value is not None and name in settings and _plain(settings[name]) != _plain(value):
-            raise InputError(f"--set {name}: --{name.replace('_', '-')} is given too, and says otherwise: leave one of them out")
+            raise InputError(f"--{name.replace('_', '-')} is given too, and says otherwise: leave one of them out",
+                             argument=f"--set {name}")
     return {**{name: value for name, value in (flags or {}).items() if value is not None}, **settings}
 
 
@@ -227,7 +228,8 @@ def spread_options(cluster: str | None, device: str) -> dict[str, Any]:
     if cluster is None:
         return {"device": device} if len(names) == 1 else {"devices": names}
     if len(names) > 1:
-        raise InputError(f"--device {device}: with --cluster it is that of each worker, and one; start a worker for each device")
+        raise InputError("with --cluster it is that of each worker, and one; start a worker for each device",
+                         argument="--device")
     return {"device": device, "executor": client_of(cluster)}
 
 

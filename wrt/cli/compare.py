@@ -32,7 +32,7 @@ def compare(a: Path, b: Path, output: Path | None, tonemap: str, exposure: float
     Settings(tonemap=tonemap, exposure=exposure)  # told before the pictures are read
     if output is not None:
         if output.suffix.lower() != ".png":
-            raise InputError("a picture of the difference is a .png", output)
+            raise InputError("must be a .png: a picture of the difference", path=output)
         check_writable(output)
     first, second = read_image(a), read_image(b)
     result = metrics.compare(first, second, exposure=exposure, tonemap=tonemap)

@@ -25,10 +25,10 @@ def devices(check: bool, tunes: bool, device: str | None, scenes: tuple[Path, ..
     from wrt.core.device import describe_devices
 
     if check and tunes:
-        raise InputError("--check and --tune are two commands: give one")
+        raise InputError("and --tune are two commands", argument="--check", hint="give one")
     if not check:
         if scenes or rays is not None or (device is not None and not tunes):
-            raise InputError("--device, --scene and --rays belong to --check, and --device to --tune")
+            raise InputError("belong to --check, and --device to --tune", argument="--device, --scene and --rays")
     if tunes:
         from wrt.lab.tune import measured
 

@@ -57,7 +57,7 @@ class Reporting:
         if self.output is None:
             return
         if self.output.suffix.lower() != ".md":
-            raise InputError("the report is a .md file", self.output)
+            raise InputError("the report is a .md file", path=self.output)
         check_writable(self.output)
 
     def write(self, text: str) -> None:

@@ -22,7 +22,7 @@ def checkpoint_options(output: Path, every: float | None, file: Path | None, res
         return {}
     file = file or output.with_name(output.name + SUFFIX)
     if os.path.realpath(file) == os.path.realpath(output):
-        raise InputError("is the picture; a checkpoint needs a file of its own", file)
+        raise InputError("is the picture; a checkpoint needs a file of its own", path=file)
     return {"checkpoint": file, "checkpoint_every": EVERY if every is None else every, "resume": resume}
 
 
@@ -53,4 +53,5 @@ def remove_checkpoint(path: Path) -> None:
     try:
         path.unlink(missing_ok=True)
     except OSError as error:
-        raise InputError(f"cannot be removed: {error.strerror}; the picture is done, so it is of no use any more", path) from error
+        raise InputError(f"cannot be removed: {error.strerror}",
+                         path=path, hint="the picture is done, so it is of no use any more") from error

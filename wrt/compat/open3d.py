@@ -73,11 +73,11 @@ class RaycastingScene:
             faces = indices.astype(np.int64)
         for array, name in ((vertices, "vertex_positions"), (faces, "triangle_indices")):
             if array.ndim != 2 or array.shape[1] != 3:
-                raise InputError(f"{name} must be (N, 3), got {array.shape}")
+                raise InputError(f"must be (N, 3), got {array.shape}", argument=name)
         if not ((faces == indices) & (faces >= 0) & (faces < len(vertices))).all():
-            raise InputError(f"triangle_indices must be 0 to {len(vertices) - 1}, whole numbers")
+            raise InputError(f"must be 0 to {len(vertices) - 1}, whole numbers", argument="triangle_indices")
         if (np.abs(vertices[np.isfinite(vertices).all(axis=1)]) > LARGEST).any():
-            raise InputError(f"vertex_positions must be at most {LARGEST:g}")
+            raise InputError(f"must be at most {LARGEST:g}", argument="vertex_positions")
         self._meshes.append((vertices, faces))
         self._built = None
         return len(self._meshes) - 1
@@ -183,7 +183,7 @@ class RaycastingScene:
 
     def _inside(self, points: np.ndarray, nthreads: int, nsamples: int) -> np.ndarray:
         if as_integer(nsamples, "nsamples", 1, MOST_SAMPLES) % 2 == 0:
-            raise InputError(f"nsamples must be odd, got {nsamples}")
+            raise InputError(f"must be odd, got {nsamples}", argument="nsamples")
         asked = Asked(self._scene()[0], _threads(nthreads), crossings=True)
         votes = np.zeros(len(points), np.int32)
         for seed in range(nsamples):
@@ -200,7 +200,7 @@ def _numbers(value: Any, name: str, shape: str) -> np.ndarray:
     try:
         value = value.cpu().numpy() if hasattr(value, "cpu") else value
     except (RuntimeError, TypeError) as error:  # torch's, of one that requires gradients, or has a type that NumPy has not
-        raise InputError(f"{name}: {error}") from error
+        raise InputError(str(error), argument=name) from error
     return real_numbers(value, name, shape)
 
 
@@ -212,14 +212,14 @@ def _arrays_of(mesh: Any) -> tuple[Any, Any]:
     for name in ("faces", "triangles"):
         if hasattr(mesh, "vertices") and hasattr(mesh, name):
             return mesh.vertices, getattr(mesh, name)
-    raise InputError(f"mesh must have vertices and triangles, got {shown(mesh)}")
+    raise InputError(f"must have vertices and triangles, got {shown(mesh)}", argument="mesh")
 
 
 def _rows(value: Any, name: str, width: int) -> tuple[tuple[int, ...], np.ndarray]:
     """The leading shape, and (N, width) float32."""
     array = _numbers(value, name, f"(..., {width})")
     if array.ndim < 1 or array.shape[-1] != width:
-        raise InputError(f"{name} must be (..., {width}), got {array.shape}")
+        raise InputError(f"must be (..., {width}), got {array.shape}", argument=name)
     return array.shape[:-1], float32(array.reshape(-1, width))
 
 
@@ -283,7 +283,7 @@ def _rays_of_matrices(intrinsic_matrix: Any, extrinsic_matrix: Any, width_px: in
     try:
         inverse = np.linalg.inv(_matrix(intrinsic_matrix, "intrinsic_matrix", (3, 3)))
     except np.linalg.LinAlgError as error:
-        raise InputError("intrinsic_matrix must have an inverse") from error
+        raise InputError("must have an inverse", argument="intrinsic_matrix") from error
     to_camera = _matrix(extrinsic_matrix, "extrinsic_matrix", (4, 4))
     x, y = np.meshgrid(np.arange(width_px) + 0.5, np.arange(height_px) + 0.5)
     to_world = to_camera[:3, :3].T
@@ -297,12 +297,12 @@ def _rays_looking_at(fov_deg: float, center: Any, eye: Any, up: Any, width_px: i
     """See RaycastingScene.create_rays_pinhole."""
     center, eye, up = (_matrix(value, name, (3,)) for value, name in ((center, "center"), (eye, "eye"), (up, "up")))
     if not 0.0 < as_number(fov_deg, "fov_deg") < 180.0:
-        raise InputError(f"fov_deg must be between 0 and 180, got {fov_deg:g}")
+        raise InputError(f"must be between 0 and 180, got {fov_deg:g}", argument="fov_deg")
     focal = 0.5 * as_integer(width_px, "width_px", 0, WIDEST) / math.tan(math.radians(0.5 * fov_deg))
     z = center - eye
     x = np.cross(up, z)
     if not x.any():
-        raise InputError("center must not be eye, nor in the direction of up from it")
+        raise InputError("must not be eye, nor in the direction of up from it", argument="center")
     z, x = z / np.linalg.norm(z), x / np.linalg.norm(x)
     to_camera = np.eye(4)
     to_camera[:3, :3] = x, np.cross(z, x), z
@@ -314,5 +314,5 @@ def _rays_looking_at(fov_deg: float, center: Any, eye: Any, up: Any, width_px: i
 def _matrix(value: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
     array = _numbers(value, name, str(shape)).astype(np.float64)
     if array.shape != shape or not np.isfinite(array).all():
-        raise InputError(f"{name} must be {shape} finite numbers, got {shown(value)}")
+        raise InputError(f"must be {shape} finite numbers, got {shown(value)}", argument=name)
     return array

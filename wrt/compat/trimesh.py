@@ -91,7 +91,7 @@ class RayMeshIntersector:
         own rule (both directions of a line agree), from the hits of this class."""
         points = np.asarray(points, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 3:
-            raise InputError(f"points must be (N, 3), got {points.shape}")
+            raise InputError(f"must be (N, 3), got {points.shape}", argument="points")
         if not self._placed.closed and len(self.mesh.faces):
             return contains_points(self, points)
         return self._placed.contains(points)
@@ -204,7 +204,8 @@ def _rays(origins: Any, directions: Any) -> tuple[np.ndarray, np.ndarray]:
     out = [np.asarray(real_numbers(rays, name, "(N, 3)"), np.float64) for name, rays in named.items()]
     origins, directions = (rays.reshape(0, 3) if rays.shape == (0,) else rays for rays in out)
     if origins.ndim != 2 or origins.shape[1] != 3 or origins.shape != directions.shape:
-        raise InputError(f"ray_origins and ray_directions must be (N, 3) both, got {origins.shape} and {directions.shape}")
+        raise InputError(f"and ray_directions must be (N, 3) both, got {origins.shape} and {directions.shape}",
+                         argument="ray_origins")
     return origins, directions
 
 

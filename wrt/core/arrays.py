@@ -43,7 +43,7 @@ def real_numbers(value: object, name: str, shape: str) -> np.ndarray:
 
     An array on a GPU is copied. Raises InputError that names the argument and the expected shape."""
     if "numpy.ma" in sys.modules and isinstance(value, np.ma.MaskedArray):  # np.ma takes long to import
-        raise InputError(f"{name} must not be a masked array: its mask would be ignored; leave masked rows out, or fill them")
+        raise InputError("must not be a masked array: its mask would be ignored; leave masked rows out, or fill them", argument=name)
     value = taken(value, name, None)
     try:
         array = value.numpy() if isinstance(value, wp.array) else np.asarray(value)
@@ -51,7 +51,7 @@ def real_numbers(value: object, name: str, shape: str) -> np.ndarray:
             return float32(array) if array.dtype.kind == "O" else array
     except (TypeError, ValueError, OverflowError):
         pass
-    raise InputError(f"{name} must be {shape} of real numbers, got {shown(value)}")
+    raise InputError(f"must be {shape} of real numbers, got {shown(value)}", argument=name)
 
 
 def float32(array: np.ndarray) -> np.ndarray:
@@ -64,9 +64,9 @@ def check_no_gradients(what: str = "this", **arrays: object) -> None:
     """Raise InputError for a Warp array that requires gradients while a tape records, because `what` has none."""
     for name, array in arrays.items() if recording_tape() is not None else ():
         if isinstance(array, wp.array) and array.requires_grad:
-            raise InputError(f"{name} requires gradients and a wp.Tape is recording, but {what} has none (t, u, v and point of"
+            raise InputError(f"requires gradients and a wp.Tape is recording, but {what} has none (t, u, v and point of"
                              f" closest_hit have, in origins, directions and vertices): ask outside of the tape, or give"
-                             f" wp.clone({name}, requires_grad=False)")
+                             f" wp.clone({name}, requires_grad=False)", argument=name)
 
 
 def is_tensor(value: object) -> TypeGuard[Tensor]:
@@ -90,8 +90,8 @@ def taken(value: object, name: str, dtype: WarpType = wp.vec3) -> Any:
             return np.from_dlpack(value)
         return wp.from_dlpack(value, dtype=dtype)
     except (BufferError, TypeError, RuntimeError, ValueError, AttributeError) as error:  # the last: JAX's, under jit
-        raise InputError(f"{name}: {shown(value)} does not share its memory: {error} (closest_hit of wrt.torch and of"
-                         f" wrt.jax has gradients)") from error
+        raise InputError(f"{shown(value)} does not share its memory: {error} (closest_hit of wrt.torch and of"
+                         f" wrt.jax has gradients)", argument=name) from error
 
 
 def returned(*given: object) -> Callable[[Array], Tensor] | None:

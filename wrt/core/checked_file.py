@@ -39,16 +39,16 @@ def read_checked(path: str | os.PathLike[str], magic: bytes, what: str) -> tuple
             file.seek(0)
             data = memoryview(file.read(os.fstat(file.fileno()).st_size))
     except OSError as error:
-        raise InputError(error.strerror or str(error), path) from error
+        raise InputError(error.strerror or str(error), path=path) from error
     except InputError as error:
         raise error.at(path) from error
     end = bytes(data[: len(magic) + MAX_HEADER]).find(b"\n", len(magic))
     if end < 0 or sha256(data[:-DIGEST_BYTES]).digest() != data[-DIGEST_BYTES:]:
-        raise InputError("is damaged: its checksum does not fit", path)
+        raise InputError("is damaged: its checksum does not fit", path=path)
     try:
         header = json.loads(bytes(data[len(magic):end]))
     except (ValueError, RecursionError):
         header = None
     if not isinstance(header, dict):
-        raise InputError(f"is no {what} of this version", path)
+        raise InputError(f"is no {what} of this version", path=path)
     return header, data[end + 1:-DIGEST_BYTES]

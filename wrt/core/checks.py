@@ -15,7 +15,7 @@ from typing import TypeVar, Union, get_args, get_origin
 import numpy as np
 import numpy.typing as npt
 
-from wrt.core.errors import InputError
+from wrt.core.errors import InputError, wrong
 
 T = TypeVar("T")
 LARGEST = 1e30  # absolute value of a number in a scene; larger ones become infinite on the device
@@ -26,9 +26,9 @@ def as_integer(value: object, what: str, low: int, high: int) -> int:
     try:
         number = operator.index(value)  # type: ignore[arg-type]
     except TypeError:
-        raise InputError(f"{what} must be a whole number, got {shown(value)}") from None
+        raise wrong(what, f"must be a whole number, got {shown(value)}") from None
     if not low <= number <= high:
-        raise InputError(f"{what} must be {low} to {high}, got {number}")
+        raise wrong(what, f"must be {low} to {high}, got {number}")
     return number
 
 
@@ -39,9 +39,9 @@ def as_size(value: object, what: str = "size", high: int = 32768) -> tuple[int, 
     try:
         width, height = map(operator.index, () if isinstance(value, str) else value)  # type: ignore[call-overload]
     except (TypeError, ValueError):
-        raise InputError(f'{what} must be two whole numbers or text such as "640x360", got {shown(value)}') from None
+        raise wrong(what, f'must be two whole numbers or text such as "640x360", got {shown(value)}') from None
     if not (1 <= width <= high and 1 <= height <= high):
-        raise InputError(f"{what} must be 1x1 to {high}x{high}, got {width}x{height}")
+        raise wrong(what, f"must be 1x1 to {high}x{high}, got {width}x{height}")
     return width, height
 
 
@@ -51,21 +51,21 @@ def as_array(value: object, dtype: npt.DTypeLike, what: str) -> np.ndarray:
         with np.errstate(over="ignore"):
             return np.ascontiguousarray(value, dtype=dtype)
     except (TypeError, ValueError):
-        raise InputError(f"{what} must be an array of numbers, got {shown(value)}") from None
+        raise wrong(what, f"must be an array of numbers, got {shown(value)}") from None
 
 
 def as_path(value: object, what: str) -> Path:
     try:
         return Path(os.fsdecode(value))  # type: ignore[arg-type]
     except TypeError:
-        raise InputError(f"{what} must be a path, got {shown(value)}") from None
+        raise wrong(what, f"must be a path, got {shown(value)}") from None
 
 
 def as_one(value: object, kind: type[T] | tuple[type[T], ...], what: str) -> T:
     """Return the value if it is of that type, or of one of those types."""
     kinds = kind if isinstance(kind, tuple) else (kind,)
     if not isinstance(value, kinds):
-        raise InputError(f"{what} must be {' or '.join(_a(each.__name__) for each in kinds)}, got {shown(value)}")
+        raise wrong(what, f"must be {' or '.join(_a(each.__name__) for each in kinds)}, got {shown(value)}")
     return value
 
 
@@ -82,30 +82,28 @@ def as_tuple(value: object, kind: type[T] | tuple[type[T], ...], what: str) -> t
 def as_names(value: object, what: str) -> tuple[str, ...]:
     """Return a tuple of names from an iterable, or from a single one."""
     if not isinstance(value, Iterable):
-        raise InputError(f"{what} must be a name or several, got {shown(value)}")
+        raise wrong(what, f"must be a name or several, got {shown(value)}")
     return as_tuple(value, str, what)
 
 
 def as_choice(value: str, choices: Collection[str], what: str) -> str:
     """Return the value if it is one of the choices."""
     if value not in choices:
-        hint = did_you_mean(value, choices)
-        raise InputError(f"{what} must be one of {', '.join(choices)}; got {shown(value)}{'; ' if hint else ''}{hint}".rstrip())
+        raise wrong(what, f"must be one of {', '.join(choices)}; got {shown(value)}", did_you_mean(value, choices).rstrip() or None)
     return value
 
 
 def require_known(name: str, known: Collection[str], what: str) -> None:
     """Raise InputError if the name is not known."""
     if name not in known:
-        raise InputError(f"no {what} {shown(name)}; {did_you_mean(name, known)}there is {', '.join(known) or 'none'}")
+        raise InputError(f"no {what} {shown(name)}", hint=f"{did_you_mean(name, known)}there is {', '.join(known) or 'none'}")
 
 
-def unknown(name: str, what: str, known: Iterable[str]) -> str:
-    """Return a message on an unknown name, with the most similar known one, and all of them; long names and lists are cut."""
+def unknown(name: str, what: str, known: Iterable[str], *, argument: str | None = None, place: str | None = None) -> InputError:
+    """Return the error of an unknown name, with the most similar known one, and all of them; long names and lists are cut."""
     names = [str(each) for each in known]
-    hint = did_you_mean(name, names)
-    return f"unknown {what} {short(name)}; {hint}known are {listed(names, 100)}" if names else (
-        f"unknown {what} {short(name)}; there are none")
+    hint = f"{did_you_mean(name, names)}known are {listed(names, 100)}" if names else "there are none"
+    return InputError(f"unknown {what} {short(name)}", argument=argument, place=place, hint=hint)
 
 
 def listed(names: Collection[str], most: int = 5) -> str:

@@ -108,7 +108,7 @@ def start(device: str) -> Device:
             return wp.get_device(device)
     except Exception as error:  # Warp raises ValueError or RuntimeError, depending on what is wrong with the name
         known = ", ".join(str(d) for d in wp.get_devices())
-        raise InputError(f"no device {device!r}; there is {known}") from error
+        raise InputError(f"no device {device!r}", argument="device", hint=f"there is {known}") from error
 
 
 def describe_devices() -> list[str]:
@@ -210,8 +210,8 @@ def _cache_errors() -> Iterator[None]:
         if not isinstance(error, OSError | UnicodeError) and not warp_private.is_warps_error(error):
             raise
         reason = "its name is not UTF-8" if isinstance(error, UnicodeError) else getattr(error, "strerror", None) or error
-        raise InputError(f"kernels cannot be compiled: {reason} (WARP_CACHE_PATH names another folder)",
-                         wp.config.kernel_cache_dir or getattr(error, "filename", None)) from error
+        raise InputError(f"kernels cannot be compiled: {reason}", hint="WARP_CACHE_PATH names another folder",
+                         path=wp.config.kernel_cache_dir or getattr(error, "filename", None)) from error
 
 
 def _require_room_to_compile(cache: Path) -> None:
@@ -234,7 +234,7 @@ def upload(array: np.ndarray, dtype: WarpType, device: Device) -> WarpArray:
     Raises InputError for more rows than the int32 indices of kernels can reach."""
     if len(array) > MOST_ROWS:
         raise InputError(f"{len(array)} rows of {dtype.__name__ if isinstance(dtype, type) else dtype.key} are more than an array"
-                         f" on a device can have, 2^31 - 1; a binary tree (bvh2) has the fewest")
+                         f" on a device can have, 2^31 - 1", hint="a binary tree (bvh2) has the fewest")
     if hasattr(dtype, "numpy_dtype"):  # a struct
         assert array.dtype == record_dtype(dtype)
         rows = np.ascontiguousarray(array).view(np.uint8)

@@ -2,32 +2,86 @@
 
 from __future__ import annotations
 
+import copy
 import os
+import re
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any, Self
 
 _PACKAGE = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
 LONGEST, END = 5000, 1000  # characters of a line of a message, which may quote what stands in a file; those kept of its end
+PREDICATE = re.compile(r"(must|is|are|has|have|holds?|needs?|requires?|shares|cannot|does|do|takes|puts|spans?|belongs?|and|or)\b")
 
 
 class InputError(ValueError):
     """Input that cannot be used: a file, a scene, an option.
 
-    The message names the file and the place in it (`path: place: what is wrong`), so that it can be shown as it is.
+    Parameters
+    ----------
+    what : what is wrong: a predicate of the argument ("must be 1 or more, got 0"), or a sentence of its own
+    argument : name of the argument, option or field that is wrong
+    path : the file that is wrong
+    place : where in the file, or of which object: "nodes[3].scale", "line 7", "camera 'main'"
+    hint : what would be right, or what to do
+
+    The parameters are attributes of the error. `str` gives the message: where, what is wrong, what would be right. Where one file
+    led to another, `path` is the second, and `outside` says where the first names it: "scene.toml: include[0]".
     """
 
-    def __init__(self, message: str, path: str | os.PathLike[str] | None = None, place: str | None = None) -> None:
-        self.path = path
-        message = "\n".join(line if len(line) <= LONGEST else f"{line[:LONGEST - END - 3]}...{line[-END:]}"
-                            for line in message.split("\n"))
-        parts = [os.fspath(path) if path is not None else None, place, message]
-        super().__init__(": ".join(part for part in parts if part))
+    def __init__(self, what: str, *, argument: str | None = None, path: str | os.PathLike[str] | None = None,
+                 place: str | None = None, hint: str | None = None) -> None:
+        super().__init__(what)
+        self.what, self.argument, self.path, self.place, self.hint = what, argument, path, place, hint
+        self.outside: str | None = None
 
-    def at(self, path: str | os.PathLike[str] | None = None, place: str | None = None) -> InputError:
-        """The same, found in that file or at that place of it."""
-        return InputError(str(self), path, place)
+    def __str__(self) -> str:
+        what, name = self.what, self.argument or ""
+        if name and PREDICATE.match(what):
+            what = f"{name} {what}"
+        elif name and not re.search(rf"\b{re.escape(name)}\b", what, re.IGNORECASE):  # else the sentence names it
+            what = f"{name}: {what}"
+        lines = _joined(self.outside, self.path, self.place, f"{what}; {self.hint}" if self.hint else what).split("\n")
+        return "\n".join(line if len(line) <= LONGEST else f"{line[:LONGEST - END - 3]}...{line[-END:]}" for line in lines)
+
+    def __reduce__(self) -> Any:
+        return _restore, (type(self), self.args, self.__dict__)
+
+    def at(self, path: str | os.PathLike[str] | None = None, place: str | None = None, hint: str | None = None) -> Self:
+        """Copy the error, found at that place of that file; if it has a file already, they are what led to that file."""
+        error = copy.copy(self)
+        if self.path is None:
+            vars(error).update(path=path, place=_joined(place, self.place) or None)
+        else:
+            vars(error).update(outside=_joined(path, place, self.outside) or None)
+        vars(error).update(hint="; ".join(filter(None, (self.hint, hint))) or None)
+        return error
+
+
+class InputErrors(InputError):
+    """Several at once, each in `errors`, and a line of the message."""
+
+    def __init__(self, what: str, errors: Sequence[InputError], *, path: str | os.PathLike[str] | None = None) -> None:
+        super().__init__(what, path=path)
+        self.errors = tuple(errors)
+
+
+def wrong(name: str, what: str, hint: str | None = None) -> InputError:
+    """Return the error of an argument, whose name may follow its place: "camera 'main': fov_y"."""
+    place, _, argument = name.rpartition(": ")
+    return InputError(what, argument=argument, place=place or None, hint=hint)
+
+
+def _restore(kind: type[InputError], args: tuple[Any, ...], fields: dict[str, Any]) -> InputError:
+    error = kind.__new__(kind, *args)
+    error.__dict__.update(fields)
+    return error
+
+
+def _joined(*parts: str | os.PathLike[str] | None) -> str:
+    return ": ".join(os.fspath(part) for part in parts if part)
 
 
 @contextmanager

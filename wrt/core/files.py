@@ -33,9 +33,9 @@ def require_file(path: Path, what: str = "") -> None:
     try:
         there = path.exists()
     except OSError as error:  # a name too long, a folder that may not be looked into
-        raise InputError(f"cannot be read: {error.strerror or error}", path) from None
+        raise InputError(f"cannot be read: {error.strerror or error}", path=path) from None
     if not there:
-        raise InputError(f"no such file{what}", path)
+        raise InputError(f"no such file{what}", path=path)
 
 
 def read_file(path: str | os.PathLike[str]) -> bytes:
@@ -50,5 +50,5 @@ def read_file(path: str | os.PathLike[str]) -> bytes:
 def utf8(text: bytes) -> bytes:
     """Return a text file's bytes without UTF-8's byte order mark. Raises InputError, without the path, for UTF-16 and UTF-32."""
     if text.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE, codecs.BOM_UTF32_BE)):
-        raise InputError("is UTF-16 or UTF-32 text; save it as UTF-8")
+        raise InputError("is UTF-16 or UTF-32 text", hint="save it as UTF-8")
     return text.removeprefix(codecs.BOM_UTF8)

@@ -18,4 +18,4 @@ def needed_by(what: str) -> Iterator[None]:
         yield
     except ModuleNotFoundError as error:
         package = (error.name or str(error)).split(".")[0]
-        raise InputError(f"{what} needs {package}: pip install {INSTALLED_AS.get(package, package)}") from error
+        raise InputError(f"{what} needs {package}", hint=f"pip install {INSTALLED_AS.get(package, package)}") from error

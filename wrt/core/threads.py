@@ -26,9 +26,9 @@ def thread_count(threads: int | None) -> int:
     """Return the number of threads to use; None is one for each core that this process may run on. Raises InputError for no count."""
     if threads is not None:
         if isinstance(threads, bool) or not hasattr(threads, "__index__"):
-            raise InputError(f"threads must be a whole number, got {shown(threads)}")
+            raise InputError(f"must be a whole number, got {shown(threads)}", argument="threads")
         if threads < 1:
-            raise InputError(f"threads must be 1 or more, got {threads}")
+            raise InputError(f"must be 1 or more, got {threads}", argument="threads")
         return operator.index(threads)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 

@@ -29,7 +29,7 @@ Record: TypeAlias = ctypes.Structure  # an argument as a kernel gets it
 
 def refusal(what: str) -> InputError:
     """Return the error for a Warp whose insides differ in `what`."""
-    return InputError(f"Warp {wp.config.version} is not supported, its insides differ ({what}): install '{WORKS_WITH}'")
+    return InputError(f"Warp {wp.config.version} is not supported, its insides differ ({what})", hint=f"install '{WORKS_WITH}'")
 
 
 try:

@@ -60,7 +60,7 @@ def _reported(path: str | os.PathLike[str]) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise InputError(f"cannot be written: {error.strerror or error}", path) from error
+        raise InputError(f"cannot be written: {error.strerror or error}", path=path) from error
 
 
 def _target(path: str | os.PathLike[str]) -> Path:
@@ -69,15 +69,15 @@ def _target(path: str | os.PathLike[str]) -> Path:
     try:
         os.access(target, os.F_OK)
     except ValueError as error:  # a zero byte or a lone surrogate, which Path.exists() hides
-        raise InputError(f"cannot be written: {error}", path) from None
+        raise InputError(f"cannot be written: {error}", path=path) from None
     if not target.parent.is_dir():
-        raise InputError("its folder does not exist", path)
+        raise InputError("its folder does not exist", path=path)
     if target.is_dir():
-        raise InputError("is a folder", path)
+        raise InputError("is a folder", path=path)
     if target.exists() and not target.is_file():
-        raise InputError("is no regular file", path)  # a device: replacing it would destroy its node
+        raise InputError("is no regular file", path=path)  # a device: replacing it would destroy its node
     if target.exists() and not os.access(target, os.W_OK):
-        raise InputError("is write-protected", path)
+        raise InputError("is write-protected", path=path)
     return target
 
 

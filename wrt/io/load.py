@@ -33,10 +33,10 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
     known = ", ".join([*LOADERS, *MESH_FORMATS])
     require_file(path, f" (a scene is one of {known})")
     if path.is_dir():
-        raise InputError(f"is a directory, not a scene file ({known})", path)
+        raise InputError(f"is a directory, not a scene file ({known})", path=path)
     load = LOADERS.get(path.suffix.lower(), _load_bare_mesh if path.suffix.lower() in MESH_FORMATS else None)
     if load is None:
-        raise InputError(f"is no scene file: known are {known}", path)
+        raise InputError(f"is no scene file: known are {known}", path=path)
     with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite is refused by whoever is to hold it
         return load(path)
 
@@ -52,7 +52,7 @@ def as_scene(value: Scene | Mesh | str | os.PathLike[str]) -> Scene:
         return _bare(value, value.name or "mesh", value.name or "mesh")
     if isinstance(value, str | os.PathLike):
         return load_scene(value)
-    raise InputError(f"scene must be a Scene, a Mesh, or the path of a scene or mesh file, got {shown(value)}")
+    raise InputError(f"must be a Scene, a Mesh, or the path of a scene or mesh file, got {shown(value)}", argument="scene")
 
 
 def schema() -> dict[str, Any]:
@@ -103,16 +103,16 @@ def _parse(path: Path) -> dict[str, Any]:
     except InputError as error:
         raise error.at(path) from error
     except UnicodeDecodeError as error:
-        raise InputError(f"byte {error.start} is not UTF-8 text", path) from error
+        raise InputError(f"byte {error.start} is not UTF-8 text", path=path) from error
     except RecursionError:
-        raise InputError("is nested too deeply", path) from None
+        raise InputError("is nested too deeply", path=path) from None
     except tomllib.TOMLDecodeError as error:
         message, place = str(error), None
         if at := re.fullmatch(r"(.*) \(at (line \d+, column \d+|end of document)\)", message, re.DOTALL):
             message, place = at.groups()
-        raise InputError(message, path, place) from error
+        raise InputError(message, path=path, place=place) from error
     except ValueError as error:  # Python's int refuses thousands of digits
-        raise InputError("holds a number of thousands of digits", path) from error
+        raise InputError("holds a number of thousands of digits", path=path) from error
 
 
 def _require_sound(value: Any) -> None:

@@ -43,7 +43,7 @@ def register_mesh_format(suffix: str, read: Reader) -> None:
     """Take files of that suffix (".off") for meshes, wherever one can be named. read raises InputError, without the path, for a
     file that it cannot read; what it gives is checked and cleaned as every mesh is."""
     if not suffix.startswith(".") or suffix != suffix.lower():
-        raise InputError(f"suffix must begin with a dot and be in small letters, got {shown(suffix)}")
+        raise InputError(f"must begin with a dot and be in small letters, got {shown(suffix)}", argument="suffix")
     MESH_FORMATS[suffix] = read
 
 
@@ -62,7 +62,7 @@ def load_mesh(path: str | os.PathLike[str], parts: Sequence[tuple[int, int]] = (
     path = as_path(path, "path")
     if path.suffix.lower() not in MESH_FORMATS:
         scene = "; wrt.load_scene and wrt.build take scenes" if path.suffix.lower() in (".toml", ".gltf", ".glb") else ""
-        raise InputError(f"is no mesh file: known are {', '.join(MESH_FORMATS)}{scene}", path)
+        raise InputError(f"is no mesh file: known are {', '.join(MESH_FORMATS)}{scene}", path=path)
     require_file(path)
     with at(path=path):
         raw = MESH_FORMATS[path.suffix.lower()](path)
@@ -71,7 +71,7 @@ def load_mesh(path: str | os.PathLike[str], parts: Sequence[tuple[int, int]] = (
         groups, face_group = _part_groups(parts, len(raw.faces)) if parts else (raw.groups, raw.face_group)
     cleaned = clean(raw.vertices, raw.faces, raw.normals, raw.uvs, face_group)
     if len(cleaned.faces) == 0:
-        raise InputError(f"none of its {len(raw.faces)} triangles has any area", path)
+        raise InputError(f"none of its {len(raw.faces)} triangles has any area", path=path)
     normals = _finite(cleaned.normals, "normals", path)
     return Mesh(
         vertices=cleaned.vertices,
@@ -88,7 +88,7 @@ def load_mesh(path: str | os.PathLike[str], parts: Sequence[tuple[int, int]] = (
 def mesh_of(value: Mesh | str | os.PathLike[str]) -> Mesh:
     """A Mesh as it is; the mesh of a file by its path (load_mesh). Raises InputError for anything else."""
     if not isinstance(value, Mesh | str | os.PathLike):
-        raise InputError(f"mesh must be a Mesh or the path of a mesh file, got {shown(value)}")
+        raise InputError(f"must be a Mesh or the path of a mesh file, got {shown(value)}", argument="mesh")
     return value if isinstance(value, Mesh) else load_mesh(value)
 
 
@@ -96,7 +96,7 @@ def as_mesh(value: Mesh | str | os.PathLike[str]) -> Mesh:
     """As mesh_of. Raises InputError where there are no triangles, too."""
     mesh = mesh_of(value)
     if not len(mesh.faces):
-        raise InputError("there are no triangles to hit", None if isinstance(value, Mesh) else value)
+        raise InputError("there are no triangles to hit", path=None if isinstance(value, Mesh) else value)
     return mesh
 
 
@@ -105,7 +105,7 @@ def _part_groups(parts: Sequence[tuple[int, int]], faces: int) -> tuple[tuple[st
     for number, (first, count) in enumerate(parts):
         if first < 0 or count < 0 or first + count > faces:
             last = short(first + count - 1)
-            raise InputError(f"triangles {short(first)} to {last}, but the file has {faces}", None, f"part {number}")
+            raise InputError(f"triangles {short(first)} to {last}, but the file has {faces}", place=f"part {number}")
         group[first:first + count] = number
     return (*(str(number) for number in range(len(parts))), "rest"), group
 

@@ -58,7 +58,7 @@ class Plan:
             if each.name == "threads" and not isinstance(value, str):
                 thread_count(value)
             if each.name == "meshes" and each.default is MISSING and not value:
-                raise InputError("name the meshes")
+                raise InputError("must be given", argument="meshes")
 
 
 @dataclass(frozen=True)
@@ -127,11 +127,11 @@ class Peers(Plan):
         super().__post_init__()
         for name in self.rivals:
             if not PEERS[name].is_installed():
-                raise InputError(f'{name} is not installed: pip install "wrt[peers]"')
+                raise InputError(f"{name} is not installed", hint='pip install "wrt[peers]"')
         if not self.structures:
-            raise InputError("structures must name one or more")
+            raise InputError("must name one or more", argument="structures")
         if self.threads not in ("one", "all", "both"):
-            raise InputError(f"threads must be one, all, both, got {self.threads!r}")
+            raise InputError(f"must be one, all, both, got {self.threads!r}", argument="threads")
 
 
 @dataclass(frozen=True)
@@ -305,7 +305,7 @@ class Mitsuba(Plan):
         super().__post_init__()
         as_choice(self.integrator, INTEGRATORS, "integrator")
         if not self.variants or not set(self.variants) <= set(VARIANTS):
-            raise InputError(f"variants must be of {', '.join(VARIANTS)}; got {', '.join(self.variants) or 'none'}")
+            raise InputError(f"must be of {', '.join(VARIANTS)}; got {', '.join(self.variants) or 'none'}", argument="variants")
 
 
 @dataclass(frozen=True)

@@ -103,7 +103,7 @@ def measured(device: str, seconds: float = 1.0, clock: Callable[[], float] = tim
     """Tune as `tune` and return all measurements; on CUDA also those of the fastest structure with each block size and stack."""
     there = start(as_one(device, str, "device"))
     if not as_one(seconds, (int, float), "seconds") > 0.0:
-        raise InputError(f"seconds must be more than 0, got {seconds}")
+        raise InputError(f"must be more than 0, got {seconds}", argument="seconds")
     geometry = Geometry.of(terrain(CELLS))
     rays = ray_sets(build(geometry, DEFAULT.accel, device), FAST if there.is_cuda else SLOW)
     phases = 2 if there.is_cuda else 1

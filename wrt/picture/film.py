@@ -69,11 +69,11 @@ class Film:
     def __post_init__(self) -> None:
         size = self.pixels.shape[:2]
         if self.pixels.shape != (*size, 3) or self.variance.shape != (*size, 3) or self.samples.shape != size:
-            raise InputError(f"film: pixels and variance must be (H, W, 3) and samples (H, W), got {self.pixels.shape},"
-                             f" {self.variance.shape} and {self.samples.shape}")
+            raise InputError(f"and variance must be (H, W, 3) and samples (H, W), got {self.pixels.shape},"
+                             f" {self.variance.shape} and {self.samples.shape}", argument="pixels", place="film")
         for name, array in self.aov.items():
             if array.shape[:2] != size:
-                raise InputError(f"film: aov {name!r} must be {size} like the pixels, got {array.shape[:2]}")
+                raise InputError(f"{name!r} must be {size} like the pixels, got {array.shape[:2]}", argument="aov", place="film")
 
     def __repr__(self) -> str:
         height, width = self.samples.shape
@@ -162,7 +162,7 @@ class Film:
         names = list(dict.fromkeys(as_names(aov, "aov")))
         unknown = [name for name in names if name not in self.layers]
         if unknown:
-            raise InputError(f"no AOV {unknown[0]!r}; there are {', '.join(self.layers)}")
+            raise InputError(f"no AOV {unknown[0]!r}", argument="aov", hint=f"there are {', '.join(self.layers)}")
         return names
 
 
@@ -224,5 +224,5 @@ AOV_VIEWS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 def aov_to_srgb8(name: str, array: np.ndarray) -> np.ndarray:
     """Return a layer as a picture to look at, (H, W, 3) uint8. Raises InputError if AOV_VIEWS has no view of that name."""
     if name not in AOV_VIEWS:
-        raise InputError(f"AOV {name!r} has no view; there are {', '.join(AOV_VIEWS)}")
+        raise InputError(f"AOV {name!r} has no view", argument="aov", hint=f"there are {', '.join(AOV_VIEWS)}")
     return AOV_VIEWS[name](array)

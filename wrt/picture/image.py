@@ -48,9 +48,10 @@ def output_format(path: PathLike, bits: int | None = None) -> tuple[str, int]:
     """Return the suffix and the bits per channel for `path`. Raises InputError if wrt does not write that format."""
     suffix = Path(path).suffix.lower()
     if suffix not in FORMATS:
-        raise InputError(f"cannot write {suffix or 'a file without a suffix'}; use {', '.join(FORMATS)}", path)
+        raise InputError(f"cannot write {suffix or 'a file without a suffix'}", path=path, hint=f"use {', '.join(FORMATS)}")
     if bits is not None and bits not in FORMATS[suffix]:
-        raise InputError(f"{suffix} is written with {' or '.join(map(str, FORMATS[suffix]))} bits, not {bits}", path)
+        raise InputError(f"{suffix} is written with {' or '.join(map(str, FORMATS[suffix]))} bits, not {bits}",
+                         argument="bits", path=path)
     return suffix, bits or FORMATS[suffix][0]
 
 
@@ -76,7 +77,7 @@ def write_image(path: PathLike, pixels: np.ndarray, *, bits: int | None = None, 
     """
     pixels = np.asarray(pixels, dtype=np.float32)
     if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.size == 0:
-        raise InputError(f"pixels must be (H, W, 3), got {pixels.shape}", path)
+        raise InputError(f"must be (H, W, 3), got {pixels.shape}", argument="pixels", path=path)
     suffix, bits = output_format(path, bits)
     if suffix == ".png":
         _warn_replaced(path, ~np.isfinite(pixels), "NaN or infinite, written as black or white")
@@ -132,7 +133,7 @@ def _write_oiio(path: PathLike, spec: Any, pixels: np.ndarray, header: bytes = b
         name = f"/dev/fd/{file.fileno()}" if os.path.isdir("/dev/fd") else file.name
         out = oiio.ImageOutput.create(os.path.basename(file.name))  # OpenImageIO rejects folders that are not UTF-8
         if out is None:
-            raise InputError(f"cannot be written: {oiio.geterror()}", path)
+            raise InputError(f"cannot be written: {oiio.geterror()}", path=path)
         try:
             good = out.open(name, spec) and out.write_image(pixels)
         finally:
@@ -140,7 +141,7 @@ def _write_oiio(path: PathLike, spec: Any, pixels: np.ndarray, header: bytes = b
         # Some failures, such as a full disk, appear in the text only.
         error = " ".join(out.geterror().split()).replace(name, os.fspath(path))
         if error or not (good and closed):
-            raise InputError(f"cannot be written: {error or 'unknown error'}", path)
+            raise InputError(f"cannot be written: {error or 'unknown error'}", path=path)
         if header:
             file.seek(0)
             first, rest = file.read().split(b"\n", 1)
@@ -237,10 +238,10 @@ def read_channels(path: PathLike) -> dict[str, np.ndarray]:
         with at(path=path):
             check_size(spec.width, spec.height, MAX_LINEAR_PIXELS)
         if spec.depth > 1 or spec.deep:
-            raise InputError("cannot be read as an image: it has no flat pixels", path)
+            raise InputError("cannot be read as an image: it has no flat pixels", path=path)
         pixels = source.read_image("float")
         if pixels is None:
-            raise InputError(f"cannot be read as an image: {_reason(source.geterror)}", path)
+            raise InputError(f"cannot be read as an image: {_reason(source.geterror)}", path=path)
         return {name: pixels[..., i] for i, name in enumerate(spec.channelnames)}
 
 
@@ -251,17 +252,17 @@ def _opened(path: PathLike) -> Iterator[Any]:
         with at(path=path), open_regular(path) as file:
             first = file.read(16)
     except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror or error}", path) from error
+        raise InputError(f"cannot be read: {error.strerror or error}", path=path) from error
     if not first.startswith(_MAGIC[Path(path).suffix.lower()]):
-        raise InputError(f"cannot be read as an image: it is no {Path(path).suffix.lower()} file", path)
+        raise InputError(f"cannot be read as an image: it is no {Path(path).suffix.lower()} file", path=path)
     oiio = _oiio()
     oiio.attribute("try_all_readers", 0)
     try:
         source = oiio.ImageInput.open(os.fspath(path))
     except TypeError:  # not UTF-8
-        raise InputError("cannot be read: OpenImageIO needs a path in UTF-8", path) from None
+        raise InputError("cannot be read: OpenImageIO needs a path in UTF-8", path=path) from None
     if source is None:
-        raise InputError(f"cannot be read as an image: {_reason(oiio.geterror)}", path)
+        raise InputError(f"cannot be read as an image: {_reason(oiio.geterror)}", path=path)
     try:
         yield source
     finally:
@@ -282,5 +283,5 @@ def _pick_colors(channels: Mapping[str, np.ndarray], path: PathLike) -> np.ndarr
         return np.stack([upper["R"], upper["G"], upper["B"]], axis=-1)
     single = [array for name, array in upper.items() if name != "A"]
     if len(single) != 1:
-        raise InputError(f"has no channels R, G, B; it has {', '.join(channels)}", path)
+        raise InputError(f"has no channels R, G, B; it has {', '.join(channels)}", path=path)
     return np.repeat(single[0][..., None], 3, axis=-1)

@@ -127,7 +127,7 @@ def tone_map(pixels: np.ndarray, exposure: float = 0.0, tonemap: str = "none") -
     brightest value of the curve. Raises InputError for an unknown name.
     """
     if tonemap not in TONEMAPS:
-        raise InputError(f"tonemap must be one of {', '.join(TONEMAPS)}; got {tonemap!r}")
+        raise InputError(f"must be one of {', '.join(TONEMAPS)}; got {tonemap!r}", argument="tonemap")
     with np.errstate(over="ignore", invalid="ignore"):  # overflow gives +inf, inf * 0 gives NaN: both are replaced below
         exposed = np.asarray(pixels, dtype=np.float32) * np.float32(2.0**exposure)
     linear = np.clip(np.nan_to_num(exposed, nan=0.0, posinf=BRIGHTEST, neginf=0.0), 0.0, BRIGHTEST)

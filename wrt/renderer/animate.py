@@ -40,7 +40,7 @@ class Animation:
         if self.degrees is not None:
             as_number(self.degrees, "degrees")
         if not self.rebuild_at >= 1.0:
-            raise InputError(f"rebuild_at must be 1 or more, got {self.rebuild_at}")
+            raise InputError(f"must be 1 or more, got {self.rebuild_at}", argument="rebuild_at")
 
 
 def animate(scene: Scene, animation: Animation, options: Options) -> Iterator[Film]:
@@ -93,11 +93,11 @@ def check_output(path: str | os.PathLike[str]) -> Path:
         check_writable(path)
         return path
     if path.suffix and not path.is_dir():
-        raise InputError(f"frames go into a folder, or into a {', '.join(MOVIES)} file", path)
+        raise InputError(f"frames go into a folder, or into a {', '.join(MOVIES)} file", path=path)
     try:
         path.mkdir(exist_ok=True)
     except OSError as error:
-        raise InputError(f"cannot be made: {error.strerror}", path) from error
+        raise InputError(f"cannot be made: {error.strerror}", path=path) from error
     check_writable(frame_path(path, 0, 1))
     return path
 

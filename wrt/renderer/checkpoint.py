@@ -57,7 +57,7 @@ def read(path: str | os.PathLike[str]) -> Saved:
             raise ValueError(f"{seconds} seconds")
         return Saved((low, high), seconds, dict(header["identity"]), body)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"is no checkpoint of this version ({type(error).__name__}: {error})", path) from error
+        raise InputError(f"is no checkpoint of this version ({type(error).__name__}: {error})", path=path) from error
 
 
 class Checkpoint:
@@ -75,7 +75,7 @@ class Checkpoint:
         check_writable(path)
         if os.path.lexists(self.path):
             if not resume:
-                raise InputError("is there already: resume it (--resume, resume=True), or remove it first", path)
+                raise InputError("is there already", path=path, hint="resume it (--resume, resume=True), or remove it first")
             self.saved = self._checked(read(self.path))
         self._last = 0.0
 
@@ -85,7 +85,7 @@ class Checkpoint:
             differ = [name for name in differ if name != "kernels"]  # other settings can need other kernels
         reported = [OTHER.get(name, f"{name} was {saved.identity.get(name)}, is {self.identity.get(name)}") for name in differ]
         if reported:
-            raise InputError(f"is a checkpoint of another render: {'; '.join(reported)}", self.path)
+            raise InputError(f"is a checkpoint of another render: {'; '.join(reported)}", path=self.path)
         return saved
 
     def facts(self) -> dict[str, Any]:
@@ -98,7 +98,7 @@ class Checkpoint:
     def begin(self) -> None:
         """Begin to count the time. Raises InputError where another render has written the file since this one looked for it."""
         if self.saved is None and os.path.lexists(self.path):
-            raise InputError("is there already: another render wrote it meanwhile", self.path)
+            raise InputError("is there already: another render wrote it meanwhile", path=self.path)
         self._last = time.monotonic()
 
     def due(self) -> bool:
@@ -123,18 +123,18 @@ class Checkpoint:
         """Put what was read into an empty film."""
         assert self.saved is not None
         if len(self.saved.body) != sum(film.view(array).nbytes for _, array in film.arrays()):
-            raise InputError("is damaged: its arrays do not fit", self.path)
+            raise InputError("is damaged: its arrays do not fit", path=self.path)
         at = 0
         for name, array in film.arrays():
             there = film.view(array)
             values = np.frombuffer(self.saved.body[at:at + there.nbytes], there.dtype).reshape(there.shape)
             if name.startswith("mean") and not np.isfinite(values).all():  # the kernel counts such samples as black
-                raise InputError("is damaged: its film is not finite", self.path)
+                raise InputError("is damaged: its film is not finite", path=self.path)
             film.put(array, values)
             at += there.nbytes
         samples = [film.view(group.samples) for group in film.groups]
         if any((each != samples[0]).any() for each in samples) or (samples[0].min(), samples[0].max()) != self.saved.samples:
-            raise InputError("is damaged: its samples do not fit", self.path)
+            raise InputError("is damaged: its samples do not fit", path=self.path)
         self.saved = replace(self.saved, body=memoryview(b""))  # the file may go now
 
 
@@ -151,5 +151,6 @@ def checkpoint_of(plan: Plan, kind: str) -> Checkpoint | None:
     file = Checkpoint(Path(options.checkpoint), options.checkpoint_every, identity, groups=plan.groups, resume=options.resume)
     taken = 0 if file.saved is None else file.saved.samples[1]
     if taken > max(1, settings.spp // plan.groups):
-        raise InputError(f"holds {taken * plan.groups} samples a pixel already; spp is {settings.spp}", file.path)
+        raise InputError(f"holds {taken * plan.groups} samples a pixel already; spp is {settings.spp}",
+                         argument="spp", path=file.path)
     return file

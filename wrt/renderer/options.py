@@ -106,26 +106,27 @@ class Options:
         self.aov = as_names(self.aov, "aov")
         no_aov = sorted(set(self.aov) - set(AOVS))
         if no_aov:
-            raise InputError(f"no AOV {', '.join(no_aov)}; {did_you_mean(no_aov[0], AOVS)}there is {', '.join(AOVS)}")
+            raise InputError(f"no AOV {', '.join(no_aov)}",
+                             argument="aov", hint=f"{did_you_mean(no_aov[0], AOVS)}there is {', '.join(AOVS)}")
         for name in ("time_limit", "target_error"):
             as_one(getattr(self, name), (int, float, np.number, type(None)), name)
         if self.time_limit is not None and not self.time_limit > 0.0:
-            raise InputError(f"time_limit must be more than 0 seconds, got {self.time_limit}")
+            raise InputError(f"must be more than 0 seconds, got {self.time_limit}", argument="time_limit")
         if self.target_error is not None and not 0.0 < self.target_error < math.inf:
-            raise InputError(f"target_error must be more than 0 and finite, got {self.target_error}")
+            raise InputError(f"must be more than 0 and finite, got {self.target_error}", argument="target_error")
         as_one(self.checkpoint_every, (int, float, np.number), "checkpoint_every")
         if not self.checkpoint_every > 0.0:
-            raise InputError(f"checkpoint_every must be more than 0 seconds, got {self.checkpoint_every}")
+            raise InputError(f"must be more than 0 seconds, got {self.checkpoint_every}", argument="checkpoint_every")
         self.checkpoint = None if self.checkpoint is None else as_path(self.checkpoint, "checkpoint")
         if as_one(self.resume, bool, "resume") and self.checkpoint is None:
-            raise InputError("resume needs a checkpoint to go on with")
+            raise InputError("needs a checkpoint to go on with", argument="resume")
         self.tile_size = None if self.tile_size is None else as_integer(self.tile_size, "tile_size", 1, 1 << 15)
         self.pass_size = None if self.pass_size is None else as_integer(self.pass_size, "pass_size", 1, 1 << 24)
         self.seed = as_integer(self.seed, "seed", 0, 2**32 - 1)
         if self.crop is not None and len(as_tuple(self.crop, (int, np.integer), "crop")) != 4:
-            raise InputError(f"crop must be x0, y0, x1, y1 in pixels, got {self.crop!r}")
+            raise InputError(f"must be x0, y0, x1, y1 in pixels, got {self.crop!r}", argument="crop")
         if not (self.progress is None or callable(self.progress)):
-            raise InputError(f"progress must be a function of a Progress, got {shown(self.progress)}")
+            raise InputError(f"must be a function of a Progress, got {shown(self.progress)}", argument="progress")
         as_one(self.camera, (str, int, np.integer, CameraKind, type(None)), "camera")
         as_one(self.accel_options, dict, "accel_options")
         as_one(self.threads, (int, np.integer, type(None)), "threads")
@@ -135,16 +136,18 @@ class Options:
         elif self.executor is None:
             start(self.device)
         elif not (isinstance(self.executor, Executor) or hasattr(self.executor, "get_executor")):  # as Dask's Client has
-            raise InputError("executor must be a concurrent.futures.Executor or a dask.distributed.Client,"
-                             f" got {shown(self.executor)}")
+            raise InputError("must be a concurrent.futures.Executor or a dask.distributed.Client,"
+                             f" got {shown(self.executor)}", argument="executor")
 
     def _check_devices(self) -> None:
         self.devices = as_tuple(self.devices, str, "devices")
         if self.executor is not None:
-            raise InputError("devices are of this machine; an executor's workers have one `device` each: give one or the other")
+            raise InputError("are of this machine; an executor's workers have one `device` each",
+                             argument="devices", hint="give one or the other")
         kinds = {str(device.arch) if device.is_cuda else "cpu" for device in map(start, self.devices)}
         if len(kinds) != 1:
-            raise InputError(f"devices must be one or more of the same kind, whose pixels are the same, got {shown(self.devices)}")
+            raise InputError(f"must be one or more of the same kind, whose pixels are the same, got {shown(self.devices)}",
+                             argument="devices")
         self.device = self.devices[0]
 
 

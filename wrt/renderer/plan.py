@@ -141,5 +141,5 @@ def _crop(settings: Settings, options: Options) -> tuple[int, int, int, int]:
     width, height = settings.size
     x0, y0, x1, y1 = (0, 0, width, height) if options.crop is None else options.crop
     if not (0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height):
-        raise InputError(f"crop {x0},{y0},{x1},{y1} is not within the picture of {width}x{height}")
+        raise InputError(f"must be within the picture of {width}x{height}, got {x0},{y0},{x1},{y1}", argument="crop")
     return x0, y0, x1, y1

@@ -6,7 +6,7 @@ import os
 from typing import Any, Unpack
 
 from wrt.core.checks import unknown
-from wrt.core.errors import InputError, warn
+from wrt.core.errors import warn
 from wrt.io.load import as_scene
 from wrt.picture.film import Film
 from wrt.renderer.options import OPTIONS, Options, RenderOptions
@@ -89,7 +89,7 @@ def render(scene: Scene | Mesh | str | os.PathLike[str], **options: Unpack[Rende
         changes["spp"] = MAX_SPP
     for name in given:
         if name not in OPTIONS:
-            raise InputError(unknown(name, "argument of render", (*SETTINGS, *OPTIONS)))
+            raise unknown(name, "argument of render", (*SETTINGS, *OPTIONS), argument=name)
     how = Options(**given)
     scene = as_scene(scene).with_settings(**changes)
     if how.executor is None and how.devices is None:

@@ -231,9 +231,7 @@ class Run:
             return
         self.checkpoint.save(self.arrays, self._elapsed())
         if isinstance(error, InputError) and not self.checkpoint.problem:
-            more = InputError(f"{error}; {self.checkpoint.path} has what was done")
-            more.path = error.path
-            raise more from error
+            raise error.at(hint=f"{self.checkpoint.path} has what was done") from error
 
     def _elapsed(self) -> float:
         """Seconds of tracing, with those before the last resume."""

@@ -52,7 +52,7 @@ class TextureTable:
             self.texels.append(texture.image.reshape(-1, 4).view(np.uint32).ravel())
             self.size += self.texels[-1].size
             if self.size > 2**31 - 1:
-                raise InputError(f"textures: more than 2^31 texels in all (at {texture.name!r})")
+                raise InputError(f"more than 2^31 texels in all (at {texture.name!r})", place="textures")
         self.rows.append(texture)
         return len(self.rows) - 1
 
@@ -211,7 +211,7 @@ def tell_left_out(scene: Scene) -> None:
     require_size(scene)
     for sphere in scene.spheres:
         if sphere.material.alpha_mode == "mask" and sphere.material.albedo_texture is not None:
-            raise InputError(f"sphere {sphere.name!r}: a cut-out texture needs a mesh; material {sphere.material.name!r}")
+            raise InputError(f"a cut-out texture needs a mesh; material {sphere.material.name!r}", place=f"sphere {sphere.name!r}")
     bare = [thing.name or str(i) for i, thing in enumerate(scene.objects)
             if thing.mesh.uvs is None and any(m.textures for m in thing.materials)]
     if bare:

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from wrt.core.checks import at_thing
-from wrt.core.errors import InputError
+from wrt.core.errors import InputError, wrong
 from wrt.core.types import ArrayLike
 from wrt.scene.kinds import Record, check_fields, forms, given
 from wrt.scene.values import SMALLEST, as_number, as_transform, as_vector
@@ -36,7 +36,7 @@ class CameraKind:
         z = matrix[:3, 2]
         x = np.cross(matrix[:3, 1], z)
         if not np.linalg.norm(x) > 0.0:
-            raise InputError(at + "camera_to_world is singular")
+            raise wrong(at + "camera_to_world", "is singular")
         z = z / np.linalg.norm(z)
         x = x / np.linalg.norm(x)
         matrix[:3, 0], matrix[:3, 1], matrix[:3, 2] = x, np.cross(z, x), z
@@ -71,11 +71,11 @@ class CameraKind:
         origin, aim, upward = (np.array(as_vector(v, n)) for v, n in ((position, "position"), (target, "target"), (up, "up")))
         z = origin - aim
         if not np.linalg.norm(z) > 0.0:
-            raise InputError("camera: position and target are the same point")
+            raise InputError("is the same point as position", argument="target", place="camera")
         z /= np.linalg.norm(z)
         x = np.cross(upward, z)
         if np.linalg.norm(x) < 1e-9 * max(float(np.linalg.norm(upward)), 1e-300):
-            raise InputError("camera: up is parallel to the direction of view")
+            raise InputError("is parallel to the direction of view", argument="up", place="camera")
         x /= np.linalg.norm(x)
         matrix = np.eye(4)
         matrix[:3, 0], matrix[:3, 1], matrix[:3, 2], matrix[:3, 3] = x, np.cross(z, x), z, origin
@@ -125,7 +125,7 @@ class Camera(CameraKind):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.blades in (1, 2):
-            raise InputError(at_thing("camera", self.name) + f"blades must be 0 (round) or 3 to 64, got {self.blades}")
+            raise wrong(at_thing("camera", self.name) + "blades", f"must be 0 (round) or 3 to 64, got {self.blades}")
 
     def record(self, size: tuple[int, int]) -> Record:
         tan_y = float(np.tan(0.5 * self.fov_y))
@@ -152,9 +152,9 @@ class Camera(CameraKind):
         s = as_number(focus_distance, "focus_distance", low=SMALLEST)
         h = as_number(sensor_height, "sensor_height", low=SMALLEST)
         if s <= f:
-            raise InputError(f"focus_distance ({s:g}) must be longer than focal_length ({f:g})")
+            raise InputError(f"must be longer than focal_length ({f:g}), got {s:g}", argument="focus_distance")
         if (f_number is None) == (aperture_radius is None):
-            raise InputError("give either f_number or aperture_radius")
+            raise InputError("or aperture_radius must be given, and not both", argument="f_number")
         radius = aperture_radius if f_number is None else f / (2.0 * as_number(f_number, "f_number", low=1e-3))
         image_distance = f * s / (s - f)
         return {"fov_y": 2.0 * math.atan(0.5 * h / image_distance), "focus_distance": s,

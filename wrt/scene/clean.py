@@ -37,7 +37,7 @@ def clean(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None = 
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
         face = int(np.argmax(((faces < 0) | (faces >= len(vertices))).any(axis=1)))
         corners = faces[face].tolist()
-        raise InputError(f"face {face} is {corners}, but there are {len(vertices)} vertices", None, "faces")
+        raise InputError(f"face {face} is {corners}, but there are {len(vertices)} vertices", argument="faces")
 
     faces, source, without = _flipped(vertices, faces)
     dropped = int(np.count_nonzero(without))

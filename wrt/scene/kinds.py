@@ -10,7 +10,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 
 from wrt.core.checks import as_array, as_choice, as_integer, as_one, as_size, at_thing
-from wrt.core.errors import InputError
+from wrt.core.errors import wrong
 from wrt.scene.values import Color, _unit, as_number, as_vector
 
 K = TypeVar("K", bound="Kind")
@@ -27,9 +27,9 @@ def _number(value: Any, what: str, limits: Limits, unit: float = 1.0) -> float:
 def _image(value: Any, what: str, limits: Limits) -> np.ndarray:
     image = as_array(value, np.float32, what)
     if image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
-        raise InputError(f"{what} must be (H, W, 3), got {image.shape}")
+        raise wrong(what, f"must be (H, W, 3), got {image.shape}")
     if not np.isfinite(image).all() or (image < 0.0).any():
-        raise InputError(f"{what} must be finite and not negative")
+        raise wrong(what, "must be finite and not negative")
     return image
 
 

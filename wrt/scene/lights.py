@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from wrt.core.checks import at_thing
-from wrt.core.errors import InputError
+from wrt.core.errors import wrong
 from wrt.scene.kinds import Kind, Record, given
 from wrt.scene.values import Color, as_number
 
@@ -68,7 +68,7 @@ class SpotLight(Light):
         as_number(self.outer, at + "outer", low=1e-4)
         if self.inner > self.outer:
             inner, outer = math.degrees(self.inner), math.degrees(self.outer)
-            raise InputError(at + f"inner ({inner:.6g} degrees) must not be larger than outer ({outer:.6g})")
+            raise wrong(at + "inner", f"must not be larger than outer ({outer:.6g} degrees), got {inner:.6g}")
 
     def record(self) -> Record:
         return {"position": self.position, "color": self.intensity, "direction": self.direction,

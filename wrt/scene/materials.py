@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from wrt.core.checks import LARGEST, as_array, as_choice, at_thing
-from wrt.core.errors import InputError
+from wrt.core.errors import wrong
 from wrt.scene.kinds import check_fields, forms, given
 from wrt.scene.values import BLACK, Color
 
@@ -42,12 +42,12 @@ class Texture:
     def __post_init__(self) -> None:
         image = np.ascontiguousarray(self.image)
         if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 4 or image.size == 0:
-            raise InputError(at_thing("texture", self.name) + f"image must be (H, W, 4) uint8, got {image.shape} {image.dtype}")
+            raise wrong(at_thing("texture", self.name) + "image", f"must be (H, W, 4) uint8, got {image.shape} {image.dtype}")
         for wrap in self.wrap:
             as_choice(wrap, WRAPS, at_thing("texture", self.name) + "wrap")
         transform = as_array(self.uv_transform, np.float64, at_thing("texture", self.name) + "uv_transform")
         if transform.shape != (2, 3) or not (np.abs(transform) <= LARGEST).all():
-            raise InputError(at_thing("texture", self.name) + f"uv_transform must be a 2x3 matrix of numbers up to {LARGEST:g}")
+            raise wrong(at_thing("texture", self.name) + "uv_transform", f"must be a 2x3 matrix of numbers up to {LARGEST:g}")
         object.__setattr__(self, "image", image)
         object.__setattr__(self, "uv_transform", transform)
 
@@ -61,7 +61,7 @@ class Checkerboard:
     scale: float = field(default=1.0, metadata=given("number", "squares for each unit of u and of v", ge=1e-6))
 
     def __post_init__(self) -> None:
-        check_fields(self, "checkerboard ")
+        check_fields(self, "checkerboard: ")
 
 
 class MaterialKind(NamedTuple):

@@ -56,34 +56,35 @@ class Mesh:
         _require_finite(vertices, self.name, "vertices")
         if self.reach > np.float32(LARGEST):
             row = int(np.argmax(np.abs(vertices).max(axis=1)))
-            raise InputError(f"vertex {row} is {vertices[row].tolist()}; at most {LARGEST:g} can be traced", self.name or None,
-                             "vertices")
+            raise InputError(f"vertex {row} is {vertices[row].tolist()}; at most {LARGEST:g} can be traced", argument="vertices",
+                             place=self.name or None)
         if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
             face = int(np.argmax(((faces < 0) | (faces >= len(vertices))).any(axis=1)))
             raise InputError(f"face {face} is {faces[face].tolist()}, but there are {len(vertices)} vertices",
-                             self.name or None, "faces")
+                             argument="faces", place=self.name or None)
         for attribute, width in (("normals", 3), ("uvs", 2)):
             if getattr(self, attribute) is not None:
                 array = self._array(attribute, np.float32, width)
                 if len(array) != len(vertices):
-                    raise InputError(f"{len(array)} {attribute} for {len(vertices)} vertices", self.name or None,
-                                     attribute)
+                    raise InputError(f"{len(array)} {attribute} for {len(vertices)} vertices", argument=attribute,
+                                     place=self.name or None)
                 _require_finite(array, self.name, attribute)
         if self.face_group is not None:
             group = as_array(self.face_group, np.int32, "face_group")
             if group.shape != (len(faces),):
-                raise InputError(f"face_group must be ({len(faces)},), got {group.shape}", self.name or None)
+                raise InputError(f"must be ({len(faces)},), got {group.shape}", argument="face_group", place=self.name or None)
             object.__setattr__(self, "face_group", group)
 
     def _array(self, attribute: str, dtype: type, width: int) -> np.ndarray:
         try:
             raw = np.asarray(getattr(self, attribute))
         except ValueError:
-            raise InputError(f"must be (N, {width}), got rows of different lengths", self.name or None, attribute) from None
+            raise InputError(f"must be (N, {width}), got rows of different lengths",
+                             argument=attribute, place=self.name or None) from None
         if raw.ndim != 2 or raw.shape[1] != width:
-            raise InputError(f"must be (N, {width}), got {raw.shape}", self.name or None, attribute)
+            raise InputError(f"must be (N, {width}), got {raw.shape}", argument=attribute, place=self.name or None)
         if dtype is np.int32 and raw.size and not np.issubdtype(raw.dtype, np.integer):
-            raise InputError(f"must hold integers, got {raw.dtype}", self.name or None, attribute)
+            raise InputError(f"must hold integers, got {raw.dtype}", argument=attribute, place=self.name or None)
         array = as_array(raw, dtype, ": ".join(part for part in (self.name, attribute) if part))
         object.__setattr__(self, attribute, array)
         return array
@@ -101,7 +102,7 @@ class Mesh:
         if isinstance(mesh, trimesh.Scene):
             mesh = mesh.to_mesh()
         if not isinstance(mesh, trimesh.Trimesh):
-            raise InputError(f"mesh must be a trimesh.Trimesh or a trimesh.Scene, got {shown(mesh)}")
+            raise InputError(f"must be a trimesh.Trimesh or a trimesh.Scene, got {shown(mesh)}", argument="mesh")
         uv = getattr(mesh.visual, "uv", None)
         uvs = None if uv is None or len(uv) != len(mesh.vertices) else np.asarray(uv)[:, :2] * (1.0, -1.0) + (0.0, 1.0)
         source = getattr(mesh, "source", None)
@@ -141,7 +142,7 @@ def _require_finite(array: np.ndarray, name: str, attribute: str) -> None:
         bad = ~finite.all(axis=1)
         row = int(np.argmax(bad))
         raise InputError(f"{attribute} {row} is {array[row].tolist()} ({int(bad.sum())} not finite in all)",
-                         name or None, attribute)
+                         argument=attribute, place=name or None)
 
 
 def unit_rows(vectors: np.ndarray) -> np.ndarray:

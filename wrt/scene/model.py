@@ -16,7 +16,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from wrt.core.checks import as_array, as_one, as_tuple, at_thing, unknown
-from wrt.core.errors import InputError
+from wrt.core.errors import InputError, wrong
 from wrt.scene.backgrounds import BACKGROUNDS, Background, ConstantBackground
 from wrt.scene.cameras import CameraKind
 from wrt.scene.lights import LIGHTS, Light
@@ -62,18 +62,18 @@ class Object:
         as_one(self.mesh, Mesh, at + "mesh")
         object.__setattr__(self, "materials", as_tuple(self.materials, Material, at + "materials"))
         if not self.materials:
-            raise InputError(at + "needs a material")
+            raise wrong(at + "materials", "must be one or more")
         object.__setattr__(self, "transform", as_transform(self.transform, at + "transform"))
         with np.errstate(over="ignore"):
             reach = (np.abs(self.transform[:3, :3]).sum(axis=1) * self.mesh.reach + np.abs(self.transform[:3, 3])).max()
         if not reach <= MAX_REACH:
-            raise InputError(at + f"reaches {reach:.3g} units from the origin; at most {MAX_REACH:g} can be rendered")
+            raise InputError(f"reaches {reach:.3g} units from the origin; at most {MAX_REACH:g} can be rendered", place=at[:-2])
         if self.face_material is not None:
             index = as_array(self.face_material, np.int32, at + "face_material")
             if index.shape != (len(self.mesh.faces),):
-                raise InputError(at + f"face_material must be ({len(self.mesh.faces)},), got {index.shape}")
+                raise wrong(at + "face_material", f"must be ({len(self.mesh.faces)},), got {index.shape}")
             if index.size and (index.min() < 0 or index.max() >= len(self.materials)):
-                raise InputError(at + f"face_material must index {len(self.materials)} materials")
+                raise wrong(at + "face_material", f"must index {len(self.materials)} materials")
             object.__setattr__(self, "face_material", index)
         if self.motion is not None:
             as_one(self.motion, Motion, at + "motion").check(self.mesh)
@@ -179,7 +179,7 @@ class Scene:
             if str(index) == str(name):
                 return camera
         known = ", ".join(f"{camera.name!r} (number {i})" for i, camera in enumerate(self.cameras))
-        raise InputError(f"no camera {name!r}; the scene's cameras are {known}")
+        raise InputError(f"no camera {name!r}", argument="camera", hint=f"the scene's cameras are {known}")
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the lowest and the highest corner, (3,) float64 each, of all shapes in world space.
@@ -220,7 +220,7 @@ class Scene:
         """Return a copy with some settings changed; None keeps one. Raises InputError for an unknown or wrong setting."""
         for name in changes:
             if name not in SETTINGS:
-                raise InputError(unknown(name, "setting", SETTINGS))
+                raise unknown(name, "setting", SETTINGS, argument=name)
         changed: dict[str, Any] = {name: value for name, value in changes.items() if value is not None}
         return replace(self, settings=replace(self.settings, **changed))
 

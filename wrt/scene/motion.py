@@ -41,9 +41,9 @@ class Motion:
             return
         keys = as_array(self.keys, np.float64, "motion: keys")
         if keys.ndim != 3 or keys.shape[1:] != (3, 3) or len(keys) < 2 or not np.isfinite(keys).all():
-            raise InputError(f"motion: keys must be (K, 3, 3), finite, with two keys or more, got {keys.shape}")
+            raise InputError(f"must be (K, 3, 3), finite, with two keys or more, got {keys.shape}", argument="keys", place="motion")
         if (keys[:, 2] == 0.0).any() or (np.sign(keys[:, 2]) != np.sign(keys[0, 2])).any():
-            raise InputError("motion: a scale must not be zero, also not between two keys")
+            raise InputError("a scale must not be zero, also not between two keys", argument="keys", place="motion")
         object.__setattr__(self, "keys", keys)
 
     def check(self, mesh: Mesh) -> None:
@@ -51,8 +51,9 @@ class Motion:
         if self.target is None:
             return
         if len(self.target.vertices) != len(mesh.vertices) or not np.array_equal(self.target.faces, mesh.faces):
-            raise InputError(f"motion: the target must have the same faces; it has {len(self.target.vertices)} vertices and "
-                             f"{len(self.target.faces)} faces, the mesh {len(mesh.vertices)} and {len(mesh.faces)}")
+            raise InputError(f"must have the same faces; it has {len(self.target.vertices)} vertices and "
+                             f"{len(self.target.faces)} faces, the mesh {len(mesh.vertices)} and {len(mesh.faces)}",
+                             argument="target", place="motion")
 
     def transform(self, time: float) -> np.ndarray:
         """Return the (4, 4) float64 matrix at a time in [0, 1]; the identity without keys."""

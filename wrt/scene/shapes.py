@@ -24,19 +24,19 @@ def quad(corner: Point = (-0.5, -0.5, 0.0), edge_u: Point = (1.0, 0.0, 0.0), edg
 
     uv is (0, 1) at `corner` and (0, 0) at the end of edge_v: an image is upright on the front with edge_u to the right and edge_v up.
     """
-    origin, u, v = (np.array(as_vector(value, "quad " + name))
+    origin, u, v = (np.array(as_vector(value, "quad: " + name))
                     for value, name in ((corner, "corner"), (edge_u, "edge_u"), (edge_v, "edge_v")))
     if not np.linalg.norm(np.cross(u, v)) > 0.0:
-        raise InputError(f"quad: edge_u {u.tolist()} and edge_v {v.tolist()} span no area")
+        raise InputError(f"{u.tolist()} and edge_v {v.tolist()} span no area", argument="edge_u", place="quad")
     return Mesh(np.array([origin, origin + u, origin + u + v, origin + v]), np.array([[0, 1, 2], [0, 2, 3]]),
                 uvs=np.array([[0, 1], [1, 1], [1, 0], [0, 0]]), name="quad")
 
 
 def box(low: Point = (-0.5, -0.5, -0.5), high: Point = (0.5, 0.5, 0.5)) -> Mesh:
     """Return a closed box with its corners at `low` and `high`, flat; each side has uvs from 0 to 1."""
-    bottom, top = np.array(as_vector(low, "box low")), np.array(as_vector(high, "box high"))
+    bottom, top = np.array(as_vector(low, "box: low")), np.array(as_vector(high, "box: high"))
     if not (top > bottom).all():
-        raise InputError(f"box: high {top.tolist()} must be above low {bottom.tolist()} in every axis")
+        raise InputError(f"must be above low {bottom.tolist()} in every axis, got {top.tolist()}", argument="high", place="box")
     return Mesh(np.where(_BOX_TOP, top, bottom), _BOX_FACES, uvs=_BOX_UVS, name="box")
 
 
@@ -52,7 +52,7 @@ _BOX_FACES.flags.writeable = _BOX_UVS.flags.writeable = False  # all boxes share
 def icosphere(subdivisions: int = 3, radius: float = 1.0) -> Mesh:
     """Return a sphere of 20 * 4^subdivisions nearly equal triangles around the origin, with exact normals and no uvs."""
     subdivisions = as_integer(subdivisions, "icosphere: subdivisions", 0, 9)
-    radius = as_number(radius, "icosphere radius", low=1e-30)
+    radius = as_number(radius, "icosphere: radius", low=1e-30)
     golden = 0.5 + math.sqrt(1.25)
     corner = np.array([[a, b * golden, 0.0] for a in (-1.0, 1.0) for b in (-1.0, 1.0)])
     points = np.concatenate([np.roll(corner, turn, axis=1) for turn in range(3)])
@@ -76,8 +76,8 @@ def icosphere(subdivisions: int = 3, radius: float = 1.0) -> Mesh:
 
 def torus(radius: float = 1.0, tube_radius: float = 0.35, segments: int = 64, tube_segments: int = 32) -> Mesh:
     """Return a torus around the y axis, `radius` being that of the circle inside the tube. u runs around the axis, v around the tube."""
-    radius = as_number(radius, "torus radius", low=1e-30)
-    tube_radius = as_number(tube_radius, "torus tube_radius", low=1e-30, high=radius)
+    radius = as_number(radius, "torus: radius", low=1e-30)
+    tube_radius = as_number(tube_radius, "torus: tube_radius", low=1e-30, high=radius)
     _require_segments("torus", segments, tube_segments)
     around = np.linspace(0.0, 2.0 * np.pi, segments + 1)
     along = np.linspace(0.0, 2.0 * np.pi, tube_segments + 1)
@@ -99,12 +99,12 @@ def lathe(profile: Sequence[Point], segments: int = 64) -> Mesh:
     line = np.asarray(profile, dtype=np.float32).astype(np.float64)
     well_formed = line.ndim == 2 and line.shape[1:] == (2,) and len(line) >= 2
     if not well_formed or not np.isfinite(line).all() or (line[:, 0] < 0.0).any():
-        raise InputError("lathe: profile must be two or more pairs (radius >= 0, height)")
+        raise InputError("must be two or more pairs (radius >= 0, height)", argument="profile", place="lathe")
     _require_segments("lathe", segments, rows=len(line) - 1)
     step = np.diff(line, axis=0)
     length = np.linalg.norm(step, axis=1)
     if not length.any():
-        raise InputError("lathe: all points of the profile are the same")
+        raise InputError("has only points that are the same", argument="profile", place="lathe")
     # The normal of a step is its direction turned right; a point has the mean of its two steps, unless it is given twice.
     side = np.stack([step[:, 1], -step[:, 0]], axis=1) / np.where(length > 0.0, length, 1.0)[:, None]
     normal = np.concatenate([side, side[-1:]]) + np.concatenate([side[:1], side])
@@ -126,7 +126,7 @@ def lathe(profile: Sequence[Point], segments: int = 64) -> Mesh:
 def prism(sides: int = 3, radius: float = 1.0, length: float = 2.0) -> Mesh:
     """Return a closed, flat prism along z, without uvs. Its base is a regular polygon with a corner at +y on a circle of `radius`."""
     sides = as_integer(sides, "prism: sides", 3, 4096)
-    radius, length = as_number(radius, "prism radius", low=1e-30), as_number(length, "prism length", low=1e-30)
+    radius, length = as_number(radius, "prism: radius", low=1e-30), as_number(length, "prism: length", low=1e-30)
     angle = np.pi / 2.0 + np.arange(sides) * (2.0 * np.pi / sides)
     ring = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     points = np.concatenate([np.column_stack([ring, np.full(sides, z)]) for z in (-0.5 * length, 0.5 * length)])
@@ -145,18 +145,18 @@ def tube(points: Sequence[Point] | np.ndarray, radius: float | Point = 0.1, segm
     """
     line = np.asarray(points, dtype=np.float64)
     if line.ndim != 2 or line.shape[1:] != (3,) or len(line) < 2 or not np.isfinite(line).all():
-        raise InputError("tube: points must be two or more triples")
+        raise InputError("must be two or more triples", argument="points", place="tube")
     _require_segments("tube", segments, rows=len(line) - 1)
     try:
         radii = np.broadcast_to(np.asarray(radius, dtype=np.float64), (len(line),))
     except ValueError:
-        raise InputError(f"tube: radius must be one number or {len(line)}, one for each point") from None
+        raise InputError(f"must be one number or {len(line)}, one for each point", argument="radius", place="tube") from None
     if not (radii > 0.0).all() or not np.isfinite(radii).all():
-        raise InputError("tube: every radius must be above 0")
+        raise InputError("must be above 0 at every point", argument="radius", place="tube")
     step = np.diff(line, axis=0)
     length = np.linalg.norm(step, axis=1, keepdims=True)
     if not (length > 0.0).all():
-        raise InputError("tube: two points in a row are the same")
+        raise InputError("has two points in a row that are the same", argument="points", place="tube")
     step /= length
     tangent = np.concatenate([step[:1], step[1:] + step[:-1], step[-1:]])
     tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-300)
@@ -234,7 +234,7 @@ def _require_segments(shape: str, *segments: int, rows: int = 1) -> None:
         as_integer(count, f"{shape}: segments", 3, 4096)
     faces = 2 * rows * math.prod(segments)
     if faces > MAX_FACES:
-        raise InputError(f"{shape}: {faces} triangles; at most {MAX_FACES} are made")
+        raise InputError(f"{faces} triangles; at most {MAX_FACES} are made", argument="segments", place=shape)
 
 
 SHAPES: dict[str, Callable[..., Mesh]] = {

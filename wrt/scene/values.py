@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from wrt.core.checks import LARGEST, as_array
-from wrt.core.errors import InputError
+from wrt.core.errors import InputError, wrong
 
 Color = tuple[float, float, float]
 BLACK: Color = (0.0, 0.0, 0.0)
@@ -23,14 +23,14 @@ def as_vector(value: object, what: str, *, low: float = -math.inf, high: float =
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{what} must be three numbers, got {value!r}") from error
+        raise wrong(what, f"must be three numbers, got {value!r}") from error
     if array.ndim == 0:
         array = np.repeat(array, 3)
     if array.shape != (3,) or not np.isfinite(array).all():
-        raise InputError(f"{what} must be three finite numbers, got {value!r}")
+        raise wrong(what, f"must be three finite numbers, got {value!r}")
     low, high = max(low, -LARGEST), min(high, LARGEST)
     if (array < low).any() or (array > high).any():
-        raise InputError(f"{what} must lie in [{low:g}, {high:g}], got {array.tolist()}")
+        raise wrong(what, f"must lie in [{low:g}, {high:g}], got {array.tolist()}")
     return (float(array[0]), float(array[1]), float(array[2]))
 
 
@@ -39,10 +39,10 @@ def as_number(value: object, what: str, *, low: float = -math.inf, high: float =
     try:
         number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError) as error:
-        raise InputError(f"{what} must be a number, got {value!r}") from error
+        raise wrong(what, f"must be a number, got {value!r}") from error
     low, high = max(low, -LARGEST), min(high, LARGEST)
     if not math.isfinite(number) or not low <= number <= high:
-        raise InputError(f"{what} must be finite and in [{low:g}, {high:g}], got {value!r}")
+        raise wrong(what, f"must be finite and in [{low:g}, {high:g}], got {value!r}")
     return number
 
 
@@ -53,20 +53,20 @@ def as_transform(value: object, what: str) -> np.ndarray:
     """
     matrix = as_array(value, np.float64, what)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise InputError(f"{what} must be a finite 4x4 matrix, got shape {matrix.shape}")
+        raise wrong(what, f"must be a finite 4x4 matrix, got shape {matrix.shape}")
     if max(map(abs, (matrix[3] - (0.0, 0.0, 0.0, 1.0)).tolist())) > 1e-6:
-        raise InputError(f"{what} must be affine (last row 0 0 0 1), got {matrix[3].tolist()}")
+        raise wrong(what, f"must be affine (last row 0 0 0 1), got {matrix[3].tolist()}")
     return matrix
 
 
 def require_count(count: int, what: str) -> None:
     """Raise InputError if a scene would hold more than MAX_OBJECTS of something."""
     if count > MAX_OBJECTS:
-        raise InputError(f"{count} {what}; a scene holds at most {MAX_OBJECTS}")
+        raise InputError(f"{count} {what}", hint=f"a scene holds at most {MAX_OBJECTS}")
 
 
 def _unit(vector: Color, what: str) -> Color:
     length = math.hypot(*vector)
     if length == 0.0:
-        raise InputError(f"{what} must not be zero")
+        raise wrong(what, "must not be zero")
     return (vector[0] / length, vector[1] / length, vector[2] / length)

@@ -117,7 +117,7 @@ def as_origin(text: str) -> str:
     match = ORIGIN.fullmatch(text.lower())
     port = 0 if match is None else int(match[3] or PORTS[match[1]])
     if match is None or port > 65535:
-        raise InputError(f"{text!r} is no origin; write one such as https://example.org or http://localhost:9000")
+        raise InputError(f"{text!r} is no origin", hint="write one such as https://example.org or http://localhost:9000")
     return origin_of(match[1], match[2], port)
 
 

@@ -79,7 +79,7 @@ def side_by_side(pictures: Mapping[str, Film | np.ndarray], columns: int = 2, sc
     codes = [each.to_srgb8() if isinstance(each, Film) else np.asarray(each) for each in pictures.values()]
     for name, array in zip(pictures, codes, strict=True):
         if array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] != 3:
-            raise InputError(f"{name}: a picture must be a Film or (H, W, 3) uint8, got {array.shape} {array.dtype}")
+            raise InputError(f"must be a Film or (H, W, 3) uint8, got {array.shape} {array.dtype}", argument=name)
     columns = min(columns, len(codes))
     width, height = (scale * max(array.shape[axis] for array in codes) for axis in (1, 0))
     rows = -(-len(codes) // columns)

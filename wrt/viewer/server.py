@@ -45,10 +45,11 @@ def import_viser() -> Any:
     try:
         import viser
     except ImportError as error:
-        raise InputError(f'the viewer needs viser ({error}): pip install "wrt[viewer]"') from error
+        raise InputError(f"the viewer needs viser ({error})", hint='pip install "wrt[viewer]"') from error
     numbers = tuple(map(int, re.findall(r"[0-9]+", viser.__version__)[:3]))
     if not VERSIONS[0] <= numbers < VERSIONS[1]:
-        raise InputError(f'the viewer cannot guard viser {viser.__version__}: pip install "wrt[viewer]" installs one that it can')
+        raise InputError(f"the viewer cannot guard viser {viser.__version__}",
+                         hint='pip install "wrt[viewer]" installs one that it can')
     return viser
 
 
@@ -61,7 +62,8 @@ def listen(place: Place) -> socket.socket:
     except (OSError, OverflowError, UnicodeError) as error:
         number = getattr(error, "errno", None) or 0
         reason = os.strerror(number) if number > 0 else getattr(error, "strerror", None) or str(error)
-        raise InputError(f"cannot listen on port {port} of {host} ({reason}); --port and --host choose another") from error
+        raise InputError(f"cannot listen on port {port} of {host} ({reason})",
+                         argument="port", hint="--port and --host choose another") from error
 
 
 def to_stderr(text: str) -> None:

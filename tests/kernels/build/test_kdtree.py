@@ -176,7 +176,7 @@ def test_options_change_no_answer(kind, options):
     ({"max_depth": "deep"}, "max_depth must be int"), ({"max_depth": True}, "max_depth must be int"),
     ({"empty_bonus": 1.5}, "empty_bonus must be 0 to 1"), ({"cost_traversal": float("nan")}, "cost_traversal"),
     ({"perfect_below": 10}, "perfect_below must be 1024"), ({"max_growth": 0.5}, "max_growth must be 1"),
-    ({"clip": "yes"}, "clip must be bool"), ({"builder": "sah"}, "kdtree has no option 'builder'")])
+    ({"clip": "yes"}, "clip must be bool"), ({"builder": "sah"}, "builder is no option of kdtree")])
 def test_options_that_are_refused(options, message):
     with pytest.raises(InputError, match=message):
         build(icosphere(0), "kdtree", **options)

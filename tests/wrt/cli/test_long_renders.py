@@ -203,7 +203,7 @@ def test_resume_without_a_checkpoint_says_that_it_begins() -> None:
     (["--checkpoint", "soon"], "write 30s, 5m or 1h"), (["--checkpoint", "0s"], "checkpoint_every must be more than 0"),
     (["--checkpoint-file", "./a.png"], "a.png: is the picture; a checkpoint needs a file of its own"),
     (["--checkpoint-file", "nowhere/c"], "nowhere/c: its folder does not exist"),
-    (["--checkpoint-file", "box.obj"], "box.obj: is there already: resume it (--resume"),
+    (["--checkpoint-file", "box.obj"], "box.obj: is there already; resume it (--resume"),
     (["--checkpoint-file", "box.obj", "--resume"], "box.obj: is no checkpoint of this version"),
 ])
 def test_what_is_refused_before_the_work(arguments: list[str], message: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -224,7 +224,7 @@ def full(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
     def failing(self: film.Film, path: Any, **options: Any) -> list[Path]:
         if Path(path).resolve().parent == folder.resolve():
-            raise InputError("cannot be written: No space left on device", path)
+            raise InputError("cannot be written: No space left on device", path=path)
         return save(self, path, **options)
 
     monkeypatch.setattr(film.Film, "save", failing)
@@ -244,7 +244,7 @@ def test_a_picture_that_cannot_be_written_is_kept_elsewhere() -> None:
 @pytest.mark.parametrize("place", ["nowhere", "tmp"])
 def test_where_no_place_takes_it_the_first_error_is_reported(place: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(self: film.Film, path: Any, **options: Any) -> list[Path]:
-        raise InputError("cannot be written: No space left on device", path)
+        raise InputError("cannot be written: No space left on device", path=path)
 
     monkeypatch.setattr(film.Film, "save", full)
     monkeypatch.setattr("tempfile.tempdir", str(Path(place).absolute()))

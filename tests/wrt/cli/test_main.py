@@ -223,7 +223,7 @@ def test_a_wrong_option_is_told_before_the_scene_is_read(arguments: list[str], m
 
 @pytest.mark.parametrize("crop", ["0,0,33,18", "5,5,5,6", "40,0,50,10"])
 def test_a_crop_outside_the_picture(crop: str) -> None:
-    refused(run("render", "box.obj", *SMALL, "--crop", crop), f"crop {crop} is not within the picture of 32x18")
+    refused(run("render", "box.obj", *SMALL, "--crop", crop), f"crop must be within the picture of 32x18, got {crop}")
     assert new_files() == set()
 
 
@@ -458,7 +458,7 @@ def test_compare_measures_and_fails_past_its_limits() -> None:
 @pytest.mark.parametrize(("arguments", "message"), [
     (["a.exr", "nothing.png"], "nothing.png: cannot be read"), (["box.obj", "a.exr"], "box.obj: not an image format"),
     (["a.exr", "small.exr"], "different sizes, 30x20 and 8x4"), (["broken.png", "a.exr"], "broken.png: cannot be read"),
-    (["a.exr", "a.exr", "-o", "d.exr"], "d.exr: a picture of the difference is a .png"),
+    (["a.exr", "a.exr", "-o", "d.exr"], "d.exr: must be a .png: a picture of the difference"),
     (["a.exr", "a.exr", "-o", "nowhere/d.png"], "its folder does not exist"),
     (["a.exr", "a.exr", "--tonemap", "nope"], "tonemap must be one of"),
     (["a.exr", "a.exr", "--exposure", "nan"], "exposure must be finite"),

@@ -28,9 +28,9 @@ GREY = Material(name="grey")
 
 
 @pytest.mark.parametrize(("make", "message"), [
-    (lambda: Mesh([[0, 0, 0], [1, 0]], [[0, 1, 2]]), "vertices: must be"),
+    (lambda: Mesh([[0, 0, 0], [1, 0]], [[0, 1, 2]]), "vertices must be"),
     (lambda: Mesh([["a"] * 3] * 3, [[0, 1, 2]]), "vertices must be an array of numbers"),
-    (lambda: Mesh(np.eye(3), "faces"), "faces: must be"), (lambda: load_mesh(5), "path must be a path, got 5"),
+    (lambda: Mesh(np.eye(3), "faces"), "faces must be"), (lambda: load_mesh(5), "path must be a path, got 5"),
     (lambda: load_scene(None), "path must be a path, got None"),
     (lambda: Object("box.obj", (GREY,)), "mesh must be a Mesh, got 'box.obj'"),
     (lambda: Object(box(), ("grey",)), r"materials\[0\] must be a Material, got 'grey'"),

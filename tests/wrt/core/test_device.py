@@ -114,7 +114,7 @@ def test_a_kernel_cache_that_cannot_be_made_is_one_message(environment: dict[str
     done = subprocess.run([sys.executable, "-m", "wrt", "devices"], cwd=ROOT, capture_output=True, text=True,
                           env={**without, "PYTHONPATH": str(ROOT), **environment})
     assert done.returncode == 2 and done.stdout == "" and done.stderr.count("\n") == 1, done
-    assert done.stderr.startswith("error: /dev/null/") and done.stderr.endswith("(WARP_CACHE_PATH names another folder)\n")
+    assert done.stderr.startswith("error: /dev/null/") and done.stderr.endswith("; WARP_CACHE_PATH names another folder\n")
 
 
 READ_ONLY_CACHE = """
@@ -139,7 +139,7 @@ def test_a_read_only_kernel_cache_without_the_kernel_is_one_message(call: str, t
     done = subprocess.run([sys.executable, "-c", READ_ONLY_CACHE.replace("CALL", call)], cwd=ROOT, capture_output=True, text=True,
                           env=os.environ | {"WARP_CACHE_PATH": str(tmp_path), "PYTHONPATH": str(ROOT)})
     (cache,) = tmp_path.iterdir()
-    assert done.stdout == f"{cache}: kernels cannot be compiled: Permission denied (WARP_CACHE_PATH names another folder)\n", done
+    assert done.stdout == f"{cache}: kernels cannot be compiled: Permission denied ; WARP_CACHE_PATH names another folder\n", done
     assert not list(cache.iterdir()) and done.stderr == ""
 
 

@@ -57,18 +57,18 @@ for call in (lambda: wrt.load_scene({str(ROOT / "scenes" / "spot.toml")!r}), lam
 """
     done = run("-W", "ignore", "-c", code, folder=tmp_path)
     assert done.stdout.splitlines() == [
-        "a TOML scene needs pydantic: pip install pydantic", "a mesh of trimesh needs trimesh: pip install trimesh",
-        "an EXR or HDR picture needs OpenImageIO: pip install openimageio",
-        "a mesh of trimesh needs trimesh: pip install trimesh"], done.stderr
+        "a TOML scene needs pydantic; pip install pydantic", "a mesh of trimesh needs trimesh; pip install trimesh",
+        "an EXR or HDR picture needs OpenImageIO; pip install openimageio",
+        "a mesh of trimesh needs trimesh; pip install trimesh"], done.stderr
 
 
 def test_the_command_line_says_so_too(tmp_path: Path) -> None:
     done = run("-c", WITHOUT + "import runpy; runpy.run_module('wrt', run_name='__main__')", folder=tmp_path)
-    assert (done.returncode, done.stderr) == (2, "error: the command line needs click: pip install click\n")
+    assert (done.returncode, done.stderr) == (2, "error: the command line needs click; pip install click\n")
 
 
 def test_other_errors_of_an_import_stay_what_they_are() -> None:
-    with pytest.raises(InputError, match="a thing needs no_such: pip install no_such"), needed_by("a thing"):
+    with pytest.raises(InputError, match="a thing needs no_such; pip install no_such"), needed_by("a thing"):
         import no_such.part  # type: ignore[import-not-found]  # noqa: F401
     with pytest.raises(ZeroDivisionError), needed_by("a thing"):
         _ = 1 / 0

@@ -74,7 +74,7 @@ def test_a_warp_with_other_insides_is_refused(owner: str, name: str, change: str
         setattr(parts[owner], name, lambda self, other: None)
     with pytest.raises(InputError) as refused:
         warp_private.prepare()
-    assert str(refused.value) == f"{DIFFER} ({owner}.{name}): install '{WORKS_WITH}'"
+    assert str(refused.value) == f"{DIFFER} ({owner}.{name}); install '{WORKS_WITH}'"
     for each, part in parts.items():
         left = {key: value for key, value in vars(part).items() if key != name}
         assert left == {key: value for key, value in before[each].items() if key != name}
@@ -88,7 +88,7 @@ def test_a_warp_without_a_name_is_one_message_of_the_command_line(tmp_path: Path
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=os.environ | {"PYTHONPATH": str(ROOT)})
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1) and not picture.exists()
     assert done.stderr.startswith(f"error: {DIFFER} (cannot import name 'array_t'")
-    assert done.stderr.endswith(f"): install '{WORKS_WITH}'\n")
+    assert done.stderr.endswith(f"); install '{WORKS_WITH}'\n")
 
 
 # --- structs ----------------------------------------------------------------------------------------------------------

@@ -419,7 +419,7 @@ def test_renders_in_other_threads(reference: Film) -> None:
     ({"size": (0, 1)}, "size must be 1x1"), ({"size": (100000, 100000)}, "size must be 1x1 to 32768x32768"),
     ({"max_depth": -1}, "max_depth"), ({"max_depth": 65}, "max_depth"), ({"min_throughput": float("nan")}, "min_throughput"),
     ({"filter": "nope"}, "filter must be one of"), ({"exposure": float("inf")}, "exposure"),
-    *(({"crop": crop}, r"crop .* is not within the picture of 37x22") for crop in (
+    *(({"crop": crop}, "crop must be within the picture of 37x22") for crop in (
         (0, 0, 38, 22), (0, 0, 37, 23), (-1, 0, 5, 5), (5, 5, 5, 6), (6, 5, 5, 6), (40, 40, 50, 50))),
 ], ids=str)
 def test_a_wrong_value_is_told_by_its_name(options: dict[str, Any], message: str) -> None:

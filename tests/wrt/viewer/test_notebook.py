@@ -135,7 +135,7 @@ def test_pictures_side_by_side_keep_their_pixels() -> None:
     assert (sheet[y:y + 22] == 255).all() and (sheet[:22] < 128).any()  # no name, and two names
     np.testing.assert_array_equal(wrt.side_by_side({"": codes}), codes)
     for wrong in ({}, {"x": codes[..., 0]}, {"x": film.pixels}):
-        with pytest.raises(InputError, match=r"side_by_side|x: a picture"):
+        with pytest.raises(InputError, match=r"side_by_side|x must be a Film"):
             wrt.side_by_side(wrong)
 
 

@@ -97,7 +97,7 @@ class Bvh2(BinaryBvh):
     def _points(self, vertices: Any) -> Any:
         points = DeviceGeometry.points_of(vertices, "vertices")
         if len(points) != self.geometry.n_vertices:
-            raise InputError(f"vertices must be ({self.geometry.n_vertices},), got ({len(points)},)")
+            raise InputError(f"must be ({self.geometry.n_vertices},), got ({len(points)},)", argument="vertices")
         if points.device.is_cpu:
             vectors(points.numpy(), "vertices")
         return points
@@ -113,11 +113,13 @@ class Bvh2(BinaryBvh):
     def _refit_in_place(self, points: Any) -> None:
         points = self._points(points)
         if points.device != self.device or self.structure.units.triangle_test.layout != "corners":
-            raise InputError(f"a refit in place is from a Warp array on {self.device}, for the watertight triangle test")
+            raise InputError(f"a refit in place is from a Warp array on {self.device}, for the watertight triangle test",
+                             argument="vertices")
         kept: InPlace | None = self._kept.get("in place")
         if kept is None or kept.tree.nodes is not self.data.nodes:
             if self.device.is_capturing:
-                raise InputError("refit in place once before a graph captures it: then what it works with is there")
+                raise InputError("a graph cannot capture the first refit in place",
+                                 hint="refit in place once before: then what it works with is there")
             kept = self._kept["in place"] = self._begin_in_place(points)
         wp.copy(kept.shape.vertices, points)
         kept.fitting.refit(kept.tree, kept.shape, self.threads)

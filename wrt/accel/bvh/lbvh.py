@@ -32,7 +32,7 @@ def build_on(device: Any, shape: Any, options: BvhOptions, threads: int = 1) -> 
     over a Shape of two primitives or more. Of a GPU nothing else comes to the host."""
     n = len(shape.faces) + len(shape.spheres)
     if n >= MOST:
-        raise InputError(f"the builder lbvh takes fewer than {MOST} primitives, got {n}")
+        raise InputError(f"lbvh takes fewer than {MOST} primitives, got {n}", argument="builder")
     number_bits, bits = kernels.bits_of(n)
     fitting = Fitting(device, n, n - 1)
     fitting.find_bounds(shape, threads)

@@ -23,7 +23,7 @@ def build_sbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryT
     Raises InputError for a split_budget above MAX_BUDGET.
     """
     if options.split_budget > MAX_BUDGET:
-        raise InputError(f"split_budget must be at most {MAX_BUDGET:g}, got {options.split_budget}")
+        raise InputError(f"must be at most {MAX_BUDGET:g}, got {options.split_budget}", argument="split_budget")
     lo, hi = geometry.bounds(threads)
     n = len(lo)
     if n <= 1:

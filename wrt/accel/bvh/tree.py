@@ -38,11 +38,11 @@ class BvhOptions(BinaryOptions):
 
     def __post_init__(self) -> None:
         if not 1 <= self.max_leaf <= MAX_LEAF:
-            raise InputError(f"max_leaf must be 1 to {MAX_LEAF}, got {self.max_leaf}")
+            raise InputError(f"must be 1 to {MAX_LEAF}, got {self.max_leaf}", argument="max_leaf")
         for name in ("cost_traversal", "cost_intersection", "split_alpha", "split_budget"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0.0):
-                raise InputError(f"{name} must be finite and not negative, got {value}")
+                raise InputError(f"must be finite and not negative, got {value}", argument=name)
 
 
 @dataclass(frozen=True, eq=False)

@@ -73,7 +73,8 @@ class WideBvh(OneMesh):
                 return small_tree(*self.geometry.bounds(), options)
             tree = collapse(binary, self.width, options.max_leaf, options.cost_traversal, options.cost_intersection)
         if self.compressed and len(binary.order) > MAX_FIRST:
-            raise InputError(f"a {self.name} holds at most {MAX_FIRST} primitives, and there are {len(binary.order)}; take bvh8")
+            raise InputError(f"a {self.name} holds at most {MAX_FIRST} primitives, and there are {len(binary.order)}",
+                             hint="take bvh8")
         return tree
 
     def _nodes(self, built: Built) -> np.ndarray:

@@ -70,7 +70,8 @@ def collapse(tree: BinaryTree, width: int, max_leaf: int, cost_traversal: float,
     launch(build_wide.collapse, 1, nodes, order, options, trees, out)
     n_nodes, rows, leaves, depth, stack = out.count.numpy().tolist()
     if rows > MAX_FIRST:
-        raise InputError(f"a wide BVH holds at most {MAX_FIRST} rows of primitives, and these need {rows}; take accel='bvh2'")
+        raise InputError(f"a wide BVH holds at most {MAX_FIRST} rows of primitives, and these need {rows}",
+                         hint="take accel='bvh2'")
     children, lo, hi = (array.numpy()[: n_nodes * width].reshape(-1, width, *array.numpy().shape[1:]).copy()
                         for array in (out.children, out.lo, out.hi))
     return WideTree(lo, hi, children, out.order.numpy()[: rows * width].reshape(-1, width).copy(), leaves, depth, stack)

@@ -55,11 +55,11 @@ class BspOptions:
     def __post_init__(self) -> None:
         for name in ("cost_intersection", "cost_axis", "cost_plane"):
             if not 0.0 < (value := getattr(self, name)) < math.inf:
-                raise InputError(f"{name} must be above 0 and finite, got {value}")
+                raise InputError(f"must be above 0 and finite, got {value}", argument=name)
         require_between(samples=(self.samples, 0, 1 << 30), max_depth=(self.max_depth, 0, MAX_DEPTH),
                         max_growth=(self.max_growth, 1.0, 1000.0))
         if self.progress is not None and not callable(self.progress):
-            raise InputError(f"progress must be a function of one number, got {self.progress!r}")
+            raise InputError(f"must be a function of one number, got {self.progress!r}", argument="progress")
 
     def __getstate__(self) -> dict[str, Any]:
         """For pickle: `progress` stays in this process."""
@@ -85,8 +85,8 @@ class Bsp(OneMesh):
     def _build(self, options: BspOptions) -> Built:
         n = len(self.geometry)
         if n > options.max_triangles:
-            raise InputError(f"bsp is slow to build, and takes up to max_triangles={options.max_triangles} primitives; there are "
-                             f"{n}: take another structure (kdtree, bvh), or raise max_triangles")
+            raise InputError(f"bsp is slow to build, and takes up to max_triangles={options.max_triangles} primitives; there are {n}",
+                             argument="max_triangles", hint="take another structure (kdtree, bvh), or raise max_triangles")
         if n == 0:
             return Built({"nodes": records(kernels.BspNode, 0), "lo": np.full(3, np.inf), "hi": np.full(3, -np.inf),
                           "extent": np.zeros(1, np.float32), "first": np.zeros(1, np.int32), "count": np.zeros(1, np.int32)},
@@ -169,7 +169,7 @@ class Builder:
         self.options.keep = keep
         while True:
             if room > MAX_ROOM:
-                raise InputError(f"a BSP tree of {n} primitives is too large; lower max_growth, or take another structure")
+                raise InputError(f"a BSP tree of {n} primitives is too large", hint="lower max_growth, or take another structure")
             launch = Launch(self.corners, self.options, room, LEFT_OVERS if keep else 0)
             if launch.run(source, tasks, cells, which):
                 return launch

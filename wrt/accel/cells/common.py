@@ -55,7 +55,7 @@ def require_between(**options: tuple[float, float, float]) -> None:
     """Raise InputError for an option (value, low, high) that is not between its limits, these included."""
     for name, (value, low, high) in options.items():
         if not low <= value <= high:
-            raise InputError(f"{name} must be {low:.10g} to {high:.10g}, got {value}")
+            raise InputError(f"must be {low:.10g} to {high:.10g}, got {value}", argument=name)
 
 
 def triangle_reach(geometry: Geometry, lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -139,7 +139,7 @@ def list_references(geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray], l
     np.cumsum(count.numpy(), out=begin[1:])
     total = int(begin[-1])
     if total >= 1 << 31:
-        raise InputError(f"grid: {total} references to primitives are too many; choose a lower density")
+        raise InputError(f"{total} references to primitives are too many", argument="density", hint="choose a lower one")
     device_begin = upload(begin, wp.int64, cpu)
     cell_of = wp.zeros(total, dtype=wp.int32, device=cpu)
     if total:

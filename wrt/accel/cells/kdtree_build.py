@@ -49,7 +49,7 @@ class KdOptions:
 
     def __post_init__(self) -> None:
         if self.max_depth is not None and (isinstance(self.max_depth, bool) or not isinstance(self.max_depth, int)):
-            raise InputError(f"max_depth must be int or None, got {self.max_depth!r}")
+            raise InputError(f"must be int or None, got {self.max_depth!r}", argument="max_depth")
         require_between(max_leaf=(self.max_leaf, 1, MAX_IN_LEAF), max_depth=(self.max_depth or 0, 0, STACK_SIZE),
                         perfect_below=(self.perfect_below, 1024, 1 << 27), cost_traversal=(self.cost_traversal, 0.0, 1e6),
                         cost_intersection=(self.cost_intersection, 0.0, 1e6), empty_bonus=(self.empty_bonus, 0.0, 1.0),
@@ -236,7 +236,7 @@ def joined(top: list[tuple[float, int]], tasks: list[Cell], parts: list[Part], r
     n_nodes = len(top) + sum(len(nodes) - 1 for nodes, _, _ in parts)
     n_references = sum(len(references) for _, references, _ in parts)
     if max(n_nodes, n_references) >= MAX_INDEX:
-        raise InputError(f"a k-d tree of {n_references} references is too large; lower max_growth or max_depth")
+        raise InputError(f"a k-d tree of {n_references} references is too large", hint="lower max_growth or max_depth")
     nodes = records(KdNode, n_nodes)
     nodes["split"][: len(top)], nodes["word"][: len(top)] = zip(*top, strict=True)
     order = np.empty(n_references, np.int32)

@@ -98,7 +98,7 @@ class Accelerator:
         """
         threads, rays, give = thread_count(threads), rays_of(origins, directions, t_min, t_max, True), returned(origins, directions)
         if not (out is None or isinstance(out, Hits)):
-            raise InputError(f"out must be Hits, got {shown(out)}")
+            raise InputError(f"must be Hits, got {shown(out)}", argument="out")
         given = None if out is None else [out.t, out.u, out.v, out.prim_id]
         t, u, v, prim_id = arrays = room_for(HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None,
                                              give is not None)

@@ -173,7 +173,7 @@ class Asked:
 def rows_of(hits: int) -> int:
     """Raise InputError for more than kernels, whose indices are int32, can reach."""
     if hits > MOST_ROWS:
-        raise InputError(f"{hits} hits are more than an array can have, 2^31 - 1; ask fewer rays at a time")
+        raise InputError(f"{hits} hits are more than an array can have, 2^31 - 1", hint="ask fewer rays at a time")
     return int(hits)
 
 

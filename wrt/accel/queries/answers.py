@@ -109,9 +109,10 @@ def room_for(types: dict[str, Any], given: list[Any] | None, n: int, device: Any
                     and (array.is_contiguous or n == 0))
         if not (fits and array.shape == (n,)):
             kind, place = ("NumPy", "writeable and") if device is None else ("Warp", f"on {device},")
-            raise InputError(f"{name} must be a {kind} array ({n},) of {np.dtype(dtype)}, {place} without gaps, got {shown(array)}")
+            raise InputError(f"must be a {kind} array ({n},) of {np.dtype(dtype)}, {place} without gaps, got {shown(array)}",
+                             argument=name)
     # Without gaps: the bounds of two arrays say all. Numbers of a Warp array are as large as those of the others.
     for (name, one), (other, two) in combinations(zip(types, given, strict=True), 2) if len(given) > 1 else ():
         if np.may_share_memory(one, two) if device is None else abs((one.ptr or 0) - (two.ptr or 0)) < n * one.strides[0]:
-            raise InputError(f"{name} and {other} share memory")
+            raise InputError(f"shares memory with {other}", argument=name)
     return given

@@ -41,7 +41,7 @@ class Cotangents(NamedTuple):
         for name, array in zip(self._fields, arrays, strict=True):
             shape = (n, 3) if name == "point" else (n,)
             if array is not None and (array.shape != shape or array.dtype.kind not in "iuf"):
-                raise InputError(f"{name} must be {shape} of real numbers, got {shown(array)}")
+                raise InputError(f"must be {shape} of real numbers, got {shown(array)}", argument=name)
         return Cotangents(*arrays)
 
     def at(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

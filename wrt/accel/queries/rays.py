@@ -53,12 +53,12 @@ def rays_of(origins: Any, directions: Any, t_min: Any, t_max: Any, gradients: bo
     origins, directions = taken(origins, "origins"), taken(directions, "directions")
     if isinstance(origins, wp.array) or isinstance(directions, wp.array):
         if any(not isinstance(array, wp.array) or array.dtype != wp.vec3 for array in (origins, directions)):
-            raise InputError("origins and directions must both be Warp arrays of vec3, or both NumPy arrays")
+            raise InputError("and directions must both be Warp arrays of vec3, or both NumPy arrays", argument="origins")
     else:
         origins, directions = _rows(origins, "origins"), _rows(directions, "directions")
     n = len(origins)
     if len(directions) != n:
-        raise InputError(f"directions must have as many rows as origins ({n}), got {len(directions)}")
+        raise InputError(f"must have as many rows as origins ({n}), got {len(directions)}", argument="directions")
     return Rays(origins, directions, _segment_ends(t_min, n, "t_min"), _segment_ends(t_max, n, "t_max"))
 
 
@@ -87,12 +87,12 @@ def _segment_ends(value: Any, n: int, name: str) -> Any:
         value = taken(value, name, wp.float32)
     if isinstance(value, wp.array):
         if value.dtype != wp.float32 or value.shape != (n,):
-            raise InputError(f"{name} must be ({n},) float32, got {value.shape} {value.dtype.__name__}")
+            raise InputError(f"must be ({n},) float32, got {value.shape} {value.dtype.__name__}", argument=name)
         return value
     if type(value) is not float:
         array = real_numbers(value, name, f"a number or ({n},)")
         if array.ndim > 1 or (array.ndim == 1 and len(array) != n):
-            raise InputError(f"{name} must be a number or ({n},), got {array.shape}")
+            raise InputError(f"must be a number or ({n},), got {array.shape}", argument=name)
         if array.ndim == 1:
             return array
         value = float(float32(array))
@@ -115,13 +115,13 @@ def _checked_ends(array: Any, name: str) -> Any:
 def _check_ends(least: Any, name: str) -> None:
     """least: of all numbers; NaN where there is one."""
     if not least >= LOWEST[name]:
-        raise InputError(f"{name} must not be NaN" + (" or below 0" if name == "t_min" else ""))
+        raise InputError("must not be NaN" + (" or below 0" if name == "t_min" else ""), argument=name)
 
 
 def _rows(value: Any, name: str) -> np.ndarray:
     array = real_numbers(value, name, "(N, 3)")
     if array.ndim != 2 or array.shape[1] != 3:
-        raise InputError(f"{name} must be (N, 3), got {array.shape}")
+        raise InputError(f"must be (N, 3), got {array.shape}", argument=name)
     return array
 
 
@@ -133,7 +133,7 @@ def vectors(value: Any, name: str, most: float = float(np.finfo(np.float32).max)
         for good, what in ((np.isfinite(array), "finite"), (np.abs(array) <= most, f"within {most:g}")):
             if not good.all():
                 row = int(np.argmin(good.all(axis=1)))
-                raise InputError(f"{name} must be {what}; row {row} is [{', '.join(map(str, array[row]))}]")
+                raise InputError(f"must be {what}; row {row} is [{', '.join(map(str, array[row]))}]", argument=name)
     return array
 
 
@@ -143,4 +143,4 @@ def _check_not_zero(directions: np.ndarray) -> None:
         zero &= directions[:, 1] == 0.0
         zero &= directions[:, 2] == 0.0
         if zero.any():
-            raise InputError(f"directions must not be zero; row {int(np.argmax(zero))} is")
+            raise InputError(f"must not be zero; row {int(np.argmax(zero))} is", argument="directions")

@@ -44,21 +44,21 @@ def visible(accel: Accelerator, a: Any, b: Any, on_a: Any = None, on_b: Any = No
     arrays on a GPU no values are looked at, and what is not finite sees nothing.
     """
     if not isinstance(accel, Accelerator):
-        raise InputError(f"accel must be a structure (wrt.build), got {shown(accel)}")
+        raise InputError(f"must be a structure (wrt.build), got {shown(accel)}", argument="accel")
     accel = copy(accel)  # which a refit meanwhile leaves as it is
     threads, device = thread_count(threads), accel.device
     check_no_gradients(a=a, b=b)
     p, q = (_points(value, name, device) for value, name in ((a, "a"), (b, "b")))
     n, as_warp, give = len(p), isinstance(taken(a, "a"), wp.array), returned(a, b)
     if len(q) != n:
-        raise InputError(f"b must have as many rows as a ({n}), got {len(q)}")
+        raise InputError(f"must have as many rows as a ({n}), got {len(q)}", argument="b")
     array = room_for(ANY_HIT_TYPES, None if out is None else [out], n, device if as_warp else None, give is not None)[0]
     snapshot, known, surfaces = accel.snapshot, on_a is not None or on_b is not None, Surfaces()
     if isinstance(snapshot.geometry, InstancedGeometry) and len(snapshot.geometry.first_instance) > 2:
-        raise InputError("visible does not take a structure over several worlds yet")
+        raise InputError("must not be over several worlds: visible does not take such a structure yet", argument="accel")
     if known:
         if accel.structure.units.instances:
-            raise InputError("on_a and on_b are for structures without instances")
+            raise InputError("is for structures without instances", argument="on_a" if on_a is not None else "on_b")
         surfaces = surroundings(snapshot).surfaces
     ids = [_prim_ids(value, name, n, len(snapshot.geometry)) if known else np.zeros(0, np.int32)
            for value, name in ((on_a, "on_a"), (on_b, "on_b"))]
@@ -119,7 +119,7 @@ def _points(value: Any, name: str, device: Any) -> Any:
     value = taken(value, name)
     if isinstance(value, wp.array):
         if value.dtype != wp.vec3 or value.ndim != 1:
-            raise InputError(f"{name} must be (N,) vec3, got {value.shape} {value.dtype.__name__}")
+            raise InputError(f"must be (N,) vec3, got {value.shape} {value.dtype.__name__}", argument=name)
         if value.device.is_cpu:
             vectors(value.numpy(), name, FARTHEST)
         return (value if value.is_contiguous else value.contiguous()).to(device)
@@ -132,8 +132,8 @@ def _prim_ids(value: Any, name: str, n: int, count: int) -> np.ndarray:
         return np.full(n, -1, np.int32)
     array = real_numbers(value, name, f"({n},) prim_ids")
     if array.shape != (n,) or array.dtype.kind not in "iu":
-        raise InputError(f"{name} must be ({n},) whole numbers, got {shown(array)}")
+        raise InputError(f"must be ({n},) whole numbers, got {shown(array)}", argument=name)
     if n and not (array.min() >= -1 and array.max() < count):
         row = int(np.argmax((array < -1) | (array >= count)))
-        raise InputError(f"{name} must be -1 to {count - 1}; row {row} is {array[row]}")
+        raise InputError(f"must be -1 to {count - 1}; row {row} is {array[row]}", argument=name)
     return array.astype(np.int32)

@@ -27,13 +27,13 @@ class WorldIds:
     def _on(self, device: Any, world: Any, n: int) -> Any:
         if isinstance(world, wp.array):
             if world.dtype != wp.int32 or world.shape != (n,):
-                raise InputError(f"world must be ({n},) int32, got {world.shape} {world.dtype.__name__}")
+                raise InputError(f"must be ({n},) int32, got {world.shape} {world.dtype.__name__}", argument="world")
             return (world if world.is_contiguous else world.contiguous()).to(device)
         ids, count = real_numbers(world, "world", f"a number or ({n},)"), len(self.first_prim)
         if ids.shape not in ((), (n,)) or (ids.dtype.kind not in "iu" and ids.size):
-            raise InputError(f"world must be a whole number or ({n},) of them, got {shown(world)}")
+            raise InputError(f"must be a whole number or ({n},) of them, got {shown(world)}", argument="world")
         if ids.size and not (ids.min() >= 0 and ids.max() < count):
-            raise InputError(f"world must be 0 to {count - 1}, got {ids.min() if ids.min() < 0 else ids.max()}")
+            raise InputError(f"must be 0 to {count - 1}, got {ids.min() if ids.min() < 0 else ids.max()}", argument="world")
         return upload(np.broadcast_to(ids, (n,)).astype(np.int32), wp.int32, device)
 
     def numbered(self, prim_id: Any) -> np.ndarray:
@@ -48,8 +48,8 @@ def worlds_asked(snapshot: Snapshot, world: Any, n: int) -> WorldIds | None:
     several = isinstance(geometry, InstancedGeometry) and geometry.worlds is not None
     if world is None:
         if several and len(geometry.worlds) > 2:
-            raise InputError(f"world must be given: the structure is over {len(geometry.worlds) - 1} worlds")
+            raise InputError(f"must be given: the structure is over {len(geometry.worlds) - 1} worlds", argument="world")
         return None
     if not several:
-        raise InputError("world is for structures over worlds: wrt.build takes a list of them")
+        raise InputError("is for structures over worlds: wrt.build takes a list of them", argument="world")
     return WorldIds(snapshot, world, n)

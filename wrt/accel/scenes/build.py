@@ -99,8 +99,8 @@ def shape_given(mesh: Any) -> Mesh | Scene:
         mesh = Mesh.from_trimesh(mesh)
     if isinstance(mesh, Scene | Mesh):
         return mesh
-    raise InputError("mesh must be a Mesh, a Scene, the path of a mesh or scene file, a trimesh.Trimesh or trimesh.Scene, or a pair"
-                     f" (vertices, faces), got {shown(mesh)}")
+    raise InputError("must be a Mesh, a Scene, the path of a mesh or scene file, a trimesh.Trimesh or trimesh.Scene, or a pair"
+                     f" (vertices, faces), got {shown(mesh)}", argument="mesh")
 
 
 def one_geometry(flat: FlatScene) -> Geometry:

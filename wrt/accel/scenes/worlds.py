@@ -23,14 +23,15 @@ def worlds_over(given: Sequence[Mesh | Scene]) -> FlatScene:
     for number, scene in enumerate(given):
         for thing in scene.objects if isinstance(scene, Scene) else ():
             if not is_invertible(thing):
-                raise InputError(f"world {number}: object {thing.name!r} is flattened or sheared too much to be an instance")
+                raise InputError("is flattened or sheared too much to be an instance",
+                                 place=f"world {number}: object {thing.name!r}")
         if isinstance(scene, Scene) and scene.spheres:
-            raise InputError(f"world {number} has spheres; worlds are of meshes")
+            raise InputError("has spheres; worlds are of meshes", place=f"world {number}")
     grey = (Material(),)
     objects = [scene.objects if isinstance(scene, Scene) else (Object(scene, grey),) for scene in given]
     together = tuple(thing for each in objects for thing in each)
     if not together:
-        raise InputError("worlds must have at least one object between them")
+        raise InputError("must have at least one object between them", argument="worlds")
     flat = flatten(Scene(together), frozenset(id(thing.mesh) for thing in together))
     geometry: Any = flat.geometry
     return replace(flat, geometry=replace(geometry, worlds=np.cumsum([0, *map(len, objects)])), objects=None)

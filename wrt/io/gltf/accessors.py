@@ -34,7 +34,7 @@ class Accessors:
         """
         accessor = self._document.item("accessors", index, place)
         if accessor.type != kind:
-            raise InputError(f"must be of type {kind}, but accessors[{index}] is {short(accessor.type)}", None, place)
+            raise InputError(f"must be of type {kind}, but accessors[{index}] is {short(accessor.type)}", place=place)
         if index not in self._arrays:
             with at(place):
                 self._arrays[index] = self._decode(accessor, f"accessors[{index}]")
@@ -44,7 +44,7 @@ class Accessors:
         dtype, count = _dtype(accessor.componentType, where), accessor.count
         most = _MAX_COUNT if accessor.bufferView is not None else _MAX_IMPLICIT_COUNT
         if not 1 <= count <= most:
-            raise InputError(f"must be 1 to {most}, got {count}", None, f"{where}.count")
+            raise InputError(f"must be 1 to {most}, got {count}", place=f"{where}.count")
         width = _WIDTHS[accessor.type]
         if accessor.bufferView is not None:
             array = self._elements(accessor.bufferView, accessor.byteOffset or 0, dtype, (count, width), where)
@@ -58,8 +58,8 @@ class Accessors:
             bad = ~np.isfinite(array).all(axis=1)
             if bad.any():
                 row = int(np.nonzero(bad)[0][0])
-                raise InputError(f"element {row} is {array[row].tolist()} ({int(bad.sum())} not finite in all)", None,
-                                 where)
+                raise InputError(f"element {row} is {array[row].tolist()} ({int(bad.sum())} not finite in all)",
+                                 place=where)
         array.flags.writeable = False
         return array
 
@@ -69,25 +69,25 @@ class Accessors:
         size = dtype.itemsize * shape[1]
         stride = stride or size
         if stride < size:
-            raise InputError(f"is {stride}, but an element has {size} bytes", None, f"bufferViews[{view}].byteStride")
+            raise InputError(f"is {stride}, but an element has {size} bytes", place=f"bufferViews[{view}].byteStride")
         end = offset + (shape[0] - 1) * stride + size
         if offset < 0 or end > len(data):
             raise InputError(f"{shape[0]} elements reach from byte {offset} to {end} of bufferViews[{view}], "
-                             f"which has {len(data)}", None, where)
+                             f"which has {len(data)}", place=where)
         elements = np.ndarray(shape, dtype, data.data, offset, (stride, dtype.itemsize))
         return elements.astype(dtype.newbyteorder("="))
 
     def _with_sparse(self, array: np.ndarray, sparse: Any, where: str) -> np.ndarray:
         """`array` with the listed elements replaced."""
         if not 1 <= sparse.count <= len(array):
-            raise InputError(f"must be 1 to {len(array)}, got {sparse.count}", None, f"{where}.count")
+            raise InputError(f"must be 1 to {len(array)}, got {sparse.count}", place=f"{where}.count")
         index_type = _dtype(sparse.indices.componentType, f"{where}.indices")
         if index_type.kind != "u":
-            raise InputError("must be an unsigned integer type", None, f"{where}.indices.componentType")
+            raise InputError("must be an unsigned integer type", place=f"{where}.indices.componentType")
         rows = self._elements(sparse.indices.bufferView, sparse.indices.byteOffset or 0, index_type, (sparse.count, 1),
                               f"{where}.indices")[:, 0]
         if rows.max() >= len(array):
-            raise InputError(f"holds {int(rows.max())}, but there are {len(array)} elements", None, f"{where}.indices")
+            raise InputError(f"holds {int(rows.max())}, but there are {len(array)} elements", place=f"{where}.indices")
         values = sparse.values
         array[rows] = self._elements(values.bufferView, values.byteOffset or 0, array.dtype.newbyteorder("<"),
                                      (sparse.count, array.shape[1]), f"{where}.values")
@@ -96,13 +96,13 @@ class Accessors:
 
 def _dtype(component_type: int, where: str) -> np.dtype:
     if component_type not in _DTYPES:
-        raise InputError(f"must be one of {', '.join(map(str, _DTYPES))}, got {component_type}", None,
-                         f"{where}.componentType")
+        raise InputError(f"must be one of {', '.join(map(str, _DTYPES))}, got {component_type}",
+                         place=f"{where}.componentType")
     return np.dtype(_DTYPES[component_type])
 
 
 def _normalised(array: np.ndarray, where: str) -> np.ndarray:
     """Integers to [0, 1] or [-1, 1], float32; the specification's table, with the clamp of the most negative value."""
     if array.dtype.kind == "f" or array.dtype.itemsize > 2:
-        raise InputError("only 8- and 16-bit integers can be normalised", None, f"{where}.normalized")
+        raise InputError("only 8- and 16-bit integers can be normalised", place=f"{where}.normalized")
     return np.maximum(array.astype(np.float32) / np.float32(np.iinfo(array.dtype).max), np.float32(-1.0))

@@ -101,7 +101,7 @@ class Document:
         """`gltf.<array>[index]`; raises InputError at `place` where there is none."""
         items = getattr(self.gltf, array)
         if not 0 <= index < len(items):
-            raise InputError(f"is {index}, but there are {len(items)} {array}", None, place)
+            raise InputError(f"is {index}, but there are {len(items)} {array}", place=place)
         return items[index]
 
     def extension(self, holder: Any, name: str, cls: Any, place: str) -> Any:
@@ -116,10 +116,10 @@ class Document:
         data = self._buffer(view.buffer, f"{where}.buffer")
         start, length = view.byteOffset or 0, view.byteLength
         if length < 1:
-            raise InputError(f"must be at least 1, got {length}", None, f"{where}.byteLength")
+            raise InputError(f"must be at least 1, got {length}", place=f"{where}.byteLength")
         if start < 0 or start + length > len(data):
             raise InputError(f"bytes {start} to {start + length} reach outside of buffers[{view.buffer}], "
-                             f"which has {len(data)}", None, where)
+                             f"which has {len(data)}", place=where)
         return data[start:start + length], view.byteStride
 
     def _buffer(self, index: int, place: str) -> np.ndarray:
@@ -132,10 +132,9 @@ class Document:
             elif index == 0 and self._binary is not None:
                 data = self._binary
             else:
-                raise InputError("has no uri, and the file has no binary chunk for it", None, where)
+                raise InputError("has no uri, and the file has no binary chunk for it", place=where)
             if len(data) < buffer.byteLength:
-                raise InputError(f"is truncated: byteLength is {buffer.byteLength}, but there are {len(data)} bytes",
-                                 None, where)
+                raise InputError(f"is truncated: byteLength is {buffer.byteLength}, but there are {len(data)} bytes", place=where)
             self._buffers[index] = np.frombuffer(data, dtype=np.uint8)[:max(buffer.byteLength, 0)]
         return self._buffers[index]
 
@@ -148,7 +147,7 @@ class Document:
         try:
             return read_file(self.path.parent / name)
         except InputError as error:
-            raise InputError(f"cannot read {short(name)}: {str(error).removeprefix('cannot be read: ')}", None, place) from None
+            raise InputError(f"cannot read {short(name)}: {str(error).removeprefix('cannot be read: ')}", place=place) from None
 
 
 def _read_container(path: Path) -> tuple[Any, bytes | memoryview | None]:
@@ -163,25 +162,25 @@ def _read_container(path: Path) -> tuple[Any, bytes | memoryview | None]:
 
 def _read_glb(data: bytes) -> tuple[Any, bytes | memoryview | None]:
     if len(data) < 20:
-        raise InputError(f"is truncated: a .glb file starts with 20 bytes, this one has {len(data)}", None, "header")
+        raise InputError(f"is truncated: a .glb file starts with 20 bytes, this one has {len(data)}", place="header")
     version, length = struct.unpack_from("<II", data, 4)
     if version != 2:
-        raise InputError(f"is glTF {version}; wrt reads 2.0", None, "header.version")
+        raise InputError(f"is glTF {version}; wrt reads 2.0", place="header.version")
     if length > len(data):
-        raise InputError(f"is truncated: {length} bytes according to its header, but there are {len(data)}", None,
-                         "header.length")
+        raise InputError(f"is truncated: {length} bytes according to its header, but there are {len(data)}",
+                         place="header.length")
     chunks: list[tuple[int, memoryview]] = []
     offset = 12
     while offset + 8 <= length:
         size, kind = struct.unpack_from("<II", data, offset)
         if offset + 8 + size > length:
-            raise InputError(f"is truncated: it ends at byte {offset + 8 + size}, the file at {length}", None,
-                             f"chunk {len(chunks)}")
+            raise InputError(f"is truncated: it ends at byte {offset + 8 + size}, the file at {length}",
+                             place=f"chunk {len(chunks)}")
         if len(chunks) < 2:  # there are no others that mean anything
             chunks.append((kind, memoryview(data)[offset + 8:offset + 8 + size]))
         offset += 8 + size
     if not chunks or chunks[0][0] != _CHUNK_JSON:
-        raise InputError("must be JSON", None, "chunk 0")
+        raise InputError("must be JSON", place="chunk 0")
     binary = chunks[1][1] if len(chunks) > 1 and chunks[1][0] == _CHUNK_BIN else None
     return _parse_json(bytes(chunks[0][1])), binary
 
@@ -205,11 +204,11 @@ def _parse_json(data: bytes) -> Any:
 def _check_version(raw: dict[str, Any]) -> None:
     asset = raw.get("asset")
     if not isinstance(asset, dict) or not isinstance(asset.get("version"), str):
-        raise InputError("must be a string such as '2.0'", None, "asset.version")
+        raise InputError("must be a string such as '2.0'", place="asset.version")
     for key, readable in (("version", r"2\.\d+"), ("minVersion", r"2\.0")):  # a later 2.x may be read as 2.0
         version = asset.get(key)
         if version is not None and not re.fullmatch(readable, str(version)):
-            raise InputError(f"is {short(version)}; wrt reads 2.0", None, f"asset.{key}")
+            raise InputError(f"is {short(version)}; wrt reads 2.0", place=f"asset.{key}")
 
 
 def _check_required_extensions(required: Iterable[str]) -> None:
@@ -217,8 +216,8 @@ def _check_required_extensions(required: Iterable[str]) -> None:
     if unknown:
         codecs = [name for name in unknown if name in _CODECS]
         hint = f"; there is no decoder for {', '.join(codecs)}: save the file without compression" if codecs else ""
-        raise InputError(f"the file needs {listed(unknown)}, which wrt does not support{hint}", None,
-                         "extensionsRequired")
+        raise InputError(f"the file needs {listed(unknown)}, which wrt does not support{hint}",
+                         place="extensionsRequired")
 
 
 def _decode_data_uri(uri: str) -> bytes:
@@ -237,7 +236,7 @@ def _local_name(uri: str, place: str) -> str:
     try:
         name = unquote_to_bytes(uri).decode("utf-8").replace("\\", "/")
     except UnicodeError:
-        raise InputError(f"{uri[:80]!r} is not UTF-8", None, place) from None
+        raise InputError(f"{uri[:80]!r} is not UTF-8", place=place) from None
     problem = ""
     if not name or any(ord(character) < 32 for character in name):
         problem = "is empty or holds a control character"
@@ -248,5 +247,5 @@ def _local_name(uri: str, place: str) -> str:
     elif ".." in name.split("/"):
         problem = "leaves the folder of the glTF file; copy what it needs beside it"
     if problem:
-        raise InputError(f"{uri[:80]!r} {problem}", None, place)
+        raise InputError(f"{uri[:80]!r} {problem}", place=place)
     return name

@@ -83,8 +83,8 @@ class Textures:
             self._document.left_out.add("nearest-neighbour sampling", "material", material)
         for axis in ("wrapS", "wrapT"):
             if getattr(sampler, axis) not in _WRAPS:
-                raise InputError(f"must be one of {', '.join(map(str, _WRAPS))}, got {getattr(sampler, axis)}", None,
-                                 f"samplers[{texture.sampler}].{axis}")
+                raise InputError(f"must be one of {', '.join(map(str, _WRAPS))}, got {getattr(sampler, axis)}",
+                                 place=f"samplers[{texture.sampler}].{axis}")
         return (_WRAPS[sampler.wrapS], _WRAPS[sampler.wrapT])
 
     def _source(self, texture: Any, place: str) -> int | None:
@@ -108,7 +108,7 @@ class Textures:
             elif image.bufferView is not None:
                 data = self._document.view(image.bufferView, f"{place}.bufferView")[0].tobytes()
             else:
-                raise InputError("has neither a uri nor a bufferView", None, place)
+                raise InputError("has neither a uri nor a bufferView", place=place)
             with at(place):
                 self._images[index] = decode_rgba8(data)
         return self._images[index]
@@ -171,8 +171,8 @@ class Materials:
         pbr = source.pbrMetallicRoughness
         factor = exactly(pbr.baseColorFactor, 4, f"{place}.pbrMetallicRoughness.baseColorFactor")
         if source.alphaMode not in _ALPHA_MODES:
-            raise InputError(f"must be one of {', '.join(_ALPHA_MODES)}, got {short(source.alphaMode)}", None,
-                             f"{place}.alphaMode")
+            raise InputError(f"must be one of {', '.join(_ALPHA_MODES)}, got {short(source.alphaMode)}",
+                             place=f"{place}.alphaMode")
         alpha, cutoff = factor[3], 0.5 if source.alphaCutoff is None else source.alphaCutoff
         if cutoff > 1.0:  # allowed, and means that nothing of it is seen
             alpha, cutoff = 0.0, 1.0

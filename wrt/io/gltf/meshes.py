@@ -57,7 +57,7 @@ class Meshes:
         """The mesh of a primitive, or None where it holds no triangle with an area."""
         left_out, attributes = self._document.left_out, primitive.attributes
         if primitive.mode not in TRIANGULATE and primitive.mode not in _NOT_TRIANGLES:
-            raise InputError(f"must be 0 to 6, got {primitive.mode}", None, f"{place}.mode")
+            raise InputError(f"must be 0 to 6, got {primitive.mode}", place=f"{place}.mode")
         if primitive.mode in _NOT_TRIANGLES or "POSITION" not in attributes:
             left_out.add(_NOT_TRIANGLES.get(primitive.mode, "primitives without POSITION"), "mesh", name)
             return None
@@ -80,8 +80,8 @@ class Meshes:
         assert positions is not None
         for attribute, array in (("NORMAL", normals), ("TEXCOORD_0", uvs)):
             if array is not None and len(array) != len(positions):
-                raise InputError(f"has {len(array)} elements, POSITION has {len(positions)}", None,
-                                 f"{place}.attributes.{attribute}")
+                raise InputError(f"has {len(array)} elements, POSITION has {len(positions)}",
+                                 place=f"{place}.attributes.{attribute}")
         indices = self._indices(primitive, len(positions), place)
         if primitive.mode == 4 and len(indices) % 3:
             self._document.left_out.add("incomplete last triangles", "mesh", name)
@@ -104,10 +104,10 @@ class Meshes:
         where = f"{place}.indices"
         indices = self._accessors.read(primitive.indices, "SCALAR", where)[:, 0]
         if indices.dtype.kind != "u":
-            raise InputError("must be of an unsigned integer type, not normalised", None, where)
+            raise InputError("must be of an unsigned integer type, not normalised", place=where)
         if indices.max() >= count:
             i = int(np.argmax(indices >= count))
-            raise InputError(f"index {i} is {int(indices[i])}, but there are {count} vertices", None, where)
+            raise InputError(f"index {i} is {int(indices[i])}, but there are {count} vertices", place=where)
         return indices.astype(np.int32)  # accessors end at 2^31 - 1
 
     def instances(self, node: Any, place: str) -> np.ndarray | None:
@@ -121,9 +121,9 @@ class Meshes:
                  for name, index in instancing.attributes.items() if name in wanted}
         counts = {len(array) for array in found.values()}
         if len(counts) != 1:
-            raise InputError(f"must hold accessors of one length, got {sorted(counts) or 'none'}", None, place)
+            raise InputError(f"must hold accessors of one length, got {sorted(counts) or 'none'}", place=place)
         if "ROTATION" in found and not found["ROTATION"].any(axis=1).all():
-            raise InputError("must hold unit quaternions, but one is zero", None, f"{place}.ROTATION")
+            raise InputError("must hold unit quaternions, but one is zero", place=f"{place}.ROTATION")
         count = counts.pop()
         self._instances += count
         with at(place):

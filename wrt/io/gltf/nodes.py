@@ -25,7 +25,7 @@ def walk(document: Document) -> Iterator[tuple[int, Any, np.ndarray]]:
         index, place, parent = stack.pop()
         node = document.item("nodes", index, place)
         if index in seen:
-            raise InputError(f"nodes[{index}] is in the scene twice", None, place)
+            raise InputError(f"nodes[{index}] is in the scene twice", place=place)
         seen.add(index)
         with np.errstate(over="ignore", invalid="ignore"):  # what overflows is reported by whatever stands there
             world = parent @ local_matrix(node, f"nodes[{index}]")
@@ -53,7 +53,7 @@ def _check_forest(document: Document) -> None:
             place = f"nodes[{index}].children[{i}]"
             document.item("nodes", child, place)
             if child in parent:
-                raise InputError(f"nodes[{child}] has two parents, the first is nodes[{parent[child]}]", None, place)
+                raise InputError(f"nodes[{child}] has two parents, the first is nodes[{parent[child]}]", place=place)
             parent[child] = index
     # With one parent each, whatever cannot be reached from a root is on a cycle or hangs from one.
     reached = [index for index in range(len(nodes)) if index not in parent]
@@ -61,7 +61,7 @@ def _check_forest(document: Document) -> None:
         reached += nodes[index].children
     if len(reached) < len(nodes):
         first = min(set(range(len(nodes))) - set(reached))
-        raise InputError("the node graph has a cycle", None, f"nodes[{first}]")
+        raise InputError("the node graph has a cycle", place=f"nodes[{first}]")
 
 
 def local_matrix(node: Any, place: str) -> np.ndarray:
@@ -73,7 +73,7 @@ def local_matrix(node: Any, place: str) -> np.ndarray:
     scale = exactly(node.scale if node.scale is not None else [1.0] * 3, 3, f"{place}.scale")
     rotation = exactly(node.rotation or [0.0, 0.0, 0.0, 1.0], 4, f"{place}.rotation")
     if not any(rotation):
-        raise InputError("must be a unit quaternion, got zero", None, f"{place}.rotation")
+        raise InputError("must be a unit quaternion, got zero", place=f"{place}.rotation")
     return compose(np.array([translation]), np.array([rotation]), np.array([scale]))[0]
 
 

@@ -150,8 +150,8 @@ class _Reader:
         self.document.left_out.add_extensions(source.extensions, "camera", name)
         lens = getattr(source, source.type) if source.type in ("perspective", "orthographic") else None
         if lens is None:
-            raise InputError("must be 'perspective' or 'orthographic', with the object of that name", None,
-                             f"cameras[{node.camera}].type")
+            raise InputError("must be 'perspective' or 'orthographic', with the object of that name",
+                             place=f"cameras[{node.camera}].type")
         with at(f"{place}.camera"):
             self.cameras.append(Camera(world, lens.yfov, name=name) if source.type == "perspective" else
                                 OrthographicCamera(world, 2.0 * lens.ymag, name=name))
@@ -162,11 +162,11 @@ class _Reader:
             return
         here = f"{place}.extensions.KHR_lights_punctual.light"
         if not 0 <= link.light < len(self._punctual):
-            raise InputError(f"is {link.light}, but there are {len(self._punctual)} lights", None, here)
+            raise InputError(f"is {link.light}, but there are {len(self._punctual)} lights", place=here)
         source, where = self._punctual[link.light], f"extensions.KHR_lights_punctual.lights[{link.light}]"
         name = node.name or source.name or f"light {link.light}"
         if source.type not in LIGHTS:
-            raise InputError(f"must be one of {', '.join(LIGHTS)}, got {short(source.type)}", None, f"{where}.type")
+            raise InputError(f"must be one of {', '.join(LIGHTS)}, got {short(source.type)}", place=f"{where}.type")
         if source.range is not None:
             self.document.left_out.add("range", "light", name)
         color = exactly(source.color, 3, f"{where}.color")

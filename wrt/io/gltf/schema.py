@@ -143,14 +143,14 @@ def read_as(hint: Any, raw: Any, place: str) -> Any:
 def exactly(values: list[float], count: int, place: str) -> list[float]:
     """`values`; raises InputError at `place` where there are not `count` of them."""
     if len(values) != count:
-        raise InputError(f"must hold {count} numbers, got {len(values)}", None, place)
+        raise InputError(f"must hold {count} numbers, got {len(values)}", place=place)
     return values
 
 
 def _object(cls: Any, raw: dict[str, Any], place: str) -> Any:
     for name in _required(cls):
         if raw.get(name) is None:
-            raise InputError("is required", None, _join(place, name))
+            raise InputError("is required", place=_join(place, name))
     values = {name: read_as(hint, raw[name], _join(place, name))
               for name, hint in _fields(cls).items() if raw.get(name) is not None}
     return cls(**values)
@@ -200,4 +200,4 @@ def _join(place: str, name: str) -> str:
 
 
 def _wrong(expected: str, raw: Any, place: str) -> InputError:
-    return InputError(f"must be {expected}, got {short(raw)}", None, place or None)
+    return InputError(f"must be {expected}, got {short(raw)}", place=place or None)

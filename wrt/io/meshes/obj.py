@@ -46,7 +46,7 @@ class _Text:
         self.absent: dict[str, None] = {}  # what faces refer to and the whole file has not: vt, vn
 
     def fail(self, line: int, message: str) -> NoReturn:
-        raise InputError(message, None, f"line {line}")
+        raise InputError(message, place=f"line {line}")
 
     def read(self, data: bytes) -> None:
         pending, number = "", 0  # lines that the next one continues

@@ -171,7 +171,7 @@ class _Source:
                 self._read(element)
 
     def fail(self, message: str, place: str | None = None) -> NoReturn:
-        raise InputError(message, None, place)
+        raise InputError(message, place=place)
 
     def _header(self) -> tuple[str, list[_Element], int]:
         """The format, the elements without their data, and where the data begin."""

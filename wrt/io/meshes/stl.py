@@ -37,7 +37,7 @@ def read(path: Path) -> RawMesh:
     with np.errstate(over="ignore"):
         bad = np.nonzero(~np.isfinite(vertices.astype(np.float32)).all(axis=1))[0]
     if len(bad):
-        raise InputError(f"position {vertices[bad[0]].tolist()} is not finite ({len(bad)} in all)", None, f"triangle {bad[0] // 3}")
+        raise InputError(f"position {vertices[bad[0]].tolist()} is not finite ({len(bad)} in all)", place=f"triangle {bad[0] // 3}")
     return RawMesh(
         vertices=vertices,
         faces=np.arange(len(vertices)).reshape(-1, 3),
@@ -52,8 +52,8 @@ def _read_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...], list[int]]:
     later ones are called name_1, name_2 ..."""
 
     def fail(number: int, message: str) -> NoReturn:
-        raise InputError(f"truncated, or no STL file: {message}, and the length is not that of a binary STL file", None,
-                         f"line {number}")
+        raise InputError(f"truncated, or no STL file: {message}, and the length is not that of a binary STL file",
+                         place=f"line {number}")
 
     numbers = array("d")
     names: list[str] = []

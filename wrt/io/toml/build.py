@@ -53,7 +53,7 @@ def build(table: tables.SceneTable, path: Path) -> Scene:
 class _Builder:
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.problems: list[str] = []
+        self.problems: list[InputError] = []
         self.materials: dict[str, Material] = {}
         self._included: dict[Path, Scene] = {}  # a file that is named again is read once
         self._included_objects = 0
@@ -67,7 +67,7 @@ class _Builder:
         try:
             yield
         except InputError as error:
-            self.problems.append(f"{place}: {error}")
+            self.problems.append(error.at(place=place))
 
     def file(self, name: str) -> Path:
         return self.path.parent / name
@@ -143,7 +143,7 @@ class _Builder:
         name, to_world = (entry, None) if isinstance(entry, str) else (entry.file, entry.transform)
         with self.at(place):
             if not name.lower().endswith((".gltf", ".glb")):
-                raise InputError(f"{name!r} is no .gltf or .glb file; a mesh file belongs into [[meshes]]")
+                raise InputError(f"{name!r} is no .gltf or .glb file", hint="a mesh file belongs into [[meshes]]")
             path = self.file(name)
             if path not in self._included:
                 self._included[path] = load_gltf(path, staged=False)
@@ -160,7 +160,7 @@ class _Builder:
         for name, material in table.override.items():
             with self.at(f"override.{name}"):
                 if name not in names and len(included) == len(table.include):
-                    raise InputError(unknown(name, "included material", names))
+                    raise unknown(name, "included material", names)
             new |= self.material(material, name, f"override.{name}")
         return [replace(scene, objects=tuple(
             replace(thing, materials=tuple(new.get(m.name, m) for m in thing.materials)) for thing in scene.objects))

@@ -39,12 +39,13 @@ class Meshes:
         groups = set(mesh.groups)
         for group in by_group:
             if group not in groups:
-                raise InputError(f"materials: {unknown(group, 'group of ' + mesh.name, mesh.groups)}")
+                raise unknown(group, "group of " + mesh.name, mesh.groups, place="materials")
         used = np.unique(mesh.face_group).tolist() if mesh.face_group is not None else []
         wanted = [by_group.get(mesh.groups[group], table.material) for group in used] if by_group else [table.material]
         for group, name in zip(used, wanted, strict=False):
             if name is None:
-                raise InputError(f"the triangles of group {mesh.groups[group]!r} have no material; give `material` for the rest")
+                raise InputError(f"the triangles of group {mesh.groups[group]!r} have no material",
+                                 hint="give `material` for the rest")
         names = list(dict.fromkeys(str(name) for name in wanted))
         if not materials.keys() >= set(names):
             return []

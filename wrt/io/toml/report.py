@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from wrt.core.checks import short, unknown
-from wrt.core.errors import InputError
+from wrt.core.errors import InputError, InputErrors
 
 if TYPE_CHECKING:
     from wrt.io.toml.schema import SceneTable
@@ -41,7 +41,7 @@ def check_settings(values: dict[str, Any], origin: str) -> dict[str, Any]:
     return _models(SettingsTable, values, Path(origin)).given()
 
 
-def _models(table: Any, data: dict[str, Any], path: Path, others: Sequence[str] = ()) -> Any:
+def _models(table: Any, data: dict[str, Any], path: Path, others: Sequence[InputError] = ()) -> Any:
     """`data` as that table. Where it is none, the InputError lists the `others` too."""
     from pydantic import ValidationError
 
@@ -53,20 +53,18 @@ def _models(table: Any, data: dict[str, Any], path: Path, others: Sequence[str] 
     raise_all([*problems, *others], path)
 
 
-def raise_all(problems: Sequence[str], path: Path) -> None:
+def raise_all(problems: Sequence[InputError], path: Path) -> None:
     """Raise one InputError with all problems, each a line, but no more than MOST; nothing where there are none."""
-    problems = list(dict.fromkeys(problems))
-    count = len(problems)
-    if count > MOST:
-        problems = [*problems[:MOST], f"and {count - MOST} more"]
-    if len(problems) == 1:
-        raise InputError(problems[0], path)
-    if problems:
-        raise InputError("\n  ".join([f"{count} errors", *problems]), path)
+    lines = {str(problem): problem for problem in problems}
+    if len(lines) == 1:
+        raise problems[0].at(path)
+    if lines:
+        more = [f"and {len(lines) - MOST} more"] * (len(lines) > MOST)
+        raise InputErrors("\n  ".join([f"{len(lines)} errors", *list(lines)[:MOST], *more]), list(lines.values()), path=path)
 
 
-def unknown_materials(data: dict[str, Any], known: Collection[str]) -> list[str]:
-    """A line for each reference to a material that is not known; values of the wrong type are left to the schema."""
+def unknown_materials(data: dict[str, Any], known: Collection[str]) -> list[InputError]:
+    """An error for each reference to a material that is not known; values of the wrong type are left to the schema."""
     found: list[tuple[str, Any]] = []
     for kind in ("spheres", "quads", "boxes", "meshes"):
         for i, table in enumerate(_tables(data.get(kind))):
@@ -77,34 +75,34 @@ def unknown_materials(data: dict[str, Any], known: Collection[str]) -> list[str]
                 found += [(f"{at}.materials.{group}", name) for group, name in groups.items()]
             found += [(f"{at}.parts[{j}].material", part.get("material"))
                       for j, part in enumerate(_tables(table.get("parts")))]
-    return [f"{place}: {unknown(name, 'material', known)}" for place, name in found if isinstance(name, str) and name not in known]
+    return [unknown(name, "material", known, place=place) for place, name in found if isinstance(name, str) and name not in known]
 
 
 def _tables(value: Any) -> list[dict[str, Any]]:
     return [table if isinstance(table, dict) else {} for table in value] if isinstance(value, list) else []
 
 
-def _line(error: Any, data: dict[str, Any], known_keys: dict[int, list[str]]) -> str:
+def _line(error: Any, data: dict[str, Any], known_keys: dict[int, list[str]]) -> InputError:
     kind, context = error["type"], error.get("ctx", {})
     place, parent = _place(error["loc"], data, kind == "missing")
     if kind == "extra_forbidden":
-        return f"{place}: {unknown(str(error['loc'][-1]), 'key', known_keys.get(id(parent), []))}"
+        return unknown(str(error["loc"][-1]), "key", known_keys.get(id(parent), []), place=place)
     if kind == "missing":
-        return f"{place}: is missing"
+        return InputError("is missing", place=place)
     if kind == "value_error":
-        return f"{place or 'file'}: {context['error']}"
+        return InputError(str(context["error"]), place=place or "file")
     if kind in ("union_tag_invalid", "union_tag_not_found"):
         tag = "type" if context["discriminator"].endswith("()") else context["discriminator"].strip("'")
         if kind == "union_tag_not_found":
-            return f"{place}.{tag}: is missing"
+            return InputError("is missing", place=f"{place}.{tag}")
         choices = [name.strip("'") for name in context["expected_tags"].split(", ")]
-        return f"{place}.{tag}: {unknown(_text(context['tag']), tag, choices)}"
+        return unknown(_text(context["tag"]), tag, choices, place=f"{place}.{tag}")
     if kind == "literal_error":
         choices = re.findall("'([^']*)'", context["expected"])
-        return f"{place}: {unknown(_text(error['input']), 'value', choices)}"
+        return unknown(_text(error["input"]), "value", choices, place=place)
     expected = _EXPECTED[kind].format(**context) if kind in _EXPECTED else error["msg"]
     value = error["input"]
-    return f"{place}: got {str(value).lower() if isinstance(value, bool) else short(value)}, expected {expected}"
+    return InputError(f"got {str(value).lower() if isinstance(value, bool) else short(value)}, expected {expected}", place=place)
 
 
 def _text(value: Any) -> str:

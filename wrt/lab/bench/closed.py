@@ -44,7 +44,7 @@ def rows(plan: Plan) -> Iterator[Row]:
     for mesh in [*made(), *map(as_mesh, plan.meshes)]:
         geometry = Geometry.of(mesh)
         if open_edges(geometry):
-            raise InputError("the mesh is not closed", mesh.name)
+            raise InputError("the mesh is not closed", place=mesh.name)
         reference, accel = Reference(geometry), build(geometry)
         known = {"mesh": mesh_name(mesh), "triangles": len(geometry.faces)}
         for who, n in asked(plan, plan.points):

@@ -49,5 +49,5 @@ def new_figure(width: float, height: float) -> Any:
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise InputError(f'plots need matplotlib ({error}); pip install "wrt[plots]" installs it') from error
+        raise InputError(f"plots need matplotlib ({error})", hint='pip install "wrt[plots]" installs it') from error
     return Figure(figsize=(width, height), dpi=DPI, layout="constrained")

@@ -34,9 +34,9 @@ def result(pool: Any, future: Any) -> Any:
     try:
         return future.result()
     except CancelledError as error:
-        raise (pool.lost() if hasattr(pool, "lost") else InputError("the executor has cancelled the work")) from error
+        raise (pool.lost() if hasattr(pool, "lost") else InputError("has cancelled the work", argument="executor")) from error
     except BrokenExecutor as error:
-        raise InputError(f"executor: {error}") from error
+        raise InputError(str(error), argument="executor") from error
 
 
 def cancel(pool: Any, futures: Iterable[Any]) -> None:
@@ -55,7 +55,7 @@ def by_mesh(run: Callable[..., list[Any]], plan: Any, report: Callable[[Any], No
     if executor is None:
         return run(plan, report)
     if not plan.meshes:
-        raise InputError("a cluster measures meshes, each on one worker: name some")
+        raise InputError("must be given: a cluster measures each mesh on one worker", argument="meshes")
     pool, rows = submitter(executor), []
     meshes = [mesh if isinstance(mesh, Mesh) else os.path.abspath(mesh) for mesh in plan.meshes]
     futures = [pool.submit(one_at_a_time, DIGEST, run, replace(plan, meshes=(mesh,))) for mesh in meshes]

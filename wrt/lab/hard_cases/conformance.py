@@ -96,7 +96,7 @@ class Case:
     def __init__(self, name: str, rays: int = 1000, seed: int = 0) -> None:
         self.name, *more = case_names([name])
         if more:
-            raise InputError(f"{name} is a group of cases: {self.name}, {', '.join(more)}")
+            raise InputError(f"is a group of cases: {self.name}, {', '.join(more)}", argument=name)
         self.rays, self.seed = fewer(name, as_integer(rays, "rays", 1, 1 << 40)), as_integer(seed, "seed", 0, 1 << 63)
 
     @property
@@ -143,7 +143,7 @@ def case_names(cases: str | Sequence[str] = ()) -> list[str]:
     """Return the cases of names and letters of groups; by default all that a closest hit on triangles can answer."""
     cases = as_tuple(cases, str, "cases")
     for name in set(cases).intersection(NOT_ASKED):
-        raise InputError(f"{name} is not for a closest hit on triangles without t_min")
+        raise InputError("is not for a closest hit on triangles without t_min", argument=name)
     return [name for name in chosen(cases or list(HARD_CASES)) if name not in NOT_ASKED]
 
 
@@ -172,10 +172,10 @@ def _answer(said: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
     try:
         t, prim_id = (np.asarray(each) for each in said)
     except (TypeError, ValueError):
-        raise InputError(f"closest_hit must return t and prim_id, got {type(said).__name__}") from None
+        raise InputError(f"must return t and prim_id, got {type(said).__name__}", argument="closest_hit") from None
     if t.shape != (n,) or prim_id.shape != (n,) or t.dtype.kind not in "iuf" or prim_id.dtype.kind not in "iu":
-        raise InputError(f"closest_hit must return t ({n},) of real numbers and prim_id ({n},) of integers, got {t.shape} of "
-                         f"{t.dtype} and {prim_id.shape} of {prim_id.dtype}")
+        raise InputError(f"must return t ({n},) of real numbers and prim_id ({n},) of integers, got {t.shape} of "
+                         f"{t.dtype} and {prim_id.shape} of {prim_id.dtype}", argument="closest_hit")
     return t.astype(np.float64), prim_id.astype(np.int64)
 
 

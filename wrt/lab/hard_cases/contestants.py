@@ -109,7 +109,7 @@ class Embree(Peer):
         try:
             self.scene = EmbreeScene(robust=self.robust)
         except TypeError as error:
-            raise InputError('embreex is too old to be asked for a mode; pip install "embreex>=4.4"') from error
+            raise InputError("embreex is too old to be asked for a mode", hint='pip install "embreex>=4.4"') from error
         self.mesh = TriangleMesh(self.scene, geometry.vertices, geometry.faces)
         self.closest(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))  # it builds when it is first asked
 

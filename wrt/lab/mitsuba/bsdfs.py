@@ -19,7 +19,7 @@ COLORED = {"diffuse": "reflectance", "mirror": "specular_reflectance", "glass": 
 
 def refuse(what: str, where: str = "") -> NoReturn:
     """Raise InputError for what Mitsuba cannot draw exactly: pictures of different light cannot be compared."""
-    raise InputError(f"not translatable exactly: {what}", None, f"Mitsuba: {where}" if where else "Mitsuba")
+    raise InputError(f"not translatable exactly: {what}", place=f"Mitsuba: {where}" if where else "Mitsuba")
 
 
 def bsdf(mi: Any, material: Material) -> dict[str, Any]:

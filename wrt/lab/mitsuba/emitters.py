@@ -60,7 +60,7 @@ def background_emitter(mi: Any, background: Background) -> dict[str, Any] | None
     """Return the background as an emitter, or None for constant black.
     Raise InputError for a picture under 3 columns wide, and for a kind that is not in BACKGROUNDS."""
     if background.kind not in BACKGROUNDS:
-        raise InputError(f"not translatable: a background of kind {background.kind!r}", None, "Mitsuba")
+        raise InputError(f"not translatable: a background of kind {background.kind!r}", place="Mitsuba")
     return BACKGROUNDS[background.kind](mi, background)
 
 
@@ -79,7 +79,7 @@ def _gradient(mi: Any, background: GradientBackground) -> dict[str, Any]:
 def _environment(mi: Any, background: EnvironmentBackground) -> dict[str, Any]:
     image = background.image
     if image.shape[1] < 3:
-        raise InputError(f"environment {background.name!r}: Mitsuba needs 3 columns or more, got {image.shape[1]}")
+        raise InputError(f"Mitsuba needs 3 columns or more, got {image.shape[1]}", place=f"environment {background.name!r}")
     # Mitsuba's first and last row lie at the poles, wrt's half a row away from them. Between two rows both are linear,
     # so that a picture with the rows and their midpoints in turn is the same function.
     above, below = np.concatenate([image[:1], image]), np.concatenate([image, image[-1:]])

@@ -168,7 +168,8 @@ def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = 
 def require_error(error: float) -> None:
     """Raise InputError if wrt's error, without the reference's own noise, is not above 0."""
     if not error > 0.0:
-        raise InputError("wrt's pictures are as exact as the reference: no error that Mitsuba could reach; try a lower --spp")
+        raise InputError("wrt's pictures are as exact as the reference: no error that Mitsuba could reach",
+                         hint="try a lower --spp")
 
 
 def process_seconds(arguments: list[str], times: int) -> float:

@@ -56,7 +56,7 @@ class MitsubaProcess:
 
     def __init__(self, job: Job) -> None:
         if importlib.util.find_spec("mitsuba") is None:
-            raise InputError('Mitsuba 3 is not usable (not installed); pip install "wrt[peers]" installs it')
+            raise InputError("Mitsuba 3 is not usable (not installed)", hint='pip install "wrt[peers]" installs it')
         if job.variant != "scalar_rgb" and job.integrator == "whitted":
             raise NotAvailable('the integrator "whitted" is Python that only scalar_rgb can run')
         if job.variant.startswith("llvm"):

@@ -38,7 +38,7 @@ def mitsuba(variant: str = VARIANT) -> Iterator[Any]:
     try:
         mi = importlib.import_module("mitsuba")
     except ImportError as error:
-        raise InputError(f'Mitsuba 3 is not usable ({error}); pip install "wrt[peers]" installs it') from error
+        raise InputError(f"Mitsuba 3 is not usable ({error})", hint='pip install "wrt[peers]" installs it') from error
     before = mi.variant()
     mi.set_variant(variant)
     level = mi.log_level()
@@ -105,7 +105,7 @@ def _check_light_transport(scene: Scene, integrator: str) -> None:
     if integrator == "whitted":
         mixed = [m.name for m in materials if m.kind == "metallic_roughness"]
         if mixed:  # Mitsuba's principled BSDF cannot sample its mirror-like part by itself
-            raise InputError(f'integrator "whitted" cannot render metallic_roughness (material {mixed[0]!r})', None, "Mitsuba")
+            raise InputError(f'integrator "whitted" cannot render metallic_roughness (material {mixed[0]!r})', place="Mitsuba")
         if scene.settings.glass_shadows == "tinted" and any(m.kind == "glass" and not m.thin for m in materials):
             refuse('glass_shadows = "tinted"')
         return

@@ -117,7 +117,7 @@ def check_folder(folder: Path) -> None:
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
-        raise InputError(f"no folder to write to: {error.strerror}", folder) from error
+        raise InputError(f"no folder to write to: {error.strerror}", path=folder) from error
     for name in (LAYERS, HISTOGRAMS):
         check_writable(folder / name)
     new_figure(1.0, 1.0)

@@ -107,7 +107,7 @@ class Profile:
         from wrt.picture.heatmap import heatmap
 
         if name not in PICTURES:
-            raise InputError(f"no picture {name!r}; there is {', '.join(PICTURES)}")
+            raise InputError(f"no picture {name!r}", hint=f"there is {', '.join(PICTURES)}")
         return Image.fromarray(heatmap(self.maps[name], TITLES[name] + ("" if name == "stack" else " a sample")))
 
     def by_depth(self) -> list[dict[str, Any]]:
@@ -179,7 +179,7 @@ def profile(scene: Scene | Mesh | PathLike, **options: Unpack[ProfileOptions]) -
     settings = {"spp": 1, **{name: value for name, value in settings.items() if value is not None}}
     for name in given:
         if name not in ProfileOptions.__annotations__:
-            raise InputError(f"a profile has no argument {name!r}")
+            raise InputError("is no argument of a profile", argument=name)
     return Profiler(as_scene(scene).with_settings(**settings), Options(**{"tile_size": TILE_SIZE, **given})).measure()
 
 

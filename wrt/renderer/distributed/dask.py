@@ -35,7 +35,7 @@ def connected(address: str) -> Iterator[Any]:
     try:
         from distributed import Client
     except ImportError:
-        raise InputError("a cluster needs dask.distributed: pip install 'wrt[cluster]'") from None
+        raise InputError("a cluster needs dask.distributed", hint="pip install 'wrt[cluster]'") from None
     for name in [name for name in logging.root.manager.loggerDict if name.split(".")[0] == "distributed"]:
         logging.getLogger(name).setLevel(logging.CRITICAL)  # what goes wrong is reported in our words
     try:
@@ -65,12 +65,12 @@ async def _identity(address: str) -> str:
 def check_workers(client: Any) -> None:
     """Raises InputError where there are no workers, or one of them has no wrt, or not the same as here."""
     if client.asynchronous:
-        raise InputError("the Client is asynchronous: make one without asynchronous=True")
+        raise InputError("is an asynchronous Client", argument="executor", hint="make one without asynchronous=True")
     where = client.scheduler.address
     try:
         client.wait_for_workers(1, timeout=WORKER_SECONDS)
     except TimeoutError as error:
-        raise InputError(f"no worker at {where}: start some with `dask worker {where}`") from error
+        raise InputError(f"no worker at {where}", hint=f"start some with `dask worker {where}`") from error
     # A function that workers without wrt have too, and before what is compared, what every version of wrt has.
     for name in ("wrt:__version__", "wrt.renderer.distributed.installed:INSTALLED"):
         for worker, found in client.run(pkgutil.resolve_name, name, on_error="return").items():
@@ -119,7 +119,7 @@ class Submitter:
         return isinstance(error, OSError | CancelledError) or self.client.status != "running"
 
     def lost(self) -> InputError:
-        return InputError("the connection to the Dask scheduler is lost", self.address)
+        return InputError("the connection to the Dask scheduler is lost", path=self.address)
 
 
 class ClusterWorkers(ExecutorWorkers):
@@ -155,7 +155,7 @@ class ClusterWorkers(ExecutorWorkers):
                 raise
         self.alone_since = self.alone_since or time.monotonic()
         if time.monotonic() - self.alone_since > PATIENCE:
-            raise InputError("no worker is left", self.address)
+            raise InputError("no worker is left", path=self.address)
         return False
 
     def _is_sent(self) -> bool:
@@ -217,7 +217,7 @@ class ClusterWorkers(ExecutorWorkers):
             if future.status == "error":
                 future.result(timeout=RESULT_SECONDS)
         except KilledWorker as error:
-            raise InputError(f"tiles kill their workers, one after another: {error}", self.address) from error
+            raise InputError(f"tiles kill their workers, one after another: {error}", path=self.address) from error
         except (CancelledError, TimeoutError):
             pass
         return None  # what it needed, or made, died with its worker

@@ -67,7 +67,7 @@ class ExecutorWorkers:
         try:
             return self.executor.submit(call, self.key, self._scene(), *job)
         except (BrokenExecutor, RuntimeError) as error:
-            raise InputError(f"executor: {error}") from error
+            raise InputError(str(error), argument="executor") from error
 
     def finished(self, pending: Iterable[Any]) -> Iterable[Any]:
         """Futures that are done, after a tenth of a second or earlier."""
@@ -79,7 +79,7 @@ class ExecutorWorkers:
             self.dead_since = time.monotonic()
         elif time.monotonic() - self.dead_since > DEAD_SECONDS:
             # Killed in the middle of writing a reply: the pool waits for the rest of it, for ever.
-            raise InputError("executor: a process of the pool was killed")
+            raise InputError("a process of the pool was killed", argument="executor")
         return done
 
     def result(self, future: Future[Any]) -> Reply | None:
@@ -87,7 +87,7 @@ class ExecutorWorkers:
         try:
             reply = future.result()
         except BrokenExecutor as error:
-            raise InputError(f"executor: {error}") from error
+            raise InputError(str(error), argument="executor") from error
         self.asked += reply is None
         return reply
 
@@ -193,7 +193,8 @@ def _unpacked(package: dict[str, Any]) -> Prepared:
         raise InputError(f"worker {worker_name()} has {differs}: all must have the same")
     prepared = _made_ready(unpack(package["scene"], package["arrays"]), Options(**package["options"]))
     if prepared.plan.kernels_hash() != package["kernels"]:
-        raise InputError(f"worker {worker_name()} makes other kernels of the same code: install the same warp-lang everywhere")
+        raise InputError(f"worker {worker_name()} makes other kernels of the same code",
+                         hint="install the same warp-lang everywhere")
     return prepared
 
 

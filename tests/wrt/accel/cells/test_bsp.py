@@ -36,7 +36,7 @@ def test_options_out_of_range_are_refused(option: str, value: float) -> None:
 
 
 def test_a_mesh_that_is_too_large_is_refused_with_a_way_out() -> None:
-    with pytest.raises(InputError, match=r"max_triangles=19 .* 20: take another"):
+    with pytest.raises(InputError, match=r"max_triangles=19 .* 20; take another"):
         build(icosphere(0), "bsp", max_triangles=19)
     assert len(build(icosphere(0), "bsp", max_triangles=20).geometry) == 20
 

@@ -85,7 +85,7 @@ def query() -> Any:
 def refused(differ: str) -> None:
     with pytest.raises(InputError) as error:
         raw_launches.check_raw_launches()
-    assert str(error.value) == (f"Warp {wp.config.version} is not supported, its insides differ ({differ}):"
+    assert str(error.value) == (f"Warp {wp.config.version} is not supported, its insides differ ({differ});"
                                 f" install 'warp-lang>=1.19,<1.20'")
 
 

@@ -167,8 +167,8 @@ def test_worlds_that_are_none(world: Any, told: str) -> None:
 def test_what_is_no_world() -> None:
     flat = Object(BALL, (Material(),), np.diag([1.0, 1.0, 0.0, 1.0]), name="flat")
     for given, told in (([], "worlds must have at least one object"), ([Scene()], "worlds must have at least one object"),
-                        ([BALL, Scene(spheres=(Sphere((0, 0, 0), 1.0, Material()),))], "world 1 has spheres"),
-                        ([Scene((flat,))], "world 0: object 'flat' is flattened"), ([BALL, 5], "mesh must be a Mesh, a Scene")):
+                        ([BALL, Scene(spheres=(Sphere((0, 0, 0), 1.0, Material()),))], "world 1: has spheres"),
+                        ([Scene((flat,))], "world 0: object 'flat': is flattened"), ([BALL, 5], "mesh must be a Mesh, a Scene")):
         with pytest.raises(wrt.InputError, match=told):
             wrt.build(given)
     with pytest.raises(wrt.InputError, match="world is for structures over worlds"):

@@ -33,7 +33,7 @@ class Plan:
 def slow_first(plan: Plan) -> list[str]:
     time.sleep(0.1 if str(plan.meshes[0]).endswith("a.ply") else 0.0)
     if str(plan.meshes[0]).endswith("bad.ply"):
-        raise InputError("no such file", plan.meshes[0])
+        raise InputError("no such file", path=plan.meshes[0])
     return [f"{Path(mesh).name} {i}" for mesh in plan.meshes for i in range(2)]
 
 

@@ -142,7 +142,7 @@ def test_an_error_on_a_worker_is_the_one_that_is_raised(client: Any) -> None:
         from wrt.renderer.prepare import Prepared
 
         def trace_tile(self: Any, work: Any, *rest: Any) -> Any:
-            raise ZeroDivisionError("as it happens") if work.first else InputError("not this scene", "a.toml")
+            raise ZeroDivisionError("as it happens") if work.first else InputError("not this scene", path="a.toml")
 
         Prepared.kept, Prepared.trace_tile = Prepared.trace_tile, trace_tile  # type: ignore
 

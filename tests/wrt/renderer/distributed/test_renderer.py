@@ -297,7 +297,7 @@ def test_a_profile_has_no_executor(threads: Executor) -> None:
 
 def test_a_closed_executor(threads: Executor) -> None:
     threads.shutdown()
-    with pytest.raises(InputError, match="executor: cannot schedule"):
+    with pytest.raises(InputError, match="executor cannot schedule"):
         render(SCENE, executor=threads)
 
 
