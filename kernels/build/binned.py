@@ -1,4 +1,4 @@
-"""Binned splits of a range of records."""
+"""Binned SAH splits of a range of records."""
 
 import warp as wp
 
@@ -23,7 +23,7 @@ from wrt.kernels.build.records import (
 
 BIN_COUNT = 32
 BINS = wp.constant(BIN_COUNT)
-# Of all bins of the three axes. (The stride of an array would be read from memory each time.)
+# Bins of all three axes. (An array's stride would be read from memory each time.)
 BinBoxes = wp.types.matrix((3 * BIN_COUNT, 8), wp.float32)
 BinCounts = wp.types.vector(3 * BIN_COUNT, wp.int32)
 BinCosts = wp.types.vector(BIN_COUNT, wp.float32)
@@ -31,8 +31,9 @@ BinCosts = wp.types.vector(BIN_COUNT, wp.float32)
 
 @wp.struct
 class Bins:
-    """Bins of centroids along each axis, 1 / scale long, from origin on. scale is 0 where the centroids cannot be told apart:
-    where they coincide, or are so close together (or so far apart) that it over- or underflows."""
+    """Bins of centroids along each axis, from `origin` on, 1 / scale long.
+    An axis that cannot separate the centroids has scale 0: they coincide, or are so close together or far apart that it over- or
+    underflows."""
 
     count: int
     origin: wp.vec3
@@ -41,24 +42,24 @@ class Bins:
 
 @wp.struct
 class Split:
-    """The chosen split: records whose bin along `axis` is below `bin` go left. axis < 0: none was found. Boxes of both sides."""
+    """The chosen split: records whose bin along `axis` is below `bin` go left; axis < 0: no split."""
 
     axis: int
     bin: int
     cost: float
-    box_0: Row
-    box_1: Row
+    box_0: Row  # Box of the left side.
+    box_1: Row  # Box of the right side.
 
 
 @wp.func
 def bin_of(center: wp.vec3, axis: int, bins: Bins) -> int:
-    """Binning and partition call this one function, so that they agree to the last bit."""
+    """Bin of a centroid. Binning and partition share this function, so that they agree to the last bit."""
     return wp.clamp(int((center[axis] - bins.origin[axis]) * bins.scale[axis]), 0, bins.count - 1)
 
 
 @wp.func
 def bins_of(task: BuildTask) -> Bins:
-    """The bins of a range, fewer of them for few records."""
+    """Make the bins of a range, fewer of them for few records."""
     out = Bins()
     out.count = wp.min(8 + (task.end - task.begin) / 8, BINS)
     low = low_of(task.measures.centers)
@@ -73,10 +74,8 @@ def bins_of(task: BuildTask) -> Bins:
 
 @wp.func
 def binned_split(data: BuildData, task: BuildTask, bins: Bins) -> Split:
-    """Wald 2007, "On fast Construction of SAH-based Bounding Volume Hierarchies": the cheapest split between two bins.
-
-    Cost: the sum over both sides of half area x count, in units of area_scale.
-    """
+    """Find the cheapest split between two bins (Wald 2007, "On fast Construction of SAH-based Bounding Volume Hierarchies").
+    The cost is the sum over both sides of half area times count, in units of area_scale."""
     scale = area_scale(task.measures.box)
     count = BinCounts()
     box = BinBoxes()
@@ -125,10 +124,9 @@ def binned_split(data: BuildData, task: BuildTask, bins: Bins) -> Split:
 
 @wp.func
 def part_by_bin(data: BuildData, task: BuildTask, bins: Bins, split: Split) -> Halves:
-    """The records of the left side go to the front.
-
-    Lomuto's partition without a branch, which nothing could predict: what is exchanged for nothing stays on its side.
-    """
+    """Partition the records: those of the left side go to the front.
+    Lomuto's partition, without its branch, which no processor could predict: a record that stays on its side is swapped with one of the
+    same side."""
     middle = int(task.begin)
     empty = empty_row()
     centers_0 = empty_row()
@@ -153,7 +151,7 @@ def part_by_bin(data: BuildData, task: BuildTask, bins: Bins, split: Split) -> H
 
 @wp.func
 def split_binned(data: BuildData, task: BuildTask) -> Halves:
-    """The cheapest split between two bins; by number where no centroids can be told apart, or the tree gets too deep."""
+    """Split between the two best bins; in halves by number if no axis separates the centroids or the tree gets too deep."""
     n = task.end - task.begin
     if n > 2 and task.depth + levels(n) < MAX_DEPTH:
         bins = bins_of(task)

@@ -1,8 +1,6 @@
-"""The BSP builder: cells are split, and their primitives clipped to the parts, until a split no longer pays; CPU backend.
-
-The host launches it once for the top of the tree, and then once for each of the cells that this left over, on all cores. A
-launch works depth first, so that it holds no more pieces at a time than lie along one path.
-"""
+"""The BSP builder, on the CPU: it splits cells and clips their primitives until no split pays.
+The host launches it once for the top of the tree, then on all cores for each cell left over. A launch works depth first: it holds only the
+pieces along one path."""
 
 import warp as wp
 
@@ -22,12 +20,12 @@ from wrt.kernels.build.bsp_split import (
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse.bsp import INNER, STACK_SIZE, BspNode
 
-MAX_CORNERS = wp.constant(16)  # a piece of a triangle that would get more keeps those it has, and sticks out of its cell
+MAX_CORNERS = wp.constant(16)  # a piece that would get more corners keeps those it has, and sticks out of its cell
 CELL_SLOTS = STACK_SIZE + 1
-HAND = wp.constant(STACK_SIZE)  # the slot of the cell that is being split
-LEFT_OVER = wp.constant(-2)  # count of a child that is built by a later launch: `first` of those left over
+HAND = wp.constant(STACK_SIZE)  # slot of the cell that is being split
+LEFT_OVER = wp.constant(-2)  # count of a child built by a later launch; `first` is its index among the cells left over
 
-# Where a launch leaves its numbers. FULL: an array was too short, and the rest is of no use.
+# Indices of a launch's results. FULL: an array was too short, and the output is unusable.
 N_NODES = wp.constant(0)
 N_ORDER = wp.constant(1)
 N_LEFT_OVER = wp.constant(2)
@@ -41,34 +39,32 @@ N_RESULTS = 8
 
 @wp.struct
 class BspTask:
-    """A cell to be built: pieces begin .. end - 1, whose points end before points_end; the link to it is that of `parent` to its
-    child `side` (parent < 0: the root's); budget: how many references its leaves may have together."""
+    """A cell to build, of the pieces begin .. end - 1."""
 
     begin: int
     end: int
-    points_end: int
-    parent: int
+    points_end: int  # End of its pieces' points.
+    parent: int  # Node whose child `side` it is; < 0: it is the root.
     side: int
     depth: int
-    budget: int
+    budget: int  # Most references of its leaves.
 
 
 @wp.struct
 class BspOutput:
-    """What a launch gives: nodes, leaves' primitives, cells left over, results (N_RESULTS numbers); cost[0]: expected nodes and
-    primitives of a line that meets a root box of surface 1."""
+    """Results of a launch."""
 
     nodes: wp.array(dtype=BspNode)
-    order: wp.array(dtype=wp.int32)
-    left_over: wp.array(dtype=BspTask)
+    order: wp.array(dtype=wp.int32)  # prim_id of the leaves' primitives.
+    left_over: wp.array(dtype=BspTask)  # Cells for later launches.
     left_cells: Cells
-    results: wp.array(dtype=wp.int32)
-    cost: wp.array(dtype=wp.float64)
+    results: wp.array(dtype=wp.int32)  # N_RESULTS numbers.
+    cost: wp.array(dtype=wp.float64)  # cost[0]: expected nodes and primitives of a line that meets a root box of surface 1.
 
 
 @wp.func
 def copy_piece(source: Pieces, i: int, target: Pieces, to: int):
-    """Everything but the points, which stay where they are."""
+    """Copy all of a piece but its points, which it shares."""
     target.prim_id[to] = source.prim_id[i]
     target.first[to] = source.first[i]
     target.count[to] = source.count[i]
@@ -80,7 +76,7 @@ def copy_piece(source: Pieces, i: int, target: Pieces, to: int):
 
 @wp.func
 def clip_piece(pieces: Pieces, i: int, to: int, size: int, split: BspSplit, side: int) -> int:
-    """Piece `to` becomes the part of piece i on one side (0 below, 1 above); its points go to `size` and on. The new size."""
+    """Clip piece i to one side (0 below, 1 above) as piece `to`, with its points at `size` and on; return the new size."""
     copy_piece(pieces, i, pieces, to)
     count = pieces.count[i]
     first = pieces.first[i]
@@ -108,7 +104,7 @@ def clip_piece(pieces: Pieces, i: int, to: int, size: int, split: BspSplit, side
             hi = wp.max(hi, c)
             n = n + 1
     if n == 0:
-        return size  # a sphere, which is not clipped
+        return size  # spheres are not clipped
     center = wp.float64(0.5) * (lo + hi)
     radius = zero
     for k in range(n):
@@ -141,7 +137,7 @@ def scope_of(tools: BspTools, task: BspTask, slot: int) -> Scope:
 
 @wp.func
 def choose(tools: BspTools, scope: Scope, depth: int) -> BspSplit:
-    """The cheapest split; where none is cheaper than a leaf, axis < 0."""
+    """Choose the cheapest split; axis < 0: none is cheaper than a leaf."""
     best = BspSplit()
     best.axis = -1
     best.cost = tools.options.cost_intersection * wp.float64(scope.end - scope.begin)
@@ -153,7 +149,7 @@ def choose(tools: BspTools, scope: Scope, depth: int) -> BspSplit:
 
 @wp.func
 def link(output: BspOutput, task: BspTask, first: int, count: int):
-    """Tell the parent what became of a child."""
+    """Link a child's result to its parent."""
     if task.parent < 0:
         output.results[ROOT_FIRST] = first
         output.results[ROOT_COUNT] = count
@@ -180,7 +176,7 @@ def write_leaf(tools: BspTools, output: BspOutput, task: BspTask):
 
 @wp.func
 def write_node(output: BspOutput, task: BspTask, split: BspSplit, tolerance: float) -> int:
-    """An inner node, whose children are empty until they link themselves."""
+    """Write an inner node, whose children are empty until they link themselves; return its index."""
     index = output.results[N_NODES]
     node = BspNode()
     node.normal = wp.vec3(split.normal)
@@ -195,7 +191,7 @@ def write_node(output: BspOutput, task: BspTask, split: BspSplit, tolerance: flo
 
 @wp.func
 def count_below(tools: BspTools, task: BspTask, split: BspSplit) -> int:
-    """How many pieces are listed below the plane."""
+    """Count the pieces listed below the plane."""
     n = int(0)
     for i in range(task.begin, task.end):
         sides = sides_of(extent_on(tools.pieces, i, split), split)
@@ -206,8 +202,8 @@ def count_below(tools: BspTools, task: BspTask, split: BspSplit) -> int:
 
 @wp.func
 def divide(tools: BspTools, task: BspTask, split: BspSplit, base: int, middle: int, size: int) -> wp.vec2i:
-    """Write the pieces of the part below from `base` and those of the part above from `middle`, clipped, with new points from
-    `size`: where both end, or (-1, -1) where there is no room for the points."""
+    """Write the pieces below the plane from `base`, those above it from `middle`, clipped, with new points from `size`. Returns where
+    pieces and points end, or (-1, -1) if there is no space for the points."""
     pieces = tools.pieces
     low = int(base)
     high = int(middle)
@@ -231,7 +227,7 @@ def divide(tools: BspTools, task: BspTask, split: BspSplit, base: int, middle: i
 
 @wp.func
 def start_pieces(source: Pieces, begin: int, end: int, target: Pieces) -> int:
-    """Copy pieces with their points to the front of `target`; how many points there are, or -1 without room for them."""
+    """Copy pieces with their points to the front of `target`; return the number of points, or -1 without space for them."""
     size = int(0)
     for i in range(begin, end):
         count = source.count[i]
@@ -247,7 +243,7 @@ def start_pieces(source: Pieces, begin: int, end: int, target: Pieces) -> int:
 
 @wp.func
 def start_root(task: BspTask, n_points: int) -> BspTask:
-    """The launch's own task, over the pieces that start_pieces has written."""
+    """Make the launch's own task, over the pieces of start_pieces."""
     task.end = task.end - task.begin
     task.begin = 0
     task.points_end = n_points
@@ -257,7 +253,7 @@ def start_root(task: BspTask, n_points: int) -> BspTask:
 
 @wp.func
 def leave_over(tools: BspTools, output: BspOutput, task: BspTask, slot: int):
-    """A later launch builds this cell."""
+    """Leave this cell to a later launch."""
     left = output.results[N_LEFT_OVER]
     output.left_over[left] = task
     copy_cell(tools.cells, slot, output.left_cells, left)
@@ -267,7 +263,7 @@ def leave_over(tools: BspTools, output: BspOutput, task: BspTask, slot: int):
 
 @wp.func
 def child_of(task: BspTask, index: int, side: int, pieces: wp.vec3i, points_end: int) -> BspTask:
-    """A side of the node `index`. pieces: where those below the plane begin, those above it, and where these end."""
+    """Make the task of a side of node `index`; pieces: where those below the plane begin, those above it begin, and all end."""
     child = BspTask()
     child.begin = pieces[side]
     child.end = pieces[side + 1]
@@ -281,7 +277,7 @@ def child_of(task: BspTask, index: int, side: int, pieces: wp.vec3i, points_end:
 
 @wp.func
 def clip_to_side(cells: Cells, split: BspSplit, side: int, to: int):
-    """The part of the cell at HAND on one side of the plane."""
+    """Clip the cell at HAND to one side of the plane, as cell `to`."""
     sign = wp.where(side == 0, wp.float64(-1.0), wp.float64(1.0))
     clip_cell(cells, HAND, to, sign * split.normal, sign * split.offset, split.pad)
 
@@ -289,7 +285,7 @@ def clip_to_side(cells: Cells, split: BspSplit, side: int, to: int):
 @kernel
 def build_cells(source: Pieces, tasks: wp.array(dtype=BspTask), cells: Cells, which: int, tools: BspTools,
                 stack: wp.array(dtype=BspTask), output: BspOutput):
-    """Build the subtree of tasks[which], which is in slot `which` of `cells`; at depth 0 the cell is the root box."""
+    """Build the subtree of tasks[which], whose cell is in slot `which`; at depth 0 the cell is the root box."""
     keep = tools.options.keep
     size = start_pieces(source, tasks[which].begin, tasks[which].end, tools.pieces)
     if size < 0:
@@ -322,7 +318,7 @@ def build_cells(source: Pieces, tasks: wp.array(dtype=BspTask), cells: Cells, wh
             write_leaf(tools, output, task)
             continue
 
-        # The pieces of cells that are left over must stay; else what lies beyond this cell's own has been dealt with.
+        # Pieces of cells left over must stay. Without such, pieces beyond this cell's own are done with.
         base = wp.where(keep > 0, used, task.end)
         if keep == 0:
             size = task.points_end

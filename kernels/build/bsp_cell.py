@@ -1,49 +1,45 @@
-"""The cells of a BSP tree while it is built: convex polyhedra in float64, their surface, and what a plane makes of them.
-
-A cell is a list of faces, each a convex polygon of points that run counterclockwise seen from outside. Cells steer the surface
-area heuristic only: where a primitive is listed, and so which hits are found, never depends on them. Rounding in a sliver of a
-cell, or a cell with more faces than there is room for, costs quality and no hit.
-"""
+"""The cells of a BSP tree during its build: convex polyhedra in float64, their surfaces, and their cuts by planes.
+A cell is a list of faces: convex polygons, counterclockwise from outside. Cells only steer the surface area heuristic; the listing of
+primitives, and so the hits, never depend on them. Rounding in a sliver, or a cell with too many faces, costs quality and no hit."""
 
 import warp as wp
 
 MAX_FACES = wp.constant(48)
-MAX_POINTS = wp.constant(288)  # a convex polyhedron of f faces has at most 6 f - 12 corners of faces
+MAX_POINTS = wp.constant(288)  # a convex polyhedron with f faces has at most 6 f - 12 corners of faces
 
 
 @wp.struct
 class Cells:
-    """Cells in slots. Of slot s: n_faces[s]; face f has the points first[s * (MAX_FACES + 1) + f] up to that of f + 1, counted
-    from s * MAX_POINTS; area[s * MAX_FACES + f] is the face's."""
+    """Cells in slots s. The points of face f begin at s * MAX_POINTS + first[s * (MAX_FACES + 1) + f], and end where face f + 1 begins."""
 
     n_faces: wp.array(dtype=wp.int32)
     first: wp.array(dtype=wp.int32)
     points: wp.array(dtype=wp.vec3d)
-    area: wp.array(dtype=wp.float64)
+    area: wp.array(dtype=wp.float64)  # Of face f: area[s * MAX_FACES + f].
 
 
 @wp.func
 def plane_side(n: wp.vec3d, d: wp.float64, p: wp.vec3d) -> wp.float64:
-    """n . p + d: above 0 on the side that the normal points to."""
+    """Value n . p + d of the plane, above 0 on the side that the normal points to."""
     return n[0] * p[0] + n[1] * p[1] + n[2] * p[2] + d
 
 
 @wp.func
 def snapped_side(n: wp.vec3d, d: wp.float64, eps: wp.float64, p: wp.vec3d) -> wp.float64:
-    """As plane_side, but 0 within eps of the plane: a face of the cell that lies in the plane does so with all its corners."""
+    """Value of the plane, but 0 within eps: a face in the plane has all its corners there."""
     s = plane_side(n, d, p)
     return wp.where(wp.abs(s) > eps, s, wp.float64(0.0))
 
 
 @wp.func
 def crossing(p: wp.vec3d, q: wp.vec3d, s_p: wp.float64, s_q: wp.float64) -> wp.vec3d:
-    """Where the segment from p to q meets the plane; s_p and s_q are of opposite sign."""
+    """Intersection of the segment from p to q with the plane; s_p and s_q are of opposite sign."""
     return p + (s_p / (s_p - s_q)) * (q - p)
 
 
 @wp.func
 def turn(x: wp.float64, y: wp.float64) -> wp.float64:
-    """Rises with the angle of the point (x, y), from -2 at -pi to 2 at pi; not for the origin. (Each machine has its own atan2.)"""
+    """Monotone function of the angle of (x, y), from -2 at -pi to 2 at pi; not for the origin. All machines agree on it, unlike atan2."""
     a = wp.float64(1.0) - x / (wp.abs(x) + wp.abs(y))
     return wp.where(y < wp.float64(0.0), -a, a)
 
@@ -56,7 +52,7 @@ def box_cell(cells: Cells, slot: int, lo: wp.vec3d, hi: wp.vec3d):
         a = (axis + 1) % 3
         b = (axis + 2) % 3
         for k in range(4):
-            # The square (0,0), (1,0), (1,1), (0,1) runs counterclockwise about +axis; the low face runs the other way.
+            # The square (0,0), (1,0), (1,1), (0,1) is counterclockwise about +axis; the low face takes it backwards.
             i = wp.where(face % 2 == 1, k, 3 - k)
             p = wp.vec3d()
             p[axis] = wp.where(face % 2 == 1, hi[axis], lo[axis])
@@ -71,14 +67,14 @@ def box_cell(cells: Cells, slot: int, lo: wp.vec3d, hi: wp.vec3d):
 
 @wp.func
 def points_of(cells: Cells, slot: int, face: int) -> wp.vec2i:
-    """The points of a face: the first, and the end."""
+    """Range of a face's points."""
     first = slot * (MAX_FACES + 1) + face
     return wp.vec2i(slot * MAX_POINTS + cells.first[first], slot * MAX_POINTS + cells.first[first + 1])
 
 
 @wp.func
 def measure_cell(cells: Cells, slot: int):
-    """Fill in the areas of the faces."""
+    """Compute the areas of the faces."""
     for face in range(cells.n_faces[slot]):
         points = points_of(cells, slot, face)
         origin = cells.points[points[0]]
@@ -90,7 +86,7 @@ def measure_cell(cells: Cells, slot: int):
 
 @wp.func
 def cell_area(cells: Cells, slot: int) -> wp.float64:
-    """The surface of a cell."""
+    """Surface of a cell."""
     total = wp.float64(0.0)
     for face in range(cells.n_faces[slot]):
         total += cells.area[slot * MAX_FACES + face]
@@ -110,15 +106,14 @@ def copy_cell(source: Cells, slot: int, target: Cells, to: int):
 
 @wp.struct
 class CutFace:
-    """A face and a plane. above: twice the area vector of its part above the plane; down, up: where its edges cross the plane, if
-    `crossed`; highest (0 or above), lowest (0 or below): distances of its corners, times the normal's length."""
+    """A face cut by a plane; distances are multiplied by the normal's length."""
 
-    above: wp.vec3d
-    down: wp.vec3d
-    up: wp.vec3d
+    above: wp.vec3d  # Twice the area vector of its part above the plane.
+    down: wp.vec3d  # Where an edge crosses the plane downwards, if `crossed`.
+    up: wp.vec3d  # Where an edge crosses it upwards, if `crossed`.
     crossed: bool
-    highest: wp.float64
-    lowest: wp.float64
+    highest: wp.float64  # Largest distance of a corner, at least 0.
+    lowest: wp.float64  # Smallest distance of a corner, at most 0.
 
 
 @wp.func
@@ -154,12 +149,9 @@ def cut_face(cells: Cells, points: wp.vec2i, n: wp.vec3d, d: wp.float64, eps: wp
 
 @wp.func
 def split_areas(cells: Cells, slot: int, n: wp.vec3d, d: wp.float64, eps: wp.float64) -> wp.vec2d:
-    """The surfaces of the parts of a cell below and above a plane, each with the cut itself.
-
-    The cut is a convex polygon with one edge for each face that the plane meets; its area is the sum of the triangles that
-    these edges make with one of its points, in whatever order they come. A plane in a face of the cell, or a cell without
-    volume, leaves a part without volume: both sides of the cut.
-    """
+    """Surfaces of the parts of a cell below and above a plane, each with the cut itself.
+    The cut is a convex polygon with an edge for each face that the plane meets. Its area is the sum of the triangles of these edges with
+    one of its points, in any order. If the plane is in a face, or the cell has no volume, one part has no volume: both sides of the cut."""
     zero = wp.float64(0.0)
     half = wp.float64(0.5)
     below = wp.float64(0.0)
@@ -212,7 +204,7 @@ def order_by_angle(rim: wp.array(dtype=wp.vec3d), count: int, center: wp.vec3d, 
 
 @wp.func
 def clip_cell(cells: Cells, slot: int, to: int, n: wp.vec3d, d: wp.float64, eps: wp.float64):
-    """The part of a cell where n . p + d >= 0, to another slot. Where that is full, the whole cell."""
+    """Copy the part of a cell with n . p + d >= 0 to another slot; the whole cell if the part does not fit."""
     zero = wp.float64(0.0)
     rim = wp.zeros(shape=48, dtype=wp.vec3d)
     n_rim = int(0)
@@ -239,7 +231,7 @@ def clip_cell(cells: Cells, slot: int, to: int, n: wp.vec3d, d: wp.float64, eps:
                     cells.points[base + size] = c
                     size = size + 1
                 if s_p >= zero and leaves == 0 and n_rim < MAX_FACES:
-                    rim[n_rim] = c  # each corner of the cut is where one face leaves the kept side and another comes to it
+                    rim[n_rim] = c  # at each corner of the cut, one face leaves the kept side and another enters it
                     center += c
                     n_rim = n_rim + 1
                     leaves = 1

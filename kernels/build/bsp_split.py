@@ -1,11 +1,11 @@
-"""The BSP builder's inner loop: planes through faces and edges beside those across an axis, on the CPU backend.
+"""The BSP builder's search for a split, on the CPU: planes through faces and edges, and planes across an axis.
 
-Ize, Wald and Parker 2008, "Ray Tracing with the BSP Tree": of each triangle in a cell the plane of its face and, at right angles
-to it, the planes through its edges are tried, and the planes across an axis at the ends of what is in the cell. The one
-that costs least by the surface area heuristic over the parts of the (convex) cell is taken. Triangles are clipped to their cells.
+Ize, Wald and Parker 2008, "Ray Tracing with the BSP Tree". Of triangles in a cell it tries the plane of the face, and the planes through
+each edge at right angles to the face. It tries planes across an axis at the ends of pieces. The surface area heuristic over the parts of
+the convex cell decides. Triangles are clipped to their cells.
 
-Everything is float64 but the planes, which are rounded to float32 before they are tried: what a plane does here is exactly
-what it does in the traversal unit, whose derivation of why no hit is lost says what the tolerances must be.
+All is float64 but the planes, which are rounded to float32 before the trial. So a plane does exactly what it does in the traversal unit
+(kernels.traverse.bsp), whose proof gives the tolerances.
 """
 
 import warp as wp
@@ -13,95 +13,90 @@ import warp as wp
 from wrt.kernels.build.bsp_cell import Cells, plane_side, split_areas
 from wrt.kernels.traverse.bsp import PLANE, SMALLEST
 
-EXACT = wp.constant(24)  # up to so many primitives, planes across an axis are tried at the ends of each; above, at
-STEPS = wp.constant(32)  # so many even steps
+EXACT = wp.constant(24)  # With at most EXACT primitives, a plane is tried at both ends of each;
+STEPS = wp.constant(32)  # with more, at STEPS even steps.
 U = wp.constant(wp.float64(2.0**-24))
-OUTWARDS = wp.constant(wp.float64(1.0 + 2.0**-20))  # for what float64 or a conversion to float32 may have rounded down
-FLAT = wp.constant(wp.float64(2.0**-16))  # what is within so much of its cell's size of a plane lies in it
+OUTWARDS = wp.constant(wp.float64(1.0 + 2.0**-20))  # covers rounding down, in float64 or to float32
+FLAT = wp.constant(wp.float64(2.0**-16))  # a piece lies in a plane if it is within this part of its cell's size
 NO_SIZE = wp.constant(wp.float64(1e-200))
 NO_AREA = wp.constant(wp.float64(1e-30))  # of a triangle, relative to the square of its extent
 
 
 @wp.struct
 class Pieces:
-    """Primitives clipped to cells. Piece i is of primitive prim_id[i]: the convex polygon of the points first[i] ..
-    first[i] + count[i] - 1, or a whole sphere (count = 0); ball[i]: one around it (center, radius); extent[i]: of the whole
-    primitive, along an axis."""
+    """Primitives clipped to cells: convex polygons, or whole spheres."""
 
     prim_id: wp.array(dtype=wp.int32)
-    first: wp.array(dtype=wp.int32)
-    count: wp.array(dtype=wp.int32)
+    first: wp.array(dtype=wp.int32)  # Its polygon is points[first[i]] .. points[first[i] + count[i] - 1].
+    count: wp.array(dtype=wp.int32)  # 0: a sphere.
     lo: wp.array(dtype=wp.vec3d)
     hi: wp.array(dtype=wp.vec3d)
-    ball: wp.array(dtype=wp.vec4d)
-    extent: wp.array(dtype=wp.float64)
+    ball: wp.array(dtype=wp.vec4d)  # A ball around it (center, radius).
+    extent: wp.array(dtype=wp.float64)  # Of the whole primitive, along an axis.
     points: wp.array(dtype=wp.vec3d)
 
 
 @wp.struct
 class BspOptions:
-    """Costs of the heuristic; samples: triangles of a cell whose planes are tried; keep: if not 0, cells of at most so many
-    pieces are left over for later launches."""
+    """Limits and SAH costs of the builder."""
 
     cost_intersection: wp.float64
     cost_axis: wp.float64
     cost_plane: wp.float64
-    samples: int
+    samples: int  # Triangles of a cell whose planes are tried.
     max_depth: int
-    keep: int
-    lo: wp.vec3d
+    keep: int  # If not 0, cells of at most so many pieces are left over for later launches.
+    lo: wp.vec3d  # The root box: lo, hi.
     hi: wp.vec3d
 
 
 @wp.struct
 class BspTools:
-    """What splits are tried with; corners: of all triangles, three each."""
+    """Arguments of a trial split."""
 
     pieces: Pieces
     cells: Cells
-    corners: wp.array(dtype=wp.vec3d)
+    corners: wp.array(dtype=wp.vec3d)  # Three for each triangle.
     options: BspOptions
 
 
 @wp.struct
 class BspSplit:
-    """A plane, and what it costs; pad: what is within it of the plane need not be listed on that side; low_flat: what lies in
-    the plane goes below."""
+    """A plane and its cost."""
 
     normal: wp.vec3d
     offset: wp.float64
     axis: int
-    pad: wp.float64
-    low_flat: bool
+    pad: wp.float64  # A piece within this distance beyond the plane is not listed there.
+    low_flat: bool  # True if pieces in the plane go below.
     cost: wp.float64
 
 
 @wp.struct
 class Scope:
-    """A cell to be split: pieces begin .. end - 1, their box, the farthest coordinates and the largest extent; the slot of the
-    cell, its surface, and how many references its subtree may have."""
+    """A cell to split, of the pieces begin .. end - 1."""
 
     begin: int
     end: int
-    lo: wp.vec3d
+    lo: wp.vec3d  # Box of the pieces: lo, hi.
     hi: wp.vec3d
-    far: wp.vec3d
-    extent: wp.float64
-    slot: int
-    area: wp.float64
-    budget: int
+    far: wp.vec3d  # Largest absolute coordinates.
+    extent: wp.float64  # Largest extent of a primitive.
+    slot: int  # Of the cell.
+    area: wp.float64  # Surface of the cell.
+    budget: int  # Most references of its subtree.
 
 
 @wp.func
 def plane_noise(split: BspSplit, far: wp.vec3d) -> wp.float64:
-    """sum |n_i| far_i + |d|: what the rounding of the plane's numbers and of values of it is relative to."""
+    """Sum |n_i| far_i + |d|, to which rounding errors of the plane and its values are relative."""
     return wp.dot(wp.abs(split.normal), far) + wp.abs(split.offset)
 
 
 @wp.func
 def plane_tolerance(split: BspSplit, scope: Scope) -> float:
-    """Half of the plane's thickness in the traversal unit: the builder's own pad, 8 u sqrt(3) of the longest extent, and 4 u of
-    the noise; a little more for the rounding of this."""
+    """Half of the plane's thickness in the traversal unit.
+    It sums the builder's own pad, 8 u sqrt(3) of the longest extent, and 4 u of the noise, a little more for its own rounding."""
     noise = plane_noise(split, scope.far)
     total = split.pad + wp.float64(14.0) * U * scope.extent + wp.float64(4.0) * U * noise
     return float(total * OUTWARDS) + SMALLEST
@@ -109,7 +104,7 @@ def plane_tolerance(split: BspSplit, scope: Scope) -> float:
 
 @wp.func
 def extent_on(pieces: Pieces, i: int, split: BspSplit) -> wp.vec2d:
-    """Lowest and highest value of the plane on a piece; of its ball only where that is enough to tell the side."""
+    """Lowest and highest value of the plane on a piece, or on its ball if that is enough to tell the side."""
     if split.axis < wp.static(PLANE):
         return wp.vec2d(pieces.lo[i][split.axis] + split.offset, pieces.hi[i][split.axis] + split.offset)
     ball = pieces.ball[i]
@@ -133,16 +128,16 @@ def extent_on(pieces: Pieces, i: int, split: BspSplit) -> wp.vec2d:
 
 @wp.func
 def sides_of(extent: wp.vec2d, split: BspSplit) -> int:
-    """On which sides a piece is listed: 1 below, 2 above, 3 both, 0 in the plane."""
+    """Sides on which a piece is listed: 1 below, 2 above, 3 both, 0 in the plane."""
     return wp.where(extent[0] < -split.pad, 1, 0) + wp.where(extent[1] > split.pad, 2, 0)
 
 
 @wp.func
 def cheaper(tools: BspTools, scope: Scope, trial: BspSplit, best: BspSplit) -> BspSplit:
-    """The cheaper of two splits; counting stops where the rest cannot save the trial."""
+    """Return the cheaper of two splits; counting stops once the trial has lost."""
     if not wp.isfinite(trial.offset):
         return best
-    # Slivers thinner than the traversal unit tells apart are visited together: a plane that makes some gains nothing.
+    # The traversal unit visits slivers thinner than its tolerance together: a plane that makes some gains nothing.
     size = scope.hi - scope.lo
     trial.pad = wp.max(FLAT * wp.max(size), wp.float64(2.0) * U * plane_noise(trial, scope.far))
     areas = split_areas(tools.cells, scope.slot, trial.normal, trial.offset, trial.pad)
@@ -192,7 +187,7 @@ def across_axis(axis: int, position: wp.float64) -> BspSplit:
 
 @wp.func
 def best_across(tools: BspTools, scope: Scope, best: BspSplit) -> BspSplit:
-    """The cheapest of `best` and planes across an axis: at the ends of every piece, or where there are many, at even steps."""
+    """Return the cheapest of `best` and the planes across an axis, at the ends of every piece or at even steps."""
     for axis in range(3):
         if scope.end - scope.begin <= EXACT:
             for i in range(scope.begin, scope.end):
@@ -210,7 +205,7 @@ def best_across(tools: BspTools, scope: Scope, best: BspSplit) -> BspSplit:
 
 @wp.func
 def plane_through(n: wp.vec3d, p: wp.vec3d) -> BspSplit:
-    """The plane at right angles to n (not 0) through p, as float32 holds it."""
+    """Make the plane at right angles to n (not 0) through p, rounded to float32."""
     split = BspSplit()
     unit = wp.normalize(n)
     split.normal = wp.vec3d(wp.vec3(unit))
@@ -221,7 +216,7 @@ def plane_through(n: wp.vec3d, p: wp.vec3d) -> BspSplit:
 
 @wp.func
 def best_plane(tools: BspTools, scope: Scope, best: BspSplit) -> BspSplit:
-    """The cheapest of `best` and the planes of some triangles, evenly spread over the cell's list: face, and three edges."""
+    """Return the cheapest of `best` and the planes of triangles evenly spread over the cell's list: face and three edges."""
     n = scope.end - scope.begin
     tried = wp.min(n, tools.options.samples)
     for k in range(tried):
@@ -229,7 +224,7 @@ def best_plane(tools: BspTools, scope: Scope, best: BspSplit) -> BspSplit:
         if tools.pieces.count[i] == 0:
             continue
         corner = 3 * tools.pieces.prim_id[i]
-        # Scaled to 1, so that no product over- or underflows.
+        # scaled to 1: no product over- or underflows
         scale = wp.float64(1.0) / wp.max(tools.pieces.extent[i], NO_SIZE)
         edge_0 = (tools.corners[corner + 1] - tools.corners[corner]) * scale
         edge_1 = (tools.corners[corner + 2] - tools.corners[corner + 1]) * scale

@@ -1,8 +1,6 @@
-"""The inner loop of the builders from the top down, on the CPU backend: ranges of primitives are split in place.
-
-In the end the records stand in the order of the leaves. The host launches it for the root, and then for the parts that are left
-over, on all cores. What differs between builders is how a range is split: SPLIT is the table of the ways there are.
-"""
+"""The inner loop of top-down builders of binary BVHs, on the CPU: it splits ranges of primitives in place.
+In the end the records are in the order of the leaves. The host launches it for the root, then on all cores for the deferred ranges.
+Builders differ in how they split a range: SPLIT is the table of splits."""
 
 from functools import cache
 from typing import Any
@@ -36,12 +34,8 @@ from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node
 
 @wp.func
 def choose_median(data: BuildData, task: BuildTask) -> int:
-    """The first record of the right side, after the records of the left side have gone to the front. So each `choose`.
-
-    Half the records on each side of the median centroid along the axis where the centroids are farthest apart:
-
-    Hoare 1961, "Algorithm 65: Find", with the middle element as the pivot.
-    """
+    """Partition the records at the median centroid of the axis with the widest spread; return the first record of the right side.
+    Half the records go to each side: Hoare 1961, "Algorithm 65: Find", with the middle element as the pivot."""
     e = 0.5 * high_of(task.measures.centers) - 0.5 * low_of(task.measures.centers)
     axis = wp.where(e[1] > e[0], 1, 0)
     axis = wp.where(e[2] > e[axis], 2, axis)
@@ -74,10 +68,8 @@ def choose_median(data: BuildData, task: BuildTask) -> int:
 
 @wp.func
 def choose_sweep(data: BuildData, task: BuildTask) -> int:
-    """The cheapest of all splits by the order of the centroids along an axis; the orders are kept by stable partition.
-
-    MacDonald and Booth 1990, "Heuristics for ray tracing using space subdivision".
-    """
+    """Partition at the cheapest of all splits in centroid order along an axis; return the first record of the right side.
+    MacDonald and Booth 1990, "Heuristics for ray tracing using space subdivision". A stable partition keeps the three orders."""
     n = data.boxes.shape[0]
     scale = area_scale(task.measures.box)
     best_axis = int(0)
@@ -122,6 +114,8 @@ def choose_sweep(data: BuildData, task: BuildTask) -> int:
 
 
 def split_at(choose: Any) -> Any:
+    """Make the split of a range from a partition."""
+
     @wp.func
     def split(data: BuildData, task: BuildTask) -> Halves:
         return halves_at(data, task, choose(data, task))
@@ -138,7 +132,7 @@ SPLIT = {
 
 @wp.func
 def child_of(task: BuildTask, halves: Halves, side: int) -> BuildTask:
-    """One side of a split range."""
+    """Task of one side of a split range."""
     child = BuildTask()
     child.begin = wp.where(side == 0, task.begin, halves.middle)
     child.end = child.begin + wp.where(side == 0, halves.count_0, halves.count_1)
@@ -156,7 +150,7 @@ def child_of(task: BuildTask, halves: Halves, side: int) -> BuildTask:
 
 @wp.func
 def worth_it(options: BuildOptions, task: BuildTask, halves: Halves) -> bool:
-    """Whether two leaves cost less than one."""
+    """Test whether two leaves cost less than one."""
     scale = area_scale(task.measures.box)
     area = row_area(task.measures.box, scale)
     parts = (row_area(halves.left.box, scale) * rows_of(options, halves.count_0)
@@ -167,7 +161,7 @@ def worth_it(options: BuildOptions, task: BuildTask, halves: Halves) -> bool:
 
 @wp.func
 def write_node(data: BuildData, task: BuildTask, halves: Halves):
-    """The inner node of a split range, its sides as leaves until they tell it what became of them."""
+    """Write the inner node of a split range; both sides count as leaves until they link themselves."""
     data.used[task.slot] = wp.uint8(1)
     node = Bvh2Node()
     node.lo_0 = low_of(halves.left.box)
@@ -183,25 +177,23 @@ def write_node(data: BuildData, task: BuildTask, halves: Halves):
 
 @wp.func
 def mark(left: wp.array(dtype=wp.uint8), begin: int, end: int):
-    """These records are a leaf's: the host drops the others."""
+    """Mark these records as a leaf's: the host drops the others."""
     for i in range(begin, end):
         left[i] = wp.uint8(1)
 
 
 @cache
 def make_build_ranges(split: Any, place: Any = None) -> Any:
-    """The kernel of a builder. split(data, task) -> Halves: its records stand in their places, or (spatial splits)
-    place(data, task, halves) -> Halves brings them there once it is known that the range becomes no leaf."""
+    """Make a builder's kernel from split(data, task) -> Halves. With spatial splits, place(data, task, halves) -> Halves moves the records
+    to their sides once the range is known not to be a leaf; other splits have done so."""
 
     @kernel
     def build_ranges(data: BuildData, tasks: wp.array(dtype=BuildTask), options: BuildOptions, stop_size: int,
                      left_over: wp.array(dtype=BuildTask), n_left_over: wp.array(dtype=wp.int32),
                      max_depth: wp.array(dtype=wp.int32)):
-        """Build the subtree of each task, down to ranges of at most stop_size records, which are listed in left_over.
-
-        Every task has two records or more. Inner nodes of a range with room for n have the slots slot .. slot + n - 2 to
-        themselves; those that stay free are squeezed out by the host. A whole subtree (stop_size 0) takes the first of them.
-        """
+        """Build the subtree of each task, and append ranges of at most stop_size records to left_over.
+        Every task has at least two records. A range with space for n records owns the node slots slot .. slot + n - 2; the host removes
+        unused ones. A whole subtree (stop_size 0) uses the first of them."""
         stack = wp.zeros(shape=wp.static(STACK_SIZE + 2), dtype=BuildTask)
         stack[0] = tasks[wp.tid()]
         size = int(1)
@@ -232,7 +224,7 @@ def make_build_ranges(split: Any, place: Any = None) -> Any:
             max_depth[0] = wp.max(max_depth[0], task.depth)
             tell_parent(data.nodes, task, task.slot, 0)
             write_node(data, task, halves)
-            # A single record is a leaf; others find out for themselves.
+            # A single record is a leaf; longer ranges are tasks.
             if halves.count_1 > 1:
                 stack[size] = child_of(task, halves, 1)
                 size = size + 1

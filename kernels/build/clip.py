@@ -1,9 +1,7 @@
-"""What of a triangle lies in an axis-aligned cell: the box of the clipped polygon, on the CPU backend, for builders.
-
-Sutherland and Hodgman 1974, "Reentrant Polygon Clipping", in float64. Conservative: the triangle unit takes hits up to some
-u of the triangle's extent beside it, so that the triangle is clipped to a cell larger by twice that, and the box of what
-remains is larger by as much again. A leaf without the triangle then never holds such a hit.
-"""
+"""Clipping a triangle to an axis-aligned cell: the box of the clipped polygon, for builders on the CPU.
+Sutherland and Hodgman 1974, "Reentrant Polygon Clipping", in float64. Conservative: the triangle unit accepts hits beside the triangle
+within some u of its extent. So the cell grows by twice that, and the box of the result by as much again. A leaf without the triangle then
+never holds such a hit."""
 
 import warp as wp
 
@@ -12,24 +10,23 @@ from wrt.kernels.units.box import PAD_COORDINATE, PAD_EXTENT
 
 CLIP_EXTENT = wp.constant(wp.float64(2.0 * PAD_EXTENT))
 CLIP_COORDINATE = wp.constant(wp.float64(PAD_COORDINATE))
-MAX_CORNERS = 12  # a triangle, and one more for each of the six planes; rounding may add some
+MAX_CORNERS = 12  # a triangle's, and one more for each of six planes; rounding may add some
 
 
 @wp.struct
 class Clippable:
-    """The primitives by prim_id. faces: of the triangles; lo, hi: padded boxes; exact: 1 where the triangle itself is clipped,
-    0 where its box is (spheres, and sizes at the ends of float32)."""
+    """The primitives by prim_id."""
 
     vertices: wp.array(dtype=wp.vec3)
-    faces: wp.array(dtype=wp.vec3i)
-    lo: wp.array(dtype=wp.vec3)
+    faces: wp.array(dtype=wp.vec3i)  # Of the triangles.
+    lo: wp.array(dtype=wp.vec3)  # Padded boxes: lo, hi.
     hi: wp.array(dtype=wp.vec3)
-    exact: wp.array(dtype=wp.uint8)
+    exact: wp.array(dtype=wp.uint8)  # 1: clip the triangle; 0: clip its box (spheres, and sizes at the ends of float32).
 
 
 @wp.struct
 class Box:
-    """Empty: lo = inf, hi = -inf."""
+    """A box; empty: lo = inf, hi = -inf."""
 
     lo: wp.vec3
     hi: wp.vec3
@@ -45,7 +42,7 @@ def empty_box() -> Box:
 
 @wp.func
 def within_cell(lo: wp.vec3, hi: wp.vec3, cell_lo: wp.vec3, cell_hi: wp.vec3) -> Box:
-    """The part of a box in a cell; empty also where it has no inside."""
+    """Intersect a box with a cell; the result is empty if it has no inside."""
     box = Box()
     box.lo = wp.max(lo, cell_lo)
     box.hi = wp.min(hi, cell_hi)
@@ -57,8 +54,8 @@ def within_cell(lo: wp.vec3, hi: wp.vec3, cell_lo: wp.vec3, cell_hi: wp.vec3) ->
 @wp.func
 def cut_by_plane(polygon: wp.array(dtype=wp.vec3d), n: int, clipped: wp.array(dtype=wp.vec3d), axis: int, sign: wp.float64,
                  wall: wp.float64) -> int:
-    """The part of a polygon of n corners on one side of a plane across an axis (sign 1: above), in `polygon`; how many corners that
-    has, MAX_CORNERS at most. clipped: room."""
+    """Clip a polygon of n corners to one side of a plane across an axis (sign 1: above), in place; return its number of corners. At most
+    MAX_CORNERS remain; clipped: scratch."""
     m = int(0)
     last = polygon[n - 1]
     last_inside = sign * (last[axis] - wall)
@@ -82,8 +79,8 @@ def cut_by_plane(polygon: wp.array(dtype=wp.vec3d), n: int, clipped: wp.array(dt
 
 @wp.func
 def clip_triangle(polygon: wp.array(dtype=wp.vec3d), clipped: wp.array(dtype=wp.vec3d), lo: wp.vec3d, hi: wp.vec3d) -> int:
-    """The part in the box lo, hi of the triangle that `polygon` begins with, in `polygon`; how many corners that has: MAX_CORNERS
-    where it is not finished, as there may be more. clipped: room."""
+    """Clip the triangle at the front of `polygon` to the box lo, hi, in place; return the number of corners. MAX_CORNERS means unfinished,
+    as there may be more; clipped: scratch."""
     low = wp.min(wp.min(polygon[0], polygon[1]), polygon[2])
     high = wp.max(wp.max(polygon[0], polygon[1]), polygon[2])
     n = int(3)
@@ -101,7 +98,7 @@ def clip_triangle(polygon: wp.array(dtype=wp.vec3d), clipped: wp.array(dtype=wp.
 
 @wp.func
 def clip_to_cell(shapes: Clippable, prim_id: int, cell_lo: wp.vec3, cell_hi: wp.vec3) -> Box:
-    """The box of what of the primitive is in the cell, larger by its margin and within the cell; or an empty box."""
+    """Box of the part of a primitive in the cell, grown by its margin, within the cell; or an empty box."""
     if shapes.exact[prim_id] == wp.uint8(0):
         return within_cell(shapes.lo[prim_id], shapes.hi[prim_id], cell_lo, cell_hi)
     polygon = wp.zeros(shape=wp.static(MAX_CORNERS), dtype=wp.vec3d)
@@ -139,7 +136,7 @@ def clip_references(
     lo: wp.array(dtype=wp.vec3),
     hi: wp.array(dtype=wp.vec3),
 ):
-    """lo, hi: the boxes of what of each primitive is in the cell."""
+    """Store the box of the part of each primitive in the cell."""
     i = wp.tid()
     box = clip_to_cell(shapes, prim_id[i], cell_lo, cell_hi)
     lo[i] = box.lo

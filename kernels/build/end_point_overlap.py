@@ -1,9 +1,7 @@
-"""The end-point overlap of a bounding volume hierarchy, triangle by triangle, on the CPU backend.
-
-Aila, Karras and Laine 2013, "On Quality Metrics of Bounding Volume Hierarchies": a ray that ends at a point of the surface visits
-every node whose box holds the point, for nothing where the point's triangle is not below. How much of each triangle lies in such
-boxes is found by clipping it to them, in float64.
-"""
+"""The end-point overlap (EPO) of a bounding volume hierarchy, by triangle, on the CPU.
+Aila, Karras and Laine 2013, "On Quality Metrics of Bounding Volume Hierarchies". A ray that ends at a point of the surface visits every
+node whose box holds the point, in vain if the point's triangle is not below. Clipping each triangle to those boxes, in float64, gives the
+share of its area in them."""
 
 import warp as wp
 
@@ -14,15 +12,14 @@ from wrt.kernels.traverse.bvh2 import STACK_SIZE
 
 @wp.struct
 class Children:
-    """Children of all nodes, `width` a node, the root's first. count > 0: a leaf with the primitives order[first] to
-    order[first + count - 1]; 0: the inner node `first`; below 0: none. lo, hi: their boxes."""
+    """Children of all nodes, `width` a node, the root's first."""
 
     width: int
     lo: wp.array(dtype=wp.vec3)
     hi: wp.array(dtype=wp.vec3)
-    first: wp.array(dtype=wp.int32)
-    count: wp.array(dtype=wp.int32)
-    order: wp.array(dtype=wp.int32)
+    first: wp.array(dtype=wp.int32)  # Of a leaf: its first primitive in `order`; else the inner node.
+    count: wp.array(dtype=wp.int32)  # > 0: a leaf's primitives; 0: an inner node; < 0: no child.
+    order: wp.array(dtype=wp.int32)  # prim_id of the leaves' primitives.
 
 
 @wp.struct
@@ -34,7 +31,7 @@ class Corners:
 
 @wp.func
 def area_inside(triangle: Corners, lo: wp.vec3d, hi: wp.vec3d) -> wp.float64:
-    """The area of what of the triangle lies in the closed box; below 0 where it does not even touch it."""
+    """Area of the part of the triangle in the closed box; below 0 if they do not touch."""
     low = wp.min(wp.min(triangle.v0, triangle.v1), triangle.v2)
     high = wp.max(wp.max(triangle.v0, triangle.v1), triangle.v2)
     for axis in range(3):
@@ -56,7 +53,7 @@ def area_inside(triangle: Corners, lo: wp.vec3d, hi: wp.vec3d) -> wp.float64:
 
 @wp.func
 def belongs(tree: Children, child: int, prim_id: int) -> int:
-    """1 where the primitive is in this leaf, else 0."""
+    """Return 1 if the primitive is in this leaf, else 0."""
     for i in range(tree.first[child], tree.first[child] + tree.count[child]):
         if tree.order[i] == prim_id:
             return 1
@@ -66,11 +63,9 @@ def belongs(tree: Children, child: int, prim_id: int) -> int:
 @kernel
 def end_point_overlap(tree: Children, vertices: wp.array(dtype=wp.vec3), faces: wp.array(dtype=wp.vec3i), first: int,
                       out: wp.array(dtype=wp.float64)):
-    """out[i]: the area of triangle i in the boxes of inner nodes that it is not below, and in those of leaves that it is not
-    in, times the primitives there.
-
-    The walk goes depth first through all boxes that the triangle meets; a node's share is known when it is left for good.
-    """
+    """Store the area of triangle i in boxes that it does not belong to: of inner nodes above other triangles only, and of other leaves.
+    A leaf's area counts once a primitive. The walk goes depth first through all boxes that the triangle meets; a node's share is known
+    once its subtree is done."""
     i = first + wp.tid()
     face = faces[i]
     triangle = Corners()
@@ -79,7 +74,7 @@ def end_point_overlap(tree: Children, vertices: wp.array(dtype=wp.vec3), faces: 
     triangle.v2 = wp.vec3d(vertices[face[2]])
     lane = wp.zeros(shape=wp.static(STACK_SIZE + 1), dtype=wp.int32)
     end = wp.zeros(shape=wp.static(STACK_SIZE + 1), dtype=wp.int32)
-    below = wp.zeros(shape=wp.static(STACK_SIZE + 1), dtype=wp.int32)  # whether the triangle was met below
+    below = wp.zeros(shape=wp.static(STACK_SIZE + 1), dtype=wp.int32)  # 1 if the triangle is below
     area = wp.zeros(shape=wp.static(STACK_SIZE + 1), dtype=wp.float64)
     end[0] = tree.width
     level = int(0)
@@ -87,7 +82,7 @@ def end_point_overlap(tree: Children, vertices: wp.array(dtype=wp.vec3), faces: 
     while level >= 0:
         child = lane[level]
         if child == end[level]:
-            if level > 0:  # the root is visited for nothing by nobody
+            if level > 0:  # the root contains every triangle
                 if below[level] == 0:
                     cost = cost + area[level]
                 else:

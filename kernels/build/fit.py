@@ -1,8 +1,6 @@
-"""Boxes of a binary BVH from its leaves up, in one launch, on the CPU and on CUDA: for builds and for refits.
-
-A thread begins at each node without inner children. Of the threads that come up to a node, the last one goes on, and finds below
-what the others have left (Karras 2012, "Maximizing Parallelism in the Construction of BVHs, Octrees, and k-d Trees", section 4).
-"""
+"""Boxes of a binary BVH from its leaves up, in one launch, on the CPU and on CUDA: for builds and refits.
+A thread begins at each node without inner children. The last thread that reaches a node goes on, and reads what the others wrote below.
+(Karras 2012, "Maximizing Parallelism in the Construction of BVHs, Octrees, and k-d Trees", section 4)."""
 
 import warp as wp
 
@@ -17,35 +15,31 @@ NO_PARENT = wp.constant(-1)
 
 @wp.struct
 class Below:
-    """What a node tells its parent. lo, hi: its box; size: primitives; used: inner nodes, itself with them, 0 where it is to be a
-    leaf; height: of these on the longest way down; cost: half the surfaces of its boxes, times what visiting them costs; plain: the
-    same where a node and a primitive cost 1 each."""
+    """Summary of a subtree, which a node hands to its parent."""
 
-    cost: wp.float64
-    plain: wp.float64
+    cost: wp.float64  # Half surfaces of its boxes, times the SAH cost of a visit.
+    plain: wp.float64  # The same with a cost of 1 for a node and for a primitive.
     lo: wp.vec3
     hi: wp.vec3
-    size: int
-    used: int
-    height: int
+    size: int  # Primitives.
+    used: int  # Inner nodes, itself included; 0: it becomes a leaf.
+    height: int  # Inner nodes on the longest path.
 
 
 @wp.struct
 class Tree:
-    """nodes: the root first, the others anywhere behind it; where a child is none, its first and count are 0; parents: of each,
-    NO_PARENT for the root; order: prim_id of what the leaves name; low, high: of each prim_id; arrived: room, 0 for each node,
-    and 0 again afterwards; below: room, one a node."""
+    """A binary tree whose boxes are fitted; the root is first, the other nodes in any order."""
 
-    nodes: wp.array(dtype=Bvh2Node)
-    parents: wp.array(dtype=wp.int32)
-    order: wp.array(dtype=wp.int32)
-    low: wp.array(dtype=wp.vec3)
+    nodes: wp.array(dtype=Bvh2Node)  # A missing child has first = count = 0.
+    parents: wp.array(dtype=wp.int32)  # NO_PARENT for the root.
+    order: wp.array(dtype=wp.int32)  # prim_id of the leaves' primitives.
+    low: wp.array(dtype=wp.vec3)  # By prim_id, as high.
     high: wp.array(dtype=wp.vec3)
-    arrived: wp.array(dtype=wp.int32)
-    below: wp.array(dtype=Below)
+    arrived: wp.array(dtype=wp.int32)  # Scratch: 0 for each node, before and after.
+    below: wp.array(dtype=Below)  # Scratch, one entry a node.
 
 
-# What a thread wrote is there for others before they hear of it.
+# A thread's writes are visible to others before they hear of them.
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
     __threadfence();
@@ -57,7 +51,7 @@ def fence() -> None: ...
 Numbers = wp.types.vector(11, wp.float64)
 
 
-# Past the first level of caches, which do not hear of what another multiprocessor writes. (It cannot give a record.)
+# It bypasses the L1 cache, which another multiprocessor's writes do not reach. (A native function cannot return a record.)
 @wp.func_native("""
     const volatile auto* from = below.data + i;
     wp::vec_t<11, wp::float64> out;
@@ -77,7 +71,7 @@ def fetched(below: wp.array(dtype=Below), i: int) -> Numbers: ...
 
 @wp.func
 def told(below: wp.array(dtype=Below), i: int) -> Below:
-    """What another thread has written."""
+    """Read the summary that another thread wrote."""
     x = fetched(below, i)
     out = Below()
     out.cost = x[0]
@@ -97,13 +91,13 @@ def inner_children(node: Bvh2Node) -> int:
 
 @wp.func
 def area_of(lo: wp.vec3, hi: wp.vec3) -> wp.float64:
-    """Half the surface; 0 for an empty box. float64: no float32 is too large."""
+    """Half the surface; 0 for an empty box. In float64, so that no float32 overflows."""
     return half_area(wp.max(wp.vec3d(hi) - wp.vec3d(lo), wp.vec3d()))
 
 
 @wp.func
 def child_of(tree: Tree, options: BuildOptions, first: int, count: int) -> Below:
-    """What a child tells: an inner node what it wrote, a leaf what its primitives say."""
+    """Summary of a child: an inner node's is stored, a leaf's comes from its primitives."""
     if count == 0 and first > 0:
         return told(tree.below, first)
     out = Below()
@@ -121,7 +115,7 @@ def child_of(tree: Tree, options: BuildOptions, first: int, count: int) -> Below
 
 @wp.func
 def joined(options: BuildOptions, a: Below, b: Below, root: bool) -> Below:
-    """What a node with these children tells: it becomes a leaf where that costs no more."""
+    """Summary of a node with these children; it becomes a leaf if that costs no more."""
     out = Below()
     out.lo = lower(a.lo, b.lo)
     out.hi = upper(a.hi, b.hi)
@@ -142,7 +136,7 @@ def joined(options: BuildOptions, a: Below, b: Below, root: bool) -> Below:
 
 @kernel
 def fit(tree: Tree, options: BuildOptions):
-    """A thread a node. options.max_leaf 0: no node becomes a leaf. What comes out does not depend on the threads' order."""
+    """Fit a node a thread; options.max_leaf 0: no node becomes a leaf. The result does not depend on the threads' order."""
     i = wp.tid()
     if inner_children(tree.nodes[i]) > 0:
         return
@@ -170,7 +164,7 @@ def fit(tree: Tree, options: BuildOptions):
 
 @kernel
 def find_parents(nodes: wp.array(dtype=Bvh2Node), parents: wp.array(dtype=wp.int32)):
-    """A thread a node. Of what is nobody's child, nothing is written."""
+    """Store each node's parent, a node a thread; nodes without a parent are left alone."""
     i = wp.tid()
     node = nodes[i]
     if node.count_0 == 0 and node.first_0 > 0:

@@ -1,8 +1,6 @@
-"""The grid builder's inner loops, on the CPU backend: count the cells of each primitive, list them, sort them by cell.
-
-Counting and listing run over ranges of primitives on all cores; the sort is one pass, in the order of the primitives, so that
-the lists do not depend on the number of threads.
-"""
+"""The grid builder's inner loops, on the CPU: count the cells of each primitive, list them, sort them by cell.
+Counting and listing run over ranges of primitives on all cores. The sort is one pass in the order of the primitives: the lists do not
+depend on the number of threads."""
 
 import warp as wp
 
@@ -13,7 +11,7 @@ from wrt.kernels.traverse.grid import GridCell, GridLayout, grid_plane, slab_of
 
 @wp.func
 def slabs_of(layout: GridLayout, lo: wp.vec3, hi: wp.vec3, axis: int) -> wp.vec2i:
-    """The first and the last closed slab that [lo, hi] meets."""
+    """First and last closed slab that [lo, hi] meets."""
     first = slab_of(layout, axis, lo[axis])
     last = slab_of(layout, axis, hi[axis])
     if last < layout.n[axis] - 1 and grid_plane(layout, axis, last + 1) <= hi[axis]:
@@ -35,7 +33,7 @@ def list_cells(
     count: wp.array(dtype=wp.int32),
     cells: wp.array(dtype=wp.int32),
 ):
-    """Primitive first + tid: write `count`, or, where there is room for cells, the cells from `begin` on."""
+    """List the cells of primitive first + tid from begin[i] on; without an array of cells, write only their number to `count`."""
     i = first + wp.tid()
     lo = source.lo[i]
     hi = source.hi[i]
@@ -51,7 +49,7 @@ def list_cells(
     n = int(0)
     for k in range(z[0], z[1] + 1):
         for j in range(y[0], y[1] + 1):
-            # A row that is missed as a whole is passed over, which is most of them under a large triangle.
+            # Skip a row that the triangle misses as a whole: most rows under a large triangle.
             if exact and x[1] - x[0] > 1:
                 if not meets_cell(triangle, slab_lo(layout, x[0], j, k), slab_lo(layout, x[1] + 1, j + 1, k + 1)):
                     continue
@@ -73,7 +71,7 @@ def sort_by_cell(
     cells: wp.array(dtype=GridCell),
     references: wp.array(dtype=wp.int32),
 ):
-    """A counting sort by one thread: the primitives of each cell in ascending order. cells: zeroed."""
+    """Sort the primitives by cell, ascending within a cell: a counting sort in one thread. cells: zeroed."""
     for r in range(cell_of.shape[0]):
         cells[cell_of[r]].count += 1
     total = int(0)

@@ -1,9 +1,7 @@
-"""The builder's inner loop: a subtree of the k-d tree by the surface area heuristic with perfect splits, on the CPU backend.
-
-Wald and Havran 2006 (kernels.build.kdtree_split). The faces are events, sorted once for the subtree; a sweep over them finds the
-best plane, and a split keeps their order: those of references on one side only are handed down, those of references that straddle
-the plane are clipped to both cells, sorted by themselves and merged in. The host launches this once a subtree, on all cores.
-"""
+"""The k-d tree builder's inner loop: a subtree by the surface area heuristic with perfect splits, on the CPU.
+Wald and Havran 2006 (kernels.build.kdtree_split). The faces are events, sorted once for the subtree, and a sweep over them finds the best
+plane. A split keeps their order. References on one side only are handed down; references that straddle the plane are clipped to both
+cells, sorted, and merged in. The host launches this once a subtree, on all cores."""
 
 import warp as wp
 
@@ -16,39 +14,39 @@ from wrt.kernels.traverse.kdtree import LEAF, STACK_SIZE, KdNode
 BOTH = wp.constant(wp.uint8(0))
 LEFT = wp.constant(wp.uint8(1))
 RIGHT = wp.constant(wp.uint8(2))
-RUN = wp.constant(8)  # so many events are sorted by insertion before the runs are merged
+RUN = wp.constant(8)  # events sorted by insertion, before runs are merged
 
 
 @wp.struct
 class KdTotals:
-    """cost: sum of half areas, of each inner node once and of a leaf once a reference; depth: nodes on the longest path."""
+    """Totals of a subtree."""
 
     nodes: int
     leaves: int
     references: int
-    depth: int
-    cost: wp.float64
+    depth: int  # Nodes on the longest path.
+    cost: wp.float64  # Sum of half areas: of each inner node once, of a leaf once a reference.
 
 
 @wp.struct
 class KdOutput:
-    """nodes (2 budget), with the subtree's root first; references (budget): prim_id in the order of the leaves; totals (1)."""
+    """The subtree."""
 
-    nodes: wp.array(dtype=KdNode)
-    references: wp.array(dtype=wp.int32)
-    totals: wp.array(dtype=KdTotals)
+    nodes: wp.array(dtype=KdNode)  # The root first; 2 budget entries.
+    references: wp.array(dtype=wp.int32)  # prim_id in the order of the leaves; budget entries.
+    totals: wp.array(dtype=KdTotals)  # One entry.
 
 
 @wp.func
 def before(a: KdEvent, b: KdEvent) -> bool:
-    """The order of the sweep: by position; there by axis; there those that end first."""
+    """Order of the sweep: by position, then by axis, ends before begins."""
     return a.position < b.position or (a.position == b.position and (a.code & 7) < (b.code & 7))
 
 
 @wp.func
 def merge(a: wp.array(dtype=KdEvent), range_a: wp.vec2i, b: wp.array(dtype=KdEvent), range_b: wp.vec2i,
           out: wp.array(dtype=KdEvent), first: int):
-    """Two sorted lists into one, at out[first]. A range is the first place, and the one behind the last."""
+    """Merge two sorted lists into one at out[first]; a range is (begin, end)."""
     i = int(range_a[0])
     j = int(range_b[0])
     k = int(first)
@@ -67,7 +65,7 @@ def merge(a: wp.array(dtype=KdEvent), range_a: wp.vec2i, b: wp.array(dtype=KdEve
 
 @wp.func
 def sort(events: wp.array(dtype=KdEvent), first: int, count: int, scratch: wp.array(dtype=KdEvent)):
-    """events[first : first + count], by insertion in short runs and then by merging; scratch is from 0 on."""
+    """Sort events[first : first + count]: short runs by insertion, then merges; scratch is used from 0 on."""
     for run in range((count + RUN - 1) / RUN):
         begin = first + run * RUN
         for i in range(begin + 1, wp.min(begin + RUN, first + count)):
@@ -84,7 +82,7 @@ def sort(events: wp.array(dtype=KdEvent), first: int, count: int, scratch: wp.ar
             middle = wp.min(begin + width, first + count)
             end = wp.min(middle + width, first + count)
             if middle < end and before(events[middle], events[middle - 1]):
-                # Only the left run is moved away: what is merged never overtakes the right one.
+                # Only the left run moves away: merged events never overtake the right run.
                 for i in range(begin, middle):
                     scratch[i - begin] = events[i]
                 merge(scratch, wp.vec2i(0, middle - begin), events, wp.vec2i(middle, end), events, begin)
@@ -93,7 +91,7 @@ def sort(events: wp.array(dtype=KdEvent), first: int, count: int, scratch: wp.ar
 
 @wp.func
 def add_events(events: wp.array(dtype=KdEvent), count: int, lo: wp.vec3, hi: wp.vec3, reference: int) -> int:
-    """Append the six faces of a box; the new count."""
+    """Append the six faces of a box; return the new count."""
     event = KdEvent()
     for axis in range(3):
         event.position = hi[axis]
@@ -107,7 +105,7 @@ def add_events(events: wp.array(dtype=KdEvent), count: int, lo: wp.vec3, hi: wp.
 
 @wp.func
 def moved(corner: wp.vec3, split: KdSplit) -> wp.vec3:
-    """A corner of the cell, moved into the splitting plane."""
+    """Move a corner of the cell into the splitting plane."""
     out = corner
     out[split.axis] = split.position
     return out
@@ -115,7 +113,7 @@ def moved(corner: wp.vec3, split: KdSplit) -> wp.vec3:
 
 @wp.func
 def mark_sides(work: KdWork, task: KdTask, split: KdSplit):
-    """Where each reference lies. Every box has an inside, so that its beginning comes before its end."""
+    """Store the side of each reference. Every box has an inside: it begins before it ends."""
     begins = 2 * split.axis + 1
     for i in range(task.first, task.first + task.count):
         event = work.events[i]
@@ -129,7 +127,7 @@ def mark_sides(work: KdWork, task: KdTask, split: KdSplit):
 
 @wp.func
 def divide(shapes: Clippable, work: KdWork, task: KdTask, split: KdSplit) -> wp.vec2i:
-    """The events of both children in place of the task's, those of the right one first; the number of both, (right, left)."""
+    """Replace a task's events by those of both children, the right one's first; return the numbers (right, left)."""
     middle_hi = moved(task.hi, split)
     middle_lo = moved(task.lo, split)
     kept_left = int(0)
@@ -146,7 +144,7 @@ def divide(shapes: Clippable, work: KdWork, task: KdTask, split: KdSplit) -> wp.
         elif side == RIGHT:
             work.kept_right[kept_right] = event
             kept_right = kept_right + 1
-        elif (event.code & 7) == 1:  # once for each that straddles the plane
+        elif (event.code & 7) == 1:  # once for each reference that straddles the plane
             box = clip_to_cell(shapes, work.prim_id[reference], task.lo, middle_hi)
             if box.lo[0] < box.hi[0]:
                 fresh_left = add_events(work.fresh_left, fresh_left, box.lo, box.hi, reference)
@@ -180,7 +178,7 @@ def write_leaf(out: KdOutput, work: KdWork, task: KdTask, totals: KdTotals) -> K
 
 @kernel
 def build_subtree(shapes: Clippable, work: KdWork, root: KdTask, options: KdOptions, out: KdOutput):
-    """The subtree of one cell, with the references of `work`; one thread."""
+    """Build the subtree of one cell, with the references of `work`, in one thread."""
     stack = wp.zeros(shape=wp.static(STACK_SIZE + 2), dtype=KdTask)
     count = int(0)
     for i in range(work.prim_id.shape[0]):
@@ -210,7 +208,7 @@ def build_subtree(shapes: Clippable, work: KdWork, root: KdTask, options: KdOpti
         out.nodes[task.slot] = node
         totals.cost += half_area(wp.vec3d(task.hi) - wp.vec3d(task.lo))
 
-        # What the budget has left over is shared out by the number of references.
+        # The rest of the budget is shared in proportion to the references.
         left = wp.max(split.n_left, 1)
         right = wp.max(split.n_right, 1)
         spare = wp.float64(task.budget - left - right) * (wp.float64(right) / wp.float64(left + right))

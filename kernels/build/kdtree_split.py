@@ -1,9 +1,7 @@
-"""The k-d tree's split: the plane that the surface area heuristic (SAH) calls cheapest.
-
-Wald and Havran 2006, "On building fast kd-Trees for Ray Tracing, and on doing that in O(N log N)": every face of every
-reference's box is a candidate, and a sweep over the sorted faces finds the best. Cells of more than `perfect_below` references
-are split between bins before, at the same costs: wrt.accel.cells.kdtree_build.binned_split.
-"""
+"""The k-d tree's split: the plane of least cost by the surface area heuristic (SAH).
+Wald and Havran 2006, "On building fast kd-Trees for Ray Tracing, and on doing that in O(N log N)". Every face of every reference's box is
+a candidate, and a sweep over the sorted faces finds the best. Larger cells, above `perfect_below` references, are first split between bins
+at the same costs (wrt.accel.cells.kdtree_build.binned_split)."""
 
 import warp as wp
 
@@ -12,50 +10,47 @@ from wrt.kernels.build.shape import half_area
 
 @wp.struct
 class KdEvent:
-    """A face of a reference's box. code = 8 * (number of the reference) + 2 * axis + (1 where the box begins, 0: ends)."""
+    """A face of a reference's box."""
 
     position: float
-    code: int
+    code: int  # 8 * index of the reference + 2 * axis + (1: the box begins, 0: it ends).
 
 
 @wp.struct
 class KdOptions:
-    """A cell becomes a leaf with max_leaf references, at max_depth, or (by_cost) where no split costs less. empty_bonus: part
-    of its cost that a split is let off which cuts off empty space."""
+    """When a cell becomes a leaf, and the SAH costs."""
 
-    max_leaf: int
-    max_depth: int
-    by_cost: int
+    max_leaf: int  # A cell with so many references is a leaf.
+    max_depth: int  # A cell at this depth is a leaf.
+    by_cost: int  # 1: a cell is a leaf if no split costs less.
     cost_traversal: wp.float64
     cost_intersection: wp.float64
-    empty_bonus: wp.float64
+    empty_bonus: wp.float64  # Part of the cost that a split saves if it cuts off empty space.
 
 
 @wp.struct
 class KdTask:
-    """A cell to build. first, count: its events; budget: leaves' references (an empty leaf counts as one) that it may come to
-    in the end; slot: its node."""
+    """A cell to build."""
 
     lo: wp.vec3
     hi: wp.vec3
-    first: int
-    count: int
-    budget: int
+    first: int  # First of its events.
+    count: int  # Number of its events.
+    budget: int  # Most references of its leaves; an empty leaf counts as one.
     depth: int
-    slot: int
+    slot: int  # Index of its node.
 
 
 @wp.struct
 class KdWork:
-    """Memory of one subtree of n references. prim_id (n), side (n): of each; lo, hi (n): their boxes in the root's cell; events
-    (6 budget): a stack of the lists of all cells that wait; kept_*, fresh_*, scratch (6 n each): the lists of one split."""
+    """Scratch of one subtree of n references."""
 
-    prim_id: wp.array(dtype=wp.int32)
-    lo: wp.array(dtype=wp.vec3)
+    prim_id: wp.array(dtype=wp.int32)  # Of each reference, as side (n).
+    lo: wp.array(dtype=wp.vec3)  # Boxes of the references in the root's cell: lo, hi (n).
     hi: wp.array(dtype=wp.vec3)
     side: wp.array(dtype=wp.uint8)
-    events: wp.array(dtype=KdEvent)
-    kept_left: wp.array(dtype=KdEvent)
+    events: wp.array(dtype=KdEvent)  # A stack of the events of all pending cells (6 budget).
+    kept_left: wp.array(dtype=KdEvent)  # Events of one split, from here to scratch (6 n each).
     kept_right: wp.array(dtype=KdEvent)
     fresh_left: wp.array(dtype=KdEvent)
     fresh_right: wp.array(dtype=KdEvent)
@@ -64,7 +59,7 @@ class KdWork:
 
 @wp.struct
 class KdSplit:
-    """axis < 0: none. n_left, n_right: references on each side, those that straddle the plane on both."""
+    """A plane; axis < 0: none. References that straddle it count on both sides."""
 
     axis: int
     position: float
@@ -76,11 +71,9 @@ class KdSplit:
 @wp.func
 def split_cost(options: KdOptions, scale: wp.float64, face: wp.vec2d, below: wp.float64, above: wp.float64, left: wp.float64,
                right: wp.float64) -> wp.float64:
-    """Of a plane across an axis with so many references on each side, `below` and `above` it so far to the cell's ends. face: the
-    cell's extent along the two other axes; scale: the cost of a reference over the cell's half area.
-
-    The host takes it too, of arrays: `split_cost.func`.
-    """
+    """SAH cost of a plane with `left` and `right` references, at distances `below` and `above` from the cell's ends.
+    Its `face` is the cell's extent along the two other axes; `scale` is the cost of a reference over the cell's half area. The host calls
+    `split_cost.func` with arrays."""
     caps = face[0] * face[1]
     rim = face[0] + face[1]
     return options.cost_traversal + scale * ((below * rim + caps) * left + (above * rim + caps) * right)
@@ -88,7 +81,7 @@ def split_cost(options: KdOptions, scale: wp.float64, face: wp.vec2d, below: wp.
 
 @wp.func
 def cheapest_split(work: KdWork, task: KdTask, options: KdOptions) -> KdSplit:
-    """The plane of least expected cost, if (by_cost) it is below the cost of a leaf and the references are in the budget."""
+    """Find the plane of least expected cost whose references are within the budget; with by_cost, only one cheaper than a leaf."""
     best = KdSplit()
     best.axis = -1
     n = task.count / 6

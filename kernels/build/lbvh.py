@@ -1,9 +1,7 @@
-"""A binary BVH along a Morton curve, every node by a thread of its own, on the CPU and on CUDA.
-
-Karras 2012, "Maximizing Parallelism in the Construction of BVHs, Octrees, and k-d Trees": primitives are sorted by the Morton code
-of their middle, and each inner node finds by itself which range of them it holds and where that is split. Then `fit` makes boxes
-and leaves from the bottom up, and `emit` writes what is left, in the order of a walk.
-"""
+"""A binary BVH along a Morton curve, a thread a node, on the CPU and on CUDA.
+Karras 2012, "Maximizing Parallelism in the Construction of BVHs, Octrees, and k-d Trees". Primitives are sorted by the Morton code of
+their middle; each inner node finds its own range of them and its split. Then `fit` makes boxes and leaves from the bottom up, and `emit`
+writes the remaining nodes in the order of a walk."""
 
 import warp as wp
 
@@ -11,31 +9,29 @@ from wrt.kernels.build.fit import NO_PARENT, Below, Tree
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse.bvh2 import Bvh2Node
 
-PARTS = 1024  # of the primitives, whose middles are measured by a thread each
+PARTS = 1024  # threads that measure the middles
 MOST_BITS = 21  # of a coordinate
 KEY_BITS = 63
 
 
 def bits_of(n: int) -> tuple[int, int]:
-    """Of keys for n primitives: bits of the number of a primitive, and of each coordinate.
-
-    Keys are different from each other, so that a node for each bit is the longest way down: with one bit left, it fits on the
-    traversal's stack, wherever the primitives are. Many of them have fewer bits for a coordinate: 14 for a million.
-    """
+    """Return the bits of a primitive's index and of a coordinate in the keys of n primitives.
+    Keys differ, so that no path is longer than a node for each bit: with one bit unused, it fits on the traversal's stack. A coordinate
+    has fewer bits for more primitives: 14 for a million."""
     number = max(n - 1, 1).bit_length()
     return number, min(MOST_BITS, (KEY_BITS - number) // 3)
 
 
 @wp.func
 def middle_of(low: wp.vec3, high: wp.vec3) -> wp.vec3:
-    """0 where it is not finite."""
+    """Middle of a box; 0 if it is not finite."""
     middle = 0.5 * low + 0.5 * high
     return wp.where(wp.isfinite(middle), middle, wp.vec3(0.0, 0.0, 0.0))
 
 
 @kernel
 def measure(low: wp.array(dtype=wp.vec3), high: wp.array(dtype=wp.vec3), ends: wp.array(dtype=wp.vec3)):
-    """The box of all middles: ends, which is empty before. A thread looks at every PARTS-th."""
+    """Store the bounds of all middles in `ends`, empty before. Each thread takes every PARTS-th."""
     i = wp.tid()
     a = wp.vec3(wp.inf, wp.inf, wp.inf)
     b = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
@@ -49,7 +45,7 @@ def measure(low: wp.array(dtype=wp.vec3), high: wp.array(dtype=wp.vec3), ends: w
 
 @wp.func
 def spread(x: wp.uint64) -> wp.uint64:
-    """21 bits, with two places free after each."""
+    """Spread 21 bits, with two zeros after each."""
     x = (x | (x << wp.uint64(32))) & wp.uint64(0x1F00000000FFFF)
     x = (x | (x << wp.uint64(16))) & wp.uint64(0x1F0000FF0000FF)
     x = (x | (x << wp.uint64(8))) & wp.uint64(0x100F00F00F00F00F)
@@ -69,7 +65,7 @@ def cell_of(x: float, begin: float, end: float, bits: int) -> wp.uint64:
 @kernel
 def write_keys(low: wp.array(dtype=wp.vec3), high: wp.array(dtype=wp.vec3), ends: wp.array(dtype=wp.vec3), bits: wp.vec2i,
                keys: wp.array(dtype=wp.uint64), order: wp.array(dtype=wp.int32), first: int):
-    """Of primitives first .. first + dim - 1: the Morton code of its middle, then its number. bits: bits_of."""
+    """Write the keys of primitives first .. first + dim - 1: Morton code of the middle, then index; bits: bits_of."""
     i = first + wp.tid()
     middle = middle_of(low[i], high[i])
     a = ends[0]
@@ -82,7 +78,7 @@ def write_keys(low: wp.array(dtype=wp.vec3), high: wp.array(dtype=wp.vec3), ends
 
 @wp.func
 def differ(keys: wp.array(dtype=wp.uint64), n: int, i: int, j: int) -> wp.uint64:
-    """In which bits two keys differ; in the highest of all where there is no key j."""
+    """Bits in which two keys differ; the highest of all if there is no key j."""
     if j < 0 or j >= n:
         return wp.uint64(0x8000000000000000)
     return keys[i] ^ keys[j]
@@ -90,16 +86,17 @@ def differ(keys: wp.array(dtype=wp.uint64), n: int, i: int, j: int) -> wp.uint64
 
 @wp.func
 def nearer(a: wp.uint64, b: wp.uint64) -> bool:
-    """Whether the highest bit of a is below that of b: the keys that differ in a have more in common."""
+    """Test whether the highest bit of a is below that of b: keys that differ in a share a longer prefix."""
     return a < b and a < (a ^ b)
 
 
 @kernel
 def link(keys: wp.array(dtype=wp.uint64), nodes: wp.array(dtype=Bvh2Node), parents: wp.array(dtype=wp.int32), first: int):
-    """Inner nodes first .. first + dim - 1 over two or more ascending keys, one node less than these; a leaf is one primitive."""
+    """Link the inner nodes first .. first + dim - 1 over ascending keys; a leaf is one primitive. There are at least two keys, and one
+    node less."""
     i = first + wp.tid()
     n = nodes.shape[0] + 1
-    # Node i begins or ends at key i: on the side where the neighbour has more in common with it.
+    # Node i begins or ends at key i, and extends to the side whose neighbour shares the longer prefix.
     after = differ(keys, n, i, i + 1)
     before = differ(keys, n, i, i - 1)
     d = wp.where(nearer(after, before), 1, -1)
@@ -113,7 +110,7 @@ def link(keys: wp.array(dtype=wp.uint64), nodes: wp.array(dtype=Bvh2Node), paren
         if nearer(differ(keys, n, i, i + (length + step) * d), outside):
             length = length + step
         step = step / 2
-    # The split: behind the last key that has more in common with key i than the other end has.
+    # The split is behind the last key that shares more with key i than the other end does.
     j = i + length * d
     whole = differ(keys, n, i, j)
     split = int(0)
@@ -143,16 +140,14 @@ def link(keys: wp.array(dtype=wp.uint64), nodes: wp.array(dtype=Bvh2Node), paren
 
 @kernel
 def emit(tree: Tree, nodes: wp.array(dtype=Bvh2Node), parents: wp.array(dtype=wp.int32), first: int):
-    """Write what `fit` has left of nodes first .. first + dim - 1: a parent before its children, left before right.
-
-    A node's place is the number of nodes before it in that order: on the way to the root, each parent and each left sibling's.
-    """
+    """Write the nodes that `fit` kept of first .. first + dim - 1: a parent before its children, left before right.
+    A node's index is the number of nodes before it in that order: on the way to the root, each parent and each left sibling's nodes."""
     i = first + wp.tid()
     slot = int(0)
     at = int(i)
     while True:
         if tree.below[at].used == 0:
-            return  # it is in a leaf
+            return  # inside a leaf
         parent = tree.parents[at]
         if parent == NO_PARENT:
             break
@@ -166,7 +161,7 @@ def emit(tree: Tree, nodes: wp.array(dtype=Bvh2Node), parents: wp.array(dtype=wp
     if node.count_0 == 0:
         left = tree.below[node.first_0]
         if left.used == 0:
-            node.first_0 = node.first_0 + 1 - left.size  # its range ends where the split is
+            node.first_0 = node.first_0 + 1 - left.size  # its range ends at the split
             node.count_0 = left.size
         else:
             node.first_0 = slot + 1

@@ -1,8 +1,6 @@
-"""The octree builder's inner loops, on the CPU backend: one level at a time, which octants does each reference meet?
-
-Octants are found over ranges of references on all cores; cells are counted and filled in the order of the references, so that
-the tree does not depend on the number of threads.
-"""
+"""The octree builder's inner loops, on the CPU: find the octants of each reference, one level at a time.
+Octants are found over ranges of references on all cores. Cells are counted and filled in the order of the references: the tree does not
+depend on the number of threads."""
 
 import warp as wp
 
@@ -13,8 +11,8 @@ from wrt.kernels.traverse.octree import OctreeLayout, octant_corner, octree_plan
 
 @wp.func
 def octants_of_box(lo: wp.vec3, hi: wp.vec3, middle: wp.vec3, end: wp.vec3) -> int:
-    """Mask of the octants, as closed boxes, that a box meets which meets their cell. middle: the planes between them; end: those
-    of the root's cell; an upper half that begins there has nothing in it that is not in the lower."""
+    """Mask of the closed octants that a box meets, if it meets their cell; middle: the planes between them. The planes `end` close the
+    root's cell: an upper half that begins there has nothing that the lower half does not have."""
     mask = int(0xFF)
     for axis in range(3):
         upper = wp.where(axis == 0, 0xAA, wp.where(axis == 1, 0xCC, 0xF0))
@@ -27,17 +25,17 @@ def octants_of_box(lo: wp.vec3, hi: wp.vec3, middle: wp.vec3, end: wp.vec3) -> i
 
 @wp.struct
 class SplitCells:
-    """The cells to be split. half: of their size, in finest cells; corners: the lowest of each cell; cell_of: of each reference."""
+    """The cells to split."""
 
-    half: int
-    corners: wp.array(dtype=wp.vec3i)
-    cell_of: wp.array(dtype=wp.int32)
+    half: int  # Half their edge, in finest cells.
+    corners: wp.array(dtype=wp.vec3i)  # Lowest corner of each cell.
+    cell_of: wp.array(dtype=wp.int32)  # Cell of each reference.
 
 
 @kernel
 def find_octants(source: CellSource, layout: OctreeLayout, first: int, cells: SplitCells, references: wp.array(dtype=wp.int32),
                  masks: wp.array(dtype=wp.int32)):
-    """Reference first + tid, of a primitive in one of the cells: the octants that it meets."""
+    """Store the mask of the octants that reference first + tid meets in its cell."""
     half = cells.half
     r = first + wp.tid()
     i = references[r]
@@ -65,7 +63,7 @@ def count_octants(
     masks: wp.array(dtype=wp.int32),
     count: wp.array2d(dtype=wp.int32),
 ):
-    """Cell first + tid, with the references begin[cell] .. begin[cell + 1] - 1: how many of them each octant has."""
+    """Count the references of each octant of cell first + tid, which has the references begin[cell] .. begin[cell + 1] - 1."""
     cell = first + wp.tid()
     for r in range(begin[cell], begin[cell + 1]):
         for octant in range(8):
@@ -81,7 +79,7 @@ def fill_octants(
     room: wp.array2d(dtype=wp.int32),
     out: wp.array(dtype=wp.int32),
 ):
-    """Cell first + tid: its references to its octants, those of octant k from room[cell, k] on (below 0: it is not split)."""
+    """Copy the references of cell first + tid to its octants, those of octant k from room[cell, k] on; below 0: the cell is not split."""
     cell = first + wp.tid()
     if room[cell, 0] < 0:
         return

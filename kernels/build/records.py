@@ -1,19 +1,19 @@
-"""What the builders of binary BVHs from the top down work on: records, ranges of them, and what ranges measure."""
+"""Records, ranges and bounds of the top-down builders of binary BVHs."""
 
 import warp as wp
 
 from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node
 from wrt.kernels.wide.lanes import row_type
 
-# From here on a range is halved by number, which takes ceil(log2(n)) more levels, whatever the SAH would like.
+# From this depth on, ranges are halved by number whatever the SAH says: that takes ceil(log2(n)) more levels.
 MAX_DEPTH = wp.constant(STACK_SIZE - 2)
-# A box as one row, low corner and negated high one (two lanes are not used): the lower numbers of two rows are the box around both.
+# A box in one vector: low corner, negated high corner, two unused lanes. The lower lanes of two rows are the box around both.
 Row = row_type(8)
 
 
 @wp.struct
 class BuildRecord:
-    """A primitive's box and which one it is."""
+    """A primitive's box and prim_id."""
 
     lo: wp.vec3
     hi: wp.vec3
@@ -22,7 +22,7 @@ class BuildRecord:
 
 @wp.struct
 class Measures:
-    """The box of some records, and that of their centroids."""
+    """The bounds of some records: of their boxes and of their centroids."""
 
     box: Row
     centers: Row
@@ -30,14 +30,11 @@ class Measures:
 
 @wp.struct
 class BuildTask:
-    """A range of records that becomes a child of `parent` (-1: the root): a leaf, or the inner node `slot`.
-
-    limit: the end of the room that it has (spatial splits).
-    """
+    """A range of records that becomes a child of `parent` (-1: the root): a leaf, or the inner node `slot`."""
 
     begin: int
     end: int
-    limit: int
+    limit: int  # End of the range's space (spatial splits).
     slot: int
     parent: int
     side: int
@@ -47,52 +44,45 @@ class BuildTask:
 
 @wp.struct
 class BuildOptions:
-    """Leaves hold at most max_leaf primitives; the costs are those of the surface area heuristic: of a node, and of a row of
-    primitives, which are tested at once."""
+    """Limits and costs of a builder."""
 
-    max_leaf: int
-    row: int
-    cost_traversal: float
-    cost_intersection: float
+    max_leaf: int  # Most primitives of a leaf.
+    row: int  # Primitives tested at once.
+    cost_traversal: float  # SAH cost of a node.
+    cost_intersection: float  # SAH cost of a row of primitives.
 
 
 @wp.struct
 class BuildData:
-    """records: rearranged; of the sweep: boxes: the records as they were, order: for each axis, one after another, the boxes by
-    centroid; area, left, scratch: room, one entry a record.
+    """Arrays of a builder, one entry a record if not said otherwise; the sweep and spatial splits use scratch arrays of their own."""
 
-    Of spatial splits: boxes: room; left: which records are in leaves; corners: of triangle i from 3 i on (what is no triangle, a
-    sphere, is cut by its box); min_overlap: the least overlap of an object split's sides for a spatial split to be tried, in units
-    of the scene's own size: scale is its area_scale.
-    """
-
-    records: wp.array(dtype=BuildRecord)
+    records: wp.array(dtype=BuildRecord)  # Rearranged by the build.
     nodes: wp.array(dtype=Bvh2Node)
     used: wp.array(dtype=wp.uint8)
-    boxes: wp.array(dtype=BuildRecord)
-    order: wp.array(dtype=wp.int32)
-    area: wp.array(dtype=wp.float32)
-    left: wp.array(dtype=wp.uint8)
-    scratch: wp.array(dtype=wp.int32)
-    corners: wp.array(dtype=wp.vec3)
-    scale: float
-    min_overlap: float
+    boxes: wp.array(dtype=BuildRecord)  # Sweep: the records in their first order. Spatial splits: scratch.
+    order: wp.array(dtype=wp.int32)  # Sweep: for each axis, one after another, indices into boxes by centroid.
+    area: wp.array(dtype=wp.float32)  # Sweep: scratch.
+    left: wp.array(dtype=wp.uint8)  # Sweep: scratch. Spatial splits: 1 for records in leaves.
+    scratch: wp.array(dtype=wp.int32)  # Sweep: scratch.
+    corners: wp.array(dtype=wp.vec3)  # Spatial splits: of triangle i from 3 i on; spheres, which follow, are clipped by their boxes.
+    scale: float  # Spatial splits: area_scale of the scene.
+    min_overlap: float  # Overlap of an object split's sides from which a spatial split is tried, in units of `scale`.
 
 
 @wp.struct
 class Halves:
-    """A split range: where the right side begins, how many records both sides have, and what they measure."""
+    """A split range."""
 
-    middle: int
-    count_0: int
-    count_1: int
+    middle: int  # Where the right side begins.
+    count_0: int  # Records of the left side.
+    count_1: int  # Records of the right side.
     left: Measures
     right: Measures
 
 
 @wp.func
 def rows_of(options: BuildOptions, n: int) -> float:
-    """How many rows n primitives fill."""
+    """Rows that n primitives fill."""
     return float((n + options.row - 1) / options.row)
 
 
@@ -118,7 +108,7 @@ def high_of(row: Row) -> wp.vec3:
 
 @wp.func
 def lower(a: Row, b: Row) -> Row:
-    """The lower number of each lane. (Warp's own minimum minds NaN, which takes three times as long.)"""
+    """Lower value of each lane. Warp's minimum minds NaN, which takes three times as long."""
     out = Row()
     for k in range(8):
         out[k] = wp.where(b[k] < a[k], b[k], a[k])
@@ -127,14 +117,14 @@ def lower(a: Row, b: Row) -> Row:
 
 @wp.func
 def area_scale(box: Row) -> float:
-    """The factor that makes a range's longest side 1, so that no area under- or overflows: what `row_area` wants."""
+    """Factor that scales a box's longest side to 1, so that areas neither under- nor overflow: the scale of `row_area`."""
     e = 0.5 * high_of(box) - 0.5 * low_of(box)
     return 1.0 / wp.max(wp.max(wp.max(e[0], e[1]), e[2]), 2.0**-126.0)
 
 
 @wp.func
 def row_area(box: Row, scale: float) -> float:
-    """Half the surface of a box, in units of a range's own size; 0 for an empty one."""
+    """Half the surface of a box, its sides multiplied by `scale`; 0 for an empty box."""
     half = 0.5 * scale * box
     x = -(half[0] + half[3])
     y = -(half[1] + half[4])
@@ -152,7 +142,7 @@ def center_of(record: BuildRecord) -> wp.vec3:
 
 @wp.func
 def levels(n: int) -> int:
-    """ceil(log2(n)): the depth of a balanced tree over n primitives."""
+    """Depth of a balanced tree over n primitives: ceil(log2(n))."""
     result = int(0)
     while result < 31 and (1 << result) < n:  # 1 << 31 is negative
         result = result + 1
@@ -161,6 +151,7 @@ def levels(n: int) -> int:
 
 @wp.func
 def measured(data: BuildData, begin: int, end: int) -> Measures:
+    """Bounds of the records begin .. end - 1."""
     out = Measures()
     out.box = empty_row()
     out.centers = empty_row()
@@ -174,7 +165,7 @@ def measured(data: BuildData, begin: int, end: int) -> Measures:
 
 @wp.func
 def parted_at(task: BuildTask, middle: int) -> Halves:
-    """Not yet measured."""
+    """Halves of a range, without their bounds."""
     out = Halves()
     out.middle = middle
     out.count_0 = middle - task.begin
@@ -184,6 +175,7 @@ def parted_at(task: BuildTask, middle: int) -> Halves:
 
 @wp.func
 def halves_at(data: BuildData, task: BuildTask, middle: int) -> Halves:
+    """Halves of a range, with their bounds."""
     out = parted_at(task, middle)
     out.left = measured(data, task.begin, middle)
     out.right = measured(data, middle, task.end)
@@ -192,7 +184,7 @@ def halves_at(data: BuildData, task: BuildTask, middle: int) -> Halves:
 
 @wp.func
 def tell_parent(nodes: wp.array(dtype=Bvh2Node), task: BuildTask, first: int, count: int):
-    """What has become of a range: a leaf (count > 0), or the inner node `first`."""
+    """Link a range's result to its parent: a leaf (count > 0), or the inner node `first`."""
     if task.parent >= 0:
         if task.side == 0:
             nodes[task.parent].first_0 = first

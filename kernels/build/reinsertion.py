@@ -1,9 +1,7 @@
-"""The inner loops of the optimiser by reinsertion, on the CPU backend.
-
-Meister and Bittner 2018, "Parallel Reinsertion for Bounding Volume Hierarchy Optimization": a subtree is taken out together
-with its parent, and put back where that makes the sum of all boxes' areas the smallest. The searches of many subtrees read the
-same tree, on all cores; then the moves are made one after the other, the best first, unless an earlier one stands in the way.
-"""
+"""The inner loops of the optimiser by reinsertion, on the CPU.
+Meister and Bittner 2018, "Parallel Reinsertion for Bounding Volume Hierarchy Optimization". A subtree is taken out with its parent, and
+put back where the sum of all boxes' areas becomes smallest. Searches for many subtrees read the same tree on all cores. The moves are then
+made one after another, the best first, unless an earlier one is in the way."""
 
 import warp as wp
 
@@ -17,22 +15,22 @@ QUEUE_SIZE = wp.constant(QUEUE)
 
 @wp.struct
 class Link:
-    """A node of the tree while it is optimised: children (-1: a leaf), parent (-1: the root), box."""
+    """A node of the tree during optimisation."""
 
-    left: int
+    left: int  # -1: a leaf.
     right: int
-    parent: int
+    parent: int  # -1: the root.
     lo: wp.vec3
     hi: wp.vec3
 
 
 @wp.struct
 class Move:
-    """What becomes of subtree `node` if it goes beside `target`: the areas shrink by `gain` together (0: it stays)."""
+    """The move of subtree `node` beside `target`."""
 
     node: int
     target: int
-    gain: float
+    gain: float  # Decrease of the sum of areas; 0: it stays.
 
 
 @wp.func
@@ -47,11 +45,9 @@ def joined_area(a: Link, b: Link, scale: float) -> float:
 
 @kernel
 def find_moves(links: wp.array(dtype=Link), moves: wp.array(dtype=Move), first: int, scale: float):
-    """The best place of each node of `moves`: branch and bound over the rest of the tree (section 3.1).
-
-    From the node upwards: the subtree beside each ancestor is searched. `saved` is what the boxes on the way shrink by
-    when the node leaves them; a place costs the area of the new parent's box, and what the boxes above it grow by.
-    """
+    """Find the best target of each move's node: branch and bound over the rest of the tree (section 3.1).
+    From the node upwards, it searches the subtree beside each ancestor. `saved` is the area that the boxes on the way lose without the
+    node. A place costs the area of the new parent's box, and the growth of the boxes above."""
     i = first + wp.tid()
     move = moves[i]
     node = links[move.node]
@@ -62,7 +58,7 @@ def find_moves(links: wp.array(dtype=Link), moves: wp.array(dtype=Move), first: 
     saved = area_of(parent.lo, parent.hi, scale)  # the parent itself goes
     pivot = int(node.parent)
     child = int(move.node)
-    # The box of the pivot without the node, empty at first.
+    # Box of the pivot without the node, empty at first.
     lo = wp.vec3(wp.inf, wp.inf, wp.inf)
     hi = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
     stack = wp.zeros(shape=wp.static(QUEUE), dtype=wp.int32)
@@ -81,7 +77,7 @@ def find_moves(links: wp.array(dtype=Link), moves: wp.array(dtype=Move), first: 
             place = links[at]
             joined = joined_area(place, node, scale)
             gain = left - joined
-            # Back beside its old sibling nothing changes.
+            # The place beside its old sibling changes nothing.
             if gain > best and not (pivot == node.parent and at == sibling):
                 best = gain
                 target = at
@@ -100,7 +96,7 @@ def find_moves(links: wp.array(dtype=Link), moves: wp.array(dtype=Move), first: 
         if pivot < 0:
             break
         if links[child].parent >= 0 and child != node.parent:
-            # The box of `child` shrinks to that of what remains in it.
+            # The box of `child` shrinks around the rest of it.
             saved = saved + area_of(links[child].lo, links[child].hi, scale) - area_of(lo, hi, scale)
     move.target = target
     move.gain = wp.where(target >= 0, best, 0.0)
@@ -118,7 +114,7 @@ def replace_child(links: wp.array(dtype=Link), parent: int, old: int, new: int):
 
 @wp.func
 def refit_up(links: wp.array(dtype=Link), areas: wp.array(dtype=wp.float32), start: int, scale: float):
-    """Boxes and areas from a node up to the root, as long as they change."""
+    """Refit boxes and areas from a node towards the root, until one does not change."""
     i = int(start)
     while i >= 0:
         link = links[i]
@@ -137,7 +133,7 @@ def refit_up(links: wp.array(dtype=Link), areas: wp.array(dtype=wp.float32), sta
 @kernel
 def make_moves(links: wp.array(dtype=Link), areas: wp.array(dtype=wp.float32), moves: wp.array(dtype=Move),
                touched: wp.array(dtype=wp.uint8), scale: float):
-    """Make the moves in their order; one that touches a node that an earlier one changed is left for another round."""
+    """Make the moves in order; one that touches a node changed by an earlier move waits for another round."""
     for m in range(moves.shape[0]):
         move = moves[m]
         if move.gain > 0.0:
@@ -147,7 +143,7 @@ def make_moves(links: wp.array(dtype=Link), areas: wp.array(dtype=wp.float32), m
             above = links[move.target].parent
             taken = int(touched[move.node]) + int(touched[parent]) + int(touched[sibling]) + int(touched[move.target])
             taken = taken + int(touched[grandparent]) + int(touched[above])
-            # Earlier moves may have brought the target below the node.
+            # An earlier move may have put the target below the node.
             i = int(move.target)
             while i >= 0 and i != move.node:
                 i = links[i].parent
@@ -174,20 +170,19 @@ def make_moves(links: wp.array(dtype=Link), areas: wp.array(dtype=wp.float32), m
 
 @wp.struct
 class Walk:
-    """Room for walks over the tree: order: the nodes, parents first; level: of each node, from 1; count: its records;
-    cost: of its subtree, by the surface area heuristic."""
+    """Scratch of walks over the tree."""
 
-    order: wp.array(dtype=wp.int32)
-    level: wp.array(dtype=wp.int32)
-    count: wp.array(dtype=wp.int32)
-    cost: wp.array(dtype=wp.float32)
+    order: wp.array(dtype=wp.int32)  # Nodes, parents first.
+    level: wp.array(dtype=wp.int32)  # Of each node, from 1.
+    count: wp.array(dtype=wp.int32)  # Records of each node.
+    cost: wp.array(dtype=wp.float32)  # SAH cost of each subtree.
     depth: wp.array(dtype=wp.int32)
 
 
 @kernel
 def walk_down(links: wp.array(dtype=Link), walk: Walk):
-    """The order of the nodes, left before right, and the depth of the tree: inner nodes on the longest way."""
-    stack = int(walk.order.shape[0])  # the end of the order is the stack: both together are never longer
+    """Order the nodes, parents first and left before right, and store the depth: inner nodes on the longest path."""
+    stack = int(walk.order.shape[0])  # the end of the order serves as the stack: both together always fit
     stack = stack - 1
     walk.order[stack] = 0
     walk.level[0] = 1
@@ -209,7 +204,7 @@ def walk_down(links: wp.array(dtype=Link), walk: Walk):
 
 @kernel
 def weigh(links: wp.array(dtype=Link), walk: Walk, options: BuildOptions, scale: float):
-    """Leaves where they cost no more than the best that can be made of the subtree, from the bottom up: their left gets < -1."""
+    """Turn subtrees into leaves if those cost no more, from the bottom up; such a node gets left = -2 - left."""
     n = walk.order.shape[0]
     for k in range(n):
         i = walk.order[n - 1 - k]

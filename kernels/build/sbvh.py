@@ -1,9 +1,7 @@
-"""The inner loop of the builder with spatial splits, on the CPU backend.
-
-Stich, Friedrich and Dietrich 2009, "Spatial Splits in Bounding Volume Hierarchies": where the sides of the best object split
-overlap, a plane may cut the range instead, and primitives on both sides of it are referred to twice. A range has room to grow,
-which is shared between its sides in proportion, so that subtrees can be built on all cores.
-"""
+"""The inner loop of the builder with spatial splits, on the CPU.
+Stich, Friedrich and Dietrich 2009, "Spatial Splits in Bounding Volume Hierarchies". If the sides of the best object split overlap, a plane
+may split the range instead, and both sides then list the primitives that it cuts. A range has spare space, which its sides share in
+proportion, so that subtrees can be built on all cores."""
 
 import warp as wp
 
@@ -31,7 +29,7 @@ from wrt.kernels.units.box import box_pad, padded_hi, padded_lo
 
 @wp.func
 def crossing(a: wp.vec3, b: wp.vec3, axis: int, plane: float) -> wp.vec3:
-    """Where the edge a b meets a plane that parts its ends, in float64 rounded once: far within the pads that are added."""
+    """Intersection of the edge a b with a plane between its ends: float64, rounded once, far within the pads added later."""
     s = (wp.float64(plane) - wp.float64(a[axis])) / (wp.float64(b[axis]) - wp.float64(a[axis]))
     p = wp.vec3d(a) + s * (wp.vec3d(b) - wp.vec3d(a))
     return wp.vec3(p)
@@ -39,12 +37,12 @@ def crossing(a: wp.vec3, b: wp.vec3, axis: int, plane: float) -> wp.vec3:
 
 @wp.func
 def cut(record: BuildRecord, axis: int, low: float, high: float, corners: wp.array(dtype=wp.vec3)) -> BuildRecord:
-    """A reference between two planes; lo > hi where nothing of it is there.
+    """Clip a reference to the part between two planes; lo > hi if nothing remains.
 
-    Conservative: the triangle's part between the planes, each moved out by the pads of the triangle's own box, is padded as
-    that box is, and kept within the reference's box. A hit is within these pads of the triangle, and so of a part of it. But
-    a hit's t is held to the triangle's own box, and a ray that grazes a triangle in an axis plane moves far on the way there:
-    of such a triangle, whose box is no thicker than its pads, the box is cut, not the triangle.
+    Conservative: the planes move outwards by the pads of the triangle's box; the clipped part is padded like that box, and stays within
+    the reference's box. A hit is within these pads of the triangle, and so of a part of it. A hit's t is clamped to the triangle's own
+    box, though, and on a ray that grazes a triangle in an axis plane the clamp moves far. So a triangle no thicker than its pads is
+    clipped by its box.
     """
     out = record
     out.lo[axis] = wp.max(record.lo[axis], low)
@@ -88,14 +86,14 @@ def is_empty(box: BuildRecord) -> bool:
 
 @wp.func
 def plane_of(low: float, high: float, k: int) -> float:
-    """The plane between bins k - 1 and k of a range's box."""
+    """Plane between bins k - 1 and k of a range's box."""
     f = float(k) / float(BINS)
     return low * (1.0 - f) + high * f
 
 
 @wp.func
 def spatial_bin(low: float, high: float, x: float) -> int:
-    """The bin of a coordinate: the last one that begins at or before it, by the planes themselves."""
+    """Bin of a coordinate: the last one that begins at or before it, by the planes themselves."""
     k = wp.clamp(int(float(BINS) * ((x - low) / (high - low))), 0, BINS - 1)
     while k > 0 and x < plane_of(low, high, k):
         k = k - 1
@@ -106,10 +104,8 @@ def spatial_bin(low: float, high: float, x: float) -> int:
 
 @wp.func
 def spatial_split(records: wp.array(dtype=BuildRecord), task: BuildTask, corners: wp.array(dtype=wp.vec3), best: Split) -> Split:
-    """The cheapest plane between two bins, if it costs less than `best`; a side may hold fewer references than the range.
-
-    Where a range is long, its references are clipped to every bin that they reach into.
-    """
+    """Find the cheapest plane between two bins that costs less than `best`; each side must hold fewer references than the range. A
+    reference is clipped to every bin that it reaches into."""
     scale = area_scale(task.measures.box)
     n = task.end - task.begin
     for axis in range(3):
@@ -160,7 +156,7 @@ def spatial_split(records: wp.array(dtype=BuildRecord), task: BuildTask, corners
 
 @wp.struct
 class Parts:
-    """The boxes of both sides of a plane, and how many references they have; one that the plane cuts is in both."""
+    """The boxes and counts of references on both sides of a plane; a reference that it cuts is in both."""
 
     left: Row
     right: Row
@@ -170,6 +166,7 @@ class Parts:
 
 @wp.func
 def parts_of(data: BuildData, task: BuildTask, axis: int, plane: float) -> Parts:
+    """Measure both sides of a plane."""
     parts = Parts()
     parts.left = empty_row()
     parts.right = empty_row()
@@ -195,8 +192,7 @@ def parts_of(data: BuildData, task: BuildTask, axis: int, plane: float) -> Parts
 
 @wp.func
 def cheaper_side(parts: Parts, box: Row, scale: float) -> int:
-    """The side that it pays to leave a reference with this box on as a whole, -1 left or 1 right; 0: it is split ("reference
-    unsplitting", section 4.4)."""
+    """Choose a side for a reference with this box: -1 left, 1 right, 0: both (section 4.4, "reference unsplitting")."""
     area_0 = row_area(parts.left, scale)
     area_1 = row_area(parts.right, scale)
     both = area_0 * float(parts.n_left) + area_1 * float(parts.n_right)
@@ -209,8 +205,8 @@ def cheaper_side(parts: Parts, box: Row, scale: float) -> int:
 
 @wp.func
 def part_by_plane(data: BuildData, task: BuildTask, split: Split) -> wp.vec2i:
-    """References left of the plane to data.boxes[begin ..], those right of it to data.boxes[.. limit - 1] backwards; how many each.
-    One on both sides is split, unless it costs less to leave it whole or there is no room."""
+    """Copy references left of the plane to data.boxes[begin ..], those right of it to data.boxes[.. limit - 1] backwards; return both
+    counts. A reference on both sides is split, unless it costs less whole or no space is left."""
     scale = area_scale(task.measures.box)
     plane = plane_of(task.measures.box[split.axis], -task.measures.box[3 + split.axis], split.bin)
     parts = parts_of(data, task, split.axis, plane)
@@ -254,7 +250,8 @@ def part_by_plane(data: BuildData, task: BuildTask, split: Split) -> wp.vec2i:
 
 @wp.func
 def object_split(data: BuildData, task: BuildTask) -> wp.vec2i:
-    """Left references to room[begin ..], right ones to room[.. limit - 1] backwards, by centroid; how many each."""
+    """Copy references by centroid, left ones to data.boxes[begin ..], right ones to data.boxes[.. limit - 1] backwards; return both
+    counts."""
     n = task.end - task.begin
     middle = task.begin + n / 2
     if n > 2 and task.depth + levels(n) < MAX_DEPTH:
@@ -289,7 +286,7 @@ def box_of(records: wp.array(dtype=BuildRecord), begin: int, end: int) -> Row:
 
 @wp.func
 def sides(data: BuildData, counts: wp.vec2i, task: BuildTask) -> Halves:
-    """What stands in data.boxes, with the boxes of both sides."""
+    """Halves of the references in data.boxes, with their boxes."""
     out = Halves()
     out.count_0 = counts[0]
     out.count_1 = counts[1]
@@ -300,7 +297,7 @@ def sides(data: BuildData, counts: wp.vec2i, task: BuildTask) -> Halves:
 
 @wp.func
 def split_references(data: BuildData, task: BuildTask) -> Halves:
-    """The cheaper of the best object split and, if the sides of that overlap, the best plane; both sides are in data.boxes."""
+    """Take the cheaper of the best object split and, if its sides overlap, the best plane; both sides are in data.boxes."""
     scale = area_scale(task.measures.box)
     halves = sides(data, object_split(data, task), task)
     n = task.end - task.begin
@@ -323,7 +320,7 @@ def split_references(data: BuildData, task: BuildTask) -> Halves:
 
 @wp.func
 def take_room(data: BuildData, task: BuildTask, halves: Halves) -> Halves:
-    """Copy both sides back, the free room between them shared in proportion."""
+    """Copy both sides back to data.records; they share the free space in proportion to their counts."""
     free = task.limit - task.begin - halves.count_0 - halves.count_1
     share = int(wp.int64(free) * wp.int64(halves.count_0) / wp.int64(halves.count_0 + halves.count_1))
     middle = task.begin + halves.count_0 + share

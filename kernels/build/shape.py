@@ -1,8 +1,5 @@
-"""Triangles and spheres on a device: the box of each, and the records that the watertight triangle test reads.
-
-Both have the bits of what the host makes (Geometry.bounds, the layout "corners"), so that a mesh that moves on a GPU need not
-travel to the host and back.
-"""
+"""Boxes and records of triangles and spheres, made on any device.
+They have the bits of the host's (Geometry.bounds, the layout "corners"), so that a mesh that moves on a GPU stays there."""
 
 from typing import Any
 
@@ -19,7 +16,7 @@ Terms = wp.types.vector(16, wp.float64)
 
 @wp.struct
 class Shape:
-    """As wrt.accel.geometry.Geometry: the faces are primitives 0 .. F - 1, the spheres those after them."""
+    """The fields of wrt.accel.geometry.Geometry: faces are primitives 0 .. F - 1, spheres the next ones."""
 
     vertices: wp.array(dtype=wp.vec3)
     faces: wp.array(dtype=wp.vec3i)
@@ -28,7 +25,7 @@ class Shape:
 
 @kernel
 def bounds(shape: Shape, low: wp.array(dtype=wp.vec3), high: wp.array(dtype=wp.vec3), first: int):
-    """The padded boxes of primitives first .. first + dim - 1; all of space where a number is not finite."""
+    """Store the padded boxes of primitives first .. first + dim - 1; all of space for one that is not finite."""
     i = first + wp.tid()
     n = shape.faces.shape[0]
     lo = wp.vec3()
@@ -40,7 +37,7 @@ def bounds(shape: Shape, low: wp.array(dtype=wp.vec3), high: wp.array(dtype=wp.v
         c = shape.vertices[face[2]]
         lo = lower(lower(a, b), c)
         hi = upper(upper(a, b), c)
-        if not wp.isfinite(a + b + c):  # or a sum beyond float32: then a few boxes are larger than they must be
+        if not wp.isfinite(a + b + c):  # or a sum beyond float32: then a few boxes are larger than necessary
             if not (wp.isfinite(a) and wp.isfinite(b) and wp.isfinite(c)):
                 lo = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
                 hi = wp.vec3(wp.inf, wp.inf, wp.inf)
@@ -55,13 +52,13 @@ def bounds(shape: Shape, low: wp.array(dtype=wp.vec3), high: wp.array(dtype=wp.v
 
 @wp.func
 def half_area(extent: Any) -> Any:
-    """Half the surface of a box of this extent, in either precision. The host takes it too, of (3, ...) arrays: half_area.func."""
+    """Half the surface of a box of this extent, in either precision. The host calls half_area.func with (3, ...) arrays."""
     return extent[0] * extent[1] + extent[1] * extent[2] + extent[2] * extent[0]
 
 
 @wp.func
 def two_sum(a: wp.float64, b: wp.float64) -> wp.vec2d:
-    """The sum as it is rounded, and what the rounding took (Knuth)."""
+    """Sum as rounded, and its rounding error (Knuth)."""
     s = a + b
     t = s - a
     return wp.vec2d(s, (a - (s - t)) + (b - t))
@@ -69,7 +66,7 @@ def two_sum(a: wp.float64, b: wp.float64) -> wp.vec2d:
 
 @wp.func
 def two_product(a: wp.float64, b: wp.float64) -> wp.vec2d:
-    """Likewise the product (Dekker)."""
+    """Product as rounded, and its rounding error (Dekker)."""
     p = a * b
     c = SPLIT * a
     a_high = c - (c - a)
@@ -82,7 +79,7 @@ def two_product(a: wp.float64, b: wp.float64) -> wp.vec2d:
 
 @wp.func
 def is_zero(terms: Terms) -> bool:
-    """Whether the exact sum is 0: Shewchuk 1997, "Adaptive Precision Floating-Point Arithmetic", grow-expansion."""
+    """Test whether the exact sum is 0 (Shewchuk 1997, "Adaptive Precision Floating-Point Arithmetic", grow-expansion)."""
     parts = Terms()
     for n in range(16):
         q = terms[n]
@@ -99,7 +96,7 @@ def is_zero(terms: Terms) -> bool:
 
 @wp.func
 def with_products(terms: Terms, place: int, e: wp.vec2d, f: wp.vec2d, sign: wp.float64) -> Terms:
-    """The exact product of two sums of two, as eight terms from `place` on."""
+    """Store the exact product of two sums of two as eight terms, from `place` on."""
     out = terms
     for i in range(2):
         for j in range(2):
@@ -111,8 +108,8 @@ def with_products(terms: Terms, place: int, e: wp.vec2d, f: wp.vec2d, sign: wp.f
 
 @wp.func
 def exactly_across(a: wp.vec3, b: wp.vec3, c: wp.vec3, i: int, j: int) -> bool:
-    """Whether component k of the cross product (b - a) x (c - a) is other than 0; i, j: the two axes beside k. Exact: all numbers
-    are multiples of 2^-298, and below 2^258."""
+    """Test exactly whether component k of (b - a) x (c - a) differs from 0; i, j: the two axes beside k. All numbers are multiples of
+    2^-298, below 2^258."""
     e_i = two_sum(wp.float64(b[i]), -wp.float64(a[i]))
     e_j = two_sum(wp.float64(b[j]), -wp.float64(a[j]))
     f_i = two_sum(wp.float64(c[i]), -wp.float64(a[i]))
@@ -123,7 +120,7 @@ def exactly_across(a: wp.vec3, b: wp.vec3, c: wp.vec3, i: int, j: int) -> bool:
 
 @wp.func
 def surely_across(a: wp.vec3, b: wp.vec3, c: wp.vec3, i: int, j: int) -> bool:
-    """The same in float64, False where that leaves a doubt."""
+    """Test the same in float64; False if in doubt."""
     left = (wp.float64(b[i]) - wp.float64(a[i])) * (wp.float64(c[j]) - wp.float64(a[j]))
     right = (wp.float64(b[j]) - wp.float64(a[j])) * (wp.float64(c[i]) - wp.float64(a[i]))
     return not wp.abs(left - right) <= DOUBT * (wp.abs(left) + wp.abs(right))
@@ -131,7 +128,7 @@ def surely_across(a: wp.vec3, b: wp.vec3, c: wp.vec3, i: int, j: int) -> bool:
 
 @wp.func
 def has_area(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> bool:
-    """Whether the corners are not on one line: as wrt.scene.clean.has_area. True where one is not finite."""
+    """Test that the corners are not on one line, as wrt.scene.clean.has_area; True if one is not finite."""
     if surely_across(a, b, c, 1, 2) or surely_across(a, b, c, 2, 0) or surely_across(a, b, c, 0, 1):
         return True
     if not (wp.isfinite(a) and wp.isfinite(b) and wp.isfinite(c)):
@@ -141,7 +138,7 @@ def has_area(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> bool:
 
 @kernel
 def write_corners(shape: Shape, order: wp.array(dtype=wp.int32), out: wp.array(dtype=Primitive), first: int):
-    """Records first .. first + dim - 1 of the layout "corners"; order: the prim_id of each."""
+    """Write the records first .. first + dim - 1 of the layout "corners"; order: their prim_id."""
     i = first + wp.tid()
     record = Primitive()
     record.prim_id = order[i]
@@ -157,7 +154,7 @@ def write_corners(shape: Shape, order: wp.array(dtype=wp.int32), out: wp.array(d
 
 @kernel
 def count_outside(faces: wp.array(dtype=wp.vec3i), n_vertices: int, count: wp.array(dtype=wp.int32), first: int):
-    """How many of the faces name a vertex that there is not."""
+    """Count the faces with an index that is not a vertex."""
     face = faces[first + wp.tid()]
     for k in range(3):
         if face[k] < 0 or face[k] >= n_vertices:

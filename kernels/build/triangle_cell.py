@@ -1,15 +1,13 @@
-"""Builders that split space ask: does a triangle, grown by its pad, meet this cell? If not, no ray needs it there.
-
-The separating axes of a triangle and a box: Akenine-Moeller 2001, "Fast 3D Triangle-Box Overlap Testing" (JGT 6(1)). The three
-axes of the box are not tested again: the caller has compared the cell with the triangle's padded box.
-"""
+"""The test of a padded triangle against a cell, for builders that split space: does the cell need to list it?
+Separating axes of a triangle and a box: Akenine-Moeller 2001, "Fast 3D Triangle-Box Overlap Testing" (JGT 6(1)). The box's own axes are
+not tested: the caller has compared the cell with the triangle's padded box."""
 
 import warp as wp
 
 
 @wp.struct
 class CellSource:
-    """Triangles (spheres come after them) and the padded boxes of all primitives."""
+    """Triangles, and the padded boxes of all primitives; spheres come after the triangles."""
 
     vertices: wp.array(dtype=wp.vec3)
     faces: wp.array(dtype=wp.vec3i)
@@ -19,22 +17,20 @@ class CellSource:
 
 @wp.struct
 class TriangleCell:
-    """Set-up, once a triangle; in float64, where all that is left to rounding is far below the pad.
-
-    grow: how far the triangle stands off its own box, (3,); normal and offset: its plane; v0, v1, v2: its corners.
-    """
+    """A triangle set up for the test, in float64, whose rounding is far below the pad."""
 
     v0: wp.vec3d
     v1: wp.vec3d
     v2: wp.vec3d
-    normal: wp.vec3d
-    grow: wp.vec3d
+    normal: wp.vec3d  # Of its plane, not normalised.
+    grow: wp.vec3d  # Pad of its box along each axis.
 
 
 @wp.func
 def triangle_cell(v0: wp.vec3, v1: wp.vec3, v2: wp.vec3, lo: wp.vec3, hi: wp.vec3) -> TriangleCell:
-    """lo, hi: the triangle's padded box. Grown by the same pads, the triangle holds every point that its unit may call a hit,
-    but for what is proportional to the hit's distance, which the ray's side widens (kernels.traverse.cell_ray)."""
+    """Set up a triangle for the test; lo, hi: its padded box.
+    Grown by that pad, the triangle holds every point that its unit may call a hit. The ray's side widens for the part proportional to the
+    hit's distance (kernels.traverse.cell_ray)."""
     out = TriangleCell()
     out.v0 = wp.vec3d(v0)
     out.v1 = wp.vec3d(v1)
@@ -48,7 +44,7 @@ def triangle_cell(v0: wp.vec3, v1: wp.vec3, v2: wp.vec3, lo: wp.vec3, hi: wp.vec
 
 @wp.func
 def apart_along(u: wp.float64, v: wp.float64, a: wp.vec2d, b: wp.vec2d, half_u: wp.float64, half_v: wp.float64) -> bool:
-    """Whether the axis (u, v) across an edge parts a box of these half sizes around 0 from the edge (a) and the corner (b)."""
+    """Test whether the axis (u, v) across an edge separates a box of these half sizes around 0 from the edge (a) and the corner (b)."""
     p = u * a[0] + v * a[1]
     q = u * b[0] + v * b[1]
     reach = wp.abs(u) * half_u + wp.abs(v) * half_v
@@ -57,7 +53,7 @@ def apart_along(u: wp.float64, v: wp.float64, a: wp.vec2d, b: wp.vec2d, half_u: 
 
 @wp.func
 def edge_apart(edge: wp.vec3d, on: wp.vec3d, off: wp.vec3d, half: wp.vec3d) -> bool:
-    """The axes edge x (the three of the box); on: a corner of the edge, off: the corner opposite, both from the cell's center."""
+    """Test the three axes edge x box axis; on: a corner of the edge, off: the opposite corner, both from the cell's center."""
     if apart_along(-edge[2], edge[1], wp.vec2d(on[1], on[2]), wp.vec2d(off[1], off[2]), half[1], half[2]):
         return True
     if apart_along(-edge[0], edge[2], wp.vec2d(on[2], on[0]), wp.vec2d(off[2], off[0]), half[2], half[0]):
@@ -67,10 +63,8 @@ def edge_apart(edge: wp.vec3d, on: wp.vec3d, off: wp.vec3d, half: wp.vec3d) -> b
 
 @wp.func
 def meets_cell(triangle: TriangleCell, lo: wp.vec3, hi: wp.vec3) -> bool:
-    """Whether the grown triangle meets the closed cell [lo, hi], given that its padded box does.
-
-    Conservative; a cell without end is met. The triangle's coordinates are finite.
-    """
+    """Test whether the grown triangle meets the closed cell [lo, hi], if its padded box does.
+    Conservative; an infinite cell is met. The triangle's coordinates must be finite."""
     half_one = wp.float64(0.5)
     low = wp.vec3d(lo)
     high = wp.vec3d(hi)

@@ -1,9 +1,7 @@
-"""Collapsing a binary BVH into a wide one, at the least expected cost.
-
-Ylitie, Karras and Laine 2017, "Efficient Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs", section 3.1: from
-the bottom up, what it costs at least to represent a subtree by at most k roots, for k up to the width; then from the top
-down, the nodes that this calls for. A leaf costs as much as the full rows of primitives that it takes to test it.
-"""
+"""The collapse of a binary BVH into a wide one of least expected cost.
+Ylitie, Karras and Laine 2017, "Efficient Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs", section 3.1. From the bottom up,
+it finds the least cost of a subtree as at most k roots, for k up to the width. From the top down, it writes the nodes of the best choice.
+A leaf costs as much as the rows of primitives that it fills."""
 
 import warp as wp
 
@@ -17,52 +15,45 @@ MAX_WIDTH = wp.constant(8)
 
 @wp.struct
 class CollapseOptions:
-    """width: children a node, and primitives a row; leaves hold at most max_leaf; costs of the surface area heuristic: of a
-    node, and of a row of primitives; stack: how many entries a traversal has room for."""
+    """Limits and SAH costs of a wide tree."""
 
-    width: int
-    max_leaf: int
-    cost_traversal: float
-    cost_intersection: float
-    stack: int
+    width: int  # Children of a node, and primitives of a row.
+    max_leaf: int  # Most primitives of a leaf.
+    cost_traversal: float  # Of a node.
+    cost_intersection: float  # Of a row of primitives.
+    stack: int  # Entries of a traversal's stack.
 
 
 @wp.struct
 class Subtrees:
-    """Of each binary node: primitives and height below it; cost and choice, one for each number of roots 1 .. MAX_WIDTH.
+    """Costs of the binary nodes' subtrees; cost and choice have an entry for each number of roots 1 .. MAX_WIDTH."""
 
-    choice of k roots: how many of them go to the left child (fewer roots are taken where they cost as much); of one root: 1 for
-    a leaf.
-    """
-
-    size: wp.array(dtype=wp.int32)
+    size: wp.array(dtype=wp.int32)  # Primitives.
     height: wp.array(dtype=wp.int32)
     cost: wp.array(dtype=wp.float32)
-    choice: wp.array(dtype=wp.uint8)
+    choice: wp.array(dtype=wp.uint8)  # Of k roots: roots of the left child. Of one root: 1 for a leaf. Fewer roots win at equal cost.
 
 
 @wp.struct
 class WideTree:
-    """What comes out. children: `width` a node, references as in kernels.wide.references; lo, hi: their boxes, empty where there is
-    no child; order: the prim_id of each lane, rows filled up with -1; count: nodes, rows, leaves, depth, and the most entries on
-    a traversal's stack. source: room for the children of one node: whose boxes they have, as 2 * (binary node) + side."""
+    """The wide tree; children without a node have an empty box."""
 
-    children: wp.array(dtype=wp.int32)
-    lo: wp.array(dtype=wp.vec3)
+    children: wp.array(dtype=wp.int32)  # References, `width` a node (kernels.wide.references).
+    lo: wp.array(dtype=wp.vec3)  # Boxes of the children: lo, hi.
     hi: wp.array(dtype=wp.vec3)
-    source: wp.array(dtype=wp.int32)
-    order: wp.array(dtype=wp.int32)
-    count: wp.array(dtype=wp.int32)
+    source: wp.array(dtype=wp.int32)  # Scratch: children of one node as 2 * binary node + side.
+    order: wp.array(dtype=wp.int32)  # prim_id of each lane; rows are filled up with -1.
+    count: wp.array(dtype=wp.int32)  # Nodes, rows, leaves, depth, most entries on a traversal's stack.
 
 
 @wp.struct
 class WideTask:
-    """Binary node `node` becomes the wide node `slot`; room: entries of the stack that are left to it; depth: 1 at the root."""
+    """A binary node that becomes the wide node `slot`."""
 
     node: int
     slot: int
-    room: int
-    depth: int
+    room: int  # Entries of the stack that are left below it.
+    depth: int  # 1 at the root.
 
 
 @wp.func
@@ -77,7 +68,7 @@ def high_of(node: Bvh2Node, side: int) -> wp.vec3:
 
 @wp.func
 def area_of(node: Bvh2Node, side: int) -> float:
-    """Half the surface of a child's box; 0 for an empty one, and finite for one too large for float32."""
+    """Half the surface of a child's box: 0 for an empty one, at most 1e30."""
     return wp.min(half_area(wp.max(high_of(node, side) - low_of(node, side), wp.vec3())), 1.0e30)
 
 
@@ -107,7 +98,7 @@ def leaf_cost(options: CollapseOptions, area: float, count: int) -> float:
 
 @wp.func
 def child_cost(trees: Subtrees, options: CollapseOptions, node: Bvh2Node, side: int, k: int) -> float:
-    """The least cost of a child as at most k roots."""
+    """Least cost of a child as at most k roots."""
     n = count_of(node, side)
     if n > 0:
         return leaf_cost(options, area_of(node, side), n)
@@ -116,16 +107,14 @@ def child_cost(trees: Subtrees, options: CollapseOptions, node: Bvh2Node, side: 
 
 @kernel
 def subtree_costs(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, trees: Subtrees):
-    """From the last node to the first: a parent stands before its children. One thread.
-
-    The cost of one root includes its own box's area, which the parent knows: it is added when the parent looks at it.
-    """
+    """Compute the costs of all subtrees from the last node to the first: parents stand before their children. One thread.
+    The cost of one root includes its own box's area, which is in its parent: the parent adds it."""
     n_nodes = nodes.shape[0]
     for j in range(n_nodes):
         i = n_nodes - 1 - j
         node = nodes[i]
         height = int(0)
-        # The costs of a child as one root could not be told before its box was known.
+        # The cost of a child as one root needs its box, which this node has.
         for side in range(2):
             if count_of(node, side) == 0:
                 c = first_of(node, side)
@@ -155,10 +144,7 @@ def subtree_costs(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, tre
 
 @wp.func
 def roots_of(nodes: wp.array(dtype=Bvh2Node), trees: Subtrees, i: int, k: int, source: wp.array(dtype=wp.int32)) -> int:
-    """Write the at most k roots that stand for the children of binary node i to `source`; how many they are.
-
-    Node i itself is opened, so that there are at least two.
-    """
+    """Write the at most k roots that replace the children of binary node i to `source`; return their number, at least two."""
     node_of = wp.zeros(shape=wp.static(8), dtype=wp.int32)
     side_of = wp.zeros(shape=wp.static(8), dtype=wp.int32)
     k_of = wp.zeros(shape=wp.static(8), dtype=wp.int32)
@@ -200,7 +186,7 @@ def roots_of(nodes: wp.array(dtype=Bvh2Node), trees: Subtrees, i: int, k: int, s
 
 @wp.func
 def gather(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), parent: int, side: int, out: WideTree, slot: int):
-    """Write the primitives of a child, of its whole subtree, to order[slot ..]."""
+    """Write the primitives of a child's subtree to order[slot ..]."""
     stack = wp.zeros(shape=wp.static(STACK_SIZE + 2), dtype=wp.int32)
     stack[0] = 2 * parent + side
     size = int(1)
@@ -222,8 +208,8 @@ def gather(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), par
 
 @wp.func
 def write_in_order(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, out: WideTree, base: int, n: int):
-    """The first n children of a row and the boxes of their sources, from the one to visit last to the one to visit first by a ray
-    that asks for any hit: those that do not exist, inner nodes, leaves; and large boxes after small ones."""
+    """Write the first n children of a row with the boxes of their sources, sorted for rays that ask for any hit.
+    From the last visited to the first: missing children, inner nodes, leaves; larger boxes are visited first."""
     reference = wp.zeros(shape=wp.static(8), dtype=wp.int32)
     source = wp.zeros(shape=wp.static(8), dtype=wp.int32)
     area = wp.zeros(shape=wp.static(8), dtype=wp.float32)
@@ -254,11 +240,9 @@ def write_in_order(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, ou
 
 @wp.func
 def take_roots(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, trees: Subtrees, task: WideTask, out: WideTree) -> int:
-    """Write the sources of the children of a wide node; return how many they are.
-
-    A node of k children leaves k - 1 on the stack while the last is walked. Where its plan would leave too little room for the
-    binary tree below, which needs one entry a level, it takes fewer children.
-    """
+    """Write the sources of the children of a wide node; return their number.
+    A node of k children leaves k - 1 on the stack during the walk of the last. The binary tree below needs one entry a level: the node
+    takes fewer children if its best choice leaves too few."""
     k = int(options.width)
     n = int(0)
     while True:
@@ -277,7 +261,7 @@ def take_roots(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, trees:
 @wp.func
 def write_rows(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), code: int, count: int, width: int,
                out: WideTree) -> int:
-    """Write the leaf of a source with so many primitives behind the rows that there are; return how many rows it takes."""
+    """Append the leaf of a source with `count` primitives to the rows; return the rows that it fills."""
     rows = (count + width - 1) / width
     first = out.count[1] * width
     gather(nodes, order, code / 2, code % 2, out, first)
@@ -289,7 +273,7 @@ def write_rows(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32),
 @kernel
 def collapse(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), options: CollapseOptions, trees: Subtrees,
              out: WideTree):
-    """Write the wide tree, depth first, and what it counts to out.count. One thread."""
+    """Write the wide tree, depth first, and its totals to out.count. One thread."""
     stack = wp.zeros(shape=wp.static(8 * STACK_SIZE), dtype=WideTask)
     root = WideTask()
     root.room = options.stack
@@ -310,7 +294,7 @@ def collapse(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), o
         room = task.room - (n - 1)
         least_room = wp.min(least_room, room)
         for j in range(n):
-            # The last child is taken from the stack first: it gets the next slots.
+            # The last child is popped first: it gets the next slots.
             code = out.source[j]
             node = nodes[code / 2]
             side = code % 2
@@ -340,10 +324,8 @@ def collapse(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), o
 @kernel
 def refit(children: wp.array(dtype=wp.int32), order: wp.array(dtype=wp.int32), width: int, low: wp.array(dtype=wp.vec3),
           high: wp.array(dtype=wp.vec3), lo: wp.array(dtype=wp.vec3), hi: wp.array(dtype=wp.vec3)):
-    """The boxes of all children around primitives that have moved, from the last node to the first. One thread.
-
-    low, high: a box for each prim_id, and one more, empty, for lanes without (order -1).
-    """
+    """Refit the boxes of all children to moved primitives, from the last node to the first. One thread.
+    low, high: a box for each prim_id, and an empty one for lanes without (order -1)."""
     n = children.shape[0]
     none = low.shape[0] - 1
     for k in range(n):

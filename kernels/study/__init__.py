@@ -1,1 +1,1 @@
-"""Device code that only the laboratory needs."""
+"""Device code of the laboratory alone."""

@@ -1,10 +1,7 @@
-"""Traversals of the binary BVH as a design would have them, to be counted: without order, without an early stop, or with a stack of
-few entries. All give the same hits as the one in use.
-
-A short stack forgets its oldest entries; when it runs out, the walk starts again at the root and follows a trail of one bit a
-level: which levels are done but for their last child (Laine 2010, "Restart Trail for Stackless BVH Traversal"; Vaidyanathan et
-al. 2019, "Wide BVH Traversal with a Short Stack").
-"""
+"""Variants of the binary BVH's traversal, for counting: without order, without early stop, or with a short stack. The hits are the same.
+A short stack forgets its oldest entries. When it is empty, the walk starts again at the root and follows a trail. It has one bit a level,
+set if only the last child is left. (Laine 2010, "Restart Trail for Stackless BVH Traversal"; Vaidyanathan et al. 2019, "Wide BVH Traversal
+with a Short Stack")."""
 
 from typing import Any, NamedTuple
 
@@ -16,18 +13,17 @@ from wrt.kernels.traverse.common import Units, make_probe, no_hit
 from wrt.kernels.traverse.counters import Counts, make_counters
 from wrt.kernels.traverse.leaf import make_leaf
 
-LEVELS = 62  # of the tree, that a trail has bits for
+LEVELS = 62  # levels of the tree that a trail has bits for
 TOP = wp.constant(wp.uint64(1 << 63))
 NONE = wp.constant(wp.uint64(0))
 
 
 class Study(NamedTuple):
-    """entries: of the stack, STACK_SIZE for all that it needs; ordered: the nearer child first; early: boxes and entries beyond
-    the best hit are dropped. A short stack needs both. Stands where a structure names its traversal's module."""
+    """A variant, used as a structure's traversal module; a short stack needs `ordered` and `early`."""
 
-    entries: int = STACK_SIZE
-    ordered: bool = True
-    early: bool = True
+    entries: int = STACK_SIZE  # Of the stack; STACK_SIZE: as many as needed.
+    ordered: bool = True  # Visit the nearer child first.
+    early: bool = True  # Drop boxes and entries beyond the best hit.
 
     def make_struct(self, record: Any) -> Any:
         return make_struct(record)
@@ -41,24 +37,23 @@ class Study(NamedTuple):
 
 @wp.struct
 class Trail:
-    """done: which levels are done but for their last child; level: one bit, lower for each step down; resumed: the level whose last
-    child is to be visited."""
+    """The path of a walk."""
 
-    done: wp.uint64
-    level: wp.uint64
-    resumed: wp.uint64
+    done: wp.uint64  # Levels that are done but for their last child.
+    level: wp.uint64  # One bit, lower for each step down.
+    resumed: wp.uint64  # Level whose last child is next.
 
 
 @wp.func
 def carry(trail: Trail) -> Trail:
-    """On to the deepest level that has a child left, over those that have none; TOP or above: there is none."""
+    """Move on to the deepest level with a child left; TOP or above: no level has one."""
     trail.done = (trail.done & ((~trail.level) + wp.uint64(1))) + trail.level
     trail.resumed = trail.done & ((~trail.done) + wp.uint64(1))
     return trail
 
 
 def make_short_stack(units: Units, entries: int, any_hit: bool, accepts: Any = None) -> Any:
-    """The closest hit, or any, with so many entries (0: none, each pop starts again at the root). The tree has LEVELS at most."""
+    """Make the unit with so many entries (0: each pop restarts at the root), for trees of at most LEVELS levels."""
     probe_of = make_probe(units)
     visit_leaf = make_leaf(units, any_hit, accepts)
     ray_aabb = units.box_test
@@ -73,7 +68,7 @@ def make_short_stack(units: Units, entries: int, any_hit: bool, accepts: Any = N
         counts = Counts()
         stack = wp.zeros(shape=wp.static(room), dtype=Child)
         stack_t = wp.zeros(shape=wp.static(room), dtype=wp.float32)
-        top = int(0)  # entries ever pushed less those popped; the newest is at (top - 1) modulo room
+        top = int(0)  # pushes - pops; the newest entry is at (top - 1) modulo room
         size = int(0)
         child = Child()
         trail = Trail()
@@ -92,7 +87,7 @@ def make_short_stack(units: Units, entries: int, any_hit: bool, accepts: Any = N
                 t_1 = ray_aabb(probe.box, node.lo_1, node.hi_1, best.t)
                 if t_0 < wp.inf or t_1 < wp.inf:
                     trail.level = trail.level >> wp.uint64(1)
-                    second = t_1 < t_0  # which is nearer; a miss is at infinity
+                    second = t_1 < t_0  # the nearer child; a miss is at infinity
                     go = bool(True)
                     if t_0 < wp.inf and t_1 < wp.inf:
                         if (trail.done & trail.level) != NONE:
@@ -106,11 +101,11 @@ def make_short_stack(units: Units, entries: int, any_hit: bool, accepts: Any = N
                     elif trail.level != trail.resumed:
                         trail.done = trail.done | trail.level
                     else:
-                        go = bool(False)  # only the first child is left in reach, and that is done
+                        go = bool(False)  # only the first child is in reach, and it is done
                     if go:
                         child = child_of(node, second)
                         continue
-            # The newest entry of the deepest level that has a child left, or from the root again.
+            # Take the newest entry, of the deepest level with a child left, or restart at the root.
             found = bool(False)
             while not found:
                 trail = carry(trail)

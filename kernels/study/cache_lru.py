@@ -1,4 +1,4 @@
-"""Replays fetches through set-associative caches that drop the least recently used line (CPU only)."""
+"""Replay of fetches through set-associative LRU caches (CPU only)."""
 
 import warp as wp
 
@@ -9,16 +9,16 @@ LINE = wp.constant(wp.int64(128))
 
 @wp.struct
 class Caches:
-    """One cache a thread, all alike: tags of `sets` sets of `ways` lines, the most recently used first; -1: nothing yet."""
+    """One cache a thread, all alike."""
 
     sets: int
     ways: int
-    tags: wp.array(dtype=wp.int64)
+    tags: wp.array(dtype=wp.int64)  # `sets` sets of `ways` lines, the most recently used first; -1: empty.
 
 
 @wp.func
 def access(caches: Caches, which: int, line: wp.int64) -> bool:
-    """Whether the line is there; it is afterwards. It belongs in set `line modulo sets`."""
+    """Return whether the line is in the cache, and put it there; its set is `line modulo sets`."""
     begin = (which * caches.sets + int(line % wp.int64(caches.sets))) * caches.ways
     moved = line
     for way in range(caches.ways):
@@ -32,50 +32,44 @@ def access(caches: Caches, which: int, line: wp.int64) -> bool:
 
 @kernel
 def replay_lru(caches: Caches, lines: wp.array(dtype=wp.int64), hit: wp.array(dtype=wp.int8)):
-    """One thread: hit[i] = 1 where lines[i] is there when it is asked for."""
+    """Replay lines in one thread: hit[i] = 1 if lines[i] is in the cache."""
     for i in range(lines.shape[0]):
         hit[i] = wp.where(access(caches, wp.tid(), lines[i]), wp.int8(1), wp.int8(0))
 
 
 @wp.struct
 class Trace:
-    """Rays in the order of warps: warp w has the rays warp_first[w] to warp_first[w + 1] (32 at most), and ray i the fetches
-    first[i] to first[i + 1]; address, size in bytes. slots: warps at a time in an SM; sms: warps go to them by turns."""
+    """Rays in the order of warps, and their fetches."""
 
-    sms: int
-    slots: int
-    warp_first: wp.array(dtype=wp.int64)
-    first: wp.array(dtype=wp.int64)
+    sms: int  # Warps go to them by turns.
+    slots: int  # Concurrent warps of an SM.
+    warp_first: wp.array(dtype=wp.int64)  # Warp w has the rays warp_first[w] .. warp_first[w + 1] - 1, at most 32.
+    first: wp.array(dtype=wp.int64)  # Ray i has the fetches first[i] .. first[i + 1] - 1.
     address: wp.array(dtype=wp.int64)
-    size: wp.array(dtype=wp.int64)
+    size: wp.array(dtype=wp.int64)  # Bytes.
 
 
 @wp.struct
 class Missed:
-    """What the L1 of SM s misses: `misses[s]` of `accesses[s]`, from room[s] on, with the round in which it is asked for and the
-    lanes that wait for it. wanted: lanes that asked for a line, each counted.
-
-    slot_warp, slot_round: (sms * slots,) what runs, -1: nothing; seen: (sms * seen_size,) the lines of a warp's round, and
-    seen_at: where each one missed, -1: it hit.
-    """
+    """Misses of each SM's L1; the misses of SM s are the entries room[s] .. room[s] + misses[s] - 1."""
 
     room: wp.array(dtype=wp.int64)
     line: wp.array(dtype=wp.int64)
-    time: wp.array(dtype=wp.int64)
-    lanes: wp.array(dtype=wp.int64)
-    wanted: wp.array(dtype=wp.int64)
+    time: wp.array(dtype=wp.int64)  # Round of the miss.
+    lanes: wp.array(dtype=wp.int64)  # Lanes that wait for the line.
+    wanted: wp.array(dtype=wp.int64)  # Lanes that asked for a line, each counted.
     accesses: wp.array(dtype=wp.int64)
     misses: wp.array(dtype=wp.int64)
-    slot_warp: wp.array(dtype=wp.int32)
-    slot_round: wp.array(dtype=wp.int64)
-    seen: wp.array(dtype=wp.int64)
-    seen_at: wp.array(dtype=wp.int64)
+    slot_warp: wp.array(dtype=wp.int32)  # Running warp of each of sms * slots slots; -1: none.
+    slot_round: wp.array(dtype=wp.int64)  # Its round.
+    seen: wp.array(dtype=wp.int64)  # Lines of a warp's round, seen_size for each SM.
+    seen_at: wp.array(dtype=wp.int64)  # Entry of each one's miss; -1: it hit.
     seen_size: int
 
 
 @wp.func
 def play_round(trace: Trace, caches: Caches, out: Missed, sm: int, warp: int, step: wp.int64, time: wp.int64) -> bool:
-    """Each lane makes its fetch number `step`; a line that several lanes touch is asked for once. Whether any has one more."""
+    """Let each lane make its fetch `step`; lanes share a line's access. Return whether a lane has a next fetch."""
     more = bool(False)
     begin = sm * out.seen_size
     seen = int(0)
@@ -113,7 +107,7 @@ def play_round(trace: Trace, caches: Caches, out: Missed, sm: int, warp: int, st
 
 @kernel
 def replay_warps(trace: Trace, caches: Caches, out: Missed, sm: int):
-    """One SM: in each round every warp that has a slot makes one fetch a lane; a warp that ends makes room for the next one."""
+    """Replay one SM: in each round every warp in a slot makes one fetch a lane; a finished warp frees its slot."""
     waiting = sm
     n = trace.warp_first.shape[0] - 1
     time = wp.int64(0)

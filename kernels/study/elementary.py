@@ -1,4 +1,4 @@
-"""The elementary functions over arrays, to be compared between devices and with what is exact."""
+"""The elementary functions over arrays, for comparison between devices and with exact values."""
 
 import warp as wp
 
@@ -10,7 +10,7 @@ FUNCTIONS = ("sin", "cos", "acos", "exp", "atan2", "power")
 
 @kernel
 def call_functions(x: wp.array(dtype=float), y: wp.array(dtype=float), out: wp.array2d(dtype=float)):
-    """A row of each pair: the functions in the order of FUNCTIONS, of x alone, or of (x, y)."""
+    """Write a row for each pair: FUNCTIONS in order, of x or of (x, y)."""
     i = wp.tid()
     sin, cos = sin_cos(x[i])
     out[i, 0] = sin

@@ -1,4 +1,4 @@
-"""How the watertight test comes to its answer where a GPU runs it: by float32, by float-float arithmetic, or by float64."""
+"""The arithmetic that decides the watertight test on a GPU: float32, float-float, or float64."""
 
 import warp as wp
 
@@ -12,7 +12,7 @@ REFUSED, SURE, HARD = 0, 1, 2
 @kernel
 def classify(primitives: wp.array(dtype=Primitive), rays: RayArrays, ray: wp.array(dtype=wp.int32),
              primitive: wp.array(dtype=wp.int32), out: wp.array(dtype=wp.int32)):
-    """Test i is of ray[i] against primitive[i]."""
+    """Classify the test of ray[i] against primitive[i]."""
     i = wp.tid()
     tested = load_ray(rays, ray[i])
     shear = triangle_ray(tested)

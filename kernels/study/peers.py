@@ -1,4 +1,4 @@
-"""Warp's own ray query as a kernel: a rival to measure, not a part of wrt."""
+"""Warp's own ray queries as kernels: rivals to measure."""
 
 import warp as wp
 
@@ -15,7 +15,7 @@ def warp_mesh_query(
     v: wp.array(dtype=wp.float32),
     prim_id: wp.array(dtype=wp.int32),
 ):
-    """directions must be of unit length; -1 on a miss."""
+    """Store the closest hit of each ray, prim_id = -1 on a miss; directions must have unit length."""
     i = wp.tid()
     query = wp.mesh_query_ray(mesh, origins[i], directions[i], 1.0e38)
     prim_id[i] = -1
@@ -35,6 +35,6 @@ def warp_mesh_any(
     reach: wp.array(dtype=wp.float32),
     dark: wp.array(dtype=wp.bool),
 ):
-    """directions must be of unit length; whether there is anything within reach."""
+    """Store whether each ray hits anything within reach; directions must have unit length."""
     i = wp.tid()
     dark[i] = wp.mesh_query_ray_anyhit(mesh, origins[i], directions[i], reach[i])

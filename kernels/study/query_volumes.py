@@ -1,4 +1,4 @@
-"""What bounding volumes cost: tests by themselves, and walks that are counted as others publish them."""
+"""The cost of bounding volumes: isolated tests, and walks counted as others publish them."""
 
 from functools import cache
 from typing import Any
@@ -14,13 +14,13 @@ from wrt.kernels.units.box import box_ray, ray_aabb
 
 @cache
 def make_enter_kernel(volumes: Volumes) -> Any:
-    """The kernel that tests each ray against both children of every node of `accel`, whatever the walk would do."""
+    """Make the kernel that tests each ray against both children of every node of `accel`."""
     struct, set_up, enter = volumes.struct, volumes.set_up, volumes.enter
     probe_of = make_probe(Units())
 
     @kernel
     def enter_all(accel: struct, rays: RayArrays, entered: wp.array(dtype=wp.int32)):
-        """entered: how many volumes each ray enters."""
+        """Store the number of volumes that each ray enters."""
         i = wp.tid()
         ray = load_ray(rays, i)
         what = set_up(accel, probe_of(ray))
@@ -36,8 +36,8 @@ def make_enter_kernel(volumes: Volumes) -> Any:
 @kernel
 def count_popped(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), rays: RayArrays, t: wp.array(dtype=wp.float32),
                  prim_id: wp.array(dtype=wp.int32), visits: wp.array(dtype=wp.int32), primitives: wp.array(dtype=wp.int32)):
-    """The walk of rays whose closest hits are known (t, prim_id), as tinybvh counts it: a visit for each node or leaf that is
-    popped, one that begins beyond the closest hit too."""
+    """Count the walk of rays with known closest hits (t, prim_id) as tinybvh does.
+    Each popped node or leaf is a visit, even one that begins beyond the closest hit."""
     i = wp.tid()
     box = box_ray(load_ray(rays, i))
     best = float(wp.inf)

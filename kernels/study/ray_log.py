@@ -1,8 +1,6 @@
-"""A log of every ray that a picture takes: what it asks, of which kind it is, and behind how many bounces.
-
-A logged structure is one more in front of the structure proper: its traversal writes the ray down, gives it a row of the
-counters, and hands it on. Only kernels that profile are compiled with it.
-"""
+"""A log of every ray of a picture: what it asks, its kind, and its number of bounces.
+A logged structure wraps the structure proper: its traversal logs the ray, gives it a row of the counters, and hands it on. Only kernels
+that profile are compiled with it."""
 
 from functools import cache
 from typing import Any
@@ -14,43 +12,42 @@ from wrt.kernels.structs import Hit, Ray, Surfaces
 
 @wp.struct
 class LoggedRay:
-    """As structs.Ray; label: of shade.paths.label; any_hit: 1 where only whether was asked; hit: 1 where there was one."""
+    """A ray as in structs.Ray, with its kind and its answer."""
 
     origin: wp.vec3
     direction: wp.vec3
     t_min: float
     t_max: float
     exclude_plus_one: int
-    label: int
-    any_hit: int
-    hit: int
+    label: int  # By shade.paths.label.
+    any_hit: int  # 1: an any-hit query.
+    hit: int  # 1: it hit.
 
 
 @wp.struct
 class RayLog:
-    """Of a tile. used: rays so far of each pixel; first: where each pixel's begin in `rays` (length 0: they are counted, and
-    not written down)."""
+    """The log of a tile."""
 
-    used: wp.array(dtype=wp.int32)
-    first: wp.array(dtype=wp.int64)
+    used: wp.array(dtype=wp.int32)  # Rays of each pixel so far.
+    first: wp.array(dtype=wp.int64)  # First entry of each pixel in `rays`; length 0: count, do not log.
     rays: wp.array(dtype=LoggedRay)
 
 
 @cache
 def make_struct(accel_struct: Any) -> Any:
-    """row: the pixel of this thread, counted from the tile's first; each thread sets it in its own copy."""
+    """Make the logged structure."""
 
     @wp.struct
     class Logged:
         accel: accel_struct
         log: RayLog
-        row: int
+        row: int  # Pixel of this thread in the tile; each thread sets it in its own copy.
 
     return Logged
 
 
 def make_traversal(accel_struct: Any, traverse: Any, any_hit: bool) -> Any:
-    """`traverse`, with the ray in the log. Its counters go to the ray's own row, or without rows to the pixel's."""
+    """Make `traverse` with a log; its counters go to the ray's row, or to the pixel's if rays are only counted."""
     struct = make_struct(accel_struct)
 
     @wp.func

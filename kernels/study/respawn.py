@@ -1,4 +1,4 @@
-"""Rays that go on from where others hit, as the integrator's do: does one meet the surface that it leaves?"""
+"""Rays that start at hits of others, as the integrator's do, to test that they do not hit the surface that they leave."""
 
 from typing import Any
 
@@ -11,19 +11,17 @@ from wrt.kernels.structs import Surfaces, kernel, make_ray
 
 @wp.struct
 class Respawn:
-    """Where rays go on from their hits; exclude: 1 to leave out the triangle that they start on, as the integrator does."""
+    """Second rays and both answers."""
 
     direction: wp.array(dtype=wp.vec3)
-    exclude: int
+    exclude: int  # 1: exclude the triangle that they start on, as the integrator does.
     first_prim_id: wp.array(dtype=wp.int32)
     next_prim_id: wp.array(dtype=wp.int32)
 
 
 def make_respawn_kernel(accel_struct: Any, traverse: Any, surface_at: Any) -> Any:
-    """The hit of each ray, and the hit of a second one that leaves from there as the integrator's do; -1 on a miss.
-
-    On a sphere the second direction is turned to the outside: towards the inside it would hit the far wall, rightly.
-    """
+    """Make the kernel that stores each ray's hit, and the hit of a second ray from there; -1 on a miss.
+    On a sphere the second direction is turned outwards: inwards it would hit the far wall, rightly."""
 
     @kernel
     def respawn(accel: accel_struct, surfaces: Surfaces, rays: RayArrays, out: Respawn, first: int):

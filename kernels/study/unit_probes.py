@@ -1,4 +1,4 @@
-"""Kernels that hold one unit a number of times and little else: what a unit is in machine code is the difference between two."""
+"""Kernels with a unit several times and little else: the difference of two kernels is the unit's machine code."""
 
 from functools import cache
 from typing import Any
@@ -22,7 +22,7 @@ class ProbeRay:
 
 @cache
 def make_box_probe(test: str | None, count: int) -> Any:
-    """`count` box tests by RAY_AABB[test], whose results are added up; without a test (None), the six planes are."""
+    """Make the kernel of `count` box tests by RAY_AABB[test], whose results are summed; None: the planes are summed."""
     unit = RAY_AABB[test] if test is not None else None
 
     @kernel
@@ -44,13 +44,13 @@ def make_box_probe(test: str | None, count: int) -> Any:
 
 
 def numbers_of(record: Any) -> int:
-    """How many numbers of a record a test reads: all but the prim_id."""
+    """Return the numbers of a record that a test reads: all but prim_id."""
     return size_of(record) // 4 - 1
 
 
 @cache
 def make_add_numbers(record: Any) -> Any:
-    """add_numbers(total, record): the numbers that a test reads, added to a total."""
+    """Make add_numbers(total, record): the sum of total and the numbers that a test reads."""
     layout = record.numpy_dtype()
     prim_id = layout["offsets"][layout["names"].index("prim_id")] // 4
 
@@ -62,7 +62,7 @@ def make_add_numbers(record: Any) -> Any:
 
 @cache
 def make_triangle_probe(test: str, count: int, adding: bool = False) -> Any:
-    """`count` triangle tests by RAY_TRIANGLE[test], whose t, u and v are added up; `adding`: the numbers of their records are."""
+    """Make the kernel of `count` tests by RAY_TRIANGLE[test], whose t, u, v are summed; adding: the records' numbers are summed."""
     unit = RAY_TRIANGLE[test].intersect
     record = RAY_TRIANGLE[test].record
     add_numbers = make_add_numbers(record)
