@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from functools import cache, partial
+from itertools import takewhile
 
 import numpy as np
 
@@ -15,12 +16,12 @@ from wrt.accel.scenes.build import build
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.errors import InputError
 from wrt.io.mesh_file import as_mesh
-from wrt.lab.bench.rays import RaySet, ray_sets
+from wrt.lab.bench.rays import RaySet, mean_counters, ray_sets
 from wrt.lab.bench.report import Columns, Part, Row, grouped, machine_line, mesh_name, tabled
 from wrt.lab.bench.report import run as run
 from wrt.lab.bench.stadium import in_stadium
 from wrt.lab.bench.timing import alternate, peak_bytes, spread
-from wrt.lab.bench.visibility import TERRAINS, fit, terrain
+from wrt.lab.bench.visibility import TERRAINS, terrain
 from wrt.lab.plans import Accel as Plan
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
@@ -36,9 +37,6 @@ COLUMNS: Columns = {
     "nodes": "{nodes:.3g}", "boxes": "{boxes:.3g}", "triangles": "{primitives:.3g}", "Mray/s": lambda row: spread(row.mrays),
     "/ first": "{over_first:.2f}", "differ": "{differ}", "wrong": "{wrong} of {checked}"}
 REFUSED: Columns = {"structure": "{structure}", "mesh": "{mesh}", "reason": "{reason}"}
-GROWTH: Columns = {
-    "structure": "{structure}", "mesh": "{mesh}", "rays": "{kind}", "cost": "{cost}",
-    "triangles": lambda row: f"{vars(row)['from']} to {row.to}", "exponent": "{exponent:.3f} ± {error:.3f}", "times": "{times:.2f}"}
 LEGEND = f"""\
 build: median of the builds, all cores. B/triangle: bytes of the whole structure, triangles included; peak B: growth of the process at
 the first build; both a triangle. SAH: expected nodes and triangles of a random line through the root, each of cost 1. refs: primitives
@@ -55,15 +53,12 @@ def names(plan: Plan) -> list[str]:
 
 
 def meshes(plan: Plan) -> Iterator[Mesh]:
-    yield from map(as_mesh, plan.meshes)
-    if not plan.meshes:
-        cells = [n for k in range(14) for n in [TERRAINS[0] * 2**k] if 2 * n * n <= plan.max_triangles]
-        yield from map(terrain, cells)
+    cells = (TERRAINS[0] * 2**k for k in range(14))
+    yield from map(as_mesh, plan.meshes) if plan.meshes else map(terrain, takewhile(lambda n: 2 * n * n <= plan.max_triangles, cells))
 
 
 def rows(plan: Plan) -> Iterator[Row]:
-    for mesh in meshes(plan):
-        yield from mesh_rows(plan, mesh)
+    return (row for mesh in meshes(plan) for row in mesh_rows(plan, mesh))
 
 
 def mesh_rows(plan: Plan, mesh: Mesh) -> Iterator[Row]:
@@ -97,12 +92,10 @@ def mesh_rows(plan: Plan, mesh: Mesh) -> Iterator[Row]:
         counted = rays.part(slice(None, None, max(len(rays) // COUNTED_RAYS, 1)))
         timed = alternate({name: partial(answer, accel, rays, plan.threads) for name, accel in built.items()}, plan.runs)
         for name, accel in built.items():
-            c = accel.closest_hit(counted.origins, counted.directions, 0.0, counted.t_max, counters=True).counters
-            assert c is not None
-            yield Row(**facts[name], kind=rays.kind, rays=len(rays), nodes=float(c.nodes.mean()), boxes=float(c.boxes.mean()),
-                      primitives=float(c.primitives.mean()), **timing(len(rays), timed[name], next(iter(timed.values()))),
-                      differ=differing(answer(accel, rays, None), truth), checked=len(few),
-                      wrong=differing(answer(accel, few, None), exact))
+            yield Row(**facts[name], kind=rays.kind, rays=len(rays), checked=len(few),
+                      **mean_counters(accel, counted, nodes="nodes", boxes="boxes", primitives="primitives"),
+                      **timing(len(rays), timed[name], next(iter(timed.values()))),
+                      differ=differing(answer(accel, rays, None), truth), wrong=differing(answer(accel, few, None), exact))
 
 
 def timing(rays: int, seconds: np.ndarray, first: np.ndarray) -> dict[str, object]:
@@ -133,30 +126,11 @@ def differing(found: Hits | np.ndarray, truth: Hits | np.ndarray) -> int:
 
 
 def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
-    """Return a table for each mesh, the refused structures, and the growth of costs."""
-    out = [tabled(COLUMNS, group, f"{mesh}, {triangles} triangles")
-           for (mesh, triangles), group in grouped(measured(rows), "mesh", "triangles").items()]
-    refused, grown = [row for row in rows if "reason" in vars(row)], [Row(**each) for each in growth(rows)]
-    return [*out, *([tabled(REFUSED, refused, "Not built")] if refused else []), *([tabled(
-        GROWTH, grown, "As triangles grow", "seconds ~ n^exponent (± one standard deviation); times: last over first.")] if grown else [])]
-
-
-def measured(rows: Sequence[Row]) -> list[Row]:
-    return [row for row in rows if "reason" not in vars(row)]
-
-
-def growth(rows: Sequence[Row]) -> list[dict[str, object]]:
-    """Return the exponents of seconds a ray and seconds of a build over the triangles of meshes of one name, from three sizes on."""
-    out = []
-    for (mesh, structure, kind), group in grouped(measured(rows), "mesh", "structure", "kind").items():
-        sizes = [row.triangles for row in group]
-        if len(set(sizes)) < 3:
-            continue
-        costs = {"search": [1.0 / row.mrays_median / 1e6 for row in group], "build": [row.build_median for row in group]}
-        for cost, seconds in costs.items():
-            out.append({"mesh": mesh, "structure": structure, "kind": kind, "cost": cost, "from": min(sizes), "to": max(sizes),
-                        "times": seconds[-1] / seconds[0], **fit(sizes, seconds)})
-    return out
+    """Return a table for each mesh, and the refused structures."""
+    refused = [row for row in rows if "reason" in vars(row)]
+    by_mesh = grouped((row for row in rows if row not in refused), "mesh", "triangles").items()
+    return [*(tabled(COLUMNS, group, f"{mesh}, {triangles} triangles") for (mesh, triangles), group in by_mesh),
+            *([tabled(REFUSED, refused, "Not built")] if refused else [])]
 
 
 def machine(plan: Plan) -> str:
@@ -170,5 +144,5 @@ def line(row: Row) -> str:
 
 
 def facts(rows: Sequence[Row], plan: Plan) -> dict[str, object]:
-    return {"rows": [row.as_dict() for row in measured(rows)],
-            "refused": [row.as_dict() for row in rows if "reason" in vars(row)], "growth": growth(rows)}
+    return {name: [row.as_dict() for row in rows if ("reason" in vars(row)) == refused]
+            for name, refused in (("rows", False), ("refused", True))}

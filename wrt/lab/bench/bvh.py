@@ -24,7 +24,7 @@ from wrt.kernels.traverse.bvh2 import box_volumes
 from wrt.kernels.traverse.bvh2_kdop import kdop_volumes
 from wrt.kernels.traverse.bvh2_sphere import sphere_volumes
 from wrt.lab.bench.accel import differing
-from wrt.lab.bench.rays import RaySet, ball_around, endless, unit
+from wrt.lab.bench.rays import RaySet, ball_around, endless, mean_counters, unit
 from wrt.lab.bench.report import Columns, Part, Row, cells, grouped, mesh_name, tabled
 from wrt.lab.bench.timing import alternate, peak_bytes, spread
 from wrt.lab.plans import Bvh as Plan
@@ -88,12 +88,9 @@ def builder_rows(plan: Plan, geometry: Geometry, rays: RaySet) -> Iterator[dict[
             seconds.append(perf_counter() - begin)
         cpu_seconds = (process_time() - cpu_begin) / plan.builds
         accel = build(geometry, "bvh2", builder=name)
-        c = accel.closest_hit(rays.origins, rays.directions, counters=True).counters
-        assert c is not None
-        yield {"builder": name, "sah_cost": accel.stats.sah_cost, "cost": published_cost(accel, rays),
-               "nodes": float(c.nodes.mean()), "leaves": float(c.leaves.mean()), "triangles": float(c.primitives.mean()),
-               "depth": accel.stats.depth, "references": accel.stats.references, "seconds": seconds, "cpu_seconds": cpu_seconds,
-               "peak_bytes": peak}
+        yield {"builder": name, "sah_cost": accel.stats.sah_cost, "cost": published_cost(accel, rays), "peak_bytes": peak,
+               **mean_counters(accel, rays, nodes="nodes", leaves="leaves", triangles="primitives"), "depth": accel.stats.depth,
+               "references": accel.stats.references, "seconds": seconds, "cpu_seconds": cpu_seconds}
 
 
 def published_cost(accel: OneMesh, rays: RaySet) -> float:
@@ -129,15 +126,12 @@ def volume_rows(plan: Plan, geometry: Geometry, rays: RaySet) -> Iterator[dict[s
     traced = alternate(trace, plan.runs)
     for name, accel in accels.items():
         area = surfaces(accel)
-        hits = accel.closest_hit(rays.origins, rays.directions, counters=True)
-        c = hits.counters
-        assert c is not None
         yield {"volume": name, "node_bytes": accel.built.arrays["nodes"].itemsize,
                "inner_area": float(area[~leaf].sum() / max(boxes[~leaf].sum(), 1e-300)),
                "leaf_area": float(area[leaf].sum() / boxes[leaf].sum()), "sah_cost": accel.stats.sah_cost,
-               "nodes": float(c.nodes.mean()), "triangles": float(c.primitives.mean()), "test_seconds": tested[name].tolist(),
+               **mean_counters(accel, rays, nodes="nodes", triangles="primitives"), "test_seconds": tested[name].tolist(),
                "ratios": (tested[name] / tested["bvh2"]).tolist(), "rays": len(rays), "seconds": traced[name].tolist(),
-               "differ": differing(hits, truth)}
+               "differ": differing(accel.closest_hit(rays.origins, rays.directions), truth)}
 
 
 def tester_of(accel: OneMesh, rays: RaySet) -> Callable[[], int]:

@@ -50,10 +50,6 @@ class Knob:
     matters: Callable[[Scene, Features], bool] = lambda scene, features: True
 
 
-def branches(scene: Scene, features: Features) -> bool:
-    return features.reflection or features.refraction or features.blend
-
-
 def triangles(scene: Scene) -> int:
     return sum(len(thing.mesh.faces) for thing in scene.objects)
 
@@ -63,6 +59,10 @@ def structures(scene: Scene) -> list[str]:
     first = {cls: name for name, cls in reversed(list(ACCELERATORS.items()))}.values()
     small = triangles(scene) + len(scene.spheres) <= BRUTE_FORCE_LIMIT
     return [name for name in ACCELERATORS if name in first and (name != "brute_force" or small)]
+
+
+def branches(scene: Scene, features: Features) -> bool:
+    return features.reflection or features.refraction or features.blend
 
 
 KNOBS = {knob.name: knob for knob in (

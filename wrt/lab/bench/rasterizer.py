@@ -5,6 +5,7 @@ miss). They share no code on the way."""
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -44,7 +45,7 @@ def directions_from_pixels(camera: CameraKind, size: tuple[int, int]) -> np.ndar
     return np.column_stack([across, down, forward - tan_x * right + tan_y * up])
 
 
-def view_struct(camera: CameraKind, size: tuple[int, int], shift: tuple[float, float] = (0.0, 0.0)) -> Any:
+def view_struct(camera: CameraKind, size: tuple[int, int], shift: tuple[float, float] = (0.0, 0.0)) -> kernels.View:
     """Return the View of a camera. shift: of all pixel centres, in pixels, right and down."""
     from_pixels = directions_from_pixels(camera, size) @ np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]], [0.0, 0.0, 1.0]])
     view = kernels.View()
@@ -92,11 +93,8 @@ class Rasterizer:
 
     def _each_part(self, kernel: Any, n: int, arguments: Any) -> None:
         step = n if self.device.is_cuda else TRIANGLES_PER_LAUNCH
-
-        def job(first: int) -> Any:
-            return lambda: wp.launch(kernel, dim=min(step, n - first), inputs=arguments(first), device=self.device)
-
-        run_all([job(first) for first in range(0, n, step)], self.threads)
+        run_all([partial(wp.launch, kernel, dim=min(step, n - first), inputs=arguments(first), device=self.device)
+                 for first in range(0, n, step)], self.threads)
 
     def _draw_bands(self, view: Any) -> None:
         """Give each thread a band of rows on the CPU, with the triangles in it, so that no two threads write the same pixel."""
@@ -106,15 +104,12 @@ class Rasterizer:
         bands = min(BANDS_PER_THREAD * self.threads, view.height)
         rows = -(-view.height // bands)
 
-        def job(first: int) -> Any:
-            def draw() -> None:
-                mine = there[(top < first + rows) & (bottom >= first)]
-                if len(mine):
-                    self._launch(view, (1, len(mine)), wp.array(mine, dtype=wp.int32, device=self.device), first, rows)
+        def draw(first: int) -> None:
+            mine = there[(top < first + rows) & (bottom >= first)]
+            if len(mine):
+                self._launch(view, (1, len(mine)), wp.array(mine, dtype=wp.int32, device=self.device), first, rows)
 
-            return draw
-
-        run_all([job(first) for first in range(0, view.height, rows)], self.threads)
+        run_all([partial(draw, first) for first in range(0, view.height, rows)], self.threads)
 
     def _launch(self, view: Any, dim: tuple[int, int], prim_ids: Any, first: int, rows: int) -> None:
         wp.launch(kernels.rasterize, dim=dim, device=self.device, inputs=[

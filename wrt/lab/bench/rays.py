@@ -31,6 +31,12 @@ class RaySet:
         return RaySet(self.kind, self.origins[rows], self.directions[rows], self.t_max[rows], self.any_hit)
 
 
+def mean_counters(accel: Accelerator, rays: RaySet, **names: str) -> dict[str, float]:
+    """Return the means of counters of closest hits, a ray. names: of each result its counter."""
+    counters = accel.closest_hit(rays.origins, rays.directions, 0.0, rays.t_max, counters=True).counters
+    return {name: float(getattr(counters, counter).mean()) for name, counter in names.items()}
+
+
 def unit(v: np.ndarray) -> np.ndarray:
     return v / np.linalg.norm(v, axis=-1, keepdims=True)
 

@@ -43,9 +43,9 @@ def cancel(pool: Any, futures: Iterable[Any]) -> None:
     """Cancel the futures that have not begun."""
     if hasattr(pool, "cancel"):
         pool.cancel(futures)
-        return
-    for future in futures:
-        future.cancel()
+    else:
+        for future in futures:
+            future.cancel()
 
 
 def by_mesh(run: Callable[..., list[Any]], plan: Any, report: Callable[[Any], None], executor: Any = None) -> list[Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -48,19 +47,16 @@ def rows(plan: Plan) -> Iterator[Row]:
 
 def priced(plan: Plan, mesh: str, geometry: Geometry, rays: RaySet, accel: str, units: Sequence[dict[str, str]]) -> Iterator[Row]:
     """Time all units in turn; the first is the default."""
-    jobs: dict[str, Any] = {}
-    sizes = {}
-    for options in units:
-        structure = build(geometry, accel, threads=1, **options)
-        unit = " ".join(f"{value}{' boxes' if key == 'box' else ''}" for key, value in options.items())
-        jobs[unit] = partial(structure.closest_hit, rays.origins, rays.directions, threads=1)
-        sizes[unit] = structure.stats.bytes / len(geometry)
-    seconds = alternate(jobs, plan.runs)
+    built = {" ".join(f"{value}{' boxes' if key == 'box' else ''}" for key, value in options.items()):
+             build(geometry, accel, threads=1, **options) for options in units}
+    seconds = alternate({unit: partial(structure.closest_hit, rays.origins, rays.directions, threads=1)
+                         for unit, structure in built.items()}, plan.runs)
     default = next(iter(seconds.values()))
     for unit, taken in seconds.items():
         price = default / taken
         yield Row(mesh=mesh, triangles=len(geometry), rays=rays.kind, unit=unit, mrays=quartiles(len(rays) / taken / 1e6),
-                  price=quartiles(price), extremes=(float(price.min()), float(price.max())), bytes_per_triangle=sizes[unit])
+                  price=quartiles(price), extremes=(float(price.min()), float(price.max())),
+                  bytes_per_triangle=built[unit].stats.bytes / len(geometry))
 
 
 def machine(plan: Plan) -> str:

@@ -6,10 +6,10 @@ import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 
+from wrt.accel.queries.answers import Hits
 from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.lab.hard_cases.common import surface
@@ -19,16 +19,12 @@ from wrt.lab.mitsuba.process import require_llvm
 from wrt.lab.mitsuba.shapes import Triangles, make_mesh
 from wrt.lab.mitsuba.translate import mitsuba
 
-TRIMESH_RAYS = 64  # at once: it tests all triangles in a box around each ray
+TRIMESH_RAYS = 64  # at once: trimesh tests all triangles in a box around each ray
 
 Answer = tuple[np.ndarray, np.ndarray]
 
 
-def own(vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> Any:
-    return build((vertices, faces)).closest_hit(origins, directions)
-
-
-def peer(kind: type[Peer], vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> Any:
+def peer(kind: type[Peer], vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> Hits:
     """Ask a library of `bench peers`."""
     who = kind()
     who.prepare(surface(vertices, faces))
@@ -72,7 +68,7 @@ class Library:
 
 
 LIBRARIES = {
-    "wrt": Library("wrt", own),
+    "wrt": Library("wrt", lambda vertices, faces, origins, directions: build((vertices, faces)).closest_hit(origins, directions)),
     "embree": Library("Embree, robust", partial(peer, Embree), ["embreex"]),
     "embree_fast": Library("Embree, fast", partial(peer, EmbreeFast), ["embreex"]),
     "open3d": Library("Open3D", partial(peer, Open3D), ["open3d"]),

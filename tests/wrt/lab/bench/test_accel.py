@@ -13,7 +13,7 @@ from tests.command_line import wrt as command
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.errors import InputError
 from wrt.lab.bench import accel as bench
-from wrt.lab.bench.accel import Plan, growth, run, timing
+from wrt.lab.bench.accel import Plan, run, timing
 from wrt.lab.bench.report import Row, text
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
@@ -114,13 +114,6 @@ def test_meshes_need_no_file_and_a_notebook_shows_tables() -> None:
         run(Plan((1,)))  # type: ignore[arg-type]
     with pytest.raises(InputError, match="no triangles"):
         run(Plan((Mesh(np.zeros((3, 3)), np.zeros((0, 3), int)),)))
-
-
-def test_growth_fits_exponents() -> None:
-    rows = [made(triangles=n, seconds=(1e-3 * n**0.25,), build=(2e-6 * n,)) for n in (1000, 10_000, 100_000)]
-    found = {g["cost"]: g for g in growth([*rows, made("alone")])}
-    assert found["search"]["exponent"] == pytest.approx(0.25) and found["build"]["exponent"] == pytest.approx(1.0)
-    assert found["search"]["times"] == pytest.approx(100.0**0.25) and growth(rows[:2]) == []
 
 
 def test_the_tables_hold_what_was_measured() -> None:
