@@ -1,11 +1,11 @@
-// The picture of the sky in lanes: environment_at of backgrounds.py, with the same bits. Loops that the compiler makes lanes of.
+// The environment's picture: environment_at of backgrounds.py with the same bits, in loops that compilers vectorise.
 #pragma once
 #include "layout.h"
 
 namespace wrt {
 
-// Look up `count` columns x and rows y of a Background's picture: red, green and blue go to x, y and z. Each has room for LANES - 1
-// numbers more, which may be anything and are written too.
+// Look up `count` columns x and lines y of a Background's picture; store red, green and blue in x, y and z. Each must have room for
+// LANES - 1 more values, which are overwritten.
 template <class Background> void environment_at(const Background& background, float* x, float* y, float* z, int count) {
     const int w = background.width, h = background.height - 1;
     const float* const pixels = (const float*)background.pixels.data;

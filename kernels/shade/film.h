@@ -1,4 +1,4 @@
-// The film in lanes: add_sample of film.py for LANES pixels at a time, with the same bits.
+// The film: add_sample of film.py for LANES pixels at a time, with the same bits.
 #pragma once
 #include "layout.h"
 
@@ -53,13 +53,13 @@ struct Pixels {
     }
 };
 
-// Add `samples` samples to each of LANES pixels of a Film, whose places are `pixels`, each pixel's in their order; done: those of the
-// first pixel, then those of the next. The LANES places behind are prefetched: they must be readable, and may be any pixels.
+// Add `samples` samples to each of LANES pixels of a Film, in their order. `pixels` has the indices of the pixels, and `done` the
+// samples of the first pixel, then of the next. The LANES indices behind `pixels` are prefetched: they must be readable.
 template <class Film, class Sample> void add_sample(const Film& film, const int* pixels, const Sample* done, int samples) {
     prefetch_pixels(film, pixels + LANES);
     Pixels sum;
     sum.load(film, pixels);
-    // Places by table: of a multiple of `samples` the compiler makes lanes for samples = 1 alone.
+    // A table of places: the compiler vectorises multiples of `samples` only for samples = 1.
     long long first[LANES];
     for (int lane = 0; lane < LANES; ++lane) first[lane] = (long long)lane * samples;
     for (int j = 0; j < samples; ++j)

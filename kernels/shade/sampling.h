@@ -1,4 +1,4 @@
-// Samples in lanes: functions of sampling.py, under the same names and with the same bits. Loops that the compiler makes lanes of.
+// Samples: functions of sampling.py with the same names and bits, in loops that compilers vectorise.
 #pragma once
 #include "layout.h"
 
@@ -41,8 +41,8 @@ static inline unsigned sobol_second(unsigned x) {
 
 static inline float unit_float(unsigned x) { return (float)(x >> 8) * UNIT; }
 
-// Points first, first + 1 ... of the sequence of sample_2d that has this seed (hash_pair(key, dimension)), both numbers of each after
-// one another. There must be room for LANES - 1 points more: they are computed and written too.
+// Store the points first, first + 1 ... of sample_2d's sequence with this seed, hash_pair(key, dimension). There must be room for
+// LANES - 1 points more, which are computed, too.
 static inline void sample_2d(unsigned seed, unsigned first, int count, float* to) {
     const unsigned seed_x = hash_u32(seed ^ SEED_X), seed_y = hash_u32(seed ^ SEED_Y);
     for (int j = 0; j < count; j += LANES) {
@@ -56,8 +56,8 @@ static inline void sample_2d(unsigned seed, unsigned first, int count, float* to
     }
 }
 
-// Each of `count` values in [0, 1) becomes its quantile; icdf: the inverse distribution, of `size` entries. The compiler cannot tell
-// where the table ends, so results go to `out` first: they cannot overwrite it.
+// Replace `count` values in [0, 1) by their quantiles. `icdf`, the inverse distribution, has `size` entries. Results go to `out` first,
+// as the compiler does not know that they cannot overwrite the table.
 static inline void quantile(const float* icdf, int size, float* values, int count) {
     for (int j = 0; j < count; j += LANES) {
         const int n = count - j < LANES ? count - j : LANES;

@@ -1,6 +1,6 @@
-// Textures in lanes: sample_texture of textures.py for pictures, with the same bits. Loops that the compiler makes lanes of.
+// Textures: sample_texture of textures.py for pictures with the same bits, in loops that compilers vectorise.
 //
-// Where the texels are is found for all hits of a block first, once for each different picture among LANES of them, and prefetched.
+// The texels' places are computed first, for all hits of a block, and prefetched. LANES hits take one pass for each of their pictures.
 #pragma once
 #include "layout.h"
 
@@ -8,7 +8,7 @@ namespace wrt {
 
 enum Kind { NONE, LINEAR, SRGB };
 
-// Where the look-ups of a block are: the texels around each, and the shares of the right and of the lower ones.
+// The look-ups of a block: the indices of the four texels around each, and the weights of the right and of the lower ones.
 template <int BLOCK> struct Places {
     int corner[4][BLOCK], kinds[BLOCK];
     float x[BLOCK], y[BLOCK];
@@ -21,8 +21,8 @@ static inline int wrapped(int at, int size, int wrap) {
     return j >= size ? 2 * size - 1 - j : j;
 }
 
-// Wrap LANES columns (or rows), and the ones next to them, for the lanes in the mask `of`. There is a division only where a picture is
-// seen more than once beside itself.
+// Wrap LANES columns (or lines), and their right (or lower) neighbours, for the lanes in the mask `of`. Only coordinates more than
+// one picture outside need a division.
 __attribute__((always_inline)) static inline void wrapped(const int* at, int size, int wrap, unsigned of, int* here, int* next) {
     if (wrap == WRAP_CLAMP) {
         for (int lane = 0; lane < LANES; ++lane) {
@@ -47,7 +47,7 @@ __attribute__((always_inline)) static inline void wrapped(const int* at, int siz
     }
 }
 
-// Find the texels of one texture for those lanes from place i on that want it.
+// Compute the texels' places of one texture, for the lanes from i on that need it.
 template <int BLOCK, class Texture>
 __attribute__((always_inline)) static inline void place_picture(Places<BLOCK>& places, int i, const Texture& texture, const int* same,
                                                                 unsigned mask, const float* us, const float* vs) {
@@ -70,7 +70,7 @@ __attribute__((always_inline)) static inline void place_picture(Places<BLOCK>& p
     wrapped(column, width, texture.wrap_u, mask, here, right);
     wrapped(row, height, texture.wrap_v, mask, above, under);
     for (int lane = 0; lane < LANES; ++lane) {
-        // Unsigned: of a lane that wants another texture, a row can be anything, and the product too.
+        // Unsigned, because the product may overflow in a lane that needs another texture.
         const int k = i + lane, begin = (int)((unsigned)texture.first + (unsigned)above[lane] * (unsigned)width);
         const int end = (int)((unsigned)texture.first + (unsigned)under[lane] * (unsigned)width);
         places.corner[0][k] = same[lane] ? begin + here[lane] : places.corner[0][k];
@@ -83,7 +83,7 @@ __attribute__((always_inline)) static inline void place_picture(Places<BLOCK>& p
     }
 }
 
-// Find the texels of LANES look-ups, from place i on.
+// Compute the texels' places of LANES look-ups, from i on.
 template <int BLOCK, class Surfaces>
 __attribute__((always_inline)) static inline void find_texels(Places<BLOCK>& places, int i, const Surfaces& surfaces, const int* wanted,
                                                               const float* us, const float* vs) {
@@ -112,14 +112,14 @@ __attribute__((always_inline)) static inline void find_texels(Places<BLOCK>& pla
     }
 }
 
-// One channel of LANES look-ups, from place i on, with the four texels around each; any_srgb: where one of their pictures is sRGB.
+// Interpolate one channel of LANES look-ups, from i on, from the four texels around each. any_srgb: one of the pictures is sRGB.
 template <int BLOCK>
 __attribute__((always_inline)) static inline void mix(const Places<BLOCK>& places, int i, unsigned (*texel)[LANES], int channel,
                                                       bool any_srgb, const float* srgb_to_linear, float* out) {
     float color[4][LANES];
     for (int k = 0; k < 4; ++k) {
         for (int lane = 0; lane < LANES; ++lane) color[k][lane] = (float)(int)(texel[k][lane] >> 8 * channel & 255) / 255.0f;
-        if (any_srgb && channel < 3)  // alpha never is
+        if (any_srgb && channel < 3)  // Alpha is always linear.
             for (int lane = 0; lane < LANES; ++lane)
                 color[k][lane] = places.kinds[i + lane] == SRGB ? srgb_to_linear[texel[k][lane] >> 8 * channel & 255] : color[k][lane];
     }
@@ -132,8 +132,8 @@ __attribute__((always_inline)) static inline void mix(const Places<BLOCK>& place
     }
 }
 
-// Sample the textures wanted[0 .. count - 1], -1 being none, and -1 behind the last up to a multiple of LANES, at us, vs. The channels
-// in the mask `channels` go to rows of BLOCK numbers, one after another; count: at most BLOCK.
+// Sample the textures wanted[0 .. count - 1] at us, vs, for a count of at most BLOCK. -1 means no texture, and fills `wanted` up to a
+// multiple of LANES. The channels in the mask `channels` go to rows of BLOCK values, one after another.
 template <int BLOCK, class Surfaces>
 __attribute__((noinline)) void sample_texture(const Surfaces& surfaces, const int* wanted, const float* us, const float* vs, int count,
                                               int channels, float* to) {

@@ -1,10 +1,9 @@
-"""Many rays through a wide BVH on the CPU: two ways to keep one core busy, for the same hits to the last bit.
+"""Many rays through a wide BVH on the CPU: packets and interleaved rays, with the same hits to the last bit.
 
-Rays that go the same way are taken through the tree as a packet (Wald et al. 2001, "Interactive Rendering with Coherent Ray
-Tracing"): a beam around all rays meets a node, and then only the children that the beam meets are tested against the rays,
-sixteen at a time. Other rays are interleaved: each takes one step in its turn, many of them under way at once, so that the core has
-something to do while a ray waits for memory or for its own last result.
-"""
+Rays with a common direction walk the tree as a packet (Wald et al. 2001, "Interactive Rendering with Coherent Ray Tracing"). First a beam
+around all rays is tested against a node. The children that the beam enters are then tested against the rays, sixteen at a time. Other rays
+are interleaved: many are under way at once, and each takes one step in its turn. The core has work while a ray waits for memory or for its
+own last result."""
 
 from functools import cache
 from typing import Any
@@ -21,11 +20,11 @@ from wrt.kernels.wide.lanes import value as number
 from wrt.kernels.wide.layout import (
     ACTIVE,
     COHERENT,
+    FIELD,
     LANES,
     PACKET_SIZE,
     PRIM_ID_ROW,
     REFUSED,
-    ROW,
     ROW_SIZE,
     SLOT,
     SLOT_SIZE,
@@ -48,13 +47,13 @@ from wrt.kernels.wide.packets import (
     make_set_up,
     make_steps,
     make_triangles,
-    meets,
     packet_kernel,
     prefetch_next,
     put_bits,
     put_slot,
     rays_at,
-    reaching,
+    rays_meeting_root,
+    rays_reaching,
     slot_at,
     spheres_of,
     write_hits,
@@ -63,31 +62,31 @@ from wrt.kernels.wide.packets import (
 from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
 from wrt.kernels.wide.traverse import WideTraversal
 
-PRIM_ID = WIDTH * PRIM_ID_ROW  # where a row has its primitives' numbers
-PACKETS = 4  # set up at a time
-SLOTS = 24  # rays under way at a time
-FEW = 6  # rays up to so many are tested one by one with the triangles of a leaf
-WORTH = 6  # rays that come to a node together, on average, from which on a packet takes less time than its rays alone
-# Where packets fall apart, one after another, none is tried for a while: so many in a row, for so many that follow.
-IN_A_ROW, PAUSE = 4, 32
+PRIM_ID = WIDTH * PRIM_ID_ROW  # Place of the prim_ids in a row.
+PACKETS = 4  # Packets that are set up together.
+SLOTS = 24  # Interleaved rays under way.
+FEW_RAYS = 6  # Up to so many rays are tested one by one against a leaf.
+MIN_VISITS = 6  # Rays a node, on average, from which a packet is faster than its rays interleaved.
+# After MAX_FAILED packets in a row that fell apart, the next PAUSE packets are interleaved.
+MAX_FAILED, PAUSE = 4, 32
 
 
 @wp.func
 def vector(packet: wp.array(dtype=wp.float32), first: int) -> wp.vec3:
-    """Three rows of one lane."""
+    """Return three consecutive fields of one ray."""
     return wp.vec3(number(packet, first), number(packet, first + LANES), number(packet, first + 2 * LANES))
 
 
 @wp.func
 def probe_at(packet: wp.array(dtype=wp.float32), ray: int) -> Probe:
-    """What the sphere unit needs of one column of a packet."""
+    """Return the sphere unit's input for the ray in one column of a packet."""
     probe = Probe()
-    probe.ray.origin = vector(packet, ray + wp.static(ROW["origin_x"]))
-    probe.ray.direction = vector(packet, ray + wp.static(ROW["direction_x"]))
-    probe.ray.t_min = number(packet, ray + wp.static(ROW["t_min"]))
-    probe.ray.exclude_plus_one = bits(packet, ray + wp.static(ROW["exclude"]))
+    probe.ray.origin = vector(packet, ray + wp.static(FIELD["origin_x"]))
+    probe.ray.direction = vector(packet, ray + wp.static(FIELD["direction_x"]))
+    probe.ray.t_min = number(packet, ray + wp.static(FIELD["t_min"]))
+    probe.ray.exclude_plus_one = bits(packet, ray + wp.static(FIELD["exclude"]))
     probe.box.origin = probe.ray.origin
-    probe.box.inv_dir = vector(packet, ray + wp.static(ROW["inverse_x"]))
+    probe.box.inv_dir = vector(packet, ray + wp.static(FIELD["inverse_x"]))
     probe.box.t_min = probe.ray.t_min
     return probe
 
@@ -95,23 +94,23 @@ def probe_at(packet: wp.array(dtype=wp.float32), ray: int) -> Probe:
 @wp.func
 def best_at(packet: wp.array(dtype=wp.float32), ray: int) -> Hit:
     best = Hit()
-    best.t = number(packet, ray + wp.static(ROW["t"]))
-    best.u = number(packet, ray + wp.static(ROW["u"]))
-    best.v = number(packet, ray + wp.static(ROW["v"]))
-    best.prim_id = bits(packet, ray + wp.static(ROW["prim_id"]))
+    best.t = number(packet, ray + wp.static(FIELD["t"]))
+    best.u = number(packet, ray + wp.static(FIELD["u"]))
+    best.v = number(packet, ray + wp.static(FIELD["v"]))
+    best.prim_id = bits(packet, ray + wp.static(FIELD["prim_id"]))
     return best
 
 
 @wp.func
 def put_best(packet: wp.array(dtype=wp.float32), ray: int, best: Hit):
-    put_number(packet, ray + wp.static(ROW["t"]), best.t)
-    put_number(packet, ray + wp.static(ROW["u"]), best.u)
-    put_number(packet, ray + wp.static(ROW["v"]), best.v)
-    put_bits(packet, ray + wp.static(ROW["prim_id"]), best.prim_id)
+    put_number(packet, ray + wp.static(FIELD["t"]), best.t)
+    put_number(packet, ray + wp.static(FIELD["u"]), best.u)
+    put_number(packet, ray + wp.static(FIELD["v"]), best.v)
+    put_bits(packet, ray + wp.static(FIELD["prim_id"]), best.prim_id)
 
 
 def make_sphere_test(units: Units, any_hit: bool, accepts: Any) -> Any:
-    """The spheres of a row in the mask against one ray of a packet; whether the ray has found what it asks for."""
+    """Return test_spheres: test the spheres of a row in the mask against one ray; for any hit, return whether one is hit."""
     better = make_better(units, accepts)
 
     @wp.func
@@ -125,7 +124,7 @@ def make_sphere_test(units: Units, any_hit: bool, accepts: Any) -> Any:
                 best = better(probe.ray, surfaces, sphere_hit(probe, surfaces, prim_id), prim_id, best)
         found = bool(best.prim_id != NO_HIT)
         if wp.static(any_hit):
-            best.t = wp.where(found, -float(wp.inf), best.t)  # nothing else is reached
+            best.t = wp.where(found, -float(wp.inf), best.t)  # Nothing else is reached.
         put_best(scratch.packets, ray, best)
         return wp.static(any_hit) and found
 
@@ -133,11 +132,11 @@ def make_sphere_test(units: Units, any_hit: bool, accepts: Any) -> Any:
 
 
 def make_accepted(any_hit: bool, accepts: Any, ray_triangles: Any) -> Any:
-    """The triangles of a row in the mask, of which `accepts` may refuse some, as in make_row_test."""
+    """Return nearest_accepted: as the triangle test of make_row_test, for triangles that `accepts` may refuse."""
 
     @wp.func
     def nearest_accepted(accel: WideBvh, first: int, mask: int, surfaces: Surfaces, scratch: Scratch, ray: int) -> bool:
-        """The nearest triangle that is hit, until one is accepted."""
+        """Test the nearest triangle that is hit, until one is accepted."""
         before = best_at(scratch.packets, ray)
         while True:
             lane = ray_triangles(accel, first, mask, scratch, ray)
@@ -149,14 +148,14 @@ def make_accepted(any_hit: bool, accepts: Any, ray_triangles: Any) -> Any:
             put_best(scratch.packets, ray, before)
             mask = mask & ~(1 << lane)
         if wp.static(any_hit):
-            put_number(scratch.packets, ray + wp.static(ROW["t"]), -float(wp.inf))
+            put_number(scratch.packets, ray + wp.static(FIELD["t"]), -float(wp.inf))
         return wp.static(any_hit)
 
     return nearest_accepted
 
 
 def make_row_test(units: Units, any_hit: bool, accepts: Any, inlined: bool) -> Any:
-    """The first `count` primitives of a row against one ray of a packet; whether the ray has found what it asks for."""
+    """Return test_row: test the first `count` primitives of a row against one ray; for any hit, return whether one is hit."""
     ray_triangles = make_ray_triangles(any_hit and accepts is None, inlined)
     test_spheres, nearest_accepted = make_sphere_test(units, any_hit, accepts), make_accepted(any_hit, accepts, ray_triangles)
 
@@ -178,7 +177,7 @@ def make_row_test(units: Units, any_hit: bool, accepts: Any, inlined: bool) -> A
 
 
 def make_packet_leaf(units: Units, any_hit: bool, accepts: Any) -> Any:
-    """The rays of a packet in the mask against the primitives of a leaf: many by lanes of rays, few one by one."""
+    """Return test_leaf: test a leaf against the rays of the mask, all at once if they are many, else one by one."""
     test_row = make_row_test(units, any_hit, accepts, False)
     triangles = make_triangles(any_hit)
 
@@ -188,7 +187,7 @@ def make_packet_leaf(units: Units, any_hit: bool, accepts: Any) -> Any:
         first = leaf_first(reference) * ROW_SIZE
         while left > 0 and mask != 0:
             n = wp.min(left, WIDTH)
-            lanes = bool(wp.static(accepts is None) and count_of(mask) > FEW)
+            lanes = bool(wp.static(accepts is None) and count_of(mask) > FEW_RAYS)
             if wp.static(units.spheres):
                 lanes = lanes and spheres_of(accel, first, (2 << (n - 1)) - 1, surfaces.n_triangles) == 0
             if lanes:
@@ -209,12 +208,12 @@ def make_packet_leaf(units: Units, any_hit: bool, accepts: Any) -> Any:
 
 
 def make_packet_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
-    """A packet with a beam, from the root."""
+    """Return walk: take a packet with a beam through the tree."""
     children, test_leaf = make_children(any_hit), make_packet_leaf(units, any_hit, accepts)
 
     @wp.func
     def walk(accel: WideBvh, surfaces: Surfaces, scratch: Scratch, base: int, active: int) -> bool:
-        """Whether it was worth it."""
+        """Return whether the packet stayed together: at least MIN_VISITS rays a node on average."""
         nodes = int(0)
         visits = int(0)
         size = int(0)
@@ -230,29 +229,31 @@ def make_packet_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
             mask = int(0)
             while size > 0 and mask == 0:
                 size = size - 1
-                mask = rays_at(scratch.stacks, size) & reaching(t_of(key_at(scratch.stacks, size)), scratch, base)
+                mask = rays_at(scratch.stacks, size) & rays_reaching(t_of(key_at(scratch.stacks, size)), scratch, base)
             if mask == 0:
                 break
             reference = reference_of(key_at(scratch.stacks, size))
-        return visits >= WORTH * nodes
+        return visits >= MIN_VISITS * nodes
 
     return walk
 
 
 def make_interleaved(units: Units, any_hit: bool, accepts: Any) -> Any:
-    """Rays of several packets, each for itself, from the root. waiting: a bit for each; lane after lane, packet after packet."""
-    test_row = make_row_test(units, any_hit, accepts, True)  # inlined: 1.02 times as fast, any hit 1.05
+    """Return interleaved: take the rays of several packets through the tree, each by itself.
+
+    `waiting` has a bit for each ray, lane after lane, packet after packet."""
+    test_row = make_row_test(units, any_hit, accepts, True)  # Inlined: 1.02 times as fast, any hit 1.05.
     begin, step, pop = make_steps(any_hit)
 
     @wp.func
     def start(accel: WideBvh, scratch: Scratch, slot: int, ray: int):
-        """`meets` has found that the ray meets a child of the root: there is a next one."""
+        """Start a ray. rays_meeting_root found that it enters a child of the root, so there is a next node or leaf."""
         column = ray / LANES * PACKET_SIZE + ray % LANES
         prefetch_next(accel, begin(accel, scratch, slot, column))
 
     @wp.func
     def turn(accel: WideBvh, surfaces: Surfaces, scratch: Scratch, slot: int) -> bool:
-        """A node or a leaf, and on to what is next; False where the ray is done."""
+        """Visit a node or a leaf, and go on to the next one; return False if the ray is done."""
         words = slot * SLOT_SIZE
         reference = slot_at(scratch.slots, words + wp.static(SLOT["next"]))
         if reference < 0:
@@ -264,7 +265,7 @@ def make_interleaved(units: Units, any_hit: bool, accepts: Any) -> Any:
                     return False
                 left = left - WIDTH
                 first = first + ROW_SIZE
-            next = pop(accel, scratch, slot, number(scratch.packets, ray + wp.static(ROW["t"])))
+            next = pop(accel, scratch, slot, number(scratch.packets, ray + wp.static(FIELD["t"])))
         else:
             next = step(accel, scratch, slot)
         if next == EMPTY:
@@ -298,8 +299,9 @@ def make_interleaved(units: Units, any_hit: bool, accepts: Any) -> Any:
 
 @cache
 def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accepts: Any = None) -> Any:
-    """Rays first .. end - 1, PACKETS packets after another, in a single thread. out: HitArrays, or for any hit an array of bool;
-    and scratch.report (of Scratch). Arrays must have no gaps."""
+    """Return the kernel that traces the rays first .. end - 1 in a single thread, PACKETS packets at a time.
+
+    It writes to `out` (HitArrays, or an array of bool for any hit) and to scratch.report. Arrays must have no gaps."""
     walk_packet = make_packet_walk(units, any_hit, accepts)
     interleaved = make_interleaved(units, any_hit, accepts)
     set_up = make_set_up(rays_struct)
@@ -312,8 +314,8 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
         put_slot(scratch.report, PAUSED, 0)
         put_slot(scratch.report, ANY_REFUSED, 0)
         for block in range(first, end, wp.static(PACKETS * LANES)):
-            alone = wp.uint64(0)
-            packets = wp.min((end - block + LANES - 1) / LANES, PACKETS)  # not a constant: the walk would be there once for each
+            single_rays = wp.uint64(0)
+            packets = wp.min((end - block + LANES - 1) / LANES, PACKETS)  # A constant would unroll the walk.
             for p in range(packets):
                 base = PACKET_SIZE * p
                 count = wp.min(end - block - LANES * p, LANES)
@@ -326,18 +328,18 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
                 active = bits(scratch.packets, base + ACTIVE)
                 paused = slot_at(scratch.report, PAUSED)
                 if active >= COHERENT and paused == 0:
-                    worth = walk_packet(accel, surfaces, scratch, base, active - COHERENT)
-                    failed = wp.where(worth, 0, slot_at(scratch.report, FAILED) + 1)
-                    if failed == IN_A_ROW:  # after the pause one more that fails is enough for the next
+                    coherent = walk_packet(accel, surfaces, scratch, base, active - COHERENT)
+                    failed = wp.where(coherent, 0, slot_at(scratch.report, FAILED) + 1)
+                    if failed == MAX_FAILED:  # After the pause, one more failure starts the next.
                         failed = failed - 1
                         put_slot(scratch.report, PAUSED, PAUSE)
                     put_slot(scratch.report, FAILED, failed)
                 else:
                     put_slot(scratch.report, PAUSED, wp.max(paused - 1, 0))
                     active = active & wp.static(COHERENT - 1)
-                    active = meets(accel, scratch, base, active)
-                    alone = alone | (wp.uint64(active) << wp.uint64(LANES * p))
-            interleaved(accel, surfaces, scratch, alone)
+                    active = rays_meeting_root(accel, scratch, base, active)
+                    single_rays = single_rays | (wp.uint64(active) << wp.uint64(LANES * p))
+            interleaved(accel, surfaces, scratch, single_rays)
             for p in range(packets):
                 write(out, block + LANES * p, wp.min(end - block - LANES * p, LANES), scratch, PACKET_SIZE * p)
 
@@ -345,16 +347,16 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
 
 
 class BatchTraversal(WideTraversal):
-    """Plain nodes of 8, for which there is a kernel for many rays at a time."""
+    """The traversal of plain nodes of 8, with a kernel for many rays."""
 
     stream_block = PACKETS * LANES
-    stream_sizes = PACKETS * PACKET_SIZE, STACK_WORDS * SLOTS, SLOT_SIZE * SLOTS, REPORT_SIZE  # lengths of a Scratch's arrays
+    stream_sizes = PACKETS * PACKET_SIZE, STACK_WORDS * SLOTS, SLOT_SIZE * SLOTS, REPORT_SIZE  # Lengths of Scratch's arrays.
 
     def __init__(self) -> None:
         super().__init__(WIDTH)
 
     def make_stream(self, units: Units, any_hit: bool, rays_struct: Any = RayArrays, accepts: Any = None) -> Any:
-        """None for units that it has no lanes for."""
+        """Return make_kernel's kernel, or None for units without a vectorised form."""
         if units.triangle != "watertight" or units.box not in ROW_PADS or units.counters or units.instances or units.resumes:
             return None
         return make_kernel(units, any_hit, rays_struct, accepts)

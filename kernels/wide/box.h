@@ -1,4 +1,4 @@
-// Boxes: units/box.py in lanes, under the same names. One ray and the boxes of a node's children, or rays of a packet and one box.
+// Boxes: units/box.py vectorised, under the same names, for one ray and the boxes of a node's children, or a packet and one box.
 #pragma once
 #include "lanes.h"
 
@@ -8,8 +8,8 @@ template <class T> struct BoxRay { Vec3<T> origin, inv_dir; };
 
 template <class T> struct Interval { T enter, leave; };
 
-// Narrow an interval to where a line is between the near and the far planes of a box. A comparison with NaN is false: such a plane
-// (0 * inf) says nothing. far_inv_dir: inv_dir, widened for the rounding of far distances.
+// Narrow an interval to the part of a line between the near and far planes of a box. A NaN (0 * inf) compares as false, so that its
+// plane changes nothing. far_inv_dir is inv_dir widened for the rounding of far distances.
 template <class T, class Plane, class Number>
 WRT_INLINE void narrow(Interval<T>& t, const Vec3<Plane>& near, const Vec3<Plane>& far, const Vec3<Number>& origin,
                        const Vec3<Number>& inv_dir, const Vec3<Number>& far_inv_dir) {
@@ -28,7 +28,7 @@ WRT_INLINE void narrow(Interval<T>& t, const Vec3<Plane>& near, const Vec3<Plane
     t.leave = leave_z < t.leave ? leave_z : t.leave;
 }
 
-// The planes of boxes that lines meet first, by the sign of their directions; for the far ones, lo and hi change places.
+// Return the planes of boxes that lines meet first, by the sign of their directions. With lo and hi swapped, return the far planes.
 template <class T> WRT_INLINE Vec3<T> near_planes(const BoxRay<T>& ray, const Vec3<T>& lo, const Vec3<T>& hi) {
     return {{ray.inv_dir[0] < 0.0f ? hi[0] : lo[0], ray.inv_dir[1] < 0.0f ? hi[1] : lo[1], ray.inv_dir[2] < 0.0f ? hi[2] : lo[2]}};
 }
@@ -41,7 +41,7 @@ template <class T> WRT_INLINE Interval<T> slab_interval(const BoxRay<T>& ray, co
 
 // --- one ray and the children of a node --------------------------------------------------------------------------------------
 
-// What a node needs of a LaneRay (lanes.py). near: which of the planes the ray meets first on each axis.
+// The part of a LaneRay (lanes.py) that a node needs. `near` has the plane that the ray meets first on each axis.
 struct NodeRay {
     Vec3<float> origin, inv_dir, far_inv_dir;
     int near[3];
@@ -53,14 +53,14 @@ template <class LaneRay> WRT_INLINE NodeRay node_ray(const LaneRay& ray) {
     return {{{o[0], o[1], o[2]}}, {{i[0], i[1], i[2]}}, {{f[0], f[1], f[2]}}, {ray.near_x, ray.near_y, ray.near_z}, ray.box.t_min};
 }
 
-// A node with N children. Layout: the numbers of nodes.py.
+// A node with N children. Layout has the constants of nodes.py.
 template <int N, class Layout> struct Node {
     typedef typename Lanes<N>::Floats Row;
     const float* numbers;
 
     WRT_MEMBER unsigned word() const { return load<unsigned>(numbers + Layout::WORD); }
 
-    // Plane `k` of all children, which is one of this axis.
+    // Return plane `k`, one of this axis, of all children.
     WRT_MEMBER Row plane(int k, int axis) const {
         if constexpr (Layout::COMPRESSED) {
             typedef unsigned char Bytes __attribute__((vector_size(N)));
@@ -83,13 +83,13 @@ template <int N, class Layout> struct Node {
         return t;
     }
 
-    // The mask of the children that the ray enters.
+    // Return the mask of the children that the ray enters.
     WRT_MEMBER int entered(const NodeRay& ray, float t_max) const {
         const Interval<Row> t = interval(ray, t_max);
         return mask_of(t.enter <= t.leave) & exist();
     }
 
-    // Where it enters them.
+    // Return the ray's entry distances.
     WRT_MEMBER Row entries(const NodeRay& ray) const { return interval(ray, 0.0f).enter; }
 };
 

@@ -1,12 +1,11 @@
 """Closest points: a walk over a wide BVH by distance instead of along a ray.
 
-The records hold NaN for the first corner of a triangle without area, which no ray may hit. A point has a distance to it all the
-same, that of a segment or a point: its corners are read from the mesh.
+The record of a triangle without area has NaN in its first corner, so that no ray hits it. A point still has a distance to it, as to a
+segment or a point. So its corners are read from the mesh.
 
-A point's distance to a triangle is float64's (Ericson 2005, "Real-Time Collision Detection", section 5.1, has the problem), held to
-that of the triangle's padded box: as rounding never turns an order round, no box on the way is farther than the triangle in it, and
-which triangle is the nearest does not depend on the tree.
-"""
+The distance to a triangle is computed in float64 (Ericson 2005, "Real-Time Collision Detection", section 5.1, has the problem). It is at
+least the distance to the triangle's padded box. Rounding keeps the order of distances, so no box on the way is farther than a triangle in
+it. Which triangle is nearest does not depend on the tree."""
 
 from functools import cache
 from typing import Any
@@ -24,12 +23,12 @@ from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
 from wrt.kernels.wide.traverse import make_gather, make_struct, row_size
 
 empty_stack = make_uninitialized(STACK_SIZE, wp.uint64)
-NOTHING = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))  # no entry of a stack: more than any
+NOTHING = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))  # Greater than any entry of a stack.
 
 
 @wp.struct
 class Nearest:
-    """A point on a triangle, and the square of its distance; prim_id = -1: there is none yet."""
+    """A point on a triangle, and its squared distance. A prim_id of -1 means that none was found so far."""
 
     d2: wp.float64
     point: wp.vec3d
@@ -40,7 +39,7 @@ class Nearest:
 
 @wp.struct
 class PointArrays:
-    """One closest point a row; where there is none, distance = inf, prim_id = -1, and the rest 0."""
+    """One closest point an entry. If there is no triangle: distance inf, prim_id -1, and the rest 0."""
 
     distance: wp.array(dtype=wp.float32)
     point: wp.array(dtype=wp.vec3)
@@ -51,7 +50,7 @@ class PointArrays:
 
 @wp.func
 def squared_distance(p: wp.vec3, lo: wp.vec3, hi: wp.vec3) -> wp.float64:
-    """From a point to a box, 0 within."""
+    """Return the squared distance from a point to a box, 0 inside."""
     out = wp.float64(0.0)
     for axis in range(3):
         x = wp.float64(p[axis])
@@ -62,7 +61,7 @@ def squared_distance(p: wp.vec3, lo: wp.vec3, hi: wp.vec3) -> wp.float64:
 
 @wp.func
 def before(a: wp.vec3d, b: wp.vec3d) -> bool:
-    """An order of points."""
+    """Compare points by x, then y, then z."""
     if a[0] != b[0]:
         return a[0] < b[0]
     if a[1] != b[1]:
@@ -72,8 +71,9 @@ def before(a: wp.vec3d, b: wp.vec3d) -> bool:
 
 @wp.func
 def along_edge(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d) -> wp.float64:
-    """Where between two points the closest one to p is: 0 at a, 1 at b. Where both are one point, 1: the smaller of
-    NaN and a number is the number."""
+    """Return the place of p's closest point on the edge: 0 at a, 1 at b.
+
+    If both are one point it is 1: the smaller of NaN and a number is the number."""
     edge = b - a
     t = wp.dot(p - a, edge) / wp.dot(edge, edge)
     return wp.max(wp.min(t, wp.float64(1.0)), wp.float64(0.0))
@@ -81,7 +81,7 @@ def along_edge(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d) -> wp.float64:
 
 @wp.func
 def nearer_edge(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, best: Nearest, corner_a: int, corner_b: int) -> Nearest:
-    """The nearer of `best` and the edge between two corners, which is the same for both triangles at it."""
+    """Return the nearer of `best` and the edge between two corners, which is the same for both triangles at it."""
     turned = before(b, a)
     start = wp.where(turned, b, a)
     end = wp.where(turned, a, b)
@@ -104,7 +104,7 @@ def nearer_edge(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, best: Nearest, corner_a: 
 
 @wp.func
 def on_edges(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> Nearest:
-    """The closest point of a triangle's three edges."""
+    """Return the closest point on a triangle's three edges."""
     out = Nearest()
     out.d2 = wp.float64(wp.inf)
     out = nearer_edge(p, a, b, out, 0, 1)
@@ -114,8 +114,9 @@ def on_edges(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> Nearest:
 
 @wp.func
 def on_triangle(point: wp.vec3, triangle: Primitive) -> Nearest:
-    """The closest point of a triangle: within it where the point is above it, else on one of its edges. Where a corner is NaN
-    or infinite, d2 is infinite: so it is in the record of a triangle without area."""
+    """Return the closest point on a triangle: inside it if the point is above it, else on an edge.
+
+    If a corner is NaN or infinite, d2 is infinite. The record of a triangle without area has such a corner."""
     p = wp.vec3d(point)
     a = wp.vec3d(triangle.v0)
     b = wp.vec3d(triangle.v1)
@@ -127,7 +128,7 @@ def on_triangle(point: wp.vec3, triangle: Primitive) -> Nearest:
     ap = p - a
     normal = wp.cross(ab, ac)
     area = wp.dot(normal, normal)
-    if not area < wp.float64(wp.inf):  # of finite corners it is far from overflow
+    if not area < wp.float64(wp.inf):  # With finite corners it is far from overflow.
         return out
     v = wp.dot(wp.cross(ab, ap), normal)
     u = wp.dot(wp.cross(ap, ac), normal)
@@ -143,7 +144,7 @@ def on_triangle(point: wp.vec3, triangle: Primitive) -> Nearest:
 
 @wp.func
 def nearer_of(p: wp.vec3, triangle: Primitive, on: Nearest, best: Nearest) -> Nearest:
-    """The nearer of `best` and the point `on` this triangle; of equal ones the lower prim_id."""
+    """Return the nearer of `best` and the point `on` this triangle; of equal ones the lower prim_id."""
     lo = lower(lower(triangle.v0, triangle.v1), triangle.v2)
     hi = upper(upper(triangle.v0, triangle.v1), triangle.v2)
     pad = box_pad(lo, hi)
@@ -157,7 +158,7 @@ def nearer_of(p: wp.vec3, triangle: Primitive, on: Nearest, best: Nearest) -> Ne
 
 @noinline
 def nearer_flat(p: wp.vec3, surfaces: Surfaces, prim_id: int, best: Nearest) -> Nearest:
-    """As nearer_of, of a triangle without area, all of which is on its edges; its record does not hold its corners."""
+    """Return nearer_of for a triangle without area: all of it is on its edges, and its record does not hold its corners."""
     face = surfaces.faces[prim_id]
     triangle = Primitive()
     triangle.v0 = surfaces.vertices[face[0]]
@@ -171,7 +172,7 @@ def nearer_flat(p: wp.vec3, surfaces: Surfaces, prim_id: int, best: Nearest) -> 
 
 
 def make_leaf_search(layout: NodeLayout) -> Any:
-    """nearest_in_leaf(accel, surfaces, reference, p, best) -> Nearest."""
+    """Return nearest_in_leaf(accel, surfaces, reference, p, best) -> Nearest."""
     struct, gather = make_struct(Primitive), make_gather(Primitive, layout.width)
     width, size_of_row = layout.width, row_size(Primitive, layout.width)
 
@@ -192,7 +193,7 @@ def make_leaf_search(layout: NodeLayout) -> Any:
 
 
 def make_closest_point(layout: NodeLayout) -> Any:
-    """closest_point(accel, surfaces, p) -> Nearest: the walk of the tree."""
+    """Return closest_point(accel, surfaces, p) -> Nearest, which walks the tree."""
     struct, nearest_in_leaf = make_struct(Primitive), make_leaf_search(layout)
     plane, exists = make_plane(layout.width, layout.compressed)
 
@@ -227,7 +228,7 @@ def make_closest_point(layout: NodeLayout) -> Any:
                             if far != NOTHING:
                                 stack[size] = far
                                 size = size + 1
-            # The nearest child at once; else pop. What is farther than the best is dropped; equal stays: see `nearer`.
+            # The nearest child is next, or pop. What is farther than the best is dropped. Equal stays: see `nearer_of`.
             while near == NOTHING and size > 0:
                 size = size - 1
                 if t_of(stack[size]) <= float(best.d2):
@@ -242,7 +243,7 @@ def make_closest_point(layout: NodeLayout) -> Any:
 
 @cache
 def make_closest_point_kernel(layout: NodeLayout) -> Any:
-    """Points first .. first + dim - 1 against a tree whose primitives are corners."""
+    """Return the kernel for points first .. first + dim - 1, in a tree whose primitives are corners."""
     struct, closest_point = make_struct(Primitive), make_closest_point(layout)
 
     @kernel

@@ -1,11 +1,11 @@
-// Steps of one ray among many that are under way at once (layout.py: LEVEL, SLOT_WORDS). All return the next reference, or EMPTY (0)
-// where the ray is done. nodes: of the tree; slot: the ray's; stacks: of all rays, where this one's begins at `bottom`.
+// Steps of one interleaved ray (layout.py: LEVEL, SLOT_WORDS). Each returns the next reference, or EMPTY (0) if the ray is done.
+// `nodes` is the tree's array, `slot` the ray's slot, and `bottom` the place in `stacks` where the ray's stack begins.
 #pragma once
 #include "packet.h"
 
 namespace wrt {
 
-// Take the next child from a ray's stack, whose last level is at `at`: for any hit the last child there, else the nearest that
+// Take the next child from a ray's stack, whose last level is at `at`. For any hit it is the last child there, else the nearest that
 // begins at or before `reach`.
 template <bool ANY_HIT> WRT_INLINE int take(const float* nodes, float reach, unsigned* stacks, int bottom, int at, int* slot) {
     unsigned* level;
@@ -15,13 +15,13 @@ template <bool ANY_HIT> WRT_INLINE int take(const float* nodes, float reach, uns
         level = stacks + at;
         child = 31 - __builtin_clz(level[LEVEL_LEFT]);
     } else {
-        // Keys are not sorted: the least is looked for when one is wanted, since most rays meet one child or two.
+        // Keys are not sorted, since most rays enter only one child or two: the least is searched here.
         unsigned key;
         for (;; at -= LEVEL) {
             if (at == bottom) return 0;
             level = stacks + at;
             key = least_of(load<Lanes<WIDTH>::Keys>(level));
-            // Equal stays: a tie may have a lower prim_id.
+            // Equal stays: a tie there may have a lower prim_id.
             if (__builtin_bit_cast(float, key & ~(unsigned)KEY_MASK) <= reach) break;
         }
         child = key & (WIDTH - 1);
@@ -35,13 +35,13 @@ template <bool ANY_HIT> WRT_INLINE int take(const float* nodes, float reach, uns
     return next;
 }
 
-// Put the children of a node that a ray meets on its stack, if it meets any, as a new level; then take one. Both cases share one
-// path: about every third node has no child that is met, and a branch on that is mispredicted. Distances are not negative.
+// Push the children of a node that a ray enters on its stack, as a new level, if there are any; then take one. Both cases share one
+// path: a third of the nodes have no entered child, and a branch would be mispredicted. Distances are not negative.
 template <bool ANY_HIT>
-WRT_INLINE int put_and_take(const float* nodes, int first, const Interval<Lanes<WIDTH>::Floats>& t, float reach, unsigned* stacks,
+WRT_INLINE int push_and_take(const float* nodes, int first, const Interval<Lanes<WIDTH>::Floats>& t, float reach, unsigned* stacks,
                             int bottom, int* slot) {
     typedef Lanes<WIDTH>::Keys Keys;
-    static_assert(WIDTH == 8, "the children have numbers");
+    static_assert(WIDTH == 8, "`child` lists eight indices");
     const auto met = t.enter <= t.leave;
     const unsigned left = mask_of(met);
     const int place = slot[SLOT_PLACE];
@@ -55,7 +55,7 @@ WRT_INLINE int put_and_take(const float* nodes, int first, const Interval<Lanes<
     return take<ANY_HIT>(nodes, reach, stacks, bottom, WRT_UNPREDICTABLE(left != 0) ? place + LEVEL : place, slot);
 }
 
-// Put a ray into a slot, at the root's children, into which `meets` has found it to go.
+// Put a ray into a slot, at the root's children, by the ROOT_ENTRIES of rays_meeting_root.
 template <bool ANY_HIT> WRT_INLINE int begin(const float* nodes, float* packets, int ray, unsigned* stacks, int bottom, int* slot) {
     typedef Lanes<WIDTH>::Floats Children;
     Children enter;
@@ -63,10 +63,10 @@ template <bool ANY_HIT> WRT_INLINE int begin(const float* nodes, float* packets,
     slot[SLOT_RAY] = ray;
     slot[SLOT_PLACE] = bottom;
     const float reach = __builtin_inff();
-    return put_and_take<ANY_HIT>(nodes, 0, {enter, all<Children>(LARGEST)}, reach, stacks, bottom, slot);
+    return push_and_take<ANY_HIT>(nodes, 0, {enter, all<Children>(LARGEST)}, reach, stacks, bottom, slot);
 }
 
-// From a node to the next child, its own or one on the stack.
+// Go from a node to the next child, of this node or on the stack.
 template <bool ANY_HIT> WRT_INLINE int step(const float* nodes, float* packets, unsigned* stacks, int bottom, int* slot) {
     typedef Lanes<WIDTH>::Floats Children;
     const int first = slot[SLOT_NEXT] * NODE_SIZE;
@@ -79,16 +79,16 @@ template <bool ANY_HIT> WRT_INLINE int step(const float* nodes, float* packets, 
     const float reach = ray[T];
     Interval<Children> t = {all<Children>(ray[T_MIN]), all<Children>(reach)};
     narrow(t, near, far, vector<float>(ray, ORIGIN_X), vector<float>(ray, INVERSE_X), vector<float>(ray, FAR_X));
-    return put_and_take<ANY_HIT>(nodes, first, t, reach, stacks, bottom, slot);
+    return push_and_take<ANY_HIT>(nodes, first, t, reach, stacks, bottom, slot);
 }
 
-// From a leaf to a child on the stack that begins at or before `reach`, the ray's t.
+// Go from a leaf to a child on the stack that begins at or before `reach`, the ray's t.
 template <bool ANY_HIT> WRT_INLINE int pop(const float* nodes, float reach, unsigned* stacks, int bottom, int* slot) {
     return take<ANY_HIT>(nodes, reach, stacks, bottom, slot[SLOT_PLACE], slot);
 }
 
-// Test the triangles of a row in the mask; return the lane of the nearest that is hit, or -1. The hit goes to the ray's column of
-// its packet: of any hit only t = -inf and some prim_id, and its lane is 0.
+// Test the triangles of a row in the mask. Store the nearest hit in the ray's column, and return its lane, or -1. For any hit, store
+// only t = -inf and some prim_id, and return lane 0.
 template <bool ANY_HIT> WRT_INLINE int ray_triangles_here(const float* row, int mask, float* column) {
     const OneRay ray = {column};
     const LeafRow triangles = {{row}};
@@ -113,7 +113,7 @@ template <bool ANY_HIT> WRT_INLINE int ray_triangles_here(const float* row, int 
     return j;
 }
 
-// The same, as a function that is called.
+// The same, not inlined.
 template <bool ANY_HIT> WRT_CALLED int ray_triangles(const float* row, int mask, float* column) {
     return ray_triangles_here<ANY_HIT>(row, mask, column);
 }

@@ -1,13 +1,13 @@
-// Lanes: numbers side by side, on all of which one instruction works. Vectors are an extension of GCC and Clang: they name no
-// instruction set, and run on every CPU.
+// Vectors of lanes, on all of which one instruction works. They are an extension of GCC and Clang, and run on every CPU without
+// naming an instruction set.
 #pragma once
 #define WRT_INLINE static inline __attribute__((always_inline))
 #define WRT_MEMBER inline __attribute__((always_inline))
-#define WRT_CALLED static __attribute__((noinline))  // else the compiler copies it to where it is called
+#define WRT_CALLED static __attribute__((noinline))  // Otherwise the compiler inlines it at each call.
 
 namespace wrt {
 
-// Integers are as long as floats: a comparison of floats gives integers, -1 or 0, and chooses between integers too.
+// Integers are as long as floats. A comparison of floats returns integers, -1 or 0, which choose between floats or integers.
 template <int N> struct Lanes {
     typedef float Floats __attribute__((vector_size(4 * N)));
     typedef int Ints __attribute__((vector_size(4 * N)));
@@ -17,7 +17,7 @@ template <int N> struct Lanes {
 
 template <class V> constexpr int lanes_of = sizeof(V) / sizeof(V{}[0]);
 
-// Memory need not be aligned.
+// Load from memory that need not be aligned.
 template <class V> WRT_INLINE V load(const void* from) {
     V out;
     __builtin_memcpy(&out, from, sizeof(out));
@@ -26,7 +26,7 @@ template <class V> WRT_INLINE V load(const void* from) {
 
 template <class V> WRT_INLINE void store(void* to, V value) { __builtin_memcpy(to, &value, sizeof(value)); }
 
-// A number in all lanes; what is lanes already stays as it is.
+// Return a number in all lanes, or a vector unchanged.
 template <class V, class Number> WRT_INLINE V all(Number x) { return x - V{}; }
 
 template <class V> WRT_INLINE V absolute(V x) {
@@ -48,7 +48,7 @@ template <class V> WRT_INLINE auto least_of(V x) {
 #endif
 }
 
-// The mask, a bit a lane, of the lanes of a comparison that hold.
+// Return the lanes where a comparison holds as a mask, a bit a lane.
 template <class V> WRT_INLINE int mask_of(V holds) {
     constexpr int N = lanes_of<V>;
 #if defined(__clang__)
@@ -64,7 +64,7 @@ template <class V> WRT_INLINE int mask_of(V holds) {
 #endif
 }
 
-// And back: a comparison that holds in the lanes of a mask.
+// Return the comparison that holds in the lanes of a mask.
 template <class Ints> WRT_INLINE Ints in_mask(int mask) {
     Ints lane;
     for (int k = 0; k < lanes_of<Ints>; ++k) lane[k] = k;
@@ -73,7 +73,7 @@ template <class Ints> WRT_INLINE Ints in_mask(int mask) {
 
 WRT_INLINE int lowest(unsigned mask) { return __builtin_ctz(mask); }
 
-// For a condition that is as often true as not.
+// For a condition that is true about half the time.
 #if defined(__clang__)
 #define WRT_UNPREDICTABLE(condition) __builtin_unpredictable(condition)
 #else

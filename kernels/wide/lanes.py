@@ -1,8 +1,7 @@
-"""Lanes: rows of 4 or 8 numbers that one CPU instruction works on, for the few loops where a ray's time goes.
+"""Rows of 4 or 8 floats that one CPU instruction works on, for the few loops that take most of a ray's time.
 
-Rows lie one after another in a flat array of float32. What works on a row has two forms, which a test holds to the same bits: C++
-for the CPU, and plain Warp, lane by lane, for CUDA.
-"""
+Rows lie one after another in a flat array of float32. Each function on a row has two forms, which a test holds to the same bits. One is C++
+for the CPU; the other is plain Warp, lane by lane, for CUDA."""
 
 from functools import cache
 from typing import Any
@@ -14,33 +13,32 @@ from wrt.kernels.units.box import FAR_PAD, BoxRay
 from wrt.kernels.units.triangle import edge_areas, outside, sheared
 from wrt.kernels.wide.layout import CACHE_LINE
 
-# The lanes' far distances are widened by way of the reciprocals, in one product instead of two: 8 u more than FAR_PAD outweigh
-# the four roundings by which the two ways may differ, so that no box is left out that the box unit enters.
+# Rows widen far distances by widening the reciprocals: one product instead of two. The two ways differ by at most four roundings.
+# 8 u more than FAR_PAD outweigh these, so that rows enter every box that the box unit enters.
 LANE_PAD = wp.constant(FAR_PAD * (1.0 + 8.0 * 2.0**-24))
 
 
 @wp.struct
 class LaneRay:
-    """A ray as rows need it. box: for the box unit, t_min never -0; far_inv_dir: reciprocals for far planes; near_x, near_y,
-    near_z: which plane (nodes.PLANES) the ray meets first on each axis; kx, ky, kz, shear_x, shear_y: as in TriangleRay; origin: in
-    the order kx, ky, kz."""
+    """A ray as the tests of rows need it."""
 
-    box: BoxRay
-    far_inv_dir: wp.vec3
-    near_x: int
+    box: BoxRay  # For the box unit; t_min is never -0.
+    far_inv_dir: wp.vec3  # Reciprocals for far planes.
+    near_x: int  # The plane (nodes.PLANES) that the ray meets first on x.
     near_y: int
     near_z: int
-    kx: int
+    kx: int  # This and the next four: as in TriangleRay.
     ky: int
     kz: int
     shear_x: float
     shear_y: float
-    origin: wp.vec3
+    origin: wp.vec3  # In the order kx, ky, kz.
 
 
 def lanes_only(body: str, otherwise: str = "0") -> str:
-    """Return a native function's body for kernels of structs.kernel on the CPU, which have the headers of wide/. CUDA calls the
-    plain form. A kernel that a user made by wp.kernel is refused (ray_query.fused)."""
+    """Return the body of a native function for the CPU, where kernels of structs.kernel have the headers of wide/.
+
+    CUDA calls the plain form. A kernel that a user made by wp.kernel is refused (ray_query.fused)."""
     return f"\n#if defined(WRT_INLINE)\n{body}\n#else\n    return {otherwise};\n#endif\n"
 
 
@@ -52,17 +50,17 @@ def lanes_only(body: str, otherwise: str = "0") -> str:
 #endif
 """)
 def lowest(mask: int) -> int:
-    """The lowest lane of a mask that has one."""
+    """Return the lowest lane of a mask, which must not be empty."""
 
 
 @wp.func_native("return rows.data[(long long)i];")
 def value(rows: wp.array(dtype=wp.float32), i: int) -> float:
-    """rows[i], of an array without gaps."""
+    """Return rows[i], of an array without gaps."""
 
 
 @wp.func_native("int value; memcpy(&value, rows.data + (long long)i, sizeof(value)); return value;")
 def bits(rows: wp.array(dtype=wp.float32), i: int) -> int:
-    """The int32 that stands in rows[i]."""
+    """Return rows[i] as the int32 of the same bits."""
 
 
 @wp.func_native(f"""
@@ -71,22 +69,22 @@ def bits(rows: wp.array(dtype=wp.float32), i: int) -> int:
 #endif
 """)
 def prefetch(rows: wp.array(dtype=wp.float32), first: int, lines: int) -> None:
-    """So many cache lines from rows[first] are soon needed."""
+    """Prefetch so many cache lines from rows[first] on."""
 
 
 @cache
 def row_type(width: int) -> Any:
-    """A row of `width` float32."""
+    """Return the vector type of a row of `width` float32."""
     return wp.types.vector(width, wp.float32)
 
 
 @cache
 def make_plain_cull(width: int) -> Any:
-    """make_cull in plain Warp, lane by lane."""
+    """Return make_cull in plain Warp, lane by lane."""
 
     @wp.func
     def corner(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay) -> wp.vec3:
-        """The corner whose three rows have this lane at first, first + width, first + 2 width; as the ray sees it."""
+        """Return a corner as the ray sees it. Its three rows have this lane at first, first + width and first + 2 width."""
         x = value(rows, first + width * ray.kx)
         y = value(rows, first + width * ray.ky)
         z = value(rows, first + width * ray.kz)
@@ -96,7 +94,7 @@ def make_plain_cull(width: int) -> Any:
     def cull(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay) -> int:
         mask = int(0)
         j = int(0)
-        while j < width:  # `for` would be unrolled, to as many instructions as all the rest of a traversal
+        while j < width:  # A `for` would be unrolled, and double a traversal's instructions.
             a = corner(rows, first + j, ray)
             b = corner(rows, first + j + 3 * width, ray)
             c = corner(rows, first + j + 6 * width, ray)
@@ -110,7 +108,7 @@ def make_plain_cull(width: int) -> Any:
 
 @cache
 def make_native_cull(width: int) -> Any:
-    """make_cull in C++, for the CPU only."""
+    """Return make_cull in C++, for the CPU only."""
 
     @wp.func_native(lanes_only(f"return wrt::cull<{width}>(rows.data + (long long)first, ray);"))
     def cull(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay) -> int: ...
@@ -120,8 +118,7 @@ def make_native_cull(width: int) -> Any:
 
 @cache
 def make_cull(width: int) -> Any:
-    """cull(rows, first, ray) -> mask of the triangles whose rows begin at `first`, without those that the watertight unit refuses
-    in float32."""
+    """Return cull(rows, first, ray): the mask of a row's triangles without the ones that the watertight unit refuses in float32."""
     plain, vector = make_plain_cull(width), make_native_cull(width)
 
     @wp.func

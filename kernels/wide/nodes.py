@@ -1,12 +1,11 @@
-"""Nodes of wide BVHs: the boxes of all children against one ray, as rows of lanes.
+"""Nodes of wide BVHs: the boxes of all children tested against one ray, as rows of lanes.
 
-Two layouts in a flat array of float32; layout.py has the constants. Plain (64 numbers a node of bvh8), 8 rows of `width` numbers:
-the six planes (PLANES), the references of the children (int32), and one that is not used, so that nodes begin where cache lines do.
-Compressed (24 numbers a node of bvh8c; Ylitie, Karras and Laine 2017, section 3.2): an origin (3 numbers), a word of three
-exponents and the mask of the children that exist, six rows of `width` bytes, and the references; a plane is origin + byte *
-2^(exponent - 127), rounded once, and the builder takes care that it is never inside of the box. An origin that is NaN says nothing
-about its axis: no ray is stopped there.
-"""
+Nodes lie in a flat array of float32; layout.py has the constants.
+- A plain node has 8 rows of `width` floats, 64 for bvh8. They are the six planes (PLANES), the children's references (int32), and an unused
+  row that aligns nodes to cache lines.
+- A compressed node has 24 floats for bvh8c (Ylitie, Karras and Laine 2017, section 3.2). They are an origin (3 floats), a word of three
+  exponents and the mask of existing children, six rows of `width` bytes, and the references. A plane is origin + byte * 2^(exponent - 127),
+  rounded once. The builder makes sure that it is never inside the box. A NaN origin leaves its axis open: it stops no ray."""
 
 from functools import cache
 from typing import Any
@@ -18,19 +17,19 @@ from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.wide.lanes import LANE_PAD, LaneRay, bits, lanes_only, row_type, value
 from wrt.kernels.wide.layout import EXIST_SHIFT, EXPONENT_BITS, FIRST_BYTES, HI_X, HI_Y, HI_Z, LO_X, LO_Y, LO_Z, MANTISSA_BITS, WORD
 
-# By how much far distances are widened for the box tests that have a form in rows.
+# Factor of far distances, for the box tests that have a form in rows.
 ROW_PADS = {"conservative": LANE_PAD, "minmax": 1.0}
 
 
 @cache
 def make_plane(width: int, compressed: bool) -> Any:
-    """plane(nodes, first, row, lane): a number of one of PLANES; and exists(nodes, first, lane): whether there is such a child."""
+    """Return plane(nodes, first, k, lane), a value of one of PLANES, and exists(nodes, first, lane) for that child."""
 
     @wp.func
     def plane(nodes: wp.array(dtype=wp.float32), first: int, k: int, lane: int) -> float:
         if wp.static(compressed):
             axis = k >> 1
-            at = k * width + lane  # of the bytes, four in a word
+            at = k * width + lane  # Of the bytes, four in a word.
             byte = (bits(nodes, first + FIRST_BYTES + (at >> 2)) >> (8 * (at & 3))) & 255
             exponent = (bits(nodes, first + WORD) >> (EXPONENT_BITS * axis)) & wp.static((1 << EXPONENT_BITS) - 1)
             return value(nodes, first + axis) + float(byte) * wp.cast(exponent << MANTISSA_BITS, wp.float32)
@@ -46,7 +45,7 @@ def make_plane(width: int, compressed: bool) -> Any:
 
 
 def lane_by_lane(width: int, compressed: bool, enters: Any) -> Any:
-    """make_children from what is said of one child: enters(nodes, first, lane, ray, t_max) -> distance, inf where it is missed."""
+    """Return make_children's function for the test of one child, enters(nodes, first, lane, ray, t_max) -> distance or inf."""
     row = row_type(width)
     _, exists = make_plane(width, compressed)
 
@@ -66,7 +65,7 @@ def lane_by_lane(width: int, compressed: bool, enters: Any) -> Any:
 
 @cache
 def make_scalar(width: int, compressed: bool, box: str) -> Any:
-    """make_children by the scalar unit of that name in RAY_AABB, for a box test that has no form in rows."""
+    """Return make_children's function by the scalar unit of RAY_AABB, for a box test that has no form in rows."""
     plane, _ = make_plane(width, compressed)
     ray_aabb = RAY_AABB[box]
 
@@ -81,7 +80,7 @@ def make_scalar(width: int, compressed: bool, box: str) -> Any:
 
 @cache
 def make_plain(width: int, compressed: bool) -> Any:
-    """make_children of rows in plain Warp."""
+    """Return make_children's function in plain Warp."""
     plane, _ = make_plane(width, compressed)
 
     @wp.func
@@ -105,7 +104,7 @@ def make_plain(width: int, compressed: bool) -> Any:
 
 @cache
 def make_native(width: int, compressed: bool) -> Any:
-    """make_children of rows in C++, for the CPU only."""
+    """Return make_children's function in C++, for the CPU only."""
     row = row_type(width)
     numbers = {"COMPRESSED": int(compressed), "WORD": WORD, "FIRST_BYTES": FIRST_BYTES, "EXPONENT_BITS": EXPONENT_BITS,
                "EXIST_SHIFT": EXIST_SHIFT, "MANTISSA_BITS": MANTISSA_BITS}
@@ -131,11 +130,10 @@ def make_native(width: int, compressed: bool) -> Any:
 
 @cache
 def make_children(width: int, compressed: bool, box: str) -> Any:
-    """children(nodes, first, ray, t_max) -> (row, mask): the mask of the children of the node that begins at `first` which the ray
-    enters before it leaves them, and at or before t_max (finite); the row of where it enters these, at least t_min.
+    """Return children(nodes, first, ray, t_max) -> (row, mask) for the node at `first` and a finite t_max.
 
-    box: a name in RAY_AABB; the ray's far_inv_dir is widened by far_pad(box). Each device runs its own form.
-    """
+    The mask has the children that the ray enters, at or before t_max and before it leaves them. The row has its entry distances, at least
+    t_min. `box` is a name in RAY_AABB; the ray's far_inv_dir is widened by far_pad(box). Each device runs its own form."""
     if box not in ROW_PADS:
         return make_scalar(width, compressed, box)
     plain, vector = make_plain(width, compressed), make_native(width, compressed)
@@ -150,5 +148,5 @@ def make_children(width: int, compressed: bool, box: str) -> Any:
 
 
 def far_pad(box: str) -> float:
-    """What far distances are multiplied by: 1 for a box test that widens them itself."""
+    """Return the factor of far distances: 1 for a box test that widens them itself."""
     return ROW_PADS.get(box, 1.0)

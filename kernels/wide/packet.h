@@ -1,11 +1,11 @@
-// Steps of a packet's walk: the nodes, triangles and stack entries that sixteen rays meet (layout.py).
+// Steps of a packet's walk: tests of nodes and triangles, and the stack (layout.py).
 #pragma once
 #include "layout.h"
 #include "triangle.h"
 
 namespace wrt {
 
-// --- all rays of a packet, or one of them (layout.py: ROWS) ---------------------------------------------------------------------
+// --- all rays of a packet, or one of them (layout.py: FIELDS) -------------------------------------------------------------------
 
 typedef Lanes<LANES>::Floats Rays;
 typedef Lanes<LANES>::Ints RayInts;
@@ -30,14 +30,14 @@ template <class T, class Number> WRT_INLINE Vec3<T> in_lanes(const Vec3<Number>&
     return {{all<T>(v[0]), all<T>(v[1]), all<T>(v[2])}};
 }
 
-// Three rows, for x, y and z.
+// Return three fields, for x, y and z.
 template <class T, class Ray> WRT_INLINE Vec3<T> vector(const Ray& ray, int first) {
     return {{all<T>(ray[first]), all<T>(ray[first + LANES]), all<T>(ray[first + 2 * LANES])}};
 }
 
 // --- triangles ----------------------------------------------------------------------------------------------------------------
 
-// The triangles of a leaf, for one ray.
+// A row of a leaf's triangles, for one ray.
 struct LeafRow : Row<WIDTH> {
     WRT_MEMBER Ints prim_id() const { return load<Ints>(numbers + WIDTH * PRIM_ID_ROW); }
 };
@@ -59,8 +59,8 @@ struct Triangle {
     WRT_MEMBER RayInts prim_id() const { return all<RayInts>(id); }
 };
 
-// Triangles that are hit in [t_min, t] or, at t itself, whose prim_id is not higher than that of the hit there: watertight,
-// within_bounds, and `better` (traverse/common.py). Only lanes of `mask` are tested, and never a ray's own triangle (EXCLUDE).
+// Return the hits in [t_min, t]. At t itself, the prim_id must not be higher than the best hit's. The steps are those of
+// `watertight`, `within_bounds` and `better` (traverse/common.py), in the lanes of `mask`, without a ray's own triangle (EXCLUDE).
 template <int N, class Triangles, class Ray>
 WRT_INLINE Hits<N> ray_triangle(const Triangles& triangles, const Ray& ray, int mask) {
     typedef typename Lanes<N>::Floats Floats;
@@ -87,7 +87,7 @@ WRT_INLINE Hits<N> ray_triangle(const Triangles& triangles, const Ray& ray, int 
     return hit;
 }
 
-// Those of a row's primitives that are no triangles.
+// Return the primitives of a row that are spheres.
 WRT_INLINE int spheres_of(const float* row, int n_triangles) {
     return mask_of(LeafRow{{row}}.prim_id() >= n_triangles);
 }
@@ -111,8 +111,9 @@ WRT_INLINE Interval<Rays> interval_in(const PacketRay& ray, const Vec3<Rays>& ne
 
 typedef Lanes<WIDTH>::Floats Children;
 
-// Where the beam enters the children of a node, and leaves them. Distances are products of two intervals: bounds are the extreme
-// origin times both reciprocals. The largest reciprocal comes first: it may be infinite, and 0 * inf = NaN then says nothing.
+// Return the distances at which the beam enters and leaves the children of a node. Distances are products of two intervals, so the
+// bounds are the extreme origin times both reciprocals. The largest reciprocal comes first: it may be infinite, and the comparison
+// then skips 0 * inf = NaN.
 WRT_INLINE Interval<Children> beam_interval(const float* packet, const float* node, const int near[3]) {
     Interval<Children> t = {all<Children>(packet[BEAM_T_MIN]), all<Children>(LARGEST)};
     for (int k = 0; k < 3; ++k) {
@@ -126,15 +127,15 @@ WRT_INLINE Interval<Children> beam_interval(const float* packet, const float* no
     return t;
 }
 
-// The first cache lines of what a reference leads to: a row of triangles, or a node.
+// Prefetch the first cache lines of the row of triangles, or the node, that a reference points to.
 WRT_INLINE void prefetch(const float* nodes, const float* primitives, int reference) {
     const float* const first = reference < 0 ? primitives + (long long)(~reference >> LEAF_BITS) * ROW_SIZE
                                              : nodes + (long long)reference * NODE_SIZE;
     for (int k = 0; k < LINES; ++k) __builtin_prefetch(first + CACHE_LINE * k);
 }
 
-// Put an entry on a stack of `size` entries; of those from `begin` on the farthest is deepest, or for any hit the first.
-template <bool ANY_HIT> WRT_INLINE void put(unsigned* stack, int begin, int size, unsigned long long key, int rays) {
+// Push an entry on a stack of `size` entries. Those from `begin` on stay sorted, the farthest deepest; for any hit, in node order.
+template <bool ANY_HIT> WRT_INLINE void push(unsigned* stack, int begin, int size, unsigned long long key, int rays) {
     unsigned* at = stack + ENTRY * size;
     if constexpr (!ANY_HIT)
         for (; at > stack + ENTRY * begin && load<unsigned long long>(at - ENTRY) < key; at -= ENTRY)
@@ -143,7 +144,7 @@ template <bool ANY_HIT> WRT_INLINE void put(unsigned* stack, int begin, int size
     at[ENTRY_RAYS] = rays;
 }
 
-// Put the children of a node that rays of the mask meet on a stack of `size` entries; the size it then has. Only with a beam.
+// Push the children of a node that rays of the mask enter on a stack of `size` entries; return its new size. Needs a beam.
 template <bool ANY_HIT>
 WRT_CALLED int children(const float* nodes, const float* primitives, float* packet, int node, int mask, unsigned* stack, int size) {
     const float* const p = nodes + (long long)node * NODE_SIZE;
@@ -161,15 +162,15 @@ WRT_CALLED int children(const float* nodes, const float* primitives, float* pack
         if (!met) continue;
         const int next = load<int>(p + REFERENCES + child);
         prefetch(nodes, primitives, next);
-        const float entry = beam.enter[child];  // of `beam.enter[child]` itself clang 22 casts the bits of element 0
+        const float entry = beam.enter[child];  // A copy: clang 22 casts the bits of element 0 of `beam.enter[child]`.
         const auto key = (unsigned long long)__builtin_bit_cast(unsigned, entry) << 32 | (unsigned)next;
-        put<ANY_HIT>(stack, size, top++, key, met);
+        push<ANY_HIT>(stack, size, top++, key, met);
     }
     return top;
 }
 
-// The rays of the mask that meet a child of the root; and ROOT_ENTRIES.
-WRT_INLINE int meets(const float* root, int mask, float* packet) {
+// Return the rays of the mask that enter a child of the root, and store ROOT_ENTRIES.
+WRT_INLINE int rays_meeting_root(const float* root, int mask, float* packet) {
     const PacketRay ray = packet_ray({packet});
     const BoxRay<Rays> box = {ray.origin, ray.inv_dir};
     const Rays never = all<Rays>(__builtin_inff());
@@ -185,11 +186,11 @@ WRT_INLINE int meets(const float* root, int mask, float* packet) {
     return out & mask;
 }
 
-// The rays that reach so far.
-WRT_INLINE int reaching(float t_entry, float* packet) { return mask_of(AllRays{packet}[T] >= t_entry); }
+// Return the rays whose t is at least t_entry.
+WRT_INLINE int rays_reaching(float t_entry, float* packet) { return mask_of(AllRays{packet}[T] >= t_entry); }
 
-// Test the first `count` triangles of a row, one after another, against the rays of the mask; return those that hit one. After any
-// hit t is -inf.
+// Test the first `count` triangles of a row, one after another, against the rays of the mask; return the rays that hit one. For any
+// hit, t becomes -inf.
 template <bool ANY_HIT> WRT_CALLED int triangles(const float* row, int count, int mask, float* numbers) {
     const AllRays packet = {numbers};
     int found = 0;
@@ -211,7 +212,7 @@ template <bool ANY_HIT> WRT_CALLED int triangles(const float* row, int count, in
     return found;
 }
 
-// HitArrays (query.py) from `first` on; a miss has t = inf and prim_id = -1.
+// Write HitArrays (query.py) from `first` on. A miss has t = inf and prim_id = -1.
 template <class HitArrays> WRT_INLINE void write_hits(const HitArrays& hits, int first, int count, float* numbers) {
     const AllRays packet = {numbers};
     const RayInts id = packet.bits(PRIM_ID), prim_id = id == NO_HIT ? all<RayInts>(-1) : id;

@@ -1,9 +1,7 @@
-"""Packets and interleaved rays: what kernels of one CPU thread call. Each function here is a call of C++ (packet.h, set_up.h,
-interleaved.h).
+"""Packets and interleaved rays, for kernels of one CPU thread: each function is a call of C++ (packet.h, set_up.h, interleaved.h).
 
-They compute what the scalar units compute, to the last bit: a test holds the two together. A packet is named by where it begins in
-Scratch.packets (`base`), a ray by its column there (`ray`: base + lane).
-"""
+Tests hold them to the bits of the scalar units. A packet begins at `base` in Scratch.packets, and a ray's column there is `ray`, base +
+lane."""
 
 from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -19,35 +17,31 @@ from wrt.kernels.wide.traverse import make_struct
 WideBvh = make_struct(Primitive)
 HEADERS = with_headers("wide/set_up.h", "wide/interleaved.h", layout=LAYOUT_H)
 
-if TYPE_CHECKING:  # as in structs
+if TYPE_CHECKING:  # As in structs.
     from typing import no_type_check as packet_kernel
 else:
     def packet_kernel(function):
-        """A kernel that may call the functions of this file."""
+        """Make a kernel that may call the functions of this file."""
         return kernel(function, extra_build_options=HEADERS)
 
 
+# Counts that a launch leaves: packets in a row that fell apart, packets until one is tried again, 1 after an invalid ray.
 FAILED, PAUSED, ANY_REFUSED = (wp.constant(place) for place in range(3))
 REPORT_SIZE = 3
 
 
 @wp.struct
 class Scratch:
-    """What one thread works in. packets: PACKET_SIZE each; stacks: STACK_WORDS a slot, or before these one packet's; slots:
-    SLOT_SIZE each.
+    """The working memory of one thread."""
 
-    report: what batch.make_kernel counts in a launch and leaves behind it. At FAILED: packets in a row that fell apart; PAUSED:
-    packets until one is tried again; ANY_REFUSED: 1 where a query refuses one of the rays, which the host reads.
-    """
-
-    packets: wp.array(dtype=wp.float32)
-    stacks: wp.array(dtype=wp.uint32)
-    slots: wp.array(dtype=wp.int32)
-    report: wp.array(dtype=wp.int32)
+    packets: wp.array(dtype=wp.float32)  # PACKET_SIZE each.
+    stacks: wp.array(dtype=wp.uint32)  # STACK_WORDS for each slot; before these run, one packet's stack.
+    slots: wp.array(dtype=wp.int32)  # SLOT_SIZE each.
+    report: wp.array(dtype=wp.int32)  # By FAILED, PAUSED and ANY_REFUSED.
 
 
 def flag(value: bool) -> str:
-    """A template's argument."""
+    """Return a bool as C++ writes a template's argument."""
     return "true" if value else "false"
 
 
@@ -56,7 +50,7 @@ def flag(value: bool) -> str:
 
 @cache
 def make_set_up(rays_struct: Any) -> Any:
-    """set_up for RayArrays, or for RenderRays, whose directions are taken as they are."""
+    """Return set_up for RayArrays, or for RenderRays, whose directions are not scaled."""
     plain = rays_struct is RayArrays
     excludes = "nullptr" if plain else "rays.exclude.data + first"
 
@@ -64,8 +58,9 @@ def make_set_up(rays_struct: Any) -> Any:
     return wrt::set_up<{flag(plain)}>(wrt::pointers_to(rays, first, {excludes}), count, pad, scratch.packets.data + base);
     """)
     def set_up(rays: rays_struct, first: int, count: int, pad: float, scratch: Scratch, base: int) -> int:
-        """Set up rays first .. first + count - 1; return the mask of those that are not empty, and COHERENT if they have a beam.
-        pad: nodes.far_pad."""
+        """Set up rays first .. first + count - 1; return the mask of rays that are not empty, plus COHERENT if they have a beam.
+
+        `pad` is nodes.far_pad."""
 
     return set_up
 
@@ -77,20 +72,21 @@ def make_children(any_hit: bool) -> Any:
                                           scratch.stacks.data, size);
     """)
     def children(accel: WideBvh, scratch: Scratch, base: int, reference: int, mask: int, size: int) -> int:
-        """Put the children of a node that rays of the mask meet on a stack of `size` entries, the nearest last or, for any hit, as
-        they are in the node; return the size it then has. Only with a beam."""
+        """Push the children of a node that rays of the mask enter on a stack of `size` entries; return its new size.
+
+        The nearest child is on top; for any hit, the last one. The packet must have a beam."""
 
     return children
 
 
-@wp.func_native("return wrt::meets(accel.nodes.data, mask, scratch.packets.data + base);")
-def meets(accel: WideBvh, scratch: Scratch, base: int, mask: int) -> int:
-    """Return the rays of the mask that meet a child of the root; write ROOT_ENTRIES."""
+@wp.func_native("return wrt::rays_meeting_root(accel.nodes.data, mask, scratch.packets.data + base);")
+def rays_meeting_root(accel: WideBvh, scratch: Scratch, base: int, mask: int) -> int:
+    """Return the rays of the mask that enter a child of the root; write ROOT_ENTRIES."""
 
 
-@wp.func_native("return wrt::reaching(t_entry, scratch.packets.data + base);")
-def reaching(t_entry: float, scratch: Scratch, base: int) -> int:
-    """Return the mask of the rays that reach so far."""
+@wp.func_native("return wrt::rays_reaching(t_entry, scratch.packets.data + base);")
+def rays_reaching(t_entry: float, scratch: Scratch, base: int) -> int:
+    """Return the mask of the rays whose t is at least t_entry."""
 
 
 @cache
@@ -99,8 +95,9 @@ def make_triangles(any_hit: bool) -> Any:
     return wrt::triangles<{flag(any_hit)}>(accel.primitives.data + first, count, mask, scratch.packets.data + base);
     """)
     def triangles(accel: WideBvh, first: int, count: int, mask: int, scratch: Scratch, base: int) -> int:
-        """Test the first `count` triangles of a row against the rays of the mask; return those that hit one. After any hit t is
-        -inf."""
+        """Test the first `count` triangles of a row against the rays of the mask; return the rays that hit one.
+
+        For any hit, t becomes -inf."""
 
     return triangles
 
@@ -115,25 +112,25 @@ def write_occluded(occluded: wp.array(dtype=wp.bool), first: int, count: int, sc
 
 @wp.func_native(f"return wrt::load<wp::uint64>(stacks.data + {ENTRY} * i);")
 def key_at(stacks: wp.array(dtype=wp.uint32), i: int) -> wp.uint64:
-    """The key of entry i of a packet's stack."""
+    """Return the key of entry i of a packet's stack."""
 
 
 @wp.func_native(f"return (int)stacks.data[{ENTRY} * i + {ENTRY_RAYS}];")
 def rays_at(stacks: wp.array(dtype=wp.uint32), i: int) -> int:
-    """The mask of the rays of entry i."""
+    """Return the mask of the rays of entry i."""
 
 
 # --- one ray of a packet, and its slot --------------------------------------------------------------------------------
 
 
 class Steps(NamedTuple):
-    """begin: put a ray into a slot, at the root's children; step: from a node to the next child, its own or one on the stack; pop:
-    to one on the stack; of those that begin at or before `reach`, the ray's t. All return the reference that is next, or EMPTY
-    where the ray is done. The nearest child is next, or for any hit the last one."""
+    """The steps of an interleaved ray. Each returns the next reference, or EMPTY if the ray is done.
 
-    begin: Any
-    step: Any
-    pop: Any
+    The next child is the nearest one, or for any hit the last one."""
+
+    begin: Any  # Put a ray into a slot, at the root's children.
+    step: Any  # From a node to the next child, of this node or on the stack.
+    pop: Any  # To a child on the stack that begins at or before `reach`, the ray's t.
 
 
 @cache
@@ -154,7 +151,7 @@ def make_steps(any_hit: bool) -> Steps:
 
 @wp.func_native("return mask & wrt::spheres_of(accel.primitives.data + first, n_triangles);")
 def spheres_of(accel: WideBvh, first: int, mask: int, n_triangles: int) -> int:
-    """Return those of a row's primitives in the mask that are no triangles."""
+    """Return the mask's primitives of a row that are spheres."""
 
 
 @cache
@@ -163,15 +160,16 @@ def make_ray_triangles(any_hit: bool, inlined: bool) -> Any:
 
     @wp.func_native(f"return wrt::{name}<{flag(any_hit)}>(accel.primitives.data + first, mask, scratch.packets.data + ray);")
     def ray_triangles(accel: WideBvh, first: int, mask: int, scratch: Scratch, ray: int) -> int:
-        """Put the nearest of a row's triangles in the mask that one ray of a packet hits into its column; return its lane, or -1.
-        For any hit return 0, whichever it is, and no u and v."""
+        """Store the nearest hit of a row's triangles in the mask in the ray's column; return its lane, or -1.
+
+        For any hit, which triangle is open: the lane is 0, and u and v are not set."""
 
     return ray_triangles
 
 
 @wp.func_native("wrt::prefetch(accel.nodes.data, accel.primitives.data, reference);")
 def prefetch_next(accel: WideBvh, reference: int) -> None:
-    """Prefetch the first cache lines of the node or the leaf that a reference points to."""
+    """Prefetch the first cache lines of the node or leaf that `reference` points to."""
 
 
 @wp.func_native("return __builtin_ctzll(mask);")

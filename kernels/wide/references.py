@@ -1,20 +1,19 @@
-"""References: what a place for a child in a wide node leads to, in one int32.
+"""References: the child of a wide node, in one int32.
 
-EMPTY; or the index of an inner node, above 0; or a leaf, below 0: where its primitives begin and how many they are. The functions
-for leaves are for kernels; the host calls `leaf_first.func(...)` and so on, with numbers or NumPy arrays of int64.
-"""
+A reference is EMPTY, the index of an inner node (above 0), or a leaf (below 0): its first primitive and their count. The functions for
+leaves are for kernels. The host calls `leaf_first.func(...)` and so on, with ints or NumPy arrays of int64."""
 
 import warp as wp
 
-EMPTY = wp.constant(0)  # a child that does not exist: the root is nobody's child
+EMPTY = wp.constant(0)  # A child that does not exist: no node has the root as a child.
 LEAF_BITS = 6
-MAX_LEAF = 1 << LEAF_BITS  # primitives of a leaf
-MAX_FIRST = 1 << (31 - LEAF_BITS)  # leaves begin below this
+MAX_LEAF = 1 << LEAF_BITS  # Most primitives of a leaf.
+MAX_FIRST = 1 << (31 - LEAF_BITS)  # Leaves begin below this.
 
 
 @wp.func
 def leaf_reference(first: int, count: int) -> int:
-    """count: 1 .. MAX_LEAF; first: 0 .. MAX_FIRST - 1, in whatever unit the nodes' layout counts."""
+    """Return the reference of a leaf of `count` (1 .. MAX_LEAF) primitives; `first` (below MAX_FIRST) counts in the layout's unit."""
     return -1 - (MAX_LEAF * first + count - 1)
 
 

@@ -1,12 +1,11 @@
 """The traversal unit of the wide BVHs: nodes of 4 or 8 children, whose boxes are tested as one row, like the triangles of a leaf.
 
-Wald, Benthin and Boulos 2008, "Getting Rid of Packets"; Afra and Ernst 2008 and 2010 for one ray at a time. A row of triangles
-is only culled: those that the watertight unit would refuse in float32 are left out, and the unit itself decides on the others, so
-that the answers are its own to the last bit. Any other triangle test gets every primitive of a leaf. Children are visited from
-the near to the far: the nearest at once, the others by way of the stack, the farthest deepest; what was popped and begins beyond
-the closest hit is dropped. Any hit asks for no order: there the last child comes first, and the builder puts leaves and large
-boxes last.
-"""
+The method is that of Wald, Benthin and Boulos 2008, "Getting Rid of Packets", and Afra and Ernst 2008 and 2010, for one ray. Rows of
+triangles are only culled of what the watertight unit would refuse in float32. The unit itself tests the rest, so that its answers keep
+their bits. Any other triangle test gets every primitive of a leaf.
+
+Children are visited from near to far. The nearest is next; the others are pushed, the farthest deepest. A popped child that begins beyond
+the closest hit is dropped. Any hit needs no order: the last child is next, and the builder puts leaves and large boxes last."""
 
 from functools import cache
 from typing import Any, NamedTuple
@@ -27,30 +26,32 @@ from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
 
 @cache
 def make_struct(record: Any) -> Any:
-    """nodes: as in kernels.wide.nodes, the root first. primitives: rows of as many primitives as a node has children: first the
-    first number of `record` of all of them, then the second ... Leaves begin with a row of their own, and their references count
-    rows; where nodes are compressed, leaves follow each other without a gap, and references count primitives."""
+    """Return the struct of a wide BVH whose leaves have this record.
+
+    A row has as many primitives as a node has children: the first float of all records, then the second, and so on. A leaf begins with a
+    row of its own, and its reference counts rows. With compressed nodes, leaves follow each other without a gap, and references count
+    primitives."""
 
     @wp.struct
     class WideBvh:
-        nodes: wp.array(dtype=wp.float32)
-        primitives: wp.array(dtype=wp.float32)
+        nodes: wp.array(dtype=wp.float32)  # As in kernels.wide.nodes, the root first.
+        primitives: wp.array(dtype=wp.float32)  # The rows.
         recorder: Recorder
 
     return WideBvh
 
 
 def row_size(record: Any, width: int) -> int:
-    """Numbers of a row of primitives."""
+    """Return the number of floats in one row of primitives."""
     return record.numpy_dtype()["itemsize"] // 4 * width
 
 
 @wp.func
 def lane_ray(probe: Probe, pad: float) -> LaneRay:
-    """Set-up, once a ray. pad: nodes.far_pad."""
+    """Set up a ray, once; `pad` is nodes.far_pad."""
     out = LaneRay()
     out.box = probe.box
-    out.box.t_min = probe.box.t_min + 0.0  # not -0: entries are sorted by their bits
+    out.box.t_min = probe.box.t_min + 0.0  # Not -0: entries are sorted by their bits.
     out.far_inv_dir = pad * probe.box.inv_dir
     out.near_x = wp.where(probe.box.inv_dir[0] < 0.0, HI_X, LO_X)
     out.near_y = wp.where(probe.box.inv_dir[1] < 0.0, HI_Y, LO_Y)
@@ -67,7 +68,7 @@ def lane_ray(probe: Probe, pad: float) -> LaneRay:
 
 @cache
 def make_gather(record: Any, width: int) -> Any:
-    """gather(rows, i): the record that has its first number at rows[i], the next at rows[i + width] and so on."""
+    """Return gather(rows, i): the record whose floats are rows[i], rows[i + width], and so on."""
 
     @wp.func_native(f"""
     float numbers[sizeof(out) / sizeof(float)];
@@ -86,7 +87,7 @@ def make_gather(record: Any, width: int) -> Any:
 
 
 def make_row_test(units: Units, any_hit: bool, accepts: Any, width: int) -> Any:
-    """The unit that tests those primitives of a row that are in the mask; its numbers begin at `first`."""
+    """Return test_row: test the primitives of a row that are in the mask; `first` is the row's first float."""
     intersect = make_intersect(units, accepts)
     gather = make_gather(units.triangle_test.record, width)
     cull = make_cull(width)
@@ -110,7 +111,7 @@ def make_row_test(units: Units, any_hit: bool, accepts: Any, width: int) -> Any:
 
 @cache
 def make_prefetch(record: Any, layout: NodeLayout) -> Any:
-    """prefetch_next(accel, reference): prefetch the first cache lines of the node or the leaf that a reference points to."""
+    """Return prefetch_next(accel, reference): prefetch the first cache lines of the node or leaf that `reference` points to."""
     struct, lines = make_struct(record), 2
 
     @wp.func
@@ -125,7 +126,7 @@ def make_prefetch(record: Any, layout: NodeLayout) -> Any:
 
 
 def make_leaf_test(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout) -> Any:
-    """test_leaf(accel, surfaces, reference, probe, rows, best) -> the best hit; for any hit, the first that is found."""
+    """Return test_leaf(accel, surfaces, reference, probe, rows, best) -> the best hit; for any hit, the first one found."""
     record = units.triangle_test.record
     struct = make_struct(record)
     test_row = make_row_test(units, any_hit, accepts, layout.width)
@@ -153,12 +154,11 @@ def make_leaf_test(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
 
 
 class Counting(NamedTuple):
-    """What a walk counts, where units.counters: node(accel, ray, counts, index), leaf(accel, ray, counts, reference) and
-    pop(counts) -> counts; push and finish as in traverse.counters.make_counters."""
+    """The counters of a walk, if units.counters. push and finish come from traverse.counters.make_counters."""
 
-    node: Any
-    leaf: Any
-    pop: Any
+    node: Any  # (accel, ray, counts, index) -> counts.
+    leaf: Any  # (accel, ray, counts, reference) -> counts.
+    pop: Any  # (counts) -> counts.
     push: Any
     finish: Any
 
@@ -196,7 +196,7 @@ def make_counting(units: Units, layout: NodeLayout) -> Counting:
 
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout) -> Any:
-    """The closest hit, or any (the first that is found), in a tree of such nodes."""
+    """Return traverse(accel, surfaces, ray): the closest hit, or for any hit the first one found."""
     struct = make_struct(units.triangle_test.record)
     children = make_children(layout.width, layout.compressed, units.box)
     probe_of = make_probe(units)
@@ -207,7 +207,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
 
     @wp.func
     def child(accel: struct, at: int) -> int:
-        """The reference at `at`."""
+        """Load the reference at `at`, and prefetch its node or leaf."""
         reference = bits(accel.nodes, at)
         prefetch_next(accel, reference)
         return reference
@@ -217,7 +217,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
         probe = probe_of(ray)
         rows = lane_ray(probe, wp.static(far_pad(units.box)))
         best = no_hit(ray)
-        best.t = wp.where(best.t < LARGEST, best.t, LARGEST)  # a box that is entered at infinity is not entered
+        best.t = wp.where(best.t < LARGEST, best.t, LARGEST)  # A box that begins at infinity is not entered.
         counts = Counts()
         stack = new_stack()
         shared = shared_stack()
@@ -250,7 +250,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
                         else:
                             far = wp.max(near, key)
                             near = wp.min(near, key)
-                            # Not sorted, but the farthest so far is deeper than this one: most nodes have two or three.
+                            # Not fully sorted: only the farthest so far stays deepest. Most nodes push two or three.
                             if size > begin:
                                 under = get(stack, shared, size - 1)
                                 put(stack, shared, size, wp.min(far, under))
@@ -261,7 +261,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
                         counts = count_push(counts, size)
                     reference = reference_of(near)
                     continue
-            # Pop; what begins beyond the closest hit is dropped. Equal stays: a tie may have a lower prim_id there.
+            # Pop, and drop what begins beyond the closest hit. Equal stays: a tie there may have a lower prim_id.
             found = bool(False)
             while size > 0 and not found:
                 size = size - 1
@@ -278,7 +278,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
 
 
 class WideTraversal:
-    """What wrt.accel takes for the traversal's module, for one layout of nodes."""
+    """The traversal of one layout of nodes, as wrt.accel takes it in place of a module."""
 
     def __init__(self, width: int, compressed: bool = False) -> None:
         self.layout = NodeLayout(width, compressed)

@@ -1,11 +1,11 @@
-// Triangles: the watertight test of units/triangle.py in lanes, under the same names. One ray and a row of triangles, or rays of a
+// Triangles: the watertight test of units/triangle.py vectorised, under the same names, for one ray and a row of triangles, or a
 // packet and one triangle.
 #pragma once
 #include "box.h"
 
 namespace wrt {
 
-// A row of N triangles: the first number of all their records, then the second, and so on.
+// A row of N triangles: the first float of all their records, then the second, and so on.
 template <int N> struct Row {
     const float* numbers;
     typedef typename Lanes<N>::Floats Floats;
@@ -14,14 +14,14 @@ template <int N> struct Row {
     WRT_MEMBER Vec3<Floats> corner(int i) const { return {{component(i, 0), component(i, 1), component(i, 2)}}; }
 };
 
-// origin: in the order kx, ky, kz.
+// The set-up of a ray. `origin` is in the order kx, ky, kz.
 template <class Int, class Number> struct TriangleRay {
     Int kx, ky, kz;
     Number shear_x, shear_y;
     Vec3<Number> origin;
 };
 
-// A corner, relative to the origin, as the ray sees it.
+// Return a corner relative to the origin, sheared along the ray.
 template <class Triangles, class Int, class Number>
 WRT_INLINE auto seen(const Triangles& triangles, int corner, const TriangleRay<Int, Number>& ray) {
     auto x = triangles.component(corner, ray.kx) - ray.origin[0];
@@ -40,7 +40,7 @@ template <class T> WRT_INLINE auto outside(const Vec3<T>& areas) {
            & ((areas[0] > zero) | (areas[1] > zero) | (areas[2] > zero));
 }
 
-// The mask of a row's triangles without those that the test refuses in float32.
+// Return the mask of a row's triangles without the ones that the test refuses in float32.
 template <int N, class LaneRay> WRT_INLINE int cull(const float* numbers, const LaneRay& ray) {
     const Row<N> row = {numbers};
     const TriangleRay<int, float> shear = {ray.kx, ray.ky, ray.kz, ray.shear_x, ray.shear_y,
@@ -60,7 +60,7 @@ template <int N> WRT_INLINE Vec3<typename Lanes<N>::Doubles> wide(const Vec3<typ
     return {{wide<N>(v[0]), wide<N>(v[1]), wide<N>(v[2])}};
 }
 
-// In the lanes of `mask`; u and v are areas[1] / area and areas[2] / area.
+// Hits in the lanes of `mask`. u is areas[1] / area, and v is areas[2] / area.
 template <int N> struct Hits {
     typename Lanes<N>::Floats t;
     Vec3<typename Lanes<N>::Doubles> areas;
@@ -68,7 +68,7 @@ template <int N> struct Hits {
     int mask;
 };
 
-// Where the z axis meets triangles of sheared corners, in float64: of the lanes of `mask`, those where it does.
+// Intersect the z axis with triangles of sheared corners, in float64, in the lanes of `mask`.
 template <int N, class Floats>
 WRT_INLINE Hits<N> crossing(const Vec3<Floats>& a, const Vec3<Floats>& b, const Vec3<Floats>& c, Floats shear_z, int mask) {
     typedef typename Lanes<N>::Doubles Doubles;
@@ -91,7 +91,7 @@ template <class T> WRT_INLINE Vec3<T> upper(const Vec3<T>& a, const Vec3<T>& b) 
     return {{b[0] > a[0] ? b[0] : a[0], b[1] > a[1] ? b[1] : a[1], b[2] > a[2] ? b[2] : a[2]}};
 }
 
-// Bounds: the constants of units/box.py and units/triangle.py, under their names.
+// Return the padding of a box. Bounds has the constants of units/box.py and units/triangle.py, under their names.
 template <class Bounds, class T> WRT_INLINE T box_pad(const Vec3<T>& lo, const Vec3<T>& hi) {
     const T e_x = hi[0] - lo[0], e_y = hi[1] - lo[1], e_z = hi[2] - lo[2];
     const T longer = e_x > e_y ? e_x : e_y;
@@ -114,7 +114,7 @@ template <class Floats> WRT_INLINE Floats clamped(Floats t, const Interval<Float
     return inside < interval.enter ? interval.enter : inside;
 }
 
-// Of the lanes of `mask`: where clamping moved t farther than rounding explains, on a ray whose shear may have underflowed.
+// Return the lanes of `mask` where clamping moved t farther than rounding explains, on a ray whose shear may have underflowed.
 template <class Bounds, class Floats>
 WRT_INLINE int underflowed(const BoxRay<Floats>& ray, Floats t, Floats moved, int mask) {
     mask &= mask_of(absolute(moved - t) > Bounds::CLAMP_ROUNDING * absolute(t) + Bounds::CLAMP_STEP);
@@ -130,7 +130,7 @@ WRT_INLINE int underflowed(const BoxRay<Floats>& ray, Floats t, Floats moved, in
     return mask & mask_of((steep < least) | ((absolute(t) < least) & (absolute(moved) < least)));
 }
 
-// Move the t of hits into the intervals of their triangles' own boxes, or of the padded ones; leave out those that miss even that.
+// Clamp the t of hits to the intervals of their triangles' boxes, or of the padded boxes. Drop hits that miss even these.
 template <class Bounds, int N, class Floats>
 WRT_INLINE void within_bounds(const BoxRay<Floats>& ray, Hits<N>& hit, const Vec3<Floats>& lo, const Vec3<Floats>& hi) {
     Interval<Floats> interval = slab_interval(ray, lo, hi);

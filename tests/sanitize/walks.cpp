@@ -57,7 +57,7 @@ public:
         if (state >= COHERENT && together) {
             walk_packet(state - COHERENT);
         } else {
-            int alone = meets(given.nodes.data(), state & (COHERENT - 1), packet.data());
+            int alone = rays_meeting_root(given.nodes.data(), state & (COHERENT - 1), packet.data());
             for (; alone; alone &= alone - 1) walk_alone(lowest(alone));
         }
     }
@@ -80,7 +80,7 @@ private:
             for (mask = 0; size > 0 && mask == 0;) {
                 const unsigned* entry = stack.data() + ENTRY * --size;
                 key = load<unsigned long long>(entry);
-                mask = (int)entry[ENTRY_RAYS] & reaching(__builtin_bit_cast(float, (unsigned)(key >> 32)), packet.data());
+                mask = (int)entry[ENTRY_RAYS] & rays_reaching(__builtin_bit_cast(float, (unsigned)(key >> 32)), packet.data());
             }
             if (mask == 0) return;
             reference = (int)(unsigned)key;

@@ -20,7 +20,7 @@ from wrt.io.mesh_file import load_mesh
 from wrt.kernels.query import HitArrays, RenderRays, make_render_rays_kernel
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.traverse.common import Units
-from wrt.kernels.wide.batch import IN_A_ROW, PACKETS, BatchTraversal
+from wrt.kernels.wide.batch import MAX_FAILED, PACKETS, BatchTraversal
 from wrt.kernels.wide.layout import LANES, STACK_SIZE
 from wrt.kernels.wide.packets import FAILED, PAUSED
 from wrt.kernels.wide.references import EMPTY, leaf_reference
@@ -217,7 +217,7 @@ def test_packets_are_given_up_where_they_fall_apart():
     # And they are given up: rays that are parallel, but far from each other, and not those beside each other.
     n = PACKETS * LANES
     apart = np.random.default_rng(7).uniform(-1.0, 1.0, (n, 2)).astype(np.float32)
-    for xy, failed in ((apart, IN_A_ROW - 1), (0.3 + 0.001 * apart, 0)):
+    for xy, failed in ((apart, MAX_FAILED - 1), (0.3 + 0.001 * apart, 0)):
         o = np.concatenate([xy, np.full((n, 1), 3.0, np.float32)], axis=1)
         scratch = new_scratch(BatchTraversal.stream_sizes)
         rays = rays_on(accel.device, rays_of(o, np.tile([0.1, 0.1, -1.0], (n, 1)), 0.0, np.inf))

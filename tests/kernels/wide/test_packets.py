@@ -14,13 +14,13 @@ from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hi
 from wrt.kernels.wide import packets
 from wrt.kernels.wide.batch import PACKETS, SLOTS
 from wrt.kernels.wide.lanes import LANE_PAD, row_type
-from wrt.kernels.wide.layout import BEAM, COHERENT, ENTRY, ENTRY_RAYS, LANES, PACKET_SIZE, ROWS, SLOT_SIZE, STACK_SIZE, STACK_WORDS, WIDTH
+from wrt.kernels.wide.layout import BEAM, COHERENT, ENTRY, ENTRY_RAYS, FIELDS, LANES, PACKET_SIZE, SLOT_SIZE, STACK_SIZE, STACK_WORDS, WIDTH
 from wrt.kernels.wide.nodes import make_plain
 from wrt.kernels.wide.packets import Scratch, WideBvh, packet_kernel
 from wrt.kernels.wide.references import EMPTY
 from wrt.kernels.wide.traverse import lane_ray
 
-EXCLUDE = LANES * ROWS.index("exclude")
+EXCLUDE = LANES * FIELDS.index("exclude")
 NOTHING = wp.constant(99)
 CHILDREN = np.array([-3, -2, -1, 1, 2, 3, 4, 5], np.int32)  # references of a node: leaves and nodes, none EMPTY
 PRIM_IDS = np.array([3, 1, 4, 0, 5, 9, 2, 6], np.int32)
@@ -107,8 +107,8 @@ def by_packets(rays: RayArrays, count: int, reach: float, empty: int, accel: Wid
     mask = active & wp.static(COHERENT - 1)
     root = WideBvh()
     root.nodes = nodes[i]
-    out.meets[i] = packets.meets(root, scratch, base, mask)
-    out.reaching[i] = packets.reaching(0.5, scratch, base)
+    out.meets[i] = packets.rays_meeting_root(root, scratch, base, mask)
+    out.reaching[i] = packets.rays_reaching(0.5, scratch, base)
     if active >= COHERENT:
         size = children(accel, with_stack(scratch, out.children[i]), base, i, mask, BELOW)
         size_any = children_any(accel, with_stack(scratch, out.children_any[i]), base, i, mask, BELOW)
@@ -261,8 +261,8 @@ class Both:
 
     def lane_rows(self, of, names):
         """(16 n, names) from the packets."""
-        table = of[:, : LANES * len(ROWS)].reshape(self.n, len(ROWS), LANES)
-        return np.stack([table[:, ROWS.index(name)].reshape(-1) for name in names], axis=1)
+        table = of[:, : LANES * len(FIELDS)].reshape(self.n, len(FIELDS), LANES)
+        return np.stack([table[:, FIELDS.index(name)].reshape(-1) for name in names], axis=1)
 
     @property
     def active(self):
@@ -337,7 +337,7 @@ def case(name):
 @pytest.mark.parametrize("name", CASES)
 def test_set_up_is_that_of_the_scalar_units(name):
     both = case(name)
-    names = [row for row in ROWS if row not in ("axes", "u", "v", "prim_id", "near_x", "near_y", "near_z", "exclude")]
+    names = [name for name in FIELDS if name not in ("axes", "u", "v", "prim_id", "near_x", "near_y", "near_z", "exclude")]
     same(both.lane_rows(both.set_up, names), both.scalar.rows.numpy())
     bits = both.lane_rows(both.set_up, ["axes", "near_x", "near_y", "near_z"]).view(np.int32)
     np.testing.assert_array_equal(bits, both.scalar.bits.numpy())
@@ -507,7 +507,7 @@ def test_lanes_beyond_the_last_ray_are_not_active(count):
     part, whole = Both(rays, nodes, corners, count), Both(rays, nodes, corners)
     assert not part.active[:, count:].any()
     np.testing.assert_array_equal(part.active[:, :count], whole.active[:, :count])
-    names = [row for row in ROWS if row not in ("u", "v", "prim_id")]
+    names = [name for name in FIELDS if name not in ("u", "v", "prim_id")]
     there = np.arange(len(rays[0])) % LANES < count
     same(part.lane_rows(part.set_up, names)[there], whole.lane_rows(whole.set_up, names)[there])
 
