@@ -6,7 +6,7 @@ import warp as wp
 
 from wrt.kernels.query import HitArrays, RayArrays, direction_scale, load_ray, store_hit
 from wrt.kernels.structs import Hit, Ray, kernel
-from wrt.kernels.units.triangle import is_crossed, seen, triangle_ray
+from wrt.kernels.units.triangle import is_crossed, to_ray_space, triangle_ray
 
 FEW = wp.constant(8)  # most rays have at most so many hits, and sorting them takes no time
 
@@ -57,7 +57,7 @@ def sort_hits(rows: wp.array(dtype=Hit), first: int, count: int):
 
 
 @wp.func
-def put_in_order(rows: wp.array(dtype=Hit), first: int, count: int, limit: int) -> int:
+def sort_and_trim(rows: wp.array(dtype=Hit), first: int, count: int, limit: int) -> int:
     """Sort a list, and keep its first hits, at most `limit`, each once; return their number. Some structures hold a triangle in several
     leaves."""
     sort_hits(rows, first, count)
@@ -75,42 +75,43 @@ def put_in_order(rows: wp.array(dtype=Hit), first: int, count: int, limit: int) 
 @wp.func
 def list_hit(lists: HitLists, ray: Ray, hit: Hit, best: Hit) -> Hit:
     """Append a hit to the list of its ray. The returned `best` stays a miss, and limits the walk.
-    If the list is too short, count[i] exceeds its length. A list with room for count[i] hits, or for 2 limit, then has room for all."""
+    If the list is too short, count[i] exceeds its length. One for count[i] hits, or for 2 limit, then holds all."""
     if lists.crossings:
         shear = triangle_ray(ray)
         face = lists.faces[hit.prim_id]
-        if not is_crossed(seen(lists.vertices[face[0]] - ray.origin, shear), seen(lists.vertices[face[1]] - ray.origin, shear),
-                          seen(lists.vertices[face[2]] - ray.origin, shear)):
+        if not is_crossed(to_ray_space(lists.vertices[face[0]] - ray.origin, shear),
+                          to_ray_space(lists.vertices[face[1]] - ray.origin, shear),
+                          to_ray_space(lists.vertices[face[2]] - ray.origin, shear)):
             return best
     first = lists.first[ray.slot]
-    room = lists.first[ray.slot + 1] - first
+    capacity = lists.first[ray.slot + 1] - first
     n = lists.count[ray.slot]
-    if n < room:
+    if n < capacity:
         lists.rows[first + n] = hit
     n += 1
-    if room > lists.limit:
-        if n == room or (n == lists.limit and n <= FEW):
-            n = put_in_order(lists.rows, first, n, lists.limit)
+    if capacity > lists.limit:
+        if n == capacity or (n == lists.limit and n <= FEW):
+            n = sort_and_trim(lists.rows, first, n, lists.limit)
             if n == lists.limit:
                 best.t = lists.rows[first + n - 1].t
-    elif n >= 2 * lists.limit:  # a list with room for 2 limit is never too short
+    elif n >= 2 * lists.limit:  # 2 limit is room enough for all
         best.t = float(-wp.inf)
     lists.count[ray.slot] = n
     return best
 
 
 def make_list_hits_kernel(accel_struct: Any, traverse: Any) -> Any:
-    """Make the kernel that fills the list of each ray that has room; traverse: made with Units.lists and accepts=list_hit."""
+    """Make the kernel that fills the list of each ray; traverse: made with Units.lists and accepts=list_hit."""
 
     @kernel
     def list_hits(accel: accel_struct, rays: RayArrays, lists: HitLists, start: int):
         i = start + wp.tid()
         first = lists.first[i]
-        room = lists.first[i + 1] - first
-        if room > 0:
+        capacity = lists.first[i + 1] - first
+        if capacity > 0:
             traverse(accel, lists, load_ray(rays, i))
-            if lists.count[i] <= room:
-                lists.count[i] = put_in_order(lists.rows, first, lists.count[i], lists.limit)
+            if lists.count[i] <= capacity:
+                lists.count[i] = sort_and_trim(lists.rows, first, lists.count[i], lists.limit)
 
     return list_hits
 

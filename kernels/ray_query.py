@@ -58,25 +58,25 @@ def fused() -> bool:
 @wp.func_native("""
     static const char* const why[] = {"a kernel that asks for hits must be made with wrt.kernel: fused multiply-add loses rays",
                                       "accel.world is of another structure or triangle test than the kernel's wrt.ray_query"};
-    static bool told[2];
-    if (!told[reason]) printf("wrt: %s\\n", why[reason]);
-    told[reason] = true;
+    static bool warned[2];
+    if (!warned[reason]) printf("wrt: %s\\n", why[reason]);
+    warned[reason] = true;
 """)
-def say_once(reason: int) -> None: ...
+def warn_once(reason: int) -> None: ...
 
 
 @wp.func
-def traversed(ray: QueryRay, is_other: bool) -> Ray:
+def traversal_ray(ray: QueryRay, is_other: bool) -> Ray:
     """Make the traversal's ray; if the kernel is not compiled as required, or the world is another one, a ray that hits nothing."""
     out = scaled_ray(ray.origin, ray.direction, ray.t_min, ray.t_max)
     if is_other or fused():
-        say_once(wp.where(is_other, 1, 0))
+        warn_once(wp.where(is_other, 1, 0))
         out.direction = wp.vec3(wp.nan, wp.nan, wp.nan)
     return out
 
 
 @wp.func
-def as_asked(hit: Hit, direction: wp.vec3) -> QueryHit:
+def make_query_hit(hit: Hit, direction: wp.vec3) -> QueryHit:
     out = QueryHit()
     out.t = hit.t * direction_scale(direction)
     out.u = hit.u
@@ -101,12 +101,12 @@ def make_ray_query(accel_struct: Any, closest: Any, any_of: Any, resuming: Any, 
     @wp.func
     def closest_hit(world: World, ray: QueryRay) -> QueryHit:
         """Closest hit in the segment; the lowest prim_id at equal t."""
-        return as_asked(closest(world.accel, world.surfaces, traversed(ray, world.kind != kind)), ray.direction)
+        return make_query_hit(closest(world.accel, world.surfaces, traversal_ray(ray, world.kind != kind)), ray.direction)
 
     @wp.func
     def any_hit(world: World, ray: QueryRay) -> bool:
         """Return True if anything is hit in the segment."""
-        hit = any_of(world.accel, world.surfaces, traversed(ray, world.kind != kind))
+        hit = any_of(world.accel, world.surfaces, traversal_ray(ray, world.kind != kind))
         return hit.prim_id >= 0
 
     @wp.func
@@ -114,9 +114,9 @@ def make_ray_query(accel_struct: Any, closest: Any, any_of: Any, resuming: Any, 
         """Next hit of this ray after `hit`, in the order of t and, at equal t, of prim_id. From the closest hit on, calls return each hit
         of the segment once. Each call walks from the root and repeats the tests at the same t: k hits at one t take k^2 tests. With
         storage for them, `wrt.all_hits` takes k log k steps."""
-        going = traversed(ray, world.kind != kind)
+        going = traversal_ray(ray, world.kind != kind)
         going.t_min = hit.scaled_t
         going.slot = hit.prim_id + 1
-        return as_asked(resuming(world.accel, world.surfaces, going), ray.direction)
+        return make_query_hit(resuming(world.accel, world.surfaces, going), ray.direction)
 
     return World, closest_hit, any_hit, next_hit

@@ -23,7 +23,7 @@ def corner(surfaces: Surfaces, vertex: int, point: wp.vec3) -> wp.vec3d:
 
 
 @wp.func
-def turned(turns: Turns, re: wp.float64, im: wp.float64) -> Turns:
+def add_angle(turns: Turns, re: wp.float64, im: wp.float64) -> Turns:
     """Add the angle of the number re + i im."""
     zero = wp.float64(0.0)
     if re == zero and im == zero:  # the point is on an edge
@@ -64,5 +64,5 @@ def wind(surfaces: Surfaces, points: wp.array(dtype=wp.vec3), turns: wp.array(dt
         if size > wp.float64(0.0) and size < wp.float64(wp.inf):
             part = one / size
             re = one + (wp.dot(a, b) * size_c + wp.dot(b, c) * size_a + wp.dot(c, a) * size_b) * part
-            total = turned(total, re, wp.dot(a, wp.cross(b, c)) * part)
+            total = add_angle(total, re, wp.dot(a, wp.cross(b, c)) * part)
     turns[i] = wp.vec3d(total.re, total.im, total.whole)

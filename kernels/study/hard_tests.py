@@ -4,7 +4,7 @@ import warp as wp
 
 from wrt.kernels.query import RayArrays, load_ray
 from wrt.kernels.structs import NO_HIT, Primitive, kernel
-from wrt.kernels.units.triangle import edge_areas, outside, seen, sure_crossing, triangle_ray
+from wrt.kernels.units.triangle import edge_areas, outside, sure_crossing, to_ray_space, triangle_ray
 
 REFUSED, SURE, HARD = 0, 1, 2
 
@@ -17,9 +17,9 @@ def classify(primitives: wp.array(dtype=Primitive), rays: RayArrays, ray: wp.arr
     tested = load_ray(rays, ray[i])
     shear = triangle_ray(tested)
     corners = primitives[primitive[i]]
-    a = seen(corners.v0 - tested.origin, shear)
-    b = seen(corners.v1 - tested.origin, shear)
-    c = seen(corners.v2 - tested.origin, shear)
+    a = to_ray_space(corners.v0 - tested.origin, shear)
+    b = to_ray_space(corners.v1 - tested.origin, shear)
+    c = to_ray_space(corners.v2 - tested.origin, shear)
     answer = int(HARD)
     if outside(edge_areas(a, b, c)):
         answer = int(REFUSED)

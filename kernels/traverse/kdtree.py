@@ -27,8 +27,8 @@ STACK_SIZE = 64
 # KdNode.word is 4 * (left child, or first primitive of a leaf) + LEAF, or + the axis of the plane.
 LEAF = wp.constant(3)
 
-HELD_RELATIVE = wp.constant(1.0 + 2.0**-19)
-HELD_GRAZING = wp.constant(2.0**-20)
+CLAMP_RELATIVE = wp.constant(1.0 + 2.0**-19)
+CLAMP_GRAZING = wp.constant(2.0**-20)
 
 
 @wp.struct
@@ -58,7 +58,7 @@ def make_struct(record: Any) -> Any:
 
 
 @wp.func
-def held_distance(direction: wp.vec3, inv_dir: wp.vec3, reach: float) -> float:
+def clamp_slack(direction: wp.vec3, inv_dir: wp.vec3, reach: float) -> float:
     """Distance by which the clamp to a triangle's box may move a hit along the ray.
     A ray that misses a triangle by rounding, 16 u of its extent, may still hit, with t clamped to the triangle's box (`within_bounds`). A
     ray that leaves the box at a shallow angle is then far from the triangle, outside the leaves around it. The distance is 16 u extent /
@@ -69,22 +69,22 @@ def held_distance(direction: wp.vec3, inv_dir: wp.vec3, reach: float) -> float:
         inverse = wp.abs(inv_dir[axis])
         if inverse < wp.inf:
             steepest = wp.max(steepest, inverse)
-    return reach * wp.min(HELD_GRAZING * steepest, 1.01 / longest)
+    return reach * wp.min(CLAMP_GRAZING * steepest, 1.01 / longest)
 
 
 @wp.func
-def limit_of(t: float, held: float) -> float:
+def limit_of(t: float, slack: float) -> float:
     """Limit behind which no cell begins that holds a hit nearer than t."""
-    return t * HELD_RELATIVE + held
+    return t * CLAMP_RELATIVE + slack
 
 
 def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
-    """Make walk(accel, surfaces, probe, part, held, counts) -> best hit, counts; part: of the ray, (t_enter, t_exit)."""
+    """Make walk(accel, surfaces, probe, part, slack, counts) -> best hit, counts; part: of the ray, (t_enter, t_exit)."""
     visit_leaf = make_leaf(units, any_hit, accepts)
     fetch_node, _, push, _ = make_counters(units, size_of(KdNode))
 
     @wp.func
-    def walk(accel: Any, surfaces: Any, probe: Probe, part: wp.vec2, held: float, counts: Counts):
+    def walk(accel: Any, surfaces: Any, probe: Probe, part: wp.vec2, slack: float, counts: Counts):
         best = no_hit(probe.ray)
         t_enter = part[0]
         t_exit = part[1]
@@ -126,7 +126,7 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
                 if best.prim_id != NO_HIT:
                     break
             # Pop the next cell that does not begin beyond the closest hit. Equal t stays: a tie may have a lower prim_id there.
-            limit = limit_of(best.t, held)
+            limit = limit_of(best.t, slack)
             found = bool(False)
             while size > 0 and not found:
                 size = size - 1
@@ -156,14 +156,14 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
         counts.boxes += 1  # the root's cell is part of the structure
         counts.box_operations += 1
         if ray_aabb(probe.box, accel.lo, accel.hi, best.t) < wp.inf:
-            held = held_distance(ray.direction, probe.box.inv_dir, accel.reach)
-            limit = limit_of(best.t, held)
+            slack = clamp_slack(ray.direction, probe.box.inv_dir, accel.reach)
+            limit = limit_of(best.t, slack)
             span = slab_interval(probe.box, accel.lo, accel.hi)
-            t_enter = earlier(span[0]) - held
-            t_exit = later(span[1]) + held
-            begin = ray.t_min * (2.0 - HELD_RELATIVE) - held
+            t_enter = earlier(span[0]) - slack
+            t_exit = later(span[1]) + slack
+            begin = ray.t_min * (2.0 - CLAMP_RELATIVE) - slack
             part = wp.vec2(wp.where(begin > t_enter, begin, t_enter), wp.where(limit < t_exit, limit, t_exit))
-            best, counts = walk(accel, surfaces, probe, part, held, counts)
+            best, counts = walk(accel, surfaces, probe, part, slack, counts)
         return finish(accel.recorder, ray, counts, best)
 
     return traverse

@@ -72,7 +72,7 @@ def pair_quotient(x: wp.vec2, y: wp.vec2, inverse: float) -> wp.vec2:
 
 
 @wp.func
-def rounds_to_one(x: wp.vec2, error: float) -> bool:
+def rounding_is_certain(x: wp.vec2, error: float) -> bool:
     """Test that every number within `error` of x rounds to the same float32, x[0]; False for NaN.
     Ziv 1991, "Fast Evaluation of Elementary Mathematical Functions with Correctly Rounded Last Bit". `error` must exceed u^2 |x|."""
     return x[0] + (x[1] - error) == x[0] and x[0] + (x[1] + error) == x[0]

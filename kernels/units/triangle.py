@@ -17,7 +17,7 @@ import warp as wp
 
 from wrt.kernels.structs import NO_HIT, Hit, PlanePrimitive, Primitive, Ray, noinline, on_cuda
 from wrt.kernels.units.box import FAR_PAD, BoxRay, box_pad, padded_hi, padded_lo, slab_interval
-from wrt.kernels.units.float_float import difference_of_products, pair_quotient, pair_sum, pair_times, rounds_to_one
+from wrt.kernels.units.float_float import difference_of_products, pair_quotient, pair_sum, pair_times, rounding_is_certain
 
 # Rounding alone moves t by so much when it is clamped to its box: seven errors (wrt.lab.oracle.bounds), and one step of a denormal.
 CLAMP_ROUNDING = wp.constant(7.0 * 2.0**-24)
@@ -75,7 +75,7 @@ def sheared(v: wp.vec3, shear_x: float, shear_y: float) -> wp.vec3:
 
 
 @wp.func
-def seen(v: wp.vec3, shear: TriangleRay) -> wp.vec3:
+def to_ray_space(v: wp.vec3, shear: TriangleRay) -> wp.vec3:
     """Bring a corner, relative to the ray's origin, into the ray's space: axes reordered, then sheared."""
     turned = wp.vec3(component(v, shear.kx), component(v, shear.ky), component(v, shear.kz))
     return sheared(turned, shear.shear_x, shear.shear_y)
@@ -162,8 +162,8 @@ def sure_crossing(a: wp.vec3, b: wp.vec3, c: wp.vec3, shear_z: float) -> Hit:
 
     Let w_i be the exact areas, A their sum, Q the sum of the sizes of their products, and Z the largest |z|. An area is off by at most 3.1
     u^2 Q, A by 9.2 u^2 Q. The sum of w_i z_i is off by 12.2 u^2 Q Z, each quotient by 30 u^2 of itself. That is 43 u^2 Q / A for u and v,
-    and 56 u^2 (Q / A) Z |shear_z| for t. The error of float64 is below one such u^2, and `rounds_to_one` needs one. If all numbers within
-    64 u^2 round alike, float64 has rounded to the same bits. The ranges of Q and Z exclude under- and overflow: products of a low part may
+    and 56 u^2 (Q / A) Z |shear_z| for t. The error of float64 is below one such u^2, and `rounding_is_certain` needs one. If all numbers
+    within 64 u^2 round alike, float64 has rounded to the same bits. The ranges of Q and Z exclude under- and overflow: products of a low part may
     lose 2^-150, but u^2 Q and u^2 Q Z are at least 2^-138.
     """
     hit = no_triangle()
@@ -185,7 +185,8 @@ def sure_crossing(a: wp.vec3, b: wp.vec3, c: wp.vec3, shear_z: float) -> Hit:
     t = pair_times(pair_quotient(z, area, inverse), shear_z)
     u = pair_quotient(w_1, area, inverse)
     v = pair_quotient(w_2, area, inverse)
-    if rounds_to_one(t, error * far * wp.abs(shear_z)) and rounds_to_one(u, error) and rounds_to_one(v, error):
+    if (rounding_is_certain(t, error * far * wp.abs(shear_z)) and rounding_is_certain(u, error)
+            and rounding_is_certain(v, error)):
         hit.t = t[0]
         hit.u = u[0]
         hit.v = v[0]
@@ -207,9 +208,9 @@ def watertight(origin: wp.vec3, shear: TriangleRay, v0: wp.vec3, v1: wp.vec3, v2
     Domain: coordinates differ by less than 2^127, and the direction's longest component is between 2^-64 and 2^64 (`kernels.query` scales
     others). wrt.lab.oracle.bounds has the error bounds.
     """
-    a = seen(v0 - origin, shear)
-    b = seen(v1 - origin, shear)
-    c = seen(v2 - origin, shear)
+    a = to_ray_space(v0 - origin, shear)
+    b = to_ray_space(v1 - origin, shear)
+    c = to_ray_space(v2 - origin, shear)
     if outside(edge_areas(a, b, c)):
         return no_triangle()
     if on_cuda():

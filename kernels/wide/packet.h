@@ -69,7 +69,7 @@ WRT_INLINE Hits<N> ray_triangle(const Triangles& triangles, const Ray& ray, int 
     auto s_x = ray[SHEAR_X], s_y = ray[SHEAR_Y];
     const TriangleRay<decltype(axes), decltype(s_x)> shear = {
         axes & AXIS_MASK, axes >> AXIS_BITS & AXIS_MASK, axes >> 2 * AXIS_BITS, s_x, s_y, vector<decltype(s_x)>(ray, TURNED_X)};
-    const Vec3<Floats> a = seen(triangles, 0, shear), b = seen(triangles, 1, shear), c = seen(triangles, 2, shear);
+    const Vec3<Floats> a = to_ray_space(triangles, 0, shear), b = to_ray_space(triangles, 1, shear), c = to_ray_space(triangles, 2, shear);
     const Ints id = triangles.prim_id(), exclude = all<Ints>(ray.bits(EXCLUDE));
     Hits<N> hit;
     hit.mask = mask & mask_of(~outside(edge_areas(a, b, c)) & (id + 1 != exclude));

@@ -23,7 +23,7 @@ template <class Int, class Number> struct TriangleRay {
 
 // Return a corner relative to the origin, sheared along the ray.
 template <class Triangles, class Int, class Number>
-WRT_INLINE auto seen(const Triangles& triangles, int corner, const TriangleRay<Int, Number>& ray) {
+WRT_INLINE auto to_ray_space(const Triangles& triangles, int corner, const TriangleRay<Int, Number>& ray) {
     auto x = triangles.component(corner, ray.kx) - ray.origin[0];
     auto y = triangles.component(corner, ray.ky) - ray.origin[1];
     auto z = triangles.component(corner, ray.kz) - ray.origin[2];
@@ -45,7 +45,7 @@ template <int N, class LaneRay> WRT_INLINE int cull(const float* numbers, const 
     const Row<N> row = {numbers};
     const TriangleRay<int, float> shear = {ray.kx, ray.ky, ray.kz, ray.shear_x, ray.shear_y,
                                            {{ray.origin[0], ray.origin[1], ray.origin[2]}}};
-    return mask_of(~outside(edge_areas(seen(row, 0, shear), seen(row, 1, shear), seen(row, 2, shear))));
+    return mask_of(~outside(edge_areas(to_ray_space(row, 0, shear), to_ray_space(row, 1, shear), to_ray_space(row, 2, shear))));
 }
 
 template <int N> WRT_INLINE typename Lanes<N>::Doubles wide(typename Lanes<N>::Floats x) {

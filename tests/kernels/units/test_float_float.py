@@ -15,7 +15,7 @@ from wrt.kernels.units.float_float import (
     pair_quotient,
     pair_sum,
     pair_times,
-    rounds_to_one,
+    rounding_is_certain,
 )
 
 U_SQUARED = 2.0**-48
@@ -39,7 +39,7 @@ def all_of_them(x: wp.array(dtype=wp.vec2), y: wp.array(dtype=wp.vec2), total: w
 @kernel
 def round_kernel(x: wp.array(dtype=wp.vec2), error: wp.array(dtype=wp.float32), out: wp.array(dtype=wp.int32)):
     i = wp.tid()
-    out[i] = wp.where(rounds_to_one(x[i], error[i]), 1, 0)
+    out[i] = wp.where(rounding_is_certain(x[i], error[i]), 1, 0)
 
 
 def pairs(rng, n):

@@ -15,7 +15,7 @@ from wrt.accel.scenes.build import build
 from wrt.accel.triangle_data import LAYOUTS
 from wrt.kernels.structs import NO_HIT, Hit, Primitive, Ray, kernel
 from wrt.kernels.units.box import box_ray
-from wrt.kernels.units.triangle import RAY_TRIANGLE, crossing, ray_triangle, seen, sure_crossing, triangle_ray, watertight
+from wrt.kernels.units.triangle import RAY_TRIANGLE, crossing, ray_triangle, sure_crossing, to_ray_space, triangle_ray, watertight
 
 # pbrt-v4, shapes_test, Triangle.BadCases: three collinear points and a ray that must miss them (published numbers).
 BAD_TRIANGLE = [[-1113.45459, -79.049614, -56.2431908], [-1113.45459, -87.0922699, -56.2431908],
@@ -428,9 +428,9 @@ def crossings_kernel(
     ray = Ray()
     ray.direction = direction[i]
     shear = triangle_ray(ray)
-    a = seen(v0[i] - origin[i], shear)
-    b = seen(v1[i] - origin[i], shear)
-    c = seen(v2[i] - origin[i], shear)
+    a = to_ray_space(v0[i] - origin[i], shear)
+    b = to_ray_space(v1[i] - origin[i], shear)
+    c = to_ray_space(v2[i] - origin[i], shear)
     sure[i] = sure_crossing(a, b, c, shear.shear_z)
     exact[i] = crossing(a, b, c, shear.shear_z)
 
