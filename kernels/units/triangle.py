@@ -163,8 +163,8 @@ def sure_crossing(a: wp.vec3, b: wp.vec3, c: wp.vec3, shear_z: float) -> Hit:
     Let w_i be the exact areas, A their sum, Q the sum of the sizes of their products, and Z the largest |z|. An area is off by at most 3.1
     u^2 Q, A by 9.2 u^2 Q. The sum of w_i z_i is off by 12.2 u^2 Q Z, each quotient by 30 u^2 of itself. That is 43 u^2 Q / A for u and v,
     and 56 u^2 (Q / A) Z |shear_z| for t. The error of float64 is below one such u^2, and `rounding_is_certain` needs one. If all numbers
-    within 64 u^2 round alike, float64 has rounded to the same bits. The ranges of Q and Z exclude under- and overflow: products of a low part may
-    lose 2^-150, but u^2 Q and u^2 Q Z are at least 2^-138.
+    within 64 u^2 round alike, float64 has rounded to the same bits. The ranges of Q and Z exclude under- and overflow: products of a low
+    part may lose 2^-150, but u^2 Q and u^2 Q Z are at least 2^-138.
     """
     hit = no_triangle()
     size = ((wp.abs(c[0] * b[1]) + wp.abs(c[1] * b[0])) + (wp.abs(a[0] * c[1]) + wp.abs(a[1] * c[0]))
