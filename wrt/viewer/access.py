@@ -1,8 +1,7 @@
-"""Who may reach the viewer: the token, and the values of Host and Origin, that a request must carry.
+"""Access to the viewer: every request must carry the token and this viewer's values of Host and Origin.
 
-The token stands in the address that is printed, and then in the path of the page (`/TOKEN/`), from which viser's page makes the
-address of its WebSocket. It is no cookie: a browser sends those to every port of a host, so that a server of another user of the
-machine would get it.
+The token is part of the printed address and then of the page's path (`/TOKEN/`), from which viser's page makes the address of its
+WebSocket. It is no cookie: a browser sends cookies to every port of a host, also to a server of another user of the machine.
 """
 
 from __future__ import annotations
@@ -13,18 +12,17 @@ import secrets
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from ipaddress import ip_address
-from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
 from wrt.core.errors import InputError
 
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 ORIGIN = re.compile(r"(https?)://([a-z0-9._-]+|\[[0-9a-f:.]+\])(?::([1-9][0-9]{0,4}))?/?")
-PORTS = {"http": 80, "https": 443}  # which a browser leaves out of an origin
+PORTS = {"http": 80, "https": 443}  # left out of an origin by browsers
 
 
 class Refused(Exception):
-    """A request that is not answered; `about` names its kind, the message is for the one who started the viewer."""
+    """A request that is not answered. `about` is its kind; the message is for the user who started the viewer."""
 
     def __init__(self, about: str, message: str) -> None:
         super().__init__(message)
@@ -33,16 +31,16 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class Access:
-    """What a request must carry. origins: such as "http://127.0.0.1:8080"; the values of Host that go with them are taken. port:
-    where the server listens."""
+    """The token and the addresses that requests must carry."""
 
-    origins: frozenset[str]
-    port: int
+    origins: frozenset[str]  # such as "http://127.0.0.1:8080"; Host must be that of one of them
+    port: int  # of the server
     token: str = field(default_factory=lambda: secrets.token_urlsafe(32), repr=False)
 
     def check(self, hosts: Sequence[str], origins: Sequence[str], address: str) -> None:
-        """Raise Refused unless the values of the headers Host and Origin are this viewer's. address: the local one that the
-        connection came to: as a number, it cannot be a name that somebody pointed here."""
+        """Raise Refused unless the values of the headers Host and Origin are this viewer's.
+
+        address: the connection's local IP address. It is allowed too, since no attacker can point a name at a number."""
         own = self.origins | {origin_of("http", as_host(address), self.port)}
         if len(hosts) != 1 or hosts[0] not in {origin.partition("//")[2] for origin in own}:
             raise Refused("host", f"a request for {shown(hosts)}, which is not this viewer; --allow-origin would let it in")
@@ -50,8 +48,9 @@ class Access:
             raise Refused("origin", f"a request by a page of {shown(origins)}; --allow-origin would let it in")
 
     def inside(self, target: str) -> tuple[str, str]:
-        """Where a request's target leads: a path without the token; and the address, relative to it, where it has to ask again,
-        or "". Raises Refused unless it carries the token, as the first part of its path or as `?token=`."""
+        """Return the path of a request's target without the token, and the relative address to redirect to, or "".
+
+        Raises Refused unless the target carries the token as the first part of its path or as `?token=`."""
         path, _, query = target.partition("?")
         first, slash, rest = path[1:].partition("/")
         if path.startswith("/") and self._is_token(first):
@@ -64,7 +63,7 @@ class Access:
         raise Refused("token", "a request without the token of the printed address")
 
     def _page(self, query: str) -> str:
-        """Relative to the root, which a proxy may have put elsewhere."""
+        """Return the page's address relative to the root, which a proxy may have moved."""
         return f"{self.token}/" + (f"?{query}" if query else "")
 
     def _is_token(self, text: str) -> bool:
@@ -73,13 +72,11 @@ class Access:
 
 @dataclass(frozen=True)
 class Place:
-    """The address that the viewer listens on. host: 127.0.0.1 is for this machine only, 0.0.0.0 for all that reach it; port: 0 is
-    any free one; allow_origins: further addresses under which browsers find it, such as "https://example.org" of a proxy. Raises
-    InputError for an origin that is none."""
+    """The address that the viewer listens on. Raises InputError for an invalid origin."""
 
-    host: str = "127.0.0.1"
-    port: int = 8080
-    allow_origins: Iterable[str] = ()
+    host: str = "127.0.0.1"  # this machine only; 0.0.0.0: every machine that reaches this one
+    port: int = 8080  # 0: any free one
+    allow_origins: Iterable[str] = ()  # further addresses of the viewer in browsers, such as a proxy's "https://example.org"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "allow_origins", tuple(as_origin(text) for text in self.allow_origins))
@@ -89,7 +86,7 @@ HERE = Place()
 
 
 def access_for(place: Place, address: str, port: int) -> tuple[Access, str]:
-    """The access to a server, and the address to print. address, port: where the server listens."""
+    """Return the Access of a server that listens at `address` and `port`, and the address to print."""
     where = ip_address(address.partition("%")[0])
     names = {as_host(address), as_host(place.host.lower())}
     home = as_host(address)
@@ -103,17 +100,17 @@ def access_for(place: Place, address: str, port: int) -> tuple[Access, str]:
 
 
 def as_host(address: str) -> str:
-    """As it stands in a URL."""
+    """Return an IP address or name in the form of a URL."""
     return f"[{address}]" if ":" in address else address
 
 
 def origin_of(scheme: str, host: str, port: int) -> str:
-    """As a browser writes it."""
+    """Return an origin in the form of browsers."""
     return f"{scheme}://{host}" + ("" if port == PORTS[scheme] else f":{port}")
 
 
 def as_origin(text: str) -> str:
-    """The origin that a user wrote, as a browser writes it. Raises InputError where it is none."""
+    """Return a user's origin in the form of browsers. Raises InputError if it is invalid."""
     match = ORIGIN.fullmatch(text.lower())
     port = 0 if match is None else int(match[3] or PORTS[match[1]])
     if match is None or port > 65535:
@@ -121,8 +118,8 @@ def as_origin(text: str) -> str:
     return origin_of(match[1], match[2], port)
 
 
-def shown(values: Any) -> str:
-    """What a stranger sent, for a line of a message."""
+def shown(values: object) -> str:
+    """Return what a client sent in a short form for a message."""
     text = ", ".join(map(repr, values)) if isinstance(values, list) else repr(values)
     text = text or "no name"
     return text if len(text) <= 60 else text[:57] + "..."

@@ -1,13 +1,13 @@
-"""Cameras between a scene and the browser's viewport, and as a table of a scene file.
+"""Cameras converted between a scene and the browser's viewport, and written as a table of a scene file.
 
-viser's cameras look along their +z with +y down (OpenCV's convention); ours look along -z with +y up. Its world is ours divided by
-`unit`, since its controls are made for things of about its unit's size.
+A camera of viser looks along +z with +y down (OpenCV's convention), one of wrt along -z with +y up. The viewport's space is the scene
+divided by `unit`, because viser's controls suit a scene of about size 1.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,19 +16,23 @@ from wrt.scene.cameras import Camera, CameraKind
 from wrt.scene.defaults import bounding_sphere
 from wrt.scene.model import Scene
 
-PARALLEL = 0.999  # cosine from which on +y is no up any more
-NO_FOCUS = Camera().focus_distance  # what a camera has where nobody set one
-LEVEL = 1e-6  # how far a camera's x axis may be from level to count as upright
+if TYPE_CHECKING:
+    import viser
+
+PARALLEL = 0.999  # Cosine between view direction and +y above which +y is no up direction.
+NO_FOCUS = Camera().focus_distance  # Of a camera without a focus of its own.
+LEVEL = 1e-6  # Largest |y| of the x axis of an upright camera
 
 
 def unit_of(scene: Scene, camera: CameraKind) -> float:
-    """How long one unit of the viewport's world is: the distance from the camera to what it orbits."""
+    """Return the length of the viewport's unit: the distance from the camera to the point that it orbits."""
     return float(np.linalg.norm(orbited_point(scene, camera) - camera.camera_to_world[:3, 3]))
 
 
 def orbited_point(scene: Scene, camera: CameraKind) -> np.ndarray:
-    """(3,): what is in focus, which is what the camera looks at; where nobody set a focus, the point of its axis that is nearest
-    to the middle of the scene, if it looks that way."""
+    """Return the point in focus (3,), or without a focus the point on the axis that is nearest to the middle of the scene.
+
+    If that middle is behind the camera, it is the point at the default focus distance."""
     origin, forward = camera.camera_to_world[:3, 3], -camera.camera_to_world[:3, 2]
     distance = _focus(camera)
     if distance == NO_FOCUS and (scene.objects or scene.spheres):
@@ -39,17 +43,17 @@ def orbited_point(scene: Scene, camera: CameraKind) -> np.ndarray:
 
 
 def up_of(camera: CameraKind) -> np.ndarray:
-    """(3,) What the viewport turns about: +y for a camera that stands upright, else the camera's own up."""
+    """Return the axis (3,) that the viewport turns about: +y for an upright camera, else the camera's own up."""
     right, up, back = camera.camera_to_world[:3, :3].T
     upright = abs(right[1]) < LEVEL and up[1] > 0.0 and abs(back[1]) < PARALLEL
     return np.array([0.0, 1.0, 0.0]) if upright else up
 
 
-def from_viewport(camera: CameraKind, viewport: Any, unit: float) -> CameraKind:
-    """The camera with the pose and, if it is a perspective one, the angle of view of viser's CameraHandle (wxyz, position, fov)."""
+def from_viewport(camera: CameraKind, viewport: viser.CameraHandle, unit: float) -> CameraKind:
+    """Return the camera with the viewport's pose and, for a perspective camera, its angle of view."""
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_quat(np.roll(viewport.wxyz, -1)).as_matrix() * (1.0, -1.0, -1.0)
-    with np.errstate(over="ignore"):  # a camera refuses what is not finite
+    with np.errstate(over="ignore"):  # a camera refuses infinite values
         pose[:3, 3] = np.asarray(viewport.position, np.float64) * unit
     if isinstance(camera, Camera):
         camera = replace(camera, fov_y=float(viewport.fov))
@@ -61,14 +65,13 @@ def _focus(camera: CameraKind) -> float:
 
 
 def camera_toml(camera: CameraKind, name: str = "view") -> str:
-    """The camera as a table of a TOML scene file; reading it gives the same camera up to rounding of float64."""
+    """Return the camera as a table of a TOML scene file, exact up to rounding of float64."""
     pose = camera.camera_to_world
     origin, up = pose[:3, 3], pose[:3, 1]
     reach = max(_focus(camera), 1e-3 * float(np.abs(origin).max()))  # a nearer target would lose digits
-    values = {"position": origin, "target": origin - reach * pose[:3, 2], "up": up,
-              **camera.as_in_files()}
-    return "\n".join([f"[cameras.{name}]", f'type = "{camera.kind}"',
-                      *(f"{key} = {_number(value)}" for key, value in values.items())]) + "\n"
+    values = {"position": origin, "target": origin - reach * pose[:3, 2], "up": up, **camera.as_in_files()}
+    lines = [f"[cameras.{name}]", f'type = "{camera.kind}"', *(f"{key} = {_number(value)}" for key, value in values.items())]
+    return "\n".join(lines) + "\n"
 
 
 def _number(value: Any) -> str:

@@ -1,36 +1,36 @@
-"""What a browser may say to the viewer: a move of the camera, a click into the picture, a value of a control.
-
-All else is dropped.
-"""
+"""Messages that a browser may send to the viewer: a camera, a click into the picture, a control's value. All others are dropped."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard
 
 from wrt.viewer.access import Refused, shown
 
+if TYPE_CHECKING:
+    import viser
+
+    Control: TypeAlias = viser.GuiInputHandle[Any]
+
 LARGEST_VIEWPORT = 16384  # pixels a side
-FARTHEST = 1e9  # coordinate, in units of the viewport
+FARTHEST = 1e9  # absolute value of a coordinate, in units of the viewport
 NARROWEST, WIDEST = 1e-5, math.pi - 1e-3  # angle of view, radians
 CAMERA = {"wxyz": 4, "position": 3, "look_at": 3, "up_direction": 3}  # lengths of its vectors
 LENS = ("fov", "near", "far")
 PIXELS = ("image_width", "image_height")
 
 
-def check_message(message: Any, control_of: Callable[[str], Any]) -> None:
-    """Raise Refused unless a decoded message is one that the viewer can follow.
-
-    control_of: viser's handle of the control with a uuid, or None.
-    """
-    kind = message.get("type") if isinstance(message, dict) else None
+def check_message(message: object, control_of: Callable[[str], Control | None]) -> None:
+    """Raise Refused unless a decoded message is allowed. control_of: returns viser's handle of the control with a uuid, or None."""
+    table: dict[str, Any] = message if isinstance(message, dict) else {}
+    kind = table.get("type")
     if kind == "ViewerCameraMessage":
-        _check_camera(message)
+        _check_camera(table)
     elif kind == "ScenePointerMessage":
-        _check_click(message)
+        _check_click(table)
     elif kind == "GuiUpdateMessage":
-        _check_update(message, control_of)
+        _check_update(table, control_of)
     elif kind == "ShareUrlRequest":
         raise Refused("share", "a request to share the viewer on the internet")
     else:
@@ -63,7 +63,7 @@ def _check_click(message: dict[str, Any]) -> None:
         raise Refused("click", "a click that is none")
 
 
-def _check_update(message: dict[str, Any], control_of: Callable[[str], Any]) -> None:
+def _check_update(message: dict[str, Any], control_of: Callable[[str], Control | None]) -> None:
     updates = message.get("updates")
     if message.keys() != {"type", "uuid", "updates"} or not isinstance(message["uuid"], str) or not isinstance(updates, dict):
         raise Refused("control", "a change of a control that is none")
@@ -76,25 +76,25 @@ def _check_update(message: dict[str, Any], control_of: Callable[[str], Any]) -> 
         raise Refused(f"control {control.label}", f"{control.label}: it cannot have the value {shown(updates['value'])}")
 
 
-def can_have(control: Any, value: Any) -> bool:
-    """Whether a browser may set a control to the value."""
+def can_have(control: Control, value: object) -> bool:
+    """Return whether a browser may set a control to the value."""
     import viser
 
     if control.disabled or not control.visible:
         return False
     if isinstance(control, viser.GuiSliderHandle | viser.GuiNumberHandle):
         low, high = (sign * math.inf if end is None else end for end, sign in ((control.min, -1.0), (control.max, 1.0)))
-        # The page rounds to seven decimals, and so may the ends be rounded.
+        # The page rounds to seven decimals, also at the ends.
         return (_is_number(value, low - 1e-6 * abs(low), high + 1e-6 * abs(high))
-                and (value == int(value) or not isinstance(control.value, int)))
+                and (not isinstance(control.value, int) or value == int(value)))
     if isinstance(control, viser.GuiDropdownHandle):
         return isinstance(value, str) and value in control.options
     return isinstance(value, bool) if isinstance(control, viser.GuiCheckboxHandle) else value is True  # a button's click
 
 
-def _is_number(value: Any, low: float, high: float) -> bool:
+def _is_number(value: object, low: float, high: float) -> TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and low <= value <= high
 
 
-def _is_vector(value: Any, length: int, low: float = -FARTHEST, high: float = FARTHEST) -> bool:
+def _is_vector(value: object, length: int, low: float = -FARTHEST, high: float = FARTHEST) -> bool:
     return isinstance(value, list) and len(value) == length and all(_is_number(each, low, high) for each in value)

@@ -1,4 +1,4 @@
-"""Pictures in a notebook: a running render in place, and several side by side."""
+"""Pictures in a notebook: a running render, and several pictures side by side."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import base64
 import html
 import time
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,15 +16,31 @@ from wrt.picture.film import Film
 from wrt.renderer.options import Progress
 from wrt.renderer.progress import COMPILING, describe
 
-SHARE = 0.1  # of the time, at most, that showing takes from rendering
+if TYPE_CHECKING:
+    from IPython.display import DisplayHandle
+    from PIL import Image
+
+SHARE = 0.1  # largest share of the time that showing takes
 
 
 class LiveView:
-    """A callback for `wrt.render(scene, progress=wrt.LiveView())`: shows the picture so far and how far it is in the output of
-    the cell, and the finished picture in the end. Interrupting the kernel ends the render, which returns what it has.
+    """A callback that shows a render's picture and progress in the output of a notebook's cell.
 
-    every: seconds between two pictures, and more where showing one takes long (SHARE). Raises InputError where there is no
-    IPython.
+    Interrupting the kernel ends the render, which returns the picture so far.
+
+    Parameters
+    ----------
+    every
+        Seconds between two pictures; more if showing one takes over a tenth of the time.
+
+    Raises
+    ------
+    InputError
+        If IPython is not installed.
+
+    Examples
+    --------
+    >>> film = wrt.render(scene, progress=wrt.LiveView())
     """
 
     def __init__(self, every: float = 0.5) -> None:
@@ -35,7 +51,7 @@ class LiveView:
         self._html, self._display = HTML, display
         self.every = every
         self._due = 0.0
-        self._handle: Any = None
+        self._handle: DisplayHandle | None = None
 
     def __call__(self, progress: Progress) -> None:
         begin = time.monotonic()
@@ -61,13 +77,30 @@ class LiveView:
             self._handle.update(self._html(page))
 
 
-TITLE, GAP = 22, 8  # pixels: above a picture, and between two
+TITLE, GAP = 22, 8  # pixels above a picture, and between two
 
 
-def side_by_side(pictures: Mapping[str, Film | np.ndarray], columns: int = 2, scale: int = 1) -> Any:
-    """Films or display codes, (H, W, 3) uint8, in rows under their names ("" is none): a PIL image, which a notebook shows.
+def side_by_side(pictures: Mapping[str, Film | np.ndarray], columns: int = 2, scale: int = 1) -> Image.Image:
+    """Return an image of several pictures in rows, each under its name.
 
-    No pixel is mixed with another: scale, a whole number, repeats each. Raises InputError for no pictures, or wrong arrays.
+    Parameters
+    ----------
+    pictures
+        Films or display codes (H, W, 3) uint8, by name ("" is none).
+    columns
+        Pictures in a row.
+    scale
+        Factor by which each pixel is repeated.
+
+    Returns
+    -------
+    PIL.Image.Image
+        An RGB image, which a notebook shows.
+
+    Raises
+    ------
+    InputError
+        For no pictures, and for an array of another shape or type.
     """
     with needed_by("a notebook's picture"):
         from PIL import Image, ImageDraw

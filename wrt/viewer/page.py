@@ -1,6 +1,6 @@
-"""The viewer in a browser: viser's orbit controls and panel before a wrt.viewer.refine.Viewer, whose pictures fill the viewport.
+"""The viewer in a browser: viser's orbit controls and panel, and the pictures of a wrt.viewer.refine.Viewer as the background.
 
-Several browsers share the panel; the picture follows the camera that moved last, in the browser where it moved.
+Several browsers share the panel. The picture follows the camera that moved last and appears in its browser.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -30,22 +30,27 @@ from wrt.viewer.refine import Viewer
 from wrt.viewer.renderers import CounterOf, Shown
 from wrt.viewer.server import Door, import_viser, listen, to_stderr
 
-MOST_PIXELS = 1 << 21  # of a picture; a larger viewport gets a coarser one
+if TYPE_CHECKING:
+    import viser
+
+Event = TypeVar("Event")
+
+MOST_PIXELS = 1 << 21  # of a picture; a larger viewport gets a coarser picture
 RESOLUTIONS = {"full": 1, "1/2": 2, "1/4": 4}
 PICTURE = "picture"
-QUALITY = {True: 92, False: 80}  # of JPEG: at full resolution, and coarse
+QUALITY = {True: 92, False: 80}  # of JPEG at full resolution, and of a coarse picture
 LEGEND_SIZE = (12, 256)
 FARTHEST_FOCUS = 1e9  # in units of the viewport
 
 
 def full_size(size: tuple[int, int], before: tuple[int, int]) -> tuple[int, int]:
-    """Of a viewport whose canvas has that size: where a browser draws slowly, viser gives it fewer pixels, of the same shape."""
+    """Return the size of the viewport of a canvas, which viser gives fewer pixels of the same shape if a browser draws slowly."""
     smaller = size[0] <= before[0] and abs(size[0] * before[1] - size[1] * before[0]) <= max(before)
     return before if smaller else size
 
 
 def status(shown: Shown, viewer: Viewer, full: tuple[int, int], browsers: int) -> str:
-    """What the panel says of a picture, as Markdown. full: the size of the viewport in pixels; browsers: how many look."""
+    """Return the panel's text about a picture, as Markdown. full: the viewport's size in pixels; browsers: their number."""
     height, width = shown.codes.shape[:2]
     rays = f"{shown.speed / 1e6:.2f} Mray/s, {shown.rays_per_sample:.1f} rays a sample"
     if shown.view.cost:
@@ -59,10 +64,10 @@ def status(shown: Shown, viewer: Viewer, full: tuple[int, int], browsers: int) -
 
 
 class Page:
-    """A server with the panel and one Viewer. Raises InputError where it cannot listen at the place.
+    """A server with the panel and one Viewer, until `close`. `url` is its address with the token.
 
-    `url` is where it is found, with the token that a browser needs; spp, counter_of: as for Viewer; warn: called with requests and
-    messages that are refused, once of each kind. `close` ends it.
+    spp, counter_of: see Viewer. warn: called once for each kind of refused request or message. Raises InputError if it cannot listen
+    at the place.
     """
 
     def __init__(self, scene: Scene, options: Options, place: Place = HERE, spp: int = 1024, *,
@@ -97,7 +102,7 @@ class Page:
             self.failure = error
 
     def wait(self) -> None:
-        """Until `close`, or an error of the renderer, which is raised."""
+        """Wait until `close`, or raise the renderer's error."""
         while self.thread.is_alive():
             self.thread.join(0.5)
         if self.failure is not None:
@@ -109,10 +114,10 @@ class Page:
 
     # --- the viewport -------------------------------------------------------------------------------------------------
 
-    async def _connected(self, client: Any) -> None:
+    async def _connected(self, client: viser.ClientHandle) -> None:
         client.camera.on_update(self._moved)
 
-    async def _gone(self, client: Any) -> None:
+    async def _gone(self, client: viser.ClientHandle) -> None:
         if client.client_id != self.watching:
             return
         others = self.server.get_clients()
@@ -121,8 +126,8 @@ class Page:
         else:
             self.viewer.pause()
 
-    async def _moved(self, viewport: Any) -> None:
-        """Not in a thread of its own: cameras must come in order."""
+    async def _moved(self, viewport: viser.CameraHandle) -> None:
+        """Follow a browser's camera. A coroutine and no thread, because cameras must come in order."""
         width, height = viewport.image_width, viewport.image_height
         if width < 1 or height < 1:
             return
@@ -133,7 +138,7 @@ class Page:
         size = max(1, round(width / coarser)), max(1, round(height / coarser))
         try:
             changed = self.viewer.change(camera=lambda camera: from_viewport(camera, viewport, self.unit), size=size)
-        except InputError as error:  # its numbers are too large in the scene's units
+        except InputError as error:  # its values are too large in the scene's units
             self.door.report("camera", f"dropped a camera: {error}")
             return
         if newcomer and not changed:
@@ -211,15 +216,15 @@ class Page:
             control.on_update(self._safe(lambda event: viewer.tone(float(exposure.value), tonemap.value)))
 
         @self.resolution.on_update
-        async def resized(event: Any) -> None:
+        async def resized(event: viser.GuiEvent[Any]) -> None:
             client = self.server.get_clients().get(self.watching)
             if client is not None:
                 await self._moved(client.camera)
 
-    def _safe(self, action: Callable[[Any], Any]) -> Callable[[Any], None]:
-        """The action for a browser's event; that it cannot be done is reported in one line."""
+    def _safe(self, action: Callable[[Event], object]) -> Callable[[Event], None]:
+        """Return the action for a browser's event with its errors reported in one line."""
 
-        def act(event: Any) -> None:
+        def act(event: Event) -> None:
             try:
                 action(event)
             except (InputError, OSError) as error:
@@ -229,25 +234,25 @@ class Page:
 
     def _set_angle(self, fov_y: float) -> None:
         for client in self.server.get_clients().values():
-            client.camera.fov = fov_y  # and the client reports that its camera changed
+            client.camera.fov = fov_y  # then the client reports a new camera
 
     def _set_lens(self, **fields: float) -> None:
         self.viewer.change(camera=lambda camera: replace(camera, **fields))
 
-    def _clicked(self, event: Any) -> None:
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
         distance = self.viewer.renderers.focus_at(self.viewer.view, *event.screen_pos) if self.by_click.value else None
         if distance is not None:
-            self.focus.value = distance
+            self.focus.value = distance  # type: ignore[misc]  # viser sets it in __setattr__
             self._set_lens(focus_distance=distance)
 
-    def _save(self, client: Any, suffix: str) -> None:
+    def _save(self, client: viser.ClientHandle | None, suffix: str) -> None:
         picture = self.viewer.picture()
         if client is not None and picture is not None:
             client.send_file_download(f"{self.name}{suffix}", encoded(picture, suffix), save_immediately=True)
 
 
-def place_camera(server: Any, camera: CameraKind, target: np.ndarray, unit: float) -> None:
-    """Where browsers begin: at the camera, which looks at `target`; unit: the length of one of the viewport's."""
+def place_camera(server: viser.ViserServer, camera: CameraKind, target: np.ndarray, unit: float) -> None:
+    """Start browsers at the camera, turning about `target`. unit: the length of the viewport's unit."""
     server.scene.set_up_direction(tuple(up_of(camera)))
     start = server.initial_camera
     start.position = tuple(camera.camera_to_world[:3, 3] / unit)
@@ -255,8 +260,8 @@ def place_camera(server: Any, camera: CameraKind, target: np.ndarray, unit: floa
     start.fov = (camera if isinstance(camera, Camera) else Camera()).fov_y
 
 
-def give_camera(client: Any, camera: CameraKind) -> None:
-    """Show a camera to a browser as a table of a scene file."""
+def give_camera(client: viser.ClientHandle | None, camera: CameraKind) -> None:
+    """Show a camera in a browser as a table of a scene file."""
     if client is None:
         return
     text = camera_toml(camera)
@@ -269,7 +274,7 @@ def give_camera(client: Any, camera: CameraKind) -> None:
 
 
 def encoded(picture: Film | np.ndarray, suffix: str) -> bytes:
-    """A picture, or the codes (h, w, 3) of a heat map, as a file's content."""
+    """Return the content of a file with a picture, or with the codes (h, w, 3) of a heat map."""
     if isinstance(picture, np.ndarray):
         return encode_png(picture)
     with tempfile.TemporaryDirectory() as folder:
@@ -279,6 +284,6 @@ def encoded(picture: Film | np.ndarray, suffix: str) -> bytes:
 
 
 def nice(value: float) -> float:
-    """The nearest power of ten times 1, 2 or 5 that is no smaller."""
+    """Round up to a power of ten times 1, 2 or 5."""
     power = 10.0 ** math.floor(math.log10(value))
     return next(power * factor for factor in (1.0, 2.0, 5.0, 10.0) if power * factor >= value * (1.0 - 1e-9))

@@ -1,6 +1,6 @@
-"""A picture that follows what is asked of it: coarse at once when anything changes, then finer while nothing does.
+"""A picture that follows a changing view: coarse at once after a change, then finer until the next change.
 
-It knows nothing of browsers: wrt.viewer.page puts one in front of it.
+It knows nothing of browsers; wrt.viewer.page connects it to one.
 """
 
 from __future__ import annotations
@@ -25,34 +25,34 @@ from wrt.scene.cameras import CameraKind
 from wrt.scene.model import Scene
 from wrt.viewer.renderers import CounterOf, Renderers, Shown, View
 
-COARSE = 0.08  # seconds that the first picture after a change should take
-PATIENCE = 0.5  # seconds after which it is given up, where the next change is waiting
-EVERY = 0.25  # seconds between two pictures of the same view, while it is refined
-SCALES = (1, 2, 4, 8, 16, 32)  # pixels a side of the picture to one of a coarse one
-REST = 0.4  # seconds without a change of exposure or tone mapping after which the picture is put out as done again
-DEEPEST = 12  # bounces that can be chosen, if the scene has no more itself
-COSTS = ("nodes", "primitives", "probes", "boxes", "stack", "node_bytes")  # counters that are offered as heat maps
+COARSE = 0.08  # Target seconds of the first picture after a change.
+PATIENCE = 0.5  # Seconds after which it is abandoned for the next change.
+EVERY = 0.25  # Seconds between two pictures of a view that is refined.
+SCALES = (1, 2, 4, 8, 16, 32)  # Pixels a side of the view to one of a coarse picture.
+REST = 0.4  # Seconds after a change of exposure or tone mapping until the picture is shown as done again.
+DEEPEST = 12  # Bounces that a user can choose, or more if the scene has more.
+COSTS = ("nodes", "primitives", "probes", "boxes", "stack", "node_bytes")  # Counters for heat maps.
 
 
 @dataclass(eq=False)
 class _Work:
-    """A view that is being rendered; number: of the change that asked for it; shown: when a picture of it was put out last."""
+    """A view that is being rendered."""
 
     view: View
-    number: int
+    request: int  # the change that asked for it
     scale: int = 1
-    shown: float = -np.inf
+    last_shown: float = -np.inf  # time of its last picture
 
 
 class Pace(dict[tuple[str, bool], float]):
-    """Seconds that a sample took last, by structure, and of the picture (False) or of heat maps (True)."""
+    """Seconds of a sample, by structure and by kind: picture (False) or heat map (True)."""
 
     def note(self, view: View, samples: int, seconds: float) -> None:
         if samples:
             self[view.accel, bool(view.cost)] = seconds / samples
 
     def scales(self, view: View) -> list[int]:
-        """From the first that is likely to take no longer than COARSE down to 1; 8 where no sample was taken yet."""
+        """Return the scales to render: the first that should take at most COARSE (8 without a measurement), then finer ones to 1."""
         pace = self.get((view.accel, bool(view.cost)))
         seconds = COARSE * 8**2 if pace is None else pace * view.size[0] * view.size[1]
         first = next((scale for scale in SCALES if seconds / scale**2 <= COARSE), SCALES[-1])
@@ -60,12 +60,13 @@ class Pace(dict[tuple[str, bool], float]):
 
 
 class Viewer:
-    """Renders what `change` asked for last. `run` does so until `stop`, for a thread of its own; all else may be called from
-    any thread, and never waits for a picture.
+    """A renderer of the view that `change` asked for last. A thread of its own calls `run`, which returns after `stop`.
 
-    show: gets every picture; report: gets a word on what is going on, "" when nothing is to be said. Both are called by `run`.
-    scene, options: as for a Renderer; options.camera is the view to begin with. spp: where refining ends. counter_of: what counts
-    for heat maps, as for Renderers.
+    All other methods may be called from any thread and never wait for a picture. `change` and `pause` increase `_requested`. The
+    thread renders while that differs from `_completed` and somebody watches.
+
+    `scene` and `options` are those of a Renderer, with the first view as options.camera. `run` calls `show` with each picture, and
+    `report` with a text on its work or "". Refining ends at `spp` samples a pixel. `counter_of` is that of Renderers.
     """
 
     def __init__(self, scene: Scene, options: Options, show: Callable[[Shown], None],
@@ -77,22 +78,22 @@ class Viewer:
         self.deepest = max(settings.max_depth, DEEPEST)
         self.view = View(camera, settings.size, settings.max_depth, options.accel)
         self.exposure, self.tonemap = settings.exposure, settings.tonemap
-        self.shown: Shown | None = None  # last
-        self.renderers = Renderers(scene.with_settings(max_depth=self.deepest), options, self._hear, counter_of)
+        self.shown: Shown | None = None  # the last picture
+        self.renderers = Renderers(scene.with_settings(max_depth=self.deepest), options, self._on_progress, counter_of)
         self._pace = Pace()
         self._condition = threading.Condition()
-        self._number = self._done = 0  # of changes, so far and rendered
-        self._looked_at = self._toned = self._stopped = False
-        self._changing = False  # whether the last picture was put out in another way, and not as done
+        self._requested = self._completed = 0  # counts of changes
+        self._watched = self._redraw = self._stopped = False
+        self._toning = False  # exposure or tone mapping change, so that the last picture was not shown as done
         self._work: _Work | None = None
-        self._film: Film | None = None  # of `shown`, where that is no heat map
+        self._film: Film | None = None  # of `shown`, unless that is a heat map
 
     # --- from any thread ----------------------------------------------------------------------------------------------
 
     def change(self, **changes: Any) -> bool:
-        """Ask for another view (fields of View; camera may be a function of the present one); whether it is another one.
+        """Ask for another view by fields of View; return whether it differs. camera: also a function of the present one.
 
-        Raises InputError for a structure or a counter that there is not.
+        Raises InputError for an unknown structure or counter.
         """
         if "accel" in changes:
             ACCELERATORS.check(changes["accel"])
@@ -102,41 +103,41 @@ class Viewer:
             if callable(changes.get("camera")):
                 changes["camera"] = changes["camera"](self.view.camera)
             view = replace(self.view, **changes)
-            if view.same(self.view) and self._looked_at:
+            if view.same(self.view) and self._watched:
                 return False
-            self.view, self._looked_at = view, True
-            self._number += 1
+            self.view, self._watched = view, True
+            self._requested += 1
             self._condition.notify_all()
             return True
 
     def tone(self, exposure: float, tonemap: str) -> None:
-        """Show the picture in another way; no ray is traced for it."""
+        """Change exposure and tone mapping, without tracing a ray."""
         with self._condition:
-            self.scene = self.scene.with_settings(exposure=exposure, tonemap=tonemap)  # raises where they are none
+            self.scene = self.scene.with_settings(exposure=exposure, tonemap=tonemap)  # raises for invalid values
             self.exposure, self.tonemap = exposure, tonemap
         self.again()
 
     def again(self) -> None:
-        """Show the last picture once more: somebody else looks."""
+        """Show the last picture once more, to another viewer."""
         with self._condition:
-            self._toned = True
+            self._redraw = True
             self._condition.notify_all()
 
     def pause(self) -> None:
-        """Trace nothing more until the next change: nobody looks."""
+        """Stop tracing until the next change, because nobody watches."""
         with self._condition:
-            self._number += 1
-            self._looked_at = False
+            self._requested += 1
+            self._watched = False
 
     def stop(self) -> None:
-        """Let `run` end, after the tiles that it is at."""
+        """Make `run` return after the tiles that are being traced."""
         with self._condition:
             self._stopped = True
-            self._number += 1
+            self._requested += 1
             self._condition.notify_all()
 
     def picture(self) -> Film | np.ndarray | None:
-        """What was shown last, to be saved: a Film (with exposure and tone mapping), or the codes (h, w, 3) of a heat map."""
+        """Return the last picture for a file: a Film with exposure and tone mapping, or the codes (h, w, 3) of a heat map."""
         with self._condition:
             film, shown = self._film, self.shown
         if film is None:
@@ -146,35 +147,36 @@ class Viewer:
     # --- the thread that renders --------------------------------------------------------------------------------------
 
     def run(self) -> None:
-        """Compile and build at once, then render whatever is asked for, until `stop`."""
+        """Compile and build, then render every view that is asked for until `stop`."""
         self._prepare(self.view)
         while True:
             with self._condition:
-                self._condition.wait_for(lambda: self._stopped or self._toned or self._asked, REST if self._changing else None)
+                self._condition.wait_for(lambda: self._stopped or self._redraw or self._pending, REST if self._toning else None)
             if self._stopped:
                 return
             self.step()
 
     @property
-    def _asked(self) -> bool:
-        return self._looked_at and self._number != self._done
+    def _pending(self) -> bool:
+        return self._watched and self._requested != self._completed
 
     def step(self) -> None:
-        """Render what was asked for last until it is as fine as it gets, or until something else is asked for. Or show the picture
-        in another way: not as done while exposure or tone mapping change, so that it is sent faster; and again when they rest."""
+        """Refine the last request until it is done or there is another one; or show the picture with another tone mapping.
+
+        While exposure or tone mapping change the picture is not shown as done, so that it is sent faster."""
         with self._condition:
-            toned, self._toned = self._toned, False
-            work = _Work(self.view, self._number) if self._asked else None
+            redraw, self._redraw = self._redraw, False
+            work = _Work(self.view, self._requested) if self._pending else None
         if work is not None:
             self._refine(work)
-            self._done = work.number
-        elif self.shown is not None and (toned or self._changing):
+            self._completed = work.request
+        elif self.shown is not None and (redraw or self._toning):
             film = self._film
             codes = self.shown.codes if film is None else to_codes(film.pixels, self.exposure, self.tonemap)
-            self._put(replace(self.shown, codes=codes), film, rests=not toned)
+            self._put(replace(self.shown, codes=codes), film, rests=not redraw)
 
     def _refine(self, work: _Work) -> None:
-        if not self._prepare(work.view) or self._number != work.number:
+        if not self._prepare(work.view) or self._requested != work.request:
             return
         self.report("")
         self._work = work
@@ -187,7 +189,7 @@ class Viewer:
             self.report(f"error: {error}")
 
     def _prepare(self, view: View) -> bool:
-        """Make the renderer that the view needs, if there is none; whether there is one then."""
+        """Make the renderer that the view needs, if it is missing; return whether that succeeded."""
         try:
             self.renderers.prepare(view)
         except InputError as error:
@@ -195,20 +197,20 @@ class Viewer:
             return False
         return True
 
-    def _given_up(self, work: _Work, seconds: float) -> bool:
-        """Whether something else is asked for, and this view has been seen or has had its time."""
-        return self._number != work.number and (work.shown > -np.inf or seconds > PATIENCE)
+    def _abandoned(self, work: _Work, seconds: float) -> bool:
+        """Return whether there is another request, and this view was shown or has had its time."""
+        return self._requested != work.request and (work.last_shown > -np.inf or seconds > PATIENCE)
 
     def _trace(self, work: _Work) -> bool:
-        """The picture at one scale, if it was not given up."""
+        """Render and show the picture at one scale; return False if it was abandoned."""
         film = self.renderers.picture(work.view, work.scale, self.spp if work.scale == 1 else 1)
         if film.stats["interrupted"]:
             return False
         self._show_film(work, film, film.stats["rays"], film.stats["seconds"]["trace"], done=work.scale == 1)
         return True
 
-    def _hear(self, progress: Progress) -> None:
-        """A renderer's progress. KeyboardInterrupt is how it is made to end."""
+    def _on_progress(self, progress: Progress) -> None:
+        """Report a renderer's progress. Raises KeyboardInterrupt to end the render."""
         if progress.stage != "trace" or self._work is None:
             done = f" {progress.done / progress.total:.0%}" if progress.stage == "build" else ""
             self.report("building the structure ..." + done if progress.stage == "build" else COMPILING)
@@ -216,32 +218,32 @@ class Viewer:
         work = self._work
         pixels = work.view.size[0] * work.view.size[1]
         self._pace.note(work.view, progress.done, progress.seconds)
-        if self._given_up(work, progress.seconds):
+        if self._abandoned(work, progress.seconds):
             raise KeyboardInterrupt
         if (work.scale == 1 and pixels <= progress.done < progress.total and progress.picture is not None
-                and time.perf_counter() - work.shown >= EVERY):
+                and time.perf_counter() - work.last_shown >= EVERY):
             self._show_film(work, progress.picture(), progress.rays, progress.seconds)
 
     def _show_film(self, work: _Work, film: Film, rays: int, seconds: float, done: bool = False) -> None:
         codes = to_codes(film.pixels, self.exposure, self.tonemap)
         self._put(Shown(codes, work.view, work.scale, int(film.samples.min()), rays / max(seconds, 1e-9),
                         rays / max(int(film.samples.sum()), 1), done), film)
-        work.shown = time.perf_counter()
+        work.last_shown = time.perf_counter()
 
     def _put(self, shown: Shown, film: Film | None, rests: bool = True) -> None:
         with self._condition:
             self.shown, self._film = shown, film
-        self._changing = shown.done and not rests
+        self._toning = shown.done and not rests
         self.show(shown if rests else replace(shown, done=False))
 
     def _count(self, work: _Work) -> bool:
-        """The heat map at one scale, if it was not given up."""
+        """Render and show the heat map at one scale; return False if it was abandoned."""
         begin = time.perf_counter()
 
         def go_on(done: int) -> bool:
             seconds = time.perf_counter() - begin
             self._pace.note(work.view, done, seconds)
-            return not self._given_up(work, seconds)
+            return not self._abandoned(work, seconds)
 
         costs = self.renderers.costs(work.view, work.scale, go_on)
         if costs is None:
@@ -251,5 +253,5 @@ class Viewer:
         speed = int(costs["probes"].sum(dtype=np.int64)) / (time.perf_counter() - begin)
         self._put(Shown(colored(values, top), work.view, work.scale, 1, speed, float(costs["probes"].mean()), work.scale == 1,
                         top, float(values.mean()), float(values.max())), None)
-        work.shown = time.perf_counter()
+        work.last_shown = time.perf_counter()
         return True

@@ -1,4 +1,4 @@
-"""The renderers behind the viewer: one for each structure that was looked at, made when a view first needs it."""
+"""The viewer's renderers: one for each structure, made when a view first needs it."""
 
 from __future__ import annotations
 
@@ -17,25 +17,26 @@ from wrt.scene.cameras import CameraKind
 from wrt.scene.digest import camera_digest
 from wrt.scene.model import Scene
 
-TILE_SIZE = 16  # a tile that runs is waited for before the next view
+TILE_SIZE = 16  # pixels; small, because the next view waits for the tiles that run
 
 
 class Counter(Protocol):
-    """Counts the work of every pixel, for heat maps."""
+    """A counter of every pixel's work, for heat maps."""
 
     def aim(self, camera: CameraKind, angles_of: tuple[int, int] | None = None, **settings: Any) -> None:
         """Turn to another view, as Prepared.aimed does."""
 
     def costs(self, go_on: Callable[[int], bool]) -> dict[str, np.ndarray] | None:
-        """Return the counters by name, (H, W) int32 each; None where `go_on`, asked with the number of pixels done, said no."""
+        """Return the counters by name, (H, W) int32 each, or None if go_on(pixels done) returned False."""
 
 
 CounterOf = Callable[[Prepared], Counter]
 
 
 class Renderers:
-    """progress: called by all of them. counter_of: makes the counter of a structure from what its renderer prepared; None: there
-    are no heat maps. Every method that makes a renderer raises InputError where that cannot be."""
+    """The renderers of a scene by structure, and their counters. Methods that make one raise InputError if it cannot be made.
+
+    progress: called by all of them. counter_of: makes the counter of a prepared structure; None: no heat maps."""
 
     def __init__(self, scene: Scene, options: Options, progress: Callable[[Progress], None], counter_of: CounterOf | None) -> None:
         self.scene, self.options, self.progress, self.counter_of = scene, options, progress, counter_of
@@ -43,7 +44,7 @@ class Renderers:
         self.counters: dict[str, Counter] = {}
 
     def prepare(self, view: View) -> None:
-        """Make what the view needs, if it is not there."""
+        """Make the renderer and the counter that the view needs, if they are missing."""
         if view.accel not in self.by_accel:
             options = replace(self.options, accel=view.accel, camera=view.camera.opened(), tile_size=TILE_SIZE,
                               progress=self.progress)
@@ -52,20 +53,21 @@ class Renderers:
             self.counters[view.accel] = self.counter_of(self.by_accel[view.accel].prepared)
 
     def picture(self, view: View, scale: int, spp: int) -> Film:
-        """A picture of the view with so many of its pixels a side to one."""
+        """Render the view with one pixel for `scale` x `scale` of its pixels."""
         renderer = self.by_accel[view.accel]
         renderer.aim(view.camera, view.size, **_settings(view, scale, spp))
         return renderer.run()
 
     def costs(self, view: View, scale: int, go_on: Callable[[int], bool]) -> dict[str, np.ndarray] | None:
-        """Return the counters of the view's pixels, as Counter.costs."""
+        """Return the counters of the view's pixels, see Counter.costs."""
         counter = self.counters[view.accel]
         counter.aim(view.camera, view.size, **_settings(view, scale, 1))
         return counter.costs(go_on)
 
     def focus_at(self, view: View, x: float, y: float) -> float | None:
-        """The distance, along the axis, of what stands at a place of the picture (0 to 1 from its top left corner); None where
-        there is nothing, or nothing was built yet."""
+        """Return the distance along the axis of the surface at a point of the picture, or None where nothing is hit or built.
+
+        x, y: 0 to 1 from the top left corner."""
         if view.accel not in self.by_accel:
             return None
         origins, directions = film_rays(view.camera, view.size, np.array([[x, y]]))
@@ -74,7 +76,7 @@ class Renderers:
         return float(hits.t[0]) * along if hits.prim_id[0] >= 0 else None
 
     def describe(self, accel: str) -> str:
-        """A structure in a few words."""
+        """Return the size and the build time of a structure as text."""
         if accel not in self.by_accel:
             return accel
         stats = self.by_accel[accel].accel.stats
@@ -88,34 +90,32 @@ def _settings(view: View, scale: int, spp: int) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What is asked for. size: (width, height) in pixels when it is fine; accel: a name in ACCELERATORS; cost: "" for the
-    picture, or one of wrt.viewer.refine.COSTS, a counter of which a heat map is made."""
+    """A view that the viewer was asked for."""
 
     camera: CameraKind
-    size: tuple[int, int]
+    size: tuple[int, int]  # width, height in pixels at full resolution
     max_depth: int
-    accel: str
-    cost: str = ""
+    accel: str  # a name in ACCELERATORS
+    cost: str = ""  # the counter of a heat map, one of wrt.viewer.refine.COSTS; "" is the picture
 
     def same(self, other: View) -> bool:
-        """Whether the picture would be the same."""
+        """Return whether the picture would be the same."""
         mine, others = ((v.size, v.max_depth, v.accel, v.cost, camera_digest(v.camera)) for v in (self, other))
         return mine == others
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """A picture to put before the eyes. codes: (h, w, 3) uint8 as a display takes them; scale: pixels of the view a side to one of
-    it; spp: samples of each pixel at least; speed: rays a second; done: it will get no finer. Of a heat map: its value with the
-    last colour, the mean and the largest value."""
+    """A picture to show."""
 
-    codes: np.ndarray
+    codes: np.ndarray  # (h, w, 3) uint8, display values
     view: View
-    scale: int
-    spp: int
-    speed: float = 0.0
+    scale: int  # pixels a side of the view to one of the picture
+    spp: int  # least number of samples of a pixel
+    speed: float = 0.0  # rays a second
     rays_per_sample: float = 0.0
-    done: bool = False
+    done: bool = False  # it gets no finer
+    # Of a heat map: the value with the last colour, the mean and the largest value.
     top: float = 0.0
     mean: float = 0.0
     largest: float = 0.0

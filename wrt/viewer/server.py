@@ -1,8 +1,8 @@
-"""viser's server behind a door: it answers nobody without the token, and hears only what the viewer can follow.
+"""viser's server behind a guard: it answers no request without the token, and gets only the messages of wrt.viewer.messages.
 
-viser serves its page and its WebSocket by one call of `websockets.asyncio.server.serve`, and offers no way to check who comes. So
-that call is given our checks, and a socket that we bound: no other port is opened. This holds for the versions of viser in
-VERSIONS; with any other one, or where viser does not make the call, nothing is served.
+viser serves its page and its WebSocket by one call of `websockets.asyncio.server.serve`, without a hook for checks. That call gets
+wrt's checks and a socket that wrt has bound, so that no other port is opened. It works with the versions of viser in VERSIONS; with
+another one, or if viser does not make the call, nothing is served.
 """
 
 from __future__ import annotations
@@ -18,30 +18,39 @@ import socket
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from http import HTTPStatus
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, TypeAlias
 from weakref import WeakSet
 
 from wrt.core.errors import InputError
 from wrt.viewer.access import Access, Place, Refused, shown
 from wrt.viewer.messages import check_message
 
-VERSIONS = (1, 1, 1), (1, 2)  # from the first on, to before the second
-LARGEST_MESSAGE = 1 << 16  # bytes; a browser sends some hundreds
-MOST_CONNECTIONS = 64  # open at a time, with those that have not shown a token yet
+if TYPE_CHECKING:
+    import viser
+    from websockets.asyncio.server import ServerConnection
+    from websockets.http11 import Request, Response
+
+    Handler: TypeAlias = Callable[[ServerConnection], Awaitable[None]]  # of a WebSocket
+    Files: TypeAlias = Callable[[ServerConnection, Request], Response | None]  # viser's answer to requests for its files
+
+VERSIONS = (1, 1, 1), (1, 2)  # the first that works, the first that may not
+LARGEST_MESSAGE = 1 << 16  # bytes; a browser sends a few hundred
+MOST_CONNECTIONS = 64  # open at a time, also without a token so far
 LONGEST_PATH = 200
-LONGEST_LINE = 300  # characters of what is reported
-CONNECTING = 0  # websockets.protocol.State of a connection without a WebSocket yet
-CLOSING = 1.0  # seconds that a browser has to say goodbye
-QUIET = logging.getLogger("wrt.viewer.refine.connections")  # what goes wrong in one connection is no matter of the others
+LONGEST_LINE = 300  # characters of a report
+CONNECTING = 0  # websockets.protocol.State of a connection before its WebSocket
+CLOSING = 1.0  # seconds for a browser to close its WebSocket
+QUIET = logging.getLogger("wrt.viewer.refine.connections")  # errors of single connections are not shown
 QUIET.propagate = False
 QUIET.addHandler(logging.NullHandler())
-_ALONE = threading.RLock()  # for what is replaced in the whole process: stdout, and websockets' `serve`
+_ALONE = threading.RLock()  # held while stdout and websockets' `serve` are replaced in the whole process
 
 
-def import_viser() -> Any:
-    """The module; raises InputError that says how to install it."""
+def import_viser() -> ModuleType:
+    """Return the module viser. Raises InputError that says how to install it."""
     try:
         import viser
     except ImportError as error:
@@ -54,7 +63,7 @@ def import_viser() -> Any:
 
 
 def listen(place: Place) -> socket.socket:
-    """A socket that listens there. Raises InputError where that cannot be."""
+    """Return a socket that listens at the place. Raises InputError if it cannot."""
     host, port = place.host, place.port
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
@@ -67,7 +76,7 @@ def listen(place: Place) -> socket.socket:
 
 
 def to_stderr(text: str) -> None:
-    """One line."""
+    """Write a line to stderr."""
     if sys.stderr is not None:
         with contextlib.suppress(OSError, ValueError):
             print(text, file=sys.stderr, flush=True)
@@ -75,35 +84,36 @@ def to_stderr(text: str) -> None:
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """viser greets on stdout, which is for data."""
+    """Drop what viser writes to stdout, which is for data."""
     with _ALONE, contextlib.redirect_stdout(io.StringIO()):
         yield
 
 
 class Door:
-    """Checks every request and every message to a viser server, which `open` starts. warn: hears of what is refused, once of each
-    kind."""
+    """Guard of a viser server, which `open` starts: it checks every request and every message.
+
+    warn: called once for each kind of refusal."""
 
     def __init__(self, access: Access, warn: Callable[[str], None] = to_stderr) -> None:
         self.access, self.warn = access, warn
-        self.viser: Any = None  # the ViserServer, when there is one
-        self.connections: WeakSet[Any] = WeakSet()
-        self._thread = 0  # in which viser serves
-        self._loop: Any = None  # of that thread
+        self.viser: Any = None  # the ViserServer, after `open`
+        self.connections: WeakSet[ServerConnection] = WeakSet()
+        self._thread = 0  # viser's thread
+        self._loop: Any = None  # its event loop
         self._told: set[str] = set()
         self._lock = threading.Lock()
 
-    def open(self, listening: socket.socket, label: str) -> Any:
-        """A viser.ViserServer behind this door. Raises InputError if viser does not pass through it."""
+    def open(self, listening: socket.socket, label: str) -> viser.ViserServer:
+        """Start a viser server behind this guard. Raises InputError if viser does not use it."""
         viser = import_viser()
         websockets: Any = importlib.import_module("websockets.asyncio.server")
-        warnings.filterwarnings("ignore", r"Queued a \w+ on a closed connection", UserWarning)  # of a browser that just left
+        warnings.filterwarnings("ignore", r"Queued a \w+ on a closed connection", UserWarning)  # after a browser has left
         host, port = listening.getsockname()[:2]
 
-        def guarded(handler: Any, *address: Any, **settings: Any) -> Any:
+        def guarded(handler: Handler, *address: object, **settings: Any) -> object:
             self._thread = self._thread or threading.get_ident()
             if self._thread != threading.get_ident():
-                return serve(handler, *address, **settings)  # of somebody else who begins at the same time
+                return serve(handler, *address, **settings)  # another server of this process that starts at the same time
             settings = {key: value for key, value in settings.items() if key not in ("host", "port", "sock")}
             self._loop = asyncio.get_running_loop()
             self._loop.set_exception_handler(self._failed)
@@ -124,7 +134,7 @@ class Door:
         return server
 
     def close(self) -> None:
-        """Stop viser's server. It would wait for connections that have not sent their request yet."""
+        """Stop viser's server, which would wait for connections that have not sent a request yet."""
         with contextlib.suppress(RuntimeError):  # it has stopped
             self._loop.call_soon_threadsafe(self._abort_half_open)
         with quiet():
@@ -136,7 +146,7 @@ class Door:
                 connection.transport.abort()
 
     def report(self, about: str, text: str) -> None:
-        """In one line, once of each kind."""
+        """Report a text in one line, once for each kind `about`."""
         with self._lock:
             if about in self._told:
                 return
@@ -145,18 +155,13 @@ class Door:
 
     # --- requests -----------------------------------------------------------------------------------------------------
 
-    def _settings(self, page: Callable[[Any, Any], Any] | None) -> dict[str, Any]:
-        """Of websockets' `serve`, in place of viser's. page: viser's answer to requests for its files."""
-        from websockets.asyncio.server import ServerConnection
-
-        class Connection(_Checked, ServerConnection):
-            door = self
-
+    def _settings(self, page: Files | None) -> dict[str, Any]:
+        """Return settings of websockets' `serve` that replace viser's."""
         return {"process_request": lambda connection, request: self._answer(connection, request, page), "server_header": None,
-                "max_size": LARGEST_MESSAGE, "close_timeout": CLOSING, "logger": QUIET, "create_connection": Connection}
+                "max_size": LARGEST_MESSAGE, "close_timeout": CLOSING, "logger": QUIET, "create_connection": _checked_connection(self)}
 
-    def _answer(self, connection: Any, request: Any, page: Callable[[Any, Any], Any] | None) -> Any:
-        """None where a WebSocket may be opened."""
+    def _answer(self, connection: ServerConnection, request: Request, page: Files | None) -> Response | None:
+        """Return the answer to a request; None opens a WebSocket."""
         from websockets.http11 import Request
 
         headers = request.headers
@@ -179,11 +184,11 @@ class Door:
         answer.headers.update(COMMON)
         return answer
 
-    def _greeting(self, handler: Callable[[Any], Any]) -> Callable[[Any], Any]:
-        """viser's handler for the browsers that speak its language; it would report others on stdout."""
+    def _greeting(self, handler: Handler) -> Handler:
+        """Return viser's handler for browsers with its protocol. It would report others on stdout."""
         import viser
 
-        async def greet(connection: Any) -> None:
+        async def greet(connection: ServerConnection) -> None:
             if connection.subprotocol == f"viser-v{viser.__version__}":
                 await handler(connection)
             else:
@@ -195,7 +200,7 @@ class Door:
     # --- messages -----------------------------------------------------------------------------------------------------
 
     def lets_in(self, data: str | bytes) -> bool:
-        """Whether viser is to get a message; one that it is not to get is reported."""
+        """Return whether viser may get a message; report a refused one."""
         try:
             check_message(_decoded(data), self._control)
         except Refused as refused:
@@ -203,51 +208,53 @@ class Door:
             return False
         return True
 
-    def _control(self, uuid: str) -> Any:
+    def _control(self, uuid: str) -> viser.GuiInputHandle[Any] | None:
         if self.viser is None:
             return None
         panels = [self.viser.gui, *(client.gui for client in self.viser.get_clients().values())]
         handles = (panel._gui_input_handle_from_uuid.get(uuid) for panel in panels)
         return next((handle for handle in handles if handle is not None), None)
 
-    def _failed(self, loop: Any, context: dict[str, Any]) -> None:
-        """In place of asyncio's traceback."""
+    def _failed(self, loop: object, context: dict[str, Any]) -> None:
+        """Report an error in one line in place of asyncio's traceback."""
         error = context.get("exception")
         what = context.get("message") if error is None else f"{type(error).__name__}: {error}"
         self.report(f"failure {type(error).__name__}", f"error: {what}")
 
 
-class _Checked:
-    """A connection whose messages are checked. For a subclass of ServerConnection."""
+def _checked_connection(door: Door) -> type[ServerConnection]:
+    """Return a class of connections whose messages the guard checks."""
+    from websockets.asyncio.server import ServerConnection
 
-    door: Door
+    class Checked(ServerConnection):
+        def connection_made(self, transport: asyncio.BaseTransport) -> None:
+            super().connection_made(transport)
+            door.connections.add(self)
+            if len(self.server.handlers) > MOST_CONNECTIONS:
+                door.report("connections", f"closed a connection; there are {MOST_CONNECTIONS} already")
+                self.transport.abort()
 
-    def connection_made(self, transport: Any) -> None:
-        super().connection_made(transport)  # type: ignore[misc]
-        self.door.connections.add(self)
-        if len(self.server.handlers) > MOST_CONNECTIONS:  # type: ignore[attr-defined]
-            self.door.report("connections", f"closed a connection; there are {MOST_CONNECTIONS} already")
-            transport.abort()
+        async def recv(self, decode: bool | None = None) -> str | bytes:  # type: ignore[override]
+            while True:
+                data: str | bytes = await super().recv(decode)
+                if door.lets_in(data):
+                    return data
 
-    async def recv(self, *arguments: Any, **settings: Any) -> Any:
-        while True:
-            data = await super().recv(*arguments, **settings)  # type: ignore[misc]
-            if self.door.lets_in(data):
-                return data
+    return Checked
 
 
 COMMON = {"Cache-Control": "no-store", "Referrer-Policy": "no-referrer", "X-Content-Type-Options": "nosniff", "Connection": "close"}
 
 
-def _response(status: HTTPStatus, **headers: str) -> Any:
-    """An answer without content."""
+def _response(status: HTTPStatus, **headers: str) -> Response:
+    """Return an answer without content."""
     from websockets.datastructures import Headers
     from websockets.http11 import Response
 
     return Response(status.value, status.phrase, Headers({"Content-Length": "0", **COMMON, **headers}))
 
 
-def _decoded(data: str | bytes) -> Any:
+def _decoded(data: str | bytes) -> object:
     import msgspec
 
     try:

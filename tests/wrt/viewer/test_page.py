@@ -33,8 +33,8 @@ from wrt.viewer.access import Place
 
 WHITTED = ROOT / "scenes" / "whitted.toml"
 SIZE = {"width": 640, "height": 480}
-ROUGHLY = 0.5  # mean difference in codes of what is on the screen: it was drawn through a texture
-PATIENCE = 120.0  # seconds; a browser that draws in software on a busy machine is slow, and kernels may have to be compiled
+ROUGHLY = 0.5  # Mean difference in codes on the screen, where a texture draws the picture.
+PATIENCE = 120.0  # Seconds, since a busy machine draws slowly and may have to compile kernels.
 
 
 # --- the command ------------------------------------------------------------------------------------------------------

@@ -43,7 +43,7 @@ SCENE = Scene(
 
 
 class Eye:
-    """Sees what is shown and hears what is told; `react` may answer a picture."""
+    """Records a viewer's pictures and reports; `react` is called with each picture."""
 
     def __init__(self, scene: Scene = SCENE, spp: int = 4, **options: Any) -> None:
         self.pictures: list[Shown] = []
@@ -130,7 +130,7 @@ def test_what_takes_too_long_is_given_up_unseen(monkeypatch: pytest.MonkeyPatch)
 
     def report(progress: Any) -> None:
         eye.viewer.change(camera=turned(5.0))
-        eye.viewer._hear(progress)
+        eye.viewer._on_progress(progress)
 
     renderer.prepared.plan.options.progress = report
     eye.see(camera=turned(1.0))
