@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import warp as wp
@@ -14,7 +14,9 @@ from wrt.accel.queries.counting import copied
 from wrt.accel.structure import Structure
 from wrt.core.device import on_host
 from wrt.core.threads import run_all
+from wrt.core.types import Device, DeviceFunction, WarpArray, WarpType
 from wrt.kernels.study import ray_log
+from wrt.kernels.traverse.common import Units
 from wrt.kernels.traverse.counters import Counts, Recorder
 from wrt.kernels.warp_private import fields_of
 from wrt.renderer.film_arrays import DeviceFilm
@@ -23,6 +25,7 @@ from wrt.renderer.prepare import Prepared, prepare
 from wrt.renderer.tiles import Rectangle, Work
 from wrt.scene.cameras import CameraKind
 
+T = TypeVar("T")
 COUNTERS = tuple(fields_of(Counts))
 
 
@@ -32,21 +35,21 @@ class LoggedStructure(NamedTuple):
     inner: Structure
 
     @property
-    def units(self) -> Any:
+    def units(self) -> Units:
         return self.inner.units
 
     @property
-    def struct(self) -> Any:
+    def struct(self) -> WarpType:
         return ray_log.make_struct(self.inner.struct)
 
-    def traversal(self, *, any_hit: bool, accepts: Any = None) -> Any:
+    def traversal(self, *, any_hit: bool, accepts: DeviceFunction | None = None) -> DeviceFunction:
         return ray_log.make_traversal(self.inner.struct, self.inner.traversal(any_hit=any_hit, accepts=accepts), any_hit)
 
 
 class CostCounter:
     """A render that counts. built: the same scene prepared for pictures, whose structure and arrays the counter shares."""
 
-    def __init__(self, plan: Plan, device: Any, built: Prepared | None = None) -> None:
+    def __init__(self, plan: Plan, device: Device, built: Prepared | None = None) -> None:
         counting = plan.structure._replace(units=plan.structure.units._replace(counters=True))
         features = replace(plan.features, counting=True)
         self.prepared = prepare(replace(plan, structure=LoggedStructure(counting), features=features), device, built)
@@ -64,11 +67,11 @@ class CostCounter:
         plan = self.prepared.plan
         return DeviceFilm(plan.scene.settings, plan.crop, self.prepared.device, plan.options.seed)
 
-    def each(self, work: Callable[[Any], Any], items: Iterable[Any]) -> None:
+    def each(self, work: Callable[[T], None], items: Iterable[T]) -> None:
         """Call `work` with each item, on all threads."""
         run_all([partial(work, item) for item in items], 1 if self.prepared.device.is_cuda else self.prepared.threads)
 
-    def trace(self, rectangle: Rectangle, film: DeviceFilm, recorder: Any, log: Any) -> None:
+    def trace(self, rectangle: Rectangle, film: DeviceFilm, recorder: Recorder, log: ray_log.RayLog) -> None:
         """Trace all samples of a tile into the film; write counters to a Recorder and rays to a RayLog."""
         data = copied(self.prepared.accel.data)  # since every tile has a recorder of its own
         data.recorder = recorder
@@ -76,7 +79,7 @@ class CostCounter:
         accel.accel, accel.log = data, log
         self.prepared.launch(film, accel)(Work(rectangle, 0, self.prepared.plan.scene.settings.spp))
 
-    def zeros(self, n: int, dtype: Any) -> Any:
+    def zeros(self, n: int, dtype: WarpType) -> WarpArray:
         return wp.zeros(n, dtype=dtype, device=self.prepared.device)
 
     def totals(self, rectangle: Rectangle, film: DeviceFilm) -> tuple[np.ndarray, np.ndarray]:

@@ -21,6 +21,7 @@ from wrt.accel.structures import ACCELERATORS
 from wrt.core.checks import as_integer
 from wrt.core.device import load_kernel, start
 from wrt.core.threads import run_all, thread_count
+from wrt.core.types import Device, JsonObject
 from wrt.io.load import load_scene
 from wrt.kernels.study.elementary import FUNCTIONS, call_functions
 from wrt.lab.bench.accel import BRUTE_FORCE_TESTS, answer
@@ -216,7 +217,7 @@ def speed_rows(plan: Check) -> tuple[list[Row], str]:
     return out, "; ".join(skipped)
 
 
-def finished(search: Callable[[], Any], device: Any) -> None:
+def finished(search: Callable[[], object], device: Device) -> None:
     search()
     wp.synchronize_device(device)
 
@@ -241,7 +242,7 @@ class Result:
                      TIMED if self.speed else "", f"Skipped: {self.skipped}" if self.skipped else ""])))]
         return markdown(parts)
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> JsonObject:
         return {"machine": self.machine, "differ": self.differ, "rows": [each.as_dict() for each in self.rows],
                 "speed": [each.as_dict() for each in self.speed], "speed_skipped": self.skipped or None}
 

@@ -24,7 +24,7 @@ def option(default: Any, text: str = "", between: tuple[int, int] | None = None,
     return field(default=default, metadata={"text": text, "between": between, "of": of})
 
 
-def the_meshes(default: object = ()) -> Sequence[Any]:
+def the_meshes(default: object = ()) -> Sequence[object]:
     return option(default)
 
 

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -18,6 +18,7 @@ from wrt.core.checks import as_one
 from wrt.core.device import start
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
+from wrt.core.types import Device, JsonObject
 from wrt.lab.bench.rays import RaySet, ray_sets
 from wrt.lab.bench.report import Columns, Row, machine_line, markdown, tabled
 from wrt.lab.bench.timing import alternate, spread
@@ -70,7 +71,7 @@ class Tuning:
         found = f"Fastest: {self.best.accel}{block}. In Python write {words}; for commands {options}."
         return markdown([tabled(COLUMNS, self.rows, "Tuning", f"Machine: {self.machine}\n\n{found}\n\n{LEGEND}")])
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> JsonObject:
         return {"machine": self.machine, "arguments": self.arguments, "best": self.best._asdict(),
                 "rows": [row.as_dict() for row in self.rows]}
 
@@ -117,7 +118,7 @@ def measured(device: str, seconds: float = 1.0, clock: Callable[[], float] = tim
     return Tuning(device, best, machine_line(f"Warp {wp.__version__}", device=device), speeds, rows)
 
 
-def measure(choices: list[Choice], geometry: Geometry, rays: Mapping[str, RaySet], device: Any, seconds: float,
+def measure(choices: list[Choice], geometry: Geometry, rays: Mapping[str, RaySet], device: Device, seconds: float,
             clock: Callable[[], float]) -> tuple[list[Row], dict[Choice, float]]:
     """Measure all choices, the default first; return the rows and each choice's speed over the default's."""
     jobs: dict[tuple[Choice, str], Callable[[], None]] = {}
@@ -144,7 +145,7 @@ def fastest(speeds: Mapping[Choice, float]) -> Choice:
     return best if speeds[best] >= MARGIN else DEFAULT
 
 
-def ask(choice: Choice, search: Callable[[], Any], device: Any) -> None:
+def ask(choice: Choice, search: Callable[[], object], device: Device) -> None:
     before = cuda.block_dim, cuda.stack
     cuda.block_dim, cuda.stack = choice.block_dim, choice.stack
     try:

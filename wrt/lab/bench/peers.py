@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from time import perf_counter, thread_time
-from typing import Any
+from typing import cast
 
 import numpy as np
 
@@ -42,15 +42,14 @@ def rows(plan: Plan) -> Iterator[Row]:
             begin = perf_counter()
             who.prepare(geometry)
             builds.append(perf_counter() - begin)
-        accel = everybody[0].accel
-        for rays in ray_sets(accel, plan.rays, plan.seed).values():
+        for rays in ray_sets(cast(Own, everybody[0]).accel, plan.rays, plan.seed).values():
             for threads in thread_counts(plan) if rays.kind in plan.kinds else ():
                 for i, measured in enumerate(compared(everybody, rays, threads, plan.runs)):
                     yield Row(mesh=mesh_name(mesh), triangles=len(mesh.faces), kind=rays.kind, rays=len(rays),
                               name=everybody[i].name, build=builds[i], threads=threads, **measured)
 
 
-def contestants(plan: Plan, rivals: Sequence[str]) -> list[Any]:
+def contestants(plan: Plan, rivals: Sequence[str]) -> list[Algorithm]:
     out: list[Algorithm] = []
     for structure in dict.fromkeys(plan.structures):
         warm_up(structure)

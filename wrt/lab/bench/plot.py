@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from wrt.core.errors import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 DPI = 100
 BINS = 60
@@ -44,7 +47,7 @@ def bins(values: Mapping[str, np.ndarray]) -> np.ndarray:
     return np.arange(0, math.ceil((top + 1.0) / width) + 1) * width
 
 
-def new_figure(width: float, height: float) -> Any:
+def new_figure(width: float, height: float) -> Figure:
     """Return an empty matplotlib Figure, sizes in inches. Raise InputError without matplotlib."""
     try:
         from matplotlib.figure import Figure

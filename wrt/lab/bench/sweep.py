@@ -8,28 +8,32 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable, Iterable
-from concurrent.futures import BrokenExecutor, CancelledError
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from wrt.core.errors import InputError
 from wrt.renderer.distributed.installed import DIGEST
 from wrt.renderer.distributed.workers import worker_name
 from wrt.scene.mesh import Mesh
 
+if TYPE_CHECKING:
+    from wrt.renderer.distributed.dask import Submitter
+
+T = TypeVar("T")
 _alone = threading.Lock()
 
 
-def submitter(executor: Any) -> Any:
+def submitter(executor: object) -> Executor | Submitter:
     """Return an Executor as it is, and a Submitter for a dask.distributed.Client."""
     if not hasattr(executor, "get_executor"):
-        return executor
+        return cast(Executor, executor)
     from wrt.renderer.distributed.dask import Submitter
 
     return Submitter(executor)
 
 
-def result(pool: Any, future: Any) -> Any:
+def result(pool: Executor | Submitter, future: Future[T]) -> T:
     """Return the result of a future. Raise the worker's error, or InputError if the result will never come."""
     try:
         return future.result()
@@ -39,7 +43,7 @@ def result(pool: Any, future: Any) -> Any:
         raise InputError(str(error), argument="executor") from error
 
 
-def cancel(pool: Any, futures: Iterable[Any]) -> None:
+def cancel(pool: Executor | Submitter, futures: Iterable[Future[T]]) -> None:
     """Cancel the futures that have not begun."""
     if hasattr(pool, "cancel"):
         pool.cancel(futures)
@@ -48,7 +52,7 @@ def cancel(pool: Any, futures: Iterable[Any]) -> None:
             future.cancel()
 
 
-def by_mesh(run: Callable[..., list[Any]], plan: Any, report: Callable[[Any], None], executor: Any = None) -> list[Any]:
+def by_mesh(run: Callable[..., list[T]], plan: Any, report: Callable[[T], None], executor: object = None) -> list[T]:
     """Return the rows of run(plan, report), each mesh measured by one worker, or all of them here without an executor.
     A worker reads a file at the same path. `report` gets the rows of a mesh together, meshes in their order. Raise InputError if the plan
     has no meshes."""
@@ -70,7 +74,7 @@ def by_mesh(run: Callable[..., list[Any]], plan: Any, report: Callable[[Any], No
     return rows
 
 
-def one_at_a_time(digest: str, function: Callable[..., Any], *arguments: Any) -> Any:
+def one_at_a_time(digest: str, function: Callable[..., T], *arguments: object) -> T:
     """Call a function on a worker, one at a time in a process: concurrent timings slow each other down.
     Raise InputError if the worker's code has another digest."""
     if digest != DIGEST:

@@ -10,16 +10,17 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 Quartiles = tuple[float, float, float]  # low, median, high
 K = TypeVar("K")
 T = TypeVar("T")
 
 
-def alternate(jobs: Mapping[K, Callable[[], Any]], runs: int, clock: Callable[[], float] = time.perf_counter) -> dict[K, np.ndarray]:
+def alternate(jobs: Mapping[K, Callable[[], object]], runs: int, clock: Callable[[], float] = time.perf_counter) -> dict[K, np.ndarray]:
     """Return seconds (runs,) of each job, after one uncounted run of each. Each round begins with the next job."""
     seconds: dict[K, list[float]] = {name: [] for name in jobs}
     names = list(jobs)
@@ -33,8 +34,8 @@ def alternate(jobs: Mapping[K, Callable[[], Any]], runs: int, clock: Callable[[]
     return {name: np.array(times) for name, times in seconds.items()}
 
 
-def quartiles(values: Any) -> Quartiles:
-    low, middle, high = (float(x) for x in np.quantile(values, (0.25, 0.5, 0.75)))
+def quartiles(values: npt.ArrayLike) -> Quartiles:
+    low, middle, high = (float(x) for x in np.quantile(np.asarray(values), (0.25, 0.5, 0.75)))
     return low, middle, high
 
 
@@ -43,7 +44,7 @@ def shown(values: Quartiles, digits: int = 3) -> str:
     return f"{values[1]:.{digits}g} [{values[0]:.{digits}g}, {values[2]:.{digits}g}]"
 
 
-def spread(values: Any, scale: float = 1.0) -> str:
+def spread(values: npt.ArrayLike, scale: float = 1.0) -> str:
     """Format many values, times `scale`, as `shown`."""
     return shown(quartiles(scale * np.asarray(values)))
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
 
 import numpy as np
 
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.rays import rays_of, rays_on
+from wrt.core.types import Device
 from wrt.kernels.query import RayArrays
 
 HIT, ASK, MISS = 1, 0, -1  # what a ray's exact answer must be; ASK: the oracle knows
@@ -48,7 +48,7 @@ class HardCase:
     def __len__(self) -> int:
         return len(self.origins)
 
-    def on(self, device: Any) -> RayArrays:
+    def on(self, device: Device) -> RayArrays:
         return rays_on(device, rays_of(self.origins, self.directions, self.t_min, self.t_max))
 
 

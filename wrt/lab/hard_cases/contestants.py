@@ -16,6 +16,7 @@ from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.core.packages import needed_by
 from wrt.core.registry import Registry
+from wrt.core.types import ArrayLike
 from wrt.lab.bench.rays import RaySet
 
 
@@ -37,11 +38,11 @@ class Algorithm(ABC):
         """Build for this geometry; return False if the library cannot take it (spheres)."""
 
     @abstractmethod
-    def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: Any = 0.0, t_max: Any = np.inf) -> Hits:
+    def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf) -> Hits:
         """Return closest hits, as wrt.accel.base.Accelerator.closest_hit."""
 
     @abstractmethod
-    def search(self, rays: RaySet, threads: int) -> Callable[[], Any]:
+    def search(self, rays: RaySet, threads: int) -> Callable[[], object]:
         """Return the work to time, with rays and results in the library's own arrays."""
 
     def occluded(self, out: Any) -> np.ndarray:
@@ -52,26 +53,24 @@ class Algorithm(ABC):
 class Own(Algorithm):
     """A structure of wrt with one triangle test and one box test."""
 
-    accel: Accelerator | None = None
+    accel: Accelerator  # after prepare()
 
     def __init__(self, triangle: str = "watertight", box: str = "conservative", structure: str = "bvh", device: str = "cpu") -> None:
         self.structure, self.device, self.units = structure, device, {"triangle": triangle, "box": box}
         self.name = triangle if box == "conservative" else f"{triangle}, {box} boxes"
 
     def prepare(self, geometry: Geometry) -> bool:
-        if self.accel is None or self.accel.geometry is not geometry:
+        if not hasattr(self, "accel") or self.accel.geometry is not geometry:
             self.accel = build(geometry, self.structure, self.device, threads=1, **self.units)
         self.bytes_per_triangle = self.accel.stats.bytes / max(len(geometry), 1)
         return True
 
-    def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: Any = 0.0, t_max: Any = np.inf) -> Hits:
-        assert self.accel is not None  # prepare() comes first
+    def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf) -> Hits:
         return self.accel.closest_hit(origins, directions, t_min, t_max, threads=1)
 
-    def search(self, rays: RaySet, threads: int) -> Callable[[], Any]:
+    def search(self, rays: RaySet, threads: int) -> Callable[[], object]:
         import warp as wp
 
-        assert self.accel is not None
         origins, directions = (wp.array(a, dtype=wp.vec3, device=self.device) for a in (rays.origins, rays.directions))
         t_max = wp.array(rays.t_max, dtype=wp.float32, device=self.device)
         ask = self.accel.any_hit if rays.any_hit else self.accel.closest_hit
@@ -113,12 +112,12 @@ class Embree(Peer):
         self.mesh = TriangleMesh(self.scene, geometry.vertices, geometry.faces)
         self.closest(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))  # it builds when it is first asked
 
-    def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: Any = 0.0, t_max: Any = np.inf) -> Hits:
+    def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf) -> Hits:
         out = self.scene.run(np.ascontiguousarray(origins), np.ascontiguousarray(directions), output=True)
         prim_id = out["primID"].astype(np.int32)
         return cut(out["tfar"], prim_id, out["u"], out["v"], t_min, t_max)
 
-    def search(self, rays: RaySet, threads: int) -> Callable[[], Any]:
+    def search(self, rays: RaySet, threads: int) -> Callable[[], object]:
         o, d = np.ascontiguousarray(rays.origins), np.ascontiguousarray(rays.directions)
         if rays.any_hit:
             return lambda: self.scene.run(o, d, dists=rays.t_max, query="OCCLUDED")
@@ -155,13 +154,14 @@ class WarpMesh(Peer):
         indices = wp.array(geometry.faces.ravel().copy(), dtype=wp.int32, device=self.device)
         self.mesh = wp.Mesh(points=points, indices=indices, bvh_constructor=self.constructor)
 
-    def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: Any = 0.0, t_max: Any = np.inf) -> Hits:
-        t, u, v, prim_id = (array.numpy() for array in self.search(RaySet("", origins, directions, np.ones(len(origins))), 1)())
+    def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf) -> Hits:
+        found: Any = self.search(RaySet("", origins, directions, np.ones(len(origins))), 1)()
+        t, u, v, prim_id = (array.numpy() for array in found)
         length = np.linalg.norm(directions.astype(np.float64), axis=1)
         # Warp's u and v belong to the first two corners; wrt's to the last two.
         return cut((t / length).astype(np.float32), prim_id, v, 1.0 - u - v, t_min, t_max)
 
-    def search(self, rays: RaySet, threads: int) -> Callable[[], Any]:
+    def search(self, rays: RaySet, threads: int) -> Callable[[], object]:
         """Return the query with unit directions, which Warp requires, and with a length beside them for any-hit rays."""
         import warp as wp
 
@@ -175,12 +175,12 @@ class WarpMesh(Peer):
         reach = wp.array(np.minimum(rays.t_max * length, 1e38).astype(np.float32), dtype=wp.float32, device=device)
         load_kernel(warp_mesh_any if rays.any_hit else warp_mesh_query, device)
 
-        def any_hit() -> Any:
+        def any_hit() -> object:
             occluded = wp.empty(n, dtype=wp.bool, device=device)
             wp.launch(warp_mesh_any, dim=n, inputs=[*inputs, reach, occluded], device=device)
             return occluded
 
-        def closest() -> Any:
+        def closest() -> object:
             out = [wp.zeros(n, dtype=dtype, device=device) for dtype in (wp.float32, wp.float32, wp.float32, wp.int32)]
             wp.launch(warp_mesh_query, dim=n, inputs=[*inputs, *out], device=device)
             return out
@@ -203,23 +203,23 @@ class Open3D(Peer):
         self.scene.add_triangles(self.tensor(geometry.vertices.copy()), self.tensor(geometry.faces.astype(np.uint32)))
         self.none = self.scene.INVALID_ID
 
-    def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: Any = 0.0, t_max: Any = np.inf) -> Hits:
+    def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf) -> Hits:
         rays = np.concatenate([origins, directions], axis=1).astype(np.float32)
         told = {name: array.numpy() for name, array in self.scene.cast_rays(self.tensor(rays), nthreads=1).items()}
         prim_id = np.where(told["primitive_ids"] == self.none, -1, told["primitive_ids"].astype(np.int64)).astype(np.int32)
         u, v = told["primitive_uvs"].T
         return cut(told["t_hit"], prim_id, u, v, t_min, t_max)
 
-    def search(self, rays: RaySet, threads: int) -> Callable[[], Any]:
+    def search(self, rays: RaySet, threads: int) -> Callable[[], object]:
         bundle = self.tensor(np.concatenate([rays.origins, rays.directions], axis=1))
         if rays.any_hit:
             return lambda: self.scene.test_occlusions(bundle, tnear=0.0, tfar=1.0, nthreads=threads)
         return lambda: self.scene.cast_rays(bundle, nthreads=threads)
 
 
-def cut(t: np.ndarray, prim_id: np.ndarray, u: np.ndarray, v: np.ndarray, t_min: Any, t_max: Any) -> Hits:
+def cut(t: np.ndarray, prim_id: np.ndarray, u: np.ndarray, v: np.ndarray, t_min: ArrayLike, t_max: ArrayLike) -> Hits:
     """Remove the hits outside of the segment."""
-    outside = (prim_id < 0) | ~((t >= t_min) & (t <= t_max))
+    outside = (prim_id < 0) | ~((t >= np.asarray(t_min)) & (t <= np.asarray(t_max)))
     return Hits(np.where(outside, np.float32(np.inf), t), np.where(outside, 0, u), np.where(outside, 0, v),
                 np.where(outside, np.int32(-1), prim_id))
 

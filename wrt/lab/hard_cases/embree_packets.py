@@ -13,6 +13,7 @@ import numpy as np
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.answers import Hits
 from wrt.core.packages import needed_by
+from wrt.core.types import ArrayLike
 from wrt.lab.bench.rays import RaySet
 from wrt.lab.hard_cases.contestants import Peer, cut
 
@@ -22,7 +23,7 @@ SLACK = 16  # bytes that Embree may read behind the last vertex
 
 
 @cache
-def library() -> Any:
+def library() -> ctypes.CDLL:
     """Load Embree 4. Raise InputError without embreex."""
     with needed_by("Embree"):
         from embreex import rtcore_scene
@@ -64,12 +65,12 @@ class EmbreePackets(Peer):
         self.scene = scene
         finalize(self, lambda: (embree.rtcReleaseScene(scene), embree.rtcReleaseDevice(device)))
 
-    def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: Any = 0.0, t_max: Any = np.inf) -> Hits:
-        found = self.search(RaySet("", origins, directions, np.ones(len(origins))), 1)()
+    def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf) -> Hits:
+        found: Any = self.search(RaySet("", origins, directions, np.ones(len(origins))), 1)()
         t, u, v, prim_id = (getattr(found, name).numpy() for name in ("t", "u", "v", "prim_id"))
         return cut(t, prim_id, u, v, t_min, t_max)
 
-    def search(self, rays: RaySet, threads: int) -> Callable[[], Any]:
+    def search(self, rays: RaySet, threads: int) -> Callable[[], object]:
         import warp as wp
 
         from wrt.core.device import load_kernel
@@ -82,7 +83,7 @@ class EmbreePackets(Peer):
         reach = wp.array(rays.t_max if rays.any_hit else np.full(n, np.inf), dtype=wp.float32, device="cpu")
         address = wp.uint64(ctypes.cast(function, ctypes.c_void_p).value or 0)
 
-        def run() -> Any:
+        def run() -> object:
             hits = HitArrays()
             hits.t = wp.clone(reach)
             if not rays.any_hit:

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from wrt.accel.queries.answers import Hits
+from wrt.core.types import JsonObject
 from wrt.lab.hard_cases.common import ASK, HIT, MISS, HardCase
 from wrt.lab.oracle.oracle import AllHits, Place, Reference, reference_of, sure
 
@@ -106,7 +108,7 @@ class Verdict:
         del out.examples[EXAMPLES:]
         return out
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> JsonObject:
         return {f.name: value.as_dict() if isinstance(value := getattr(self, f.name), Errors) else value for f in fields(Verdict)}
 
     def wrong(self, count: str, case: HardCase, rows: np.ndarray, why: str, prim_id: np.ndarray | None = None) -> None:
@@ -124,7 +126,7 @@ class Verdict:
 CLAIM = np.dtype([("row", np.int64), ("t", np.float64), ("prim_id", np.int64), ("t_bound", np.float64), ("sound", bool), ("hit", bool)])
 
 
-def judge(case: HardCase, hits: Any, asked: int | None = None, *, lowest: bool = True) -> Verdict:
+def judge(case: HardCase, hits: Hits, asked: int | None = None, *, lowest: bool = True) -> Verdict:
     """Judge closest hits: t, u, v, prim_id (N,), prim_id -1 on a miss (wrt.accel.queries.answers.Hits).
 
     - Each reported hit is compared with its own primitive, exactly. The oracle looks for nearer hits of `asked` of them (None: case.asked),
@@ -149,7 +151,7 @@ def judge(case: HardCase, hits: Any, asked: int | None = None, *, lowest: bool =
     return verdict
 
 
-def check(case: HardCase, hits: Any) -> Verdict:
+def check(case: HardCase, hits: Hits) -> Verdict:
     """Judge without the oracle, for any number of rays: expected hits and misses, and t inside of the segment.
     Rays whose answer only the oracle knows (ASK) may miss. Arguments as for `judge`."""
     every = np.ones(len(case.geometry), bool)

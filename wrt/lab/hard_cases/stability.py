@@ -20,6 +20,7 @@ from wrt.accel.structure import Structure
 from wrt.core.device import load_kernel, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
+from wrt.core.types import JsonObject, Kernel
 from wrt.kernels.shade.surface import make_surface_at
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.study.respawn import Respawn, make_respawn_kernel
@@ -40,14 +41,10 @@ SPEED_RAYS = 200_000
 ASKED = 2000  # of a rival's claimed hits in one case: is anything nearer? Of the default's, all are asked
 CHUNK = 2**18
 
-def unless_refused(form: str) -> Callable[[Any], str]:
-    return lambda row: form.format_map(vars(row)) if row.refused is None else ""
-
-
 COLUMNS: Columns = {
     "case": "{case}", "algorithm": "{algorithm}",
     "rays": lambda row: {None: str(row.verdict.rays), True: "refused", False: "ACCEPTED"}[row.refused],
-    **{head: unless_refused(form) for head, form in {
+    **{head: partial(lambda form, row: form.format_map(vars(row)) if row.refused is None else "", form) for head, form in {
         "judged": "{judged}", "misses": "{verdict.misses}", "false hits": "{verdict.false_hits}",
         "wrong prim": "{verdict.wrong_prim}", "self-hits": "{verdict.self_hits}", "duplicates": "{verdict.duplicate_hits}",
         "ties": "{verdict.ties}",
@@ -65,7 +62,7 @@ class Row:
     judged: int = 0
     refused: bool | None = None
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> JsonObject:
         return {name: value for name, value in vars(self).items() if name != "verdict"} | self.verdict.as_dict()
 
 
@@ -75,7 +72,7 @@ class Result(Line):
 
 
 def run(plan: Plan, report: Callable[[Row], None] = lambda row: None,
-        progress: Callable[[str], None] = lambda line: None, executor: Any = None) -> Result:
+        progress: Callable[[str], None] = lambda line: None, executor: object = None) -> Result:
     """Put every chosen case to every algorithm, the same rays for all.
 
     - report: called with each finished row; progress: called now and then with a line of text, from any thread.
@@ -233,7 +230,7 @@ def _surfaces(case: HardCase, device: Any) -> Any:
 
 
 @cache
-def _respawn_kernel(structure: Structure) -> Any:
+def _respawn_kernel(structure: Structure) -> Kernel:
     surface_at = make_surface_at(structure.units.spheres, False, False, False)
     return make_respawn_kernel(structure.struct, structure.traversal(any_hit=False), surface_at)
 
@@ -241,7 +238,7 @@ def _respawn_kernel(structure: Structure) -> Any:
 def respawn(algorithm: Own, case: HardCase) -> tuple[np.ndarray, np.ndarray]:
     """Return prim_id of each ray's hit, and of the ray from the hit along case.next_directions."""
     accel, n = algorithm.accel, len(case)
-    assert accel is not None and case.next_directions is not None
+    assert case.next_directions is not None
     kernel = _respawn_kernel(accel.structure)
     load_kernel(kernel, accel.device)
     out = Respawn()
@@ -254,7 +251,6 @@ def respawn(algorithm: Own, case: HardCase) -> tuple[np.ndarray, np.ndarray]:
 
 def _judge_all(algorithm: Own, case: HardCase) -> Verdict:
     """Judge all hits of the first ALL_HITS_RAYS rays; return the duplicates only."""
-    assert algorithm.accel is not None
     part = replace(case, **{name: getattr(case, name)[:ALL_HITS_RAYS] for name in ("origins", "directions", "t_min", "t_max", "expected")})
     hits = all_hits(algorithm.accel, part.origins, part.directions, part.t_min, part.t_max)
     verdict = judge_all_hits(part, hits.ray_id, hits.prim_id, hits.t)

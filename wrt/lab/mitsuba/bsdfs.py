@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, NoReturn
+from types import ModuleType
+from typing import Any, NoReturn, TypeAlias
 
 import numpy as np
 
@@ -11,7 +12,9 @@ from wrt.picture.tonemap import decode_srgb
 from wrt.scene.materials import Checkerboard, Material, Texture
 from wrt.scene.values import Color
 
-BSDFS: dict[str, dict[str, Any]] = {"diffuse": {"type": "diffuse"}, "mirror": {"type": "conductor", "material": "none"},
+Plugin: TypeAlias = dict[str, Any]  # for mitsuba.load_dict
+MitsubaObject: TypeAlias = Any  # of a class that Mitsuba makes when its variant is set
+BSDFS: dict[str, Plugin] = {"diffuse": {"type": "diffuse"}, "mirror": {"type": "conductor", "material": "none"},
                                     "conductor": {"type": "conductor"}, "glass": {"ext_ior": 1.0}}
 # What the albedo is there.
 COLORED = {"diffuse": "reflectance", "mirror": "specular_reflectance", "glass": "specular_transmittance"}
@@ -22,7 +25,7 @@ def refuse(what: str, where: str = "") -> NoReturn:
     raise InputError(f"not translatable exactly: {what}", place=f"Mitsuba: {where}" if where else "Mitsuba")
 
 
-def bsdf(mi: Any, material: Material) -> dict[str, Any]:
+def bsdf(mi: ModuleType, material: Material) -> Plugin:
     """Return the material as a dictionary for `mitsuba.load_dict`."""
     where = f"material {material.name!r}"
     if material.kind not in BSDFS:
@@ -40,7 +43,7 @@ def bsdf(mi: Any, material: Material) -> dict[str, Any]:
     return result if opacity is None else {"type": "mask", "opacity": opacity, "bsdf": result}
 
 
-def emission(mi: Any, material: Material) -> dict[str, Any]:
+def emission(mi: ModuleType, material: Material) -> Plugin:
     """Return an area emitter; one that does not light other surfaces is never sampled."""
     if material.alpha_mode != "opaque":
         refuse("emission of a surface that is partly transparent", f"material {material.name!r}")
@@ -48,7 +51,7 @@ def emission(mi: Any, material: Material) -> dict[str, Any]:
     return {"type": "area", "radiance": radiance, "sampling_weight": 1.0 if material.lights_others else 0.0}
 
 
-def _bsdf(mi: Any, material: Material) -> dict[str, Any]:
+def _bsdf(mi: ModuleType, material: Material) -> Plugin:
     """Return the material without its back side and its opacity."""
     result = dict(BSDFS[material.kind])
     if material.kind == "conductor":
@@ -64,11 +67,11 @@ def _bsdf(mi: Any, material: Material) -> dict[str, Any]:
     return result
 
 
-def rgb(color: Color) -> dict[str, Any]:
+def rgb(color: Color) -> Plugin:
     return {"type": "rgb", "value": list(color)}
 
 
-def _color(mi: Any, factor: Color, texture: Texture | Checkerboard | None) -> dict[str, Any]:
+def _color(mi: ModuleType, factor: Color, texture: Texture | Checkerboard | None) -> Plugin:
     """Return factor times the texture's RGB, linear."""
     if texture is None:
         return rgb(factor)
@@ -77,7 +80,7 @@ def _color(mi: Any, factor: Color, texture: Texture | Checkerboard | None) -> di
     return _bitmap(mi, texture, linear_rgb(texture) * np.asarray(factor, np.float32))
 
 
-def _checkerboard(mi: Any, factor: Color, texture: Checkerboard) -> dict[str, Any]:
+def _checkerboard(mi: ModuleType, factor: Color, texture: Checkerboard) -> Plugin:
     # Mitsuba's board has two squares to one unit of its coordinates, and color0 in the one at the origin.
     first, second = (rgb(np.multiply(color, factor).tolist()) for color in (texture.color_a, texture.color_b))
     to_uv = mi.ScalarTransform3f().scale([0.5 * texture.scale, 0.5 * texture.scale])
@@ -90,7 +93,7 @@ def linear_rgb(texture: Texture) -> np.ndarray:
     return (decode_srgb(steps) if texture.srgb else steps).astype(np.float32)[texture.image[..., :3]]
 
 
-def _bitmap(mi: Any, texture: Texture, values: np.ndarray) -> dict[str, Any]:
+def _bitmap(mi: ModuleType, texture: Texture, values: np.ndarray) -> Plugin:
     """Return texels (H, W, C) float32 with the texture's filter and transform; row 0 is at v = 0 in both programs."""
     if texture.wrap[0] != texture.wrap[1]:
         refuse("wrap that differs between the axes", f"texture {texture.name!r}")
@@ -99,7 +102,7 @@ def _bitmap(mi: Any, texture: Texture, values: np.ndarray) -> dict[str, Any]:
             "filter_type": "bilinear", "wrap_mode": texture.wrap[0], "to_uv": mi.ScalarTransform3f(to_uv)}
 
 
-def _opacity(mi: Any, material: Material) -> Any:
+def _opacity(mi: ModuleType, material: Material) -> MitsubaObject:
     """Return None if opaque, else a number or a bitmap."""
     if material.alpha_mode == "opaque":
         return None

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 
 from wrt.core.errors import InputError
-from wrt.lab.mitsuba.bsdfs import refuse, rgb
+from wrt.lab.mitsuba.bsdfs import Plugin, refuse, rgb
 from wrt.scene.backgrounds import Background, ConstantBackground, EnvironmentBackground, GradientBackground
 from wrt.scene.lights import Light, SpotLight
 
@@ -19,20 +20,20 @@ SPOT_TEXELS = 1024
 WIDEST_SPOT = math.radians(80.0)
 
 
-def light_emitter(mi: Any, light: Light) -> dict[str, Any]:
+def light_emitter(mi: ModuleType, light: Light) -> Plugin:
     """Return a light as a dictionary for `mitsuba.load_dict`."""
     if light.kind not in LIGHTS:
         refuse(f"light {light.name!r} of kind {light.kind!r}")
     return LIGHTS[light.kind](mi, light)
 
 
-def _spot(mi: Any, light: SpotLight) -> dict[str, Any]:
+def _spot(mi: ModuleType, light: SpotLight) -> Plugin:
     """Mitsuba's falloff is linear in the angle; put wrt's into the texture that Mitsuba projects from the light."""
     direction = np.array(light.direction)
     up = np.eye(3)[int(np.argmin(np.abs(direction)))]
     cutoff = math.degrees(light.outer)
     target = np.array(light.position) + direction
-    spot: dict[str, Any] = {
+    spot: Plugin = {
         "type": "spot", "intensity": rgb(light.intensity), "cutoff_angle": cutoff, "beam_width": cutoff * (1.0 - 1e-6),
         "to_world": mi.ScalarTransform4f().look_at(list(light.position), target.tolist(), up.tolist()),
     }
@@ -48,7 +49,7 @@ def _spot(mi: Any, light: SpotLight) -> dict[str, Any]:
     return spot | {"texture": {"type": "bitmap", "data": mi.TensorXf(texels), "raw": True, "wrap_mode": "clamp"}}
 
 
-LIGHTS: dict[str, Callable[[Any, Any], dict[str, Any]]] = {
+LIGHTS: dict[str, Callable[[Any, Any], Plugin]] = {
     "point": lambda mi, light: {"type": "point", "position": list(light.position), "intensity": rgb(light.intensity)},
     "directional": lambda mi, light: {
         "type": "directional", "direction": list(light.direction), "irradiance": rgb(light.irradiance)},
@@ -56,7 +57,7 @@ LIGHTS: dict[str, Callable[[Any, Any], dict[str, Any]]] = {
 }
 
 
-def background_emitter(mi: Any, background: Background) -> dict[str, Any] | None:
+def background_emitter(mi: ModuleType, background: Background) -> Plugin | None:
     """Return the background as an emitter, or None for constant black.
     Raise InputError for a picture under 3 columns wide, and for a kind that is not in BACKGROUNDS."""
     if background.kind not in BACKGROUNDS:
@@ -64,11 +65,11 @@ def background_emitter(mi: Any, background: Background) -> dict[str, Any] | None
     return BACKGROUNDS[background.kind](mi, background)
 
 
-def _constant(mi: Any, background: ConstantBackground) -> dict[str, Any] | None:
+def _constant(mi: ModuleType, background: ConstantBackground) -> Plugin | None:
     return {"type": "constant", "radiance": rgb(background.color)} if max(background.color) > 0.0 else None
 
 
-def _gradient(mi: Any, background: GradientBackground) -> dict[str, Any]:
+def _gradient(mi: ModuleType, background: GradientBackground) -> Plugin:
     height = np.cos(np.linspace(0.0, math.pi, GRADIENT_ROWS))[:, None]
     share = 0.5 * (height + 1.0)
     rows = share * np.array(background.top) + (1.0 - share) * np.array(background.bottom)
@@ -76,7 +77,7 @@ def _gradient(mi: Any, background: GradientBackground) -> dict[str, Any]:
     return {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(picture, np.float32))}
 
 
-def _environment(mi: Any, background: EnvironmentBackground) -> dict[str, Any]:
+def _environment(mi: ModuleType, background: EnvironmentBackground) -> Plugin:
     image = background.image
     if image.shape[1] < 3:
         raise InputError(f"Mitsuba needs 3 columns or more, got {image.shape[1]}", place=f"environment {background.name!r}")
@@ -91,6 +92,6 @@ def _environment(mi: Any, background: EnvironmentBackground) -> dict[str, Any]:
     return {"type": "envmap", "bitmap": mi.Bitmap(rows), "scale": background.scale, "to_world": turn}
 
 
-BACKGROUNDS: dict[str, Callable[[Any, Any], dict[str, Any] | None]] = {
+BACKGROUNDS: dict[str, Callable[[Any, Any], Plugin | None]] = {
     "constant": _constant, "gradient": _gradient, "environment": _environment,
 }

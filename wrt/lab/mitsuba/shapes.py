@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 
-from wrt.lab.mitsuba.bsdfs import bsdf, emission, refuse
+from wrt.lab.mitsuba.bsdfs import MitsubaObject, Plugin, bsdf, emission, refuse
 from wrt.scene.materials import Material
 from wrt.scene.model import Object, Sphere
 
@@ -32,7 +33,7 @@ class Triangles(NamedTuple):
         return Triangles(self.vertices[vertices], faces.reshape(-1, 3), normals, uvs)
 
 
-def object_parts(mi: Any, thing: Object, object_id: int) -> Iterator[tuple[str, Any, Part]]:
+def object_parts(mi: ModuleType, thing: Object, object_id: int) -> Iterator[tuple[str, MitsubaObject, Part]]:
     """Yield (shape id, `mitsuba.Mesh`, Part) for each material that a face of the object has."""
     world = _to_world(thing)
     of_face = np.zeros(len(world.faces), np.int32) if thing.face_material is None else thing.face_material
@@ -47,7 +48,7 @@ def object_parts(mi: Any, thing: Object, object_id: int) -> Iterator[tuple[str, 
         yield name, make_mesh(mi, name, triangles, _properties(mi, material)), part
 
 
-def sphere_shape(mi: Any, sphere: Sphere) -> Any:
+def sphere_shape(mi: ModuleType, sphere: Sphere) -> Plugin:
     """Return a sphere, turned: Mitsuba's u runs around z from x and its v down from +z; z becomes +y and x becomes -x."""
     pose = np.eye(4)
     pose[:3, :3] = sphere.radius * np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
@@ -55,9 +56,9 @@ def sphere_shape(mi: Any, sphere: Sphere) -> Any:
     return {"type": "sphere", "to_world": mi.ScalarTransform4f(pose), **_properties(mi, sphere.material)}
 
 
-def _properties(mi: Any, material: Material) -> dict[str, Any]:
+def _properties(mi: ModuleType, material: Material) -> Plugin:
     """Return a shape's nested plugins: its BSDF, its emitter, the medium inside."""
-    nested: dict[str, Any] = {"bsdf": bsdf(mi, material)}
+    nested: Plugin = {"bsdf": bsdf(mi, material)}
     if material.is_emissive:
         if material.two_sided:
             refuse("two_sided emission", f"material {material.name!r}")
@@ -107,7 +108,7 @@ def _face_normals(triangles: Triangles) -> np.ndarray:
     return (normals / np.where(length > 0.0, length, 1.0)).astype(np.float32)
 
 
-def make_mesh(mi: Any, name: str, triangles: Triangles, nested: dict[str, Any]) -> Any:
+def make_mesh(mi: ModuleType, name: str, triangles: Triangles, nested: Plugin) -> MitsubaObject:
     properties = mi.Properties()
     for key, value in nested.items():
         properties[key] = mi.load_dict(value)

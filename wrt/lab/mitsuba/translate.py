@@ -16,13 +16,14 @@ import importlib
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 
 from wrt.core.checks import as_choice
 from wrt.core.errors import InputError
-from wrt.lab.mitsuba.bsdfs import refuse
+from wrt.lab.mitsuba.bsdfs import MitsubaObject, Plugin, refuse
 from wrt.lab.mitsuba.emitters import background_emitter, light_emitter
 from wrt.lab.mitsuba.shapes import Part, object_parts, sphere_shape
 from wrt.scene.cameras import Camera, CameraKind, OrthographicCamera
@@ -33,7 +34,7 @@ INTEGRATORS = ("auto", "whitted", "path", "direct", "volpath")
 
 
 @contextmanager
-def mitsuba(variant: str = VARIANT) -> Iterator[Any]:
+def mitsuba(variant: str = VARIANT) -> Iterator[ModuleType]:
     """Set a variant of the module `mitsuba` while the block runs. Raise InputError if Mitsuba is missing."""
     try:
         mi = importlib.import_module("mitsuba")
@@ -54,17 +55,17 @@ def mitsuba(variant: str = VARIANT) -> Iterator[Any]:
 class Translation(NamedTuple):
     """scene: the `mitsuba.Scene`; parts: shape id -> the object and faces of the shape."""
 
-    scene: Any
+    scene: MitsubaObject
     parts: dict[str, Part]
 
 
-def translate(mi: Any, scene: Scene, camera: CameraKind | str | int | None = None, integrator: str = "auto") -> Translation:
+def translate(mi: ModuleType, scene: Scene, camera: CameraKind | str | int | None = None, integrator: str = "auto") -> Translation:
     """Return the scene for the module `mitsuba` with its current variant, with sensor, film, sampler and integrator.
 
     camera: a camera, or the name or index of the scene's. integrator: of INTEGRATORS; "auto" is "volpath" if something absorbs or is partly
     transparent, else "path". Raise InputError for what cannot be translated exactly."""
     as_choice(integrator, INTEGRATORS, "integrator")
-    contents: dict[str, Any] = {"type": "scene", "embree_use_robust_intersections": True}
+    contents: Plugin = {"type": "scene", "embree_use_robust_intersections": True}
     parts: dict[str, Part] = {}
     for index, thing in enumerate(scene.objects):
         for name, shape, part in object_parts(mi, thing, index):
@@ -120,7 +121,7 @@ def _check_light_transport(scene: Scene, integrator: str) -> None:
             refuse(f'alpha with integrator "{integrator}"')
 
 
-def _integrator(mi: Any, name: str, scene: Scene, lit: bool, parts: dict[str, Part]) -> Any:
+def _integrator(mi: ModuleType, name: str, scene: Scene, lit: bool, parts: dict[str, Part]) -> MitsubaObject:
     max_depth = scene.settings.max_depth
     if name == "whitted":
         from wrt.lab.mitsuba.whitted import Walk, whitted_integrator
@@ -134,11 +135,11 @@ def _integrator(mi: Any, name: str, scene: Scene, lit: bool, parts: dict[str, Pa
     return {"type": name, "max_depth": max_depth + 2, "rr_depth": 1 << 16}
 
 
-def _sensor(mi: Any, scene: Scene, camera: CameraKind) -> dict[str, Any]:
+def _sensor(mi: ModuleType, scene: Scene, camera: CameraKind) -> Plugin:
     far, (width, height) = _farthest(scene, camera), scene.settings.size
     # Mitsuba's camera looks along +z with +x to the left: half a turn about y away from glTF's.
     pose = camera.camera_to_world @ np.diag([-1.0, 1.0, -1.0, 1.0])
-    sensor: dict[str, Any] = {
+    sensor: Plugin = {
         "near_clip": 1e-5 * far, "far_clip": 4.0 * far,
         "film": {"type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgb", "component_format": "float32",
                  "rfilter": {"type": "box"}},

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import importlib
-from typing import Any
+from types import ModuleType
 
+from wrt.lab.mitsuba.bsdfs import MitsubaObject
 from wrt.scene.values import Color
 
 MAX_TRANSPARENT = 256  # surfaces in a row that a ray may go straight through
@@ -17,7 +18,8 @@ class Walk:
     - max_depth: bounces after the first hit; lights: True if there is an emitter to sample.
     - absorption: shape id -> coefficient inside; blended: ids of shapes that rays pass by their alpha, which is no bounce."""
 
-    def __init__(self, mi: Any, max_depth: int, ambient: Color, lights: bool, absorption: dict[str, Color], blended: set[str]) -> None:
+    def __init__(self, mi: ModuleType, max_depth: int, ambient: Color, lights: bool, absorption: dict[str, Color],
+                 blended: set[str]) -> None:
         flags = mi.BSDFFlags
         self.mi, self.max_depth, self.lights, self.blended = mi, max_depth, lights, blended
         self.diffuse, self.smooth, self.null = int(flags.Diffuse), int(flags.Smooth), int(flags.Null)
@@ -28,7 +30,7 @@ class Walk:
         self.ambient = mi.Color3f(ambient)
         self.inside = {shape: mi.Color3f(value) for shape, value in absorption.items()}
 
-    def transmittance(self, scene: Any, si: Any, light: Any) -> Any:
+    def transmittance(self, scene: MitsubaObject, si: MitsubaObject, light: MitsubaObject) -> MitsubaObject:
         """Return the share of the light that passes a shadow ray's surfaces: solid ones block all, cut-outs and thin panes a part."""
         share = self.mi.Color3f(1.0)
         ray = si.spawn_ray_to(light.p)
@@ -43,7 +45,7 @@ class Walk:
             ray = hit.spawn_ray_to(light.p)
         return self.mi.Color3f(0.0)
 
-    def direct_light(self, scene: Any, sampler: Any, si: Any, bsdf: Any) -> Any:
+    def direct_light(self, scene: MitsubaObject, sampler: MitsubaObject, si: MitsubaObject, bsdf: MitsubaObject) -> MitsubaObject:
         """Sample one light once; traced reflections find lights with an area."""
         light, weight = scene.sample_emitter_direction(si, sampler.next_2d(), False)
         if light.pdf == 0.0 or not (light.delta or bsdf.flags() & self.diffuse):
@@ -51,7 +53,7 @@ class Walk:
         value = weight * bsdf.eval(self.anywhere, si, si.to_local(light.d))
         return value * self.transmittance(scene, si, light) if max(value) > 0.0 else value
 
-    def reflected(self, scene: Any, sampler: Any, si: Any, bsdf: Any) -> Any:
+    def reflected(self, scene: MitsubaObject, sampler: MitsubaObject, si: MitsubaObject, bsdf: MitsubaObject) -> MitsubaObject:
         """Return the light of emitters and of the ambient that a surface reflects back along the path."""
         radiance = self.mi.Color3f(0.0)
         if self.lights and bsdf.flags() & self.smooth:
@@ -61,7 +63,7 @@ class Walk:
             radiance += self.ambient * bsdf.eval_diffuse_reflectance(si) * there
         return radiance
 
-    def sample(self, scene: Any, sampler: Any, ray: Any) -> tuple[Any, bool, list[Any]]:
+    def sample(self, scene: MitsubaObject, sampler: MitsubaObject, ray: MitsubaObject) -> tuple[MitsubaObject, bool, list[str]]:
         """Return radiance along a ray, whether it hit anything, and no AOVs, as Mitsuba's SamplingIntegrator.sample."""
         radiance, throughput, within = self.mi.Color3f(0.0), self.mi.Color3f(1.0), None
         depth = passed = 0
@@ -93,7 +95,7 @@ class Walk:
         return radiance, True, []
 
 
-def whitted_integrator(mi: Any, walk: Walk) -> Any:
+def whitted_integrator(mi: MitsubaObject, walk: Walk) -> MitsubaObject:
     """Return an integrator that samples a Walk, in Python: some 10 microseconds a bounce, for small pictures."""
 
     class Whitted(mi.SamplingIntegrator):  # its base exists only once Mitsuba's variant is set
@@ -103,7 +105,7 @@ def whitted_integrator(mi: Any, walk: Walk) -> Any:
         def aov_names(self) -> list[str]:
             return []
 
-        def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: bool = True) -> Any:
+        def sample(self, scene: MitsubaObject, sampler: MitsubaObject, ray: MitsubaObject, *_: object) -> MitsubaObject:
             return walk.sample(scene, sampler, ray)
 
     return Whitted()

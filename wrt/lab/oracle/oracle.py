@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,6 +22,12 @@ from wrt.lab.oracle.bounds import Bounds, sphere_bounds, sure, triangle_bounds
 from wrt.scene.exact import UNIT, Crossings, Place, SphereCrossings, exact_plane, sphere_crossings, triangle_crossings
 
 __all__ = ["AllHits", "Answer", "Bounds", "Crossings", "Place", "Reference", "closest", "reference_of", "sure", "t_bound"]
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from wrt.accel.geometry import Geometry
+    from wrt.scene.mesh import Mesh
 
 WIDTH = 4  # children of a node
 RAYS_AT_ONCE = 8192
@@ -67,7 +73,7 @@ class _Rays:
     near: np.ndarray
 
     @staticmethod
-    def of(origins: Any, directions: Any, t_min: Any, t_max: Any) -> _Rays:
+    def of(origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike, t_max: ArrayLike) -> _Rays:
         o, d = (np.ascontiguousarray(np.asarray(x, dtype=np.float32).astype(np.float64).T) for x in (origins, directions))
         n = o.shape[1]
         ends = [np.broadcast_to(np.asarray(x, dtype=np.float64), (n,)) for x in (t_min, t_max)]
@@ -86,7 +92,7 @@ class Reference:
     - geometry: vertices (V, 3), faces (F, 3) and perhaps spheres (S, 4) of centre and radius; float32 values.
     - prim_id counts the faces first, then the spheres. finite: (N,) bool, which primitives can be hit at all."""
 
-    def __init__(self, geometry: Any) -> None:
+    def __init__(self, geometry: Geometry | Mesh) -> None:
         vertices = np.asarray(geometry.vertices, dtype=np.float32).astype(np.float64)
         faces = np.asarray(geometry.faces, dtype=np.int64)
         spheres = np.asarray(getattr(geometry, "spheres", np.zeros((0, 4))), dtype=np.float32).astype(np.float64)
@@ -130,7 +136,7 @@ class Reference:
             node = (node[:, None] * WIDTH + np.arange(WIDTH)).reshape(-1)
         return ray, self.leaf_prim[node]
 
-    def all_hits(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf) -> AllHits:
+    def all_hits(self, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf) -> AllHits:
         """Return every hit of each ray in its closed segment. origins, directions: (N, 3), taken as float32; t_min, t_max: numbers or (N,).
         Rays that are not finite, or have no direction, hit nothing."""
         rays = _Rays.of(origins, directions, t_min, t_max)
@@ -173,13 +179,13 @@ class Reference:
         sphere = prim_id - self.n_triangles
         return rays.origin[:, ray], rays.direction[:, ray], self.center[:, sphere], self.radius[sphere]
 
-    def closest(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf) -> Answer:
+    def closest(self, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf) -> Answer:
         """Return the closest hit of each ray in its closed segment; arguments as for all_hits."""
         return self.closest_of(self.all_hits(origins, directions, t_min, t_max), origins, directions)
 
-    def closest_of(self, hits: AllHits, origins: Any, directions: Any) -> Answer:
+    def closest_of(self, hits: AllHits, origins: ArrayLike, directions: ArrayLike) -> Answer:
         """Return the closest of each ray's hits, which all_hits found for these rays."""
-        n = len(origins)
+        n = len(np.asarray(origins))
         answer = Answer(np.full(n, np.inf), np.full(n, -1, np.int32), np.zeros(n), np.zeros(n), np.zeros(n, np.int8), np.zeros(n, bool))
         if not len(hits):
             return answer
@@ -197,8 +203,8 @@ class Reference:
             getattr(answer, name)[ray] = getattr(hits, name)[winner]
         return answer
 
-    def _first_exactly(self, hits: AllHits, rows: np.ndarray, group: np.ndarray, origins: Any,
-                       directions: Any) -> Iterator[tuple[int, list[int]]]:
+    def _first_exactly(self, hits: AllHits, rows: np.ndarray, group: np.ndarray, origins: ArrayLike,
+                       directions: ArrayLike) -> Iterator[tuple[int, list[int]]]:
         """Yield, for each group among the rows, those with exactly the lowest t, by prim_id. Spheres are compared in float64."""
         rays = _Rays.of(origins, directions, 0.0, np.inf)
         triangle = hits.prim_id[rows] < self.n_triangles
@@ -212,7 +218,7 @@ class Reference:
             tied = [int(row) for row in part if exact[int(row)] == lowest]
             yield int(group[part[0]]), sorted(tied, key=lambda row: int(hits.prim_id[row]))
 
-    def against(self, origins: Any, directions: Any, prim_id: np.ndarray) -> tuple[Crossings, Bounds]:
+    def against(self, origins: ArrayLike, directions: ArrayLike, prim_id: np.ndarray) -> tuple[Crossings, Bounds]:
         """Intersect ray i with triangle prim_id[i] alone, anywhere on the ray's line; all must be finite.
         Return the exact crossings, and how far off a float32 unit may be."""
         rays = _Rays.of(origins, directions, 0.0, np.inf)
@@ -220,7 +226,8 @@ class Reference:
         found = triangle_crossings(rays.origin, rays.direction, corners, all_rows=True)
         return found, triangle_bounds(rays.origin, rays.direction, corners, found)
 
-    def against_sphere(self, origins: Any, directions: Any, prim_id: np.ndarray) -> tuple[SphereCrossings, np.ndarray, np.ndarray]:
+    def against_sphere(self, origins: ArrayLike, directions: ArrayLike,
+                       prim_id: np.ndarray) -> tuple[SphereCrossings, np.ndarray, np.ndarray]:
         """Return the crossings of ray i with sphere prim_id[i], bounds on the two t's (2, N), and whether a hit may be reported."""
         rays = _Rays.of(origins, directions, 0.0, np.inf)
         columns = self._sphere_columns(rays, np.arange(len(prim_id)), prim_id)
@@ -298,12 +305,13 @@ def _meets(boxes: np.ndarray, node: np.ndarray, rays: _Rays, ray: np.ndarray) ->
 
 
 @lru_cache(maxsize=4)
-def reference_of(geometry: Any) -> Reference:
+def reference_of(geometry: Geometry | Mesh) -> Reference:
     """Return the Reference of a geometry object, built once."""
     return Reference(geometry)
 
 
-def closest(geometry: Any, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf) -> Answer:
+def closest(geometry: Geometry | Mesh, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0,
+            t_max: ArrayLike = np.inf) -> Answer:
     """Return the closest hit of each ray in the closed segment [t_min, t_max]; at exactly equal t the lowest prim_id.
 
     geometry: as for `Reference`; origins, directions: (N, 3), taken as float32; t_min, t_max: numbers or (N,). t is good to 1e-14 relative,
@@ -312,7 +320,7 @@ def closest(geometry: Any, origins: Any, directions: Any, t_min: Any = 0.0, t_ma
     return reference_of(geometry).closest(origins, directions, t_min, t_max)
 
 
-def t_bound(origins: Any, directions: Any, triangles: Any) -> np.ndarray:
+def t_bound(origins: ArrayLike, directions: ArrayLike, triangles: ArrayLike) -> np.ndarray:
     """Return how far the watertight test's t for ray i and triangle i may be from the exact one: (N,) float64, inf without a bound.
     See `wrt.lab.oracle.bounds`."""
     rays = _Rays.of(origins, directions, 0.0, np.inf)

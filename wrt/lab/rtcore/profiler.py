@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 import warp as wp
@@ -28,7 +28,10 @@ from wrt.renderer.tiles import Rectangle
 from wrt.scene.cameras import CameraKind
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Scene
-from wrt.scene.settings import SETTINGS
+from wrt.scene.settings import SETTINGS, SettingChanges
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 KINDS = ("primary", "reflection", "refraction", "straight", "shadow")
 PICTURES = (*COUNTERS, "lines", *(f"probes_{kind}" for kind in KINDS))
@@ -100,7 +103,7 @@ class Profile:
             sums[f"probes_{kind}"] = np.bincount(rays.pixel, rays.kind == i, n) / self.spp
         return {name: value.reshape(self.size[1], self.size[0]) for name, value in sums.items()}
 
-    def heatmap(self, name: str) -> Any:
+    def heatmap(self, name: str) -> Image.Image:
         """Return one of `maps` as a PIL image with its scale, which notebooks show. Raise InputError for an unknown name."""
         from PIL import Image
 
@@ -110,7 +113,7 @@ class Profile:
             raise InputError(f"no picture {name!r}", hint=f"there is {', '.join(PICTURES)}")
         return Image.fromarray(heatmap(self.maps[name], TITLES[name] + ("" if name == "stack" else " a sample")))
 
-    def by_depth(self) -> list[dict[str, Any]]:
+    def by_depth(self) -> list[dict[str, object]]:
         """Return a row for each kind of ray at each depth: depth, kind, hits, and each counter summed (`stack`: the largest)."""
         rays, rows = self.rays, []
         for depth in np.unique(rays.depth):
@@ -124,19 +127,9 @@ class Profile:
         return rows
 
 
-class ProfileOptions(TypedDict, total=False):
-    """Keyword arguments of `profile`: settings of the scene, then options of the render."""
+class ProfileOptions(SettingChanges, total=False):
+    """Keyword arguments of `profile`: settings of the scene, and options of the render."""
 
-    spp: int | None
-    size: tuple[int, int] | str | None
-    max_depth: int | None
-    min_throughput: float | None
-    filter: str | None
-    fresnel: str | None
-    glass_shadows: str | None
-    sampler: str | None
-    exposure: float | None
-    tonemap: str | None
     seed: int
     device: str
     accel: str
@@ -178,7 +171,7 @@ def profile(scene: Scene | Mesh | PathLike, **options: Unpack[ProfileOptions]) -
     settings = {name: given.pop(name) for name in SETTINGS if name in given}
     settings = {"spp": 1, **{name: value for name, value in settings.items() if value is not None}}
     for name in given:
-        if name not in ProfileOptions.__annotations__:
+        if name not in ProfileOptions.__optional_keys__:
             raise InputError("is no argument of a profile", argument=name)
     return Profiler(as_scene(scene).with_settings(**settings), Options(**{"tile_size": TILE_SIZE, **given})).measure()
 
@@ -243,7 +236,7 @@ class Profiler:
         first = np.cumsum(tile.used, dtype=np.int64) - tile.used
         n = int(tile.used.sum(dtype=np.int64))
 
-        def run(film: int, recorder: Any) -> Any:
+        def run(film: int, recorder: Recorder) -> ray_log.RayLog:
             recorder.counts = zeros(n, Counts)
             log = ray_log.RayLog()
             log.used = zeros(len(tile.used), wp.int32)
