@@ -252,6 +252,7 @@ def test_the_text_can_be_followed(tmp_path: Path) -> None:
     for folder in ("wrt", "kernels"):
         shutil.copytree(ROOT / folder, tmp_path / folder, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
     apply(tmp_path)
+    shutil.copy(ROOT / "tests" / "stored_normal.py", tmp_path)
     (tmp_path / "sign.toml").write_text(SIGN)
     (tmp_path / "stage.toml").write_text(STAGE)
     assert python(tmp_path, "-c", TRY_IT).endswith("all of it works\n")

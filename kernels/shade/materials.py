@@ -144,7 +144,7 @@ def make_metallic_roughness(features: Features) -> Any:
     return metallic_roughness
 
 
-# By the names in wrt.scene.materials.MATERIALS: from a scene's features to the device function. Material.kind is the index here.
+# From a scene's features to the device function; Material.kind is the index.
 MATERIALS = {
     "diffuse": lambda features: diffuse,
     "mirror": lambda features: mirror,
