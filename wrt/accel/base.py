@@ -1,8 +1,7 @@
-"""A structure over one mesh: what it is built from, what becomes of it, what it tells of itself."""
+"""Structures over one mesh: construction, refits, files."""
 
 from __future__ import annotations
 
-import os
 from abc import ABC, abstractmethod
 from copy import copy
 from dataclasses import replace
@@ -24,28 +23,28 @@ from wrt.core.arrays import check_no_gradients, taken
 from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.core.seconds import build_clock
+from wrt.core.types import ArrayLike, KernelModule, PathLike, WarpArray, WarpStruct, WarpType
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.warp_private import fields_of
 
 
 class OneMesh(Accelerator, ABC):
-    """A structure over a geometry, on a device. Subclasses set `name`, `kernels` and `options`, and implement `_build`.
+    """A structure over a mesh, on a device. Subclasses set `name`, `kernels` and `options`, and implement `_build`.
 
-    options: a frozen dataclass of what the builder can be told; it raises InputError for values out of range. kernels: the
-    traversal's module, with make_struct(record) and make_traversal(units, any_hit, accepts). stream: of structures with a kernel
-    for many rays at a time on the CPU (wrt.accel.queries.batches), where that is made: make_stream(units, any_hit), which gives
-    None for units that it has no kernel for; stream_block; stream_sizes. The last of the kernel's slots tells whether it met a ray
-    that a query refuses. can_refit: whether `_refit` follows vertices.
+    options: frozen dataclass of the builder's options, which raises InputError for values out of range. kernels: module of the
+    traversal, with make_struct(record) and make_traversal(units, any_hit, accepts). stream: module of a kernel for many rays at a
+    time on the CPU (wrt.accel.queries.batches), with make_stream(units, any_hit), which returns None for units without one,
+    stream_block and stream_sizes. can_refit: whether `_refit` follows vertices.
     """
 
     name: ClassVar[str]
-    kernels: Any
-    stream: ClassVar[Any] = None
-    options: ClassVar[type[Any]]
+    kernels: KernelModule
+    stream: ClassVar[KernelModule | None] = None
+    options: ClassVar[type[Any]]  # a dataclass of each structure's own
     can_refit: ClassVar[bool] = False
 
     def __init__(self, geometry: Geometry, attributes: FlatScene | None = None, /, device: str = "cpu", threads: int | None = None, *,
-                 triangle: str = "watertight", box: str = "conservative", **options: Any) -> None:
+                 triangle: str = "watertight", box: str = "conservative", **options: object) -> None:
         super().__init__(Structure(type(self), Units(triangle, box)), geometry.kept(), attributes, device, threads)
         self.built_with = options_of(self.name, self.options, options)
         begin = build_clock()
@@ -54,9 +53,11 @@ class OneMesh(Accelerator, ABC):
 
     @classmethod
     def restore(cls, built: Built, geometry: Geometry, attributes: FlatScene | None = None, /, device: str = "cpu",
-                threads: int | None = None, *, units: Units | None = None, built_with: Any = None) -> Self:
-        """What was built before over the same geometry. built_with: its options (None: not known, and those that there are by
-        default). Raises InputError where `built` is no such structure."""
+                threads: int | None = None, *, units: Units | None = None, built_with: object = None) -> Self:
+        """Restore a structure over the same geometry from `built`. built_with: its options (None: the defaults).
+
+        Raises InputError if `built` is not a structure of this class over the geometry.
+        """
         self = cls.__new__(cls)
         Accelerator.__init__(self, Structure(cls, units or Units()), geometry.kept(), attributes, device, threads)
         self.built_with = cls.options() if built_with is None else built_with
@@ -66,43 +67,41 @@ class OneMesh(Accelerator, ABC):
         self._take(built, begin, built.sah_cost)
         return self
 
-    def __reduce__(self) -> Any:
-        """For pickle: what `save` writes, and what the structure is over. A refit there measures growth from the shape of now."""
+    def __reduce__(self) -> tuple[object, ...]:
+        """Pickle the arrays and the geometry. In the copy, a refit measures growth from the present shape."""
         units, snapshot = self.structure.units, self._snapshot
         make = partial(type(self).restore, device=str(self.device), threads=self.threads, units=units, built_with=self.built_with)
-        return make, (snapshot.built.on_host(), snapshot.geometry, snapshot.attributes)
+        return make, (self.built, self.geometry, snapshot.attributes)
 
     @property
     def geometry(self) -> Geometry:
-        """The geometry that the structure is over, as it is now."""
-        geometry: Geometry = self._snapshot.geometry
-        return geometry
+        """Geometry of the mesh as it is now."""
+        return self._snapshot.one_mesh[0]
 
     @property
     def built(self) -> Built:
-        """What the builder gave, or the last refit."""
-        built: Built = self._snapshot.built
-        return built.on_host()
+        """Arrays of the builder or of the last refit, on the host."""
+        return self._snapshot.one_mesh[1].on_host()
 
     @property
-    def world(self) -> Any:
-        """The structure, as it is now, as an argument of a kernel of one's own (wrt.ray_query)."""
+    def world(self) -> WarpStruct:
+        """The structure as it is now, as an argument of kernels (`wrt.ray_query`)."""
         return kernel_argument(self._snapshot)
 
     def _over(self, geometry: Geometry) -> Self:
-        """A copy over another geometry, before anything is built over it: others still ask for the old shape."""
+        """Return a copy over another geometry with nothing built yet; queries of `self` go on with the old shape."""
         other = copy(self)
         other._snapshot = self._snapshot.over(geometry)
         return other
 
     def _built_over(self, geometry: Geometry, built: Built, built_cost: float) -> Self:
-        """A copy with what was built over another geometry."""
+        """Return a copy with arrays that were built over another geometry."""
         other = self._over(geometry)
         other._take(built, build_clock(), built_cost)
         return other
 
     def _take(self, built: Built, begin: float, built_cost: float) -> None:
-        """Have what was built. begin: when that began; built_cost: as in Snapshot."""
+        """Upload the arrays and set the snapshot. begin: clock at the start of the build; built_cost: as in Snapshot."""
         data = self._upload(built)
         stats = AccelStats(build_clock() - begin, built.nodes, built.leaves, built.depth, built.references,
                            array_bytes(data), built.sah_cost)
@@ -110,41 +109,52 @@ class OneMesh(Accelerator, ABC):
 
     @abstractmethod
     def _build(self, options: Any) -> Built:
-        """The structure over self.geometry, on the host; options: an instance of the class's `options`."""
+        """Build over self.geometry, on the host; options: an instance of the class's `options`."""
 
     def _check(self, built: Built) -> None:
-        """Raise InputError where arrays that come from a file would lead a ray out of them or round in circles."""
+        """Raise InputError if arrays of a file would lead a ray out of bounds or into a cycle."""
         raise InputError(f"a {self.name} cannot be read from a file")
 
     def _refit(self, built: Built) -> Built:
-        """The same tree around self.geometry, whose vertices have moved. Asked of structures that can_refit."""
+        """Fit the tree to self.geometry, whose vertices have moved. Called only if can_refit."""
         raise NotImplementedError
 
-    def _moved(self, vertices: Any) -> Geometry:
-        """The geometry with other vertices. Raises InputError for what these cannot be."""
+    def _moved(self, vertices: ArrayLike) -> Geometry:
+        """Return the geometry with other vertices. Raises InputError for other shapes and values that are not finite."""
         moved = vectors(vertices, "vertices").copy()
         if moved.shape != (self.geometry.n_vertices, 3):
             raise InputError(f"must be {(self.geometry.n_vertices, 3)}, got {moved.shape}", argument="vertices")
         return Geometry(moved, self.geometry.faces, self.geometry.spheres)
 
-    def _refit_in_place(self, points: Any) -> None:
-        """As `refit`, in place."""
+    def _refit_in_place(self, points: ArrayLike) -> None:
         raise InputError(f"a {self.name} cannot be refitted in place", hint="take bvh2")
 
-    def refit(self, vertices: Any, rebuild_at: float = np.inf, *, in_place: bool = False) -> Refit:
-        """Follow vertices that have moved, (V, 3) float32 (a tensor, too) or a Warp array (V,) of vec3, as many as before: boxes
-        are fitted anew, the tree stays as it is. bvh2 takes a Warp array where it is: of a GPU nothing comes to the host but the
-        growth.
+    def refit(self, vertices: ArrayLike, rebuild_at: float = np.inf, *, in_place: bool = False) -> Refit:
+        """Fit the boxes of the tree to vertices that have moved; the tree itself stays.
 
-        It answers as exactly as a new one, but slower and slower as the motion mixes what was near. rebuild_at: build it anew
-        (as it was built) where the SAH cost passes this multiple of what it was when built. Other threads may go on asking:
-        every query that begins before the refit ends answers of the old shape, all others of the new one. While a wp.Tape records,
-        hits after it have gradients in a Warp array that requires them.
+        Hits are as exact as those of a new structure, but queries get slower as the motion mixes primitives that were near each
+        other. Other threads may go on with queries: those that begin before the refit ends see the old shape.
 
-        in_place: from a Warp array on the structure's device into the arrays that there are, for a CUDA graph to capture: after a
-        first call no memory is taken, nothing copied and nothing waited for; the growth is not known (NaN), and no other thread
-        may ask meanwhile. Raises InputError for another shape or values that are not finite (of a Warp array on a GPU they are
-        not looked at), and from structures that cannot be refitted.
+        Parameters
+        ----------
+        vertices : (V, 3) array_like, or Warp array (V,) of vec3
+            As many as before, finite; the values of a Warp array on a GPU are not checked. bvh2 reads a Warp array in place.
+            While a `wp.Tape` records, later hits have gradients in a Warp array that requires them.
+        rebuild_at : float
+            Build a new tree if the SAH cost exceeds this multiple of its value at the last build.
+        in_place : bool
+            Write a Warp array on the structure's device into the existing arrays, as a CUDA graph can capture. After a first call
+            this allocates nothing and waits for nothing; no other thread may query meanwhile. Only bvh2.
+
+        Returns
+        -------
+        Refit
+            Growth of the SAH cost (NaN in place), and whether a new tree was built.
+
+        Raises
+        ------
+        InputError
+            For other shapes and values, and for structures that cannot be refitted.
         """
         if not self.can_refit:
             raise InputError(f"a {self.name} cannot follow vertices that move", hint="build it again, or take bvh2")
@@ -156,7 +166,7 @@ class OneMesh(Accelerator, ABC):
                 self._refit_in_place(vertices)
                 return Refit(build_clock() - begin, float("nan"), False)
             beside = self._over(self._moved(vertices))
-            built, built_cost = beside._refit(before.built), before.built_cost
+            built, built_cost = beside._refit(before.one_mesh[1]), before.built_cost
             growth = float(built.sah_cost) / float(built_cost) if built_cost > 0.0 else 1.0
             if rebuilt := growth > rebuild_at:
                 built = beside._build(self.built_with)
@@ -166,23 +176,35 @@ class OneMesh(Accelerator, ABC):
             self._snapshot = replace(beside._snapshot, followed=followed)
             return Refit(beside.stats.build_seconds, growth, rebuilt)
 
-    def _children(self, built: Built) -> Any:
-        """A hierarchy of boxes as kernels.build.end_point_overlap.Children."""
+    def _children(self, built: Built) -> WarpStruct:
+        """Return a hierarchy of boxes as kernels.build.end_point_overlap.Children."""
         raise InputError(f"a {self.name} has no end-point overlap: it is no hierarchy of boxes")
 
     def epo(self) -> float:
-        """End-point overlap of a BVH: nodes and primitives visited for nothing at a random point of the surface
-        (wrt.accel.epo).
+        """Compute the end-point overlap of a BVH: expected number of nodes and primitives visited in vain at a surface point.
 
-        It tells of rays that end, as stats.sah_cost does of lines that nothing stops; it takes about as long as a build. Raises
-        InputError for structures that are no BVH.
+        It predicts the cost of rays that end on surfaces, as `stats.sah_cost` predicts that of lines. It takes as long as a build.
+
+        Returns
+        -------
+        float
+            Overlap with both costs 1.
+
+        Raises
+        ------
+        InputError
+            For structures that are no BVH.
+
+        References
+        ----------
+        Aila, Karras and Laine 2013, "On Quality Metrics of Bounding Volume Hierarchies".
         """
         from wrt.accel.epo import end_point_overlap
 
-        snapshot = self._snapshot
-        return end_point_overlap(self._children(snapshot.built.on_host()), snapshot.geometry, self.threads)
+        geometry, built = self._snapshot.one_mesh
+        return end_point_overlap(self._children(built.on_host()), geometry, self.threads)
 
-    def _upload(self, built: Built) -> Any:
+    def _upload(self, built: Built) -> WarpStruct:
         data = self.structure.struct()
         types = fields_of(data)
         for name, array in built.arrays.items():
@@ -192,15 +214,26 @@ class OneMesh(Accelerator, ABC):
         data.primitives = self._there(self._primitives(built), types["primitives"].dtype)
         return data
 
-    def _there(self, array: Any, dtype: Any) -> Any:
+    def _there(self, array: np.ndarray | WarpArray, dtype: WarpType) -> WarpArray:
         return array if isinstance(array, wp.array) else upload(array, dtype, self.device)
 
-    def _primitives(self, built: Built) -> Any:
-        """What the struct's `primitives` holds: the triangle test's records, in the order of the leaves."""
+    def _primitives(self, built: Built) -> np.ndarray | WarpArray:
+        """Return the records of the triangle test in the order of the leaves."""
         return self.geometry.primitives(self.structure.units, built.order, self.threads)
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the structure to a file (.accel) that wrt.load_accel reads. Raises InputError where the system refuses."""
+    def save(self, path: PathLike) -> None:
+        """Write the structure to a file that `wrt.load_accel` reads.
+
+        Parameters
+        ----------
+        path : str or path
+            File with the suffix .accel.
+
+        Raises
+        ------
+        InputError
+            For another suffix, and if the file cannot be written.
+        """
         save(self._snapshot, path)
 
     def __repr__(self) -> str:
@@ -209,7 +242,7 @@ class OneMesh(Accelerator, ABC):
                 f"{s.bytes / 1e6:.1f} MB, SAH {s.sah_cost:.1f}, built in {s.build_seconds:.3f} s)")
 
 
-def array_bytes(data: Any) -> int:
-    """Bytes of all arrays of a Warp struct."""
+def array_bytes(data: WarpStruct) -> int:
+    """Return the bytes of all arrays of a Warp struct."""
     arrays = (getattr(data, name) for name in fields_of(data))
     return sum(array.capacity for array in arrays if isinstance(array, wp.array))

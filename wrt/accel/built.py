@@ -1,4 +1,4 @@
-"""The arrays that a builder gives, and figures of a structure: sizes, costs, refits."""
+"""Arrays that a builder makes, and figures of a structure: sizes, costs, refits."""
 
 from __future__ import annotations
 
@@ -8,16 +8,17 @@ from typing import Any
 import warp as wp
 
 from wrt.core.device import on_host
+from wrt.core.types import WarpArray
 
 
 @dataclass(frozen=True, eq=False)
 class Built:
-    """What a builder gives: arrays, one for each field of the structure's struct but `primitives` and `recorder`, records or
-    rows of numbers (a field that is no array: a NumPy scalar or row); order: (R,) int32, the prim_id of each record of
-    `primitives`, where one may stand more than once, unless cells share records: then there is an array `references` of their
-    indices; and what AccelStats tells of a tree.
+    """Result of a builder, in NumPy arrays, or in Warp's if it was built on a device (`parents`: of each node there).
 
-    What was made on a device is there: then arrays and order are Warp's, and parents is the parent of each node."""
+    arrays: one for each field of the structure's struct but `primitives` and `recorder`: records, or rows of numbers. order: (R,)
+    int32, prim_id of each record of `primitives`; one may occur several times. Where cells share records, an array `references` has
+    their indices. nodes, leaves, depth, sah_cost: as in AccelStats.
+    """
 
     arrays: dict[str, Any]
     order: Any
@@ -25,10 +26,10 @@ class Built:
     leaves: int = 0
     depth: int = 0
     sah_cost: float = float("nan")
-    parents: Any = None
+    parents: WarpArray | None = None
 
     def on_host(self) -> Built:
-        """The same with NumPy arrays."""
+        """Return the same with NumPy arrays."""
         if not isinstance(self.order, wp.array):
             return self
         return replace(self, arrays={name: on_host(array) for name, array in self.arrays.items()}, order=on_host(self.order),
@@ -41,24 +42,44 @@ class Built:
 
 @dataclass(frozen=True)
 class AccelStats:
-    """build_seconds: wall clock, without those in which the builder's kernels were compiled; nodes, leaves, depth: 0 where there is
-    no tree; references: primitives in all leaves together, more than there are where a structure splits space; bytes: on the
-    device, triangles included; sah_cost: expected cost of a random line through the root box, one node visited and one
-    primitive tested costing 1 each (NaN where nobody knows)."""
+    """Figures of a structure.
 
-    build_seconds: float
-    nodes: int
-    leaves: int
-    depth: int
-    references: int
-    bytes: int
-    sah_cost: float
+    Attributes
+    ----------
+    build_seconds : float
+        Wall clock, without the compilation of kernels.
+    nodes, leaves, depth : int
+        Size of the tree; 0 without a tree.
+    references : int
+        Primitives in all leaves together; structures that split space hold some of them several times.
+    bytes : int
+        Memory on the device, triangles included.
+    sah_cost : float
+        Expected cost of a random line through the root box, at 1 per node visited and 1 per primitive tested; NaN if unknown.
+    """
+
+    build_seconds: float = 0.0
+    nodes: int = 0
+    leaves: int = 0
+    depth: int = 0
+    references: int = 0
+    bytes: int = 0
+    sah_cost: float = float("nan")
 
 
 @dataclass(frozen=True)
 class Refit:
-    """What OneMesh.refit or Instances.move did: seconds; growth: SAH cost of the refitted tree over that of the tree when it was
-    built; rebuilt: whether that was too much, and a new tree was built."""
+    """Result of `refit` or `move`.
+
+    Attributes
+    ----------
+    seconds : float
+        Wall clock.
+    growth : float
+        SAH cost of the refitted tree divided by its cost when it was built.
+    rebuilt : bool
+        Whether that was above `rebuild_at`, so that a new tree was built.
+    """
 
     seconds: float
     growth: float

@@ -47,6 +47,11 @@ class InstancedGeometry:
         return np.array([0, len(self.part)] if self.worlds is None else self.worlds, np.int64)
 
     @property
+    def n_worlds(self) -> int:
+        """Number of worlds; 1 where instances are not in worlds."""
+        return 1 if self.worlds is None else len(self.worlds) - 1
+
+    @property
     def world_first_prim(self) -> np.ndarray:
         """(W,) int64: the first of each world's primitives among those of all."""
         if self.worlds is None:

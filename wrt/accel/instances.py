@@ -104,6 +104,7 @@ class Instances(Accelerator):
 
     def __repr__(self) -> str:
         s, geometry = self.stats, self.geometry
+        assert isinstance(geometry, InstancedGeometry)
         return (f"Instances({len(geometry)} primitives in {len(geometry.part)} instances of "
                 f"{len(self.bottoms)} {self.structure.accel.name}, {s.bytes / 1e6:.1f} MB, built in {s.build_seconds:.3f} s)")
 

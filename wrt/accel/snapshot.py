@@ -1,57 +1,64 @@
-"""A structure at one time: all that a query reads, and all that a refit replaces."""
+"""State of a structure at one time: everything that a query reads and a refit replaces."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import TypeVar
 from weakref import WeakKeyDictionary
 
+from wrt.accel.built import AccelStats, Built
 from wrt.accel.flat_scene import FlatScene
+from wrt.accel.geometry import Geometry
+from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.structure import Structure
+from wrt.core.types import Device, WarpArray, WarpStruct
 
 T = TypeVar("T")
+UNBUILT = AccelStats()
 
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """A structure as it was once. A refit replaces it as a whole, and only a refit in place writes to what is in it: whoever takes
-    it once has parts that belong together, whatever other threads do.
+    """State of a structure. A refit replaces it as a whole; only a refit in place writes to its arrays.
 
-    structure: kind and test units; device: a Warp device; surfaces: kernels.structs.Surfaces with the number of triangles and the
-    spheres alone; attributes: what wrt.build knows of the primitives beyond the geometry (None: nothing); geometry: a Geometry or
-    an InstancedGeometry.
-
-    data: the Warp struct that kernels get; stats: AccelStats; built: what the builder gave, None of instances; built_cost: the SAH
-    cost that growth is measured against; roots: of instances the root of each world, a Warp array (W,); followed: the Warp array
-    of a refit, where it requires gradients (wrt.accel.queries.gradients); changes: whether refits in place write to it.
+    surfaces: kernels.structs.Surfaces with the number of triangles and the spheres alone. attributes: normals, materials and the
+    like, where wrt.build knows them. built: None over instances. built_cost: SAH cost that growth is measured against. roots: root
+    of each world (W,), over instances. followed: vertices of the last refit, if they require gradients. changes: refits in place
+    write to it.
     """
 
     structure: Structure
-    device: Any
-    surfaces: Any
+    device: Device
+    surfaces: WarpStruct
     attributes: FlatScene | None
-    geometry: Any
-    data: Any = None
-    stats: Any = None
-    built: Any = None
+    geometry: Geometry | InstancedGeometry
+    data: WarpStruct = None
+    stats: AccelStats = UNBUILT
+    built: Built | None = None
     built_cost: float = float("nan")
-    roots: Any = None
-    followed: Any = None
+    roots: WarpArray | None = None
+    followed: WarpArray | None = None
     changes: bool = False
 
-    def over(self, geometry: Any) -> Snapshot:
-        """The same over another geometry, before anything is built over it."""
+    @property
+    def one_mesh(self) -> tuple[Geometry, Built]:
+        """Geometry and arrays of a structure over one mesh."""
+        assert isinstance(self.geometry, Geometry) and self.built is not None
+        return self.geometry, self.built
+
+    def over(self, geometry: Geometry | InstancedGeometry) -> Snapshot:
+        """Return a snapshot over another geometry, with nothing built yet."""
         return Snapshot(self.structure, self.device, self.surfaces, self.attributes, geometry)
 
-    def counting(self, data: Any) -> Snapshot:
-        """The same for kernels that count, with another record of what they read."""
+    def counting(self, data: WarpStruct) -> Snapshot:
+        """Return the snapshot for kernels that count, with `data` in place of its own."""
         units = self.structure.units._replace(counters=True)
         return replace(self, structure=self.structure._replace(units=units), data=data)
 
 
 def once(make: Callable[[Snapshot], T]) -> Callable[[Snapshot], T]:
-    """A function of a snapshot: called once for each, unless refits in place change it."""
+    """Cache a function of a snapshot, except for snapshots that refits in place change."""
     kept: WeakKeyDictionary[Snapshot, T] = WeakKeyDictionary()
 
     def made(snapshot: Snapshot) -> T:

@@ -1,14 +1,13 @@
-"""Structures in files, to be built once: what `wrt build` writes and `wrt.load_accel` reads.
+"""Files of structures, which `wrt build` writes and `wrt.load_accel` reads.
 
-A file is a checked one (wrt.core.checked_file), whose header says what is in it and over which geometry. Types come from the
-structure's class, and indices are checked before a ray follows them.
+They are checked files (wrt.core.checked_file) whose header has the structure, the arrays and a hash of the geometry. Types come from
+the structure's class, and indices are checked before a ray follows them.
 """
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -23,54 +22,61 @@ from wrt.core import warp_private
 from wrt.core.checked_file import read_checked, write_checked
 from wrt.core.device import record_dtype
 from wrt.core.errors import InputError
+from wrt.core.types import JsonObject, PathLike, WarpType
 from wrt.core.version import VERSION
 from wrt.core.write_file import check_writable, replacing
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.warp_private import fields_of
 
+if TYPE_CHECKING:
+    from wrt.accel.base import OneMesh
+
 MAGIC = b"wrt acceleration structure 1\n"
 STATS = ("nodes", "leaves", "depth", "sah_cost")
 
 
-def array_types(accel: type[Any], triangle: str = "watertight") -> dict[str, np.dtype[Any]]:
-    """What each array of Built.arrays holds, by the fields of the structure's struct."""
+def array_types(accel: type[OneMesh], triangle: str = "watertight") -> dict[str, np.dtype]:
+    """Return the types of the rows of Built.arrays, by the fields of the structure's struct."""
     kinds = fields_of(Structure(accel, Units(triangle)).struct())
     return {name: row_type(kind.dtype if isinstance(kind, wp.array) else kind) for name, kind in kinds.items()
             if name not in ("primitives", "recorder")}
 
 
-def row_type(kind: Any) -> np.dtype[Any]:
-    """The NumPy type of one row of a Warp type: a struct, a vector or a number."""
+def row_type(kind: WarpType) -> np.dtype:
+    """Return the NumPy type of a row of a Warp type: a struct, a vector or a number."""
     return record_dtype(kind) if hasattr(kind, "numpy_dtype") else warp_private.row_type(kind)
 
 
-def check_target(path: str | os.PathLike[str]) -> None:
-    """Raise the InputError that saving to `path` would end in, before any work is done for it."""
+def check_target(path: PathLike) -> None:
+    """Raise InputError if `path` is no file for a structure, before any work is done."""
     if Path(path).suffix.lower() != ".accel":
         raise InputError("a structure is written to a .accel file", path=path)
     check_writable(path)
 
 
-def save(snapshot: Snapshot, path: str | os.PathLike[str]) -> None:
-    """Write it whole or not at all. Raises InputError where the system refuses."""
+def save(snapshot: Snapshot, path: PathLike) -> None:
+    """Write a structure wholly or not at all. Raises InputError if the file cannot be written."""
     check_target(path)
-    structure, built = snapshot.structure, snapshot.built.on_host()
+    structure, (geometry, built) = snapshot.structure, snapshot.one_mesh
+    built = built.on_host()
     units = structure.units
     rows = {name: np.ascontiguousarray(np.atleast_1d(array)) for name, array in built.arrays.items()}
     types = array_types(structure.accel, units.triangle)
     body = [rows[name].astype(types[name].base, copy=False).tobytes() for name in types]
     body.append(built.order.astype("<i4").tobytes())
     header = {"accel": structure.accel.name, "triangle": units.triangle, "box": units.box, "wrt": VERSION,
-              "geometry": snapshot.geometry.digest(), "bytes": {name: len(part) for name, part in zip(types, body, strict=False)},
+              "geometry": geometry.digest(), "bytes": {name: len(part) for name, part in zip(types, body, strict=False)},
               "order": len(built.order)} | {name: getattr(built, name) for name in STATS}
     with replacing(path) as file:
         write_checked(file, MAGIC, header, body)
 
 
-def read(path: str | os.PathLike[str], geometry: Geometry, attributes: FlatScene | None = None, device: str = "cpu",
-         threads: int | None = None) -> Any:
-    """A structure from a file that `save` wrote, over the same geometry. Raises InputError for a file that is missing, foreign,
-    damaged, of another version or over another mesh."""
+def read(path: PathLike, geometry: Geometry, attributes: FlatScene | None = None, device: str = "cpu",
+         threads: int | None = None) -> OneMesh:
+    """Read a structure over the same geometry.
+
+    Raises InputError for a file that is missing, foreign, damaged, of another version or over another mesh.
+    """
     header, body = read_checked(path, MAGIC, "acceleration structure")
     try:
         cls = ACCELERATORS.get(header["accel"])
@@ -79,7 +85,7 @@ def read(path: str | os.PathLike[str], geometry: Geometry, attributes: FlatScene
         if header["geometry"] != geometry.digest():
             raise InputError("was built over another mesh")
         built = read_arrays(cls, header, body)
-        with np.errstate(over="ignore", invalid="ignore"):  # numbers at the end of their range are looked at like all others
+        with np.errstate(over="ignore", invalid="ignore"):  # of values near the end of float32
             return cls.restore(built, geometry, attributes, device, threads, units=Units(header["triangle"], header["box"]))
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         if isinstance(error, InputError):
@@ -87,7 +93,7 @@ def read(path: str | os.PathLike[str], geometry: Geometry, attributes: FlatScene
         raise InputError(f"is no structure of this version ({type(error).__name__}: {error})", path=path) from error
 
 
-def read_arrays(cls: type[Any], header: dict[str, Any], body: memoryview) -> Built:
+def read_arrays(cls: type[OneMesh], header: JsonObject, body: memoryview) -> Built:
     types = array_types(cls, header["triangle"])
     arrays, at = {}, 0
     for name, dtype in types.items():
@@ -104,25 +110,25 @@ def read_arrays(cls: type[Any], header: dict[str, Any], body: memoryview) -> Bui
 
 
 def check_order(order: np.ndarray, count: int, name: str) -> None:
-    """Raise InputError unless all primitives 0 .. count - 1 are there, and no others."""
+    """Raise InputError unless `order` has all primitives 0 .. count - 1 and no others."""
     within = order.min(initial=0) >= 0 and order.max(initial=-1) < count
     if not (within and np.bincount(order, minlength=count).all()):
         raise InputError(f"is no {name} over this geometry: its primitives are not in it, or not all of them")
 
 
 def check_binary(nodes: np.ndarray, n_primitives: int, max_depth: int) -> None:
-    """Raise InputError unless these Bvh2Node records are a tree from node 0 over primitives 0 .. n - 1, no deeper than that."""
+    """Raise InputError unless Bvh2Node records are a tree with root 0 over n primitives, no deeper than `max_depth`."""
     check_links(nodes, [(nodes["lo_" + side] == np.inf).all(axis=1) & (nodes["hi_" + side] == -np.inf).all(axis=1)
                         for side in ("0", "1")], n_primitives, max_depth)
 
 
 def check_links(nodes: np.ndarray, empties: list[np.ndarray], n_primitives: int, max_depth: int) -> None:
-    """As check_binary, of any records with its links; empties: which of their two children do not exist, (N,) bool each."""
+    """Check the links of a binary tree, as check_binary. empties: which of the two children do not exist, (N,) bool each."""
     inner_of = []
     for side, empty in zip(("0", "1"), empties, strict=True):
         first, count = nodes["first_" + side].astype(np.int64), nodes["count_" + side].astype(np.int64)
         leaf = count > 0
-        if (empty & ((first != 0) | leaf)).any():  # nobody asks such a child's box: kernels look at `first` and `count`
+        if (empty & ((first != 0) | leaf)).any():  # kernels read `first` and `count`, not the box
             raise InputError("is damaged: a child that does not exist leads somewhere")
         if (count < 0).any() or (leaf & ((first < 0) | (first + count > n_primitives))).any():
             raise InputError("is damaged: a node leads out of the tree")
@@ -132,8 +138,10 @@ def check_links(nodes: np.ndarray, empties: list[np.ndarray], n_primitives: int,
 
 
 def check_tree(n: int, parent: np.ndarray, child: np.ndarray, max_depth: int) -> None:
-    """Raise InputError unless n nodes are a tree from node 0 on, of at most max_depth levels below it, where each child stands
-    behind its parent: no walk returns to where it was."""
+    """Raise InputError unless n nodes are a tree with root 0 and at most max_depth levels below it.
+
+    Each child must come after its parent, so that there are no cycles.
+    """
     sound = n > 0 and bool((child > parent).all()) and np.array_equal(np.sort(child), np.arange(1, n))
     if sound:
         above, at = np.zeros(n, np.int64), np.arange(1, n)

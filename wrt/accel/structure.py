@@ -1,25 +1,29 @@
-"""A kind of structure together with its test units: what a kernel is made from."""
+"""A class of structures with its intersection tests: the key of a kernel."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any, NamedTuple, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, NamedTuple, TypeVar, get_type_hints
 
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.checks import accepts, did_you_mean, require_known
 from wrt.core.device import made_once
 from wrt.core.errors import InputError
+from wrt.core.types import DeviceFunction, Kernel, WarpType
 from wrt.kernels.query import make_any_hit_kernel, make_closest_hit_kernel, make_worlds_kernel
 from wrt.kernels.traverse import instances as traverse_instances
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.units.triangle import RAY_TRIANGLE
 
+if TYPE_CHECKING:
+    from wrt.accel.base import OneMesh
+
 T = TypeVar("T")
 
 
 def check_units(triangle: str, box: str) -> None:
-    """Raise InputError where there is no triangle test or box test of that name."""
+    """Raise InputError for an unknown triangle test or box test."""
     require_known(triangle, RAY_TRIANGLE, "triangle test")
     require_known(box, RAY_AABB, "box test")
 
@@ -29,8 +33,8 @@ class NoOptions:
     """Options of a structure that has none."""
 
 
-def options_of(name: str, options: type[T], given: dict[str, Any]) -> T:
-    """The options of a structure, a dataclass. Raises InputError for what it has not, for other types and values out of range."""
+def options_of(name: str, options: type[T], given: dict[str, object]) -> T:
+    """Make the options of a structure. Raises InputError for unknown options, other types and values out of range."""
     known, types = {field.name: field for field in fields(options)}, get_type_hints(options)  # type: ignore[arg-type]
     for option, value in given.items():
         if option not in known:
@@ -42,35 +46,37 @@ def options_of(name: str, options: type[T], given: dict[str, Any]) -> T:
     return options(**given)
 
 
-def default_options(name: str) -> dict[str, Any]:
-    """The options of the structure of that name, with their defaults."""
+def default_options(name: str) -> dict[str, object]:
+    """Return the options of the structure of that name with their defaults."""
     return {field.name: field.default for field in fields(ACCELERATORS[name].options)}
 
 
 class Structure(NamedTuple):
-    """An Accelerator class together with the units that walk its structures: what a kernel is made from. Hashable. Where the units
-    walk instances, it is a tree over structures of this kind (wrt.accel.instances)."""
+    """A class of structures and its units, from which kernels are made. Hashable.
 
-    accel: type[Any]
+    With Units.instances it is a tree over structures of this class (wrt.accel.instances).
+    """
+
+    accel: type[OneMesh]
     units: Units = Units()
 
     @property
-    def struct(self) -> Any:
-        """The Warp struct of the structure's arrays."""
+    def struct(self) -> WarpType:
+        """Warp struct of the structure's arrays."""
         return struct_of(self)
 
     @property
-    def bottom(self) -> Any:
-        """The struct of one structure, also where there are instances of several."""
+    def bottom(self) -> WarpType:
+        """Warp struct of one structure, also below instances."""
         return struct_of(self._replace(units=self.units._replace(instances=False)))
 
     def require_one_mesh(self, message: str) -> None:
-        """Raise InputError with that message where there are instances or spheres."""
+        """Raise InputError with that message if there are instances or spheres."""
         if self.units.instances or self.units.spheres:
             raise InputError(message)
 
-    def traversal(self, *, any_hit: bool, accepts: Any = None) -> Any:
-        """The traversal unit as a Warp function (accel, surfaces, ray) -> Hit."""
+    def traversal(self, *, any_hit: bool, accepts: DeviceFunction | None = None) -> DeviceFunction:
+        """Make the traversal, a Warp function (accel, surfaces, ray) -> Hit."""
         traverse = self.accel.kernels.make_traversal(self.units, any_hit, accepts)
         if self.units.instances:
             return traverse_instances.make_traversal(self.units, any_hit, traverse, self.bottom)
@@ -78,22 +84,22 @@ class Structure(NamedTuple):
 
 
 @made_once
-def struct_of(structure: Structure) -> Any:
+def struct_of(structure: Structure) -> WarpType:
     if structure.units.instances:
         return traverse_instances.make_struct(structure.bottom)
     return structure.accel.kernels.make_struct(structure.units.triangle_test.record)
 
 
 @made_once
-def closest_hit_kernel(structure: Structure) -> Any:
+def closest_hit_kernel(structure: Structure) -> Kernel:
     return make_closest_hit_kernel(structure.struct, structure.traversal(any_hit=False))
 
 
 @made_once
-def any_hit_kernel(structure: Structure) -> Any:
+def any_hit_kernel(structure: Structure) -> Kernel:
     return make_any_hit_kernel(structure.struct, structure.traversal(any_hit=True))
 
 
 @made_once
-def worlds_kernel(structure: Structure, any_hit: bool) -> Any:
+def worlds_kernel(structure: Structure, any_hit: bool) -> Kernel:
     return make_worlds_kernel(structure.struct, structure.traversal(any_hit=any_hit), any_hit)

@@ -1,21 +1,23 @@
-"""The table of acceleration structures: by name, where each one is. Each is imported when it is first asked for: the command line's
-help must not wait for Warp."""
+"""Table of acceleration structures: name -> module and class, imported on first use, so that the command line's help needs no Warp."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 from wrt.core import cuda
 from wrt.core.errors import InputError
 from wrt.core.registry import Registry
 
+if TYPE_CHECKING:
+    from wrt.accel.base import OneMesh
+
 FIELDS = ("name", "kernels", "options")  # class fields without a default in wrt.accel.base.OneMesh
 
 
-class Structures(Registry[type[Any]]):
-    """Name -> class of structures over one mesh. Raises InputError that names the class field that one lacks."""
+class Structures(Registry[type["OneMesh"]]):
+    """Name -> class of structures over one mesh. Raises InputError that names a class field which is missing."""
 
-    def __getitem__(self, name: str) -> type[Any]:
+    def __getitem__(self, name: str) -> type[OneMesh]:
         kind = super().__getitem__(name)
         for field in FIELDS:
             if not hasattr(kind, field):
@@ -40,5 +42,5 @@ ACCELERATORS = Structures("structure", {
 
 
 def stack_on(device: str) -> str:
-    """In kernels.traverse.stack.PLACES, where kernels for a device have their stacks."""
+    """Return the place of the stacks of kernels for a device, from kernels.traverse.stack.PLACES."""
     return "local" if device == "cpu" else cuda.stack  # a CPU's threads have no other

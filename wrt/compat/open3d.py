@@ -14,7 +14,7 @@ import numpy as np
 
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.accelerator import Accelerator
-from wrt.accel.queries.all_hits import Asked
+from wrt.accel.queries.all_hits import ListQuery
 from wrt.accel.queries.closest_points import closest_points
 from wrt.accel.queries.contains import odd_crossings
 from wrt.accel.queries.rays import vectors
@@ -184,7 +184,7 @@ class RaycastingScene:
     def _inside(self, points: np.ndarray, nthreads: int, nsamples: int) -> np.ndarray:
         if as_integer(nsamples, "nsamples", 1, MOST_SAMPLES) % 2 == 0:
             raise InputError(f"must be odd, got {nsamples}", argument="nsamples")
-        asked = Asked(self._scene()[0], _threads(nthreads), crossings=True)
+        asked = ListQuery(self._scene()[0], _threads(nthreads), crossings=True)
         votes = np.zeros(len(points), np.int32)
         for seed in range(nsamples):
             votes += odd_crossings(asked, points, seed)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from wrt.accel.queries.accelerator import Accelerator
-from wrt.accel.queries.all_hits import ALL, Asked, first_hits
+from wrt.accel.queries.all_hits import ALL, ListQuery, first_hits
 from wrt.accel.queries.contains import open_edges_of
 
 
@@ -16,7 +16,7 @@ def every_hit(accel: Accelerator, origins: np.ndarray, directions: np.ndarray, t
     A ray hits the faces that it crosses (all_hits, crossings). If it crosses none and only touches some, it hits the first of them,
     or, if the mesh is closed, the first two: there it enters and leaves. If it begins there, it may touch just one.
     """
-    crossed = Asked(accel, threads, crossings=True).of(origins, directions).all(limit)
+    crossed = ListQuery(accel, threads, crossings=True).of(origins, directions).all(limit)
     found = [crossed.ray_id, crossed.prim_id, crossed.t, crossed.u, crossed.v]
     rays = np.flatnonzero(crossed.counts == 0)
     if len(rays):

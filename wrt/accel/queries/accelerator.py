@@ -1,21 +1,24 @@
-"""A structure that is asked: rays as arrays in, hits as arrays out."""
+"""Queries of a structure: rays as arrays in, hits as arrays out."""
 
 from __future__ import annotations
 
 import threading
-from typing import Any
+from typing import Any, Self, overload
 
 import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from wrt.accel.built import AccelStats
 from wrt.accel.flat_scene import FlatScene
-from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES, Hits, room_for
+from wrt.accel.geometry import Geometry
+from wrt.accel.instanced_geometry import InstancedGeometry
+from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES, Hits, answer_arrays
 from wrt.accel.queries.batches import Query, trace_query
 from wrt.accel.queries.counting import counted
 from wrt.accel.queries.gradients import record
 from wrt.accel.queries.rays import rays_of
-from wrt.accel.queries.world_ids import worlds_asked
+from wrt.accel.queries.world_ids import check_world
 from wrt.accel.snapshot import Snapshot
 from wrt.accel.structure import Structure, check_units
 from wrt.core.arrays import returned
@@ -23,22 +26,31 @@ from wrt.core.checks import shown
 from wrt.core.device import start, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
+from wrt.core.types import ArrayLike, NumpyLike, TensorT, WarpArray, WarpStruct
 from wrt.core.warp_private import recording_tape
 from wrt.kernels.structs import Surfaces
 
 
 class Accelerator:
-    """A structure that answers: over one mesh (wrt.accel.base.OneMesh), or over instances (wrt.accel.instances.Instances).
+    """A structure over one mesh (`OneMesh`) or over instances (`Instances`), and its queries.
 
-    Several threads may ask one structure at a time, and one of them may refit it: docs/moving.md, "Several threads".
+    Several threads may ask one structure, while one of them refits it (docs/moving.md, "Several threads").
 
-    structure: its kind and test units; device: a Warp device; threads: those that build and refit.
+    Attributes
+    ----------
+    structure : Structure
+        Class of the structure and its intersection tests.
+    device : wp.Device
+        Device of its arrays.
+    threads : int
+        Threads that build and refit it.
     """
 
     _snapshot: Snapshot  # replaced as a whole
 
-    def __init__(self, structure: Structure, geometry: Any, attributes: FlatScene | None, device: str, threads: int | None) -> None:
-        """geometry, attributes: as in Snapshot. Children build over it, and then take a snapshot with what they built."""
+    def __init__(self, structure: Structure, geometry: Geometry | InstancedGeometry, attributes: FlatScene | None, device: str,
+                 threads: int | None) -> None:
+        """Keep what every structure has; subclasses build over it and replace the snapshot. Arguments as in `Snapshot`."""
         check_units(structure.units.triangle, structure.units.box)
         self.device = start(device)
         self.threads = thread_count(threads)
@@ -48,62 +60,89 @@ class Accelerator:
         surfaces.spheres = upload(geometry.spheres.copy(), wp.vec4, self.device)  # copied: the caller may write to its array later
         self._snapshot = Snapshot(self.structure, self.device, surfaces, attributes, geometry)
         self._refitting = threading.Lock()
-        self._kept: dict[str, Any] = {}  # what refits go on using
+        self._kept: dict[str, Any] = {}  # arrays that later refits use again
 
-    def __copy__(self) -> Accelerator:
-        """The same structure, which a refit of this one leaves as it is."""
+    def __copy__(self) -> Self:
+        """Return the same structure; a refit of one of the two does not change the other."""
         other = object.__new__(type(self))
         other.__dict__.update(self.__dict__)
         return other
 
     @property
     def snapshot(self) -> Snapshot:
-        """The structure as it is now: its parts belong together, whatever refits do meanwhile."""
+        """Consistent view of the structure as it is now, which later refits leave as it is."""
         return self._snapshot
 
     @property
-    def geometry(self) -> Any:
-        """The Geometry or InstancedGeometry that the structure is over, as it is now."""
+    def geometry(self) -> Geometry | InstancedGeometry:
+        """Shapes that the structure is over, as they are now."""
         return self._snapshot.geometry
 
     @property
-    def data(self) -> Any:
-        """The Warp struct that kernels get. A refit makes another, but in place it writes to this one's arrays."""
+    def data(self) -> WarpStruct:
+        """Warp struct that kernels get. A refit makes another one; a refit in place writes to the arrays of this one."""
         return self._snapshot.data
 
     @property
     def stats(self) -> AccelStats:
-        """What was built, how large it is, and what it costs."""
-        stats: AccelStats = self._snapshot.stats
-        return stats
+        """Size, cost and build time of the structure."""
+        return self._snapshot.stats
 
-    def closest_hit(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
-                    threads: int | None = None, *, counters: bool = False, trace: bool = False, out: Hits | None = None,
-                    world: Any = None) -> Hits:
-        """The closest hit of each ray in the closed segment [t_min, t_max]; at equal t the lowest prim_id.
+    @overload
+    def closest_hit(self, origins: WarpArray, directions: WarpArray, t_min: ArrayLike = ..., t_max: ArrayLike = ...,
+                    threads: int | None = ..., *, counters: bool = ..., trace: bool = ..., out: Hits[WarpArray] | None = ...,
+                    world: ArrayLike | None = ...) -> Hits[WarpArray]: ...
+    @overload
+    def closest_hit(self, origins: NumpyLike, directions: NumpyLike, t_min: ArrayLike = ..., t_max: ArrayLike = ...,
+                    threads: int | None = ..., *, counters: bool = ..., trace: bool = ..., out: Hits | None = ...,
+                    world: ArrayLike | None = ...) -> Hits: ...
+    @overload
+    def closest_hit(self, origins: TensorT, directions: TensorT, t_min: ArrayLike = ..., t_max: ArrayLike = ...,
+                    threads: int | None = ..., *, counters: bool = ..., trace: bool = ..., out: Hits[TensorT] | None = ...,
+                    world: ArrayLike | None = ...) -> Hits[TensorT]: ...
+    def closest_hit(self, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
+                    threads: int | None = None, *, counters: bool = False, trace: bool = False, out: Hits[Any] | None = None,
+                    world: ArrayLike | None = None) -> Hits[Any]:
+        """Find the closest hit of each ray in the closed segment [t_min, t_max]; at equal t, that of the lowest prim_id.
 
-        Closed means that a surface through the origin is hit at t_min = 0; a t_min above 0 leaves it out. origins,
-        directions: (N, 3) real numbers, taken as float32; origins up to 1e37, so that differences are finite; directions finite,
-        not zero and of any length (where t would be beyond float32, there is no hit); t_min (>= 0), t_max: scalars or (N,).
-        float32 without gaps is read where it is, all else is copied part by part. Warp arrays are (N,) vec3, and of their values
-        only t_min and t_max are looked at, on the CPU. threads: 1 or more, or one a core. counters: count what each ray costs
-        (hits.counters); trace: also record what it fetches, which takes a second run. out: hits of as many rays, whose arrays take
-        the new ones (NumPy's, or Warp's if the rays are; they must not overlap with the rays' own). world: over several worlds,
-        which one each ray sees, a number or (N,) int (a Warp array is not looked at; a ray of a world that is none hits nothing).
+        A surface through the origin is hit at t_min = 0; a t_min above 0 leaves it out. While a `wp.Tape` records, t, u, v and
+        `hits.point` have gradients at fixed prim_id in Warp arrays that require them: origins, directions, and the vertices of the
+        last refit (docs/gradients.md).
 
-        Several threads may ask at a time, with or without counters, while another refits. While a wp.Tape records, t, u, v and
-        hits.point have gradients at fixed prim_id (wrt.accel.queries.gradients.adjoint) in Warp arrays that require them: origins,
-        directions, and the vertices of the last refit. What came in as tensors of torch or JAX goes out as such. Raises InputError
-        that names the argument and what was expected; what `out` holds is lost then.
+        Parameters
+        ----------
+        origins, directions : (N, 3) array_like, or Warp arrays (N,) of vec3
+            Real numbers, taken as float32, and read in place if they are float32 without gaps. Coordinates of origins up to 1e37;
+            directions of any length but 0. The values of Warp arrays are not checked.
+        t_min, t_max : float or (N,) array_like
+            Segment in units of the direction's length, t_min >= 0. A Warp array on a GPU is not checked.
+        threads : int, optional
+            Threads on the CPU; one per core by default.
+        counters, trace : bool
+            Count the costs of each ray (`hits.counters`); `trace` also records every fetch, in a second run.
+        out : Hits, optional
+            Hits of N rays whose arrays take the results. They must not overlap with the arrays of the rays.
+        world : int or (N,) array_like of int, optional
+            World that each ray sees; required over several worlds. In an unchecked Warp array, a world that does not exist is empty.
+
+        Returns
+        -------
+        Hits
+            Arrays of NumPy, or of the library of `origins`: Warp, PyTorch, JAX.
+
+        Raises
+        ------
+        InputError
+            Names the argument and what was expected. The arrays of `out` may have been overwritten.
         """
         threads, rays, give = thread_count(threads), rays_of(origins, directions, t_min, t_max, True), returned(origins, directions)
         if not (out is None or isinstance(out, Hits)):
             raise InputError(f"must be Hits, got {shown(out)}", argument="out")
         given = None if out is None else [out.t, out.u, out.v, out.prim_id]
-        t, u, v, prim_id = arrays = room_for(HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None,
+        t, u, v, prim_id = arrays = answer_arrays(HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None,
                                              give is not None)
         snapshot = self._snapshot  # once: a refit may replace it meanwhile
-        worlds = worlds_asked(snapshot, world, len(t))
+        worlds = check_world(snapshot, world, len(t))
         query, costs = Query(rays, arrays, threads, worlds), None
         if counters or trace:
             costs = counted(snapshot, query, fetches_too=trace)
@@ -114,20 +153,47 @@ class Accelerator:
             record(hits, t=t, u=u, v=v)
         return hits if give is None else hits.each(give)
 
-    def any_hit(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
-                threads: int | None = None, *, out: Any = None, world: Any = None) -> Any:
-        """Whether each ray hits anything in its segment: (N,) bool, True where closest_hit finds a hit and nowhere else. Arguments
-        as in closest_hit; out: an array that takes the answer."""
+    @overload
+    def any_hit(self, origins: WarpArray, directions: WarpArray, t_min: ArrayLike = ..., t_max: ArrayLike = ...,
+                threads: int | None = ..., *, out: WarpArray | None = ..., world: ArrayLike | None = ...) -> WarpArray: ...
+    @overload
+    def any_hit(self, origins: NumpyLike, directions: NumpyLike, t_min: ArrayLike = ..., t_max: ArrayLike = ...,
+                threads: int | None = ..., *, out: npt.NDArray[np.bool_] | None = ...,
+                world: ArrayLike | None = ...) -> npt.NDArray[np.bool_]: ...
+    @overload
+    def any_hit(self, origins: TensorT, directions: TensorT, t_min: ArrayLike = ..., t_max: ArrayLike = ...,
+                threads: int | None = ..., *, out: TensorT | None = ..., world: ArrayLike | None = ...) -> TensorT: ...
+    def any_hit(self, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
+                threads: int | None = None, *, out: object = None, world: ArrayLike | None = None) -> object:
+        """Test whether each ray hits anything in its segment: exactly where `closest_hit` finds a hit.
+
+        Parameters
+        ----------
+        origins, directions, t_min, t_max, threads, world
+            See `closest_hit`.
+        out : (N,) bool, optional
+            Array that takes the answers.
+
+        Returns
+        -------
+        (N,) bool
+            Array of NumPy, or of the library of `origins`.
+
+        Raises
+        ------
+        InputError
+            Names the argument and what was expected.
+        """
         threads, rays, give = thread_count(threads), rays_of(origins, directions, t_min, t_max), returned(origins, directions)
         given = None if out is None else [out]
-        arrays = room_for(ANY_HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None, give is not None)
+        arrays = answer_arrays(ANY_HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None, give is not None)
         snapshot = self._snapshot
-        trace_query(snapshot, Query(rays, arrays, threads, worlds_asked(snapshot, world, len(arrays[0]))))
+        trace_query(snapshot, Query(rays, arrays, threads, check_world(snapshot, world, len(arrays[0]))))
         return arrays[0] if give is None else give(arrays[0])
 
 
 def snapshot_of(accel: Accelerator) -> Snapshot:
-    """The snapshot of a structure that is asked for points or for all hits. Raises InputError unless it is over one mesh."""
+    """Return the snapshot of a structure over one mesh without spheres. Raises InputError for any other."""
     message = f"accel must be a structure over one mesh (wrt.build), got {shown(accel)}"
     if not isinstance(accel, Accelerator):
         raise InputError(message)

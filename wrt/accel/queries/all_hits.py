@@ -1,13 +1,14 @@
-"""All hits of a ray, in order."""
+"""All hits of a ray in order of distance."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Generic, overload
 
 import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from wrt.accel.queries.accelerator import Accelerator, snapshot_of
@@ -21,70 +22,81 @@ from wrt.core.checks import as_integer, as_one
 from wrt.core.device import MOST_ROWS, launch_on, made_once, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
+from wrt.core.types import Array, ArrayLike, ArrayT, Kernel, NumpyLike, TensorT, WarpArray, WarpStruct
 from wrt.kernels.hit_lists import FEW, HitLists, copy_hits, list_hit, make_list_hits_kernel
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import Hit
 from wrt.kernels.warp_private import fields_of
 
 ALL = (1 << 30) - 1
-RAYS_AT_ONCE = 1 << 18  # for whose first walk there are 32 MiB
+RAYS_AT_ONCE = 1 << 18  # whose lists of the first walk take 32 MiB
 
 
 @dataclass(frozen=True, eq=False)
-class AllHits:
-    """Those of ray i are rows first[i] to first[i + 1] of t, u, v (float32) and prim_id (int32), in the order of t and, where that
-    is equal, of prim_id; first: (N + 1,) int64. NumPy arrays; torch's or JAX's if the rays were."""
+class AllHits(Generic[ArrayT]):
+    """M hits of N rays in order of t and, where that is equal, of prim_id. Arrays of NumPy, PyTorch or JAX.
 
-    first: Any
-    t: Any
-    u: Any
-    v: Any
-    prim_id: Any
+    Attributes
+    ----------
+    first : (N + 1,) int64
+        The hits of ray i are rows first[i] to first[i + 1] of the other arrays.
+    t, u, v : (M,) float32
+        As in `Hits`.
+    prim_id : (M,) int32
+        Index of the face.
+    """
+
+    first: ArrayT
+    t: ArrayT
+    u: ArrayT
+    v: ArrayT
+    prim_id: ArrayT
 
     def __len__(self) -> int:
         return len(self.first) - 1
 
     @property
-    def counts(self) -> Any:
-        """(N,) int64, as of count_hits."""
-        return self.first[1:] - self.first[:-1]
+    def counts(self) -> ArrayT:
+        """Number of hits of each ray, (N,) int64."""
+        counts: ArrayT = self.first[1:] - self.first[:-1]
+        return counts
 
     @property
-    def ray_id(self) -> Any:
-        """The ray of each hit, (len(t),) int64."""
-        ray_id = np.repeat(np.arange(len(self)), to_numpy(self.counts))
+    def ray_id(self) -> ArrayT:
+        """Ray of each hit, (M,) int64."""
+        ray_id: Any = np.repeat(np.arange(len(self)), to_numpy(self.counts))
         give = returned(self.first)
         return ray_id if give is None else give(wp.array(ray_id, dtype=wp.int64, device=to_warp(self.first).device))
 
     def __repr__(self) -> str:
-        return f"AllHits({len(self)} rays, {len(self.t)} hits)"
+        return f"AllHits({len(self)} rays, {int(self.first[-1])} hits)"
 
 
-class Asked:
-    """A structure that is asked, as it is now: `of` gives it rays, and `all`, `first` or `counts` answers."""
+class ListQuery:
+    """A structure in its present state and rays: `of` sets the rays; `all`, `first` and `counts` answer."""
 
     n = 0
     rays: RayArrays
-    give: Any = to_numpy  # what answers become, which are Warp's
+    give: Any = to_numpy  # converts Warp arrays to those of the caller's library
 
     def __init__(self, accel: Accelerator, threads: int | None, crossings: bool = False) -> None:
         self.snapshot = snapshot_of(accel)
         self.threads, self.device = thread_count(threads), self.snapshot.device
-        self.lists: Any = HitLists()
+        self.lists: WarpStruct = HitLists()
         self.lists.crossings = as_one(crossings, bool, "crossings")
         if crossings:
             surfaces = surroundings(self.snapshot).surfaces
             self.lists.vertices, self.lists.faces = surfaces.vertices, surfaces.faces
 
-    def of(self, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf) -> Asked:
-        """Raises InputError that names the argument."""
+    def of(self, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf) -> ListQuery:
+        """Set the rays. Raises InputError that names the argument."""
         rays = rays_of(origins, directions, t_min, t_max)
         self.n, self.rays = len(rays.origins), rays_on(self.device, rays)
         self.give = returned(origins, directions) or to_numpy
         return self
 
-    def all(self, limit: int = ALL) -> AllHits:
-        """The hits of each ray, `limit` at most."""
+    def all(self, limit: int = ALL) -> AllHits[Any]:
+        """Find the first `limit` hits of each ray."""
         counts, parts = [np.zeros(0, np.int64)], []
         for rays, lists, of_each in self._listed(limit):
             begin = np.concatenate([[0], np.cumsum(of_each)])
@@ -95,8 +107,8 @@ class Asked:
         hits = parts[0] if len(parts) == 1 else self._joined(parts)
         return AllHits(self.given(first), *map(self.give, (hits.t, hits.u, hits.v, hits.prim_id)))
 
-    def first(self, k: int) -> Hits:
-        """The first k hits of each ray: (N, k)."""
+    def first(self, k: int) -> Hits[Any]:
+        """Find the first k hits of each ray, in arrays (N, k)."""
         hits = self._arrays(self.n * k)
         hits.t.fill_(np.inf)
         hits.u.zero_()
@@ -109,17 +121,19 @@ class Asked:
         return Hits(*(self.give(array.reshape((self.n, k))) for array in (hits.t, hits.u, hits.v, hits.prim_id)))
 
     def counts(self) -> np.ndarray:
-        """How many hits each ray has, (N,) int64. Where no triangle is in several leaves, the first walk has counted them all."""
+        """Count the hits of each ray, (N,) int64. If no triangle is in several leaves, the first walk has the counts."""
         counting = self.snapshot.stats.references == len(self.snapshot.geometry)
         return np.concatenate([np.zeros(0, np.int64), *(of_each for _, _, of_each in self._listed(ALL, counting))])
 
-    def given(self, numbers: np.ndarray) -> Any:
-        """int64 as an answer."""
+    def given(self, numbers: np.ndarray) -> Array:
+        """Return int64 numbers as an array of the caller's library."""
         return numbers if self.give is to_numpy else self.give(upload(numbers, wp.int64, self.device))
 
     def _listed(self, limit: int, counting: bool = False) -> Iterator[tuple[Any, list[Any], np.ndarray]]:
-        """Of so many rays at a time: the rays; lists, in one of which a ray has its hits, `limit` at most; and how many.
-        counting: lists may be too short."""
+        """Yield parts of the rays with their lists of hits, and the number of hits of each ray, at most `limit`.
+
+        A ray has its hits in one of the lists. counting: the numbers are complete, the lists may not be.
+        """
         limit = min(limit, ALL)
         for begin in range(0, self.n, RAYS_AT_ONCE):
             n, rays = min(RAYS_AT_ONCE, self.n - begin), self.rays
@@ -136,9 +150,9 @@ class Asked:
                 counts = np.where(many, lists[1].count.numpy(), counts)
             yield rays, lists, counts
 
-    def _filled(self, rays: RayArrays, room: np.ndarray, limit: int) -> Any:
-        """HitLists with room for so many hits of each ray, after the walk."""
-        lists: Any = HitLists()
+    def _filled(self, rays: RayArrays, room: np.ndarray, limit: int) -> WarpStruct:
+        """Walk, and return HitLists with space for `room` hits of each ray."""
+        lists: WarpStruct = HitLists()
         lists.limit, lists.crossings = limit, self.lists.crossings
         lists.vertices, lists.faces = self.lists.vertices, self.lists.faces
         first = np.concatenate([[0], np.cumsum(room)])
@@ -148,17 +162,17 @@ class Asked:
         self._launch(list_hits_kernel(self.snapshot.structure), len(room), self.snapshot.data, rays, lists)
         return lists
 
-    def _copy(self, rays: RayArrays, lists: list[Any], begin: np.ndarray, hits: Any) -> None:
+    def _copy(self, rays: RayArrays, lists: list[WarpStruct], begin: np.ndarray, hits: WarpStruct) -> None:
         for each in lists:
             self._launch(copy_hits, len(rays.origin), rays, each, upload(begin, wp.int32, self.device), hits)
 
-    def _arrays(self, n: int) -> Any:
+    def _arrays(self, n: int) -> WarpStruct:
         empty = partial(wp.empty, rows_of(n), device=self.device)
-        hits: Any = HitArrays()
+        hits: WarpStruct = HitArrays()
         hits.t, hits.u, hits.v, hits.prim_id = *(empty(dtype=wp.float32) for _ in range(3)), empty(dtype=wp.int32)
         return hits
 
-    def _joined(self, parts: list[Any]) -> Any:
+    def _joined(self, parts: list[WarpStruct]) -> WarpStruct:
         out, at = self._arrays(sum(len(part.t) for part in parts)), 0
         for part in parts:
             for name in fields_of(HitArrays):
@@ -166,48 +180,115 @@ class Asked:
             at += len(part.t)
         return out
 
-    def _launch(self, kernel: Any, n: int, *inputs: Any) -> None:
+    def _launch(self, kernel: Kernel, n: int, *inputs: object) -> None:
         launch_on(self.device, kernel, n, *inputs, None, threads=self.threads, step=RAYS_PER_LAUNCH)
 
 
 def rows_of(hits: int) -> int:
-    """Raise InputError for more than kernels, whose indices are int32, can reach."""
+    """Return the size of an array of hits. Raises InputError above 2^31 - 1, the largest index of a kernel."""
     if hits > MOST_ROWS:
         raise InputError(f"{hits} hits are more than an array can have, 2^31 - 1", hint="ask fewer rays at a time")
     return int(hits)
 
 
 @made_once
-def list_hits_kernel(structure: Structure) -> Any:
+def list_hits_kernel(structure: Structure) -> Kernel:
     listing = structure._replace(units=structure.units._replace(lists=True))
     return make_list_hits_kernel(structure.struct, listing.traversal(any_hit=False, accepts=list_hit))
 
 
-def all_hits(accel: Accelerator, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
-             threads: int | None = None, crossings: bool = False) -> AllHits:
-    """Every hit of each ray in its segment, in order. Arguments as in Accelerator.closest_hit; the answer is of NumPy, or of
-    torch or JAX if the rays are.
+@overload
+def all_hits(accel: Accelerator, origins: NumpyLike | WarpArray, directions: NumpyLike | WarpArray, t_min: ArrayLike = ...,
+             t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ...) -> AllHits: ...
+@overload
+def all_hits(accel: Accelerator, origins: TensorT, directions: TensorT, t_min: ArrayLike = ..., t_max: ArrayLike = ...,
+             threads: int | None = ..., crossings: bool = ...) -> AllHits[TensorT]: ...
+def all_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
+             threads: int | None = None, crossings: bool = False) -> AllHits[Any]:
+    """Find every hit of each ray in its segment, in order of distance. A ray hits each triangle at most once.
 
-    Each triangle is there once. Between two triangles no ray is lost: one through their common edge hits one of them or both,
-    depending on rounding (float32, of the ray against the mesh). crossings: only where the ray goes through, as if it stood aside
-    of edges and corners by as little as one likes: where a surface goes on, one triangle, and none or two at an outline. So a ray
-    crosses a closed surface an even number of times from outside to outside, with the watertight test exactly. One walk finds all
-    hits of most rays, and two those of the others; n hits take n log n steps, also where many are at the same t. Raises InputError.
+    No ray is lost between two triangles: through their common edge it hits one or both, depending on rounding. n hits take n log n
+    steps, also if many are at the same t.
+
+    Parameters
+    ----------
+    accel : Accelerator
+        Structure over one mesh without spheres.
+    origins, directions, t_min, t_max, threads
+        See `Accelerator.closest_hit`.
+    crossings : bool
+        Find crossings of the surface instead: at a shared edge or corner the ray counts as moved aside by an infinitesimal distance.
+        It then hits one triangle where the surface goes on, and none or two at an outline. A ray that begins and ends outside of a
+        closed mesh crosses it an even number of times; with the watertight test, exactly.
+
+    Returns
+    -------
+    AllHits
+        Arrays of NumPy, or of the library of `origins`: PyTorch, JAX.
+
+    Raises
+    ------
+    InputError
+        Names the argument and what was expected.
     """
-    return Asked(accel, threads, crossings).of(origins, directions, t_min, t_max).all()
+    return ListQuery(accel, threads, crossings).of(origins, directions, t_min, t_max).all()
 
 
-def count_hits(accel: Accelerator, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
-               threads: int | None = None, crossings: bool = False) -> Any:
-    """How many hits each ray has in its segment, (N,) int64; as all_hits. Unless a triangle is in several leaves (cells), the hits
-    take no memory."""
-    asked = Asked(accel, threads, crossings).of(origins, directions, t_min, t_max)
-    return asked.given(asked.counts())
+@overload
+def count_hits(accel: Accelerator, origins: NumpyLike | WarpArray, directions: NumpyLike | WarpArray, t_min: ArrayLike = ...,
+               t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ...) -> npt.NDArray[np.int64]: ...
+@overload
+def count_hits(accel: Accelerator, origins: TensorT, directions: TensorT, t_min: ArrayLike = ..., t_max: ArrayLike = ...,
+               threads: int | None = ..., crossings: bool = ...) -> TensorT: ...
+def count_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
+               threads: int | None = None, crossings: bool = False) -> object:
+    """Count the hits of each ray in its segment, without memory for them unless the structure has triangles in several leaves.
+
+    Parameters
+    ----------
+    accel, origins, directions, t_min, t_max, threads, crossings
+        See `all_hits`.
+
+    Returns
+    -------
+    (N,) int64
+        Array of NumPy, or of the library of `origins`: PyTorch, JAX.
+
+    Raises
+    ------
+    InputError
+        Names the argument and what was expected.
+    """
+    query = ListQuery(accel, threads, crossings).of(origins, directions, t_min, t_max)
+    return query.given(query.counts())
 
 
-def first_hits(accel: Accelerator, k: int, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf,
-               threads: int | None = None, crossings: bool = False) -> Hits:
-    """The first k hits of each ray in order, as Hits of (N, k) arrays; what a ray has not is a miss. As all_hits, but what lies
-    beyond the k-th is not walked to."""
+@overload
+def first_hits(accel: Accelerator, k: int, origins: NumpyLike | WarpArray, directions: NumpyLike | WarpArray, t_min: ArrayLike = ...,
+               t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ...) -> Hits: ...
+@overload
+def first_hits(accel: Accelerator, k: int, origins: TensorT, directions: TensorT, t_min: ArrayLike = ..., t_max: ArrayLike = ...,
+               threads: int | None = ..., crossings: bool = ...) -> Hits[TensorT]: ...
+def first_hits(accel: Accelerator, k: int, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0,
+               t_max: ArrayLike = np.inf, threads: int | None = None, crossings: bool = False) -> Hits[Any]:
+    """Find the first k hits of each ray in order of distance; the walk ends at the k-th.
+
+    Parameters
+    ----------
+    accel, origins, directions, t_min, t_max, threads, crossings
+        See `all_hits`.
+    k : int
+        Number of hits, at least 1.
+
+    Returns
+    -------
+    Hits
+        Arrays (N, k); a ray with fewer hits has misses at the end. They have no points and normals.
+
+    Raises
+    ------
+    InputError
+        Names the argument and what was expected.
+    """
     k = as_integer(k, "k", 1, (1 << 31) - 1)
-    return Asked(accel, threads, crossings).of(origins, directions, t_min, t_max).first(k)
+    return ListQuery(accel, threads, crossings).of(origins, directions, t_min, t_max).first(k)

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import warp as wp
 
-from wrt.accel.queries.hit_points import HitPoints
+from wrt.accel.queries.hit_points import HitPoints, Source
 from wrt.core.arrays import taken, to_numpy, to_warp
 from wrt.core.checks import shown
 from wrt.core.device import empty_aligned
 from wrt.core.errors import InputError
 from wrt.core.html import html_table
+from wrt.core.types import Array, ArrayT, Device, TensorT, WarpArray
 
 HIT_TYPES = {"out.t": np.float32, "out.u": np.float32, "out.v": np.float32, "out.prim_id": np.int32}
 ANY_HIT_TYPES = {"out": np.bool_}
@@ -23,9 +25,17 @@ ANY_HIT_TYPES = {"out": np.bool_}
 
 @dataclass(frozen=True, eq=False)
 class Counters:
-    """What each ray cost, (N,) each, as in kernels.traverse.counters.Counts; trace: the fetches of all rays one after another,
-    those of ray i from first[i] to first[i + 1]: address (int64, bytes; primitives from PRIMITIVE_SPACE on) and size (int64,
-    bytes)."""
+    """Costs of each ray of a query: `counters.nodes`, `counters.primitives` and the other fields of `counts` are (N,) arrays.
+
+    Attributes
+    ----------
+    counts : (N,) structured array
+        Counts as `kernels.traverse.counters.Counts` has them.
+    first : (N + 1,) int64
+        The fetches of ray i are rows first[i] to first[i + 1] of `address` and `size`; all 0 without `trace=True`.
+    address, size : (M,) int64
+        Address and size of each fetch in bytes. Addresses of primitives begin at `PRIMITIVE_SPACE`.
+    """
 
     counts: np.ndarray
     first: np.ndarray
@@ -49,20 +59,31 @@ class Counters:
 
 
 @dataclass(frozen=True, eq=False)
-class Hits(HitPoints):
-    """t: (N,) float32, in units of |direction|, inf on a miss; prim_id: (N,) int32, -1 on a miss; u, v: (N,) float32:
-    the point is (1 - u - v) v0 + u v1 + v v2 (0 on a miss and on spheres). NumPy arrays; Warp's, torch's or JAX's if the rays were.
-    counters: what each ray cost, where that was asked for. source: what the points, normals and ids are computed from."""
+class Hits(HitPoints[ArrayT]):
+    """Hits of N rays. The arrays are NumPy's, or those of the rays' library: Warp, PyTorch or JAX.
 
-    t: Any
-    u: Any
-    v: Any
-    prim_id: Any
+    Attributes
+    ----------
+    t : (N,) float32
+        Distance in units of the direction's length; inf on a miss.
+    u, v : (N,) float32
+        The point is (1 - u - v) v0 + u v1 + v v2. Both are 0 on a miss and on a sphere.
+    prim_id : (N,) int32
+        Index of the face, or number of faces plus index of the sphere; -1 on a miss.
+    counters : Counters or None
+        Costs of each ray, if the query was asked to count.
+    source : tuple or None
+        Snapshot and rays from which points, normals and ids are computed. Pickled hits have none.
+    """
+
+    t: ArrayT
+    u: ArrayT
+    v: ArrayT
+    prim_id: ArrayT
     counters: Counters | None = None
-    source: Any = None
+    source: Source | None = None
 
-    def __reduce__(self) -> Any:
-        """In a file or in another process they know their rays no more."""
+    def __reduce__(self) -> tuple[object, ...]:
         return Hits, (self.t, self.u, self.v, self.prim_id, self.counters)
 
     def __len__(self) -> int:
@@ -74,28 +95,31 @@ class Hits(HitPoints):
     def _repr_html_(self) -> str:
         hits = self.numpy()
         t = hits.t[hits.prim_id >= 0]
-        facts: dict[str, Any] = {"rays": len(self), "hits": len(t), "misses": len(self) - len(t)}
+        facts: dict[str, float] = {"rays": len(self), "hits": len(t), "misses": len(self) - len(t)}
         if len(t):
             facts |= {"nearest t": float(t.min()), "farthest t": float(t.max())}
         return html_table("Hits", (), facts.items()) + (self.counters._repr_html_() if self.counters else "")
 
-    def numpy(self) -> Hits:
-        """The same with NumPy arrays; of hits on the CPU they share the memory."""
+    def numpy(self) -> Hits[npt.NDArray[Any]]:
+        """Return the hits with NumPy arrays, which share the memory of hits on the CPU."""
         return self.each(to_numpy)
 
-    def warp(self) -> Hits:
-        """The same with Warp arrays; of hits on the CPU they share the memory."""
+    def warp(self) -> Hits[WarpArray]:
+        """Return the hits with Warp arrays, which share the memory of hits on the CPU."""
         return self.each(to_warp)
 
-    def each(self, convert: Callable[[Any], Any]) -> Hits:
-        """The same with each of the four arrays converted."""
-        return replace(self, **{name: convert(getattr(self, name)) for name in ("t", "u", "v", "prim_id")})
+    def each(self, convert: Callable[[ArrayT], TensorT]) -> Hits[TensorT]:
+        """Return the hits with each of the four arrays converted."""
+        return Hits(convert(self.t), convert(self.u), convert(self.v), convert(self.prim_id), self.counters, self.source)
 
 
-def room_for(types: dict[str, Any], given: list[Any] | None, n: int, device: Any, shared: bool = False) -> list[Any]:
-    """Where n answers go: an array of each type, of Warp on a device, or of NumPy (None); those that are given, if there are some.
-    shared: with another library: JAX would copy what does not begin with a cache line. Raises InputError that calls one by its
-    name in `types` where it does not fit."""
+def answer_arrays(types: Mapping[str, type], given: list[Any] | None, n: int, device: Device | None,
+                  shared: bool = False) -> list[Array]:
+    """Return an array (N,) of each type for the answers: NumPy's (`device` is None) or Warp's; `given` ones are checked.
+
+    shared: another library takes them; JAX would copy an array that does not begin with a cache line. Raises InputError that names
+    the array by its key in `types`.
+    """
     if given is None:
         empty = empty_aligned if shared else np.empty
         return [empty(n, dtype) if device is None else wp.empty(n, dtype=wp.dtype_from_numpy(dtype), device=device)
@@ -111,7 +135,7 @@ def room_for(types: dict[str, Any], given: list[Any] | None, n: int, device: Any
             kind, place = ("NumPy", "writeable and") if device is None else ("Warp", f"on {device},")
             raise InputError(f"must be a {kind} array ({n},) of {np.dtype(dtype)}, {place} without gaps, got {shown(array)}",
                              argument=name)
-    # Without gaps: the bounds of two arrays say all. Numbers of a Warp array are as large as those of the others.
+    # The arrays have no gaps, so that their bounds tell all.
     for (name, one), (other, two) in combinations(zip(types, given, strict=True), 2) if len(given) > 1 else ():
         if np.may_share_memory(one, two) if device is None else abs((one.ptr or 0) - (two.ptr or 0)) < n * one.strides[0]:
             raise InputError(f"shares memory with {other}", argument=name)

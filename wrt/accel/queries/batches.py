@@ -1,4 +1,4 @@
-"""A query's rays in launches, spread over threads: many rays at a time where a structure has a kernel for them, else one."""
+"""Launches of a query: its rays in parts over threads, by a kernel for many rays at a time where the structure has one."""
 
 from __future__ import annotations
 
@@ -18,36 +18,35 @@ from wrt.accel.structures import stack_on
 from wrt.core.arrays import to_warp
 from wrt.core.device import empty_aligned, launch_on, load_kernel, made_once, memory_of
 from wrt.core.threads import run_all
+from wrt.core.types import Array, Device, Kernel, KernelModule, WarpStruct
 from wrt.core.warp_private import array_record, record_of, struct_record
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.warp_private import fields_of
 from wrt.kernels.wide.packets import ANY_REFUSED, REPORT_SIZE, Scratch
 
-# Rays of a launch, about: work for a few milliseconds, of which the launch costs little, and Ctrl-C is heard soon. Up to FEWEST
-# are not divided. A thread takes a SHARES-th of its part of what is left, LEAST or more, so that all end at about the same time.
+# Rays of a launch: some milliseconds of work, so that the launch itself costs little and Ctrl-C is answered soon. Up to FEWEST are
+# one launch. A thread takes 1 / SHARES of its part of the remaining rays, at least LEAST, so that all threads end together.
 FEWEST, MOST, LEAST, SHARES = 8192, 131072, 4096, 2
-RAYS_PER_LAUNCH = 16384  # one at a time
-MOST_ON_GPU = 1 << 26  # rays from the host that are on a GPU at once: 3 GB with their hits; a kernel counts in int32
+RAYS_PER_LAUNCH = 16384  # by kernels for one ray
+MOST_ON_GPU = 1 << 26  # rays from the host on a GPU at once: 3 GB with their hits; a kernel counts in int32
 BYTES_OF_RAY = 48  # with its hit
-SURE = 1 << 20  # rays that a GPU has room for: to ask takes longer
-MOST_PACKED = (1 << 31) - 64  # a kernel counts in int32, and by blocks up to the end or beyond
-SMALL = 1024  # so few are copied, which takes less time than to describe arrays to a kernel
+SURE = 1 << 20  # rays that every GPU has memory for, so that it is not asked
+MOST_PACKED = (1 << 31) - 64  # a kernel counts in int32, and its last block may pass the end
+SMALL = 1024  # up to so many rays, a copy takes less time than records of the caller's arrays
 
 
 class Query(NamedTuple):
-    """A call of closest_hit or any_hit. out: the arrays that take the answers, of HIT_TYPES or of ANY_HIT_TYPES; worlds: which each
-    ray sees, in a structure over several."""
+    """A call of closest_hit or any_hit. out: the arrays for the answers, of HIT_TYPES or of ANY_HIT_TYPES."""
 
     rays: Rays
-    out: list[Any]
+    out: list[Array]
     threads: int
     worlds: WorldIds | None = None
 
 
 def trace_query(snapshot: Snapshot, query: Query) -> None:
-    """Write the answers of a structure to the query's arrays. Raises InputError for rays that are refused; the answers are then
-    nothing to go by."""
+    """Write the answers of a structure to the query's arrays. Raises InputError for invalid rays, after some answers are written."""
     if query.worlds is not None:
         trace_worlds(snapshot, query, query.worlds)
     elif snapshot.device.is_cuda:
@@ -57,8 +56,7 @@ def trace_query(snapshot: Snapshot, query: Query) -> None:
 
 
 def parts(n: int, threads: int, block: int) -> list[tuple[int, int]]:
-    """Ranges first .. end - 1 of n rays, all but the last of multiples of `block`: large ones first, as each launch takes a while,
-    and small ones in the end, as what a thread still traces then is waited for."""
+    """Divide n rays into ranges [first, end) of multiples of `block`: large ones first, and small ones last for balance."""
     out, first = [], 0
     while first < n:
         size = MOST if threads == 1 else max(LEAST, min((n - first) // (SHARES * threads), MOST))
@@ -69,11 +67,11 @@ def parts(n: int, threads: int, block: int) -> list[tuple[int, int]]:
 
 
 class Tracer:
-    """What answers queries on the CPU: the kernel for a structure, and workers that are kept from call to call."""
+    """Queries on the CPU: the kernel for a structure, and its workers, which later calls use again."""
 
     def __init__(self, structure: Structure, any_hit: bool) -> None:
-        stream = structure.accel.stream
-        # A kernel for many rays at a time, or None where there is but the one for one ray.
+        stream: KernelModule = structure.accel.stream
+        # A kernel for many rays at a time, or None if the structure has a kernel for one ray only.
         self.stream = stream and stream.make_stream(structure.units, any_hit)
         self.kernel = self.stream or (any_hit_kernel if any_hit else closest_hit_kernel)(structure)
         self.block = stream.stream_block if self.stream else 1
@@ -83,10 +81,10 @@ class Tracer:
         self.free: list[Worker] = []
 
     def trace(self, snapshot: Snapshot, query: Query) -> None:
-        """As trace_query. Rays that are refused have been traced by then."""
+        """Trace on the CPU, as trace_query. Invalid rays are found after tracing."""
         load_kernel(self.kernel, cpu := wp.get_device("cpu"))
         rays, threads = query.rays.on(cpu), query.threads
-        if not self.stream:  # which says itself whether it met such
+        if not self.stream:  # a kernel for many rays reports invalid ones itself
             rays = rays.checked()
         given, answers = [np.asarray(array) for array in rays], [np.asarray(array) for array in query.out]
         n = len(given[0])
@@ -107,14 +105,14 @@ class Tracer:
                 worker.launch(snapshot, worker.packed, 0, end - first)
                 copy(worker.answers, slice(end - first), answers, slice(first, end))
             refused.append(bool(worker.report[ANY_REFUSED]))
-            self.free.append(worker)  # not after an error: a thread may still be at work in it
+            self.free.append(worker)  # not after an error, when a thread may still use it
 
         run_all([partial(job, *each) for each in ranges], threads)
         if any(refused):
             rays.checked()
 
     def borrow(self) -> Worker:
-        """For one launch."""
+        """Take a worker for one launch."""
         try:
             return self.free.pop()
         except IndexError:
@@ -124,17 +122,19 @@ class Tracer:
 tracer = made_once(Tracer)
 
 
-def new_scratch(sizes: tuple[int, ...]) -> Any:
-    """sizes: as stream_sizes of a traversal's module; aligned, as rows of lanes would else lie in two cache lines each."""
-    out: Any = Scratch()
+def new_scratch(sizes: tuple[int, ...]) -> WarpStruct:
+    """Return Scratch with arrays of these sizes, which begin at cache lines, so that no row of lanes lies in two."""
+    out: WarpStruct = Scratch()
     for (name, kind), size in zip(fields_of(Scratch).items(), sizes, strict=False):
         setattr(out, name, to_warp(empty_aligned((size,), wp.dtype_to_numpy(kind.dtype))))
     return out
 
 
 class Worker:
-    """A launch that is recorded once, what it works in, and arrays for rays and answers that cannot be used where they are. For one
-    thread at a time."""
+    """A recorded launch, its scratch memory, and buffers for rays and answers that a kernel cannot use in place.
+
+    One thread uses it at a time.
+    """
 
     def __init__(self, tracer: Tracer) -> None:
         self.given = [np.empty((FEWEST, 3), np.float32), np.empty((FEWEST, 3), np.float32), *np.empty((2, FEWEST), np.float32)]
@@ -146,13 +146,13 @@ class Worker:
         check_raw_launches()
         self.threads = 1
         self.command = wp.launch(tracer.kernel, dim=1, inputs=[*tracer.inputs, *own, 0], device="cpu", record_cmd=True)
-        self.inputs: list[Any] = [None] * (len(own) + 5)  # as they were last
+        self.inputs: list[object] = [None] * (len(own) + 5)  # of the last launch
         self.own = [record_of(self.scratch)] if tracer.stream else []
 
     def launch(self, snapshot: Snapshot, packed: tuple[Any, Any], first: int, end: int) -> None:
-        """Trace rays first .. end - 1. report[ANY_REFUSED] tells whether the kernel met one that is refused."""
+        """Trace the rays [first, end). report[ANY_REFUSED] is set if the kernel met an invalid one."""
         inputs = [record_of(snapshot.data), record_of(snapshot.surfaces), *packed, *self.own, first, end]
-        for i, last in enumerate(self.inputs):  # the kernel for one ray has no `end`
+        for i, last in enumerate(self.inputs):  # without `end` for the kernel for one ray
             if inputs[i] is not last:
                 self.command.set_param_at_index_from_ctype(i, inputs[i])
                 self.inputs[i] = inputs[i]
@@ -164,17 +164,17 @@ class Worker:
 
 
 def readable(array: np.ndarray) -> bool:
-    """Whether a kernel can read it where it is."""
+    """Return whether a kernel can read the array in place."""
     return array.dtype == np.float32 and array.flags.aligned and (array.flags.c_contiguous or array.strides == (0,))
 
 
 def pack(given: list[np.ndarray], answers: list[np.ndarray]) -> tuple[Any, Any]:
-    """Rays and answers as kernels get them: RayArrays, and HitArrays or an array of bool. Nothing keeps the memory."""
+    """Make a kernel's records of rays and answers: RayArrays, and HitArrays or an array of bool. They do not keep the memory."""
     return struct_record(RayArrays, given), struct_record(HitArrays, answers) if len(answers) > 1 else array_record(answers[0])
 
 
 def copy(sources: list[np.ndarray], rows: slice, targets: list[np.ndarray], to: slice) -> None:
-    """Copy rows of arrays; what is beyond float32 becomes infinite."""
+    """Copy rows of arrays; values beyond float32 become infinite."""
     for source, target in zip(sources, targets, strict=True):
         if source.dtype == target.dtype:
             target[to] = source[rows]
@@ -183,13 +183,13 @@ def copy(sources: list[np.ndarray], rows: slice, targets: list[np.ndarray], to: 
                 target[to] = source[rows]
 
 
-def rays_on_gpu(n: int, device: Any) -> int:
-    """How many rays from the host go there at once: no more than half of what is free has room for."""
+def rays_on_gpu(n: int, device: Device) -> int:
+    """Return the number of rays from the host to trace at once: half of the free memory, or MOST_ON_GPU."""
     return MOST_ON_GPU if n <= SURE else max(FEWEST, min(MOST_ON_GPU, int(memory_of(device) / 2.0 / BYTES_OF_RAY)))
 
 
 def trace_on_gpu(snapshot: Snapshot, query: Query) -> None:
-    """As trace_query. What is Warp's is traced in one launch; what comes from the host in parts of MOST_ON_GPU."""
+    """Trace on a GPU, as trace_query: Warp arrays in one launch, rays from the host in parts."""
     device, structure, rays, out = snapshot.device, snapshot.structure, query.rays, query.out
     structure = structure._replace(units=structure.units._replace(stack=stack_on(device.alias)))
     kernel = (closest_hit_kernel if len(out) > 1 else any_hit_kernel)(structure)
@@ -202,17 +202,17 @@ def trace_on_gpu(snapshot: Snapshot, query: Query) -> None:
 
 
 def trace_worlds(snapshot: Snapshot, query: Query, worlds: WorldIds) -> None:
-    """As trace_query, each ray in its own world; on a GPU in one launch."""
+    """Trace each ray in its own world, as trace_query; on a GPU in one launch."""
     device = snapshot.device
     inputs = [snapshot.data, snapshot.surfaces, rays_on(device, query.rays), worlds.arrays]
     launch_over(device, worlds_kernel(snapshot.structure, len(query.out) == 1), inputs, query.out, query.threads)
 
 
-def launch_over(device: Any, kernel: Any, inputs: list[Any], out: list[Any], threads: int = 1) -> None:
-    """Launch a kernel for one ray over as many as there is room for answers, which may be NumPy's."""
+def launch_over(device: Device, kernel: Kernel, inputs: list[Any], out: list[Array], threads: int = 1) -> None:
+    """Launch a kernel for one ray over all rays whose answers `out` takes."""
     there = [to_warp(array) if device.is_cpu or isinstance(array, wp.array)
              else wp.empty(len(array), dtype=wp.dtype_from_numpy(array.dtype), device=device) for array in out]
-    hits: Any = HitArrays()
+    hits: WarpStruct = HitArrays()
     for name, array in zip(fields_of(HitArrays), there, strict=False) if len(out) > 1 else ():
         setattr(hits, name, array)
     launch_on(device, kernel, len(out[0]), *inputs, hits if len(out) > 1 else there[0], None, threads=threads, step=RAYS_PER_LAUNCH)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -16,6 +15,7 @@ from wrt.accel.queries.rays import vectors
 from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
+from wrt.core.types import ArrayLike, KernelModule
 from wrt.kernels.query import FARTHEST
 from wrt.kernels.warp_private import fields_of
 from wrt.kernels.wide.closest_point import PointArrays, make_closest_point_kernel
@@ -26,8 +26,19 @@ POINTS_PER_LAUNCH = 4096
 
 @dataclass(frozen=True, eq=False)
 class ClosestPoints:
-    """distance (N,) float32, inf where the mesh has no faces; point (N, 3) float32; u, v (N,) float32, the point is
-    (1 - u - v) v0 + u v1 + v v2; prim_id (N,) int32, -1 where there is none, and the rest 0."""
+    """Closest points of a mesh; without faces, distances are inf, prim_ids -1, and the rest 0.
+
+    Attributes
+    ----------
+    distance : (N,) float32
+        Distance from the query point.
+    point : (N, 3) float32
+        Closest point.
+    u, v : (N,) float32
+        The closest point is (1 - u - v) v0 + u v1 + v v2.
+    prim_id : (N,) int32
+        Face of the closest point.
+    """
 
     distance: np.ndarray
     point: np.ndarray
@@ -42,19 +53,36 @@ class ClosestPoints:
         return f"ClosestPoints({len(self)} points)"
 
 
-def closest_points(accel: Accelerator, points: Any, threads: int | None = None) -> ClosestPoints:
-    """The point of a mesh that is closest to each of `points`; of several faces at the same distance that of the lowest prim_id,
-    also at an edge or a corner that they share. The answer is of NumPy, and does not depend on the tree.
+def closest_points(accel: Accelerator, points: ArrayLike, threads: int | None = None) -> ClosestPoints:
+    """Find the point of a mesh that is closest to each query point; of faces at the same distance, on that of the lowest prim_id.
 
-    accel: a bvh4, bvh8 or bvh8c over one mesh, with the watertight triangle test. points: (N, 3) real numbers, taken as float32.
-    All is reckoned in float64 and rounded once: distance is off by no more than 2^-23 of itself, and 1e-15 of the mesh's largest
-    coordinate times how much longer a triangle is than high; distances that differ by less may change places. A face without area
-    counts as the segment or the point that it is, though no ray hits it; one with a corner that is not finite is left out. Raises
-    InputError that names the argument.
+    The result does not depend on the tree. It is computed in float64 and rounded once. The relative error of a distance is 2^-23;
+    its absolute error is 1e-15 times the mesh's largest coordinate times the ratio of a triangle's length to its height. Distances
+    that differ by less may change places. Faces without area count as the segment or point that they are, though no ray hits them;
+    faces with corners that are not finite are ignored.
+
+    Parameters
+    ----------
+    accel : Accelerator
+        A bvh4, bvh8 or bvh8c over one mesh without spheres, with the watertight triangle test.
+    points : (N, 3) array_like
+        Query points, taken as float32.
+    threads : int, optional
+        Threads on the CPU; one per core by default.
+
+    Returns
+    -------
+    ClosestPoints
+        NumPy arrays.
+
+    Raises
+    ------
+    InputError
+        For other structures, and for points that are not finite.
     """
     snapshot = snapshot_of(accel)
     structure = snapshot.structure
-    kernels: Any = structure.accel.kernels
+    kernels: KernelModule = structure.accel.kernels
     if not isinstance(kernels, WideTraversal) or structure.units.triangle != "watertight":
         raise InputError("closest points are asked of a bvh4, bvh8 or bvh8c with the watertight triangle test, not of a"
                          f" {structure.accel.name} with {structure.units.triangle!r}")
@@ -68,10 +96,26 @@ def closest_points(accel: Accelerator, points: Any, threads: int | None = None) 
     return ClosestPoints(*(getattr(out, name).numpy() for name in fields_of(PointArrays)))
 
 
-def signed_distance(accel: Accelerator, points: Any, threads: int | None = None) -> np.ndarray:
-    """The distance of each point to a closed mesh, (N,) float32, below 0 inside. As closest_points and wrt.contains."""
-    accel = copy(accel)  # which a refit meanwhile leaves as it is
-    points = vectors(points, "points", FARTHEST)  # else what is inside would be a tensor, of a GPU perhaps
+def signed_distance(accel: Accelerator, points: ArrayLike, threads: int | None = None) -> np.ndarray:
+    """Compute the distance of each point to a closed mesh, negative inside.
+
+    Parameters
+    ----------
+    accel, points, threads
+        See `closest_points`; the mesh must be closed, as for `contains`.
+
+    Returns
+    -------
+    (N,) float32
+        NumPy array.
+
+    Raises
+    ------
+    InputError
+        For a mesh that is not closed, other structures, and points that are not finite.
+    """
+    accel = copy(accel)  # a refit by another thread does not change the copy
+    points = vectors(points, "points", FARTHEST)  # `contains` would return a tensor for a tensor
     inside = contains(accel, points, threads)
     distance = closest_points(accel, points, threads).distance
     return np.where(inside, -distance, distance)

@@ -1,8 +1,6 @@
-"""A query that counts what each ray costs, and may record what it fetches."""
+"""Queries that count the costs of each ray, and can record its fetches."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -11,15 +9,16 @@ from wrt.accel.queries.answers import Counters
 from wrt.accel.queries.batches import Query, trace_query
 from wrt.accel.snapshot import Snapshot
 from wrt.core.device import on_host, upload
+from wrt.core.types import WarpStruct
 from wrt.kernels.traverse.counters import SIZE_RANGE, Counts
 
 
 def counted(snapshot: Snapshot, query: Query, fetches_too: bool) -> Counters:
-    """Answer the query and count. Where fetches are asked for, it is traced twice: only then is it known how many each ray has."""
+    """Answer the query and count. For the fetches it is traced twice, because the first run tells how many each ray has."""
     n, device = len(query.out[0]), snapshot.device
 
     def run(first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        # The struct of the counting kernel is the same, but what it records is this call's alone.
+        # A copy of the struct, because each call records into arrays of its own.
         own = copied(snapshot.data)
         own.recorder.counts = wp.zeros(n, dtype=Counts, device=device)
         own.recorder.first = upload(first, wp.int64, device)
@@ -35,8 +34,8 @@ def counted(snapshot: Snapshot, query: Query, fetches_too: bool) -> Counters:
     return Counters(counts, first, fetches // int(SIZE_RANGE), fetches % int(SIZE_RANGE))
 
 
-def copied(data: Any) -> Any:
-    """A Warp struct with the same arrays and numbers, of which fields may be set."""
+def copied(data: WarpStruct) -> WarpStruct:
+    """Return a Warp struct with the same arrays and numbers, whose fields may be set."""
     out = type(data)()
     out.assign(data)
     return out

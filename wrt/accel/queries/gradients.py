@@ -1,9 +1,9 @@
-"""Derivatives of closest hits in closed form: one adjoint, for NumPy, wp.Tape, torch and JAX."""
+"""Derivatives of closest hits in closed form: one adjoint for NumPy, wp.Tape, PyTorch and JAX."""
 
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -13,30 +13,42 @@ from wrt.core.arrays import check_no_gradients, float32, to_numpy
 from wrt.core.checks import shown
 from wrt.core.errors import InputError
 from wrt.core.threads import run_all, thread_count
+from wrt.core.types import Array, ArrayLike, ArrayT
 from wrt.core.warp_private import recording_tape
 
+if TYPE_CHECKING:
+    from wrt.accel.queries.hit_points import HitPoints
+
 ONE_MESH = "only hits of a structure over one mesh, without spheres, have gradients"
-HITS_PER_JOB = 8192  # so that what is between stays in the cache
+HITS_PER_JOB = 8192  # whose intermediate arrays stay in the cache
 
 
-class Gradients(NamedTuple):
-    """Derivatives of a number by what hits come from: vertices (V, 3), origins (N, 3), directions (N, 3), all float64."""
+class Gradients(NamedTuple, Generic[ArrayT]):
+    """Derivatives of a number by the inputs of a query.
 
-    vertices: Any
-    origins: Any
-    directions: Any
+    Attributes
+    ----------
+    vertices : (V, 3) float64
+        By the vertices of the mesh.
+    origins, directions : (N, 3) float64
+        By the rays; 0 for rays that missed.
+    """
+
+    vertices: ArrayT
+    origins: ArrayT
+    directions: ArrayT
 
 
 class Cotangents(NamedTuple):
-    """Derivatives of a number by hits: (N,) each, point (N, 3); None: it does not depend on them."""
+    """Derivatives of a number by hits: (N,) each, point (N, 3). None: the number does not depend on them."""
 
-    t: Any = None
-    u: Any = None
-    v: Any = None
-    point: Any = None
+    t: ArrayLike | None = None
+    u: ArrayLike | None = None
+    v: ArrayLike | None = None
+    point: ArrayLike | None = None
 
     def checked(self, n: int) -> Cotangents:
-        """The same as NumPy arrays. Raises InputError for other shapes."""
+        """Return the same as NumPy arrays. Raises InputError for other shapes."""
         arrays = [given if given is None else to_numpy(given) for given in self]
         for name, array in zip(self._fields, arrays, strict=True):
             shape = (n, 3) if name == "point" else (n,)
@@ -44,26 +56,25 @@ class Cotangents(NamedTuple):
                 raise InputError(f"must be {shape} of real numbers, got {shown(array)}", argument=name)
         return Cotangents(*arrays)
 
-    def at(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """By t, u and v, and by the point, two (3, len(rows)) float64."""
-        by_tuv = np.zeros((3, len(rows)))
+    def at(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the derivatives by (t, u, v) and by the point for some rays: two (3, len(rays)) float64."""
+        by_tuv = np.zeros((3, len(rays)))
         for target, given in zip(by_tuv, self[:3], strict=True):
-            target[:] = 0.0 if given is None else given[rows]
-        return by_tuv, np.zeros((3, 1)) if self.point is None else columns(self.point[rows])
+            target[:] = 0.0 if given is None else np.asarray(given)[rays]
+        return by_tuv, np.zeros((3, 1)) if self.point is None else columns(np.asarray(self.point)[rays])
 
 
-def adjoint(geometry: Geometry, origins: Any, directions: Any, prim_id: Any, cotangents: Cotangents,
+def adjoint(geometry: Geometry, origins: Array, directions: Array, prim_id: Array, cotangents: Cotangents,
             threads: int | None = None) -> Gradients:
-    """Derivatives of a number by vertices, origins and directions, at fixed prim_id, from its derivatives by hits.
+    """Compute derivatives by vertices, origins and directions, at fixed prim_id, from the derivatives by hits.
 
-    A hit solves o + t d = (1 - u - v) v0 + u v1 + v v2. With M = [d, v0 - v1, v0 - v2] that is M (t, u, v) = v0 - o, and what
-    moves either side by x moves (t, u, v) by M^-1 x. So one vector a ray, lambda = M^-T (dL/dt, dL/du, dL/dv), has it all: the
-    corners get their weights of it, the origin -lambda, the direction -t lambda; the point o + t d adds its own.
+    A hit solves o + t d = (1 - u - v) v0 + u v1 + v v2. With M = [d, v0 - v1, v0 - v2] that is M (t, u, v) = v0 - o, so that a
+    change of either side by x changes (t, u, v) by M^-1 x. One vector per ray, lambda = M^-T (dL/dt, dL/du, dL/dv), is therefore
+    enough. The corners get lambda times their weights, the origin -lambda, the direction -t lambda; the point o + t d adds its own.
 
-    All is float64, t, u and v too. The sum at a vertex is taken in the order of the rays, whatever the threads: it has the same
-    bits each time. A miss has no part in it, and no derivatives; nor has a ray that runs along its triangle's plane, to the last
-    bit of float64, or meets a triangle without area. (Nearly along it they are right and large: they grow as 1 / cos of the
-    angle to the normal.) How outlines move is not in it: prim_id is fixed.
+    All values are float64, also t, u and v. The sum at a vertex runs in the order of the rays, so that its bits do not depend on
+    threads. Derivatives are 0 for misses, for triangles without area, and for rays in their triangle's plane to the last bit of
+    float64. Near the plane they are right and grow as 1 / cos of the angle to the normal.
     """
     prim_id, o, d = to_numpy(prim_id), float32(to_numpy(origins)), float32(to_numpy(directions))  # as they were traced
     vertices, faces = geometry.vertices, geometry.faces
@@ -83,7 +94,7 @@ def adjoint(geometry: Geometry, origins: Any, directions: Any, prim_id: Any, cot
         inverse, exists = inverse_rows(way, v1 - v0, v2 - v0)
         t, u, v = (inverse * (v0 - place)).sum(axis=1)
         by_tuv[0] += (by_point * way).sum(axis=0)
-        at_hit = (inverse * by_tuv[:, None]).sum(axis=0)  # lambda
+        at_hit = (inverse * by_tuv[:, None]).sum(axis=0)  # lambda, above
         at_origin = np.where(exists, by_point - at_hit, 0.0)
         out.origins[ray], out.directions[ray] = at_origin.T, (t * at_origin).T
         for axis in range(3):
@@ -95,11 +106,13 @@ def adjoint(geometry: Geometry, origins: Any, directions: Any, prim_id: Any, cot
     return out
 
 
-def record(hits: Any, **outputs: Any) -> None:
-    """Let a wp.Tape that records have gradients of Warp arrays of `hits`, given by their names in Cotangents, in origins,
-    directions and the array that the structure's last refit followed: those of them that require gradients."""
-    (snapshot, rays, _), tape = hits.source, recording_tape()
-    leaves = Gradients(snapshot.followed, rays.origins, rays.directions)
+def record(hits: HitPoints[Any], **outputs: Any) -> None:
+    """Make the recording wp.Tape propagate gradients of `outputs`, arrays of hits by their names in Cotangents.
+
+    They go to origins, directions and the vertices of the last refit, where these require gradients.
+    """
+    (snapshot, rays, _), tape = hits.source, recording_tape()  # type: ignore[misc]  # of a query that just ran
+    leaves: Gradients[Any] = Gradients(snapshot.followed, rays.origins, rays.directions)
     wanted = [array for array in leaves if isinstance(array, wp.array) and array.requires_grad and array.size]
     if tape is None or not wanted:
         return
@@ -118,20 +131,20 @@ def record(hits: Any, **outputs: Any) -> None:
     tape.record_func(backward, [*wanted, *outputs.values()])
 
 
-def check_recorded(hits: Any, name: str) -> None:
-    """Raise InputError where a tape would wait for gradients of what has none."""
-    snapshot, rays, _ = hits.source
+def check_recorded(hits: HitPoints[Any], name: str) -> None:
+    """Raise InputError if a tape would expect gradients of a property that has none."""
+    snapshot, rays, _ = hits.source  # type: ignore[misc]  # its caller needs it, too
     given = {"vertices": snapshot.followed, "origins": rays.origins, "directions": rays.directions}
     check_no_gradients(f"hits.{name}", **given)
 
 
 def columns(rows: np.ndarray) -> np.ndarray:
-    """(N, 3) as (3, N) float64."""
+    """Return (N, 3) as (3, N) float64."""
     return np.ascontiguousarray(rows.T, np.float64)
 
 
 def inverse_rows(d: np.ndarray, e1: np.ndarray, e2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The rows of [d, -e1, -e2]^-1, (3, 3, N), 0 where there is none, and where there is one (N,)."""
+    """Return the rows of [d, -e1, -e2]^-1, (3, 3, N), 0 where it does not exist, and a mask (N,) of where it does."""
     adjugate = np.stack([_cross(e1, e2), _cross(d, e2), _cross(e1, d)])
     with np.errstate(all="ignore"):
         inverse = adjugate / (d * adjugate[0]).sum(axis=0)
@@ -141,5 +154,5 @@ def inverse_rows(d: np.ndarray, e1: np.ndarray, e2: np.ndarray) -> tuple[np.ndar
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Of columns; np.cross takes longer."""
+    """Cross product of (3, N) arrays; np.cross takes longer."""
     return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])

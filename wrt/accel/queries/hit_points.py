@@ -1,118 +1,141 @@
-"""Points of hits with error bounds, normals, texture coordinates and ids: computed when asked for."""
+"""Points of hits with error bounds, normals, texture coordinates and ids, computed on first use."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeAlias
 
 import numpy as np
 import warp as wp
 
 from wrt.accel.flat_scene import FlatScene, Placed, flat_scene_of, placed_now, run_of
+from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.queries.gradients import ONE_MESH, Cotangents, Gradients, adjoint, check_recorded, record
 from wrt.accel.queries.rays import Rays, rays_on
-from wrt.accel.queries.world_ids import WorldIds
+from wrt.accel.queries.world_ids import WorldIds, over_worlds
 from wrt.accel.snapshot import Snapshot, once
 from wrt.core.arrays import returned, to_warp
 from wrt.core.device import launch_on, records, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
+from wrt.core.types import ArrayLike, ArrayT, WarpStruct
 from wrt.kernels import structs
 from wrt.kernels.query import HitArrays
 from wrt.kernels.shade.hit_points import HitPlaces, ObjectIds, hit_places
 from wrt.kernels.warp_private import fields_of
 
 HITS_PER_LAUNCH = 65536
+Source: TypeAlias = tuple[Snapshot, Rays, WorldIds | None]
 
 
 class Surroundings(NamedTuple):
-    """What a structure was over on a device when it was asked: as the kernel takes it, and where it is from."""
+    """Inputs of the kernel `hit_places`, and the scene that they come from."""
 
     scene: FlatScene
-    surfaces: Any
-    object_ids: Any
+    surfaces: WarpStruct
+    object_ids: WarpStruct
 
 
-class HitPoints:
-    """Properties of hits that a structure gave. Each is computed anew each time, from the arrays of the hits and of the rays, which
-    are kept and not copied: leave them as they were until then. Arrays are of the library that the hits are of.
+class HitPoints(Generic[ArrayT]):
+    """Properties of hits that `closest_hit` found, as arrays of the library of the hits.
 
-    Raises InputError where the hits are not closest_hit's, or what is asked for is not there.
+    Each access computes its property anew from the arrays of hits and rays. These are not copied: do not write to them before.
+    Properties raise InputError where the hits have no `source`, or the structure does not have the property.
     """
 
-    t: Any
-    u: Any
-    v: Any
-    prim_id: Any
-    source: tuple[Snapshot, Rays, WorldIds | None] | None
+    t: ArrayT
+    u: ArrayT
+    v: ArrayT
+    prim_id: ArrayT
+    source: Source | None
 
     @property
-    def point(self) -> Any:
-        """(N, 3) float32: where each ray as it is given meets its primitive, in the world, to point_error; NaN on a miss.
+    def point(self) -> ArrayT:
+        """Point where each ray meets its primitive, in world space, to within `point_error`: (N, 3) float32, NaN on a miss.
 
-        It is of the ray and not of u and v, whose rounding needles make large: float64, rounded once. Where the ray passes its
-        triangle by, to rounding, the point is moved onto the triangle, and the error is as large as the move; where it runs along,
-        the point is that of u and v, and the error the triangle's size.
+        It is computed from the ray in float64 and rounded once, because u and v have large errors on needles. If the ray passes its
+        triangle by, to rounding, the point is moved onto the triangle, and the error contains the move. If the ray lies in the
+        triangle's plane, the point comes from u and v, and the error is the triangle's size.
         """
         return self._filled("point")
 
     @property
-    def point_error(self) -> Any:
-        """(N, 3) float32: no component of `point` is farther off than this; most often half a float32 step. NaN on a miss."""
+    def point_error(self) -> ArrayT:
+        """Bound of the error of each component of `point`, mostly half a float32 step: (N, 3) float32, NaN on a miss."""
         return self._filled("error")
 
     @property
-    def normal(self) -> Any:
-        """(N, 3) float32: unit normal of the flat triangle, on the side from which it is counter-clockwise (of a sphere: outwards),
-        whatever side the ray comes from; NaN on a miss."""
+    def normal(self) -> ArrayT:
+        """Unit normal of the flat triangle on its counter-clockwise side, of a sphere outwards: (N, 3) float32, NaN on a miss."""
         return self._filled("normal")
 
     @property
-    def shading_normal(self) -> Any:
-        """(N, 3) float32: the normals that the mesh had when the structure was built, interpolated, of unit length, on the side of
-        `normal`; the same as `normal` where there are none. NaN on a miss."""
+    def shading_normal(self) -> ArrayT:
+        """Unit normal interpolated from those of the mesh as it was built, on the side of `normal`: (N, 3) float32, NaN on a miss.
+
+        It equals `normal` where the mesh has no normals.
+        """
         return self._filled("shading")
 
     @property
-    def uv(self) -> Any:
-        """(N, 2) float32: texture coordinates interpolated, (0, 0) the top left of a picture; in a scene (0, 0) where an object has
-        none. NaN on a miss."""
+    def uv(self) -> ArrayT:
+        """Interpolated texture coordinates, (0, 0) being the top left of a picture: (N, 2) float32, NaN on a miss.
+
+        In a scene they are (0, 0) on objects without texture coordinates.
+        """
         return self._filled("uv")
 
     @property
-    def object(self) -> Any:
-        """(N,) int32: index into scene.objects, and behind them into scene.spheres; -1 on a miss."""
+    def object(self) -> ArrayT:
+        """Index into `scene.objects`, or their number plus the index into `scene.spheres`: (N,) int32, -1 on a miss."""
         return self._filled("object")
 
     @property
-    def instance(self) -> Any:
-        """(N,) int32: what Instances.move takes: over a scene the same as `object`, else a row of accel.geometry.to_world; -1 on a
-        miss."""
+    def instance(self) -> ArrayT:
+        """Index that `Instances.move` takes: `object` over a scene, else a row of `accel.geometry.to_world`. (N,) int32, -1 on a miss."""
         return self._filled("instance")
 
     @property
-    def material(self) -> Any:
-        """(N,) int32: index into scene.materials; -1 on a miss."""
+    def material(self) -> ArrayT:
+        """Index into `scene.materials`: (N,) int32, -1 on a miss."""
         return self._filled("material")
 
-    def gradients(self, t: Any = None, u: Any = None, v: Any = None, point: Any = None) -> Gradients:
-        """Derivatives of a number, such as a sum of squares to be made small, by vertices, origins and directions at fixed prim_id,
-        from its derivatives by these hits, (N,) and (N, 3); of misses they are not looked at (wrt.accel.queries.gradients.adjoint).
+    def gradients(self, t: ArrayLike | None = None, u: ArrayLike | None = None, v: ArrayLike | None = None,
+                  point: ArrayLike | None = None) -> Gradients[ArrayT]:
+        """Compute derivatives of a number by vertices, origins and directions from its derivatives by these hits.
 
-        Raises InputError for other shapes, and where the structure is not over one mesh.
+        Each ray keeps its prim_id: the movement of outlines is not in it (docs/gradients.md).
+
+        Parameters
+        ----------
+        t, u, v : (N,) array_like, optional
+            Derivatives of the number by `t`, `u` and `v`; zero by default. Those of misses are ignored.
+        point : (N, 3) array_like, optional
+            Derivatives of the number by `point`; zero by default.
+
+        Returns
+        -------
+        Gradients
+            Arrays of float64.
+
+        Raises
+        ------
+        InputError
+            For other shapes, and unless the structure is over one mesh without spheres.
         """
         snapshot, rays, _ = self._source()
         snapshot.structure.require_one_mesh(ONE_MESH)
-        found = adjoint(snapshot.geometry, rays.origins, rays.directions, self.prim_id, Cotangents(t, u, v, point))
+        prim_id: Any = self.prim_id
+        found: Gradients[Any] = adjoint(snapshot.one_mesh[0], rays.origins, rays.directions, prim_id, Cotangents(t, u, v, point))
         give = returned(self.t)
         return found if give is None else Gradients(*map(give, found))
 
-    def _source(self) -> tuple[Snapshot, Rays, WorldIds | None]:
+    def _source(self) -> Source:
         if self.source is None:
             raise InputError("these hits do not know their rays: only those of closest_hit have points, normals and ids")
         return self.source
 
-    def _filled(self, name: str) -> Any:
+    def _filled(self, name: str) -> ArrayT:
         snapshot, rays, worlds = self._source()
         if name in ("error", "normal", "shading", "uv"):
             check_recorded(self, name)
@@ -129,7 +152,7 @@ class HitPoints:
         for each in fields_of(HitArrays):
             setattr(hits, each, to_warp(getattr(self, each)).to(device))
         if worlds is not None:
-            hits.prim_id = upload(worlds.numbered(self.prim_id), wp.int32, device)
+            hits.prim_id = upload(worlds.over_all(self.prim_id), wp.int32, device)
         inputs = [surfaces, object_ids, rays_on(device, rays), hits, out]
         launch_on(device, hit_places, n, *inputs, None, threads=thread_count(None), step=HITS_PER_LAUNCH)
         if isinstance(self.t, wp.array):
@@ -141,25 +164,25 @@ class HitPoints:
 
 
 def _require(scene: FlatScene, name: str) -> None:
-    """Raise InputError where hits in this scene have no such thing."""
+    """Raise InputError if hits in this scene do not have the property."""
     if name == "uv" and not len(scene.uvs):
         raise InputError("the mesh has no texture coordinates (uvs)")
     if name == "instance" and not isinstance(scene.geometry, InstancedGeometry):
         raise InputError("the structure has no instances")
     if name in ("object", "material") and scene.objects is None:
-        if isinstance(scene.geometry, InstancedGeometry) and scene.geometry.worlds is not None:
+        if over_worlds(scene.geometry):
             raise InputError(f"hits over worlds do not know their {name} yet; hits.instance is known")
         raise InputError(f"the structure is not over a scene: there is no {name}")
 
 
 @once
 def surroundings(snapshot: Snapshot) -> Surroundings:
-    """Of a structure, on its device."""
+    """Upload the scene of a structure to its device."""
     geometry, device = snapshot.geometry, snapshot.device
     scene, surfaces = snapshot.attributes or flat_scene_of(geometry), structs.Surfaces()
     placed = placed_now(scene, geometry)
     surfaces.n_triangles = geometry.n_triangles
-    surfaces.vertices = upload(geometry.vertices if placed is None else scene.vertices, wp.vec3, device)
+    surfaces.vertices = upload(geometry.vertices if isinstance(geometry, Geometry) else scene.vertices, wp.vec3, device)
     surfaces.faces = upload(scene.faces, wp.vec3i, device)
     surfaces.normals = upload(np.zeros((1, 3)) if scene.normals is None else scene.normals, wp.vec3, device)
     surfaces.uvs = upload(scene.uvs, wp.vec2, device)
@@ -168,21 +191,21 @@ def surroundings(snapshot: Snapshot) -> Surroundings:
     object_ids = ObjectIds()
     if scene.objects is not None:
         object_ids.first_prim = upload(scene.objects, wp.int32, device)
-    if placed is not None:
+    if placed is not None and isinstance(geometry, InstancedGeometry):
         surfaces.instances = upload(instance_records(placed), structs.Instance, device)
         object_ids.instance = upload(_instance_of(placed, geometry), wp.int32, device)
     return Surroundings(scene, surfaces, object_ids)
 
 
 def _instance_of(placed: Placed, geometry: InstancedGeometry) -> np.ndarray:
-    """Which instance each run of primitives is; those that are joined are all of the first, and spheres too."""
+    """Return the instance of each run of primitives; 0 for joined objects and spheres."""
     out = np.zeros(len(placed.first_prim), np.int32)
     out[run_of(placed, geometry)] = np.nonzero(geometry.is_placed)[0]
     return out
 
 
 def instance_records(placed: Placed) -> np.ndarray:
-    """As kernels.structs.Instance."""
+    """Return the runs as records of kernels.structs.Instance."""
     out = records(structs.Instance, len(placed.first_prim))
     for name in ("first_prim", "first_face", "first_material", "material_step"):
         out[name] = getattr(placed, name)

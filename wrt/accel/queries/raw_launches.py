@@ -1,36 +1,36 @@
-"""Launches whose arguments wrt makes by hand, because Warp's own way takes longer than a small query or a wave of paths: their
-records for kernels that launch others, and the self-test that comes before the first one."""
+"""Launches with hand-made arguments, for kernels that launch others, and the self-test before the first one.
+
+Warp's own launch takes longer than a small query or a wave of paths.
+"""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 import warp as wp
 
 from wrt.core import device, warp_private
 from wrt.core.device import load_kernel, made_once
+from wrt.core.types import WarpStruct
 from wrt.kernels.launch_probe import PER_THREAD, Canary, probe
 from wrt.kernels.launches import Launch
 
-GUARD = -0x21524111  # what the self-test's memory holds before a kernel writes to it
-GUARDS = 64  # words before and behind its arrays: what a launch with wrong arguments reads and writes is memory of its own
+GUARD = -0x21524111  # initial value of the self-test's memory
+GUARDS = 64  # words before and behind its arrays, which a launch with wrong arguments may read or write
 
 
 class Launches:
-    """Records of launches for kernels that launch others (wrt.kernels.launches). Keeps what their addresses lead to."""
+    """Recorded launches for kernels that launch others (wrt.kernels.launches), and the objects that their addresses point into."""
 
     def __init__(self) -> None:
-        self.kept: list[Any] = []
+        self.kept: list[object] = []
 
-    def recorded(self, command: Any, block: int = 1) -> Any:
-        """Return a record for the device. command: of wp.launch(..., device="cpu", record_cmd=True); block: as Launch's. Raises
-        InputError where the self-test fails."""
+    def recorded(self, command: wp.Launch, block: int = 1) -> WarpStruct:
+        """Return a record of wp.launch(..., device="cpu", record_cmd=True) for the device. Raises InputError if the self-test fails."""
         check_raw_launches()
         return self.of(command, block)
 
-    def of(self, command: Any, block: int) -> Any:
-        """As `recorded`, without the self-test."""
+    def of(self, command: wp.Launch, block: int) -> WarpStruct:
+        """Return a record without the self-test."""
         launch = warp_private.recorded(command)
         self.kept.append(launch.owners)
         record = Launch()
@@ -40,14 +40,12 @@ class Launches:
 
 
 def preload_headers() -> None:
-    """Begin to precompile Warp's headers where the kernel cache is empty (wrt.core.device.preload_headers), with the self-test's
-    kernel."""
+    """Begin to precompile Warp's headers with the self-test's kernel (wrt.core.device.preload_headers)."""
     device.preload_headers(probe)
 
 
 def check_raw_launches() -> None:
-    """Test, once in a process, that launches are as wrt makes them by hand. Raises InputError that names the versions of Warp that
-    wrt works with."""
+    """Test hand-made launches, once per process. Raises InputError that names the versions of Warp that wrt works with."""
     load_kernel(probe, wp.get_device("cpu"))
     _test_once()
 
@@ -65,19 +63,19 @@ def _test_once() -> None:
 
 
 def _has_records(memory: np.ndarray, given: np.ndarray) -> bool:
-    """Whether arrays are recorded as Warp records its own; nothing is launched before this is sure."""
+    """Return whether records of arrays equal Warp's. Nothing is launched before."""
     one_for_all = np.ndarray(given.shape, np.float32, given, strides=(0,))
     for array in (given[8:], one_for_all):
         same = wp.array(ptr=array.ctypes.data, dtype=wp.float32, shape=array.shape, strides=array.strides, device="cpu")
         if bytes(warp_private.array_record(array)) != bytes(warp_private.record_of(same)):
             return False
-    canary: Any = Canary()
+    canary: WarpStruct = Canary()
     canary.words = wp.array(memory, dtype=wp.int32, device="cpu", copy=False)
     return bytes(warp_private.struct_record(Canary, [memory])) == bytes(warp_private.record_of(canary))
 
 
 def _has_arguments(memory: np.ndarray, given: np.ndarray) -> bool:
-    """Whether a launch gets the arguments that are set by hand, and is as large as it is told."""
+    """Return whether a launch receives hand-made arguments and the given size."""
     first, end = 3, 11
     command = _command(memory, given, Launch())
     command.set_param_at_index_from_ctype(3, first)
@@ -88,7 +86,7 @@ def _has_arguments(memory: np.ndarray, given: np.ndarray) -> bool:
 
 
 def _launches_itself(memory: np.ndarray, given: np.ndarray) -> bool:
-    """Whether a kernel that launches another gives it a range: its last two arguments, and its size."""
+    """Return whether a kernel passes a range to the kernel that it launches: its last two arguments, and its size."""
     first, end = 20, 42
     launches = Launches()
     command = _command(memory, given, launches.of(_command(memory, given, Launch()), PER_THREAD))
@@ -98,8 +96,8 @@ def _launches_itself(memory: np.ndarray, given: np.ndarray) -> bool:
     return _wrote(memory, given, first, end)
 
 
-def _command(memory: np.ndarray, given: np.ndarray, launch: Any) -> Any:
-    """A launch of the kernel by one thread, with arrays that are set by hand."""
+def _command(memory: np.ndarray, given: np.ndarray, launch: WarpStruct) -> wp.Launch:
+    """Record a launch of the kernel with one thread and hand-made arrays."""
     command = wp.launch(probe, dim=1, inputs=[Canary(), None, launch, 0, 0], device="cpu", record_cmd=True, record_tape=False)
     command.set_param_at_index_from_ctype(0, warp_private.struct_record(Canary, [memory[GUARDS:-GUARDS]]))
     command.set_param_at_index_from_ctype(1, warp_private.array_record(given[GUARDS:-GUARDS]))
@@ -107,7 +105,7 @@ def _command(memory: np.ndarray, given: np.ndarray, launch: Any) -> Any:
 
 
 def _wrote(memory: np.ndarray, given: np.ndarray, first: int, end: int) -> bool:
-    """Whether the kernel wrote these words and no other; they are guards again then."""
+    """Return whether the kernel wrote these words and no others, and reset the memory."""
     expected = np.full_like(memory, GUARD)
     expected[GUARDS + first : GUARDS + end] = given[GUARDS + first : GUARDS + end] + end
     written, memory[:] = memory.copy(), GUARD

@@ -1,9 +1,9 @@
-"""Hits from inside a kernel of one's own: what wrt.ray_query gives."""
+"""Queries from kernels of the user: `wrt.ray_query`."""
 
 from __future__ import annotations
 
 import zlib
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.snapshot import Snapshot
@@ -12,35 +12,61 @@ from wrt.accel.structures import ACCELERATORS
 from wrt.core.checks import as_one
 from wrt.core.device import made_once
 from wrt.core.errors import InputError
+from wrt.core.types import DeviceFunction, WarpStruct, WarpType
 from wrt.kernels.ray_query import QueryHit, QueryRay, make_ray_query, query_ray
 from wrt.kernels.traverse.common import Units
 
 
 class RayQuery(NamedTuple):
-    """Warp functions and types for kernels over structures of one kind; they have the answers of Accelerator.closest_hit, to the
-    last bit.
+    """Warp functions and types for kernels over structures of one kind, with the bits of `Accelerator.closest_hit`.
 
-    World: the type of the argument that OneMesh.world is. ray(origin, direction) -> Ray, from the origin to infinity; its
-    t_min and t_max can be set. closest_hit(world, ray) -> Hit, with t, u, v and prim_id, which is -1 on a miss.
-    any_hit(world, ray) -> bool. next_hit(world, ray, hit) -> Hit: the one after a hit of this ray, in the order of t and prim_id.
+    Attributes
+    ----------
+    World : type
+        Type of the kernel argument `accel.world`.
+    Ray, Hit : type
+        Structs with `t_min` and `t_max`, and with `t`, `u`, `v` and `prim_id` (-1 on a miss).
+    ray : (origin, direction) -> Ray
+        Ray from the origin to infinity.
+    closest_hit : (world, ray) -> Hit
+        Closest hit in the ray's segment.
+    any_hit : (world, ray) -> bool
+        Whether the ray hits anything.
+    next_hit : (world, ray, hit) -> Hit
+        Next hit of the ray in the order of t and prim_id.
     """
 
-    World: Any
-    Ray: Any
-    Hit: Any
-    ray: Any
-    closest_hit: Any
-    any_hit: Any
-    next_hit: Any
+    World: WarpType
+    Ray: WarpType
+    Hit: WarpType
+    ray: DeviceFunction
+    closest_hit: DeviceFunction
+    any_hit: DeviceFunction
+    next_hit: DeviceFunction
 
 
 def ray_query(accel: Accelerator | str, *, triangle: str | None = None, box: str | None = None) -> RayQuery:
-    """What a kernel needs to ask structures for hits, on the CPU and on CUDA.
+    """Return functions and types with which kernels query structures, on the CPU and on CUDA.
 
-    accel: a structure that the kernel is for, or for all of a kind its name in wrt.ACCELERATORS, with the intersection tests that
-    they are built with. Make the kernel with @wrt.kernel, which takes no arguments: where a kernel is compiled with fused
-    multiply-add, or gets a structure of another kind, it prints so once, and its rays hit nothing.
-    Raises InputError for unknown names, and for structures over several meshes.
+    Make the kernel with `@wrt.kernel`. A kernel that is compiled with fused multiply-add, or gets a structure of another kind,
+    prints so once, and its rays hit nothing.
+
+    Parameters
+    ----------
+    accel : Accelerator or str
+        A structure over one mesh, or the name in `wrt.ACCELERATORS` of all structures of a kind.
+    triangle, box : str, optional
+        Intersection tests of the structures, with a name only.
+
+    Returns
+    -------
+    RayQuery
+        Made once per kind of structure and tests.
+
+    Raises
+    ------
+    InputError
+        For unknown names, and for structures over several meshes.
     """
     message = "accel must be a structure over one mesh, or the name of one"
     if isinstance(accel, str):
@@ -60,20 +86,20 @@ def ray_query(accel: Accelerator | str, *, triangle: str | None = None, box: str
 
 
 @made_once
-def query_of(structure: Structure) -> tuple[Any, Any, Any, Any]:
-    """make_ray_query of a structure."""
+def query_of(structure: Structure) -> tuple[WarpType, DeviceFunction, DeviceFunction, DeviceFunction]:
+    """Make the type World, closest_hit, any_hit and next_hit of a kind of structure."""
     resuming = structure._replace(units=structure.units._replace(resumes=True))
     return make_ray_query(structure.struct, structure.traversal(any_hit=False), structure.traversal(any_hit=True),
                           resuming.traversal(any_hit=False), kind_of(structure))
 
 
 def kind_of(structure: Structure) -> int:
-    """A number for the layout of a structure's records and for its triangle test."""
+    """Return a hash of the structure's name and its triangle test."""
     return zlib.crc32(f"{structure.accel.name} {structure.units.triangle}".encode()) & 0x7FFFFFFF
 
 
-def kernel_argument(snapshot: Snapshot) -> Any:
-    """A structure and what it is over as one record. Raises InputError where it is not over one mesh."""
+def kernel_argument(snapshot: Snapshot) -> WarpStruct:
+    """Return the structure as one record. Raises InputError unless it is over one mesh."""
     structure = snapshot.structure
     structure.require_one_mesh("kernels of one's own ask structures over one mesh")
     world = query_of(structure)[0]()

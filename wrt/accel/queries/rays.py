@@ -1,4 +1,4 @@
-"""Rays of a query: the arrays that a caller gives, checked, and as kernels take them."""
+"""Rays of a query: the caller's arrays, their checks, and the form that kernels take."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import warp as wp
 from wrt.core.arrays import check_no_gradients, float32, real_numbers, taken
 from wrt.core.device import upload
 from wrt.core.errors import InputError
+from wrt.core.types import Array, ArrayLike, Device, WarpArray
 from wrt.core.warp_private import keep
 from wrt.kernels.query import FARTHEST, RayArrays
 from wrt.kernels.warp_private import fields_of
@@ -19,51 +20,59 @@ LOWEST = {"t_min": 0.0, "t_max": -np.inf}
 
 
 class Rays(NamedTuple):
-    """What somebody gives as rays: NumPy arrays of any real numbers and with any gaps, (N, 3) and (N,) (a stride of 0: one number
-    for all), or Warp's of vec3 and float32. Their shapes are right, their numbers anything."""
+    """Rays with checked shapes and unchecked values.
 
-    origins: Any
-    directions: Any
-    t_min: Any
-    t_max: Any
+    NumPy arrays (N, 3) and (N,) of real numbers, a stride of 0 meaning one number for all rays; or Warp's of vec3 and float32.
+    """
+
+    origins: Array
+    directions: Array
+    t_min: Array
+    t_max: Array
 
     @property
     def as_warp(self) -> bool:
         return isinstance(self.origins, wp.array)
 
-    def on(self, device: Any) -> Rays:
-        """The same, with Warp arrays of other devices copied to this one."""
+    def on(self, device: Device) -> Rays:
+        """Copy Warp arrays of other devices to this one."""
         return Rays(*[array.to(device) if isinstance(array, wp.array) else array for array in self])
 
     def checked(self) -> Rays:
-        """The same as float32 without gaps. Raises InputError that names the first that kernels must not get; of Warp arrays, only
-        t_min and t_max on the CPU are looked at."""
+        """Return the rays as float32 without gaps. Raises InputError for the first value that kernels must not get.
+
+        Of Warp arrays, only t_min and t_max on the CPU are checked.
+        """
         if self.as_warp:
-            origins, directions = (a if a.is_contiguous else a.contiguous() for a in (self.origins, self.directions))
+            rays: Any = self[:2]
+            origins, directions = (a if a.is_contiguous else a.contiguous() for a in rays)
         else:
             origins, directions = vectors(self.origins, "origins", FARTHEST), vectors(self.directions, "directions")
             _check_not_zero(directions)
         return Rays(origins, directions, _checked_ends(self.t_min, "t_min"), _checked_ends(self.t_max, "t_max"))
 
 
-def rays_of(origins: Any, directions: Any, t_min: Any, t_max: Any, gradients: bool = False) -> Rays:
-    """The arguments of Accelerator.closest_hit, whose shapes and kinds are checked. gradients: whether origins and directions may
-    require them. Raises InputError that names the argument."""
-    check_no_gradients(t_min=t_min, t_max=t_max, **({} if gradients else {"origins": origins, "directions": directions}))
-    origins, directions = taken(origins, "origins"), taken(directions, "directions")
-    if isinstance(origins, wp.array) or isinstance(directions, wp.array):
-        if any(not isinstance(array, wp.array) or array.dtype != wp.vec3 for array in (origins, directions)):
+def rays_of(origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike, t_max: ArrayLike, gradients: bool = False) -> Rays:
+    """Check shapes and types of a query's rays. gradients: whether origins and directions may require gradients.
+
+    Raises InputError that names the argument.
+    """
+    without: dict[str, Any] = {} if gradients else {"origins": origins, "directions": directions}
+    check_no_gradients(t_min=t_min, t_max=t_max, **without)
+    rays: list[Any] = [taken(origins, "origins"), taken(directions, "directions")]
+    if any(isinstance(array, wp.array) for array in rays):
+        if any(not isinstance(array, wp.array) or array.dtype != wp.vec3 for array in rays):
             raise InputError("and directions must both be Warp arrays of vec3, or both NumPy arrays", argument="origins")
     else:
-        origins, directions = _rows(origins, "origins"), _rows(directions, "directions")
-    n = len(origins)
-    if len(directions) != n:
-        raise InputError(f"must have as many rows as origins ({n}), got {len(directions)}", argument="directions")
-    return Rays(origins, directions, _segment_ends(t_min, n, "t_min"), _segment_ends(t_max, n, "t_max"))
+        rays = [_rows(rays[0], "origins"), _rows(rays[1], "directions")]
+    n = len(rays[0])
+    if len(rays[1]) != n:
+        raise InputError(f"must have as many rows as origins ({n}), got {len(rays[1])}", argument="directions")
+    return Rays(rays[0], rays[1], _segment_ends(t_min, n, "t_min"), _segment_ends(t_max, n, "t_max"))
 
 
-def rays_on(device: Any, rays: Rays) -> RayArrays:
-    """Checked, as Warp arrays on a device; what is on another is copied."""
+def rays_on(device: Device, rays: Rays) -> RayArrays:
+    """Check the rays and return them as Warp arrays on a device."""
     out = RayArrays()
     for name, array, dtype in zip(fields_of(RayArrays), rays.checked().on(device), (wp.vec3, wp.vec3, wp.float32, wp.float32),
                                   strict=True):
@@ -74,15 +83,15 @@ def rays_on(device: Any, rays: Rays) -> RayArrays:
     return out
 
 
-def one_for_all(value: float, n: int, device: Any) -> Any:
-    """An array of n times the same number, which is there once: written by the device, so that a graph can capture it."""
+def one_for_all(value: float, n: int, device: Device) -> WarpArray:
+    """Return an array of stride 0 that repeats one number. The device writes it, so that a graph can capture it."""
     one = wp.full(1, value, dtype=wp.float32, device=device)
     out = wp.array(ptr=one.ptr, shape=(n,), strides=(0,), dtype=wp.float32, device=device)
     keep(out, one)
     return out
 
 
-def _segment_ends(value: Any, n: int, name: str) -> Any:
+def _segment_ends(value: ArrayLike, n: int, name: str) -> Array:
     if type(value) is not float:  # most are
         value = taken(value, name, wp.float32)
     if isinstance(value, wp.array):
@@ -101,7 +110,7 @@ def _segment_ends(value: Any, n: int, name: str) -> Any:
     return np.ndarray((n,), np.float32, number, strides=(0,))  # type: ignore[arg-type]
 
 
-def _checked_ends(array: Any, name: str) -> Any:
+def _checked_ends(array: Array, name: str) -> Array:
     if isinstance(array, wp.array):
         array = array if array.is_contiguous else array.contiguous()
         if array.device.is_cuda:
@@ -112,21 +121,21 @@ def _checked_ends(array: Any, name: str) -> Any:
     return array
 
 
-def _check_ends(least: Any, name: str) -> None:
-    """least: of all numbers; NaN where there is one."""
+def _check_ends(least: float, name: str) -> None:
+    """Raise InputError for a bad minimum of t_min or t_max; it is NaN if any value is."""
     if not least >= LOWEST[name]:
         raise InputError("must not be NaN" + (" or below 0" if name == "t_min" else ""), argument=name)
 
 
-def _rows(value: Any, name: str) -> np.ndarray:
+def _rows(value: ArrayLike, name: str) -> np.ndarray:
     array = real_numbers(value, name, "(N, 3)")
     if array.ndim != 2 or array.shape[1] != 3:
         raise InputError(f"must be (N, 3), got {array.shape}", argument=name)
     return array
 
 
-def vectors(value: Any, name: str, most: float = float(np.finfo(np.float32).max)) -> np.ndarray:
-    """(N, 3) float32, no component beyond `most`."""
+def vectors(value: ArrayLike, name: str, most: float = float(np.finfo(np.float32).max)) -> np.ndarray:
+    """Return (N, 3) float32. Raises InputError for other shapes, and for components that are NaN or beyond `most`."""
     array = float32(_rows(value, name))
     numbers = array.reshape(-1)
     if not (numbers.min(initial=0.0) >= -most and numbers.max(initial=0.0) <= most):  # False for NaN

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import overload
 
 import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from wrt.accel.queries.accelerator import Accelerator, snapshot_of
@@ -13,20 +14,46 @@ from wrt.accel.queries.rays import vectors
 from wrt.core.arrays import returned
 from wrt.core.device import launch_on, upload
 from wrt.core.threads import thread_count
+from wrt.core.types import ArrayLike, NumpyLike, TensorT, WarpArray
 from wrt.kernels.query import FARTHEST
 from wrt.kernels.winding import wind
 
 POINTS_PER_LAUNCH = 256
 
 
-def winding_number(accel: Accelerator, points: Any, threads: int | None = None) -> Any:
-    """How often the mesh winds around each of `points`, (N,) float64: the solid angles of its triangles together, over 4 pi.
+@overload
+def winding_number(accel: Accelerator, points: NumpyLike | WarpArray, threads: int | None = None) -> npt.NDArray[np.float64]: ...
+@overload
+def winding_number(accel: Accelerator, points: TensorT, threads: int | None = None) -> TensorT: ...
+def winding_number(accel: Accelerator, points: ArrayLike, threads: int | None = None) -> object:
+    """Compute the generalized winding number of a mesh at each point: the sum of its triangles' solid angles over 4 pi.
 
-    points: (N, 3) real numbers, taken as float32. Around a closed mesh whose triangles face outwards it is 1 inside and 0 outside,
-    to 1e-9, more where parts overlap, and -1 where they face inwards; of an open one it goes over from one to the other, so that
-    above 0.5 is mostly inside (Jacobson, Kavan and Sorkine-Hornung 2013, "Robust Inside-Outside Segmentation Using Generalized
-    Winding Numbers"). On a triangle it is between its two sides. Every triangle is looked at: a point takes as long as the mesh is
-    large, some 40 ns a triangle. Raises InputError as closest_points does.
+    For a closed mesh whose triangles face outwards it is 1 inside and 0 outside, to 1e-9; it adds up where parts overlap, and is
+    negative where triangles face inwards. Around an open mesh it changes smoothly: above 0.5 a point is mostly inside. On a triangle
+    it lies between the values of both sides. Every point costs some 40 ns per triangle.
+
+    Parameters
+    ----------
+    accel : Accelerator
+        Structure over one mesh without spheres.
+    points : (N, 3) array_like
+        Points, taken as float32.
+    threads : int, optional
+        Threads on the CPU; one per core by default.
+
+    Returns
+    -------
+    (N,) float64
+        Array of NumPy, or of the library of `points`: PyTorch, JAX.
+
+    Raises
+    ------
+    InputError
+        For other structures, and for points that are not finite.
+
+    References
+    ----------
+    Jacobson, Kavan and Sorkine-Hornung 2013, "Robust Inside-Outside Segmentation using Generalized Winding Numbers".
     """
     snapshot = snapshot_of(accel)
     rows, give, device = vectors(points, "points", FARTHEST), returned(points), snapshot.device

@@ -1,8 +1,8 @@
-"""The world that each ray of a query sees, in a structure over several."""
+"""World that each ray of a query sees, in a structure over several."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TypeGuard
 
 import numpy as np
 import warp as wp
@@ -13,18 +13,20 @@ from wrt.core.arrays import real_numbers, to_numpy
 from wrt.core.checks import shown
 from wrt.core.device import upload
 from wrt.core.errors import InputError
+from wrt.core.types import ArrayLike, Device, WarpArray, WarpStruct
 from wrt.kernels.query import Worlds
 
 
 class WorldIds:
-    """The world of each of n rays: arrays for kernels, on the structure's device."""
+    """World of each of n rays, in arrays for kernels on the structure's device."""
 
-    def __init__(self, snapshot: Snapshot, world: Any, n: int) -> None:
-        self.first_prim = snapshot.geometry.world_first_prim
-        self.arrays: Any = Worlds()
+    def __init__(self, snapshot: Snapshot, first_prim: np.ndarray, world: ArrayLike, n: int) -> None:
+        """first_prim: (W,) first prim_id of each world."""
+        self.first_prim = first_prim
+        self.arrays: WarpStruct = Worlds()
         self.arrays.id, self.arrays.root = self._on(snapshot.device, world, n), snapshot.roots
 
-    def _on(self, device: Any, world: Any, n: int) -> Any:
+    def _on(self, device: Device, world: ArrayLike, n: int) -> WarpArray:
         if isinstance(world, wp.array):
             if world.dtype != wp.int32 or world.shape != (n,):
                 raise InputError(f"must be ({n},) int32, got {world.shape} {world.dtype.__name__}", argument="world")
@@ -36,20 +38,24 @@ class WorldIds:
             raise InputError(f"must be 0 to {count - 1}, got {ids.min() if ids.min() < 0 else ids.max()}", argument="world")
         return upload(np.broadcast_to(ids, (n,)).astype(np.int32), wp.int32, device)
 
-    def numbered(self, prim_id: Any) -> np.ndarray:
-        """(N,) int32: prim_ids of hits as numbers among the primitives of all worlds."""
+    def over_all(self, prim_id: ArrayLike) -> np.ndarray:
+        """Convert prim_ids of hits in their worlds to indices among the primitives of all worlds, (N,) int32."""
         own, world = to_numpy(prim_id), self.arrays.id.numpy()
         return np.where(own >= 0, own + self.first_prim[np.where(own >= 0, world, 0)], -1).astype(np.int32)
 
 
-def worlds_asked(snapshot: Snapshot, world: Any, n: int) -> WorldIds | None:
-    """The argument of a query; None where there is but one world, and none is named. Raises InputError that calls it `world`."""
+def over_worlds(geometry: object) -> TypeGuard[InstancedGeometry]:
+    """Return whether a structure was built from a list of worlds."""
+    return isinstance(geometry, InstancedGeometry) and geometry.worlds is not None
+
+
+def check_world(snapshot: Snapshot, world: ArrayLike | None, n: int) -> WorldIds | None:
+    """Return the worlds that n rays see, or None without worlds. Raises InputError that names the argument `world`."""
     geometry = snapshot.geometry
-    several = isinstance(geometry, InstancedGeometry) and geometry.worlds is not None
     if world is None:
-        if several and len(geometry.worlds) > 2:
-            raise InputError(f"must be given: the structure is over {len(geometry.worlds) - 1} worlds", argument="world")
+        if over_worlds(geometry) and geometry.n_worlds > 1:
+            raise InputError(f"must be given: the structure is over {geometry.n_worlds} worlds", argument="world")
         return None
-    if not several:
+    if not over_worlds(geometry):
         raise InputError("is for structures over worlds: wrt.build takes a list of them", argument="world")
-    return WorldIds(snapshot, world, n)
+    return WorldIds(snapshot, geometry.world_first_prim, world, n)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wrt.accel.base import Accelerator
+from wrt.accel.base import OneMesh
 from wrt.accel.geometry import Geometry
 
 RAY_KINDS = ("primary", "shadow", "diffuse", "random")
@@ -74,7 +74,7 @@ def random(n: int, center: np.ndarray, radius: float, rng: np.random.Generator) 
     return RaySet("random", a.astype(np.float32), unit(b - a).astype(np.float32), endless(n))
 
 
-def ray_sets(accel: Accelerator, n: int, seed: int = 0, inside: bool = False) -> dict[str, RaySet]:
+def ray_sets(accel: OneMesh, n: int, seed: int = 0, inside: bool = False) -> dict[str, RaySet]:
     """Return about n rays of every kind (for primary rays the next lower square number), the same for the same arguments.
     The structure finds what the camera sees. inside: the camera stands in the middle of the mesh's box, as in a room."""
     g = accel.geometry

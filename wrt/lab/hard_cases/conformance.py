@@ -182,4 +182,4 @@ def _answer(said: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
 def _segment(part: HardCase, t: np.ndarray, prim_id: np.ndarray) -> Any:
     """Return hits as a query with the case's t_max would report them."""
     beyond = (prim_id >= 0) & (t > part.t_max)
-    return replace(Hits(t, None, None, prim_id), prim_id=np.where(beyond, -1, prim_id))
+    return replace(Hits[Any](t, None, None, prim_id), prim_id=np.where(beyond, -1, prim_id))
