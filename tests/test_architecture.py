@@ -54,7 +54,7 @@ IN_WRT = {
     "jax": {"accel", "core"},
     "sensors": {"scene", "core"},
     "testing": {"lab"},
-    "torch": {"accel"},
+    "torch": {"accel", "core"},
 }
 # Of kernels/, the parts that each folder of wrt/ may import. The others import none.
 KERNELS_OF_HOST = {

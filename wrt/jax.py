@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,12 +12,33 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.queries.gradients import Cotangents, adjoint
 from wrt.accel.tensors import HitTensors, hits_of, library
 from wrt.core.errors import InputError
+from wrt.core.types import ArrayLike
+
+if TYPE_CHECKING:
+    from jax import Array
 
 
-def closest_hit(accel: OneMesh, vertices: Any, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf, *,
-                rebuild_at: float = 2.0) -> HitTensors:
-    """As wrt.torch.closest_hit, for arrays of JAX, also in jax.jit, jax.grad and jax.vmap: a callback on the host asks the
-    structure, which is a constant there. (JAX wraps an error that the callback raises.)"""
+def closest_hit(accel: OneMesh, vertices: ArrayLike | None, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0,
+                t_max: ArrayLike = np.inf, *, rebuild_at: float = 2.0) -> HitTensors[Array]:
+    """Find the closest hit of each ray, with gradients, also in jax.jit, jax.grad and jax.vmap.
+
+    A callback on the host asks the structure, which is a constant of the traced function. JAX wraps errors of the callback.
+
+    Parameters
+    ----------
+    accel, vertices, origins, directions, t_min, t_max, rebuild_at
+        See `wrt.torch.closest_hit`; arrays of JAX.
+
+    Returns
+    -------
+    HitTensors
+        Arrays of JAX.
+
+    Raises
+    ------
+    InputError
+        Names the argument and what was expected; also without JAX.
+    """
     jnp = library("jax", "jax.numpy")
     given = (jnp.asarray(each) for each in (() if vertices is None else (vertices,)) + (origins, directions))
     *shape, o, d = (each.astype(np.float32) if each.dtype.kind in "iu" else each for each in given)
@@ -29,7 +50,7 @@ def closest_hit(accel: OneMesh, vertices: Any, origins: Any, directions: Any, t_
 
 @cache
 def _function() -> Any:
-    """With a custom derivative, of arrays: vertices (or None), origins, directions, t_min and t_max."""
+    """Make closest_hit(accel, rebuild_at, vertices or None, origins, directions, t_min, t_max) with a custom derivative."""
     jax = library("jax")
 
     def on_host(function: Any, shapes: Any, *arrays: Any) -> Any:

@@ -1,25 +1,48 @@
-"""Closest hits with gradients for torch: `wrt.torch.closest_hit`."""
+"""Closest hits with gradients for PyTorch: `wrt.torch.closest_hit`."""
 
 from __future__ import annotations
 
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from wrt.accel.base import OneMesh
 from wrt.accel.queries.gradients import Cotangents, adjoint
 from wrt.accel.tensors import HitTensors, hits_of, library
+from wrt.core.types import ArrayLike
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
-def closest_hit(accel: OneMesh, vertices: Any, origins: Any, directions: Any, t_min: Any = 0.0, t_max: Any = np.inf, *,
-                rebuild_at: float = 2.0) -> HitTensors:
-    """The closest hit of each ray, with gradients of t, u, v and point at fixed prim_id in vertices, origins and directions.
+def closest_hit(accel: OneMesh, vertices: Tensor | None, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0,
+                t_max: ArrayLike = np.inf, *, rebuild_at: float = 2.0) -> HitTensors[Tensor]:
+    """Find the closest hit of each ray, with gradients of t, u, v and point at fixed prim_id.
 
-    accel: a structure over one mesh, which follows `vertices`, (V, 3), where they are not those it has (OneMesh.refit, as
-    rebuild_at is); None: it stays. All else as in Accelerator.closest_hit: tensors of torch, on the CPU or a GPU, taken as float32.
-    Gradients (wrt.accel.queries.gradients.adjoint) are computed in float64 on the CPU, and have the same bits each time; those of a
-    miss are 0. There are no second derivatives. Raises InputError that names the argument, and where torch is not installed.
+    Gradients are computed in float64 on the CPU and have the same bits in every run; those of misses are 0. There are no second
+    derivatives (docs/gradients.md).
+
+    Parameters
+    ----------
+    accel : OneMesh
+        Structure over one mesh without spheres.
+    vertices : (V, 3) tensor or None
+        Vertices that the structure is refitted to if they are new; None leaves it as it is.
+    origins, directions, t_min, t_max
+        See `Accelerator.closest_hit`; tensors on the CPU or a GPU, taken as float32.
+    rebuild_at : float
+        See `OneMesh.refit`.
+
+    Returns
+    -------
+    HitTensors
+        Tensors on the CPU, or on the GPU of `origins`.
+
+    Raises
+    ------
+    InputError
+        Names the argument and what was expected; also without torch.
     """
     torch = library("torch")
     given = (each if each is None else torch.as_tensor(each) for each in (vertices, origins, directions))
@@ -27,13 +50,13 @@ def closest_hit(accel: OneMesh, vertices: Any, origins: Any, directions: Any, t_
 
 
 @cache
-def _function() -> Any:
+def _function() -> Any:  # a class of torch.autograd.Function
     torch = library("torch")
 
     def forward(ctx: Any, accel: OneMesh, rebuild_at: float, t_min: Any, t_max: Any, *given: Any) -> tuple[Any, ...]:
         vertices, *rays = (each if each is None else each.detach().float().contiguous() for each in given)
         hits = hits_of(accel, vertices, (*rays, t_min, t_max), rebuild_at)
-        ctx.geometry = hits.source[1].geometry
+        ctx.geometry = hits.source[0].mesh  # type: ignore[index]
         ctx.leaves = [each if each is None else (each.device, each.dtype) for each in given]
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(hits.prim_id)

@@ -76,12 +76,12 @@ class OneMesh(Accelerator, ABC):
     @property
     def geometry(self) -> Geometry:
         """Geometry of the mesh as it is now."""
-        return self._snapshot.one_mesh[0]
+        return self._snapshot.mesh
 
     @property
     def built(self) -> Built:
         """Arrays of the builder or of the last refit, on the host."""
-        return self._snapshot.one_mesh[1].on_host()
+        return self._snapshot.arrays.on_host()
 
     @property
     def world(self) -> WarpStruct:
@@ -166,7 +166,7 @@ class OneMesh(Accelerator, ABC):
                 self._refit_in_place(vertices)
                 return Refit(build_clock() - begin, float("nan"), False)
             beside = self._over(self._moved(vertices))
-            built, built_cost = beside._refit(before.one_mesh[1]), before.built_cost
+            built, built_cost = beside._refit(before.arrays), before.built_cost
             growth = float(built.sah_cost) / float(built_cost) if built_cost > 0.0 else 1.0
             if rebuilt := growth > rebuild_at:
                 built = beside._build(self.built_with)
@@ -201,7 +201,7 @@ class OneMesh(Accelerator, ABC):
         """
         from wrt.accel.epo import end_point_overlap
 
-        geometry, built = self._snapshot.one_mesh
+        geometry, built = self._snapshot.mesh, self._snapshot.arrays
         return end_point_overlap(self._children(built.on_host()), geometry, self.threads)
 
     def _upload(self, built: Built) -> WarpStruct:

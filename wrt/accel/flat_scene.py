@@ -1,4 +1,4 @@
-"""Attributes of primitives beyond the geometry: their places, normals, texture coordinates, materials and objects."""
+"""A scene as arrays: geometry, and the places, normals, texture coordinates, materials and objects of its primitives."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from wrt.accel.instanced_geometry import InstancedGeometry
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """The scene's primitives in runs of one mesh in one place, in the order of prim_id; the last run may be all spheres.
+    """Runs of primitives of one mesh in one place, in the order of prim_id; the last run may be all spheres.
 
     (I,) int64 each: first_prim, first_face (into FlatScene.faces), first_material (into FlatScene.prim_material), material_step (1, or 0
     where all are of one material); to_world: (I, 3, 4) float64.
@@ -27,12 +27,12 @@ class Placed:
 
 @dataclass(frozen=True, eq=False)
 class FlatScene:
-    """All shapes of a scene, or a mesh by itself. prim_id counts the faces of all objects in their order, then the spheres.
+    """All shapes of a scene, or one mesh, as arrays. prim_id counts the faces of all objects in their order, then the spheres.
 
-    geometry: what is hit; vertices (V, 3), faces (F, 3), normals (V, 3) or None, uvs (V, 2), the last two zero where an object
-    has none, uvs (0, 2) where a mesh by itself has none; prim_material: index into the scene's materials. Without `placed`, all
-    is in world space and numbered as primitives are; with it, meshes with several places are there once, in their own space.
-    objects: the first prim_id of each object, and behind them of each sphere; None where there is no scene.
+    vertices: (V, 3); faces: (F, 3); normals: (V, 3) or None; uvs: (V, 2). Normals and uvs are zero for objects without them; uvs are
+    (0, 2) for one mesh without them. prim_material: index into the scene's materials. Without `placed`, everything is in world space
+    and in the order of prim_id; with it, instanced meshes are there once, in their own space. objects: first prim_id of each object
+    and then of each sphere; None without a scene.
     """
 
     geometry: Geometry | InstancedGeometry
@@ -45,21 +45,21 @@ class FlatScene:
     objects: np.ndarray | None = None
 
     def places(self, prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The row in `faces` of each triangle, and its row in `placed` (0 where nothing is), (N,) each."""
+        """Return the row of each triangle in `faces` and in `placed` (0 without `placed`), (N,) each."""
         if self.placed is None:
             return prim_id, np.zeros(len(prim_id), np.int32)
         run, local = self._run(prim_id)
         return self.placed.first_face[run] + local, run
 
     def materials(self, prim_id: np.ndarray) -> np.ndarray:
-        """The material of each primitive, (N,) int32."""
+        """Return the material of each primitive, (N,) int32."""
         if self.placed is None:
             return self.prim_material[prim_id]
         run, local = self._run(prim_id)
         return self.prim_material[self.placed.first_material[run] + self.placed.material_step[run] * local]
 
     def corners(self, prim_id: np.ndarray) -> np.ndarray:
-        """The corners of triangles in world space, (N, 3, 3) float64."""
+        """Return the corners of triangles in world space, (N, 3, 3) float64."""
         face, run = self.places(prim_id)
         corners = self.vertices[self.faces[face]].astype(np.float64)
         if self.placed is None:
@@ -88,7 +88,7 @@ def flat_scene_of(geometry: Geometry | InstancedGeometry, normals: np.ndarray | 
 
 
 def placed_now(scene: FlatScene, geometry: Geometry | InstancedGeometry) -> Placed | None:
-    """scene.placed, with the instances where they are now in a geometry that began as the scene's."""
+    """Return scene.placed with the present matrices of the geometry."""
     if scene.placed is None or not isinstance(geometry, InstancedGeometry):
         return None
     to_world = scene.placed.to_world.copy()
@@ -97,5 +97,5 @@ def placed_now(scene: FlatScene, geometry: Geometry | InstancedGeometry) -> Plac
 
 
 def run_of(placed: Placed, geometry: InstancedGeometry) -> np.ndarray:
-    """The run of each instance that is placed (InstancedGeometry.is_placed); one without primitives has none of its own."""
+    """Return the run of each instance with a transform of its own. An instance without primitives shares another's run."""
     return np.searchsorted(placed.first_prim, geometry.first_prim[geometry.is_placed], side="right") - 1

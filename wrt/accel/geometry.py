@@ -1,11 +1,10 @@
-"""The triangles and spheres that a structure is built over."""
+"""Triangles and spheres that a structure is built over."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -13,6 +12,7 @@ import warp as wp
 from wrt.accel.triangle_data import LAYOUTS
 from wrt.core.device import records, upload
 from wrt.core.threads import run_all
+from wrt.core.types import Device, WarpArray, WarpStruct
 from wrt.kernels.build.shape import Shape
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.units.box import PAD_COORDINATE, PAD_EXTENT, PAD_SMALLEST
@@ -23,7 +23,7 @@ RECORDS_PER_JOB = 32768
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """What is hit, in world space: vertices (V, 3) float32, faces (F, 3) int32, spheres (S, 4) float32 (center, radius).
+    """Shapes in world space: vertices (V, 3) float32, faces (F, 3) int32, spheres (S, 4) float32 (center, radius).
 
     prim_id counts the faces first, then the spheres.
     """
@@ -34,7 +34,7 @@ class Geometry:
 
     @staticmethod
     def of(mesh: Mesh) -> Geometry:
-        """Of a mesh alone; prim_ids are indices into its faces."""
+        """Make the geometry of a mesh, without spheres."""
         return Geometry(mesh.vertices, mesh.faces, np.zeros((0, 4), np.float32))
 
     def __len__(self) -> int:
@@ -42,23 +42,23 @@ class Geometry:
 
     @property
     def n_triangles(self) -> int:
-        """How many of the primitives are triangles: they come before the spheres."""
+        """Number of triangles."""
         return len(self.faces)
 
     @property
     def n_vertices(self) -> int:
-        """How many vertices there are."""
+        """Number of vertices."""
         return len(self.vertices)
 
     def digest(self) -> str:
-        """SHA-256 of the arrays: the same for the same geometry, whatever file it came from."""
+        """Return the SHA-256 of the arrays."""
         out = sha256()
         for array in (self.vertices, self.faces, self.spheres):
             out.update(f"{array.shape}{array.dtype.str}".encode() + np.ascontiguousarray(array).tobytes())
         return out.hexdigest()
 
-    def on(self, device: Any, faces: Any = None) -> Any:
-        """The same on a device (a Warp device): kernels.build.shape.Shape. faces: those that are there already."""
+    def on(self, device: Device, faces: WarpArray | None = None) -> WarpStruct:
+        """Upload to a device, as kernels.build.shape.Shape. faces: those that are there already."""
         shape = Shape()
         shape.vertices = upload(self.vertices, wp.vec3, device)
         shape.faces = upload(self.faces, wp.vec3i, device) if faces is None else faces
@@ -66,14 +66,14 @@ class Geometry:
         return shape
 
     def kept(self) -> Geometry:
-        """What a structure goes on using: with nothing that others write to."""
+        """Return the geometry without arrays that others may write to."""
         return self
 
     def bounds(self, threads: int = 1, out: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest corner of every primitive's padded box, two (N, 3) float32; out: arrays that take them.
+        """Compute the padded box of every primitive: low and high, (N, 3) float32, into `out` if given.
 
-        To the last bit what the units take (kernels.units.triangle.within_bounds): a hit is never outside its box. Around a
-        triangle with a corner that is not finite, all of space, as kernels.build.shape has it.
+        The boxes have the bits of those in the units (kernels.units.triangle.within_bounds), so that no hit is outside its box.
+        Around a triangle with a corner that is not finite the box is all of space, as in kernels.build.shape.
         """
         lo, hi = out or (np.empty((len(self), 3), np.float32) for _ in range(2))
 
@@ -96,8 +96,8 @@ class Geometry:
         return lo, hi
 
     def primitives(self, units: Units, order: np.ndarray | None = None, threads: int = 1) -> np.ndarray:
-        """What the triangle test of `units` reads, in the given order of prim_id, or in their own."""
-        if order is not None and len(order) > len(self):  # what stands more than once is made once
+        """Return the records of the triangle test of `units`, in the given order of prim_id or in their own."""
+        if order is not None and len(order) > len(self):  # make each record once
             return self.primitives(units, None, threads)[order]
         prim_id = np.arange(len(self), dtype=np.int32) if order is None else order
         out = records(units.triangle_test.record, len(prim_id))

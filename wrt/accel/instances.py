@@ -1,9 +1,8 @@
-"""Two levels: meshes that stand in several places are kept once, and a tree over the places leads to them."""
+"""Two levels: each mesh is stored once, and a tree over its instances leads to it."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -20,6 +19,7 @@ from wrt.core.checks import shown
 from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.core.seconds import build_clock
+from wrt.core.types import ArrayLike
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.traverse.instances import Placement
 from wrt.kernels.warp_private import fields_of
@@ -29,20 +29,20 @@ ALIGNMENT = 64  # bytes, between the addresses of structures
 
 
 class Instances(Accelerator):
-    """A binary BVH over instances of structures of one kind, each built once. Options: those of the kind; `wrt.build` makes it.
+    """A binary BVH over instances of structures of one class, each built once. `wrt.build` makes it, with the options of the class.
 
-    Same answers for every kind of structure and every tree: the closest of what the structures say of the ray in their spaces.
+    The closest hit is the closest that the structures find for the ray in their own spaces, whatever the tree.
     """
 
     name = "instances"
 
     def __init__(self, kind: type[OneMesh], geometry: InstancedGeometry, attributes: FlatScene | None = None, /, device: str = "cpu",
-                 threads: int | None = None, *, triangle: str = "watertight", box: str = "conservative", **options: Any) -> None:
+                 threads: int | None = None, *, triangle: str = "watertight", box: str = "conservative", **options: object) -> None:
         begin = build_clock()
         super().__init__(Structure(kind, Units(triangle, box, instances=True)), geometry, attributes, device, threads)
         self.bottoms = [kind(part, device=device, threads=threads, triangle=triangle, box=box, **options)
                         for part in geometry.parts]
-        # As they are now: a Warp array of structs holds addresses, and does not keep what a refit would replace.
+        # Snapshots keep the arrays, of which the Warp array of structs holds addresses only.
         self._placed = [bottom.snapshot for bottom in self.bottoms]
         self._bottoms = wp.array([each.data for each in self._placed], dtype=self.structure.bottom, device=self.device)
         self._top = build_top(geometry, *world_boxes(geometry, np.arange(len(geometry.part)), self._boxes(geometry, BOXES)))
@@ -52,8 +52,8 @@ class Instances(Accelerator):
     def _boxes(self, geometry: InstancedGeometry, most: int) -> list[Boxes]:
         return part_boxes(geometry, [bottom.built.order for bottom in self.bottoms], most)
 
-    def _take_top(self, geometry: Any, begin: float, built_cost: float) -> None:
-        """Answer from now on as the upper level is now."""
+    def _take_top(self, geometry: InstancedGeometry, begin: float, built_cost: float) -> None:
+        """Upload the upper level and set the snapshot."""
         top, data = self._top, self.structure.struct()
         sizes = np.array([top.nodes.nbytes, *(each.stats.bytes for each in self._placed)], np.int64)
         data.nodes = upload(top.nodes, fields_of(data)["nodes"].dtype, self.device)
@@ -61,26 +61,41 @@ class Instances(Accelerator):
         data.bottoms, data.slack = self._bottoms, top.slack
         data.bases = upload(np.cumsum((sizes + ALIGNMENT - 1) // ALIGNMENT * ALIGNMENT)[:-1], wp.int64, self.device)
         stats = [each.stats for each in self._placed]
-        told = AccelStats(
+        total = AccelStats(
             build_clock() - begin, len(top.nodes) + sum(s.nodes for s in stats), top.leaves + sum(s.leaves for s in stats),
             top.depth + max((s.depth for s in stats), default=0), sum(s.references for s in stats),
             array_bytes(data) + sum(s.bytes for s in stats), float("nan"))
-        self._snapshot = replace(self._snapshot, geometry=geometry, data=data, stats=told, built_cost=built_cost, roots=self._roots)
+        self._snapshot = replace(self._snapshot, geometry=geometry, data=data, stats=total, built_cost=built_cost, roots=self._roots)
 
-    def move(self, instance: Any, matrix: Any, rebuild_at: float = np.inf) -> Refit:
-        """Put an instance in another place, or several at once: boxes of the upper level are fitted anew, its trees stay as they
-        are, and the meshes are not touched.
+    def move(self, instance: ArrayLike, matrix: ArrayLike, rebuild_at: float = np.inf) -> Refit:
+        """Move instances: fit the boxes of the upper level to new matrices. Hits have the bits of a new structure.
 
-        instance: what hits.instance tells, or (R,) of them, none twice: over a scene the number of an object, as hits.object; else
-        a row of geometry.to_world (over worlds, row geometry.first_instance[w] + k is object k of world w). matrix: to the world,
-        (4, 4) or (R, 4, 4), affine. The hits are those of a
-        structure that is built anew, to the last bit. rebuild_at, and what other threads may do meanwhile: as in refit; growth is
-        that of the upper level. Raises InputError for other shapes and rows, for what is not an instance, and for matrices that
-        flatten or shear more than wrt.build takes for instances.
+        Other threads may go on with queries, as during `OneMesh.refit`.
+
+        Parameters
+        ----------
+        instance : int or (R,) array_like of int
+            Values of `hits.instance`, each at most once: over a scene, indices of objects; else rows of `geometry.to_world`.
+            Over worlds, row `geometry.first_instance[w] + k` is object k of world w.
+        matrix : (4, 4) or (R, 4, 4) array_like
+            Affine maps from object to world space.
+        rebuild_at : float
+            Build the upper level anew if its SAH cost exceeds this multiple of its value at the last build.
+
+        Returns
+        -------
+        Refit
+            Growth of the upper level's SAH cost, and whether it was built anew.
+
+        Raises
+        ------
+        InputError
+            For other shapes and indices, for objects that are not instances, and for matrices that flatten or shear too much.
         """
         with self._refitting:
             begin, before = build_clock(), self._snapshot
-            geometry: Any = before.geometry
+            geometry = before.geometry
+            assert isinstance(geometry, InstancedGeometry)
             rows, matrices = moves(rows_of(geometry, before.attributes), instance, matrix)
             to_world = geometry.to_world.copy()
             to_world[rows] = matrices
@@ -99,7 +114,7 @@ class Instances(Accelerator):
             self._take_top(geometry, begin, cost)
             return Refit(self.stats.build_seconds, growth, rebuilt)
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self) -> tuple[object, ...]:
         raise TypeError("structures with instances cannot be pickled yet: pickle the scene, and build it again (wrt.build)")
 
     def __repr__(self) -> str:
@@ -110,8 +125,7 @@ class Instances(Accelerator):
 
 
 def rows_of(geometry: InstancedGeometry, scene: FlatScene | None) -> np.ndarray:
-    """Row of geometry.to_world by the number that a caller has: over a scene that of the object, whose rows are fewer where several
-    objects are joined. -1: it has no place of its own."""
+    """Return the row of geometry.to_world for each value of hits.instance; -1 for objects without a place of their own."""
     placed = np.flatnonzero(geometry.is_placed)
     if scene is None or scene.objects is None:
         rows, numbers = np.full(len(geometry.part), -1), placed
@@ -121,9 +135,11 @@ def rows_of(geometry: InstancedGeometry, scene: FlatScene | None) -> np.ndarray:
     return rows
 
 
-def moves(row_of: np.ndarray, instance: Any, matrix: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The arguments of Instances.move as (R,) rows and (R, 3, 4) float64; row_of: of `rows_of`. Raises InputError that names
-    the argument."""
+def moves(row_of: np.ndarray, instance: ArrayLike, matrix: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Check the arguments of Instances.move and return (R,) rows and (R, 3, 4) float64; row_of: see `rows_of`.
+
+    Raises InputError that names the argument.
+    """
     rows = real_numbers(instance, "instance", "a whole number, or (R,)")
     if rows.ndim > 1 or (rows.dtype.kind not in "iu" and rows.size):
         raise InputError(f"must be a whole number, or (R,) of them, got {shown(instance)}", argument="instance")

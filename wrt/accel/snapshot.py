@@ -42,10 +42,16 @@ class Snapshot:
     changes: bool = False
 
     @property
-    def one_mesh(self) -> tuple[Geometry, Built]:
-        """Geometry and arrays of a structure over one mesh."""
-        assert isinstance(self.geometry, Geometry) and self.built is not None
-        return self.geometry, self.built
+    def mesh(self) -> Geometry:
+        """Geometry of a structure over one mesh."""
+        assert isinstance(self.geometry, Geometry)
+        return self.geometry
+
+    @property
+    def arrays(self) -> Built:
+        """Arrays of a structure over one mesh."""
+        assert self.built is not None
+        return self.built
 
     def over(self, geometry: Geometry | InstancedGeometry) -> Snapshot:
         """Return a snapshot over another geometry, with nothing built yet."""

@@ -57,15 +57,14 @@ def check_target(path: PathLike) -> None:
 def save(snapshot: Snapshot, path: PathLike) -> None:
     """Write a structure wholly or not at all. Raises InputError if the file cannot be written."""
     check_target(path)
-    structure, (geometry, built) = snapshot.structure, snapshot.one_mesh
-    built = built.on_host()
+    structure, built = snapshot.structure, snapshot.arrays.on_host()
     units = structure.units
     rows = {name: np.ascontiguousarray(np.atleast_1d(array)) for name, array in built.arrays.items()}
     types = array_types(structure.accel, units.triangle)
     body = [rows[name].astype(types[name].base, copy=False).tobytes() for name in types]
     body.append(built.order.astype("<i4").tobytes())
     header = {"accel": structure.accel.name, "triangle": units.triangle, "box": units.box, "wrt": VERSION,
-              "geometry": geometry.digest(), "bytes": {name: len(part) for name, part in zip(types, body, strict=False)},
+              "geometry": snapshot.mesh.digest(), "bytes": {name: len(part) for name, part in zip(types, body, strict=False)},
               "order": len(built.order)} | {name: getattr(built, name) for name in STATS}
     with replacing(path) as file:
         write_checked(file, MAGIC, header, body)

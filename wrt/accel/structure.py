@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, NamedTuple, TypeVar, get_type_hints
+from typing import Any, NamedTuple, TypeVar, get_type_hints
 
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.checks import accepts, did_you_mean, require_known
@@ -15,9 +15,6 @@ from wrt.kernels.traverse import instances as traverse_instances
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.units.triangle import RAY_TRIANGLE
-
-if TYPE_CHECKING:
-    from wrt.accel.base import OneMesh
 
 T = TypeVar("T")
 
@@ -57,7 +54,7 @@ class Structure(NamedTuple):
     With Units.instances it is a tree over structures of this class (wrt.accel.instances).
     """
 
-    accel: type[OneMesh]
+    accel: type[Any]  # a subclass of wrt.accel.base.OneMesh, which stands above
     units: Units = Units()
 
     @property

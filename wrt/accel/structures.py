@@ -1,23 +1,20 @@
-"""Table of acceleration structures: name -> module and class, imported on first use, so that the command line's help needs no Warp."""
+"""Table of acceleration structures: name -> module and class, imported on first use; the command line's help needs no Warp."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 from wrt.core import cuda
 from wrt.core.errors import InputError
 from wrt.core.registry import Registry
 
-if TYPE_CHECKING:
-    from wrt.accel.base import OneMesh
-
 FIELDS = ("name", "kernels", "options")  # class fields without a default in wrt.accel.base.OneMesh
 
 
-class Structures(Registry[type["OneMesh"]]):
+class Structures(Registry[type[Any]]):
     """Name -> class of structures over one mesh. Raises InputError that names a class field which is missing."""
 
-    def __getitem__(self, name: str) -> type[OneMesh]:
+    def __getitem__(self, name: str) -> type[Any]:
         kind = super().__getitem__(name)
         for field in FIELDS:
             if not hasattr(kind, field):

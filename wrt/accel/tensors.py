@@ -1,34 +1,43 @@
-"""Closest hits for libraries of tensors: what wrt.torch and wrt.jax share."""
+"""Closest hits for PyTorch and JAX: shared code of wrt.torch and wrt.jax."""
 
 from __future__ import annotations
 
 import importlib
-from typing import Any, NamedTuple
+from types import ModuleType
+from typing import Any, Generic, NamedTuple
 
 import numpy as np
 
 from wrt.accel.base import OneMesh
 from wrt.accel.queries.accelerator import snapshot_of
+from wrt.accel.queries.answers import Hits
 from wrt.core.arrays import float32, to_numpy
 from wrt.core.errors import InputError
+from wrt.core.types import ArrayLike, ArrayT
 
 
-class HitTensors(NamedTuple):
-    """Of the closest hits: t, u, v (N,) float32 and prim_id (N,) int32 as Accelerator.closest_hit gives them, and point (N, 3)
-    float32, as Hits.point (NaN on a miss)."""
+class HitTensors(NamedTuple, Generic[ArrayT]):
+    """Closest hits of N rays as tensors of PyTorch or JAX.
 
-    t: Any
-    u: Any
-    v: Any
-    point: Any
-    prim_id: Any
-
-
-def hits_of(accel: OneMesh, vertices: Any, rays: tuple[Any, ...], rebuild_at: float) -> Any:
-    """Hits of closest_hit, once the structure has followed the vertices (None, or as they are: it stays). rays: its arguments.
-
-    Raises InputError that names the argument.
+    Attributes
+    ----------
+    t, u, v : (N,) float32
+        As in `Hits`.
+    point : (N, 3) float32
+        As in `Hits`; NaN on a miss.
+    prim_id : (N,) int32
+        Index of the face; -1 on a miss.
     """
+
+    t: ArrayT
+    u: ArrayT
+    v: ArrayT
+    point: ArrayT
+    prim_id: ArrayT
+
+
+def hits_of(accel: OneMesh, vertices: ArrayLike | None, rays: tuple[Any, ...], rebuild_at: float) -> Hits[Any]:
+    """Refit the structure if the vertices are new, and ask closest_hit(*rays). Raises InputError that names the argument."""
     snapshot_of(accel)
     if vertices is not None:
         now, followed = to_numpy(vertices), accel.geometry.vertices
@@ -37,8 +46,8 @@ def hits_of(accel: OneMesh, vertices: Any, rays: tuple[Any, ...], rebuild_at: fl
     return accel.closest_hit(*rays)
 
 
-def library(name: str, module: str = "") -> Any:
-    """A library that wrt does not need. Raises InputError that says how to get it, where it is not there."""
+def library(name: str, module: str = "") -> ModuleType:
+    """Import an optional library. Raises InputError that says how to install it."""
     try:
         return importlib.import_module(module or name)
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""How corners become what a triangle test reads: LAYOUTS, which rows of kernels.units.triangle.RAY_TRIANGLE name."""
+"""Records of triangle tests from corners: LAYOUTS, by the names in kernels.units.triangle.RAY_TRIANGLE."""
 
 from __future__ import annotations
 
@@ -10,23 +10,24 @@ from wrt.scene.clean import corners_have_area
 
 
 def corners(record: np.ndarray, v0: np.ndarray, v1: np.ndarray, v2: np.ndarray) -> None:
-    """The corners as they are. A triangle without area gets NaN for v0, which no ray hits: whether corners are on a line
-    is more than float32 or float64 can tell, and is the same for every ray."""
+    """Write the corners. A triangle without area gets NaN for v0, so that no ray hits it.
+
+    Collinearity is decided exactly here, once for every ray; float64 could not decide it in a query.
+    """
     record["v0"], record["v1"], record["v2"] = v0, v1, v2
     record["v0"][~corners_have_area(v0, v1, v2)] = np.nan
 
 
 def edges(record: np.ndarray, v0: np.ndarray, v1: np.ndarray, v2: np.ndarray) -> None:
-    """A corner and the two edges from it, each rounded to float32."""
+    """Write a corner and the two edges from it, rounded to float32."""
     with np.errstate(over="ignore"):
         record["v0"], record["v1"], record["v2"] = v0, v1 - v0, v2 - v0
 
 
 def transform(record: np.ndarray, v0: np.ndarray, v1: np.ndarray, v2: np.ndarray) -> None:
-    """The affine map from world space to the unit triangle, in float64, rounded once: rows a (u), b (v), c (height).
+    """Write the affine map from world space to the unit triangle: rows a (u), b (v), c (height), in float64 and rounded once.
 
-    The third axis is the unit normal, so that c is the triangle's plane. A triangle without area gets zeros: its slope is 0,
-    which no ray hits.
+    The third axis is the unit normal, so that c is the triangle's plane. A triangle without area gets zeros, so that no ray hits it.
     """
     p = v0.astype(np.float64)
     e1, e2 = v1 - p, v2 - p

@@ -128,14 +128,14 @@ class Bvh2(BinaryBvh):
     def save(self, path: str | os.PathLike[str]) -> None:
         """As OneMesh.save. Of a tree that was refitted in place, what it costs is looked up first."""
         snapshot = self._snapshot
-        _, built = snapshot.one_mesh
+        built = snapshot.arrays
         if math.isnan(built.sah_cost):
             snapshot = replace(snapshot, built=replace(built, sah_cost=sah_cost(built.on_host().arrays["nodes"])))
         save(snapshot, path)
 
     def _begin_in_place(self, points: Any) -> InPlace:
         """Arrays of its own for the structure, and what is kept beside them."""
-        built, spheres = self._on_device(self._snapshot.one_mesh[1]), self.geometry.spheres
+        built, spheres = self._on_device(self._snapshot.arrays), self.geometry.spheres
         built = replace(built, arrays={"nodes": wp.clone(built.arrays["nodes"])}, sah_cost=float("nan"))
         moved = DeviceGeometry.moved(wp.clone(points), self._shape().faces, spheres)
         beside = self._built_over(moved, built, self._snapshot.built_cost)

@@ -65,7 +65,7 @@ class AllHits(Generic[ArrayT]):
     def ray_id(self) -> ArrayT:
         """Ray of each hit, (M,) int64."""
         ray_id: Any = np.repeat(np.arange(len(self)), to_numpy(self.counts))
-        give = returned(self.first)
+        give: Any = returned(self.first)
         return ray_id if give is None else give(wp.array(ray_id, dtype=wp.int64, device=to_warp(self.first).device))
 
     def __repr__(self) -> str:

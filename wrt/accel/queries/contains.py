@@ -38,13 +38,13 @@ def open_edges(geometry: Geometry) -> int:
 @once
 def open_edges_of(snapshot: Snapshot) -> int:
     """Count the open edges of a structure's mesh."""
-    return open_edges(snapshot.one_mesh[0])
+    return open_edges(snapshot.mesh)
 
 
 @once
 def used_bounds(snapshot: Snapshot) -> tuple[np.ndarray, np.ndarray]:
     """Return the box of all finite faces: low and high, (3,); inf and -inf without faces."""
-    geometry, _ = snapshot.one_mesh
+    geometry = snapshot.mesh
     used = geometry.vertices[finite_faces(geometry)].reshape(-1, 3)
     return used.min(axis=0, initial=np.inf), used.max(axis=0, initial=-np.inf)
 

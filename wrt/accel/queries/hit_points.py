@@ -126,8 +126,8 @@ class HitPoints(Generic[ArrayT]):
         snapshot, rays, _ = self._source()
         snapshot.structure.require_one_mesh(ONE_MESH)
         prim_id: Any = self.prim_id
-        found: Gradients[Any] = adjoint(snapshot.one_mesh[0], rays.origins, rays.directions, prim_id, Cotangents(t, u, v, point))
-        give = returned(self.t)
+        found: Gradients[Any] = adjoint(snapshot.mesh, rays.origins, rays.directions, prim_id, Cotangents(t, u, v, point))
+        give: Any = returned(self.t)
         return found if give is None else Gradients(*map(give, found))
 
     def _source(self) -> Source:
@@ -159,7 +159,7 @@ class HitPoints(Generic[ArrayT]):
             if name == "point":
                 record(self, point=array)
             return array
-        give = returned(self.t)
+        give: Any = returned(self.t)
         return array.numpy() if give is None else give(array)
 
 
