@@ -31,10 +31,9 @@ from wrt.kernels.warp_private import fields_of
 class OneMesh(Accelerator, ABC):
     """A structure over a mesh, on a device. Subclasses set `name`, `kernels` and `options`, and implement `_build`.
 
-    options: frozen dataclass of the builder's options, which raises InputError for values out of range. kernels: module of the
-    traversal, with make_struct(record) and make_traversal(units, any_hit, accepts). stream: module of a kernel for many rays at a
-    time on the CPU (wrt.accel.queries.batches), with make_stream(units, any_hit), which returns None for units without one,
-    stream_block and stream_sizes. can_refit: whether `_refit` follows vertices.
+    options: frozen dataclass, which raises InputError for values out of range. kernels: module with make_struct(record) and
+    make_traversal(units, any_hit, accepts). stream: module of a kernel for many rays at a time on the CPU (wrt.accel.queries.batches),
+    with make_stream(units, any_hit) or None, stream_block and stream_sizes. can_refit: whether `_refit` follows vertices.
     """
 
     name: ClassVar[str]
@@ -54,10 +53,7 @@ class OneMesh(Accelerator, ABC):
     @classmethod
     def restore(cls, built: Built, geometry: Geometry, attributes: FlatScene | None = None, /, device: str = "cpu",
                 threads: int | None = None, *, units: Units | None = None, built_with: object = None) -> Self:
-        """Restore a structure over the same geometry from `built`. built_with: its options (None: the defaults).
-
-        Raises InputError if `built` is not a structure of this class over the geometry.
-        """
+        """Restore a structure from its arrays and options (None: the defaults). Raises InputError if they do not fit the geometry."""
         self = cls.__new__(cls)
         Accelerator.__init__(self, Structure(cls, units or Units()), geometry.kept(), attributes, device, threads)
         self.built_with = cls.options() if built_with is None else built_with
@@ -69,9 +65,8 @@ class OneMesh(Accelerator, ABC):
 
     def __reduce__(self) -> tuple[object, ...]:
         """Pickle the arrays and the geometry. In the copy, a refit measures growth from the present shape."""
-        units, snapshot = self.structure.units, self._snapshot
-        make = partial(type(self).restore, device=str(self.device), threads=self.threads, units=units, built_with=self.built_with)
-        return make, (self.built, self.geometry, snapshot.attributes)
+        named = {"device": str(self.device), "threads": self.threads, "units": self.structure.units, "built_with": self.built_with}
+        return partial(type(self).restore, **named), (self.built, self.geometry, self._snapshot.attributes)
 
     @property
     def geometry(self) -> Geometry:
@@ -88,16 +83,12 @@ class OneMesh(Accelerator, ABC):
         """The structure as it is now, as an argument of kernels (`wrt.ray_query`)."""
         return kernel_argument(self._snapshot)
 
-    def _over(self, geometry: Geometry) -> Self:
-        """Return a copy over another geometry with nothing built yet; queries of `self` go on with the old shape."""
+    def _over(self, geometry: Geometry, built: Built | None = None, built_cost: float = np.nan) -> Self:
+        """Return a copy over another geometry, with arrays if they are built; queries of `self` go on with the old shape."""
         other = copy(self)
         other._snapshot = self._snapshot.over(geometry)
-        return other
-
-    def _built_over(self, geometry: Geometry, built: Built, built_cost: float) -> Self:
-        """Return a copy with arrays that were built over another geometry."""
-        other = self._over(geometry)
-        other._take(built, build_clock(), built_cost)
+        if built is not None:
+            other._take(built, build_clock(), built_cost)
         return other
 
     def _take(self, built: Built, begin: float, built_cost: float) -> None:
@@ -132,14 +123,14 @@ class OneMesh(Accelerator, ABC):
     def refit(self, vertices: ArrayLike, rebuild_at: float = np.inf, *, in_place: bool = False) -> Refit:
         """Fit the boxes of the tree to vertices that have moved; the tree itself stays.
 
-        Hits are as exact as those of a new structure, but queries get slower as the motion mixes primitives that were near each
-        other. Other threads may go on with queries: those that begin before the refit ends see the old shape.
+        Hits are exact, but queries get slower as the motion mixes primitives. Queries of other threads that begin before the refit
+        ends see the old shape.
 
         Parameters
         ----------
         vertices : (V, 3) array_like, or Warp array (V,) of vec3
-            As many as before, finite; the values of a Warp array on a GPU are not checked. bvh2 reads a Warp array in place.
-            While a `wp.Tape` records, later hits have gradients in a Warp array that requires them.
+            As many as before, finite (not checked in a Warp array on a GPU); bvh2 reads a Warp array in place. Later hits have
+            gradients in a Warp array that requires them while a `wp.Tape` records.
         rebuild_at : float
             Build a new tree if the SAH cost exceeds this multiple of its value at the last build.
         in_place : bool
@@ -183,7 +174,7 @@ class OneMesh(Accelerator, ABC):
     def epo(self) -> float:
         """Compute the end-point overlap of a BVH: expected number of nodes and primitives visited in vain at a surface point.
 
-        It predicts the cost of rays that end on surfaces, as `stats.sah_cost` predicts that of lines. It takes as long as a build.
+        It predicts the cost of rays that end on surfaces, as `stats.sah_cost` predicts that of lines (`wrt.accel.epo`).
 
         Returns
         -------
@@ -194,10 +185,6 @@ class OneMesh(Accelerator, ABC):
         ------
         InputError
             For structures that are no BVH.
-
-        References
-        ----------
-        Aila, Karras and Laine 2013, "On Quality Metrics of Bounding Volume Hierarchies".
         """
         from wrt.accel.epo import end_point_overlap
 
@@ -205,17 +192,17 @@ class OneMesh(Accelerator, ABC):
         return end_point_overlap(self._children(built.on_host()), geometry, self.threads)
 
     def _upload(self, built: Built) -> WarpStruct:
+        def there(array: np.ndarray | WarpArray, dtype: WarpType) -> WarpArray:
+            return array if isinstance(array, wp.array) else upload(array, dtype, self.device)
+
         data = self.structure.struct()
         types = fields_of(data)
         for name, array in built.arrays.items():
             kind = types[name]
             is_array = isinstance(kind, wp.array)
-            setattr(data, name, self._there(array, kind.dtype) if is_array else kind(*np.ravel(array)))
-        data.primitives = self._there(self._primitives(built), types["primitives"].dtype)
+            setattr(data, name, there(array, kind.dtype) if is_array else kind(*np.ravel(array)))
+        data.primitives = there(self._primitives(built), types["primitives"].dtype)
         return data
-
-    def _there(self, array: np.ndarray | WarpArray, dtype: WarpType) -> WarpArray:
-        return array if isinstance(array, wp.array) else upload(array, dtype, self.device)
 
     def _primitives(self, built: Built) -> np.ndarray | WarpArray:
         """Return the records of the triangle test in the order of the leaves."""

@@ -1,4 +1,4 @@
-"""No structure: the yardstick that every other one is held to."""
+"""Test of all primitives: the reference for every structure."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from wrt.kernels.traverse import brute_force as kernels
 
 
 class BruteForce(OneMesh):
-    """All primitives, one after another."""
+    """Test of all primitives, one after another."""
 
     name = "brute_force"
     kernels = kernels

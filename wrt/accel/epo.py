@@ -1,26 +1,24 @@
-"""End-point overlap: how much of the surface lies in the boxes of a hierarchy without belonging to what is below them."""
+"""End-point overlap: the part of the surface that lies in boxes of a hierarchy without being below them."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 import warp as wp
 
 from wrt.accel.geometry import Geometry
 from wrt.core.device import launch, start, upload
+from wrt.core.types import WarpStruct
 from wrt.kernels.build import end_point_overlap as kernels
 
 TRIANGLES_PER_LAUNCH = 16384
 
 
-def end_point_overlap(tree: Any, geometry: Geometry, threads: int) -> float:
-    """The metric EPO of a hierarchy (kernels.build.end_point_overlap.Children on the CPU) with both costs 1; 0 without any area.
+def end_point_overlap(tree: WarpStruct, geometry: Geometry, threads: int) -> float:
+    """Compute the EPO of a hierarchy (kernels.build.end_point_overlap.Children on the CPU) with both costs 1; 0 without any area.
 
-    Aila, Karras and Laine 2013, "On Quality Metrics of Bounding Volume Hierarchies", equation 2: the sum, over all nodes, of
-    the node's cost times the share of the whole surface that is in its box and not below it. Only triangles have surface here;
-    spheres count where they are tested. A triangle with several references is below a node that has any of them. Triangles with
-    a corner that is not finite have no surface.
+    Aila, Karras and Laine 2013, "On Quality Metrics of Bounding Volume Hierarchies", equation 2: sum over all nodes of the node's
+    cost times the part of the whole surface that is in its box and not below it. Only finite triangles have surface; spheres count
+    as tests. A triangle with several references is below each node that has one of them.
     """
     cpu = start("cpu")
     n = len(geometry.faces)
@@ -36,8 +34,8 @@ def end_point_overlap(tree: Any, geometry: Geometry, threads: int) -> float:
     return float(out.numpy()[finite].sum() / surface)
 
 
-def children(lo: np.ndarray, hi: np.ndarray, first: np.ndarray, count: np.ndarray, order: np.ndarray) -> Any:
-    """Children for end_point_overlap: lo, hi (N, width, 3); first, count (N, width); order: of the primitives."""
+def children(lo: np.ndarray, hi: np.ndarray, first: np.ndarray, count: np.ndarray, order: np.ndarray) -> WarpStruct:
+    """Make Children for end_point_overlap. lo, hi: (N, width, 3); first, count: (N, width); order: of the primitives."""
     cpu = start("cpu")
     tree = kernels.Children()
     tree.width = first.shape[1]

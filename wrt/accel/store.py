@@ -7,7 +7,7 @@ the structure's class, and indices are checked before a ray follows them.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -28,14 +28,11 @@ from wrt.core.write_file import check_writable, replacing
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.warp_private import fields_of
 
-if TYPE_CHECKING:
-    from wrt.accel.base import OneMesh
-
 MAGIC = b"wrt acceleration structure 1\n"
 STATS = ("nodes", "leaves", "depth", "sah_cost")
 
 
-def array_types(accel: type[OneMesh], triangle: str = "watertight") -> dict[str, np.dtype]:
+def array_types(accel: type[Any], triangle: str = "watertight") -> dict[str, np.dtype]:
     """Return the types of the rows of Built.arrays, by the fields of the structure's struct."""
     kinds = fields_of(Structure(accel, Units(triangle)).struct())
     return {name: row_type(kind.dtype if isinstance(kind, wp.array) else kind) for name, kind in kinds.items()
@@ -71,7 +68,7 @@ def save(snapshot: Snapshot, path: PathLike) -> None:
 
 
 def read(path: PathLike, geometry: Geometry, attributes: FlatScene | None = None, device: str = "cpu",
-         threads: int | None = None) -> OneMesh:
+         threads: int | None = None) -> Any:
     """Read a structure over the same geometry.
 
     Raises InputError for a file that is missing, foreign, damaged, of another version or over another mesh.
@@ -92,7 +89,7 @@ def read(path: PathLike, geometry: Geometry, attributes: FlatScene | None = None
         raise InputError(f"is no structure of this version ({type(error).__name__}: {error})", path=path) from error
 
 
-def read_arrays(cls: type[OneMesh], header: JsonObject, body: memoryview) -> Built:
+def read_arrays(cls: type[Any], header: JsonObject, body: memoryview) -> Built:
     types = array_types(cls, header["triangle"])
     arrays, at = {}, 0
     for name, dtype in types.items():

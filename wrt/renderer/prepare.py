@@ -172,7 +172,7 @@ class _Preparation:
         begin = time.perf_counter()
         self.arrays = upload_scene(self.plan.scene, self.device, self.plan.meshes)
         uploaded = time.perf_counter()
-        chosen = {"triangle": options.triangle, "box": options.box, **options.accel_options}
+        chosen: dict[str, Any] = {"triangle": options.triangle, "box": options.box, **options.accel_options}
         if reports_progress(self.plan.accel):
             chosen = {"progress": partial(setattr, self, "fraction_built"), **chosen}
         self.accel = build(self.arrays.world.geometry, self.plan.accel, options.device, self.threads, **chosen)

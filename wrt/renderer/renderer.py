@@ -73,8 +73,8 @@ class Renderer:
             return {"structure": "rebuilt" if refit["rebuilt"] else "refitted", "seconds": refit["seconds"],
                     "growth": refit["growth"]}
         options = plan.options
-        accel = build(geometry, plan.accel, options.device, old.threads, triangle=options.triangle, box=options.box,
-                      **options.accel_options)
+        chosen: dict[str, Any] = {"triangle": options.triangle, "box": options.box, **options.accel_options}
+        accel = build(geometry, plan.accel, options.device, old.threads, **chosen)
         self.prepared = replace(self.prepared, accel=accel)
         return {"structure": "rebuilt", "seconds": accel.stats.build_seconds, "growth": float("nan")}
 

@@ -138,7 +138,7 @@ class Bvh2(BinaryBvh):
         built, spheres = self._on_device(self._snapshot.arrays), self.geometry.spheres
         built = replace(built, arrays={"nodes": wp.clone(built.arrays["nodes"])}, sah_cost=float("nan"))
         moved = DeviceGeometry.moved(wp.clone(points), self._shape().faces, spheres)
-        beside = self._built_over(moved, built, self._snapshot.built_cost)
+        beside = self._over(moved, built, self._snapshot.built_cost)
         fitting, shape = Fitting(self.device, len(self.geometry), built.nodes), beside._shape()
         self._snapshot = replace(beside.snapshot, changes=True)
         return InPlace(fitting, tree_of(fitting, self.data.nodes, built.parents, built.order), shape)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any, Generic, NamedTuple
+from typing import Any, Generic, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -15,9 +15,6 @@ from wrt.core.errors import InputError
 from wrt.core.threads import run_all, thread_count
 from wrt.core.types import Array, ArrayLike, ArrayT
 from wrt.core.warp_private import recording_tape
-
-if TYPE_CHECKING:
-    from wrt.accel.queries.hit_points import HitPoints
 
 ONE_MESH = "only hits of a structure over one mesh, without spheres, have gradients"
 HITS_PER_JOB = 8192  # whose intermediate arrays stay in the cache
@@ -106,12 +103,12 @@ def adjoint(geometry: Geometry, origins: Array, directions: Array, prim_id: Arra
     return out
 
 
-def record(hits: HitPoints[Any], **outputs: Any) -> None:
+def record(hits: Any, **outputs: Any) -> None:
     """Make the recording wp.Tape propagate gradients of `outputs`, arrays of hits by their names in Cotangents.
 
     They go to origins, directions and the vertices of the last refit, where these require gradients.
     """
-    (snapshot, rays, _), tape = hits.source, recording_tape()  # type: ignore[misc]  # of a query that just ran
+    (snapshot, rays, _), tape = hits.source, recording_tape()
     leaves: Gradients[Any] = Gradients(snapshot.followed, rays.origins, rays.directions)
     wanted = [array for array in leaves if isinstance(array, wp.array) and array.requires_grad and array.size]
     if tape is None or not wanted:
@@ -131,9 +128,9 @@ def record(hits: HitPoints[Any], **outputs: Any) -> None:
     tape.record_func(backward, [*wanted, *outputs.values()])
 
 
-def check_recorded(hits: HitPoints[Any], name: str) -> None:
+def check_recorded(hits: Any, name: str) -> None:
     """Raise InputError if a tape would expect gradients of a property that has none."""
-    snapshot, rays, _ = hits.source  # type: ignore[misc]  # its caller needs it, too
+    snapshot, rays, _ = hits.source
     given = {"vertices": snapshot.followed, "origins": rays.origins, "directions": rays.directions}
     check_no_gradients(f"hits.{name}", **given)
 

@@ -1,4 +1,4 @@
-"""All shapes of a scene as arrays: triangles that stand in one place in the world, meshes with many places in their own space."""
+"""Scenes as arrays: joined triangles in world space, and instanced meshes in their own space."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ MOST = 2**31 - 2  # faces, and vertices
 
 
 def flatten(scene: Scene, meshes: frozenset[int] = frozenset()) -> FlatScene:
-    """The flat scene; meshes: the id()s of those that are kept once (wrt.accel.scenes.instancing)."""
+    """Flatten a scene. meshes: id()s of the meshes that are stored once (wrt.accel.scenes.instancing)."""
     return flatten_instanced(scene, meshes) if meshes else flatten_joined(scene)
 
 
 def flatten_joined(scene: Scene) -> FlatScene:
     """Transform and join all objects. Positions are computed in float64 and rounded once.
 
-    Of faces whose corners rounding put on a line, see `wrt.scene.clean.flip_collinear`.
+    `wrt.scene.clean.flip_collinear` treats faces whose corners rounding puts on a line.
     """
     index = {id(material): i for i, material in enumerate(scene.materials)}
     joined = _joined(scene.objects, index)
@@ -37,7 +37,7 @@ def flatten_joined(scene: Scene) -> FlatScene:
 
 
 def flatten_instanced(scene: Scene, meshes: frozenset[int]) -> FlatScene:
-    """As flatten_joined, with the meshes of those id()s kept once. The rest is joined in world space, as part 0 of the geometry."""
+    """Flatten a scene with instances of the meshes of those id()s. Other objects are joined in world space, as part 0."""
     index = {id(material): i for i, material in enumerate(scene.materials)}
     flat = _joined(tuple(thing for thing in scene.objects if not is_instance(thing, meshes)), index)
     parts = {0: flat}  # then by id of the mesh
@@ -69,7 +69,7 @@ def flatten_instanced(scene: Scene, meshes: frozenset[int]) -> FlatScene:
 
 def _placed_scene(scene: Scene, index: dict[int, int], parts: dict[int, _Joined], rows: list[tuple[int, int, int, int, np.ndarray]],
                   materials: dict[tuple[int, ...], tuple[int, np.ndarray]], numbers: list[np.ndarray], n_triangles: int) -> FlatScene:
-    """The arrays of `flatten_instanced`, put together."""
+    """Assemble the result of `flatten_instanced`."""
     spheres = _spheres(scene)
     of_spheres = _sphere_materials(scene, index)
     numbers.append(np.arange(n_triangles, n_triangles + len(spheres), dtype=np.int64))
@@ -123,7 +123,7 @@ def _require_room(vertices: int, faces: int) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Joined:
-    """Objects in one, or a mesh by itself; source: (F,) of which face each one is a part."""
+    """Joined objects, or one mesh. source: (F,) the original face of each face."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -134,7 +134,7 @@ class _Joined:
 
 
 def _joined(objects: tuple[Object, ...], index: dict[int, int]) -> _Joined:
-    """All objects in world space; material: of each face, by `index` of its id()."""
+    """Join objects in world space; material: of each face, by `index` of its id()."""
     parts, material, first = [], [np.zeros(0, np.int32)], 0
     for thing in objects:
         v, f, n, t = _transformed(thing)
@@ -145,7 +145,7 @@ def _joined(objects: tuple[Object, ...], index: dict[int, int]) -> _Joined:
         _require_room(first, 0)
     none = [np.zeros((0, width), dtype) for width, dtype in ((3, np.float32), (3, np.int32), (3, np.float32), (2, np.float32))]
     vertices, faces, normals, uvs = map(np.concatenate, zip(*parts, strict=True)) if parts else none
-    # Far from 0, rounding puts corners on a line that were on none. All at once: a call for each of many boxes takes long.
+    # Far from 0, rounding puts corners on a line. One call for all objects, because a call for each of many boxes takes long.
     faces, source = flip_collinear(vertices, faces)
     return _Joined(vertices, faces, normals, uvs, source, np.concatenate(material)[source])
 
@@ -156,7 +156,7 @@ def _own_space(mesh: Mesh) -> _Joined:
 
 
 def _attributes(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """normals and uvs of the vertices, 0 where there are none."""
+    """Return normals and uvs of the vertices, 0 if the mesh has none."""
     return (np.zeros_like(mesh.vertices) if mesh.normals is None else mesh.normals,
             np.zeros((len(mesh.vertices), 2), np.float32) if mesh.uvs is None else mesh.uvs)
 

@@ -1,4 +1,4 @@
-"""Which meshes are kept once, with a place for each object, and which are copied into the world."""
+"""Choice of the meshes that are stored once, with an instance for each object, and of those that are copied."""
 
 from __future__ import annotations
 
@@ -16,11 +16,9 @@ MIN_SAVED = 250_000
 
 
 def instanced_meshes(scene: Scene, instancing: str = "auto") -> frozenset[int]:
-    """The id() of each mesh that is kept once: where the copies that this saves have MIN_SAVED triangles or more ("auto"), or
-    wherever two or more objects share a mesh ("always").
+    """Return the id() of each mesh to store once: where that saves MIN_SAVED triangles ("auto"), or for all shared ones ("always").
 
-    Objects whose transform flattens or shears too much (MAX_SPREAD) are always copied: see `is_instance`.
-    Raises InputError for an unknown choice.
+    Objects whose transform flattens or shears too much (MAX_SPREAD) are always copied. Raises InputError for an unknown choice.
     """
     as_choice(instancing, INSTANCING, "instancing")
     if instancing == "never":
@@ -34,7 +32,7 @@ def instanced_meshes(scene: Scene, instancing: str = "auto") -> frozenset[int]:
 
 
 def stored_meshes(scene: Scene, kept_once: frozenset[int]) -> list[Mesh]:
-    """What a structure is over: each mesh of `kept_once` (of instanced_meshes), and one more for each copy."""
+    """Return the meshes that a structure stores: those of `kept_once` (of instanced_meshes), and one for each copy."""
     once = {id(thing.mesh): thing.mesh for thing in scene.objects if is_instance(thing, kept_once)}
     return [*once.values(), *(thing.mesh for thing in scene.objects if not is_instance(thing, kept_once))]
 
@@ -44,8 +42,8 @@ def is_instance(thing: Object, meshes: frozenset[int]) -> bool:
 
 
 def is_invertible(thing: Object) -> bool:
-    """Whether rays can be taken to the object's own space without much loss."""
-    from wrt.accel.instanced_geometry import MAX_SPREAD  # imports Warp: the help of `render`, which lists INSTANCING, does not wait
+    """Return whether rays can be transformed to the object's own space without much loss."""
+    from wrt.accel.instanced_geometry import MAX_SPREAD  # imports Warp, which the help of `render` does without
 
     linear = thing.transform[:3, :3]
     with np.errstate(all="ignore"):

@@ -1,14 +1,14 @@
-"""Several worlds in one structure: meshes and scenes as one geometry, all of whose objects are instances."""
+"""Several worlds in one structure: all their objects are instances in one geometry."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from wrt.accel.flat_scene import FlatScene
+from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.scenes.flatten import flatten
 from wrt.accel.scenes.instancing import is_invertible
 from wrt.core.errors import InputError
@@ -18,8 +18,7 @@ from wrt.scene.model import Object, Scene
 
 
 def worlds_over(given: Sequence[Mesh | Scene]) -> FlatScene:
-    """One geometry over several worlds, all of whose objects are instances; each mesh is kept once. Raises InputError for spheres
-    and for objects that are flattened."""
+    """Make one geometry over several worlds; each mesh is stored once. Raises InputError for spheres and flattened objects."""
     for number, scene in enumerate(given):
         for thing in scene.objects if isinstance(scene, Scene) else ():
             if not is_invertible(thing):
@@ -33,5 +32,6 @@ def worlds_over(given: Sequence[Mesh | Scene]) -> FlatScene:
     if not together:
         raise InputError("must have at least one object between them", argument="worlds")
     flat = flatten(Scene(together), frozenset(id(thing.mesh) for thing in together))
-    geometry: Any = flat.geometry
+    geometry = flat.geometry
+    assert isinstance(geometry, InstancedGeometry)
     return replace(flat, geometry=replace(geometry, worlds=np.cumsum([0, *map(len, objects)])), objects=None)

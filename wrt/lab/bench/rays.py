@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from wrt.accel.base import OneMesh
 from wrt.accel.geometry import Geometry
+from wrt.accel.queries.accelerator import Accelerator
 
 RAY_KINDS = ("primary", "shadow", "diffuse", "random")
 SEEN = 0.55  # half of the picture's height over its distance: a field of view of 58 degrees
@@ -74,10 +75,10 @@ def random(n: int, center: np.ndarray, radius: float, rng: np.random.Generator) 
     return RaySet("random", a.astype(np.float32), unit(b - a).astype(np.float32), endless(n))
 
 
-def ray_sets(accel: OneMesh, n: int, seed: int = 0, inside: bool = False) -> dict[str, RaySet]:
+def ray_sets(accel: Accelerator, n: int, seed: int = 0, inside: bool = False) -> dict[str, RaySet]:
     """Return about n rays of every kind (for primary rays the next lower square number), the same for the same arguments.
     The structure finds what the camera sees. inside: the camera stands in the middle of the mesh's box, as in a room."""
-    g = accel.geometry
+    g: Any = accel.geometry  # a Geometry: the structure is over one mesh
     _, _, center, radius = ball_around(g)
     rng = np.random.default_rng(seed)
     eye = center + 1.5 * radius * unit(np.array([0.6, 0.35, 0.8]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -45,7 +46,7 @@ def rows(plan: Plan) -> Iterator[Row]:
     yield from priced(plan, f"{ALONE} triangles, no structure", few, rays, "brute_force", triangles)
 
 
-def priced(plan: Plan, mesh: str, geometry: Geometry, rays: RaySet, accel: str, units: Sequence[dict[str, str]]) -> Iterator[Row]:
+def priced(plan: Plan, mesh: str, geometry: Geometry, rays: RaySet, accel: str, units: Sequence[dict[str, Any]]) -> Iterator[Row]:
     """Time all units in turn; the first is the default."""
     built = {" ".join(f"{value}{' boxes' if key == 'box' else ''}" for key, value in options.items()):
              build(geometry, accel, threads=1, **options) for options in units}

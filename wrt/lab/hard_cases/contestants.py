@@ -12,7 +12,7 @@ import numpy as np
 from wrt.accel.base import Accelerator
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.answers import Hits
-from wrt.accel.scenes.build import build
+from wrt.accel.scenes.build import BuildOptions, build
 from wrt.core.errors import InputError
 from wrt.core.packages import needed_by
 from wrt.core.registry import Registry
@@ -56,7 +56,7 @@ class Own(Algorithm):
     accel: Accelerator  # after prepare()
 
     def __init__(self, triangle: str = "watertight", box: str = "conservative", structure: str = "bvh", device: str = "cpu") -> None:
-        self.structure, self.device, self.units = structure, device, {"triangle": triangle, "box": box}
+        self.structure, self.device, self.units = structure, device, BuildOptions(triangle=triangle, box=box)
         self.name = triangle if box == "conservative" else f"{triangle}, {box} boxes"
 
     def prepare(self, geometry: Geometry) -> bool:
