@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.shade.backgrounds import make_background
+from wrt.kernels.shade.backgrounds import BACKGROUNDS
 from wrt.kernels.shade.direct import make_light_points
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.film import Pixel, add_sample, load_pixel, make_write_aovs, pixel_center, store_pixel
@@ -59,7 +59,7 @@ def make_radiance(features: Features, accel_struct: Any, closest_hit: Any, any_h
     Path = make_path(features.counting)
     paths, shading = make_paths(features.counting), make_shading(features)
     step, follow_up = make_step(features, shading), make_follow_up(features)
-    background_radiance = make_background(features)
+    background_radiance = BACKGROUNDS[features.background].radiance
     transmittance = make_transmittance(features, shading, accel_struct, closest_hit, any_hit)
     direct_light = make_direct_light(features, accel_struct, transmittance, step)
 

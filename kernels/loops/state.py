@@ -40,7 +40,7 @@ class Progress:
 
 @wp.struct
 class Pixels:
-    """By pixel p of the wave."""
+    """The wave's pixels: arrays by pixel p."""
 
     order: wp.array(dtype=wp.int32)  # Index in the tile, y * width + x.
     key: wp.array(dtype=wp.uint32)  # Seed of the samples.
@@ -49,8 +49,9 @@ class Pixels:
 
 @wp.struct
 class Samples:
-    """By sample s of the wave. Paths are stacked: paths[level * capacity + s], level < pending, wait. At level `pending` is the
-    queued path."""
+    """The wave's samples: arrays by sample s.
+
+    Paths are stacked: paths[level * capacity + s], level < pending, wait. At level `pending` is the queued path."""
 
     film_point: wp.array(dtype=wp.vec2)  # In pixels.
     lens_point: wp.array(dtype=wp.vec2)  # In [0, 1)^2.
@@ -62,7 +63,7 @@ class Samples:
 
 @wp.struct
 class RayQueue:
-    """By place k in the queue of rays."""
+    """The queue of rays: arrays by place k."""
 
     sample: wp.array(dtype=wp.int32)  # The sample of the ray.
     rays: RenderRays
@@ -80,17 +81,17 @@ class Outcomes:
 
 @wp.struct
 class Receivers:
-    """By index a: the surfaces that wait for shadow rays. Entry light * capacity + a of `shadow` is the slot of a's shadow ray."""
+    """The surfaces that wait for shadow rays: arrays by receiver a, and `shadow` by light * capacity + a."""
 
     sample: wp.array(dtype=wp.int32)
     pending_light: wp.array(dtype=PendingLight)
     scatter: wp.array(dtype=Scatter)  # Only with transparent shadows.
-    shadow: wp.array(dtype=wp.int32)  # -1: the surface needs none for this light.
+    shadow: wp.array(dtype=wp.int32)  # Slot of the shadow ray, or -1.
 
 
 @wp.struct
 class Shadows:
-    """By slot, light * capacity + index of the shadow ray."""
+    """The shadow rays: arrays by slot, light * capacity + index."""
 
     value: wp.array(dtype=wp.vec3)  # Radiance that the light adds if nothing is in between.
     walk: wp.array(dtype=ShadowWalk)  # The ray's progress, with transparent shadows.
@@ -98,7 +99,7 @@ class Shadows:
 
 @wp.struct
 class ShadowQueue:
-    """By place, light * capacity + index: the shadow rays that are traced next. Without transparent shadows the place is the
+    """The shadow rays that are traced next: arrays by place, light * capacity + index. Without transparent shadows the place is the
     slot."""
 
     rays: RenderRays
@@ -138,16 +139,16 @@ class Wave:
     sample.radiance = radiance; sample.lost = lost;
     sample.rays = rays; sample.cut_depth = cut_depth; sample.cut_throughput = cut_throughput;
 """)
-def put_fields(samples: wp.array(dtype=Sample), i: int, radiance: wp.vec3, rays: int, cut_depth: int, cut_throughput: int,
+def store_fields(samples: wp.array(dtype=Sample), i: int, radiance: wp.vec3, rays: int, cut_depth: int, cut_throughput: int,
                lost: float) -> None: ...
 
 
 @wp.func
-def put_sample(samples: wp.array(dtype=Sample), i: int, sample: Sample):
+def store_sample(samples: wp.array(dtype=Sample), i: int, sample: Sample):
     """Store sample i field by field.
 
     A copy of the struct would read 16 bytes at a time what was written 4 bytes at a time. The core cannot forward such stores."""
-    put_fields(samples, i, sample.radiance, sample.rays, sample.cut_depth, sample.cut_throughput, sample.lost)
+    store_fields(samples, i, sample.radiance, sample.rays, sample.cut_depth, sample.cut_throughput, sample.lost)
 
 
 @wp.func

@@ -23,7 +23,7 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.launches import Launch, run_range, run_with
-from wrt.kernels.loops.state import Task, Wave, put_sample
+from wrt.kernels.loops.state import Task, Wave, store_sample
 from wrt.kernels.query import load_hit, load_render_ray, store_render_ray
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.film import add_sample, load_pixel, make_write_aovs, store_pixel
@@ -86,7 +86,7 @@ def make_add_direct_light(transparent_shadows: bool) -> Any:
                 direct.transmittance = light
                 direct.rays = rays
             s = wave.receivers.sample[a]
-            put_sample(wave.samples.total, s, add_surface_light(wave.samples.total[s], wave.receivers.pending_light[a], direct))
+            store_sample(wave.samples.total, s, add_surface_light(wave.samples.total[s], wave.receivers.pending_light[a], direct))
         for i in range(lights):
             wave.shadow_queue.count[i] = 0
         wave.progress[0].receivers = 0

@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.loops.state import BLOCK, Wave, put_sample
+from wrt.kernels.loops.state import BLOCK, Wave, store_sample
 from wrt.kernels.memory import number_of_vec2, put_in_vec2, put_in_vec3, put_int, put_number
 from wrt.kernels.query import load_render_ray, store_render_ray
 from wrt.kernels.shade.features import Features
@@ -93,7 +93,7 @@ def make_queue_camera_rays(features: Features, camera_kind: Any) -> Any:
 
 
 @wp.func
-def without_dead(wave: Wave, first: int, end: int, queued: int) -> int:
+def close_gaps(wave: Wave, first: int, end: int, queued: int) -> int:
     """Close the gaps that camera rays without length leave in the queue; their samples are black.
 
     The rays of the samples first .. end - 1 move to the places from `queued` on. Return the place behind the last one."""
@@ -106,7 +106,7 @@ def without_dead(wave: Wave, first: int, end: int, queued: int) -> int:
                 wave.queue.sample[place] = s
             place += 1
         else:
-            put_sample(wave.samples.total, s, Sample())
+            store_sample(wave.samples.total, s, Sample())
     return place
 
 
@@ -125,7 +125,7 @@ def make_begin_kernel(features: Features, camera_kind: Any) -> Any:
             end = wp.min(first + wp.max(BLOCK / samples, 1), end_pixel)
             place_samples(wave, film, limits, first, end)
             if queue_camera_rays(wave, camera, film, first * samples, end * samples) > 0 or queued < first * samples:
-                queued = without_dead(wave, first * samples, end * samples, queued)
+                queued = close_gaps(wave, first * samples, end * samples, queued)
             else:
                 queued = end * samples
             first = end

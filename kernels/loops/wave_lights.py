@@ -29,7 +29,7 @@ def first_is_mesh(lighting: Lighting) -> bool:
 
 
 class BlockSamples:
-    """Which light samples are computed for a whole block before they are needed."""
+    """The light samples that are computed for a whole block before they are needed."""
 
     def __init__(self, features: Features) -> None:
         kind = BACKGROUNDS[features.background]

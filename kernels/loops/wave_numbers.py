@@ -19,7 +19,7 @@ def key_at(wave: Wave, s: int) -> wp.uint32:
 
 
 @wp.func
-def put_keys(wave: Wave, first: int, end: int):
+def store_keys(wave: Wave, first: int, end: int):
     """Store the keys of the hits first .. end - 1, at most BLOCK, in the rows KEYS."""
     task = wave.task[0]
     for j in range(first, end):

@@ -5,10 +5,10 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from wrt.kernels.launches import Launch, run_range
-from wrt.kernels.loops.state import BLOCK, Outcomes, Path, RayQueue, Wave, push_path, put_sample, queue_next
+from wrt.kernels.loops.state import BLOCK, Outcomes, Path, RayQueue, Wave, push_path, queue_next, store_sample
 from wrt.kernels.loops.wave_lights import Vertex, make_wave_lights
 from wrt.kernels.loops.wave_normals import make_wave_normals
-from wrt.kernels.loops.wave_numbers import make_sample_facets, put_keys
+from wrt.kernels.loops.wave_numbers import make_sample_facets, store_keys
 from wrt.kernels.loops.wave_rows import FACETS, MISS_COLORS, MISS_DIRECTIONS
 from wrt.kernels.loops.wave_surfaces import make_wave_surfaces
 from wrt.kernels.loops.wave_textures import make_wave_textures, textures_vectorised
@@ -108,13 +108,13 @@ def make_add_background(features: Features) -> Any:
                 out = Sample()
                 out.radiance += background
                 out.rays = 1
-                put_sample(wave.samples.total, s, out)
+                store_sample(wave.samples.total, s, out)
             else:
                 pending = wave.samples.pending[s]
                 total = wave.samples.total[s]
                 total.radiance += wp.cw_mul(wave.samples.paths[pending * wave.capacity + s].throughput, background)
                 total.rays += 1
-                put_sample(wave.samples.total, s, total)
+                store_sample(wave.samples.total, s, total)
                 wave.samples.traced_rays[s] = wave.samples.traced_rays[s] + 1
                 wave.outcomes.resumed_samples[resumed] = s
                 resumed += wp.where(pending > 0, 1, 0)
@@ -150,7 +150,7 @@ def make_block_functions(features: Features, shading: Shading, step: Step) -> Bl
         sample_textures(surfaces, wave.block.rows, end - first)
         compute_normals(wave.block.rows, end - first)
         if wp.static(needs_keys):
-            put_keys(wave, first, end)
+            store_keys(wave, first, end)
         if wp.static(features.rough):
             sample_facets(wave, end - first)
         if wp.static(features.direct_light):
@@ -271,7 +271,7 @@ def make_shade_kernels(features: Features) -> tuple[Any, Any]:
                 receivers += 1
             else:
                 total = add_surface_light(total, next.pending_light, Shadow())
-            put_sample(wave.samples.total, hit.sample, total)
+            store_sample(wave.samples.total, hit.sample, total)
             if pending > 0:
                 wave.samples.traced_rays[hit.sample] = hit.traced
                 queue_next(wave, queued, hit.sample, pending)

@@ -28,7 +28,7 @@ def gradient(b: Background, direction: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def turn_of(angle: float) -> tuple[float, float]:
+def rotation_of(angle: float) -> tuple[float, float]:
     """Return the sine and cosine of the background's rotation."""
     sin = angle  # Most pictures are not rotated. For 0 and -0, sin_cos has the same bits.
     cos = float(1.0)
@@ -38,15 +38,15 @@ def turn_of(angle: float) -> tuple[float, float]:
 
 
 @wp.func
-def turned(d: wp.vec3, sin: float, cos: float) -> wp.vec3:
+def rotated(d: wp.vec3, sin: float, cos: float) -> wp.vec3:
     """Rotate about +y, counter-clockwise seen from above, by the angle of this sine and cosine."""
     return wp.vec3(cos * d[0] + sin * d[2], d[1], cos * d[2] - sin * d[0])
 
 
 @wp.func
 def rotate_y(d: wp.vec3, angle: float) -> wp.vec3:
-    sin, cos = turn_of(angle)
-    return turned(d, sin, cos)
+    sin, cos = rotation_of(angle)
+    return rotated(d, sin, cos)
 
 
 @wp.func
@@ -102,10 +102,10 @@ def make_environment_block(directions: Rows, colors: Rows) -> Any:
 
     @wp.func
     def environment_block(b: Background, rows: wp.array(dtype=wp.float32), count: int):
-        sin, cos = turn_of(-b.rotation)
+        sin, cos = rotation_of(-b.rotation)
         i = int(0)
         while i < count:
-            d = turned(load_direction(rows, i), sin, cos)
+            d = rotated(load_direction(rows, i), sin, cos)
             store_place(rows, i, wp.vec3(environment_column(b, d[0], d[2]), environment_row(b, d[1]), 0.0))
             i = i + 1
         environment_colors(b, rows, wp.static(colors.first * colors.length), wp.static(colors.length), count)
@@ -153,11 +153,6 @@ BACKGROUNDS = {
 
 
 # --- the scene's ------------------------------------------------------------------------------------------------------
-
-
-def make_background(features: Features) -> Any:
-    """Return the function (background, unit direction) -> radiance of a scene."""
-    return BACKGROUNDS[features.background].radiance
 
 
 def make_sky_point(features: Features) -> Any:

@@ -69,7 +69,7 @@ def make_follow_up(features: Features) -> Any:
     lost = make_lost(features)
 
     @wp.func
-    def verdict_on(path: Path, limits: Limits, traced: int) -> int:
+    def verdict_of(path: Path, limits: Limits, traced: int) -> int:
         largest = wp.max(path.throughput)
         if largest <= 0.0:
             return NONE
@@ -78,7 +78,7 @@ def make_follow_up(features: Features) -> Any:
         return wp.where(largest < limits.min_throughput, CUT_BY_THROUGHPUT, FOLLOWED)
 
     @wp.func
-    def counted(before: FollowUp, verdict: int) -> FollowUp:
+    def add_verdict(before: FollowUp, verdict: int) -> FollowUp:
         out = before
         out.cut_depth += wp.where(verdict == CUT_BY_DEPTH, 1, 0)
         out.cut_throughput += wp.where(verdict == CUT_BY_THROUGHPUT, 1, 0)
@@ -90,17 +90,17 @@ def make_follow_up(features: Features) -> Any:
         out.pending_light.light = shaded.light
         out.pending_light.throughput = shaded.throughput
         if wp.static(features.blend):
-            out.onward = verdict_on(shaded.onward, limits, traced)
+            out.onward = verdict_of(shaded.onward, limits, traced)
             out.lost = lost(surfaces, shaded.onward, out.onward)
-            out = counted(out, out.onward)
+            out = add_verdict(out, out.onward)
         if wp.static(features.reflection):
-            out.reflected = verdict_on(shaded.reflected, limits, traced)
+            out.reflected = verdict_of(shaded.reflected, limits, traced)
             out.pending_light.lost_reflected = lost(surfaces, shaded.reflected, out.reflected)
-            out = counted(out, out.reflected)
+            out = add_verdict(out, out.reflected)
         if wp.static(features.refraction):
-            out.refracted = verdict_on(shaded.refracted, limits, traced)
+            out.refracted = verdict_of(shaded.refracted, limits, traced)
             out.pending_light.lost_refracted = lost(surfaces, shaded.refracted, out.refracted)
-            out = counted(out, out.refracted)
+            out = add_verdict(out, out.refracted)
         return out
 
     return follow_up

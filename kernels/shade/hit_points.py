@@ -104,24 +104,24 @@ def on_plane(v0: wp.vec3d, v1: wp.vec3d, v2: wp.vec3d, off: wp.vec3d, origin: wp
 
 
 @wp.func
-def clamped_to_triangle(found: PlanePoint, v0: wp.vec3d, v1: wp.vec3d, v2: wp.vec3d) -> PlanePoint:
+def clamped_to_triangle(at: PlanePoint, v0: wp.vec3d, v1: wp.vec3d, v2: wp.vec3d) -> PlanePoint:
     """Move a point beside the triangle onto it, and add the distance to its error.
 
     A ray at an edge, or on an outline, may pass its triangle by a rounding error and then meet the plane far away."""
     e1 = v1 - v0
     e2 = v2 - v0
-    way = found.point - v0
-    square = wp.dot(found.normal, found.normal)
-    u = wp.dot(found.normal, wp.cross(way, e2)) / square
-    v = wp.dot(found.normal, wp.cross(e1, way)) / square
+    way = at.point - v0
+    square = wp.dot(at.normal, at.normal)
+    u = wp.dot(at.normal, wp.cross(way, e2)) / square
+    v = wp.dot(at.normal, wp.cross(e1, way)) / square
     if u >= wp.float64(0.0) and v >= wp.float64(0.0) and u + v <= wp.float64(1.0):
-        return found
+        return at
     u = wp.max(wp.float64(0.0), u)  # In this order -0 becomes 0 on the CPU as on CUDA.
     v = wp.max(wp.float64(0.0), v)
     over = wp.max(u + v, wp.float64(1.0))
-    out = found
+    out = at
     out.point = v0 + (u / over) * e1 + (v / over) * e2
-    out.error = found.error + wp.abs(found.point - out.point)
+    out.error = at.error + wp.abs(at.point - out.point)
     return out
 
 
@@ -144,14 +144,14 @@ def on_triangle(surfaces: Surfaces, place: Place, u: float, v: float, origin: wp
         v2 = to_world(instance, v2, wp.float64(1.0))
         middle = to_world(instance, middle, wp.float64(1.0))
         side = wp.float64(instance.handedness)
-    found = clamped_to_triangle(on_plane(v0, v1, v2, off, origin, direction), v0, v1, v2)
-    found.normal = side * found.normal
+    at = clamped_to_triangle(on_plane(v0, v1, v2, off, origin, direction), v0, v1, v2)
+    at.normal = side * at.normal
     # To rounding, the ray runs along the plane: its point may be anywhere on the triangle.
     reach = wp.max(wp.max(wp.abs(v0 - middle), wp.abs(v1 - middle)), wp.abs(v2 - middle)) + off
-    if not longest(found.error) <= longest(reach):
-        found.point = middle
-        found.error = reach
-    return found
+    if not longest(at.error) <= longest(reach):
+        at.point = middle
+        at.error = reach
+    return at
 
 
 @wp.func
@@ -202,7 +202,7 @@ def shading_normal(surfaces: Surfaces, place: Place, u: float, v: float, geometr
 
 
 @wp.func
-def last_row(first: wp.array(dtype=wp.int32), prim_id: int) -> int:
+def last_entry(first: wp.array(dtype=wp.int32), prim_id: int) -> int:
     """Return the last entry that does not begin behind prim_id. Entries without primitives begin where the next one does."""
     low = int(0)
     high = int(first.shape[0])
@@ -235,7 +235,7 @@ def place_of(surfaces: Surfaces, prim_id: int) -> Place:
 
 
 @wp.func
-def put_miss(out: HitPlaces, i: int):
+def write_miss(out: HitPlaces, i: int):
     nothing = wp.vec3(wp.nan, wp.nan, wp.nan)
     if out.point.shape[0] > 0:
         out.point[i] = nothing
@@ -256,9 +256,9 @@ def put_miss(out: HitPlaces, i: int):
 
 
 @wp.func
-def put_ids(surfaces: Surfaces, object_ids: ObjectIds, place: Place, prim_id: int, out: HitPlaces, i: int):
+def write_ids(surfaces: Surfaces, object_ids: ObjectIds, place: Place, prim_id: int, out: HitPlaces, i: int):
     if out.object.shape[0] > 0:
-        out.object[i] = last_row(object_ids.first_prim, prim_id)
+        out.object[i] = last_entry(object_ids.first_prim, prim_id)
     if out.instance.shape[0] > 0:
         out.instance[i] = object_ids.instance[place.instance]
     if out.material.shape[0] > 0:
@@ -266,17 +266,17 @@ def put_ids(surfaces: Surfaces, object_ids: ObjectIds, place: Place, prim_id: in
 
 
 @wp.func
-def put_point(found: PlanePoint, out: HitPlaces, i: int):
-    point = wp.vec3(found.point)
+def write_point(at: PlanePoint, out: HitPlaces, i: int):
+    point = wp.vec3(at.point)
     if out.point.shape[0] > 0:
         out.point[i] = point
     if out.error.shape[0] > 0:
         least = wp.vec3d(SMALLEST, SMALLEST, SMALLEST)
-        out.error[i] = wp.vec3(SAFETY * (found.error + U32 * wp.abs(found.point)) + least)
+        out.error[i] = wp.vec3(SAFETY * (at.error + U32 * wp.abs(at.point)) + least)
 
 
 @wp.func
-def put_interpolated(surfaces: Surfaces, place: Place, u: float, v: float, normal: wp.vec3, out: HitPlaces, i: int):
+def write_interpolated(surfaces: Surfaces, place: Place, u: float, v: float, normal: wp.vec3, out: HitPlaces, i: int):
     if out.shading.shape[0] > 0:
         out.shading[i] = shading_normal(surfaces, place, u, v, normal)
     if out.uv.shape[0] > 0:
@@ -284,7 +284,7 @@ def put_interpolated(surfaces: Surfaces, place: Place, u: float, v: float, norma
 
 
 @wp.func
-def put_interpolated_on_sphere(normal: wp.vec3, out: HitPlaces, i: int):
+def write_interpolated_on_sphere(normal: wp.vec3, out: HitPlaces, i: int):
     if out.shading.shape[0] > 0:
         out.shading[i] = normal
     if out.uv.shape[0] > 0:
@@ -298,25 +298,25 @@ def hit_places(surfaces: Surfaces, object_ids: ObjectIds, rays: RayArrays, hits:
     prim_id = hits.prim_id[i]
     count = surfaces.n_triangles + surfaces.spheres.shape[0]
     if prim_id < 0 or prim_id >= count:
-        put_miss(out, i)
+        write_miss(out, i)
         return
     place = place_of(surfaces, prim_id)
-    put_ids(surfaces, object_ids, place, prim_id, out, i)
+    write_ids(surfaces, object_ids, place, prim_id, out, i)
     if out.point.shape[0] + out.error.shape[0] + out.normal.shape[0] + out.shading.shape[0] + out.uv.shape[0] == 0:
         return
     origin = wp.vec3d(rays.origin[i])
     direction = wp.vec3d(rays.direction[i])
     if prim_id >= surfaces.n_triangles:
         on_ball = on_sphere(surfaces.spheres[prim_id - surfaces.n_triangles], hits.t[i], origin, direction)
-        put_point(on_ball, out, i)
+        write_point(on_ball, out, i)
         normal = wp.vec3(wp.normalize(on_ball.normal))
         if out.normal.shape[0] > 0:
             out.normal[i] = normal
-        put_interpolated_on_sphere(normal, out, i)
+        write_interpolated_on_sphere(normal, out, i)
     else:
-        found = on_triangle(surfaces, place, hits.u[i], hits.v[i], origin, direction)
-        put_point(found, out, i)
-        normal = wp.vec3(wp.normalize(found.normal / longest(found.normal)))
+        at = on_triangle(surfaces, place, hits.u[i], hits.v[i], origin, direction)
+        write_point(at, out, i)
+        normal = wp.vec3(wp.normalize(at.normal / longest(at.normal)))
         if out.normal.shape[0] > 0:
             out.normal[i] = normal
-        put_interpolated(surfaces, place, hits.u[i], hits.v[i], normal, out, i)
+        write_interpolated(surfaces, place, hits.u[i], hits.v[i], normal, out, i)

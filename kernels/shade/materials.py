@@ -16,7 +16,7 @@ SMOOTH = wp.constant(1.0e-4)  # GGX's alpha. Below, facets deviate by less than 
 
 @wp.struct
 class Scatter:
-    """How a surface scatters light, and where rays go on. A weight of 0 means no ray."""
+    """Weights and directions of a surface's scattered light. A weight of 0 means no ray."""
 
     reflected: wp.vec3  # Weight towards `reflection`, on the ray's side.
     reflection: wp.vec3
@@ -88,7 +88,7 @@ def conductor(m: Material, s: Surface, n: wp.vec3, wo: wp.vec3, out: Scatter) ->
 
 
 def make_glass(features: Features) -> Any:
-    """Return reflection and refraction at a boundary to index m.ior, or at a thin pane."""
+    """Return the function for reflection and refraction at a boundary to index m.ior, or at a thin pane."""
     fresnel = fresnel_schlick if features.schlick else fresnel_dielectric
 
     @wp.func
@@ -119,7 +119,7 @@ def make_glass(features: Features) -> Any:
 
 
 def make_metallic_roughness(features: Features) -> Any:
-    """Return glTF 2.0's material (appendix B): a metal and a coated diffuse or clear body, mixed by `metallic`."""
+    """Return the function for glTF 2.0's material (appendix B): a metal and a coated diffuse or clear body, mixed by `metallic`."""
     fresnel = fresnel_schlick if features.schlick else fresnel_dielectric
     glass = make_glass(features)
 
@@ -186,7 +186,7 @@ def make_link(number: int, function: Any, others: Any) -> Any:
 
 
 def make_scatter(features: Features) -> Any:
-    """Return the function that scatters light at a surface."""
+    """Return the function that scatters light at a surface of any kind."""
     of_kind = make_of_kind(features)
 
     @wp.func

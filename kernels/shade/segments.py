@@ -74,9 +74,9 @@ def segments(surfaces: Surfaces, pairs: Pairs, size: float, rays: RayArrays, fir
         p = lifted(surfaces, pairs.on_a[i], pairs.a[i], pairs.b[i])
     if pairs.on_b.shape[0] > 0:
         q = lifted(surfaces, pairs.on_b[i], pairs.b[i], pairs.a[i])
-    turned = largest(q) < largest(p) or (largest(q) == largest(p) and is_before(q, p))
-    origin = wp.where(turned, q, p)
-    target = wp.where(turned, p, q)
+    swapped = largest(q) < largest(p) or (largest(q) == largest(p) and is_before(q, p))
+    origin = wp.where(swapped, q, p)
+    target = wp.where(swapped, p, q)
     way = target - origin
     length = largest(way)
     rays.origin[i] = origin

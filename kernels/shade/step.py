@@ -30,7 +30,7 @@ def make_shaded(counting: bool) -> Any:
 
     @wp.struct
     class Shaded:
-        """What follows from a path and its hit. A path of throughput 0 is none."""
+        """The result of shading a path's hit. A path of throughput 0 is none."""
 
         light: wp.vec3  # Emission and the ambient term.
         throughput: wp.vec3  # Weight of this surface's light in the sample.

@@ -37,10 +37,10 @@ def next_away(x: float, direction: float) -> float:
 
 @wp.func
 def spawn_point(point: wp.vec3, error: wp.vec3, normal: wp.vec3, direction: wp.vec3) -> wp.vec3:
-    """Return the origin of a ray that leaves towards `direction`: outside the box of the point's error, on that side.
+    """Return the origin of a ray that leaves towards `direction`: outside the box of the point's error, on that side of the surface.
 
-    It is the smallest such step along the normal, rounded away (Pharr, Jakob and Humphreys 2023, "Physically Based Rendering",
-    section 6.8.6). It scales with the coordinates, unlike a fixed epsilon."""
+    It is the smallest such step along the normal, rounded away (Pharr, Jakob and Humphreys 2023, "Physically Based Rendering", section
+    6.8.6). It scales with the coordinates, unlike a fixed epsilon."""
     distance = wp.dot(wp.abs(normal), error)
     offset = wp.where(wp.dot(direction, normal) < 0.0, -distance, distance) * normal
     p = point + offset

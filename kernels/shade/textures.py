@@ -40,7 +40,7 @@ def texel(surfaces: Surfaces, texture: Texture, column: int, row: int) -> wp.vec
 
 
 @wp.func
-def place_between(at: float, size: int) -> float:
+def texel_place(at: float, size: int) -> float:
     """Return a texture coordinate in texels, counted from the first texel's centre."""
     # Beyond 2^24 float32 has no fractions, and beyond 2^31 the integer depends on the device.
     return wp.clamp(at * float(size) - 0.5, -FARTHEST, FARTHEST)
@@ -57,8 +57,8 @@ def texture_uv(texture: Texture, uv: wp.vec2) -> wp.vec2:
 @wp.func
 def picture(surfaces: Surfaces, texture: Texture, u: float, v: float) -> wp.vec4:
     """Sample a picture, bilinearly."""
-    x = place_between(u, texture.width)
-    y = place_between(v, texture.height)
+    x = texel_place(u, texture.width)
+    y = texel_place(v, texture.height)
     left = wrapped(int(wp.floor(x)), texture.width, texture.wrap_u)
     right = wrapped(int(wp.floor(x)) + 1, texture.width, texture.wrap_u)
     fx = x - wp.floor(x)

@@ -49,13 +49,13 @@ from wrt.kernels.wide.packets import (
     make_triangles,
     packet_kernel,
     prefetch_next,
-    put_bits,
-    put_slot,
     rays_at,
     rays_meeting_root,
     rays_reaching,
     slot_at,
     spheres_of,
+    store_bits,
+    store_slot,
     write_hits,
     write_occluded,
 )
@@ -102,11 +102,11 @@ def best_at(packet: wp.array(dtype=wp.float32), ray: int) -> Hit:
 
 
 @wp.func
-def put_best(packet: wp.array(dtype=wp.float32), ray: int, best: Hit):
+def store_best(packet: wp.array(dtype=wp.float32), ray: int, best: Hit):
     put_number(packet, ray + wp.static(FIELD["t"]), best.t)
     put_number(packet, ray + wp.static(FIELD["u"]), best.u)
     put_number(packet, ray + wp.static(FIELD["v"]), best.v)
-    put_bits(packet, ray + wp.static(FIELD["prim_id"]), best.prim_id)
+    store_bits(packet, ray + wp.static(FIELD["prim_id"]), best.prim_id)
 
 
 def make_sphere_test(units: Units, any_hit: bool, accepts: Any) -> Any:
@@ -125,7 +125,7 @@ def make_sphere_test(units: Units, any_hit: bool, accepts: Any) -> Any:
         found = bool(best.prim_id != NO_HIT)
         if wp.static(any_hit):
             best.t = wp.where(found, -float(wp.inf), best.t)  # Nothing else is reached.
-        put_best(scratch.packets, ray, best)
+        store_best(scratch.packets, ray, best)
         return wp.static(any_hit) and found
 
     return test_spheres
@@ -145,7 +145,7 @@ def make_accepted(any_hit: bool, accepts: Any, ray_triangles: Any) -> Any:
             hit = best_at(scratch.packets, ray)
             if accepts(surfaces, hit.prim_id, hit.u, hit.v):
                 break
-            put_best(scratch.packets, ray, before)
+            store_best(scratch.packets, ray, before)
             mask = mask & ~(1 << lane)
         if wp.static(any_hit):
             put_number(scratch.packets, ray + wp.static(FIELD["t"]), -float(wp.inf))
@@ -310,9 +310,9 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
 
     @packet_kernel
     def trace(accel: WideBvh, surfaces: Surfaces, rays: rays_struct, out: out_type, scratch: Scratch, first: int, end: int):
-        put_slot(scratch.report, FAILED, 0)
-        put_slot(scratch.report, PAUSED, 0)
-        put_slot(scratch.report, ANY_REFUSED, 0)
+        store_slot(scratch.report, FAILED, 0)
+        store_slot(scratch.report, PAUSED, 0)
+        store_slot(scratch.report, ANY_REFUSED, 0)
         for block in range(first, end, wp.static(PACKETS * LANES)):
             single_rays = wp.uint64(0)
             packets = wp.min((end - block + LANES - 1) / LANES, PACKETS)  # A constant would unroll the walk.
@@ -320,9 +320,9 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
                 base = PACKET_SIZE * p
                 count = wp.min(end - block - LANES * p, LANES)
                 active = set_up(rays, block + LANES * p, count, wp.static(far_pad(units.box)), scratch, base)
-                put_bits(scratch.packets, base + ACTIVE, active)
+                store_bits(scratch.packets, base + ACTIVE, active)
                 if bits(scratch.packets, base + REFUSED) != 0:
-                    put_slot(scratch.report, ANY_REFUSED, 1)
+                    store_slot(scratch.report, ANY_REFUSED, 1)
             for p in range(packets):
                 base = PACKET_SIZE * p
                 active = bits(scratch.packets, base + ACTIVE)
@@ -332,10 +332,10 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
                     failed = wp.where(coherent, 0, slot_at(scratch.report, FAILED) + 1)
                     if failed == MAX_FAILED:  # After the pause, one more failure starts the next.
                         failed = failed - 1
-                        put_slot(scratch.report, PAUSED, PAUSE)
-                    put_slot(scratch.report, FAILED, failed)
+                        store_slot(scratch.report, PAUSED, PAUSE)
+                    store_slot(scratch.report, FAILED, failed)
                 else:
-                    put_slot(scratch.report, PAUSED, wp.max(paused - 1, 0))
+                    store_slot(scratch.report, PAUSED, wp.max(paused - 1, 0))
                     active = active & wp.static(COHERENT - 1)
                     active = rays_meeting_root(accel, scratch, base, active)
                     single_rays = single_rays | (wp.uint64(active) << wp.uint64(LANES * p))

@@ -39,7 +39,7 @@ class Nearest:
 
 @wp.struct
 class PointArrays:
-    """One closest point an entry. If there is no triangle: distance inf, prim_id -1, and the rest 0."""
+    """Closest points. If there is no triangle: distance inf, prim_id -1, and the rest 0."""
 
     distance: wp.array(dtype=wp.float32)
     point: wp.array(dtype=wp.vec3)

@@ -101,12 +101,12 @@ WRT_INLINE Rays no_hit(const SixteenRays& rays) {
 
 WRT_INLINE Rays component(const Vec3<Rays>& v, RayInts k) { return k == 0 ? v[0] : (k == 1 ? v[1] : v[2]); }
 
-template <class Ray> WRT_INLINE void put_vector(const Ray& ray, int first, const Vec3<Rays>& v) {
+template <class Ray> WRT_INLINE void store_vector(const Ray& ray, int first, const Vec3<Rays>& v) {
     for (int k = 0; k < 3; ++k) ray.put(first + LANES * k, v[k]);
 }
 
 // Store the triangle unit's set-up (triangle_ray).
-WRT_INLINE void put_triangle_ray(const AllRays& packet, const Vec3<Rays>& o, const Vec3<Rays>& d) {
+WRT_INLINE void store_triangle_ray(const AllRays& packet, const Vec3<Rays>& o, const Vec3<Rays>& d) {
     const RayInts zero = {}, one = all<RayInts>(1), two = all<RayInts>(2);
     const Rays size_x = absolute(d[0]), size_y = absolute(d[1]), size_z = absolute(d[2]);
     RayInts kz = size_y > size_x ? one : zero;
@@ -115,8 +115,8 @@ WRT_INLINE void put_triangle_ray(const AllRays& packet, const Vec3<Rays>& o, con
     const Rays d_z = component(d, kz);
     const RayInts kx = d_z < 0.0f ? after : next, ky = d_z < 0.0f ? next : after;
     packet.put_bits(AXES, kx | ky << AXIS_BITS | kz << 2 * AXIS_BITS);
-    put_vector(packet, TURNED_X, {{component(o, kx), component(o, ky), component(o, kz)}});
-    put_vector(packet, SHEAR_X, {{component(d, kx) / d_z, component(d, ky) / d_z, 1.0f / d_z}});
+    store_vector(packet, TURNED_X, {{component(o, kx), component(o, ky), component(o, kz)}});
+    store_vector(packet, SHEAR_X, {{component(d, kx) / d_z, component(d, ky) / d_z, 1.0f / d_z}});
 }
 
 // Return the place of an axis's near planes in a node.
@@ -135,7 +135,7 @@ WRT_INLINE Rays lesser(Rays a, Rays b, Rays c, Rays d) { return lesser(lesser(a,
 
 // Store the beam around all active rays of the packet (layout.py: BEAM_WORDS). Return false if their directions differ in sign
 // along an axis.
-WRT_INLINE bool put_beam(float* packet, const SixteenRays& rays, const Vec3<Rays>& inv_dir, int active, float far_pad) {
+WRT_INLINE bool store_beam(float* packet, const SixteenRays& rays, const Vec3<Rays>& inv_dir, int active, float far_pad) {
     int down[3];
     for (int k = 0; k < 3; ++k) {
         down[k] = mask_of(inv_dir[k] < 0.0f) & active;
@@ -176,14 +176,14 @@ template <bool SCALED> WRT_CALLED int set_up(const RayPointers& from, int count,
     packet.put(SCALE, scale_rays<SCALED>(rays));
     rays.t_max = no_hit(rays);
     const Vec3<Rays>&o = rays.origin, &d = rays.direction, i = {{1.0f / d[0], 1.0f / d[1], 1.0f / d[2]}};
-    put_vector(packet, ORIGIN_X, o);
-    put_vector(packet, DIRECTION_X, d);
-    put_vector(packet, INVERSE_X, i);
-    put_vector(packet, FAR_X, {{far_pad * i[0], far_pad * i[1], far_pad * i[2]}});
+    store_vector(packet, ORIGIN_X, o);
+    store_vector(packet, DIRECTION_X, d);
+    store_vector(packet, INVERSE_X, i);
+    store_vector(packet, FAR_X, {{far_pad * i[0], far_pad * i[1], far_pad * i[2]}});
     packet.put_bits(NEAR_X, near_row(i[0], LO_X, HI_X));
     packet.put_bits(NEAR_Y, near_row(i[1], LO_Y, HI_Y));
     packet.put_bits(NEAR_Z, near_row(i[2], LO_Z, HI_Z));
-    put_triangle_ray(packet, o, d);
+    store_triangle_ray(packet, o, d);
     packet.put(T_MIN, rays.t_min);
     packet.put_bits(EXCLUDE, rays.exclude);
     packet.put(T, rays.t_max);
@@ -191,7 +191,7 @@ template <bool SCALED> WRT_CALLED int set_up(const RayPointers& from, int count,
     packet.put(V, Rays{});
     packet.put_bits(PRIM_ID, all<RayInts>(NO_HIT));
     const int active = mask_of(rays.t_max >= rays.t_min) & ((1 << count) - 1);
-    return put_beam(numbers, rays, i, active, far_pad) ? active | COHERENT : active;
+    return store_beam(numbers, rays, i, active, far_pad) ? active | COHERENT : active;
 }
 
 }  // namespace wrt

@@ -1,4 +1,4 @@
-"""What waves are made of, piece by piece."""
+"""The parts of waves."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Camera rays against closed forms in float64; of a lens, the lecture's construction: chief ray, parallel ray, and the point S
-where they meet."""
+"""Camera rays against closed forms in float64. A lens is held to the construction by chief ray, parallel ray and their point S."""
 
 from functools import cache
 from importlib import import_module
@@ -30,7 +29,7 @@ def camera_kernel(device, features):
 
 
 def rays(camera, size, film, xi=None):
-    """origins, directions (N, 3) float64 of a camera's rays at film points, with lens samples xi."""
+    """Return origins and directions, (N, 3) float64, of a camera's rays at film points with lens samples xi."""
     film = np.asarray(film, float).reshape(-1, 2)
     xi = np.zeros_like(film) if xi is None else xi
     kernel = camera_kernel(camera.device, Features(**camera.switches()))
@@ -70,7 +69,7 @@ def test_default_camera_looks_along_minus_z_with_y_up():
 
 
 def meeting_point(point_a, direction_a, point_b, direction_b):
-    """Where two lines that lie in one plane cross, by least squares in float64; and how far apart they pass."""
+    """Return where two lines in one plane cross, by least squares in float64, and their distance there."""
     a = np.stack([direction_a, -direction_b], axis=1)
     (s, t), *_ = np.linalg.lstsq(a, point_b - point_a, rcond=None)
     p, q = point_a + s * direction_a, point_b + t * direction_b

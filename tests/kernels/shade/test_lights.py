@@ -57,7 +57,7 @@ def environment_kernel(b: Background, direction: wp.array(dtype=wp.vec3), out: w
 
 
 def take(scene, point=(0.0, 0.0, 0.0), n=(0.0, 1.0, 0.0), light=0, xi=None, features=ALL_LIGHTS):
-    """Light samples and their shadow rays, structured arrays; light = number of lights is the background."""
+    """Return light samples and their shadow rays as structured arrays; the light after the last is the background."""
     xi = sobol_like(1 << 15, np.random.default_rng(0)) if xi is None else xi
     on_device = upload_scene(scene, DEVICE)
     out, ray = zeros(len(xi), LightSample), zeros(len(xi), Ray)
@@ -67,7 +67,7 @@ def take(scene, point=(0.0, 0.0, 0.0), n=(0.0, 1.0, 0.0), light=0, xi=None, feat
 
 
 def irradiance(scene, point=(0.0, 0.0, 0.0), n=(0.0, 1.0, 0.0), light=0, **rest):
-    """(3,): mean of weight times the cosine over the samples, unshadowed."""
+    """Return the mean of weight times cosine over the samples, unoccluded, (3,)."""
     out, _ = take(scene, point, n, light, **rest)
     cosine = np.maximum(out["wi"].astype(np.float64) @ np.asarray(n, float), 0.0)
     return (out["weight"] * cosine[:, None]).mean(axis=0)
@@ -182,7 +182,7 @@ def test_many_emitters_of_different_size_and_power():
 def test_a_ball_of_triangles_and_the_exact_sphere():
     radius, distance = 0.5, 2.0
     exact = np.pi * (radius / distance) ** 2
-    # Of a convex light, what turns its front to the point is what the point sees: no shadows are needed for the closed form.
+    # A convex light occludes none of its faces that turn to the point: the closed form needs no shadows.
     mesh = icosphere(4)
     ball = Mesh(mesh.vertices * radius + [0.0, distance, 0.0], mesh.faces)
     found = irradiance(Scene(objects=(lamp(ball, (1.0, 1.0, 1.0)),)), xi=sobol_like(1 << 17, np.random.default_rng(8)))
@@ -307,7 +307,7 @@ def radiance_of(background, direction):
 
 
 def bilinear(background, direction):
-    """The look-up by its definition in wrt.scene.backgrounds, float64: middle column along -z, columns run towards +x, row 0 up."""
+    """Look up a picture by the definition in wrt.scene.backgrounds, in float64: middle column along -z, columns towards +x, line 0 up."""
     image = background.image.astype(np.float64)
     height, width = image.shape[:2]
     c, s = np.cos(-background.rotation), np.sin(-background.rotation)

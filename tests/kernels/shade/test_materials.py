@@ -1,4 +1,4 @@
-"""Fresnel's formulas against closed forms and complex arithmetic; what each kind of material makes of a ray."""
+"""Fresnel's formulas against closed forms and complex arithmetic, and the scattering of each kind of material."""
 
 from functools import cache
 
@@ -140,8 +140,8 @@ def test_tint_runs_from_f0_to_white():
 
 @pytest.mark.parametrize("exponent", [0.0, 1.0, 10.0, 100.0, 1e4, 1e5])
 def test_highlight_is_normalised(exponent):
-    # Hemispherical reflectance at normal incidence by quadrature in the half vector's angle: exactly 1, so never more.
-    # wi is at twice that angle; its solid angle is 4 cos(h) dh of the half vector's, while it is above the surface.
+    # Quadrature over the half vector's angle h: hemispherical reflectance at normal incidence is exactly 1, and so never more.
+    # The direction wi is at 2 h. Its solid angle is 4 cos(h) times the half vector's, while it is above the surface.
     x, w = np.polynomial.legendre.leggauss(300)
     reach = min(np.pi / 4.0, 12.0 / np.sqrt(exponent + 1.0))
     h, w = 0.5 * reach * (x + 1.0), 0.5 * reach * w
@@ -250,7 +250,7 @@ def test_thin_glass_sums_the_reflections_of_both_faces():
 
 
 def some_materials():
-    """One of each kind, and the corners of the metallic-roughness model, with albedo 1: nothing is swallowed."""
+    """Return a material of each kind, and the corners of metallic-roughness, with albedo 1: none may absorb light."""
     rest = {"albedo": (1.0, 1.0, 1.0)}
     yield from (Material("mirror", **rest), Material("glass", ior=1.5, **rest), Material("glass", thin=True, **rest))
     yield Material("conductor", roughness=0.5)

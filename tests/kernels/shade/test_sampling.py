@@ -120,8 +120,8 @@ def test_samples_lie_in_the_half_open_square():
 
 
 def test_keys_and_dimensions_are_independent():
-    # The same net for two pixels or two dimensions would show as structure: their points must be uncorrelated, and pairs
-    # made of one coordinate of each must fill the square evenly.
+    # The same net for two pixels or two dimensions would show as structure. Their points must be uncorrelated, and pairs of one
+    # coordinate of each must fill the square evenly.
     rng = np.random.default_rng(1)
     n = 4096
     sets = [samples(key, np.arange(n), dimension) for key, dimension in

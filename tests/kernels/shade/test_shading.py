@@ -1,4 +1,4 @@
-"""One table of a material's textures: both loops, the host's material and its switches have the same ones."""
+"""The table of a material's textures: both loops, the host's material and its switches have the same ones."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_host_and_device_have_the_same_textures() -> None:
 
 
 def test_channels_go_to_numbers_of_texels_that_follow_one_another() -> None:
-    """A block's rows of them do too, where the wave loop puts one channel after another."""
+    """The wave loop stores one channel after another, so a block's rows must follow one another, too."""
     rows, seen = Rows(Texels, 64), []
     for texture in TEXTURES.values():
         fields = [rows.field(name) for name in texture.fields]

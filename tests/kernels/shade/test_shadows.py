@@ -1,4 +1,4 @@
-"""Shadow rays through what lets light through, by pictures whose answer is known; renderer/test_tinted_shadows.py has more."""
+"""Shadow rays through transparent surfaces, by pictures with a known answer; renderer/test_tinted_shadows.py has more."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ EXTRA = tuple(Object(quad((1e4, i, 0), (1, 0, 0), (0, 1, 0)), (material,)) for i
 
 
 def lit(*objects, light=SUN, shadows="opaque"):
-    """Radiance of a white floor below the objects, and the render's statistics."""
+    """Return the radiance of a white floor below the objects, and the render's statistics."""
     scene = Scene(objects=(FLOOR, *objects, *EXTRA), lights=(light,),
                   cameras=(Camera.look_at((0.0, 0.5, 0.8), (0.0, 0.0, 0.0), fov_y=0.01),),
                   settings=Settings(size=(2, 2), spp=1, filter="box", glass_shadows=shadows, max_depth=0))
@@ -62,7 +62,7 @@ def test_panes_of_alpha_0_shade_nothing_up_to_a_number_that_is_counted(count):
 
 @pytest.mark.parametrize("count", [0, 3, 255, 256])
 def test_an_opaque_pane_behind_clear_ones_is_counted_as_one_more(count):
-    """It ends the shadow, and is a ray; behind MAX_TRANSPARENT panes nobody looks what it is."""
+    """The ray to it counts. Behind MAX_TRANSPARENT panes no ray looks what follows."""
     clear = Material(alpha=0.0, alpha_mode="blend")
     lamp = PointLight((0.0, 3.0, 0.0), ONE)
     value, stats = lit(*(pane(clear, y) for y in np.linspace(1.0, 2.0, count)), pane(WHITE, 2.5), light=lamp)
@@ -120,7 +120,7 @@ KINDS = [("diffuse", {}), ("mirror", {}), ("conductor", {}), ("glass", {}), ("gl
 @pytest.mark.parametrize("alpha_mode", ["opaque", "mask", "blend"])
 @pytest.mark.parametrize("kind", range(len(KINDS)))
 def test_opaque_is_what_leaves_the_floor_below_it_dark(kind, alpha_mode):
-    """From either side."""
+    """The pane is seen from either side."""
     materials = [Material(name, alpha_mode=alpha_mode, alpha=0.5, alpha_cutoff=0.1, **fields) for name, fields in KINDS]
     out = zeros(len(KINDS), wp.bool)
     launch(opaque_kernel, len(KINDS), upload(material_records(tuple(materials), TextureTable()), MaterialRecord, DEVICE), out)

@@ -32,13 +32,13 @@ def moved(mesh, scale=1.0, by=(0.0, 0.0, 0.0)):
 
 
 def hidden(*materials):
-    """Tiny triangles far behind every camera here, one a material."""
+    """Return tiny triangles far behind every camera here, one for each material."""
     return tuple(Object(Mesh([[0, i, 1e4], [1e-3, i, 1e4], [0, i + 1e-3, 1e4]], [[0, 1, 2]]), (material,))
                  for i, material in enumerate(materials))
 
 
 def glow(radiance=1.0):
-    """A surface that is only seen: it lights nothing and reflects nothing."""
+    """Return a surface that is only visible: it lights nothing and reflects nothing."""
     return Material(albedo=(0.0,) * 3, emission=(radiance,) * 3, emits_light=False)
 
 
@@ -98,14 +98,14 @@ def test_clear_glass_vanishes_in_a_white_room():
     lost = film.stats["lost_throughput_per_sample"]
     assert film.stats["rays_per_sample"] > 3.0
     assert 1e-4 < lost < 0.05 and (film.pixels <= 1.0 + 1e-5).all()
-    # What is lost is what the cut rays would have brought home, those cut inside too.
+    # `lost` is the light that the cut rays would have carried, also the rays cut inside glass.
     assert film.pixels.mean(dtype=np.float64) == pytest.approx(1.0 - lost, abs=1e-5)
     flat = render(scene, max_depth=30, camera=toward((0.0, 1.4, 0.0), (0.0, 1.4, 5.0)))
     assert np.allclose(flat.pixels, 1.0, atol=1e-4)
 
 
 def slab_scene(thickness=1.0, degrees=0.0, material=CLEAR, camera=None):
-    """A slab before a glowing wall; behind the camera it is dark, so that only what goes through is seen."""
+    """Return a slab before a glowing wall. It is dark behind the camera, so that only light through the slab is visible."""
     slab = box((-50.0, -50.0, -0.5 * thickness), (50.0, 50.0, 0.5 * thickness))
     angle = np.radians(degrees)
     turn = np.eye(4)
@@ -116,7 +116,7 @@ def slab_scene(thickness=1.0, degrees=0.0, material=CLEAR, camera=None):
 
 
 def slab_transmittance(cosine, n, inside=1.0):
-    """Of a slab, all inner reflections summed: (1 - R)^2 a / (1 - R^2 a^2), a being what its glass leaves on one way."""
+    """Return a slab's transmittance with all inner reflections, (1 - R)^2 a / (1 - R^2 a^2), for a transmittance a of one crossing."""
     inner = np.sqrt(1.0 - (1.0 - cosine**2) / n**2)
     s, p = (cosine - n * inner) / (cosine + n * inner), (n * cosine - inner) / (n * cosine + inner)
     r = 0.5 * (s * s + p * p)
@@ -232,7 +232,7 @@ def test_shadows_and_the_ambient_term():
     lid = Object(moved(quad((-1.0, 1.0, 1.0), (2.0, 0.0, 0.0), (0.0, 0.0, -2.0))), (Material(albedo=(0.0,) * 3),))
     scene = lit_scene(floor(), lid, lights=(PointLight((0.0, 2.0, 0.0), (50.0,) * 3),), ambient=(0.3, 0.2, 0.1))
     under = render(scene, camera=toward((0.5, 0.0, 0.0), (9.0, 0.5, 0.0), fov=1e-3), spp=256)
-    # Under the lid the point light is hidden and the sky is what shows past a 2 x 2 square at height 1: its form factor.
+    # Under the lid the point light is hidden. The sky shows past a 2 x 2 square at height 1, by its form factor.
     corner = [(1.5, 1.0), (0.5, 1.0)]
     factor = 0.0
     for x, y in corner:
@@ -278,8 +278,8 @@ def test_a_tree_of_rays_without_end_is_cut_and_told():
     scene = Scene(objects=tuple(panes), cameras=(toward(),), settings=SETTINGS, background=WHITE_SKY)
     options = {"size": (2, 2), "spp": 1, "min_throughput": 0.0}
     whole, endless = render(scene, max_depth=12, **options), render(scene, max_depth=64, **options)
-    assert whole.stats["rays"] < 4 * MAX_RAYS <= endless.stats["rays"] <= 4 * (MAX_RAYS + 200)  # those that wait are traced still
-    for film in (whole, endless):  # all that is not lost comes from the sky
+    assert whole.stats["rays"] < 4 * MAX_RAYS <= endless.stats["rays"] <= 4 * (MAX_RAYS + 200)  # Waiting rays are still traced.
+    for film in (whole, endless):  # All light that is not lost comes from the sky.
         assert 0.0 < film.stats["lost_throughput_per_sample"] < 0.2 and film.stats["cut_by_depth"] > 0
         assert film.pixels.mean() + film.stats["lost_throughput_per_sample"] == pytest.approx(1.0, abs=1e-4)
 
@@ -327,7 +327,7 @@ def test_nothing_but_background():
 
 
 def busy_scene():
-    """Lens, filter, glass, rough metal, texture, area light, point light and sky at once."""
+    """Return a scene with lens, filter, glass, rough metal, texture, area light, point light and sky."""
     board = Material(albedo=ONE, albedo_texture=Checkerboard(scale=4.0))
     ground = quad((-4, -1, 4), (8, 0, 0), (0, 0, -8))
     camera = Camera.look_at((1.0, 1.0, 5.0), (0.2, -0.3, 0.0), fov_y=0.7, aperture_radius=0.1, focus_distance=5.0, blades=6)
@@ -380,8 +380,8 @@ def test_fewer_samples_are_the_first_ones_and_the_seed_matters(reference):
 
 
 def test_variance_is_that_of_the_mean(reference):
-    # Of many renders with other seeds, the spread of the pixels must be what one render says of itself, or less: samples of
-    # one pixel are spread more evenly than chance would.
+    # The pixels' variance over many seeds must be at most the variance that one render reports. It is less, as the samples of a
+    # pixel are more even than random ones.
     films = [render(busy_scene(), seed=seed, threads=2) for seed in range(2, 14)]
     spread = np.var([film.pixels for film in films], axis=0, ddof=1).mean()
     claimed = np.mean([film.variance for film in films])

@@ -1,4 +1,4 @@
-"""Points, normals and coordinates at a hit against float64, and that no new ray meets the surface it leaves."""
+"""Points, normals and coordinates at a hit against float64. A new ray must not hit the surface that it leaves."""
 
 from functools import cache
 

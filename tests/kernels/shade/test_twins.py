@@ -49,7 +49,7 @@ def points_kernel(key: wp.uint32, first: int, n: int, lanes: wp.array(dtype=wp.v
 
 
 def check_points() -> None:
-    """Whichever index a pixel begins with, and however many are drawn."""
+    """Compare for several first indices and counts."""
     for key, first in ((0, 0), (0xFFFFFFFF, 5), (0x12345678, (1 << 20) - 7), (77, 0x7FFFFFFF - 37)):
         for n in (1, 7, 8, 9, 12, 16, 37):
             room = AT + LANES * -(-n // LANES)
@@ -95,7 +95,7 @@ def seen_kernel(b: Background, rows: wp.array(dtype=float), count: int):
 
 
 def check_environment() -> None:
-    """Also at its seam and its poles; what stands behind the last direction is anything."""
+    """Compare also at the seam and the poles. Values behind the last direction are arbitrary."""
     for rotation in (0.0, 0.7):
         rng = np.random.default_rng(1)
         axes = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [-0.0, 1, -0.0], [0.5**0.5, 0, 0.5**0.5]])
@@ -128,7 +128,7 @@ def textures_kernel(surfaces: Surfaces, wanted: wp.array(dtype=wp.int32), uv: wp
 
 
 def in_lanes(surfaces: Any, index: Any, uv: np.ndarray, channels: int = 15) -> np.ndarray:
-    """(N, 4): the channels asked for, then NaN. Numbers behind the last are anything, as in a block that is not full."""
+    """Return the channels asked for, then NaN, (N, 4). Values behind the last are arbitrary, as in a block that is not full."""
     wanted, coordinates = np.full(BLOCK, -1), np.full((2, BLOCK), np.nan, np.float32)
     wanted[: len(uv)], coordinates[:, : len(uv)] = index, uv.T
     out = floats(np.full(4 * BLOCK, np.nan))
@@ -137,7 +137,7 @@ def in_lanes(surfaces: Any, index: Any, uv: np.ndarray, channels: int = 15) -> n
 
 
 def check_textures() -> None:
-    """Of several pictures, wrapped in every way, near and far away, and of none."""
+    """Compare several pictures, wrapped in every way, near and far away, and no picture."""
     for count in (1, 17, 64):
         rng = np.random.default_rng(count)
         wraps = [(u, v) for u in ("repeat", "clamp", "mirror") for v in ("repeat", "clamp", "mirror")]
@@ -215,7 +215,7 @@ def check_film() -> None:
 
 
 class Twin(NamedTuple):
-    """native: a Warp function that calls C++; name: of its scalar twin, in `file`; check: asserts that both have the same bits."""
+    """A native function, and its scalar twin of this name in `file`. `check` asserts that both have the same bits."""
 
     native: Any
     file: Any

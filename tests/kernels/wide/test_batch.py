@@ -1,4 +1,4 @@
-"""Many rays at a time: the answers are those of the kernel for one ray, to the last bit, however rays are mixed."""
+"""Many rays at a time: the answers have the bits of the kernel for one ray, however rays are mixed."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def new_hits(n):
 
 
 def one_by_one(accel, o, d, t_min, t_max):
-    """Closest hits and any hits by the kernel for one ray."""
+    """Return closest hits and any hits by the kernel for one ray."""
     rays, n = rays_on(accel.device, rays_of(o, d, t_min, t_max)), len(o)
     hits = new_hits(n)
     launch(closest_hit_kernel(accel.structure), n, accel.data, accel.snapshot.surfaces, rays, hits, 0)
@@ -61,7 +61,7 @@ def sphere():
 
 
 def mixed_rays(n, seed=0):
-    """Runs of rays that go the same way, of all lengths, between rays that do not."""
+    """Return coherent runs of rays, of all lengths, between incoherent rays."""
     rng = np.random.default_rng(seed)
     run = np.repeat(np.arange(n), rng.integers(1, 40, n))[:n]
     center, towards = 2.5 * rng.normal(size=(n, 3)), rng.normal(size=(n, 3))
@@ -87,7 +87,7 @@ def test_more_rays_than_a_launch(sphere, threads):
     o, d, _, _ = mixed_rays(150_001)
     for _ in range(3):
         assert_same(sphere, o, d, threads=threads)
-    assert 1 <= len(free) <= threads  # what the jobs work in is lent again
+    assert 1 <= len(free) <= threads  # Working memory is used again.
     assert all(array.ptr % 64 == 0 for worker in free for array in (worker.scratch.packets, worker.scratch.stacks))
 
 
@@ -131,7 +131,7 @@ def soup(corners):
 
 
 def crowd(seed=1):
-    """Many triangles in few places: leaves of several rows, ties in t between all of a leaf, thin ones and such without area."""
+    """Return many triangles in few places: leaves of several rows, ties in t, thin triangles and triangles without area."""
     rng = np.random.default_rng(seed)
     place = rng.normal(size=(6, 3, 3))
     corners = np.concatenate([np.repeat(place, 60, axis=0), place[:, :1] + [[[0, 0, 0], [1, 0, 0], [2, 0, 0]]],
@@ -156,8 +156,8 @@ def test_trees_of_one_leaf(count):
 
 
 def chain(k):
-    """A tree of nodes with k children, all but one of them leaves of one triangle, that needs a whole stack; every box is that of
-    the root."""
+    """Return a tree that needs a whole stack. All but one of a node's k children are leaves of one triangle, and every box is the
+    root's."""
     counts = [k] * (STACK_SIZE // (k - 1)) + [STACK_SIZE % (k - 1) + 1] * (STACK_SIZE % (k - 1) > 0)
     children = np.zeros((len(counts), 8), np.int32)
     for i, count in enumerate(counts):
@@ -186,7 +186,7 @@ def test_trees_that_need_a_whole_stack(k):
 
 
 def test_rays_that_are_special(sphere):
-    # Along axes and through vertices, of very long and very short directions, and segments that are empty.
+    # They run along axes and through vertices, with very long and very short directions, or have empty segments.
     rng = np.random.default_rng(7)
     vertices = sphere.geometry.vertices
     n = 20_000
@@ -286,7 +286,7 @@ def one_in_three(surfaces: Surfaces, prim_id: int, u: float, v: float) -> bool:
 
 @cpu_only
 def test_hits_that_are_not_accepted_are_passed():
-    """As of cut-outs: many triangles of a row are hit, and the nearest is often refused."""
+    """As with cut-outs: many triangles of a row are hit, and the nearest is often refused."""
     mesh, spheres = crowd(), np.array([[0.5, 0.5, 0.5, 0.2]], np.float32)
     accel = build(Geometry(mesh.vertices, mesh.faces, spheres), "bvh8")
     o, d, _, t_max = mixed_rays(4000, 4)

@@ -1,4 +1,4 @@
-"""Rows of lanes: the C++ for the CPU says, bit for bit, what the plain Warp for CUDA says."""
+"""Rows of lanes: the C++ for the CPU returns the bits of the plain Warp for CUDA."""
 
 from functools import cache
 
@@ -25,7 +25,7 @@ pytestmark = cpu_only
 
 @cache
 def both_kernel(width, compressed):
-    """The native form and the plain one: of node i of `nodes` and block i of `rows` for ray i."""
+    """Return the native and the plain result for node i, block i of `rows` and ray i."""
     row = row_type(width)
     probe_of = make_probe(Units())
 

@@ -1,4 +1,4 @@
-"""Packets: what sixteen lanes compute is, bit for bit, what the scalar units compute for each ray."""
+"""Packets: sixteen lanes return the bits that the scalar units return for each ray."""
 
 from functools import cache
 
@@ -29,7 +29,7 @@ SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, 0.5, 1e-40, -1e-40, 3e38, -3e38, np.in
 
 @wp.struct
 class Lanes:
-    """What the lanes say: per packet, then per ray."""
+    """The results of the lanes: by packet, then by ray."""
 
     state: wp.array(dtype=wp.int32)
     meets: wp.array(dtype=wp.int32)
@@ -210,7 +210,7 @@ def scalar_kernel():
 
 
 class Both:
-    """Rays, (16 n, 3) each, with a node and a row of triangles for each packet, through both."""
+    """Rays (16 n, 3), a node and a row of triangles for each packet, tested by lanes and by scalar units."""
 
     def __init__(self, rays, nodes, corners, count=LANES, any_hit=False, reach=LARGEST, in_row=WIDTH, exclude=None):
         self.rays = RayArrays()
@@ -304,7 +304,7 @@ def special_case(rng, n):
     """Zeros of both signs, denormals, overflow, infinities and NaN everywhere."""
     direction = rng.choice(SPECIAL[:7], (n * LANES, 3))
     direction[~direction.any(axis=1)] = 1.0
-    alike = rng.random(n * LANES) < 0.5  # else hardly a packet has a beam
+    alike = rng.random(n * LANES) < 0.5  # Otherwise hardly a packet has a beam.
     direction[alike] = np.abs(direction[alike])
     ends = np.array([0.0, -0.0, 0.5, 1.0, 1e30, 3.4e38, -np.inf, np.inf], np.float32)
     rays = rng.choice(SPECIAL, (n * LANES, 3), p=[0.17, 0.1] + [0.08] * 9 + [0.01]), direction, rng.choice(ends[:4], n * LANES), \
@@ -358,7 +358,7 @@ def test_packets_with_a_beam_go_the_same_way(name):
 
 @pytest.mark.parametrize("name", CASES)
 def test_a_beam_enters_what_one_of_its_rays_enters(name):
-    # And the masks of the children are those of the box unit, ray by ray; so is what `meets` says of all children together.
+    # The children's masks are the box unit's, ray by ray. So is the result of rays_meeting_root for all children together.
     both = case(name)
     entered = both.scalar.entered.numpy().reshape(-1, LANES, 1) >> np.arange(WIDTH) & 1
     entered = entered.astype(bool) & both.active[..., None]
@@ -368,7 +368,7 @@ def test_a_beam_enters_what_one_of_its_rays_enters(name):
     first = np.where(entered, both.scalar.entries.numpy().reshape(-1, LANES, WIDTH), np.inf).min(axis=1)
     for i in np.flatnonzero(coherent):
         for stack, any_hit in zip(both.stacks, (False, True), strict=True):
-            size = stack[i, 0, 3]  # what `children` says, where no entry is
+            size = stack[i, 0, 3]  # The result of `children`, stored where no entry is.
             assert (stack[i, BELOW:size, ENTRY_RAYS] > 0).all()
             assert not stack[i, :BELOW, :3].any() and not stack[i, size:].any()
             references, begins = stack[i, BELOW:size, 0].view(np.int32), stack[i, BELOW:size, 1].view(np.float32)
@@ -402,14 +402,15 @@ def test_a_beam_has_the_ends_of_all_its_rays(name):
 
 
 def walked(both, reach=np.inf):
-    """(16 n, 9) children of each ray's node as a step and pops should tell them: at most `reach` away, the near first, where
-    entries differ by more than keys leave out; and the entries."""
+    """Return the children of each ray's node in the order of a step and pops, (16 n, 9), and the mask of entered children.
+
+    The children begin at most at `reach`, sorted by their keys."""
     entered = (both.scalar.entered.numpy()[:, None] >> np.arange(WIDTH) & 1).astype(bool)
     entries = np.where(entered, both.scalar.entries.numpy(), np.inf)
     keys = np.where(entered, (entries.view(np.int32) & ~15 | np.arange(WIDTH) + 8).astype(np.int64), 2**40)
     order = np.argsort(keys, axis=1)
     begins = (np.take_along_axis(keys, order, axis=1).clip(0, 2**31 - 1) & ~15).astype(np.int32).view(np.float32)
-    within = np.take_along_axis(entered, order, axis=1) & ((begins <= reach) | (np.arange(WIDTH) == 0))  # the first is not popped
+    within = np.take_along_axis(entered, order, axis=1) & ((begins <= reach) | (np.arange(WIDTH) == 0))  # The first is not popped.
     return np.concatenate([np.where(within, CHILDREN[order], NOTHING), np.full((len(order), 1), NOTHING)], axis=1), entered
 
 
@@ -419,8 +420,9 @@ def test_a_step_and_pops_lead_from_the_near_to_the_far(name):
     expected, entered = walked(both)
     np.testing.assert_array_equal(np.where(entered.any(axis=1, keepdims=True), both.walk, NOTHING), expected)
     assert (both.walk[~entered.any(axis=1), 0] == NOTHING).all()
-    np.testing.assert_array_equal(both.missed, both.walk[:, 1])  # a node without a child that is met is as good as a pop
-    # A key is never farther than the entry, and hardly nearer: no child is dropped that begins before the hit.
+    np.testing.assert_array_equal(both.missed, both.walk[:, 1])  # A node without an entered child is as good as a pop.
+
+    # A key is never farther than the entry, and hardly nearer. So no child that begins before the hit is dropped.
     entries = both.scalar.entries.numpy()[entered]
     begins = (entries.view(np.int32) & ~15).view(np.float32).astype(np.float64)
     assert (begins <= entries).all() and (begins >= entries * (1.0 - 2.0**-19) - 2.0**-144).all()
@@ -513,5 +515,5 @@ def test_lanes_beyond_the_last_ray_are_not_active(count):
 
 
 def test_constants_fit_each_other():
-    assert ENTRY * (STACK_SIZE + 1) <= STACK_WORDS  # a packet's stack, and that of one ray
-    assert SLOTS <= 31 and PACKETS * LANES == 64 and COHERENT == 1 << LANES  # masks of slots, of waiting rays and of lanes
+    assert ENTRY * (STACK_SIZE + 1) <= STACK_WORDS  # Both a packet's stack and a ray's.
+    assert SLOTS <= 31 and PACKETS * LANES == 64 and COHERENT == 1 << LANES  # Masks of slots, of waiting rays and of lanes.
