@@ -1,4 +1,4 @@
-"""The upper level of instances: for each world a binary tree over those in it, all in one array of nodes."""
+"""Upper level of instances: a binary tree for each world, all in one array of nodes."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from wrt.kernels.units.box import PAD_COORDINATE
 
 ROUNDOFF = 2.0**-24
 SLACK = 32.0 * ROUNDOFF  # see kernels.traverse.instances.enter
-BOXES = 1 << 22  # box transforms that finding the instances' own boxes may take
-MOVED_BOXES = 1 << 18  # the same where some are moved, which happens often; their boxes are a little larger
+BOXES = 1 << 22  # box transforms for the boxes of all instances
+MOVED_BOXES = 1 << 18  # for moved instances, which get slightly larger boxes in less time
 MATRICES = 1 << 17  # box transforms at a time
 
 Boxes = tuple[np.ndarray, np.ndarray]  # centers and halves, (G, 3) float64 each
@@ -30,9 +30,12 @@ Boxes = tuple[np.ndarray, np.ndarray]  # centers and halves, (G, 3) float64 each
 
 @dataclass(frozen=True, eq=False)
 class TopLevel:
-    """nodes: (N,) Bvh2Node records, each world's tree with its root first; roots: (W,), where these are; parents: (N,) int32, -1
-    for a root; order: (I,) int32, the instance of each leaf; depth: of the deepest; low, high: (I, 3) float32, the boxes of the
-    instances; spread: (I,), see `spread_of`; placements: (I,) records in the order of the leaves."""
+    """Trees over instances.
+
+    nodes: (N,) Bvh2Node records, each world's tree with its root first. roots: (W,) their rows. parents: (N,) int32, -1 for a root.
+    order: (I,) int32, instance of each leaf. depth: of the deepest tree. low, high: (I, 3) float32, boxes of the instances. spread:
+    (I,), see `spread_of`. placements: (I,) records in the order of the leaves.
+    """
 
     nodes: np.ndarray
     roots: np.ndarray
@@ -50,12 +53,12 @@ class TopLevel:
 
     @property
     def slack(self) -> float:
-        """The part of the distance by which boxes are widened: see kernels.traverse.instances.enter."""
+        """Fraction of the distance by which boxes are widened (kernels.traverse.instances.enter)."""
         return float(np.float32(SLACK * self.spread.max(initial=1.0)))
 
     @property
     def cost(self) -> float:
-        """The sum of the surfaces of all boxes, each over that of its tree's root."""
+        """Sum of the surfaces of all boxes, each divided by that of its tree's root."""
         areas = np.stack([half_areas(self.nodes["lo_" + side], self.nodes["hi_" + side]) for side in "01"])
         of_root = [end(self.nodes[name + "_0"], self.nodes[name + "_1"])[self.roots]
                    for name, end in (("lo", np.minimum), ("hi", np.maximum))]
@@ -64,7 +67,7 @@ class TopLevel:
 
 
 def build_top(geometry: InstancedGeometry, low: np.ndarray, high: np.ndarray) -> TopLevel:
-    """low, high: of each instance's box."""
+    """Build the trees over the boxes of all instances."""
     first = geometry.first_instance
     nodes, order, roots, depth = split_worlds(low, high, first)
     parents = parents_of(upload(nodes, Bvh2Node, start("cpu"))).numpy()
@@ -74,9 +77,9 @@ def build_top(geometry: InstancedGeometry, low: np.ndarray, high: np.ndarray) ->
 
 
 def split_worlds(low: np.ndarray, high: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-    """nodes, order, roots, depth of trees over rows first[w] .. first[w + 1] - 1 of boxes, by binned SAH."""
+    """Build a tree by binned SAH over the boxes [first[w], first[w + 1]) of each world: nodes, order, roots, depth."""
     cpu, count, n = start("cpu"), np.diff(first), len(low)
-    # A tree takes as many slots as it has boxes, or one where it has none.
+    # A tree takes as many slots as it has boxes, at least one.
     slot = np.cumsum([0, *np.maximum(count, 1)])
     nodes = records(Bvh2Node, int(slot[-1]))
     used = np.zeros(len(nodes), np.uint8)
@@ -98,7 +101,7 @@ def split_worlds(low: np.ndarray, high: np.ndarray, first: np.ndarray) -> tuple[
 
 
 def write_placements(top: TopLevel, geometry: InstancedGeometry, rows: np.ndarray) -> TopLevel:
-    """With what the kernels need of those instances, and their spread."""
+    """Return the trees with new placements and spreads of some instances."""
     place = np.empty(len(top.order), np.int64)
     place[top.order] = np.arange(len(top.order))
     placements, spread = top.placements.copy(), top.spread.copy()
@@ -112,12 +115,12 @@ def write_placements(top: TopLevel, geometry: InstancedGeometry, rows: np.ndarra
 
 
 def spread_of(to_world: np.ndarray, to_local: np.ndarray) -> np.ndarray:
-    """How much rounding in a mesh's own space may grow on its way to the world: max sum of a row of |A| |A^-1|, (I,)."""
+    """Return the growth of rounding errors from a mesh's own space to world space: largest row sum of |A| |A^-1|, (I,)."""
     return np.asarray((np.abs(to_world[:, :, :3]) @ np.abs(to_local[:, :, :3])).sum(axis=2).max(axis=1, initial=1.0))
 
 
 def refit_top(top: TopLevel, geometry: InstancedGeometry, rows: np.ndarray, low: np.ndarray, high: np.ndarray) -> TopLevel:
-    """The same trees where those instances, no row twice, have moved; low, high: their boxes."""
+    """Fit the trees to new boxes of some instances, no row twice."""
     cpu, fitting = start("cpu"), Fitting(start("cpu"), len(top.order), len(top.nodes))
     all_low, all_high = top.low.copy(), top.high.copy()
     all_low[rows], all_high[rows] = low, high
@@ -129,10 +132,9 @@ def refit_top(top: TopLevel, geometry: InstancedGeometry, rows: np.ndarray, low:
 
 
 def world_boxes(geometry: InstancedGeometry, rows: np.ndarray, boxes: list[Boxes]) -> tuple[np.ndarray, np.ndarray]:
-    """The box of each of those instances, two (R, 3) float32: of the boxes of its primitives, transformed, and rounded outwards.
+    """Return the box of each instance around the transformed boxes of its primitives: low and high (R, 3) float32.
 
-    A box around a transformed mesh would do for most hits; but t is held to the box of the primitive that is hit, which may
-    stand out of the mesh.
+    A box around the transformed mesh is not enough: a hit has a t in the box of its primitive, which may stick out of the mesh.
     """
     lo, hi = np.full((len(rows), 3), np.inf, np.float32), np.full((len(rows), 3), -np.inf, np.float32)
     for index, (center, half) in enumerate(boxes):
@@ -146,16 +148,17 @@ def world_boxes(geometry: InstancedGeometry, rows: np.ndarray, boxes: list[Boxes
 
 
 def part_boxes(geometry: InstancedGeometry, orders: list[np.ndarray], most: int) -> list[Boxes]:
-    """Boxes that hold those of each part's primitives, so that all instances together have about `most`, but 8 each. orders: of
-    each part's primitives, so that neighbours are near."""
+    """Return boxes around groups of each part's primitives: about `most` for all instances together, at least 8 each.
+
+    orders: order of each part's primitives in which neighbours are near.
+    """
     groups = max(most // max(len(geometry.part), 1), 8)
     corners = [grouped_boxes(part, order, groups) for part, order in zip(geometry.parts, orders, strict=True)]
     return [(0.5 * (low + high), 0.5 * (high - low)) for low, high in corners]
 
 
 def grouped_boxes(geometry: Geometry, order: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray]:
-    """Boxes, no more than about `groups`, two (G, 3) float64, that together hold all boxes of a geometry. order: of prim_ids,
-    so that neighbours are near."""
+    """Return about `groups` boxes that hold all primitives' boxes: low and high (G, 3) float64. order: see `part_boxes`."""
     low, high = (corner.astype(np.float64) for corner in geometry.bounds())
     if len(low) <= groups:
         return low, high
@@ -164,7 +167,7 @@ def grouped_boxes(geometry: Geometry, order: np.ndarray, groups: int) -> tuple[n
 
 
 def rounded_out(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Corners in float64 to float32, outwards, with room for the rounding of the origin's coordinates."""
+    """Round corners outwards to float32, with a margin for the rounding of the origin's coordinates."""
     pad = 2.0 * PAD_COORDINATE * np.maximum(np.abs(low), np.abs(high))
     return np.nextafter((low - pad).astype(np.float32), np.float32(-np.inf)), \
         np.nextafter((high + pad).astype(np.float32), np.float32(np.inf))

@@ -1,12 +1,11 @@
-"""The binary BVH: a binary tree, as its builder made it, and nothing more."""
+"""Binary BVH, as its builder makes it."""
 
 from __future__ import annotations
 
 import math
-import os
 from abc import abstractmethod
 from dataclasses import asdict, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -23,6 +22,7 @@ from wrt.accel.queries.rays import vectors
 from wrt.accel.store import check_binary, save
 from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError
+from wrt.core.types import ArrayLike, PathLike, WarpArray, WarpStruct
 from wrt.kernels.build.shape import write_corners
 from wrt.kernels.structs import Primitive
 from wrt.kernels.traverse import bvh2 as kernels
@@ -31,11 +31,11 @@ RECORDS_PER_JOB = 32768
 
 
 class InPlace(NamedTuple):
-    """What refits in place work with: room; kernels.build.fit.Tree; the Shape that they copy the points into."""
+    """Arrays of refits in place: kernels.build.fit.Tree, and the Shape that they copy the points into."""
 
     fitting: Fitting
-    tree: Any
-    shape: Any
+    tree: WarpStruct
+    shape: WarpStruct
 
 
 class BinaryBvh(OneMesh):
@@ -53,7 +53,7 @@ class BinaryBvh(OneMesh):
 
     @abstractmethod
     def _around(self, nodes: np.ndarray, order: np.ndarray, leaves: int, depth: int) -> Built:
-        """The structure over a tree with boxes: Bvh2Node records."""
+        """Make the structure from Bvh2Node records."""
 
     def _check(self, built: Built) -> None:
         check_binary(built.arrays["nodes"], len(built.order), kernels.STACK_SIZE)
@@ -74,27 +74,27 @@ class Bvh2(BinaryBvh):
     def _around(self, nodes: np.ndarray, order: np.ndarray, leaves: int, depth: int) -> Built:
         return Built({"nodes": nodes}, order, len(nodes), leaves, depth, sah_cost(nodes))
 
-    def _shape(self) -> Any:
-        """The geometry on the device. Its faces stay there for the next time."""
+    def _shape(self) -> WarpStruct:
+        """Upload the geometry. Its faces stay on the device for the next time."""
         shape = self.geometry.on(self.device, self._kept.get("faces"))
         self._kept["faces"] = shape.faces
         return shape
 
     def _on_device(self, built: Built) -> Built:
-        """With arrays that are on the device, and the parents."""
+        """Return the arrays on the device, with the parents."""
         nodes, order = built.arrays["nodes"], built.order
         if not isinstance(order, wp.array):
             nodes, order = upload(nodes.copy(), kernels.Bvh2Node, self.device), upload(order.copy(), wp.int32, self.device)
         return replace(built, arrays={"nodes": nodes}, order=order,
                        parents=parents_of(nodes) if built.parents is None else built.parents)
 
-    def _moved(self, vertices: Any) -> Geometry:
+    def _moved(self, vertices: ArrayLike) -> Geometry:
         if not isinstance(vertices, wp.array):
             return super()._moved(vertices)
         points = wp.clone(self._points(vertices), device=self.device)
         return DeviceGeometry.moved(points, self._shape().faces, self.geometry.spheres)
 
-    def _points(self, vertices: Any) -> Any:
+    def _points(self, vertices: ArrayLike) -> WarpArray:
         points = DeviceGeometry.points_of(vertices, "vertices")
         if len(points) != self.geometry.n_vertices:
             raise InputError(f"must be ({self.geometry.n_vertices},), got ({len(points)},)", argument="vertices")
@@ -103,14 +103,14 @@ class Bvh2(BinaryBvh):
         return points
 
     def _refit(self, built: Built) -> Built:
-        """On the device; to the host comes what the tree costs."""
+        """Refit on the device; only the cost of the tree is copied to the host."""
         built = self._on_device(built)
         nodes = wp.clone(built.arrays["nodes"])
         fitting = Fitting(self.device, len(self.geometry), len(nodes))
         fitting.refit(tree_of(fitting, nodes, built.parents, built.order), self._shape(), self.threads)
         return replace(built, arrays={"nodes": nodes}, sah_cost=fitting.root().sah_cost)
 
-    def _refit_in_place(self, points: Any) -> None:
+    def _refit_in_place(self, points: ArrayLike) -> None:
         points = self._points(points)
         if points.device != self.device or self.structure.units.triangle_test.layout != "corners":
             raise InputError(f"a refit in place is from a Warp array on {self.device}, for the watertight triangle test",
@@ -125,16 +125,16 @@ class Bvh2(BinaryBvh):
         kept.fitting.refit(kept.tree, kept.shape, self.threads)
         self._write_corners(kept.shape, kept.tree.order, self.data.primitives)
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """As OneMesh.save. Of a tree that was refitted in place, what it costs is looked up first."""
+    def save(self, path: PathLike) -> None:
+        """Save as OneMesh.save, with the cost of a tree that was refitted in place."""
         snapshot = self._snapshot
         built = snapshot.arrays
         if math.isnan(built.sah_cost):
             snapshot = replace(snapshot, built=replace(built, sah_cost=sah_cost(built.on_host().arrays["nodes"])))
         save(snapshot, path)
 
-    def _begin_in_place(self, points: Any) -> InPlace:
-        """Arrays of its own for the structure, and what is kept beside them."""
+    def _begin_in_place(self, points: WarpArray) -> InPlace:
+        """Give the structure arrays of its own, and return those that refits in place need."""
         built, spheres = self._on_device(self._snapshot.arrays), self.geometry.spheres
         built = replace(built, arrays={"nodes": wp.clone(built.arrays["nodes"])}, sah_cost=float("nan"))
         moved = DeviceGeometry.moved(wp.clone(points), self._shape().faces, spheres)
@@ -143,8 +143,8 @@ class Bvh2(BinaryBvh):
         self._snapshot = replace(beside.snapshot, changes=True)
         return InPlace(fitting, tree_of(fitting, self.data.nodes, built.parents, built.order), shape)
 
-    def _primitives(self, built: Built) -> Any:
-        """On the device where the order is there, the triangle test reads corners, and primitives have no numbers of their own."""
+    def _primitives(self, built: Built) -> np.ndarray | WarpArray:
+        """Write the records on the device if the order is there and they are plain corners; else on the host."""
         if (not isinstance(built.order, wp.array) or self.structure.units.triangle_test.layout != "corners"
                 or isinstance(self.geometry, NumberedGeometry)):
             return super()._primitives(built.on_host())
@@ -152,10 +152,10 @@ class Bvh2(BinaryBvh):
         self._write_corners(self._shape(), built.order, out)
         return out
 
-    def _write_corners(self, shape: Any, order: Any, out: Any) -> None:
+    def _write_corners(self, shape: WarpStruct, order: WarpArray, out: WarpArray) -> None:
         launch_on(self.device, write_corners, len(order), shape, order, out, None, threads=self.threads, step=RECORDS_PER_JOB)
 
-    def _children(self, built: Built) -> Any:
+    def _children(self, built: Built) -> WarpStruct:
         from wrt.accel.epo import children
 
         nodes = built.arrays["nodes"]

@@ -1,4 +1,4 @@
-"""The builders of binary BVHs: the registry. Binary and wide structures offer them as the option `builder`."""
+"""Registry of builders of binary BVHs: the option `builder` of binary and wide structures."""
 
 from __future__ import annotations
 
@@ -22,6 +22,6 @@ BVH_BUILDERS: Registry[Callable[[Geometry, BvhOptions, int], BinaryTree]] = Regi
 
 
 def build_binary(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
-    """A binary tree over the padded boxes of the geometry. Raises InputError for an unknown builder."""
+    """Build a binary tree over the padded boxes of the geometry. Raises InputError for an unknown builder."""
     BVH_BUILDERS.check(options.builder)
     return BVH_BUILDERS[options.builder](geometry, options, threads)

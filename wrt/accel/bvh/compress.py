@@ -1,5 +1,7 @@
-"""Boxes of wide nodes in 8 bits a plane: Ylitie, Karras and Laine 2017, "Efficient Incoherent Ray Traversal on GPUs Through
-Compressed Wide BVHs", section 3.2; the layout is that of kernels/wide/nodes.py."""
+"""Boxes of wide nodes in 8 bits a plane, in the layout of kernels/wide/nodes.py.
+
+Ylitie, Karras and Laine 2017, "Efficient Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs", section 3.2.
+"""
 
 from __future__ import annotations
 
@@ -13,14 +15,13 @@ EXPONENT_SHIFTS = EXPONENT_BITS * np.arange(3, dtype=np.uint32)  # of the expone
 
 
 def decoded(origin: np.ndarray, step: np.ndarray, byte: np.ndarray) -> np.ndarray:
-    """The planes as kernels take them: one rounding, that of the sum. origin, step: (..., 1) float32; byte: (..., W)."""
+    """Decode planes as kernels do, with one rounding, that of the sum. origin, step: (..., 1) float32; byte: (..., W)."""
     with np.errstate(invalid="ignore", over="ignore"):
         return origin + byte.astype(np.float32) * step
 
 
 def steps(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """The exponents (biased) of the least power of two by which 255 steps lead from low to high or beyond; LARGEST_EXPONENT
-    where none does."""
+    """Return the biased exponent of the least power of two whose 255-fold leads from low to high; LARGEST_EXPONENT if none does."""
     with np.errstate(invalid="ignore", over="ignore"):
         _, exponent = np.frexp((high.astype(np.float64) - low) / LARGEST_BYTE)
         biased = np.clip(np.where(high > low, exponent, -EXPONENT_BIAS) - 1 + EXPONENT_BIAS, 1, LARGEST_EXPONENT)
@@ -35,8 +36,10 @@ def powers(biased: np.ndarray) -> np.ndarray:
 
 
 def compress(lo: np.ndarray, hi: np.ndarray, exists: np.ndarray) -> np.ndarray:
-    """The numbers of each node that stand before its references. lo, hi: (N, W, 3) float32; exists: (N, W) whether there is
-    such a child. Every box that comes out contains the one that went in; an axis on which 8 bits are too few stops no ray."""
+    """Compress boxes to the numbers of a node before its references. lo, hi: (N, W, 3) float32; exists: (N, W) bool.
+
+    Every compressed box contains the original. An axis for which 8 bits are not enough stops no ray.
+    """
     n, width = exists.shape
     low = np.where(exists[..., None], lo, np.float32(np.inf)).min(axis=1)
     high = np.where(exists[..., None], hi, np.float32(-np.inf)).max(axis=1)
@@ -59,7 +62,7 @@ def compress(lo: np.ndarray, hi: np.ndarray, exists: np.ndarray) -> np.ndarray:
 
 
 def nearest(origin: np.ndarray, step: np.ndarray, planes: np.ndarray, upward: bool) -> np.ndarray:
-    """The byte whose plane is the last one not above each plane, or the first one not below it (upward)."""
+    """Return the byte of the last plane not above each given plane, or of the first not below it (upward)."""
     with np.errstate(over="ignore", invalid="ignore"):
         t = (planes.astype(np.float64) - origin) / step.astype(np.float64)
     byte = np.clip(np.where(np.isfinite(t), np.ceil(t) if upward else np.floor(t), 0.0), 0.0, LARGEST_BYTE)
@@ -71,14 +74,13 @@ def nearest(origin: np.ndarray, step: np.ndarray, planes: np.ndarray, upward: bo
 
 
 def existing_children(nodes: np.ndarray, width: int) -> np.ndarray:
-    """(N, W): which children exist, as the nodes' words say."""
+    """Return which children exist, (N, W) bool, from the words of the nodes."""
     word = np.ascontiguousarray(nodes[:, WORD]).view(np.uint32)
     return (word[:, None] >> np.arange(EXIST_SHIFT, EXIST_SHIFT + width, dtype=np.uint32) & 1).astype(bool)
 
 
 def decompress(nodes: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """lo, hi: (N, W, 3) float32, the boxes as kernels take them: empty where there is no child, endless on axes that stop
-    no ray."""
+    """Return the boxes as kernels decode them, lo and hi (N, W, 3): empty without a child, infinite on axes that stop no ray."""
     n = len(nodes)
     word = np.ascontiguousarray(nodes[:, WORD]).view(np.uint32)
     step = powers(word[:, None] >> EXPONENT_SHIFTS & LARGEST_EXPONENT)

@@ -1,4 +1,4 @@
-"""The surface of 14-DOPs (kernels/units/kdop.py), in closed form, for many at once: what the surface area heuristic wants."""
+"""Surface areas of 14-DOPs (kernels/units/kdop.py) in closed form, for the surface area heuristic."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ Bounds = tuple[np.ndarray, np.ndarray]
 
 
 def kdop_areas(nodes: np.ndarray, middle: np.ndarray) -> np.ndarray:
-    """The surfaces of both children of KdopNode records, (2, N) float64: 0 where there is none, inf where it is not finite."""
+    """Return the surface of both children of KdopNode records, (2, N) float64: 0 without a child, inf if it is not finite."""
     out = np.empty((2, len(nodes)))
     for i, side in enumerate("01"):
         lo, hi = (nodes[f"{end}_{side}"].astype(np.float64) - middle for end in ("lo", "hi"))
@@ -21,9 +21,9 @@ def kdop_areas(nodes: np.ndarray, middle: np.ndarray) -> np.ndarray:
 
 
 def kdop_area(lo: np.ndarray, hi: np.ndarray, cut_lo: np.ndarray, cut_hi: np.ndarray) -> np.ndarray:
-    """(N,) of boxes lo, hi, (N, 3), between planes cut_lo, cut_hi, (N, 4), along the diagonals of `project`."""
+    """Return the surface (N,) of boxes lo, hi, (N, 3), between planes cut_lo, cut_hi, (N, 4), along the diagonals of `project`."""
     axes = [(lo[:, i], hi[:, i]) for i in range(3)]
-    # A plane that cuts nothing off touches the box: one far away would cost all digits.
+    # A plane that cuts nothing off is moved to the box: far away, it would cost all digits.
     cuts = [(np.maximum(cut_lo[:, k], np.minimum(sign * lo, sign * hi).sum(axis=1)),
              np.minimum(cut_hi[:, k], np.maximum(sign * lo, sign * hi).sum(axis=1))) for k, sign in enumerate(DIAGONALS)]
     total = np.zeros(len(lo))
@@ -47,13 +47,13 @@ def negated(bounds: Bounds) -> Bounds:
 
 
 def quarter(t: np.ndarray) -> np.ndarray:
-    """The area below the diagonal z = t - y of the quarter y, z >= 0."""
+    """Return the area below the diagonal z = t - y of the quarter y, z >= 0."""
     t = np.maximum(t, 0.0)
     return 0.5 * t * t
 
 
 def box_face(x: np.ndarray, y: Bounds, z: Bounds, sum_all: Bounds, minus_x: Bounds, minus_y: Bounds, minus_z: Bounds) -> np.ndarray:
-    """What of the rectangle y, z at x is within the four slabs of (x + y + z), (-x + y + z), (x - y + z) and (x + y - z)."""
+    """Return the area of the rectangle y, z at x within the slabs of all four diagonals."""
     up = np.maximum(sum_all[0] - x, minus_x[0] + x), np.minimum(sum_all[1] - x, minus_x[1] + x)  # y + z
     across = np.maximum(minus_y[0] - x, x - minus_z[1]), np.minimum(minus_y[1] - x, x - minus_z[0])  # z - y
     area = (below(y, z, up[1], across[1]) - below(y, z, up[0], across[1])
@@ -62,7 +62,7 @@ def box_face(x: np.ndarray, y: Bounds, z: Bounds, sum_all: Bounds, minus_x: Boun
 
 
 def below(y: Bounds, z: Bounds, q: np.ndarray, s: np.ndarray) -> np.ndarray:
-    """The area of the rectangle y, z where y + z <= q and z - y <= s: a tent over y whose ridge is at (q - s) / 2."""
+    """Return the area of the rectangle y, z where y + z <= q and z - y <= s: a tent over y with its ridge at (q - s) / 2."""
     ridge = np.clip(0.5 * (q - s), y[0], y[1])
     height = z[1] - z[0]
 
@@ -75,7 +75,10 @@ def below(y: Bounds, z: Bounds, q: np.ndarray, s: np.ndarray) -> np.ndarray:
 
 
 def askew_faces(axes: list[Bounds], cuts: list[Bounds]) -> np.ndarray:
-    """Both faces across the first diagonal: hexagons, seen along x as a rectangle in y and z between two lines y + z = const."""
+    """Return the area of both faces across the first diagonal.
+
+    They are hexagons, seen along x as a rectangle in y and z between two lines y + z = const.
+    """
     (x0, x1), total = axes[0], np.zeros(len(axes[0][0]))
     for end in (0, 1):
         b = cuts[0][end]

@@ -1,25 +1,24 @@
-"""The builder along a Morton curve, which works on any device (the kernels are kernels/build/lbvh.py)."""
+"""Builder along a Morton curve, for any device (kernels: kernels/build/lbvh.py)."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import warp as wp
 
-from wrt.accel.bvh.refit import Fitting, tree_of
+from wrt.accel.bvh.refit import Fitting, Root, tree_of
 from wrt.accel.bvh.top_down import build_options
 from wrt.accel.bvh.tree import BinaryTree, BvhOptions, small_tree
 from wrt.accel.geometry import Geometry
 from wrt.core.device import launch_on, on_host, start
 from wrt.core.errors import InputError
+from wrt.core.types import Device, WarpArray, WarpStruct
 from wrt.kernels.build import lbvh as kernels
 from wrt.kernels.traverse.bvh2 import Bvh2Node
 
-MOST = 1 << 30  # the sort has room for two of each
+MOST = 1 << 30  # the sort needs two entries for each primitive
 
 
 def build_lbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
-    """The least work, and the worst tree but for the median's."""
+    """Build with the least work; the tree is better than the median's only."""
     if len(geometry) <= 1:
         return small_tree(*geometry.bounds())
     cpu = start("cpu")
@@ -27,9 +26,12 @@ def build_lbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryT
     return BinaryTree(on_host(nodes).copy(), order.numpy().copy(), root.height)
 
 
-def build_on(device: Any, shape: Any, options: BvhOptions, threads: int = 1) -> tuple[Any, Any, Any, Any]:
-    """Bvh2Node records, the parent of each, the prim_id of each primitive of the leaves (Warp arrays on the device), and a Root,
-    over a Shape of two primitives or more. Of a GPU nothing else comes to the host."""
+def build_on(device: Device, shape: WarpStruct, options: BvhOptions,
+             threads: int = 1) -> tuple[WarpArray, WarpArray, WarpArray, Root]:
+    """Build over a Shape of two primitives or more: Bvh2Node records, their parents, prim_ids of the leaves, and a Root.
+
+    The arrays stay on the device.
+    """
     n = len(shape.faces) + len(shape.spheres)
     if n >= MOST:
         raise InputError(f"lbvh takes fewer than {MOST} primitives, got {n}", argument="builder")

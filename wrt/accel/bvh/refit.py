@@ -1,14 +1,15 @@
-"""Binary trees that follow their vertices, on any device (the kernels are kernels/build/fit.py)."""
+"""Refits of binary trees on any device (kernels: kernels/build/fit.py)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import warp as wp
 
 from wrt.accel.bvh.tree import half_areas
 from wrt.core.device import launch_on, on_host
+from wrt.core.types import Device, WarpArray, WarpStruct
 from wrt.kernels.build import fit as kernels
 from wrt.kernels.build.records import BuildOptions
 from wrt.kernels.build.shape import bounds
@@ -17,7 +18,7 @@ PRIMITIVES_PER_JOB = 32768
 
 
 class Root(NamedTuple):
-    """What the host asks of a whole tree. used: inner nodes; height: of these on the longest way; sah_cost: as in AccelStats."""
+    """Figures of a whole tree. used: inner nodes; height: of these on the longest path; sah_cost: as in AccelStats."""
 
     used: int
     height: int
@@ -26,9 +27,9 @@ class Root(NamedTuple):
 
 @dataclass(eq=False)
 class Fitting:
-    """Room on a device to fit a tree of so many nodes around so many primitives: taken once, used as often as they move."""
+    """Arrays on a device to fit a tree around its primitives, used again for every refit."""
 
-    device: Any
+    device: Device
     primitives: int
     nodes: int
 
@@ -37,32 +38,31 @@ class Fitting:
         self.arrived = wp.zeros(self.nodes, dtype=wp.int32, device=self.device)
         self.below = wp.empty(self.nodes, dtype=kernels.Below, device=self.device)
 
-    def find_bounds(self, shape: Any, threads: int = 1) -> None:
-        """Of each primitive of a kernels.build.shape.Shape."""
+    def find_bounds(self, shape: WarpStruct, threads: int = 1) -> None:
+        """Compute the box of each primitive of a kernels.build.shape.Shape."""
         launch_on(self.device, bounds, self.primitives, shape, self.low, self.high, None, threads=threads, step=PRIMITIVES_PER_JOB)
 
-    def fit(self, tree: Any, options: Any = None) -> None:
-        """options: None: no subtree becomes a leaf."""
+    def fit(self, tree: WarpStruct, options: WarpStruct | None = None) -> None:
+        """Fit the boxes of the tree; with options, subtrees become leaves where that costs less."""
         if options is None:
             options = BuildOptions()
             options.row = 1
         launch_on(self.device, kernels.fit, self.nodes, tree, options)
 
-    def refit(self, tree: Any, shape: Any, threads: int = 1) -> None:
-        """Only the boxes change. Boxes of spatial splits become those of the whole triangles. On a GPU two launches and nothing
-        else: a graph can capture them."""
+    def refit(self, tree: WarpStruct, shape: WarpStruct, threads: int = 1) -> None:
+        """Fit the boxes to the shape; those of spatial splits become the boxes of whole triangles. A graph can capture it."""
         self.find_bounds(shape, threads)
         self.fit(tree)
 
     def root(self) -> Root:
-        """Of the tree that was fitted last."""
+        """Return the figures of the tree that was fitted last."""
         root = on_host(self.below[:1])[0]
         area, plain = float(half_areas(root["lo"], root["hi"])), float(root["plain"])
         return Root(int(root["used"]), int(root["height"]), plain / area if area > 0.0 else float(root["size"]))
 
 
-def tree_of(fitting: Fitting, nodes: Any, parents: Any, order: Any) -> Any:
-    """kernels.build.fit.Tree."""
+def tree_of(fitting: Fitting, nodes: WarpArray, parents: WarpArray | None, order: WarpArray) -> WarpStruct:
+    """Make a kernels.build.fit.Tree."""
     tree = kernels.Tree()
     tree.nodes, tree.parents, tree.order = nodes, parents, order
     for name in ("low", "high", "arrived", "below"):
@@ -70,8 +70,8 @@ def tree_of(fitting: Fitting, nodes: Any, parents: Any, order: Any) -> Any:
     return tree
 
 
-def parents_of(nodes: Any) -> Any:
-    """Of each of Bvh2Node records on a device, there; kernels.build.fit.NO_PARENT of a root."""
+def parents_of(nodes: WarpArray) -> WarpArray:
+    """Return the parent of each Bvh2Node record on the device; kernels.build.fit.NO_PARENT for a root."""
     parents = wp.full(len(nodes), kernels.NO_PARENT, dtype=wp.int32, device=nodes.device)
     launch_on(nodes.device, kernels.find_parents, len(nodes), nodes, parents)
     return parents

@@ -1,9 +1,9 @@
-"""The optimiser of finished trees by reinsertion (the loops are Warp kernels, kernels/build/reinsertion.py)."""
+"""Optimisation of finished trees by reinsertion (kernels: kernels/build/reinsertion.py)."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -12,18 +12,22 @@ from wrt.accel.bvh.top_down import build_binned, build_options
 from wrt.accel.bvh.tree import BinaryTree, BvhOptions
 from wrt.accel.geometry import Geometry
 from wrt.core.device import launch, on_host, preloading, records, start, upload
+from wrt.core.types import WarpArray, WarpStruct
 from wrt.kernels.build import reinsertion as kernels
 from wrt.kernels.build.shape import half_area
 from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node
 
 NODES_PER_LAUNCH = 256
-# A subtree of so many primitives or fewer is moved as a whole, where only the largest are: wide rows are filled again afterwards.
+# With LARGEST_NODES, subtrees of so many primitives move as a whole; the collapse fills wide rows afterwards.
 SMALL_LEAF = 4
 
 
 class Effort(NamedTuple):
-    """share: of all nodes, the largest, whose places are searched for in a round; rounds: the most; least_gain: a round that
-    takes off less than this share of the areas is the last one."""
+    """Extent of the optimisation.
+
+    share: fraction of the nodes, the largest ones, that a round tries to move. rounds: at most. least_gain: a round that reduces the
+    sum of areas by a smaller fraction is the last.
+    """
 
     share: float
     rounds: int
@@ -35,7 +39,7 @@ LARGEST_NODES = Effort(0.03, 8, 1e-2)
 
 
 def build_reinsertion(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
-    """Binned SAH down to single primitives, optimised by reinsertion (Meister and Bittner 2018), then collapsed into leaves."""
+    """Build by binned SAH down to single primitives, optimise by reinsertion, and collapse into leaves (Meister, Bittner 2018)."""
     tree = build_binned(geometry, replace(options, max_leaf=1), threads)
     if len(tree.nodes) < 2:
         return tree
@@ -44,10 +48,10 @@ def build_reinsertion(geometry: Geometry, options: BvhOptions, threads: int) -> 
 
 
 def build_refined(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
-    """Binned SAH, and the largest boxes put where they add least: most of what reinsertion brings, in a tenth of its time.
+    """Build by binned SAH and reinsert the largest boxes: most of the gain of full reinsertion in a tenth of its time.
 
-    That few nodes are worth it, those that cost most, is from Bittner, Hapala and Havran 2013, "Fast Insertion-Based
-    Optimization of Bounding Volume Hierarchies"."""
+    Bittner, Hapala and Havran 2013, "Fast Insertion-Based Optimization of Bounding Volume Hierarchies".
+    """
     leaf = min(options.max_leaf, SMALL_LEAF)
     with preloading(*([kernels.find_moves, kernels.make_moves, kernels.walk_down] if len(geometry) > leaf else [])):
         tree = build_binned(geometry, replace(options, max_leaf=leaf), threads)
@@ -58,7 +62,7 @@ def build_refined(geometry: Geometry, options: BvhOptions, threads: int) -> Bina
 
 
 def leaf_begins(tree: BinaryTree) -> np.ndarray:
-    """Whether a leaf begins at a record, (R,) bool."""
+    """Return whether a leaf begins at each record, (R,) bool."""
     begins = np.zeros(len(tree.order), bool)
     for side in ("0", "1"):
         begins[tree.nodes["first_" + side][tree.nodes["count_" + side] > 0]] = True
@@ -66,7 +70,7 @@ def leaf_begins(tree: BinaryTree) -> np.ndarray:
 
 
 def links_of(tree: BinaryTree) -> np.ndarray:
-    """The nodes of a tree as links: inner ones first, then the leaves in the order of their records."""
+    """Convert a tree to links: inner nodes first, then the leaves in the order of their records."""
     nodes, n_inner = tree.nodes, len(tree.nodes)
     links, number = records(kernels.Link, 2 * n_inner + 1), np.cumsum(leaf_begins(tree), dtype=np.int32) - 1
     links["left"], links["right"] = -1, -1
@@ -92,16 +96,17 @@ def half_areas(links: np.ndarray, scale: np.float32) -> np.ndarray:
 
 
 def scale_of(links: np.ndarray) -> np.float32:
-    """What boxes are multiplied by, so that the root's longest edge is 2; 0 where it is not finite."""
+    """Return the factor that makes the root's longest edge 2; 0 for an infinite root."""
     with np.errstate(over="ignore"):
         extent = (np.float32(0.5) * links["hi"][0] - np.float32(0.5) * links["lo"][0]).max()
     return np.float32(1.0) / max(extent, np.float32(2.0**-126)) if np.isfinite(extent) else np.float32(0.0)
 
 
-def optimized(tree: BinaryTree, effort: Effort, threads: int) -> tuple[Any, Any, float]:
-    """The links of the tree with less area in their boxes, the walk down to them, and the share of the areas that is gone.
+def optimized(tree: BinaryTree, effort: Effort, threads: int) -> tuple[WarpArray, WarpStruct, float]:
+    """Return the optimised links, the walk down to them, and the fraction of the areas that is gone.
 
-    The optimiser knows nothing of depth: where the tree becomes deeper than the stack, half as many rounds are made."""
+    If the tree becomes deeper than the stack, the optimisation begins again with half as many rounds.
+    """
     before, rounds = links_of(tree), effort.rounds
     while True:
         links = upload(before.copy(), kernels.Link, start("cpu"))
@@ -112,9 +117,11 @@ def optimized(tree: BinaryTree, effort: Effort, threads: int) -> tuple[Any, Any,
         rounds //= 2
 
 
-def move(links: Any, effort: Effort, rounds: int, threads: int) -> float:
-    """Rounds: the best place of each large node is searched for, then the moves are made, the best first. The share of the areas
-    that is gone in the end."""
+def move(links: WarpArray, effort: Effort, rounds: int, threads: int) -> float:
+    """In each round, search the best place of each large node, and make the moves, the best first.
+
+    Return the fraction of the areas that is gone.
+    """
     cpu = start("cpu")
     view = on_host(links)
     scale = scale_of(view)
@@ -138,7 +145,7 @@ def move(links: Any, effort: Effort, rounds: int, threads: int) -> float:
 
 
 def largest(links: np.ndarray, areas: np.ndarray, share: float) -> np.ndarray:
-    """Those of the largest nodes that can be moved, (K,) int32: not the root and its children, whose parent is the root."""
+    """Return the largest nodes that can be moved, (K,) int32: not the root and its children."""
     movable = links["parent"] > 0
     most = int(share * len(links))
     if share < 1.0 and 0 < most < len(links):
@@ -146,7 +153,7 @@ def largest(links: np.ndarray, areas: np.ndarray, share: float) -> np.ndarray:
     return np.flatnonzero(movable).astype(np.int32)
 
 
-def walk_down(links: Any) -> Any:
+def walk_down(links: WarpArray) -> WarpStruct:
     cpu = start("cpu")
     walk = kernels.Walk()
     for name in ("order", "level", "count"):
@@ -157,8 +164,8 @@ def walk_down(links: Any) -> Any:
     return walk
 
 
-def with_leaves(tree: BinaryTree, links: np.ndarray, walk: Any) -> BinaryTree:
-    """The links as a tree, with the leaves of the one that they were made of. Records of a subtree stand next to each other."""
+def with_leaves(tree: BinaryTree, links: np.ndarray, walk: WarpStruct) -> BinaryTree:
+    """Convert links to a tree with the leaves of the original tree. Records of a subtree are adjacent."""
     n_inner, order = len(tree.nodes), walk.order.numpy()
     before, begins, counts = np.zeros((3, len(links)), np.int32)
     before[n_inner:] = np.flatnonzero(leaf_begins(tree))
@@ -170,8 +177,7 @@ def with_leaves(tree: BinaryTree, links: np.ndarray, walk: Any) -> BinaryTree:
 
 
 def nodes_of(links: np.ndarray, inner: np.ndarray, begins: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Bvh2Node records of inner links, parents first; begins, counts: of each link that is a leaf, its first record and how many
-    there are."""
+    """Make Bvh2Node records of inner links, parents first. begins, counts: first record and number of records of each leaf."""
     nodes, boxes = records(Bvh2Node, len(inner)), np.concatenate([links["lo"], links["hi"]], axis=1)
     begins[inner], counts[inner] = np.arange(len(inner)), 0
     for side, name in (("0", "left"), ("1", "right")):
@@ -182,11 +188,11 @@ def nodes_of(links: np.ndarray, inner: np.ndarray, begins: np.ndarray, counts: n
     return nodes
 
 
-def collapse(tree: BinaryTree, links: Any, walk: Any, options: BvhOptions) -> BinaryTree:
-    """Subtrees become leaves wherever that costs no more; the depth is that of what is left. tree: with one record a leaf."""
+def collapse(tree: BinaryTree, links: WarpArray, walk: WarpStruct, options: BvhOptions) -> BinaryTree:
+    """Collapse subtrees of a tree with one record a leaf into leaves wherever that costs no more."""
     launch(kernels.weigh, 1, links, walk, build_options(options), scale_of(on_host(links)))
     rows, order, counts = on_host(links), walk.order.numpy(), walk.count.numpy().copy()
-    # The links below one, 2 count - 2 of them, come next in the walk: of a leaf, they are inside it.
+    # The 2 count - 2 links below a link come next in the walk: those below a leaf are inside it.
     leaf, after = rows["left"][order] < 0, np.arange(1, len(order) + 1)
     change = np.bincount(after[leaf], minlength=len(order) + 1)
     inside = np.cumsum(change - np.bincount((after + 2 * counts[order] - 2)[leaf], minlength=len(order) + 1))[:-1] > 0

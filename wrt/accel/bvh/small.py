@@ -1,4 +1,4 @@
-"""Wide trees over few primitives, made in Python: to load a builder's kernels takes as long, and to compile them much longer."""
+"""Wide trees over few primitives in Python: loading the builders' kernels takes as long, and compiling them much longer."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ SMALL = 128  # primitives
 
 
 class _Choice(NamedTuple):
-    """Of a subtree, to be at most some number of children of a node: what they cost, how many they are, and how many of these are
-    from its first part; none of them where the subtree is one child."""
+    """Best way to make a subtree at most some number of children of a node.
+
+    cost: of these children. children: their number. first: how many of them come from the first part; 0: the subtree is one child.
+    """
 
     cost: float
     children: int
@@ -23,8 +25,10 @@ class _Choice(NamedTuple):
 
 
 class _Subtree:
-    """Of a binary tree: items (n,), their boxes lo, hi (n, 3), and half the surface of the box around them. parts: two where there
-    are two items, once it is split. choices: for at most 1, 2, .. children; opened: the best where it is not one."""
+    """Subtree of a binary tree: items (n,), their boxes lo, hi (n, 3), and half the surface of the box around them.
+
+    parts: its two children once it is split. choices: for at most 1, 2, .. children. opened: the best choice of two or more.
+    """
 
     parts: list[_Subtree]
     choices: list[_Choice]
@@ -32,12 +36,12 @@ class _Subtree:
 
     def __init__(self, items: np.ndarray, lo: np.ndarray, hi: np.ndarray, area: float, options: BvhOptions) -> None:
         self.items, self.lo, self.hi, self.area, self.options = items, lo, hi, area, options
-        # A ray by itself tests a row's primitives at once, a packet one after another: a leaf costs half its rows, half its items.
+        # Single rays test a row's primitives at once, packets one after another: a leaf costs half its rows and half its items.
         rows = 0.5 * -(-len(items) // options.row) + 0.5 * len(items) / options.row
         self.leaf_cost = options.cost_intersection * rows * area if len(items) <= options.max_leaf else np.inf
 
     def split(self) -> None:
-        """Where a sweep along each axis finds the least cost; of several such places, where the parts are most equal."""
+        """Split where a sweep along the axes finds the least cost; of equal costs, where the parts are most equal."""
         n, self.parts = len(self.items), []
         if n == 1:
             return
@@ -56,7 +60,7 @@ class _Subtree:
                       for part, area in ((order[: k + 1, axis], below), (order[k + 1 :, axis], above))]
 
     def choose(self) -> None:
-        """After its parts have: as kernels.build.wide does, the least cost for every number of children."""
+        """Find the least cost for every number of children, as kernels.build.wide does, after the parts have."""
         self.choices = [_Choice(self.leaf_cost, 1, 0)]
         self.opened = _Choice(np.inf, 0, 0)
         if self.parts:
@@ -72,7 +76,7 @@ class _Subtree:
         self.choices += self.choices[-1:] * (self.options.row - len(self.choices))
 
     def _is_leaf_beside(self, cost: float) -> bool:
-        """Whether a leaf is no worse than what costs so much, which may be inf as a leaf of too many is."""
+        """Return whether a leaf costs no more than `cost`, which may be inf."""
         return len(self.items) == 1 or (len(self.items) <= self.options.max_leaf and self.leaf_cost <= cost)
 
     @property
@@ -86,16 +90,17 @@ class _Subtree:
         return first.roots(first.choices[choice.first - 1]) + second.roots(second.choices[choice.children - choice.first - 1])
 
     def children(self) -> list[_Subtree]:
-        """Of the node over this subtree, from the one to visit last to the one to visit first by a ray that asks for any hit: inner
-        nodes, leaves; and large boxes after small ones."""
+        """Return the children of the node over this subtree in reverse order of an any-hit ray: inner nodes, leaves; small, large."""
         if self._is_leaf_beside(self.opened.cost):
             return [self]
         return sorted(self.roots(self.opened), key=lambda child: (child.is_leaf, child.area))
 
 
 def small_tree(lo: np.ndarray, hi: np.ndarray, options: BvhOptions) -> WideTree:
-    """The wide tree over boxes lo, hi (n, 3) float32, with options.row children a node: a binary tree by the surface area heuristic
-    (MacDonald and Booth 1990) down to single boxes, collapsed at least cost."""
+    """Build the wide tree over boxes lo, hi (n, 3) float32, with options.row children a node.
+
+    A binary tree by the surface area heuristic (MacDonald and Booth 1990) down to single boxes is collapsed at least cost.
+    """
     width = options.row
     subtrees = []
     if len(lo):

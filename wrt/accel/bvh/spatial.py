@@ -1,4 +1,4 @@
-"""The builder with spatial splits (the loop is a Warp kernel, kernels/build/sbvh.py)."""
+"""Builder with spatial splits (kernel: kernels/build/sbvh.py)."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ MAX_BUDGET = 8.0
 
 
 def build_sbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
-    """Spatial splits where the sides of an object split overlap (Stich et al. 2009); a primitive may be in several leaves.
+    """Build with spatial splits where the sides of an object split overlap (Stich et al. 2009).
 
-    Raises InputError for a split_budget above MAX_BUDGET.
+    A primitive may be in several leaves. Raises InputError for a split_budget above MAX_BUDGET.
     """
     if options.split_budget > MAX_BUDGET:
         raise InputError(f"must be at most {MAX_BUDGET:g}, got {options.split_budget}", argument="split_budget")
@@ -39,14 +39,14 @@ def build_sbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryT
         data.scale = 1.0 / max(half.max(), 2.0**-126)
         x, y, z = half * data.scale
         area = options.split_alpha * (x * y + y * z + z * x)
-    # Where a scene has no end there is no split that is worth it.
+    # An infinite scene gets no spatial splits.
     data.min_overlap = min(area, 3e38) if np.isfinite(area) else 3e38
     depth = run_tasks(make_build_ranges(split_references, take_room), data, build_options(options), n, threads, room)
     return compact(data, depth)
 
 
 def compact(data: build_records.BuildData, depth: int) -> BinaryTree:
-    """The tree without the room between its leaves."""
+    """Return the tree without the gaps between its leaves."""
     used = data.left.numpy() != 0
     nodes = squeeze(on_host(data.nodes), data.used.numpy() != 0)
     index = np.cumsum(used, dtype=np.int32) - 1

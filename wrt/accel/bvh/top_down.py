@@ -1,4 +1,4 @@
-"""Builders from the top down, which split ranges of primitives in place (the loops are Warp kernels, kernels/build/bvh2.py)."""
+"""Top-down builders, which split ranges of primitives in place (kernels: kernels/build/bvh2.py)."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from wrt.accel.bvh.tree import BinaryTree, BvhOptions, small_tree, squeeze
 from wrt.accel.geometry import Geometry
 from wrt.core.device import load_kernel, on_host, records, start, upload
 from wrt.core.threads import run_growing
+from wrt.core.types import Kernel, WarpStruct
 from wrt.kernels.build import bvh2 as build_bvh2
 from wrt.kernels.build import records as build_records
 from wrt.kernels.traverse.bvh2 import Bvh2Node
@@ -19,17 +20,17 @@ from wrt.kernels.warp_private import fields_of
 
 
 def build_binned(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
-    """Binned SAH (Wald 2007): fast, and within a few per cent of the full sweep."""
+    """Build by binned SAH (Wald 2007): fast, and within a few per cent of the full sweep."""
     return split_ranges("binned", primitive_records(geometry, threads), options, threads)
 
 
 def build_median(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
-    """Object median along the longest axis: what there was before the surface area heuristic."""
+    """Build by object medians along the longest axis, without the surface area heuristic."""
     return split_ranges("median", primitive_records(geometry, threads), options, threads)
 
 
 def build_sweep(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
-    """Full-sweep SAH: every split of a range by centroid, along all three axes."""
+    """Build by full-sweep SAH: every split of a range by centroid, along all three axes."""
     lo, hi = geometry.bounds(threads)
     center = 0.5 * lo + 0.5 * hi
     n = len(lo)
@@ -40,7 +41,7 @@ def build_sweep(geometry: Geometry, options: BvhOptions, threads: int) -> Binary
 
 
 def primitive_records(geometry: Geometry, threads: int) -> np.ndarray:
-    """BuildRecords of all primitives."""
+    """Make BuildRecords of all primitives."""
     build = records(build_records.BuildRecord, len(geometry))
     build["prim_id"] = np.arange(len(geometry))
     geometry.bounds(threads, out=(build["lo"], build["hi"]))
@@ -48,15 +49,15 @@ def primitive_records(geometry: Geometry, threads: int) -> np.ndarray:
 
 
 def in_order(lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
-    """BuildRecords of the boxes lo, hi (N, 3) float32, in the order of prim_id."""
+    """Make BuildRecords of boxes lo, hi (N, 3) float32, in the order of prim_id."""
     build = records(build_records.BuildRecord, len(lo))
     build["prim_id"], build["lo"], build["hi"] = np.arange(len(lo)), lo, hi
     return build
 
 
-def build_data(**arrays: np.ndarray) -> Any:
-    """kernels.build.records.BuildData with these of its arrays."""
-    data: Any = build_records.BuildData()
+def build_data(**arrays: np.ndarray) -> WarpStruct:
+    """Make kernels.build.records.BuildData with these arrays."""
+    data: WarpStruct = build_records.BuildData()
     for name, array in arrays.items():
         setattr(data, name, upload(array, fields_of(build_records.BuildData)[name].dtype, start("cpu")))
     return data
@@ -72,19 +73,19 @@ def split_ranges(builder: str, build: np.ndarray, options: BvhOptions, threads: 
     return BinaryTree(squeeze(on_host(data.nodes), data.used.numpy() != 0), on_host(data.records)["prim_id"].copy(), depth)
 
 
-def build_options(options: BvhOptions) -> Any:
-    """What kernels take of the options."""
+def build_options(options: BvhOptions) -> WarpStruct:
+    """Convert the options for kernels."""
     out = build_records.BuildOptions()
     out.max_leaf, out.row = options.max_leaf, options.row
     out.cost_traversal, out.cost_intersection = options.cost_traversal, options.cost_intersection
     return out
 
 
-def run_tasks(kernel: Any, data: Any, settings: Any, n: int, threads: int, room: int = 0) -> int:
-    """Build the tree over records 0 .. n - 1 on all threads; its depth.
+def run_tasks(kernel: Kernel, data: WarpStruct, settings: WarpStruct, n: int, threads: int, room: int = 0) -> int:
+    """Build the tree over n records on all threads, and return its depth. The tree does not depend on threads.
 
-    room: how many records there is room for, where references may be duplicated. A large range is split into halves or less,
-    which are tasks of their own: the tree is the same for any number of threads.
+    room: number of records that fit, for builders that duplicate references. A large range is split into halves or less, which
+    are tasks of their own.
     """
     cpu = start("cpu")
     load_kernel(kernel, cpu)
@@ -94,7 +95,7 @@ def run_tasks(kernel: Any, data: Any, settings: Any, n: int, threads: int, room:
     def begin(task: np.ndarray) -> tuple[Any, Any]:
         size = int(task["end"][0] - task["begin"][0])
         stop = max(size // 2, least) if threads > 1 and size > least else 0
-        # Ranges of two or more records that do not overlap: there can be no more of them than this.
+        # Disjoint ranges of two or more records: there cannot be more of them.
         most = (max(int(task["limit"][0]), int(task["end"][0])) - int(task["begin"][0])) // 2 if stop else 1
         left_over = wp.empty(most, dtype=build_records.BuildTask, device=cpu)
         count, depth = (wp.zeros(1, dtype=wp.int32, device=cpu) for _ in range(2))

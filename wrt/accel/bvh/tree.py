@@ -1,4 +1,4 @@
-"""What builders of binary BVHs take and give, and the surface area heuristic that they are judged by."""
+"""Options and trees of binary BVH builders, and the surface area heuristic."""
 
 from __future__ import annotations
 
@@ -16,10 +16,12 @@ MAX_LEAF = 64
 
 @dataclass(frozen=True)
 class BinaryOptions:
-    """builder: a name in BVH_BUILDERS; max_leaf: 1 to 64 primitives; cost_traversal, cost_intersection: of the SAH, of one node
-    visited and one primitive tested. Of spatial splits (builder "sbvh"): split_alpha: the overlap of an object split, as a share
-    of the root's area, from which a plane is tried (Stich et al. 2009); split_budget: how many references there may be beyond
-    one a primitive, as a share of the primitives."""
+    """Options of binary structures.
+
+    builder: a name in BVH_BUILDERS. max_leaf: 1 to 64 primitives. cost_traversal, cost_intersection: SAH cost of a node visited and
+    of a primitive tested. For builder "sbvh", as fractions: split_alpha is the overlap of an object split over the root's area from
+    which spatial splits are tried (Stich et al. 2009). split_budget is the number of additional references over primitives.
+    """
 
     builder: str = "binned"
     max_leaf: int = 4
@@ -31,8 +33,10 @@ class BinaryOptions:
 
 @dataclass(frozen=True)
 class BvhOptions(BinaryOptions):
-    """What builders take: as told, and row: primitives that are tested at once, so that a leaf costs as many tests as it has rows.
-    Raises InputError for values out of range."""
+    """Options of builders, with the number of primitives that are tested at once (`row`): a leaf costs as many tests as it has rows.
+
+    Raises InputError for values out of range.
+    """
 
     row: int = 1
 
@@ -47,8 +51,11 @@ class BvhOptions(BinaryOptions):
 
 @dataclass(frozen=True, eq=False)
 class BinaryTree:
-    """nodes: (N,) Bvh2Node records, the root first, a parent before its children; order: (R,) int32, the prim_id of each
-    record of the leaves, where one may stand more than once; depth: inner nodes on the longest way from the root."""
+    """A binary tree.
+
+    nodes: (N,) Bvh2Node records, each parent before its children. order: (R,) int32, prim_id of each record of the leaves, where one
+    may occur several times. depth: inner nodes on the longest path from the root.
+    """
 
     nodes: np.ndarray
     order: np.ndarray
@@ -60,7 +67,7 @@ class BinaryTree:
 
 
 def small_tree(lo: np.ndarray, hi: np.ndarray) -> BinaryTree:
-    """The tree over no box or one: a root with nothing to split. lo, hi: (0 or 1, 3) float32."""
+    """Return the tree over no box or one. lo, hi: (0 or 1, 3) float32."""
     nodes = records(Bvh2Node, 1)
     nodes["lo_0"], nodes["hi_0"], nodes["lo_1"], nodes["hi_1"] = np.inf, -np.inf, np.inf, -np.inf
     if len(lo):
@@ -69,7 +76,7 @@ def small_tree(lo: np.ndarray, hi: np.ndarray) -> BinaryTree:
 
 
 def squeeze(nodes: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """The nodes in use, renumbered; their order (a parent before its children, left before right) stays."""
+    """Return the used nodes with new indices, in the same order: parents before children, left before right."""
     index = np.cumsum(used, dtype=np.int32) - 1
     out = nodes[used]
     for side in ("0", "1"):
@@ -79,23 +86,25 @@ def squeeze(nodes: np.ndarray, used: np.ndarray) -> np.ndarray:
 
 
 def half_areas(lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
-    """Half the surfaces of boxes lo, hi (..., 3), (...) float64; 0 for empty ones."""
+    """Return half the surface of each box lo, hi (..., 3), in float64; 0 for empty boxes."""
     e = np.clip(hi.astype(np.float64) - lo.astype(np.float64), 0.0, 1e39)
     return np.asarray(half_area.func(np.moveaxis(e, -1, 0)))
 
 
 def root_area(nodes: np.ndarray) -> float:
-    """Half the surface of the box around the whole tree."""
+    """Return half the surface of the box around the whole tree."""
     return float(half_areas(np.minimum(nodes["lo_0"][0], nodes["lo_1"][0]), np.maximum(nodes["hi_0"][0], nodes["hi_1"][0])))
 
 
 def expected_cost(root: float, areas: np.ndarray, counts: np.ndarray) -> float:
-    """Expected node visits plus primitives tested (both costing 1) of a random line that meets a root box of this surface. areas,
-    counts: of all children, in the same units; count 0: an inner node. The root itself is visited."""
+    """Return the expected number of nodes visited and primitives tested by a random line through a root box of area `root`.
+
+    areas, counts: of all children; count 0: an inner node. The visit of the root counts.
+    """
     return 1.0 + float((areas * np.maximum(counts, 1)).sum() / root) if root > 0.0 else float(counts.sum())
 
 
 def sah_cost(nodes: np.ndarray) -> float:
-    """Of Bvh2Node records."""
+    """Return the SAH cost of Bvh2Node records."""
     areas = np.stack([half_areas(nodes["lo_" + side], nodes["hi_" + side]) for side in "01"])
     return expected_cost(root_area(nodes), areas, np.stack([nodes["count_0"], nodes["count_1"]]))

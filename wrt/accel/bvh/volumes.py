@@ -1,8 +1,6 @@
-"""Binary BVHs whose bounding volumes are no boxes: the same trees, with spheres or 14-DOPs around what is below each node."""
+"""Binary BVHs with other bounding volumes: the trees of bvh2 with spheres or 14-DOPs."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -15,6 +13,7 @@ from wrt.accel.bvh.tree import expected_cost, root_area
 from wrt.accel.geometry import Geometry
 from wrt.accel.store import check_links
 from wrt.core.device import launch, on_host, records, start, upload
+from wrt.core.types import WarpType
 from wrt.kernels.build import volumes as fits
 from wrt.kernels.traverse import bvh2_kdop as traverse_bvh2_kdop
 from wrt.kernels.traverse import bvh2_sphere as traverse_bvh2_sphere
@@ -48,10 +47,10 @@ class Bvh2Sphere(BinaryBvh):
 
 
 class Bvh2Kdop(BinaryBvh):
-    """14-DOPs: the boxes of bvh2, cut by eight planes askew. Options: those of bvh2.
+    """14-DOPs: the boxes of bvh2, cut by eight diagonal planes. Options: those of bvh2.
 
-    k-DOPs rather than oriented boxes: their planes are the same everywhere, so that they are fitted from the leaves up without a
-    search, a ray is prepared once for all of them, and three slabs are the box, whose distances a traversal must keep to.
+    Their planes are the same everywhere, unlike those of oriented boxes. They are fitted from the leaves up without a search, and a
+    ray is prepared once for all of them. Three slabs are the box, whose distances a traversal must keep to.
     """
 
     name = "bvh2_kdop"
@@ -68,7 +67,7 @@ class Bvh2Kdop(BinaryBvh):
 
 
 def boxes_around(built: Built, geometry: Geometry) -> np.ndarray:
-    """Bvh2Node records with the links of other nodes, and boxes that fit the geometry: empty where a child is none."""
+    """Return Bvh2Node records with the links of other nodes and boxes that fit the geometry, empty without a child."""
     cpu = start("cpu")
     nodes = upload(with_links(Bvh2Node, built.arrays["nodes"], LINKS), Bvh2Node, cpu)
     fitting = Fitting(cpu, len(geometry), len(nodes))
@@ -77,14 +76,15 @@ def boxes_around(built: Built, geometry: Geometry) -> np.ndarray:
 
 
 def cost_of(nodes: np.ndarray, areas: np.ndarray) -> float:
-    """As wrt.accel.bvh.tree.sah_cost, of lines that meet the root's box, for volumes with these surfaces, (2, N). Where volumes
-    stick out of the root's box, lines that pass it by count too."""
+    """Return the SAH cost of volumes with these surfaces, (2, N), for lines through the root's box.
+
+    Parts of volumes outside the root's box count, too.
+    """
     return expected_cost(2.0 * root_area(nodes), areas, np.stack([nodes["count_0"], nodes["count_1"]]))
 
 
 def spans_of(nodes: np.ndarray) -> list[np.ndarray]:
-    """begin, end: of each child of Bvh2Node records (of node i: 2 i and 2 i + 1), the records in its subtree, which stand next to
-    each other."""
+    """Return begin and end of the adjacent records below each child of Bvh2Node records; node i has children 2 i and 2 i + 1."""
     first, count = (np.stack([nodes[f"{what}_0"], nodes[f"{what}_1"]], axis=1).reshape(-1) for what in ("first", "count"))
     ends = []
     for side in range(2):
@@ -95,8 +95,8 @@ def spans_of(nodes: np.ndarray) -> list[np.ndarray]:
     return [ends[0], ends[1]]
 
 
-def with_links(struct: Any, nodes: np.ndarray, names: tuple[str, ...] | None = None) -> np.ndarray:
-    """Records of another kind of node with what they share with these, or with these of their fields."""
+def with_links(struct: WarpType, nodes: np.ndarray, names: tuple[str, ...] | None = None) -> np.ndarray:
+    """Make records of another kind of node with the fields in common, or with those of these names."""
     out = records(struct, len(nodes))
     for name in names or set(out.dtype.names or ()) & set(nodes.dtype.names or ()):
         out[name] = nodes[name]
@@ -104,7 +104,7 @@ def with_links(struct: Any, nodes: np.ndarray, names: tuple[str, ...] | None = N
 
 
 def fit_spheres(nodes: np.ndarray, order: np.ndarray, geometry: Geometry, threads: int) -> np.ndarray:
-    """SphereNode records around the padded boxes of the geometry below each Bvh2Node record."""
+    """Make SphereNode records around the padded boxes of the geometry below each Bvh2Node record."""
     cpu = start("cpu")
     lo, hi = geometry.bounds()
     out = upload(with_links(traverse_bvh2_sphere.SphereNode, nodes), traverse_bvh2_sphere.SphereNode, cpu)
@@ -115,7 +115,7 @@ def fit_spheres(nodes: np.ndarray, order: np.ndarray, geometry: Geometry, thread
 
 
 def middle_of(nodes: np.ndarray) -> np.ndarray:
-    """The middle of the root's box, (3,) float32; 0 along an axis where that is not finite."""
+    """Return the middle of the root's box, (3,) float32; 0 along infinite axes."""
     lo, hi = np.minimum(nodes["lo_0"][0], nodes["lo_1"][0]), np.maximum(nodes["hi_0"][0], nodes["hi_1"][0])
     with np.errstate(invalid="ignore", over="ignore"):
         middle = (np.float32(0.5) * lo + np.float32(0.5) * hi).astype(np.float32)
@@ -123,7 +123,7 @@ def middle_of(nodes: np.ndarray) -> np.ndarray:
 
 
 def cuts(geometry: Geometry, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where every primitive lies along the four diagonals, padded, relative to `middle`: two (N, 4) float32."""
+    """Return the padded extent of every primitive along the four diagonals, relative to `middle`: low and high (N, 4) float32."""
     n = len(geometry.faces)
     lo, hi = np.empty((len(geometry), 4), np.float32), np.empty((len(geometry), 4), np.float32)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -141,13 +141,13 @@ def cuts(geometry: Geometry, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def project(v: np.ndarray) -> np.ndarray:
-    """(N, 3) float32 -> (N, 4), as kernels.units.kdop.project."""
+    """Project (N, 3) float32 to the four diagonals, (N, 4), as kernels.units.kdop.project."""
     x, y, z = v[:, 0], v[:, 1], v[:, 2]
     return np.stack([x + y + z, y - x + z, x - y + z, x + y - z], axis=1)
 
 
 def fit_kdops(nodes: np.ndarray, order: np.ndarray, geometry: Geometry, middle: np.ndarray) -> np.ndarray:
-    """KdopNode records around the geometry below each Bvh2Node record."""
+    """Make KdopNode records around the geometry below each Bvh2Node record."""
     cpu = start("cpu")
     cut_lo, cut_hi = cuts(geometry, middle)
     out = upload(with_links(traverse_bvh2_kdop.KdopNode, nodes), traverse_bvh2_kdop.KdopNode, cpu)

@@ -1,10 +1,10 @@
-"""Wide BVHs: a binary one collapsed into nodes of 4 or 8 children."""
+"""Wide BVHs: binary trees collapsed into nodes of 4 or 8 children."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from wrt.accel.bvh.wide_tree import COLLAPSE, WideTree, check_wide, collapse, la
 from wrt.core.device import empty_aligned, preloading, record_dtype
 from wrt.core.errors import InputError
 from wrt.core.threads import run_all
+from wrt.core.types import WarpStruct
 from wrt.kernels.wide.batch import BatchTraversal
 from wrt.kernels.wide.layout import PLANES, STACK_SIZE, first_reference, node_size
 from wrt.kernels.wide.references import EMPTY, MAX_FIRST, leaf_count, leaf_first
@@ -26,7 +27,7 @@ ROWS_PER_JOB = 4096
 
 
 def aligned(array: np.ndarray) -> np.ndarray:
-    """The same numbers in memory that begins where a cache line does."""
+    """Copy an array into memory that begins at a cache line."""
     out = empty_aligned(array.shape, array.dtype)
     out[...] = array
     return out
@@ -34,8 +35,10 @@ def aligned(array: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Bvh4Options(BinaryOptions):
-    """As BinaryOptions, for the binary tree that becomes a wide one. cost_traversal, cost_intersection: of one node visited and one
-    row of primitives tested; max_leaf is as many as a row has lanes by default."""
+    """Options of wide structures: BinaryOptions, where cost_intersection is that of one row of primitives.
+
+    max_leaf is by default the number of lanes in a row.
+    """
 
     builder: str = "refined"
 
@@ -64,8 +67,8 @@ class WideBvh(OneMesh):
         return replace(built, sah_cost=(self._tree(built) if self.compressed else tree).sah_cost(tree.root_area))
 
     def _collapsed(self, options: BvhOptions) -> WideTree:
-        """The tree of the builder that options name."""
-        # Two leaves are worth it where they have less area than one: what their places in a node cost is not yet known.
+        """Build a binary tree and collapse it."""
+        # Two leaves are better than one if they have less area: the cost of their places in a node is not known yet.
         of_binary = replace(options, max_leaf=min(options.max_leaf, self.width), cost_traversal=0.0, cost_intersection=1.0)
         with preloading(*(COLLAPSE if len(self.geometry) > 1 else ())):
             binary = build_binary(self.geometry, of_binary, self.threads)
@@ -81,12 +84,12 @@ class WideBvh(OneMesh):
         return built.arrays["nodes"].reshape(-1, node_size(self.width, self.compressed))
 
     def _references(self, built: Built) -> np.ndarray:
-        """(N, width) int32 of all children."""
+        """Return the references to all children, (N, width) int32."""
         first = first_reference(self.width, self.compressed)
         return np.ascontiguousarray(self._nodes(built)[:, first : first + self.width]).view(np.int32)
 
     def _arrays(self, tree: WideTree) -> dict[str, np.ndarray]:
-        """The node rows of kernels.wide.nodes."""
+        """Return the node rows of kernels.wide.nodes."""
         n, size, first = len(tree.children), node_size(self.width, self.compressed), first_reference(self.width, self.compressed)
         nodes = np.zeros((n, size), np.float32)
         nodes[:, first : first + self.width] = tree.children.view(np.float32)
@@ -99,7 +102,7 @@ class WideBvh(OneMesh):
         return {"nodes": nodes.reshape(-1)}
 
     def _tree(self, built: Built) -> WideTree:
-        """The tree that _arrays laid out; compressed boxes as a ray meets them."""
+        """Return the tree that _arrays laid out, with compressed boxes as rays meet them."""
         head = self._nodes(built)[:, : first_reference(self.width, self.compressed)]
         if self.compressed:
             lo, hi = decompress(head, self.width)
@@ -110,7 +113,7 @@ class WideBvh(OneMesh):
         return WideTree(lo, hi, children, lanes_of(children, built.order, self.width), built.leaves, built.depth, 0)
 
     def _primitives(self, built: Built) -> np.ndarray:
-        """What the triangle test reads, number by number in rows; lanes without a primitive hold the one before, untested."""
+        """Return the records of the triangle test in rows of lanes; an unused lane repeats the primitive before it."""
         order = (built.order if self.compressed
                  else lanes_of(self._references(built), built.order, self.width).reshape(-1))
         units, width = self.structure.units, self.width
@@ -127,7 +130,7 @@ class WideBvh(OneMesh):
         run_all([partial(fill, first) for first in range(0, len(rows), ROWS_PER_JOB)], self.threads)
         return rows.reshape(-1)
 
-    def _upload(self, built: Built) -> Any:
+    def _upload(self, built: Built) -> WarpStruct:
         return super()._upload(replace(built, arrays={name: aligned(array) for name, array in built.arrays.items()}))
 
     def _check(self, built: Built) -> None:
@@ -148,7 +151,7 @@ class WideBvh(OneMesh):
         built = replace(built, arrays=self._arrays(tree))
         return replace(built, sah_cost=self._tree(built).sah_cost(tree.root_area))
 
-    def _children(self, built: Built) -> Any:
+    def _children(self, built: Built) -> WarpStruct:
         from wrt.accel.epo import children
 
         tree = self._tree(built)
@@ -177,8 +180,7 @@ class Bvh8(WideBvh):
 
 
 class Bvh8c(WideBvh):
-    """As bvh8, with the same options, for less memory: boxes in 8 bits a plane (Ylitie, Karras and Laine 2017), rounded so that
-    they hold what they held, and leaves without gaps."""
+    """bvh8 in less memory: boxes in 8 bits a plane, rounded outwards, and leaves without gaps (Ylitie, Karras and Laine 2017)."""
 
     name = "bvh8c"
     options = Bvh8Options

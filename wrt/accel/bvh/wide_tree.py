@@ -1,4 +1,4 @@
-"""Wide trees: a binary BVH collapsed into nodes of several children (the loops are Warp kernels, kernels/build/wide.py)."""
+"""Wide trees: binary BVHs collapsed into nodes of several children (kernels: kernels/build/wide.py)."""
 
 from __future__ import annotations
 
@@ -21,9 +21,12 @@ COLLAPSE = build_wide.subtree_costs, build_wide.collapse  # kernels of `collapse
 
 @dataclass(frozen=True, eq=False)
 class WideTree:
-    """lo, hi: (N, W, 3) float32, the boxes of each node's children, empty where there is none (these come first); children: (N, W)
-    int32, references as in kernels.wide.references; order: (rows, W) int32, the prim_id in each lane of the leaves' rows, -1 where
-    there is none; leaves: how many; depth: nodes on the longest way from the root; stack: the most entries a walk has."""
+    """A tree of nodes with W children.
+
+    lo, hi: (N, W, 3) float32, boxes of the children; empty boxes come first. children: (N, W) int32, see kernels.wide.references.
+    order: (rows, W) int32, prim_id in each lane of the leaves' rows, or -1. depth: nodes on the longest path from the root. stack:
+    largest number of entries on the stack of a walk.
+    """
 
     lo: np.ndarray
     hi: np.ndarray
@@ -35,21 +38,21 @@ class WideTree:
 
     @property
     def areas(self) -> np.ndarray:
-        """(N, W): half the surface of each child's box in float64, 0 where there is none."""
+        """Half the surface of each child's box, (N, W) float64; 0 for empty boxes."""
         return half_areas(self.lo, self.hi)
 
     @property
     def root_area(self) -> float:
-        """Half the surface of the box around all."""
+        """Half the surface of the root's box."""
         return float(half_areas(self.lo[0].min(axis=0), self.hi[0].max(axis=0)))
 
     def sah_cost(self, root: float) -> float:
-        """As wrt.accel.bvh.tree.expected_cost, for a root box with this half of its surface."""
+        """Return the SAH cost for a root box with half the surface `root`."""
         return expected_cost(root, self.areas, np.where(self.children < 0, leaf_count.func(self.children), 0))
 
 
 def collapse(tree: BinaryTree, width: int, max_leaf: int, cost_traversal: float, cost_intersection: float) -> WideTree:
-    """The wide tree of least expected cost over the nodes of a binary one of two or more leaves."""
+    """Collapse a binary tree of two or more leaves into the wide tree of least expected cost."""
     cpu = start("cpu")
     n = len(tree.nodes)
     options = build_wide.CollapseOptions()
@@ -78,7 +81,7 @@ def collapse(tree: BinaryTree, width: int, max_leaf: int, cost_traversal: float,
 
 
 def refit(tree: WideTree, geometry: Geometry) -> WideTree:
-    """The same tree around the geometry as it is now. Boxes of spatial splits become those of the whole triangles."""
+    """Fit the boxes to the geometry. Boxes of spatial splits become those of the whole triangles."""
     cpu = start("cpu")
     width = tree.children.shape[1]
     low, high = (upload(np.append(box, [[end] * 3], axis=0), wp.vec3, cpu)  # lane -1: an empty box
@@ -90,7 +93,7 @@ def refit(tree: WideTree, geometry: Geometry) -> WideTree:
 
 
 def packed(children: np.ndarray, unit: int) -> np.ndarray:
-    """The same references with leaves one after another in units of so many primitives; kernels count rows, or primitives."""
+    """Renumber the leaves in references one after another, counted in `unit` primitives: 1, or a row."""
     leaf = children < 0
     references = children[leaf].astype(np.int64)
     count = leaf_count.func(references)
@@ -104,8 +107,10 @@ def packed(children: np.ndarray, unit: int) -> np.ndarray:
 
 
 def lanes_of(children: np.ndarray, order: np.ndarray, width: int) -> np.ndarray:
-    """Which primitive stands in each lane of the leaves' rows: (rows, width), -1 where there is none. children: references in
-    units of `width`; order: (R,) the prim_id of every record, leaf after leaf as their rows are."""
+    """Return the primitive in each lane of the leaves' rows, (rows, width), or -1.
+
+    children: references that count rows. order: (R,) prim_id of every record, leaf after leaf.
+    """
     leaves = children[children < 0]
     row, count = leaf_first.func(leaves), leaf_count.func(leaves)
     rows = int((row - (-count // width)).max(initial=0))
@@ -118,8 +123,10 @@ def lanes_of(children: np.ndarray, order: np.ndarray, width: int) -> np.ndarray:
 
 
 def check_wide(children: np.ndarray, n_primitives: int, unit: int) -> None:
-    """Raise InputError unless (N, width) references are a tree from node 0 whose leaves hold n primitives one after another, in
-    units of so many, and whose walks fit on a traversal's stack."""
+    """Raise InputError unless references (N, width) are a tree with root 0 whose walks fit on the stack.
+
+    Its leaves must hold n primitives one after another, counted in `unit` primitives.
+    """
     n = len(children)
     inner = children > 0
     if n == 0 or (children[inner] >= n).any() or (children <= np.arange(n)[:, None])[inner].any():
@@ -136,7 +143,7 @@ def check_wide(children: np.ndarray, n_primitives: int, unit: int) -> None:
 
 
 def stack_need(children: np.ndarray) -> int:
-    """The most entries that a walk can have on its stack."""
+    """Return the largest number of entries on the stack of a walk."""
     level, used, most = np.zeros(1, np.int64), np.zeros(1, np.int64), 0
     while len(level):
         below = used + np.maximum((children[level] != EMPTY).sum(axis=1) - 1, 0)

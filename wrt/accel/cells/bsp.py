@@ -1,4 +1,4 @@
-"""The BSP tree: cells cut by planes of any orientation (the loops are Warp kernels, kernels/build_bsp*.py)."""
+"""BSP tree: cells cut by planes of any orientation (kernels: kernels/build/bsp*.py)."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from wrt.accel.store import check_tree
 from wrt.core.device import launch, on_host, records, start, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import run_all
+from wrt.core.types import WarpArray, WarpStruct
 from wrt.kernels.build import bsp as build_bsp
 from wrt.kernels.build import bsp_split
 from wrt.kernels.build.bsp_cell import MAX_FACES, MAX_POINTS, Cells
@@ -26,7 +27,7 @@ from wrt.kernels.build.bsp_split import BspTools, Pieces
 from wrt.kernels.traverse import bsp as kernels
 
 MAX_DEPTH = 60  # below the traversal unit's stack
-ROOM = 8  # pieces at a time, nodes and references for each primitive; more where that is not enough
+ROOM = 8  # pieces, nodes and references for each primitive; doubled if that is not enough
 SPARE = 1024
 MAX_ROOM = (2**31 - 1) // 6 - SPARE  # points of pieces are counted in int32, six for each
 LEFT_OVERS = 1024  # subtrees at most that are built on their own
@@ -36,12 +37,13 @@ PIECE = {"prim_id": (wp.int32, ()), "first": (wp.int32, ()), "count": (wp.int32,
 
 @dataclass(frozen=True)
 class BspOptions:
-    """cost_intersection, cost_axis, cost_plane: of one primitive, of a node across an axis, of any other; the defaults are those of
-    the Manta renderer. samples: 0 or more; so many triangles of a cell, evenly spread over its list, give their four planes as
-    candidates; 0: a k-d tree. max_depth: 1 to 60; 0: 16 + 2 log2 of the number of primitives. max_growth: 1 to 1000, references in
-    all leaves for each primitive; a cell may use up its share of them, by how many it has. max_triangles: more primitives are
-    refused. progress: called with the fraction that is done, 0 to 1, from the threads that build. Raises InputError for values out
-    of range."""
+    """Options of the BSP tree. Raises InputError for values out of range.
+
+    cost_intersection, cost_axis, cost_plane: of a primitive, of a node across an axis, of another node; defaults of the Manta renderer.
+    samples: number of triangles of a cell, evenly spread over its list, that offer four planes each; 0: a k-d tree. max_depth: 1 to
+    60; 0: 16 + 2 log2 of the number of primitives. max_growth: limit of references per primitive, 1 to 1000, divided among cells by
+    their primitives. max_triangles: more primitives are refused. progress: called with the finished fraction, from several threads.
+    """
 
     cost_intersection: float = 75.0
     cost_axis: float = 10.0
@@ -62,11 +64,11 @@ class BspOptions:
             raise InputError(f"must be a function of one number, got {self.progress!r}", argument="progress")
 
     def __getstate__(self) -> dict[str, Any]:
-        """For pickle: `progress` stays in this process."""
+        """Pickle without `progress`, which belongs to this process."""
         return {**self.__dict__, "progress": None}
 
-    def on_device(self, lo: np.ndarray, hi: np.ndarray, n: int) -> Any:
-        """As the kernels take them, for n primitives with these boxes."""
+    def on_device(self, lo: np.ndarray, hi: np.ndarray, n: int) -> WarpStruct:
+        """Convert the options for kernels, for n primitives with these boxes."""
         out = bsp_split.BspOptions()
         out.cost_intersection, out.cost_axis, out.cost_plane = self.cost_intersection, self.cost_axis, self.cost_plane
         out.samples, out.max_depth = self.samples, self.max_depth or min(MAX_DEPTH, 16 + 2 * math.ceil(math.log2(n)))
@@ -75,8 +77,10 @@ class BspOptions:
 
 
 class Bsp(OneMesh):
-    """Ize, Wald and Parker 2008, "Ray Tracing with the BSP Tree". Slow to build: a subset of all triangles' planes is tried.
-    Options: BspOptions."""
+    """A BSP tree, which is slow to build. Options: BspOptions.
+
+    Ize, Wald and Parker 2008, "Ray Tracing with the BSP Tree"; a subset of all triangles' planes is tried.
+    """
 
     name = "bsp"
     kernels = kernels
@@ -115,9 +119,9 @@ class Bsp(OneMesh):
 
 
 class Launch:
-    """One launch of the kernel with room for so many pieces; `results`, `nodes`, `order` and `cost` are its outcome."""
+    """One launch of the kernel, with memory for `room` pieces, and its results."""
 
-    def __init__(self, corners: Any, options: Any, room: int, left_overs: int) -> None:
+    def __init__(self, corners: WarpArray, options: WarpStruct, room: int, left_overs: int) -> None:
         self.cpu = start("cpu")
         self.room = room
         self.tools = BspTools()
@@ -133,8 +137,8 @@ class Launch:
         self.output.results = wp.zeros(build_bsp.N_RESULTS, dtype=wp.int32, device=self.cpu)
         self.output.cost = wp.zeros(1, dtype=wp.float64, device=self.cpu)
 
-    def run(self, source: Any, tasks: Any, cells: Any, which: int) -> bool:
-        """False where there was no room."""
+    def run(self, source: WarpStruct, tasks: WarpArray, cells: WarpStruct, which: int) -> bool:
+        """Launch; return False if the memory was not enough."""
         launch(build_bsp.build_cells, 1, source, tasks, cells, which, self.tools, self.stack, self.output)
         self.results = self.output.results.numpy().copy()
         self.nodes = on_host(self.output.nodes)[: self.results[build_bsp.N_NODES]].copy()
@@ -144,16 +148,16 @@ class Launch:
 
 
 class Subtree:
-    """What is kept of a launch that built one subtree."""
+    """Results of a launch that built one subtree."""
 
     def __init__(self, launch: Launch) -> None:
         self.results, self.nodes, self.order, self.cost = launch.results, launch.nodes, launch.order, launch.cost
 
 
 class Builder:
-    """The top of the tree in one launch, then the cells that it leaves over, largest first, on all threads."""
+    """Build of the top of the tree in one launch, then of the remaining cells, largest first, on all threads."""
 
-    def __init__(self, geometry: Geometry, options: Any, threads: int, budget: int, progress: Callable[[float], None]) -> None:
+    def __init__(self, geometry: Geometry, options: WarpStruct, threads: int, budget: int, progress: Callable[[float], None]) -> None:
         self.options, self.threads, self.budget, self.progress = options, threads, budget, progress
         self.source, corners = start_pieces(geometry)
         lo, hi = geometry.bounds()
@@ -163,8 +167,8 @@ class Builder:
         self.corners = upload(corners, wp.vec3d, start("cpu"))
         self.done = 0
 
-    def launch(self, source: Any, tasks: Any, cells: Any, which: int, n: int, keep: int) -> Launch:
-        """Launch with more and more room until it is enough."""
+    def launch(self, source: WarpStruct, tasks: WarpArray, cells: WarpStruct, which: int, n: int, keep: int) -> Launch:
+        """Launch with more and more memory until it is enough."""
         room = ROOM * n + SPARE
         self.options.keep = keep
         while True:
@@ -196,7 +200,7 @@ class Builder:
         return self.join(top, [subtree for subtree in subtrees if subtree is not None])
 
     def join(self, top: Launch, subtrees: list[Subtree]) -> Built:
-        """One array of nodes, the top first, and one of primitives."""
+        """Join the nodes, the top first, and the primitives."""
         parts = [Subtree(top), *subtrees]
         first_node = np.cumsum([0] + [len(part.nodes) for part in parts])
         first_primitive = np.cumsum([0] + [len(part.order) for part in parts])
@@ -220,8 +224,8 @@ class Builder:
                      sum(part.cost for part in parts))
 
 
-def pieces_of(n: int, points: int) -> Any:
-    """Room for n pieces with so many points together."""
+def pieces_of(n: int, points: int) -> WarpStruct:
+    """Allocate n pieces with `points` points together."""
     pieces = Pieces()
     for name, (dtype, _) in PIECE.items():
         setattr(pieces, name, wp.empty(n, dtype=dtype, device=start("cpu")))
@@ -229,7 +233,7 @@ def pieces_of(n: int, points: int) -> Any:
     return pieces
 
 
-def cells_of(slots: int) -> Any:
+def cells_of(slots: int) -> WarpStruct:
     cells, cpu = Cells(), start("cpu")
     cells.n_faces = wp.zeros(slots, dtype=wp.int32, device=cpu)
     cells.first = wp.zeros(slots * (MAX_FACES + 1), dtype=wp.int32, device=cpu)
@@ -238,8 +242,8 @@ def cells_of(slots: int) -> Any:
     return cells
 
 
-def start_pieces(geometry: Geometry) -> tuple[Any, np.ndarray]:
-    """Every primitive as a piece, and the corners of the triangles, (3 F, 3) float64."""
+def start_pieces(geometry: Geometry) -> tuple[WarpStruct, np.ndarray]:
+    """Return a piece for every primitive, and the corners of the triangles, (3 F, 3) float64."""
     n, triangles = len(geometry), len(geometry.faces)
     corners = geometry.vertices[geometry.faces].astype(np.float64)
     spheres = geometry.spheres.astype(np.float64)

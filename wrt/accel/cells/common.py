@@ -1,8 +1,6 @@
-"""What the builders of structures with cells share: their input on the device, and what is checked of a file."""
+"""Shared parts of structures with cells: the builders' input, and checks of files."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -13,13 +11,14 @@ from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.store import row_type
 from wrt.core.device import start, upload
 from wrt.core.errors import InputError
+from wrt.core.types import WarpStruct
 from wrt.kernels.build.triangle_cell import CellSource
 from wrt.kernels.units.box import PAD_EXTENT
 from wrt.kernels.warp_private import fields_of
 
 
-def cell_source(geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray]) -> Any:
-    """The triangles, and the padded boxes of all primitives."""
+def cell_source(geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray]) -> WarpStruct:
+    """Upload the triangles and the padded boxes of all primitives."""
     cpu, source = start("cpu"), CellSource()
     source.vertices = upload(geometry.vertices, wp.vec3, cpu)
     source.faces = upload(geometry.faces, wp.vec3i, cpu)
@@ -28,7 +27,7 @@ def cell_source(geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray]) -> An
 
 
 def one_row(accel: Accelerator, built: Built) -> dict[str, np.ndarray]:
-    """The arrays of `built`, where what is a single vector or number is one, and no longer the one row that it is in a file."""
+    """Return the arrays of `built`, with one-row arrays of a file squeezed into vectors and scalars."""
     arrays = dict(built.arrays)
     for name, kind in fields_of(accel.structure.struct()).items():
         if name in arrays and not isinstance(kind, wp.array):
@@ -37,13 +36,13 @@ def one_row(accel: Accelerator, built: Built) -> dict[str, np.ndarray]:
 
 
 def check_numbers(arrays: dict[str, np.ndarray]) -> None:
-    """Raise InputError unless pad and extent are what kernels.traverse.cell_ray.cell_slack may be given, and mailbox is a bool."""
+    """Raise InputError unless pad and extent are valid for kernels.traverse.cell_ray.cell_slack, and mailbox is 0 or 1."""
     if not (arrays["pad"] >= 0.0 and arrays["extent"] >= 0.0 and arrays["mailbox"] in (0, 1)):
         raise InputError("is damaged: its numbers are out of range")
 
 
 def check_references(cells: np.ndarray, references: np.ndarray, n_primitives: int) -> None:
-    """Raise InputError unless these records (first, count) stay within the references, and those within the primitives."""
+    """Raise InputError unless records (first, count) stay within the references, and these within the primitives."""
     first, count = cells["first"].astype(np.int64), cells["count"].astype(np.int64)
     if ((first < 0) | (count < 0) | (first + count > len(references))).any():
         raise InputError("is damaged: a cell leads out of the references")
@@ -52,19 +51,19 @@ def check_references(cells: np.ndarray, references: np.ndarray, n_primitives: in
 
 
 def require_between(**options: tuple[float, float, float]) -> None:
-    """Raise InputError for an option (value, low, high) that is not between its limits, these included."""
+    """Raise InputError for an option (value, low, high) outside of its limits."""
     for name, (value, low, high) in options.items():
         if not low <= value <= high:
             raise InputError(f"must be {low:.10g} to {high:.10g}, got {value}", argument=name)
 
 
 def triangle_reach(geometry: Geometry, lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """For kernels.traverse.cell_ray.cell_slack: the largest pad and the largest extent of all triangles' padded boxes."""
+    """Return the largest pad and extent of all triangles' padded boxes, for kernels.traverse.cell_ray.cell_slack."""
     n = len(geometry.faces)
     if not n:
         return np.zeros((), np.float32), np.zeros((), np.float32)
     with np.errstate(over="ignore", invalid="ignore"):
         extent = (hi[:n] - lo[:n]).max()
-        # The pad of a box is no larger than this share of its extent and its coordinates (Geometry.bounds).
+        # The pad of a box is at most this fraction of its extent and its coordinates (Geometry.bounds).
         pad = np.float32(PAD_EXTENT) * (extent + np.maximum(np.abs(lo[:n]), np.abs(hi[:n])).max())
     return np.asarray(pad), np.asarray(extent)

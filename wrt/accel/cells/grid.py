@@ -1,10 +1,9 @@
-"""The uniform grid: cells of one size, each with a list of the primitives that meet it."""
+"""Uniform grid: cells of one size, each with a list of the primitives that meet it."""
 
 from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -16,6 +15,7 @@ from wrt.accel.cells.common import cell_source, check_numbers, check_references,
 from wrt.accel.geometry import Geometry
 from wrt.core.device import launch, on_host, records, start, upload
 from wrt.core.errors import InputError
+from wrt.core.types import WarpArray, WarpStruct
 from wrt.kernels.build import grid as build_grid
 from wrt.kernels.traverse import grid as kernels
 from wrt.kernels.units.box import PAD_EXTENT
@@ -28,8 +28,10 @@ PRIMITIVES_PER_LAUNCH = 16384
 
 @dataclass(frozen=True)
 class GridOptions:
-    """density: cells for each primitive, on average over the grid's box, 1e-3 to 1e3; mailbox: whether a primitive that spans
-    several cells is tested once where it can be. Raises InputError for values out of range."""
+    """Options of the grid. Raises InputError for values out of range.
+
+    density: cells per primitive, 1e-3 to 1e3. mailbox: avoid repeated tests of a primitive in several cells.
+    """
 
     density: float = 2.0
     mailbox: bool = True
@@ -41,8 +43,8 @@ class GridOptions:
 class Grid(OneMesh):
     """A uniform grid. Options: GridOptions.
 
-    At most MAX_CELLS cells and, as estimated from the boxes, MAX_REFERENCES references: beyond, the cells are larger, and a
-    RuntimeWarning says so. Spheres are listed wherever their box is. The `box` test is not used.
+    Cells are enlarged, with a RuntimeWarning, beyond MAX_CELLS cells or an estimate of MAX_REFERENCES references. Spheres are listed
+    in every cell of their box. The `box` test is not used.
     """
 
     name = "grid"
@@ -74,15 +76,15 @@ class Grid(OneMesh):
         check_references(arrays["cells"], arrays["references"], len(built.order))
 
 
-def resolution(lo: np.ndarray, hi: np.ndarray, density: float) -> Any:
-    """The layout: nearly cubic cells, about `density` of them a primitive (Cleary and Wyvill 1988: the cube root)."""
+def resolution(lo: np.ndarray, hi: np.ndarray, density: float) -> WarpStruct:
+    """Return the layout: nearly cubic cells, about `density` per primitive (Cleary and Wyvill 1988)."""
     layout = kernels.GridLayout()
     low, high = lo.min(axis=0, initial=np.inf), hi.max(axis=0, initial=-np.inf)
     extent = high.astype(np.float64) - low.astype(np.float64)
     wanted = density * len(lo)
     n = np.ones(3, np.int64)
     if len(lo) and np.isfinite(extent).all():
-        # A cell is not so small that the rounding of its planes matters.
+        # Cells are so large that the rounding of their planes does not matter.
         finest = np.maximum(np.abs(low), np.abs(high)).astype(np.float64) * PAD_EXTENT
         with np.errstate(divide="ignore", invalid="ignore"):
             most = np.clip(np.where(extent > 0.0, extent / finest, 1.0), 1, MAX_AXIS)
@@ -102,7 +104,7 @@ def resolution(lo: np.ndarray, hi: np.ndarray, density: float) -> Any:
 
 
 def cells_along(extent: np.ndarray, most: np.ndarray, wanted: float) -> np.ndarray:
-    """(3,) numbers of cells: each 1 to `most`, in proportion to the extent between, and their product near `wanted`."""
+    """Return numbers of cells (3,) in proportion to the extent, each 1 to `most`, whose product is about `wanted`."""
     def along(log_scale: float) -> np.ndarray:
         return np.clip(extent * 2.0**log_scale, 1.0, most)
 
@@ -118,20 +120,20 @@ def cells_along(extent: np.ndarray, most: np.ndarray, wanted: float) -> np.ndarr
 
 
 def references_bound(lo: np.ndarray, hi: np.ndarray, size: np.ndarray) -> float:
-    """About as many references as there may be: a triangle that spans a x b x c cells meets up to ab + bc + ca of them."""
+    """Estimate the references: a triangle that spans a x b x c cells meets up to ab + bc + ca of them."""
     a, b, c = (((hi.astype(np.float64) - lo) / np.maximum(size, 1e-300)) + 1.0).T
     return float((a * b + b * c + c * a).sum()) / 3.0
 
 
-def list_references(geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray], layout: Any,
+def list_references(geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray], layout: WarpStruct,
                     threads: int) -> tuple[np.ndarray, np.ndarray]:
-    """Cell records, and the primitives of all cells one after another (R,) int32."""
+    """Return cell records, and the primitives of all cells one after another, (R,) int32."""
     cpu = start("cpu")
     source = cell_source(geometry, bounds)
     n = len(geometry)
     count = wp.zeros(n, dtype=wp.int32, device=cpu)
 
-    def run(begin: Any, cells: Any) -> None:
+    def run(begin: WarpArray, cells: WarpArray) -> None:
         launch(build_grid.list_cells, n, source, layout, None, begin, count, cells, threads=threads, step=PRIMITIVES_PER_LAUNCH)
 
     run(wp.zeros(0, dtype=wp.int64, device=cpu), wp.zeros(0, dtype=wp.int32, device=cpu))
@@ -150,8 +152,8 @@ def list_references(geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray], l
     return on_host(cells), references.numpy()
 
 
-def sah_cost(layout: Any, visits: int) -> float:
-    """Expected cells and primitives of a random line through the grid's box: `visits` cells and references, all of one size."""
+def sah_cost(layout: WarpStruct, visits: int) -> float:
+    """Return the expected cells and primitives of a random line through the box; visits: number of cells and references."""
     extent = np.array(layout.hi, np.float64) - np.array(layout.lo, np.float64)
     whole, cell = (float(half_areas(np.zeros(3), e)) for e in (extent, extent / np.array(layout.n, np.float64)))
     return visits * cell / whole if whole > 0.0 else float(visits)

@@ -1,4 +1,4 @@
-"""The k-d tree: space is split by axis-aligned planes, and a primitive stands in every leaf that it reaches into."""
+"""The k-d tree: axis-aligned planes split space, and a primitive is in every leaf that it reaches into."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The k-d tree's builder: binned SAH for large cells here, in whole-array NumPy; perfect splits below, a subtree a task."""
+"""Builder of k-d trees: binned SAH in NumPy for large cells, and a kernel with perfect splits for each subtree below."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from wrt.accel.geometry import Geometry
 from wrt.core.device import launch, load_kernel, on_host, records, start, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import run_all
+from wrt.core.types import WarpStruct
 from wrt.kernels.build import kdtree as kernels
 from wrt.kernels.build.clip import Clippable, clip_references
 from wrt.kernels.build.kdtree_split import split_cost
@@ -22,7 +23,7 @@ from wrt.kernels.build.shape import half_area
 from wrt.kernels.traverse.kdtree import LEAF, STACK_SIZE, KdNode
 
 BINS = 64
-# Triangles beyond are put into cells by their boxes: the margin of clipping would underflow, or be all of space.
+# Triangles of other sizes are put into cells by their boxes, because the margin of clipping would underflow or be infinite.
 CLIP_SIZES = (1e-30, 1e30)
 MAX_IN_LEAF = 1 << 24  # the node holds the number as a float32
 MAX_INDEX = 1 << 29  # a node's word has 29 bits for it
@@ -31,11 +32,13 @@ Part = tuple[np.ndarray, np.ndarray, Any]  # nodes, order and totals of a subtre
 
 @dataclass(frozen=True)
 class KdOptions:
-    """max_leaf: cells with so many primitives are not split; max_depth (None: 8 + 1.3 log2 n); by_cost: stop where no split costs
-    less than a leaf; cost_traversal, cost_intersection: of the SAH; empty_bonus: 0 to 1, what a split that cuts off empty space is
-    let off; perfect_below: larger cells are split between 64 bins, smaller ones at the best of all planes; clip: triangles are put
-    into cells by what lies in them, not by their boxes; max_growth: how many references, and empty leaves, there may be for each
-    primitive. Raises InputError for values out of range."""
+    """Options of the k-d tree. Raises InputError for values out of range.
+
+    max_leaf: cells with so many primitives are not split. max_depth: None for 8 + 1.3 log2 n. by_cost: stop where no split costs less
+    than a leaf. cost_traversal, cost_intersection: of the SAH. empty_bonus: discount, 0 to 1, for splits that cut off empty space.
+    perfect_below: number of primitives above which cells are split between 64 bins instead of at the best of all planes. clip: put
+    triangles into cells exactly instead of by their boxes. max_growth: limit of references and empty leaves per primitive.
+    """
 
     max_leaf: int = 1
     max_depth: int | None = None
@@ -56,14 +59,14 @@ class KdOptions:
                         max_growth=(self.max_growth, 1.0, 1e4))
 
     def depth(self, n: int) -> int:
-        """As given, or 8 + 1.3 log2 n (Havran 2000; Pharr et al., "Physically Based Rendering", section 4.4)."""
+        """Return max_depth, or 8 + 1.3 log2 n (Havran 2000; Pharr et al., "Physically Based Rendering", section 4.4)."""
         if self.max_depth is not None:
             return self.max_depth
         return min(round(8.0 + 1.3 * np.log2(max(n, 1))), STACK_SIZE)
 
 
 class Cell(NamedTuple):
-    """A cell to build, and its references: prim_id (n,) and their boxes in it (n, 3)."""
+    """A cell to build, and its references: prim_id (n,) and their boxes lo, hi in it (n, 3)."""
 
     cell_lo: np.ndarray
     cell_hi: np.ndarray
@@ -76,7 +79,7 @@ class Cell(NamedTuple):
 
 
 def build_tree(geometry: Geometry, options: KdOptions, threads: int) -> Built:
-    """The tree over a geometry; the same for every number of threads. Its cost is that with both costs 1."""
+    """Build the tree over a geometry. It does not depend on threads. Its cost is that with both costs 1."""
     lo, hi = geometry.bounds()
     n = len(lo)
     if n == 0:
@@ -93,8 +96,8 @@ def build_tree(geometry: Geometry, options: KdOptions, threads: int) -> Built:
     return joined(top, tasks, parts, root, area, reach)
 
 
-def clippable(geometry: Geometry, lo: np.ndarray, hi: np.ndarray, clip: bool) -> tuple[Any, float]:
-    """The primitives for kernels.build.clip, and the largest extent of those that it clips."""
+def clippable(geometry: Geometry, lo: np.ndarray, hi: np.ndarray, clip: bool) -> tuple[WarpStruct, float]:
+    """Upload the primitives for kernels.build.clip; return them with the largest extent of the clipped ones."""
     cpu = start("cpu")
     with np.errstate(over="ignore"):
         extent = (hi - lo).max(axis=1)
@@ -107,8 +110,8 @@ def clippable(geometry: Geometry, lo: np.ndarray, hi: np.ndarray, clip: bool) ->
     return shapes, float(extent[exact].max(initial=0.0))
 
 
-def split_top(root: Cell, shapes: Any, options: KdOptions) -> tuple[list[tuple[float, int]], list[Cell], float]:
-    """Nodes (split, word) of the top of the tree, the cells that are left to do, and the half areas of the nodes together."""
+def split_top(root: Cell, shapes: WarpStruct, options: KdOptions) -> tuple[list[tuple[float, int]], list[Cell], float]:
+    """Split large cells: return nodes (split, word), the remaining cells, and the sum of the nodes' half areas."""
     max_depth = options.depth(len(root.prim_id))
     nodes, tasks, area = [(0.0, 0)], [], 0.0
     todo = [root]
@@ -129,10 +132,10 @@ def split_top(root: Cell, shapes: Any, options: KdOptions) -> tuple[list[tuple[f
 
 
 def binned_split(cell: Cell, options: KdOptions) -> tuple[int, np.float32] | None:
-    """The cheapest plane (axis, position) between bins, if that is (by_cost) cheaper than a leaf and within the budget.
+    """Return the cheapest plane (axis, position) between bins within the budget, with by_cost only if cheaper than a leaf.
 
-    Shevtsov, Soupikov and Kapustin 2007, "Highly Parallel Fast KD-tree Construction": boxes are counted in the bins where they
-    begin and in those where they end.
+    Boxes are counted in the bins where they begin and in those where they end (Shevtsov, Soupikov and Kapustin 2007, "Highly
+    Parallel Fast KD-tree Construction").
     """
     n = len(cell.prim_id)
     best = options.cost_intersection * n if options.by_cost else np.inf
@@ -159,8 +162,8 @@ def binned_split(cell: Cell, options: KdOptions) -> tuple[int, np.float32] | Non
     return found
 
 
-def divide(cell: Cell, plane: tuple[int, np.float32], shapes: Any, slot: int) -> list[Cell]:
-    """The cells on both sides of the plane, in the slots `slot` and slot + 1; what straddles it is clipped to both."""
+def divide(cell: Cell, plane: tuple[int, np.float32], shapes: WarpStruct, slot: int) -> list[Cell]:
+    """Return the cells on both sides of the plane, for the slots `slot` and slot + 1; straddling primitives are clipped."""
     axis, position = plane
     goes = [cell.lo[:, axis] < position, cell.hi[:, axis] > position]
     straddles = goes[0] & goes[1]
@@ -182,16 +185,16 @@ def divide(cell: Cell, plane: tuple[int, np.float32], shapes: Any, slot: int) ->
     return out
 
 
-def clipped(shapes: Any, prim_id: np.ndarray, cell_lo: np.ndarray, cell_hi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The boxes of what of each primitive is in a cell."""
+def clipped(shapes: WarpStruct, prim_id: np.ndarray, cell_lo: np.ndarray, cell_hi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the box of the part of each primitive that is in a cell."""
     cpu = start("cpu")
     lo, hi = (wp.zeros(len(prim_id), dtype=wp.vec3, device=cpu) for _ in range(2))
     launch(clip_references, len(prim_id), shapes, upload(prim_id, wp.int32, cpu), wp.vec3(*cell_lo), wp.vec3(*cell_hi), lo, hi)
     return lo.numpy(), hi.numpy()
 
 
-def build_subtrees(tasks: list[Cell], shapes: Any, options: KdOptions, threads: int) -> list[Part]:
-    """nodes, order and totals of each task."""
+def build_subtrees(tasks: list[Cell], shapes: WarpStruct, options: KdOptions, threads: int) -> list[Part]:
+    """Build a subtree for each task on all threads."""
     chosen = kernels.KdOptions()
     chosen.max_leaf, chosen.by_cost, chosen.empty_bonus = options.max_leaf, options.by_cost, options.empty_bonus
     chosen.cost_traversal, chosen.cost_intersection = options.cost_traversal, options.cost_intersection
@@ -202,13 +205,13 @@ def build_subtrees(tasks: list[Cell], shapes: Any, options: KdOptions, threads: 
     def job(i: int) -> None:
         parts[i] = build_subtree(tasks[i], shapes, chosen)
 
-    # Largest first, so that no thread is left with a big one at the end.
+    # Largest first, so that all threads end together.
     run_all([partial(job, i) for i in sorted(range(len(tasks)), key=lambda i: -len(tasks[i].prim_id))], threads)
     return parts
 
 
-def build_subtree(cell: Cell, shapes: Any, options: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """One launch. Its memory is not touched before it is needed: most of what the budget allows never is."""
+def build_subtree(cell: Cell, shapes: WarpStruct, options: WarpStruct) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Build a subtree in one launch. Most of the allocated memory is never touched."""
     cpu = start("cpu")
     n = len(cell.prim_id)
     work = kernels.KdWork()
@@ -232,7 +235,7 @@ def build_subtree(cell: Cell, shapes: Any, options: Any) -> tuple[np.ndarray, np
 
 def joined(top: list[tuple[float, int]], tasks: list[Cell], parts: list[Part], root: Cell, area: float,
            reach: float) -> Built:
-    """One tree of the top and the subtrees: each root goes to its slot, the other nodes and the references behind all before."""
+    """Join the top and the subtrees: each root goes to its slot, its other nodes and its references to the end."""
     n_nodes = len(top) + sum(len(nodes) - 1 for nodes, _, _ in parts)
     n_references = sum(len(references) for _, references, _ in parts)
     if max(n_nodes, n_references) >= MAX_INDEX:

@@ -1,4 +1,4 @@
-"""The octree, an adaptive grid: a cell with much in it is cut into eight, and an octant with nothing in it takes no memory."""
+"""Octree: a cell with many primitives is cut into eight, and an empty octant takes no memory."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from wrt.kernels.traverse import octree as kernels
 class Octree(OneMesh):
     """An octree. Options: OctreeOptions.
 
-    Spheres are listed wherever their box is. The `box` test is not used.
+    Spheres are listed in every cell of their box. The `box` test is not used.
     """
 
     name = "octree"

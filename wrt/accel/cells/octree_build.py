@@ -1,9 +1,8 @@
-"""The builder of octrees: level by level from the root down, all cells of a level at once."""
+"""Builder of octrees: level by level from the root down, all cells of a level at once."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -13,6 +12,7 @@ from wrt.accel.bvh.tree import half_areas
 from wrt.accel.cells.common import cell_source, require_between, triangle_reach
 from wrt.accel.geometry import Geometry
 from wrt.core.device import launch, records, start, upload
+from wrt.core.types import WarpArray, WarpStruct
 from wrt.kernels.build import octree as build_octree
 from wrt.kernels.traverse.octree import MAX_LEVELS, OctreeLayout, OctreeNode
 from wrt.kernels.units.box import PAD_EXTENT
@@ -25,10 +25,12 @@ OCTANTS = np.arange(8)[:, None] >> np.arange(3) & 1  # (8, 3): which half, in x,
 
 @dataclass(frozen=True)
 class OctreeOptions:
-    """max_leaf: cells with so many primitives are not split; max_depth: splits from the root down, 0 to MAX_LEVELS; by_cost: stop
-    also where the octants cost a ray as much as the cell; max_growth: in every part of the tree, at most so many references for
-    each primitive, and never more than MAX_REFERENCES; mailbox: whether a primitive that spans several cells is tested once where
-    it can be. Raises InputError for values out of range."""
+    """Options of the octree. Raises InputError for values out of range.
+
+    max_leaf: cells with so many primitives are not split. max_depth: levels below the root, 0 to MAX_LEVELS. by_cost: stop also where
+    octants cost a ray as much as the cell. max_growth: limit of references per primitive in every part of the tree. mailbox: avoid
+    repeated tests of a primitive in several cells.
+    """
 
     max_leaf: int = 8
     max_depth: int = MAX_LEVELS
@@ -43,8 +45,11 @@ class OctreeOptions:
 
 @dataclass
 class Cells:
-    """The cells of one level: lowest corners (M, 3) int32 in finest cells; the primitives of cell i are references[begin[i]] ..
-    references[begin[i + 1] - 1]; growth: (M,) by how much those in the leaves below may be more than these."""
+    """The cells of one level.
+
+    corner: (M, 3) int32, lowest corners in units of finest cells. references: those of cell i are [begin[i], begin[i + 1]). growth:
+    (M,) factor by which the leaves below may have more references.
+    """
 
     corner: np.ndarray
     begin: np.ndarray
@@ -56,22 +61,22 @@ class Cells:
         return np.diff(self.begin)
 
     def part(self, chosen: np.ndarray) -> Cells:
-        """The chosen cells, (M,) bool."""
+        """Return the chosen cells, (M,) bool."""
         count = self.count
         references = self.references[np.repeat(chosen, count)]
         begin = np.concatenate([[0], np.cumsum(count[chosen])]).astype(np.int32)
         return Cells(self.corner[chosen], begin, references, self.growth[chosen])
 
 
-def root_cell(lo: np.ndarray, hi: np.ndarray, max_depth: int) -> Any:
-    """The layout around these boxes: a cube from the lowest corner, cut off at the highest one."""
+def root_cell(lo: np.ndarray, hi: np.ndarray, max_depth: int) -> WarpStruct:
+    """Return the layout around these boxes: a cube from the lowest corner, cut off at the highest one."""
     layout = OctreeLayout()
     low, high = lo.min(axis=0, initial=np.inf), hi.max(axis=0, initial=-np.inf)
     layout.lo, layout.hi, layout.size, layout.levels = wp.vec3(*low), wp.vec3(*high), 0.0, 0
     edge = float((high.astype(np.float64) - low).max())
     if not 0.0 < edge < 1e37:
         return layout
-    # A cell is not so small that the rounding of its planes matters, or that float32 has no such number.
+    # Cells are so large that the rounding of their planes does not matter, and that float32 can represent them.
     finest = max(float(np.abs([low, high]).max()) * PAD_EXTENT, 1e-37)
     layout.levels = min(max_depth, max(int(np.log2(edge / finest)), 0))
     size = np.float32(edge / (1 << layout.levels))
@@ -81,22 +86,19 @@ def root_cell(lo: np.ndarray, hi: np.ndarray, max_depth: int) -> Any:
     return layout
 
 
-def planes(layout: Any, corner: np.ndarray) -> np.ndarray:
-    """Coordinates (..., 3) of planes by their numbers, float64, to within rounding those of the kernels."""
+def planes(layout: WarpStruct, corner: np.ndarray) -> np.ndarray:
+    """Return coordinates (..., 3) of planes from their indices, in float64; the kernels' differ by rounding."""
     lo, hi = np.array(layout.lo, np.float64), np.array(layout.hi, np.float64)
     return np.minimum(lo + corner * float(layout.size), hi)
 
 
-def areas(layout: Any, corner: np.ndarray, size: int) -> np.ndarray:
-    """Half the surface of the cells (..., 3) of this size."""
+def areas(layout: WarpStruct, corner: np.ndarray, size: int) -> np.ndarray:
+    """Return half the surface of the cells (..., 3) of this size."""
     return half_areas(planes(layout, corner), planes(layout, corner + size))
 
 
 def build_tree(geometry: Geometry, options: OctreeOptions, threads: int) -> Built:
-    """Split the cells that have more than max_leaf primitives, where that pays, until none is left to split.
-
-    nodes: breadth first; depth: levels, the root's included; sah_cost: in nodes and primitives, of a random line through the root.
-    """
+    """Split cells with more than max_leaf primitives where that pays. Nodes are in breadth-first order; the root is a level."""
     bounds = geometry.bounds()
     layout, n = root_cell(*bounds, options.max_depth), len(geometry)
     split = _Splitter(geometry, bounds, layout, threads)
@@ -131,16 +133,16 @@ def build_tree(geometry: Geometry, options: OctreeOptions, threads: int) -> Buil
 
 
 def choose(cells: Cells, split: _Splitter, half: int, options: OctreeOptions) -> tuple[np.ndarray, np.ndarray, Cells]:
-    """Which cells of the level to split, (M,) bool; how much each octant of those has, (K, 8); and the cells of the next level."""
+    """Choose the cells to split, (M,) bool; return them, the counts of their octants (K, 8), and the cells of the next level."""
     chosen = cells.count > options.max_leaf if half else np.zeros(len(cells.corner), bool)
     large = cells.part(chosen)
     count = split.count(large, half)
-    # Every cell has room of its own, in proportion to what is in it, so that a small thing is not left with none by large ones.
+    # Each cell has its own budget, in proportion to its primitives, so that large objects leave some for small ones.
     growth = large.growth * large.count / np.maximum(count.sum(axis=1), 1)
     keep = growth >= 1.0
     corner = large.corner[:, None] + half * OCTANTS
     if options.by_cost:
-        # What a ray through the cell is expected to cost, in cells fetched and primitives tested, as one cell and as octants.
+        # Expected cost of a ray through the cell, in cells fetched and primitives tested, as one cell and as octants.
         area, whole = areas(split.layout, corner, half), areas(split.layout, large.corner, 2 * half)
         keep &= (area * (count + (count > 0))).sum(axis=1) < whole * large.count
     chosen[chosen] = keep
@@ -148,17 +150,17 @@ def choose(cells: Cells, split: _Splitter, half: int, options: OctreeOptions) ->
 
 
 class _Splitter:
-    """The kernels of kernels.build.octree over one geometry."""
+    """Kernels of kernels.build.octree over one geometry."""
 
-    def __init__(self, geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray], layout: Any, threads: int) -> None:
+    def __init__(self, geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray], layout: WarpStruct, threads: int) -> None:
         self.cpu, self.layout, self.threads = start("cpu"), layout, threads
         self.source = cell_source(geometry, bounds)
 
-    def _int32(self, array: np.ndarray) -> Any:
+    def _int32(self, array: np.ndarray) -> WarpArray:
         return upload(np.ascontiguousarray(array, np.int32), wp.int32, self.cpu)
 
     def count(self, cells: Cells, half: int) -> np.ndarray:
-        """How many references each octant of each cell has, (M, 8)."""
+        """Count the references of each octant of each cell, (M, 8)."""
         m, n = len(cells.corner), len(cells.references)
         self.begin, self.references = self._int32(cells.begin), self._int32(cells.references)
         self.masks = wp.zeros(n, dtype=wp.int32, device=self.cpu)
@@ -173,7 +175,7 @@ class _Splitter:
         return count.numpy()
 
     def fill(self, cells: Cells, corner: np.ndarray, count: np.ndarray, growth: np.ndarray) -> Cells:
-        """The octants that have something, one cell after another; those of other cells are 0. `count` was called just before."""
+        """Return the octants with references, cell after cell. Called just after `count`; other cells have counts of 0."""
         begin = np.concatenate([[0], np.cumsum(count.ravel())])
         room = np.where(count.any(axis=1, keepdims=True), begin[:-1].reshape(-1, 8), -1)
         out = wp.zeros(int(begin[-1]), dtype=wp.int32, device=self.cpu)
