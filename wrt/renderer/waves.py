@@ -1,4 +1,4 @@
-"""Pictures on the CPU by waves of samples (wrt.kernels.loops.wave): which kernels, what they work in, and the waves of a tile."""
+"""Pictures on the CPU by waves of samples (wrt.kernels.loops.wave): their kernels, working memory and launches."""
 
 from __future__ import annotations
 
@@ -6,14 +6,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from importlib import import_module
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
 
 from wrt.accel.queries.batches import new_scratch
 from wrt.accel.queries.raw_launches import Launches
-from wrt.core.device import made_once, records, upload
+from wrt.accel.structure import Structure
+from wrt.core.device import made_once, records, start, upload
+from wrt.core.types import Kernel, WarpArray, WarpStruct, WarpType
 from wrt.kernels.launches import Launch
 from wrt.kernels.loops import state, wave, wave_begin, wave_rows, wave_shade
 from wrt.kernels.loops.state import BLOCK
@@ -28,25 +30,25 @@ from wrt.kernels.wide.batch import BatchTraversal
 from wrt.renderer.film_arrays import AovFilm, DeviceFilm
 from wrt.renderer.tiles import Work
 
-# Samples of a wave: 4,096 to 32,768 are 0.92 to 1.06 times as fast, by the scene. Fewer where each has room for many paths or asks
-# many lights: ROOM is for all of them together.
-CAPACITY, ROOM = 16384, 1 << 18
-ALL = 1 << 30  # rays of a kernel whose only thread takes them all
+# Most samples of a wave; 4,096 to 32,768 are 0.92 to 1.06 times as fast, depending on the scene. Fewer if a sample has many paths or
+# lights: MAX_SLOTS is the limit of all samples' together.
+CAPACITY, MAX_SLOTS = 16384, 1 << 18
+ALL = 1 << 30  # Rays of a kernel whose only thread takes them all.
 OF_CAMERA = ("camera", "lens", "blades", "filter", "independent")
 OF_CUTOUT = ("instances", "textures", "checkerboards", "cutout")
 
 
 class SceneRecords(NamedTuple):
-    """The device's records of a scene: of its structure, surfaces and lighting, and of the camera."""
+    """The device's records of a scene."""
 
-    accel: Any
-    surfaces: Any
-    lighting: Any
-    camera: Any
+    accel: WarpStruct
+    surfaces: WarpStruct
+    lighting: WarpStruct
+    camera: WarpStruct
 
 
-def some(features: Features, names: tuple[str, ...]) -> Features:
-    """Only those switches, so that scenes that differ in others share a kernel."""
+def keep_only(features: Features, names: tuple[str, ...]) -> Features:
+    """Reset every switch outside `names`, so that scenes that differ only in those share a kernel."""
     return Features(**{name: getattr(features, name) for name in names})
 
 
@@ -58,9 +60,10 @@ begin_aov_kernel = made_once(wave_begin.make_begin_aov_kernel)
 
 
 @made_once
-def queue_kernel(structure: Any, features: Features, any_hit: bool) -> tuple[Any, int]:
-    """The structure's kernel for many rays at a time, where it has one, or for one ray after another; and the rays of one of its
-    threads. Spheres are always provided for, so that scenes with and without them share it."""
+def queue_kernel(structure: Structure, features: Features, any_hit: bool) -> tuple[Kernel, int]:
+    """Return the kernel for a queue of rays, and the rays that one of its threads takes: ALL, or 1 without a kernel for many.
+
+    It always handles spheres, so that scenes with and without them share it."""
     structure = structure._replace(units=structure.units._replace(spheres=True))
     accepts = make_cutout(features)
     stream = structure.accel.stream
@@ -72,29 +75,29 @@ def queue_kernel(structure: Any, features: Features, any_hit: bool) -> tuple[Any
 
 @dataclass(frozen=True)
 class WaveKernels:
-    """Those that a picture is made by; None: not needed. block: of queue_kernel."""
+    """The kernels of a picture; None: not needed."""
 
-    shade: Any
-    prepare: Any
-    closest_hit: Any
-    any_hit: Any
-    shadow: Any
-    begin: Any
-    loop: Any
-    begin_aov: Any
-    aov: Any
-    block: int
+    shade: Kernel
+    prepare: Kernel | None
+    closest_hit: Kernel
+    any_hit: Kernel | None
+    shadow: Kernel | None
+    begin: Kernel
+    loop: Kernel
+    begin_aov: Kernel | None
+    aov: Kernel | None
+    block: int  # As queue_kernel returns it.
 
-    def all(self) -> list[Any]:
-        """What takes longest to compile comes first."""
+    def all(self) -> list[Kernel]:
+        """Return the kernels, the slowest to compile first."""
         return [kernel for kernel in vars(self).values() if isinstance(kernel, wp.Kernel)]
 
 
-def wave_kernels(features: Features, structure: Any, aov: bool) -> WaveKernels:
-    """aov: whether AOVs are asked for."""
+def wave_kernels(features: Features, structure: Structure, aov: bool) -> WaveKernels:
+    """Return the kernels of a picture, with those of AOVs on request."""
     default = Features()
     surfaces = replace(features, camera=default.camera, lens=False, blades=False, filter=False, stack_size=default.stack_size)
-    cutout, camera = some(features, OF_CUTOUT), import_module(features.camera)
+    cutout, camera = keep_only(features, OF_CUTOUT), import_module(features.camera)
     transparent = features.transparent_shadows
     closest_hit, block = queue_kernel(structure, cutout, False)
     shade, prepare = shade_kernels(surfaces)
@@ -104,7 +107,7 @@ def wave_kernels(features: Features, structure: Any, aov: bool) -> WaveKernels:
         closest_hit=closest_hit,
         any_hit=queue_kernel(structure, cutout, True)[0] if features.direct_light and not transparent else None,
         shadow=shadow_kernel(surfaces) if transparent else None,
-        begin=begin_kernel(some(features, OF_CAMERA), camera),
+        begin=begin_kernel(keep_only(features, OF_CAMERA), camera),
         loop=wave.make_loop_kernel(transparent),
         begin_aov=begin_aov_kernel(camera) if aov else None,
         aov=aov_kernel(surfaces) if aov else None,
@@ -114,17 +117,17 @@ def wave_kernels(features: Features, structure: Any, aov: bool) -> WaveKernels:
 
 @dataclass(frozen=True)
 class Waves:
-    """The kernels of a scene, and what their threads work in. features: those that size it; lights: the background among them;
-    free: what no thread uses at the moment."""
+    """The kernels of a scene, and the working memory of their threads."""
 
     kernels: WaveKernels
-    features: Features
-    lights: int
-    free: list[Buffers] = field(default_factory=list)
+    features: Features  # For the size of the buffers.
+    lights: int  # A sampled background is one of them.
+    free: list[Buffers] = field(default_factory=list)  # Buffers that no thread uses.
 
-    def launch(self, scene: SceneRecords, limits: list[Any], film: DeviceFilm | AovFilm) -> Callable[[Work], int]:
-        """A function that takes some work's samples into the film, and gives their number; several threads may call it. limits:
-        those of each group of the film."""
+    def launch(self, scene: SceneRecords, limits: list[WarpStruct], film: DeviceFilm | AovFilm) -> Callable[[Work], int]:
+        """Return a function that renders some work into the film and returns its number of samples.
+
+        Several threads may call it. `limits` are those of each group of the film."""
         recorded: dict[int, Picture | Aovs] = {}
 
         def trace(work: Work) -> int:
@@ -136,52 +139,53 @@ class Waves:
                 recorded[id(buffers)] = (Aovs(self, buffers, scene, film) if isinstance(film, AovFilm)
                                          else Picture(self, buffers, scene, limits, film))
             recorded[id(buffers)].take(work)
-            self.free.append(buffers)  # not after an error
+            self.free.append(buffers)  # Not after an error.
             return work.total
 
         return trace
 
 
 def capacity(features: Features, lights: int) -> int:
-    """Samples of a wave."""
-    return max(min(CAPACITY, ROOM // max(lights, features.stack_size)), 64)
+    """Return the number of samples in a wave."""
+    return max(min(CAPACITY, MAX_SLOTS // max(lights, features.stack_size)), 64)
 
 
 class Buffers:
-    """What one thread works in. task, order: views of the wave's."""
+    """The working memory of one thread."""
 
     def __init__(self, features: Features, lights: int) -> None:
         self.capacity = n = capacity(features, lights)
-        self.task, self.order = records(state.Task, 1), np.zeros(n, np.int32)
-        w = self.wave = state.Wave()
+        self.task, self.order = records(state.Task, 1), np.zeros(n, np.int32)  # The wave's arrays view them.
+        w, cpu = state.Wave(), start("cpu")
+        self.wave = w
         w.capacity = n
-        w.task, w.progress = upload(self.task, state.Task, "cpu"), wp.zeros(1, dtype=state.Progress, device="cpu")
-        w.pixels.order = upload(self.order, wp.int32, "cpu")
-        w.pixels.key, w.pixels.film_index = room(n, wp.uint32), room(n + LANES, wp.int32)
-        w.samples.film_point, w.samples.lens_point = room(n + LANES, wp.vec2), room(n + LANES, wp.vec2)
-        w.samples.total, w.samples.pending, w.samples.traced_rays = room(n, Sample), room(n, wp.int32), room(n, wp.int32)
-        w.samples.paths = room(n * features.stack_size, state.Path)
-        w.queue.sample, w.queue.rays, w.queue.hits = room(n, wp.int32), queue(n), hit_arrays(n)
-        w.outcomes.hit_rays, w.outcomes.missed_rays, w.outcomes.resumed_samples = (room(n, wp.int32) for _ in range(3))
+        w.task, w.progress = upload(self.task, state.Task, cpu), wp.zeros(1, dtype=state.Progress, device="cpu")
+        w.pixels.order = upload(self.order, wp.int32, cpu)
+        w.pixels.key, w.pixels.film_index = empty(n, wp.uint32), empty(n + LANES, wp.int32)
+        w.samples.film_point, w.samples.lens_point = empty(n + LANES, wp.vec2), empty(n + LANES, wp.vec2)
+        w.samples.total, w.samples.pending, w.samples.traced_rays = empty(n, Sample), empty(n, wp.int32), empty(n, wp.int32)
+        w.samples.paths = empty(n * features.stack_size, state.Path)
+        w.queue.sample, w.queue.rays, w.queue.hits = empty(n, wp.int32), empty_rays(n), empty_hits(n)
+        w.outcomes.hit_rays, w.outcomes.missed_rays, w.outcomes.resumed_samples = (empty(n, wp.int32) for _ in range(3))
         self.allocate_shadows(features.transparent_shadows, lights)
-        w.block.rows = room(wave_rows.ROWS * BLOCK, wp.float32)
+        w.block.rows = empty(wave_rows.ROWS * BLOCK, wp.float32)
         self.scratch = new_scratch(BatchTraversal.stream_sizes)
 
     def allocate_shadows(self, transparent: bool, lights: int) -> None:
-        """Allocate what asking lights takes."""
+        """Allocate the receivers and their shadow rays."""
         w, n, slots = self.wave, self.capacity, self.capacity * lights
-        w.receivers.sample, w.receivers.pending_light = room(n, wp.int32), room(n, PendingLight)
-        w.receivers.shadow = room(slots, wp.int32)
-        w.shadows.value, w.shadow_queue.rays = room(slots, wp.vec3), queue(slots)
+        w.receivers.sample, w.receivers.pending_light = empty(n, wp.int32), empty(n, PendingLight)
+        w.receivers.shadow = empty(slots, wp.int32)
+        w.shadows.value, w.shadow_queue.rays = empty(slots, wp.vec3), empty_rays(slots)
         w.shadow_queue.count = wp.zeros(max(lights, 1), dtype=wp.int32, device="cpu")
         if transparent:
-            w.receivers.scatter, w.shadows.walk = room(n, Scatter), room(slots, ShadowWalk)
-            w.shadow_queue.slot, w.shadow_queue.hits = room(slots, wp.int32), hit_arrays(slots)
+            w.receivers.scatter, w.shadows.walk = empty(n, Scatter), empty(slots, ShadowWalk)
+            w.shadow_queue.slot, w.shadow_queue.hits = empty(slots, wp.int32), empty_hits(slots)
         else:
-            w.shadow_queue.occluded = room(slots, wp.bool)
+            w.shadow_queue.occluded = empty(slots, wp.bool)
 
     def take(self, work: Work, each: Callable[[], None]) -> None:
-        """Call `each` for every wave of some work, with its task in place."""
+        """Call `each` for every wave of some work, after setting its task."""
         task, (x, y, width, height) = self.task[0], work.rectangle
         task["x"], task["y"], task["width"] = x, y, width
         order, most = block_order(width, height), min(work.n, self.capacity)
@@ -196,14 +200,14 @@ class Buffers:
 
 
 class Picture:
-    """The launches of a picture in some buffers, packed once: all that changes from wave to wave is in the buffers."""
+    """The launches of a picture in some buffers, packed once: only the buffers change from wave to wave."""
 
-    def __init__(self, waves: Waves, buffers: Buffers, scene: SceneRecords, limits: list[Any], film: DeviceFilm) -> None:
+    def __init__(self, waves: Waves, buffers: Buffers, scene: SceneRecords, limits: list[WarpStruct], film: DeviceFilm) -> None:
         kernels, w = waves.kernels, buffers.wave
-        self.buffers, self.kept, self.groups = buffers, Launches(), []
-        recorded = self.kept.recorded
+        self.buffers, self.launches, self.groups = buffers, Launches(), []
+        recorded = self.launches.recorded
 
-        def trace(kernel: Any, rays: Any, out: Any) -> Any:
+        def trace(kernel: Kernel, rays: object, out: object) -> WarpStruct:
             return recorded(traversal(kernels, kernel, buffers, scene.accel, scene.surfaces, rays, out), kernels.block)
 
         block = recorded(command(kernels.prepare, w, scene.surfaces, scene.lighting, 0, 0), ALL) if kernels.prepare else Launch()
@@ -224,13 +228,13 @@ class Picture:
             self.groups.append(command(kernels.loop, w, of_group, waves.lights, group))
 
     def take(self, work: Work) -> None:
-        """All samples of some work."""
+        """Trace all samples of some work."""
         for group in self.groups:
             self.buffers.take(work, group.launch)
 
 
 class Aovs:
-    """As Picture, of AOVs."""
+    """The launches of AOVs in some buffers."""
 
     def __init__(self, waves: Waves, buffers: Buffers, scene: SceneRecords, film: AovFilm) -> None:
         kernels, w = waves.kernels, buffers.wave
@@ -251,35 +255,36 @@ class Aovs:
         self.aov.launch()
 
 
-def command(kernel: Any, *inputs: Any) -> Any:
+def command(kernel: Kernel | None, *inputs: object) -> wp.Launch:
+    """Record a launch of one thread."""
     return wp.launch(kernel, dim=1, inputs=inputs, device="cpu", record_cmd=True, record_tape=False)
 
 
-def traversal(kernels: WaveKernels, kernel: Any, buffers: Buffers, *inputs: Any) -> Any:
-    """A launch whose last two arguments are the range of a queue's rays: first, end."""
+def traversal(kernels: WaveKernels, kernel: Kernel, buffers: Buffers, *inputs: object) -> wp.Launch:
+    """Record a launch whose last two arguments are the range of a queue's rays: first, end."""
     return command(kernel, *inputs, *([buffers.scratch] if kernels.block > 1 else []), 0, 0)
 
 
-def room(n: int, dtype: Any) -> Any:
+def empty(n: int, dtype: WarpType) -> WarpArray:
     return wp.empty(n, dtype=dtype, device="cpu")
 
 
-def queue(n: int) -> Any:
+def empty_rays(n: int) -> WarpStruct:
     out = RenderRays()
-    out.origin, out.direction, out.exclude = room(n, wp.vec3), room(n, wp.vec3), room(n, wp.int32)
-    out.t_min, out.t_max = wp.zeros(n, dtype=wp.float32, device="cpu"), room(n, wp.float32)
+    out.origin, out.direction, out.exclude = empty(n, wp.vec3), empty(n, wp.vec3), empty(n, wp.int32)
+    out.t_min, out.t_max = wp.zeros(n, dtype=wp.float32, device="cpu"), empty(n, wp.float32)
     return out
 
 
-def hit_arrays(n: int) -> Any:
+def empty_hits(n: int) -> WarpStruct:
     out = HitArrays()
-    out.t, out.u, out.v, out.prim_id = (room(n, dtype) for dtype in (wp.float32, wp.float32, wp.float32, wp.int32))
+    out.t, out.u, out.v, out.prim_id = (empty(n, dtype) for dtype in (wp.float32, wp.float32, wp.float32, wp.int32))
     return out
 
 
 @lru_cache(maxsize=64)
 def block_order(width: int, height: int) -> np.ndarray:
-    """The pixels of a rectangle (row by row: y * width + x), int32, in squares of 4x4, 2x2 within: neighbours go the same way."""
+    """Return the pixels of a rectangle, y * width + x, in squares of 4x4 and 2x2, so that neighbours go the same way; int32."""
     y, x = np.mgrid[:height, :width]
     within = (x & 1) | (y & 1) << 1 | (x & 2) << 1 | (y & 2) << 2
     return np.lexsort((within.ravel(), x.ravel() // 4, y.ravel() // 4)).astype(np.int32)

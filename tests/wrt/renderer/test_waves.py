@@ -121,7 +121,7 @@ def test_more_samples_a_pixel_than_camera_rays_are_made_at_a_time() -> None:
 
 
 def filled_with(byte: int) -> Callable[[int, Any], Any]:
-    """As waves.room, of arrays that hold this byte."""
+    """Return an array like waves.empty's whose bytes are all this one."""
 
     def filled(n: int, dtype: Any) -> Any:
         array = wp.empty(n, dtype=dtype, device="cpu")
@@ -137,7 +137,7 @@ def test_nothing_is_read_before_it_is_written(name: str, monkeypatch: pytest.Mon
     ready = prepared(name)
     films = [film_of(ready, (0, 3))]
     for byte in (0xCD, 0xFF, 0x01):
-        monkeypatch.setattr(waves, "room", filled_with(byte))
+        monkeypatch.setattr(waves, "empty", filled_with(byte))
         films.append(film_of(replace(ready, waves=replace(ready.waves, free=[])), (0, 3)))
     for film in films[1:]:
         assert_same(films[0], film)
@@ -176,7 +176,7 @@ def test_waves_are_smaller_where_each_sample_takes_more_room() -> None:
     features = plan_of(load_scene(SCENES / "whitted.toml"), Options()).features
     assert waves.Buffers(features, 2).capacity == waves.CAPACITY
     many = waves.Buffers(features, 1000)
-    assert 64 <= many.capacity < waves.CAPACITY and len(many.wave.shadows.value) == 1000 * many.capacity <= waves.ROOM
+    assert 64 <= many.capacity < waves.CAPACITY and len(many.wave.shadows.value) == 1000 * many.capacity <= waves.MAX_SLOTS
     assert waves.Buffers(replace(features, stack_size=1 << 20), 1).capacity == 64
 
 
