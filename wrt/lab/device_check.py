@@ -48,17 +48,17 @@ MESHES: dict[str, Callable[[], Mesh]] = {
     "ball": partial(shapes.icosphere, 3), "torus": partial(shapes.torus, 1.0, 0.4, 64, 32), "terrain": partial(terrain, 48),
     "teapot": partial(shapes.teapot, 32), "teapot in a ring": lambda: shapes.merged([shapes.torus(500.0), shapes.teapot(16)], "")}
 CONSTRUCTORS = ("sah", "median", "lbvh", "cubql")  # of Warp's BVH
-FAST, SLOW, RUNS = 1 << 20, 1 << 15, 7  # rays to time on CUDA, and on the CPU
-TIMED_CELLS = 192  # a side of the terrain for it
+FAST, SLOW, RUNS = 1 << 20, 1 << 15, 7  # timed rays on CUDA and on the CPU
+TIMED_CELLS = 192  # of a side of the terrain that is timed
 COLUMNS: Columns = {"part": "{part}", "what": "{what}", "compared": "{count}", "differ": "{differ}",
                     "where": lambda row: ", ".join(row.where[:4]) + (", ..." if len(row.where) > 4 else "")}
 SPEED: Columns = {"who": "{who}", "rays": "{kind}", "Mray/s": lambda row: spread(row.mrays), "wrt / it": "{first_over_it:.2f}"}
 LEGEND = """\
-compared: answers, whose bits must be those of the CPU; differ: those that are not, and where. All that differs is a fault: report
-it, with this table."""
+compared: number of answers; differ: answers with other bits than the CPU's, and where. Each difference is a fault: please report it with
+this table."""
 TIMED = """\
-Rays and answers are on the device; median of the runs by turns, the middle half of them in brackets. wrt / it: how many times as
-fast wrt's default structure is."""
+Rays and answers are on the device; median of the runs in turn, quartiles in brackets. wrt / it: how many times as fast wrt's default
+structure is."""
 
 
 @dataclass(frozen=True)
@@ -224,7 +224,7 @@ def finished(search: Callable[[], object], device: Device) -> None:
 
 @dataclass(frozen=True)
 class Result:
-    """machine: what was compared, and where; rows, speed, skipped: as `rows` and `speed_rows` give them."""
+    """What was compared and where (`machine`), the comparisons (`rows`), and the results of `speed_rows`."""
 
     machine: str
     rows: list[Row]

@@ -336,5 +336,5 @@ def test_kernels_compile_for_turing_and_hopper(tmp_path: Path) -> None:
 def test_only_a_perspective_camera_can_be_rasterized():
     mesh = icosphere(1)
     ball = Geometry(mesh.vertices, mesh.faces, np.zeros((0, 4), np.float32))
-    with pytest.raises(InputError, match="perspective camera; camera 'sky' is fisheye"):
+    with pytest.raises(InputError, match="camera 'sky': is fisheye; only a perspective camera"):
         Rasterizer(ball).draw(FisheyeCamera(name="sky"), (8, 8))

@@ -1,4 +1,4 @@
-"""`wrt.tune` by a clock of the tests' own: what is found best is what the caller gets, and can pass on."""
+"""`wrt.tune` by a clock of the tests' own: the caller gets the best choice, and can pass it on."""
 
 from __future__ import annotations
 

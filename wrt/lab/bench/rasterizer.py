@@ -31,7 +31,7 @@ ROWS_ON_CUDA = 16  # of a band; one thread draws a triangle's part of it
 def as_perspective(camera: CameraKind) -> Camera:
     """Raise InputError for a camera that does not keep straight edges straight."""
     if not isinstance(camera, Camera):
-        raise InputError(f"z-buffer and rays are compared through a perspective camera; camera {camera.name!r} is {camera.kind}")
+        raise InputError(f"is {camera.kind}; only a perspective camera suits z-buffer and rays", place=f"camera {camera.name!r}")
     return camera
 
 
@@ -60,7 +60,7 @@ class Rasterizer:
 
     def __init__(self, geometry: Geometry, device: str = "cpu", threads: int | None = None) -> None:
         if len(geometry.spheres):
-            raise InputError(f"a rasterizer draws triangles; the geometry has {len(geometry.spheres)} spheres")
+            raise InputError(f"has {len(geometry.spheres)} spheres, and a rasterizer draws triangles only", argument="geometry")
         self.device, self.threads = start(device), thread_count(threads)
         self.triangles = len(geometry.faces)
         self.vertices = upload(geometry.vertices, wp.vec3, self.device)

@@ -15,8 +15,8 @@ KINDS = ("lost", "invented", "wrong_triangle")
 TITLE = "The hard cases and ray libraries"
 COLUMNS: Columns = {"library": "{library}", **OF_A_CASE}
 LEGEND = """\
-lost: rays that must hit and are said to miss; invented: hits of a triangle that the ray passes by more than float32's rounding, or
-that are not on the ray; wrong triangle: a nearer one was left out, by more than the rounding. Of faces at the same distance any is
+lost: rays that must hit and are reported to miss. invented: hits of a triangle that the ray passes by more than float32's rounding, or
+that are not on the ray. wrong triangle: a triangle nearer by more than the rounding was left out. Of faces at the same distance any is
 right. ulp: the largest error of t, in float32 steps of the exact one. Input that is not finite may be refused."""
 
 
@@ -27,7 +27,7 @@ def rows(plan: Plan) -> Iterator[Row]:
             yield Row(library=library.name, missing=reason)
             continue
         for result in results(library.closest_hit, plan.cases, plan.rays, plan.seed):
-            yield Row(library=library.name, missing="", told=result.told, wrong=result.wrong, **vars(result))
+            yield Row(library=library.name, missing="", note=result.note, wrong=result.wrong, **vars(result))
 
 
 def line(row: Row) -> str:

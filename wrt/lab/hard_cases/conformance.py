@@ -18,7 +18,7 @@ from wrt.lab.hard_cases.cases import HARD_CASES, HardCase, Verdict, chosen, chun
 ClosestHit = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Any]
 NOT_ASKED = ("C_spheres", "H_exact_ends")  # not of triangles, and rays that begin after their origin
 COLUMNS: Columns = {"case": "{case}", "rays": "{rays}", "lost": "{lost}", "invented": "{invented}",
-                    "wrong triangle": "{wrong_triangle}", "t ulp": "{t_ulp:.3g}", "": lambda row: row.told}
+                    "wrong triangle": "{wrong_triangle}", "t ulp": "{t_ulp:.3g}", "": lambda row: row.note}
 
 
 @dataclass(frozen=True)
@@ -51,13 +51,13 @@ class Result:
         return not (self.wrong or (self.raised and not self.refused))
 
     @property
-    def told(self) -> str:
+    def note(self) -> str:
         """The error that was raised, or "refused" if that was right; "" without an error."""
         return "refused" if self.refused else self.raised
 
     def __str__(self) -> str:
         counted = f"{self.lost} lost, {self.invented} invented, {self.wrong_triangle} of a wrong triangle"
-        lines = [f"{self.case}: of {self.rays} rays {counted}{f'; {self.told}' if self.told else ''}"]
+        lines = [f"{self.case}: of {self.rays} rays {counted}{f'; {self.note}' if self.note else ''}"]
         lines += ["  ray {row}: {why}; said: triangle {prim_id}; origin {origin}, direction {direction}".format_map(ray)
                   for ray in self.examples]
         return "\n".join(lines)
@@ -81,7 +81,7 @@ class Report:
         return Result("all", **counts, t_ulp=max((result.t_ulp for result in self.results), default=0.0))
 
     def _lines(self) -> list[list[str]]:
-        return [cells(COLUMNS, Row(**vars(result), told=result.told)) for result in (*self.results, self.total)]
+        return [cells(COLUMNS, Row(**vars(result), note=result.note)) for result in (*self.results, self.total)]
 
     def __str__(self) -> str:
         return table(tuple(COLUMNS), self._lines())
@@ -154,15 +154,27 @@ def results(closest_hit: ClosestHit, cases: str | Sequence[str] = (), rays: int 
 
 
 def hard_cases(closest_hit: ClosestHit, cases: str | Sequence[str] = (), rays: int = 1000, seed: int = 0) -> Report:
-    """Put the hard cases to a ray library: how many rays it loses, invents and gives to a wrong triangle.
+    """Put the hard cases to a ray library: count the rays that it loses, invents and gives to a wrong triangle.
 
-    closest_hit(vertices, faces, origins, directions) gets (V, 3) float32, (F, 3) int32, (N, 3) float32 and (N, 3) float32; the
-    directions have any length. It returns t and prim_id, (N,) each, as a pair or as attributes: the distance in units of
-    |direction|, and which face is hit, -1 where none is; t counts only where one is. Of faces at the same distance any is right.
+    Parameters
+    ----------
+    closest_hit : function of (vertices, faces, origins, directions)
+        It gets (V, 3) float32, (F, 3) int32, (N, 3) float32 and (N, 3) float32; directions have any length. It returns t and prim_id, (N,)
+        each, as a pair or as attributes: the distance in units of |direction|, which counts for hits only, and the face, -1 on a miss. Of
+        faces at the same distance any is right.
+    cases : names, or letters of groups
+        By default all.
+    rays, seed
+        Rays of each case, and another seed for other rays.
 
-    cases: names, or letters of their groups; without any, all. rays: of each case. seed: other rays. Raises InputError for a name
-    that is none, and where closest_hit returns something else.
-    """
+    Returns
+    -------
+    Report
+
+    Raises
+    ------
+    InputError
+        An unknown name, or closest_hit returns something else."""
     return Report(tuple(results(closest_hit, cases, rays, seed)))
 
 

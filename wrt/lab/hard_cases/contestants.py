@@ -110,7 +110,7 @@ class Embree(Peer):
         except TypeError as error:
             raise InputError("embreex is too old to be asked for a mode", hint='pip install "embreex>=4.4"') from error
         self.mesh = TriangleMesh(self.scene, geometry.vertices, geometry.faces)
-        self.closest(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))  # it builds when it is first asked
+        self.closest(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))  # it builds at its first query
 
     def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf) -> Hits:
         out = self.scene.run(np.ascontiguousarray(origins), np.ascontiguousarray(directions), output=True)
@@ -205,10 +205,10 @@ class Open3D(Peer):
 
     def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf) -> Hits:
         rays = np.concatenate([origins, directions], axis=1).astype(np.float32)
-        told = {name: array.numpy() for name, array in self.scene.cast_rays(self.tensor(rays), nthreads=1).items()}
-        prim_id = np.where(told["primitive_ids"] == self.none, -1, told["primitive_ids"].astype(np.int64)).astype(np.int32)
-        u, v = told["primitive_uvs"].T
-        return cut(told["t_hit"], prim_id, u, v, t_min, t_max)
+        found = {name: array.numpy() for name, array in self.scene.cast_rays(self.tensor(rays), nthreads=1).items()}
+        prim_id = np.where(found["primitive_ids"] == self.none, -1, found["primitive_ids"].astype(np.int64)).astype(np.int32)
+        u, v = found["primitive_uvs"].T
+        return cut(found["t_hit"], prim_id, u, v, t_min, t_max)
 
     def search(self, rays: RaySet, threads: int) -> Callable[[], object]:
         bundle = self.tensor(np.concatenate([rays.origins, rays.directions], axis=1))

@@ -162,7 +162,7 @@ def _plain_faults(case: HardCase, t: np.ndarray, prim_id: np.ndarray, finite: np
     """Find what is wrong whatever the oracle says, and the rays whose reported hit may be one. finite: flags of the primitives."""
     reported = prim_id >= 0
     verdict = Verdict(rays=len(case), hits=int(reported.sum()))
-    verdict.wrong("misses", case, np.flatnonzero(~reported & (case.expected == HIT)), "must hit, is said to miss")
+    verdict.wrong("misses", case, np.flatnonzero(~reported & (case.expected == HIT)), "must hit, is reported to miss")
     verdict.wrong("false_hits", case, np.flatnonzero(reported & (case.expected == MISS)), "must miss", prim_id)
     possible = reported & np.isfinite(t) & (t >= case.t_min) & (t <= case.t_max) & (prim_id < len(finite))
     possible[possible] &= finite[prim_id[possible]]
@@ -346,11 +346,11 @@ def judge_all_hits(case: HardCase, ray: np.ndarray, prim_id: np.ndarray, t: np.n
     if case.closed and len(ray) > 1:
         pair = (ray[1:] == ray[:-1]) & (np.diff(t) <= limit.t[1:] + limit.t[:-1])
         twice[1:] |= pair & (np.sign(exact.slope[1:]) == np.sign(exact.slope[:-1]))
-    verdict.wrong("duplicate_hits", case, ray[twice], "one crossing, told twice")
+    verdict.wrong("duplicate_hits", case, ray[twice], "one crossing, reported twice")
 
     found = reference.all_hits(case.origins, case.directions, case.t_min, case.t_max)
     certain, _ = _certain(case, reference, found, np.arange(len(case)), case.origins, case.directions)
-    told = set(zip(ray.tolist(), prim_id.tolist(), strict=True))
-    lost = [r for r, p in zip(found.ray[certain].tolist(), found.prim_id[certain].tolist(), strict=True) if (r, p) not in told]
+    reported = set(zip(ray.tolist(), prim_id.tolist(), strict=True))
+    lost = [r for r, p in zip(found.ray[certain].tolist(), found.prim_id[certain].tolist(), strict=True) if (r, p) not in reported]
     verdict.wrong("misses", case, np.array(lost, dtype=np.int64), "has a hit that had to be found")
     return verdict

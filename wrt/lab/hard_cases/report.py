@@ -14,13 +14,12 @@ from wrt.lab.hard_cases.cases import Verdict
 from wrt.lab.hard_cases.stability import ASKED, COLUMNS, Plan, Result, Row
 
 LEGEND = f"""\
-rays: of which the oracle judged the first ones ("judged", {{sample}} of a case at most); the others have an answer that is known
-without it (a closed surface must be hit, corners on a line never, a ray must not hit the triangle that it leaves), and were held
-to that. misses, false hits, wrong prim: rays lost, invented, or given to a primitive behind another, by more than the derived error
-bound. Within the bound nothing is wrong, but counted: ties (the same exact t), near ties (the bound cannot tell which is nearer; of
-all hits for the default, of {ASKED} a case for the others) and borderline (the exact ray passes an edge by less than the bound).
-duplicates: one crossing of a surface told twice by an all-hits query. t: error in float32 ulp of the exact distance, and its share
-of the bound."""
+judged: the first rays of a case, {{sample}} at most, which the oracle judged. The answer of the others is known without it: a closed
+surface must be hit, corners on a line never, and a ray must not hit the triangle that it leaves. misses, false hits, wrong prim: rays
+lost, invented, or given to a primitive behind another one, by more than the derived error bound. Within the bound nothing is wrong, but
+counted: ties (the same exact t), near ties (the bound hides which is nearer; for the default of all hits, else of {ASKED} a case) and
+borderline (the exact ray passes an edge by less than the bound). duplicates: one crossing of a surface that an all-hits query reports
+twice. t: error in float32 ulp of the exact distance, and its share of the bound."""
 
 
 def sums(rows: Sequence[Row]) -> dict[str, Verdict]:
@@ -55,8 +54,8 @@ GROUPS: Columns = {"group": "{name}", "rays": "{v.rays}", "judged": "{judged}", 
 def _summary(result: Result) -> Part:
     lines = [Line(name=name, v=v, error=usual_error(result.rows, name), **vars(result.speed[name]))
              for name, v in sums(result.rows).items()]
-    text = ("Summed over all cases. usual t ulp: the 99.9th percentile in the middle one of the cases. Speed on one thread, case "
-            "A's sphere of 159,200 triangles, runs by turns: median [quartiles].")
+    text = ("Summed over all cases. usual t ulp: the 99.9th percentile in the median case. Speed on one thread, case A's sphere of 159,200 "
+            "triangles, runs in turn: median [quartiles].")
     return tabled(ALL, lines, "All cases", text)
 
 
@@ -72,9 +71,9 @@ def _groups(result: Result) -> Part:
 
 def text(result: Result, plan: Plan) -> str:
     """Return the whole report as Markdown."""
-    told = "\n\n".join([f"Machine: {machine(plan)}; {result.seconds:.0f} s in all.", f"To repeat: `{repeating(plan)}`",
+    head = "\n\n".join([f"Machine: {machine(plan)}; {result.seconds:.0f} s in all.", f"To repeat: `{repeating(plan)}`",
                         LEGEND.format(sample=plan.sample), *(f"{line}." for line in _notes(result))])
-    return markdown([Part("Stability of the intersection tests", told), _summary(result), _groups(result),
+    return markdown([Part("Stability of the intersection tests", head), _summary(result), _groups(result),
                      tabled(COLUMNS, result.rows, "Every case")])
 
 

@@ -35,10 +35,10 @@ from wrt.renderer.distributed.installed import DIGEST
 from wrt.renderer.distributed.workers import worker_name
 from wrt.renderer.progress import TimeLeft
 
-ALL_HITS_TESTS = 20_000_000  # ray-primitive tests that a case's all-hits check may take
+ALL_HITS_TESTS = 20_000_000  # ray-primitive tests of a case's all-hits check, at most
 ALL_HITS_RAYS = 2000
 SPEED_RAYS = 200_000
-ASKED = 2000  # of a rival's claimed hits in one case: is anything nearer? Of the default's, all are asked
+ASKED = 2000  # hits of a case that the oracle checks for nearer ones; of the default, all
 CHUNK = 2**18
 
 COLUMNS: Columns = {
@@ -166,7 +166,7 @@ def run_case(name: str, rays: int, algorithm: Algorithm, seed: int = 0) -> Row |
 def run_more(name: str, plan: Plan, progress: Callable[[str], None]) -> Iterator[Verdict]:
     """Yield verdicts on the rays beyond the sample through the default tests, on all threads, without the oracle."""
     left, begin = fewer(name, plan.rays) - fewer(name, plan.sample), time.perf_counter()
-    own = threading.local()  # a structure for each thread, which several parts may use
+    own = threading.local()  # a structure for each thread
 
     def part(index: int) -> Verdict:
         own.default = getattr(own, "default", None) or Own()
@@ -200,7 +200,7 @@ def more_part(name: str, plan: Plan, index: int, own: Own | None = None) -> Verd
     own.prepare(case.geometry)
     verdict = check(case, own.closest(case.origins, case.directions, case.t_min, case.t_max))
     if case.next_directions is None:
-        verdict.rays -= int((case.expected == ASK).sum())  # nothing was checked of them
+        verdict.rays -= int((case.expected == ASK).sum())  # they were not checked
         return verdict
     return verdict + judge_next(case, *respawn(own, case))
 

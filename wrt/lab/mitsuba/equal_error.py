@@ -32,7 +32,7 @@ from wrt.scene.materials import Material
 from wrt.scene.model import Scene
 
 PILOT_SPP = 16
-SAME = 0.25  # of the squared error compared at: a squared bias beyond it means that the pictures are not of the same light
+SAME = 0.25  # of the squared error; a larger squared bias means that the pictures show different light
 
 
 def matte(scene: Scene) -> Scene:
@@ -126,7 +126,7 @@ def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = 
     """Measure. command: arguments of `python -m wrt` that render this scene at 1 spp, to time a process (None: not timed).
     Unusable variants are left out and named in the result. Raise InputError if none is usable, or if Mitsuba cannot draw the scene
     exactly."""
-    scene = scene.with_settings(filter="box")  # the only one whose pixels Mitsuba takes by themselves
+    scene = scene.with_settings(filter="box")  # Mitsuba takes the pixels of no other filter by themselves
     seeds = [int(word) for word in np.random.SeedSequence(plan.seed).generate_state(REFERENCE_SEEDS + plan.repeats)]
     pictures, starts = seeds[REFERENCE_SEEDS:], plan.starts if command else 0
     threads, ours = thread_count(options.threads), []
@@ -203,14 +203,13 @@ def text(result: Row) -> str:
     sides = [Row(**vars(result.wrt), name="wrt", ratio=None, process_ratio=1.0),
              *(Row(**vars(rival), name=f"Mitsuba {variant}, {result.integrator}") for variant, rival in result.mitsuba.items())]
     width, height = result.size
-    told = [f"Mitsuba {variant} is not available: {why}." for variant, why in result.not_available.items()]
-    told += [f"The picture of {variant} is not of the same light: its ratio says nothing. Try --matte, or another --integrator."
+    notes = [f"Mitsuba {variant} is not available: {why}." for variant, why in result.not_available.items()]
+    notes += [f"The picture of {variant} is not of the same light: its ratio says nothing. Try --matte, or another --integrator."
              for variant, rival in result.mitsuba.items() if not rival.same_light]
     head = f"{result.scene}, {width}x{height}, {result.threads} threads; the reference's own RMSE is {result.reference.rmse:.2g}."
-    return markdown([tabled(COLUMNS, sides, "", head), Part("", "\n".join([LEGEND, *told]))]).rstrip()
+    return markdown([tabled(COLUMNS, sides, "", head), Part("", "\n".join([LEGEND, *notes]))]).rstrip()
 
 
 LEGEND = """\
-times wrt's: how many times as long Mitsuba takes to wrt's error, tracing alone (median and quartiles) and as a whole process, with
-start, imports, scene, structure and compiler; what both programs' compilers keep on disk was there before. Mitsuba traces with
-Embree in its robust mode."""
+times wrt's: how many times as long Mitsuba takes to wrt's error, tracing alone (median and quartiles) and as a whole process with start,
+imports, scene, structure and compiler. The compilers' caches on disk were filled before. Mitsuba traces with Embree in its robust mode."""

@@ -80,7 +80,7 @@ def read_cubin(data: bytes) -> dict[str, KernelCode]:
             out[name] = KernelCode(name, sections[f".text.{name}"].data(), facts.get((_REGISTERS, number), 0),
                                    facts.get((_FRAME, number), 0), shared.data_size if shared else 0)
     except (ELFError, KeyError, struct.error) as error:
-        raise InputError("is no CUDA binary that can be read") from error
+        raise InputError("this is no readable CUDA binary") from error
     return out
 
 

@@ -74,7 +74,7 @@ def resident_warps(code: KernelCode, arch: int, block_dim: int) -> int:
 def per_unit(few: KernelCode, many: KernelCode) -> dict[str, float]:
     """Return the instructions by class that one more unit adds to a kernel. Raise InputError where the compiler unrolls the loop."""
     if few.operations()["STG"] != 1 or many.operations()["STG"] != 1:
-        raise InputError("this compiler unrolls the kernels that hold the units: their instructions cannot be told apart")
+        raise InputError("this compiler unrolls the probe kernels: the instructions of one unit cannot be separated")
     a, b = few.classes(), many.classes()
     return {name: (b[name] - a[name]) / (MANY - FEW) for name in (*CLASSES, "other")}
 

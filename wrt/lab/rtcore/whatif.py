@@ -43,7 +43,7 @@ def studied(study: Study) -> type[Bvh2]:
 def with_traversal(accel: OneMesh, study: Study) -> OneMesh:
     """Return the same tree with another traversal. Raise InputError if it is too deep for a restart trail."""
     if study.entries < STACK_SIZE and accel.stats.depth > LEVELS:
-        raise InputError(f"the tree is {accel.stats.depth} deep: more than the {LEVELS} levels that a restart trail has bits for")
+        raise InputError(f"the tree is {accel.stats.depth} levels deep, and a restart trail has bits for {LEVELS}")
     return studied(study).restore(accel.built, accel.geometry)
 
 

@@ -1,4 +1,4 @@
-"""bench accel: the rows hold what was measured, a structure that loses a ray is told, and the command writes what it says."""
+"""bench accel: the rows hold what was measured, a structure that loses a ray is reported, and the command writes the tables."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""bench bvh: rays and counts are what they are said to be, and the trees are as good as those that others publish."""
+"""bench bvh: rays and counts have closed forms, and the trees are as good as published ones."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def box(tmp_path: Path) -> Path:
 
 
 def test_inward_rays_meet_the_box_as_often_as_its_surface_says() -> None:
-    # Of uniform lines through a convex body, those that meet a convex body in it are as its surface to the outer one's.
+    # The share of uniform lines through a convex body that meet an inner convex body is the ratio of their surfaces.
     geometry = Geometry.of(icosphere(2))
     ball = build(geometry, "bvh")
     rays = inward(geometry, 40_000, 1)

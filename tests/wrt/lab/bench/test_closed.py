@@ -33,7 +33,7 @@ def test_wrong_points_are_counted() -> None:
 
     def others(points: np.ndarray) -> np.ndarray:
         out = wrt.contains(accel, points)
-        out[1:121:3] ^= True  # not those that are aimed at corners, which may be on the surface
+        out[1:121:3] ^= True  # points aimed at corners are left out: they may be on the surface
         return out
 
     wrong = closed.points_wrong(geometry, reference, others, 3000, 0)

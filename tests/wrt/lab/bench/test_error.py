@@ -340,7 +340,7 @@ def test_ctrl_c_before_the_first_row_has_nothing_to_keep(tmp_path: Path, monkeyp
 
 
 def test_constant_background_has_no_error() -> None:
-    # Nothing to estimate: every number is 0 or cannot be told, and nothing fails.
+    # Nothing to estimate: every value is 0 or NaN, and nothing fails.
     scene = Scene(background=ConstantBackground((0.5, 0.5, 0.5)), cameras=(Camera(),), settings=Settings(size=(4, 4)))
     result = bench.sweep(scene, bench.Plan(knobs=("fresnel",), max_spp=4, repeats=3, reference_spp=4), Options())
     assert all(math.isnan(row.rmse.value) and row.noise == 0.0 and not row.pareto for row in result.rows)

@@ -353,7 +353,7 @@ def test_the_verdict_on_all_hits() -> None:
     assert 4 <= lost.misses <= 5 and lost.duplicate_hits == 0
     wrong = judge_all_hits(case, ray, np.where(np.arange(len(ray)) < 4, prim_id ^ 64, prim_id), t)
     assert wrong.false_hits == 4
-    # Two triangles of a mesh on both sides of an edge, one crossing: exactly at a vertex it is told by each of them.
+    # Two triangles of a mesh on both sides of an edge, one crossing: exactly at a vertex each of them reports it.
     corner = generate("A_far_vertices", 5, seed=1)
     exact = reference_of(corner.geometry).all_hits(corner.origins, corner.directions)
     told = judge_all_hits(corner, exact.ray, exact.prim_id, exact.t.astype(np.float32))

@@ -27,7 +27,7 @@ CASES = ("B_jittered_vertices", "D_published", "G_coincident_uniform", "I_rays_n
 def test_wrt_loses_nothing() -> None:
     report = hard_cases(own, CASES, rays=100)
     assert report.ok and [result.case for result in report.results] == list(CASES)
-    assert report.results[-1].refused and report.results[-1].told == "refused"
+    assert report.results[-1].refused and report.results[-1].note == "refused"
     assert (report.total.rays, report.total.wrong) == (400, 0) and 0.0 < report.total.t_ulp < 100.0
     assert [cell.strip() for cell in str(report).splitlines()[-1].split("|")[1:6]] == ["all", "400", "0", "0", "0"]
 
@@ -84,7 +84,7 @@ def test_what_is_raised_is_told_and_input_that_is_not_finite_may_be_refused() ->
         raise RuntimeError("no\nmore")
 
     report = hard_cases(broken, ["D_published", "I_mesh_not_finite"], rays=5)
-    assert [(result.told, result.ok) for result in report.results] == [("RuntimeError: no", False), ("refused", True)]
+    assert [(result.note, result.ok) for result in report.results] == [("RuntimeError: no", False), ("refused", True)]
     assert not report.ok and "RuntimeError: no" in str(report) and "RuntimeError" in report._repr_html_()
     with pytest.raises(RuntimeError, match="no"):
         Case("D_published", 5).check(broken)

@@ -1,4 +1,4 @@
-"""Time to equal error against Mitsuba: what is measured is what it says, and another light is noticed."""
+"""Time to equal error against Mitsuba: the figures hold, and a picture of other light is noticed."""
 
 from __future__ import annotations
 

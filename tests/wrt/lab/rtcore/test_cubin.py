@@ -1,4 +1,4 @@
-"""CUDA binaries: what is read is what was compiled; what is no binary is refused."""
+"""CUDA binaries: the reader finds what was compiled, and refuses other files."""
 
 from __future__ import annotations
 
@@ -40,5 +40,5 @@ def test_the_code_of_a_kernel_is_found(tmp_path: Path) -> None:
 def test_what_is_no_binary_is_refused(tmp_path: Path) -> None:
     good = compiled(plain, tmp_path)
     for bad in (b"", b"\x7fELF\x02", b"nonsense" * 100, good[:len(good) // 2], b"\x7fELF\x01" + good[5:]):
-        with pytest.raises(InputError, match="no CUDA binary"):
+        with pytest.raises(InputError, match="no readable CUDA binary"):
             read_cubin(bad)

@@ -1,4 +1,4 @@
-"""Machine code for Turing: operations are called by their names, and a unit is what it is made of."""
+"""Machine code for Turing: operations have their names, and a unit has the instructions of its parts."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_a_box_test_is_six_differences_and_seven_products() -> None:
 def test_a_kernel_whose_body_stands_twice_is_refused() -> None:
     twice = compiled(floats)
     assert twice.operations()["STG"] > 1
-    with pytest.raises(InputError, match="cannot be told apart"):
+    with pytest.raises(InputError, match="cannot be separated"):
         per_unit(twice, twice)
 
 

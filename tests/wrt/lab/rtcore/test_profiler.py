@@ -147,7 +147,7 @@ def test_what_a_profile_cannot_do_is_refused(scene: Scene, monkeypatch: pytest.M
 
 
 def test_nothing_of_the_log_is_in_a_render(scene: Scene, tmp_path: Path) -> None:
-    """The machine code for Turing is that of a source without a word on counting, to the last byte."""
+    """A source without counting compiles to the same machine code for Turing, to the last byte."""
     features, structure = features_of(scene, scene.camera(None)), Structure(ACCELERATORS["bvh"], Units())
     folder = Path(wrt.__file__).parent.parent / "kernels"
     modules, names = {}, ("paths", "step", "follow_up", "film", "one_ray")
