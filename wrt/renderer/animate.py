@@ -1,4 +1,4 @@
-"""Frame after frame: the camera goes round, meshes move, and the structure follows them."""
+"""Animations: the camera orbits, meshes move, and the acceleration structure is refitted or rebuilt."""
 
 from __future__ import annotations
 
@@ -27,9 +27,12 @@ MOVIES = {".gif": "GIF", ".png": "PNG", ".apng": "PNG"}
 
 @dataclass(frozen=True)
 class Animation:
-    """frames: how many, at times 0, 1 / frames, 2 / frames ... of the period, so that the last is followed by the first; degrees:
-    how far the camera goes round, likewise (None: once, or not at all where something moves); rebuild_at: from which growth of
-    the SAH cost on the structure is built anew rather than refitted. Raises InputError for values out of range."""
+    """Parameters of an animation. Raises InputError for values out of range.
+
+    frames: their number, at the times 0, 1 / frames, 2 / frames ... of the period; the first follows the last seamlessly.
+    degrees: orbit of the camera in the period (None: 360, or 0 if an object moves).
+    rebuild_at: growth of the SAH cost from which the structure is rebuilt in place of a refit.
+    """
 
     frames: int = 36
     degrees: float | None = None
@@ -44,10 +47,10 @@ class Animation:
 
 
 def animate(scene: Scene, animation: Animation, options: Options) -> Iterator[Film]:
-    """The frames, one by one, each with stats["frame"]: time, and what was done with the structure ("built", "kept", "refitted"
-    or "rebuilt"), in how many seconds, and the growth of its SAH cost. An interrupted frame is the last one.
+    """Yield the frames one by one; an interrupted frame is the last.
 
-    Meshes that move are copied into the world (instancing "never"). Raises InputError where nothing would move.
+    stats["frame"] of each has its time, the action on the structure ("built", "kept", "refitted" or "rebuilt"), its seconds, and the
+    growth of the SAH cost. Moving meshes are not instanced. Raises InputError if nothing would move.
     """
     degrees = animation.degrees if animation.degrees is not None else (0.0 if moves(scene) else 360.0)
     if animation.frames > 1 and degrees == 0.0 and not moves(scene):
@@ -72,7 +75,7 @@ def animate(scene: Scene, animation: Animation, options: Options) -> Iterator[Fi
 
 
 def orbited(camera: CameraKind, middle: np.ndarray, degrees: float) -> CameraKind:
-    """The camera turned about the vertical axis (+y) through the point of its line of view that is nearest to `middle` (3,)."""
+    """Return the camera rotated about the +y axis through the point on its viewing axis closest to `middle` (3,)."""
     if degrees == 0.0:
         return camera
     pose = camera.camera_to_world
@@ -87,7 +90,7 @@ def orbited(camera: CameraKind, middle: np.ndarray, degrees: float) -> CameraKin
 
 
 def check_output(path: str | os.PathLike[str]) -> Path:
-    """The path, if frames can be written there: a file of MOVIES, or a folder, which is made. Raises InputError if not."""
+    """Return the path of a file of MOVIES, or of a folder, which is made. Raises InputError if frames cannot be written there."""
     path = Path(path)
     if path.suffix.lower() in MOVIES:
         check_writable(path)
@@ -103,13 +106,15 @@ def check_output(path: str | os.PathLike[str]) -> Path:
 
 
 def frame_path(folder: Path, number: int, frames: int) -> Path:
-    """Names that sort as the frames do."""
+    """Return a file name for a frame; the names sort in the order of the frames."""
     return folder / f"frame_{number:0{max(len(str(frames - 1)), 3)}d}.png"
 
 
 def save_movie(path: str | os.PathLike[str], frames: Sequence[np.ndarray], fps: float) -> None:
-    """Pictures, (H, W, 3) uint8 each, as one file that plays round and round: .gif (256 colours a frame, dithered, hundredths of
-    a second) or .png, .apng (all colours). Written whole or not at all. Raises InputError where the system refuses."""
+    """Write pictures, (H, W, 3) uint8 each, as one looping file, whole or not at all. Raises InputError if the system refuses.
+
+    .gif has 256 dithered colours a frame and times in hundredths of a second; .png and .apng keep all colours.
+    """
     with needed_by("a movie"):
         from PIL import Image
 

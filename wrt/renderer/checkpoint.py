@@ -1,8 +1,8 @@
-"""Long renders that survive: the film in a file that is whole at any moment (wrt.core.write_file).
+"""Checkpoints of long renders: the film in a file that is complete at any moment (wrt.core.write_file).
 
-A checkpoint is a checked file (wrt.core.checked_file): who made it (IDENTITY: everything that can change a pixel), how far it is,
-and the film's arrays. How many samples each pixel has is one of them: rendering goes on from any state in which each pixel is done
-whole. Two renders that write one checkpoint replace each other's: what it holds is one of them, whole.
+A checkpoint is a checked file (wrt.core.checked_file) with the identity of its render (all that can change a pixel), its progress, and
+the arrays of the film, the number of samples of each pixel among them. A render resumes from any state between two tiles. If two renders
+write one checkpoint, it holds the last complete state of either.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from wrt.scene.digest import camera_digest, scene_digest
 from wrt.scene.settings import SETTINGS
 
 MAGIC = b"wrt checkpoint 1\n"
-# What may change between a checkpoint and going on with it; and the camera and the device, which are compared by what they are.
+# Options that may change on resume; and the camera and the device, which are compared by digest and by kind.
 NO_PIXEL = ("spp", "exposure", "tonemap", "threads", "aov", "time_limit", "target_error", "tile_size", "pass_size", "progress",
             "checkpoint", "checkpoint_every", "resume", "camera", "device", "devices", "executor")
-# What is said of a value that differs; of the rest, both values are shown.
+# Messages for values that differ; for all others, both values are shown.
 OTHER = {"scene": "the scene is another", "camera": "the camera is another", "kernels": "the kernels are another version"}
 
 
 @dataclass(frozen=True)
 class Saved:
-    """What a checkpoint holds. samples: the fewest and the most of a pixel (of each group); seconds of tracing."""
+    """Contents of a checkpoint. samples: the smallest and the largest number of a pixel, in each group; seconds: of tracing."""
 
     samples: tuple[int, int]
     seconds: float
@@ -46,11 +46,11 @@ class Saved:
 
 
 def read(path: str | os.PathLike[str]) -> Saved:
-    """Raises InputError where the file is missing, foreign, damaged or of another version."""
+    """Read a checkpoint. Raises InputError for a missing, foreign or damaged file, and for one of another version."""
     header, body = read_checked(path, MAGIC, "checkpoint")
     try:
         low, high = map(int, header["samples"])
-        if not 0 <= low <= high < 1 << 31:  # the film's counts are int32, and a message could not hold thousands of digits
+        if not 0 <= low <= high < 1 << 31:  # counts of the film are int32
             raise ValueError("samples out of range")
         seconds = float(header["seconds"])
         if not 0.0 <= seconds < math.inf:
@@ -61,10 +61,10 @@ def read(path: str | os.PathLike[str]) -> Saved:
 
 
 class Checkpoint:
-    """The file of one render. identity: what must be the same for going on, as JSON has it; groups: of samples.
+    """The file of one render. identity: JSON values that must be equal on resume; groups: number of groups of samples.
 
-    With `resume` an existing file is read, and refused if it belongs to another render. Without it any existing file is refused.
-    Both, and whether the file can be written, are reported before the work.
+    With `resume`, an existing file is read, and refused if its identity differs; without, any existing file is refused. These errors, and
+    those of writing, are raised before the work.
     """
 
     def __init__(self, path: Path, every: float, identity: dict[str, Any], *, groups: int, resume: bool) -> None:
@@ -82,31 +82,31 @@ class Checkpoint:
     def _checked(self, saved: Saved) -> Saved:
         differ = [name for name in {**self.identity, **saved.identity} if self.identity.get(name) != saved.identity.get(name)]
         if differ != ["kernels"]:
-            differ = [name for name in differ if name != "kernels"]  # other settings can need other kernels
+            differ = [name for name in differ if name != "kernels"]  # other settings may compile other kernels
         reported = [OTHER.get(name, f"{name} was {saved.identity.get(name)}, is {self.identity.get(name)}") for name in differ]
         if reported:
             raise InputError(f"is a checkpoint of another render: {'; '.join(reported)}", path=self.path)
         return saved
 
-    def facts(self) -> dict[str, Any]:
-        """What a film's stats say of it."""
+    def facts(self) -> dict[str, object]:
+        """Return the entries of a film's stats."""
         resumed = None if self.saved is None else {"samples": self.saved.samples[0] * self.groups, "seconds": self.saved.seconds}
         return {"checkpoint": None if self.problem else str(self.path), "resumed": resumed}
 
     # --- writing ------------------------------------------------------------------------------------------------------
 
     def begin(self) -> None:
-        """Begin to count the time. Raises InputError where another render has written the file since this one looked for it."""
+        """Start the clock. Raises InputError if another render has written the file since the constructor looked for it."""
         if self.saved is None and os.path.lexists(self.path):
             raise InputError("is there already: another render wrote it meanwhile", path=self.path)
         self._last = time.monotonic()
 
     def due(self) -> bool:
-        """Whether it is time: `every` seconds after the last file was there."""
+        """Return True once `every` seconds have passed since the last save."""
         return time.monotonic() - self._last >= self.every
 
     def save(self, film: DeviceFilm, seconds: float) -> None:
-        """Write the film. Where the system refuses, the old file stays, `problem` says why, and the render goes on in memory."""
+        """Write the film. If the system refuses, the old file stays, `problem` has the reason, and the render continues."""
         samples = film.view(film.groups[0].samples)
         header = {"samples": [int(samples.min()), int(samples.max())], "seconds": seconds, "identity": self.identity}
         try:
@@ -120,7 +120,7 @@ class Checkpoint:
     # --- reading ------------------------------------------------------------------------------------------------------
 
     def restore(self, film: DeviceFilm) -> None:
-        """Put what was read into an empty film."""
+        """Copy the arrays of the file into an empty film."""
         assert self.saved is not None
         if len(self.saved.body) != sum(film.view(array).nbytes for _, array in film.arrays()):
             raise InputError("is damaged: its arrays do not fit", path=self.path)
@@ -128,19 +128,21 @@ class Checkpoint:
         for name, array in film.arrays():
             there = film.view(array)
             values = np.frombuffer(self.saved.body[at:at + there.nbytes], there.dtype).reshape(there.shape)
-            if name.startswith("mean") and not np.isfinite(values).all():  # the kernel counts such samples as black
+            if name.startswith("mean") and not np.isfinite(values).all():  # the kernel stores such samples as black
                 raise InputError("is damaged: its film is not finite", path=self.path)
             film.put(array, values)
             at += there.nbytes
         samples = [film.view(group.samples) for group in film.groups]
         if any((each != samples[0]).any() for each in samples) or (samples[0].min(), samples[0].max()) != self.saved.samples:
             raise InputError("is damaged: its samples do not fit", path=self.path)
-        self.saved = replace(self.saved, body=memoryview(b""))  # the file may go now
+        self.saved = replace(self.saved, body=memoryview(b""))  # the memory of the file may go now
 
 
 def checkpoint_of(plan: Plan, kind: str) -> Checkpoint | None:
-    """The file that the plan's options ask for. kind: of the device (wrt.renderer.prepare.kind_of). Raises InputError where it
-    cannot be written, or gone on with."""
+    """Return the checkpoint of the plan's options, or None. kind: of the device (wrt.renderer.prepare.kind_of).
+
+    Raises InputError if it cannot be written or resumed.
+    """
     options, settings = plan.options, plan.scene.settings
     if options.checkpoint is None:
         return None

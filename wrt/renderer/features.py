@@ -1,10 +1,9 @@
-"""The switches that a scene needs of a render kernel."""
+"""Features of the render kernels that a scene needs."""
 
 from __future__ import annotations
 
 import math
 from functools import cache
-from typing import Any
 
 import numpy as np
 
@@ -17,12 +16,12 @@ from wrt.scene.materials import MATERIALS, SLOTS, Checkerboard, Texture
 from wrt.scene.model import Scene
 
 STACK_STEP = 16
-# Textures with a switch of their own; those of all other parameters share one (wrt.kernels.shade.shading.TEXTURES).
+# Textures with a feature of their own; all others share one (wrt.kernels.shade.shading.TEXTURES).
 COMMON = {"albedo_texture", "emission_texture", "normal_texture"}
 
 
 def switches(features: Features) -> dict[str, bool]:
-    """Return every on/off feature that a scene can need, by name; each kind is one."""
+    """Return each on/off feature that a scene can need, by name; every kind of light, material and background is one."""
     on_off = {name: value for name, value in vars(features).items() if isinstance(value, bool) and name != "counting"}
     return on_off | {f"{name}_lights": name in features.lights for name in (*LIGHTS, *EMISSIVE)} | {
         name: name in features.materials for name in MATERIALS} | {
@@ -34,7 +33,7 @@ def mesh_lights(scene: Scene) -> bool:
 
 
 def features_of(scene: Scene, camera: CameraKind, meshes: frozenset[int] = frozenset()) -> Features:
-    """The features that this scene needs through this camera, with its settings. meshes: those kept once (instancing.py)."""
+    """Return the features that a scene needs with this camera. meshes: id()s of the instanced meshes (wrt.accel.scenes.instancing)."""
     settings, materials = scene.settings, scene.materials
     textures = [texture for material in materials for texture in material.textures]
     kinds = {material.kind for material in materials}
@@ -51,8 +50,8 @@ def features_of(scene: Scene, camera: CameraKind, meshes: frozenset[int] = froze
     reflection = any(MATERIALS[kind].reflects for kind in kinds)
     refraction = bool(clear)
     children = int(reflection) + int(refraction) + int(blend)
-    # The ray at hand is popped before its children are pushed: each level adds one ray less than it has children. What goes
-    # straight on through a blended surface takes no level: it waits below its siblings, until they are done.
+    # A ray is popped before its children are pushed: each level adds one ray less than it has children. The ray straight through a
+    # blended surface takes no level: it waits below its siblings until they are done.
     pending = (children - 1) * (settings.max_depth + 1) + 1
     return Features(
         camera=camera.device,
@@ -90,11 +89,10 @@ def features_of(scene: Scene, camera: CameraKind, meshes: frozenset[int] = froze
 
 @cache
 def filter_icdf(name: str, size: int = 4097) -> np.ndarray:
-    """The inverse distribution of a pixel filter along one axis, (size,) float32, in pixels from the centre.
+    """Return the inverse distribution of a pixel filter along x or y, (size,) float32, in pixels from the centre.
 
-    gaussian: standard deviation 0.5, cut at 1.5 pixels; blackman-harris: its four-term window over 3 pixels (Harris 1978).
-    Separable: used for x and y alike. Tabulated by the trapezoidal rule over 20,000 points. Between entries the device takes
-    a straight line, which widens the thin tails: with 4097 entries the standard deviation is off by 2e-4, with 257 by 8e-3.
+    gaussian: standard deviation 0.5, cut at 1.5 pixels; blackman-harris: the four-term window over 3 pixels (Harris 1978). The device
+    interpolates linearly, which widens the tails: with 4097 entries the standard deviation is off by 2e-4, with 257 by 8e-3.
     """
     x = np.linspace(-1.5, 1.5, 20001)
     if name == "gaussian":
@@ -108,8 +106,8 @@ def filter_icdf(name: str, size: int = 4097) -> np.ndarray:
     return np.interp(np.linspace(0.0, 1.0, size), cdf / cdf[-1], x).astype(np.float32)
 
 
-def describe(scene: Scene, camera: str | int | None = None) -> dict[str, Any]:
-    """What `python -m wrt info` prints: counts, names, bounds (None without shapes), and the features on and off."""
+def describe(scene: Scene, camera: str | int | None = None) -> dict[str, object]:
+    """Return counts, names, bounds (None without shapes) and features of a scene, as `python -m wrt info` prints them."""
     has_shapes = scene.spheres or any(len(thing.mesh.faces) for thing in scene.objects)
     low, high = (corner.tolist() for corner in scene.bounds()) if has_shapes else (None, None)
     return {

@@ -41,7 +41,7 @@ class Progress:
     stage
         "trace"; before it, if that takes longer than a second, "compile" (reported once) and "build".
     note
-        Trouble that does not end the render; "" if there is none.
+        Trouble that does not end the render; "" without.
     picture
         Makes a Film of the samples so far (pixels, variance, samples) while the render runs. Tiles under way are half done in it.
     """

@@ -48,16 +48,16 @@ def render(scene: Scene | Mesh | str | os.PathLike[str], **options: Unpack[Rende
         Seconds of tracing. The first sample of each pixel is always taken.
     target_error
         Stop once the estimated error is no larger: the root mean square, over pixels and channels, of the standard error in
-        linear radiance. It is noise alone, without what max_depth and min_throughput cut. Each pixel's samples are split over
-        four independent sequences, and the estimate is made when each has 1, 2, 4, 8 ... samples. `spp` is then the most to
-        take, rounded down to a multiple of four; without the keyword, 65,536 and not the scene's own value.
+        linear radiance. It is noise alone, without what max_depth and min_throughput cut. Each pixel's samples form four
+        independent sequences. The estimate is made when each has 1, 2, 4, 8 ... samples. The keyword `spp` is then the upper
+        limit, rounded down to a multiple of four; without it the limit is 65,536, whatever the scene says.
     tile_size, pass_size
         Side of a tile in pixels, and samples of a pixel in one pass. None: chosen by wrt.
     progress
         Called with a Progress about ten times a second.
     checkpoint, checkpoint_every, resume
         File that holds the work so far, written every `checkpoint_every` seconds of tracing and at the end; it stays. An existing
-        file is refused, unless `resume` is True: the picture is then that of an uninterrupted render, bit for bit.
+        file is refused, unless `resume` is True: the picture then has the bits of an uninterrupted render.
     devices
         Several devices of this machine, of one kind, that share the tiles, in place of `device`.
     executor
