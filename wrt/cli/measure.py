@@ -106,7 +106,6 @@ def stability(how: Reporting, plan: Stability) -> None:
         if not how.as_json:
             say("  ".join(cells(study.COLUMNS, row)), err=False)
 
-    study.chosen(plan.cases)
     how.check_markdown()
     client = client_of(how.cluster)
     if not how.as_json:

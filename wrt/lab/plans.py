@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 STRUCTURES = ("structure", "wrt.accel.structures:ACCELERATORS")
 KINDS = ("kind of ray", "wrt.lab.bench.rays:RAY_KINDS")
 GPUS = ("GPU", "wrt.lab.rtcore.parameters:GPUS")
+SOME_THREADS = ("one", "all", "both")
 THREADS = "Threads on the CPU  [default: all cores]"
 INSIDE = "The camera stands in the middle of the mesh's box, as in a room"
 MODELLED = "The GPU to model: rtx2080ti or rtx2060"
@@ -44,6 +45,7 @@ class Plan:
 
     def __post_init__(self) -> None:
         from wrt.core.checks import as_integer, require_known
+        from wrt.core.device import start
         from wrt.core.errors import InputError
         from wrt.core.threads import thread_count
 
@@ -57,8 +59,14 @@ class Plan:
                     require_known(name, getattr(importlib.import_module(module), table), of[0])
             if each.name == "threads" and not isinstance(value, str):
                 thread_count(value)
-            if each.name == "meshes" and each.default is MISSING and not value:
-                raise InputError("must be given", argument="meshes")
+            if each.name == "device":
+                start(value)
+            if each.name == "cases":
+                from wrt.lab.hard_cases.cases import chosen
+
+                chosen(value)
+            if isinstance(value, Sequence) and not value and (each.default is MISSING or each.default):
+                raise InputError("must name one or more", argument=each.name)
 
 
 @dataclass(frozen=True)
@@ -78,12 +86,6 @@ class Visibility(Plan):
     device: str = option("cpu", "cpu, cuda:0, ... (see `devices`)")
     threads: int | None = option(None, THREADS)
 
-    def __post_init__(self) -> None:
-        from wrt.core.device import start
-
-        super().__post_init__()
-        start(self.device)
-
 
 @dataclass(frozen=True)
 class Units(Plan):
@@ -91,8 +93,7 @@ class Units(Plan):
 
     MESHES: mesh files; without any, a sphere, a terrain and a teapot."""
 
-    COMMAND, STUDY = "bench units", "wrt.lab.bench.units"
-    QUICK = {"rays": 1 << 14, "runs": 5}
+    COMMAND, STUDY, QUICK = "bench units", "wrt.lab.bench.units", {"rays": 1 << 14, "runs": 5}
     meshes: Sequence[Any] = the_meshes()
     rays: int = option(2**17, "Rays of each kind", (1, 2**28))
     runs: int = option(9, "Runs of each unit, in turn", (1, 1000))
@@ -107,18 +108,16 @@ class Peers(Plan):
 
     MESHES: mesh files; without any, a sphere."""
 
-    COMMAND, STUDY = "bench peers", "wrt.lab.bench.peers"
-    QUICK = {"rays": 20_000, "runs": 5}
+    COMMAND, STUDY, QUICK = "bench peers", "wrt.lab.bench.peers", {"rays": 20_000, "runs": 5}
     meshes: Sequence[Any] = the_meshes()
     structures: Sequence[str] = option(("bvh",), "Of wrt, by name; ratios are of the first", of=STRUCTURES)
-    rivals: Sequence[str] = option((), "embree, embree_fast, embree16, embree16_incoherent, warp, open3d  [default: "
-                                   "those that are installed]",
+    rivals: Sequence[str] = option((), "embree, embree_fast, embree16, embree16_incoherent, warp, open3d  [default: all installed]",
                                    of=("rival", "wrt.lab.hard_cases.contestants:PEERS"))
     kinds: Sequence[str] = the_kinds()
     rays: int = option(100_000, "Rays of each kind", (1, 2**28))
     runs: int = option(7, "Runs of each, in turn", (1, 1000))
     seed: int = option(0, "Other rays")
-    threads: str = option("both", "one (by its CPU time), all (by the clock) or both")
+    threads: str = option("both", "one (by its CPU time), all (by the clock) or both", of=("number of threads", f"{__name__}:SOME_THREADS"))
 
     def __post_init__(self) -> None:
         from wrt.core.errors import InputError
@@ -128,10 +127,6 @@ class Peers(Plan):
         for name in self.rivals:
             if not PEERS[name].is_installed():
                 raise InputError(f"{name} is not installed", hint='pip install "wrt[peers]"')
-        if not self.structures:
-            raise InputError("must name one or more", argument="structures")
-        if self.threads not in ("one", "all", "both"):
-            raise InputError(f"must be one, all, both, got {self.threads!r}", argument="threads")
 
 
 @dataclass(frozen=True)
@@ -140,19 +135,12 @@ class HardCases(Plan):
 
     CASES: names such as E_grid, or the letters of groups; without any, all."""
 
-    COMMAND, STUDY = "bench hard-cases", "wrt.lab.hard_cases.comparison"
-    QUICK = {"rays": 100}
+    COMMAND, STUDY, QUICK = "bench hard-cases", "wrt.lab.hard_cases.comparison", {"rays": 100}
     cases: Sequence[str] = option(())
     libraries: Sequence[str] = option((), "Which: wrt, embree ... (a wrong name lists them)  [default: all that are installed]",
                                       of=("library", "wrt.lab.hard_cases.libraries:LIBRARIES"))
     rays: int = option(1000, "Rays of each case", (1, 2**40))
     seed: int = option(0, "Other rays")
-
-    def __post_init__(self) -> None:
-        from wrt.lab.hard_cases.cases import chosen
-
-        super().__post_init__()
-        chosen(self.cases)
 
 
 @dataclass(frozen=True)
@@ -162,8 +150,7 @@ class Closed(Plan):
 
     MESHES: closed mesh files, beside seven made meshes."""
 
-    COMMAND, STUDY = "bench closed", "wrt.lab.bench.closed"
-    QUICK = {"points": 1000, "rays": 1000, "others": 1000}
+    COMMAND, STUDY, QUICK = "bench closed", "wrt.lab.bench.closed", {"points": 1000, "rays": 1000, "others": 1000}
     meshes: Sequence[Any] = the_meshes()
     points: int = option(10_000, "Points of each mesh", (1, 2**28))
     rays: int = option(10_000, "Rays of each mesh", (1, 2**28))
@@ -177,8 +164,7 @@ class Accel(Plan):
 
     MESHES: mesh files; without any, a terrain that grows from a thousand triangles on."""
 
-    COMMAND, STUDY = "bench accel", "wrt.lab.bench.accel"
-    QUICK = {"rays": 20_000, "runs": 3, "max_triangles": 20_000}
+    COMMAND, STUDY, QUICK = "bench accel", "wrt.lab.bench.accel", {"rays": 20_000, "runs": 3, "max_triangles": 20_000}
     meshes: Sequence[Any] = the_meshes()
     structures: Sequence[str] = option((), "Which, by name  [default: all but brute_force]", of=STRUCTURES)
     kinds: Sequence[str] = the_kinds()
@@ -195,8 +181,7 @@ class Accel(Plan):
 class Bvh(Plan):
     """Builders of binary BVHs over MESHES: quality, time and memory; and boxes, spheres and 14-DOPs around the same tree."""
 
-    COMMAND, STUDY = "bench bvh", "wrt.lab.bench.bvh"
-    QUICK = {"rays": 1 << 14, "builds": 1, "runs": 3}
+    COMMAND, STUDY, QUICK = "bench bvh", "wrt.lab.bench.bvh", {"rays": 1 << 14, "builds": 1, "runs": 3}
     meshes: Sequence[Any] = the_meshes(MISSING)
     builders: Sequence[str] = option((), "Which, by name  [default: all]", of=("builder", "wrt.accel.bvh.builders:BVH_BUILDERS"))
     rays: int = option(2**18, "Rays into each mesh", (1, 2**26))
@@ -210,8 +195,7 @@ class Bvh(Plan):
 class RtCore(Plan):
     """The model of the RT core on MESHES: what limits it, rays a second as ranges, and which assumption moves them most."""
 
-    COMMAND, STUDY = "bench rtcore", "wrt.lab.rtcore.meshes"
-    QUICK = {"rays": 1 << 12}
+    COMMAND, STUDY, QUICK = "bench rtcore", "wrt.lab.rtcore.meshes", {"rays": 1 << 12}
     meshes: Sequence[Any] = the_meshes(MISSING)
     structures: Sequence[str] = option((), "Which, by name  [default: every BVH]", of=STRUCTURES)
     kinds: Sequence[str] = the_kinds("primary", "diffuse")
@@ -225,8 +209,7 @@ class RtCore(Plan):
 class Float64(Plan):
     """How many triangle tests, and of how many rays, need float64 if a GPU runs the watertight test on MESHES."""
 
-    COMMAND, STUDY = "bench float64", "wrt.lab.rtcore.hard_tests"
-    QUICK = {"rays": 1 << 12}
+    COMMAND, STUDY, QUICK = "bench float64", "wrt.lab.rtcore.hard_tests", {"rays": 1 << 12}
     meshes: Sequence[Any] = the_meshes(MISSING)
     kinds: Sequence[str] = the_kinds("primary", "diffuse")
     rays: int = option(2**16, "Rays of each kind", (1, 2**22))
@@ -239,8 +222,7 @@ class Pictures(Plan):
     """SCENES by waves of samples, as the CPU renders, beside one ray at a time: nanoseconds a sample on one thread, in turn.
     Also the pixels that differ (none may)."""
 
-    COMMAND, STUDY = "bench pictures", "wrt.lab.bench.pictures"
-    QUICK = {"size": "160x90", "spp": 4, "runs": 3}
+    COMMAND, STUDY, QUICK = "bench pictures", "wrt.lab.bench.pictures", {"size": "160x90", "spp": 4, "runs": 3}
     scenes: Sequence[Any] = option(MISSING)
     size: str = option("640x360", "Pixels of each picture")
     spp: int = option(16, "Samples a pixel", (1, 1 << 16))
@@ -291,21 +273,12 @@ class Mitsuba(Plan):
     repeats: int = option(7, "Pictures of each, alternating, each with its own seed", (3, 1000))
     reference_spp: int | None = option(None, "Samples of each of the reference's 8 seeds  [default: 8 times --spp]")
     rival_limit: float = option(60.0, "No picture of Mitsuba's takes longer  [default: 60s]")
-    integrator: str = option("auto", "Mitsuba's: path, volpath, direct or whitted (in Python, scalar_rgb only)")
-    variants: Sequence[str] = option(("scalar_rgb", "llvm_ad_rgb"), "Mitsuba's; llvm_ad_rgb needs an LLVM library")
+    integrator: str = option("auto", "Mitsuba's: path, volpath, direct or whitted (in Python, scalar_rgb only)",
+                             of=("integrator", "wrt.lab.mitsuba.translate:INTEGRATORS"))
+    variants: Sequence[str] = option(("scalar_rgb", "llvm_ad_rgb"), "Mitsuba's; llvm_ad_rgb needs an LLVM library",
+                                     of=("variant of Mitsuba", "wrt.lab.mitsuba.process:VARIANTS"))
     starts: int = option(3, "How often to time whole processes; 0: not at all")
     seed: int = option(0, "Decides on all seeds")
-
-    def __post_init__(self) -> None:
-        from wrt.core.checks import as_choice
-        from wrt.core.errors import InputError
-        from wrt.lab.mitsuba.process import VARIANTS
-        from wrt.lab.mitsuba.translate import INTEGRATORS
-
-        super().__post_init__()
-        as_choice(self.integrator, INTEGRATORS, "integrator")
-        if not self.variants or not set(self.variants) <= set(VARIANTS):
-            raise InputError(f"must be of {', '.join(VARIANTS)}; got {', '.join(self.variants) or 'none'}", argument="variants")
 
 
 @dataclass(frozen=True)

@@ -132,7 +132,7 @@ def test_matte_leaves_the_albedo_and_what_lights_others() -> None:
 
 @pytest.mark.parametrize("wrong", [{"spp": 0}, {"repeats": 2}, {"integrator": "x"}, {"variants": ()}, {"variants": ("cuda_rgb",)}])
 def test_plans_that_cannot_be_measured(wrong: dict[str, Any]) -> None:
-    with pytest.raises(InputError, match=next(iter(wrong))):
+    with pytest.raises(InputError, match=next(iter(wrong)).removesuffix("s")):
         Plan(**wrong)
 
 
