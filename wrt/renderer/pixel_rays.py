@@ -1,4 +1,4 @@
-"""The rays of a picture as arrays, for asking a structure directly instead of rendering."""
+"""The camera rays of a picture as arrays, for queries."""
 
 from __future__ import annotations
 
@@ -17,11 +17,25 @@ camera_rays_kernel = made_once(make_camera_rays_kernel)
 
 
 def camera_rays(camera: CameraKind, size: tuple[int, int] | str) -> tuple[np.ndarray, np.ndarray]:
-    """One ray a pixel, through the middle of the lens and the pixel's centre: those of a Film's AOVs.
+    """Make one ray for each pixel, through the centre of the lens and of the pixel, as the AOVs of a Film have it.
 
-    size: width and height, or "640x360". Returns origins and directions, (width * height, 3) float32 each, in world space, row
-    by row from the top left; directions have unit length, so that a hit's t is the AOV "depth". Where a camera has no ray,
-    beyond a fisheye's image circle, they are 0: `directions.any(axis=1)` are the rays that there are. Raises InputError.
+    Parameters
+    ----------
+    camera
+        A camera of any kind.
+    size
+        Width and height of the picture, or text such as "640x360".
+
+    Returns
+    -------
+    origins, directions
+        (width * height, 3) float32 each, in world space, row by row from the top left. Directions have unit length, so that t of a
+        hit is the AOV "depth"; they are 0 beyond the image circle of a fisheye.
+
+    Raises
+    ------
+    InputError
+        If an argument has the wrong type or the size is out of range.
     """
     width, height = as_size(size)
     x = (np.arange(width, dtype=np.float32) + np.float32(0.5)) / np.float32(width)
@@ -31,8 +45,7 @@ def camera_rays(camera: CameraKind, size: tuple[int, int] | str) -> tuple[np.nda
 
 
 def film_rays(camera: CameraKind, size: tuple[int, int], film: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """As `camera_rays`, through points (N, 2) of a picture of `size` pixels: (0, 0) is its top left corner, (1, 1) the bottom
-    right one."""
+    """Make rays through points (N, 2) of a picture of `size` pixels; (0, 0) is its top left corner, (1, 1) the bottom right."""
     device = start("cpu")
     kernel = camera_rays_kernel(import_module(as_one(camera, CameraKind, "camera").device))
     origins, directions = (wp.empty(len(film), dtype=wp.vec3, device=device) for _ in range(2))

@@ -1,30 +1,32 @@
-"""Pictures by one ray at a time (wrt.kernels.loops.one_ray): on CUDA, and wherever rays are counted.
+"""Pictures by one ray at a time (wrt.kernels.loops.one_ray): on CUDA, and for counters.
 
-A thread takes a pixel; or a sample, where the pixels alone would leave multiprocessors of a GPU without work.
+A thread takes a pixel, or a sample if the pixels alone would leave multiprocessors of a GPU idle.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import warp as wp
 
 from wrt.core.device import launch_on
+from wrt.core.types import Device, Kernel, WarpStruct
 from wrt.kernels.loops.one_ray import Tile, add_samples
 from wrt.kernels.shade.step import Sample
 from wrt.renderer.film_arrays import AovFilm, DeviceFilm
 from wrt.renderer.tiles import Work
 from wrt.renderer.waves import SceneRecords
 
-THREADS_OF_SM = 2048  # that a multiprocessor keeps at a time, of NVIDIA's largest
-ROUNDS = 4  # times as many samples in a launch
+THREADS_OF_SM = 2048  # resident threads of NVIDIA's largest multiprocessors
+ROUNDS = 4  # samples of a launch for each resident thread
 
 
-def film_launch(device: Any, kernel: Any, scene: SceneRecords, limits: list[Any], film: DeviceFilm,
+def film_launch(device: Device, kernel: Kernel, scene: SceneRecords, limits: list[WarpStruct], film: DeviceFilm,
                 alone: bool) -> Callable[[Work], int]:
-    """A function that adds some work's samples to the film, and gives their number. limits: those of each group of the film; alone:
-    a pixel is always one thread's."""
+    """Return a function that adds samples to the film and returns their number.
+
+    limits: for each group of the film; alone: one thread for each pixel, always.
+    """
     room = 0 if alone else device.sm_count * THREADS_OF_SM * ROUNDS
     samples = wp.empty(0, dtype=Sample, device=device)
 
@@ -48,8 +50,8 @@ def film_launch(device: Any, kernel: Any, scene: SceneRecords, limits: list[Any]
     return trace
 
 
-def aov_launch(device: Any, kernel: Any, scene: SceneRecords, film: AovFilm) -> Callable[[Work], int]:
-    """As film_launch, of AOVs."""
+def aov_launch(device: Device, kernel: Kernel, scene: SceneRecords, film: AovFilm) -> Callable[[Work], int]:
+    """Return a function that writes AOVs to the film and returns the number of its pixels."""
 
     def trace(work: Work) -> int:
         launch_on(device, kernel, work.rectangle[2] * work.rectangle[3], scene.accel, scene.surfaces, scene.camera, film.struct,
@@ -59,7 +61,7 @@ def aov_launch(device: Any, kernel: Any, scene: SceneRecords, film: AovFilm) -> 
     return trace
 
 
-def tile_of(work: Work) -> Any:
+def tile_of(work: Work) -> WarpStruct:
     tile = Tile()
     tile.x, tile.y, tile.width, _ = work.rectangle
     tile.first_sample, tile.n_samples, tile.threads = work.first, work.n, 1

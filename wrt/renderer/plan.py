@@ -12,6 +12,7 @@ from wrt.accel.structure import Structure
 from wrt.accel.structures import ACCELERATORS, stack_on
 from wrt.core.device import made_once, memory_of
 from wrt.core.errors import InputError
+from wrt.core.types import Device, Kernel, WarpStruct
 from wrt.core.warp_private import module_hash
 from wrt.kernels import structs
 from wrt.kernels.loops import one_ray as kernels
@@ -25,24 +26,26 @@ from wrt.scene.cameras import CameraKind
 from wrt.scene.model import Scene
 from wrt.scene.settings import SettingChanges, Settings
 
-AIMED = ("size", "spp", "max_depth", "min_throughput", "exposure", "tonemap")  # settings that no kernel is compiled from
+AIMED = ("size", "spp", "max_depth", "min_throughput", "exposure", "tonemap")  # settings that do not change the kernels
 
 
 @made_once
-def render_kernel(features: Features, structure: Any) -> Any:
+def render_kernel(features: Features, structure: Structure) -> Kernel:
     return kernels.make_render_kernel(features, structure, import_module(features.camera))
 
 
 @made_once
-def aov_kernel(features: Features, structure: Any) -> Any:
+def aov_kernel(features: Features, structure: Structure) -> Kernel:
     return kernels.make_aov_kernel(features, structure, import_module(features.camera))
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """accel: the structure's name, where the options may say "bvh"; meshes: the id()s of those that are kept once
-    (wrt.accel.scenes.instancing); structure: what the kernels are made for, a Structure or what has its fields and methods; crop:
-    x0, y0, x1, y1 in pixels; deepest: the bounces that the kernels have room for."""
+    """A scene and the options of its render, resolved.
+
+    accel: the structure's own name, "bvh" being an alias; meshes: id()s of the instanced meshes (wrt.accel.scenes.instancing); structure:
+    of the kernels, a Structure or a class with its members; crop: x0, y0, x1, y1 in pixels; deepest: bounces that fit into the stacks of the kernels.
+    """
 
     scene: Scene
     options: Options
@@ -56,17 +59,17 @@ class Plan:
 
     @property
     def groups(self) -> int:
-        """Independent sequences of samples a pixel (wrt.renderer.film_arrays)."""
+        """Number of independent sequences of samples of a pixel (wrt.renderer.film_arrays)."""
         return 1 if self.options.target_error is None else GROUPS
 
     @property
     def area(self) -> int:
-        """Pixels of the crop."""
+        """Number of pixels of the crop."""
         x0, y0, x1, y1 = self.crop
         return (x1 - x0) * (y1 - y0)
 
-    def require_memory(self, device: Any) -> None:
-        """Raise InputError where the film, with the picture that becomes of it, is larger than the memory of the device."""
+    def require_memory(self, device: Device) -> None:
+        """Raise InputError if the film, with the picture written from it, is larger than the memory of the device."""
         x0, y0, x1, y1 = self.crop
         pixel = BYTES_OF_FILM + BYTES_OF_GROUP * (self.groups - 1) + (BYTES_OF_AOVS if self.options.aov else 0)
         if self.area * pixel > (there := memory_of(device)):
@@ -75,7 +78,7 @@ class Plan:
 
     @property
     def by_waves(self) -> bool:
-        """On the CPU many samples are taken at a time; on CUDA, and where rays are counted, one."""
+        """True on the CPU, except with counters: waves of many samples. Otherwise a thread traces one sample at a time."""
         return self.options.device == "cpu" and not self.structure.units.counters
 
     @property
@@ -83,8 +86,8 @@ class Plan:
         return wave_kernels(self.features, self.structure, bool(self.options.aov))
 
     @property
-    def kernels(self) -> list[Any]:
-        """All that are compiled; without waves first the render kernel, then the AOV kernel where AOVs are asked for."""
+    def kernels(self) -> list[Kernel]:
+        """All kernels to compile. Without waves, the render kernel is first; the AOV kernel follows if the options name AOVs."""
         if self.by_waves:
             return self.wave_kernels.all()
         makes = [render_kernel, aov_kernel] if self.options.aov else [render_kernel]
@@ -92,14 +95,13 @@ class Plan:
         return [make(self.features, self.structure) for make in makes] + folds
 
     def kernels_hash(self) -> str:
-        """Of the whole code that makes pixels, the same in every process."""
+        """Return a hash of all code that makes pixels, equal in every process."""
         block_dim = 1 if self.options.device == "cpu" else None
         kernels = replace(self, options=replace(self.options, aov=())).kernels
         hashes = [module_hash(kernel, block_dim) for kernel in kernels]
         return hashlib.sha256(b"".join(hashes)).hexdigest()
 
-    def limits(self, seed: int) -> Any:
-        """The kernels' record of the same name."""
+    def limits(self, seed: int) -> WarpStruct:
         limits = structs.Limits()
         limits.max_depth, limits.min_throughput = self.scene.settings.max_depth, self.scene.settings.min_throughput
         limits.seed = seed
@@ -121,12 +123,12 @@ class Plan:
         return replace(self, scene=scene, camera=camera, crop=_crop(scene.settings, self.options))
 
     def moved(self, scene: Scene) -> Plan:
-        """The same objects in other places."""
+        """Return the plan for the same objects, moved."""
         return replace(self, scene=scene, meshes=instanced_meshes(scene, self.options.instancing))
 
 
 def plan_of(scene: Scene, options: Options) -> Plan:
-    """Raises InputError for a camera or a crop that there is not."""
+    """Resolve options for a scene. Raises InputError for an unknown camera, and for a crop outside the picture."""
     accel = "bvh8" if options.accel == "bvh" else options.accel
     camera = options.camera if isinstance(options.camera, CameraKind) else scene.camera(options.camera)
     meshes = instanced_meshes(scene, options.instancing)

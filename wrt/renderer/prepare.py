@@ -1,4 +1,4 @@
-"""A scene made ready to trace on one device: its kernels compiled, its arrays uploaded, its structure built."""
+"""Preparation of a scene for one device: kernels compiled, arrays uploaded, acceleration structure built."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.scenes.build import build, reports_progress
 from wrt.core.device import load_kernel
 from wrt.core.threads import Pool, thread_count
+from wrt.core.types import Device, Kernel, WarpStruct
 from wrt.renderer.film_arrays import AovFilm, DeviceFilm
 from wrt.renderer.options import Progress
 from wrt.renderer.pixels import aov_launch, film_launch
@@ -26,25 +27,27 @@ from wrt.renderer.waves import CAPACITY, SceneRecords, Waves
 from wrt.scene.cameras import CameraKind
 from wrt.scene.settings import SettingChanges
 
-TILE_SIZE = 32  # the least on the CPU
-TILES_EACH = 8  # for each thread at least
-PREPARING = "wrt prepares"  # what the threads that compile and build are called
-PREPARING_REPORTED = 1.0  # seconds of compiling and building before `progress` hears of it
+TILE_SIZE = 32  # smallest side on the CPU
+TILES_EACH = 8  # smallest number of tiles for each thread
+PREPARING = "wrt prepares"  # name of the threads that compile and build
+PREPARING_REPORTED = 1.0  # seconds of compiling and building until `progress` is called
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """kernels: as Plan.kernels, compiled; arrays: the scene on the device; camera: the device's record of plan.camera; waves:
-    what makes pictures on the CPU (Plan.by_waves); seconds: of "upload" and "build", and until the last kernel was there "compile",
-    which runs beside them."""
+    """A prepared scene.
+
+    kernels: Plan.kernels, compiled; arrays: the scene on the device; camera: the device's record of plan.camera; waves: for Plan.by_waves.
+    seconds: of "upload" and "build", and of "compile", which runs beside them, until the last kernel was loaded.
+    """
 
     plan: Plan
-    device: Any
+    device: Device
     threads: int
-    kernels: list[Any]
+    kernels: list[Kernel]
     arrays: DeviceScene
     accel: Accelerator
-    camera: Any
+    camera: WarpStruct
     waves: Waves | None
     seconds: dict[str, float]
 
@@ -57,15 +60,17 @@ class Prepared:
         plan.require_memory(self.device)
         return replace(self, plan=plan, camera=camera_struct(camera, angles_of or plan.scene.settings.size))
 
-    def facts(self) -> dict[str, Any]:
-        """Counts of the scene and its structure."""
+    def facts(self) -> dict[str, object]:
+        """Return counts of the scene and its structure."""
         return {"triangles": self.accel.geometry.n_triangles, "stored_triangles": len(self.arrays.world.faces),
                 "spheres": len(self.accel.geometry.spheres),
                 "accel": {"name": self.plan.accel, **asdict(self.accel.stats)}}
 
     def tiles(self, samples: int) -> Iterator[Rectangle]:
-        """What one launch traces, where each pixel takes so many samples: the whole crop on CUDA; on the CPU one or two waves, if
-        there are enough of them for all threads."""
+        """Yield the tiles of a pass with `samples` of each pixel.
+
+        On CUDA, one tile is the whole crop. On the CPU, a tile has one or two waves, but each thread gets TILES_EACH tiles.
+        """
         x0, y0, x1, y1 = self.plan.crop
         side = TILE_SIZE
         if self.device.is_cuda:
@@ -75,8 +80,11 @@ class Prepared:
             side = 1 << int(0.5 * math.log2(max(pixels, TILE_SIZE**2)))
         return tiles(self.plan.crop, side if self.device.is_cuda else self.plan.options.tile_size or side)
 
-    def launch(self, film: DeviceFilm | AovFilm, accel: Any = None) -> Callable[[Work], int]:
-        """A function that traces some work into the film, and gives its samples. accel: a record in place of the structure's."""
+    def launch(self, film: DeviceFilm | AovFilm, accel: WarpStruct | None = None) -> Callable[[Work], int]:
+        """Return a function that traces some work into the film and returns its number of samples.
+
+        accel: device record in place of the structure's.
+        """
         accel = self.accel.data if accel is None else accel
         scene = SceneRecords(accel, self.arrays.surfaces, self.arrays.lighting, self.camera)
         limits = [] if isinstance(film, AovFilm) else [self.plan.limits(seed) for seed in film.seeds]
@@ -87,15 +95,16 @@ class Prepared:
         alone = self.device.is_cpu or self.plan.structure.units.counters
         return film_launch(self.device, self.kernels[0], scene, limits, film, alone)
 
-    # --- what a worker is asked for (wrt.renderer.distributed) ---
+    # --- calls of workers (wrt.renderer.distributed) ---
 
-    def ready(self) -> dict[str, Any]:
+    def ready(self) -> dict[str, object]:
         return {"facts": self.facts(), "seconds": self.seconds}
 
     def trace_tile(self, work: Work, seed: int, state: list[np.ndarray] | None) -> list[np.ndarray]:
-        """The arrays of a film of that rectangle (DeviceFilm.arrays) with those samples added to `state` (None: zeros).
+        """Return the arrays of a film of the rectangle (DeviceFilm.arrays), with the samples of `work` added to `state` (None: zeros).
 
-        It changes nothing here, so that it can be called in several threads, and again."""
+        It has no side effects, so that several threads can call it, and a failed call can be repeated.
+        """
         film = DeviceFilm(self.plan.scene.settings, corners(work.rectangle), self.device, seed, self.plan.groups)
         for (_, array), values in zip(film.arrays(), state or (), strict=False):
             film.put(array, values)
@@ -103,21 +112,22 @@ class Prepared:
         return [film.picture(array) for _, array in film.arrays()]
 
     def aov_tile(self, work: Work) -> list[np.ndarray]:
-        """The AOVs that were asked for, in their order, of a rectangle."""
+        """Return the AOVs of the options, in their order, for a rectangle."""
         film = AovFilm(self.plan.scene.settings, corners(work.rectangle), self.device)
         self.launch(film)(work)
         return [film.picture(name) for name in self.plan.options.aov]
 
 
-def kind_of(device: Any) -> str:
-    """Pictures of two devices of the same kind have the same bits."""
+def kind_of(device: Device) -> str:
+    """Name the kind of a device; pictures of two devices of one kind have the same bits."""
     return f"cuda, sm_{device.arch}" if device.is_cuda else "cpu"
 
 
-def prepare(plan: Plan, device: Any, built: Prepared | None = None) -> Prepared:
-    """Compile and build for a device of Warp's. built: whose arrays and structure are taken, for other kernels over them.
+def prepare(plan: Plan, device: Device, built: Prepared | None = None) -> Prepared:
+    """Compile and build. built: source of the arrays and the structure, to compile other kernels alone.
 
-    Raises InputError where the scene cannot be rendered."""
+    Raises InputError if the scene cannot be rendered.
+    """
     work = _Preparation(plan, device)
     work.run(([work.build] if built is None else []) + [partial(work.compile, kernel) for kernel in work.kernels])
     arrays, accel = (work.arrays, work.accel) if built is None else (built.arrays, built.accel)
@@ -128,19 +138,19 @@ def prepare(plan: Plan, device: Any, built: Prepared | None = None) -> Prepared:
 
 
 class _Preparation:
-    """Threads of its own: some compile, which takes longest, and meanwhile one uploads and builds."""
+    """Own threads: some compile, which takes longest, while one uploads and builds."""
 
     arrays: DeviceScene
     accel: Accelerator
 
-    def __init__(self, plan: Plan, device: Any) -> None:
+    def __init__(self, plan: Plan, device: Device) -> None:
         self.plan, self.device, self.kernels = plan, device, plan.kernels
         self.threads = thread_count(plan.options.threads)
         self.begin, self.seconds = time.perf_counter(), {"compile": 0.0}
-        self.compiled, self.fraction_built, self.reported = list[Any](), 0.0, ("", 0)
+        self.compiled, self.fraction_built, self.reported = list[Kernel](), 0.0, ("", 0)
 
     def run(self, jobs: list[Callable[[], None]]) -> None:
-        """Neither Ctrl-C nor an error waits for the compiler, and no wait is long: Python may hear of Ctrl-C only between two."""
+        """Run the jobs. Neither Ctrl-C nor an error waits for the compiler; waits are short, since Python handles Ctrl-C between them."""
         pool = Pool(1 + min(self.threads, len(self.kernels)), PREPARING)
         pending = {pool.submit(job) for job in jobs}
         try:
@@ -155,14 +165,14 @@ class _Preparation:
             pool.shutdown(wait=False, cancel_futures=True)
 
     def _report(self, seconds: float) -> None:
-        """Call `progress` where there is something new."""
+        """Call `progress` if the stage or its percentage has changed."""
         stage, done = ("build", int(100.0 * self.fraction_built)) if self.fraction_built > 0.0 else ("compile", 0)
         progress, compiling = self.plan.options.progress, len(self.compiled) < len(self.kernels)
         if progress is not None and (stage, done) != self.reported and (compiling or stage == "build"):
             self.reported = stage, done
             progress(Progress(done, 100, 0, seconds, stage=stage))
 
-    def compile(self, kernel: Any) -> None:
+    def compile(self, kernel: Kernel) -> None:
         load_kernel(kernel, self.device)
         self.compiled.append(kernel)
         self.seconds["compile"] = time.perf_counter() - self.begin

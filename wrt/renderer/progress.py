@@ -1,4 +1,4 @@
-"""How a render reports on a terminal: a bar where there is one, a line now and then where there is none."""
+"""Progress of a render on stderr: a bar on a terminal, otherwise a line every ten seconds."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ if TYPE_CHECKING:
 
 COMPILING = "compiling kernels (first time for this kind of scene) ..."
 BUILDING = "building the structure"
-LINE_EVERY = 10.0  # seconds between lines where stderr is no terminal
+LINE_EVERY = 10.0  # seconds between lines, if stderr is no terminal
 
 
 def describe(progress: Progress) -> str:
-    """Rays a second, the time left, and what goes wrong."""
+    """Return rays per second, the time left, and the note."""
     note = f"; {progress.note}" if progress.note else ""
     return f"{progress.rays_per_second / 1e6:.1f} Mray/s, {time_left(progress.seconds_left)}{note}"
 
 
 def time_left(seconds: float) -> str:
-    """Minutes and seconds; "?" where they are not known."""
+    """Return minutes and seconds; "?" if unknown."""
     return f"{int(seconds // 60)}:{int(seconds % 60):02d} left" if seconds < 1e6 else "?"
 
 
 class TimeLeft:
-    """How long work of known size will take, at the mean speed so far."""
+    """Estimate of the time left, at the mean speed so far, for work of known size."""
 
     def __init__(self, total: float) -> None:
         self.total, self.done, self.begin = total, 0.0, time.perf_counter()
 
     def __str__(self) -> str:
-        """", about 1:30 left", to put behind a line; nothing before anything is done."""
+        """Return a suffix such as ", about 1:30 left"; empty before anything is done."""
         if self.done <= 0.0:
             return ""
         seconds = (time.perf_counter() - self.begin) * max(self.total - self.done, 0.0) / self.done
@@ -45,14 +45,14 @@ class TimeLeft:
 
 @contextmanager
 def progress_reporter(quiet: bool) -> Iterator[Callable[[Progress], None] | None]:
-    """A callback for `wrt.render(progress=...)` that writes to stderr; None where quiet, or where that is closed."""
-    if quiet or sys.stderr is None:  # print would then write among the data
+    """Yield a callback for `wrt.render(progress=...)` that writes to stderr; None if quiet, or if stderr is closed."""
+    if quiet or sys.stderr is None:  # print would then write to stdout
         yield None
         return
     with _bar() if sys.stderr.isatty() else nullcontext(_lines()) as report:
 
         def careful(progress: Progress) -> None:
-            with suppress(OSError):  # a terminal that is gone (SIGHUP) is no reason to lose the picture
+            with suppress(OSError):  # a closed terminal (SIGHUP) must not end the render
                 report(progress)
 
         yield careful

@@ -1,4 +1,4 @@
-"""One scene on one device, rendered as often as one likes: with another seed, through another camera, after a move."""
+"""Repeated renders of one scene on one device: with other seeds, cameras and settings, and after objects have moved."""
 
 from __future__ import annotations
 
@@ -29,12 +29,11 @@ from wrt.scene.cameras import CameraKind
 from wrt.scene.model import Scene
 from wrt.scene.settings import SettingChanges
 
-REFINED_FROM = 8  # camera samples a triangle: with fewer, to refine a tree takes longer than it saves
+REFINED_FROM = 8  # camera samples per triangle: with fewer, refining the tree costs more time than it saves
 
 
 class Renderer:
-    """A scene made ready; `prepared` says how, and `run` takes the samples. once: one picture is all that it is for. Raises
-    InputError where it cannot be rendered."""
+    """A prepared scene, which `run` renders. once: for a single picture. Raises InputError if the scene cannot be rendered."""
 
     def __init__(self, scene: Scene, options: Options, *, once: bool = False) -> None:
         if options.executor is not None or options.devices is not None:
@@ -43,7 +42,7 @@ class Renderer:
         plan = plan_of(scene, options)
         plan.require_memory(device)
         self.checkpoint = checkpoint_of(plan, kind_of(device))
-        if once and (builder := builder_for(plan)):  # after the checkpoint: another render of it may take another tree
+        if once and (builder := builder_for(plan)):  # not in the checkpoint: a resumed render may use another tree
             plan = replace(plan, options=replace(options, accel_options=builder | options.accel_options))
         self.prepared = prepare(plan, device)
 
@@ -57,14 +56,16 @@ class Renderer:
             raise InputError("this renderer was not made for a checkpoint")
         self.prepared = self.prepared.aimed(camera, angles_of, **settings)
 
-    def follow(self, scene: Scene, rebuild_at: float) -> dict[str, Any]:
-        """Go on with a scene that has the same objects in other places: its surfaces are uploaded anew, and the structure is
-        refitted, or where it cannot be, or has grown too costly, built anew. Returns what was done with it ("refitted" or
-        "rebuilt"), in how many seconds, and by how much its SAH cost has grown (NaN: not known)."""
+    def follow(self, scene: Scene, rebuild_at: float) -> dict[str, object]:
+        """Replace the scene by one with the same objects, moved: upload its surfaces, and refit the structure.
+
+        The structure is rebuilt if it cannot be refitted, or if its SAH cost would grow by `rebuild_at` or more. Returns "structure"
+        ("refitted" or "rebuilt"), "seconds", and "growth" of the SAH cost (NaN: unknown).
+        """
         old = self.prepared
         plan = old.plan.moved(scene)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", SceneWarning)  # reported when this was made
+            warnings.simplefilter("ignore", SceneWarning)  # reported by the constructor
             arrays = upload_scene(scene, old.device, plan.meshes)
         geometry: Any = arrays.world.geometry
         self.prepared = replace(old, plan=plan, arrays=arrays)
@@ -79,23 +80,20 @@ class Renderer:
         return {"structure": "rebuilt", "seconds": accel.stats.build_seconds, "growth": float("nan")}
 
     def run(self, *, seed: int | None = None, spp: int | None = None) -> Film:
-        """Take all samples (or as many as time allows, or as the target error needs) and return the film.
-
-        seed, spp: in place of the options' and the scene's; not with a checkpoint.
-        """
+        """Render until samples, time limit or target error end it. seed, spp: replace those of options and scene, without a checkpoint."""
         if self.checkpoint is not None and (seed is not None or spp is not None):
             raise InputError("a render with a checkpoint has the seed and spp that it was made with")
         return Run(LocalTracer(self.prepared), self.checkpoint, seed, spp).film()
 
 
 def builder_for(plan: Plan) -> dict[str, str]:
-    """The structure's option `builder` for one picture, where its default takes too long for so few samples."""
+    """Return the structure's option `builder` for a single picture; empty if its default pays off for the number of samples."""
     triangles = sum(len(mesh.faces) for mesh in stored_meshes(plan.scene, plan.meshes))
     few = triangles > SMALL and plan.area * plan.scene.settings.spp < REFINED_FROM * triangles
     return {"builder": "binned"} if few and default_options(plan.accel).get("builder") == "refined" else {}
 
 
 def same_faces(before: Geometry, now: Geometry | InstancedGeometry) -> bool:
-    """Whether the same faces lie between other vertices; rounding may have put a face's corners on a line."""
+    """Return True if only vertices differ. Rounding may have made a face collinear, which changes the faces."""
     return (isinstance(now, Geometry) and np.array_equal(before.faces, now.faces)
             and before.vertices.shape == now.vertices.shape)

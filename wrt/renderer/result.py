@@ -1,4 +1,4 @@
-"""From the film's arrays to what `render` gives back."""
+"""Films made from device arrays, with their statistics."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ from wrt.renderer.film_arrays import DeviceFilm
 from wrt.renderer.plan import Plan
 from wrt.scene.model import Scene
 
+Facts = dict[str, Any]  # entries of a film's stats
+
 
 def film_of(plan: Plan, arrays: DeviceFilm, seed: int, aov: dict[str, np.ndarray], seconds: dict[str, float],
-            facts: dict[str, Any]) -> Film:
-    """The film with its statistics. facts: of the scene, its structure and the run's end, which go into them as they are."""
+            facts: Facts) -> Film:
+    """Return the film with its statistics. facts: entries about the scene, its structure and the end of the run."""
     arrays = arrays.snapshot()
     options, settings, samples = plan.options, plan.scene.settings, arrays.samples()
     total = max(int(samples.sum()), 1)
@@ -42,7 +44,7 @@ def film_of(plan: Plan, arrays: DeviceFilm, seed: int, aov: dict[str, np.ndarray
 
 
 def film_so_far(plan: Plan, arrays: DeviceFilm) -> Film:
-    """The pixels alone."""
+    """Return a film with pixels, variance and samples alone."""
     return _pixels(plan, arrays.snapshot())
 
 
@@ -52,11 +54,11 @@ def _pixels(plan: Plan, arrays: DeviceFilm) -> Film:
 
 
 def plain_text(name: str) -> str:
-    """A name that a file can hold: names out of glTF files and of the system may have lone surrogates, which become "?"."""
+    """Return a name that UTF-8 can encode: lone surrogates, of glTF files and file names, become "?"."""
     return name.encode("utf-8", "replace").decode()
 
 
 def _most_cut_by_throughput(scene: Scene) -> float:
-    """What a ray that is cut by its throughput is worth at most: in glass, light is denser."""
+    """Return the largest throughput of a ray that min_throughput cuts; inside glass, radiance is larger by ior^2."""
     glass = [m.ior for m in scene.materials if m.kind == "glass" or m.transmission > 0.0]
     return scene.settings.min_throughput * max(glass, default=1.0) ** 2

@@ -1,4 +1,4 @@
-"""What is traced when: the passes of a run and their tiles, until samples, time or the target error end it, or Ctrl-C does."""
+"""Schedule of a run: passes and their tiles, until samples, time, target error or Ctrl-C end it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, wait
 from contextlib import closing
 from functools import partial
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import warp as wp
@@ -18,43 +18,45 @@ import warp as wp
 from wrt.core.errors import InputError
 from wrt.core.interrupts import held_interrupts
 from wrt.core.threads import submit, with_stack
+from wrt.core.types import Device
 from wrt.picture.film import Film
 from wrt.renderer.checkpoint import Checkpoint
 from wrt.renderer.film_arrays import AovFilm, DeviceFilm
 from wrt.renderer.options import Options, Progress
 from wrt.renderer.plan import Plan
 from wrt.renderer.prepare import Prepared
-from wrt.renderer.result import film_of, film_so_far
+from wrt.renderer.result import Facts, film_of, film_so_far
 from wrt.renderer.tiles import Rectangle, Work, work_left
 
-MAX_PASS = 64  # samples a pixel in one pass: what Ctrl-C has to wait for on a GPU, and how uneven it leaves a picture on the CPU
-# Times as many samples a pixel after a pass as before it. On the CPU waves of many samples of few pixels are the fastest (16 spp: 4
-# is up to 1.15 times as fast as 2, and 16 up to 1.1 times as fast as 4), but pictures that end early are the less even.
+MAX_PASS = 64  # samples of a pixel in one pass: Ctrl-C waits for a pass on a GPU, and leaves such differences on the CPU
+# Factor of the samples of a pixel in each pass. Larger factors are faster on the CPU (16 spp: 4 is up to 1.15 times as fast as 2),
+# but leave a picture that ends early less even.
 GROWTH = 4
 STEP_SECONDS = 0.1
-OVERTIME = 5.0  # seconds: a pass that gives no answer for so long after the time limit is given up
-SILENT = 20.0  # seconds without an answer that are reported; also OVERTIME of the first pass, as without it pixels are black
-# Samples (summed over pixels) that are done, and whether no tile runs at the moment: then each pixel is done whole.
+OVERTIME = 5.0  # seconds without an answer after the time limit, until a pass is abandoned
+SILENT = 20.0  # seconds without an answer until it is reported; also OVERTIME of the first pass, since pixels are black without it
+
+# Samples done, summed over pixels, and True while no tile runs: then no pixel is half done.
 Steps = Generator[tuple[int, bool], None, None]
 
 
 class OutOfTime(Exception):
-    """A pass is given up: whoever traces it does not answer."""
+    """A pass is abandoned, because its tracer does not answer."""
 
 
 class Tracer(Protocol):
-    """Who traces the tiles of a run: threads of this process, or others (wrt.renderer.distributed).
+    """Traces the tiles of a run: threads of this process, or workers (wrt.renderer.distributed).
 
-    device: of the film; seconds: of making the scene ready; facts: counts of it and its structure. `trace` gives a step every
-    tenth of a second or so, and one in the end; where `due()` is true, one in which no tile runs. Closed early, it lets the tiles
-    that run end and begins no others.
+    device: of the film; seconds: of the preparation, by stage; facts: counts of the scene and its structure. `trace` yields a step about
+    every tenth of a second, and one at the end. If `due()` is true, it yields a step without running tiles. When it is closed early, tiles
+    that run come to their end, and no others begin.
     """
 
     plan: Plan
-    device: Any
+    device: Device
     seconds: dict[str, float]
 
-    def facts(self) -> dict[str, Any]: ...
+    def facts(self) -> Facts: ...
 
     def tiles(self, samples: int) -> Iterable[Rectangle]: ...
 
@@ -62,7 +64,7 @@ class Tracer(Protocol):
 
 
 class LocalTracer:
-    """On the device that the scene was prepared for: on all threads, or in one launch on CUDA."""
+    """Traces on the device of a prepared scene: on all threads, or in one launch on CUDA."""
 
     def __init__(self, prepared: Prepared) -> None:
         self.prepared, self.plan, self.device, self.seconds = prepared, prepared.plan, prepared.device, prepared.seconds
@@ -75,10 +77,10 @@ class LocalTracer:
             wp.synchronize_device(self.device)
             yield done, True
             return
-        if min(self.prepared.threads, len(work)) == 1:  # this one
+        if min(self.prepared.threads, len(work)) == 1:  # the calling one
             yield from self._trace_here(trace, work, due)
             return
-        left, samples = deque(work), list[int]()  # a future for each job would take a tenth of a short picture's time
+        left, samples = deque(work), list[int]()  # a future for each job would add 10 % to a short picture
         at_rest = False
 
         def trace_left() -> None:
@@ -117,11 +119,11 @@ class LocalTracer:
 
 
 class Passes:
-    """First sample and number of samples (of each group) of each pass: 1, 3, 12, 48, 64 ..., so that a first picture comes soon.
+    """Iterator over passes: first sample and number of samples, in each group, 1, 3, 12, 48, 64 ..., so that a first picture comes soon.
 
-    A time limit counts from the first pass on: a pass takes no more samples than are likely to be done by then, but for the
-    first of each pixel, which is always taken; nor, with `every`, more than in so many seconds. samples: the fewest and the most
-    that pixels have already; a render that was saved within a pass begins with the pixels that are behind.
+    A time limit counts from the first pass on. A pass takes no more samples than are likely to be done in the time left, or in `every`
+    seconds; the first sample of each pixel is always taken. samples: the smallest and the largest number that pixels have already.
+    A render that was saved within a pass begins with the pixels that are behind.
     """
 
     def __init__(self, film: DeviceFilm, options: Options, spp: int, samples: tuple[int, int], every: float) -> None:
@@ -133,14 +135,14 @@ class Passes:
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
         limit = self.options.time_limit or math.inf
-        first = known = self.fewest  # the speed is that of the samples since `known`, when `since`
+        first = known = self.fewest  # the speed is measured over the samples since `known`, at the time `since`
         begin = since = time.perf_counter()
         self.deadline = begin + limit
         count = self._size(first)
         while first < self.spp and (first < self.most or not self._precise_enough(first)):
             count = min(count, (self.most if first < self.most else self.spp) - first)
             if self.options.target_error is not None:
-                count = min(count, (1 << first.bit_length()) - first)  # no farther than to the next power of 2
+                count = min(count, (1 << first.bit_length()) - first)  # up to the next power of 2
             if first > 0 and min(limit, self.every) < math.inf:
                 now = time.perf_counter()
                 left = self.deadline - now
@@ -156,11 +158,11 @@ class Passes:
             count = self._size(first)
 
     def _size(self, first: int) -> int:
-        """Of a pass, if nothing but the samples so far matters."""
+        """Return the size of a pass without limits of time and error."""
         return self.options.pass_size or min(max((GROWTH - 1) * first, 1), self.largest)
 
     def _precise_enough(self, taken: int) -> bool:
-        """Whether the target error is reached after so many samples of each group; looked at when they are a power of 2."""
+        """Return True if the target error is reached after `taken` samples in each group; checked at powers of 2."""
         target = self.options.target_error
         if target is None or taken == 0 or taken & (taken - 1):
             return False
@@ -172,7 +174,7 @@ class Passes:
 
 
 class Run:
-    """One picture of a scene that is ready. seed, spp: in place of the options' and the scene's (None)."""
+    """One picture of a prepared scene. seed, spp: replace the options' and the scene's, unless None."""
 
     def __init__(self, tracer: Tracer, checkpoint: Checkpoint | None, seed: int | None = None, spp: int | None = None) -> None:
         plan = tracer.plan
@@ -186,12 +188,12 @@ class Run:
         if checkpoint is not None and checkpoint.saved is not None:
             checkpoint.restore(self.arrays)
             samples, self.seconds_before = checkpoint.saved.samples, checkpoint.saved.seconds
-        if checkpoint is not None and tracer.device.is_cuda:  # where a launch is the whole picture
+        if checkpoint is not None and tracer.device.is_cuda:  # a launch takes the whole picture
             every = checkpoint.every
         self.passes = Passes(self.arrays, plan.options, spp or plan.scene.settings.spp, samples, every)
 
     def film(self) -> Film:
-        """Take the samples, and give the film."""
+        """Take the samples and return the film."""
         begin = self.begin = time.perf_counter()
         interrupted = out_of_time = False
         with held_interrupts() as self.interrupts:
@@ -204,7 +206,7 @@ class Run:
                 self.begin = time.perf_counter()
                 for first, count in self.passes:
                     self._take(first, count)
-            except KeyboardInterrupt:  # from _follow, or from a progress callback that wants the end
+            except KeyboardInterrupt:  # from _follow, or from a progress callback
                 interrupted = True
             except OutOfTime:
                 out_of_time = True
@@ -219,14 +221,14 @@ class Run:
             facts = self._facts(interrupted or bool(self.interrupts), out_of_time)
             return film_of(self.plan, self.arrays, self.seed, self.aov, self.seconds, facts)
 
-    def _facts(self, interrupted: bool, out_of_time: bool) -> dict[str, Any]:
-        """Of the scene, and of how the run ended."""
+    def _facts(self, interrupted: bool, out_of_time: bool) -> Facts:
+        """Return facts of the scene and of the end of the run."""
         end = {"interrupted": interrupted, "signal": int(self.interrupts[0]) if self.interrupts else None,
                "timed_out": (out_of_time or self.passes.timed_out) and not interrupted}
         return self.tracer.facts() | end | ({} if self.checkpoint is None else self.checkpoint.facts())
 
     def _keep(self, error: Exception) -> None:
-        """What ends a run leaves a checkpoint, if the film can still be read: not that of a CUDA device that failed."""
+        """Save a checkpoint before an error ends the run, unless the device is CUDA: its film may be unreadable."""
         if self.checkpoint is None or self.tracer.device.is_cuda:
             return
         self.checkpoint.save(self.arrays, self._elapsed())
@@ -234,16 +236,16 @@ class Run:
             raise error.at(hint=f"{self.checkpoint.path} has what was done") from error
 
     def _elapsed(self) -> float:
-        """Seconds of tracing, with those before the last resume."""
+        """Return the seconds of tracing, including those before a resume."""
         return self.seconds_before + time.perf_counter() - self.begin
 
     def _due(self) -> bool:
         return self.checkpoint is not None and self.checkpoint.due()
 
     def _take(self, first: int, count: int) -> None:
-        """Bring every pixel from `first` to `first + count` samples a group, where it has fewer."""
+        """Bring every pixel with fewer samples to `first + count` in each group."""
         work, before = [Work(tile, first, count) for tile in self.tracer.tiles(count)], first * self.plan.area
-        if first < self.passes.most:  # of a resumed render
+        if first < self.passes.most:  # after a resume
             samples = self.arrays.view(self.arrays.groups[0].samples)
             work, before = work_left(work, samples, self.plan.crop), int(samples.sum(dtype=np.int64))
         self._follow(self.arrays, work, lambda done, silent: self._report(before + done, silent), OVERTIME if first else SILENT)
@@ -255,27 +257,29 @@ class Run:
         self.aov = {name: arrays.picture(name) for name in self.plan.options.aov}
 
     def _follow(self, film: DeviceFilm | AovFilm, work: list[Work], report: Callable[[int, float], None], overtime: float) -> None:
-        """Trace, save and report. KeyboardInterrupt where Ctrl-C came: tiles that run come to their end, so that
-        a pixel is never half done. OutOfTime where the time limit is over, and there was no answer for so long."""
+        """Trace, save and report. Raises KeyboardInterrupt after Ctrl-C, once no tile runs, so that no pixel is half done.
+
+        Raises OutOfTime if there was no answer for `overtime` seconds after the time limit.
+        """
         total = sum(job.total for job in work)
         if self.interrupts:
             raise KeyboardInterrupt
-        before, heard = 0, time.perf_counter()
+        before, received = 0, time.perf_counter()
         with closing(self.tracer.trace(film, work, self._due)) as steps:
             for done, at_rest in steps:
                 now = time.perf_counter()
                 if done > before:
-                    before, heard = done, now
+                    before, received = done, now
                 if self.checkpoint is not None and at_rest and self.checkpoint.due():
                     self.checkpoint.save(self.arrays, self._elapsed())
-                report(done, now - heard)
+                report(done, now - received)
                 if done < total and self.interrupts:
                     raise KeyboardInterrupt
-                if done < total and now - max(heard, self.passes.deadline) > overtime:
+                if done < total and now - max(received, self.passes.deadline) > overtime:
                     raise OutOfTime
 
     def _report(self, done: int, silent: float) -> None:
-        """done: samples of a group, summed over the pixels; silent: seconds without an answer."""
+        """Call `progress`. done: samples of a group, summed over the pixels; silent: seconds without an answer."""
         plan = self.plan
         if plan.options.progress is None:
             return

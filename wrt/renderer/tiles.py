@@ -1,4 +1,4 @@
-"""How a picture is divided: tiles, and the samples that each still needs."""
+"""Tiles of a picture, and the samples that each still needs."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ class Work(NamedTuple):
 
     @property
     def total(self) -> int:
-        """Samples in all."""
+        """Number of samples, summed over the pixels."""
         return self.rectangle[2] * self.rectangle[3] * self.n
 
 
 def tiles(crop: tuple[int, int, int, int], step: int) -> Iterator[Rectangle]:
-    """Squares of side `step`, smaller at the right and the bottom, that make up the rectangle x0, y0, x1, y1; row by row."""
+    """Yield squares of side `step`, smaller at the right and the bottom, that cover the rectangle x0, y0, x1, y1, row by row."""
     x0, y0, x1, y1 = crop
     for y in range(y0, y1, step):
         for x in range(x0, x1, step):
@@ -32,15 +32,15 @@ def tiles(crop: tuple[int, int, int, int], step: int) -> Iterator[Rectangle]:
 
 
 def corners(rectangle: Rectangle) -> tuple[int, int, int, int]:
-    """x0, y0, x1, y1"""
+    """Return x0, y0, x1, y1 of a rectangle."""
     x, y, width, height = rectangle
     return x, y, x + width, y + height
 
 
 def work_left(work: list[Work], samples: np.ndarray, crop: tuple[int, int, int, int]) -> list[Work]:
-    """What is left of the work where pixels have samples already: samples, (H, W) of the crop, `first` or more.
+    """Return the work that is left. samples: (H, W) of the crop, `first` or more.
 
-    A rectangle with differing pixels is halved until each part has equally many: they differ by whole old tiles.
+    A rectangle is halved until all pixels of a part have equally many samples; they differ by whole tiles of an earlier run.
     """
     out = []
     stack = work[::-1]

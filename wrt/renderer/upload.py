@@ -1,7 +1,8 @@
-"""From a scene to the device's records: its world, tables of materials, textures and lights."""
+"""Upload of a scene: geometry, and tables of materials, textures and lights."""
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -16,6 +17,7 @@ from wrt.accel.scenes.flatten import flatten
 from wrt.core.checks import listed
 from wrt.core.device import records, upload
 from wrt.core.errors import InputError, warn
+from wrt.core.types import Device, WarpStruct
 from wrt.kernels import structs
 from wrt.kernels.shade import backgrounds, lights, materials, textures
 from wrt.kernels.warp_private import fields_of
@@ -27,13 +29,13 @@ from wrt.scene.model import Scene
 from wrt.scene.size import require_size
 from wrt.scene.values import LUMINANCE
 
-# More area lights than this are sampled as one, by power: a shadow ray to each would cost more than it tells.
+# More area lights than this are sampled as one, by power: a shadow ray to each would cost more than it gains.
 MAX_MESH_LIGHTS = 16
 WRAPS = {"repeat": textures.WRAP_REPEAT, "clamp": textures.WRAP_CLAMP, "mirror": textures.WRAP_MIRROR}
 
 
 class TextureTable:
-    """Texels of all pictures one after another; a picture used twice is stored once."""
+    """Texels of all images in sequence; an image used twice is stored once."""
 
     def __init__(self) -> None:
         self.rows: list[Texture | Checkerboard] = []
@@ -74,20 +76,20 @@ class TextureTable:
 
 @cache
 def srgb_table() -> np.ndarray:
-    """(512,) float32: linear values of the 256 sRGB codes (IEC 61966-2-1), then i / 255."""
+    """Return (512,) float32: linear values of the 256 sRGB codes (IEC 61966-2-1), then i / 255."""
     code = np.arange(256) / 255.0
     return np.concatenate([decode_srgb(code), code]).astype(np.float32)
 
 
-def number(kind: str, table: dict[str, Any], what: str) -> int:
-    """Where a kind stands in the device's table. Raises InputError where it does not."""
+def index_of(kind: str, table: Collection[str], what: str) -> int:
+    """Return the index of a kind in a table of device functions. Raises InputError if it has none."""
     if kind not in table:
         raise InputError(f"{what} {kind!r} has no device function: wrt.kernels.shade has no row for it")
     return list(table).index(kind)
 
 
 def material_records(used: tuple[Material, ...], table: TextureTable) -> np.ndarray:
-    """What a kind does not use is 0, and no texture. What is clear without `transmission` lets all of it through."""
+    """Return the device's materials. Fields that a kind does not use are 0 and without texture; `transmission` of clear kinds is 1."""
     out = records(structs.Material, max(len(used), 1))
     some_use = kinds_that_use()
     for row, material in zip(out, used, strict=False):
@@ -96,7 +98,7 @@ def material_records(used: tuple[Material, ...], table: TextureTable) -> np.ndar
             if name.endswith("_texture"):
                 row[name] = -1 if unused else table.index(getattr(material, name))
             elif name == "kind":
-                row[name] = number(material.kind, materials.MATERIALS, "material kind")
+                row[name] = index_of(material.kind, materials.MATERIALS, "material kind")
             elif name == "alpha_mode":
                 row[name] = ALPHA_MODES.index(material.alpha_mode)
             elif unused:
@@ -107,14 +109,16 @@ def material_records(used: tuple[Material, ...], table: TextureTable) -> np.ndar
 
 
 def light_records(scene: Scene, world: FlatScene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lights, emitters and the emitters' cdf (float32). Each object with emissive faces is one light; beyond
-    MAX_MESH_LIGHTS all are one together."""
+    """Return lights, emitters and the cdf of the emitters (float32).
+
+    Each object with emissive faces is one light; more than MAX_MESH_LIGHTS together are one.
+    """
     rows: list[dict[str, Any]] = []
     for light in scene.lights:
-        rows.append({"kind": number(light.kind, lights.LIGHTS, "light kind"), **light.record()})
+        rows.append({"kind": index_of(light.kind, lights.LIGHTS, "light kind"), **light.record()})
     for sphere in scene.spheres:
         if sphere.material.lights_others:
-            rows.append({"kind": number("sphere", lights.LIGHTS, "light kind"), "position": sphere.center, "radius": sphere.radius,
+            rows.append({"kind": index_of("sphere", lights.LIGHTS, "light kind"), "position": sphere.center, "radius": sphere.radius,
                          "color": sphere.material.emission, "two_sided": sphere.material.two_sided})
     groups = _emissive_groups(scene, world)
     if len(groups) > MAX_MESH_LIGHTS:
@@ -125,7 +129,7 @@ def light_records(scene: Scene, world: FlatScene) -> tuple[np.ndarray, np.ndarra
     for prim_id in groups:
         part, cdf = _emitters(scene, world, prim_id)
         if len(part):
-            rows.append({"kind": number("mesh", lights.LIGHTS, "light kind"), "first": first, "count": len(part)})
+            rows.append({"kind": index_of("mesh", lights.LIGHTS, "light kind"), "first": first, "count": len(part)})
             parts.append(part)
             cdfs.append(cdf)
             first += len(part)
@@ -137,7 +141,7 @@ def light_records(scene: Scene, world: FlatScene) -> tuple[np.ndarray, np.ndarra
 
 
 def _emissive_groups(scene: Scene, world: FlatScene) -> list[np.ndarray]:
-    """prim_ids of the faces that light, object by object."""
+    """Return the prim_ids of the emissive faces of each object that has some."""
     lit = np.array([m.lights_others for m in scene.materials], bool)
     groups = []
     first = 0
@@ -153,14 +157,14 @@ def _emissive_groups(scene: Scene, world: FlatScene) -> list[np.ndarray]:
 
 
 def _emitters(scene: Scene, world: FlatScene, prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The emitters of one light and their cdf; both empty where they have no power."""
+    """Return the emitters of one light and their cdf; both are empty if the power is 0."""
     corner = world.corners(prim_id)
     area = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
     power = np.array([LUMINANCE @ np.array(m.emission) for m in scene.materials])[world.materials(prim_id)] * area
     total = power.sum()
     if not total > 0.0:
         return records(structs.Emitter, 1)[:0], np.zeros(0, np.float32)
-    # The density is that of the rounded table, by which they are chosen.
+    # The density follows the rounded cdf, which samples the emitters.
     cdf = (np.cumsum(power) / total).astype(np.float32)
     cdf[np.nonzero(power)[0][-1] :] = 1.0
     share = np.diff(cdf.astype(np.float64), prepend=0.0)
@@ -169,14 +173,14 @@ def _emitters(scene: Scene, world: FlatScene, prim_id: np.ndarray) -> tuple[np.n
     out["v0"], out["v1"], out["v2"] = corners = np.moveaxis(world.vertices[world.faces[face]], 1, 0)
     out["normal"] = unit_normals(*corners)
     out["material"] = world.materials(prim_id)
-    # A light of less than 2^-128 square units lights nothing: a density of inf. At SMALLEST_LIT that is 3e-9 of its radiance.
+    # An emitter below 2^-128 square units has the density inf and lights nothing.
     with np.errstate(over="ignore"):
         out["pdf_area"] = np.divide(share, area, out=np.zeros_like(area), where=area > 0.0)
     return out, cdf
 
 
 def unit_normals(v0: np.ndarray, v1: np.ndarray, v2: np.ndarray) -> np.ndarray:
-    """Bit for bit as wrt.kernels.shade.surface.triangle_normal has them: corners (N, 3) float32 each, (N, 3) float32 out."""
+    """Return unit normals (N, 3) float32 of corners (N, 3) float32 each, with the bits of wrt.kernels.shade.surface.triangle_normal."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore", under="ignore"):
         a, b = (edge / np.abs(edge).max(axis=1, keepdims=True) for edge in (v1 - v0, v2 - v0))
         n = a[:, [1, 2, 0]] * b[:, [2, 0, 1]] - a[:, [2, 0, 1]] * b[:, [1, 2, 0]]
@@ -185,9 +189,9 @@ def unit_normals(v0: np.ndarray, v1: np.ndarray, v2: np.ndarray) -> np.ndarray:
         return np.where(length > 0.0, n / length, np.float32(0.0))
 
 
-def background_struct(background: Background, device: Any) -> Any:
-    b: Any = structs.Background()
-    number(background.kind, backgrounds.BACKGROUNDS, "background kind")
+def background_struct(background: Background, device: Device) -> WarpStruct:
+    b: WarpStruct = structs.Background()
+    index_of(background.kind, backgrounds.BACKGROUNDS, "background kind")
     for name, value in background.record().items():
         kind = fields_of(b)[name]
         if isinstance(value, np.ndarray):
@@ -199,15 +203,15 @@ def background_struct(background: Background, device: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class DeviceScene:
-    """What the kernels take: surfaces and lighting, and the world with the geometry to build a structure over."""
+    """Surfaces and lighting for the kernels, and the flat scene with the geometry for the acceleration structure."""
 
     world: FlatScene
-    surfaces: Any
-    lighting: Any
+    surfaces: WarpStruct
+    lighting: WarpStruct
 
 
-def tell_left_out(scene: Scene) -> None:
-    """A SceneWarning for what a picture leaves out. Raises InputError where the scene cannot be rendered."""
+def warn_left_out(scene: Scene) -> None:
+    """Give a SceneWarning for parts that a picture leaves out. Raises InputError if the scene cannot be rendered."""
     require_size(scene)
     for sphere in scene.spheres:
         if sphere.material.alpha_mode == "mask" and sphere.material.albedo_texture is not None:
@@ -223,10 +227,9 @@ def tell_left_out(scene: Scene) -> None:
              f" {listed(unreached)} (emits_light = false says that it is meant)")
 
 
-def upload_scene(scene: Scene, device: Any, meshes: frozenset[int] = frozenset()) -> DeviceScene:
-    """Put a scene on a device (a Warp device); meshes: the id()s of those that are kept once (wrt.accel.scenes.instancing). Raises
-    InputError where the scene cannot be rendered."""
-    tell_left_out(scene)
+def upload_scene(scene: Scene, device: Device, meshes: frozenset[int] = frozenset()) -> DeviceScene:
+    """Upload a scene. meshes: id()s of the instanced meshes (wrt.accel.scenes.instancing). Raises InputError as `warn_left_out` does."""
+    warn_left_out(scene)
     world = flatten(scene, meshes)
     table = TextureTable()
     rows = material_records(scene.materials, table)
@@ -257,8 +260,8 @@ def upload_scene(scene: Scene, device: Any, meshes: frozenset[int] = frozenset()
     return DeviceScene(world, s, lighting)
 
 
-def camera_struct(camera: CameraKind, size: tuple[int, int]) -> Any:
-    """The camera for a picture of so many pixels."""
+def camera_struct(camera: CameraKind, size: tuple[int, int]) -> WarpStruct:
+    """Return the device's camera for a picture of `size` pixels."""
     c = import_module(camera.device).Camera()
     pose = camera.camera_to_world
     c.origin = wp.vec3(*pose[:3, 3])

@@ -22,7 +22,7 @@ from wrt.renderer.plan import Plan, plan_of
 from wrt.renderer.prepare import PREPARING_REPORTED
 from wrt.renderer.schedule import STEP_SECONDS, Run, Steps
 from wrt.renderer.tiles import Rectangle, Work, tiles
-from wrt.renderer.upload import tell_left_out
+from wrt.renderer.upload import warn_left_out
 from wrt.scene.model import Scene
 
 TILES_EACH = 4  # of a pass, for each that traces: the last one to come must not be long
@@ -36,7 +36,7 @@ class DistributedRenderer:
         self.device = start("cpu")  # of the film
         self.plan = plan_of(scene, options)
         self.plan.require_memory(self.device)
-        tell_left_out(scene)
+        warn_left_out(scene)
         self.workers = workers_for(self.plan)
         self.tiles_by: Counter[str] = Counter()
         self.kind, self.seconds, self.counts = self._made_ready()

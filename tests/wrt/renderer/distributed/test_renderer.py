@@ -303,7 +303,7 @@ def test_a_closed_executor(threads: Executor) -> None:
 
 def test_what_a_picture_leaves_out_is_told_once(threads: Executor, monkeypatch: pytest.MonkeyPatch) -> None:
     for place in (module, upload):
-        monkeypatch.setattr(place, "tell_left_out", lambda scene: warnings.warn("left out", SceneWarning, stacklevel=1))
+        monkeypatch.setattr(place, "warn_left_out", lambda scene: warnings.warn("left out", SceneWarning, stacklevel=1))
     for how in ({"executor": threads}, {"devices": ["cpu", "cpu"]}):
         with pytest.warns(SceneWarning, match="left out") as told:
             render(SCENE, spp=1, **how)
