@@ -105,7 +105,8 @@ def rows(plan: Check, tell: Callable[[str], None]) -> Iterator[Row]:
     yield hard_row(plan)
     for name, scene in plan.pictures.items():
         tell(f"picture of {name}")
-        yield picture_row(plan, name, scene)
+        here, there = (render(scene, device=device, **PICTURE).pixels.reshape(-1, 3) for device in ("cpu", plan.device))
+        yield row("pixels", name, {"": different(here, there)})
 
 
 def compile_all(plan: Check) -> None:
@@ -124,33 +125,30 @@ def function_rows(plan: Check) -> Iterator[Row]:
     x, y = np.concatenate([common, rng.integers(0, 2**32, size=common.shape, dtype=np.uint32).view(np.float32)], axis=1)
     here, there = (called(x, y, device) for device in ("cpu", plan.device))
     for i, name in enumerate(FUNCTIONS):
-        yield row("functions", name, len(x), {"": different(here[:, i], there[:, i])})
+        yield row("functions", name, {"": different(here[:, i], there[:, i])})
 
 
 def called(x: np.ndarray, y: np.ndarray, name: str) -> np.ndarray:
     device = start(name)
     out = wp.empty((len(x), len(FUNCTIONS)), dtype=wp.float32, device=device)
     load_kernel(call_functions, device)
-    given = [wp.array(each, dtype=wp.float32, device=device) for each in (x, y)]
-    wp.launch(call_functions, len(x), [*given, out], device=device)
+    wp.launch(call_functions, len(x), [*(wp.array(each, dtype=wp.float32, device=device) for each in (x, y)), out], device=device)
     return out.numpy()
 
 
 def hit_rows(plan: Check) -> Iterator[Row]:
     """Yield a row for each structure."""
-    worlds = {name: Geometry.of(make()) for name, make in MESHES.items()}
-    on_cpu = {name: build(geometry, device="cpu") for name, geometry in worlds.items()}
+    geometries = {name: Geometry.of(make()) for name, make in MESHES.items()}
+    on_cpu = {name: build(geometry, device="cpu") for name, geometry in geometries.items()}
     rays = {name: ray_sets(accel, plan.rays) for name, accel in on_cpu.items()}
     for structure in structures():
-        differ, count = dict[str, np.ndarray](), 0
-        for mesh, geometry in worlds.items():
+        differ = dict[str, np.ndarray]()
+        for mesh, geometry in geometries.items():
             accel = build(geometry, structure, device=plan.device)
             n = BRUTE_FORCE_TESTS // (20 * len(geometry)) if structure == "brute_force" else plan.rays
             for kind, some in rays[mesh].items():
-                part = some.part(slice(0, n))
-                differ[f"{mesh}, {kind}"] = compare(accel, on_cpu[mesh], part)
-                count += len(part)
-        yield row("hits", structure, count, differ)
+                differ[f"{mesh}, {kind}"] = compare(accel, on_cpu[mesh], some.part(slice(0, n)))
+        yield row("hits", structure, differ)
 
 
 def compare(accel: Accelerator, truth: Accelerator, rays: RaySet) -> np.ndarray:
@@ -169,33 +167,26 @@ def different(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def hard_row(plan: Check) -> Row:
     """Compare the default structure in all hard cases whose rays the host accepts."""
-    differ, count = dict[str, np.ndarray](), 0
+    differ = dict[str, np.ndarray]()
     for name in HARD_CASES:
         case = generate(name, plan.cases)
         if not case.refused:
             rays = RaySet(name, case.origins, case.directions, case.t_max)
             differ[name] = compare(build(case.geometry, device=plan.device), build(case.geometry, device="cpu"), rays)
-            count += len(case)
-    return row("hits", f"bvh8, {len(differ)} hard cases", count, differ)
+    return row("hits", f"bvh8, {len(differ)} hard cases", differ)
 
 
-def picture_row(plan: Check, name: str, scene: Scene) -> Row:
-    here, there = (render(scene, device=device, **PICTURE).pixels.reshape(-1, 3) for device in ("cpu", plan.device))
-    return row("pixels", name, len(here), {"": different(here, there)})
-
-
-def row(part: str, what: str, count: int, differ: dict[str, np.ndarray]) -> Row:
-    """Count the answers that differ. differ: flags, by place."""
-    numbers = {place: int(each.sum()) for place, each in differ.items()}
-    return Row(part=part, what=what, count=count, differ=sum(numbers.values()),
-               where=[place for place, number in numbers.items() if number and place])
+def row(part: str, what: str, differ: dict[str, np.ndarray]) -> Row:
+    """Count the answers that differ. differ: a flag for each answer, by place."""
+    return Row(part=part, what=what, count=sum(map(len, differ.values())), differ=sum(int(each.sum()) for each in differ.values()),
+               where=[place for place, each in differ.items() if each.any() and place])
 
 
 def speed_rows(plan: Check) -> tuple[list[Row], str]:
     """Measure wrt's structures beside Warp's query with each constructor; return no rows if the device has none, and what was skipped."""
     geometry, device = Geometry.of(terrain(TIMED_CELLS)), start(plan.device)
     everybody: dict[str, Any] = {f"wrt {name}": Own(structure=name, device=plan.device) for name in structures() if name != "brute_force"}
-    skipped, warps = [], dict[str, Any]()
+    skipped, warps, out = [], dict[str, Any](), list[Row]()
     for constructor in CONSTRUCTORS:
         warp = WarpMesh(plan.device, constructor)
         try:
@@ -203,7 +194,6 @@ def speed_rows(plan: Check) -> tuple[list[Row], str]:
             warps[f"Warp, {constructor}"] = warp
         except RuntimeError as error:  # also what is not implemented
             skipped.append(f"Warp, {constructor}: {error}")
-    out = list[Row]()
     for own in everybody.values() if warps else ():
         own.prepare(geometry)
     everybody |= warps

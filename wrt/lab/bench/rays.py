@@ -28,7 +28,7 @@ class RaySet:
     def __len__(self) -> int:
         return len(self.origins)
 
-    def part(self, rows: slice) -> RaySet:
+    def part(self, rows: slice | np.ndarray) -> RaySet:
         return RaySet(self.kind, self.origins[rows], self.directions[rows], self.t_max[rows], self.any_hit)
 
 

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from itertools import chain
@@ -15,12 +16,13 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from wrt.accel.geometry import Geometry
 from wrt.accel.queries.all_hits import all_hits
 from wrt.accel.structure import Structure
 from wrt.core.device import load_kernel, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
-from wrt.core.types import JsonObject, Kernel
+from wrt.core.types import Device, JsonObject, Kernel
 from wrt.kernels.shade.surface import make_surface_at
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.study.respawn import Respawn, make_respawn_kernel
@@ -45,9 +47,8 @@ COLUMNS: Columns = {
     "case": "{case}", "algorithm": "{algorithm}",
     "rays": lambda row: {None: str(row.verdict.rays), True: "refused", False: "ACCEPTED"}[row.refused],
     **{head: partial(lambda form, row: form.format_map(vars(row)) if row.refused is None else "", form) for head, form in {
-        "judged": "{judged}", "misses": "{verdict.misses}", "false hits": "{verdict.false_hits}",
-        "wrong prim": "{verdict.wrong_prim}", "self-hits": "{verdict.self_hits}", "duplicates": "{verdict.duplicate_hits}",
-        "ties": "{verdict.ties}",
+        "judged": "{judged}", "misses": "{verdict.misses}", "false hits": "{verdict.false_hits}", "wrong prim": "{verdict.wrong_prim}",
+        "self-hits": "{verdict.self_hits}", "duplicates": "{verdict.duplicate_hits}", "ties": "{verdict.ties}",
         "near ties": "{verdict.near_ties}", "borderline": "{verdict.borderline}", "t ulp max": "{verdict.t.largest:.3g}",
         "t ulp 99.9 %": "{verdict.t.p999:.3g}", "t / bound": "{verdict.t.largest_ratio:.2g}"}.items()}}
 
@@ -79,12 +80,10 @@ def run(plan: Plan, report: Callable[[Row], None] = lambda row: None,
     - executor: a concurrent.futures.Executor or dask.distributed.Client whose workers trace and judge. Speed is measured here.
 
     Interrupted by Ctrl-C, return the finished rows; raise KeyboardInterrupt if there are none. Raise InputError for an unknown case."""
-    begin = time.perf_counter()
-    names = chosen(plan.cases)
-    algorithms, peers = all_algorithms(plan), PEERS.values() if plan.peers else ()
+    begin, names, algorithms = time.perf_counter(), chosen(plan.cases), all_algorithms(plan)
     progress("measuring the speed")
     found = Result(rows=[], speed=measure_speed(algorithms, plan.runs), interrupted=None, undone=[],
-                   not_installed=[peer.name for peer in peers if not peer.is_installed()])
+                   not_installed=[peer.name for peer in PEERS.values() if plan.peers and not peer.is_installed()])
     pool = None if executor is None else submitter(executor)
     try:
         for row in _rows(names, [algorithm.name for algorithm in algorithms], plan, progress, pool):
@@ -102,8 +101,7 @@ def run(plan: Plan, report: Callable[[Row], None] = lambda row: None,
 
 def all_algorithms(plan: Plan) -> list[Algorithm]:
     """Return wrt's tests, the default first, and the wanted peers that are installed."""
-    peers = PEERS.values() if plan.peers else ()
-    return [*own_algorithms(), *(peer() for peer in peers if peer.is_installed())]
+    return [*own_algorithms(), *(peer() for peer in PEERS.values() if plan.peers and peer.is_installed())]
 
 
 def _rows(names: list[str], algorithms: list[str], plan: Plan, progress: Callable[[str], None], pool: Any) -> Iterator[Row]:
@@ -209,17 +207,15 @@ def _is_refused(case: HardCase, algorithm: Algorithm) -> bool:
     """Return True if input that is not finite raises InputError: rays in the query, vertices in Mesh."""
     from wrt.scene.mesh import Mesh
 
-    try:
+    with suppress(InputError):
         Mesh(case.geometry.vertices, case.geometry.faces)
         algorithm.prepare(case.geometry)
         algorithm.closest(case.origins, case.directions)
-    except InputError:
-        return True
-    return False
+        return False
+    return True
 
 
-def _surfaces(case: HardCase, device: Any) -> Any:
-    geometry = case.geometry
+def _surfaces(geometry: Geometry, device: Device) -> Surfaces:
     surfaces = Surfaces()
     surfaces.n_triangles = len(geometry.faces)
     surfaces.vertices = upload(geometry.vertices, wp.vec3, device)
@@ -245,7 +241,8 @@ def respawn(algorithm: Own, case: HardCase) -> tuple[np.ndarray, np.ndarray]:
     out.direction = upload(case.next_directions, wp.vec3, accel.device)
     out.exclude = 1
     out.first_prim_id, out.next_prim_id = (wp.empty(n, dtype=wp.int32, device=accel.device) for _ in range(2))
-    wp.launch(kernel, dim=n, inputs=[accel.data, _surfaces(case, accel.device), case.on(accel.device), out, 0], device=accel.device)
+    surfaces = _surfaces(case.geometry, accel.device)
+    wp.launch(kernel, dim=n, inputs=[accel.data, surfaces, case.on(accel.device), out, 0], device=accel.device)
     return out.first_prim_id.numpy(), out.next_prim_id.numpy()
 
 

@@ -38,7 +38,7 @@ def in_warps(accel: Accelerator, sets: dict[str, RaySet]) -> dict[str, RaySet]:
     started = pixels[np.arange(len(primary)) * len(pixels) // len(primary)] if len(pixels) else np.arange(len(primary))
     orders = {"primary": np.argsort(place), "random": np.arange(len(primary))}
     starts_at_hits = np.argsort(place[started], kind="stable")
-    return {kind: rays.part(orders.get(kind, starts_at_hits)) for kind, rays in sets.items()}  # type: ignore[arg-type]
+    return {kind: rays.part(orders.get(kind, starts_at_hits)) for kind, rays in sets.items()}
 
 
 TITLE = "The model of the RT core on meshes"

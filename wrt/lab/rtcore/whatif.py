@@ -142,22 +142,19 @@ def traced(name: str, accel: OneMesh, rays: RaySet, node_bytes: tuple[int, int] 
     return Variant(name, rays, size, hits.prim_id, hits.t, counters)
 
 
-def width(geometry: Geometry, rays: RaySet) -> Iterator[Variant]:
+def width(tree: Bvh2, rays: RaySet) -> Iterator[Variant]:
     """Compare node widths, node formats and bounding volumes: every BVH of the registry."""
-    for name in bvhs():
-        yield traced(name, build(geometry, name), rays)
+    return (traced(name, build(tree.geometry, name), rays) for name in bvhs())
 
 
-def stack(geometry: Geometry, rays: RaySet) -> Iterator[Variant]:
+def stack(tree: Bvh2, rays: RaySet) -> Iterator[Variant]:
     """Compare a full stack with short ones that restart."""
-    tree = Bvh2(geometry)
     for entries in ENTRIES:
         yield traced("full stack" if entries == STACK_SIZE else f"{entries} entries", with_traversal(tree, Study(entries)), rays)
 
 
-def planes(geometry: Geometry, rays: RaySet) -> Iterator[Variant]:
+def planes(tree: Bvh2, rays: RaySet) -> Iterator[Variant]:
     """Compare float32 box planes with planes of few bits in the frame of the node, rounded outwards."""
-    tree = Bvh2(geometry)
     first = traced("fp32", tree, rays)
     yield first
     for bits in BITS:
@@ -165,37 +162,33 @@ def planes(geometry: Geometry, rays: RaySet) -> Iterator[Variant]:
         yield traced(f"{bits} bits", accel, rays, (first.node_bytes, size))
 
 
-def order(geometry: Geometry, rays: RaySet) -> Iterator[Variant]:
+def order(tree: Bvh2, rays: RaySet) -> Iterator[Variant]:
     """Switch off the nearer child first, and the early stop."""
-    tree = Bvh2(geometry)
     for name, study in (("both", Study()), ("early stop alone", Study(ordered=False)), ("order alone", Study(early=False)),
                         ("neither", Study(ordered=False, early=False))):
         yield traced(name, with_traversal(tree, study), rays)
 
 
-def sorting(geometry: Geometry, rays: RaySet) -> Iterator[Variant]:
+def sorting(tree: Bvh2, rays: RaySet) -> Iterator[Variant]:
     """Trace rays in the order of the picture, sorted by origin and direction, and shuffled."""
-    tree = Bvh2(geometry)
     orders = {"as they come": np.arange(len(rays)), "sorted": by_coherence(rays.origins, rays.directions),
               "shuffled": np.random.default_rng(0).permutation(len(rays))}
     for name, which in orders.items():
-        variant = traced(name, tree, rays.part(which))  # type: ignore[arg-type]
-        back = np.argsort(which)
+        variant, back = traced(name, tree, rays.part(which)), np.argsort(which)
         yield replace(variant, prim_id=variant.prim_id[back], t=variant.t[back])
 
 
 # Rates, of boxes against triangles, ask the model about the variants of width.
-STUDIES: dict[str, Callable[[Geometry, RaySet], Iterator[Variant]]] = {
+STUDIES: dict[str, Callable[[Bvh2, RaySet], Iterator[Variant]]] = {
     "width": width, "stack": stack, "planes": planes, "order": order, "sorting": sorting, "rates": width}
 
 
 def rows(plan: Plan) -> Iterator[Row]:
-    geometry = Geometry.of(as_mesh(plan.mesh))
-    tree = Bvh2(geometry)
+    tree = Bvh2(Geometry.of(as_mesh(plan.mesh)))
     sets = in_warps(tree, ray_sets(tree, plan.rays, plan.seed, plan.inside))
     for kind in dict.fromkeys(plan.kinds):
         first = None
-        for variant in STUDIES[plan.study](geometry, sets[kind]):
+        for variant in STUDIES[plan.study](tree, sets[kind]):
             first = first or variant
             if plan.study == "rates":
                 yield from rate_rows(variant, kind, GPUS[plan.gpu])
