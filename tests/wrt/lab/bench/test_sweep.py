@@ -44,7 +44,7 @@ def test_rows_come_in_the_order_of_the_meshes(pool: Executor, tmp_path: Path, mo
     assert told == ["a.ply 0", "a.ply 1", "b.ply 0", "b.ply 1"]
     with pytest.raises(InputError, match=f"{tmp_path}/bad.ply: no such file"):  # a worker has a folder of its own
         by_mesh(slow_first, Plan(("a.ply", "bad.ply")), told.append, pool)
-    with pytest.raises(InputError, match="name some"):
+    with pytest.raises(InputError, match="meshes must be given"):
         by_mesh(slow_first, Plan(()), told.append, pool)
 
 

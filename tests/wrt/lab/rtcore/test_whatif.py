@@ -162,7 +162,7 @@ def test_what_there_is_not_is_refused(ball: Path, monkeypatch: pytest.MonkeyPatc
         with pytest.raises(InputError, match=words):
             Plan(**{"study": "order", "mesh": ball, **wrong})  # type: ignore[arg-type]
     deep = Bvh2(Geometry.of(icosphere(1)))
-    with monkeypatch.context() as patch, pytest.raises(InputError, match="63 deep"):
+    with monkeypatch.context() as patch, pytest.raises(InputError, match="63 levels deep"):
         patch.setattr(Bvh2, "stats", replace(deep.stats, depth=63))
         with_traversal(deep, Study(4))
     assert with_traversal(deep, Study(STACK_SIZE)).stats.nodes == deep.stats.nodes
