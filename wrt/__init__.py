@@ -25,7 +25,7 @@ from wrt.core.version import VERSION as __version__
 if not Path(__file__).is_file():
     raise ImportError("wrt cannot be imported from a zip file, because it reads files beside its code: unpack or install it")
 
-# Type checkers and editors see these imports. At run time each is made when the name is first used (__getattr__).
+# Type checkers and editors see these imports. At run time __getattr__ makes each on first use.
 if TYPE_CHECKING:
     from wrt import compat as compat
     from wrt import jax as jax
@@ -81,7 +81,7 @@ if TYPE_CHECKING:
 
 
 def _public() -> dict[str, str]:
-    """The module of each public name, as the imports above have it."""
+    """Return the module of each public name from the imports above."""
     imports = [node for node in ast.walk(ast.parse(Path(__file__).read_bytes())) if isinstance(node, ast.ImportFrom)]
     return {each.name: node.module or "" for node in imports for each in node.names if each.asname == each.name}
 
@@ -92,8 +92,7 @@ __all__ = ["__version__", *(name for name in _HOME if name not in _MODULES)]
 
 
 def _find_kernels() -> None:
-    """In a checkout, wrt/kernels is a symbolic link to kernels/. Where links are not kept (the source distribution, Windows),
-    wrt.kernels is made of that folder itself."""
+    """Load wrt.kernels from kernels/ if the symbolic link wrt/kernels is not there: in a source distribution, or on Windows."""
     folder = Path(__file__).resolve().parent.parent / "kernels"
     if (Path(__file__).parent / "kernels").is_dir() or not folder.is_dir():
         return
@@ -110,7 +109,7 @@ _find_kernels()
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is first used: `python -m wrt --help` must not wait for Warp."""
+    """Import a public name on first use, so that `python -m wrt --help` does not wait for Warp."""
     if name in _MODULES:
         return importlib.import_module(f"{__name__}.{name}")
     if name in _HOME:

@@ -1,4 +1,4 @@
-"""Open3D's ray casting scene, answered by wrt.
+"""Open3D's ray casting scene with wrt's queries.
 
 >>> from wrt.compat.open3d import RaycastingScene          # in place of open3d.t.geometry.RaycastingScene
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import sys
 from contextlib import suppress
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from wrt.compat.surfaces import every_hit
 from wrt.core.arrays import float32, real_numbers
 from wrt.core.checks import as_integer, shown
 from wrt.core.errors import InputError
+from wrt.core.types import ArrayLike
 from wrt.kernels.query import FARTHEST
 from wrt.scene.values import LARGEST, as_number
 
@@ -31,25 +32,38 @@ WIDEST = 1 << 15  # pixels
 
 
 class Array(np.ndarray):
-    """A NumPy array with the methods by which a program takes Open3D's tensors to NumPy."""
+    """A NumPy array with the methods that convert Open3D's tensors to NumPy."""
 
     def numpy(self) -> np.ndarray:
-        """The same memory as a plain array."""
+        """Return the same memory as a plain array."""
         return self.view(np.ndarray)
 
     def cpu(self) -> Array:
-        """Itself."""
+        """Return the array itself."""
         return self
 
 
-class RaycastingScene:
-    """As open3d.t.geometry.RaycastingScene; docs/compat.md has what differs.
+Answer: TypeAlias = Any  # an Array, or Open3D's tensor
+MeshOrArray: TypeAlias = Any  # (V, 3) positions, or a mesh of any library
 
-    rays: (..., 6), origin and direction of any length; query_points: (..., 3); tensors or arrays of real numbers, as float32. A
-    ray or a point that is not finite hits nothing, nor does a direction of 0. Answers are Open3D's tensors where the program has
-    imported open3d, as there, and else NumPy arrays. nthreads: 0 for one a core. device: "cpu" or "cuda:0", also as Open3D writes
-    it. Raises InputError, a ValueError, that names the argument; also for a point or an origin with a finite coordinate beyond
-    1e37.
+
+class RaycastingScene:
+    """A scene like open3d.t.geometry.RaycastingScene; docs/compat.md has the differences.
+
+    Answers are Open3D's tensors if the program has imported open3d, and NumPy arrays otherwise. A ray or a point that is not finite
+    hits nothing; neither does a direction of 0. All methods raise InputError, a ValueError, that names the argument, also for
+    points and origins with a finite coordinate beyond 1e37.
+
+    Parameters
+    ----------
+    nthreads : int
+        Threads that build, and in a method those of the query; 0: one per core.
+    device
+        "cpu", "cuda:0", or Open3D's names of these.
+    rays : (..., 6) array_like
+        In methods: origins and directions of any length, taken as float32.
+    query_points : (..., 3) array_like
+        In methods: points, taken as float32.
     """
 
     INVALID_ID: ClassVar[int] = 0xFFFFFFFF
@@ -60,9 +74,22 @@ class RaycastingScene:
         self._meshes: list[tuple[np.ndarray, np.ndarray]] = []
         self._built: tuple[Accelerator, np.ndarray, np.ndarray] | None = None
 
-    def add_triangles(self, vertex_positions: Any = None, triangle_indices: Any = None, mesh: Any = None) -> int:
-        """Add a mesh, whose geometry ID is given back: (V, 3) positions and (F, 3) indices, or what has them (a TriangleMesh of
-        Open3D, a wrt.Mesh, a trimesh.Trimesh). Copied. What is built follows at the next query."""
+    def add_triangles(self, vertex_positions: MeshOrArray = None, triangle_indices: ArrayLike | None = None,
+                      mesh: object = None) -> int:
+        """Add a copy of a mesh. The next query builds the structure.
+
+        Parameters
+        ----------
+        vertex_positions, triangle_indices
+            (V, 3) real numbers and (F, 3) indices; or a mesh alone.
+        mesh
+            Instead: a TriangleMesh of Open3D, a `wrt.Mesh` or a `trimesh.Trimesh`.
+
+        Returns
+        -------
+        int
+            Geometry ID.
+        """
         if mesh is None and triangle_indices is None:
             mesh = vertex_positions
         if mesh is not None:
@@ -82,10 +109,15 @@ class RaycastingScene:
         self._built = None
         return len(self._meshes) - 1
 
-    def cast_rays(self, rays: Any, nthreads: int = 0) -> dict[str, Any]:
-        """The first hit of each ray, of several at the same distance that of the lowest IDs: t_hit (...), inf on a miss;
-        geometry_ids and primitive_ids (...) uint32, INVALID_ID on a miss; primitive_uvs (..., 2) and primitive_normals (..., 3), 0
-        on a miss."""
+    def cast_rays(self, rays: ArrayLike, nthreads: int = 0) -> dict[str, Answer]:
+        """Find the first hit of each ray; of several at the same distance, that of the lowest IDs.
+
+        Returns
+        -------
+        dict
+            t_hit (...), inf on a miss; geometry_ids and primitive_ids (...) uint32, INVALID_ID on a miss; primitive_uvs (..., 2)
+            and primitive_normals (..., 3), 0 on a miss.
+        """
         accel, _, normals = self._scene()
         shape, good, origins, directions = _asked_rays(rays)
         hits = accel.closest_hit(origins, directions, threads=_threads(nthreads))
@@ -95,23 +127,34 @@ class RaycastingScene:
                  "primitive_normals": normals[hits.prim_id]}
         return _answers(found, good, shape)
 
-    def test_occlusions(self, rays: Any, tnear: float = 0.0, tfar: float = math.inf, nthreads: int = 0) -> Any:
-        """Whether each ray hits anything between tnear and tfar, (...) bool."""
+    def test_occlusions(self, rays: ArrayLike, tnear: float = 0.0, tfar: float = math.inf, nthreads: int = 0) -> Answer:
+        """Test whether each ray hits anything: (...) bool.
+
+        Parameters
+        ----------
+        tnear, tfar
+            Segment in units of the direction's length.
+        """
         accel = self._scene()[0]
         shape, good, origins, directions = _asked_rays(rays)
         found = accel.any_hit(origins, directions, tnear, tfar, threads=_threads(nthreads))
         return _answer(_spread(found, good, False), shape)
 
-    def count_intersections(self, rays: Any, nthreads: int = 0) -> Any:
-        """How many surfaces each ray crosses, (...) int32; one that it meets at an edge or a corner counts once."""
+    def count_intersections(self, rays: ArrayLike, nthreads: int = 0) -> Answer:
+        """Count the surfaces that each ray crosses; one that it meets at an edge or a corner counts once. (...) int32."""
         shape, good, origins, directions = _asked_rays(rays)
         ray, *_ = every_hit(self._scene()[0], origins, directions, _threads(nthreads))
         return _answer(_spread(np.bincount(ray, minlength=len(origins)).astype(np.int32), good, 0), shape)
 
-    def list_intersections(self, rays: Any, nthreads: int = 0) -> dict[str, Any]:
-        """What count_intersections counts, M together, those of a ray in the order of t: ray_splits (N + 1,), those of ray i are
-        rows ray_splits[i] to ray_splits[i + 1]; ray_ids, geometry_ids, primitive_ids (M,), uint32 all; t_hit (M,); primitive_uvs
-        (M, 2)."""
+    def list_intersections(self, rays: ArrayLike, nthreads: int = 0) -> dict[str, Answer]:
+        """List the M intersections that `count_intersections` counts, those of a ray in order of distance.
+
+        Returns
+        -------
+        dict
+            ray_splits (N + 1,): ray i has the rows ray_splits[i] to ray_splits[i + 1]; ray_ids, geometry_ids, primitive_ids (M,),
+            all uint32; t_hit (M,); primitive_uvs (M, 2).
+        """
         shape, good, origins, directions = _asked_rays(rays)
         ray, face, t, u, v = every_hit(self._scene()[0], origins, directions, _threads(nthreads))
         rows = ray if good is None else np.flatnonzero(good)[ray]
@@ -121,9 +164,15 @@ class RaycastingScene:
                  "geometry_ids": geometry_ids, "primitive_ids": primitive_ids, "primitive_uvs": np.stack([u, v], axis=1)}
         return {name: _answer(array, array.shape[:1]) for name, array in found.items()}
 
-    def compute_closest_points(self, query_points: Any, nthreads: int = 0) -> dict[str, Any]:
-        """The point of the meshes that is closest to each (wrt.closest_points): points (..., 3), geometry_ids and primitive_ids
-        (...) uint32, primitive_uvs (..., 2), primitive_normals (..., 3). INVALID_ID and 0 where there is none."""
+    def compute_closest_points(self, query_points: ArrayLike, nthreads: int = 0) -> dict[str, Answer]:
+        """Find the closest point of the meshes (wrt.closest_points).
+
+        Returns
+        -------
+        dict
+            points (..., 3), geometry_ids and primitive_ids (...) uint32, primitive_uvs (..., 2), primitive_normals (..., 3);
+            INVALID_ID and 0 without a mesh.
+        """
         shape, good, points = _asked_points(query_points)
         accel, _, normals = self._scene()
         found = closest_points(accel, points, _threads(nthreads))
@@ -132,36 +181,46 @@ class RaycastingScene:
                    "primitive_uvs": np.stack([found.u, found.v], axis=1), "primitive_normals": normals[found.prim_id]}
         return _answers(answers, good, shape)
 
-    def compute_distance(self, query_points: Any, nthreads: int = 0) -> Any:
-        """The distance of each point to the meshes, (...) float32; inf where there are none, and of what is no point NaN."""
+    def compute_distance(self, query_points: ArrayLike, nthreads: int = 0) -> Answer:
+        """Compute the distance of each point to the meshes, (...) float32: inf without a mesh, NaN for points that are not finite."""
         shape, good, points = _asked_points(query_points)
         return _answer(_spread(closest_points(self._scene()[0], points, _threads(nthreads)).distance, good, np.nan), shape)
 
-    def compute_signed_distance(self, query_points: Any, nthreads: int = 0, nsamples: int = 1) -> Any:
-        """compute_distance, below 0 where compute_occupancy is 1."""
+    def compute_signed_distance(self, query_points: ArrayLike, nthreads: int = 0, nsamples: int = 1) -> Answer:
+        """Compute the distance of each point to the meshes, negative where `compute_occupancy` is 1: (...) float32."""
         shape, good, points = _asked_points(query_points)
         inside = self._inside(points, nthreads, nsamples)
         distance = closest_points(self._scene()[0], points, _threads(nthreads)).distance
         return _answer(_spread(np.where(inside, -distance, distance), good, np.nan), shape)
 
-    def compute_occupancy(self, query_points: Any, nthreads: int = 0, nsamples: int = 1) -> Any:
-        """1.0 for points inside, 0.0 for others, (...) float32: whether a ray from the point crosses the surfaces an odd number of
-        times. Where these are closed, one ray decides exactly (wrt.contains), and where not, most of `nsamples`, an odd number."""
+    def compute_occupancy(self, query_points: ArrayLike, nthreads: int = 0, nsamples: int = 1) -> Answer:
+        """Compute 1.0 for points inside and 0.0 for others, (...) float32: inside, a ray crosses surfaces an odd number of times.
+
+        Parameters
+        ----------
+        nsamples
+            Odd number of rays of which the majority decides. For closed surfaces one ray is exact (wrt.contains).
+        """
         shape, good, points = _asked_points(query_points)
         return _answer(_spread(self._inside(points, nthreads, nsamples).astype(np.float32), good, 0.0), shape)
 
     @staticmethod
-    def create_rays_pinhole(*given: Any, **named: Any) -> Any:
-        """Rays through the pixels' centers, (height_px, width_px, 6) float32, in rows along the camera's x axis, one after another
-        along y: (intrinsic_matrix, extrinsic_matrix, width_px, height_px), (3, 3) and world to camera (4, 4); or
-        (fov_deg, center, eye, up, width_px, height_px), the field of view along x, what is looked at, and from where. There, y is
-        up, as in Open3D: a picture made of the rows as they are stands on its head."""
+    def create_rays_pinhole(*given: Any, **named: Any) -> Answer:
+        """Make rays through the pixels' centers, row by row along the camera's y axis: (height_px, width_px, 6) float32.
+
+        Parameters
+        ----------
+        *given, **named
+            (intrinsic_matrix, extrinsic_matrix, width_px, height_px): (3, 3), and (4, 4) from world to camera. Or (fov_deg, center,
+            eye, up, width_px, height_px): field of view along x in degrees, point to look at, and camera position; y is then up, as
+            in Open3D, so that the first row is the lowest.
+        """
         make = _rays_looking_at if len(given) + len(named) == 6 else _rays_of_matrices
         rays = make(*given, **named)
         return _answer(rays.reshape(-1, 6), rays.shape[:2])
 
     def _scene(self) -> tuple[Accelerator, np.ndarray, np.ndarray]:
-        """The structure over all meshes; the first prim_id of each; the unit normals of all faces, at the end 0 for -1."""
+        """Return the structure, the first prim_id of each mesh, and the unit normals of all faces with a 0 at the end for -1."""
         if self._built is None:
             vertices, faces = [np.zeros((1, 3), np.float32)], [np.zeros((0, 3), np.int64)]
             for positions, indices in self._meshes:
@@ -173,7 +232,7 @@ class RaycastingScene:
         return self._built
 
     def _ids(self, prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """geometry_ids and primitive_ids."""
+        """Return geometry_ids and primitive_ids."""
         first = self._scene()[1]
         if not len(first):
             return (np.full(len(prim_id), self.INVALID_ID, np.uint32),) * 2
@@ -196,18 +255,18 @@ def _threads(nthreads: int) -> int | None:
 
 
 def _numbers(value: Any, name: str, shape: str) -> np.ndarray:
-    """An array of real numbers, also of a tensor."""
+    """Convert arrays and tensors to real numbers."""
     try:
         value = value.cpu().numpy() if hasattr(value, "cpu") else value
-    except (RuntimeError, TypeError) as error:  # torch's, of one that requires gradients, or has a type that NumPy has not
+    except (RuntimeError, TypeError) as error:  # torch's, if it requires gradients, or NumPy does not have its type
         raise InputError(str(error), argument=name) from error
     return real_numbers(value, name, shape)
 
 
 def _arrays_of(mesh: Any) -> tuple[Any, Any]:
-    """Positions and indices of a mesh of another library."""
+    """Return positions and indices of a mesh of another library."""
     if hasattr(mesh, "vertex"):
-        with suppress(KeyError):  # Open3D's, of a mesh without any
+        with suppress(KeyError):  # Open3D's, for an empty mesh
             return mesh.vertex.positions, mesh.triangle.indices
     for name in ("faces", "triangles"):
         if hasattr(mesh, "vertices") and hasattr(mesh, name):
@@ -216,7 +275,7 @@ def _arrays_of(mesh: Any) -> tuple[Any, Any]:
 
 
 def _rows(value: Any, name: str, width: int) -> tuple[tuple[int, ...], np.ndarray]:
-    """The leading shape, and (N, width) float32."""
+    """Return the leading shape, and (N, width) float32."""
     array = _numbers(value, name, f"(..., {width})")
     if array.ndim < 1 or array.shape[-1] != width:
         raise InputError(f"must be (..., {width}), got {array.shape}", argument=name)
@@ -224,7 +283,7 @@ def _rows(value: Any, name: str, width: int) -> tuple[tuple[int, ...], np.ndarra
 
 
 def _normals(mesh: Geometry) -> np.ndarray:
-    """See RaycastingScene._scene."""
+    """Return the normals of RaycastingScene._scene."""
     a, b, c = (mesh.vertices[mesh.faces[:, i]].astype(np.float64) for i in range(3))
     with np.errstate(invalid="ignore"):  # of corners that are not finite
         normal = np.cross(b - a, c - a)
@@ -234,7 +293,7 @@ def _normals(mesh: Geometry) -> np.ndarray:
 
 
 def _asked_rays(value: Any) -> tuple[tuple[int, ...], np.ndarray | None, np.ndarray, np.ndarray]:
-    """The leading shape, which rays can hit something (None: all), and origins and directions of these."""
+    """Return the leading shape, the mask of rays that can hit something (None: all), and their origins and directions."""
     shape, rays = _rows(value, "rays", 6)
     good = _finite(rays, "rays") & rays[:, 3:].any(axis=1)
     rays = rays if good.all() else rays[good]
@@ -242,21 +301,21 @@ def _asked_rays(value: Any) -> tuple[tuple[int, ...], np.ndarray | None, np.ndar
 
 
 def _asked_points(value: Any) -> tuple[tuple[int, ...], np.ndarray | None, np.ndarray]:
-    """The same of points."""
+    """Return the leading shape, the mask of finite points (None: all), and these points."""
     shape, points = _rows(value, "query_points", 3)
     good = _finite(points, "query_points")
     return (shape, None, points) if good.all() else (shape, good, points[good])
 
 
 def _finite(array: np.ndarray, name: str) -> np.ndarray:
-    """Which rows are finite. Raises InputError for a point or an origin that is finite and too far away, as wrt's queries do."""
+    """Return which rows are finite. Raises InputError for finite points beyond the range of wrt's queries."""
     good = np.isfinite(array).all(axis=1)
     vectors(array[:, :3] if good.all() else np.where(good[:, None], array[:, :3], 0.0), name, FARTHEST)
     return good
 
 
-def _spread(array: np.ndarray, good: np.ndarray | None, missing: Any) -> np.ndarray:
-    """Rows of what was asked, among `missing` for what was not."""
+def _spread(array: np.ndarray, good: np.ndarray | None, missing: float) -> np.ndarray:
+    """Insert rows of `missing` for the questions that were left out."""
     if good is None:
         return array
     out = np.full((len(good), *array.shape[1:]), missing, array.dtype)
@@ -265,20 +324,20 @@ def _spread(array: np.ndarray, good: np.ndarray | None, missing: Any) -> np.ndar
 
 
 def _answers(found: dict[str, np.ndarray], good: np.ndarray | None, shape: tuple[int, ...]) -> dict[str, Any]:
-    """Each with what it has for a miss."""
+    """Convert answers, with the values of misses for the questions that were left out."""
     missed = {"t_hit": np.inf, "geometry_ids": RaycastingScene.INVALID_ID, "primitive_ids": RaycastingScene.INVALID_ID}
     return {name: _answer(_spread(array, good, missed.get(name, 0.0)), shape) for name, array in found.items()}
 
 
-def _answer(array: np.ndarray, shape: tuple[int, ...]) -> Any:
-    """With the leading shape of the question."""
+def _answer(array: np.ndarray, shape: tuple[int, ...]) -> Answer:
+    """Return an answer with the leading shape of the question."""
     array = np.ascontiguousarray(array).reshape((*shape, *array.shape[1:]))
     open3d = sys.modules.get("open3d")
     return array.view(Array) if open3d is None else open3d.core.Tensor.from_numpy(array)
 
 
 def _rays_of_matrices(intrinsic_matrix: Any, extrinsic_matrix: Any, width_px: int, height_px: int) -> np.ndarray:
-    """See RaycastingScene.create_rays_pinhole."""
+    """Make the rays of RaycastingScene.create_rays_pinhole."""
     width_px, height_px = (as_integer(size, name, 0, WIDEST) for size, name in ((width_px, "width_px"), (height_px, "height_px")))
     try:
         inverse = np.linalg.inv(_matrix(intrinsic_matrix, "intrinsic_matrix", (3, 3)))
@@ -294,7 +353,7 @@ def _rays_of_matrices(intrinsic_matrix: Any, extrinsic_matrix: Any, width_px: in
 
 
 def _rays_looking_at(fov_deg: float, center: Any, eye: Any, up: Any, width_px: int, height_px: int) -> np.ndarray:
-    """See RaycastingScene.create_rays_pinhole."""
+    """Make the rays of RaycastingScene.create_rays_pinhole."""
     center, eye, up = (_matrix(value, name, (3,)) for value, name in ((center, "center"), (eye, "eye"), (up, "up")))
     if not 0.0 < as_number(fov_deg, "fov_deg") < 180.0:
         raise InputError(f"must be between 0 and 180, got {fov_deg:g}", argument="fov_deg")

@@ -1,4 +1,4 @@
-"""All hits of rays as other libraries count them: a surface is hit once where a ray meets an edge or a corner of it."""
+"""All hits of rays as other libraries count them: an edge or a corner of a surface is one hit."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from wrt.accel.queries.contains import open_edges_of
 
 def every_hit(accel: Accelerator, origins: np.ndarray, directions: np.ndarray, threads: int | None,
               limit: int = ALL) -> tuple[np.ndarray, ...]:
-    """ray, face, t, u, v of each hit, those of a ray together and in order, `limit` of them at most.
+    """Return ray, face, t, u and v of each hit, ray by ray in order of distance, at most `limit` of a ray.
 
-    A ray hits the faces that it crosses (all_hits, crossings). If it crosses none and only touches some, it hits the first of them,
-    or, if the mesh is closed, the first two: there it enters and leaves. If it begins there, it may touch just one.
+    A ray hits the faces that it crosses (`all_hits` with crossings). A ray that only touches faces hits the first of them. If the
+    mesh is closed, it hits the first two, where it enters and leaves, or one if it begins there.
     """
     crossed = ListQuery(accel, threads, crossings=True).of(origins, directions).all(limit)
     found = [crossed.ray_id, crossed.prim_id, crossed.t, crossed.u, crossed.v]

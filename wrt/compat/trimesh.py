@@ -1,7 +1,7 @@
-"""trimesh's ray class, answered by wrt.
+"""trimesh's ray class with wrt's queries.
 
 >>> from wrt.compat.trimesh import RayMeshIntersector
->>> mesh.ray = RayMeshIntersector(mesh)                 # mesh.contains and the rest of trimesh ask it from now on
+>>> mesh.ray = RayMeshIntersector(mesh)                 # mesh.contains and the rest of trimesh use it from now on
 """
 
 from __future__ import annotations
@@ -18,24 +18,34 @@ from wrt.accel.scenes.build import build
 from wrt.compat.surfaces import every_hit
 from wrt.core.arrays import real_numbers
 from wrt.core.errors import InputError
+from wrt.core.types import ArrayLike
 from wrt.kernels.query import FARTHEST
 from wrt.scene.mesh import Mesh
 
 if TYPE_CHECKING:
     import trimesh
 
-AWAY = 4.0  # radii of a mesh; what is farther from it is brought near before it is rounded to float32
+AWAY = 4.0  # radii of a mesh; origins farther away are moved near it before they are rounded to float32
 
 
 class RayMeshIntersector:
-    """As trimesh.ray.ray_pyembree.RayMeshIntersector, and with the keywords of ray_triangle's. docs/compat.md has what differs.
+    """A ray class like trimesh.ray.ray_pyembree's, with the keywords of ray_triangle's; docs/compat.md has the differences.
 
-    geometry: a trimesh.Trimesh; when it changes, the next query builds anew. scale_to_box: also find very large and very small
-    meshes, whose coordinates or areas are beyond float32. device, threads: as in wrt.build.
+    Hits are decided watertight in float32, relative to the mesh, and located in float64. A ray that is not finite or has no
+    direction hits nothing. All methods raise InputError, a ValueError, for other shapes.
 
-    A method takes ray_origins and ray_directions, (N, 3) each, in the mesh's units; directions of any length. A ray that is not
-    finite or has no direction hits nothing. Hits are decided watertight in float32, relative to the mesh, and located in float64.
-    Raises InputError, a ValueError, for other shapes.
+    Parameters
+    ----------
+    geometry : trimesh.Trimesh
+        Mesh. When it changes, the next query builds anew.
+    scale_to_box : bool
+        Scale meshes whose coordinates or areas are beyond float32.
+    device, threads
+        See `wrt.build`.
+    ray_origins, ray_directions : (N, 3) array_like
+        In methods: rays in the mesh's units; directions of any length.
+    multiple_hits, max_hits
+        In methods: whether to find more than the first hit, and the largest number of hits of a ray.
     """
 
     def __init__(self, geometry: trimesh.Trimesh, scale_to_box: bool = True, *, device: str = "cpu",
@@ -46,15 +56,24 @@ class RayMeshIntersector:
 
     @cache_decorator
     def _placed(self) -> _Placed:
-        """Made again when the mesh has changed."""
+        """Structure over the present mesh."""
         return _Placed(self.mesh.vertices, self.mesh.faces, **self._options)
 
-    def intersects_id(self, ray_origins: Any, ray_directions: Any, multiple_hits: bool = True, max_hits: int = 100,
+    def intersects_id(self, ray_origins: ArrayLike, ray_directions: ArrayLike, multiple_hits: bool = True, max_hits: int = 100,
                       return_locations: bool = False) -> tuple[np.ndarray, ...]:
-        """Faces that are hit, (M,) int64, and by which ray, (M,) int64; return_locations: also where, (M, 3) float64.
+        """Find the faces that rays hit: all first hits in the order of the rays, then all second ones, and so on.
 
-        First hits in the order of the rays, then second ones ...; multiple_hits: more than the first; max_hits: of a ray, at
-        most. At an edge or a corner, a surface is hit once (docs/compat.md).
+        An edge or a corner of a surface is one hit (docs/compat.md).
+
+        Parameters
+        ----------
+        return_locations
+            Also return the points.
+
+        Returns
+        -------
+        tuple
+            Face and ray of each hit, (M,) int64; with return_locations also the point, (M, 3) float64.
         """
         origins, directions = _rays(ray_origins, ray_directions)
         placed, most = self._placed, max_hits if multiple_hits else min(max_hits, 1)
@@ -68,27 +87,35 @@ class RayMeshIntersector:
         corners = self.mesh.vertices.view(np.ndarray)[self.mesh.faces.view(np.ndarray)[face]]
         return face, ray, located(corners, origins[ray], directions[ray], u[order], v[order])
 
-    def intersects_location(self, ray_origins: Any, ray_directions: Any, multiple_hits: bool = True,
+    def intersects_location(self, ray_origins: ArrayLike, ray_directions: ArrayLike, multiple_hits: bool = True,
                             max_hits: int = 100) -> tuple[np.ndarray, ...]:
-        """As intersects_id: where, (M, 3) float64; by which ray, and which faces, (M,) int64 each."""
+        """Find the points where rays hit the mesh, in the order of `intersects_id`.
+
+        Returns
+        -------
+        tuple
+            Point (M, 3) float64, ray and face (M,) int64 of each hit.
+        """
         face, ray, where = self.intersects_id(ray_origins, ray_directions, multiple_hits, max_hits, return_locations=True)
         return where, ray, face
 
-    def intersects_first(self, ray_origins: Any, ray_directions: Any) -> np.ndarray:
-        """The face that each ray hits first, the lowest of several at the same distance; -1: none. (N,) int32."""
+    def intersects_first(self, ray_origins: ArrayLike, ray_directions: ArrayLike) -> np.ndarray:
+        """Find the face that each ray hits first; of several at the same distance, the lowest. (N,) int32, -1 on a miss."""
         origins, directions = _rays(ray_origins, ray_directions)
         out = np.full(len(origins), -1, np.int32)
         ray, face, _, _ = self._placed.first_hit(origins, directions)
         out[ray] = face
         return out
 
-    def intersects_any(self, ray_origins: Any, ray_directions: Any) -> np.ndarray:
-        """Whether each ray hits anything, (N,) bool."""
+    def intersects_any(self, ray_origins: ArrayLike, ray_directions: ArrayLike) -> np.ndarray:
+        """Test whether each ray hits anything: (N,) bool."""
         return self._placed.any_hit(*_rays(ray_origins, ray_directions))
 
     def contains_points(self, points: Any) -> np.ndarray:
-        """Whether each of `points`, (N, 3), is inside: (N,) bool, by wrt.contains. Where the mesh is not closed, by trimesh's
-        own rule (both directions of a line agree), from the hits of this class."""
+        """Test whether points (N, 3) are inside, by wrt.contains: (N,) bool.
+
+        For a mesh that is not closed, trimesh's own rule applies to the hits of this class: both directions of a line agree.
+        """
         points = np.asarray(points, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 3:
             raise InputError(f"must be (N, 3), got {points.shape}", argument="points")
@@ -111,13 +138,12 @@ class RayMeshIntersector:
 
 
 class _Placed:
-    """A structure over a mesh in a place where float32 serves it best: near 0 (not moved where it is there already, so that no
-    vertex is rounded more than it must be), and of a size near 1, by a power of two.
+    """A structure over a mesh that is moved near 0, if it is far away, and scaled near 1 by a power of two, for float32.
 
-    A face with a corner that is not finite is hit no more, as one without area; all keep their numbers.
+    Faces with a corner that is not finite keep their indices and become faces without area, which no ray hits.
     """
 
-    def __init__(self, vertices: Any, faces: Any, scale_to_box: bool, device: str, threads: int | None) -> None:
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray, scale_to_box: bool, device: str, threads: int | None) -> None:
         vertices, faces = np.array(vertices, np.float64), np.array(faces, np.int64).reshape(-1, 3)
         faces[~np.isfinite(vertices).all(axis=1)[faces].all(axis=1)] = 0
         unused = np.ones(len(vertices), bool)
@@ -141,9 +167,9 @@ class _Placed:
         return np.ldexp(points - self.shift, self.exponent)
 
     def asked(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray | None, np.ndarray, np.ndarray]:
-        """Rays as the structure takes them, and which they are of those given (None: all): those that can hit something.
+        """Return the rows of the rays that can hit something (None: all), and these rays for the structure.
 
-        What begins far away begins at the mesh instead, in float64: rounding would have moved it aside.
+        Far origins are moved to the mesh along their rays in float64, because rounding would displace them.
         """
         with np.errstate(all="ignore"):
             origins = self.moved(origins)
@@ -163,14 +189,14 @@ class _Placed:
         return rows, origins[rows].astype(np.float32), directions[rows].astype(np.float32)
 
     def first_hit(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
-        """ray, face, u, v of each hit."""
+        """Return ray, face, u and v of each hit."""
         rows, origins, directions = self.asked(origins, directions)
         hits: Hits = self.accel.closest_hit(origins, directions, threads=self.threads)
         hit = np.flatnonzero(hits.prim_id >= 0)
         return _of(rows, hit), hits.prim_id[hit].astype(np.int64), hits.u[hit], hits.v[hit]
 
     def every_hit(self, origins: np.ndarray, directions: np.ndarray, limit: int) -> tuple[np.ndarray, ...]:
-        """The same of all hits, `limit` of a ray at most, those of a ray together and in order."""
+        """Return the same for all hits, at most `limit` of a ray, ray by ray in order of distance."""
         rows, origins, directions = self.asked(origins, directions)
         ray, face, _, u, v = every_hit(self.accel, origins, directions, self.threads, limit)
         return _of(rows, ray), face.astype(np.int64), u, v
@@ -188,7 +214,10 @@ class _Placed:
 
 
 def located(corners: np.ndarray, origins: np.ndarray, directions: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Where rays hit triangles (M, 3, 3), in float64 (Moeller, Trumbore 1997). u, v: float32's, for rays that pass in float64."""
+    """Return the points where rays hit triangles (M, 3, 3), in float64 (Moeller, Trumbore 1997).
+
+    u, v: from float32, for rays that miss in float64.
+    """
     a = corners[:, 0]
     e, f, s = corners[:, 1] - a, corners[:, 2] - a, origins - a
     with np.errstate(all="ignore"):
@@ -199,7 +228,7 @@ def located(corners: np.ndarray, origins: np.ndarray, directions: np.ndarray, u:
     return a + np.where(on, x, u)[:, None] * e + np.where(on, y, v)[:, None] * f
 
 
-def _rays(origins: Any, directions: Any) -> tuple[np.ndarray, np.ndarray]:
+def _rays(origins: ArrayLike, directions: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     named = {"ray_origins": origins, "ray_directions": directions}
     out = [np.asarray(real_numbers(rays, name, "(N, 3)"), np.float64) for name, rays in named.items()]
     origins, directions = (rays.reshape(0, 3) if rays.shape == (0,) else rays for rays in out)
