@@ -76,7 +76,7 @@ class RaycastingScene:
 
     def add_triangles(self, vertex_positions: MeshOrArray = None, triangle_indices: ArrayLike | None = None,
                       mesh: object = None) -> int:
-        """Add a copy of a mesh. The next query builds the structure.
+        """Add a copy of a mesh and return its geometry ID. The next query builds the structure.
 
         Parameters
         ----------
@@ -84,11 +84,6 @@ class RaycastingScene:
             (V, 3) real numbers and (F, 3) indices; or a mesh alone.
         mesh
             Instead: a TriangleMesh of Open3D, a `wrt.Mesh` or a `trimesh.Trimesh`.
-
-        Returns
-        -------
-        int
-            Geometry ID.
         """
         if mesh is None and triangle_indices is None:
             mesh = vertex_positions
@@ -123,8 +118,7 @@ class RaycastingScene:
         hits = accel.closest_hit(origins, directions, threads=_threads(nthreads))
         geometry_ids, primitive_ids = self._ids(hits.prim_id)
         found = {"t_hit": hits.t, "geometry_ids": geometry_ids, "primitive_ids": primitive_ids,
-                 "primitive_uvs": np.stack([hits.u, hits.v], axis=1),
-                 "primitive_normals": normals[hits.prim_id]}
+                 "primitive_uvs": np.stack([hits.u, hits.v], axis=1), "primitive_normals": normals[hits.prim_id]}
         return _answers(found, good, shape)
 
     def test_occlusions(self, rays: ArrayLike, tnear: float = 0.0, tfar: float = math.inf, nthreads: int = 0) -> Answer:
