@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -131,7 +131,9 @@ class Case:
                     raise
                 said = f"{type(error).__name__}: {error}".splitlines()[0][:100]
                 return Result(self.name, self.rays, raised=said, refused=part.refused)
-            verdict += judge(part, _segment(part, *_answer(said, len(part))), lowest=False)
+            t, prim_id = _answer(said, len(part))
+            prim_id = np.where((prim_id >= 0) & (t > part.t_max), -1, prim_id)  # as a query with the case's t_max would report it
+            verdict += judge(part, Hits(t, None, None, prim_id), lowest=False)
         return Result(self.name, verdict.rays, verdict.misses, verdict.false_hits, verdict.wrong_prim, verdict.t.largest,
                       examples=tuple(verdict.examples))
 
@@ -189,9 +191,3 @@ def _answer(said: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
         raise InputError(f"must return t ({n},) of real numbers and prim_id ({n},) of integers, got {t.shape} of "
                          f"{t.dtype} and {prim_id.shape} of {prim_id.dtype}", argument="closest_hit")
     return t.astype(np.float64), prim_id.astype(np.int64)
-
-
-def _segment(part: HardCase, t: np.ndarray, prim_id: np.ndarray) -> Any:
-    """Return hits as a query with the case's t_max would report them."""
-    beyond = (prim_id >= 0) & (t > part.t_max)
-    return replace(Hits[Any](t, None, None, prim_id), prim_id=np.where(beyond, -1, prim_id))
