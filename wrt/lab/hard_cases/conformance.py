@@ -133,7 +133,7 @@ class Case:
                 return Result(self.name, self.rays, raised=said, refused=part.refused)
             t, prim_id = _answer(said, len(part))
             prim_id = np.where((prim_id >= 0) & (t > part.t_max), -1, prim_id)  # as a query with the case's t_max would report it
-            verdict += judge(part, Hits(t, None, None, prim_id), lowest=False)
+            verdict += judge(part, Hits(t, None, None, prim_id), lowest=False)  # type: ignore[arg-type]  # None: t alone is measured
         return Result(self.name, verdict.rays, verdict.misses, verdict.false_hits, verdict.wrong_prim, verdict.t.largest,
                       examples=tuple(verdict.examples))
 
