@@ -80,7 +80,7 @@ def test_rows_and_command(box) -> None:
 
 
 @pytest.mark.parametrize(("options", "message"), [
-    ({"meshes": ()}, "meshes must be given"), ({"builders": ("guess",)}, "no builder 'guess'"), ({"rays": 0}, "rays must be"),
+    ({"meshes": ()}, "meshes must name one or more"), ({"builders": ("guess",)}, "no builder 'guess'"), ({"rays": 0}, "rays must be"),
     ({"threads": 0}, "threads must be")])
 def test_plans_that_are_refused(options, message: str) -> None:
     with pytest.raises(InputError, match=message):
