@@ -9,16 +9,16 @@ from wrt.kernels.build.records import (
     Halves,
     Row,
     area_scale,
+    balanced_depth,
     center_of,
     empty_row,
-    halves_at,
     high_of,
-    levels,
     low_of,
     lower,
-    parted_at,
+    measure_halves,
     row_area,
     row_of,
+    unmeasured_halves,
 )
 
 BIN_COUNT = 32
@@ -123,7 +123,7 @@ def binned_split(data: BuildData, task: BuildTask, bins: Bins) -> Split:
 
 
 @wp.func
-def part_by_bin(data: BuildData, task: BuildTask, bins: Bins, split: Split) -> Halves:
+def partition_by_bin(data: BuildData, task: BuildTask, bins: Bins, split: Split) -> Halves:
     """Partition the records: those of the left side go to the front.
     Lomuto's partition, without its branch, which no processor could predict: a record that stays on its side is swapped with one of the
     same side."""
@@ -141,7 +141,7 @@ def part_by_bin(data: BuildData, task: BuildTask, bins: Bins, split: Split) -> H
         middle = middle + wp.where(left, 1, 0)
         centers_0 = lower(centers_0, wp.where(left, row, empty))
         centers_1 = lower(centers_1, wp.where(left, empty, row))
-    out = parted_at(task, middle)
+    out = unmeasured_halves(task, middle)
     out.left.box = split.box_0
     out.left.centers = centers_0
     out.right.box = split.box_1
@@ -153,9 +153,9 @@ def part_by_bin(data: BuildData, task: BuildTask, bins: Bins, split: Split) -> H
 def split_binned(data: BuildData, task: BuildTask) -> Halves:
     """Split between the two best bins; in halves by number if no axis separates the centroids or the tree gets too deep."""
     n = task.end - task.begin
-    if n > 2 and task.depth + levels(n) < MAX_DEPTH:
+    if n > 2 and task.depth + balanced_depth(n) < MAX_DEPTH:
         bins = bins_of(task)
         split = binned_split(data, task, bins)
         if split.axis >= 0:
-            return part_by_bin(data, task, bins, split)
-    return halves_at(data, task, task.begin + n / 2)
+            return partition_by_bin(data, task, bins, split)
+    return measure_halves(data, task, task.begin + n / 2)

@@ -1,5 +1,5 @@
 """The BSP builder, on the CPU: it splits cells and clips their primitives until no split pays.
-The host launches it once for the top of the tree, then on all cores for each cell left over. A launch works depth first: it holds only the
+The host launches it once for the top of the tree, then on all cores for each deferred cell. A launch works depth first: it holds only the
 pieces along one path."""
 
 import warp as wp
@@ -22,13 +22,13 @@ from wrt.kernels.traverse.bsp import INNER, STACK_SIZE, BspNode
 
 MAX_CORNERS = wp.constant(16)  # a piece that would get more corners keeps those it has, and sticks out of its cell
 CELL_SLOTS = STACK_SIZE + 1
-HAND = wp.constant(STACK_SIZE)  # slot of the cell that is being split
-LEFT_OVER = wp.constant(-2)  # count of a child built by a later launch; `first` is its index among the cells left over
+CURRENT = wp.constant(STACK_SIZE)  # slot of the cell that is being split
+DEFERRED = wp.constant(-2)  # count of a child built by a later launch; `first` is its index among the deferred cells
 
 # Indices of a launch's results. FULL: an array was too short, and the output is unusable.
 N_NODES = wp.constant(0)
 N_ORDER = wp.constant(1)
-N_LEFT_OVER = wp.constant(2)
+N_DEFERRED = wp.constant(2)
 DEPTH = wp.constant(3)
 LEAVES = wp.constant(4)
 FULL = wp.constant(5)
@@ -56,8 +56,8 @@ class BspOutput:
 
     nodes: wp.array(dtype=BspNode)
     order: wp.array(dtype=wp.int32)  # prim_id of the leaves' primitives.
-    left_over: wp.array(dtype=BspTask)  # Cells for later launches.
-    left_cells: Cells
+    deferred: wp.array(dtype=BspTask)  # Cells for later launches.
+    deferred_cells: Cells
     results: wp.array(dtype=wp.int32)  # N_RESULTS numbers.
     cost: wp.array(dtype=wp.float64)  # cost[0]: expected nodes and primitives of a line that meets a root box of surface 1.
 
@@ -252,13 +252,13 @@ def start_root(task: BspTask, n_points: int) -> BspTask:
 
 
 @wp.func
-def leave_over(tools: BspTools, output: BspOutput, task: BspTask, slot: int):
+def defer(tools: BspTools, output: BspOutput, task: BspTask, slot: int):
     """Leave this cell to a later launch."""
-    left = output.results[N_LEFT_OVER]
-    output.left_over[left] = task
-    copy_cell(tools.cells, slot, output.left_cells, left)
-    link(output, task, left, LEFT_OVER)
-    output.results[N_LEFT_OVER] = left + 1
+    left = output.results[N_DEFERRED]
+    output.deferred[left] = task
+    copy_cell(tools.cells, slot, output.deferred_cells, left)
+    link(output, task, left, DEFERRED)
+    output.results[N_DEFERRED] = left + 1
 
 
 @wp.func
@@ -277,9 +277,9 @@ def child_of(task: BspTask, index: int, side: int, pieces: wp.vec3i, points_end:
 
 @wp.func
 def clip_to_side(cells: Cells, split: BspSplit, side: int, to: int):
-    """Clip the cell at HAND to one side of the plane, as cell `to`."""
+    """Clip the cell at CURRENT to one side of the plane, as cell `to`."""
     sign = wp.where(side == 0, wp.float64(-1.0), wp.float64(1.0))
-    clip_cell(cells, HAND, to, sign * split.normal, sign * split.offset, split.pad)
+    clip_cell(cells, CURRENT, to, sign * split.normal, sign * split.offset, split.pad)
 
 
 @kernel
@@ -303,11 +303,11 @@ def build_cells(source: Pieces, tasks: wp.array(dtype=BspTask), cells: Cells, wh
         task = stack[waiting]
         output.results[DEPTH] = wp.max(output.results[DEPTH], task.depth)
         n = task.end - task.begin
-        if n <= keep and output.results[N_LEFT_OVER] < output.left_over.shape[0]:
-            leave_over(tools, output, task, waiting)
+        if n <= keep and output.results[N_DEFERRED] < output.deferred.shape[0]:
+            defer(tools, output, task, waiting)
             continue
-        copy_cell(tools.cells, waiting, tools.cells, HAND)
-        scope = scope_of(tools, task, HAND)
+        copy_cell(tools.cells, waiting, tools.cells, CURRENT)
+        scope = scope_of(tools, task, CURRENT)
         share = wp.where(root_area > wp.float64(0.0), scope.area / root_area, wp.float64(1.0))
         split = choose(tools, scope, task.depth)
         if split.axis < 0:
@@ -318,7 +318,7 @@ def build_cells(source: Pieces, tasks: wp.array(dtype=BspTask), cells: Cells, wh
             write_leaf(tools, output, task)
             continue
 
-        # Pieces of cells left over must stay. Without such, pieces beyond this cell's own are done with.
+        # Pieces of deferred cells must stay. Without such, pieces beyond this cell's own are done with.
         base = wp.where(keep > 0, used, task.end)
         if keep == 0:
             size = task.points_end

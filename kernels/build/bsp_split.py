@@ -45,7 +45,7 @@ class BspOptions:
     cost_plane: wp.float64
     samples: int  # Triangles of a cell whose planes are tried.
     max_depth: int
-    keep: int  # If not 0, cells of at most so many pieces are left over for later launches.
+    keep: int  # If not 0, cells of at most so many pieces are deferred to later launches.
     lo: wp.vec3d  # The root box: lo, hi.
     hi: wp.vec3d
 

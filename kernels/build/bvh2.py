@@ -15,18 +15,18 @@ from wrt.kernels.build.records import (
     BuildTask,
     Halves,
     area_scale,
+    balanced_depth,
     center_of,
     empty_row,
-    halves_at,
     high_of,
-    levels,
+    link_to_parent,
     low_of,
     lower,
-    measured,
+    measure,
+    measure_halves,
     row_area,
+    row_count,
     row_of,
-    rows_of,
-    tell_parent,
 )
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node
@@ -75,7 +75,7 @@ def choose_sweep(data: BuildData, task: BuildTask) -> int:
     best_axis = int(0)
     best_cost = float(wp.inf)
     best = int(task.begin + (task.end - task.begin) / 2)
-    if task.depth + levels(task.end - task.begin) < MAX_DEPTH:
+    if task.depth + balanced_depth(task.end - task.begin) < MAX_DEPTH:
         for axis in range(3):
             side = empty_row()
             for k in range(task.begin + 1, task.end):
@@ -118,7 +118,7 @@ def split_at(choose: Any) -> Any:
 
     @wp.func
     def split(data: BuildData, task: BuildTask) -> Halves:
-        return halves_at(data, task, choose(data, task))
+        return measure_halves(data, task, choose(data, task))
 
     return split
 
@@ -149,14 +149,14 @@ def child_of(task: BuildTask, halves: Halves, side: int) -> BuildTask:
 
 
 @wp.func
-def worth_it(options: BuildOptions, task: BuildTask, halves: Halves) -> bool:
+def split_pays(options: BuildOptions, task: BuildTask, halves: Halves) -> bool:
     """Test whether two leaves cost less than one."""
     scale = area_scale(task.measures.box)
     area = row_area(task.measures.box, scale)
-    parts = (row_area(halves.left.box, scale) * rows_of(options, halves.count_0)
-             + row_area(halves.right.box, scale) * rows_of(options, halves.count_1))
+    parts = (row_area(halves.left.box, scale) * row_count(options, halves.count_0)
+             + row_area(halves.right.box, scale) * row_count(options, halves.count_1))
     split_cost = options.cost_traversal * area + options.cost_intersection * parts
-    return split_cost < options.cost_intersection * rows_of(options, task.end - task.begin) * area
+    return split_cost < options.cost_intersection * row_count(options, task.end - task.begin) * area
 
 
 @wp.func
@@ -176,7 +176,7 @@ def write_node(data: BuildData, task: BuildTask, halves: Halves):
 
 
 @wp.func
-def mark(left: wp.array(dtype=wp.uint8), begin: int, end: int):
+def mark_leaf(left: wp.array(dtype=wp.uint8), begin: int, end: int):
     """Mark these records as a leaf's: the host drops the others."""
     for i in range(begin, end):
         left[i] = wp.uint8(1)
@@ -189,9 +189,9 @@ def make_build_ranges(split: Any, place: Any = None) -> Any:
 
     @kernel
     def build_ranges(data: BuildData, tasks: wp.array(dtype=BuildTask), options: BuildOptions, stop_size: int,
-                     left_over: wp.array(dtype=BuildTask), n_left_over: wp.array(dtype=wp.int32),
+                     deferred: wp.array(dtype=BuildTask), n_deferred: wp.array(dtype=wp.int32),
                      max_depth: wp.array(dtype=wp.int32)):
-        """Build the subtree of each task, and append ranges of at most stop_size records to left_over.
+        """Build the subtree of each task, and append ranges of at most stop_size records to deferred.
         Every task has at least two records. A range with space for n records owns the node slots slot .. slot + n - 2; the host removes
         unused ones. A whole subtree (stop_size 0) uses the first of them."""
         stack = wp.zeros(shape=wp.static(STACK_SIZE + 2), dtype=BuildTask)
@@ -203,17 +203,17 @@ def make_build_ranges(split: Any, place: Any = None) -> Any:
             task = stack[size]
             n = task.end - task.begin
             if n <= stop_size and task.parent >= 0:
-                left_over[wp.atomic_add(n_left_over, 0, 1)] = task
+                deferred[wp.atomic_add(n_deferred, 0, 1)] = task
                 continue
             if task.parent < 0:
-                task.measures = measured(data, task.begin, task.end)
+                task.measures = measure(data, task.begin, task.end)
 
             halves = split(data, task)
             if n <= options.max_leaf and task.parent >= 0:
-                if not worth_it(options, task, halves):
-                    tell_parent(data.nodes, task, task.begin, n)
+                if not split_pays(options, task, halves):
+                    link_to_parent(data.nodes, task, task.begin, n)
                     if wp.static(place is not None):
-                        mark(data.left, task.begin, task.end)
+                        mark_leaf(data.left, task.begin, task.end)
                     continue
 
             if wp.static(place is not None):
@@ -222,18 +222,18 @@ def make_build_ranges(split: Any, place: Any = None) -> Any:
                 task.slot = slot
                 slot = slot + 1
             max_depth[0] = wp.max(max_depth[0], task.depth)
-            tell_parent(data.nodes, task, task.slot, 0)
+            link_to_parent(data.nodes, task, task.slot, 0)
             write_node(data, task, halves)
             # A single record is a leaf; longer ranges are tasks.
             if halves.count_1 > 1:
                 stack[size] = child_of(task, halves, 1)
                 size = size + 1
             elif wp.static(place is not None):
-                mark(data.left, halves.middle, halves.middle + 1)
+                mark_leaf(data.left, halves.middle, halves.middle + 1)
             if halves.count_0 > 1:
                 stack[size] = child_of(task, halves, 0)
                 size = size + 1
             elif wp.static(place is not None):
-                mark(data.left, task.begin, task.begin + 1)
+                mark_leaf(data.left, task.begin, task.begin + 1)
 
     return build_ranges

@@ -4,7 +4,7 @@ A thread begins at each node without inner children. The last thread that reache
 
 import warp as wp
 
-from wrt.kernels.build.records import BuildOptions, rows_of
+from wrt.kernels.build.records import BuildOptions, row_count
 from wrt.kernels.build.shape import half_area
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse.bvh2 import Bvh2Node
@@ -14,15 +14,15 @@ NO_PARENT = wp.constant(-1)
 
 
 @wp.struct
-class Below:
+class SubtreeSummary:
     """Summary of a subtree, which a node hands to its parent."""
 
     cost: wp.float64  # Half surfaces of its boxes, times the SAH cost of a visit.
-    plain: wp.float64  # The same with a cost of 1 for a node and for a primitive.
+    unit_cost: wp.float64  # The same with a cost of 1 for a node and for a primitive.
     lo: wp.vec3
     hi: wp.vec3
     size: int  # Primitives.
-    used: int  # Inner nodes, itself included; 0: it becomes a leaf.
+    inner_nodes: int  # Inner nodes, itself included; 0: it becomes a leaf.
     height: int  # Inner nodes on the longest path.
 
 
@@ -36,7 +36,7 @@ class Tree:
     low: wp.array(dtype=wp.vec3)  # By prim_id, as high.
     high: wp.array(dtype=wp.vec3)
     arrived: wp.array(dtype=wp.int32)  # Scratch: 0 for each node, before and after.
-    below: wp.array(dtype=Below)  # Scratch, one entry a node.
+    summaries: wp.array(dtype=SubtreeSummary)  # Scratch, one entry a node.
 
 
 # A thread's writes are visible to others before they hear of them.
@@ -53,39 +53,39 @@ Numbers = wp.types.vector(11, wp.float64)
 
 # It bypasses the L1 cache, which another multiprocessor's writes do not reach. (A native function cannot return a record.)
 @wp.func_native("""
-    const volatile auto* from = below.data + i;
+    const volatile auto* from = summaries.data + i;
     wp::vec_t<11, wp::float64> out;
     out.c[0] = from->cost;
-    out.c[1] = from->plain;
+    out.c[1] = from->unit_cost;
     for (int k = 0; k < 3; ++k) {
         out.c[2 + k] = from->lo.c[k];
         out.c[5 + k] = from->hi.c[k];
     }
     out.c[8] = from->size;
-    out.c[9] = from->used;
+    out.c[9] = from->inner_nodes;
     out.c[10] = from->height;
     return out;
 """)
-def fetched(below: wp.array(dtype=Below), i: int) -> Numbers: ...
+def read_numbers(summaries: wp.array(dtype=SubtreeSummary), i: int) -> Numbers: ...
 
 
 @wp.func
-def told(below: wp.array(dtype=Below), i: int) -> Below:
+def read_summary(summaries: wp.array(dtype=SubtreeSummary), i: int) -> SubtreeSummary:
     """Read the summary that another thread wrote."""
-    x = fetched(below, i)
-    out = Below()
+    x = read_numbers(summaries, i)
+    out = SubtreeSummary()
     out.cost = x[0]
-    out.plain = x[1]
+    out.unit_cost = x[1]
     out.lo = wp.vec3(float(x[2]), float(x[3]), float(x[4]))
     out.hi = wp.vec3(float(x[5]), float(x[6]), float(x[7]))
     out.size = int(x[8])
-    out.used = int(x[9])
+    out.inner_nodes = int(x[9])
     out.height = int(x[10])
     return out
 
 
 @wp.func
-def inner_children(node: Bvh2Node) -> int:
+def inner_child_count(node: Bvh2Node) -> int:
     return (wp.where(node.count_0 == 0 and node.first_0 > 0, 1, 0) + wp.where(node.count_1 == 0 and node.first_1 > 0, 1, 0))
 
 
@@ -96,11 +96,11 @@ def area_of(lo: wp.vec3, hi: wp.vec3) -> wp.float64:
 
 
 @wp.func
-def child_of(tree: Tree, options: BuildOptions, first: int, count: int) -> Below:
+def child_summary(tree: Tree, options: BuildOptions, first: int, count: int) -> SubtreeSummary:
     """Summary of a child: an inner node's is stored, a leaf's comes from its primitives."""
     if count == 0 and first > 0:
-        return told(tree.below, first)
-    out = Below()
+        return read_summary(tree.summaries, first)
+    out = SubtreeSummary()
     out.lo = wp.vec3(wp.inf, wp.inf, wp.inf)
     out.hi = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
     for j in range(first, first + count):
@@ -108,28 +108,28 @@ def child_of(tree: Tree, options: BuildOptions, first: int, count: int) -> Below
         out.hi = upper(out.hi, tree.high[tree.order[j]])
     out.size = count
     area = area_of(out.lo, out.hi)
-    out.cost = wp.float64(options.cost_intersection * rows_of(options, count)) * area
-    out.plain = wp.float64(count) * area
+    out.cost = wp.float64(options.cost_intersection * row_count(options, count)) * area
+    out.unit_cost = wp.float64(count) * area
     return out
 
 
 @wp.func
-def joined(options: BuildOptions, a: Below, b: Below, root: bool) -> Below:
+def merge_summaries(options: BuildOptions, a: SubtreeSummary, b: SubtreeSummary, root: bool) -> SubtreeSummary:
     """Summary of a node with these children; it becomes a leaf if that costs no more."""
-    out = Below()
+    out = SubtreeSummary()
     out.lo = lower(a.lo, b.lo)
     out.hi = upper(a.hi, b.hi)
     out.size = a.size + b.size
     area = area_of(out.lo, out.hi)
     out.cost = wp.float64(options.cost_traversal) * area + a.cost + b.cost
-    out.plain = area + a.plain + b.plain
-    out.used = 1 + a.used + b.used
+    out.unit_cost = area + a.unit_cost + b.unit_cost
+    out.inner_nodes = 1 + a.inner_nodes + b.inner_nodes
     out.height = 1 + wp.max(a.height, b.height)
-    leaf = wp.float64(options.cost_intersection * rows_of(options, out.size)) * area
+    leaf = wp.float64(options.cost_intersection * row_count(options, out.size)) * area
     if out.size <= options.max_leaf and leaf <= out.cost and not root:
         out.cost = leaf
-        out.plain = wp.float64(out.size) * area
-        out.used = 0
+        out.unit_cost = wp.float64(out.size) * area
+        out.inner_nodes = 0
         out.height = 0
     return out
 
@@ -138,23 +138,23 @@ def joined(options: BuildOptions, a: Below, b: Below, root: bool) -> Below:
 def fit(tree: Tree, options: BuildOptions):
     """Fit a node a thread; options.max_leaf 0: no node becomes a leaf. The result does not depend on the threads' order."""
     i = wp.tid()
-    if inner_children(tree.nodes[i]) > 0:
+    if inner_child_count(tree.nodes[i]) > 0:
         return
     while True:
         node = tree.nodes[i]
-        a = child_of(tree, options, node.first_0, node.count_0)
-        b = child_of(tree, options, node.first_1, node.count_1)
+        a = child_summary(tree, options, node.first_0, node.count_0)
+        b = child_summary(tree, options, node.first_1, node.count_1)
         node.lo_0 = a.lo
         node.hi_0 = a.hi
         node.lo_1 = b.lo
         node.hi_1 = b.hi
         tree.nodes[i] = node
         parent = tree.parents[i]
-        tree.below[i] = joined(options, a, b, parent == NO_PARENT)
+        tree.summaries[i] = merge_summaries(options, a, b, parent == NO_PARENT)
         if parent == NO_PARENT:
             return
         fence()
-        expected = inner_children(tree.nodes[parent])
+        expected = inner_child_count(tree.nodes[parent])
         if wp.atomic_add(tree.arrived, parent, 1) + 1 < expected:
             return
         fence()

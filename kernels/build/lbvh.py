@@ -1,11 +1,10 @@
-"""A binary BVH along a Morton curve, a thread a node, on the CPU and on CUDA.
-Karras 2012, "Maximizing Parallelism in the Construction of BVHs, Octrees, and k-d Trees". Primitives are sorted by the Morton code of
-their middle; each inner node finds its own range of them and its split. Then `fit` makes boxes and leaves from the bottom up, and `emit`
-writes the remaining nodes in the order of a walk."""
+"""A binary BVH along a Morton curve, a thread a node, on the CPU and on CUDA. Karras 2012, "Maximizing Parallelism in the Construction of
+BVHs, Octrees, and k-d Trees". Primitives are sorted by the Morton code of their middle; each inner node finds its own range of them and
+its split. Then `fit` makes boxes and leaves from the bottom up, and `write_nodes` writes the remaining nodes in walk order."""
 
 import warp as wp
 
-from wrt.kernels.build.fit import NO_PARENT, Below, Tree
+from wrt.kernels.build.fit import NO_PARENT, SubtreeSummary, Tree
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse.bvh2 import Bvh2Node
 
@@ -139,14 +138,14 @@ def link(keys: wp.array(dtype=wp.uint64), nodes: wp.array(dtype=Bvh2Node), paren
 
 
 @kernel
-def emit(tree: Tree, nodes: wp.array(dtype=Bvh2Node), parents: wp.array(dtype=wp.int32), first: int):
+def write_nodes(tree: Tree, nodes: wp.array(dtype=Bvh2Node), parents: wp.array(dtype=wp.int32), first: int):
     """Write the nodes that `fit` kept of first .. first + dim - 1: a parent before its children, left before right.
     A node's index is the number of nodes before it in that order: on the way to the root, each parent and each left sibling's nodes."""
     i = first + wp.tid()
     slot = int(0)
     at = int(i)
     while True:
-        if tree.below[at].used == 0:
+        if tree.summaries[at].inner_nodes == 0:
             return  # inside a leaf
         parent = tree.parents[at]
         if parent == NO_PARENT:
@@ -154,25 +153,25 @@ def emit(tree: Tree, nodes: wp.array(dtype=Bvh2Node), parents: wp.array(dtype=wp
         slot = slot + 1
         node = tree.nodes[parent]
         if node.count_1 == 0 and node.first_1 == at and node.count_0 == 0:
-            slot = slot + tree.below[node.first_0].used
+            slot = slot + tree.summaries[node.first_0].inner_nodes
         at = parent
     node = tree.nodes[i]
-    left = Below()
+    left = SubtreeSummary()
     if node.count_0 == 0:
-        left = tree.below[node.first_0]
-        if left.used == 0:
+        left = tree.summaries[node.first_0]
+        if left.inner_nodes == 0:
             node.first_0 = node.first_0 + 1 - left.size  # its range ends at the split
             node.count_0 = left.size
         else:
             node.first_0 = slot + 1
             parents[slot + 1] = slot
     if node.count_1 == 0:
-        right = tree.below[node.first_1]
-        if right.used == 0:
+        right = tree.summaries[node.first_1]
+        if right.inner_nodes == 0:
             node.count_1 = right.size
         else:
-            node.first_1 = slot + 1 + left.used
-            parents[slot + 1 + left.used] = slot
+            node.first_1 = slot + 1 + left.inner_nodes
+            parents[slot + 1 + left.inner_nodes] = slot
     nodes[slot] = node
     if i == 0:
         parents[0] = NO_PARENT

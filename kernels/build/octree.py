@@ -76,15 +76,15 @@ def fill_octants(
     begin: wp.array(dtype=wp.int32),
     masks: wp.array(dtype=wp.int32),
     references: wp.array(dtype=wp.int32),
-    room: wp.array2d(dtype=wp.int32),
+    next_place: wp.array2d(dtype=wp.int32),
     out: wp.array(dtype=wp.int32),
 ):
-    """Copy the references of cell first + tid to its octants, those of octant k from room[cell, k] on; below 0: the cell is not split."""
+    """Copy the references of cell first + tid to its octants, for octant k to next_place[cell, k] and on; below 0: not split."""
     cell = first + wp.tid()
-    if room[cell, 0] < 0:
+    if next_place[cell, 0] < 0:
         return
     for r in range(begin[cell], begin[cell + 1]):
         for octant in range(8):
             if ((masks[r] >> octant) & 1) != 0:
-                out[room[cell, octant]] = references[r]
-                room[cell, octant] += 1
+                out[next_place[cell, octant]] = references[r]
+                next_place[cell, octant] += 1

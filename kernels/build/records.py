@@ -81,7 +81,7 @@ class Halves:
 
 
 @wp.func
-def rows_of(options: BuildOptions, n: int) -> float:
+def row_count(options: BuildOptions, n: int) -> float:
     """Rows that n primitives fill."""
     return float((n + options.row - 1) / options.row)
 
@@ -141,7 +141,7 @@ def center_of(record: BuildRecord) -> wp.vec3:
 
 
 @wp.func
-def levels(n: int) -> int:
+def balanced_depth(n: int) -> int:
     """Depth of a balanced tree over n primitives: ceil(log2(n))."""
     result = int(0)
     while result < 31 and (1 << result) < n:  # 1 << 31 is negative
@@ -150,7 +150,7 @@ def levels(n: int) -> int:
 
 
 @wp.func
-def measured(data: BuildData, begin: int, end: int) -> Measures:
+def measure(data: BuildData, begin: int, end: int) -> Measures:
     """Bounds of the records begin .. end - 1."""
     out = Measures()
     out.box = empty_row()
@@ -164,7 +164,7 @@ def measured(data: BuildData, begin: int, end: int) -> Measures:
 
 
 @wp.func
-def parted_at(task: BuildTask, middle: int) -> Halves:
+def unmeasured_halves(task: BuildTask, middle: int) -> Halves:
     """Halves of a range, without their bounds."""
     out = Halves()
     out.middle = middle
@@ -174,16 +174,16 @@ def parted_at(task: BuildTask, middle: int) -> Halves:
 
 
 @wp.func
-def halves_at(data: BuildData, task: BuildTask, middle: int) -> Halves:
+def measure_halves(data: BuildData, task: BuildTask, middle: int) -> Halves:
     """Halves of a range, with their bounds."""
-    out = parted_at(task, middle)
-    out.left = measured(data, task.begin, middle)
-    out.right = measured(data, middle, task.end)
+    out = unmeasured_halves(task, middle)
+    out.left = measure(data, task.begin, middle)
+    out.right = measure(data, middle, task.end)
     return out
 
 
 @wp.func
-def tell_parent(nodes: wp.array(dtype=Bvh2Node), task: BuildTask, first: int, count: int):
+def link_to_parent(nodes: wp.array(dtype=Bvh2Node), task: BuildTask, first: int, count: int):
     """Link a range's result to its parent: a leaf (count > 0), or the inner node `first`."""
     if task.parent >= 0:
         if task.side == 0:

@@ -5,7 +5,7 @@ made one after another, the best first, unless an earlier one is in the way."""
 
 import warp as wp
 
-from wrt.kernels.build.records import BuildOptions, rows_of
+from wrt.kernels.build.records import BuildOptions, row_count
 from wrt.kernels.build.shape import half_area
 from wrt.kernels.structs import kernel
 
@@ -180,7 +180,7 @@ class Walk:
 
 
 @kernel
-def walk_down(links: wp.array(dtype=Link), walk: Walk):
+def order_nodes(links: wp.array(dtype=Link), walk: Walk):
     """Order the nodes, parents first and left before right, and store the depth: inner nodes on the longest path."""
     stack = int(walk.order.shape[0])  # the end of the order serves as the stack: both together always fit
     stack = stack - 1
@@ -203,7 +203,7 @@ def walk_down(links: wp.array(dtype=Link), walk: Walk):
 
 
 @kernel
-def weigh(links: wp.array(dtype=Link), walk: Walk, options: BuildOptions, scale: float):
+def choose_leaves(links: wp.array(dtype=Link), walk: Walk, options: BuildOptions, scale: float):
     """Turn subtrees into leaves if those cost no more, from the bottom up; such a node gets left = -2 - left."""
     n = walk.order.shape[0]
     for k in range(n):
@@ -216,7 +216,7 @@ def weigh(links: wp.array(dtype=Link), walk: Walk, options: BuildOptions, scale:
         else:
             walk.count[i] = walk.count[link.left] + walk.count[link.right]
             cost = options.cost_traversal * area + walk.cost[link.left] + walk.cost[link.right]
-            whole = options.cost_intersection * rows_of(options, walk.count[i]) * area
+            whole = options.cost_intersection * row_count(options, walk.count[i]) * area
             walk.cost[i] = cost
             if walk.count[i] <= options.max_leaf and not cost < whole and i > 0:
                 walk.cost[i] = whole

@@ -14,13 +14,13 @@ from wrt.kernels.build.records import (
     Halves,
     Row,
     area_scale,
+    balanced_depth,
     center_of,
     empty_row,
     high_of,
-    levels,
     low_of,
     lower,
-    measured,
+    measure,
     row_area,
     row_of,
 )
@@ -36,7 +36,7 @@ def crossing(a: wp.vec3, b: wp.vec3, axis: int, plane: float) -> wp.vec3:
 
 
 @wp.func
-def cut(record: BuildRecord, axis: int, low: float, high: float, corners: wp.array(dtype=wp.vec3)) -> BuildRecord:
+def clip_reference(record: BuildRecord, axis: int, low: float, high: float, corners: wp.array(dtype=wp.vec3)) -> BuildRecord:
     """Clip a reference to the part between two planes; lo > hi if nothing remains.
 
     Conservative: the planes move outwards by the pads of the triangle's box; the clipped part is padded like that box, and stays within
@@ -129,7 +129,7 @@ def spatial_split(records: wp.array(dtype=BuildRecord), task: BuildTask, corners
                 for b in range(first, last + 1):
                     part = record
                     if first < last:
-                        part = cut(record, axis, plane_of(low, high, b), plane_of(low, high, b + 1), corners)
+                        part = clip_reference(record, axis, plane_of(low, high, b), plane_of(low, high, b + 1), corners)
                     if not is_empty(part):
                         box[b] = lower(box[b], row_of(part.lo, part.hi))
             side = empty_row()
@@ -155,7 +155,7 @@ def spatial_split(records: wp.array(dtype=BuildRecord), task: BuildTask, corners
 
 
 @wp.struct
-class Parts:
+class Sides:
     """The boxes and counts of references on both sides of a plane; a reference that it cuts is in both."""
 
     left: Row
@@ -165,9 +165,9 @@ class Parts:
 
 
 @wp.func
-def parts_of(data: BuildData, task: BuildTask, axis: int, plane: float) -> Parts:
+def measure_sides(data: BuildData, task: BuildTask, axis: int, plane: float) -> Sides:
     """Measure both sides of a plane."""
-    parts = Parts()
+    parts = Sides()
     parts.left = empty_row()
     parts.right = empty_row()
     for i in range(task.begin, task.end):
@@ -179,11 +179,11 @@ def parts_of(data: BuildData, task: BuildTask, axis: int, plane: float) -> Parts
             parts.right = lower(parts.right, row_of(record.lo, record.hi))
             parts.n_right += 1
         else:
-            part = cut(record, axis, -wp.inf, plane, data.corners)
+            part = clip_reference(record, axis, -wp.inf, plane, data.corners)
             if not is_empty(part):
                 parts.left = lower(parts.left, row_of(part.lo, part.hi))
                 parts.n_left += 1
-            part = cut(record, axis, plane, wp.inf, data.corners)
+            part = clip_reference(record, axis, plane, wp.inf, data.corners)
             if not is_empty(part):
                 parts.right = lower(parts.right, row_of(part.lo, part.hi))
                 parts.n_right += 1
@@ -191,7 +191,7 @@ def parts_of(data: BuildData, task: BuildTask, axis: int, plane: float) -> Parts
 
 
 @wp.func
-def cheaper_side(parts: Parts, box: Row, scale: float) -> int:
+def cheaper_side(parts: Sides, box: Row, scale: float) -> int:
     """Choose a side for a reference with this box: -1 left, 1 right, 0: both (section 4.4, "reference unsplitting")."""
     area_0 = row_area(parts.left, scale)
     area_1 = row_area(parts.right, scale)
@@ -204,12 +204,12 @@ def cheaper_side(parts: Parts, box: Row, scale: float) -> int:
 
 
 @wp.func
-def part_by_plane(data: BuildData, task: BuildTask, split: Split) -> wp.vec2i:
+def partition_by_plane(data: BuildData, task: BuildTask, split: Split) -> wp.vec2i:
     """Copy references left of the plane to data.boxes[begin ..], those right of it to data.boxes[.. limit - 1] backwards; return both
     counts. A reference on both sides is split, unless it costs less whole or no space is left."""
     scale = area_scale(task.measures.box)
     plane = plane_of(task.measures.box[split.axis], -task.measures.box[3 + split.axis], split.bin)
-    parts = parts_of(data, task, split.axis, plane)
+    parts = measure_sides(data, task, split.axis, plane)
     done_0 = int(0)
     done_1 = int(0)
     for i in range(task.begin, task.end):
@@ -217,8 +217,8 @@ def part_by_plane(data: BuildData, task: BuildTask, split: Split) -> wp.vec2i:
         to_left = bool(record.hi[split.axis] < plane)
         to_right = bool(record.lo[split.axis] >= plane)
         if not to_left and not to_right:
-            part_0 = cut(record, split.axis, -wp.inf, plane, data.corners)
-            part_1 = cut(record, split.axis, plane, wp.inf, data.corners)
+            part_0 = clip_reference(record, split.axis, -wp.inf, plane, data.corners)
+            part_1 = clip_reference(record, split.axis, plane, wp.inf, data.corners)
             to_left = is_empty(part_1)
             to_right = is_empty(part_0) and not to_left
             if not to_left and not to_right:
@@ -254,7 +254,7 @@ def object_split(data: BuildData, task: BuildTask) -> wp.vec2i:
     counts."""
     n = task.end - task.begin
     middle = task.begin + n / 2
-    if n > 2 and task.depth + levels(n) < MAX_DEPTH:
+    if n > 2 and task.depth + balanced_depth(n) < MAX_DEPTH:
         bins = bins_of(task)
         split = binned_split(data, task, bins)
         if split.axis >= 0:
@@ -285,7 +285,7 @@ def box_of(records: wp.array(dtype=BuildRecord), begin: int, end: int) -> Row:
 
 
 @wp.func
-def sides(data: BuildData, counts: wp.vec2i, task: BuildTask) -> Halves:
+def copied_halves(data: BuildData, counts: wp.vec2i, task: BuildTask) -> Halves:
     """Halves of the references in data.boxes, with their boxes."""
     out = Halves()
     out.count_0 = counts[0]
@@ -299,11 +299,11 @@ def sides(data: BuildData, counts: wp.vec2i, task: BuildTask) -> Halves:
 def split_references(data: BuildData, task: BuildTask) -> Halves:
     """Take the cheaper of the best object split and, if its sides overlap, the best plane; both sides are in data.boxes."""
     scale = area_scale(task.measures.box)
-    halves = sides(data, object_split(data, task), task)
+    halves = copied_halves(data, object_split(data, task), task)
     n = task.end - task.begin
     lo = wp.max(low_of(halves.left.box), low_of(halves.right.box))
     overlap = row_area(row_of(lo, wp.min(high_of(halves.left.box), high_of(halves.right.box))), data.scale)
-    if task.depth + levels(n) >= MAX_DEPTH or not overlap > data.min_overlap:
+    if task.depth + balanced_depth(n) >= MAX_DEPTH or not overlap > data.min_overlap:
         return halves
     best = Split()
     best.axis = -1
@@ -312,14 +312,14 @@ def split_references(data: BuildData, task: BuildTask) -> Halves:
     best = spatial_split(data.records, task, data.corners, best)
     if best.axis < 0:
         return halves
-    counts = part_by_plane(data, task, best)
+    counts = partition_by_plane(data, task, best)
     if counts[0] == 0 or counts[1] == 0:
         counts = object_split(data, task)
-    return sides(data, counts, task)
+    return copied_halves(data, counts, task)
 
 
 @wp.func
-def take_room(data: BuildData, task: BuildTask, halves: Halves) -> Halves:
+def share_space(data: BuildData, task: BuildTask, halves: Halves) -> Halves:
     """Copy both sides back to data.records; they share the free space in proportion to their counts."""
     free = task.limit - task.begin - halves.count_0 - halves.count_1
     share = int(wp.int64(free) * wp.int64(halves.count_0) / wp.int64(halves.count_0 + halves.count_1))
@@ -329,6 +329,6 @@ def take_room(data: BuildData, task: BuildTask, halves: Halves) -> Halves:
     for i in range(halves.count_1):
         data.records[middle + i] = data.boxes[task.limit - 1 - i]
     halves.middle = middle
-    halves.left = measured(data, task.begin, task.begin + halves.count_0)
-    halves.right = measured(data, middle, middle + halves.count_1)
+    halves.left = measure(data, task.begin, task.begin + halves.count_0)
+    halves.right = measure(data, middle, middle + halves.count_1)
     return halves

@@ -52,7 +52,7 @@ class WideTask:
 
     node: int
     slot: int
-    room: int  # Entries of the stack that are left below it.
+    free_entries: int  # Entries of the stack that are left below it.
     depth: int  # 1 at the root.
 
 
@@ -143,7 +143,7 @@ def subtree_costs(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, tre
 
 
 @wp.func
-def roots_of(nodes: wp.array(dtype=Bvh2Node), trees: Subtrees, i: int, k: int, source: wp.array(dtype=wp.int32)) -> int:
+def write_roots(nodes: wp.array(dtype=Bvh2Node), trees: Subtrees, i: int, k: int, source: wp.array(dtype=wp.int32)) -> int:
     """Write the at most k roots that replace the children of binary node i to `source`; return their number, at least two."""
     node_of = wp.zeros(shape=wp.static(8), dtype=wp.int32)
     side_of = wp.zeros(shape=wp.static(8), dtype=wp.int32)
@@ -185,7 +185,7 @@ def roots_of(nodes: wp.array(dtype=Bvh2Node), trees: Subtrees, i: int, k: int, s
 
 
 @wp.func
-def gather(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), parent: int, side: int, out: WideTree, slot: int):
+def write_primitives(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), parent: int, side: int, out: WideTree, slot: int):
     """Write the primitives of a child's subtree to order[slot ..]."""
     stack = wp.zeros(shape=wp.static(STACK_SIZE + 2), dtype=wp.int32)
     stack[0] = 2 * parent + side
@@ -239,20 +239,20 @@ def write_in_order(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, ou
 
 
 @wp.func
-def take_roots(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, trees: Subtrees, task: WideTask, out: WideTree) -> int:
+def choose_roots(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, trees: Subtrees, task: WideTask, out: WideTree) -> int:
     """Write the sources of the children of a wide node; return their number.
     A node of k children leaves k - 1 on the stack during the walk of the last. The binary tree below needs one entry a level: the node
     takes fewer children if its best choice leaves too few."""
     k = int(options.width)
     n = int(0)
     while True:
-        n = roots_of(nodes, trees, task.node, k, out.source)
+        n = write_roots(nodes, trees, task.node, k, out.source)
         tallest = int(0)
         for j in range(n):
             code = out.source[j]
             if count_of(nodes[code / 2], code % 2) == 0:
                 tallest = wp.max(tallest, trees.height[first_of(nodes[code / 2], code % 2)])
-        if k == 2 or task.room - (n - 1) >= tallest:
+        if k == 2 or task.free_entries - (n - 1) >= tallest:
             break
         k = k - 1
     return n
@@ -264,7 +264,7 @@ def write_rows(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32),
     """Append the leaf of a source with `count` primitives to the rows; return the rows that it fills."""
     rows = (count + width - 1) / width
     first = out.count[1] * width
-    gather(nodes, order, code / 2, code % 2, out, first)
+    write_primitives(nodes, order, code / 2, code % 2, out, first)
     for i in range(count, rows * width):
         out.order[first + i] = -1
     return rows
@@ -276,7 +276,7 @@ def collapse(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), o
     """Write the wide tree, depth first, and its totals to out.count. One thread."""
     stack = wp.zeros(shape=wp.static(8 * STACK_SIZE), dtype=WideTask)
     root = WideTask()
-    root.room = options.stack
+    root.free_entries = options.stack
     root.depth = 1
     stack[0] = root
     size = int(1)
@@ -284,15 +284,15 @@ def collapse(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), o
     out.count[1] = 0
     n_leaves = int(0)
     depth = int(0)
-    least_room = int(options.stack)
+    least_free = int(options.stack)
     while size > 0:
         size = size - 1
         task = stack[size]
         depth = wp.max(depth, task.depth)
         base = task.slot * options.width
-        n = take_roots(nodes, options, trees, task, out)
-        room = task.room - (n - 1)
-        least_room = wp.min(least_room, room)
+        n = choose_roots(nodes, options, trees, task, out)
+        free_entries = task.free_entries - (n - 1)
+        least_free = wp.min(least_free, free_entries)
         for j in range(n):
             # The last child is popped first: it gets the next slots.
             code = out.source[j]
@@ -308,7 +308,7 @@ def collapse(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), o
                 child = WideTask()
                 child.node = c
                 child.slot = n_nodes
-                child.room = room
+                child.free_entries = free_entries
                 child.depth = task.depth + 1
                 out.children[base + j] = n_nodes
                 stack[size] = child
@@ -318,7 +318,7 @@ def collapse(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), o
     out.count[0] = n_nodes
     out.count[2] = n_leaves
     out.count[3] = depth
-    out.count[4] = options.stack - least_room
+    out.count[4] = options.stack - least_free
 
 
 @kernel

@@ -59,16 +59,16 @@ def make_short_stack(units: Units, entries: int, any_hit: bool, accepts: Any = N
     ray_aabb = units.box_test
     fetch_node, _, push, finish = make_counters(units, size_of(Bvh2Node))
     struct = make_struct(units.triangle_test.record)
-    room = max(entries, 1)
+    capacity = max(entries, 1)
 
     @wp.func
     def traverse(accel: struct, surfaces: Surfaces, ray: Ray) -> Hit:
         probe = probe_of(ray)
         best = no_hit(ray)
         counts = Counts()
-        stack = wp.zeros(shape=wp.static(room), dtype=Child)
-        stack_t = wp.zeros(shape=wp.static(room), dtype=wp.float32)
-        top = int(0)  # pushes - pops; the newest entry is at (top - 1) modulo room
+        stack = wp.zeros(shape=wp.static(capacity), dtype=Child)
+        stack_t = wp.zeros(shape=wp.static(capacity), dtype=wp.float32)
+        top = int(0)  # pushes - pops; the newest entry is at (top - 1) modulo capacity
         size = int(0)
         child = Child()
         trail = Trail()
@@ -93,10 +93,10 @@ def make_short_stack(units: Units, entries: int, any_hit: bool, accepts: Any = N
                         if (trail.done & trail.level) != NONE:
                             second = not second
                         elif wp.static(entries > 0):
-                            stack[top % wp.static(room)] = child_of(node, not second)
-                            stack_t[top % wp.static(room)] = wp.where(second, t_0, t_1)
+                            stack[top % wp.static(capacity)] = child_of(node, not second)
+                            stack_t[top % wp.static(capacity)] = wp.where(second, t_0, t_1)
                             top = top + 1
-                            size = wp.min(size + 1, wp.static(room))
+                            size = wp.min(size + 1, wp.static(capacity))
                             counts = push(counts, size)
                     elif trail.level != trail.resumed:
                         trail.done = trail.done | trail.level
@@ -115,8 +115,8 @@ def make_short_stack(units: Units, entries: int, any_hit: bool, accepts: Any = N
                     top = top - 1
                     counts.pops += 1
                     trail.level = trail.resumed
-                    found = stack_t[top % wp.static(room)] <= best.t
-                    child = stack[top % wp.static(room)]
+                    found = stack_t[top % wp.static(capacity)] <= best.t
+                    child = stack[top % wp.static(capacity)]
                 else:
                     trail.level = TOP
                     found = True

@@ -51,9 +51,9 @@ class Trace:
 
 @wp.struct
 class Missed:
-    """Misses of each SM's L1; the misses of SM s are the entries room[s] .. room[s] + misses[s] - 1."""
+    """Misses of each SM's L1; the misses of SM s are the entries first[s] .. first[s] + misses[s] - 1."""
 
-    room: wp.array(dtype=wp.int64)
+    first: wp.array(dtype=wp.int64)
     line: wp.array(dtype=wp.int64)
     time: wp.array(dtype=wp.int64)  # Round of the miss.
     lanes: wp.array(dtype=wp.int64)  # Lanes that wait for the line.
@@ -92,7 +92,7 @@ def play_round(trace: Trace, caches: Caches, out: Missed, sm: int, warp: int, st
                     out.seen[entry] = line
                     out.seen_at[entry] = wp.int64(-1)
                     if not access(caches, sm, line):
-                        at = out.room[sm] + out.misses[sm]
+                        at = out.first[sm] + out.misses[sm]
                         out.line[at] = line
                         out.time[at] = time
                         out.lanes[at] = wp.int64(0)

@@ -14,7 +14,7 @@ from wrt.accel.bvh.builders import BVH_BUILDERS, BvhOptions, build_binary, sah_c
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
-from wrt.kernels.build.records import levels
+from wrt.kernels.build.records import balanced_depth
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse.bvh2 import STACK_SIZE
 from wrt.scene.mesh import Mesh
@@ -273,7 +273,7 @@ def test_the_deepest_tree_still_finds_everything():
 @kernel
 def levels_kernel(n: wp.array(dtype=wp.int32), out: wp.array(dtype=wp.int32)):
     i = wp.tid()
-    out[i] = levels(n[i])
+    out[i] = balanced_depth(n[i])
 
 
 def test_levels_end_for_every_number():

@@ -19,7 +19,7 @@ from wrt.kernels.traverse.bvh2 import Bvh2Node
 from wrt.scene.shapes import torus
 
 
-def test_boxes_hold_what_is_below_and_room_is_left_as_it_was() -> None:
+def test_boxes_bound_their_subtrees_and_a_refit_can_be_repeated() -> None:
     mesh = torus(1.0, 0.4, 40, 20)
     geometry = Geometry(mesh.vertices, mesh.faces, np.array([[0.0, 0.0, 3.0, 0.5]], np.float32))
     tree = build_binary(geometry, BvhOptions(), 1)
@@ -33,19 +33,20 @@ def test_boxes_hold_what_is_below_and_room_is_left_as_it_was() -> None:
         fitting.refit(linked, geometry.on(DEVICE))
         assert there.numpy().tobytes() == tree.nodes.tobytes()
         assert not fitting.arrived.numpy().any()
-    below = fitting.below.numpy()
-    assert below["size"][0] == len(geometry) and (below["used"][0], below["height"][0]) == (len(nodes), tree.depth)
+    summaries = fitting.summaries.numpy()
+    assert summaries["size"][0] == len(geometry)
+    assert (summaries["inner_nodes"][0], summaries["height"][0]) == (len(nodes), tree.depth)
 
 
-def test_a_gpu_waits_for_what_others_have_written_and_reads_it_past_its_own_cache(tmp_path: Path) -> None:
+def test_on_a_gpu_fences_order_the_writes_and_reads_bypass_the_l1_cache(tmp_path: Path) -> None:
     (ptx,) = wp.compile_aot_module(fit.fit.module, arch=75, module_dir=tmp_path, use_ptx=True)
     text = Path(ptx).read_text()
     assert len(re.findall(r"\batom\.global\.add", text)) == 1
-    assert len(re.findall(r"\bmembar\.gl|\bfence\.\w+\.gpu", text)) == 2  # before others are told, and after
-    assert len(re.findall(r"\bld\.volatile", text)) >= 2 * 11  # of both children all that they tell
+    assert len(re.findall(r"\bmembar\.gl|\bfence\.\w+\.gpu", text)) == 2  # after the writes, and before the reads
+    assert len(re.findall(r"\bld\.volatile", text)) >= 2 * 11  # both children's summaries
 
 
 def test_they_compile_for_hopper(tmp_path: Path) -> None:
-    for kernel in (fit.fit, lbvh.emit):
+    for kernel in (fit.fit, lbvh.write_nodes):
         (binary,) = wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path)
         assert Path(binary).stat().st_size > 5000

@@ -69,7 +69,7 @@ class Bvh2(BinaryBvh):
         if options.builder != "lbvh" or len(self.geometry) < 2:
             return super()._by(options)
         nodes, parents, order, root = build_on(self.device, self._shape(), options, self.threads)
-        return Built({"nodes": nodes}, order, root.used, root.used + 1, root.height, root.sah_cost, parents)
+        return Built({"nodes": nodes}, order, root.inner_nodes, root.inner_nodes + 1, root.height, root.sah_cost, parents)
 
     def _around(self, nodes: np.ndarray, order: np.ndarray, leaves: int, depth: int) -> Built:
         return Built({"nodes": nodes}, order, len(nodes), leaves, depth, sah_cost(nodes))

@@ -51,7 +51,7 @@ def build_on(device: Device, shape: WarpStruct, options: BvhOptions,
     linked = tree_of(fitting, nodes, parents, order)
     fitting.fit(linked, build_options(options))
     out, out_parents = (wp.empty(n - 1, dtype=kind, device=device) for kind in (Bvh2Node, wp.int32))
-    launch_on(device, kernels.emit, n - 1, linked, out, out_parents, None)
+    launch_on(device, kernels.write_nodes, n - 1, linked, out, out_parents, None)
     root = fitting.root()
-    return wp.clone(out[: root.used]), wp.clone(out_parents[: root.used]), order, root
+    return wp.clone(out[: root.inner_nodes]), wp.clone(out_parents[: root.inner_nodes]), order, root
 

@@ -18,9 +18,9 @@ PRIMITIVES_PER_JOB = 32768
 
 
 class Root(NamedTuple):
-    """Figures of a whole tree. used: inner nodes; height: of these on the longest path; sah_cost: as in AccelStats."""
+    """Figures of a whole tree. height: inner nodes on the longest path; sah_cost: as in AccelStats."""
 
-    used: int
+    inner_nodes: int
     height: int
     sah_cost: float
 
@@ -36,7 +36,7 @@ class Fitting:
     def __post_init__(self) -> None:
         self.low, self.high = (wp.empty(self.primitives, dtype=wp.vec3, device=self.device) for _ in range(2))
         self.arrived = wp.zeros(self.nodes, dtype=wp.int32, device=self.device)
-        self.below = wp.empty(self.nodes, dtype=kernels.Below, device=self.device)
+        self.summaries = wp.empty(self.nodes, dtype=kernels.SubtreeSummary, device=self.device)
 
     def find_bounds(self, shape: WarpStruct, threads: int = 1) -> None:
         """Compute the box of each primitive of a kernels.build.shape.Shape."""
@@ -56,16 +56,16 @@ class Fitting:
 
     def root(self) -> Root:
         """Return the figures of the tree that was fitted last."""
-        root = on_host(self.below[:1])[0]
-        area, plain = float(half_areas(root["lo"], root["hi"])), float(root["plain"])
-        return Root(int(root["used"]), int(root["height"]), plain / area if area > 0.0 else float(root["size"]))
+        root = on_host(self.summaries[:1])[0]
+        area, unit_cost = float(half_areas(root["lo"], root["hi"])), float(root["unit_cost"])
+        return Root(int(root["inner_nodes"]), int(root["height"]), unit_cost / area if area > 0.0 else float(root["size"]))
 
 
 def tree_of(fitting: Fitting, nodes: WarpArray, parents: WarpArray | None, order: WarpArray) -> WarpStruct:
     """Make a kernels.build.fit.Tree."""
     tree = kernels.Tree()
     tree.nodes, tree.parents, tree.order = nodes, parents, order
-    for name in ("low", "high", "arrived", "below"):
+    for name in ("low", "high", "arrived", "summaries"):
         setattr(tree, name, getattr(fitting, name))
     return tree
 

@@ -53,7 +53,7 @@ def build_refined(geometry: Geometry, options: BvhOptions, threads: int) -> Bina
     Bittner, Hapala and Havran 2013, "Fast Insertion-Based Optimization of Bounding Volume Hierarchies".
     """
     leaf = min(options.max_leaf, SMALL_LEAF)
-    with preloading(*([kernels.find_moves, kernels.make_moves, kernels.walk_down] if len(geometry) > leaf else [])):
+    with preloading(*([kernels.find_moves, kernels.make_moves, kernels.order_nodes] if len(geometry) > leaf else [])):
         tree = build_binned(geometry, replace(options, max_leaf=leaf), threads)
         if len(tree.nodes) < 2:
             return tree
@@ -111,7 +111,7 @@ def optimized(tree: BinaryTree, effort: Effort, threads: int) -> tuple[WarpArray
     while True:
         links = upload(before.copy(), kernels.Link, start("cpu"))
         fell = move(links, effort, rounds, threads)
-        walk = walk_down(links)
+        walk = order_nodes(links)
         if rounds == 0 or int(walk.depth.numpy()[0]) <= STACK_SIZE:
             return links, walk, fell
         rounds //= 2
@@ -153,14 +153,14 @@ def largest(links: np.ndarray, areas: np.ndarray, share: float) -> np.ndarray:
     return np.flatnonzero(movable).astype(np.int32)
 
 
-def walk_down(links: WarpArray) -> WarpStruct:
+def order_nodes(links: WarpArray) -> WarpStruct:
     cpu = start("cpu")
     walk = kernels.Walk()
     for name in ("order", "level", "count"):
         setattr(walk, name, wp.empty(len(links), dtype=wp.int32, device=cpu))
     walk.cost = wp.empty(len(links), dtype=wp.float32, device=cpu)
     walk.depth = wp.zeros(1, dtype=wp.int32, device=cpu)
-    launch(kernels.walk_down, 1, links, walk)
+    launch(kernels.order_nodes, 1, links, walk)
     return walk
 
 
@@ -190,7 +190,7 @@ def nodes_of(links: np.ndarray, inner: np.ndarray, begins: np.ndarray, counts: n
 
 def collapse(tree: BinaryTree, links: WarpArray, walk: WarpStruct, options: BvhOptions) -> BinaryTree:
     """Collapse subtrees of a tree with one record a leaf into leaves wherever that costs no more."""
-    launch(kernels.weigh, 1, links, walk, build_options(options), scale_of(on_host(links)))
+    launch(kernels.choose_leaves, 1, links, walk, build_options(options), scale_of(on_host(links)))
     rows, order, counts = on_host(links), walk.order.numpy(), walk.count.numpy().copy()
     # The 2 count - 2 links below a link come next in the walk: those below a leaf are inside it.
     leaf, after = rows["left"][order] < 0, np.arange(1, len(order) + 1)

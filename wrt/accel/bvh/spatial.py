@@ -11,7 +11,7 @@ from wrt.core.device import on_host, records
 from wrt.core.errors import InputError
 from wrt.kernels.build import records as build_records
 from wrt.kernels.build.bvh2 import make_build_ranges
-from wrt.kernels.build.sbvh import split_references, take_room
+from wrt.kernels.build.sbvh import share_space, split_references
 from wrt.kernels.traverse.bvh2 import Bvh2Node
 
 MAX_BUDGET = 8.0
@@ -41,7 +41,7 @@ def build_sbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryT
         area = options.split_alpha * (x * y + y * z + z * x)
     # An infinite scene gets no spatial splits.
     data.min_overlap = min(area, 3e38) if np.isfinite(area) else 3e38
-    depth = run_tasks(make_build_ranges(split_references, take_room), data, build_options(options), n, threads, room)
+    depth = run_tasks(make_build_ranges(split_references, share_space), data, build_options(options), n, threads, room)
     return compact(data, depth)
 
 

@@ -97,13 +97,13 @@ def run_tasks(kernel: Kernel, data: WarpStruct, settings: WarpStruct, n: int, th
         stop = max(size // 2, least) if threads > 1 and size > least else 0
         # Disjoint ranges of two or more records: there cannot be more of them.
         most = (max(int(task["limit"][0]), int(task["end"][0])) - int(task["begin"][0])) // 2 if stop else 1
-        left_over = wp.empty(most, dtype=build_records.BuildTask, device=cpu)
+        deferred = wp.empty(most, dtype=build_records.BuildTask, device=cpu)
         count, depth = (wp.zeros(1, dtype=wp.int32, device=cpu) for _ in range(2))
-        inputs = [data, upload(task, build_records.BuildTask, cpu), settings, stop, left_over, count, depth]
+        inputs = [data, upload(task, build_records.BuildTask, cpu), settings, stop, deferred, count, depth]
 
         def parts() -> list[np.ndarray]:
             depths.append(int(depth.numpy()[0]))
-            return [on_host(left_over)[i : i + 1] for i in range(int(count.numpy()[0]))]
+            return [on_host(deferred)[i : i + 1] for i in range(int(count.numpy()[0]))]
 
         return partial(wp.launch, kernel, dim=1, device=cpu, inputs=inputs), parts
 

@@ -121,7 +121,7 @@ class Bsp(OneMesh):
 class Launch:
     """One launch of the kernel, with memory for `room` pieces, and its results."""
 
-    def __init__(self, corners: WarpArray, options: WarpStruct, room: int, left_overs: int) -> None:
+    def __init__(self, corners: WarpArray, options: WarpStruct, room: int, n_deferred: int) -> None:
         self.cpu = start("cpu")
         self.room = room
         self.tools = BspTools()
@@ -132,8 +132,8 @@ class Launch:
         self.output = build_bsp.BspOutput()
         self.output.nodes = wp.empty(room, dtype=kernels.BspNode, device=self.cpu)
         self.output.order = wp.empty(room, dtype=wp.int32, device=self.cpu)
-        self.output.left_over = wp.empty(left_overs, dtype=build_bsp.BspTask, device=self.cpu)
-        self.output.left_cells = cells_of(left_overs)
+        self.output.deferred = wp.empty(n_deferred, dtype=build_bsp.BspTask, device=self.cpu)
+        self.output.deferred_cells = cells_of(n_deferred)
         self.output.results = wp.zeros(build_bsp.N_RESULTS, dtype=wp.int32, device=self.cpu)
         self.output.cost = wp.zeros(1, dtype=wp.float64, device=self.cpu)
 
@@ -185,12 +185,12 @@ class Builder:
         root["end"], root["budget"] = self.n, self.budget
         top = self.launch(self.source, upload(root, build_bsp.BspTask, start("cpu")), cells_of(0), 0, self.n,
                           keep if self.n > keep else 0)
-        tasks = on_host(top.output.left_over)[: top.results[build_bsp.N_LEFT_OVER]]
+        tasks = on_host(top.output.deferred)[: top.results[build_bsp.N_DEFERRED]]
         size = tasks["end"] - tasks["begin"]
         subtrees: list[Subtree | None] = [None] * len(tasks)
 
         def job(i: int) -> None:
-            subtrees[i] = Subtree(self.launch(top.tools.pieces, top.output.left_over, top.output.left_cells, i, int(size[i]), 0))
+            subtrees[i] = Subtree(self.launch(top.tools.pieces, top.output.deferred, top.output.deferred_cells, i, int(size[i]), 0))
             self.done += int(size[i])
             self.progress(self.done / max(int(size.sum()), 1))
 
@@ -213,7 +213,7 @@ class Builder:
         roots[:, 0] += np.where(roots[:, 1] == kernels.INNER, first_node[:-1], first_primitive[:-1])
         for side in ("0", "1"):
             nodes = parts[0].nodes
-            left = np.nonzero(nodes["count_" + side] == build_bsp.LEFT_OVER)[0]
+            left = np.nonzero(nodes["count_" + side] == build_bsp.DEFERRED)[0]
             root = roots[1 + nodes["first_" + side][left]]
             nodes["first_" + side][left], nodes["count_" + side][left] = root[:, 0], root[:, 1]
         arrays = {"nodes": np.concatenate([part.nodes for part in parts]), "first": roots[0, :1], "count": roots[0, 1:],

@@ -109,7 +109,7 @@ def first_level(warp: np.ndarray, fetches: Counters, sms: int, slots: int, l1: C
     trace.warp_first, trace.first = upload(warp_first, wp.int64, cpu), upload(fetches.first, wp.int64, cpu)
     trace.address, trace.size = upload(address, wp.int64, cpu), upload(fetches.size, wp.int64, cpu)
     out = Missed()
-    out.room = upload(begin, wp.int64, cpu)
+    out.first = upload(begin, wp.int64, cpu)
     out.line, out.time, out.lanes = (wp.empty(int(begin[-1]), dtype=wp.int64, device=cpu) for _ in range(3))
     out.accesses, out.misses, out.wanted = (wp.zeros(sms, dtype=wp.int64, device=cpu) for _ in range(3))
     out.slot_warp = wp.full(sms * slots, -1, dtype=wp.int32, device=cpu)

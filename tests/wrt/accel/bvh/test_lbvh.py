@@ -44,7 +44,7 @@ def test_the_tree_is_one_and_fits_the_stack(name: str, max_leaf: int) -> None:
     nodes, parents, order, root = build_on(DEVICE, geometry.on(DEVICE), options)
     assert nodes.device == parents.device == order.device == DEVICE
     rows = nodes.numpy()
-    assert len(rows) == root.used and root.height <= sum((bits_of(len(geometry))[0], 3 * bits_of(len(geometry))[1]))
+    assert len(rows) == root.inner_nodes and root.height <= sum((bits_of(len(geometry))[0], 3 * bits_of(len(geometry))[1]))
     check_binary(rows, len(geometry), root.height)  # a parent stands before its children
     assert np.array_equal(np.sort(order.numpy()), np.arange(len(geometry)))
     above = parents.numpy()
