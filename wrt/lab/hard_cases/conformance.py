@@ -106,7 +106,7 @@ class Case:
 
     @property
     def about(self) -> str:
-        """What is hard in this case."""
+        """The difficulty of this case, in words."""
         return generate(self.name, 1).notes
 
     def result(self, closest_hit: ClosestHit) -> Result:
@@ -162,12 +162,12 @@ def hard_cases(closest_hit: ClosestHit, cases: str | Sequence[str] = (), rays: i
     ----------
     closest_hit : function of (vertices, faces, origins, directions)
         It gets (V, 3) float32, (F, 3) int32, (N, 3) float32 and (N, 3) float32; directions have any length. It returns t and prim_id, (N,)
-        each, as a pair or as attributes: the distance in units of |direction|, which counts for hits only, and the face, -1 on a miss. Of
-        faces at the same distance any is right.
+        each, as a pair or as attributes. t is the distance in units of |direction| and counts for hits only. A prim_id is the index of a
+        face, -1 on a miss. Any of several faces at the same distance is right.
     cases : names, or letters of groups
-        By default all.
-    rays, seed
-        Rays of each case, and another seed for other rays.
+        All cases by default.
+    rays, seed : int
+        Number of rays of each case. Another seed gives other rays.
 
     Returns
     -------

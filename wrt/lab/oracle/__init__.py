@@ -1,1 +1,1 @@
-"""What a ray hits, in float64 and exact arithmetic, with the bounds that float32 answers are held to."""
+"""Hits of rays in float64 and exact arithmetic, and the error bounds that float32 answers must keep."""
