@@ -1,7 +1,7 @@
-"""Dask workers, on one machine or on many: how a scheduler is found, and how its workers trace tiles.
+"""Dask workers on one machine or many: connection to a scheduler, and tiles as tasks.
 
-Tasks that ran on a worker that died are run again by the scheduler; the scene is scattered once, and again where it died with
-all that held it. Nothing is imported from Dask before somebody asks for it.
+The scheduler repeats the tasks of a worker that died. The scene is scattered once, and again if all workers that held it have died. Dask
+is imported at first use.
 """
 
 from __future__ import annotations
@@ -10,34 +10,39 @@ import asyncio
 import logging
 import pkgutil
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future
 from concurrent.futures import wait as wait_here
 from contextlib import contextmanager, suppress
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 from wrt.core.device import describe_devices
 from wrt.core.errors import InputError
 from wrt.core.version import VERSION
 from wrt.renderer.distributed.installed import INSTALLED, difference
-from wrt.renderer.distributed.workers import ExecutorWorkers, Reply
+from wrt.renderer.distributed.workers import ExecutorWorkers, Package, Reply, ReplyFuture
 
-CONNECT_SECONDS = 5.0  # to find the scheduler
-WORKER_SECONDS = 10.0  # for a first worker to come
-RESULT_SECONDS = 30.0  # to fetch what a worker made
-PATIENCE = 60.0  # seconds without any worker, in a render
+if TYPE_CHECKING:
+    from distributed import Client
+
+CONNECT_SECONDS = 5.0  # to reach the scheduler
+WORKER_SECONDS = 10.0  # until the first worker must have come
+RESULT_SECONDS = 30.0  # to fetch the results of workers
+PATIENCE = 60.0  # seconds of a render without any worker
 
 
 @contextmanager
-def connected(address: str) -> Iterator[Any]:
-    """A Client of the scheduler at that address (tcp://host:8786). Raises InputError where nobody answers, there is no
-    worker, or one cannot render for us."""
+def connected(address: str) -> Iterator[Client]:
+    """Yield a Client of the scheduler at an address such as tcp://host:8786.
+
+    Raises InputError if there is no answer, no worker, or a worker with another installation.
+    """
     try:
         from distributed import Client
     except ImportError:
         raise InputError("a cluster needs dask.distributed", hint="pip install 'wrt[cluster]'") from None
     for name in [name for name in logging.root.manager.loggerDict if name.split(".")[0] == "distributed"]:
-        logging.getLogger(name).setLevel(logging.CRITICAL)  # what goes wrong is reported in our words
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # errors are reported by InputError
     try:
         kind = asyncio.run(asyncio.wait_for(_identity(address), CONNECT_SECONDS))
         if kind != "Scheduler":
@@ -45,7 +50,7 @@ def connected(address: str) -> Iterator[Any]:
         client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
     except TimeoutError as error:
         raise InputError(f"no Dask scheduler at {address!r}: no answer in {CONNECT_SECONDS:g} s") from error
-    except Exception as error:  # of any kind, where something else answers
+    except Exception as error:  # of any kind, if another program answers
         raise InputError(f"no Dask scheduler at {address!r}: {error}") from error
     with client:
         check_workers(client)
@@ -53,25 +58,25 @@ def connected(address: str) -> Iterator[Any]:
 
 
 async def _identity(address: str) -> str:
-    """Who answers there. A Client by itself waits for ever for one that takes the connection and says nothing."""
+    """Return the type of the server at an address. A Client alone would wait forever for a silent server."""
     from distributed.core import rpc
     from distributed.security import Security
 
-    how = Security().get_connection_args("client")  # as Dask's configuration has it, and a Client too
+    how = Security().get_connection_args("client")  # as Dask configures a Client
     async with rpc(address, timeout=CONNECT_SECONDS, connection_args=how) as there:
         return str((await there.identity())["type"])
 
 
-def check_workers(client: Any) -> None:
-    """Raises InputError where there are no workers, or one of them has no wrt, or not the same as here."""
+def check_workers(client: Client) -> None:
+    """Raise InputError if there are no workers, or one has no wrt or another installation than this process."""
     if client.asynchronous:
         raise InputError("is an asynchronous Client", argument="executor", hint="make one without asynchronous=True")
-    where = client.scheduler.address
+    where = client.scheduler.address  # type: ignore[union-attr]
     try:
         client.wait_for_workers(1, timeout=WORKER_SECONDS)
     except TimeoutError as error:
         raise InputError(f"no worker at {where}", hint=f"start some with `dask worker {where}`") from error
-    # A function that workers without wrt have too, and before what is compared, what every version of wrt has.
+    # `resolve_name` exists on workers without wrt, and the first name in every version of wrt.
     for name in ("wrt:__version__", "wrt.renderer.distributed.installed:INSTALLED"):
         for worker, found in client.run(pkgutil.resolve_name, name, on_error="return").items():
             if isinstance(found, BaseException):
@@ -82,31 +87,32 @@ def check_workers(client: Any) -> None:
                 raise InputError(f"worker {worker} has {differs}: all must have the same")
 
 
-def machines(client: Any) -> str:
-    """What the workers run on, as far as it differs."""
+def machines(client: Client) -> str:
+    """Describe the devices of the workers, with the number of workers of each."""
     devices = [lines[0] for lines in client.run(describe_devices).values()]
     return "; ".join(f"{devices.count(line)} workers of {line}" for line in dict.fromkeys(devices))
 
 
 class Submitter:
-    """A dask.distributed.Client with the little of an Executor that a sweep takes: its own futures know of every end there is."""
+    """The methods of an Executor that a sweep needs, for a dask.distributed.Client."""
 
-    def __init__(self, client: Any) -> None:
-        check_workers(client)
-        self.client, self.address = client, str(client.scheduler.address)
+    def __init__(self, client: object) -> None:
+        self.client = cast(Any, client)
+        check_workers(self.client)
+        self.address = str(self.client.scheduler.address)
 
-    def submit(self, function: Any, *arguments: Any) -> Any:
+    def submit(self, function: Callable[..., object], *arguments: object) -> ReplyFuture:
         with self.guarded():
             return self.client.submit(function, *arguments, pure=False)
 
-    def cancel(self, futures: Iterable[Any]) -> None:
+    def cancel(self, futures: Iterable[ReplyFuture]) -> None:
         if self.client.status == "running":
-            with suppress(Exception):  # it may be lost meanwhile, and then there is nothing to cancel
+            with suppress(Exception):  # the connection may be lost, and the futures with it
                 self.client.cancel(list(futures))
 
     @contextmanager
     def guarded(self) -> Iterator[None]:
-        """A connection that breaks shows in errors of many kinds: all of them are `lost`."""
+        """Raise `lost` in place of the errors of many types that a broken connection causes."""
         try:
             yield
         except Exception as error:
@@ -115,7 +121,7 @@ class Submitter:
             raise
 
     def is_broken(self, error: Exception) -> bool:
-        """Whether this error came of a broken connection."""
+        """Return True if the error comes from a broken connection."""
         return isinstance(error, OSError | CancelledError) or self.client.status != "running"
 
     def lost(self) -> InputError:
@@ -125,14 +131,14 @@ class Submitter:
 class ClusterWorkers(ExecutorWorkers):
     """The workers of a dask.distributed.Client."""
 
-    def __init__(self, client: Any, key: str, package: dict[str, Any]) -> None:
+    def __init__(self, client: object, key: str, package: Package) -> None:
         self.submitter = Submitter(client)
         super().__init__(self.submitter, key, package)
-        self.client, self.address = client, self.submitter.address
+        self.client, self.address = self.submitter.client, self.submitter.address
         self.scattered: Any = None
-        self.fetches: dict[Future[list[Any]], list[Any]] = {}  # replies that are on their way, and what they are the results of
+        self.fetches: dict[Future[list[Any]], list[ReplyFuture]] = {}  # replies under way, and their futures
         self.fetched: dict[str, Reply | None] = {}
-        self.anybody, self.ask_again = True, 0.0
+        self.has_workers, self.next_look = True, 0.0
         self.alone_since: float | None = None
 
     def slots(self) -> int:
@@ -143,7 +149,7 @@ class ClusterWorkers(ExecutorWorkers):
         return self.scattered
 
     def ready(self) -> bool:
-        """Whether there are workers, and the scene is where they are, if one asked for it."""
+        """Return True if there are workers, and the scene is scattered if one requested it."""
         if self.client.status not in ("running", "connecting"):
             raise self.submitter.lost()
         try:
@@ -159,24 +165,24 @@ class ClusterWorkers(ExecutorWorkers):
         return False
 
     def _is_sent(self) -> bool:
-        sent = not self.asked or (self.scattered is not None and self.scattered.status in ("pending", "finished"))
-        if not sent or time.monotonic() >= self.ask_again:
-            self.anybody, self.ask_again = bool(self.client.nthreads()), time.monotonic() + 1.0
-        if sent or not self.anybody:
-            return self.anybody
-        with suppress(TimeoutError):  # the last worker went away meanwhile
-            # A list of one: a dict by itself would be a dict of futures.
+        sent = not self.requests or (self.scattered is not None and self.scattered.status in ("pending", "finished"))
+        if not sent or time.monotonic() >= self.next_look:
+            self.has_workers, self.next_look = bool(self.client.nthreads()), time.monotonic() + 1.0
+        if sent or not self.has_workers:
+            return self.has_workers
+        with suppress(TimeoutError):  # the last worker has left
+            # A list of one: a dict alone would become a dict of futures.
             self.scattered = self.client.scatter([self.package], broadcast=True, hash=False)[0]
             return True
         return False
 
-    def cancel(self, futures: Iterable[Any]) -> None:
+    def cancel(self, futures: Iterable[ReplyFuture]) -> None:
         for fetch in self.fetches:
             fetch.cancel()
         self.fetches.clear()
         self.submitter.cancel(futures)
 
-    def finished(self, pending: Iterable[Any]) -> Iterable[Any]:
+    def finished(self, pending: Iterable[ReplyFuture]) -> Iterable[ReplyFuture]:
         from distributed import wait
 
         coming = {future.key for futures in self.fetches.values() for future in futures}
@@ -197,21 +203,21 @@ class ClusterWorkers(ExecutorWorkers):
             futures = self.fetches.pop(fetch)
             with self.submitter.guarded(), suppress(TimeoutError, CancelledError):
                 replies = fetch.result()
-                if len(replies) == len(futures):  # else a worker died before it gave its own away
+                if len(replies) == len(futures):  # otherwise a worker died before it sent its replies
                     self.fetched |= {future.key: reply for future, reply in zip(futures, replies, strict=True)}
             done += futures
         return done
 
     async def _fetch(self, futures: list[Any]) -> list[Any]:
-        """Replies, all in one call, which a worker that hangs makes a long one."""
+        """Return the replies of several futures in one call, within RESULT_SECONDS."""
         return await asyncio.wait_for(self.client.gather(futures, errors="skip", asynchronous=True), RESULT_SECONDS)
 
-    def result(self, future: Any) -> Reply | None:
+    def result(self, future: ReplyFuture) -> Reply | None:
         from distributed import KilledWorker
 
         if future.key in self.fetched:
             reply = self.fetched.pop(future.key)
-            self.asked += reply is None
+            self.requests += reply is None
             return reply
         try:
             if future.status == "error":
@@ -220,4 +226,4 @@ class ClusterWorkers(ExecutorWorkers):
             raise InputError(f"tiles kill their workers, one after another: {error}", path=self.address) from error
         except (CancelledError, TimeoutError):
             pass
-        return None  # what it needed, or made, died with its worker
+        return None  # its input, or its result, died with its worker

@@ -1,6 +1,6 @@
-"""What of this installation can change a bit of a result: wrt's own code, host side and kernels, and what it is run by.
+"""All of this installation that can change a bit of a result: the code of wrt, and the versions of Python, NumPy and Warp.
 
-Machines that share work are compared by it. A version says too little: two checkouts of one version can differ in any line.
+Machines that share work must agree. The version of wrt does not suffice: two checkouts of one version can differ in any line.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ import warp as wp
 from wrt.core.version import VERSION
 
 CODE = (".py", ".h", ".cpp", ".cu")
-SHOWN = 3  # files that a message names
+SHOWN = 3  # files named in a message
 Installed = dict[str, dict[str, str]]
 
 
 def _files() -> dict[str, str]:
-    """A digest of each file of code, by its name in the package: kernels/ too, wherever it stands."""
+    """Return a digest of each file of code, by its name in the package, kernels/ included."""
     folders = [("", Path(__file__).parents[2]), *(("kernels/", Path(folder)) for folder in import_module("wrt.kernels").__path__)]
     digests = {before + path.relative_to(folder).as_posix(): sha256(path.read_bytes()).hexdigest()[:16]
                for before, folder in folders for path in folder.rglob("*") if path.suffix in CODE}
     return dict(sorted(digests.items()))
 
 
-# Read when wrt is asked for it first, and no more: files that are changed later are not what runs.
+# Read once, at import: files that change later are not the code that runs.
 INSTALLED: Installed = {
-    # Of Python, the minor version changes arithmetic (3.12: sum() of floats).
+    # A minor version of Python can change arithmetic (3.12: sum() of floats).
     "versions": {"wrt": VERSION, "Python": "{}.{}".format(*sys.version_info), "NumPy": np.__version__,
                  "Warp": wp.__version__},
     "files": _files(),
@@ -39,11 +39,11 @@ DIGEST = sha256(repr(INSTALLED).encode()).hexdigest()
 
 
 def difference(here: Installed, there: Installed) -> str:
-    """What is installed there and is not as here, in words; "" where all is the same."""
+    """Describe the differences of another installation; "" if there are none."""
     ours, theirs = here["versions"], there["versions"]
     differ = [f"{name} {theirs.get(name)} (here {version})" for name, version in ours.items() if theirs.get(name) != version]
     files = sorted(name for name in {**here["files"], **there["files"]} if here["files"].get(name) != there["files"].get(name))
-    if files and ours["wrt"] == theirs.get("wrt"):  # in another version, many are others
+    if files and ours["wrt"] == theirs.get("wrt"):  # another version has many other files
         more = f" and {len(files) - SHOWN} more" if len(files) > SHOWN else ""
         differ.append(f"other code of wrt {ours['wrt']} ({', '.join(files[:SHOWN])}{more})")
     return "; ".join(differ)

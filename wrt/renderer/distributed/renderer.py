@@ -1,5 +1,6 @@
-"""A render whose tiles others trace. The film stays here, and with it all that follows from it: passes, time limit, target
-error, checkpoints, pictures so far. So the pixels are those of a render by threads, bit for bit, whoever traces them."""
+"""Distributed renders: workers trace the tiles, and this process has the film, the passes, limits and checkpoints.
+
+The pixels have the bits of a render by threads."""
 
 from __future__ import annotations
 
@@ -20,17 +21,18 @@ from wrt.renderer.film_arrays import AovFilm, DeviceFilm
 from wrt.renderer.options import Options, Progress
 from wrt.renderer.plan import Plan, plan_of
 from wrt.renderer.prepare import PREPARING_REPORTED
+from wrt.renderer.result import Facts
 from wrt.renderer.schedule import STEP_SECONDS, Run, Steps
 from wrt.renderer.tiles import Rectangle, Work, tiles
 from wrt.renderer.upload import warn_left_out
 from wrt.scene.model import Scene
 
-TILES_EACH = 4  # of a pass, for each that traces: the last one to come must not be long
-SIDES = {"cpu": (32, 256), "cuda": (256, 1024)}  # pixels: smaller tiles are not worth sending, larger ones take long
+TILES_EACH = 4  # tiles of a pass for each slot, so that the last one is short
+SIDES = {"cpu": (32, 256), "cuda": (256, 1024)}  # limits of a side in pixels: smaller tiles are not worth a message, larger ones take long
 
 
 class DistributedRenderer:
-    """A scene made ready by workers, for options with `devices` or an `executor`; a Tracer for its own runs."""
+    """A scene prepared by workers, for options with `devices` or an `executor`; the Tracer of its own runs."""
 
     def __init__(self, scene: Scene, options: Options) -> None:
         self.device = start("cpu")  # of the film
@@ -43,12 +45,12 @@ class DistributedRenderer:
         self.checkpoint = checkpoint_of(self.plan, self.kind)
 
     def run(self) -> Film:
-        """Take all samples (or as many as time allows, or as the target error needs) and return the film."""
+        """Render until samples, time limit or target error end it."""
         self.tiles_by.clear()
         return Run(self, self.checkpoint).film()
 
     def _made_ready(self) -> tuple[str, dict[str, float], dict[str, Any]]:
-        """The kind of the workers' devices, and seconds and facts (Prepared.ready) of those who have the scene ready."""
+        """Return the kind of the workers' devices, and the seconds and facts (Prepared.ready) of their preparation."""
         begin, reported, replies = time.perf_counter(), self.plan.options.progress is None, []
         for done in self.workers.run([("ready",)] * self.workers.slots()):
             seconds = time.perf_counter() - begin
@@ -65,17 +67,17 @@ class DistributedRenderer:
 
     # --- a Tracer (wrt.renderer.schedule) ---
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Facts:
         return {**self.counts, "workers": dict(self.tiles_by)}
 
     def tiles(self, samples: int) -> Iterator[Rectangle]:
-        """Large ones, whatever `samples` is: a call to a worker costs more than a wave."""
+        """Yield large tiles for any number of samples: a call to a worker costs more than a wave."""
         low, high = SIDES["cuda" if self.plan.options.device.startswith("cuda") else "cpu"]
         side = math.ceil(math.sqrt(self.plan.area / (TILES_EACH * self.workers.slots())))
         return tiles(self.plan.crop, self.plan.options.tile_size or min(max(side, low), high))
 
     def trace(self, film: DeviceFilm | AovFilm, work: list[Work], due: Callable[[], bool]) -> Steps:
-        """No pixel of the film is ever half done: whole tiles are written to it, here. Closed early, it gives up tiles that run."""
+        """Trace, as Tracer defines. Whole tiles are written to the film here, so that no pixel is ever half done."""
         jobs: Iterable[Job]
         if isinstance(film, AovFilm):
             views = [film.view(name) for name in self.plan.options.aov]
@@ -89,7 +91,7 @@ class DistributedRenderer:
             for done in running:
                 if done is not None:
                     (_, part, *_), reply = done
-                    _check_kind(reply, self.kind)  # a worker may have come later
+                    _check_kind(reply, self.kind)  # a worker may have joined since
                     self.tiles_by[reply[0]] += 1
                     total += part.total
                     for view, array in zip(views, reply[2], strict=True):
@@ -119,7 +121,7 @@ def workers_for(plan: Plan) -> ExecutorWorkers:
 
 
 def _waited_for(replies: list[Reply], waited: float) -> dict[str, float]:
-    """The seconds of the worker that took longest; no more than was waited, as it may have been ready before."""
+    """Return the seconds of the slowest worker, limited to the wait, since it may have prepared the scene earlier."""
     seconds: dict[str, float] = max((reply[2]["seconds"] for reply in replies), key=lambda each: max(each.values()))
     return {name: min(value, waited) for name, value in seconds.items()}
 

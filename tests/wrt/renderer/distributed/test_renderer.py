@@ -153,7 +153,7 @@ def test_few_scenes_are_kept(threads: Executor) -> None:
     for color in (0.1, 0.2, 0.3):
         material = Material(albedo=(color, 0.5, 0.5))
         render(replace(SCENE, objects=(Object(box(), (material,)),)), executor=threads, spp=1)
-    assert len(workers._ready) == workers.KEPT_READY
+    assert len(workers._ready) == workers.CACHED
 
 
 # --- what belongs to a render ----------------------------------------------------------------------------------------
