@@ -1,4 +1,4 @@
-"""Scene files: TOML, glTF, or a bare mesh, each as a `Scene`."""
+"""Readers of scene files: TOML, glTF, or a mesh alone."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import re
 import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from wrt.core.checks import as_path, shown
 from wrt.core.errors import InputError, at, warn
 from wrt.core.files import read_file, require_file, utf8
 from wrt.core.packages import needed_by
+from wrt.core.types import JsonObject, PathLike
 from wrt.io.mesh_file import MESH_FORMATS, load_mesh
 from wrt.scene.defaults import stage
 from wrt.scene.materials import Material
@@ -22,12 +22,20 @@ from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene
 
 
-def load_scene(path: str | os.PathLike[str]) -> Scene:
-    """Read a scene: TOML (.toml), glTF 2.0 (.gltf, .glb), or one mesh (MESH_FORMATS) in light grey.
+def load_scene(path: PathLike) -> Scene:
+    """Read a scene file: TOML (.toml), glTF 2.0 (.gltf, .glb), or a mesh in light grey.
 
-    A scene without a camera gets one that frames it, one without any light gets lights; each such addition is named
-    in a SceneWarning. Raises InputError that names the file and the place; for TOML it lists all that is wrong at
-    once, each with its path in the file, its value and what was expected.
+    A scene without a camera gets one that frames it, and a scene without a light gets lights; a SceneWarning names them.
+
+    Parameters
+    ----------
+    path
+        The file. Its suffix tells the format: .toml, .gltf, .glb or one of wrt.MESH_FORMATS.
+
+    Raises
+    ------
+    InputError
+        With the file and the place in it. For TOML it lists all mistakes, each with its key, value and what was expected.
     """
     path = as_path(path, "path")
     known = ", ".join([*LOADERS, *MESH_FORMATS])
@@ -37,15 +45,12 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
     load = LOADERS.get(path.suffix.lower(), _load_bare_mesh if path.suffix.lower() in MESH_FORMATS else None)
     if load is None:
         raise InputError(f"is no scene file: known are {known}", path=path)
-    with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite is refused by whoever is to hold it
+    with np.errstate(over="ignore", invalid="ignore"):  # the scene refuses infinite values
         return load(path)
 
 
-def as_scene(value: Scene | Mesh | str | os.PathLike[str]) -> Scene:
-    """A scene as it is; of a path or a Mesh, the one that `load_scene` would make of the file, with the same warnings.
-
-    Raises InputError for anything else.
-    """
+def as_scene(value: Scene | Mesh | PathLike) -> Scene:
+    """Return a scene unchanged, or the scene of a path or a Mesh with the warnings of `load_scene`. Raises InputError for others."""
     if isinstance(value, Scene):
         return value
     if isinstance(value, Mesh):
@@ -55,8 +60,8 @@ def as_scene(value: Scene | Mesh | str | os.PathLike[str]) -> Scene:
     raise InputError(f"must be a Scene, a Mesh, or the path of a scene or mesh file, got {shown(value)}", argument="scene")
 
 
-def schema() -> dict[str, Any]:
-    """The JSON Schema (draft 2020-12) of TOML scene files."""
+def schema() -> JsonObject:
+    """Return the JSON Schema (draft 2020-12) of TOML scene files."""
     with needed_by("the schema of TOML scenes"):
         from wrt.io.toml.schema import scene_table
 
@@ -83,8 +88,8 @@ def _load_bare_mesh(path: Path) -> Scene:
     return _bare(load_mesh(path), path.stem, path)
 
 
-def _bare(mesh: Mesh, name: str, path: str | os.PathLike[str]) -> Scene:
-    """A mesh alone, in light grey."""
+def _bare(mesh: Mesh, name: str, path: PathLike) -> Scene:
+    """Return the scene of a mesh alone, in light grey."""
     grey = Material(name="light grey", albedo=(0.75, 0.75, 0.75))
     unread = " (.mtl files are not read)" if os.fspath(path).lower().endswith(".obj") else ""
     parts = f"its {len(mesh.groups)} parts are all light grey{unread}: a TOML scene can give each a material"
@@ -95,7 +100,7 @@ def _bare(mesh: Mesh, name: str, path: str | os.PathLike[str]) -> Scene:
 LOADERS: dict[str, Callable[[Path], Scene]] = {".toml": _load_toml, ".gltf": _load_gltf, ".glb": _load_gltf}
 
 
-def _parse(path: Path) -> dict[str, Any]:
+def _parse(path: Path) -> JsonObject:
     try:
         data = tomllib.loads(utf8(read_file(path)).decode())
         _require_sound(data)
@@ -115,16 +120,16 @@ def _parse(path: Path) -> dict[str, Any]:
         raise InputError("holds a number of thousands of digits", path=path) from error
 
 
-def _require_sound(value: Any) -> None:
-    """Raise InputError for an integer of more than 64 bits, as TOML demands (others cannot deal with thousands of digits)."""
+def _require_sound(value: object) -> None:
+    """Raise InputError for an integer of more than 64 bits, which TOML forbids."""
     for each in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
         _require_sound(each)
     if isinstance(value, int) and not -(1 << 63) <= value < 1 << 63:
         raise InputError("holds an integer of more than 64 bits")
 
 
-def _staged(scene: Scene, path: str | os.PathLike[str], notes: Sequence[str] = ()) -> Scene:
-    """The scene with a camera and light where it lacks them; what was added is told, after `notes`."""
+def _staged(scene: Scene, path: PathLike, notes: Sequence[str] = ()) -> Scene:
+    """Add a camera and lights to a scene without them, and warn with `notes` and the additions."""
     with at(path=path):
         scene, added = stage(scene)
     if notes or added:

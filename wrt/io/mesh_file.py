@@ -1,4 +1,4 @@
-"""Mesh files become a `Mesh`; MESH_FORMATS says by their suffix who reads them."""
+"""Reading of mesh files as a `Mesh`, with a reader for each suffix in MESH_FORMATS."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from wrt.core.checks import as_path, short, shown
 from wrt.core.errors import InputError, at, warn
 from wrt.core.files import require_file
 from wrt.core.registry import Registry
+from wrt.core.types import PathLike
 from wrt.io.meshes import PLACES
 from wrt.scene.clean import clean
 from wrt.scene.mesh import Mesh, unit_rows
@@ -20,10 +21,7 @@ from wrt.scene.mesh import Mesh, unit_rows
 
 @dataclass(frozen=True, eq=False)
 class RawMesh:
-    """What a file holds, triangulated and with every index in range, but not yet cleaned.
-
-    The arrays are those of `Mesh`; incomplete: faces with fewer than three corners; positions: how many the file has.
-    """
+    """A file's arrays as in `Mesh`, triangulated and with every index in range, but not yet cleaned."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -31,8 +29,8 @@ class RawMesh:
     uvs: np.ndarray | None = None
     groups: tuple[str, ...] = ()
     face_group: np.ndarray | None = None
-    incomplete: int = 0
-    positions: int = 0
+    incomplete: int = 0  # faces with fewer than three corners
+    positions: int = 0  # in the file
 
 
 Reader = Callable[[Path], RawMesh]
@@ -40,24 +38,40 @@ MESH_FORMATS: Registry[Reader] = Registry("mesh format", PLACES)
 
 
 def register_mesh_format(suffix: str, read: Reader) -> None:
-    """Take files of that suffix (".off") for meshes, wherever one can be named. read raises InputError, without the path, for a
-    file that it cannot read; what it gives is checked and cleaned as every mesh is."""
+    """Make files with a suffix readable wherever a mesh can be named.
+
+    Parameters
+    ----------
+    suffix
+        Such as ".off", in small letters.
+    read
+        Returns a file's RawMesh, which is then checked and cleaned. Raises InputError, without the path, for a file it cannot read.
+    """
     if not suffix.startswith(".") or suffix != suffix.lower():
         raise InputError(f"must begin with a dot and be in small letters, got {shown(suffix)}", argument="suffix")
     MESH_FORMATS[suffix] = read
 
 
-def load_mesh(path: str | os.PathLike[str], parts: Sequence[tuple[int, int]] = ()) -> Mesh:
-    """Read a mesh file of one of MESH_FORMATS.
+def load_mesh(path: PathLike, parts: Sequence[tuple[int, int]] = ()) -> Mesh:
+    """Read a mesh file, with faces and vertices in the order of the file.
 
-    Nothing is merged or reordered: faces and vertices keep the order of the file, except that faces without area and
-    vertices without a face are dropped (`Mesh.dropped` counts the faces). Polygons become triangles. Normals and uvs
-    are those of the file, or None; normals are made unit length, v is flipped so that (0, 0) is the top left of a
-    picture. parts: ranges (first, count) of the file's triangles, counted before any is dropped; they become `groups`
-    "0", "1" ... in place of the file's own, the triangles in none of them the last group, "rest". Raises InputError
-    that names the file, and the place where it is known: a file that is missing, truncated or has no triangles, an
-    index out of range, a position that is NaN or infinite. Normals and uvs that are not finite are replaced by zero
-    with one SceneWarning.
+    Polygons become triangles. Faces without area and vertices without a face are dropped (`Mesh.dropped` counts the faces); nothing is
+    merged. Normals are made unit length, and v is flipped so that (0, 0) is the top left of a picture. Normals and uvs that are not
+    finite become zero, with one SceneWarning.
+
+    Parameters
+    ----------
+    path
+        A file with a suffix of wrt.MESH_FORMATS.
+    parts
+        Ranges (first, count) of the file's triangles before any is dropped. They become the groups "0", "1" ... in place of the
+        file's groups; the triangles outside of them become the last group, "rest".
+
+    Raises
+    ------
+    InputError
+        With the file and the place: a file that is missing, truncated or without triangles, an index out of range, a position that
+        is not finite.
     """
     path = as_path(path, "path")
     if path.suffix.lower() not in MESH_FORMATS:
@@ -85,15 +99,15 @@ def load_mesh(path: str | os.PathLike[str], parts: Sequence[tuple[int, int]] = (
     )
 
 
-def mesh_of(value: Mesh | str | os.PathLike[str]) -> Mesh:
-    """A Mesh as it is; the mesh of a file by its path (load_mesh). Raises InputError for anything else."""
+def mesh_of(value: Mesh | PathLike) -> Mesh:
+    """Return a Mesh unchanged, or the mesh of a file by its path. Raises InputError for others."""
     if not isinstance(value, Mesh | str | os.PathLike):
         raise InputError(f"must be a Mesh or the path of a mesh file, got {shown(value)}", argument="mesh")
     return value if isinstance(value, Mesh) else load_mesh(value)
 
 
-def as_mesh(value: Mesh | str | os.PathLike[str]) -> Mesh:
-    """As mesh_of. Raises InputError where there are no triangles, too."""
+def as_mesh(value: Mesh | PathLike) -> Mesh:
+    """Return mesh_of(value). Raises InputError for a mesh without triangles, too."""
     mesh = mesh_of(value)
     if not len(mesh.faces):
         raise InputError("there are no triangles to hit", path=None if isinstance(value, Mesh) else value)
@@ -111,7 +125,7 @@ def _part_groups(parts: Sequence[tuple[int, int]], faces: int) -> tuple[tuple[st
 
 
 def _finite(array: np.ndarray | None, attribute: str, path: Path) -> np.ndarray | None:
-    """The array as float32, with zeros in rows that are not finite: a bad normal must not cost the whole mesh."""
+    """Convert to float32 and set rows that are not finite to zero, so that a bad normal does not cost the whole mesh."""
     if array is None:
         return None
     with np.errstate(over="ignore"):

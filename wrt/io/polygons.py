@@ -1,4 +1,4 @@
-"""Polygons of mesh files become triangles: a fan where that is right, ear clipping where the polygon is concave."""
+"""Triangulation of the polygons of mesh files: a fan for convex polygons, ear clipping for concave ones."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ from wrt.core.packages import needed_by
 def triangulate(corners: np.ndarray, counts: np.ndarray, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Cut polygons into triangles, in the order of the polygons and with their winding.
 
-    corners: (C,) integers, the vertex indices of all polygons in a row; counts: (P,) corners of each polygon;
-    vertices: (V, 3) positions. Returns (T, 3) integers, indices into `corners`, and (T,), the polygon each triangle
-    is of. A polygon of n corners gives n - 2 triangles, one with fewer than three gives none. Convex polygons become
-    the fan about their first corner. A polygon is concave where a triangle of that fan faces against the polygon's
-    own area vector; it is projected along that vector and cut by ear clipping (mapbox-earcut). Self-intersecting
-    polygons have no right answer: they get triangles all the same.
+    corners: (C,) integers, the vertex indices of all polygons in sequence; counts: (P,) corners of each polygon; vertices: (V, 3).
+    Returns (T, 3) integers, indices into `corners`, and (T,), the polygon of each triangle. A polygon of n corners gives n - 2
+    triangles, or none for n < 3. Convex polygons become the fan about their first corner. A polygon is concave if a triangle of that
+    fan faces against the polygon's area vector; it is projected along that vector and cut by ear clipping (mapbox-earcut).
+    Self-intersecting polygons have no right answer, and get triangles all the same.
     """
     counts, corners = np.asarray(counts, dtype=np.int64), np.asarray(corners)
     fan = np.maximum(counts - 2, 0)
@@ -38,7 +37,7 @@ def triangulate(corners: np.ndarray, counts: np.ndarray, vertices: np.ndarray) -
 
 
 def strip(indices: np.ndarray) -> np.ndarray:
-    """(N,) -> (N - 2, 3): a triangle of each vertex and the two before it."""
+    """Return the triangles (N - 2, 3) of a strip: each vertex with the two before it."""
     i = np.arange(max(len(indices) - 2, 0), dtype=indices.dtype)
     odd = i & 1  # every second triangle swaps two corners, so that all face one way
     return indices[np.stack([i, i + 1 + odd, i + 2 - odd], axis=1)]
@@ -46,10 +45,9 @@ def strip(indices: np.ndarray) -> np.ndarray:
 
 def _areas(corners: np.ndarray, counts: np.ndarray, vertices: np.ndarray, triangles: np.ndarray,
            polygon: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The area vectors (P, 3) of the polygons of more than three corners (twice the area long), and the numbers of those that have
-    a triangle which faces against theirs."""
+    """Return the area vectors (P, 3) of polygons with over three corners, of twice the area's length, and the indices of concave ones."""
     area, against = np.zeros((len(counts), 3)), np.zeros(len(counts), dtype=bool)
-    large = counts > 3  # triangles need no second look
+    large = counts > 3  # triangles are convex
     size, several = counts[large] - 2, large[polygon]
     a, b, c = (vertices.take(corners.take(triangles[several, i]), axis=0) for i in range(3))
     with np.errstate(invalid="ignore", over="ignore"):
@@ -60,8 +58,9 @@ def _areas(corners: np.ndarray, counts: np.ndarray, vertices: np.ndarray, triang
 
 
 def _ears(outline: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """(n - 2, 3) indices into the (n, 3) outline of one polygon, seen along `normal`; a fan where it has fewer ears, as
-    self-intersecting ones have."""
+    """Return triangles (n - 2, 3) of one polygon's outline (n, 3), seen along `normal`; a fan if it has fewer ears.
+
+    Self-intersecting polygons have fewer."""
     with needed_by("a concave polygon"):
         from mapbox_earcut import triangulate_float64
 

@@ -1,4 +1,4 @@
-"""glTF accessors as NumPy arrays: typed, strided, sparse and normalised ones.
+"""glTF accessors as NumPy arrays: typed, strided, sparse and normalised.
 
 Source: Khronos, glTF 2.0 specification, section 3.6.2 (accessors), and KHR_mesh_quantization for integer positions.
 """
@@ -16,21 +16,21 @@ from wrt.io.gltf.document import Document
 _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _MAX_COUNT = 2**31 - 1
-_MAX_IMPLICIT_COUNT = 2**22  # zeros that no buffer stands behind: a file of a few bytes must not ask for all memory
+_MAX_IMPLICIT_COUNT = 2**22  # of zeros without a buffer: a file of a few bytes must not ask for all memory
 
 
 class Accessors:
-    """Reads accessors of a document, each once; the arrays are shared, and read-only."""
+    """A reader of a document's accessors, each once. The arrays are shared and read-only."""
 
     def __init__(self, document: Document) -> None:
         self._document = document
         self._arrays: dict[int, np.ndarray] = {}
 
     def read(self, index: int, kind: str, place: str) -> np.ndarray:
-        """Accessor `index` as (count, width of `kind`), float32 or its own integer type where it is not normalised.
+        """Return accessor `index` as (count, width of `kind`): float32, or its own integer type if it is not normalised.
 
-        kind: "SCALAR", "VEC2", "VEC3" or "VEC4". Raises InputError at `place` where the accessor has another kind, does
-        not fit in its buffer view, or holds a float that is not finite.
+        kind: "SCALAR", "VEC2", "VEC3" or "VEC4". Raises InputError at `place` if the accessor has another kind, does not fit into its
+        buffer view, or holds a float that is not finite.
         """
         accessor = self._document.item("accessors", index, place)
         if accessor.type != kind:
@@ -48,7 +48,7 @@ class Accessors:
         width = _WIDTHS[accessor.type]
         if accessor.bufferView is not None:
             array = self._elements(accessor.bufferView, accessor.byteOffset or 0, dtype, (count, width), where)
-        else:  # zeros, says the specification
+        else:  # zeros, by the specification
             array = np.zeros((count, width), dtype)
         if accessor.sparse is not None:
             array = self._with_sparse(array, accessor.sparse, f"{where}.sparse")
@@ -64,7 +64,7 @@ class Accessors:
         return array
 
     def _elements(self, view: int, offset: int, dtype: np.dtype, shape: tuple[int, int], where: str) -> np.ndarray:
-        """`shape` elements from a buffer view, packed; they need not be aligned."""
+        """Return elements of a buffer view as a packed array of `shape`; they need not be aligned."""
         data, stride = self._document.view(view, f"{where}.bufferView")
         size = dtype.itemsize * shape[1]
         stride = stride or size
@@ -78,7 +78,7 @@ class Accessors:
         return elements.astype(dtype.newbyteorder("="))
 
     def _with_sparse(self, array: np.ndarray, sparse: Any, where: str) -> np.ndarray:
-        """`array` with the listed elements replaced."""
+        """Replace the listed elements of `array`."""
         if not 1 <= sparse.count <= len(array):
             raise InputError(f"must be 1 to {len(array)}, got {sparse.count}", place=f"{where}.count")
         index_type = _dtype(sparse.indices.componentType, f"{where}.indices")
@@ -102,7 +102,7 @@ def _dtype(component_type: int, where: str) -> np.dtype:
 
 
 def _normalised(array: np.ndarray, where: str) -> np.ndarray:
-    """Integers to [0, 1] or [-1, 1], float32; the specification's table, with the clamp of the most negative value."""
+    """Map integers to float32 in [0, 1] or [-1, 1] by the specification's table, which clamps the most negative value."""
     if array.dtype.kind == "f" or array.dtype.itemsize > 2:
         raise InputError("only 8- and 16-bit integers can be normalised", place=f"{where}.normalized")
     return np.maximum(array.astype(np.float32) / np.float32(np.iinfo(array.dtype).max), np.float32(-1.0))

@@ -1,4 +1,4 @@
-"""A glTF 2.0 file on disk: the container (.gltf, .glb), its JSON, its buffers and the files it refers to.
+"""A glTF 2.0 file: the container (.gltf, .glb), its JSON, its buffers and the files that it refers to.
 
 Source: Khronos, glTF 2.0 specification, sections 2 (concepts), 3.6 (buffers) and 4 (GLB).
 """
@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import base64
 import json
-import os
 import re
 import struct
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias, TypeVar
 from urllib.parse import unquote_to_bytes
 
 import numpy as np
@@ -21,8 +20,11 @@ from wrt.core.checks import listed, short
 from wrt.core.errors import InputError, at
 from wrt.core.files import read_file, utf8
 from wrt.core.packages import needed_by
+from wrt.core.types import JsonObject, PathLike
 from wrt.io.gltf.schema import read_as
 
+T = TypeVar("T")
+GltfObject: TypeAlias = Any  # a dataclass of pygltflib, which has no types
 GLB_MAGIC = b"glTF"
 _CHUNK_JSON, _CHUNK_BIN = 0x4E4F534A, 0x004E4942
 
@@ -31,14 +33,14 @@ SUPPORTED_EXTENSIONS = frozenset({
     "KHR_materials_transmission", "KHR_materials_volume", "KHR_materials_ior", "KHR_materials_emissive_strength",
     "KHR_materials_unlit", "EXT_texture_webp", "EXT_texture_avif",
 })
-# They describe the file, or what can be done with it, and change no pixel.
+# These describe the file or its use and change no pixel.
 METADATA_EXTENSIONS = frozenset({
     "KHR_xmp", "KHR_xmp_json_ld", "KHR_animation_pointer", "KHR_interactivity", "KHR_node_selectability",
     "KHR_node_hoverability", "KHR_audio_emitter", "EXT_structural_metadata", "EXT_mesh_features",
     "EXT_instance_features", "AGI_articulations", "AGI_stk_metadata", "FB_geometry_metadata", "MSFT_audio_emitter",
     "MSFT_lod",
 })
-DEFAULT_LOOK = frozenset({"KHR_materials_variants"})  # a choice between looks, of which wrt shows the default
+DEFAULT_LOOK = frozenset({"KHR_materials_variants"})  # wrt shows the default look
 _CODECS = frozenset({
     "KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression", "KHR_texture_basisu",
     "MSFT_texture_dds",
@@ -46,16 +48,16 @@ _CODECS = frozenset({
 
 
 class LeftOut:
-    """What a file holds and the picture does not show, each thing once with the places where it stands."""
+    """Features of a file that the picture leaves out, each with its places."""
 
     def __init__(self) -> None:
         self._places: dict[str, dict[str, dict[str, None]]] = {}
 
     def add(self, feature: str, kind: str, name: str) -> None:
-        """Note `feature` at the thing `name` of the kind `kind` ("material", "node", ...)."""
+        """Note `feature` at `name`, which is of the kind `kind` ("material", "node", ...)."""
         self._places.setdefault(feature, {}).setdefault(kind, {})[name] = None
 
-    def add_extensions(self, extensions: dict[str, Any] | None, kind: str, name: str) -> None:
+    def add_extensions(self, extensions: JsonObject | None, kind: str, name: str) -> None:
         """Note each extension that wrt does not read and that could change the picture."""
         for extension in extensions or ():
             if extension not in SUPPORTED_EXTENSIONS and extension not in METADATA_EXTENSIONS:
@@ -65,7 +67,7 @@ class LeftOut:
         return feature in self._places
 
     def sentence(self) -> str:
-        """All of it on one line, or ""; long lists of names are cut."""
+        """Return all features in one line, or ""; long lists of names are cut."""
         return ", ".join(f"{feature} ({self._where(kinds)})" for feature, kinds in self._places.items())
 
     @staticmethod
@@ -78,12 +80,12 @@ class LeftOut:
 
 
 class Document:
-    """The typed JSON of one file (`gltf`, a pygltflib.GLTF2) and the bytes it refers to.
+    """The typed JSON of a file (`gltf`, a pygltflib.GLTF2) and the bytes that it refers to.
 
-    Errors are InputErrors that name the place in the JSON; the caller adds the file.
+    An InputError has the place in the JSON; the caller adds the file.
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: PathLike) -> None:
         with needed_by("a glTF file"):
             import pygltflib
 
@@ -97,20 +99,20 @@ class Document:
         self.left_out = LeftOut()
         self._buffers: dict[int, np.ndarray] = {}
 
-    def item(self, array: str, index: int, place: str) -> Any:
-        """`gltf.<array>[index]`; raises InputError at `place` where there is none."""
+    def item(self, array: str, index: int, place: str) -> GltfObject:
+        """Return `gltf.<array>[index]`. Raises InputError at `place` if the index is out of range."""
         items = getattr(self.gltf, array)
         if not 0 <= index < len(items):
             raise InputError(f"is {index}, but there are {len(items)} {array}", place=place)
         return items[index]
 
-    def extension(self, holder: Any, name: str, cls: Any, place: str) -> Any:
-        """The extension `name` of a glTF object as an instance of `cls`, or None where the object has none."""
+    def extension(self, holder: GltfObject, name: str, cls: type[T], place: str) -> T | None:
+        """Return the extension `name` of a glTF object as an instance of `cls`, or None."""
         raw = (holder.extensions or {}).get(name)
         return None if raw is None else read_as(cls, raw, f"{place}.extensions.{name}".removeprefix("."))
 
     def view(self, index: int, place: str) -> tuple[np.ndarray, int | None]:
-        """The bytes of a buffer view (N,) uint8, and its stride."""
+        """Return the bytes of a buffer view (N,) uint8, and its stride."""
         view = self.item("bufferViews", index, place)
         where = f"bufferViews[{index}]"
         data = self._buffer(view.buffer, f"{where}.buffer")
@@ -139,7 +141,7 @@ class Document:
         return self._buffers[index]
 
     def resource(self, uri: str, place: str) -> bytes:
-        """The bytes behind a data: URI or a relative path; nothing outside of the glTF file's folder is read."""
+        """Return the bytes of a data: URI or of a file by its relative path, in the folder of the glTF file or below."""
         if uri[:5].lower() == "data:":
             with at(place):
                 return _decode_data_uri(uri)
@@ -150,8 +152,8 @@ class Document:
             raise InputError(f"cannot read {short(name)}: {str(error).removeprefix('cannot be read: ')}", place=place) from None
 
 
-def _read_container(path: Path) -> tuple[Any, bytes | memoryview | None]:
-    """The parsed JSON and the binary chunk of a .gltf or .glb file; the first bytes tell which it is."""
+def _read_container(path: Path) -> tuple[object, bytes | memoryview | None]:
+    """Return the parsed JSON and the binary chunk of a .gltf or .glb file; the first bytes tell the format."""
     data = read_file(path)
     if data[:4] == GLB_MAGIC:
         return _read_glb(data)
@@ -160,7 +162,7 @@ def _read_container(path: Path) -> tuple[Any, bytes | memoryview | None]:
     return _parse_json(data), None
 
 
-def _read_glb(data: bytes) -> tuple[Any, bytes | memoryview | None]:
+def _read_glb(data: bytes) -> tuple[object, bytes | memoryview | None]:
     if len(data) < 20:
         raise InputError(f"is truncated: a .glb file starts with 20 bytes, this one has {len(data)}", place="header")
     version, length = struct.unpack_from("<II", data, 4)
@@ -176,7 +178,7 @@ def _read_glb(data: bytes) -> tuple[Any, bytes | memoryview | None]:
         if offset + 8 + size > length:
             raise InputError(f"is truncated: it ends at byte {offset + 8 + size}, the file at {length}",
                              place=f"chunk {len(chunks)}")
-        if len(chunks) < 2:  # there are no others that mean anything
+        if len(chunks) < 2:  # others have no meaning
             chunks.append((kind, memoryview(data)[offset + 8:offset + 8 + size]))
         offset += 8 + size
     if not chunks or chunks[0][0] != _CHUNK_JSON:
@@ -185,7 +187,7 @@ def _read_glb(data: bytes) -> tuple[Any, bytes | memoryview | None]:
     return _parse_json(bytes(chunks[0][1])), binary
 
 
-def _parse_json(data: bytes) -> Any:
+def _parse_json(data: bytes) -> object:
     def refuse(constant: str) -> None:
         raise InputError(f"is not valid JSON: it holds {constant}")
 
@@ -201,7 +203,7 @@ def _parse_json(data: bytes) -> Any:
         raise InputError(f"is not valid JSON: {error}") from None
 
 
-def _check_version(raw: dict[str, Any]) -> None:
+def _check_version(raw: JsonObject) -> None:
     asset = raw.get("asset")
     if not isinstance(asset, dict) or not isinstance(asset.get("version"), str):
         raise InputError("must be a string such as '2.0'", place="asset.version")
@@ -232,7 +234,7 @@ def _decode_data_uri(uri: str) -> bytes:
 
 
 def _local_name(uri: str, place: str) -> str:
-    """The relative path that a URI stands for. A scene file is untrusted: it may name no path outside of its folder."""
+    """Return the relative path of a URI. Raises InputError for a path outside of the folder, because the file is untrusted."""
     try:
         name = unquote_to_bytes(uri).decode("utf-8").replace("\\", "/")
     except UnicodeError:

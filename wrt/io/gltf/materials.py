@@ -1,8 +1,7 @@
-"""glTF images, textures and materials as those of a wrt scene.
+"""Images, textures and materials of glTF files, converted to those of a wrt scene.
 
-Occlusion textures are left out on purpose: they hold baked ambient shadow, and a ray tracer finds its own. So are the
-thickness textures of KHR_materials_volume: a ray meets the far side itself. Back faces are not culled, whatever
-`doubleSided` says: a ray tracer that let rays through them would leak light. None of this is warned about.
+Three things are left out without a warning. Occlusion textures hold baked ambient shadow, which a ray tracer computes. A ray meets the
+far side of a volume itself, without thickness textures. Back faces are not culled in spite of `doubleSided`, because light would leak.
 Source: Khronos, glTF 2.0 specification, sections 3.8 (texture data) and 3.9 (materials), and each extension's own text.
 """
 
@@ -15,7 +14,7 @@ import numpy as np
 
 from wrt.core.checks import short
 from wrt.core.errors import InputError, at
-from wrt.io.gltf.document import Document
+from wrt.io.gltf.document import Document, GltfObject
 from wrt.io.gltf.schema import EmissiveStrength, Ior, TextureSource, TextureTransform, Transmission, Unlit, Volume, exactly
 from wrt.picture.decode import decode_rgba8
 from wrt.scene.materials import Material, Texture
@@ -23,10 +22,10 @@ from wrt.scene.values import BLACK, Color, as_number, as_vector
 
 _WRAPS = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 _NEAREST = 9728
-_DARKEST = 1e-6  # of an attenuation colour: 0 would need infinite absorption
+_DARKEST = 1e-6  # channel of an attenuation colour; 0 would need infinite absorption
 _ALPHA_MODES = {"OPAQUE": "opaque", "MASK": "mask", "BLEND": "blend"}
 
-# Values with which an extension that wrt does not read changes nothing: then it need not be named.
+# Values with which an extension that wrt does not read has no effect, so that no warning names it.
 _NEUTRAL: dict[str, dict[str, Any]] = {
     "KHR_materials_clearcoat": {"clearcoatFactor": 0},
     "KHR_materials_sheen": {"sheenColorFactor": [0, 0, 0]},
@@ -40,15 +39,15 @@ _NEUTRAL: dict[str, dict[str, Any]] = {
 
 
 class Textures:
-    """Makes textures; each image is decoded once, and equal settings on one image give the same Texture object."""
+    """A cache of textures: each image is decoded once, and equal settings of one image share a Texture."""
 
     def __init__(self, document: Document) -> None:
         self._document = document
         self._images: dict[int, np.ndarray] = {}
         self._textures: dict[tuple[Any, ...], Texture] = {}
 
-    def texture(self, info: Any, srgb: bool, material: str, place: str) -> Texture | None:
-        """The texture of a textureInfo, or None where there is none, it has no image, or it wants a second set of coordinates."""
+    def texture(self, info: GltfObject, srgb: bool, material: str, place: str) -> Texture | None:
+        """Return the texture of a textureInfo, or None for no textureInfo, no image, or a second set of coordinates."""
         if info is None:
             return None
         document = self._document
@@ -75,7 +74,7 @@ class Textures:
             self._textures[key] = Texture(self._image(source), srgb=srgb, wrap=wrap, uv_transform=matrix, name=name)
         return self._textures[key]
 
-    def _wrap(self, texture: Any, material: str, place: str) -> tuple[str, str]:
+    def _wrap(self, texture: GltfObject, material: str, place: str) -> tuple[str, str]:
         if texture.sampler is None:
             return ("repeat", "repeat")
         sampler = self._document.item("samplers", texture.sampler, f"{place}.sampler")
@@ -87,8 +86,8 @@ class Textures:
                                  place=f"samplers[{texture.sampler}].{axis}")
         return (_WRAPS[sampler.wrapS], _WRAPS[sampler.wrapT])
 
-    def _source(self, texture: Any, place: str) -> int | None:
-        """The image's index; the core's (PNG or JPEG) before the one of an extension; None where the texture has neither."""
+    def _source(self, texture: GltfObject, place: str) -> int | None:
+        """Return the index of the texture's PNG or JPEG image, else of the image in an extension, else None."""
         source = texture.source
         for name in ("EXT_texture_webp", "EXT_texture_avif"):
             if source is None:
@@ -115,10 +114,10 @@ class Textures:
 
 
 def _uv_transform(transform: TextureTransform, place: str) -> np.ndarray:
-    """(2, 3): offset, then rotation, then scale act on (u, v, 1) from the right.
+    """Return the (2, 3) matrix that scales, then rotates, then offsets (u, v, 1).
 
-    A positive rotation is counter-clockwise as the image is seen, with v downwards: the GLSL listing in the text of
-    KHR_texture_transform turns the other way, its prose, its example and the sample models turn this way.
+    A positive rotation is counter-clockwise in the image, with v downwards, as in the prose, the example and the sample models of
+    KHR_texture_transform. The GLSL listing in its text turns the other way.
     """
     offset_u, offset_v = exactly(transform.offset, 2, f"{place}.offset")
     scale_u, scale_v = exactly(transform.scale, 2, f"{place}.scale")
@@ -127,7 +126,7 @@ def _uv_transform(transform: TextureTransform, place: str) -> np.ndarray:
 
 
 class Materials:
-    """Makes materials; each index gives one Material object."""
+    """A cache of materials: each index gives one Material object."""
 
     def __init__(self, document: Document) -> None:
         self._document = document
@@ -135,7 +134,7 @@ class Materials:
         self._materials: dict[int | None, Material] = {}
 
     def material(self, index: int | None, place: str) -> Material:
-        """The material `index`, or the specification's default one (white, metallic, rough) for None."""
+        """Return the material `index`, or for None the specification's default: white, metallic, rough."""
         if index not in self._materials:
             if index is None:
                 self._materials[None] = Material(kind="metallic_roughness", name="default", albedo=(1.0, 1.0, 1.0),
@@ -145,7 +144,7 @@ class Materials:
                 self._materials[index] = self._make(source, source.name or f"material {index}", f"materials[{index}]")
         return self._materials[index]
 
-    def _make(self, source: Any, name: str, place: str) -> Material:
+    def _make(self, source: GltfObject, name: str, place: str) -> Material:
         import pygltflib
 
         self._name_unread_extensions(source, name)
@@ -160,21 +159,21 @@ class Materials:
         with at(place):
             return Material(**fields)
 
-    def _name_unread_extensions(self, source: Any, name: str) -> None:
+    def _name_unread_extensions(self, source: GltfObject, name: str) -> None:
         for extension, raw in (source.extensions or {}).items():
             neutral = _NEUTRAL.get(extension) if isinstance(raw, dict) else None
             if neutral is None or any(raw.get(key, value) != value for key, value in neutral.items()):
                 self._document.left_out.add_extensions({extension: raw}, "material", name)
 
-    def _base(self, source: Any, name: str, place: str) -> dict[str, Any]:
-        """Name, base colour, alpha and sides: what unlit materials have as well."""
+    def _base(self, source: GltfObject, name: str, place: str) -> dict[str, Any]:
+        """Return the fields that unlit materials have, too: name, base colour, alpha and sides."""
         pbr = source.pbrMetallicRoughness
         factor = exactly(pbr.baseColorFactor, 4, f"{place}.pbrMetallicRoughness.baseColorFactor")
         if source.alphaMode not in _ALPHA_MODES:
             raise InputError(f"must be one of {', '.join(_ALPHA_MODES)}, got {short(source.alphaMode)}",
                              place=f"{place}.alphaMode")
         alpha, cutoff = factor[3], 0.5 if source.alphaCutoff is None else source.alphaCutoff
-        if cutoff > 1.0:  # allowed, and means that nothing of it is seen
+        if cutoff > 1.0:  # allowed; then nothing of it is visible
             alpha, cutoff = 0.0, 1.0
         return {
             "name": name, "albedo": tuple(factor[:3]), "alpha": alpha, "alpha_mode": _ALPHA_MODES[source.alphaMode],
@@ -183,7 +182,7 @@ class Materials:
                                                      f"{place}.pbrMetallicRoughness.baseColorTexture"),
         }
 
-    def _reflection(self, source: Any, name: str, place: str) -> dict[str, Any]:
+    def _reflection(self, source: GltfObject, name: str, place: str) -> dict[str, Any]:
         pbr = source.pbrMetallicRoughness
         fields: dict[str, Any] = {"metallic": pbr.metallicFactor, "roughness": pbr.roughnessFactor}
         fields["metallic_roughness_texture"] = self._textures.texture(
@@ -198,8 +197,8 @@ class Materials:
                 fields["ior"] = ior.ior
         return fields
 
-    def _transmission(self, source: Any, name: str, place: str) -> dict[str, Any]:
-        """Glass: a thin pane unless a volume of some thickness is declared."""
+    def _transmission(self, source: GltfObject, name: str, place: str) -> dict[str, Any]:
+        """Return the fields of glass: a thin pane unless there is a volume with a thickness."""
         transmission = self._document.extension(source, "KHR_materials_transmission", Transmission, place)
         if transmission is None or transmission.transmissionFactor == 0.0:
             return {}
@@ -213,7 +212,7 @@ class Materials:
                 fields |= {"thin": False, "absorption": absorption(volume)}
         return fields
 
-    def _emission(self, source: Any, name: str, place: str) -> dict[str, Any]:
+    def _emission(self, source: GltfObject, name: str, place: str) -> dict[str, Any]:
         factor = exactly(source.emissiveFactor, 3, f"{place}.emissiveFactor")
         strength = self._document.extension(source, "KHR_materials_emissive_strength", EmissiveStrength, place)
         emission = tuple(value * (strength.emissiveStrength if strength else 1.0) for value in factor)
@@ -238,7 +237,7 @@ def absorption(volume: Volume) -> Color:
 
 
 def _unlit(fields: dict[str, Any]) -> dict[str, Any]:
-    """A surface that shows its base colour whatever the light: emission that lights nothing else."""
+    """Return the fields of a surface that emits its base colour and lights nothing."""
     base, texture = fields["albedo"], fields["albedo_texture"]
     return fields | {
         "kind": "diffuse", "albedo": BLACK, "emission": base, "emission_texture": texture, "two_sided": True,

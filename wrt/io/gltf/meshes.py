@@ -6,13 +6,12 @@ Source: Khronos, glTF 2.0 specification, section 3.7; EXT_mesh_gpu_instancing, K
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
 from wrt.core.errors import InputError, at
 from wrt.io.gltf.accessors import Accessors
-from wrt.io.gltf.document import Document
+from wrt.io.gltf.document import Document, GltfObject
 from wrt.io.gltf.nodes import compose
 from wrt.io.gltf.schema import Instancing
 from wrt.io.polygons import strip
@@ -20,10 +19,10 @@ from wrt.scene.clean import clean
 from wrt.scene.mesh import Mesh, unit_rows
 from wrt.scene.values import require_count
 
-# Attributes that are read, or named by who wants them (skins, textures), or are the application's own (underscore).
-# TANGENT is named where a normal map would use it: tangents are made from the texture coordinates.
+# Attributes that wrt reads, that other warnings name (skins, textures), or that belong to an application (underscore). A warning names
+# TANGENT if there is a normal map: wrt makes tangents from texture coordinates.
 _NAMED_ELSEWHERE = ("POSITION", "NORMAL", "TANGENT", "TEXCOORD_", "JOINTS_", "WEIGHTS_", "_")
-# What a node's instances may set, and what holds where they do not.
+# Attributes of a node's instances, with their defaults.
 _INSTANCE_ATTRIBUTES: dict[str, tuple[str, tuple[float, ...]]] = {
     "TRANSLATION": ("VEC3", (0.0, 0.0, 0.0)),
     "ROTATION": ("VEC4", (0.0, 0.0, 0.0, 1.0)),
@@ -45,16 +44,16 @@ _NOT_TRIANGLES = {0: "points", 1: "lines", 2: "lines", 3: "lines"}
 
 
 class Meshes:
-    """Makes meshes; primitives with the same accessors and mode share one Mesh object."""
+    """A cache of meshes: primitives with the same accessors and mode share a Mesh."""
 
     def __init__(self, document: Document) -> None:
         self._document = document
         self._accessors = Accessors(document)
-        self._meshes: dict[tuple[Any, ...], Mesh | None] = {}
+        self._meshes: dict[tuple[object, ...], Mesh | None] = {}
         self._instances = 0
 
-    def mesh(self, primitive: Any, name: str, place: str) -> Mesh | None:
-        """The mesh of a primitive, or None where it holds no triangle with an area."""
+    def mesh(self, primitive: GltfObject, name: str, place: str) -> Mesh | None:
+        """Return the mesh of a primitive, or None if no triangle has an area."""
         left_out, attributes = self._document.left_out, primitive.attributes
         if primitive.mode not in TRIANGULATE and primitive.mode not in _NOT_TRIANGLES:
             raise InputError(f"must be 0 to 6, got {primitive.mode}", place=f"{place}.mode")
@@ -73,7 +72,7 @@ class Meshes:
             left_out.add("primitives without a triangle that has an area", "mesh", name)
         return self._meshes[key]
 
-    def _make(self, primitive: Any, name: str, place: str) -> Mesh | None:
+    def _make(self, primitive: GltfObject, name: str, place: str) -> Mesh | None:
         positions = self._attribute(primitive, "POSITION", "VEC3", place)
         normals = self._attribute(primitive, "NORMAL", "VEC3", place)
         uvs = self._attribute(primitive, "TEXCOORD_0", "VEC2", place)
@@ -89,16 +88,16 @@ class Meshes:
             cleaned = clean(positions, TRIANGULATE[primitive.mode](indices), normals, uvs)
             if not len(cleaned.faces):
                 return None
-            normals = None if cleaned.normals is None else unit_rows(cleaned.normals)  # quantised ones are off by a percent
+            normals = None if cleaned.normals is None else unit_rows(cleaned.normals)  # quantised normals are off by a percent
             return Mesh(cleaned.vertices, cleaned.faces, normals, cleaned.uvs, dropped=cleaned.dropped, name=name)
 
-    def _attribute(self, primitive: Any, attribute: str, kind: str, place: str) -> np.ndarray | None:
+    def _attribute(self, primitive: GltfObject, attribute: str, kind: str, place: str) -> np.ndarray | None:
         index = primitive.attributes.get(attribute)
         if index is None:
             return None
         return self._accessors.read(index, kind, f"{place}.attributes.{attribute}").astype(np.float32, copy=False)
 
-    def _indices(self, primitive: Any, count: int, place: str) -> np.ndarray:
+    def _indices(self, primitive: GltfObject, count: int, place: str) -> np.ndarray:
         if primitive.indices is None:
             return np.arange(count, dtype=np.int32)
         where = f"{place}.indices"
@@ -110,8 +109,8 @@ class Meshes:
             raise InputError(f"index {i} is {int(indices[i])}, but there are {count} vertices", place=where)
         return indices.astype(np.int32)  # accessors end at 2^31 - 1
 
-    def instances(self, node: Any, place: str) -> np.ndarray | None:
-        """(N, 4, 4) transforms of a node's instances, relative to the node, or None where it has just itself."""
+    def instances(self, node: GltfObject, place: str) -> np.ndarray | None:
+        """Return transforms (N, 4, 4) of a node's instances relative to the node, or None without instances."""
         instancing = self._document.extension(node, "EXT_mesh_gpu_instancing", Instancing, place)
         if instancing is None:
             return None

@@ -1,22 +1,21 @@
-"""The node graph of a glTF file, and where its nodes stand. Source: Khronos, glTF 2.0 specification, section 3.5."""
+"""The node graph of a glTF file, and the transforms of its nodes. Source: Khronos, glTF 2.0 specification, section 3.5."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
 from wrt.core.errors import InputError, at
-from wrt.io.gltf.document import Document
+from wrt.io.gltf.document import Document, GltfObject
 from wrt.io.gltf.schema import exactly
 from wrt.scene.values import as_transform
 
 
-def walk(document: Document) -> Iterator[tuple[int, Any, np.ndarray]]:
-    """Each node of the default scene as (index, node, world matrix (4, 4) float64), parents before children.
+def walk(document: Document) -> Iterator[tuple[int, GltfObject, np.ndarray]]:
+    """Yield index, node and matrix to world space (4, 4) float64 of each node of the default scene, parents before children.
 
-    Raises InputError for a node with two parents or that is its own ancestor, anywhere in the file.
+    Raises InputError if any node of the file has two parents or is its own ancestor.
     """
     _check_forest(document)
     stack = [(index, place, np.eye(4)) for index, place in reversed(_roots(document))]
@@ -27,7 +26,7 @@ def walk(document: Document) -> Iterator[tuple[int, Any, np.ndarray]]:
         if index in seen:
             raise InputError(f"nodes[{index}] is in the scene twice", place=place)
         seen.add(index)
-        with np.errstate(over="ignore", invalid="ignore"):  # what overflows is reported by whatever stands there
+        with np.errstate(over="ignore", invalid="ignore"):  # the objects of the node report an overflow
             world = parent @ local_matrix(node, f"nodes[{index}]")
         yield index, node, world
         children = [(child, f"nodes[{index}].children[{i}]", world) for i, child in enumerate(node.children)]
@@ -55,7 +54,7 @@ def _check_forest(document: Document) -> None:
             if child in parent:
                 raise InputError(f"nodes[{child}] has two parents, the first is nodes[{parent[child]}]", place=place)
             parent[child] = index
-    # With one parent each, whatever cannot be reached from a root is on a cycle or hangs from one.
+    # Nodes with one parent each that no root reaches are on a cycle or below one.
     reached = [index for index in range(len(nodes)) if index not in parent]
     for index in reached:
         reached += nodes[index].children
@@ -64,8 +63,8 @@ def _check_forest(document: Document) -> None:
         raise InputError("the node graph has a cycle", place=f"nodes[{first}]")
 
 
-def local_matrix(node: Any, place: str) -> np.ndarray:
-    """A node's own transform (4, 4) float64: its matrix, or translation * rotation * scale."""
+def local_matrix(node: GltfObject, place: str) -> np.ndarray:
+    """Return a node's own transform (4, 4) float64: its matrix, or translation * rotation * scale."""
     if node.matrix is not None:
         with at(f"{place}.matrix"):
             return as_transform(np.array(exactly(node.matrix, 16, "")).reshape(4, 4).T, "it")
@@ -78,11 +77,11 @@ def local_matrix(node: Any, place: str) -> np.ndarray:
 
 
 def compose(translation: np.ndarray, rotation: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """(N, 4, 4) matrices translation * rotation * scale from (N, 3), (N, 4) and (N, 3).
+    """Return matrices (N, 4, 4) translation * rotation * scale from (N, 3), (N, 4) and (N, 3).
 
     The rotations are quaternions x, y, z, w of any length but 0.
     """
-    rotation = rotation / np.abs(rotation).max(axis=1, keepdims=True)  # the square of the length must not vanish
+    rotation = rotation / np.abs(rotation).max(axis=1, keepdims=True)  # the square of the length must not underflow
     x, y, z, w = (rotation / np.linalg.norm(rotation, axis=1, keepdims=True)).T
     columns = [
         [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + z * w), 2.0 * (x * z - y * w)],

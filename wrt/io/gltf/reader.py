@@ -1,9 +1,8 @@
 """glTF 2.0 files (.gltf, .glb) as wrt scenes: the node graph, meshes, instances, cameras and lights.
 
-Positions, cameras and lights are in the file's own units; light intensities (candela, lux) are taken as radiometric
-ones, one for one, as most renderers do. A camera's aspect ratio and clipping planes do not count: the picture's size
-and the rays decide. Skinned and animated things stand in their rest pose. Where the file names no default scene, its
-first is shown, and where it has no scenes at all, every root node.
+Positions, cameras and lights keep the file's units. Light intensities (candela, lux) count as radiometric ones, as in most renderers. A
+camera's aspect ratio and clipping planes are ignored. Skinned and animated objects have their rest pose. Without a default scene the
+first one is read, and without scenes every root node.
 Source: Khronos, glTF 2.0 specification, section 3; KHR_lights_punctual, EXT_mesh_gpu_instancing, KHR_mesh_quantization.
 """
 
@@ -12,13 +11,13 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
 from wrt.core.checks import short
 from wrt.core.errors import InputError, at, warn
-from wrt.io.gltf.document import Document
+from wrt.core.types import PathLike
+from wrt.io.gltf.document import Document, GltfObject
 from wrt.io.gltf.materials import Materials
 from wrt.io.gltf.meshes import Meshes
 from wrt.io.gltf.nodes import walk
@@ -33,14 +32,12 @@ from wrt.scene.settings import Settings
 from wrt.scene.values import require_count
 
 
-def load_gltf(path: str | os.PathLike[str], *, staged: bool = True) -> Scene:
-    """Read a glTF 2.0 file.
+def load_gltf(path: PathLike, *, staged: bool = True) -> Scene:
+    """Read a glTF 2.0 file. Meshes, materials and textures that it shares are shared objects in the scene.
 
-    Meshes, materials and textures that the file shares are shared objects in the scene. staged: a file without a camera
-    or light gets one (see `wrt.scene.defaults`), and one without triangles is refused; False: the scene is as in the file, as
-    another file includes it. Everything that is left out or added is named in one SceneWarning.
-    The scene's settings are the defaults, but for glass_shadows = "tinted" where the file has solid glass (KHR_materials_volume).
-    Raises InputError that names the file and the place in its JSON.
+    staged: add a camera or lights to a file without them (wrt.scene.defaults), and refuse a file without triangles; False: for a file
+    that another one includes. One SceneWarning names everything left out or added. Settings are the defaults, but glass_shadows is
+    "tinted" if the file has solid glass (KHR_materials_volume). Raises InputError with the file and the place in its JSON.
     """
     with at(path=path):
         document = Document(path)
@@ -80,7 +77,7 @@ class _Reader:
     def __post_init__(self) -> None:
         self._meshes = Meshes(self.document)
         self._materials = Materials(self.document)
-        self._parts: dict[int, list[tuple[Mesh, Material]]] = {}  # of each mesh
+        self._parts: dict[int, list[tuple[Mesh, Material]]] = {}  # by the mesh's index
         lights = self.document.extension(self.document.gltf, "KHR_lights_punctual", PunctualLights, "")
         self._punctual = lights.lights if lights else []
 
@@ -100,11 +97,11 @@ class _Reader:
             if extension not in left_out:
                 left_out.add_extensions({extension: raw}, "file", document.path.name)
         scene = Scene(tuple(self.objects), (), tuple(self.lights), tuple(self.cameras), name=document.path.stem)
-        # Other viewers light what stands in glass, and so do shadow rays that go through it.
+        # Other viewers light objects inside of glass; shadow rays that pass through it do, too.
         solid_glass = any(material.transmission > 0.0 and not material.thin for material in scene.materials)
         return replace(scene, settings=Settings(glass_shadows="tinted" if solid_glass else "opaque"))
 
-    def _add_mesh(self, node: Any, world: np.ndarray, name: str, place: str) -> None:
+    def _add_mesh(self, node: GltfObject, world: np.ndarray, name: str, place: str) -> None:
         source = self.document.item("meshes", node.mesh, f"{place}.mesh")
         known = node.mesh in self._parts
         if not known:
@@ -119,12 +116,12 @@ class _Reader:
                 require_count(len(self.objects) + len(transforms), "objects")
                 self.objects += [Object(mesh, (material,), transform, name=name) for transform in transforms]
 
-    def _parts_of(self, source: Any, number: int) -> Iterator[tuple[Mesh, Material]]:
-        """The mesh and the material of each primitive that has triangles; asked once for all nodes that show them."""
+    def _parts_of(self, source: GltfObject, number: int) -> Iterator[tuple[Mesh, Material]]:
+        """Yield the mesh and the material of each primitive with triangles; called once for all nodes with this mesh."""
         left_out, mesh_name = self.document.left_out, source.name or f"mesh {number}"
         for i, primitive in enumerate(source.primitives):
             where = f"meshes[{number}].primitives[{i}]"
-            # A compressed copy beside plain accessors changes nothing: were it the only one, it would be required.
+            # A compressed copy beside plain accessors has no effect; a file without plain accessors would require the extension.
             extensions = {k: v for k, v in (primitive.extensions or {}).items() if k != "KHR_draco_mesh_compression"}
             left_out.add_extensions(extensions, "mesh", mesh_name)
             mesh = self._meshes.mesh(primitive, mesh_name, where)
@@ -134,8 +131,8 @@ class _Reader:
                     left_out.add("TANGENT, in place of which tangents are made from TEXCOORD_0", "mesh", mesh_name)
                 yield mesh, material
 
-    def _placements(self, node: Any, world: np.ndarray, name: str, place: str) -> np.ndarray:
-        """(N, 4, 4) world matrices of a node's mesh: one, or one for each instance; without those that flatten it."""
+    def _placements(self, node: GltfObject, world: np.ndarray, name: str, place: str) -> np.ndarray:
+        """Return matrices to world space (N, 4, 4) of a node's mesh or its instances, except for those with determinant 0."""
         instances = self._meshes.instances(node, place)
         with np.errstate(over="ignore", invalid="ignore"):
             transforms = world[None] if instances is None else world @ instances
@@ -144,7 +141,7 @@ class _Reader:
             self.document.left_out.add("meshes scaled to no volume", "node", name)
         return transforms[~flat]
 
-    def _add_camera(self, node: Any, world: np.ndarray, place: str) -> None:
+    def _add_camera(self, node: GltfObject, world: np.ndarray, place: str) -> None:
         source = self.document.item("cameras", node.camera, f"{place}.camera")
         name = node.name or source.name or f"camera {node.camera}"
         self.document.left_out.add_extensions(source.extensions, "camera", name)
@@ -156,7 +153,7 @@ class _Reader:
             self.cameras.append(Camera(world, lens.yfov, name=name) if source.type == "perspective" else
                                 OrthographicCamera(world, 2.0 * lens.ymag, name=name))
 
-    def _add_light(self, node: Any, world: np.ndarray, place: str) -> None:
+    def _add_light(self, node: GltfObject, world: np.ndarray, place: str) -> None:
         link = self.document.extension(node, "KHR_lights_punctual", PunctualLightOfNode, place)
         if link is None:
             return

@@ -1,7 +1,7 @@
-"""What a glTF document may hold: JSON values become typed objects, each checked against its declared type.
+"""The schema of glTF documents: JSON values become typed objects, each checked against its declared type.
 
-The core's objects are pygltflib's dataclasses; those of the extensions that wrt reads stand here. pygltflib's own
-decoder is not used: it turns 1.5 and "1" into the index 1, and its errors do not say where in the file they are.
+The core's objects are pygltflib's dataclasses; the extensions that wrt reads have theirs here. Its own decoder is not used: it
+turns 1.5 and "1" into the index 1, and its errors have no place in the file.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class Instancing:
 
 # --- checking ---------------------------------------------------------------------------------------------------------
 
-# pygltflib gives fields that the specification requires the default None.
+# Fields that the specification requires, although pygltflib gives them the default None.
 _REQUIRED = {
     "Accessor": ("componentType", "count", "type"), "Sparse": ("count", "indices", "values"),
     "AccessorSparseIndices": ("bufferView", "componentType"), "AccessorSparseValues": ("bufferView",),
@@ -116,12 +116,11 @@ _SCALARS: dict[Any, tuple[str, tuple[type, ...]]] = {
 }
 
 
-def read_as(hint: Any, raw: Any, place: str) -> Any:
-    """The JSON value `raw` as the type `hint`: a scalar, a list, a dict, or a dataclass (here or of pygltflib).
+def read_as(hint: Any, raw: object, place: str) -> Any:
+    """Convert the JSON value `raw` to the type `hint`: a scalar, a list, a dict, or a dataclass (here or of pygltflib).
 
-    Keys that the class does not have are left out, so are `extras`; null stands for a key that is not there. Raises
-    InputError that names the place where a value has another type, a number is not finite, or a required key is
-    missing.
+    Unknown keys and `extras` are left out; null is a missing key. Raises InputError with the place of a value of another type, a number
+    that is not finite, or a missing key that is required.
     """
     hint = _without_none(hint)
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
@@ -135,13 +134,13 @@ def read_as(hint: Any, raw: Any, place: str) -> Any:
         raise _wrong("an object", raw, place)
     if origin is dict:
         return raw if arguments[1] is Any else {k: read_as(arguments[1], v, f"{place}.{k}") for k, v in raw.items()}
-    if hint.__name__ == "Attributes":  # pygltflib's one class that is no dataclass: accessors by the attribute's name
+    if hint.__name__ == "Attributes":  # the only class of pygltflib that is no dataclass: accessors by name
         return {k: read_as(int, v, f"{place}.{k}") for k, v in raw.items()}
     return _object(hint, raw, place)
 
 
 def exactly(values: list[float], count: int, place: str) -> list[float]:
-    """`values`; raises InputError at `place` where there are not `count` of them."""
+    """Return `values`. Raises InputError at `place` unless there are `count` of them."""
     if len(values) != count:
         raise InputError(f"must hold {count} numbers, got {len(values)}", place=place)
     return values
@@ -172,7 +171,7 @@ def _required(cls: Any) -> tuple[str, ...]:
 def _scalar(hint: Any, raw: Any, place: str) -> Any:
     expected, accepted = _SCALARS[hint]
     if hint is int and isinstance(raw, float) and raw.is_integer():
-        raw = int(raw)  # JSON does not tell 1.0 from 1
+        raw = int(raw)  # JSON has one kind of number
     fits = isinstance(raw, accepted) and (hint is bool or not isinstance(raw, bool))
     if not fits:
         raise _wrong(expected, raw, place)
@@ -181,7 +180,7 @@ def _scalar(hint: Any, raw: Any, place: str) -> Any:
     if hint is float:
         try:
             number = float(raw)
-        except OverflowError:  # an integer too long for a double
+        except OverflowError:  # an integer beyond float64
             number = math.inf
         if not math.isfinite(number):
             raise _wrong("a finite number", raw, place)

@@ -1,6 +1,6 @@
-"""Mesh formats: a module of this folder reads one, by its function `read`, and has the name of the files' suffix.
+"""Mesh formats: each module of this folder has the name of a suffix, and its function `read` reads such files.
 
-The command line's help reads the table too, and must not wait for NumPy.
+The command line's help lists them, so that this file must not import NumPy.
 """
 
 from __future__ import annotations

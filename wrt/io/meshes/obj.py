@@ -1,9 +1,8 @@
 """Wavefront OBJ text: positions, normals, texture coordinates and named groups of faces.
 
-Why not trimesh: measured with 5.2, it fails with an IndexError on relative indices (`f
--4 -3 -2 -1`), loses the names of materials whose .mtl is missing, sorts the faces by material, and where positions
-and normals are indexed apart it keeps one normal for each position. A material's faces, and their order, are what a
-scene file refers to.
+Why not trimesh 5.2: it fails with an IndexError on relative indices (`f -4 -3 -2 -1`), sorts the faces by material, and loses the
+names of materials without an .mtl file. If positions and normals are indexed apart, it keeps one normal for each position. Scene files
+refer to a material's faces and their order.
 """
 
 from __future__ import annotations
@@ -23,33 +22,33 @@ from wrt.core.files import read_file, utf8
 from wrt.io.mesh_file import RawMesh
 from wrt.io.polygons import triangulate
 
-# What stands in a corner `v/vt/vn`, and how many numbers of a line of it are kept.
+# The parts of a corner `v/vt/vn`, each with the count of numbers that wrt keeps of its lines.
 _KEEP = {"v": 3, "vt": 2, "vn": 3}
 _CORNER = "face corner {} is not v, v/vt, v//vn or v/vt/vn"
 
 
 class _Text:
-    """The lines of one OBJ file, sorted by what they are; indices are absolute from here on."""
+    """The lines of an OBJ file by their keyword, with absolute indices."""
 
     def __init__(self) -> None:
         self.numbers = {key: array("d") for key in _KEEP}
         self.lines = {key: array("q") for key in _KEEP}
         self.counts, self.face_lines = array("q"), array("q")
-        # Every different corner by its text, numbered as they come, and which one each corner is.
+        # Each distinct corner text with its index in the order of the file, and the index of every corner.
         self.different: dict[str, int] = defaultdict(count().__next__)
         self.corners = array("i")
-        # Of each keyword: every different name, numbered as they come ("" before the first), and of every span the first polygon
-        # and which name it has; where several begin with one polygon, the last counts.
+        # For each keyword the distinct names with their index ("" is 0), and for each span its first polygon and its name's index. Of
+        # several spans that begin at one polygon, the last counts.
         self.names: dict[str, dict[str, int]] = {
             key: defaultdict(count(1).__next__, {"": 0}) for key in ("usemtl", "g", "o")}
         self.spans = {key: (array("q"), array("i")) for key in self.names}
-        self.absent: dict[str, None] = {}  # what faces refer to and the whole file has not: vt, vn
+        self.absent: dict[str, None] = {}  # vt or vn, if faces refer to them and the file has none
 
     def fail(self, line: int, message: str) -> NoReturn:
         raise InputError(message, place=f"line {line}")
 
     def read(self, data: bytes) -> None:
-        pending, number = "", 0  # lines that the next one continues
+        pending, number = "", 0  # pending: lines that continue
         for number, line in enumerate(io.TextIOWrapper(io.BytesIO(data), "utf-8", "replace"), 1):
             if line.endswith(("\\\n", "\\")):
                 pending += line.removesuffix("\n")[:-1] + " "
@@ -81,7 +80,7 @@ class _Text:
         try:
             self.numbers[key].extend(map(float, given))
         except ValueError:
-            bad = given[len(self.numbers[key]) % keep]  # those before it are in
+            bad = given[len(self.numbers[key]) % keep]  # the numbers before it were appended
             self.fail(line, f"{key} holds {short(bad)}, which is not a number")
 
     def _corners(self, corners: list[str], line: int) -> None:
@@ -97,7 +96,7 @@ class _Text:
         which.append(self.names[key][name])
 
     def _absolute(self, corner: str, line: int) -> str:
-        """A corner with relative indices (-1 is the latest) in absolute ones (1 is the first)."""
+        """Replace relative indices in a corner (-1 is the latest) by absolute ones (1 is the first)."""
         parts = corner.split("/")
         for i, (part, key) in enumerate(zip(parts, _KEEP, strict=False)):
             if part.startswith("-"):
@@ -114,13 +113,13 @@ class _Text:
         return "/".join(parts)
 
     def array(self, key: str) -> np.ndarray:
-        """(N, 2 or 3) float64 of all `key` lines."""
+        """Return the numbers of all `key` lines, (N, 2 or 3) float64."""
         return np.frombuffer(self.numbers[key], np.float64).reshape(-1, _KEEP[key])
 
     def triples(self) -> tuple[np.ndarray, np.ndarray]:
-        """(U, 3) int64: every different corner as zero-based v, vt, vn (-1: not given); (C,) int32 which one each corner is.
+        """Return the distinct corners (U, 3) int64 as zero-based v, vt, vn (-1: none), and the index of each corner (C,) int32.
 
-        They are sorted by v first, so that the vertices keep the order of the file.
+        Corners are sorted by v first, so that the vertices keep the order of the file.
         """
         index = np.frombuffer(self.corners, np.int32)
         different = np.zeros((len(self.different), 3), dtype=np.int64)
@@ -147,8 +146,7 @@ class _Text:
         return self.face_lines[int(face)]
 
     def groups(self) -> tuple[tuple[str, ...], np.ndarray | None]:
-        """Names of the parts and the part of each polygon: by material, else by group, else by object; () where
-        none."""
+        """Return the names of the parts and each polygon's part: by material, else by group, else by object; () if there are none."""
         key = next((key for key, (starts, _) in self.spans.items() if starts), None)
         if key is None:
             return (), None
@@ -160,14 +158,13 @@ class _Text:
 
 
 def read(path: Path) -> RawMesh:
-    """Read the faces of an OBJ file as it has them: nothing is merged or put in another order.
+    """Read the faces of an OBJ file in its order; nothing is merged.
 
-    Each different combination of position, texture coordinate and normal becomes one vertex. A corner without a
-    normal gets a zero normal (flat there), one without a texture coordinate (0, 0). Where a file has no vt, or no vn, at all, their
-    indices are left out with a SceneWarning. Faces with fewer than three
-    corners are left out and counted. Groups are the spans of `usemtl`, else of `g`, else of `o`; faces before the
-    first have the name "". Vertex colours, lines, points and curves are not read. Raises InputError with the line's
-    number for numbers that are none, indices out of range and positions that are not finite.
+    Each distinct combination of position, texture coordinate and normal becomes a vertex. A corner without a normal gets a zero normal
+    (flat there), one without a texture coordinate (0, 0). If the file has no vt, or no vn, at all, a SceneWarning says that their indices
+    are left out. Groups are the spans of `usemtl`, else of `g`, else of `o`; faces before the first have the name "". Vertex colours,
+    lines, points and curves are not read. Raises InputError with the line for words that are no numbers, indices out of range and
+    positions that are not finite.
     """
     text = _Text()
     text.read(utf8(read_file(path)))
@@ -203,7 +200,7 @@ def read(path: Path) -> RawMesh:
 
 
 def _gather(values: np.ndarray, index: np.ndarray) -> np.ndarray | None:
-    """values[index], with a row of zeros where the index is -1; None where that is everywhere."""
+    """Return values[index], zero where the index is -1; None if it is -1 everywhere."""
     if not (index >= 0).any():
         return None
     return np.where((index >= 0)[:, None], values[index], 0.0)

@@ -1,8 +1,7 @@
 """PLY files (Stanford polygon format), text and binary: positions, normals, texture coordinates, faces of any size, strips.
 
-Why not trimesh: measured with 5.2, it refuses binary files that mix triangles with other polygons ("unexpected
-length"), puts the second halves of all quads behind the first ones, and computes normals anew where a file has
-texture coordinates.
+Why not trimesh 5.2: it refuses binary files that mix triangles with other polygons ("unexpected length"). It puts the second halves of all
+quads behind the first ones, and computes normals anew for files with texture coordinates.
 """
 
 from __future__ import annotations
@@ -28,11 +27,11 @@ _TYPES = {
     "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
     "int64": "i8", "uint64": "u8", "float": "f4", "double": "f8", "float32": "f4", "float64": "f8",
 }
-_SIZES = [name for name, kind in _TYPES.items() if kind[0] != "f"]  # what a list's length may be
+_SIZES = [name for name, kind in _TYPES.items() if kind[0] != "f"]  # types of a list's length
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _UV_NAMES = (("u", "v"), ("s", "t"), ("texture_u", "texture_v"), ("texcoord_u", "texcoord_v"))
 _INDEX_NAMES = ("vertex_indices", "vertex_index")
-BYTES_AT_ONCE = 1 << 18  # of a text, before they become numbers
+BYTES_AT_ONCE = 1 << 18  # of text that become numbers together
 _WORD = re.compile(rb"\S+")
 
 
@@ -44,7 +43,7 @@ class _Property(NamedTuple):
 
 @dataclass
 class _Element:
-    """One `element` of the header; of each property all values in a row, and how many there are in each row."""
+    """An `element` of the header, with the values of each property in sequence and their count in each row."""
 
     name: str
     rows: int
@@ -54,14 +53,12 @@ class _Element:
 
 
 def read(path: Path) -> RawMesh:
-    """Read a PLY file's vertices and faces in the order of the file; faces with more than three corners are
-    triangulated. Behind the faces come the triangles of `tristrips`: lists of vertices, of which each makes a triangle with the two
-    before it, turned by turns so that all face one way; -1 begins a new strip.
+    """Read a PLY file's vertices and faces in the order of the file; larger faces are triangulated.
 
-    Vertex normals are nx, ny, nz; texture coordinates u, v (or s, t or texture_u, texture_v) of vertices, else
-    `texcoord` lists of faces, for which a vertex is split where its faces disagree. Colours and other properties are
-    not read. Raises InputError that names the header's line, or the element and row of what is truncated, not a
-    number, or out of range.
+    The triangles of `tristrips` follow the faces; -1 begins a new strip. Vertex normals are nx, ny, nz. Texture coordinates are a
+    vertex's u, v (or s, t or texture_u, texture_v), else the `texcoord` lists of faces; a vertex is split if its faces disagree. Colours
+    and other properties are not read. Raises InputError with the header's line, or with the element and row of a value that is missing,
+    not a number, or out of range.
     """
     source = _Source(path)
     elements = {element.name: element for element in source.elements}
@@ -105,8 +102,7 @@ def _columns(columns: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarr
 
 
 def _faces(source: _Source, face: _Element | None, vertices: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Corners of all faces in a row (C,), the corners of each face (P,), and their texture coordinates (C, 2) or
-    None."""
+    """Return the corners of all faces (C,), the corner count of each face (P,), and texture coordinates (C, 2) or None."""
     if face is None or face.rows == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64), None
     given, counts = _indices(source, face)
@@ -118,7 +114,7 @@ def _faces(source: _Source, face: _Element | None, vertices: int) -> tuple[np.nd
 
 
 def _strips(source: _Source, strips: _Element, vertices: int) -> np.ndarray:
-    """Corners of the triangles of all strips in a row (3 T,)."""
+    """Return the corners of the triangles of all strips (3 T,)."""
     if strips.rows == 0:
         return np.zeros(0, np.int64)
     given, counts = _indices(source, strips)
@@ -130,7 +126,7 @@ def _strips(source: _Source, strips: _Element, vertices: int) -> np.ndarray:
 
 
 def _indices(source: _Source, element: _Element) -> tuple[np.ndarray, np.ndarray]:
-    """The values of the element's lists of vertices, in a row, and how many are in each."""
+    """Return the values of the element's lists of vertices in sequence, and their counts."""
     name = next((name for name in _INDEX_NAMES if name in element.values), None)
     if name is None:
         source.fail(f"has no list {' or '.join(_INDEX_NAMES)}", f"element {element.name}")
@@ -138,7 +134,7 @@ def _indices(source: _Source, element: _Element) -> tuple[np.ndarray, np.ndarray
 
 
 def _within(source: _Source, given: np.ndarray, counts: np.ndarray, vertices: int, kind: str) -> np.ndarray:
-    """The indices as integers. Raises InputError, with the number of the `kind`, for one that is no vertex's."""
+    """Return the indices as integers. Raises InputError, with the row of the `kind`, for an index without a vertex."""
     with np.errstate(invalid="ignore"):
         indices: np.ndarray = given.astype(np.int32 if vertices < 1 << 31 else np.int64)
     wrong = (indices < 0) | (indices >= vertices) | (indices != given)
@@ -150,19 +146,19 @@ def _within(source: _Source, given: np.ndarray, counts: np.ndarray, vertices: in
 
 
 def _split(corners: np.ndarray, texcoord: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Make one vertex of each different (vertex, u, v): the vertex it comes from, the new corners, its uv."""
+    """Make a vertex of each distinct (vertex, u, v). Returns the vertex it comes from, the new corners and its uv."""
     rows, renumbered = np.unique(np.column_stack([corners, texcoord]), axis=0, return_inverse=True)
     return rows[:, 0].astype(np.int64), renumbered.reshape(-1), rows[:, 1:]
 
 
 class _Source:
-    """A PLY file: its header, then the elements read with it."""
+    """A PLY file: its header and the elements."""
 
     def __init__(self, path: Path) -> None:
         self.data = utf8(read_file(path))
         form, self.elements, self.at = self._header()
         self.order = _ORDERS[form]
-        if form == "ascii":  # from here on as a binary file that has float64 everywhere, which holds every index exactly
+        if form == "ascii":  # becomes a binary file of float64, which holds every index exactly
             self.data, self.at = self._numbers(), 0
             for element in self.elements:
                 element.properties = [p._replace(type="f8", count_type=p.count_type and "f8") for p in element.properties]
@@ -174,7 +170,7 @@ class _Source:
         raise InputError(message, place=place)
 
     def _header(self) -> tuple[str, list[_Element], int]:
-        """The format, the elements without their data, and where the data begin."""
+        """Return the format, the elements without their data, and the offset of the data."""
         if not self.data.startswith(b"ply"):
             self.fail("is not a PLY file: it does not begin with 'ply'")
         elements: list[_Element] = []
@@ -204,7 +200,7 @@ class _Source:
         return form, elements, begin
 
     def _read(self, element: _Element) -> None:
-        """Read all rows at once where their lists are as long as the first row's (nearly always), else row by row."""
+        """Read all rows at once if their lists are as long as those of the first row (nearly always), else row by row."""
         begin = self.at
         sizes = [len(part) for part in self._row(element, 0)]
         self.at = begin
@@ -220,7 +216,7 @@ class _Source:
                 element.counts[p.name] = np.array([len(row[i]) for row in rows], dtype=np.int64)
 
     def _take_table(self, element: _Element, table: list[np.ndarray], sizes: list[int]) -> bool:
-        """Keep the columns of a table; False where a list is not as long as `sizes` says."""
+        """Keep the columns of a table; return False if a list has another length than in `sizes`."""
         columns = iter(table)
         for p, size in zip(element.properties, sizes, strict=True):
             if p.count_type and (next(columns) != size).any():
@@ -230,7 +226,7 @@ class _Source:
         return True
 
     def _row(self, element: _Element, row: int) -> list[np.ndarray]:
-        """The values of each property in the next row."""
+        """Return the values of each property in the next row."""
         parts = []
         for p in element.properties:
             size = 1
@@ -251,7 +247,7 @@ class _Source:
         self.fail(f"truncated: the header promises {element.rows}, but the file ends in number {row}", f"element {element.name}")
 
     def _take(self, kind: str, count: int) -> np.ndarray | None:
-        """The next values; None where the file ends before."""
+        """Return the next values, or None if the file ends before."""
         dtype = np.dtype(self.order + kind)
         if self.at + count * dtype.itemsize > len(self.data):
             return None
@@ -259,7 +255,7 @@ class _Source:
         return np.frombuffer(self.data, dtype, count, self.at - count * dtype.itemsize)
 
     def _table(self, fields: list[tuple[str, int]], rows: int) -> list[np.ndarray] | None:
-        """(rows, n) of each field (type, n), of records one behind the other; None where the file ends before."""
+        """Return an array (rows, n) for each field (type, n) of consecutive records, or None if the file ends before."""
         record = np.dtype([(f"f{i}", self.order + kind, (n,)) for i, (kind, n) in enumerate(fields)])
         if self.at + rows * record.itemsize > len(self.data):
             return None
@@ -268,7 +264,7 @@ class _Source:
         return [table[f"f{i}"] for i in range(len(fields))]
 
     def _numbers(self) -> bytes:
-        """The words of a text as float64."""
+        """Return the words of the text as float64."""
         numbers, stream = array("d"), io.BytesIO(self.data)
         stream.seek(self.at)
         while text := b"".join(stream.readlines(BYTES_AT_ONCE)):
@@ -276,7 +272,7 @@ class _Source:
             try:
                 numbers.extend(map(float, text.split()))
             except ValueError:
-                bad = next(islice(_WORD.finditer(text), len(numbers) - before, None))  # those before it are in
+                bad = next(islice(_WORD.finditer(text), len(numbers) - before, None))  # the numbers before it were appended
                 line = self.data.count(b"\n", 0, stream.tell() - len(text) + bad.start()) + 1
                 self.fail(f"{short(bad[0].decode('latin-1'))} is not a number", f"line {line}")
         return numbers.tobytes()

@@ -1,7 +1,7 @@
 """STL files, text and binary.
 
-Why not trimesh: measured with 5.2, it leaves out what stands before the end where an `endsolid` is missing, logs a traceback
-for each facet normal that is no number, and lets NumPy warn of positions that are not finite.
+Why not trimesh 5.2: it leaves out the triangles before a missing `endsolid`. It logs a traceback for each facet normal that is no number,
+and lets NumPy warn of positions that are not finite.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribut
 def read(path: Path) -> RawMesh:
     """Read the triangles of an STL file in the order of the file; each has three vertices of its own.
 
-    The solids of a text file become groups. Facet normals are not read: they say no more than the winding does. Raises
-    InputError for a file that is truncated or no STL, and for a position that is not finite.
+    The solids of a text file become groups. Facet normals are not read, because the winding tells the same. Raises InputError for a file
+    that is truncated or no STL, and for a position that is not finite.
     """
     data = read_file(path)
     groups: tuple[str, ...] = ()
@@ -48,8 +48,7 @@ def read(path: Path) -> RawMesh:
 
 
 def _read_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...], list[int]]:
-    """Positions (3 T, 3) float64, the names of the solids, and how many triangles each has. Solids of one name stay apart: the
-    later ones are called name_1, name_2 ..."""
+    """Return positions (3 T, 3) float64, and names and triangle counts of the solids. Later solids of a name get name_1, name_2 ..."""
 
     def fail(number: int, message: str) -> NoReturn:
         raise InputError(f"truncated, or no STL file: {message}, and the length is not that of a binary STL file",
@@ -57,7 +56,7 @@ def _read_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...], list[int]]:
 
     numbers = array("d")
     names: list[str] = []
-    ends: list[int] = []  # of each solid, in vertices
+    ends: list[int] = []  # vertices up to the end of each solid
     number, inside = 1, False
     for number, found in enumerate(_LINE.finditer(data), 1):
         line = found[0]
@@ -87,7 +86,7 @@ def _read_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...], list[int]]:
 
 
 def _each_once(names: list[str]) -> tuple[str, ...]:
-    known: dict[str, int] = {}  # the last number of each
+    known: dict[str, int] = {}  # the last suffix of each
     for name in names:
         unique = name
         while unique in known:

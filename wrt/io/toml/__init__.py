@@ -1,1 +1,1 @@
-"""Scene files in TOML: tables, their checks, and the scene that they make."""
+"""Scene files in TOML: their tables, checks, and conversion to a scene."""

@@ -1,4 +1,4 @@
-"""A checked TOML scene file becomes a `Scene`: files are read, names looked up, degrees become radians."""
+"""Conversion of a checked TOML scene file to a `Scene`: read files, look up names, convert degrees to radians."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 from wrt.core.checks import unknown
 from wrt.core.errors import InputError, at
 from wrt.core.files import read_file
-from wrt.io.toml.kinds import make, taken
+from wrt.io.toml.kinds import make, values_of
 from wrt.io.toml.meshes import Meshes
 from wrt.io.toml.report import raise_all, unknown_materials
 from wrt.io.toml.transforms import transform, turn
@@ -31,16 +31,15 @@ from wrt.scene.values import BLACK, SMALLEST, as_vector, require_count
 if TYPE_CHECKING:
     from wrt.io.toml import schema as tables
     from wrt.io.toml.camera_schema import PoseTable
-    from wrt.io.toml.material_schema import MaterialTable
-    from wrt.io.toml.values import Table
-
+    from wrt.io.toml.material_schema import ColorTextureTable, ImageTable, MaterialTable
+    from wrt.io.toml.values import Table, TypedTable
 
 
 def build(table: tables.SceneTable, path: Path) -> Scene:
-    """The scene that the tables describe; files are looked for beside `path`.
+    """Make the scene of the tables; names of files are relative to the folder of `path`.
 
-    A file that is named twice is read once, and its mesh or texture is one object. Raises one InputError that lists
-    every name that is not known, every file that cannot be used, and every value that the scene refuses.
+    A file that is named twice is read once, and its mesh or texture is one object. Raises one InputError that lists all unknown names,
+    unusable files and values that the scene refuses.
     """
     builder = _Builder(path)
     with at(path=path):
@@ -55,10 +54,10 @@ class _Builder:
         self.path = path
         self.problems: list[InputError] = []
         self.materials: dict[str, Material] = {}
-        self._included: dict[Path, Scene] = {}  # a file that is named again is read once
+        self._included: dict[Path, Scene] = {}  # by path
         self._included_objects = 0
         self._images: dict[Path, np.ndarray] = {}
-        self._textures: dict[tuple[Any, ...], Texture | Checkerboard] = {}
+        self._textures: dict[tuple[str, bool], Texture | Checkerboard] = {}
         self.meshes = Meshes(path.parent)
 
     @contextlib.contextmanager
@@ -82,7 +81,7 @@ class _Builder:
             included += self.included(entry, f"include[{i}]")
         included = self.overridden(included, table)
         known = {m.name: m for scene in included for m in scene.materials} | self.materials
-        # A material that is itself wrong is known all the same: one mistake gives one line.
+        # A wrong material counts as known, so that one mistake gives one line.
         self.problems += unknown_materials(table.model_dump(exclude_unset=True), {**known, **table.materials})
         self.materials = known
 
@@ -132,7 +131,7 @@ class _Builder:
         )
 
     def found(self, name: str | None) -> list[Material]:
-        """The material of that name, or nothing where it is not known (which is reported elsewhere)."""
+        """Return the material of that name in a list, or [] for an unknown name, which unknown_materials reports."""
         return [self.materials[name]] if name in self.materials else []
 
     # --- included files ---
@@ -154,7 +153,7 @@ class _Builder:
         return []
 
     def overridden(self, included: list[Scene], table: tables.SceneTable) -> list[Scene]:
-        """The included scenes with the materials that the file replaces."""
+        """Return the included scenes with the materials that the file overrides."""
         names = list(dict.fromkeys(m.name for scene in included for m in scene.materials))
         new: dict[str, Material] = {}
         for name, material in table.override.items():
@@ -169,7 +168,7 @@ class _Builder:
     # --- materials ---
 
     def material(self, table: MaterialTable, name: str, place: str) -> dict[str, Material]:
-        """The material by its name, or nothing where it is wrong."""
+        """Return the material by its name, or {} if it is wrong."""
         fields = table.given("metal", *SLOTS)
         if table.metal is not None:
             fields["eta"], fields["k"] = CONDUCTORS[table.metal]
@@ -182,22 +181,21 @@ class _Builder:
             return {name: Material(name=name, **fields)}
         return {}
 
-    def texture(self, table: Any, is_color: bool) -> Texture | Checkerboard:
-        """table: ImageTable or ColorTextureTable."""
+    def texture(self, table: ImageTable | ColorTextureTable, is_color: bool) -> Texture | Checkerboard:
         key = (table.model_dump_json(), is_color)
         if key not in self._textures:
-            if getattr(table, "checkerboard", None) is not None:
-                self._textures[key] = Checkerboard(**table.checkerboard.given())
+            if (checkerboard := getattr(table, "checkerboard", None)) is not None:
+                self._textures[key] = Checkerboard(**checkerboard.given())
             else:
                 cosine, sine = turn(table.rotation)
                 (u, v), (du, dv) = table.scale, table.offset
                 self._textures[key] = Texture(
-                    self.image(self.file(table.file)),
+                    self.image(self.file(str(table.file))),
                     srgb=is_color if table.srgb is None else table.srgb,
-                    wrap=tuple(table.wrap),
+                    wrap=(table.wrap[0], table.wrap[1]),
                     # As in KHR_texture_transform: scale, then turn (v points down), then move.
                     uv_transform=np.array([[cosine * u, sine * v, du], [-sine * u, cosine * v, dv]]),
-                    name=table.file,
+                    name=str(table.file),
                 )
         return self._textures[key]
 
@@ -217,25 +215,26 @@ class _Builder:
             return ConstantBackground()
         return make(BACKGROUNDS[given.type], given, "", lambda name: read_image(self.file(name)))
 
-    def light(self, table: Any, name: str) -> Light | Object:
-        """A light; a rectangle is an object that shines and reflects nothing."""
+    def light(self, table: TypedTable, name: str) -> Light | Object:
+        """Return a light, or for a rectangle an object that emits and reflects nothing."""
+        from wrt.io.toml.schema import RectangleLightTable
         from wrt.picture.image import read_image
 
-        if table.type == "rectangle":
+        if isinstance(table, RectangleLightTable):
             material = Material(name=name, albedo=BLACK, emission=as_vector(table.radiance, "radiance"), two_sided=table.two_sided)
             return Object(shapes.quad(table.corner, table.edge_u, table.edge_v), (material,), name=name)
         return make(LIGHTS[table.type], table, name, lambda file: read_image(self.file(file)))
 
 
 def settings(table: Table, included: Sequence[Scene]) -> Settings:
-    """What the file says; where it does not say how glass casts shadows, the included files decide: tinted if one needs that."""
+    """Return the file's settings. Without glass_shadows in the file, it is "tinted" if an included file needs that."""
     tinted = any(scene.settings.glass_shadows == "tinted" for scene in included)
     needed = {"glass_shadows": "tinted"} if tinted else {}
     return Settings(**{**needed, **table.given()})
 
 
 def moved(scene: Scene, matrix: np.ndarray) -> Scene:
-    """The scene's shapes, lights and cameras under a further (4, 4) transform; intensities stay as they are, as in glTF."""
+    """Transform a scene's shapes, lights and cameras by a (4, 4) matrix. Intensities stay the same, as in glTF."""
     if np.array_equal(matrix, np.eye(4)):
         return scene
     return replace(
@@ -247,12 +246,12 @@ def moved(scene: Scene, matrix: np.ndarray) -> Scene:
 
 
 def make_camera(table: PoseTable, name: str) -> CameraKind:
-    """A camera from where it stands and looks, or from its matrix; a perspective one by its angle of view, or by a real lens."""
+    """Make a camera from position and target or from a matrix, and a perspective one from its angle of view or a real lens."""
     kind = CAMERAS[table.type]
     values: dict[str, Any] = {}
     if "focus_distance" in forms(kind) and table.position is not None and table.target is not None:
         values["focus_distance"] = max(math.dist(table.position, table.target), SMALLEST)
-    values |= taken(kind, table)
+    values |= values_of(kind, table)
     focal_length, sensor_height = (getattr(table, key, None) for key in ("focal_length", "sensor_height"))
     if focal_length is not None and sensor_height is not None:
         values |= Camera.lens(focal_length, values.get("focus_distance", 1.0), sensor_height,

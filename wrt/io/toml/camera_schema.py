@@ -1,4 +1,4 @@
-"""The tables of cameras in a TOML scene file: each has a pose, and the parameters of its kind's class."""
+"""Camera tables of a TOML scene file: each has a pose and the parameters of its kind."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from typing import Annotated, Any, Literal
 from pydantic import Discriminator, Field, Tag, create_model, model_validator
 
 from wrt.io.toml.kinds import described
-from wrt.io.toml.values import Length, Matrix, Point, Positive, Table, Vector
+from wrt.io.toml.values import Annotation, Length, Matrix, Point, Positive, TypedTable, Vector
 from wrt.scene.cameras import Camera, CameraKind
 
 
-class PoseTable(Table):
+class PoseTable(TypedTable):
     """Give position and target, or matrix."""
 
     type: str = Camera.kind
-    position: Point | None = Field(None, description="where the camera stands")
-    target: Point | None = Field(None, description="the point in the middle of the picture")
-    up: Vector = Field([0.0, 1.0, 0.0], description="what is up in the picture")
+    position: Point | None = Field(None, description="of the camera")
+    target: Point | None = Field(None, description="point in the middle of the picture")
+    up: Vector = Field([0.0, 1.0, 0.0], description="direction that is up in the picture")
     matrix: Matrix | None = Field(None, description="camera to world, row by row; the camera looks along -z, +y is up")
 
     @model_validator(mode="after")
@@ -30,7 +30,7 @@ class PoseTable(Table):
         return self
 
     def problems(self) -> list[str]:
-        """What is wrong with the table as a whole."""
+        """Return the mistakes of the table as a whole."""
         if (self.matrix is None) == (self.position is None and self.target is None):
             return ["give either position and target, or matrix"]
         return ["needs both position and target"] if self.matrix is None and (self.position is None or self.target is None) else []
@@ -58,19 +58,19 @@ class LensTable(PoseTable):
         return problems
 
 
-def camera_table(kind: type[CameraKind]) -> Any:
-    """The table of a kind of camera: its pose, and the parameters of its class."""
+def camera_table(kind: type[CameraKind]) -> type[PoseTable]:
+    """Make the table of a kind of camera: its pose and the parameters of its class."""
     base = LensTable if issubclass(kind, Camera) else PoseTable
     keys: dict[str, Any] = {"type": (Literal[kind.kind], Camera.kind if kind is Camera else Field())}
     about_kind = (kind.__doc__ or "").split("\n\n")[0]
     return create_model(f"{kind.__name__}Table", __base__=base, __doc__=f"{about_kind} {base.__doc__}", **keys, **described(kind))
 
 
-def _type_of_camera(table: Any) -> str:
+def _type_of_camera(table: object) -> str:
     return str(table.get("type", Camera.kind)) if isinstance(table, dict) else getattr(table, "type", Camera.kind)
 
 
-def any_camera(kinds: tuple[type[CameraKind], ...]) -> Any:
-    """A table of one of these kinds, as its `type` says."""
+def any_camera(kinds: tuple[type[CameraKind], ...]) -> Annotation:
+    """Return the annotation of a table of one of these kinds, chosen by its `type`."""
     tables: list[Any] = [Annotated[camera_table(kind), Tag(kind.kind)] for kind in kinds]
     return Annotated[reduce(or_, tables), Discriminator(_type_of_camera)]

@@ -1,31 +1,32 @@
-"""Tables of a TOML scene file from what the fields of a class say of themselves, and lights and backgrounds from such tables."""
+"""Tables of a TOML scene file made from the described fields of a class, and lights and backgrounds made from such tables."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import MISSING, fields
 from typing import Annotated, Any, Literal, TypeVar
 
+import numpy as np
 from pydantic import Field, create_model
 
-from wrt.io.toml.values import Angle, Point, Radiance, Share, Size, Table, Vector, unit
+from wrt.io.toml.values import Angle, Annotation, Point, Radiance, Share, Size, Table, TypedTable, Vector, unit
 from wrt.scene.kinds import Kind, Limits, forms
 from wrt.scene.values import SMALLEST
 
 K = TypeVar("K", bound=Kind)
 _literal: Any = Literal
-TYPES: dict[str, Callable[[Limits], Any]] = {
+TYPES: dict[str, Callable[[Limits], Annotation]] = {
     "point": lambda limits: Point, "direction": lambda limits: Vector, "angle": lambda limits: Angle,
     "color": lambda limits: Share if limits.get("le") == 1.0 else Radiance,
     "number": lambda limits: float, "whole": lambda limits: int, "flag": lambda limits: bool, "size": lambda limits: Size,
     "choice": lambda limits: _literal[limits["among"]], "image": lambda limits: str,
 }
-BOUNDED = ("number", "whole", "angle")  # the other types have their bounds
+BOUNDED = ("number", "whole", "angle")  # forms whose limits become bounds; the other types have theirs
 
 
-def described(kind: type[Any], types: dict[str, Callable[[Limits], Any]] = TYPES) -> dict[str, Any]:
-    """The keys of a table for a class: the fields that `given` describes, with angles in degrees and an image by its file."""
+def described(kind: type, types: Mapping[str, Callable[[Limits], Annotation]] = TYPES) -> dict[str, Annotation]:
+    """Return the keys of a class's table: the fields that wrt.scene.kinds describes, angles in degrees, an image by its file."""
     found: dict[str, Any] = {}
     for key, each in forms(kind).items():
         form, limits = each.metadata["form"], each.metadata["limits"]
@@ -42,14 +43,14 @@ def described(kind: type[Any], types: dict[str, Callable[[Limits], Any]] = TYPES
     return found
 
 
-def kind_table(kind: type[Kind], what: str) -> type[Table]:
-    """The table of that kind: PointLightTable, say, where `what` is Light."""
+def kind_table(kind: type[Kind], what: str) -> type[TypedTable]:
+    """Make the table of a kind, such as PointLightTable for `what` Light."""
     found = {"type": (_literal[kind.kind], ...), **described(kind)}
     if "file" not in found and _has_name(kind):
         found["name"] = (str, Field("", description="for messages"))
     summary = (kind.__doc__ or kind.__name__).split("\n\n")[0]
     name = "".join(part.capitalize() for part in kind.kind.split("_"))
-    return create_model(f"{name}{what}Table", __base__=Table, __doc__=summary, **found)
+    return create_model(f"{name}{what}Table", __base__=TypedTable, __doc__=summary, **found)
 
 
 def _has_name(kind: type[Kind]) -> bool:
@@ -57,14 +58,14 @@ def _has_name(kind: type[Kind]) -> bool:
 
 
 def _written(form: str, value: Any) -> Any:
-    """A default as a file would have it."""
+    """Return a default in the form of a file."""
     if form == "angle":
         return math.degrees(value)
     return list(value) if isinstance(value, tuple) else value
 
 
-def taken(kind: type[Any], table: Any) -> dict[str, Any]:
-    """What a checked table gives of those keys, by the class's fields; an image by its file."""
+def values_of(kind: type, table: Table) -> dict[str, Any]:
+    """Return the values that a checked table gives, by the class's fields; an image by its file."""
     values: dict[str, Any] = {}
     for key, each in forms(kind).items():
         form = each.metadata["form"]
@@ -75,9 +76,9 @@ def taken(kind: type[Any], table: Any) -> dict[str, Any]:
     return values
 
 
-def make(kind: type[K], table: Any, name: str, read: Callable[[str], Any]) -> K:
-    """The light or background of a checked table; `read` is given the name of an image file."""
-    values: dict[str, Any] = ({"name": name} if _has_name(kind) else {}) | taken(kind, table)
+def make(kind: type[K], table: Table, name: str, read: Callable[[str], np.ndarray]) -> K:
+    """Make the light or background of a checked table. read: returns the image of a file's name."""
+    values: dict[str, Any] = ({"name": name} if _has_name(kind) else {}) | values_of(kind, table)
     for key, each in forms(kind).items():
         if each.metadata["form"] == "image":
             values |= {key: read(values[key]), "name": values[key]}

@@ -1,4 +1,4 @@
-"""Textures and materials of a TOML scene file as pydantic models."""
+"""Tables of textures and materials of a TOML scene file, as pydantic models."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _checkerboard: Any = create_model("_Checkerboard", __base__=Table, **described(C
 
 
 class CheckerboardTable(_checkerboard):
-    """Two colours in turn."""
+    """Squares of two alternating colours."""
 
 
 class _PlacedImage(Table):
@@ -53,9 +53,9 @@ class ColorTextureTable(_PlacedImage):
 
 
 class MaterialTable(Table):
-    """How a surface answers light."""
+    """A surface's reflection, transmission and emission."""
 
-    kind: str = Field("diffuse")  # a choice of those there are: material_table
+    kind: str = Field("diffuse")  # material_table makes it a choice of the registered kinds
     metal: Literal["gold", "silver", "copper", "aluminium"] | None = Field(None, description="a metal's eta and k (conductor)")
 
     @model_validator(mode="after")
@@ -72,7 +72,7 @@ class MaterialTable(Table):
 
 
 def material_table(kinds: tuple[str, ...]) -> type[MaterialTable]:
-    """MaterialTable with all that a Material has, and a choice between these kinds."""
+    """Make a MaterialTable with all fields of Material and a choice of these kinds."""
     literal: Any = Literal
     about = "; ".join(f"{name}: {MATERIALS[name].about}" for name in kinds)
     texture = {"texture": lambda limits: ColorTextureTable if Checkerboard in limits["among"] else ImageTable}

@@ -1,11 +1,11 @@
-"""The meshes of a scene file: read or made by a formula, with their materials, places and motion."""
+"""Meshes of a scene file, read or made by a formula, with their materials, transforms and motion."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 
 
 class Meshes:
-    """Makes the objects of [[meshes]]. A mesh that is asked for twice is one; files are looked for in `folder`."""
+    """A cache of the meshes of [[meshes]]. Names of files are relative to `folder`."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._meshes: dict[tuple[Any, ...], Mesh] = {}
+        self._meshes: dict[tuple[object, ...], Mesh] = {}
 
     def objects(self, table: MeshTable, place: str, materials: Mapping[str, Material]) -> list[Object]:
-        """One for each instance; none where a material is not known (which is reported elsewhere)."""
+        """Make an object for each instance; none if a material is unknown, which unknown_materials reports."""
         parts = table.parts or []
         mesh = self._smoothed(table, tuple((part.first, part.count) for part in parts), table.smooth)
         by_group: Mapping[str, str] = table.materials or {str(i): part.material for i, part in enumerate(parts)}
@@ -69,10 +69,10 @@ class Meshes:
         return Motion(keys, None if table.morph is None else self._smoothed(table.morph, (), table.smooth))
 
     def _smoothed(self, table: MeshTable | MorphTable, parts: tuple[tuple[int, int], ...], wanted: bool | None) -> Mesh:
-        """The table's file or shape, with normals, or without, where one of that is wanted."""
+        """Return the mesh of the table's file or shape. wanted: True adds missing normals, False drops them."""
         shape = table.shape
         if shape is not None:
-            key: tuple[Any, ...] = (shape.model_dump_json(),)
+            key: tuple[object, ...] = (shape.model_dump_json(),)
             plain = self._once(key, lambda: shapes.SHAPES[shape.kind](**shape.given("kind")))
         else:
             path = self._folder / str(table.file)
@@ -82,7 +82,7 @@ class Meshes:
             return plain
         return self._once((*key, wanted), lambda: smooth(plain) if wanted else replace(plain, normals=None))
 
-    def _once(self, key: tuple[Any, ...], make: Callable[[], Mesh]) -> Mesh:
+    def _once(self, key: tuple[object, ...], make: Callable[[], Mesh]) -> Mesh:
         if key not in self._meshes:
             self._meshes[key] = make()
         return self._meshes[key]

@@ -87,7 +87,7 @@ def _places(tables: dict[str, Schema]) -> dict[str, list[str]]:
 
 
 def _references(value: Any, place: str) -> list[tuple[str, str]]:
-    """The tables that a value may be, and where: [] marks a list, NAME a key that is free."""
+    """Return the tables that a value may be, each with its place: [] marks a list, NAME any key."""
     if "$ref" in value:
         return [(value["$ref"], place)]
     parts = [(each, place) for each in (*value.get("anyOf", ()), *value.get("oneOf", ()))]
@@ -146,7 +146,7 @@ def _default(value: Schema) -> str:
 
 
 def _find(value: Any, key: str) -> str:
-    """What the value or a part of it says of the key; "" where none does."""
+    """Return what the value or a part of it has for the key, or ""."""
     if key in value:
         return str(value[key])
     inner = [*value.get("anyOf", ()), *([value["items"]] if isinstance(value.get("items"), dict) else [])]

@@ -1,5 +1,4 @@
-"""The tables of a TOML scene file checked against the schema, and everything that is wrong told in lines for a
-person."""
+"""Checks of a TOML scene file against the schema, with a line for each mistake."""
 
 from __future__ import annotations
 
@@ -10,12 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 from wrt.core.checks import short, unknown
 from wrt.core.errors import InputError, InputErrors
+from wrt.core.types import JsonObject
 
 if TYPE_CHECKING:
     from wrt.io.toml.schema import SceneTable
 
-MOST = 20  # problems that are told of one file
-# What was expected, by pydantic's type of error; {} is filled from the error's context.
+MOST = 20  # problems reported of one file
+
+# The expected value by pydantic's type of error; {} is filled from the error's context.
 _EXPECTED = {
     "float_type": "a number", "int_type": "a whole number", "string_type": "text", "bool_type": "true or false",
     "list_type": "an array", "dict_type": "a table", "model_type": "a table", "model_attributes_type": "a table",
@@ -25,8 +26,8 @@ _EXPECTED = {
 }
 
 
-def check(data: dict[str, Any], path: Path) -> SceneTable:
-    """The file's tables as models. Raises one InputError that lists everything that is wrong."""
+def check(data: JsonObject, path: Path) -> SceneTable:
+    """Convert a file's tables to models. Raises one InputError that lists all mistakes."""
     from wrt.io.toml.schema import scene_table
 
     materials = data.get("materials")
@@ -34,15 +35,15 @@ def check(data: dict[str, Any], path: Path) -> SceneTable:
     return _models(scene_table(), data, path, [] if data.get("include") else unknown_materials(data, known))
 
 
-def check_settings(values: dict[str, Any], origin: str) -> dict[str, Any]:
-    """Settings by name, checked as [settings] of a file is. Raises one InputError that lists everything that is wrong."""
+def check_settings(values: JsonObject, origin: str) -> JsonObject:
+    """Check settings by the rules of a file's [settings]. Raises one InputError that lists all mistakes."""
     from wrt.io.toml.schema import SettingsTable
 
     return _models(SettingsTable, values, Path(origin)).given()
 
 
 def _models(table: Any, data: dict[str, Any], path: Path, others: Sequence[InputError] = ()) -> Any:
-    """`data` as that table. Where it is none, the InputError lists the `others` too."""
+    """Convert `data` to that table. Raises one InputError that lists its mistakes and the `others`."""
     from pydantic import ValidationError
 
     known_keys: dict[int, list[str]] = {}
@@ -54,7 +55,7 @@ def _models(table: Any, data: dict[str, Any], path: Path, others: Sequence[Input
 
 
 def raise_all(problems: Sequence[InputError], path: Path) -> None:
-    """Raise one InputError with all problems, each a line, but no more than MOST; nothing where there are none."""
+    """Raise one InputError with a line for each problem, at most MOST, if there are any."""
     lines = {str(problem): problem for problem in problems}
     if len(lines) == 1:
         raise problems[0].at(path)
@@ -63,8 +64,8 @@ def raise_all(problems: Sequence[InputError], path: Path) -> None:
         raise InputErrors("\n  ".join([f"{len(lines)} errors", *list(lines)[:MOST], *more]), list(lines.values()), path=path)
 
 
-def unknown_materials(data: dict[str, Any], known: Collection[str]) -> list[InputError]:
-    """An error for each reference to a material that is not known; values of the wrong type are left to the schema."""
+def unknown_materials(data: JsonObject, known: Collection[str]) -> list[InputError]:
+    """Return an error for each reference to an unknown material. Values of a wrong type are left to the schema."""
     found: list[tuple[str, Any]] = []
     for kind in ("spheres", "quads", "boxes", "meshes"):
         for i, table in enumerate(_tables(data.get(kind))):
@@ -105,15 +106,15 @@ def _line(error: Any, data: dict[str, Any], known_keys: dict[int, list[str]]) ->
     return InputError(f"got {str(value).lower() if isinstance(value, bool) else short(value)}, expected {expected}", place=place)
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     return value if isinstance(value, str) else short(value)
 
 
 def _place(location: Sequence[str | int], data: Any, missing: bool) -> tuple[str, Any]:
-    """The path in the file, and the table the last key is in.
+    """Return the path in the file, and the table of the last key.
 
-    pydantic's location also names the members of unions, which are nowhere in the file: what leads to nothing is left
-    out, but for the last part where a key is missing.
+    pydantic's location also has names of union members, which are not in the file. Parts that lead nowhere are left out, except for a
+    last part that is missing.
     """
     place, parent = "", data
     for i, part in enumerate(location):
@@ -127,5 +128,5 @@ def _place(location: Sequence[str | int], data: Any, missing: bool) -> tuple[str
 
 
 def _key(name: str) -> str:
-    """A key as TOML writes it."""
+    """Quote a key in the form of TOML."""
     return name if name and name.replace("_", "").replace("-", "").isalnum() and name.isascii() else f'"{name}"'

@@ -1,4 +1,4 @@
-"""What may stand in a TOML scene file: pydantic models, and the JSON Schema that comes from them.
+"""The schema of TOML scene files: pydantic models, from which the JSON Schema is made.
 
 Names, bounds and defaults are those of the dataclasses in wrt/scene/. Angles are in degrees here and in radians there; lengths
 have the scene's own unit; colours are linear Rec. 709. Wherever a colour stands, one number is a grey.
@@ -28,6 +28,7 @@ from wrt.io.toml.values import (
     Segments,
     Subdivisions,
     Table,
+    TypedTable,
     Vector,
     require_one,
     unit,
@@ -110,7 +111,7 @@ class BoxTable(Table):
     name: str = Field("", description="for messages")
 
 
-# The parameters of each of SHAPES, by its names: what they are, and what the reference says of them.
+# The type and the description of each parameter of SHAPES.
 SHAPE_KEYS: dict[str, dict[str, tuple[Any, str]]] = {
     "icosphere": {"subdivisions": (Subdivisions, "each makes four triangles of one"), "radius": (Length, "of the ball")},
     "torus": {"radius": (Length, "from the axis to the middle of the tube"), "tube_radius": (Length, "of the tube"),
@@ -126,7 +127,7 @@ SHAPE_KEYS: dict[str, dict[str, tuple[Any, str]]] = {
 
 
 def shape_table(kind: str) -> type[Table]:
-    """The table of a shape, with the defaults of its function."""
+    """Make the table of a shape, with the defaults of its function."""
     literal: Any = Literal
     parameters = signature(SHAPES[kind]).parameters
     keys: dict[str, Any] = {"kind": (literal[kind], ...)}
@@ -204,7 +205,7 @@ class MeshTable(Table):
 # --- lights -----------------------------------------------------------------------------------------------------------
 
 
-class RectangleLightTable(Table):
+class RectangleLightTable(TypedTable):
     """A parallelogram that shines; its front is towards cross(edge_u, edge_v)."""
 
     type: Literal["rectangle"]
@@ -242,7 +243,7 @@ class SceneTable(Table):
 
 
 def scene_table() -> type[SceneTable]:
-    """The SceneTable of the kinds of cameras, lights, backgrounds and materials that there are: one can be added at any time."""
+    """Return the SceneTable of all registered kinds of cameras, lights, backgrounds and materials."""
     return _scene_table(tuple(CAMERAS.values()), tuple(LIGHTS.values()), tuple(BACKGROUNDS.values()), tuple(MATERIALS))
 
 

@@ -1,4 +1,4 @@
-"""Transforms of a scene file become matrices."""
+"""Matrices of the transforms of a scene file."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
 
 def transform(table: TransformTable | None) -> np.ndarray:
-    """(4, 4) float64: scale, then rotate, then translate; the identity for None.
+    """Return the matrix (4, 4) float64 that scales, rotates and translates; None gives the identity.
 
-    Raises InputError where the matrix is singular.
+    Raises InputError for a singular matrix.
     """
     matrix = np.eye(4)
     if table is None:
@@ -37,7 +37,7 @@ def transform(table: TransformTable | None) -> np.ndarray:
 
 
 def _about(axis: np.ndarray, degrees: float) -> np.ndarray:
-    """(3, 3) rotation about an axis (Rodrigues)."""
+    """Return the (3, 3) rotation about an axis (Rodrigues)."""
     x, y, z = axis / np.linalg.norm(axis)
     cosine, sine = turn(degrees)
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -45,7 +45,7 @@ def _about(axis: np.ndarray, degrees: float) -> np.ndarray:
 
 
 def turn(degrees: float) -> tuple[float, float]:
-    """Cosine and sine, exact for whole quarter turns, so that axis-parallel things stay axis-parallel."""
+    """Return cosine and sine, exact for quarter turns, so that axis-parallel edges stay axis-parallel."""
     quarters, rest = divmod(degrees, 90.0)
     if rest == 0.0:
         return ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[int(quarters) % 4]

@@ -1,20 +1,20 @@
-"""Values of a TOML scene file as pydantic types, and the tables that they stand in.
-
-Wherever a colour stands, one number is a grey.
-"""
+"""Types of the values of a TOML scene file, and the base class of its tables. One number in place of a colour is a grey."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, WithJsonSchema, model_validator
 
+from wrt.core.types import JsonObject
 from wrt.scene.materials import WRAPS
 
+Annotation: TypeAlias = Any  # a type, or metadata of one, that is made while the program runs
 
-def _repeated(count: int) -> Callable[[Any], Any]:
-    """A single value (but no bool and no text) stands for `count` of it."""
+
+def _repeated(count: int) -> Callable[[object], object]:
+    """Return a function that turns a single number into a list of `count`."""
     return lambda value: [value] * count if isinstance(value, int | float) and not isinstance(value, bool) else value
 
 
@@ -23,8 +23,8 @@ def _or_one(values: dict[str, Any], count: int) -> WithJsonSchema:
     return WithJsonSchema({"anyOf": [values, array]})
 
 
-def unit(name: str) -> Any:
-    """Says in the schema what a number is measured in."""
+def unit(name: str) -> Annotation:
+    """Return the metadata that gives a number its unit in the schema."""
     return Field(json_schema_extra={"unit": name})
 
 
@@ -59,21 +59,27 @@ Size = Annotated[list[Annotated[int, Field(ge=1, le=32768)]], Field(min_length=2
 
 
 class Table(BaseModel):
-    """A table of the file: unknown keys, wrong types, NaN and infinity are errors."""
+    """A table of the file. Unknown keys, wrong types, NaN and infinity are errors."""
 
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
     @model_validator(mode="before")
     @classmethod
     def _note_keys(cls, data: Any, info: ValidationInfo) -> Any:
-        """Leave the known keys where the report of an unknown one finds them."""
+        """Keep the known keys for the report of an unknown key."""
         if isinstance(info.context, dict) and isinstance(data, dict):
             info.context[id(data)] = list(cls.model_fields)
         return data
 
-    def given(self, *leave_out: str) -> dict[str, Any]:
-        """The fields that the file gives, as plain values."""
+    def given(self, *leave_out: str) -> JsonObject:
+        """Return the fields that the file gives, as plain values."""
         return self.model_dump(exclude_unset=True, exclude=set(leave_out))
+
+
+class TypedTable(Table):
+    """A table whose `type` names its kind."""
+
+    type: str
 
 
 def require_one(table: Table, *choices: tuple[str, ...]) -> None:
