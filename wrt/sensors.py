@@ -201,8 +201,7 @@ def with_range_noise(ranges: ArrayLike, seed: int, constant: float = 0.0, propor
     ranges, shape = as_array(ranges, np.float64, "ranges"), np.shape(ranges)
     if not (ranges >= 0.0).all():
         raise InputError(f"must be 0 or more, or inf for a miss, got {ranges[~(ranges >= 0.0)][0]:g}", argument="ranges")
-    constant, proportional = (as_number(value, name, low=0.0) for value, name in ((constant, "constant"),
-                                                                                (proportional, "proportional")))
+    constant, proportional = (as_number(value, name, low=0.0) for value, name in ((constant, "constant"), (proportional, "proportional")))
     if not 0.0 <= as_number(dropout, "dropout") <= 1.0:
         raise InputError(f"must be 0 to 1, got {dropout:g}", argument="dropout")
     rng = np.random.default_rng(as_integer(seed, "seed", 0, (1 << 63) - 1))

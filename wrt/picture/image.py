@@ -50,8 +50,7 @@ def output_format(path: PathLike, bits: int | None = None) -> tuple[str, int]:
     if suffix not in FORMATS:
         raise InputError(f"cannot write {suffix or 'a file without a suffix'}", path=path, hint=f"use {', '.join(FORMATS)}")
     if bits is not None and bits not in FORMATS[suffix]:
-        raise InputError(f"{suffix} is written with {' or '.join(map(str, FORMATS[suffix]))} bits, not {bits}",
-                         argument="bits", path=path)
+        raise InputError(f"{suffix} is written with {' or '.join(map(str, FORMATS[suffix]))} bits, not {bits}", argument="bits", path=path)
     return suffix, bits or FORMATS[suffix][0]
 
 
@@ -113,8 +112,7 @@ def write_exr(path: PathLike, channels: Mapping[str, np.ndarray], metadata: Meta
         spec.attribute(METADATA_PREFIX + key, _utf8(value).decode())
     for name, array in channels.items():
         if array.dtype.kind in "iu" and array.size and int(array.max()) > EXACT_IN_FLOAT:
-            warn(f"{os.fspath(path)}: {name} goes up to {array.max()} and is rounded: its channel is exact to"
-                 f" {EXACT_IN_FLOAT}")
+            warn(f"{os.fspath(path)}: {name} goes up to {array.max()} and is rounded: its channel is exact to {EXACT_IN_FLOAT}")
     _write_oiio(path, spec, np.stack(arrays, axis=-1, dtype=np.float32, casting="unsafe"))
 
 

@@ -197,8 +197,7 @@ def _heat(share: np.ndarray) -> np.ndarray:
     """Return colours, (..., 3) uint8, of shares in [-1, 1]; others are clipped."""
     steps = np.linspace(0.0, 1.0, len(BRIGHTER))
     size = np.clip(np.abs(share), 0.0, 1.0)
-    colors = [np.where(share >= 0.0, np.interp(size, steps, BRIGHTER[:, i]), np.interp(size, steps, DARKER[:, i]))
-              for i in range(3)]
+    colors = [np.where(share >= 0.0, np.interp(size, steps, BRIGHTER[:, i]), np.interp(size, steps, DARKER[:, i])) for i in range(3)]
     return np.rint(np.stack(colors, axis=-1)).astype(np.uint8)
 
 

@@ -153,6 +153,5 @@ def checkpoint_of(plan: Plan, kind: str) -> Checkpoint | None:
     file = Checkpoint(Path(options.checkpoint), options.checkpoint_every, identity, groups=plan.groups, resume=options.resume)
     taken = 0 if file.saved is None else file.saved.samples[1]
     if taken > max(1, settings.spp // plan.groups):
-        raise InputError(f"holds {taken * plan.groups} samples a pixel already; spp is {settings.spp}",
-                         argument="spp", path=file.path)
+        raise InputError(f"holds {taken * plan.groups} samples a pixel already; spp is {settings.spp}", argument="spp", path=file.path)
     return file

@@ -133,8 +133,7 @@ def plan_of(scene: Scene, options: Options) -> Plan:
     camera = options.camera if isinstance(options.camera, CameraKind) else scene.camera(options.camera)
     meshes = instanced_meshes(scene, options.instancing)
     features = features_of(scene, camera, meshes)
-    units = Units(options.triangle, options.box, features.spheres, instances=features.instances,
-                  stack=stack_on(options.device))
+    units = Units(options.triangle, options.box, features.spheres, instances=features.instances, stack=stack_on(options.device))
     return Plan(scene, options, camera, accel, meshes, features, Structure(ACCELERATORS[accel], units),
                 _crop(scene.settings, options), scene.settings.max_depth)
 

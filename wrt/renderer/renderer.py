@@ -71,8 +71,7 @@ class Renderer:
         self.prepared = replace(old, plan=plan, arrays=arrays)
         if isinstance(old.accel, OneMesh) and old.accel.can_refit and same_faces(old.accel.geometry, geometry):
             refit = asdict(old.accel.refit(geometry.vertices, rebuild_at))
-            return {"structure": "rebuilt" if refit["rebuilt"] else "refitted", "seconds": refit["seconds"],
-                    "growth": refit["growth"]}
+            return {"structure": "rebuilt" if refit["rebuilt"] else "refitted", "seconds": refit["seconds"], "growth": refit["growth"]}
         options = plan.options
         chosen: dict[str, Any] = {"triangle": options.triangle, "box": options.box, **options.accel_options}
         accel = build(geometry, plan.accel, options.device, old.threads, **chosen)
@@ -95,5 +94,4 @@ def builder_for(plan: Plan) -> dict[str, str]:
 
 def same_faces(before: Geometry, now: Geometry | InstancedGeometry) -> bool:
     """Return True if only vertices differ. Rounding may have made a face collinear, which changes the faces."""
-    return (isinstance(now, Geometry) and np.array_equal(before.faces, now.faces)
-            and before.vertices.shape == now.vertices.shape)
+    return (isinstance(now, Geometry) and np.array_equal(before.faces, now.faces) and before.vertices.shape == now.vertices.shape)

@@ -16,8 +16,7 @@ from wrt.scene.model import Scene
 Facts = dict[str, Any]  # entries of a film's stats
 
 
-def film_of(plan: Plan, arrays: DeviceFilm, seed: int, aov: dict[str, np.ndarray], seconds: dict[str, float],
-            facts: Facts) -> Film:
+def film_of(plan: Plan, arrays: DeviceFilm, seed: int, aov: dict[str, np.ndarray], seconds: dict[str, float], facts: Facts) -> Film:
     """Return the film with its statistics. facts: entries about the scene, its structure and the end of the run."""
     arrays = arrays.snapshot()
     options, settings, samples = plan.options, plan.scene.settings, arrays.samples()

@@ -220,8 +220,7 @@ def warn_left_out(scene: Scene) -> None:
             if thing.mesh.uvs is None and any(m.textures for m in thing.materials)]
     if bare:
         warn(f"no texture coordinates, so that a texture's first texel is everywhere: objects {listed(bare)}")
-    unreached = [m.name or str(i) for i, m in enumerate(scene.materials)
-                 if m.is_emissive and m.emits_light and not m.lights_others]
+    unreached = [m.name or str(i) for i, m in enumerate(scene.materials) if m.is_emissive and m.emits_light and not m.lights_others]
     if unreached:
         warn("emission that is seen but lights nothing, since a texture or alpha says where it is: materials"
              f" {listed(unreached)} (emits_light = false says that it is meant)")
@@ -245,8 +244,7 @@ def upload_scene(scene: Scene, device: Device, meshes: frozenset[int] = frozense
     s.prim_material = upload(world.prim_material, wp.int32, device)
     s.materials = upload(rows, structs.Material, device)
     s.textures = upload(table.records(), structs.Texture, device)
-    s.texels = upload(np.concatenate([np.zeros(1, np.uint32), *table.texels])[1:] if table.texels else np.zeros(1),
-                      wp.uint32, device)
+    s.texels = upload(np.concatenate([np.zeros(1, np.uint32), *table.texels])[1:] if table.texels else np.zeros(1), wp.uint32, device)
     s.srgb_to_linear = upload(srgb_table(), wp.float32, device)
 
     lighting = structs.Lighting()

@@ -83,5 +83,4 @@ class EnvironmentBackground(Background):
                 "pixels": self.image.reshape(-1, 3), "row_cdf": row / row[-1], "column_cdf": (column / column[:, -1:]).ravel()}
 
 
-BACKGROUNDS: dict[str, type[Background]] = {
-    each.kind: each for each in (ConstantBackground, GradientBackground, EnvironmentBackground)}
+BACKGROUNDS: dict[str, type[Background]] = {each.kind: each for each in (ConstantBackground, GradientBackground, EnvironmentBackground)}

@@ -70,8 +70,7 @@ def _triple(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, np
 
 
 def _triple_exact(a: list[Any], b: list[Any], c: list[Any]) -> Any:
-    return (a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2])
-            + a[2] * (b[0] * c[1] - b[1] * c[0]))
+    return (a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2]) + a[2] * (b[0] * c[1] - b[1] * c[0]))
 
 
 def whole_numbers(*arrays: np.ndarray) -> tuple[list[list[Any]], int]:
@@ -106,8 +105,7 @@ def _sign(x: Any) -> np.ndarray:
 
 def _resolve(rows: np.ndarray, o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, ...], out: Crossings) -> None:
     """Overwrite entries of `out` with results in integer arithmetic; t, u, v are then correctly rounded."""
-    weights, (numerator, slope, slope_power), normal, power = exact_plane(
-        o[:, rows], d[:, rows], tuple(corner[:, rows] for corner in v))
+    weights, (numerator, slope, slope_power), normal, power = exact_plane(o[:, rows], d[:, rows], tuple(corner[:, rows] for corner in v))
     w_sign = np.stack([_sign(w) for w in weights])
     slope_sign = _sign(slope)
     zeros = (w_sign == 0).sum(axis=0)
@@ -127,8 +125,7 @@ def _resolve(rows: np.ndarray, o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray
     out.slope[rows] = np.ldexp(slope.astype(np.float64), slope_power)
 
 
-def triangle_crossings(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, np.ndarray, np.ndarray], *,
-                       all_rows: bool = False) -> Crossings:
+def triangle_crossings(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, np.ndarray, np.ndarray], *, all_rows: bool = False) -> Crossings:
     """Intersect line i with triangle i. o, d and the corners in v: (3, N) float64 that hold finite float32 values.
 
     `place` is exact. For hits the relative error of t is at most ACCURATE (the bound is t_error), and so is the error of u and v.

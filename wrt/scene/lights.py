@@ -25,8 +25,7 @@ class PointLight(Light):
 
     kind = "point"
     position: Color = field(metadata=given("point", "position"))
-    intensity: Color = field(metadata=given(
-        "color", "equal in all directions; irradiance = intensity / distance^2", "radiant intensity"))
+    intensity: Color = field(metadata=given("color", "equal in all directions; irradiance = intensity / distance^2", "radiant intensity"))
     name: str = ""
 
     def record(self) -> Record:

@@ -106,11 +106,11 @@ class Material:
     Parameters
     ----------
     kind
-        "diffuse": Lambert with `albedo`, plus a normalised Blinn-Phong highlight of `specular` and `exponent`.
-        "mirror": reflectance `albedo` at every angle.
-        "conductor": exact Fresnel reflection with the index of refraction `eta` + i `k` (presets in CONDUCTORS); `roughness`.
-        "glass": dielectric of index `ior` that reflects and refracts; `albedo` tints transmission; `absorption`, `thin`, `roughness`.
-        "metallic_roughness": glTF 2.0's, from `albedo` (base colour), `metallic`, `roughness`, `ior`, `transmission`.
+        - "diffuse": Lambert with `albedo`, plus a normalised Blinn-Phong highlight of `specular` and `exponent`.
+        - "mirror": reflectance `albedo` at every angle.
+        - "conductor": exact Fresnel reflection with the index of refraction `eta` + i `k` (presets in CONDUCTORS); `roughness`.
+        - "glass": dielectric of index `ior` that reflects and refracts; `albedo` tints transmission; `absorption`, `thin`, `roughness`.
+        - "metallic_roughness": glTF 2.0's, from `albedo` (base colour), `metallic`, `roughness`, `ior`, `transmission`.
     albedo
         Reflectance, or for glass the transmittance of each surface.
     absorption
@@ -142,8 +142,7 @@ class Material:
         "color", "reflectance; of glass the transmittance of each surface, 1 for clear glass", le=1.0))
     specular: Color = field(default=BLACK, metadata=given("color", "colour of the highlight (diffuse)", le=1.0))
     exponent: float = field(default=50.0, metadata=given("number", "exponent of the highlight (diffuse)", ge=0.0, le=1e6))
-    eta: Color = field(default=CONDUCTORS["silver"][0], metadata=given(
-        "color", "real part of the index of refraction (conductor)", le=1e3))
+    eta: Color = field(default=CONDUCTORS["silver"][0], metadata=given("color", "real part of the index of refraction (conductor)", le=1e3))
     k: Color = field(default=CONDUCTORS["silver"][1], metadata=given("color", "imaginary part (conductor)", le=1e3))
     ior: float = field(default=1.5, metadata=given("number", "index of refraction (glass, metallic_roughness)", ge=1.0, le=10.0))
     absorption: Color = field(default=BLACK, metadata=given(
@@ -165,8 +164,7 @@ class Material:
         "texture", "multiplies albedo; its alpha multiplies alpha", among=(Texture, Checkerboard)))
     metallic_roughness_texture: Texture | None = field(default=None, metadata=given(
         "texture", "green multiplies roughness, blue metallic", among=(Texture,)))
-    transmission_texture: Texture | None = field(default=None, metadata=given(
-        "texture", "red multiplies transmission", among=(Texture,)))
+    transmission_texture: Texture | None = field(default=None, metadata=given("texture", "red multiplies transmission", among=(Texture,)))
     emission_texture: Texture | Checkerboard | None = field(default=None, metadata=given(
         "texture", "multiplies emission", among=(Texture, Checkerboard)))
     normal_texture: Texture | None = field(default=None, metadata=given("texture", "tangent-space normal map", among=(Texture,)))

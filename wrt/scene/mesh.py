@@ -66,8 +66,7 @@ class Mesh:
             if getattr(self, attribute) is not None:
                 array = self._array(attribute, np.float32, width)
                 if len(array) != len(vertices):
-                    raise InputError(f"{len(array)} {attribute} for {len(vertices)} vertices", argument=attribute,
-                                     place=self.name or None)
+                    raise InputError(f"{len(array)} {attribute} for {len(vertices)} vertices", argument=attribute, place=self.name or None)
                 _require_finite(array, self.name, attribute)
         if self.face_group is not None:
             group = as_array(self.face_group, np.int32, "face_group")
@@ -79,8 +78,7 @@ class Mesh:
         try:
             raw = np.asarray(getattr(self, attribute))
         except ValueError:
-            raise InputError(f"must be (N, {width}), got rows of different lengths",
-                             argument=attribute, place=self.name or None) from None
+            raise InputError(f"must be (N, {width}), got rows of different lengths", argument=attribute, place=self.name or None) from None
         if raw.ndim != 2 or raw.shape[1] != width:
             raise InputError(f"must be (N, {width}), got {raw.shape}", argument=attribute, place=self.name or None)
         if dtype is np.int32 and raw.size and not np.issubdtype(raw.dtype, np.integer):

@@ -91,8 +91,7 @@ class _Packer:
                 place = {"array": len(self.arrays) - 1}
             else:
                 left_out = (*self.left_out.get(object, ()), *self.left_out.get(type(value), ()))
-                content = {each.name: None if each.name in left_out else self.plain(getattr(value, each.name))
-                           for each in fields(value)}
+                content = {each.name: None if each.name in left_out else self.plain(getattr(value, each.name)) for each in fields(value)}
                 self.things.append((type(value).__name__, content))
                 place = {"thing": len(self.things) - 1}
             self.known[id(value)] = place

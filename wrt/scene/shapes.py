@@ -58,8 +58,7 @@ def icosphere(subdivisions: int = 3, radius: float = 1.0) -> Mesh:
     points = np.concatenate([np.roll(corner, turn, axis=1) for turn in range(3)])
     # The faces are the triples of corners at the distance 2 from each other.
     near = np.isclose(np.linalg.norm(points[:, None] - points[None], axis=2), 2.0)
-    faces = np.array([(i, j, k) for i in range(12) for j in range(i) for k in range(j)
-                      if near[i, j] and near[j, k] and near[k, i]])
+    faces = np.array([(i, j, k) for i in range(12) for j in range(i) for k in range(j) if near[i, j] and near[j, k] and near[k, i]])
     turned = np.linalg.det(points[faces]) < 0.0
     faces[turned] = faces[turned][:, ::-1]
     points /= np.linalg.norm(points, axis=1, keepdims=True)

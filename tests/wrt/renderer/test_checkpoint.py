@@ -199,7 +199,7 @@ def refuses(message: str, path: Path, **options: Any) -> None:
 
 def test_a_file_that_is_there_is_never_overwritten(path: Path) -> None:
     path.write_bytes(b"a diary")
-    refuses("a.checkpoint: is there already: resume it", path)
+    refuses("a.checkpoint: is there already; resume it", path)
     refuses("a.checkpoint: is no checkpoint of this version", path, resume=True)
     path.write_bytes(pickle.dumps({"seconds": 0}))
     refuses("is no checkpoint", path, resume=True)

@@ -128,5 +128,4 @@ def _waited_for(replies: list[Reply], waited: float) -> dict[str, float]:
 
 def _check_kind(reply: Reply, kind: str) -> None:
     if reply[1] != kind:
-        raise InputError(f"the workers' devices are of several kinds, which do not round alike: {kind},"
-                         f" and at {reply[0]} {reply[1]}")
+        raise InputError(f"the workers' devices are of several kinds, which do not round alike: {kind}, and at {reply[0]} {reply[1]}")

@@ -198,8 +198,7 @@ def _unpacked(package: Package) -> Prepared:
         raise InputError(f"worker {worker_name()} has {differs}: all must have the same")
     prepared = _prepared(unpack(package["scene"], package["arrays"]), Options(**package["options"]))
     if prepared.plan.kernels_hash() != package["kernels"]:
-        raise InputError(f"worker {worker_name()} makes other kernels of the same code",
-                         hint="install the same warp-lang everywhere")
+        raise InputError(f"worker {worker_name()} makes other kernels of the same code", hint="install the same warp-lang everywhere")
     return prepared
 
 

@@ -291,7 +291,7 @@ def test_bad_options(options: dict[str, Any], said: str | None) -> None:
 
 
 def test_a_profile_has_no_executor(threads: Executor) -> None:
-    with pytest.raises(InputError, match="no argument 'executor'"):
+    with pytest.raises(InputError, match="executor is no argument of a profile"):
         profile(SCENE, executor=threads)
 
 
