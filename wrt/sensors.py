@@ -160,6 +160,11 @@ def raster_lidar(fov: tuple[float, float], size: tuple[int, int] | str, pose: Ar
     Returns
     -------
     Sensor
+
+    Raises
+    ------
+    InputError
+        Names the argument and what was expected.
     """
     width, height = as_size(size)
     angles = as_array(fov, np.float64, "fov")

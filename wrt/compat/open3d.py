@@ -181,7 +181,7 @@ class RaycastingScene:
         return _answer(_spread(closest_points(self._scene()[0], points, _threads(nthreads)).distance, good, np.nan), shape)
 
     def compute_signed_distance(self, query_points: ArrayLike, nthreads: int = 0, nsamples: int = 1) -> Answer:
-        """Compute the distance of each point to the meshes, negative where `compute_occupancy` is 1: (...) float32."""
+        """Compute distances to the meshes, negative where `compute_occupancy` with `nsamples` is 1: (...) float32."""
         shape, good, points = _asked_points(query_points)
         inside = self._inside(points, nthreads, nsamples)
         distance = closest_points(self._scene()[0], points, _threads(nthreads)).distance

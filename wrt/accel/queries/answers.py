@@ -109,7 +109,7 @@ class Hits(HitPoints[ArrayT]):
         return self.each(to_warp)
 
     def each(self, convert: Callable[[ArrayT], TensorT]) -> Hits[TensorT]:
-        """Return the hits with each of the four arrays converted."""
+        """Return the hits with each of the four arrays passed through `convert`."""
         return Hits(convert(self.t), convert(self.u), convert(self.v), convert(self.prim_id), self.counters, self.source)
 
 

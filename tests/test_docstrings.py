@@ -1,0 +1,78 @@
+"""Docstrings of what users call: numpydoc sections that describe every parameter, and results and errors where there are some."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import re
+from collections.abc import Callable, Iterator
+from typing import get_args
+
+import pytest
+
+import wrt
+
+MODULES = ("wrt.torch", "wrt.jax", "wrt.sensors", "wrt.testing", "wrt.compat.trimesh", "wrt.compat.open3d", "wrt.picture.metrics")
+CLASSES = ("wrt.accel.base:OneMesh", "wrt.accel.instances:Instances", "wrt.accel.queries.answers:Hits", "wrt.picture.film:Film",
+           "wrt.compat.trimesh:RayMeshIntersector", "wrt.compat.open3d:RaycastingScene")
+WITHOUT_SECTIONS = ("wrt.kernels.structs",)  # modules that are not yet done
+NOT_CALLED = ("pytest_addoption", "pytest_generate_tests", "located")  # by users
+PLAIN = re.compile(r"(float|int|str|bool|None|\w*(Mesh|Scene|Film|Hits|Refit)\w*|list\[str\]|[\s|])+")  # a name that says all
+
+
+def callables() -> Iterator[tuple[str, Callable[..., object], str]]:
+    """Yield public functions and methods: name, function, and the docstring of the class or ""."""
+    for home, names in [("wrt", wrt.__all__), *((each, None) for each in MODULES)]:
+        module = importlib.import_module(home)
+        for name in names or getattr(module, "__all__", vars(module)):
+            thing = getattr(module, name)
+            own = names or getattr(thing, "__module__", "").startswith("wrt.lab.hard_cases") or getattr(thing, "__module__", "") == home
+            if inspect.isfunction(thing) and own and not name.startswith("_") and name not in NOT_CALLED:
+                if thing.__module__ not in WITHOUT_SECTIONS:
+                    yield f"{home}.{name}", thing, ""
+    for place in CLASSES:
+        home, name = place.split(":")
+        for method, function in inspect.getmembers(getattr(importlib.import_module(home), name), inspect.isfunction):
+            if not method.startswith("_") and function.__module__.startswith("wrt."):
+                yield f"{name}.{method}", function, getattr(importlib.import_module(home), name).__doc__ or ""
+
+
+def section(docstring: str, title: str) -> str:
+    """Return the text below a title of numpydoc, up to the next title; "" without one."""
+    match = re.search(rf"^{title}\n-+\n(.*?)(?=^\w[^\n]*\n-+\n|\Z)", inspect.cleandoc(docstring), re.S | re.M)
+    return match[1] if match else ""
+
+
+def described(docstring: str) -> set[str]:
+    """Return the names in the section Parameters: `a, b : type`, or without a type."""
+    rows = re.findall(r"^(\S[^\n:]*?)(?: :[^\n]*)?$", section(docstring, "Parameters"), re.M)
+    return {name.strip(" *") for row in rows for name in row.split(",")}
+
+
+def parameters(function: Callable[..., object]) -> set[str]:
+    """Return the names of the parameters; of `**options: Unpack[Some]`, those in Some unless `options` is described."""
+    found = set()
+    for name, each in inspect.signature(function).parameters.items():
+        if each.kind is each.VAR_KEYWORD and name not in described(function.__doc__ or ""):
+            kind = inspect.signature(function, eval_str=True).parameters[name].annotation
+            found |= set(get_args(kind)[0].__annotations__) if get_args(kind) else {name}
+        elif name not in ("self", "cls"):
+            found.add(name)
+    return found
+
+
+@pytest.mark.parametrize("name, function, of_class", list(callables()), ids=[name for name, *_ in callables()])
+def test_parameters_and_results_are_described(name: str, function: Callable[..., object], of_class: str) -> None:
+    docstring = function.__doc__ or ""
+    missing = parameters(function) - described(docstring) - described(of_class)
+    # The first line may describe the one argument of a method.
+    first = docstring.split("\n")[0]
+    assert docstring and (not missing or (of_class and len(missing) == 1 and (missing <= set(re.findall(r"\w+", first))))), missing
+    result = str(inspect.signature(function).return_annotation)
+    assert of_class or PLAIN.fullmatch(result) or section(docstring, "Returns") or section(docstring, "Yields"), result
+
+
+def test_functions_that_check_arguments_say_what_they_raise() -> None:
+    raising = [(name, function) for name, function, of_class in callables()
+               if not of_class and re.search(r"raise InputError|\bas_(one|choice|integer)\(", inspect.getsource(function))]
+    assert len(raising) > 5 and [name for name, function in raising if not section(function.__doc__ or "", "Raises")] == []
