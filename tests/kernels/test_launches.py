@@ -1,4 +1,4 @@
-"""Kernels of the CPU that launch others: each as it was recorded, with another last argument, or of a range of rays."""
+"""CPU kernels that launch others: as recorded, with another last argument, or for a range of rays."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from wrt.kernels.structs import kernel
 
 @wp.struct
 class Log:
-    """What was launched: `entries` so far, of `what`, and how often each number was in a range."""
+    """Log of launches: `entries` so far, their values in `what`, and how often each index was in a range."""
 
     entries: wp.array(dtype=wp.int32)
     what: wp.array(dtype=wp.int32)
@@ -64,7 +64,7 @@ def log() -> Log:
     return out
 
 
-def test_a_kernel_launches_another_until_that_has_done_enough() -> None:
+def test_a_kernel_launches_another_repeatedly() -> None:
     it, launches = log(), Launches()
     of_note = launches.recorded(recorded(note, it, 10.0, 7))
     gc.collect()
@@ -86,11 +86,11 @@ def test_a_range_is_taken_by_as_many_threads_as_it_needs(kernel: wp.Kernel, bloc
     np.testing.assert_array_equal(it.seen.numpy(), expected)
 
 
-def test_nothing_stays_of_launches_that_are_let_go() -> None:
+def test_released_launches_free_their_memory() -> None:
     it = log()
     Launches().recorded(recorded(take, it, 0, 0))
     gc.collect()
-    gc.disable()  # what only the collector frees stays
+    gc.disable()  # objects that only the collector frees stay
     try:
         before = len(gc.get_objects())
         for _ in range(50):

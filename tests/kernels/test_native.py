@@ -14,7 +14,7 @@ from wrt.kernels.structs import kernel
 
 
 def result(path):
-    """What the function of this file returns."""
+    """Value that the function of this file returns."""
 
     @wp.func_native(source(path, SIZE=7, WIDTH=2.0**-120, UNUSED=True))
     def number() -> float: ...

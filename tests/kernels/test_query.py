@@ -1,4 +1,4 @@
-"""The kernels over arrays of rays: which rows they touch, and what a miss leaves behind."""
+"""The kernels over arrays of rays: the entries that they write, and what they write on a miss."""
 
 import numpy as np
 import pytest
@@ -87,7 +87,7 @@ LARGEST = np.finfo(np.float32).max
 
 @pytest.mark.parametrize("name", STRUCTURES)
 @pytest.mark.parametrize("t_max", [np.inf, LARGEST, 2.0**127])
-def test_a_hit_whose_t_is_beyond_float32_is_none(name, t_max):
+def test_a_hit_whose_t_is_beyond_float32_is_a_miss(name, t_max):
     # t = 2^128, beyond by half a step; the last number there is; one step less; 2^127; far within; beyond by a lot.
     distance = np.array([1.0, 1.0 - 2.0**-24, 1.0 - 2.0**-23, 0.5, 2.0**-40, 2.0**12]) * 2.0**-12
     expected = distance.astype(np.float64) * 2.0**140
@@ -128,7 +128,7 @@ def ray_defaults(origin: wp.array(dtype=wp.vec3), direction: wp.array(dtype=wp.v
     out[i] = wp.where(i == 0, Ray(), make_ray(origin[i], direction[i]))
 
 
-def test_make_ray_goes_to_infinity_and_leaves_nothing_out():
+def test_make_ray_goes_to_infinity_and_excludes_nothing():
     out = zeros(2, Ray)
     wp.launch(ray_defaults, dim=2, inputs=[vec3s(np.ones((2, 3))), vec3s(np.full((2, 3), 2.0)), out], device=DEVICE)
     zero, ray = out.numpy()
@@ -138,8 +138,8 @@ def test_make_ray_goes_to_infinity_and_leaves_nothing_out():
 
 
 @pytest.mark.parametrize("name", families_first())
-def test_a_ray_with_nothing_said_of_it_leaves_no_triangle_out(name):
-    # As somebody writes a kernel of his own: triangle 0 is hit, unless it is left out by its number + 1.
+def test_a_ray_excludes_no_triangle_by_default(name):
+    # A user's kernel: triangle 0 is hit, unless exclude_plus_one names it.
     structure = Structure(ACCELERATORS[name])
     struct, traverse = structure.struct, structure.traversal(any_hit=False)
 

@@ -62,7 +62,7 @@ def test_rows_follow_one_another() -> None:
 
 
 def copied(source: Rows, target: Rows, things: Any, without: tuple[str, ...] = ()) -> Any:
-    """Things that went to rows, from there to other rows, and back; and those rows."""
+    """Values that went to rows, from there to other rows, and back; and those rows."""
     store, load, store_again, load_again = source.store(), source.load(*without), target.store(), target.load()
 
     @kernel

@@ -19,7 +19,7 @@ from wrt.kernels.structs import kernel
 @kernel
 def cut_cell(cells: Cells, lo: wp.vec3d, hi: wp.vec3d, normal: wp.array(dtype=wp.vec3d), offset: wp.array(dtype=wp.float64),
              eps: wp.float64, areas: wp.array(dtype=wp.vec3d)):
-    """Cut the box in slot 0 by one plane after another, and keep what is above; areas: predicted (below, above), and clipped."""
+    """Cut the box in slot 0 by one plane after another, and keep the part above; areas: predicted (below, above), then clipped."""
     box_cell(cells, 0, lo, hi)
     for i in range(normal.shape[0]):
         n = normal[i]
@@ -34,7 +34,7 @@ def cut_cell(cells: Cells, lo: wp.vec3d, hi: wp.vec3d, normal: wp.array(dtype=wp
 
 
 def cut(lo, hi, normals, offsets, eps=1e-12):
-    """Predicted and clipped areas, (N, 2) each, and the cells: slot 0 what is left, 1 and 2 below and above the last plane."""
+    """Predicted and clipped areas, (N, 2) each, and the cells: the rest in slot 0, below and above the last plane in 1 and 2."""
     n, cells = len(normals), cells_of(3)
     areas = wp.zeros(2 * n, dtype=wp.vec3d, device=DEVICE)
     launch(cut_cell, 1, cells, wp.vec3d(*lo), wp.vec3d(*hi), wp.array(normals, dtype=wp.vec3d, device=DEVICE),

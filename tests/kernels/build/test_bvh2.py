@@ -1,4 +1,4 @@
-"""The BVH's builder: what every tree must satisfy, whatever it was built over."""
+"""The binary BVH's builders: invariants of every tree over any input."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ from wrt.scene.shapes import icosphere, torus
 
 
 def geometry_of(lo, hi):
-    """A triangle in each box: from one corner by a third to the opposite one."""
+    """A triangle in each box: its corners are two opposite corners of the box and a third one."""
     lo, hi = np.asarray(lo, np.float32).reshape(-1, 3), np.asarray(hi, np.float32).reshape(-1, 3)
     third = np.where([True, False, True], lo, hi)
     vertices = np.stack([lo, third, hi], axis=1).reshape(-1, 3)
@@ -34,8 +34,8 @@ def make(lo, hi, builder="binned", threads=1, **changes):
 
 
 def check_tree(lo, hi, tree, max_leaf=4):
-    """Every primitive in a leaf, boxes nested, depth right and within the stack; number of leaves. Unless space was split,
-    every primitive in one leaf, and boxes tight."""
+    """Check that each primitive is in a leaf, boxes nest, and the depth is right and within the stack; return the number of leaves.
+    Without spatial splits, each primitive must be in one leaf, and boxes must be tight."""
     lo, hi = geometry_of(lo, hi).bounds()
     nodes, order, depth = tree.nodes, tree.order, tree.depth
     assert np.array_equal(np.unique(order), np.arange(len(lo)))
@@ -84,12 +84,12 @@ def points(values):
 
 
 def progression(rng):
-    """Ratio 16 and up: the bins can only ever take the largest one off."""
+    """Ratio 16 and up: bins can only split off the largest box."""
     return points(16.0 ** np.arange(-29, 15)[:, None] * np.array([1.0, 0.0, 0.0]))
 
 
 def crowded_progression(rng):
-    """The same with a crowd at each step, in three axes: deeper than the stack if nothing were done."""
+    """The same with a crowd at each step, in three axes: without the depth limit, deeper than the stack."""
     steps = [np.eye(3)[axis] * 4.0**k for axis in range(3) for k in range(-60, 31) for _ in range(3)]
     return points(np.concatenate([steps, np.zeros((500, 3))]))
 
@@ -154,9 +154,9 @@ def test_one_and_two_threads_build_the_same_tree(builder):
     assert same(two, make(lo, hi, builder, threads=2))
 
 
-def test_no_subtree_is_forgotten_however_many_are_left_to_the_threads():
-    # Crowds of more than a thread's share, each with shells around it that are split off one after the other: hundreds of
-    # small ranges are left over at the top, where a well-behaved scene leaves some dozens.
+def test_no_subtree_is_forgotten_however_many_are_deferred():
+    # Crowds of more than a thread's share, each inside shells that are split off one after another. Hundreds of small ranges are deferred
+    # at the top; an ordinary scene defers some dozens.
     parts = []
     for crowd in range(32):
         base = np.full(3, (crowd + 1.0) * 2**19)
@@ -181,7 +181,7 @@ def test_every_builder_gives_the_same_bits_as_brute_force(builder, kind):
 
 
 def test_splits_follow_the_surface_area():
-    # Two far clusters: the root must separate them; the expected cost is far below that of a split in the middle by number.
+    # Two far clusters: the root must separate them. The expected cost is far below the cost of a median split.
     rng = np.random.default_rng(4)
     center = np.where(np.arange(1000)[:, None] < 100, [-50.0, 0.0, 0.0], [50.0, 0.0, 0.0]) + rng.random((1000, 3))
     tree = make(center, center + 0.01)
@@ -240,13 +240,13 @@ def test_sah_cost_by_hand():
 @pytest.mark.parametrize("options, message", [
     ({"builder": "guess"}, "no builder 'guess'; there is binned"), ({"cost_traversal": -1.0}, "cost_traversal must be finite"),
     ({"cost_intersection": np.inf}, "cost_intersection must be finite")])
-def test_options_that_are_refused(options, message):
+def test_invalid_options_are_refused(options, message):
     with pytest.raises(InputError, match=message):
         build(icosphere(0), "bvh2", **options)
 
 
 @pytest.mark.parametrize("max_leaf", [0, 65, -1])
-def test_leaf_sizes_that_are_refused(max_leaf):
+def test_invalid_leaf_sizes_are_refused(max_leaf):
     with pytest.raises(InputError, match="max_leaf"):
         build(icosphere(0), "bvh2", max_leaf=max_leaf)
 

@@ -1,4 +1,4 @@
-"""Clipping for builders: what is left of a triangle in a cell is never less than there is, and hardly more."""
+"""Clipping for builders: the clipped box never misses a part of the triangle in the cell, and is hardly larger."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def clip(corners, cell_lo, cell_hi, spheres=(), exact=True):
 
 
 def polygon_in(triangle, lo, hi):
-    """The corners of what of a triangle is in a box, by cutting with one half-space after the other in float64."""
+    """Corners of the part of a triangle in a box, cut by one half-space after another in float64."""
     polygon = triangle.astype(np.float64)
     for axis in range(3):
         for sign, bound in ((1.0, lo[axis]), (-1.0, hi[axis])):

@@ -1,4 +1,4 @@
-"""Boxes from the leaves up, by as many threads as there are nodes: what makes that right on a GPU is in the machine code."""
+"""Fitting boxes from the leaves up, a thread a node; the machine code shows the order of memory that a GPU needs."""
 
 from __future__ import annotations
 

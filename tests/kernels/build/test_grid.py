@@ -1,4 +1,4 @@
-"""The grid's builder: every cell lists what is in it, whatever the grid is built over."""
+"""The grid's builder: every cell lists its primitives, over any input."""
 
 from dataclasses import replace
 
@@ -63,13 +63,13 @@ def test_cells_that_only_the_box_of_a_triangle_meets_do_not_list_it():
     lowest = where.sum(axis=1)
     assert (lowest <= 10).all() and (lowest + 3 >= 10).all()
     x, y, z = np.indices((10, 10, 10))
-    expected = ((x + y + z <= 10) & (x + y + z + 3 >= 10)).sum()  # closed, and the pads: those that touch at a corner too
+    expected = ((x + y + z <= 10) & (x + y + z + 3 >= 10)).sum()  # closed cells, and pads: cells that touch at a corner count too
     assert len(where) == 20 * expected
 
 
 @pytest.mark.parametrize("density", [0.1, 1.0, 8.0])
 def test_as_many_cells_as_the_density_asks_for(density):
-    # Boxes of many shapes, also without height: the number of cells comes out, and they are nearly cubes.
+    # Boxes of many shapes, some without height: the number of cells is as asked, and cells are nearly cubes.
     rng = np.random.default_rng(3)
     for shape in ([1, 1, 1], [1, 2, 3], [30, 1, 1], [1, 0, 1], [20, 5, 0]):
         geometry = triangles((rng.uniform(-1.0, 1.0, (5000, 1, 3)) + 0.02 * rng.normal(size=(5000, 3, 3))) * shape)
@@ -93,7 +93,7 @@ def test_too_many_references_make_larger_cells_and_a_warning(monkeypatch):
 
 
 @pytest.mark.parametrize("density", [0.0, -1.0, 1e9, float("nan")])
-def test_densities_that_are_refused(density):
+def test_invalid_densities_are_refused(density):
     with pytest.raises(InputError, match="density"):
         build(icosphere(0), "grid", density=density)
 

@@ -1,4 +1,4 @@
-"""The k-d tree's builder: what every tree must satisfy, whatever it was built over, and that its splits are the cheapest."""
+"""The k-d tree's builder: invariants of every tree over any input, and that its splits are the cheapest."""
 
 from types import SimpleNamespace
 
@@ -24,7 +24,7 @@ def make(geometry, threads=1, **options):
 
 
 def cells(tree):
-    """(lo, hi, depth, word & 3, members or None) of all nodes, the root first; each node is met once."""
+    """(lo, hi, depth, word & 3, members or None) of all nodes, the root first; each node once."""
     met = np.zeros(len(tree.nodes), int)
     todo = [(0, tree.lo.astype(np.float64), tree.hi.astype(np.float64), 1)]
     while todo:
@@ -44,7 +44,7 @@ def cells(tree):
 
 
 def check_tree(geometry, tree, max_depth, growth):
-    """Leaves hold every primitive that reaches into them, once, and none whose padded box does not; numbers are right."""
+    """Check that leaves hold each primitive that reaches into them once, and no primitive whose padded box does not."""
     box_lo, box_hi = geometry.bounds()
     box_hi = np.where(box_lo < box_hi, box_hi, np.nextafter(box_hi, np.float32(np.inf)))
     size = np.maximum(np.abs(box_lo), np.abs(box_hi)).max(axis=1, keepdims=True).astype(np.float64)
@@ -101,7 +101,7 @@ def test_the_cost_is_the_sum_over_the_cells(kind):
 
 
 def expected_cost(tree, options, plane, geometry):
-    """What a split of the root costs by the boxes of the primitives: by definition, without any sweep."""
+    """Cost of a split of the root by the primitives' boxes, by definition, without a sweep."""
     lo, hi = geometry.bounds()
     axis, position = plane
     left, right = np.count_nonzero(lo[:, axis] < position), np.count_nonzero(hi[:, axis] > position)
@@ -177,7 +177,7 @@ def test_options_change_no_answer(kind, options):
     ({"empty_bonus": 1.5}, "empty_bonus must be 0 to 1"), ({"cost_traversal": float("nan")}, "cost_traversal"),
     ({"perfect_below": 10}, "perfect_below must be 1024"), ({"max_growth": 0.5}, "max_growth must be 1"),
     ({"clip": "yes"}, "clip must be bool"), ({"builder": "sah"}, "builder is no option of kdtree")])
-def test_options_that_are_refused(options, message):
+def test_invalid_options_are_refused(options, message):
     with pytest.raises(InputError, match=message):
         build(icosphere(0), "kdtree", **options)
 

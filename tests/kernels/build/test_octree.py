@@ -1,4 +1,4 @@
-"""The octree's builder: every leaf lists what is in it, and the tree stays within its bounds whatever it is built over."""
+"""The octree's builder: every leaf lists its primitives, and the tree stays within its bounds, over any input."""
 
 from dataclasses import replace
 
@@ -99,7 +99,7 @@ def test_depth_and_size_are_bounded(heap, by_cost):
 
 
 def test_references_are_limited_in_every_part_alike():
-    # A ball beside a soup that would take every reference there is: the ball's leaves are as small as when it is alone.
+    # A ball beside a soup that would take all references: the ball's leaves are as small as without it.
     rng = np.random.default_rng(6)
     soup = triangles(rng.uniform(-1.0, 1.0, (2000, 1, 3)) + 0.3 * rng.normal(size=(2000, 3, 3)))
     ball = icosphere(3)
@@ -116,7 +116,7 @@ def test_references_are_limited_in_every_part_alike():
 
 @pytest.mark.parametrize("options", [{"max_leaf": 0}, {"max_depth": -1}, {"max_depth": 21}, {"max_growth": 0.5},
                                      {"max_growth": float("nan")}])
-def test_options_that_are_refused(options):
+def test_invalid_options_are_refused(options):
     with pytest.raises(InputError, match=next(iter(options))):
         build(icosphere(0), "octree", **options)
 

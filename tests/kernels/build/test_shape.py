@@ -1,4 +1,4 @@
-"""Boxes and corners that a device makes have the bits of those that the host makes."""
+"""Boxes and corners made on a device have the bits of the host's."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Triangle against cell: held to clipping the triangle by the cell's planes, in float64."""
+"""The test of a triangle against a cell, compared with clipping the triangle to the cell in float64."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def meets(corners: wp.array(dtype=wp.vec3), lo: wp.array(dtype=wp.vec3), hi: wp.
 
 
 def clipped(polygon, lo, hi):
-    """What is left of a polygon in a closed box (Sutherland and Hodgman)."""
+    """Part of a polygon in a closed box (Sutherland and Hodgman)."""
     for axis in range(3):
         for sign, bound in ((1.0, hi[axis]), (-1.0, -lo[axis])):
             out = []
@@ -64,7 +64,7 @@ def test_meets_exactly_the_cells_that_clipping_leaves_something_in(case):
     pad = np.maximum(corners.min(axis=1) - lo.astype(np.float64), hi.astype(np.float64) - corners.max(axis=1))
     triangle = [list(c) for c in corners.astype(np.float64)]
     inside = np.array([len(clipped(triangle[i], cell_lo[i], cell_hi[i])) > 0 for i in range(n)])
-    # Grown by its pad the triangle is no more than that away: a cell that is larger by it on all sides has a part of it.
+    # The grown triangle is at most its pad away: a cell larger by that on all sides holds a part of it.
     reach = 1.000001 * pad
     near = np.array([len(clipped(triangle[i], cell_lo[i] - reach[i], cell_hi[i] + reach[i])) > 0 for i in range(n)])
     assert found[inside].all()

@@ -1,4 +1,4 @@
-"""The collapse of binary trees into wide ones: what every tree must satisfy, and that none is cheaper."""
+"""The collapse of binary trees into wide ones: invariants of every tree, and that no collapse is cheaper."""
 
 from functools import cache
 
@@ -15,13 +15,13 @@ from wrt.scene.shapes import icosphere
 
 
 def leaf(reference):
-    """First row, and how many primitives."""
+    """First row and number of primitives."""
     return (-1 - reference) // 64, (-1 - reference) % 64 + 1
 
 
 def check_tree(tree, geometry, width, max_leaf):
-    """Every primitive in a leaf, every leaf's rows full but the last, boxes tight around what is in them (or, where space was
-    split, within); the numbers told are right."""
+    """Check that each primitive is in a leaf, all rows of a leaf but the last are full, boxes are tight, and totals are right. After
+    spatial splits, boxes need only be within the primitives' boxes."""
     lo, hi = geometry.bounds()
     assert np.array_equal(np.unique(tree.order[tree.order >= 0]), np.arange(len(lo)))
     split = (tree.order >= 0).sum() > len(lo)
@@ -57,7 +57,7 @@ def check_tree(tree, geometry, width, max_leaf):
 @pytest.mark.parametrize("width", [4, 8])
 @pytest.mark.parametrize("kind", ["soup", "coincident", "progression", "tiny_and_huge", "mixed", "all_equal"])
 @pytest.mark.parametrize("builder", BVH_BUILDERS)
-def test_trees_hold_what_they_promise(builder, kind, width):
+def test_trees_keep_their_invariants(builder, kind, width):
     geometry = GEOMETRIES[kind](np.random.default_rng(1))
     binary = build_binary(geometry, BvhOptions(builder, 1), 1)
     for max_leaf in (1, 2 * width):
@@ -70,7 +70,7 @@ def area(lo, hi):
 
 
 def least_cost(nodes, order_size, width, max_leaf, c_node, c_row):
-    """By trying every way to choose the roots below each wide node: the cost over the root's area."""
+    """Try every choice of roots below each wide node; return the least cost over the root's area."""
 
     def child(index, side):
         return index, side
@@ -172,7 +172,7 @@ def test_any_binary_builder_gives_the_same_answers(builder):
 
 
 def test_the_expected_cost_is_what_random_lines_find():
-    # Lines through two random points of a sphere around the mesh are uniform: nodes and primitives of those that meet the root.
+    # Lines through two random points of a sphere around the mesh are uniform. Count nodes and primitives of the lines that meet the root.
     rng = np.random.default_rng(5)
     structure = build(icosphere(2), "bvh8")
     tree = structure._tree(structure.built)

@@ -1,4 +1,4 @@
-"""What rays allow for where a triangle is listed only in cells that it meets: none is lost from far away, nor where it grazes."""
+"""Margins of walks in cells that list a triangle only where it is: no ray is lost, from far away or grazing."""
 
 import numpy as np
 import pytest

@@ -40,7 +40,7 @@ def triangles(corners, spheres=NO_SPHERES):
 
 
 def coincident(rng):
-    """60 triangles, each there five times, in a shuffled order."""
+    """60 triangles, each five times, in a shuffled order."""
     corners = rng.uniform(-1.0, 1.0, (60, 1, 3)) + 0.4 * rng.normal(size=(60, 3, 3))
     return triangles(np.repeat(corners, 5, axis=0)[rng.permutation(300)])
 
@@ -207,7 +207,7 @@ def test_the_segment_is_closed(name):
 @pytest.mark.parametrize("name", STRUCTURES)
 @pytest.mark.parametrize("kind", ["none", "one", "two", "one_sphere", "soup"])
 def test_rays_that_are_not_finite_miss_and_end(kind, name):
-    # NaN compares false with everything: such a ray must not enter an empty box and go round for ever.
+    # NaN compares false with everything: such a ray must not enter an empty box and loop for ever.
     structure = build(GEOMETRIES[kind](np.random.default_rng(5)), name)
     rows = []
     for bad in (np.nan, np.inf, -np.inf):
@@ -254,7 +254,7 @@ def test_a_closed_mesh_is_watertight(placed, name):
 
 @pytest.mark.parametrize("name", STRUCTURES)
 def test_a_floor_of_long_triangles_is_watertight(name):
-    # The rounding of far corners moves the seams by more than the relative margin of a box test covers near the eye.
+    # The rounding of far corners moves the seams by more than the relative margin of a box test near the origin.
     rng = np.random.default_rng(7)
     x = np.linspace(-4.0, 4.0, 9)
     vertices = np.array([[a, 0.0, z] for a in x for z in (-1000.0, 1000.0)])

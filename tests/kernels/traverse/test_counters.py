@@ -1,4 +1,4 @@
-"""The counters: exactly what a walk in plain Python counts, or what every walk obeys, and no code where they are off."""
+"""The counters: equal to a walk in plain Python, or within the laws of every walk, and absent from the code when off."""
 
 import inspect
 import sys
@@ -119,7 +119,7 @@ def test_no_rays_cost_nothing(name):
 
 @pytest.mark.parametrize("name", families_first())
 def test_counting_off_leaves_nothing_in_the_machine_code(name, monkeypatch, tmp_path):
-    """For Turing, it is that of a source whose counters do nothing, to the last byte."""
+    """The code for Turing equals that of a source whose counters do nothing, to the last byte."""
 
     @wp.func
     def fetch_node(recorder: Recorder, ray: Ray, counts: Counts, index: int, boxes: int) -> Counts:

@@ -1,4 +1,4 @@
-"""Two levels: the closest of what each structure says of the ray in its own space, for every structure, and no ray lost."""
+"""Two levels: the closest of all structures' hits, for every structure, and no ray lost."""
 
 from functools import cache
 
@@ -20,7 +20,7 @@ NODE_BYTES = Bvh2Node.numpy_dtype()["itemsize"]
 
 
 def matrix(rng, scale=2.0, far=20.0, shear=True):
-    """A random affine map: turned, scaled by up to 10^scale to either side along axes that are turned too, mirrored, moved."""
+    """A random affine map: rotations, scales up to 10^scale along rotated axes, mirrors and a translation."""
     out = np.eye(4)
     turn = Rotation.random(2, random_state=int(rng.integers(1 << 30))).as_matrix()
     out[:3, :3] = turn[0] @ np.diag(10.0 ** rng.uniform(-scale, scale, 3) * rng.choice([-1.0, 1.0], 3))
@@ -32,7 +32,7 @@ def matrix(rng, scale=2.0, far=20.0, shear=True):
 
 @cache
 def crowd():
-    """Two balls' worth of instances, many of which overlap, two in the same place, beside a part in the world with spheres."""
+    """Overlapping instances of two balls, two in the same place, and a part in the world with spheres."""
     rng = np.random.default_rng(1)
     ball, ring = Geometry.of(icosphere(2)), Geometry.of(torus(segments=12, tube_segments=8))
     matrices = [matrix(rng, 0.7, 4.0) for _ in range(24)]
@@ -65,7 +65,7 @@ def rows_times(rows, v, w):
 
 
 def expected(geometry, origins, directions, t_min, t_max):
-    """t, prim_id, u, v: every instance asked by itself, by brute force; at equal t the lowest prim_id."""
+    """t, prim_id, u, v by brute force over every instance; at equal t the lowest prim_id."""
     n = len(origins)
     best = {"t": np.full(n, np.inf, np.float32), "prim_id": np.full(n, -1)} | {k: np.zeros(n, np.float32) for k in "uv"}
     for part, rows, first in zip(geometry.part, inverse_of(geometry.to_world), geometry.first_prim, strict=True):
@@ -93,7 +93,7 @@ def crowd_expected(part):
 
 
 @pytest.mark.parametrize("name", families_first())
-def test_the_closest_of_what_each_structure_says_to_the_last_bit(name):
+def test_hits_are_the_closest_of_all_instances_to_the_last_bit(name):
     accel = build(crowd(), name)
     for part in (False, True):
         origins, directions, t_min, t_max, truth = crowd_expected(part)
@@ -158,10 +158,10 @@ def fine_cube(n):
     return np.concatenate(vertices), np.concatenate(faces).astype(np.int32)
 
 
-def test_a_far_mesh_is_hit_exactly_where_its_structure_says():
-    """Past the edges of a cube, nearly along the world's axes, from 1e4 to 1e6 sizes away: the cube fills its world box, but
-    lies aslant in its own space, where the rounded ray is off by far more than boxes are padded. Without the widening of `enter`
-    many hits would be passed by."""
+def test_a_far_mesh_is_hit_exactly_where_its_own_structure_is():
+    """Rays past the edges of a cube, nearly along the world's axes, from 1e4 to 1e6 sizes away. The cube fills its world box, but is
+    aslant in its own space, where the ray's rounding exceeds the boxes' pads by far. Without the widening of `enter` many hits would be
+    passed by."""
     (vertices, faces), rng = fine_cube(24), np.random.default_rng(6)
     for power in (4, 5, 6):
         m = np.eye(4)
@@ -179,7 +179,7 @@ def test_a_far_mesh_is_hit_exactly_where_its_structure_says():
 
 
 def test_rays_that_graze_the_instances_boxes_are_not_lost():
-    """Flat instances, whose box is as thin as the mesh: rays within the plane of the box's faces, and at its edges."""
+    """Flat instances, whose boxes are as thin as the mesh: rays in the planes of the boxes' faces, and at their edges."""
     corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
     square = Geometry(corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32), NO_SPHERES)
     rng = np.random.default_rng(7)

@@ -1,4 +1,4 @@
-"""The stack of a walk, wherever it is: what is put is what is there, each thread has its own, and walks have the same answers."""
+"""The stack of a walk in either place: it returns what was put, each thread has its own, and walks find the same hits."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def make_probe_kernel(where: str) -> Any:
 
 
 @pytest.mark.parametrize("where", PLACES)
-def test_what_is_put_is_there_and_each_thread_has_its_own(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_get_returns_what_put_stored_and_threads_do_not_share(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
     out = wp.zeros((THREADS, SIZE), dtype=wp.uint64, device=DEVICE)
     places = wp.zeros(THREADS, dtype=wp.uint64, device=DEVICE)
     monkeypatch.setattr("wrt.core.cuda.block_dim", BLOCK)
@@ -54,8 +54,8 @@ def test_what_is_put_is_there_and_each_thread_has_its_own(where: str, monkeypatc
     expected = 1000 * np.arange(THREADS)[:, None] + np.arange(SIZE)
     expected[:, 3] = 7
     assert (out.numpy() == expected).all()
-    # Threads run one after another on a virtual GPU, and would not see that they write to each other's entries: where these are is
-    # read. The first of all threads of a block lie side by side, and the next ones behind them.
+    # A virtual GPU runs threads one after another, which hides writes to another thread's entries. So the test reads the addresses: the
+    # first entries of all threads of a block are adjacent, and the next ones follow them.
     first = places.numpy().reshape(-1, BLOCK).astype(np.int64)
     if DEVICE.is_cuda and where == "shared":
         assert (first - first[:, :1] == 8 * np.arange(BLOCK)).all() and (first > 0).all()
@@ -65,10 +65,9 @@ def test_what_is_put_is_there_and_each_thread_has_its_own(where: str, monkeypatc
 
 @pytest.mark.skipif(not device.IS_VIRTUAL, reason="run with --device cuda:0: the CPU has one place")
 @pytest.mark.parametrize(("name", "entry", "instances"), [("bvh8", 8, False), ("bvh2", ENTRY, False), ("bvh2", ENTRY, True)])
-def test_walks_have_the_same_answers_wherever_the_stack_is(name: str, entry: int, instances: bool,
+def test_walks_find_the_same_hits_with_either_stack(name: str, entry: int, instances: bool,
                                                               monkeypatch: pytest.MonkeyPatch) -> None:
-    """Among triangles that overlap, so that stacks become deeper than shared memory has room for; of instances' two walks both are
-    under way at a time."""
+    """Overlapping triangles make stacks deeper than shared memory holds; instances run two walks at a time."""
     rng = np.random.default_rng(5)
     corners = (rng.normal(size=(800, 1, 3)) * (0.3, 0.3, 4.0) + rng.normal(size=(800, 3, 3))).astype(np.float32)
     mesh = Geometry.of(Mesh(corners.reshape(-1, 3), np.arange(2400, dtype=np.int32).reshape(-1, 3)))

@@ -1,4 +1,4 @@
-"""The bounding sphere's unit: what is inside is let through, whatever the scale; what is clearly outside is not."""
+"""The bounding sphere's unit: it lets every hit inside through at any scale, and rejects clear misses."""
 
 import numpy as np
 import pytest
@@ -69,7 +69,7 @@ def exact(origin, direction, center, radius):
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_no_line_that_meets_it_is_lost_nor_entered_too_late(seed):
+def test_every_line_that_meets_it_enters_in_time(seed):
     origin, direction, center, radius = cases(seed)
     with np.errstate(under="ignore"):
         near, enter, leave = exact(origin, direction, center, radius)
@@ -82,7 +82,7 @@ def test_no_line_that_meets_it_is_lost_nor_entered_too_late(seed):
     assert np.isfinite(entries(origin, direction, center, radius, 0.0, end)[meets]).all()
 
 
-def test_what_passes_by_is_kept_out():
+def test_clear_misses_are_rejected():
     origin, direction, center, radius = cases(3)
     near, enter, _ = exact(origin, direction, center, radius)
     size = np.linalg.norm(origin - center, axis=1) / radius  # 64 u of distance and radius are let in, coordinates added up

@@ -55,7 +55,7 @@ def fractions(rows):
     return [sum(map(Fraction, row.tolist())) for row in rows]
 
 
-def test_what_is_exact_and_what_is_bounded():
+def test_sums_are_exact_and_the_rest_is_within_its_bounds():
     rng = np.random.default_rng(0)
     x, y = pairs(rng, N), pairs(rng, N)
     y[: N // 4] = -x[: N // 4]  # sums and differences that cancel, all or nearly all
@@ -78,7 +78,7 @@ def test_what_is_exact_and_what_is_bounded():
         assert 0.01 * U_SQUARED < max(errors) <= factor * U_SQUARED, name
 
 
-def test_a_number_rounds_to_one_where_no_midpoint_is_within_the_error():
+def test_rounding_is_certain_if_no_midpoint_is_within_the_error():
     """Around 1 + j 2^-25 steps of float32 are 2^-23 wide: midpoints are half a step from the high part."""
     low = np.float32([0.0, 2.0**-25, 2.0**-24 - 2.0**-40, -(2.0**-25), 2.0**-24 - 2.0**-40, np.nan, 0.0, 0.0])
     error = np.float32([2.0**-26, 2.0**-26, 2.0**-41, 2.0**-26, 2.0**-39, 2.0**-26, np.inf, np.nan])

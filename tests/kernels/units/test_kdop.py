@@ -1,4 +1,4 @@
-"""The 14-DOP's unit: whatever the triangle unit hits is let through, grazing rays too; what its corners cut off is not."""
+"""The 14-DOP's unit: it lets every hit of the triangle unit through, grazing rays too, and rejects its cut corners."""
 
 import numpy as np
 import pytest
@@ -114,7 +114,7 @@ def test_the_corners_of_the_box_are_cut_off():
     assert entry[0] == entry[2] == np.inf and entry[1] == box_entry[1]
 
 
-def test_more_than_half_of_what_meets_the_box_of_a_slanted_triangle_is_kept_out():
+def test_more_than_half_of_the_rays_that_meet_a_slanted_triangles_box_are_rejected():
     rng = np.random.default_rng(5)
     corners = np.broadcast_to([[1.0, 0.1, 0.0], [0.0, 1.0, 0.1], [0.1, 0.0, 1.0]], (20_000, 3, 3))
     origin = 3.0 * directions(rng, 20_000)

@@ -33,7 +33,7 @@ def triangle_kernel(
     line: wp.array(dtype=Hit),
     unit: wp.array(dtype=Hit),
 ):
-    """The watertight test by itself, and the unit with t held to the triangle's box."""
+    """The watertight test alone, and the unit, which clamps t to the triangle's box."""
     i = wp.tid()
     ray = Ray()
     ray.origin = origin[i]
@@ -279,8 +279,8 @@ def test_moving_everything_by_powers_of_two_changes_no_bit(seed, power, step):
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_neighbours_see_their_edge_from_both_sides(seed):
-    # Two triangles fold over an edge, and rays come from anywhere: which one is hit may not depend on which is asked first,
-    # and where the rays pass the edge within the width of both, one of them is. (The areas at the edge are negatives.)
+    # Two triangles fold over an edge, and rays come from anywhere. Their order may not decide which one is hit. A ray that passes the edge
+    # within the width of both hits one: the areas at the edge are negatives.
     rng = np.random.default_rng(seed)
     n = 2000
     edge = rounded(rng.normal(size=(n, 2, 3)) * 10.0 ** rng.uniform(-3, 3, (n, 1, 1)) + rng.normal(size=(n, 1, 3)))
@@ -328,8 +328,8 @@ def test_triangles_without_area_are_missed():
 
 
 @pytest.mark.parametrize(("origin", "direction", "triangle", "t"), [
-    # Across x the ray goes by less than float32 has numbers for, from a face of the triangle's box: the sheared corners do not
-    # see it, while the slab of x ends where the ray starts.
+    # Across x the ray moves by less than float32 resolves, from a face of the triangle's box. The sheared corners miss that, while the
+    # slab of x ends where the ray starts.
     ((0.0, 3.6090652682815795e-20, 3.338891601232995e-20), (-2.652004651570872e-37, 0.0, 0.29204800724983215),
      ((-2e-20, 1e-20, -3e-20), (0.0, 4e-20, -3e-20), (0.0, 3e-20, 4e-20)), -1.23e-19),
     ((0.0, 3.6090652682815795e-20, -2.5e-20), (2.652004651570872e-37, 0.0, 0.29204800724983215),
@@ -436,7 +436,7 @@ def crossings_kernel(
 
 
 def without_float64(origin, direction, triangle):
-    """Which hits float-float arithmetic is sure of, (N,), and which there are; those that it is sure of have float64's bits."""
+    """Mask (N,) of the hits that float-float arithmetic is certain of, and all hits; the certain ones have float64's bits."""
     n = len(origin)
     sure, exact = zeros(n, Hit), zeros(n, Hit)
     triangle = np.asarray(triangle, np.float32)
@@ -447,13 +447,13 @@ def without_float64(origin, direction, triangle):
     return told, is_hit(exact)
 
 
-def test_float_float_arithmetic_is_sure_of_all_but_hard_cases():
+def test_float_float_arithmetic_is_certain_but_for_hard_cases():
     told, hit = without_float64(*aimed_rays(np.random.default_rng(13), 200_000, spread=0.2))
     assert hit.sum() > 50_000 and 0 < (hit & ~told).sum() < 1e-3 * hit.sum()
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_what_float_float_arithmetic_is_sure_of_has_the_bits_of_float64(seed):
+def test_certain_float_float_hits_have_the_bits_of_float64(seed):
     """Wild triangles, at rays of all lengths and all scales, where much under- and overflows."""
     origin, direction, triangle = adversarial_hits(np.random.default_rng(seed), 200_000)
     told, hit = without_float64(origin, direction, triangle)
@@ -467,7 +467,7 @@ def test_what_float_float_arithmetic_is_sure_of_has_the_bits_of_float64(seed):
         assert without_float64(*given)[0].sum() > 5000
 
 
-def test_through_an_edge_and_from_the_plane_are_hard_cases():
+def test_rays_through_an_edge_or_from_the_plane_are_hard_cases():
     square = np.array([[-1.0, -1.0, 0.0], [3.0, -1.0, 0.0], [-1.0, 3.0, 0.0]])
     origin = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 1.0], [0.0, 0.0, 0.0], [np.nan, 0.0, 1.0]])
     told, hit = without_float64(origin, np.broadcast_to([0.0, 0.0, -1.0], (4, 3)), np.broadcast_to(square, (4, 3, 3)))
@@ -509,7 +509,7 @@ def test_every_test_agrees_with_float64_on_sound_triangles(test):
 
 
 @pytest.mark.parametrize("test", RAY_TRIANGLE)
-def test_every_test_misses_what_has_no_area_and_what_is_behind(test):
+def test_every_test_misses_triangles_without_area_and_behind(test):
     rng = np.random.default_rng(11)
     a, b = rounded(rng.normal(size=(2, 3)))
     direction = rounded(rng.normal(size=(500, 3)))
