@@ -44,8 +44,8 @@ class Film:
         - "material_id", int32: index into `scene.materials`; -1 on a miss.
     stats
         Counts, and `stats["seconds"]` of wall-clock time by stage: "compile", which runs beside "upload" and "build", then "aov" and
-        "trace", with the seconds before a resume. "lost_throughput_per_sample" is the radiance that rays which were cut would have
-        added in surroundings of radiance 1; "visibly_cut" is the share of pixels that lack 5 % or more of it because of max_depth.
+        "trace", with the seconds before a resume. "lost_throughput_per_sample" is the radiance that cut rays would have added in
+        surroundings of radiance 1. "visibly_cut" is the share of pixels that lack 5 % or more of it because of max_depth.
     metadata
         Entries that `save` writes into files: scene, spp, seed, seconds, version ...
     exposure, tonemap

@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from PIL.ImageFont import FreeTypeFont, ImageFont
 
 INK, PALE = (30, 30, 30), (110, 110, 110)
-BAR, MARGIN, TITLE = 18, 14, 30  # pixels: width of the bar, around everything, height of the title
+BAR, MARGIN, TITLE = 18, 14, 30  # pixels: width of the scale, margin, height of the title
 LEAST = 480  # narrower pictures are enlarged by a whole factor
-BRIGHTEST = 99.0  # percentile of the values that gets the last colour, so that outliers do not darken all else
+BRIGHTEST = 99.0  # percentile of the values that gets the last colour
 
 
 @cache

@@ -67,8 +67,8 @@ def write_image(path: PathLike, pixels: np.ndarray, *, bits: int | None = None, 
                 tonemap: str = "none", metadata: Metadata | None = None) -> None:
     """Write one picture in the format of the suffix.
 
-    pixels: (H, W, 3) linear. bits: per channel, of FORMATS (default 8 for PNG, 32 for EXR and HDR; 16 in EXR is half). `exposure` and
-    `tonemap` apply to PNG alone. metadata: text entries `wrt:key`.
+    - pixels: (H, W, 3) linear. bits: per channel, of FORMATS (default 8 for PNG, 32 for EXR and HDR; 16 in EXR is half).
+    - exposure, tonemap: apply to PNG alone; metadata: text entries `wrt:key`.
 
     EXR keeps NaN and infinite values. In PNG, NaN and -inf are black, +inf is white. HDR has 0 for NaN and negative values, and its
     largest value for +inf. A SceneWarning counts replaced pixels. Raises InputError if the file cannot be written; an existing file

@@ -101,7 +101,7 @@ def agx_contrast(x: np.ndarray) -> np.ndarray:
 def agx(linear: np.ndarray) -> np.ndarray:
     """Apply Troy Sobotka's AgX, base look: inset, log2 between -10 and +6.5 stops, sigmoid, outset, 2.2 power to linear.
 
-    Sources: T. Sobotka, AgX-S2O3 (inset matrix, range, sigmoid), with the slope and powers of the NumPy version in his
+    Sources: T. Sobotka, AgX-S2O3 (inset matrix, range, sigmoid), with the slope and powers of the NumPy version in the
     AgX repository; B. Wrensch, "Minimal AgX Implementation" (2023), for undoing the inset after the curve and for the
     2.2 power that the codes are meant for.
     """

@@ -29,9 +29,9 @@ MOVIES = {".gif": "GIF", ".png": "PNG", ".apng": "PNG"}
 class Animation:
     """Parameters of an animation. Raises InputError for values out of range.
 
-    frames: their number, at the times 0, 1 / frames, 2 / frames ... of the period; the first follows the last seamlessly.
-    degrees: orbit of the camera in the period (None: 360, or 0 if an object moves).
-    rebuild_at: growth of the SAH cost from which the structure is rebuilt in place of a refit.
+    - frames: their number, at the times 0, 1 / frames, 2 / frames ... of the period; the first follows the last seamlessly.
+    - degrees: orbit of the camera in the period (None: 360, or 0 if an object moves).
+    - rebuild_at: growth of the SAH cost from which the structure is rebuilt in place of a refit.
     """
 
     frames: int = 36

@@ -1,7 +1,7 @@
 """Checkpoints of long renders: the film in a file that is complete at any moment (wrt.core.write_file).
 
-A checkpoint is a checked file (wrt.core.checked_file) with the identity of its render (all that can change a pixel), its progress, and
-the arrays of the film, the number of samples of each pixel among them. A render resumes from any state between two tiles. If two renders
+A checkpoint is a checked file (wrt.core.checked_file). It has the identity of its render (all that can change a pixel), its progress, and
+the arrays of the film with the number of samples of each pixel. A render resumes from any state between two tiles. If two renders
 write one checkpoint, it holds the last complete state of either.
 """
 

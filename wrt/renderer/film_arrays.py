@@ -97,8 +97,9 @@ class DeviceFilm:
     def visibly_cut(self, most_by_throughput: float) -> float:
         """Return the share of pixels that are visibly too dark because of max_depth, a lower bound.
 
-        In surroundings of radiance 1, the mean brightness that the eye adapts to, the rays cut by depth would have added VISIBLE or more
-        to such a pixel. most_by_throughput: upper bound of the throughput of one ray cut by min_throughput, which `lost` contains too.
+        In surroundings of radiance 1, which the eye adapts to, the rays cut by depth would have added VISIBLE or more to such a pixel.
+
+        most_by_throughput: upper bound of the throughput of one ray cut by min_throughput, which `lost` contains too.
         """
         film = self.groups[0]
         lost = sum((self.view(group.lost) for group in self.groups[1:]), self.view(film.lost))

@@ -43,8 +43,8 @@ def aov_kernel(features: Features, structure: Structure) -> Kernel:
 class Plan:
     """A scene and the options of its render, resolved.
 
-    accel: the structure's own name, "bvh" being an alias; meshes: id()s of the instanced meshes (wrt.accel.scenes.instancing).
-    structure: a Structure, or a class with its members; crop: x0, y0, x1, y1 in pixels; deepest: bounces that the kernels' stacks hold.
+    - accel: the structure's own name ("bvh" is an alias); meshes: id()s of the instanced meshes (wrt.accel.scenes.instancing).
+    - structure: a Structure, or a class with its members; crop: x0, y0, x1, y1 in pixels; deepest: bounces that the kernels' stacks hold.
     """
 
     scene: Scene

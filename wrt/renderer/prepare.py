@@ -37,8 +37,8 @@ PREPARING_REPORTED = 1.0  # seconds of compiling and building until `progress` i
 class Prepared:
     """A prepared scene.
 
-    kernels: Plan.kernels, compiled; arrays: the scene on the device; camera: the device's record of plan.camera; waves: for Plan.by_waves.
-    seconds: of "upload" and "build", and of "compile", which runs beside them, until the last kernel was loaded.
+    - kernels: Plan.kernels, compiled; arrays: the scene on the device; camera: its device struct; waves: for Plan.by_waves.
+    - seconds: of "upload" and "build", and of "compile", which runs beside them, until the last kernel was loaded.
     """
 
     plan: Plan

@@ -28,13 +28,13 @@ from wrt.renderer.prepare import Prepared
 from wrt.renderer.result import Facts, film_of, film_so_far
 from wrt.renderer.tiles import Rectangle, Work, work_left
 
-MAX_PASS = 64  # samples of a pixel in one pass: Ctrl-C waits for a pass on a GPU, and leaves such differences on the CPU
-# Factor of the samples of a pixel in each pass. Larger factors are faster on the CPU (16 spp: 4 is up to 1.15 times as fast as 2),
+MAX_PASS = 64  # samples of a pixel: Ctrl-C waits for the end of a pass on a GPU
+# Factor from pass to pass. Larger factors are faster on the CPU (16 spp: 4 is up to 1.15 times as fast as 2),
 # but leave a picture that ends early less even.
 GROWTH = 4
 STEP_SECONDS = 0.1
-OVERTIME = 5.0  # seconds without an answer after the time limit, until a pass is abandoned
-SILENT = 20.0  # seconds without an answer until it is reported; also OVERTIME of the first pass, since pixels are black without it
+OVERTIME = 5.0  # seconds without an answer after the time limit until a pass is abandoned; SILENT in the first pass
+SILENT = 20.0  # seconds without an answer until a report
 
 # Samples done, summed over pixels, and True while no tile runs: then no pixel is half done.
 Steps = Generator[tuple[int, bool], None, None]
@@ -47,7 +47,7 @@ class OutOfTime(Exception):
 class Tracer(Protocol):
     """Traces the tiles of a run: threads of this process, or workers (wrt.renderer.distributed).
 
-    device: of the film; seconds: of the preparation, by stage; facts: counts of the scene and its structure. `trace` yields a step about
+    device: of the film; seconds: of each stage of the preparation; facts: entries of stats. `trace` yields a step about
     every tenth of a second, and one at the end. If `due()` is true, it yields a step without running tiles. When it is closed early, tiles
     that run come to their end, and no others begin.
     """
@@ -122,7 +122,7 @@ class Passes:
     """Iterator over passes: first sample and number of samples, in each group, 1, 3, 12, 48, 64 ..., so that a first picture comes soon.
 
     A time limit counts from the first pass on. A pass takes no more samples than are likely to be done in the time left, or in `every`
-    seconds; the first sample of each pixel is always taken. samples: the smallest and the largest number that pixels have already.
+    seconds. The first sample of each pixel is always taken. `samples`: the smallest and the largest number that pixels have already.
     A render that was saved within a pass begins with the pixels that are behind.
     """
 

@@ -4,8 +4,8 @@ Inputs are float32 values in float64: integers times powers of two. A sign is co
 its error (a static filter: Shewchuk 1997, "Adaptive Precision Floating-Point Arithmetic and Fast Robust Geometric Predicates"). The few
 others are recomputed in Python's integers, without rounding. A product of three float32 neither over- nor underflows in float64.
 
-With a, b, c = v0 - o, v1 - o, v2 - o and N = (v1 - v0) x (v2 - v0), the line o + t d meets the plane at t = a.N / d.N, with
-barycentrics w0 = d.(b x c) / d.N for v0 and so on (the scalar triple products; their sum is d.N).
+Let `a, b, c = v0 - o, v1 - o, v2 - o` and `N = (v1 - v0) x (v2 - v0)`. The line `o + t d` meets the plane at `t = a.N / d.N`, and the
+barycentric of v0 is `w0 = d.(b x c) / d.N`. The scalar triple products add up to `d.N`.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ class Place(IntEnum):
 class Crossings:
     """Results for N pairs of line and primitive, (N,) each.
 
-    place: int8, of Place; t, u, v: float64, inf or NaN if the line is parallel or misses the sphere; t_error: bound on |t - exact t|;
-    slope: d.N, float64 (1 for spheres).
+    place: int8, of Place; t, u, v: float64, inf or NaN if the line is parallel or misses the sphere. `t_error`: bound on
+    |t - exact t|; `slope`: d.N, float64 (1 for spheres).
     """
 
     place: np.ndarray

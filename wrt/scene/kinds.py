@@ -52,8 +52,8 @@ FORMS: dict[str, Callable[[Any, str, Limits], Any]] = {
 def given(form: str, about: str, unit: str = "", **limits: Any) -> dict[str, Any]:
     """Return a field's `metadata`.
 
-    form: a key of FORMS; about: its entry in the reference of scene files; unit: unless the form implies one; limits: of numbers,
-    angles and colours (ge, gt, le, lt), or the allowed values (among).
+    - form: a key of FORMS; about: entry in the reference of scene files; unit: unless the form implies it.
+    - limits: ge, gt, le, lt of numbers, angles and colours, or the allowed values (among).
     """
     return {"form": form, "about": about, "unit": unit, "limits": limits}
 

@@ -67,9 +67,9 @@ class Checkerboard:
 class MaterialKind(NamedTuple):
     """Properties of a kind of material; kernels/shade/materials.py has its device function under the same name.
 
-    about: entry in the reference of scene files; uses: fields of Material that this kind reads and not every kind does (other kinds
-    have 0 on the device, and a scene file may not give them); scatters: `albedo` is diffuse, at least in part; reflects: spawns
-    reflected rays; clear: transmits light without a field `transmission`.
+    - about: entry in the reference of scene files.
+    - uses: fields that this kind reads and not every kind does. For other kinds they are 0 on the device, and no keys of a scene file.
+    - scatters: `albedo` is diffuse, at least in part; reflects: spawns reflected rays; clear: transmits light without `transmission`.
     """
 
     about: str

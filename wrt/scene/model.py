@@ -167,7 +167,7 @@ class Scene:
         return tuple(used.values())
 
     def camera(self, name: str | int | None = None) -> CameraKind:
-        """Return the camera of that name or index (None: the first). Raises InputError if there is none."""
+        """Return the camera of that name or index (None: the first). Raises InputError for an unknown one."""
         if not self.cameras:
             raise InputError("the scene has no camera")
         if name is None:
@@ -200,8 +200,8 @@ class Scene:
     def outlines(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield points, (N, 3) float64, whose convex hull holds an object, and its transform, for each object with faces.
 
-        The points are the vertices of its mesh. If all objects together have more than MANY_VERTICES, a mesh that several objects
-        share is replaced by the corners of its box: many small nodes of a file that show one large mesh would take hours.
+        The points are the vertices of its mesh. Shared meshes are replaced by the corners of their boxes if all objects together have
+        more than MANY_VERTICES: a file of many nodes with one large mesh would take hours.
         """
         shown = [thing for thing in self.objects if len(thing.mesh.faces)]
         times = Counter(id(thing.mesh) for thing in shown)

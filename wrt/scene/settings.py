@@ -38,7 +38,7 @@ class Settings:
     sampler
         "sobol" (Owen-scrambled, evenly spread), or "independent" random numbers, whose noise falls more slowly.
     exposure, tonemap
-        Stops, each of which doubles the displayed values; curve from linear to display: "none", "reinhard", "aces" or "agx".
+        Stops (factors of 2) of the displayed values; curve from linear to display: "none", "reinhard", "aces" or "agx".
 
     Raises
     ------

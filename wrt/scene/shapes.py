@@ -40,8 +40,8 @@ def box(low: Point = (-0.5, -0.5, -0.5), high: Point = (0.5, 0.5, 0.5)) -> Mesh:
     return Mesh(np.where(_BOX_TOP, top, bottom), _BOX_FACES, uvs=_BOX_UVS, name="box")
 
 
-# For each of the 24 corners and each axis, True at `high`: four corners of the low and of the high side across x, in the order of a quad
-# (reversed on the low side, so that it faces out), then the same across y and z.
+# True for each of the 24 corners and each axis at `high`. First are the low and the high side across x, with four corners in the order of
+# a quad (reversed on the low side, so that it faces out). The sides across y and z follow.
 _BOX_SIDES = np.array([[[0, 1, 0], [0, 0, 0], [0, 0, 1], [0, 1, 1]], [[1, 0, 0], [1, 1, 0], [1, 1, 1], [1, 0, 1]]], dtype=bool)
 _BOX_TOP = np.concatenate([np.roll(_BOX_SIDES, axis, axis=2) for axis in range(3)]).reshape(24, 3)
 _BOX_FACES = (np.array([[0, 1, 2], [0, 2, 3]]) + 4 * np.arange(6)[:, None, None]).reshape(12, 3).astype(np.int32)

@@ -28,7 +28,7 @@ def require_size(scene: Scene) -> None:
 
 
 def _light_with_a_place(scene: Scene) -> str:
-    """Return the name of the first light at a finite distance, or of the first emissive shape; "" if there is none."""
+    """Return the name of the first light at a finite distance, or of the first emissive shape; "" without any."""
     for light in scene.lights:
         if light.places():
             return at_thing("light", light.name)[:-2]

@@ -12,10 +12,10 @@ from wrt.core.errors import InputError, wrong
 Color = tuple[float, float, float]
 BLACK: Color = (0.0, 0.0, 0.0)
 WHITE: Color = (1.0, 1.0, 1.0)
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # weights of linear Rec. 709
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 SMALLEST = 1e-30  # smallest length
-MAX_OBJECTS = 1 << 20  # of objects, of spheres and of lights: a few bytes of a file can ask for any number
-MAX_REACH = 1e18  # largest coordinate of a shape in world space: the square of a distance must be a float32
+MAX_OBJECTS = 1 << 20  # of objects, of spheres and of lights
+MAX_REACH = 1e18  # largest coordinate in world space: squares of distances must be float32
 
 
 def as_vector(value: object, what: str, *, low: float = -math.inf, high: float = math.inf) -> Color:

@@ -125,7 +125,7 @@ def blurred_square(distance: float) -> tuple[float, float, float]:
     """Diameter of the circle of confusion at this distance along x and y, and light in the picture, in pixels.
 
     A glowing square that faces the lens is drawn, as wide as 20 pixels of the unblurred picture. Its blurred picture is
-    the convolution of square, disc and pixel: variances add, that of a disc of diameter C being C^2 / 16.
+    the convolution of square, disc and pixel: variances add, and a disc of diameter C has C^2 / 16.
     """
     image_distance = FOCAL * FOCUS / (FOCUS - FOCAL)
     width = 20.0 * SENSOR / PIXELS * distance / image_distance

@@ -1,4 +1,4 @@
-"""Kernels that are compiled beforehand are those that a render then takes."""
+"""A render uses the kernels that were compiled ahead of time."""
 
 from __future__ import annotations
 

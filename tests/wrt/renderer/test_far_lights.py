@@ -54,7 +54,7 @@ def test_sphere_light(distance: float, shift: tuple[float, float, float] | int) 
 @pytest.mark.parametrize("distance", [1.0, 10.0, 100.0, 10_000.0])
 def test_square_light(distance: float, shift: tuple[float, float, float] | int) -> None:
     shift = resolved(shift, distance)
-    half = 0.4  # the form factor of a square above a point is four times that of a quarter with the point below its corner
+    half = 0.4  # a square above a point has four times the form factor of its quarter, whose corner is above the point
     side = half / math.hypot(half, distance)
     expected = 4.0 * 0.5 * 2.0 * side * math.atan(side)
     square = Object(quad((-half, 0, -half), (2 * half, 0, 0), (0, 0, 2 * half)), (EMITTER,), transform=place(distance, shift))

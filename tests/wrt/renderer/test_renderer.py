@@ -246,8 +246,8 @@ def test_passes_take_each_sample_once(passes: Any, spp: int, pass_size: int | No
 
 
 @pytest.mark.parametrize(("limit", "seconds", "expected"), [
-    (10.0, 1.0, [1, 3, 6]),  # the last pass is no longer than the time that is left
-    (10.0, 3.0, [1, 2, 1]),  # what is left is not enough, but one sample is the least there is
+    (10.0, 1.0, [1, 3, 6]),  # the last pass fits into the time left
+    (10.0, 3.0, [1, 2, 1]),  # one sample is taken even if the time does not suffice
     (0.5, 1.0, [1]),  # the first sample is always taken
     (1e9, 1.0, [1, 3, 12, 4]),
     (np.inf, 1.0, [1, 3, 12, 4]),

@@ -1,4 +1,4 @@
-"""Faces without area and vertices without faces leave; everything else stays as it was."""
+"""Faces without area and vertices without faces are dropped; all else is unchanged."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def test_flips_remove_corners_on_a_line_and_nothing_else():
     assert on_a_line(rough.vertices, rough.faces) > 500 and on_a_line(rough.vertices, faces) == 0
     assert len(faces) == len(rough.faces) and is_closed(faces) and faces.dtype == np.int32
     assert volume(rough.vertices, faces, center) == pytest.approx(volume(rough.vertices, rough.faces, center), rel=1e-12)
-    # Each face with area is the sum of those that it is the source of.
+    # Each face with area is the sum of the faces with its index as their source.
     changed = (faces != rough.faces).any(axis=1)
     assert (source[~changed] == np.flatnonzero(~changed)).all() and 500 < changed.sum() < 10_000
     before, after = (area(rough.vertices, f) for f in (rough.faces, faces))

@@ -16,9 +16,9 @@ WORDS = {"string": "text", "boolean": "true or false", "integer": "whole number"
 HEAD = """\
 # Scene files
 
-A scene is a [TOML](https://toml.io) file: `python -m wrt render scene.toml`, `wrt.load_scene("scene.toml")`. `python -m wrt validate
-scene.toml` reports every mistake in a file with its place: unknown keys, wrong types, values out of range, NaN and infinity.
-`python -m wrt schema` prints the JSON Schema for editors, and this page with `--markdown`.
+A scene is a [TOML](https://toml.io) file: `python -m wrt render scene.toml`, `wrt.load_scene("scene.toml")`. The command `python -m wrt
+validate scene.toml` reports every mistake with its place. `python -m wrt schema` prints the JSON Schema for editors, and this page with
+`--markdown`.
 
 - World space is right-handed, +y is up. Matrices are 16 numbers, row by row, and act on column vectors.
 - *length* is in the scene's own unit. A scene must be at least 1e-15 units across, and no shape may reach farther than 1e18 from the

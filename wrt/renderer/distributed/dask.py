@@ -68,7 +68,7 @@ async def _identity(address: str) -> str:
 
 
 def check_workers(client: Client) -> None:
-    """Raise InputError if there are no workers, or one has no wrt or another installation than this process."""
+    """Raise InputError if there are no workers, or one without wrt, or with another installation than this process."""
     if client.asynchronous:
         raise InputError("is an asynchronous Client", argument="executor", hint="make one without asynchronous=True")
     where = client.scheduler.address  # type: ignore[union-attr]

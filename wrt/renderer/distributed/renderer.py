@@ -27,8 +27,8 @@ from wrt.renderer.tiles import Rectangle, Work, tiles
 from wrt.renderer.upload import warn_left_out
 from wrt.scene.model import Scene
 
-TILES_EACH = 4  # tiles of a pass for each slot, so that the last one is short
-SIDES = {"cpu": (32, 256), "cuda": (256, 1024)}  # limits of a side in pixels: smaller tiles are not worth a message, larger ones take long
+TILES_EACH = 4  # of a pass, for each slot
+SIDES = {"cpu": (32, 256), "cuda": (256, 1024)}  # limits of a tile's side: a smaller one is not worth a message, a larger one takes long
 
 
 class DistributedRenderer:

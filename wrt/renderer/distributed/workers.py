@@ -1,7 +1,7 @@
 """Workers of a distributed render: the devices of this machine, or the workers of an executor.
 
 A tile is a pure function of the scene, the samples to take and its previous state (Prepared.trace_tile). Any worker can compute it, and
-another one can repeat it after a worker has died. A worker process prepares a scene once, and caches it under its digest.
+repeat it after another has died. A worker process prepares a scene once, and caches it under its digest.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from wrt.scene.digest import scene_digest
 from wrt.scene.model import Scene
 from wrt.scene.pack import pack, unpack
 
-QUEUED = 3  # calls that wait or run, for each slot, so that no worker is idle
-SLOTS = 32  # concurrent calls, if the executor does not know its number
-DEAD_SECONDS = 5.0  # from the death of a process until an error, if its pool does not notice
-CACHED = 2  # prepared scenes of a worker process
-OPTIONS_SENT = ("device", "accel", "aov", "target_error", "triangle", "box", "instancing", "accel_options")  # options of the workers
+QUEUED = 3  # Submitted calls for each slot, so that no worker is idle.
+SLOTS = 32  # Slots of an executor that does not know its number.
+DEAD_SECONDS = 5.0  # Until the death of a process is an error.
+CACHED = 2  # Prepared scenes of a worker process.
+OPTIONS_SENT = ("device", "accel", "aov", "target_error", "triangle", "box", "instancing", "accel_options")
 LOCAL: dict[str, Any] = {"executor": None, "devices": None, "checkpoint": None, "resume": False, "progress": None}
 
-Job = tuple[Any, ...]  # the name of a method of Prepared, and its arguments
-Reply = tuple[str, str, Any]  # the worker's name, the kind of its device (kind_of), and the result of the method
-Package = dict[str, Any]  # a scene and its options in plain values and arrays (`packaged`)
-ReplyFuture = Any  # a Future of concurrent.futures, or of dask.distributed, whose result is a Reply or None
+Job = tuple[Any, ...]  # The name of a method of Prepared, and its arguments.
+Reply = tuple[str, str, Any]  # The worker's name, the kind of its device (kind_of), and the result of the method.
+Package = dict[str, Any]  # A scene and its options in plain values and arrays (`packaged`).
+ReplyFuture = Any  # A Future of concurrent.futures or dask.distributed; its result is a Reply or None.
 
 
 class ExecutorWorkers:

@@ -88,7 +88,7 @@ def test_the_picture_is_the_same(client: Any, whole: Film) -> None:
 
 @pytest.mark.parametrize("killed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_killed_workers_cost_only_their_tiles(client: Any, whole: Film, tmp_path: Path, killed: int) -> None:
-    """Of two: with both of them the scene is gone too, and is sent to those that come after."""
+    """If both of two workers die, the scene is lost too, and sent to the next ones."""
     flags = [str(tmp_path / str(i)) for i in range(killed)]
     before = set(client.run(os.getpid).values())
     client.run(dies_in_a_tile, flags)

@@ -129,7 +129,7 @@ def test_an_executor_that_tells_nothing_gets_the_scene_once(whole: Film) -> None
     executor = Deaf()
     assert same(render(SCENE, executor=executor, aov=["depth", "normal", "material_id"], **HOW), whole)
     first = executor.packages
-    assert 1 <= first <= workers.QUEUED * workers.SLOTS  # those that were asked before one had it
+    assert 1 <= first <= workers.QUEUED * workers.SLOTS  # the calls submitted before a worker had the scene
     render(SCENE, executor=executor, aov=["depth", "normal", "material_id"], **HOW)
     assert executor.packages == first
 
@@ -227,7 +227,7 @@ def test_a_worker_s_error_is_told_and_the_work_is_saved(tmp_path: Path, threads:
 
 
 def other(part: str, **changes: str) -> dict[str, Any]:
-    """A package from somebody who has something else installed."""
+    """Return a package from another installation."""
     return {"installed": {**INSTALLED, part: INSTALLED[part] | changes}}
 
 
@@ -264,7 +264,7 @@ def test_all_code_counts_wherever_the_kernels_stand(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("alike", [1, 5])
 def test_workers_on_devices_of_several_kinds_are_refused(alike: int, threads: Executor, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those that are there first, and those that come later."""
+    """Workers that are there first, and workers that join later."""
     asked: list[str] = []
     monkeypatch.setattr(workers, "kind_of", lambda device: asked.append("") or f"cuda, sm_{80 + (len(asked) > alike)}")
     with pytest.raises(InputError, match=r"several kinds.*: cuda, sm_8., and at .* cuda, sm_8."):
