@@ -180,16 +180,16 @@ class OrthographicCamera(CameraKind):
 
 @dataclass(frozen=True, eq=False)
 class FisheyeCamera(CameraKind):
-    """An equidistant fisheye: the angle to the axis is proportional to the distance from the centre; black beyond the image circle.
+    """An equidistant fisheye; black beyond the image circle, whose diameter is the shorter side of the picture.
 
-    fov: full angle of view across the image circle in radians; the diameter of the circle is the shorter side of the picture.
+    The angle to the axis is proportional to the distance from the centre. fov: full angle across the circle in radians.
     """
 
     kind = "fisheye"
     device = "wrt.kernels.shade.cameras.fisheye"
 
     fov: float = field(default=math.pi, metadata=given(
-        "angle", "full angle of view across the image circle, whose diameter is the shorter side of the picture", ge=0.0005, le=360.0))
+        "angle", "full angle of view across the image circle", ge=0.0005, le=360.0))
 
     def record(self, size: tuple[int, int]) -> Record:
         """Return half the angle of view, and half the sides of the picture in radii of the image circle."""
@@ -198,7 +198,7 @@ class FisheyeCamera(CameraKind):
 
 @dataclass(frozen=True, eq=False)
 class PanoramaCamera(CameraKind):
-    """All directions around a point, equirectangular: the camera's axis is in the middle; the edges are behind, above and below.
+    """All directions around a point, equirectangular, with the camera's axis in the middle.
 
     A picture of aspect ratio 2:1 can serve as the image of an EnvironmentBackground.
     """

@@ -128,8 +128,8 @@ def _resolve(rows: np.ndarray, o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray
 def triangle_crossings(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, np.ndarray, np.ndarray], *, all_rows: bool = False) -> Crossings:
     """Intersect line i with triangle i. o, d and the corners in v: (3, N) float64 that hold finite float32 values.
 
-    `place` is exact. For hits the relative error of t is at most ACCURATE (the bound is t_error), and so is the error of u and v.
-    all_rows: the same accuracy for misses, with COPLANAR and DEGENERATE; otherwise both are OUTSIDE.
+    `place` is exact. For hits the relative error of t is at most ACCURATE (bound: t_error). The error of u and v is at most ACCURATE, too.
+    With `all_rows`, misses have the same accuracy, and COPLANAR and DEGENERATE; otherwise both are OUTSIDE.
     """
     a, b, c = (corner - o for corner in v)
     weights = np.empty((3, o.shape[1]))

@@ -74,7 +74,7 @@ def icosphere(subdivisions: int = 3, radius: float = 1.0) -> Mesh:
 
 
 def torus(radius: float = 1.0, tube_radius: float = 0.35, segments: int = 64, tube_segments: int = 32) -> Mesh:
-    """Return a torus around the y axis, `radius` being that of the circle inside the tube. u runs around the axis, v around the tube."""
+    """Return a torus around the y axis. u runs around the axis, v around the tube."""
     radius = as_number(radius, "torus: radius", low=1e-30)
     tube_radius = as_number(tube_radius, "torus: tube_radius", low=1e-30, high=radius)
     _require_segments("torus", segments, tube_segments)
@@ -89,7 +89,7 @@ def torus(radius: float = 1.0, tube_radius: float = 0.35, segments: int = 64, tu
 
 
 def lathe(profile: Sequence[Point], segments: int = 64) -> Mesh:
-    """Return the surface of revolution of a profile around the y axis.
+    """Return a surface of revolution of a profile around the y axis.
 
     profile: two or more points (radius, height); from the bottom up, the surface faces outwards. It is closed if both ends are on the
     axis. A point given twice makes a sharp edge; all others are smooth. u runs around the axis, v from the end of the profile to its start.

@@ -20,7 +20,7 @@ class PoseTable(TypedTable):
     position: Point | None = Field(None, description="of the camera")
     target: Point | None = Field(None, description="point in the middle of the picture")
     up: Vector = Field([0.0, 1.0, 0.0], description="direction that is up in the picture")
-    matrix: Matrix | None = Field(None, description="camera to world, row by row; the camera looks along -z, +y is up")
+    matrix: Matrix | None = Field(None, description="camera to world; the camera looks along -z, +y is up")
 
     @model_validator(mode="after")
     def _check(self) -> PoseTable:

@@ -21,9 +21,9 @@ class CheckerboardTable(_checkerboard):
 
 class _PlacedImage(Table):
     srgb: bool | None = Field(
-        None, description="RGB is sRGB-encoded (default: true for albedo and emission, else false)")
+        None, description="RGB is sRGB-encoded (default: for albedo and emission)")
     wrap: Wraps = Field(["repeat", "repeat"], description="beyond the image, in u and in v (one for both)")
-    scale: Scale2 = Field([1.0, 1.0], description="how often the image repeats in one unit of u and of v")
+    scale: Scale2 = Field([1.0, 1.0], description="repetitions in one unit of u and of v")
     offset: Annotated[list[float], Field(min_length=2, max_length=2)] = Field(
         [0.0, 0.0], description="added to u and v")
     rotation: Angle = Field(0.0, description="about uv (0, 0): turns the image clockwise")

@@ -43,7 +43,7 @@ from wrt.scene.shapes import SHAPES
 
 RADIANCE = unit("radiance")
 SettingsTable: Any = create_model(
-    "SettingsTable", __base__=Table, __doc__="How the scene wants to be rendered; the command line can override all of it.",
+    "SettingsTable", __base__=Table, __doc__="Defaults of a render; the command line overrides them.",
     **described(Settings))
 
 # --- shapes -----------------------------------------------------------------------------------------------------------
@@ -54,10 +54,10 @@ class TransformTable(Table):
 
     translate: Point = Field([0.0, 0.0, 0.0], description="last")
     rotate: Angles = Field([0.0, 0.0, 0.0], description="about x, then y, then z")
-    axis: Vector | None = Field(None, description="axis of a rotation by `angle`, in place of rotate")
-    angle: Angle | None = Field(None, description="about axis, counter-clockwise for who looks against it")
+    axis: Vector | None = Field(None, description="axis of a rotation, in place of rotate")
+    angle: Angle | None = Field(None, description="about axis, counter-clockwise seen against it")
     scale: Scale3 = Field([1.0, 1.0, 1.0], description="first; one number or one for each axis")
-    matrix: Matrix | None = Field(None, description="object to world, row by row, in place of everything else")
+    matrix: Matrix | None = Field(None, description="object to world, in place of all else")
 
     @model_validator(mode="after")
     def _check(self) -> TransformTable:
@@ -79,7 +79,7 @@ class IncludeTable(Table):
 
     file: str = Field(description="glTF file, relative to the scene file")
     transform: TransformTable | None = Field(
-        None, description="the file's world to this one's: of shapes, cameras and lights, whose intensities stay as they are")
+        None, description="file to world, of shapes, cameras and lights; intensities stay")
 
 
 class SphereTable(Table):
@@ -94,7 +94,7 @@ class SphereTable(Table):
 class QuadTable(Table):
     """A parallelogram; its front is towards cross(edge_u, edge_v), uvs run from 0 to 1."""
 
-    corner: Point = Field(description="lower left for who sees the front upright")
+    corner: Point = Field(description="lower left of the upright front")
     edge_u: Point = Field(description="from the corner to the right")
     edge_v: Point = Field(description="from the corner up")
     material: str = Field(description="name of a material")
@@ -116,7 +116,7 @@ SHAPE_KEYS: dict[str, dict[str, tuple[Any, str]]] = {
     "icosphere": {"subdivisions": (Subdivisions, "each makes four triangles of one"), "radius": (Length, "of the ball")},
     "torus": {"radius": (Length, "from the axis to the middle of the tube"), "tube_radius": (Length, "of the tube"),
               "segments": (Segments, "around the axis"), "tube_segments": (Segments, "around the tube")},
-    "lathe": {"profile": (Profile, "points (radius, height), from the bottom up; one given twice makes a sharp edge"),
+    "lathe": {"profile": (Profile, "points (radius, height), bottom up; a repeated one makes a sharp edge"),
               "segments": (Segments, "around the axis")},
     "prism": {"sides": (Segments, "of the polygon"), "radius": (Length, "of the circle through its corners"),
               "length": (Length, "along z")},
@@ -148,13 +148,13 @@ else:
 class PartTable(Table):
     """A range of a mesh file's triangles, in the order of the file."""
 
-    first: int = Field(ge=0, description="number of the first triangle, from 0")
+    first: int = Field(ge=0, description="index of the first triangle")
     count: int = Field(ge=0, description="how many")
     material: str = Field(description="name of a material")
 
 
 class MorphTable(Table):
-    """A mesh with the same faces, whose shape another one takes on and leaves again in the period of an animation."""
+    """A mesh with the same faces; in an animation, the vertices move to it and back."""
 
     file: str | None = Field(None, description="mesh file, relative to the scene file")
     shape: Shape | None = Field(None, description="in place of a file")
@@ -166,10 +166,10 @@ class MorphTable(Table):
 
 
 class KeyTable(Table):
-    """Where a mesh is at a moment of an animation; between two moments, straight on. Scales, then rotates, then translates."""
+    """Placement in an animation, interpolated linearly. Scales, then rotates, then translates."""
 
     translate: Point = Field([0.0, 0.0, 0.0], description="last")
-    rotate: Angles = Field([0.0, 0.0, 0.0], description="about x, then y, then z; a full turn is from 0 to 360")
+    rotate: Angles = Field([0.0, 0.0, 0.0], description="about x, then y, then z; not limited to 360")
     scale: Scale3 = Field([1.0, 1.0, 1.0], description="first; one number or one for each axis")
 
 
@@ -178,17 +178,16 @@ class MeshTable(Table):
 
     file: str | None = Field(None, description="mesh file, relative to the scene file")
     shape: Shape | None = Field(None, description="in place of a file")
-    material: str | None = Field(None, description="name of a material; beside materials or parts, that of the rest")
+    material: str | None = Field(None, description="name of a material, or that of the rest beside materials or parts")
     materials: dict[str, str] | None = Field(
-        None, description="group of the file (OBJ: usemtl, else g, else o; STL: solid) = a material's name")
-    parts: list[PartTable] | None = Field(None, description="materials by ranges of triangles; a later range wins")
-    smooth: bool | None = Field(None, description="true: make vertex normals where the mesh has none; false: flat, "
-                                "even where it has some (default: as it is)")
+        None, description="material of each group of the file (OBJ: usemtl, else g, else o; STL: solid)")
+    parts: list[PartTable] | None = Field(None, description="materials by ranges of triangles; later ranges win")
+    smooth: bool | None = Field(None, description="true: compute missing vertex normals; false: flat (default: as in the file)")
     transform: TransformTable | None = Field(None, description="object to world")
     instances: Annotated[list[TransformTable], Field(min_length=1)] | None = Field(
-        None, description="the mesh once for each, placed so before `transform` places all of them; kept once in memory")
+        None, description="a copy of the mesh for each, before `transform`; stored once")
     motion: Annotated[list[KeyTable], Field(min_length=2)] | None = Field(
-        None, description="of `wrt animate`: moments evenly spread over the period, before the mesh's instances and transform")
+        None, description="of `wrt animate`: placements evenly spread over the period, before instances and transform")
     morph: MorphTable | None = Field(None, description="of `wrt animate`: another shape, and back")
     name: str = Field("", description="for messages")
 
@@ -223,18 +222,17 @@ IncludeEntry = Annotated[
                   custom_error_type="include_type", custom_error_message="a file's name or a table")]
 
 class SceneTable(Table):
-    """A wrt scene file. Angles are in degrees, lengths in the scene's own unit, colours linear Rec. 709 (one number:
-    grey); +y is up by convention."""
+    """A wrt scene file."""
 
     title: str = Field("", description="what the picture shows")
     include: list[IncludeEntry] = Field(
-        [], description="glTF files, or tables with a transform; their shapes, cameras and lights come behind this file's")
-    settings: Any = Field(default_factory=SettingsTable, description="how the scene wants to be rendered")
+        [], description="glTF files; their shapes, cameras and lights follow this file's")
+    settings: Any = Field(default_factory=SettingsTable, description="defaults of a render")
     cameras: dict[str, Any] = Field({}, description="by name; the first is the default")
-    background: Any = Field(None, description="what rays that leave the scene see (default: black)")
-    ambient: Annotated[Radiance, RADIANCE] = Field([0.0, 0.0, 0.0], description="what every diffuse surface receives, unshadowed")
+    background: Any = Field(None, description="radiance of rays that hit nothing (default: black)")
+    ambient: Annotated[Radiance, RADIANCE] = Field([0.0, 0.0, 0.0], description="added to every diffuse surface, unshadowed")
     materials: dict[str, MaterialTable] = Field({}, description="by name")
-    override: dict[str, MaterialTable] = Field({}, description="replaces the included material of that name")
+    override: dict[str, MaterialTable] = Field({}, description="replaces included materials")
     spheres: list[SphereTable] = Field([], description="exact spheres")
     quads: list[QuadTable] = Field([], description="parallelograms")
     boxes: list[BoxTable] = Field([], description="closed boxes")

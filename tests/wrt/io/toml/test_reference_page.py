@@ -64,8 +64,8 @@ def test_every_number_has_a_unit_or_is_known_to_have_none() -> None:
     ("Camera", "| `fov_y` | number (degrees, 0.0005 to 179.94) | `45.0` | full vertical angle of view |"),
     ("Sphere", "| `radius` | number (length, > 0) | required | its radius |"),
     ("Tube", "| `radius` | number or list of numbers (length, > 0) | `0.1` | one, or one for each point |"),
-    ("Mesh", "| `instances` | list of [Transform](#transform) (1 or more) |  | the mesh once for each, placed so before"
-             " `transform` places all of them; kept once in memory |"),
+    ("Mesh", "| `instances` | list of [Transform](#transform) (1 or more) |  | a copy of the mesh for each, before"
+             " `transform`; stored once |"),
     ("Gradient", "| `top` | 1 or 3 numbers (radiance, >= 0) | `[0.5,0.7,1.0]` | from straight above (+y) |"),
 ])
 def test_rows(section: str, row: str) -> None:
