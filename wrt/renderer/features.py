@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 
 from wrt.accel.scenes.instancing import instanced_meshes
+from wrt.core.types import JsonObject
 from wrt.kernels.shade.features import Features
 from wrt.scene.backgrounds import BACKGROUNDS
 from wrt.scene.cameras import CameraKind
@@ -106,7 +107,7 @@ def filter_icdf(name: str, size: int = 4097) -> np.ndarray:
     return np.interp(np.linspace(0.0, 1.0, size), cdf / cdf[-1], x).astype(np.float32)
 
 
-def describe(scene: Scene, camera: str | int | None = None) -> dict[str, object]:
+def describe(scene: Scene, camera: str | int | None = None) -> JsonObject:
     """Return counts, names, bounds (None without shapes) and features of a scene, as `python -m wrt info` prints them."""
     has_shapes = scene.spheres or any(len(thing.mesh.faces) for thing in scene.objects)
     low, high = (corner.tolist() for corner in scene.bounds()) if has_shapes else (None, None)

@@ -258,4 +258,5 @@ def make_camera(table: PoseTable, name: str) -> CameraKind:
                               f_number=getattr(table, "f_number", None), aperture_radius=values.get("aperture_radius"))
     if table.matrix is not None:
         return kind(np.array(table.matrix).reshape(4, 4), name=name, **values)
+    assert table.position is not None and table.target is not None  # as the schema checks
     return kind.look_at(table.position, table.target, table.up, name=name, **values)
