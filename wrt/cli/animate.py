@@ -1,14 +1,13 @@
-"""The command `animate`: frames of a scene, in a folder or as one moving picture."""
+"""The command `animate`, which renders frames of a scene into a folder or an animated picture."""
 
 from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Any
 
 import click
 
-from wrt.cli.common import depth_hint, load, naming, say, say_json, settings_of, shared, warnings_reported
+from wrt.cli.common import Given, Parsed, depth_hint, load, naming, say, say_json, settings_of, shared, warnings_reported
 from wrt.core.errors import InputError
 from wrt.core.interrupts import exit_code
 
@@ -23,9 +22,9 @@ from wrt.core.interrupts import exit_code
 @click.option("--rebuild-at", type=float, default=1.5, show_default=True,
               help="Growth of the structure's SAH cost from which it is built anew, not refitted")
 @shared("spp", "size", "given", "seed", "device", "threads", "camera", "accel", "quiet", "as_json")
-def animate(scene: Path, output: Path, fps: float, given: tuple[tuple[str, Any], ...], quiet: bool, as_json: bool,
-            **options: Any) -> None:
-    """A turntable of SCENE, or its motion (`motion` and `morph` of TOML scenes), frame by frame."""
+def animate(scene: Path, output: Path, fps: float, given: Given, quiet: bool, as_json: bool,
+            **options: Parsed) -> None:
+    """Render frames of SCENE: a turntable, or its motion (`motion` and `morph` of TOML scenes)."""
     from wrt.renderer import animate as animation
     from wrt.renderer.options import Options
 

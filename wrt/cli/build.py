@@ -1,13 +1,12 @@
-"""The command that builds a structure for later: `build`."""
+"""The command `build`, which saves a structure."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import click
 
-from wrt.cli.common import Setting, now_and_then, say, say_json, shared, warnings_reported
+from wrt.cli.common import Given, Setting, now_and_then, say, say_json, shared, values_of, warnings_reported
 from wrt.core.errors import InputError
 from wrt.io.meshes import SUFFIXES
 
@@ -15,9 +14,9 @@ from wrt.io.meshes import SUFFIXES
 @click.command(help=f"Build a structure over MESH ({SUFFIXES}) once, and write it to a file for wrt.load_accel.")
 @click.argument("mesh", type=click.Path(path_type=Path))
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="File to write: .accel")
-@click.option("--set", "settings", type=Setting(), multiple=True, help="An option of the structure, such as max_leaf=8; repeatable")
+@click.option("--set", "given", type=Setting(), multiple=True, help="An option of the structure, such as max_leaf=8; repeatable")
 @shared("accel", "threads", "quiet", "as_json")
-def build(mesh: Path, output: Path, accel: str, settings: tuple[tuple[str, Any], ...], threads: int | None, quiet: bool,
+def build(mesh: Path, output: Path, accel: str, given: Given, threads: int | None, quiet: bool,
           as_json: bool) -> None:
     from dataclasses import asdict
 
@@ -27,7 +26,7 @@ def build(mesh: Path, output: Path, accel: str, settings: tuple[tuple[str, Any],
     from wrt.accel.store import check_target
 
     check_target(output)
-    options = settled(settings)
+    options = values_of(given, mesh="MESH", accel="--accel", device="the CPU", threads="--threads", progress="-q")
     if reports_progress(accel):
         tell = now_and_then(quiet)
         options["progress"] = lambda done: tell(f"{accel}: {100.0 * done:.0f} % built")
@@ -42,13 +41,3 @@ def build(mesh: Path, output: Path, accel: str, settings: tuple[tuple[str, Any],
     if not quiet:
         say(repr(structure))
     say(output, err=False)
-
-
-def settled(settings: tuple[tuple[str, Any], ...]) -> dict[str, Any]:
-    """Options by name; InputError where one is set twice or belongs to another flag."""
-    out: dict[str, Any] = {}
-    for name, value in settings:
-        if name in out or name in ("mesh", "accel", "device", "threads", "progress"):
-            raise InputError(f"{'set twice' if name in out else 'has a flag of its own'}", argument=f"--set {name}")
-        out[name] = value
-    return out

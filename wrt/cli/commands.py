@@ -1,4 +1,4 @@
-"""The table of commands: by name, where each one is. Each is imported when it is called, or listed by --help."""
+"""The table of commands with the place of each, which is imported when it is called or listed by --help."""
 
 from __future__ import annotations
 

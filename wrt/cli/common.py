@@ -1,11 +1,10 @@
-"""What the commands share: types of options, how a scene is loaded, and how they tell of things."""
+"""Parts that the commands share: types of options, loading of scenes, and output."""
 
 from __future__ import annotations
 
 import ast
 import contextlib
 import dataclasses
-import difflib
 import functools
 import importlib
 import json
@@ -14,25 +13,35 @@ import re
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import click
 
 from wrt.core.errors import InputError, SceneWarning
 
-DIGITS = "[0-9]{1,9}"  # more are no pixel, and Python refuses to read thousands
-SEEN = 0.003  # of the pixels: a patch of 26x26 in a picture of 640x360; fewer are seen neither as a patch nor told from noise
+if TYPE_CHECKING:
+    from click.shell_completion import CompletionItem
+    from distributed import Client
+
+    from wrt.scene.model import Scene
+    from wrt.scene.settings import SettingChanges
+
+Decorator: TypeAlias = Callable[[Callable[..., None]], Callable[..., None]]
+Parsed: TypeAlias = Any  # The value of an option, which click has converted to the option's type.
+Given: TypeAlias = tuple[tuple[str, bool | int | float | str], ...]  # The values of --set by name.
+DIGITS = "[0-9]{1,9}"  # More are no pixel, and Python refuses to read thousands.
+VISIBLE = 0.003  # Share of the pixels: a patch of 26x26 in a picture of 640x360. Fewer look like noise.
 
 
 class Written(click.ParamType):
-    """A value that is written by a pattern. form: how to write it; value: of the groups that the pattern finds."""
+    """A value that a pattern describes. form: the form in words; value: makes the value of the pattern's groups."""
 
-    def __init__(self, name: str, pattern: str, form: str, value: Callable[..., Any]) -> None:
+    def __init__(self, name: str, pattern: str, form: str, value: Callable[..., object]) -> None:
         self.name, self.pattern, self.form, self.value = name, pattern, form, value
 
-    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> object:
         match = re.fullmatch(self.pattern, str(value))
         if not match:
             self.fail(f"{value!r} is not {self.form}", param, ctx)
@@ -51,39 +60,31 @@ class Names(click.ParamType):
 
     name = "NAME,..."
 
-    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[str, ...]:
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, ...]:
         if isinstance(value, tuple):  # the default
             return value
         return tuple(name.strip() for name in str(value).split(",") if name.strip())
 
 
 class Commands(click.Group):
-    """Commands; a name that is none is answered with those that there are, an option that is none with the nearest one."""
+    """A group that suggests a similar option, compared without dashes. click compares the dashes too, which are always alike."""
 
-    def invoke(self, ctx: click.Context) -> Any:
+    def invoke(self, ctx: click.Context) -> object:
         try:
             return super().invoke(ctx)
-        except click.NoSuchOption as error:  # click compares with the dashes, which are always alike
+        except click.NoSuchOption as error:
+            from wrt.core.checks import most_similar
+
             known = {name.strip("-") for each in error.ctx.command.params for name in each.opts} if error.ctx else set()
-            meant = {"--width": "size", "--height": "size"}.get(error.option_name, error.option_name.strip("-"))
-            near = "".join(f" Did you mean '--{each}'?" for each in difflib.get_close_matches(meant, known, n=1))
-            raise click.UsageError(f"No such option {error.option_name!r}.{near}", error.ctx) from None
-
-    def resolve_command(self, ctx: click.Context, args: list[str]) -> tuple[str | None, click.Command | None, list[str]]:
-        try:
-            return super().resolve_command(ctx, args)
-        except click.UsageError as error:
-            if self.get_command(ctx, args[0]) is None and "No such command" in error.format_message():
-                from wrt.core.checks import did_you_mean
-
-                known = self.list_commands(ctx)
-                ctx.fail(f"No such command {args[0]!r}; {did_you_mean(args[0], known)}there is {', '.join(known)}")
-            raise
+            near = most_similar({"--width": "size", "--height": "size"}.get(error.option_name, error.option_name.strip("-")), known)
+            hint = f" Did you mean '--{near}'?" if near else ""
+            raise click.UsageError(f"No such option {error.option_name!r}.{hint}", error.ctx) from None
 
 
 class OneOf(click.ParamType):
-    """One name of a table, given as "module:TABLE". It is only shown, by --help and by completion in a shell: whoever takes the
-    option checks it against the table, and tells the nearest name."""
+    """A name of a table, given as "module:TABLE". This type only lists the names for --help and completion.
+
+    The function that gets the option checks it against the table and suggests a similar name."""
 
     name = "NAME"
 
@@ -91,14 +92,14 @@ class OneOf(click.ParamType):
         self.place = place
 
     def names(self) -> list[str]:
-        """The table's, whose module is imported now."""
+        """Return the names of the table, whose module is imported now."""
         module, table = self.place.split(":")
         return list(getattr(importlib.import_module(module), table))
 
-    def get_metavar(self, param: Any, ctx: Any = None) -> str:
+    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
         return f"[{'|'.join(self.names())}]"
 
-    def shell_complete(self, ctx: Any, param: Any, incomplete: str) -> list[Any]:
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
         from click.shell_completion import CompletionItem
 
         return [CompletionItem(name) for name in self.names() if name.startswith(incomplete)]
@@ -112,7 +113,7 @@ class Setting(click.ParamType):
 
     name = "NAME=VALUE"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, Any]:
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, bool | int | float | str]:
         name, sign, text = str(value).partition("=")
         if not sign or not name:
             self.fail(f"{value!r} is not NAME=VALUE", param, ctx)
@@ -120,24 +121,16 @@ class Setting(click.ParamType):
             parsed = ast.literal_eval(text)
         except (ValueError, SyntaxError, MemoryError, RecursionError):
             parsed = text
-        return name, parsed if isinstance(parsed, bool | int | float | str) else text
-
-
-class SceneSetting(Setting):
-    """A setting of a scene."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, Any]:
-        name, parsed = super().convert(value, param, ctx)
-        return name, str(value).partition("=")[2] if name == "size" else parsed  # 0x360 is no number
+        return name, parsed if isinstance(parsed, bool | int | float | str) and name != "size" else text  # 0x360 is no number
 
 
 SET = click.option(
-    "--set", "given", type=SceneSetting(), multiple=True,
+    "--set", "given", type=Setting(), multiple=True,
     help="A setting of the scene, such as glass_shadows=tinted; repeatable. There is size, spp, max_depth, min_throughput, filter,"
          " fresnel, glass_shadows, sampler, exposure and tonemap (docs/scene_format.md)")
 
 
-# What several commands take, by the names of the arguments.
+# Options and arguments of several commands, by the names of the functions' parameters.
 SHARED = {
     "scene": click.argument("scene", type=click.Path(path_type=Path)),
     "spp": click.option("--spp", type=int, help="Samples a pixel  [default: the scene's]"),
@@ -155,75 +148,80 @@ SHARED = {
 }
 
 
-def shared(*names: str) -> Callable[[Any], Any]:
-    """A command with these of SHARED."""
+def shared(*names: str) -> Decorator:
+    """Give a command these options of SHARED."""
     return lambda command: functools.reduce(lambda wrapped, name: SHARED[name](wrapped), reversed(names), command)
 
 
-def names_of(kind: type[Any]) -> list[str]:
+def names_of(kind: type) -> list[str]:
     """Return the names of a dataclass's fields."""
     return [each.name for each in dataclasses.fields(kind)]
 
 
-def gathering(name: str, make: Callable[..., Any], names: Sequence[str], options: Sequence[Any]) -> Callable[[Any], Any]:
-    """Give a command these options, of which it gets one argument of that name: what `make` makes of them. names: those of the
-    options, and perhaps of others."""
+def gathering(name: str, make: Callable[..., object], names: Sequence[str], options: Sequence[Decorator]) -> Decorator:
+    """Give a command these options, whose values it gets as one argument `name`, made by `make`.
+
+    names: the parameters for `make`; names without an option are left out."""
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(command)
-        def gathered(**given: Any) -> None:
+        def gathered(**given: Parsed) -> None:
             own = {each: given.pop(each) for each in names if each in given}
             command(**given, **{name: make(**own)})
 
-        return functools.reduce(lambda wrapped, option: option(wrapped), options, gathered)
+        wrapped: Callable[..., None] = gathered
+        for option in options:
+            wrapped = option(wrapped)
+        return wrapped
 
     return decorate
 
 
-def settings_of(given: tuple[tuple[str, Any], ...], flags: dict[str, Any] | None = None, **taken: str) -> dict[str, Any]:
-    """The settings that --set gives, and those of `flags`, which are flags of their own (None: not given).
+def values_of(given: Given, **elsewhere: str) -> dict[str, Parsed]:
+    """Return the values of --set by name. Raises InputError for a name that is given twice with different values.
 
-    taken: settings that this command does not take from --set, each with who decides on it. Values are checked as those of a
-    scene file are. Raises InputError for them, and where a setting is given twice and not the same.
-    """
-    from wrt.core.checks import as_size
-    from wrt.io.toml.report import check_settings
-
-    if not given:
-        return dict(flags or {})
-    values: dict[str, Any] = {}
+    elsewhere: names that this command does not take from --set, each with the option that decides on it; InputError for them."""
+    values: dict[str, Parsed] = {}
     for name, value in given:
-        if name in taken:
-            raise InputError(f"{taken[name]} decides on that here", argument=f"--set {name}")
+        if name in elsewhere:
+            raise InputError(f"{elsewhere[name]} decides on that here", argument=f"--set {name}")
         if name in values and values[name] != value:
             raise InputError(f"given twice, {values[name]!r} and {value!r}", argument=f"--set {name}")
         values[name] = value
+    return values
+
+
+def settings_of(given: Given, flags: Mapping[str, Parsed] | None = None, **elsewhere: str) -> SettingChanges:
+    """Return the scene's settings of --set, checked like those of a file, and of `flags`, the options of their own (None: not given).
+
+    elsewhere: see values_of. Raises InputError for invalid settings, and for one that --set and a flag give differently."""
+    from wrt.core.checks import as_size
+    from wrt.io.toml.report import check_settings
+
+    flags = {name: value for name, value in (flags or {}).items() if value is not None}
+    values = values_of(given, **elsewhere)
     if "size" in values:
         values["size"] = list(as_size(values["size"], "--set size"))
-    settings = check_settings(values, "--set")
-    for name, value in (flags or {}).items():
-        if value is not None and name in settings and _plain(settings[name]) != _plain(value):
+    settings = check_settings(values, "--set") if values else {}
+    for name, value in flags.items():
+        if name in settings and (tuple(settings[name]) if name == "size" else settings[name]) != value:
             raise InputError(f"--{name.replace('_', '-')} is given too, and says otherwise: leave one of them out",
                              argument=f"--set {name}")
-    return {**{name: value for name, value in (flags or {}).items() if value is not None}, **settings}
-
-
-def _plain(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list | tuple) else value
+    return cast("SettingChanges", {**flags, **settings})
 
 
 def depth_hint(visibly_cut: float, max_depth: int, option: str = "--max-depth") -> str | None:
-    """A line for who may want more bounces: where so many pixels lack light visibly (Film.stats) that somebody would see them."""
+    """Return advice on max_depth, or None if too few pixels are visibly too dark. visibly_cut: their share, of Film.stats."""
     from wrt.scene.settings import MAX_DEPTH
 
-    if visibly_cut < SEEN:
+    if visibly_cut < VISIBLE:
         return None
     advice = f"raise {option}" if max_depth < MAX_DEPTH else f"{MAX_DEPTH} is the most there is"
     return f"max_depth {max_depth} leaves {100.0 * visibly_cut:.2g}% of the pixels visibly too dark: {advice}"
 
 
-def spread_options(cluster: str | None, device: str) -> dict[str, Any]:
-    """The options of `wrt.render` for --cluster and --device; a cluster's connection is open until the command ends."""
+def spread_options(cluster: str | None, device: str) -> dict[str, Parsed]:
+    """Return the options of `wrt.render` for --cluster and --device. A cluster's connection is open until the command ends."""
     names = [name.strip() for name in device.split(",")]
     if cluster is None:
         return {"device": device} if len(names) == 1 else {"devices": names}
@@ -233,8 +231,8 @@ def spread_options(cluster: str | None, device: str) -> dict[str, Any]:
     return {"device": device, "executor": client_of(cluster)}
 
 
-def client_of(cluster: str | None) -> Any:
-    """A dask.distributed.Client that is open until the command ends; None of None."""
+def client_of(cluster: str | None) -> Client | None:
+    """Return a Dask client that is open until the command ends; None for None."""
     if cluster is None:
         return None
     from wrt.renderer.distributed.dask import connected
@@ -246,8 +244,8 @@ CLUSTER = click.option("--cluster", metavar="ADDRESS",
                        help="Spread over the workers of a Dask scheduler, tcp://host:8786 (docs/cluster.md)")
 
 
-def load(path: Path, quiet: bool) -> Any:
-    """The scene, with the loader's warnings on stderr."""
+def load(path: Path, quiet: bool) -> Scene:
+    """Read a scene, with the loader's warnings on stderr."""
     from wrt.io.load import load_scene
 
     with warnings_reported(quiet):
@@ -256,7 +254,7 @@ def load(path: Path, quiet: bool) -> Any:
 
 @contextlib.contextmanager
 def warnings_reported(quiet: bool) -> Iterator[None]:
-    """Tell the block's warnings on stderr when it is over, a line each; none where it fails: one message is enough."""
+    """Write the block's warnings to stderr at its end, a line each; none if it fails, since one message is enough."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", SceneWarning)
         yield
@@ -267,7 +265,7 @@ def warnings_reported(quiet: bool) -> Iterator[None]:
 
 @contextlib.contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """What is found wrong with a scene after it was read is told with its file; what is wrong with another file names that."""
+    """Add the scene's file to errors that are found after it was read, unless they name a file."""
     try:
         yield
     except InputError as error:
@@ -276,10 +274,10 @@ def naming(path: Path) -> Iterator[None]:
         raise error.at(path) from error
 
 
-def json_text(value: Any) -> str:
-    """As JSON, which has no NaN and no infinity: they become null; what it has no form for becomes text."""
+def json_text(value: object) -> str:
+    """Return a value as JSON. NaN and infinity become null, and values without a form in JSON become text."""
 
-    def plain(value: Any) -> Any:
+    def plain(value: object) -> object:
         if isinstance(value, dict):
             return {str(key): plain(each) for key, each in value.items()}
         if isinstance(value, list | tuple):
@@ -289,21 +287,20 @@ def json_text(value: Any) -> str:
     return json.dumps(plain(value), default=str, allow_nan=False)
 
 
-def say_json(value: Any) -> None:
-    """As JSON on stdout."""
+def say_json(value: object) -> None:
+    """Write a value as JSON to stdout."""
     click.echo(json_text(value))
 
 
 def say(text: object, err: bool = True) -> None:
-    """On stderr, where a terminal that is gone is no reason to fail, or on stdout. Control characters that a stranger's file or its
-    name holds are escaped: they give the terminal no orders."""
+    """Write a line to stderr, without an error if the terminal is gone, or to stdout. Control characters, of files, are escaped."""
     text = re.sub(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]", lambda control: f"\\x{ord(control[0]):02x}", str(text))
     with contextlib.suppress(OSError) if err else contextlib.nullcontext():
         click.echo(text, err=err)
 
 
 def now_and_then(quiet: bool, every: float = 10.0) -> Callable[[str], None]:
-    """Where lines of progress go: on a terminal each one over the last, else one in `every` seconds."""
+    """Return a function that writes lines of progress: on a terminal over the last one, else once in `every` seconds."""
     terminal = sys.stderr is not None and sys.stderr.isatty()
     due = time.monotonic()
 

@@ -1,9 +1,8 @@
-"""The command that measures the error of a picture: `compare`."""
+"""The command `compare`, which measures the error of a picture."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import click
 
@@ -23,13 +22,13 @@ from wrt.core.errors import InputError
               help="For PSNR and FLIP, which see what a display shows")
 @click.option("--exposure", type=float, default=0.0, show_default=True, help="Stops, likewise")
 @shared("as_json")
-def compare(a: Path, b: Path, output: Path | None, tonemap: str, exposure: float, as_json: bool, **limits: Any) -> None:
+def compare(a: Path, b: Path, output: Path | None, tonemap: str, exposure: float, as_json: bool, **limits: float | None) -> None:
     """Measure the error of picture A against the reference B."""
     from wrt.picture import metrics
     from wrt.picture.image import check_writable, read_image, write_codes
     from wrt.scene.settings import Settings
 
-    Settings(tonemap=tonemap, exposure=exposure)  # told before the pictures are read
+    Settings(tonemap=tonemap, exposure=exposure)  # raises before the pictures are read
     if output is not None:
         if output.suffix.lower() != ".png":
             raise InputError("must be a .png: a picture of the difference", path=output)

@@ -1,30 +1,29 @@
-"""The command that fills the kernel cache beforehand: `compile`."""
+"""The command `compile`, which fills the kernel cache in advance."""
 
 from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Any
 
 import click
 
 from wrt.cli.common import load, naming, say, say_json, shared, warnings_reported
 
 
-@click.command("compile", help="Compile what queries of a structure, and pictures of SCENES with all AOVs, take: into Warp's cache"
-               " (WARP_CACHE_PATH), for a container or a cluster. What is there is not compiled again.")
+@click.command("compile", help="Compile the kernels for queries of a structure, and for pictures of SCENES with all AOVs, into Warp's cache"
+               " (WARP_CACHE_PATH), for a container or a cluster. Kernels in the cache are not compiled again.")
 @click.argument("scenes", nargs=-1, type=click.Path(path_type=Path))
 @shared("accel", "device", "threads", "quiet", "as_json")
 def compile_kernels(scenes: tuple[Path, ...], accel: str, device: str, threads: int | None, quiet: bool, as_json: bool) -> None:
     from wrt.core.threads import thread_count
     from wrt.renderer.compile import compile_picture, compile_queries
 
-    count, done = thread_count(threads), list[dict[str, Any]]()
+    count, done = thread_count(threads), list[dict[str, object]]()
 
     def tell(what: str, names: list[str], begin: float) -> None:
         done.append({"for": what, "kernels": names, "seconds": time.perf_counter() - begin})
         if not as_json:
-            say(f"{what}: {len(names)} kernels, {done[-1]['seconds']:.1f} s", err=False)
+            say(f"{what}: {len(names)} kernels, {time.perf_counter() - begin:.1f} s", err=False)
 
     begin = time.perf_counter()
     tell(f"queries of {accel}", compile_queries(accel, device), begin)

@@ -1,4 +1,4 @@
-"""The command that tells what there is to compute on, whether it computes as it should, and what is fastest on it: `devices`."""
+"""The command `devices`, which lists devices, checks one against the CPU, or finds its fastest structure."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from wrt.core.errors import InputError
 
 
 @click.command()
-@click.option("--check", is_flag=True, help="Compare a device with the CPU, bit for bit, and measure its speed; exit code 1 where"
-                                            " a bit differs. Minutes, as all kernels are compiled")
+@click.option("--check", is_flag=True, help="Compare a device with the CPU, bit for bit, and measure its speed; exit code 1 if"
+                                            " a bit differs. Takes minutes, to compile all kernels")
 @click.option("--tune", "tunes", is_flag=True, help="Measure which structure is fastest on a device, and print what to write")
 @click.option("--device", help="To check or to tune: cuda:0, ...  [default: cuda:0]")
 @click.option("--scene", "scenes", type=click.Path(path_type=Path), multiple=True,
-              help="To check by, repeatable  [default: those that ship with wrt]")
-@click.option("--rays", type=int, help="To check by, of each kind for each mesh and structure  [default: 20000]")
+              help="For --check, repeatable  [default: the scenes of wrt]")
+@click.option("--rays", type=int, help="For --check, of each kind for each mesh and structure  [default: 20000]")
 @shared("quiet", "as_json")
 def devices(check: bool, tunes: bool, device: str | None, scenes: tuple[Path, ...], rays: int | None, quiet: bool,
             as_json: bool) -> None:

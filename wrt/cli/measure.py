@@ -1,4 +1,4 @@
-"""The commands that measure: `bench` with those below it, `stability`, `profile`, `whatif`. They parse, call and print."""
+"""The commands that measure: `bench` with its subcommands, `stability`, `profile`, `whatif`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from wrt.cli.common import SIZE, Commands, Names, client_of, load, naming, say, settings_of, shared, warnings_reported
+from wrt.cli.common import SIZE, Commands, Given, Names, Parsed, client_of, load, naming, say, settings_of, shared, warnings_reported
 from wrt.cli.reporting import Reporting, measured, planned, reporting
 from wrt.core.registry import Registry
 from wrt.lab import plans
@@ -19,8 +19,8 @@ BENCHES: Registry[click.Command] = Registry("bench", {}, "wrt.benches")
 
 
 @click.group(cls=Commands, commands=BENCHES, invoke_without_command=True, no_args_is_help=True)
-@click.option("--quick", is_flag=True, help="With a command: as its own --quick. Without one: of all that need no file, one after"
-                                            " another, a minute on two cores")
+@click.option("--quick", is_flag=True, help="With a command: its own --quick. Without one: all commands that need no file, one after"
+                                            " another, in a minute on two cores")
 @click.pass_context
 def bench(context: click.Context, quick: bool) -> None:
     """Measure: speed against error, and one method against another."""
@@ -48,7 +48,7 @@ whatif = measured(plans.WhatIf)
 @click.option("--structures", type=Names(), default=("bvh", "bvh2"), show_default=True, help="Traversals to look at, by name")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
 def instructions(structures: tuple[str, ...], as_json: bool) -> None:
-    """The units in machine code for Turing: instructions of each box and triangle test; registers, stack and code of
+    """Show the units in machine code for Turing: instructions of each box and triangle test, and registers, stack and code of
     traversals, also for Hopper."""
     from wrt.accel.structures import ACCELERATORS
     from wrt.lab.bench.report import markdown
@@ -72,8 +72,8 @@ def instructions(structures: tuple[str, ...], as_json: bool) -> None:
 @shared("max_depth", "given", "crop", "camera", "accel", "seed", "threads")
 @click.option("--gpu", default="rtx2080ti", show_default=True, help="What the model reckons for: rtx2080ti or rtx2060")
 @reporting("Folder for heat maps, EXR layers, histograms and a report")
-def profile(how: Reporting, scene: Path, given: tuple[tuple[str, Any], ...], gpu: str, **options: Any) -> None:
-    """What every ray of SCENE costs: counters by pixel, kind and depth, and a model of the RT core."""
+def profile(how: Reporting, scene: Path, given: Given, gpu: str, **options: Parsed) -> None:
+    """Count the work of every ray of SCENE, by pixel, kind and depth, and model the RT core."""
     from wrt.core.checks import require_known
     from wrt.lab.rtcore import profile_report as report
     from wrt.lab.rtcore.parameters import GPUS
@@ -122,8 +122,8 @@ def stability(how: Reporting, plan: Stability) -> None:
 @click.option("--size", type=SIZE, default="128x72", show_default=True, help="Pixels")
 @shared("camera", "given", "seed", "device", "threads")
 @reporting()
-def error(how: Reporting, plan: Error, scene: Path, given: tuple[tuple[str, Any], ...], size: tuple[int, int],
-          **options: Any) -> None:
+def error(how: Reporting, plan: Error, scene: Path, given: Given, size: tuple[int, int],
+          **options: Parsed) -> None:
     """Speed against error of SCENE over the knobs that a render has: each picture against a converged reference."""
     from wrt.lab.bench import error as study
     from wrt.lab.bench import error_report as report
@@ -132,7 +132,7 @@ def error(how: Reporting, plan: Error, scene: Path, given: tuple[tuple[str, Any]
     rendering = Options(**options)
     settings = settings_of(given, size="--size", spp="--max-spp")
     how.check_markdown()
-    loaded = load(scene, how.quiet).with_settings(size=size, **settings)
+    loaded = load(scene, how.quiet).with_settings(**settings).with_settings(size=size)
     with warnings_reported(how.quiet), naming(scene):
         result = study.sweep(loaded, plan, rendering, how.progress)
     text = report.text(result)
@@ -147,7 +147,7 @@ def error(how: Reporting, plan: Error, scene: Path, given: tuple[tuple[str, Any]
 @click.option("--matte", is_flag=True, help="Make every surface diffuse, for the integrator direct, which draws the same light")
 @shared("camera", "given")
 @reporting()
-def mitsuba(how: Reporting, plan: Mitsuba, scene: Path, given: tuple[tuple[str, Any], ...], size: tuple[int, int], matte: bool,
+def mitsuba(how: Reporting, plan: Mitsuba, scene: Path, given: Given, size: tuple[int, int], matte: bool,
             camera: str | None) -> None:
     """SCENE by wrt and by Mitsuba 3 (scalar_rgb and llvm_ad_rgb), on all threads: time to equal error, process start included and
     excluded.
@@ -161,7 +161,7 @@ def mitsuba(how: Reporting, plan: Mitsuba, scene: Path, given: tuple[tuple[str, 
         plan = replace(plan, integrator="direct")
     how.check_markdown()
     settings = settings_of(given, size="--size", spp="--spp")
-    loaded = load(scene, how.quiet).with_settings(size=size, **settings)
+    loaded = load(scene, how.quiet).with_settings(**settings).with_settings(size=size)
     with tempfile.TemporaryDirectory() as folder, warnings_reported(how.quiet), naming(scene):
         command = ["render", str(scene), "--spp", "1", "--size", f"{size[0]}x{size[1]}", "-q", "-o", f"{folder}/start.png"]
         command += [f"--set={name}={value}" for name, value in settings.items()]

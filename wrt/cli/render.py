@@ -1,21 +1,23 @@
-"""The command that makes a picture: `render`."""
+"""The command `render`, which makes a picture."""
 
 from __future__ import annotations
 
 import os
 import signal
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from wrt.cli.common import (
     CLUSTER,
     DURATION,
+    Given,
     Names,
     OneOf,
+    Parsed,
     depth_hint,
     load,
     naming,
@@ -30,6 +32,11 @@ from wrt.cli.save import checkpoint_options, remove_checkpoint, save_film
 from wrt.core.errors import InputError
 from wrt.core.interrupts import Interrupted, exit_code
 from wrt.io.meshes import SUFFIXES
+
+if TYPE_CHECKING:
+    from wrt.picture.film import Film
+    from wrt.scene.model import Scene
+    from wrt.scene.settings import SettingChanges
 
 
 @click.command(help=f"Render SCENE (.toml, .gltf, .glb, or a mesh: {SUFFIXES}) to a picture.")
@@ -59,8 +66,8 @@ from wrt.io.meshes import SUFFIXES
 @click.option("--checkpoint-file", type=click.Path(path_type=Path), help="Where to  [default: the picture's name + .checkpoint]")
 @click.option("--resume", is_flag=True, help="Go on from the checkpoint; without one, from the beginning")
 @shared("quiet", "as_json")
-def render(scene: Path, output: Path | None, given: tuple[tuple[str, Any], ...], quiet: bool, as_json: bool,
-           **options: Any) -> None:
+def render(scene: Path, output: Path | None, given: Given, quiet: bool, as_json: bool,
+           **options: Parsed) -> None:
     begin = time.perf_counter()
     output, bits = output or Path(f"{scene.stem or 'picture'}.png"), options.pop("bits")
     check_picture(output, bits)
@@ -69,7 +76,7 @@ def render(scene: Path, output: Path | None, given: tuple[tuple[str, Any], ...],
 
         preload_headers()  # while the rest is imported
     settings = check_options(output, given, options)
-    layers = options["aov"] if output.suffix.lower() != ".exr" else None  # in an EXR file they are channels, all of them
+    layers = options["aov"] if output.suffix.lower() != ".exr" else None  # in an EXR file layers are channels
     check_layers(output, layers)
     clock, begin = {"import": time.perf_counter() - begin}, time.perf_counter()
     loaded = load(scene, quiet).with_settings(**settings)
@@ -83,7 +90,7 @@ def render(scene: Path, output: Path | None, given: tuple[tuple[str, Any], ...],
         begin = time.perf_counter()
         paths, late, misplaced = save_film(film, output, bits, layers)
     if checkpoint is not None and not (misplaced or film.stats["interrupted"] or film.stats["timed_out"]):
-        remove_checkpoint(checkpoint)  # it has done its work
+        remove_checkpoint(checkpoint)  # the picture is done
         film.stats["checkpoint"] = None
     if late:
         film.stats |= {"interrupted": True, "signal": film.stats["signal"] or late[0]}
@@ -102,23 +109,24 @@ def render(scene: Path, output: Path | None, given: tuple[tuple[str, Any], ...],
 
 
 def check_picture(output: Path, bits: int | None) -> None:
-    """Raise InputError where no picture can be written there."""
+    """Raise InputError if no picture can be written there."""
     from wrt.picture.image import check_writable
 
     check_writable(output, bits)
 
 
 def check_layers(output: Path, layers: Sequence[str] | None) -> None:
-    """Raise InputError where a layer's picture cannot be written beside the output."""
+    """Raise InputError if a layer's picture cannot be written beside the output."""
     from wrt.picture.film import aov_path
 
     for name in layers or ():
         check_picture(aov_path(output, name), None)
 
 
-def check_options(output: Path, given: tuple[tuple[str, Any], ...], options: dict[str, Any]) -> dict[str, Any]:
-    """Return the scene's settings, and leave in `options` those of `wrt.render`. Raises InputError for what is wrong with either,
-    before a scene is read and a kernel compiled."""
+def check_options(output: Path, given: Given, options: dict[str, Parsed]) -> SettingChanges:
+    """Return the scene's settings, and leave the options of `wrt.render` in `options`.
+
+    Raises InputError for invalid ones, before a scene is read and a kernel compiled."""
     from wrt.renderer.options import Options
     from wrt.scene.model import Scene
 
@@ -133,8 +141,8 @@ def check_options(output: Path, given: tuple[tuple[str, Any], ...], options: dic
     return settings
 
 
-def trace(loaded: Any, path: Path, spp: int | None, options: dict[str, Any], quiet: bool) -> Any:
-    """Return the Film of a scene, with progress on stderr. Raises Interrupted where there is no sample to keep."""
+def trace(loaded: Scene, path: Path, spp: int | None, options: dict[str, Parsed], quiet: bool) -> Film:
+    """Render a scene, with progress on stderr. Raises Interrupted if there is no sample to keep."""
     from wrt.renderer.progress import progress_reporter
     from wrt.renderer.render import render as render_scene
     from wrt.renderer.result import plain_text
@@ -147,7 +155,7 @@ def trace(loaded: Any, path: Path, spp: int | None, options: dict[str, Any], qui
     return film
 
 
-def _summary(film: Any) -> str:
+def _summary(film: Film) -> str:
     s = film.stats
     cut = f"cut: {s['cut_by_depth']} rays by depth, {s['cut_by_throughput']} by throughput"
     end = "interrupted" if s["interrupted"] else "time limit" if s["timed_out"] else ""
@@ -167,8 +175,8 @@ def _summary(film: Any) -> str:
             f"{cut}, lost throughput {s['lost_throughput_per_sample']:.2g} a sample{lost}\n{_seconds(s)}{kept}{hint}")
 
 
-def _seconds(stats: dict[str, Any]) -> str:
-    """Of each stage: upload and build run beside compile."""
+def _seconds(stats: Mapping[str, Any]) -> str:
+    """Return the seconds of each stage. Upload and build run beside compile."""
     seconds = stats["seconds"]
     notes = dict.fromkeys(seconds, "")
     if stats.get("resumed"):

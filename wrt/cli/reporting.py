@@ -1,9 +1,9 @@
-"""What the commands that measure share: options, progress, where a report goes, and text or JSON at the end."""
+"""Parts that the measuring commands share: options, progress, the report's file, and the final text or JSON."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,10 @@ from wrt.cli.common import (
     CLUSTER,
     DURATION,
     SHARED,
+    Decorator,
     Names,
     OneOf,
+    Parsed,
     client_of,
     gathering,
     names_of,
@@ -31,16 +33,16 @@ from wrt.core.interrupts import exit_code
 from wrt.core.write_file import check_writable, write_bytes
 from wrt.lab.plans import STRUCTURES, Plan
 
+# Types of options by the annotations of a plan's fields; all others are paths.
 TYPES: dict[str, Any] = {"int": int, "int | None": int, "bool": bool, "str": str, "Sequence[str]": Names(), "float": DURATION}
 
 
 @dataclass(frozen=True)
 class Reporting:
-    """output: a report's file or folder (None: none); cluster: a Dask scheduler's address; quiet: no progress; as_json: JSON, not
-    text."""
+    """The options of a report."""
 
-    output: Path | None = None
-    cluster: str | None = None
+    output: Path | None = None  # file or folder of the report
+    cluster: str | None = None  # address of a Dask scheduler
     quiet: bool = False
     as_json: bool = False
 
@@ -53,7 +55,7 @@ class Reporting:
         return now_and_then(self.quiet)
 
     def check_markdown(self) -> None:
-        """Raise InputError where a Markdown file cannot be written there, before any work is done for it."""
+        """Raise InputError if the report, a Markdown file, cannot be written."""
         if self.output is None:
             return
         if self.output.suffix.lower() != ".md":
@@ -64,9 +66,8 @@ class Reporting:
         if self.output is not None:
             write_bytes(self.output, (text.rstrip("\n") + "\n").encode())
 
-    def end(self, text: str, data: dict[str, Any], paths: Sequence[Path] = (), interrupted: int | None = None) -> None:
-        """The result on stdout, and what was written: `paths`, or the output. interrupted: the signal that ended the work early,
-        whose exit code this ends with."""
+    def end(self, text: str, data: Mapping[str, object], paths: Sequence[Path] = (), interrupted: int | None = None) -> None:
+        """Write the result and the written files (`paths`, or the output) to stdout. interrupted: exit with this signal's code."""
         if self.as_json:
             say_json(data)
         else:
@@ -78,25 +79,26 @@ class Reporting:
 
 
 def reporting(report: str = "Write the tables as Markdown (.md)", *, cluster: bool = False,
-              quiet: str = "No progress, no warnings") -> Callable[[Any], Any]:
-    """A command with these options, which it gets as one argument, `how`. report: help of -o."""
+              quiet: str = "No progress, no warnings") -> Decorator:
+    """Give a command the options of Reporting, which it gets as the argument `how`. report, quiet: help of -o and -q."""
     options = [SHARED["as_json"],
                click.option("-q", "--quiet", is_flag=True, help=quiet),
                click.option("-o", "--output", type=click.Path(path_type=Path), help=report)]
     return gathering("how", Reporting, names_of(Reporting), [*options, CLUSTER] if cluster else options)
 
 
-def planned(plan: type[Plan]) -> Callable[[Any], Any]:
-    """A command with a plan's options, which it gets as one argument, `plan`. With --quick the plan's QUICK stands in for the
-    options that are not given, and one line says for which."""
+def planned(plan: type[Plan]) -> Decorator:
+    """Give a command a plan's options, which it gets as the argument `plan`.
 
-    def make(quick: bool, **given: Any) -> Plan:
+    --quick replaces the options that are not given by the plan's QUICK, and reports them in one line."""
+
+    def make(quick: bool, **given: Parsed) -> Plan:
         if quick:
             context = click.get_current_context()
             less = {name: value for name, value in plan.QUICK.items()
                     if context.get_parameter_source(name) is not ParameterSource.COMMANDLINE}
-            told = [f"{name.replace('_', '-')} {value} instead of {given[name]}" for name, value in less.items()]
-            say(f"{context.info_name} --quick: {', '.join(told) or 'all is given, nothing is left out'}")
+            replaced = [f"{name.replace('_', '-')} {value} instead of {given[name]}" for name, value in less.items()]
+            say(f"{context.info_name} --quick: {', '.join(replaced) or 'all is given, nothing is left out'}")
             given |= less
         return plan(**given)
 
@@ -104,12 +106,12 @@ def planned(plan: type[Plan]) -> Callable[[Any], Any]:
     return gathering("plan", make, ["quick", *names_of(plan)], [*map(parameter, dataclasses.fields(plan)[::-1]), flag])
 
 
-def parameter(each: dataclasses.Field[Any]) -> Any:
-    """A field of a plan as an argument or an option of a command."""
+def parameter(each: dataclasses.Field[object]) -> Decorator:
+    """Return a field of a plan as an argument or an option of a command."""
     known, needed = each.metadata, each.default is MISSING
     kind = TYPES.get(str(each.type), click.Path(path_type=Path))
     if not known["text"]:
-        several: Any = {"nargs": -1, "required": needed} if str(each.type).startswith("Sequence") else {}
+        several: dict[str, Any] = {"nargs": -1, "required": needed} if str(each.type).startswith("Sequence") else {}
         kind = OneOf(known["of"][1]) if known["of"] else str if each.name == "cases" else kind
         return click.argument(each.name, type=kind, metavar=each.name.upper() if known["of"] else None, **several)
     flag = f"--{each.name.replace('_', '-')}"
@@ -122,13 +124,12 @@ def parameter(each: dataclasses.Field[Any]) -> Any:
 
 
 def measured(plan: type[Plan]) -> click.Command:
-    """Return the command that runs the study of a plan, each mesh on one worker where there is a cluster. The study is a module as
-    wrt.lab.bench.report.study_of says."""
+    """Return the command that runs a plan's study (wrt.lab.bench.report.study_of); a cluster runs each mesh on one worker."""
 
     @click.command(plan.COMMAND.split()[-1], help=plan.__doc__)
     @planned(plan)
     @reporting(cluster="meshes" in plan.__annotations__)
-    def command(how: Reporting, plan: Any) -> None:
+    def command(how: Reporting, plan: Plan) -> None:
         from wrt.lab.bench import report
         from wrt.lab.bench.sweep import by_mesh
 

@@ -1,4 +1,4 @@
-"""How the command line keeps what a long render made: its checkpoint, and another place for a picture that cannot be written."""
+"""Keeping the work of a long render: its checkpoint, and another folder for a picture that cannot be written."""
 
 from __future__ import annotations
 
@@ -6,18 +6,22 @@ import contextlib
 import os
 import shutil
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from wrt.core.errors import InputError
 from wrt.core.interrupts import held_interrupts
 
-EVERY = 60.0
+if TYPE_CHECKING:
+    from wrt.picture.film import Film
+
+EVERY = 60.0  # seconds between two checkpoints
 SUFFIX = ".checkpoint"  # after the picture's name
 
 
-def checkpoint_options(output: Path, every: float | None, file: Path | None, resume: bool) -> dict[str, Any]:
-    """The options of `wrt.render` for --checkpoint, --checkpoint-file and --resume; none of them is no checkpoint."""
+def checkpoint_options(output: Path, every: float | None, file: Path | None, resume: bool) -> dict[str, object]:
+    """Return the options of `wrt.render` for --checkpoint, --checkpoint-file and --resume; without any, there is no checkpoint."""
     if every is None and file is None and not resume:
         return {}
     file = file or output.with_name(output.name + SUFFIX)
@@ -26,12 +30,11 @@ def checkpoint_options(output: Path, every: float | None, file: Path | None, res
     return {"checkpoint": file, "checkpoint_every": EVERY if every is None else every, "resume": resume}
 
 
-def save_film(film: Any, output: Path, bits: int | None, layers: Any) -> tuple[list[Path], list[int], InputError | None]:
-    """Write the picture in any case: what was rendered is never thrown away for a full disk.
+def save_film(film: Film, output: Path, bits: int | None, layers: Sequence[str] | None) -> tuple[list[Path], list[int], InputError | None]:
+    """Write the picture, on failure into a new folder wrt-* in the folder for temporary files (TMPDIR).
 
-    Where `output` cannot be written, the picture goes into a new folder wrt-* in the folder for temporary files (TMPDIR). Returns
-    the paths written, the numbers of the signals that came meanwhile, and the error where the picture is not at `output`. Raises
-    InputError where neither place takes it.
+    Returns the paths written, the numbers of the signals that arrived meanwhile, and the error if the picture is not at `output`. Raises
+    InputError if neither folder takes it.
     """
     with held_interrupts() as late:
         try:
@@ -47,8 +50,8 @@ def save_film(film: Any, output: Path, bits: int | None, layers: Any) -> tuple[l
 
 
 def remove_checkpoint(path: Path) -> None:
-    """Remove the checkpoint of a picture that is done. Raises InputError where the system refuses."""
-    if path.is_dir():  # put there by somebody else; the render has warned that it is no place for a checkpoint
+    """Remove the checkpoint of a finished picture. Raises InputError if the system refuses."""
+    if path.is_dir():  # not wrt's; the render has warned that it cannot hold a checkpoint
         return
     try:
         path.unlink(missing_ok=True)

@@ -1,21 +1,21 @@
-"""The commands that look at scene files without rendering: `info`, `schema`, `validate`."""
+"""The commands `info`, `schema` and `validate`, which read scene files without rendering."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 import click
 
-from wrt.cli.common import load, naming, say, say_json, settings_of, shared
+from wrt.cli.common import Given, load, naming, say, say_json, settings_of, shared
 from wrt.core.errors import InputError
 
 
 @click.command()
 @shared("scene", "camera", "given", "as_json")
-def info(scene: Path, camera: str | None, given: tuple[tuple[str, Any], ...], as_json: bool) -> None:
-    """Tell what SCENE holds, and which features its kernel is compiled with."""
+def info(scene: Path, camera: str | None, given: Given, as_json: bool) -> None:
+    """Describe SCENE, and list the features that its kernel is compiled with."""
     from wrt.renderer.features import describe
 
     settings = settings_of(given)
@@ -25,7 +25,7 @@ def info(scene: Path, camera: str | None, given: tuple[tuple[str, Any], ...], as
     if as_json:
         say_json(facts)
         return
-    features = facts.pop("features")
+    features = cast("dict[str, bool]", facts.pop("features"))
     for name, value in facts.items():
         between = "; " if isinstance(value, list) and value and isinstance(value[0], str) else ", "  # names may have commas
         shown = "none" if value in (None, []) else between.join(map(str, value)) if isinstance(value, list) else value
@@ -52,7 +52,7 @@ def schema(markdown: bool) -> None:
 @click.command()
 @click.argument("scenes", nargs=-1, required=True, type=click.Path(path_type=Path))
 def validate(scenes: tuple[Path, ...]) -> None:
-    """Check SCENES without rendering; exit code 2 where one cannot be used."""
+    """Check SCENES without rendering; exit code 2 if one cannot be used."""
     bad = 0
     for scene in scenes:
         try:

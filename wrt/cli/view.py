@@ -1,4 +1,4 @@
-"""The command `view`: a look around in a scene, in a browser."""
+"""The command `view`, which shows a scene in a browser."""
 
 from __future__ import annotations
 
@@ -9,47 +9,39 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import click
 
-from wrt.cli.common import gathering, load, naming, say, settings_of, shared
-
-
-def place_of(**given: Any) -> Any:
-    """Return the viewer's Place of the options below."""
-    from wrt.viewer.access import Place
-
-    return Place(**given)
-
+from wrt.cli.common import Given, Parsed, gathering, load, names_of, naming, say, settings_of, shared
+from wrt.viewer.access import Place
 
 PLACE = (
     click.option("--allow-origin", "allow_origins", multiple=True, metavar="ORIGIN",
-                 help="Another address under which browsers find it, such as https://example.org of a proxy; repeatable"),
+                 help="Another address of the viewer in browsers, such as https://example.org of a proxy; repeatable"),
     click.option("--host", default="127.0.0.1", show_default=True,
-                 help="For which machines: 127.0.0.1 is this one only, 0.0.0.0 all that reach it and have the printed address"),
+                 help="127.0.0.1: this machine only; 0.0.0.0: every machine that reaches it, with the printed address"),
     click.option("--port", type=click.IntRange(0, 65535), default=8080, show_default=True,
-                 help="Where to listen; 0 is any free one"),
+                 help="To listen on; 0 is any free one"),
 )
 
 
 @click.command()
 @shared("scene")
-@gathering("place", place_of, ("host", "port", "allow_origins"), PLACE)
+@gathering("place", Place, names_of(Place), PLACE)
 @click.option("--open/--no-open", "open_browser", default=True, help="Open a browser  [default: where there is a desktop]")
 @click.option("--spp", type=click.IntRange(1, 1 << 24), default=1024, show_default=True, help="Samples a pixel to refine until")
 @shared("device", "threads", "camera", "accel", "given", "quiet")
-def view(scene: Path, place: Any, open_browser: bool, spp: int, given: tuple[tuple[str, Any], ...], quiet: bool,
-         **options: Any) -> None:
-    """Look around in SCENE: an orbit camera in the browser, whose picture gets finer while it stands still.
+def view(scene: Path, place: Place, open_browser: bool, spp: int, given: Given, quiet: bool,
+         **options: Parsed) -> None:
+    """Show SCENE in a browser with an orbit camera; the picture gets finer while the camera rests.
 
-    The address that it prints holds a token: whoever has it may look and steer. Needs the extra `viewer`. Ctrl-C ends it.
+    The printed address holds a token: everybody with it may look and steer. Needs the extra `viewer`. Ctrl-C ends it.
     """
     from wrt.viewer.page import Page
     from wrt.viewer.server import import_viser, listen
 
     import_viser()
-    listen(place).close()  # told before the scene is read
+    listen(place).close()  # raises before the scene is read
     from wrt.lab.costs import CostCounter
     from wrt.renderer.options import Options
 
@@ -57,7 +49,7 @@ def view(scene: Path, place: Any, open_browser: bool, spp: int, given: tuple[tup
     settings = settings_of(given, size="the browser's window", spp="--spp")
     loaded = load(scene, quiet).with_settings(**settings)
     with naming(scene):
-        loaded.camera(rendering.camera)  # told with the file's name
+        loaded.camera(options["camera"])  # raises with the file's name
     page = Page(loaded, rendering, place, spp, counter_of=CostCounter.beside, warn=(lambda text: None) if quiet else say)
     say(page.url, err=False)
     if not quiet:
@@ -66,7 +58,7 @@ def view(scene: Path, place: Any, open_browser: bool, spp: int, given: tuple[tup
         with in_browser(page.url) if open_browser and has_desktop() else contextlib.nullcontext():
             page.wait()
     except KeyboardInterrupt:
-        pass  # this is how it is meant to end
+        pass  # the normal end
     finally:
         page.close()
     raise SystemExit(0)  # at once, even if a kernel is being compiled
@@ -74,11 +66,12 @@ def view(scene: Path, place: Any, open_browser: bool, spp: int, given: tuple[tup
 
 @contextlib.contextmanager
 def in_browser(url: str) -> Iterator[None]:
-    """With a browser that was sent to the address, through a file in a folder of ours: everybody on the machine can read the
-    command line of a browser, and the address holds the token."""
+    """Open a browser through a file in a private folder, because all users of the machine can read a browser's command line.
+
+    The address holds the token."""
     import webbrowser
 
-    with tempfile.TemporaryDirectory(prefix="wrt-view-") as folder:  # nobody else may look into it
+    with tempfile.TemporaryDirectory(prefix="wrt-view-") as folder:  # no other user may read it
         path = Path(folder) / "view.html"
         address = html.escape(url)
         path.write_text('<!doctype html><meta charset="utf-8"><meta name="referrer" content="no-referrer"><title>wrt</title>'
@@ -88,5 +81,5 @@ def in_browser(url: str) -> Iterator[None]:
 
 
 def has_desktop() -> bool:
-    """Whether a browser would open in a window, and not take over the terminal."""
+    """Return whether a browser would open in a window and not in the terminal."""
     return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

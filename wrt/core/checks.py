@@ -114,9 +114,14 @@ def listed(names: Collection[str], most: int = 5) -> str:
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
     """Return a question with the most similar known name, for the middle of a message; "" if none is similar."""
+    near = most_similar(name, known) if isinstance(name, str) else ""
+    return f"did you mean {near!r}? " if near else ""
+
+
+def most_similar(name: str, known: Iterable[str]) -> str:
+    """Return the known name that is most similar, "" if none is."""
     names = [each for each in islice(known, 1000) if len(each) <= 100]
-    near = difflib.get_close_matches(name[:100], names, n=1) if isinstance(name, str) else []
-    return f"did you mean {near[0]!r}? " if near else ""
+    return next(iter(difflib.get_close_matches(name[:100], names, n=1)), "")
 
 
 def at_thing(kind: str, name: str) -> str:
