@@ -21,8 +21,8 @@ T = TypeVar("T")
 
 def check_units(triangle: str, box: str) -> None:
     """Raise InputError for an unknown triangle test or box test."""
-    require_known(triangle, RAY_TRIANGLE, "triangle test")
-    require_known(box, RAY_AABB, "box test")
+    require_known(triangle, RAY_TRIANGLE, "triangle test", "triangle")
+    require_known(box, RAY_AABB, "box test", "box")
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Structure(NamedTuple):
     def require_one_mesh(self, message: str) -> None:
         """Raise InputError with that message if there are instances or spheres."""
         if self.units.instances or self.units.spheres:
-            raise InputError(message)
+            raise InputError(message, argument="accel")
 
     def traversal(self, *, any_hit: bool, accepts: DeviceFunction | None = None) -> DeviceFunction:
         """Make the traversal, a Warp function (accel, surfaces, ray) -> Hit."""

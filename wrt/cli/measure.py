@@ -80,7 +80,7 @@ def profile(how: Reporting, scene: Path, given: Given, gpu: str, **options: Pars
     from wrt.lab.rtcore.profiler import profile as measure
     from wrt.renderer.progress import progress_reporter
 
-    require_known(gpu, GPUS, "GPU")
+    require_known(gpu, GPUS, "GPU", "gpu")
     if how.output is not None:
         report.check_folder(how.output)
     settings = settings_of(given, {name: options.pop(name) for name in ("size", "max_depth")}, spp="--spp")

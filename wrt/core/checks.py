@@ -93,10 +93,11 @@ def as_choice(value: str, choices: Collection[str], what: str) -> str:
     return value
 
 
-def require_known(name: str, known: Collection[str], what: str) -> None:
+def require_known(name: str, known: Collection[str], what: str, argument: str | None = None) -> None:
     """Raise InputError if the name is not known."""
     if name not in known:
-        raise InputError(f"no {what} {shown(name)}", hint=f"{did_you_mean(name, known)}there is {', '.join(known) or 'none'}")
+        raise InputError(f"no {what} {shown(name)}", argument=argument,
+                         hint=f"{did_you_mean(name, known)}there is {', '.join(known) or 'none'}")
 
 
 def unknown(name: str, what: str, known: Iterable[str], *, argument: str | None = None, place: str | None = None) -> InputError:

@@ -43,11 +43,11 @@ class Registry(UserDict[str, T]):
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.kind}: {', '.join(self)})"
 
-    def check(self, name: str) -> None:
+    def check(self, name: str, argument: str | None = None) -> None:
         """Raise InputError if the table has no such name."""
         from wrt.core.checks import require_known  # imports NumPy, for which the help of commands does not wait
 
-        require_known(name, self, self.kind)
+        require_known(name, self, self.kind, argument)
 
     def _all(self) -> dict[str, Any]:
         """Return all entries, with those of installed packages."""

@@ -56,7 +56,7 @@ class Plan:
             if of is not None:
                 module, table = of[1].split(":")
                 for name in (value,) if isinstance(value, str) else value:
-                    require_known(name, getattr(importlib.import_module(module), table), of[0])
+                    require_known(name, getattr(importlib.import_module(module), table), of[0], each.name)
             if each.name == "threads" and not isinstance(value, str):
                 thread_count(value)
             if each.name == "device":

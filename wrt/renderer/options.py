@@ -100,7 +100,7 @@ class Options:
     def __post_init__(self) -> None:
         for name in ("accel", "device", "triangle", "box", "instancing"):
             as_one(getattr(self, name), str, name)
-        ACCELERATORS.check(self.accel)
+        ACCELERATORS.check(self.accel, "accel")
         check_units(self.triangle, self.box)
         as_choice(self.instancing, INSTANCING, "instancing")
         self.aov = as_names(self.aov, "aov")

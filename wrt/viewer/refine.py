@@ -96,9 +96,9 @@ class Viewer:
         Raises InputError for an unknown structure or counter.
         """
         if "accel" in changes:
-            ACCELERATORS.check(changes["accel"])
+            ACCELERATORS.check(changes["accel"], "accel")
         if changes.get("cost"):
-            require_known(changes["cost"], self.costs, "counter")
+            require_known(changes["cost"], self.costs, "counter", "cost")
         with self._condition:
             if callable(changes.get("camera")):
                 changes["camera"] = changes["camera"](self.view.camera)

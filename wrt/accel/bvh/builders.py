@@ -23,5 +23,5 @@ BVH_BUILDERS: Registry[Callable[[Geometry, BvhOptions, int], BinaryTree]] = Regi
 
 def build_binary(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
     """Build a binary tree over the padded boxes of the geometry. Raises InputError for an unknown builder."""
-    BVH_BUILDERS.check(options.builder)
+    BVH_BUILDERS.check(options.builder, "builder")
     return BVH_BUILDERS[options.builder](geometry, options, threads)

@@ -196,6 +196,6 @@ def snapshot_of(accel: Accelerator) -> Snapshot:
     """Return the snapshot of a structure over one mesh without spheres. Raises InputError for any other."""
     message = f"accel must be a structure over one mesh (wrt.build), got {shown(accel)}"
     if not isinstance(accel, Accelerator):
-        raise InputError(message)
+        raise InputError(message, argument="accel")
     accel.structure.require_one_mesh(message)
     return accel.snapshot

@@ -71,15 +71,16 @@ def ray_query(accel: Accelerator | str, *, triangle: str | None = None, box: str
     message = "accel must be a structure over one mesh, or the name of one"
     if isinstance(accel, str):
         units = Units(as_one(triangle or Units().triangle, str, "triangle"), as_one(box or Units().box, str, "box"))
-        ACCELERATORS.check(accel)
+        ACCELERATORS.check(accel, "accel")
         check_units(units.triangle, units.box)
         structure = Structure(ACCELERATORS[accel], units)
     elif triangle is not None or box is not None:
-        raise InputError("triangle and box belong to a structure's name; a structure has its own")
+        raise InputError("triangle and box belong to a structure's name; a structure has its own",
+                         argument="triangle" if box is None else "box")
     elif isinstance(accel, Accelerator):
         structure = accel.structure
     else:
-        raise InputError(message)
+        raise InputError(message, argument="accel")
     structure.require_one_mesh(message)
     world, closest_hit, any_hit, next_hit = query_of(structure)
     return RayQuery(world, QueryRay, QueryHit, query_ray, closest_hit, any_hit, next_hit)

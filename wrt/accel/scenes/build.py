@@ -151,7 +151,7 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = "cpu", t
     InputError
         Names the argument and what was expected.
     """
-    ACCELERATORS.check(as_one(accel, str, "accel"))
+    ACCELERATORS.check(as_one(accel, str, "accel"), "accel")
     kind, device = ACCELERATORS[accel], as_one(device, str, "device")
     flat = (worlds_over([shape_given(each) for each in mesh]) if isinstance(mesh, list)
              else None if isinstance(mesh, Geometry | InstancedGeometry) else flat_scene_given(mesh))  # of a geometry no more is known

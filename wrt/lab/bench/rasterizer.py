@@ -130,7 +130,7 @@ class RayCaster:
     """The same pictures by one ray a pixel, through a structure that is built here."""
 
     def __init__(self, geometry: Geometry, accel: str = "bvh", device: str = "cpu", threads: int | None = None) -> None:
-        ACCELERATORS.check(accel)
+        ACCELERATORS.check(accel, "accel")
         self.accel, self.threads = build(geometry, accel, device, threads), threads
         self.seen: tuple[CameraKind | None, tuple[int, int]] = None, (0, 0)  # camera and size of the rays
 

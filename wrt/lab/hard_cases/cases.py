@@ -86,7 +86,7 @@ def chosen(cases: Sequence[str]) -> list[str]:
     for case in cases or list(HARD_CASES):
         found = [name for name in HARD_CASES if name == case or name.split("_")[0] == case]
         if not found:
-            require_known(case, HARD_CASES, "hard case")
+            require_known(case, HARD_CASES, "hard case", "cases")
         names += found
     return names
 

@@ -1,0 +1,34 @@
+"""Expect a refusal, and look at the fields of its error: messages may be written better without a change of tests."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from wrt.core.errors import InputError
+
+
+@contextlib.contextmanager
+def refused(argument: str | None = None, what: str = "", place: str | None = None, path: str | os.PathLike[str] | None = None,
+            hint: str = "") -> Iterator[pytest.ExceptionInfo[InputError]]:
+    """Expect an InputError for that argument, None for an error of no argument.
+
+    `what` and `hint` are key words within those fields. `place` is the whole field; `path` is the whole field or the name of the file.
+    """
+    with pytest.raises(InputError) as caught:
+        yield caught
+    error = caught.value
+    found = {"argument": error.argument}
+    if place is not None:
+        found["place"] = error.place
+    if path is not None:
+        found["path"] = None if error.path is None else os.fspath(error.path)
+        if os.fspath(path) == os.path.basename(path) and found["path"]:
+            found["path"] = Path(found["path"]).name
+    expected = {"argument": argument, "place": place, "path": None if path is None else os.fspath(path)}
+    assert found == {name: expected[name] for name in found}, str(error)
+    assert what in error.what and hint in (error.hint or ""), str(error)
