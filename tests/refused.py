@@ -6,10 +6,13 @@ import contextlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, TypeAlias
 
 import pytest
 
 from wrt.core.errors import InputError
+
+Refusal: TypeAlias = tuple[Any, ...]  # positional arguments of `refused`, in a table of cases
 
 
 @contextlib.contextmanager

@@ -9,11 +9,11 @@ from tests.kernel_tools import rounded
 from tests.kernels.build.test_bvh2 import CASES, geometry_of
 from tests.kernels.build.test_clip import polygon_in
 from tests.kernels.traverse.test_common import GEOMETRIES, assert_same_hits, rays_for, triangles
+from tests.refused import refused
 from wrt.accel.cells.kdtree_build import Cell as BuilderCell
 from wrt.accel.cells.kdtree_build import KdOptions, binned_split, build_tree
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
-from wrt.core.errors import InputError
 from wrt.kernels.traverse.kdtree import LEAF, STACK_SIZE
 from wrt.scene.shapes import icosphere, torus
 
@@ -172,13 +172,13 @@ def test_options_change_no_answer(kind, options):
 
 
 @pytest.mark.parametrize("options, message", [
-    ({"max_leaf": 0}, "max_leaf must be 1"), ({"max_depth": 65}, "max_depth must be 0 to 64"),
-    ({"max_depth": "deep"}, "max_depth must be int"), ({"max_depth": True}, "max_depth must be int"),
-    ({"empty_bonus": 1.5}, "empty_bonus must be 0 to 1"), ({"cost_traversal": float("nan")}, "cost_traversal"),
-    ({"perfect_below": 10}, "perfect_below must be 1024"), ({"max_growth": 0.5}, "max_growth must be 1"),
-    ({"clip": "yes"}, "clip must be bool"), ({"builder": "sah"}, "builder is no option of kdtree")])
+    ({"max_leaf": 0}, ("max_leaf", "must be 1")), ({"max_depth": 65}, ("max_depth", "0 to 64")),
+    ({"max_depth": "deep"}, ("max_depth", "int")), ({"max_depth": True}, ("max_depth", "int")),
+    ({"empty_bonus": 1.5}, ("empty_bonus", "0 to 1")), ({"cost_traversal": float("nan")}, ("cost_traversal",)),
+    ({"perfect_below": 10}, ("perfect_below", "1024")), ({"max_growth": 0.5}, ("max_growth", "must be 1")),
+    ({"clip": "yes"}, ("clip", "bool")), ({"builder": "sah"}, ("builder", "option of kdtree"))])
 def test_invalid_options_are_refused(options, message):
-    with pytest.raises(InputError, match=message):
+    with refused(*message):
         build(icosphere(0), "kdtree", **options)
 
 

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.refused import Refusal, refused
+
 from tests.kernel_tools import DEVICE, launch, rounded, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
@@ -63,15 +65,15 @@ def test_threads_of_a_build_parse_no_types(name: str, monkeypatch: pytest.Monkey
 
 
 def test_unknown_names_and_devices_are_refused() -> None:
-    with pytest.raises(InputError, match=r"no structure 'quadtree'.*bvh2"):
+    with refused("accel", "no structure 'quadtree'"):
         build(BALL, "quadtree")
-    with pytest.raises(InputError, match=r"no device 'tpu'.*cpu"):
+    with refused("device", "no device 'tpu'"):
         build(BALL, device="tpu")
-    with pytest.raises(InputError, match="max_leaf is no option of brute_force"):
+    with refused("max_leaf", "option of brute_force"):
         build(BALL, "brute_force", max_leaf=3)
-    with pytest.raises(InputError, match=r"bulder is no option of bvh8; did you mean 'builder'\? there is "):
+    with refused("bulder", "option of bvh8", hint="'builder'"):
         build(BALL, bulder="sah")
-    with pytest.raises(InputError, match="threads"):
+    with refused("threads"):
         build(BALL, threads=0)
 
 
@@ -156,45 +158,45 @@ def test_warp_arrays_come_back_as_warp_arrays(name: str) -> None:
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
-    (([[0, 0]], [[1, 0, 0]]), r"origins must be \(N, 3\), got \(1, 2\)"),
-    (([0, 0, 0], [[1, 0, 0]]), r"origins must be \(N, 3\)"),
-    (([[0, 0, 0]], [[1, 0, 0], [0, 1, 0]]), r"directions must have as many rows as origins \(1\), got 2"),
-    (([[0, 0, 0]], [[0, 0, 0]]), "directions must not be zero; row 0"),
-    (([[0, 0, 0], [0, 0, 0]], [[1, 0, 0], [-0.0, 0, 0]]), "row 1"),
-    (([[0, np.nan, 0]], [[1, 0, 0]]), "origins must be finite; row 0"),
-    (([[0, 0, 0]], [[1, np.inf, 0]]), "directions must be finite"),
-    (([["a", "b", "c"]], [[1, 0, 0]]), "origins must be"),
-    (([[0, 0, 0]], [[1, 0, 0]], -1.0), "t_min must not be NaN or below 0"),
-    (([[0, 0, 0]], [[1, 0, 0]], 0.0, np.nan), "t_max must not be NaN"),
-    (([[0, 0, 0]], [[1, 0, 0]], [0.0, 0.0]), r"t_min must be a number or \(1,\), got \(2,\)"),
-    (([[0, 0, 0]], [[1, 0, 0]], 0.0, [[1.0]]), r"t_max must be a number or \(1,\)"),
-    (([[0, 0, 0]], [[1, 0, 0]], "near"), "t_min must be"),
-    (([[0, 0, 0], [1e38, 0, 0]], [[1, 0, 0]] * 2), r"origins must be within 1e\+37; row 1 is \[1e\+38"),
-    (([[0, 0, -1.1e37]], [[1, 0, 0]]), r"origins must be within 1e\+37; row 0"),
-    (([[0, 0, 1e300]], [[1, 0, 0]]), "origins must be finite; row 0 is"),
-    (([[0, 0, 10**400]], [[1, 0, 0]]), r"origins must be \(N, 3\) of real numbers"),
-    ((np.zeros((1, 3), complex), [[1, 0, 0]]), r"origins must be \(N, 3\) of real numbers, got an array \(1, 3\) of complex128"),
-    (([[0, 0, 0]], [[1j, 0, 0]]), r"directions must be \(N, 3\) of real numbers, got \[\[1j, 0, 0\]\]"),
-    ((np.zeros((1, 3), bool), [[1, 0, 0]]), r"origins must be \(N, 3\) of real numbers, got an array \(1, 3\) of bool"),
-    (([[0, 0, 0]], [["1", "0", "0"]]), r"directions must be \(N, 3\) of real numbers"),
-    ((np.zeros((1, 3), "datetime64[s]"), [[1, 0, 0]]), r"origins must be \(N, 3\) of real numbers"),
-    ((np.ma.zeros((1, 3)), [[1, 0, 0]]), "origins must not be a masked array"),
-    (([[0, 0, 0]], np.ma.masked_less([[1.0, 0, 0]], 0.5)), "directions must not be a masked array"),
-    (([[0, 0, 0]], [[1, 0, 0]], 1j), r"t_min must be a number or \(1,\) of real numbers, got a complex"),
-    (([[0, 0, 0]], [[1, 0, 0]], True), r"t_min must be a number or \(1,\) of real numbers, got True"),
-    (([[0, 0, 0]], [[1, 0, 0]], 0.0, np.ma.ones(1)), "t_max must not be a masked array"),
-    (([[0, 0, 0]], [[1, 0, 0]], 0.0, "5"), "t_max must be a number"),
-    (([[0, 0, 0]], [[1, 0, 0]], 0.0, None), "t_max must"),
-    (([[0, 0, 0]], [[1, 0, 0]], 0.0, 1.0, 1.5), "threads must be a whole number, got 1.5"),
-    (([[0, 0, 0]], [[1, 0, 0]], 0.0, 1.0, "2"), "threads must be a whole number, got '2'"),
-    (([[0, 0, 0]], [[1, 0, 0]], 0.0, 1.0, True), "threads must be a whole number, got True"),
-    ((np.zeros((0, 3)), np.zeros((0, 3)), 0.0, 1.0, 1.5), "threads must be a whole number, got 1.5"),
+    (([[0, 0]], [[1, 0, 0]]), ("origins", "(N, 3)")),
+    (([0, 0, 0], [[1, 0, 0]]), ("origins", "(N, 3)")),
+    (([[0, 0, 0]], [[1, 0, 0], [0, 1, 0]]), ("directions", "as many rows")),
+    (([[0, 0, 0]], [[0, 0, 0]]), ("directions", "row 0")),
+    (([[0, 0, 0], [0, 0, 0]], [[1, 0, 0], [-0.0, 0, 0]]), ("directions", "row 1")),
+    (([[0, np.nan, 0]], [[1, 0, 0]]), ("origins", "row 0")),
+    (([[0, 0, 0]], [[1, np.inf, 0]]), ("directions", "finite")),
+    (([["a", "b", "c"]], [[1, 0, 0]]), ("origins",)),
+    (([[0, 0, 0]], [[1, 0, 0]], -1.0), ("t_min", "NaN or below 0")),
+    (([[0, 0, 0]], [[1, 0, 0]], 0.0, np.nan), ("t_max", "NaN")),
+    (([[0, 0, 0]], [[1, 0, 0]], [0.0, 0.0]), ("t_min", "number or (1,)")),
+    (([[0, 0, 0]], [[1, 0, 0]], 0.0, [[1.0]]), ("t_max", "number or (1,)")),
+    (([[0, 0, 0]], [[1, 0, 0]], "near"), ("t_min",)),
+    (([[0, 0, 0], [1e38, 0, 0]], [[1, 0, 0]] * 2), ("origins", "row 1")),
+    (([[0, 0, -1.1e37]], [[1, 0, 0]]), ("origins", "row 0")),
+    (([[0, 0, 1e300]], [[1, 0, 0]]), ("origins", "row 0")),
+    (([[0, 0, 10**400]], [[1, 0, 0]]), ("origins", "(N, 3)")),
+    ((np.zeros((1, 3), complex), [[1, 0, 0]]), ("origins", "(N, 3)")),
+    (([[0, 0, 0]], [[1j, 0, 0]]), ("directions", "(N, 3)")),
+    ((np.zeros((1, 3), bool), [[1, 0, 0]]), ("origins", "(N, 3)")),
+    (([[0, 0, 0]], [["1", "0", "0"]]), ("directions", "(N, 3)")),
+    ((np.zeros((1, 3), "datetime64[s]"), [[1, 0, 0]]), ("origins", "(N, 3)")),
+    ((np.ma.zeros((1, 3)), [[1, 0, 0]]), ("origins", "masked array")),
+    (([[0, 0, 0]], np.ma.masked_less([[1.0, 0, 0]], 0.5)), ("directions", "masked array")),
+    (([[0, 0, 0]], [[1, 0, 0]], 1j), ("t_min", "number or (1,)")),
+    (([[0, 0, 0]], [[1, 0, 0]], True), ("t_min", "number or (1,)")),
+    (([[0, 0, 0]], [[1, 0, 0]], 0.0, np.ma.ones(1)), ("t_max", "masked array")),
+    (([[0, 0, 0]], [[1, 0, 0]], 0.0, "5"), ("t_max", "number")),
+    (([[0, 0, 0]], [[1, 0, 0]], 0.0, None), ("t_max",)),
+    (([[0, 0, 0]], [[1, 0, 0]], 0.0, 1.0, 1.5), ("threads", "whole number")),
+    (([[0, 0, 0]], [[1, 0, 0]], 0.0, 1.0, "2"), ("threads", "whole number")),
+    (([[0, 0, 0]], [[1, 0, 0]], 0.0, 1.0, True), ("threads", "whole number")),
+    ((np.zeros((0, 3)), np.zeros((0, 3)), 0.0, 1.0, 1.5), ("threads", "whole number")),
 ])
 @pytest.mark.filterwarnings("error")  # one message, and no other
-def test_bad_arguments_are_named(arguments: tuple, message: str) -> None:
+def test_bad_arguments_are_named(arguments: tuple, message: Refusal) -> None:
     structure = build(BALL, "brute_force")
     for query in (structure.closest_hit, structure.any_hit):
-        with pytest.raises(InputError, match=message):
+        with refused(*message):
             query(*arguments)
 
 
@@ -258,24 +260,24 @@ def test_gradients_that_there_are_not_are_refused_and_not_lost_in_silence() -> N
 def test_bad_warp_arrays_are_named() -> None:
     structure = build(BALL, "brute_force")
     good = vec3s([[1.0, 0.0, 0.0]])
-    with pytest.raises(InputError, match="both be Warp arrays of vec3"):
+    with refused("origins", "both be Warp arrays"):
         structure.closest_hit(good, np.ones((1, 3)))
-    with pytest.raises(InputError, match="both be Warp arrays of vec3"):
+    with refused("origins", "both be Warp arrays"):
         structure.closest_hit(np.ones((1, 3)), good)
-    with pytest.raises(InputError, match="both be Warp arrays of vec3"):
+    with refused("origins", "both be Warp arrays"):
         structure.closest_hit(wp.zeros(1, dtype=wp.vec2, device=DEVICE), good)
-    with pytest.raises(InputError, match="as many rows"):
+    with refused("directions", "as many rows"):
         structure.closest_hit(good, vec3s(np.ones((2, 3))))
-    with pytest.raises(InputError, match="t_max must be"):
+    with refused("t_max"):
         structure.closest_hit(good, good, t_max=wp.zeros(3, dtype=wp.float32, device=DEVICE))
-    for name, value, message in (("t_min", -0.5, "t_min must not be NaN or below 0"), ("t_min", np.nan, "t_min must not be NaN"),
-                                 ("t_max", np.nan, "t_max must not be NaN")):
-        with pytest.raises(InputError, match=message):
+    for name, value, message in (("t_min", -0.5, ("t_min", "NaN or below 0")), ("t_min", np.nan, ("t_min", "NaN")),
+                                 ("t_max", np.nan, ("t_max", "NaN"))):
+        with refused(*message):
             structure.closest_hit(good, good, **{name: wp.array([value], dtype=wp.float32, device="cpu")})
 
 
 def test_threads_must_be_positive() -> None:
-    with pytest.raises(InputError, match="threads must be 1 or more"):
+    with refused("threads", "1 or more"):
         build(BALL).closest_hit([[0, 0, 0]], [[1, 0, 0]], threads=0)
 
 

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.refused import Refusal, refused
+
 from tests.kernel_tools import DEVICE  # isort: skip (starts Warp)
 import warp as wp
 
@@ -125,26 +127,26 @@ def test_triangles_with_a_point_that_is_not_finite_are_hit_by_no_ray(name: str, 
 
 
 @pytest.mark.parametrize(("points", "indices", "message"), [
-    (BALL.vertices, BALL.faces, "points must be a Warp array"),
-    (there(BALL.vertices, wp.vec3), BALL.faces, "indices must be a Warp array"),
-    (there(BALL.vertices, wp.vec3), there(np.arange(4), wp.int32), "indices must be a Warp array"),
-    (there(BALL.vertices[:9], wp.vec3), there(BALL.faces, wp.vec3i), r"indices must be 0 to 8; \d+ triangles have others"),
-    (there(BALL.vertices, wp.vec3), there([-1, 0, 1], wp.int32), "1 triangles have others"),
+    (BALL.vertices, BALL.faces, ("points", "Warp array")),
+    (there(BALL.vertices, wp.vec3), BALL.faces, ("indices", "Warp array")),
+    (there(BALL.vertices, wp.vec3), there(np.arange(4), wp.int32), ("indices", "Warp array")),
+    (there(BALL.vertices[:9], wp.vec3), there(BALL.faces, wp.vec3i), ("indices", "triangles have others")),
+    (there(BALL.vertices, wp.vec3), there([-1, 0, 1], wp.int32), ("indices", "1 triangles have others")),
 ])
-def test_what_is_refused(points: Any, indices: Any, message: str) -> None:
-    with pytest.raises(InputError, match=message):
+def test_what_is_refused(points: Any, indices: Any, message: Refusal) -> None:
+    with refused(*message):
         wrt.DeviceGeometry(points, indices)
 
 
 def test_refits_that_are_refused() -> None:
     accel = build(BALL, "bvh2")
-    for given, message in ((there(BALL.vertices[1:], wp.vec3), r"vertices must be \(162,\), got \(161,\)"),
-                           (there(BALL.faces, wp.vec3i), "vertices must be a Warp array"), (BALL.vertices, "must be a Warp array")):
-        with pytest.raises(InputError, match=message):
+    for given, message in ((there(BALL.vertices[1:], wp.vec3), ("vertices", "(162,)")),
+                           (there(BALL.faces, wp.vec3i), ("vertices", "Warp array")), (BALL.vertices, ("vertices", "Warp array"))):
+        with refused(*message):
             accel.refit(given, in_place=True)
     if wp.get_device(DEVICE).is_cpu:
         for in_place in (False, True):
-            with pytest.raises(InputError, match="vertices must be finite"):
+            with refused("vertices", "finite"):
                 accel.refit(there(np.full_like(BALL.vertices, np.nan), wp.vec3), in_place=in_place)
     for name, options in (("bvh8", {}), ("bvh2_kdop", {}), ("bvh2", {"triangle": "plane"})):
         with pytest.raises(InputError, match="in place"):

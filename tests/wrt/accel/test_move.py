@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.placed import place
+from tests.refused import Refusal, refused
 from tests.wrt.accel.queries.test_threads import at_a_time
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry, NumberedGeometry
@@ -124,21 +125,21 @@ def with_a_part_in_the_world() -> Instances:
 
 
 @pytest.mark.parametrize("instance, matrix, told", [
-    (3, np.zeros(3), r"matrix must be \(4, 4\), got \(3,\)"),
-    ([1, 2], np.eye(4), r"matrix must be \(2, 4, 4\), got \(4, 4\)"),
-    ([[1], [1, 2]], np.eye(4), "instance must be a whole number"),
-    (3, "no", r"matrix must be \(4, 4\) of real numbers"),
-    (4, np.eye(4), "instance must be 0 to 3"), (-1, np.eye(4), "instance must be 0 to 3"),
-    (0.5, np.eye(4), "instance must be a whole number"), ([2, 2], np.tile(np.eye(4), (2, 1, 1)), "instance has a number twice"),
-    (0, np.eye(4), "instance 0 has no place of its own"),
-    (1, np.diag([1.0, 1.0, 0.0, 1.0]), "flatten nothing; that of instance 1"),
-    (1, np.full((3, 4), np.nan), "matrix must be finite"), (1, 2.0 * np.eye(4), "matrix must be affine"),
-    (1, np.diag([1e25, 1e25, 1e25, 1.0]), "farther than 1e"),
+    (3, np.zeros(3), ("matrix", "(4, 4)")),
+    ([1, 2], np.eye(4), ("matrix", "(2, 4, 4)")),
+    ([[1], [1, 2]], np.eye(4), ("instance", "whole number")),
+    (3, "no", ("matrix", "(4, 4)")),
+    (4, np.eye(4), ("instance", "0 to 3")), (-1, np.eye(4), ("instance", "0 to 3")),
+    (0.5, np.eye(4), ("instance", "whole number")), ([2, 2], np.tile(np.eye(4), (2, 1, 1)), ("instance", "number twice")),
+    (0, np.eye(4), ("instance", "0 has no place")),
+    (1, np.diag([1.0, 1.0, 0.0, 1.0]), ("matrix", "flatten nothing")),
+    (1, np.full((3, 4), np.nan), ("matrix", "finite")), (1, 2.0 * np.eye(4), ("matrix", "affine")),
+    (1, np.diag([1e25, 1e25, 1e25, 1.0]), ("matrix", "farther than 1e")),
 ])
-def test_what_is_refused_changes_nothing(instance: Any, matrix: Any, told: str) -> None:
+def test_what_is_refused_changes_nothing(instance: Any, matrix: Any, told: Refusal) -> None:
     accel = with_a_part_in_the_world()
     before = accel.snapshot
-    with pytest.raises(InputError, match=told):
+    with refused(*told):
         accel.move(instance, matrix)
     assert accel.snapshot is before
 
@@ -189,9 +190,9 @@ def test_over_a_scene_an_instance_is_an_object() -> None:
         assert np.flatnonzero(np.isinf(accel.closest_hit(origins, down).t)).tolist() == [k]
         accel.move(int(before.instance[k]), shifted(10.0 * k))
         assert np.array_equal(accel.closest_hit(origins, down).t, before.t)
-    with pytest.raises(InputError, match="instance 20 has no place of its own"):
+    with refused("instance", "20 has no place"):
         accel.move(20, shifted(1000.0))
-    with pytest.raises(InputError, match="instance must be 0 to 20"):
+    with refused("instance", "0 to 20"):
         accel.move(21, shifted(1000.0))
 
 

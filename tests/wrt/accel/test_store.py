@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 import wrt
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
+from tests.refused import Refusal, refused
 from tests.structures import STRUCTURES
 from wrt.accel.device_geometry import DeviceGeometry
 from wrt.accel.geometry import Geometry
@@ -109,39 +110,39 @@ def test_a_round_trip_changes_nothing(name: str, geometry: str, tmp_path: Path) 
 
 def test_public_names_take_paths(saved: Path, tmp_path: Path) -> None:
     same(wrt.load_accel(saved, BALL), build(BALL))
-    with pytest.raises(InputError, match="mesh must be"):
+    with refused("mesh"):
         wrt.load_accel(saved, 7)  # type: ignore[arg-type]
 
 
 def test_another_mesh_is_refused(saved: Path) -> None:
-    with pytest.raises(InputError, match=r"ball\.accel.*built over another mesh"):
+    with refused(what="built over another mesh", path="ball.accel"):
         load_accel(saved, icosphere(3))
 
 
 @pytest.mark.parametrize(("spoil", "message"), [
-    (lambda data: data[:-1], "damaged"),
-    (lambda data: data[:200], "damaged"),
-    (lambda data: b"", "no acceleration structure"),
-    (lambda data: b"PK\3\4" + data, "no acceleration structure"),
-    (lambda data: data[:5000] + bytes([data[5000] ^ 1]) + data[5001:], "damaged"),
-    (lambda data: signed(MAGIC + b"[]\n"), "no acceleration structure"),
-    (lambda data: signed(MAGIC + b"{}\n"), "no structure of this version"),
-    (lambda data: signed(MAGIC + b"{" * 100000), "damaged"),
-    (lambda data: signed(MAGIC + b"[" * 60000 + b"\n"), "no structure|damaged|no acceleration"),
+    (lambda data: data[:-1], (None, "damaged")),
+    (lambda data: data[:200], (None, "damaged")),
+    (lambda data: b"", (None, "no acceleration structure")),
+    (lambda data: b"PK\3\4" + data, (None, "no acceleration structure")),
+    (lambda data: data[:5000] + bytes([data[5000] ^ 1]) + data[5001:], (None, "damaged")),
+    (lambda data: signed(MAGIC + b"[]\n"), (None, "no acceleration structure")),
+    (lambda data: signed(MAGIC + b"{}\n"), (None, "no structure")),
+    (lambda data: signed(MAGIC + b"{" * 100000), (None, "damaged")),
+    (lambda data: signed(MAGIC + b"[" * 60000 + b"\n"), (None, "no acceleration")),
 ])
-def test_a_damaged_or_foreign_file_is_refused(saved: Path, spoil, message: str) -> None:
+def test_a_damaged_or_foreign_file_is_refused(saved: Path, spoil, message: Refusal) -> None:
     saved.write_bytes(spoil(saved.read_bytes()))
-    with pytest.raises(InputError, match=message) as error:
+    with refused(*message) as error:
         load_accel(saved, BALL)
     assert "ball.accel" in str(error.value)
 
 
 def test_missing_files_and_wrong_suffixes(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"nothing\.accel"):
+    with refused(path="nothing.accel"):
         load_accel(tmp_path / "nothing.accel", BALL)
-    with pytest.raises(InputError, match=r"a \.accel file"):
+    with refused(what=".accel file"):
         build(BALL).save(tmp_path / "x.npz")
-    with pytest.raises(InputError, match="does not exist"):
+    with refused(what="does not exist"):
         build(BALL).save(tmp_path / "no" / "x.accel")
 
 
@@ -175,7 +176,7 @@ def set_child(i: int, first: int, count: int):
 ])
 def test_indices_are_checked_before_a_ray_follows_them(saved: Path, change) -> None:
     edited(saved, change)
-    with pytest.raises(InputError, match=r"ball\.accel"):
+    with refused(path="ball.accel"):
         load_accel(saved, BALL)
 
 
@@ -184,7 +185,7 @@ def test_a_child_that_does_not_exist_leads_nowhere() -> None:
     nodes = build(wrt.Mesh(np.eye(3), np.array([[0, 1, 2]])), "bvh2").built.arrays["nodes"].copy()
     check_binary(nodes, 1, 64)
     nodes["first_1"][0] = 10**8
-    with pytest.raises(InputError, match="does not exist"):
+    with refused(what="does not exist"):
         check_binary(nodes, 1, 64)
 
 
@@ -226,7 +227,7 @@ def test_the_command(tmp_path: Path, monkeypatch) -> None:
     for arguments, message in (
             (("box.obj", "-o", "box.npz"), ".accel file"), (("none.obj", "-o", "a.accel"), "none.obj"),
             (("box.obj", "-o", "a.accel", "--accel", "x"), "no structure 'x'"),
-            (("box.obj", "-o", "a.accel", "--set", "leaf=2"), "leaf is no option of bvh8"),
+            (("box.obj", "-o", "a.accel", "--set", "leaf=2"), "leaf is no option"),
             (("box.obj", "-o", "a.accel", "--set", "max_leaf=2", "--set", "max_leaf=3"), "given twice"),
             (("box.obj", "-o", "a.accel", "--set", "max_leaf=many"), "max_leaf"),
             (("box.obj", "-o", "a.accel", "--set", "max_leaf"), "NAME=VALUE")):

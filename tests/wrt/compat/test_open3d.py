@@ -10,6 +10,7 @@ import pytest
 import trimesh
 
 import wrt
+from tests.refused import refused
 from wrt.compat.open3d import RaycastingScene
 from wrt.scene import shapes
 
@@ -223,34 +224,34 @@ class Refuses:
 
 def test_what_is_refused() -> None:
     scene, pinhole = scene_of(BOX), RaycastingScene.create_rays_pinhole
-    for call, told in ((lambda: scene.cast_rays(np.zeros((3, 5))), r"rays must be \(..., 6\), got \(3, 5\)"),
-                       (lambda: scene.cast_rays("rays"), r"rays must be \(..., 6\) of real numbers"),
-                       (lambda: scene.cast_rays(np.ones((2, 6)) * 1j), r"rays must be \(..., 6\) of real numbers"),
-                       (lambda: scene.cast_rays(np.ma.masked_all((2, 6))), "rays must not be a masked array"),
-                       (lambda: scene.cast_rays(Refuses()), "rays: it requires grad"),
-                       (lambda: scene.compute_occupancy(np.zeros(6)), r"query_points must be \(..., 3\), got \(6,\)"),
+    for call, told in ((lambda: scene.cast_rays(np.zeros((3, 5))), ("rays", "6)")),
+                       (lambda: scene.cast_rays("rays"), ("rays", "6) of real numbers")),
+                       (lambda: scene.cast_rays(np.ones((2, 6)) * 1j), ("rays", "6) of real numbers")),
+                       (lambda: scene.cast_rays(np.ma.masked_all((2, 6))), ("rays", "masked array")),
+                       (lambda: scene.cast_rays(Refuses()), ("rays", "requires grad")),
+                       (lambda: scene.compute_occupancy(np.zeros(6)), ("query_points", "3)")),
                        (lambda: scene.compute_distance([[np.nan, 0, 0], [1e38, 0, 0]]),
-                        r"query_points must be within 1e\+37; row 1 is"),
-                       (lambda: scene.cast_rays([[0, -1e38, 0, 0, 1, 0]]), r"rays must be within 1e\+37; row 0"),
-                       (lambda: scene.compute_occupancy(np.zeros(3), nsamples=2), "nsamples must be odd, got 2"),
-                       (lambda: scene.cast_rays(np.zeros((3, 6)), nthreads=-1), "nthreads must be"),
-                       (lambda: scene.add_triangles(np.zeros((3, 3)), [[0, 1, 3]]), "triangle_indices must be 0 to 2"),
-                       (lambda: scene.add_triangles(np.zeros((3, 2)), [[0, 1, 2]]), r"vertex_positions must be \(N, 3\)"),
-                       (lambda: scene.add_triangles(), r"vertex_positions must be \(N, 3\)"),
-                       (lambda: scene.add_triangles("a", "b"), r"vertex_positions must be \(N, 3\) of real numbers"),
-                       (lambda: scene.add_triangles(np.eye(3), [[0, 1, 1.5]]), "triangle_indices must be 0 to 2, whole numbers"),
-                       (lambda: scene.add_triangles(np.eye(3), [[0, 1, np.nan]]), "triangle_indices must be 0 to 2, whole numbers"),
-                       (lambda: scene.add_triangles(1e35 * np.eye(3), [[0, 1, 2]]), r"vertex_positions must be at most 1e\+30"),
-                       (lambda: scene.add_triangles(7), "mesh must have vertices and triangles, got 7"),
-                       (lambda: scene.create_rays_pinhole(np.eye(2), np.eye(4), 8, 4), r"intrinsic_matrix must be \(3, 3\)"),
-                       (lambda: pinhole(np.zeros((3, 3)), np.eye(4), 8, 4), "intrinsic_matrix must have an inverse"),
-                       (lambda: pinhole("K", np.eye(4), 8, 4), "intrinsic_matrix must be"),
-                       (lambda: pinhole(np.eye(3), np.eye(4), -1, 4), "width_px must be 0 to"),
-                       (lambda: pinhole(np.eye(3), np.eye(4), 8, 4.5), "height_px must be a whole number"),
-                       (lambda: pinhole(0, [0, 0, 0], [0, 0, 1], [0, 1, 0], 8, 4), "fov_deg must be between 0 and 180"),
-                       (lambda: pinhole(60, [0, 0, 0], [0, 1, 0], [0, 2, 0], 8, 4), "center must not be eye"),
-                       (lambda: RaycastingScene(device="SYCL:0").cast_rays(np.ones((1, 6))), "no device 'sycl:0'")):
-        with pytest.raises(wrt.InputError, match=told):
+                        ("query_points", "row 1")),
+                       (lambda: scene.cast_rays([[0, -1e38, 0, 0, 1, 0]]), ("rays", "row 0")),
+                       (lambda: scene.compute_occupancy(np.zeros(3), nsamples=2), ("nsamples", "odd")),
+                       (lambda: scene.cast_rays(np.zeros((3, 6)), nthreads=-1), ("nthreads",)),
+                       (lambda: scene.add_triangles(np.zeros((3, 3)), [[0, 1, 3]]), ("triangle_indices", "0 to 2")),
+                       (lambda: scene.add_triangles(np.zeros((3, 2)), [[0, 1, 2]]), ("vertex_positions", "(N, 3)")),
+                       (lambda: scene.add_triangles(), ("vertex_positions", "(N, 3)")),
+                       (lambda: scene.add_triangles("a", "b"), ("vertex_positions", "(N, 3)")),
+                       (lambda: scene.add_triangles(np.eye(3), [[0, 1, 1.5]]), ("triangle_indices", "0 to 2")),
+                       (lambda: scene.add_triangles(np.eye(3), [[0, 1, np.nan]]), ("triangle_indices", "0 to 2")),
+                       (lambda: scene.add_triangles(1e35 * np.eye(3), [[0, 1, 2]]), ("vertex_positions", "at most 1e+30")),
+                       (lambda: scene.add_triangles(7), ("mesh", "vertices and triangles")),
+                       (lambda: scene.create_rays_pinhole(np.eye(2), np.eye(4), 8, 4), ("intrinsic_matrix", "(3, 3)")),
+                       (lambda: pinhole(np.zeros((3, 3)), np.eye(4), 8, 4), ("intrinsic_matrix", "inverse")),
+                       (lambda: pinhole("K", np.eye(4), 8, 4), ("intrinsic_matrix",)),
+                       (lambda: pinhole(np.eye(3), np.eye(4), -1, 4), ("width_px", "0")),
+                       (lambda: pinhole(np.eye(3), np.eye(4), 8, 4.5), ("height_px", "whole number")),
+                       (lambda: pinhole(0, [0, 0, 0], [0, 0, 1], [0, 1, 0], 8, 4), ("fov_deg", "between 0")),
+                       (lambda: pinhole(60, [0, 0, 0], [0, 1, 0], [0, 2, 0], 8, 4), ("center", "eye")),
+                       (lambda: RaycastingScene(device="SYCL:0").cast_rays(np.ones((1, 6))), ("device", "no device 'sycl:0'"))):
+        with refused(*told):
             call()
 
 

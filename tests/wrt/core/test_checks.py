@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.refused import Refusal, refused
 from wrt.accel.scenes.build import build
 from wrt.core.checks import shown
-from wrt.core.errors import InputError, SceneWarning
+from wrt.core.errors import SceneWarning
 from wrt.io.load import load_scene
 from wrt.io.mesh_file import load_mesh
 from wrt.picture.film import Film
@@ -28,41 +29,41 @@ GREY = Material(name="grey")
 
 
 @pytest.mark.parametrize(("make", "message"), [
-    (lambda: Mesh([[0, 0, 0], [1, 0]], [[0, 1, 2]]), "vertices must be"),
-    (lambda: Mesh([["a"] * 3] * 3, [[0, 1, 2]]), "vertices must be an array of numbers"),
-    (lambda: Mesh(np.eye(3), "faces"), "faces must be"), (lambda: load_mesh(5), "path must be a path, got 5"),
-    (lambda: load_scene(None), "path must be a path, got None"),
-    (lambda: Object("box.obj", (GREY,)), "mesh must be a Mesh, got 'box.obj'"),
-    (lambda: Object(box(), ("grey",)), r"materials\[0\] must be a Material, got 'grey'"),
-    (lambda: Object(box(), 5), "materials: each must be a Material, got 5"),
-    (lambda: Object(box(), GREY, transform="up"), "transform must be an array of numbers, got 'up'"),
-    (lambda: Object(box(), GREY, face_material="all"), "face_material must be an array"),
-    (lambda: Sphere((0, 0, 0), 1.0, None), "material must be a Material, got None"),
-    (lambda: Material(albedo_texture="wood.png"), "albedo_texture must be a Texture or a Checkerboard, got 'wood.png'"),
-    (lambda: Material(normal_texture=5), "normal_texture must be a Texture, got 5"),
-    (lambda: EnvironmentBackground("sky.hdr"), "image must be an array of numbers, got 'sky.hdr'"),
-    (lambda: Texture("wood.png"), r"image must be \(H, W, 4\) uint8"),
-    (lambda: Camera(blades="six"), "blades must be a whole number, got 'six'"),
-    (lambda: Camera(blades=2), r"blades must be 0 \(round\) or 3 to 64, got 2"),
-    (lambda: Scene(objects=(box(),)), r"objects\[0\] must be an Object, got a Mesh"),
-    (lambda: Scene(lights=5), "lights: each must be a PointLight or a DirectionalLight or a SpotLight, got 5"),
-    (lambda: Scene(background=(0, 0, 0)), "background must be a ConstantBackground or .*, got \\(0, 0, 0\\)"),
-    (lambda: Scene(settings={"spp": 4}), "settings must be a Settings, got a dict"),
-    (lambda: Material(kind="gold"), "^material: kind must be one of"),
-    (lambda: Material(kind="gold", name="ring"), "^material 'ring': kind must be one of"),
-    (lambda: PointLight((0, 0), 1), "^light: position must be three finite numbers"),
-    (lambda: Settings(spp=2.0), "spp must be a whole number, got 2.0"),
-    (lambda: Settings(size="640"), "size must be two whole numbers or text"),
+    (lambda: Mesh([[0, 0, 0], [1, 0]], [[0, 1, 2]]), ("vertices",)),
+    (lambda: Mesh([["a"] * 3] * 3, [[0, 1, 2]]), ("vertices", "array of numbers")),
+    (lambda: Mesh(np.eye(3), "faces"), ("faces",)), (lambda: load_mesh(5), ("path",)),
+    (lambda: load_scene(None), ("path",)),
+    (lambda: Object("box.obj", (GREY,)), ("mesh", "Mesh", "object")),
+    (lambda: Object(box(), ("grey",)), ("materials[0]", "Material", "object")),
+    (lambda: Object(box(), 5), ("each", "Material", "object: materials")),
+    (lambda: Object(box(), GREY, transform="up"), ("transform", "array of numbers", "object")),
+    (lambda: Object(box(), GREY, face_material="all"), ("face_material", "array", "object")),
+    (lambda: Sphere((0, 0, 0), 1.0, None), ("material", "Material", "sphere")),
+    (lambda: Material(albedo_texture="wood.png"), ("albedo_texture", "Texture or a Checkerboard", "material")),
+    (lambda: Material(normal_texture=5), ("normal_texture", "Texture", "material")),
+    (lambda: EnvironmentBackground("sky.hdr"), ("image", "array of numbers", "environment")),
+    (lambda: Texture("wood.png"), ("image", "(H, W, 4) uint8", "texture")),
+    (lambda: Camera(blades="six"), ("blades", "whole number", "camera")),
+    (lambda: Camera(blades=2), ("blades", "0 (round)", "camera")),
+    (lambda: Scene(objects=(box(),)), ("objects[0]", "Object")),
+    (lambda: Scene(lights=5), ("each", "PointLight", "lights")),
+    (lambda: Scene(background=(0, 0, 0)), ("background", "ConstantBackground")),
+    (lambda: Scene(settings={"spp": 4}), ("settings", "Settings")),
+    (lambda: Material(kind="gold"), ("kind", "must be one", "material")),
+    (lambda: Material(kind="gold", name="ring"), ("kind", "must be one", "material 'ring'")),
+    (lambda: PointLight((0, 0), 1), ("position", "three finite numbers", "light")),
+    (lambda: Settings(spp=2.0), ("spp", "whole number")),
+    (lambda: Settings(size="640"), ("size", "two whole numbers")),
 ], ids=lambda value: value if isinstance(value, str) else "")
-def test_the_wrong_type_is_told_by_name(make: Callable[[], Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
+def test_the_wrong_type_is_told_by_name(make: Callable[[], Any], message: Refusal) -> None:
+    with refused(*message):
         make()
 
 
 @pytest.mark.parametrize("matrix", [np.diag([1e39, 1, 1, 1]), np.diag([1, 1, 1e19, 1]),
                                     [[1, 0, 0, -2e18], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]], ids=["wide", "deep", "far"])
 def test_objects_out_of_reach_are_refused(matrix: Any) -> None:
-    with pytest.raises(InputError, match=r"object 'planet': reaches .* units from the origin; at most 1e\+18"):
+    with refused(what="reaches", place="object 'planet'"):
         Object(box(), GREY, matrix, name="planet")
 
 
@@ -83,7 +84,7 @@ def test_meshes_end_at_1e30() -> None:
     vertices = np.float32([[0, 0, 0], [1e29, 0, 0], [0, 1e30, 0]])
     hits = build(Mesh(vertices, [[0, 1, 2]])).closest_hit([[1e28, 1e29, 1e29]], [[0, 0, -1]])
     assert hits.prim_id.tolist() == [0] and hits.t.tolist() == [np.float32(1e29)]
-    with pytest.raises(InputError, match=r"vertices: vertex 2 is .*; at most 1e\+30 can be traced"):
+    with refused("vertices", "vertex 2"):
         Mesh(vertices * 3, [[0, 1, 2]])
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from tests.fuzz.seeds import scenes, side_files
 from tests.gltf_files import one_triangle
+from tests.refused import refused
 from wrt.accel.scenes.build import load_accel
 from wrt.core.errors import InputError
 from wrt.core.files import read_file
@@ -44,7 +45,7 @@ def test_a_name_too_long_for_the_system(suffix: str, tmp_path: Path) -> None:
     (tmp_path / "a.toml").write_text(f"materials.m = {{}}\n[[meshes]]\nmaterial = 'm'\nfile = '{'box.obj' * 1000}{suffix}'")
     with pytest.raises(InputError, match="name too long") if suffix != ".toml" else pytest.raises(InputError, match="no mesh file"):
         load_scene(tmp_path / "a.toml")
-    with pytest.raises(InputError, match="name too long"):
+    with refused(what="name too long"):
         load_scene(tmp_path / f"{'x' * 5000}{suffix}")
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from tests.command_line import BOX_OBJ
 from tests.data import ROOT
-from wrt.core.errors import InputError
+from tests.refused import refused
 from wrt.core.packages import needed_by
 
 ABSENT = ("scipy", "pydantic", "PIL", "OpenImageIO", "pygltflib", "rich", "click", "trimesh", "matplotlib", "viser", "distributed",
@@ -68,7 +68,7 @@ def test_the_command_line_says_so_too(tmp_path: Path) -> None:
 
 
 def test_other_errors_of_an_import_stay_what_they_are() -> None:
-    with pytest.raises(InputError, match="a thing needs no_such; pip install no_such"), needed_by("a thing"):
+    with refused(what="thing needs no_such", hint="pip install no_such"), needed_by("a thing"):
         import no_such.part  # type: ignore[import-not-found]  # noqa: F401
     with pytest.raises(ZeroDivisionError), needed_by("a thing"):
         _ = 1 / 0

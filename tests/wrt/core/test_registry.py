@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from wrt.core.errors import InputError
+from tests.refused import refused
 from wrt.core.registry import Registry
 
 
@@ -24,7 +24,7 @@ def test_entries_become_what_they_name() -> None:
     with pytest.raises(KeyError):
         table["float"]
     table.check("decimal")
-    with pytest.raises(InputError, match="no number 'float'; there is fraction, decimal"):
+    with refused(what="no number 'float'", hint="fraction, decimal"):
         table.check("float")
 
 
@@ -48,7 +48,7 @@ def test_installed_packages_add_rows_and_replace_none(tmp_path: Path, monkeypatc
         table: Registry[type] = Registry("number", {"fraction": "fractions:Fraction"}, "numbers")
         assert ask(table) and list(table) == ["fraction", "ordinal"]
         assert table["fraction"] is table["ordinal"] is Fraction
-    with pytest.raises(InputError, match="no number 'a'; there is fraction, ordinal"):
+    with refused(what="no number 'a'", hint="fraction, ordinal"):
         table.check("a")
 
 

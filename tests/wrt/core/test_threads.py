@@ -13,14 +13,14 @@ from functools import partial
 import pytest
 
 from tests.data import ROOT
-from wrt.core.errors import InputError
+from tests.refused import refused
 from wrt.core.threads import run_all, run_growing, thread_count
 
 
 def test_threads() -> None:
     assert thread_count(3) == 3 and 1 <= thread_count(None) <= (os.cpu_count() or 1)
     for wrong in (0, -1):
-        with pytest.raises(InputError, match="threads must be 1 or more"):
+        with refused("threads", "1 or more"):
             thread_count(wrong)
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from tests.command_line import wrt as command
 from tests.gltf_files import GltfFile, one_triangle
+from tests.refused import Refusal, refused
 from wrt.core.errors import InputError, SceneWarning
 from wrt.io.gltf.reader import load_gltf
 from wrt.io.load import load_scene
@@ -52,24 +53,26 @@ def test_nodes_times_instances_are_counted(tmp_path: Path, monkeypatch: pytest.M
     hidden = instanced(40, 1, 3)  # they show nothing, but are made all the same
     for node in hidden.json["nodes"]:
         node["scale"] = [0, 1, 1]
-    with pytest.raises(InputError, match=r"nodes\[2\].*: 120 instances; a scene holds at most 100"):
+    with refused(what="120 instances", place="nodes[2].extensions.EXT_mesh_gpu_instancing.attributes"):
         load_gltf(hidden.write(tmp_path))
     one_triangle().write(tmp_path, "a.glb")
     (tmp_path / "a.toml").write_text('include = ["a.glb"' + ', "a.glb"' * 100 + "]")
-    with pytest.raises(InputError, match=r"a\.toml: include\[100\]: 101 objects; a scene holds at most 100"):
+    with refused(what="101 objects", place="include[100]", path="a.toml"):
         load_scene(tmp_path / "a.toml")
-    with pytest.raises(InputError, match="101 lights; a scene holds at most 100"):
+    with refused(what="101 lights"):
         Scene(lights=tuple(load_gltf(one_triangle().write(tmp_path)).lights) * 101)
 
 
 @pytest.mark.parametrize(("change", "message"), [
-    ({"count": 2**31}, "count: must be 1 to 2147483647, got 2147483648"), ({"count": 10**18}, "must be 1 to"),
-    ({"count": 2**31 - 1}, "2147483647 elements reach from byte 0 to"), ({"byteOffset": 2**40}, "reach from byte 1099511627776 to"),
+    ({"count": 2**31}, (None, "1 to 2147483647", "meshes[0].primitives[0].attributes.POSITION: accessors[0].count")),
+    ({"count": 10**18}, (None, "1", "meshes[0].primitives[0].attributes.POSITION: accessors[0].count")),
+    ({"count": 2**31 - 1}, (None, "2147483647 elements reach", "meshes[0].primitives[0].attributes.POSITION: accessors[0]")),
+    ({"byteOffset": 2**40}, (None, "reach", "meshes[0].primitives[0].attributes.POSITION: accessors[0]")),
 ])
-def test_accessors_beyond_their_buffer(change: dict[str, int], message: str, tmp_path: Path) -> None:
+def test_accessors_beyond_their_buffer(change: dict[str, int], message: Refusal, tmp_path: Path) -> None:
     file = one_triangle()
     file.json["accessors"][0] |= change
-    with pytest.raises(InputError, match=message):
+    with refused(*message):
         load_gltf(file.write(tmp_path))
 
 
@@ -95,7 +98,7 @@ def test_shapes_of_too_many_triangles(shape, arguments: dict) -> None:
          "keys", "tables", "names", "long"])
 def test_toml_that_is_deep_or_long(text: str, tmp_path: Path) -> None:
     (tmp_path / "a.toml").write_text(text)
-    with pytest.raises(InputError, match=r"a\.toml: ") as caught:
+    with refused(path="a.toml") as caught:
         load_scene(tmp_path / "a.toml")
     assert len(str(caught.value)) < 30_000
 
@@ -108,7 +111,7 @@ def test_toml_that_is_deep_or_long(text: str, tmp_path: Path) -> None:
 ], ids=["brackets", "braces", "extras", "digits", "version", "chain", "extension"])
 def test_json_that_is_deep_or_long(text: str, tmp_path: Path) -> None:
     (tmp_path / "a.gltf").write_text(text)
-    with pytest.raises(InputError, match=r"a\.gltf: ") as caught:
+    with refused(path="a.gltf") as caught:
         load_scene(tmp_path / "a.gltf")
     assert len(str(caught.value)) < 30_000
 
@@ -155,6 +158,6 @@ def test_names_give_the_terminal_no_orders(tmp_path: Path) -> None:
 @pytest.mark.parametrize("number", [1e31, 1e300, float("inf"), float("nan")])
 def test_transforms_of_textures_end_where_the_device_does(number: float) -> None:
     image = np.zeros((1, 1, 4), np.uint8)
-    with pytest.raises(InputError, match=r"uv_transform must be a 2x3 matrix of numbers up to 1e\+30"):
+    with refused("uv_transform", "2x3 matrix", place="texture"):
         Texture(image, uv_transform=np.array([[1.0, 0.0, 0.0], [0.0, number, 0.0]]))
     assert Texture(image, uv_transform=np.full((2, 3), 1e30)).uv_transform[0, 0] == 1e30

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tests.data import DATA, data_path
+from tests.refused import refused
 from wrt.core.errors import InputError, SceneWarning
 from wrt.io.mesh_file import load_mesh
 
@@ -60,7 +61,7 @@ def test_parts_count_the_triangles_of_the_file(tmp_path: Path) -> None:
     mesh = load_mesh(path, parts=[(2, 1), (0, 2)])
     assert mesh.groups == ("0", "1", "rest") and mesh.face_group is not None
     assert mesh.face_group.tolist() == [1, 0, 2] and mesh.dropped == 1
-    with pytest.raises(InputError, match="part 1: triangles 3 to 4, but the file has 4"):
+    with refused(what="triangles 3 to 4", place="part 1"):
         load_mesh(path, parts=[(0, 1), (3, 2)])
 
 
@@ -99,7 +100,7 @@ def test_odd_files_load_or_are_refused(path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", [".glb", ".GLTF", ".toml"])
 def test_a_scene_file_is_told_where_it_is_taken(suffix: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"is no mesh file: known are .*; wrt.load_scene and wrt.build take scenes$"):
+    with refused(what="load_scene and wrt"):
         load_mesh(tmp_path / f"a{suffix}")
-    with pytest.raises(InputError, match=r"is no mesh file: known are [^;]*$"):
+    with refused(what="mesh file: known"):
         load_mesh(tmp_path / "a.xyz")

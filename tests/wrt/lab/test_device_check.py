@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from tests.command_line import wrt as run
+from tests.refused import refused
 from wrt.accel.queries.answers import Hits
-from wrt.core.errors import InputError
 from wrt.lab import device_check
 from wrt.lab.device_check import Check, built_in, different, structures
 from wrt.renderer.render import render
@@ -122,5 +122,5 @@ def test_devices_are_listed_as_json_too() -> None:
 
 
 def test_rays_are_whole_numbers() -> None:
-    with pytest.raises(InputError, match="rays must be"):
+    with refused("rays"):
         Check("cpu", rays=1.5)  # type: ignore[arg-type]

@@ -12,9 +12,9 @@ import warp as wp
 import wrt
 from tests import device
 from tests.command_line import wrt as run
+from tests.refused import refused
 from wrt.core import cuda
 from wrt.core.device import launch_on, start
-from wrt.core.errors import InputError
 from wrt.kernels.traverse.stack import PLACES
 from wrt.lab import tune as tuning
 from wrt.lab.tune import DEFAULT, Choice, measured, tune
@@ -90,7 +90,7 @@ def test_mistakes_of_the_command(words: tuple[str, ...], message: str) -> None:
 
 
 def test_no_time_to_measure_is_refused() -> None:
-    with pytest.raises(InputError, match="seconds must be more than 0"):
+    with refused("seconds", "more than 0"):
         tune(device.NAME, seconds=0.0)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.refused import refused
 from wrt.core.errors import InputError
 from wrt.picture import image
 from wrt.picture.decode import decode_rgba8
@@ -38,7 +39,7 @@ def test_sixteen_bits_come_whole(channels: int, color_type: int, tmp_path: Path)
     assert np.array_equal(to_codes(image.read_image(tmp_path / "a.png"), bits=16), expected)
     assert np.array_equal(decode_rgba8(data)[..., :3], expected >> 8)
     (tmp_path / "a.png").write_bytes(data[:-40])
-    with pytest.raises(InputError, match=r"a\.png: cannot be read as an image"):
+    with refused(what="read", path="a.png"):
         image.read_image(tmp_path / "a.png")
 
 
@@ -84,7 +85,7 @@ def test_no_other_format_is_tried(form: str, tmp_path: Path) -> None:
     """Whatever the file is called: Pillow and OpenImageIO know many more, and some run programs."""
     buffer = io.BytesIO()
     Image.fromarray(np.zeros((16, 16, 3), np.uint8)).save(buffer, form)
-    with pytest.raises(InputError, match="none of PNG, JPEG, WEBP, AVIF, BMP, GIF"):
+    with refused(what="none"):
         decode_rgba8(buffer.getvalue())
     for suffix in (".png", ".exr", ".hdr"):
         (tmp_path / f"a{suffix}").write_bytes(buffer.getvalue())

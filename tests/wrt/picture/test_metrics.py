@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wrt.core.errors import InputError
+from tests.refused import refused
 from wrt.picture.metrics import BAR_HEIGHT, NONFINITE_COLOR, PIXELS_PER_DEGREE, RELMSE_EPS, compare, difference_image, failures, flip_map
 from wrt.picture.tonemap import decode_srgb
 
@@ -98,9 +98,9 @@ def test_mean_ratio_with_a_black_reference() -> None:
 
 @pytest.mark.parametrize("measure", [compare, difference_image])
 def test_wrong_sizes_are_input_errors(measure: Any) -> None:
-    with pytest.raises(InputError, match="different sizes, 64x48 and 63x48"):
+    with refused(what="different sizes, 64x48"):
         measure(scene_like(), scene_like()[:, 1:])
-    with pytest.raises(InputError, match=r"\(H, W, 3\)"):
+    with refused(what="(H, W, 3)"):
         measure(scene_like()[..., 0], scene_like()[..., 0])
 
 

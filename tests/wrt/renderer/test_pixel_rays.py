@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import wrt
+from tests.refused import Refusal, refused
 from tests.wrt.renderer.test_checkpoint import SCENE
-from wrt.core.errors import InputError
 from wrt.scene.cameras import CAMERAS, CameraKind
 from wrt.scene.shapes import box
 
@@ -61,7 +61,7 @@ def test_the_corners_are_where_the_angle_of_view_ends() -> None:
     np.testing.assert_allclose(directions, expected, atol=1e-7)
 
 
-@pytest.mark.parametrize(("camera", "size", "told"), [(None, (4, 4), "camera"), (SCENE.cameras[0], (0, 4), "size")])
-def test_mistakes_are_named(camera: wrt.Camera, size: tuple[int, int], told: str) -> None:
-    with pytest.raises(InputError, match=told):
+@pytest.mark.parametrize(("camera", "size", "told"), [(None, (4, 4), ("camera", "amera")), (SCENE.cameras[0], (0, 4), ("size",))])
+def test_mistakes_are_named(camera: wrt.Camera, size: tuple[int, int], told: Refusal) -> None:
+    with refused(*told):
         wrt.camera_rays(camera, size)

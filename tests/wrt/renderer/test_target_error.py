@@ -12,7 +12,7 @@ import pytest
 import wrt
 from tests.command_line import wrt as run_command
 from tests.data import ROOT
-from wrt.core.errors import InputError
+from tests.refused import refused
 from wrt.picture.film import aov_to_srgb8
 from wrt.picture.image import read_channels
 from wrt.renderer.film_arrays import GROUPS
@@ -136,7 +136,7 @@ def test_time_limit_and_interrupt_end_it_as_well() -> None:
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, math.inf])
 def test_a_target_must_be_a_positive_number(bad: float) -> None:
-    with pytest.raises(InputError, match="target_error must be more than 0"):
+    with refused("target_error", "more than 0"):
         render(SCENE, target_error=bad)
 
 

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.refused import refused
 from wrt.core.errors import InputError
 from wrt.lab.hard_cases.common import sphere
 from wrt.scene.clean import clean, flip_collinear, has_area
@@ -154,5 +155,5 @@ def test_corners_of_very_different_size_are_decided_exactly(powers, seed):
 def test_faces_are_of_any_kind_of_integers(dtype: type) -> None:
     corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], np.float32)
     assert clean(corners, np.array([[0, 1, 2]], dtype))[1].tolist() == [[0, 1, 2]]
-    with pytest.raises(InputError, match=r"face 0 is \[0, 1, 3\], but there are 3 vertices"):
+    with refused("faces", "3 vertices"):
         clean(corners, np.array([[0, 1, 3]], dtype))

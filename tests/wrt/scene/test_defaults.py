@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from wrt.core.errors import InputError
+from tests.refused import refused
 from wrt.scene.backgrounds import ConstantBackground, GradientBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.defaults import DARK, bounding_sphere, frame_camera, is_lit, stage
@@ -112,5 +112,5 @@ def test_a_background_counts_as_light():
 
 
 def test_nothing_to_frame_is_an_error():
-    with pytest.raises(InputError, match="no shapes"):
+    with refused(what="no shapes"):
         stage(Scene())

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import wrt
+from tests.refused import refused
 from wrt.core.errors import InputError
 from wrt.scene.digest import scene_digest
 from wrt.scene.materials import Material
@@ -60,19 +61,19 @@ def test_a_scene_at_a_time_has_the_same_objects_without_motion() -> None:
 
 
 @pytest.mark.parametrize(("given", "message"), [
-    ({"keys": np.zeros((2, 3))}, r"keys must be \(K, 3, 3\)"),
-    ({"keys": np.array([key()])}, "two keys or more"),
-    ({"keys": np.array([key(), key((np.nan, 0.0, 0.0))])}, "finite"),
-    ({"keys": np.array([key(), key(scale=(-1.0, 1.0, 1.0))])}, "scale must not be zero, also not between"),
-    ({"target": "ball"}, "target"),
+    ({"keys": np.zeros((2, 3))}, ("keys", "(K, 3, 3)", "motion")),
+    ({"keys": np.array([key()])}, ("keys", "two keys or more", "motion")),
+    ({"keys": np.array([key(), key((np.nan, 0.0, 0.0))])}, ("keys", "finite", "motion")),
+    ({"keys": np.array([key(), key(scale=(-1.0, 1.0, 1.0))])}, ("keys", "scale", "motion")),
+    ({"target": "ball"}, ("target", "", "motion")),
 ])
 def test_bad_motions_are_refused(given, message) -> None:
-    with pytest.raises(InputError, match=message):
+    with refused(*message):
         Motion(**given)
 
 
 def test_a_target_must_have_the_same_faces() -> None:
-    with pytest.raises(InputError, match="target must have the same faces; it has 162 vertices and 320 faces"):
+    with refused("target", "same faces", place="motion"):
         Object(icosphere(1), (GREY,), name="a", motion=Motion(target=icosphere(2)))
 
 
@@ -99,7 +100,7 @@ material = "m"
     assert motion.keys.tolist() == [key(scale=(2.0, 2.0, 2.0)), key((1.0, 0.0, 0.0), (0.0, 0.0, 90.0))]
     np.testing.assert_allclose(np.linalg.norm(motion.target.vertices, axis=1), 3.0, rtol=1e-6)
     path.write_text(path.read_text().replace("subdivisions = 1, radius", "subdivisions = 2, radius"))
-    with pytest.raises(InputError, match=r"meshes\[0\]: .*target must have the same faces"):
+    with refused("target", "same faces", place="meshes[0]: motion"):
         wrt.load_scene(path)
     path.write_text(path.read_text().replace('morph = { shape', 'morph = { file = "x.obj", shape'))
     with pytest.raises(InputError, match="morph"):

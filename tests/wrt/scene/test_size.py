@@ -12,6 +12,7 @@ import pytest
 import wrt
 from tests.command_line import wrt as command
 from tests.gltf_files import TRIANGLE, GltfFile
+from tests.refused import refused
 from wrt.core.errors import InputError
 from wrt.scene.backgrounds import ConstantBackground
 from wrt.scene.cameras import Camera
@@ -108,7 +109,7 @@ def test_other_scenes_are_right_down_to_1e_30(name: str, scale: float) -> None:
 
 
 def test_scenes_below_1e_30_are_refused() -> None:
-    with pytest.raises(InputError, match=r"the scene is 8e-31 units across; at least 1e-30 can be rendered: make it larger"):
+    with refused(what="scene is 8e-31"):
         wrt.render(scene_of({"background": SKY}, 4e-31), size=(4, 4), spp=1)
 
 
@@ -153,7 +154,7 @@ def test_tiny_shapes_far_from_their_light_are_lit() -> None:
 def test_only_what_can_be_hit_makes_a_scene_large() -> None:
     unused = wrt.Mesh(np.concatenate([1e-17 * TRIANGLE, [[1.0, 1.0, 1.0]]]).astype(np.float32), np.array([[0, 1, 2]], np.int32))
     scene = Scene(objects=(Object(unused, (LAMP,)),), cameras=(Camera(),))
-    with pytest.raises(InputError, match=r"1e-17 units across"):
+    with refused(what="1e-17 units across"):
         wrt.render(scene, size=(4, 4), spp=1)
 
 
@@ -210,5 +211,5 @@ def test_a_tiny_file_may_be_included_and_made_larger(tmp_path: Path) -> None:
     (tmp_path / "a.toml").write_text('include = [{ file = "a.gltf", transform = { scale = 1e20 } }]')
     assert wrt.load_scene(tmp_path / "a.toml").bounds()[1].max() == pytest.approx(1e-4)
     (tmp_path / "a.toml").write_text('include = ["a.gltf"]')
-    with pytest.raises(InputError, match=r"a\.toml: the scene is 1e-24 units across"):
+    with refused(what="scene is 1e-24", path="a.toml"):
         wrt.load_scene(tmp_path / "a.toml")

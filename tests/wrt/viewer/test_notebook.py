@@ -17,6 +17,7 @@ import pytest
 from PIL import Image
 
 import wrt
+from tests.refused import refused
 from tests.wrt.renderer.test_checkpoint import SCENE
 from wrt.core.errors import InputError
 from wrt.core.html import SHOWN_ROWS, Rows, html_table, number
@@ -104,7 +105,7 @@ def test_before_tracing_there_is_only_text(shown: list[tuple[str, str]], monkeyp
 def test_without_a_notebook_there_is_one_message(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "IPython", None)
     monkeypatch.setitem(sys.modules, "IPython.display", None)
-    with pytest.raises(InputError, match="IPython is not installed"):
+    with refused(what="IPython is not installed"):
         LiveView()
 
 

@@ -7,12 +7,12 @@ import pytest
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 
 from tests.kernels.traverse.test_common import GEOMETRIES
+from tests.refused import refused
 from wrt.accel.bvh.builders import BVH_BUILDERS
 from wrt.accel.bvh.kdop_area import kdop_area
 from wrt.accel.bvh.volumes import cuts, project
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
-from wrt.core.errors import InputError
 from wrt.scene.shapes import icosphere
 
 BALL = icosphere(3)
@@ -163,5 +163,5 @@ def test_denormal_meshes_are_hit_as_by_brute_force(name: str) -> None:
 @pytest.mark.parametrize("name", ["bvh2_sphere", "bvh2_kdop"])
 def test_options_are_those_of_the_binary_tree(name: str) -> None:
     assert build(BALL, name, max_leaf=1).stats.leaves == len(BALL.faces)
-    with pytest.raises(InputError, match="no builder"):
+    with refused("builder", "no builder"):
         build(BALL, name, builder="guess")

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.refused import Refusal, refused
 from wrt.accel.bvh.compress import compress, decompress
 from wrt.accel.bvh.wide_tree import check_wide, lanes_of, packed
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
-from wrt.core.errors import InputError
 from wrt.scene.shapes import icosphere
 
 WIDE = {"bvh4": 4, "bvh8": 8, "bvh8c": 8}
@@ -57,14 +57,14 @@ def test_arrays_of_a_file_are_checked(name: str) -> None:
     inner = np.argwhere(children > 0)
     leaf = np.argwhere(children < 0)
     for (i, j), value, message in [
-        (inner[0], 0, "no tree"), (inner[0], len(children), "leads out"), (inner[-1], 1, "leads out|no tree"),
-        (leaf[0], 0, "other primitives"), (leaf[0], children[tuple(leaf[0])] - 64, "other primitives"),
-        (leaf[1], -(2**31), "other primitives"), (leaf[0], 1, "leads out|no tree")]:
+        (inner[0], 0, (None, "no tree")), (inner[0], len(children), (None, "leads out")), (inner[-1], 1, (None, "leads out")),
+        (leaf[0], 0, (None, "other primitives")), (leaf[0], children[tuple(leaf[0])] - 64, (None, "other primitives")),
+        (leaf[1], -(2**31), (None, "other primitives")), (leaf[0], 1, (None, "leads out"))]:
         spoiled = children.copy()
         spoiled[i, j] = value
-        with pytest.raises(InputError, match=message):
+        with refused(*message):
             check_wide(spoiled, len(BALL.faces), width)
-    with pytest.raises(InputError, match="leads out"):
+    with refused(what="leads out"):
         check_wide(np.zeros((0, width), np.int32), 0, width)
 
 
@@ -78,7 +78,7 @@ def test_a_child_that_does_not_exist_has_no_box(name: str) -> None:
         nodes = accel.built.arrays["nodes"].reshape(-1, 8, WIDE[name]).copy()
         assert (nodes[:, k][none] == plane).all()
         nodes[:, k][none] = 0.0
-        with pytest.raises(InputError, match="damaged: a child that does not exist"):
+        with refused(what="damaged: a child"):
             accel._check(replace(accel.built, arrays={"nodes": nodes.reshape(-1)}))
     nodes = accel.built.arrays["nodes"].reshape(-1, 8, WIDE[name]).copy()
     nodes[:, 7] = np.nan  # not used
@@ -95,7 +95,7 @@ def test_a_tree_too_deep_for_the_stack_is_refused() -> None:
         return children
 
     check_wide(chain(9), 9 * 8 - 8, 8)
-    with pytest.raises(InputError, match="64 entries"):
+    with refused(what="64 entries"):
         check_wide(chain(10), 10 * 8 - 9, 8)
 
 
@@ -112,11 +112,11 @@ def test_lanes_follow_the_leaves(width: int) -> None:
 
 
 @pytest.mark.parametrize(("options", "message"), [
-    ({"max_leaf": 0}, "max_leaf"), ({"max_leaf": 65}, "max_leaf"), ({"cost_traversal": -1.0}, "cost_traversal"),
-    ({"builder": "nonsense"}, "no builder"), ({"width": 3}, "no option"), ({"max_leaf": 2.5}, "max_leaf must be"),
+    ({"max_leaf": 0}, ("max_leaf",)), ({"max_leaf": 65}, ("max_leaf",)), ({"cost_traversal": -1.0}, ("cost_traversal",)),
+    ({"builder": "nonsense"}, ("builder", "no builder")), ({"width": 3}, ("width", "no option")), ({"max_leaf": 2.5}, ("max_leaf",)),
 ])
-def test_options_out_of_range_are_refused(options, message: str) -> None:
-    with pytest.raises(InputError, match=message):
+def test_options_out_of_range_are_refused(options, message: Refusal) -> None:
+    with refused(*message):
         build(BALL, "bvh8", **options)
 
 
@@ -183,5 +183,5 @@ def test_a_node_that_tells_of_other_children_is_refused() -> None:
     accel = build(BALL, "bvh8c")
     nodes = accel.built.arrays["nodes"].reshape(-1, 24)
     nodes[3, 3:4].view(np.uint32)[0] ^= np.uint32(1 << 31)
-    with pytest.raises(InputError, match="children that it does not have"):
+    with refused(what="children"):
         accel._check(accel.built)

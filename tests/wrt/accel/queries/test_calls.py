@@ -14,6 +14,7 @@ import pytest
 import warp as wp
 
 from tests.kernel_tools import DEVICE, cpu_only
+from tests.refused import Refusal, refused
 from wrt.accel import queries
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.answers import Hits
@@ -141,18 +142,18 @@ def test_answers_go_where_the_caller_says(ball: Accelerator, n: int, as_warp: bo
 
 
 @pytest.mark.parametrize(("field", "array", "message"), [
-    ("t", np.zeros(4, np.float32), r"out.t must be a NumPy array \(3,\) of float32, writeable and without gaps, got an array"),
-    ("t", np.zeros(3), "out.t must be .* of float32.*, got .* of float64"),
-    ("u", np.zeros((3, 1), np.float32), r"out.u must be .* \(3,\)"), ("v", np.zeros(6, np.float32)[::2], "out.v must be .*gaps"),
-    ("v", frozen(np.zeros(3, np.float32)), "out.v must be .*writeable"), ("prim_id", np.zeros(3, np.int64), "out.prim_id .* int32"),
-    ("prim_id", [0, 0, 0], "out.prim_id must be a NumPy array"), ("t", None, "out.t must be a NumPy array"),
-    ("t", "warp", r"out.t must be a NumPy array \(3,\) of float32.*, got"),
+    ("t", np.zeros(4, np.float32), ("out.t", "NumPy array (3,)")),
+    ("t", np.zeros(3), ("out.t", "float32")),
+    ("u", np.zeros((3, 1), np.float32), ("out.u", "(3,)")), ("v", np.zeros(6, np.float32)[::2], ("out.v", "gaps")),
+    ("v", frozen(np.zeros(3, np.float32)), ("out.v", "writeable")), ("prim_id", np.zeros(3, np.int64), ("out.prim_id", "int32")),
+    ("prim_id", [0, 0, 0], ("out.prim_id", "NumPy array")), ("t", None, ("out.t", "NumPy array")),
+    ("t", "warp", ("out.t", "NumPy array (3,)")),
 ])
-def test_room_that_does_not_fit_is_named(ball: Accelerator, field: str, array: Any, message: str) -> None:
+def test_room_that_does_not_fit_is_named(ball: Accelerator, field: str, array: Any, message: Refusal) -> None:
     rays = some_rays(3)
     room = {name: np.zeros(3, np.int32 if name == "prim_id" else np.float32) for name in FIELDS}
     room[field] = wp.zeros(3, dtype=wp.float32, device="cpu") if isinstance(array, str) else array  # type: ignore[assignment]
-    with pytest.raises(InputError, match=message):
+    with refused(*message):
         ball.closest_hit(*rays, out=Hits(**room))
 
 
@@ -182,15 +183,15 @@ def test_arrays_that_share_memory_are_refused(ball: Accelerator, as_warp: bool) 
 def test_room_of_another_kind_is_named(ball: Accelerator) -> None:
     rays = some_rays(3)
     on_warp = tuple(to_warp(a, wp.vec3) for a in rays)
-    with pytest.raises(InputError, match="out must be Hits, got an array"):
+    with refused("out", "Hits"):
         ball.closest_hit(*rays, out=np.zeros(3))  # type: ignore[arg-type]
-    with pytest.raises(InputError, match=r"out must be a NumPy array \(3,\) of bool.*, got an array \(3,\) of float32"):
+    with refused("out", "NumPy array (3,)"):
         ball.any_hit(*rays, out=np.zeros(3, np.float32))
     with pytest.raises(InputError, match=rf"out must be a Warp array \(3,\) of bool, on {DEVICE}, without gaps, got an array"):
         ball.any_hit(*on_warp, out=np.zeros(3, bool))
     for wrong in (wp.zeros(4, dtype=wp.bool, device=DEVICE), wp.zeros(3, dtype=wp.int32, device=DEVICE),
                   wp.zeros(6, dtype=wp.bool, device=DEVICE)[::2]):
-        with pytest.raises(InputError, match=r"out must be a Warp array \(3,\) of bool"):
+        with refused("out", "Warp array (3,)"):
             ball.any_hit(*on_warp, out=wrong)
 
 
@@ -228,7 +229,7 @@ def test_origins_are_named_before_what_follows(ball: Accelerator) -> None:
     origins[-1], directions[0], directions[1] = np.nan, 0.0, np.inf
     with pytest.raises(InputError, match=f"origins must be finite; row {MANY - 1} is"):
         ball.closest_hit(origins, directions, np.full(MANY, -1.0), threads=2)
-    with pytest.raises(InputError, match="directions must be finite; row 1 is"):
+    with refused("directions", "row 1"):
         ball.closest_hit(origins[:-1], directions[:-1], threads=2)
 
 
@@ -241,7 +242,7 @@ def test_numbers_of_warp_arrays_are_not_looked_at_but_for_segments(ball: Acceler
     np.testing.assert_array_equal(np.delete(found, [5, 6, 7]), np.delete(expected, [5, 6, 7]))
     ends = np.ones(MANY, np.float32)
     ends[-1] = np.nan
-    with pytest.raises(InputError, match="t_max must not be NaN"):
+    with refused("t_max", "NaN"):
         ball.closest_hit(*on_warp, t_max=to_warp(ends))
 
 
@@ -251,7 +252,7 @@ def test_a_structure_answers_after_an_error(ball: Accelerator) -> None:
     wrong = origins.copy()
     wrong[3] = np.nan
     for _ in range(3):
-        with pytest.raises(InputError, match="row 3"):
+        with refused("origins", "row 3"):
             ball.closest_hit(wrong, directions, threads=2)
         assert bits(ball.closest_hit(origins, directions, threads=2)) == expected
 

@@ -11,6 +11,7 @@ import warp as wp
 
 import wrt
 from tests.device import NAME as DEVICE
+from tests.refused import refused
 from wrt.accel.geometry import Geometry
 from wrt.scene import shapes
 
@@ -84,7 +85,7 @@ def test_a_mesh_that_a_refit_in_place_opens_is_open() -> None:
         assert wrt.contains(accel, [[0.1, 0.2, 0.3], [0.6, 0.0, 0.0]]).tolist() == [True, scale == 3.0]
     corners[:3] += np.float32(0.1)
     accel.refit(points_of(corners), in_place=True)
-    with pytest.raises(wrt.InputError, match="6 edges have an odd number of faces"):
+    with refused(what="6 edges"):
         wrt.contains(accel, [[0.1, 0.2, 0.3]])
 
 
@@ -103,7 +104,7 @@ def test_a_mesh_with_a_corner_that_is_no_number_is_open() -> None:
     ball_points = ball.vertices.copy()
     ball_points[7, 1] = np.nan
     faces = wp.array(ball.faces.reshape(-1), dtype=wp.int32, device=DEVICE)
-    with pytest.raises(wrt.InputError, match="the mesh is not closed"):
+    with refused(what="mesh is not closed"):
         wrt.contains(wrt.build(wrt.DeviceGeometry(points_of(ball_points), faces), "bvh2", DEVICE), [[0.0, 0.0, 0.0]])
 
 
@@ -125,11 +126,11 @@ def test_what_is_refused_and_what_is_empty() -> None:
     assert wrt.contains(ball, none).shape == (0,)
     assert wrt.contains(wrt.build(wrt.Mesh(none, np.zeros((0, 3), np.int32))), [[0.0, 0.0, 0.0]]).tolist() == [False]
     flat = wrt.build(shapes.quad())
-    for accel, points, said in ((flat, [[0.0, 0.0, 0.0]], "the mesh is not closed: 4 edges"),
-                                (ball, [[0.0, np.nan, 0.0]], "points must be finite"),
-                                (ball, [0.0, 1.0], r"points must be \(N, 3\)"),
-                                (ball, [[0.0, 1.0, 2.0], [0.0]], r"points must be \(N, 3\) of real numbers"),
-                                (ball, np.ma.zeros((1, 3)), "points must not be a masked array"),
-                                ("bvh", [[0.0, 0.0, 0.0]], "accel must be a structure over one mesh")):
-        with pytest.raises(wrt.InputError, match=said):
+    for accel, points, said in ((flat, [[0.0, 0.0, 0.0]], (None, "mesh")),
+                                (ball, [[0.0, np.nan, 0.0]], ("points", "finite")),
+                                (ball, [0.0, 1.0], ("points", "(N, 3)")),
+                                (ball, [[0.0, 1.0, 2.0], [0.0]], ("points", "(N, 3)")),
+                                (ball, np.ma.zeros((1, 3)), ("points", "masked array")),
+                                ("bvh", [[0.0, 0.0, 0.0]], ("accel", "structure over one mesh"))):
+        with refused(*said):
             wrt.contains(accel, points)  # type: ignore[arg-type]

@@ -11,6 +11,7 @@ import warp as wp
 import wrt
 from tests.kernel_tools import DEVICE, cpu_only, vec3s
 from tests.placed import place
+from tests.refused import Refusal, refused
 from wrt.accel.geometry import Geometry
 from wrt.core.arrays import to_numpy
 from wrt.scene import shapes
@@ -211,33 +212,33 @@ def test_arrays_of_warp_and_arrays_that_are_given() -> None:
 
 @cpu_only
 def test_warp_arrays_on_the_cpu_are_looked_at() -> None:
-    with pytest.raises(wrt.InputError, match="b must be finite"):
+    with refused("b", "finite"):
         wrt.visible(wrt.build(soup()), vec3s(np.zeros((1, 3))), vec3s([[0.0, np.nan, 0.0]]))
 
 
 @pytest.mark.parametrize("a, b, more, said", [
-    ([[np.nan, 0, 0]], [[0, 0, 1]], {}, "a must be finite; row 0"),
-    ([[0, 0, 0]], [[0, 0, np.inf]], {}, "b must be finite; row 0"),
-    ([[0, 0, 0]], [[0, 0, 1], [0, 0, 2]], {}, r"b must have as many rows as a \(1\), got 2"),
-    ([0, 0, 0], [[0, 0, 1]], {}, r"a must be \(N, 3\)"),
-    ([[0, 0, 2e37]], [[0, 0, 1]], {}, "a must be within 1e.37"),
-    ([[0, 0, 0]], [[0, 0, 1]], {"on_a": [60]}, "on_a must be -1 to 59; row 0 is 60"),
-    ([[0, 0, 0]], [[0, 0, 1]], {"on_b": [0.5]}, "on_b must be .1,. whole numbers"),
-    ([[0, 0, 0]], [[0, 0, 1]], {"on_b": [0, 1]}, "on_b must be .1,. whole numbers"),
-    ([[0, 0, 0]], [[0, 0, 1]], {"out": np.zeros(2, bool)}, "out must be a NumPy array"),
-    ([[0, 0, 0]], [[0, 0, 1]], {"threads": 0}, "threads must be 1 or more"),
+    ([[np.nan, 0, 0]], [[0, 0, 1]], {}, ("a", "row 0")),
+    ([[0, 0, 0]], [[0, 0, np.inf]], {}, ("b", "row 0")),
+    ([[0, 0, 0]], [[0, 0, 1], [0, 0, 2]], {}, ("b", "as many rows")),
+    ([0, 0, 0], [[0, 0, 1]], {}, ("a", "(N, 3)")),
+    ([[0, 0, 2e37]], [[0, 0, 1]], {}, ("a", "within 1e")),
+    ([[0, 0, 0]], [[0, 0, 1]], {"on_a": [60]}, ("on_a", "row 0")),
+    ([[0, 0, 0]], [[0, 0, 1]], {"on_b": [0.5]}, ("on_b", "whole numbers")),
+    ([[0, 0, 0]], [[0, 0, 1]], {"on_b": [0, 1]}, ("on_b", "whole numbers")),
+    ([[0, 0, 0]], [[0, 0, 1]], {"out": np.zeros(2, bool)}, ("out", "NumPy array")),
+    ([[0, 0, 0]], [[0, 0, 1]], {"threads": 0}, ("threads", "1 or more")),
 ])
-def test_what_is_refused(a: Any, b: Any, more: dict[str, Any], said: str) -> None:
-    with pytest.raises(wrt.InputError, match=said):
+def test_what_is_refused(a: Any, b: Any, more: dict[str, Any], said: Refusal) -> None:
+    with refused(*said):
         wrt.visible(wrt.build(soup()), a, b, **more)
 
 
 def test_what_takes_no_prim_ids() -> None:
     points = np.zeros((1, 3))
-    with pytest.raises(wrt.InputError, match="accel must be a structure"):
+    with refused("accel", "structure"):
         wrt.visible("bvh", points, points)  # type: ignore[arg-type]
-    with pytest.raises(wrt.InputError, match="on_a is for structures without instances"):
+    with refused("on_a", "structures without instances"):
         wrt.visible(wrt.build(place((Geometry.of(shapes.box()), np.eye(4)))), points, points, [0])
-    with pytest.raises(wrt.InputError, match="accel must not be over several worlds"):
+    with refused("accel", "over several worlds"):
         wrt.visible(wrt.build([shapes.box(), shapes.box()]), points, points)
     assert wrt.visible(wrt.build([shapes.box()]), points, points + 3.0).tolist() == [False]

@@ -12,10 +12,10 @@ import trimesh
 import wrt
 from tests.command_line import BOX_OBJ
 from tests.data import ROOT
+from tests.refused import Refusal, refused
 from wrt.accel.geometry import Geometry
 from wrt.accel.instances import Instances
 from wrt.accel.scenes.flatten import flatten_joined
-from wrt.core.errors import InputError
 from wrt.scene import shapes
 from wrt.scene.materials import Material
 from wrt.scene.model import Object, Scene
@@ -81,13 +81,13 @@ def test_a_path_is_built_as_its_mesh_is(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
-    ((None,), "mesh must be a Mesh, a Scene, the path of a mesh or scene file, .*, got None"),
-    ((np.zeros((3, 3)),), r"mesh must be a Mesh, .*, got an array \(3, 3\) of float64"),
-    (((np.eye(3),),), "mesh must be .* a pair .vertices, faces., got"), ((wrt.Camera(),), "mesh must be .*, got a Camera"),
-    (("nothing.glb",), "nothing.glb: no such file"), (("nothing.ply",), "nothing.ply: no such file"),
-    (("scene.toml",), "scene.toml: no such file"), ((wrt.Mesh(np.eye(3), [[0, 1, 2]]), 5), "accel must be a str, got 5"),
-    ((wrt.Mesh(np.eye(3), [[0, 1, 2]]), "bvh", 5), "device must be a str, got 5"),
+    ((None,), ("mesh", "Mesh, a Scene")),
+    ((np.zeros((3, 3)),), ("mesh", "Mesh")),
+    (((np.eye(3),),), ("mesh", "vertices, faces")), ((wrt.Camera(),), ("mesh",)),
+    (("nothing.glb",), (None, "no such file", None, "nothing.glb")), (("nothing.ply",), (None, "no such file", None, "nothing.ply")),
+    (("scene.toml",), (None, "no such file", None, "scene.toml")), ((wrt.Mesh(np.eye(3), [[0, 1, 2]]), 5), ("accel", "str")),
+    ((wrt.Mesh(np.eye(3), [[0, 1, 2]]), "bvh", 5), ("device", "str")),
 ], ids=str)
-def test_anything_else_is_refused_by_name(arguments: tuple[Any, ...], message: str) -> None:
-    with pytest.raises(InputError, match=message):
+def test_anything_else_is_refused_by_name(arguments: tuple[Any, ...], message: Refusal) -> None:
+    with refused(*message):
         wrt.build(*arguments)

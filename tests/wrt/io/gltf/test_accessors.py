@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.gltf_files import COMPONENT, KIND, GltfFile, load_warned, one_triangle
+from tests.refused import refused
 from wrt.core.errors import InputError
 from wrt.io.gltf.accessors import Accessors
 from wrt.io.gltf.document import Document
@@ -49,7 +50,7 @@ def test_normalised_integers(tmp_path, dtype, integers, floats):
 def test_what_cannot_be_normalised(tmp_path, dtype):
     file = GltfFile()
     file.accessor([1, 2], dtype, normalized=True)
-    with pytest.raises(InputError, match=r"here: accessors\[0\].normalized: only 8- and 16-bit"):
+    with refused(what="only 8-", place="here: accessors[0].normalized"):
         read(file, tmp_path, "SCALAR")
 
 
@@ -145,18 +146,18 @@ def test_an_accessor_without_data_is_zeros(tmp_path):
 
 
 @pytest.mark.parametrize("changes, message", [
-    ({"byteLength": 10**9}, r"bufferViews\[0\]: bytes 0 to 1000000000 reach outside of buffers\[0\], which has 48"),
-    ({"byteLength": 0}, r"bufferViews\[0\].byteLength: must be at least 1"),
-    ({"byteOffset": -4}, r"bufferViews\[0\]: bytes -4 to 44 reach outside"),
-    ({"buffer": 3}, r"bufferViews\[0\].buffer: is 3, but there are 1 buffers"),
-    ({"byteStride": 8}, r"bufferViews\[0\].byteStride: is 8, but an element has 12 bytes"),
-    ({"byteStride": -12}, r"bufferViews\[0\].byteStride: is -12"),
+    ({"byteLength": 10**9}, (None, "which has 48", "here: bufferViews[0]")),
+    ({"byteLength": 0}, (None, "at least 1", "here: bufferViews[0].byteLength")),
+    ({"byteOffset": -4}, (None, "bytes -4", "here: bufferViews[0]")),
+    ({"buffer": 3}, (None, "3, but there", "here: bufferViews[0].buffer")),
+    ({"byteStride": 8}, (None, "8, but", "here: bufferViews[0].byteStride")),
+    ({"byteStride": -12}, (None, "-12", "here: bufferViews[0].byteStride")),
 ])
 def test_views_that_do_not_fit(tmp_path, changes, message):
     file = GltfFile()
     file.accessor(np.zeros((4, 3)))
     file.json["bufferViews"][0].update(changes)
-    with pytest.raises(InputError, match=message):
+    with refused(*message):
         read(file, tmp_path, "VEC3")
 
 
@@ -166,5 +167,5 @@ def test_floats_that_are_not_finite(tmp_path, bad):
     values = np.zeros((4, 3))
     values[2, 1] = bad
     file.accessor(values)
-    with pytest.raises(InputError, match=r"here: accessors\[0\]: element 2 is .* \(1 not finite in all\)"):
+    with refused(what="(1 not finite", place="here: accessors[0]"):
         read(file, tmp_path, "VEC3")

@@ -15,6 +15,7 @@ import pytest
 from PIL import Image
 
 from tests.gltf_files import GltfFile, encode, load_warned, one_material, one_triangle
+from tests.refused import refused
 from wrt.core.errors import InputError, SceneWarning
 from wrt.io.gltf.reader import load_gltf
 from wrt.picture.decode import MAX_SIDE, decode_rgba8
@@ -143,21 +144,22 @@ def test_each_slot_has_its_encoding(tmp_path):
 
 
 @pytest.mark.parametrize("source, message", [
-    ({"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1]}}, "baseColorFactor: must hold 4 numbers, got 3"),
-    ({"pbrMetallicRoughness": {"baseColorFactor": [2, 1, 1, 1]}}, r"materials\[0\]: .*albedo must lie in \[0, 1\]"),
-    ({"pbrMetallicRoughness": {"metallicFactor": "shiny"}}, "metallicFactor: must be a number, got 'shiny'"),
-    ({"pbrMetallicRoughness": {"roughnessFactor": -1}}, r"materials\[0\]: .*roughness must be finite and in \[0, 1\]"),
-    ({"pbrMetallicRoughness": {"baseColorTexture": {}}}, "baseColorTexture.index: is required"),
-    (base(), r"materials\[0\].pbrMetallicRoughness.baseColorTexture.index: is 0, but there are 0 textures"),
-    ({"alphaMode": "GLASS"}, r"materials\[0\].alphaMode: must be one of OPAQUE, MASK, BLEND, got 'GLASS'"),
-    ({"emissiveFactor": [-1, 0, 0]}, "emission must lie in"),
-    ({"extensions": {"KHR_materials_ior": {"ior": 0.5}}}, "ior must be finite and in"),
-    ({"extensions": {"KHR_materials_ior": 3}}, "extensions.KHR_materials_ior: must be an object, got 3"),
+    ({"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1]}},
+     (None, "hold 4 numbers", "materials[0].pbrMetallicRoughness.baseColorFactor")),
+    ({"pbrMetallicRoughness": {"baseColorFactor": [2, 1, 1, 1]}}, ("albedo", "lie", "materials[0]: material 'material 0'")),
+    ({"pbrMetallicRoughness": {"metallicFactor": "shiny"}}, (None, "number", "materials[0].pbrMetallicRoughness.metallicFactor")),
+    ({"pbrMetallicRoughness": {"roughnessFactor": -1}}, ("roughness", "finite", "materials[0]: material 'material 0'")),
+    ({"pbrMetallicRoughness": {"baseColorTexture": {}}}, (None, "required", "materials[0].pbrMetallicRoughness.baseColorTexture.index")),
+    (base(), (None, "0, but there", "materials[0].pbrMetallicRoughness.baseColorTexture.index")),
+    ({"alphaMode": "GLASS"}, (None, "OPAQUE, MASK, BLEND", "materials[0].alphaMode")),
+    ({"emissiveFactor": [-1, 0, 0]}, ("emission", "lie", "materials[0]: material 'material 0'")),
+    ({"extensions": {"KHR_materials_ior": {"ior": 0.5}}}, ("ior", "finite", "materials[0]: material 'material 0'")),
+    ({"extensions": {"KHR_materials_ior": 3}}, (None, "object", "materials[0].extensions.KHR_materials_ior")),
     ({"extensions": {"KHR_materials_transmission": {"transmissionFactor": 1}, "KHR_materials_volume": {
-        "thicknessFactor": 1, "attenuationDistance": 0}}}, "KHR_materials_volume: attenuationDistance must be"),
+        "thicknessFactor": 1, "attenuationDistance": 0}}}, ("attenuationDistance", "", "materials[0].extensions.KHR_materials_volume")),
 ])
 def test_wrong_materials_are_refused(tmp_path, source, message):
-    with pytest.raises(InputError, match=message):
+    with refused(*message):
         material_of(source, tmp_path)
 
 
@@ -194,7 +196,7 @@ def test_wrap_modes(tmp_path, code, wrap):
 
 
 def test_unknown_wrap_mode(tmp_path):
-    with pytest.raises(InputError, match=r"samplers\[0\].wrapS: must be one of .*, got 1"):
+    with refused(what="must be one", place="samplers[0].wrapS"):
         load(textured(base(), wrapS=1), tmp_path)
 
 
@@ -253,13 +255,13 @@ def test_webp_by_its_extension(tmp_path):
 
 
 @pytest.mark.parametrize("texture, message", [
-    ({"source": 4}, r"textures\[0\].source: is 4, but there are 0 images"),
-    ({"source": 0, "sampler": 1}, r"textures\[0\].sampler: is 1, but there are 0 samplers"),
+    ({"source": 4}, (None, "4, but there", "textures[0].source")),
+    ({"source": 0, "sampler": 1}, (None, "1, but there", "textures[0].sampler")),
 ])
 def test_textures_whose_parts_are_not_there(tmp_path, texture, message):
     file = one_material(base())
     file.add("textures", texture)
-    with pytest.raises(InputError, match=message):
+    with refused(*message):
         load(file, tmp_path)
 
 
@@ -307,14 +309,14 @@ def test_truncated_images(format):
     noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)
     data = encode(noise, format)
     for length in (0, 5, 20, len(data) // 2):
-        with pytest.raises(InputError, match="cannot be read as an image"):
+        with refused(what="read"):
             decode_rgba8(data[:length])
 
 
 def test_images_that_are_none():
     eps = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 10 10\n%%EndComments\nshowpage\n"
     for data in (b"hello", eps):
-        with pytest.raises(InputError, match="none of PNG, JPEG"):
+        with refused(what="none"):
             decode_rgba8(data)
 
 
@@ -328,7 +330,7 @@ def test_images_beyond_the_limit(size):
 def test_decompression_bombs():
     with pytest.raises(InputError, match=f"it is 10000x16000; at most {MAX_SIDE} a side and 134217728 pixels are read"):
         decode_rgba8(png_header(10000, 16000))
-    with pytest.raises(InputError, match=r"exceeds limit of"):
+    with refused(what="exceeds limit"):
         decode_rgba8(png_header(MAX_SIDE, MAX_SIDE))  # in Pillow's own words
     with pytest.raises(InputError):
         decode_rgba8(png_header(2**31 - 1, 2**31 - 1))
@@ -338,15 +340,15 @@ def test_an_unsound_image_is_named(tmp_path):
     file = one_material(base())
     file.add("textures", {"source": file.add("images", {"uri": "picture.png"})})
     path = file.write(tmp_path)
-    with pytest.raises(InputError, match=r"images\[0\].uri: cannot read 'picture.png'"):
+    with refused(what="cannot read 'picture", place="images[0].uri"):
         load_gltf(path)
     (tmp_path / "picture.png").write_bytes(encode(PIXELS)[:40])
-    with pytest.raises(InputError, match=r"images\[0\].uri \(picture.png\): cannot be read as an image"):
+    with refused(what="image", place="images[0].uri (picture.png)"):
         load_gltf(path)
     (tmp_path / "picture.png").write_bytes(encode(PIXELS))
     assert load_gltf(path, staged=False).materials[0].albedo_texture.name == "picture.png"
     file.json["images"] = [{"mimeType": "image/png"}]
-    with pytest.raises(InputError, match=r"images\[0\]: has neither a uri nor a bufferView"):
+    with refused(what="neither a uri", place="images[0]"):
         load_gltf(file.write(tmp_path))
 
 

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.gltf_files import TRIANGLE, GltfFile, load_warned, one_triangle, with_light
-from wrt.core.errors import InputError
+from tests.refused import refused
 from wrt.io.gltf.reader import load_gltf
 from wrt.scene.cameras import OrthographicCamera
 from wrt.scene.lights import DirectionalLight, PointLight, SpotLight
@@ -82,7 +82,7 @@ def test_the_default_scene_is_shown(tmp_path):
     file.json["scene"] = 1
     assert [o.name for o in load(file, tmp_path).objects] == ["c", "b"]
     file.json["scene"] = 2
-    with pytest.raises(InputError, match="scene: is 2, but there are 2 scenes"):
+    with refused(what="2, but there", place="scene"):
         load(file, tmp_path)
 
 
@@ -95,46 +95,46 @@ def test_a_deep_chain_needs_no_recursion(tmp_path):
 
 
 @pytest.mark.parametrize("children, message", [
-    ({0: [1], 1: [2], 2: [0]}, r"nodes\[0\]: the node graph has a cycle"),
-    ({0: [1], 2: [2]}, r"nodes\[2\]: the node graph has a cycle"),
-    ({0: [2], 1: [2]}, r"nodes\[1\].children\[0\]: nodes\[2\] has two parents, the first is nodes\[0\]"),
-    ({0: [1, 1]}, r"nodes\[0\].children\[1\]: nodes\[1\] has two parents"),
-    ({0: [7]}, r"nodes\[0\].children\[0\]: is 7, but there are 3 nodes"),
-    ({0: [-1]}, r"nodes\[0\].children\[0\]: is -1"),
-    ({0: [0.5]}, r"nodes\[0\].children\[0\]: must be an integer, got 0.5"),
-    ({0: 1}, r"nodes\[0\].children: must be an array, got 1"),
+    ({0: [1], 1: [2], 2: [0]}, (None, "node graph", "nodes[0]")),
+    ({0: [1], 2: [2]}, (None, "node graph", "nodes[2]")),
+    ({0: [2], 1: [2]}, (None, "two parents", "nodes[1].children[0]")),
+    ({0: [1, 1]}, (None, "two parents", "nodes[0].children[1]")),
+    ({0: [7]}, (None, "7, but there", "nodes[0].children[0]")),
+    ({0: [-1]}, (None, "nodes", "nodes[0].children[0]")),
+    ({0: [0.5]}, (None, "integer", "nodes[0].children[0]")),
+    ({0: 1}, (None, "array", "nodes[0].children")),
 ])
 def test_graphs_that_are_no_forest(tmp_path, children, message):
     file = GltfFile()
     for i in range(3):
         file.node(children=children.get(i, []))
-    with pytest.raises(InputError, match=message):
+    with refused(*message):
         load(file, tmp_path)
 
 
 def test_a_node_that_the_scene_reaches_twice(tmp_path):
     file = one_triangle()
     file.json["scenes"] = [{"nodes": [0, 0]}]
-    with pytest.raises(InputError, match=r"scenes\[0\].nodes\[1\]: nodes\[0\] is in the scene twice"):
+    with refused(what="scene twice", place="scenes[0].nodes[1]"):
         load(file, tmp_path)
 
 
 @pytest.mark.parametrize("fields, message", [
-    ({"matrix": [1.0] * 15}, r"nodes\[0\].matrix: must hold 16 numbers, got 15"),
-    ({"matrix": [1.0] * 16}, r"nodes\[0\].matrix: it must be affine"),
-    ({"scale": [1, 1]}, r"nodes\[0\].scale: must hold 3 numbers, got 2"),
-    ({"scale": [1, "1", 1]}, r"nodes\[0\].scale\[1\]: must be a number, got '1'"),
-    ({"rotation": [0, 0, 0, 0]}, r"nodes\[0\].rotation: must be a unit quaternion"),
-    ({"translation": [1e400, 0, 0]}, r"Infinity|nodes\[0\].translation\[0\]: must be a finite number"),
-    ({"mesh": 3}, r"nodes\[0\].mesh: is 3, but there are 1 meshes"),
-    ({"mesh": True}, r"nodes\[0\].mesh: must be an integer, got True"),
-    ({"camera": 0}, r"nodes\[0\].camera: is 0, but there are 0 cameras"),
-    ({"extensions": []}, r"nodes\[0\].extensions: must be an object"),
+    ({"matrix": [1.0] * 15}, (None, "hold 16 numbers", "nodes[0].matrix")),
+    ({"matrix": [1.0] * 16}, ("it", "affine", "nodes[0].matrix")),
+    ({"scale": [1, 1]}, (None, "hold 3 numbers", "nodes[0].scale")),
+    ({"scale": [1, "1", 1]}, (None, "number", "nodes[0].scale[1]")),
+    ({"rotation": [0, 0, 0, 0]}, (None, "unit quaternion", "nodes[0].rotation")),
+    ({"translation": [1e400, 0, 0]}, (None, "Infinity")),
+    ({"mesh": 3}, (None, "3, but there", "nodes[0].mesh")),
+    ({"mesh": True}, (None, "integer", "nodes[0].mesh")),
+    ({"camera": 0}, (None, "0, but there", "nodes[0].camera")),
+    ({"extensions": []}, (None, "object", "nodes[0].extensions")),
 ])
 def test_wrong_nodes(tmp_path, fields, message):
     file = one_triangle()
     file.json["nodes"][0].update(fields)
-    with pytest.raises(InputError, match=message):
+    with refused(*message):
         load(file, tmp_path)
 
 
@@ -142,7 +142,7 @@ def test_a_product_that_overflows(tmp_path):
     file = one_triangle()
     file.json["nodes"][0]["scale"] = [1e200] * 3
     file.node(children=[0], scale=[1e200] * 3)
-    with pytest.raises(InputError, match=r"nodes\[0\]: .*(must be a finite 4x4 matrix|reaches inf units)"):
+    with refused("transform", "finite 4x4 matrix", place="nodes[0]: object 'place'"):
         load(file, tmp_path)
 
 
@@ -150,7 +150,7 @@ def test_a_product_that_overflows(tmp_path):
 def test_a_mesh_out_of_reach(tmp_path, fields):
     file = one_triangle()
     file.json["nodes"][0].update(fields)
-    with pytest.raises(InputError, match=r"nodes\[0\]: object .*: reaches .* units from the origin; at most 1e\+18"):
+    with refused(what="reaches", place="nodes[0]: object 'place'"):
         load(file, tmp_path)
 
 
@@ -164,7 +164,7 @@ def test_a_rotation_may_have_any_length(tmp_path):
 def test_a_mesh_scaled_to_nothing_is_named(tmp_path):
     file = one_triangle()
     file.json["nodes"][0]["scale"] = [1, 0, 1]
-    with pytest.raises(InputError, match=r"no triangles; .*meshes scaled to no volume \(node 'place'\)"):
+    with refused(what="meshes scaled"):
         load(file, tmp_path)
 
 
@@ -206,8 +206,8 @@ def test_fans_face_one_way(tmp_path, count):
 
 @pytest.mark.parametrize("mode", [4, 5, 6])
 def test_too_few_points_make_no_triangle(tmp_path, mode):
-    message = r"no triangles; .*primitives without a triangle that has an area \(mesh 'thing'\)"
-    with pytest.raises(InputError, match=message):
+    message = (None, "primitives without a triangle")
+    with refused(*message):
         load(one_triangle(vertices=TRIANGLE[:2], mode=mode), tmp_path)
 
 
@@ -307,47 +307,49 @@ def test_instances_with_translations_alone_and_rotations_as_bytes(tmp_path):
 
 
 @pytest.mark.parametrize("attributes, message", [
-    ({}, "must hold accessors of one length, got none"),
-    ({"TRANSLATION": 1, "SCALE": 2}, r"must hold accessors of one length, got \[2, 3\]"),
-    ({"TRANSLATION": 3}, r"attributes.TRANSLATION: must be of type VEC3, but accessors\[3\] is 'VEC4'"),
-    ({"ROTATION": 3}, "attributes.ROTATION.* quaternions, but one is zero"),
-    ({"SCALE": 9}, r"attributes.SCALE: is 9, but there are 4 accessors"),
-    ({"SCALE": "x"}, r"attributes.SCALE: must be an integer"),
+    ({}, (None, "hold accessors", "nodes[0].extensions.EXT_mesh_gpu_instancing.attributes")),
+    ({"TRANSLATION": 1, "SCALE": 2}, (None, "hold accessors", "nodes[0].extensions.EXT_mesh_gpu_instancing.attributes")),
+    ({"TRANSLATION": 3}, (None, "type VEC3", "nodes[0].extensions.EXT_mesh_gpu_instancing.attributes.TRANSLATION")),
+    ({"ROTATION": 3}, (None, "quaternions", "nodes[0].extensions.EXT_mesh_gpu_instancing.attributes.ROTATION")),
+    ({"SCALE": 9}, (None, "9, but there", "nodes[0].extensions.EXT_mesh_gpu_instancing.attributes.SCALE")),
+    ({"SCALE": "x"}, (None, "integer", "nodes[0].extensions.EXT_mesh_gpu_instancing.attributes.SCALE")),
 ])
 def test_wrong_instances(tmp_path, attributes, message):
     file = one_triangle()
     for array in (np.zeros((2, 3)), np.zeros((3, 3)), np.zeros((2, 4))):
         file.accessor(array)
     file.json["nodes"][0]["extensions"] = {"EXT_mesh_gpu_instancing": {"attributes": attributes}}
-    with pytest.raises(InputError, match=message):
+    with refused(*message):
         load(file, tmp_path)
 
 
 @pytest.mark.parametrize("change, message", [
     (lambda f, p: p.update(indices=f.accessor([0, 1, 3], "uint16")),
-     r"meshes\[0\].primitives\[0\].indices: index 2 is 3, but there are 3 vertices"),
-    (lambda f, p: p.update(indices=f.accessor([0, 1, 2])), r"primitives\[0\].indices: must be of an unsigned"),
-    (lambda f, p: p.update(indices=f.accessor([0, 1, 2], "int16")), r"primitives\[0\].indices: must be of an unsigned"),
-    (lambda f, p: p.update(indices=5), r"primitives\[0\].indices: is 5, but there are 1 accessors"),
-    (lambda f, p: p.update(mode=9), r"primitives\[0\].mode: must be 0 to 6, got 9"),
-    (lambda f, p: p.update(material=2), r"primitives\[0\].material: is 2, but there are 0 materials"),
-    (lambda f, p: p.update(attributes="POSITION"), r"primitives\[0\].attributes: must be an object, got 'POSITION'"),
-    (lambda f, p: p["attributes"].update(POSITION="0"), r"attributes.POSITION: must be an integer, got '0'"),
-    (lambda f, p: p["attributes"].update(POSITION=4), r"primitives\[0\].attributes.POSITION: is 4, but"),
-    (lambda f, p: p["attributes"].update(NORMAL=f.accessor(SQUARE)), r"NORMAL: has 4 elements, POSITION has 3"),
-    (lambda f, p: p["attributes"].update(TEXCOORD_0=f.accessor(TRIANGLE)), r"TEXCOORD_0: must be of type VEC2"),
+     (None, "index 2 is 3", "meshes[0].primitives[0].indices")),
+    (lambda f, p: p.update(indices=f.accessor([0, 1, 2])), (None, "unsigned", "meshes[0].primitives[0].indices")),
+    (lambda f, p: p.update(indices=f.accessor([0, 1, 2], "int16")), (None, "unsigned", "meshes[0].primitives[0].indices")),
+    (lambda f, p: p.update(indices=5), (None, "5, but there", "meshes[0].primitives[0].indices")),
+    (lambda f, p: p.update(mode=9), (None, "0 to 6", "meshes[0].primitives[0].mode")),
+    (lambda f, p: p.update(material=2), (None, "2, but there", "meshes[0].primitives[0].material")),
+    (lambda f, p: p.update(attributes="POSITION"), (None, "object", "meshes[0].primitives[0].attributes")),
+    (lambda f, p: p["attributes"].update(POSITION="0"), (None, "integer", "meshes[0].primitives[0].attributes.POSITION")),
+    (lambda f, p: p["attributes"].update(POSITION=4), (None, "4, but", "meshes[0].primitives[0].attributes.POSITION")),
+    (lambda f, p: p["attributes"].update(NORMAL=f.accessor(SQUARE)),
+     (None, "4 elements, POSITION", "meshes[0].primitives[0].attributes.NORMAL")),
+    (lambda f, p: p["attributes"].update(TEXCOORD_0=f.accessor(TRIANGLE)),
+     (None, "type VEC2", "meshes[0].primitives[0].attributes.TEXCOORD_0")),
     (lambda f, p: p["attributes"].update(POSITION=f.accessor([[0, 0, 0], [np.nan, 0, 0], [0, 1, 0]])),
-     r"meshes\[0\].primitives\[0\].attributes.POSITION: accessors\[1\]: element 1 is \[nan, 0.0, 0.0\]"),
+     (None, "element 1", "meshes[0].primitives[0].attributes.POSITION: accessors[1]")),
     (lambda f, p: f.json["accessors"][0].update(count=4),
-     r"attributes.POSITION: accessors\[0\]: 4 elements reach from byte 0 to 48 of bufferViews\[0\], which has 36"),
-    (lambda f, p: f.json.update(meshes={}), "meshes: must be an array"),
-    (lambda f, p: f.json["meshes"].insert(0, None), r"meshes\[0\]: must be an object, got None"),
+     (None, "4 elements reach", "meshes[0].primitives[0].attributes.POSITION: accessors[0]")),
+    (lambda f, p: f.json.update(meshes={}), (None, "array", "meshes")),
+    (lambda f, p: f.json["meshes"].insert(0, None), (None, "object", "meshes[0]")),
 ])
 def test_wrong_primitives(tmp_path, change, message):
     file = one_triangle()
     change(file, file.json["meshes"][0]["primitives"][0])
     path = file.write(tmp_path)
-    with pytest.raises(InputError, match=message) as error:
+    with refused(*message) as error:
         load_gltf(path)
     assert str(error.value).startswith(f"{path}: ")
 
@@ -381,19 +383,19 @@ def test_an_orthographic_camera_is_as_high_as_its_ymag_says(tmp_path):
 
 
 @pytest.mark.parametrize("camera, message", [
-    ({"type": "perspective"}, r"cameras\[0\].type: must be 'perspective' or"),
-    ({"type": "fisheye"}, r"cameras\[0\].type: must be 'perspective' or"),
-    ({}, r"cameras\[0\].type: is required"),
-    ({"type": "perspective", "perspective": {}}, r"cameras\[0\].perspective.yfov: is required"),
-    ({"type": "orthographic", "orthographic": {"ymag": 1}}, r"cameras\[0\].orthographic.xmag: is required"),
-    ({"type": "orthographic", "orthographic": {"xmag": 1, "ymag": 0}}, r"nodes\[1\].camera: .*height must be"),
-    ({"type": "perspective", "perspective": {"yfov": 4}}, r"nodes\[1\].camera: .*fov_y must be"),
-    ({"type": "perspective", "perspective": {"yfov": "wide"}}, r"perspective.yfov: must be a number"),
+    ({"type": "perspective"}, (None, "'perspective'", "cameras[0].type")),
+    ({"type": "fisheye"}, (None, "'perspective'", "cameras[0].type")),
+    ({}, (None, "required", "cameras[0].type")),
+    ({"type": "perspective", "perspective": {}}, (None, "required", "cameras[0].perspective.yfov")),
+    ({"type": "orthographic", "orthographic": {"ymag": 1}}, (None, "required", "cameras[0].orthographic.xmag")),
+    ({"type": "orthographic", "orthographic": {"xmag": 1, "ymag": 0}}, ("height", "", "nodes[1].camera: camera 'camera 0'")),
+    ({"type": "perspective", "perspective": {"yfov": 4}}, ("fov_y", "", "nodes[1].camera: camera 'camera 0'")),
+    ({"type": "perspective", "perspective": {"yfov": "wide"}}, (None, "number", "cameras[0].perspective.yfov")),
 ])
 def test_wrong_cameras(tmp_path, camera, message):
     file = one_triangle()
     file.node(camera=file.add("cameras", camera))
-    with pytest.raises(InputError, match=message):
+    with refused(*message):
         load(file, tmp_path)
 
 
@@ -420,21 +422,22 @@ def test_light_defaults_and_range(tmp_path):
 
 
 @pytest.mark.parametrize("light, message", [
-    ({"type": "area"}, r"lights\[0\].type: must be one of point, directional, spot, got 'area'"),
-    ({}, r"extensions.KHR_lights_punctual.lights\[0\].type: is required"),
-    ({"type": "point", "color": [1, 1]}, r"lights\[0\].color: must hold 3 numbers, got 2"),
-    ({"type": "point", "intensity": -1}, r"lights\[0\]: .*intensity must lie in"),
-    ({"type": "spot", "spot": {"outerConeAngle": 2}}, r"lights\[0\]: .*outer must be"),
-    ({"type": "spot", "spot": {"innerConeAngle": 1, "outerConeAngle": 0.5}}, r"lights\[0\]: .*inner .*must not be larger"),
-    (3, r"lights\[0\]: must be an object, got 3"),
+    ({"type": "area"}, (None, "point, directional, spot", "extensions.KHR_lights_punctual.lights[0].type")),
+    ({}, (None, "required", "extensions.KHR_lights_punctual.lights[0].type")),
+    ({"type": "point", "color": [1, 1]}, (None, "hold 3 numbers", "extensions.KHR_lights_punctual.lights[0].color")),
+    ({"type": "point", "intensity": -1}, ("intensity", "lie", "extensions.KHR_lights_punctual.lights[0]: light 'light 0'")),
+    ({"type": "spot", "spot": {"outerConeAngle": 2}}, ("outer", "", "extensions.KHR_lights_punctual.lights[0]: light 'light 0'")),
+    ({"type": "spot", "spot": {"innerConeAngle": 1, "outerConeAngle": 0.5}},
+     ("inner", "larger", "extensions.KHR_lights_punctual.lights[0]: light 'light 0'")),
+    (3, (None, "object", "extensions.KHR_lights_punctual.lights[0]")),
 ])
 def test_wrong_lights(tmp_path, light, message):
-    with pytest.raises(InputError, match=message):
+    with refused(*message):
         load(with_light(light), tmp_path)
 
 
 def test_a_light_that_is_not_there(tmp_path):
     file = with_light({"type": "point"})
     del file.json["extensions"]
-    with pytest.raises(InputError, match=r"nodes\[1\].extensions.KHR_lights_punctual.light: is 0, but there are 0"):
+    with refused(what="0, but there", place="nodes[1].extensions.KHR_lights_punctual.light"):
         load(file, tmp_path)

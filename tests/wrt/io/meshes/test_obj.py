@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.data import data_path
+from tests.refused import refused
 from wrt.core.errors import InputError, SceneWarning
 from wrt.io.mesh_file import load_mesh
 from wrt.io.meshes.obj import read as read_obj
@@ -130,7 +131,7 @@ def test_same_triangles_as_trimesh(name: str) -> None:
 
 @pytest.mark.parametrize("index", ["99999999999999999999", "9" * 5000, "-" + "9" * 5000])
 def test_indices_of_any_length_are_told(index: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"a\.obj: line 5: face corner '") as caught:
+    with refused(what="face corner '", place="line 5", path="a.obj") as caught:
         load_mesh(write(tmp_path, f"{SQUARE}f 1 2 {index}\n"))
     assert len(str(caught.value)) < 300 + len(str(tmp_path))
 
@@ -147,8 +148,8 @@ def test_many_corners_and_relative_ones(tmp_path: Path) -> None:
     relative = " ".join(f"-{i % 4 + 1}" for i in range(300))
     raw = read_obj(write(tmp_path, f"{SQUARE}vn 0 0 1\nvn 0 1 0\ng a\nf {corners}\ng b\nf {relative} # {corners}\nf 1 2 3\n"))
     assert raw.groups == ("a", "b") and len(raw.faces) == 298 + 298 + 1
-    for bad, message in (("v 1 x 0\n", "line 5: v holds 'x'"), ("f 1 2 -9 4\n", "line 5: face corner '-9': v index -9")):
-        with pytest.raises(InputError, match=message):
+    for bad, message in (("v 1 x 0\n", (None, "v holds 'x'", "line 5")), ("f 1 2 -9 4\n", (None, "face corner '-9'", "line 5"))):
+        with refused(*message):
             load_mesh(write(tmp_path, SQUARE + bad + SQUARE))
 
 

@@ -15,6 +15,7 @@ import pytest
 
 from tests import command_line
 from tests.data import ROOT
+from tests.refused import refused
 from wrt.core.errors import InputError
 from wrt.lab.bench.report import Row
 from wrt.lab.mitsuba import equal_error
@@ -76,13 +77,13 @@ def test_a_variant_without_its_library_is_left_out_and_named(monkeypatch) -> Non
     result = equal_error.run(ROOM, replace(PLAN, integrator="direct"), Options())
     assert set(result.mitsuba) == {"scalar_rgb"} and "/nowhere/libLLVM.so" in result.not_available["llvm_ad_rgb"]
     assert "Mitsuba llvm_ad_rgb is not available: " in equal_error.text(result)
-    with pytest.raises(InputError, match=r"Mitsuba llvm_ad_rgb: .*/nowhere/libLLVM\.so"):
+    with refused(what="Mitsuba llvm_ad_rgb"):
         equal_error.run(ROOM, replace(PLAN, integrator="direct", variants=("llvm_ad_rgb",)), Options())
 
 
 def test_a_picture_without_error_has_nothing_to_be_equal_to() -> None:
     empty = Scene(cameras=ROOM.cameras, background=ConstantBackground((0.5, 0.5, 0.5)), settings=ROOM.settings)
-    with pytest.raises(InputError, match="no error that Mitsuba could reach"):
+    with refused(what="no error"):
         equal_error.run(empty, replace(PLAN, variants=("scalar_rgb",)), Options())
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.mitsuba_oracle import render_mitsuba
-from wrt.core.errors import InputError
+from tests.refused import refused
 from wrt.lab.mitsuba import process as mitsuba_process
 from wrt.lab.mitsuba.process import PATH_VARIABLE, Job, MitsubaProcess, NotAvailable, require_llvm
 from wrt.scene.backgrounds import ConstantBackground
@@ -82,7 +82,7 @@ def test_a_process_that_ends_is_told_with_its_reason() -> None:
 def test_a_scene_that_mitsuba_cannot_draw_is_an_input_error_of_the_scene() -> None:
     pytest.importorskip("mitsuba", reason='needs Mitsuba 3: pip install "wrt[peers]"')
     shiny = replace(SCENE, spheres=(Sphere((0.0, 0.0, 0.0), 0.5, Material(specular=(0.5, 0.5, 0.5))),))
-    with pytest.raises(InputError, match="not translatable exactly: Blinn-Phong") as caught:
+    with refused(what="not translatable exactly: Blinn-Phong", place="Mitsuba: material ''") as caught:
         MitsubaProcess(JOB._replace(scene=shiny))
     assert not isinstance(caught.value, NotAvailable)
 
@@ -90,7 +90,7 @@ def test_a_scene_that_mitsuba_cannot_draw_is_an_input_error_of_the_scene() -> No
 def test_missing_mitsuba_is_told_as_that(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mitsuba_process.importlib.util, "find_spec", lambda name: None)
     for variant in mitsuba_process.VARIANTS:
-        with pytest.raises(InputError, match="Mitsuba 3 is not usable"):
+        with refused(what="Mitsuba 3"):
             MitsubaProcess(JOB._replace(variant=variant))
 
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
 import warp as wp
 
-from wrt.core.errors import InputError
+from tests.refused import refused
 from wrt.lab.rtcore.cubin import read_cubin
 
 
@@ -40,5 +39,5 @@ def test_the_code_of_a_kernel_is_found(tmp_path: Path) -> None:
 def test_what_is_no_binary_is_refused(tmp_path: Path) -> None:
     good = compiled(plain, tmp_path)
     for bad in (b"", b"\x7fELF\x02", b"nonsense" * 100, good[:len(good) // 2], b"\x7fELF\x01" + good[5:]):
-        with pytest.raises(InputError, match="no readable CUDA binary"):
+        with refused(what="no readable CUDA binary"):
             read_cubin(bad)

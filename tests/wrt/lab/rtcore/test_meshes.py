@@ -10,8 +10,8 @@ import pytest
 
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
+from tests.refused import refused
 from wrt.accel.scenes.build import build
-from wrt.core.errors import InputError
 from wrt.lab.bench.rays import ray_sets
 from wrt.lab.bench.report import run, text
 from wrt.lab.rtcore.meshes import Plan, bvhs, in_warps
@@ -50,9 +50,10 @@ def test_rows_and_command(tmp_path: Path) -> None:
 
 
 def test_what_there_is_not_is_refused(tmp_path: Path) -> None:
-    for wrong, words in (({"structures": ("x",)}, "no structure"), ({"kinds": ("x",)}, "no kind"), ({"gpu": "x"}, "no GPU"),
-                         ({"rays": 0}, "rays must be")):
-        with pytest.raises(InputError, match=words):
+    for wrong, words in (({"structures": ("x",)}, ("structures", "no structure")), ({"kinds": ("x",)}, ("kinds", "no kind")),
+              ({"gpu": "x"}, ("gpu", "no GPU")),
+                         ({"rays": 0}, ("rays",))):
+        with refused(*words):
             Plan((tmp_path / "box.obj",), **wrong)  # type: ignore[arg-type]
     assert command("bench", "rtcore", str(tmp_path / "none.obj")).code == 2
     assert command("bench", "rtcore", str(tmp_path / "none.obj"), "-o", str(tmp_path / "a.txt")).errors[0].count(".md") == 1

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from tests.command_line import wrt as command
+from tests.refused import refused
 from tests.wrt.lab.rtcore.test_profiler import MIRRORS
-from wrt.core.errors import InputError
 from wrt.lab.bench.plot import bins, histograms
 from wrt.lab.rtcore.parameters import GPUS
 from wrt.lab.rtcore.profile_report import GROUPS, check_folder, model_rows, warp_order, work_of
@@ -66,7 +66,7 @@ def test_work_has_the_fetches_of_its_rays(measured: Profile) -> None:
 def test_a_notebook_shows_heat_maps_and_the_model(measured: Profile) -> None:
     picture = measured.heatmap("nodes")
     np.testing.assert_array_equal(np.asarray(picture), heatmap(measured.maps["nodes"], "nodes fetched a sample"))
-    with pytest.raises(InputError, match="no picture 'wings'; there is"):
+    with refused(what="no picture 'wings'"):
         measured.heatmap("wings")
     rows = model_rows(measured, GPUS["rtx2080ti"])
     page = rows._repr_html_()
@@ -106,10 +106,10 @@ def test_histograms_are_drawn_of_anything() -> None:
 
 def test_what_cannot_be_written_is_told_before_the_work(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="no folder to write to"):
+    with refused(what="no folder"):
         check_folder(tmp_path / "file")
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(InputError, match=r'plots need matplotlib .*pip install "wrt\[plots\]"'):
+    with refused(what="plots need matplotlib", hint="pip install \"wrt"):
         check_folder(tmp_path)
 
 
