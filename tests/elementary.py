@@ -1,5 +1,5 @@
 """The elementary functions of shading, measured: `python -m tests.elementary` (half an hour) prints the time a call and the largest
-errors. One argument: of all 2^32 floats; two: of random ones and of those that IEEE 754 names.
+errors. One argument: of all 2^32 floats; two: random ones and the special values of IEEE 754.
 
 The truth is the C library's in float64, whose own error is below 2^-27 of an ulp of float32; test_elementary.py holds the worst
 arguments to 60 decimal digits.

@@ -1,4 +1,4 @@
-"""Small launches on the device of the tests, for those that run device functions by themselves."""
+"""Small launches on the device of the tests, for tests of single device functions."""
 
 import numpy as np
 import pytest

@@ -15,7 +15,7 @@ Check = Callable[[int, int], str]  # of a group and a seed: what differs
 
 
 def checked(check: Check, group: int, seed: int) -> str:
-    """As check; an error is told like a difference."""
+    """As check; an error counts as a difference."""
     try:
         return check(group, seed)
     except Exception:

@@ -13,5 +13,5 @@ FAMILIES = ("bvh2", "bvh8", "grid", "kdtree")
 
 
 def families_first(names: list[str] = STRUCTURES) -> list[Any]:
-    """Parameters: those that are not in FAMILIES are marked slow."""
+    """Test parameters; structures outside FAMILIES are marked slow."""
     return [name if name in FAMILIES else pytest.param(name, marks=pytest.mark.slow) for name in names]

@@ -90,10 +90,11 @@ BELOW_KERNELS = {
     "study": {"native", "query", "shade", "wide", "build", "traverse", "units", "structs"},
 }
 LIBRARIES_OF_KERNELS = {"warp", "dataclasses", "functools", "re", "typing", "collections", "math", "pathlib"}
-# Ceilings, lowered where less is reached and never raised.
+# Ceilings, lowered where less is reached. Only that of all lines may rise, by a commit that says for what.
 LONGEST_FUNCTION = 100  # lines
 LONG_FUNCTIONS = 10  # that have more than 60 lines
 LONG_SIGNATURES = 3  # with more than 7 parameters
+MOST_LINES = 47_000  # of wrt and kernels, with headers
 
 
 def module(path: Path) -> str:
@@ -353,6 +354,12 @@ def test_functions_are_short() -> None:
     assert [name for name, length in lengths if length > LONGEST_FUNCTION] == []
     long = [name for name, length in lengths if length > 60]
     assert len(long) <= LONG_FUNCTIONS, long
+
+
+def test_the_sources_stay_small() -> None:
+    """A change that needs more lines raises the ceiling, and its message says by how much and for what."""
+    headers = (ROOT / "kernels").rglob("*.h")
+    assert sum(path.read_text("utf-8").count("\n") for path in (*HOST, *KERNELS, *headers)) <= MOST_LINES
 
 
 def test_signatures_are_short() -> None:

@@ -12,10 +12,10 @@ that leave their arrays (likewise) or read what nobody wrote (0xA5); what depend
 CUDA branches that do not compile, or say something else; the signs of zeros by fminf and fmaxf. It counts
 launches, copies and synchronisations.
 
-It does not find: what NVIDIA's compilers and driver do; speed; a wait that lacks (each call is done when it returns); races
-(threads run one after another). A graph is what its capture recorded, and what cannot be captured is an error. Of Warp's own CUDA
-code only a sort is there (no Mesh, no Bvh). A kernel's sin, pow, exp and the like are the host's, not NVIDIA's, whose last bits
-differ; wrt's kernels have their own.
+It does not find: what NVIDIA's compilers and driver do; speed; a wait that lacks (each call is done when it returns); races (threads run
+one after another). A graph repeats the calls that its capture recorded; a call that cannot be captured is an error. Of Warp's own CUDA
+code only a sort is there (no Mesh, no Bvh). A kernel's sin, pow, exp and the like are the host's, not NVIDIA's, whose last bits differ;
+wrt's kernels have their own.
 """
 
 from __future__ import annotations

@@ -43,6 +43,6 @@ def precompiled_headers() -> tempfile.TemporaryDirectory[str]:
 
 
 def compile_module(source: str, arch: int, path: str, *, fuse_fp: bool) -> int:
-    """Write the object file. Zero, or an error, which Clang has told on stderr."""
+    """Write the object file. Zero, or an error that Clang has printed on stderr."""
     return compile_for_host(for_host(source, arch), Path(path).with_suffix(".cpp").name, path, precompiled_headers().name,
                             fuse_fp=fuse_fp, level=LEVEL)

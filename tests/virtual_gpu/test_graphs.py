@@ -1,4 +1,4 @@
-"""CUDA graphs on a virtual GPU: what is captured is done when it is launched, and what cannot be captured is told."""
+"""CUDA graphs on a virtual GPU: a launch does the work that was captured, and work that cannot be captured is refused."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ class Geometry:
         return out.hexdigest()
 
     def on(self, device: Device, faces: WarpArray | None = None) -> WarpStruct:
-        """Upload to a device, as kernels.build.shape.Shape. faces: those that are there already."""
+        """Upload to a device, as kernels.build.shape.Shape. faces: arrays that are on the device already."""
         shape = Shape()
         shape.vertices = upload(self.vertices, wp.vec3, device)
         shape.faces = upload(self.faces, wp.vec3i, device) if faces is None else faces

@@ -42,7 +42,7 @@ class Instances(Accelerator):
         super().__init__(Structure(kind, Units(triangle, box, instances=True)), geometry, attributes, device, threads)
         self.bottoms = [kind(part, device=device, threads=threads, triangle=triangle, box=box, **options)
                         for part in geometry.parts]
-        # Snapshots keep the arrays, of which the Warp array of structs holds addresses only.
+        # Snapshots keep the arrays: the Warp array of structs holds only their addresses.
         self._placed = [bottom.snapshot for bottom in self.bottoms]
         self._bottoms = wp.array([each.data for each in self._placed], dtype=self.structure.bottom, device=self.device)
         self._top = build_top(geometry, *world_boxes(geometry, np.arange(len(geometry.part)), self._boxes(geometry, BOXES)))

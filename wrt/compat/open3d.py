@@ -193,7 +193,7 @@ class RaycastingScene:
         Parameters
         ----------
         nsamples
-            Odd number of rays of which the majority decides. For closed surfaces one ray is exact (wrt.contains).
+            Odd number of rays; the majority decides. For closed surfaces one ray is exact (wrt.contains).
         """
         shape, good, points = _asked_points(query_points)
         return _answer(_spread(self._inside(points, nthreads, nsamples).astype(np.float32), good, 0.0), shape)

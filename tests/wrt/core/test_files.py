@@ -1,4 +1,4 @@
-"""Only regular files are read, and whatever is not one is told at once: pipes and devices may have no end."""
+"""Only regular files are read; all others are refused at once, as pipes and devices may have no end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Queries need Warp and NumPy alone; what else is not there is told with the line that installs it."""
+"""Queries need Warp and NumPy alone; the message on any other missing package has the line that installs it."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ SCENE = ROOT / "scenes" / "conductor.toml"
 
 
 class Clock:
-    """A clock that stands still until it is told."""
+    """A clock that stands still until a test moves it."""
 
     def __init__(self) -> None:
         self.now = 100.0

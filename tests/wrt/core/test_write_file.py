@@ -334,7 +334,7 @@ def test_checkpoints_and_pictures_on_windows(tmp_path: Path) -> None:
     assert film.stats["resumed"] and film.stats["checkpoint"] == str(path) and names(tmp_path) == {path.name}
     for name in ("a.png", "a.exr", "a.hdr"):
         film.save(tmp_path / name)
-        film.save(tmp_path / name)  # over what is there
+        film.save(tmp_path / name)  # over an existing file
     build(icosphere(0)).save(tmp_path / "a.accel")
     assert names(tmp_path) == {path.name, "a.png", "a.exr", "a.hdr", "a.accel"}
 

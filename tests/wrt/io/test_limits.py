@@ -23,7 +23,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::wrt.core.errors.SceneWarning")
 
 
 def instanced(count: int, times: int = 1, nodes: int = 1) -> GltfFile:
-    """A triangle at `count` places of which no buffer says anything."""
+    """A triangle at `count` places that no buffer describes."""
     file = GltfFile()
     one = file.view(np.zeros(3, np.float32).tobytes())
     index = {"bufferView": file.view(b"\0\0\0\0"), "componentType": 5125}

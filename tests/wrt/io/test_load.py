@@ -75,7 +75,7 @@ def gltf(path: Path) -> None:
     }))
 
 
-# --- what a file says is what the scene holds -------------------------------------------------------------------------
+# --- the scene holds everything that the file says -------------------------------------------------------------------------
 
 
 def test_settings_cameras_and_light(tmp_path: Path) -> None:

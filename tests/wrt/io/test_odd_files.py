@@ -68,7 +68,7 @@ def test_no_triangle_is_lost_on_the_way(name: str) -> None:
 
 
 def test_the_wall_with_a_hole_keeps_its_area() -> None:
-    """Cut fan-wise, its polygons give 66 triangles of which 11 have no area; another cut may make fewer empty ones. Some
+    """Cut fan-wise, its polygons give 66 triangles, 11 of them without area; another cut may make fewer empty ones. Some
     of its polygons are concave, so that their area is that of the vector sum over the fan, not of the fan's triangles."""
     path = odd("wallhole.obj")
     mesh = load_mesh(path)

@@ -134,7 +134,7 @@ class Bvh2(BinaryBvh):
         save(snapshot, path)
 
     def _begin_in_place(self, points: WarpArray) -> InPlace:
-        """Give the structure arrays of its own, and return those that refits in place need."""
+        """Give the structure its own arrays; return the arrays that refits in place need."""
         built, spheres = self._on_device(self._snapshot.arrays), self.geometry.spheres
         built = replace(built, arrays={"nodes": wp.clone(built.arrays["nodes"])}, sah_cost=float("nan"))
         moved = DeviceGeometry.moved(wp.clone(points), self._shape().faces, spheres)

@@ -1,4 +1,4 @@
-"""Choice of the meshes that are stored once, with an instance for each object, and of those that are copied."""
+"""Choice between meshes that are stored once, with an instance for each object, and meshes that are copied."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ def below(nodes: np.ndarray, order: np.ndarray) -> list[tuple[int, str, np.ndarr
 
 
 def of_all_sizes(rng: np.random.Generator) -> Geometry:
-    """Triangles of which the builder refined moves some."""
+    """Triangles that make the builder "refined" move some subtrees."""
     n = 2000
     corners = rng.uniform(-1.0, 1.0, (n, 1, 3)) + rng.uniform(-1.0, 1.0, (n, 3, 3)) * 10.0 ** rng.uniform(-3.0, 0.0, (n, 1, 1))
     faces = np.arange(3 * n, dtype=np.int32).reshape(-1, 3)

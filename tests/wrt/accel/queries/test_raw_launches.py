@@ -54,7 +54,7 @@ def longer(data: int, ndim: int, shape: Any, strides: Any, array_t: Any = warp_p
 
 
 def other_size(launch: warp_private.Recorded) -> warp_private.Recorded:
-    """As if a kernel did not read its size where it is told."""
+    """As if a kernel did not read its size from the place that wrt writes."""
     bounds, code = type(launch.owners[1])(1), Code(launch.entry)
     called = Code(lambda _, args: code(ctypes.addressof(bounds), args))
     return launch._replace(entry=ctypes.cast(called, ctypes.c_void_p).value, owners=(launch.owners, bounds, code, called))

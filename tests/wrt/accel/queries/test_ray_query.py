@@ -63,7 +63,7 @@ def test_one_query_is_for_all_structures_of_a_kind_and_follows_a_refit() -> None
 def test_a_kernel_that_fuses_says_so_and_hits_nothing(capfd: pytest.CaptureFixture[str]) -> None:
     accel = wrt.build(shapes.icosphere(1), "bvh2")
     asked = np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32), np.zeros(1, np.float32), np.full(1, np.inf, np.float32)
-    # As CUDA's compiler does by Warp's default; that for the CPU has to be told.
+    # As CUDA's compiler does by Warp's default; the CPU's compiler needs the option.
     options = {"cpu_compiler_flags": f"{wp.config.cpu_compiler_flags} -ffp-contract=fast"}
     kernel = make_kernel(wrt.ray_query(accel), lambda function: wp.kernel(function, enable_backward=False, module="unique",
                                                                           module_options=options))
