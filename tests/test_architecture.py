@@ -94,7 +94,7 @@ LIBRARIES_OF_KERNELS = {"warp", "dataclasses", "functools", "re", "typing", "col
 LONGEST_FUNCTION = 100  # lines
 LONG_FUNCTIONS = 10  # that have more than 60 lines
 LONG_SIGNATURES = 3  # with more than 7 parameters
-MOST_LINES = 47_000  # of wrt and kernels, with headers
+MOST_LINES = 47_100  # of wrt and kernels, with headers
 
 
 def module(path: Path) -> str:

@@ -91,8 +91,8 @@ def nearer(a: wp.uint64, b: wp.uint64) -> bool:
 
 @kernel
 def link(keys: wp.array(dtype=wp.uint64), nodes: wp.array(dtype=Bvh2Node), parents: wp.array(dtype=wp.int32), first: int):
-    """Link the inner nodes first .. first + dim - 1 over ascending keys; a leaf is one primitive. There are at least two keys, and one
-    node less."""
+    """Find the two children of each inner node first .. first + dim - 1, and write the node and its children's entries in `parents`.
+    dim: number of threads; each takes one node. keys: ascending, at least two. nodes: one fewer than keys. A leaf is one primitive."""
     i = first + wp.tid()
     n = nodes.shape[0] + 1
     # Node i begins or ends at key i, and extends to the side whose neighbour shares the longer prefix.

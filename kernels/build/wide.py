@@ -208,8 +208,9 @@ def write_primitives(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.i
 
 @wp.func
 def write_in_order(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, out: WideTree, base: int, n: int):
-    """Write the first n children of a row with the boxes of their sources, sorted for rays that ask for any hit.
-    From the last visited to the first: missing children, inner nodes, leaves; larger boxes are visited first."""
+    """Sort the n children of the wide node at `base` for any-hit rays, and write their references and boxes.
+    An any-hit ray visits the last slot first. So the slots hold, from the first to the last: empty slots, inner nodes, leaves. Inner nodes
+    and leaves are each sorted by ascending box area. out.source names the binary node and side that hold the box of each child."""
     reference = wp.zeros(shape=wp.static(8), dtype=wp.int32)
     source = wp.zeros(shape=wp.static(8), dtype=wp.int32)
     area = wp.zeros(shape=wp.static(8), dtype=wp.float32)

@@ -44,7 +44,9 @@ def film_index(task: Task, at: int, x: int, y: int, columns: int) -> int:
 
 
 def make_shadow_kernel(features: Features) -> Any:
-    """Return the kernel that advances the shadow rays to one light past the surface that each has hit."""
+    """Return the kernel that moves each queued shadow ray of one light past the surface that the ray has just hit.
+
+    A ray that is blocked, cut or at the light leaves the queue. Only transparent shadows need this kernel."""
     advance_shadow = make_advance_shadow(features, make_shading(features))
 
     @kernel

@@ -97,8 +97,9 @@ def outside(areas: Any) -> bool:
 
 @wp.func
 def inside_edge(area: wp.float64, start: wp.vec3, end: wp.vec3, winding: wp.float64) -> bool:
-    """Test whether the z axis is on the triangle's side of the edge from start to end; winding: the triangle's signed area.
-    On the edge itself, the axis moved to (e, e^2) for an infinitesimal e > 0 decides."""
+    """Test whether the z axis passes the edge from start to end on the side where the triangle lies.
+    area: of edge_areas for this edge. winding: sum of the three areas; its sign is the triangle's winding. If the axis meets the edge
+    (area 0), the axis moved in x and y by (e, e^2), for an infinitesimal e > 0, decides."""
     zero = wp.float64(0.0)
     side = wp.where(winding < zero, -area, area)
     if side == zero:
@@ -356,9 +357,10 @@ def plane_equation(box: BoxRay, shear: TriangleRay, ray: Ray, triangle: PlanePri
 
 @wp.func
 def baldwin_weber(box: BoxRay, shear: TriangleRay, ray: Ray, triangle: PlanePrimitive) -> Hit:
-    """Transform the ray so that the triangle is (0,0,0), (1,0,0), (0,1,0), and intersect it with z = 0.
+    """Map the ray to the space where the triangle is (0,0,0), (1,0,0), (0,1,0), and intersect the ray with the plane z = 0.
     Baldwin and Weber 2016, "Fast Ray-Triangle Intersections by Coordinate Transformation" (JCGT 5(3)). a, b, c are the rows of the affine
-    map. The paper fixes one coordinate of the free direction, which saves three of the twelve numbers; here all are stored."""
+    map. The triangle does not determine which direction becomes the z axis. The paper picks a coordinate axis, so that three of the map's
+    twelve numbers are constants. Here it is the triangle's unit normal, and all twelve numbers are stored."""
     slope = along(triangle.c, ray.direction)
     if slope == 0.0:
         return no_triangle()

@@ -120,7 +120,11 @@ def spread_of(to_world: np.ndarray, to_local: np.ndarray) -> np.ndarray:
 
 
 def refit_top(top: TopLevel, geometry: InstancedGeometry, rows: np.ndarray, low: np.ndarray, high: np.ndarray) -> TopLevel:
-    """Fit the trees to new boxes of some instances, no row twice."""
+    """Return the trees refitted to instances that moved; the tree structure stays.
+
+    geometry: already has the new matrices. rows: (R,) indices of the moved instances, without repeats. low, high: (R, 3) float32, the
+    new boxes of these instances in world space.
+    """
     cpu, fitting = start("cpu"), Fitting(start("cpu"), len(top.order), len(top.nodes))
     all_low, all_high = top.low.copy(), top.high.copy()
     all_low[rows], all_high[rows] = low, high

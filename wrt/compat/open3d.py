@@ -318,7 +318,11 @@ def _spread(array: np.ndarray, good: np.ndarray | None, missing: float) -> np.nd
 
 
 def _answers(found: dict[str, np.ndarray], good: np.ndarray | None, shape: tuple[int, ...]) -> dict[str, Any]:
-    """Convert answers, with the values of misses for the questions that were left out."""
+    """Return the results of all rays or points of the caller as arrays or tensors.
+
+    found: results by name, one row for each ray or point that was queried. good: mask of the queried ones; None: all. The others get
+    the values of a miss. shape: leading shape of the caller's rays or points.
+    """
     missed = {"t_hit": np.inf, "geometry_ids": RaycastingScene.INVALID_ID, "primitive_ids": RaycastingScene.INVALID_ID}
     return {name: _answer(_spread(array, good, missed.get(name, 0.0)), shape) for name, array in found.items()}
 

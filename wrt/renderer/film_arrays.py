@@ -107,7 +107,10 @@ class DeviceFilm:
         return float((by_depth > VISIBLE * self.samples()).mean())
 
     def samples(self) -> np.ndarray:
-        """Return the number of samples, (H, W) int32, over all groups, which have equally many in a pixel."""
+        """Return the number of samples of each pixel, summed over the groups, (H, W) int32.
+
+        All groups have the same number of samples in a pixel.
+        """
         return sum((self.picture(film.samples) for film in self.groups[1:]), self.picture(self.groups[0].samples))
 
     def pixels_and_variance(self) -> tuple[np.ndarray, np.ndarray]:

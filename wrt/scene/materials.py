@@ -175,7 +175,7 @@ class Material:
         check_fields(self, at)
 
     def uses(self, field: str) -> bool:
-        """Return True if `field` is one that not every kind reads, and this kind does."""
+        """Return True if this kind reads `field` and some other kind does not. `reads` also accepts the fields of every kind."""
         return field in MATERIALS[self.kind].uses
 
     def reads(self, field: str) -> bool:

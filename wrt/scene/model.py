@@ -217,7 +217,10 @@ class Scene:
                 yield vertices.astype(np.float64), thing.transform
 
     def with_settings(self, **changes: Unpack[SettingChanges]) -> Scene:
-        """Return a copy with some settings changed; None keeps one. Raises InputError for an unknown or wrong setting."""
+        """Return a copy of the scene with the given settings changed. A setting given as None keeps the scene's value.
+
+        Raises InputError for an unknown setting and for a wrong value.
+        """
         for name in changes:
             if name not in SETTINGS:
                 raise unknown(name, "setting", SETTINGS, argument=name)

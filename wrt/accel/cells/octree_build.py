@@ -175,7 +175,12 @@ class _Splitter:
         return count.numpy()
 
     def fill(self, cells: Cells, corner: np.ndarray, count: np.ndarray, growth: np.ndarray) -> Cells:
-        """Return the octants with references, cell after cell. Called just after `count`; other cells have counts of 0."""
+        """Return the next level: all octants that have references, cell after cell.
+
+        Call it right after `self.count` of the same cells, because it reads the octant masks that `self.count` stored. corner: (M, 8, 3),
+        lowest corners of the octants. count: (M, 8), references of each octant, or 0 throughout for a cell that stays a leaf. growth:
+        (M,), the growth that a cell's octants inherit.
+        """
         begin = np.concatenate([[0], np.cumsum(count.ravel())])
         room = np.where(count.any(axis=1, keepdims=True), begin[:-1].reshape(-1, 8), -1)
         out = wp.zeros(int(begin[-1]), dtype=wp.int32, device=self.cpu)

@@ -28,7 +28,11 @@ def light_emitter(mi: ModuleType, light: Light) -> Plugin:
 
 
 def _spot(mi: ModuleType, light: SpotLight) -> Plugin:
-    """Mitsuba's falloff is linear in the angle; put wrt's into the texture that Mitsuba projects from the light."""
+    """Return a spot light as a dictionary for `mitsuba.load_dict`, with wrt's falloff in the light's projected texture.
+
+    Mitsuba's own falloff is linear in the angle and differs from wrt's, so `beam_width` is set to switch it off.
+    Raises InputError for a soft edge beyond 80 degrees from the axis.
+    """
     direction = np.array(light.direction)
     up = np.eye(3)[int(np.argmin(np.abs(direction)))]
     cutoff = math.degrees(light.outer)

@@ -84,7 +84,9 @@ def predict(work: Work, gpu: Gpu, core: Core = BASE) -> Prediction:
 
 
 def sweep(work: Work, gpu: Gpu, core: Core = BASE, names: tuple[str, ...] = ("boxes", "triangles")) -> list[Prediction]:
-    """Predict for all combinations of the values in SWEEPS of these fields of Core."""
+    """Return a prediction for each combination of assumed values.
+
+    names: the fields of Core that vary, each over its values in SWEEPS. `core` gives the other fields."""
     return [predict(work, gpu, each) for each in variants(core, names)]
 
 
