@@ -60,7 +60,7 @@ IN_WRT = {
 KERNELS_OF_HOST = {
     "accel": {"launch_probe", "launches", "hit_lists", "query", "ray_query", "winding", "build", "shade", "traverse", "wide",
               "units", "warp_private", "structs"},
-    "compat": {"query"},
+    "compat": {"placed_rays", "query"},
     "renderer": {"launches", "query", "loops", "shade", "traverse", "wide", "warp_private", "structs"},
     "lab": {"query", "study", "shade", "traverse", "units", "warp_private", "structs"},
 }
@@ -81,6 +81,7 @@ BELOW_KERNELS = {
     "traverse": {"units", "structs"},
     "query": {"traverse", "units", "structs"},
     "hit_lists": {"query", "units", "structs"},
+    "placed_rays": {"query", "structs"},
     "ray_query": {"query", "structs"},
     "winding": {"structs"},
     "wide": {"headers", "memory", "query", "traverse", "units", "structs"},

@@ -18,11 +18,10 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.snapshot import Snapshot
 from wrt.accel.structure import Structure
 from wrt.accel.structures import ACCELERATORS
-from wrt.core import warp_private
 from wrt.core.checked_file import read_checked, write_checked
-from wrt.core.device import record_dtype
+from wrt.core.device import row_type
 from wrt.core.errors import InputError
-from wrt.core.types import JsonObject, PathLike, WarpType
+from wrt.core.types import JsonObject, PathLike
 from wrt.core.version import VERSION
 from wrt.core.write_file import check_writable, replacing
 from wrt.kernels.traverse.common import Units
@@ -37,11 +36,6 @@ def array_types(accel: type[Any], triangle: str = "watertight") -> dict[str, np.
     kinds = fields_of(Structure(accel, Units(triangle)).struct())
     return {name: row_type(kind.dtype if isinstance(kind, wp.array) else kind) for name, kind in kinds.items()
             if name not in ("primitives", "recorder")}
-
-
-def row_type(kind: WarpType) -> np.dtype:
-    """Return the NumPy type of a row of a Warp type: a struct, a vector or a number."""
-    return record_dtype(kind) if hasattr(kind, "numpy_dtype") else warp_private.row_type(kind)
 
 
 def check_target(path: PathLike) -> None:

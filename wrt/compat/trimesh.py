@@ -9,23 +9,28 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 from trimesh.caching import Cache, cache_decorator
 from trimesh.ray.ray_util import contains_points
 
 from wrt.accel.queries.answers import Hits
 from wrt.accel.queries.contains import contains, open_edges_of
+from wrt.accel.queries.raw_kernel import RawKernel
 from wrt.accel.scenes.build import build
 from wrt.compat.surfaces import every_hit
 from wrt.core.arrays import real_numbers
 from wrt.core.errors import InputError
-from wrt.core.types import ArrayLike
-from wrt.kernels.query import FARTHEST
+from wrt.core.threads import thread_count
+from wrt.core.types import ArrayLike, WarpStruct
+from wrt.core.warp_private import record_of, struct_record
+from wrt.kernels.placed_rays import HitPoints64, PlacedRays, Placement, locate_hits, place_rays
 from wrt.scene.mesh import Mesh
 
 if TYPE_CHECKING:
     import trimesh
 
 AWAY = 4.0  # radii of a mesh; origins farther away are moved near it before they are rounded to float32
+PLACE_RAYS, LOCATE_HITS = RawKernel(place_rays, Placement(), PlacedRays()), RawKernel(locate_hits, HitPoints64())
 
 
 class RayMeshIntersector:
@@ -78,14 +83,10 @@ class RayMeshIntersector:
         origins, directions = _rays(ray_origins, ray_directions)
         placed, most = self._placed, max_hits if multiple_hits else min(max_hits, 1)
         ray, face, u, v = placed.every_hit(origins, directions, most) if most > 1 else placed.first_hit(origins, directions)
-        number = np.arange(len(ray)) - np.searchsorted(ray, ray)  # of each hit among those of its ray
-        order = np.argsort(number, kind="stable")
-        order = order[:np.searchsorted(number[order], most)]
-        ray, face = ray[order], face[order]
-        if not return_locations:
-            return face, ray
-        corners = self.mesh.vertices.view(np.ndarray)[self.mesh.faces.view(np.ndarray)[face]]
-        return face, ray, located(corners, origins[ray], directions[ray], u[order], v[order])
+        if most != 1:
+            order = _in_rounds(ray) if most > 1 else np.zeros(0, np.int64)
+            ray, face, u, v = (array[order] for array in (ray, face, u, v))
+        return (face, ray, placed.located(origins, directions, ray, face, u, v)) if return_locations else (face, ray)
 
     def intersects_location(self, ray_origins: ArrayLike, ray_directions: ArrayLike, multiple_hits: bool = True,
                             max_hits: int = 100) -> tuple[np.ndarray, ...]:
@@ -102,10 +103,7 @@ class RayMeshIntersector:
     def intersects_first(self, ray_origins: ArrayLike, ray_directions: ArrayLike) -> np.ndarray:
         """Find the face that each ray hits first; of several at the same distance, the lowest. (N,) int32, -1 on a miss."""
         origins, directions = _rays(ray_origins, ray_directions)
-        out = np.full(len(origins), -1, np.int32)
-        ray, face, _, _ = self._placed.first_hit(origins, directions)
-        out[ray] = face
-        return out
+        return self._placed.first_face(origins, directions)
 
     def intersects_any(self, ray_origins: ArrayLike, ray_directions: ArrayLike) -> np.ndarray:
         """Test whether each ray hits anything: (N,) bool."""
@@ -155,9 +153,14 @@ class _Placed:
         self.exponent = -int(np.frexp(half)[1]) if scale_to_box else 0
         vertices[unused] = self.low
         self.accel = build(Mesh(self.moved(vertices), faces), device=device, threads=threads)
-        self.threads = threads
+        self.threads, self.vertices, self.faces = threads, vertices, faces
         box = self.moved(np.stack([self.low, self.high]))
-        self.center, self.radius = box.mean(axis=0), float(np.linalg.norm(box[1] - box[0])) / 2
+        center, radius = box.mean(axis=0), float(np.linalg.norm(box[1] - box[0])) / 2
+        self.placement: WarpStruct = Placement()
+        self.placement.shift, self.placement.center = wp.vec3d(*self.shift), wp.vec3d(*center)
+        half_way = self.exponent // 2
+        self.placement.scale, self.placement.scale_again = 2.0**half_way, 2.0**(self.exponent - half_way)
+        self.placement.radius, self.placement.near = radius, AWAY * radius
 
     @property
     def closed(self) -> bool:
@@ -167,26 +170,15 @@ class _Placed:
         return np.ldexp(points - self.shift, self.exponent)
 
     def asked(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray | None, np.ndarray, np.ndarray]:
-        """Return the rows of the rays that can hit something (None: all), and these rays for the structure.
-
-        Far origins are moved to the mesh along their rays in float64, because rounding would displace them.
-        """
-        with np.errstate(all="ignore"):
-            origins = self.moved(origins)
-            longest = np.abs(directions).max(axis=1, initial=0.0)
-            if not (longest.min(initial=1.0) > 2.0**-30 and longest.max(initial=1.0) < 2.0**30):
-                directions = np.ldexp(directions, -np.frexp(longest)[1][:, None])
-            to_center = self.center - origins
-            far = np.flatnonzero(np.einsum("ij,ij->i", to_center, to_center) > (AWAY * self.radius) ** 2)
-            if len(far):
-                unit = directions[far] / np.linalg.norm(directions[far], axis=1)[:, None]
-                ahead = np.einsum("ij,ij->i", to_center[far], unit) - 2.0 * self.radius
-                origins[far] += unit * np.maximum(ahead, 0.0)[:, None]
-            good = (np.abs(origins).max(axis=1, initial=0.0) <= FARTHEST) & (longest > 0.0) & (longest < np.inf)  # False for NaN
-        if good.all():
-            return None, origins.astype(np.float32), directions.astype(np.float32)
-        rows = np.flatnonzero(good)
-        return rows, origins[rows].astype(np.float32), directions[rows].astype(np.float32)
+        """Return the rows of the rays that can hit something (None: all), and these rays for the structure."""
+        placed_origins, placed_directions = np.empty((2, *origins.shape), np.float32)
+        valid = np.empty(len(origins), bool)
+        arrays = origins, directions, placed_origins, placed_directions, valid
+        PLACE_RAYS.launch(len(origins), record_of(self.placement), struct_record(PlacedRays, arrays), threads=thread_count(self.threads))
+        if valid.all():
+            return None, placed_origins, placed_directions
+        rows = np.flatnonzero(valid)
+        return rows, placed_origins[rows], placed_directions[rows]
 
     def first_hit(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return ray, face, u and v of each hit."""
@@ -195,6 +187,12 @@ class _Placed:
         hit = np.flatnonzero(hits.prim_id >= 0)
         return _of(rows, hit), hits.prim_id[hit].astype(np.int64), hits.u[hit], hits.v[hit]
 
+    def first_face(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Return the face of each ray's first hit, (N,) int32; -1 on a miss."""
+        n = len(origins)
+        rows, origins, directions = self.asked(origins, directions)
+        return _spread(rows, self.accel.closest_hit(origins, directions, threads=self.threads).prim_id, n, -1)
+
     def every_hit(self, origins: np.ndarray, directions: np.ndarray, limit: int) -> tuple[np.ndarray, ...]:
         """Return the same for all hits, at most `limit` of a ray, ray by ray in order of distance."""
         rows, origins, directions = self.asked(origins, directions)
@@ -202,10 +200,16 @@ class _Placed:
         return _of(rows, ray), face.astype(np.int64), u, v
 
     def any_hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        out = np.zeros(len(origins), bool)
+        n = len(origins)
         rows, origins, directions = self.asked(origins, directions)
-        out[slice(None) if rows is None else rows] = self.accel.any_hit(origins, directions, threads=self.threads)
-        return out
+        return _spread(rows, self.accel.any_hit(origins, directions, threads=self.threads), n, False)
+
+    def located(self, origins: np.ndarray, directions: np.ndarray, *hits: np.ndarray) -> np.ndarray:
+        """Return the points (M, 3) float64 of hits: ray and face (M,) int64, u and v (M,) float32."""
+        points = np.empty((len(hits[0]), 3))
+        arrays = origins, directions, self.vertices, self.faces, *map(np.ascontiguousarray, hits), points
+        LOCATE_HITS.launch(len(points), struct_record(HitPoints64, arrays), threads=thread_count(self.threads))
+        return points
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         out = ((points >= self.low) & (points <= self.high)).all(axis=1)
@@ -213,29 +217,33 @@ class _Placed:
         return out
 
 
-def located(corners: np.ndarray, origins: np.ndarray, directions: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Return the points where rays hit triangles (M, 3, 3), in float64 (Moeller, Trumbore 1997).
-
-    u, v: from float32, for rays that miss in float64.
-    """
-    a = corners[:, 0]
-    e, f, s = corners[:, 1] - a, corners[:, 2] - a, origins - a
-    with np.errstate(all="ignore"):
-        p, q = np.cross(directions, f), np.cross(s, e)
-        det = np.einsum("ij,ij->i", e, p)
-        x, y = np.einsum("ij,ij->i", s, p) / det, np.einsum("ij,ij->i", directions, q) / det
-        on = (x >= 0.0) & (y >= 0.0) & (x + y <= 1.0)  # False for NaN
-    return a + np.where(on, x, u)[:, None] * e + np.where(on, y, v)[:, None] * f
-
-
 def _rays(origins: ArrayLike, directions: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     named = {"ray_origins": origins, "ray_directions": directions}
     out = [np.asarray(real_numbers(rays, name, "(N, 3)"), np.float64) for name, rays in named.items()]
-    origins, directions = (rays.reshape(0, 3) if rays.shape == (0,) else rays for rays in out)
+    origins, directions = (np.ascontiguousarray(rays.reshape(0, 3) if rays.shape == (0,) else rays) for rays in out)
     if origins.ndim != 2 or origins.shape[1] != 3 or origins.shape != directions.shape:
         raise InputError(f"and ray_directions must be (N, 3) both, got {origins.shape} and {directions.shape}",
                          argument="ray_origins")
     return origins, directions
+
+
+def _in_rounds(ray: np.ndarray) -> np.ndarray:
+    """Return the order of hits, given ray by ray, that has all first hits of the rays, then all second ones, and so on."""
+    begins = np.flatnonzero(np.diff(ray, prepend=-1))
+    counts = np.diff(begins, append=len(ray))
+    number = np.arange(len(ray)) - np.repeat(begins, counts)  # of a hit among those of its ray
+    if counts.max(initial=0) <= 1 << 16:
+        number = number.astype(np.uint16)  # NumPy sorts short integers in linear time
+    return np.argsort(number, kind="stable")
+
+
+def _spread(rows: np.ndarray | None, found: np.ndarray, n: int, missing: object) -> np.ndarray:
+    """Return the answers of n rays: those of `rows` (None: of all), and `missing` for the others."""
+    if rows is None:
+        return found
+    out = np.full(n, missing, found.dtype)
+    out[rows] = found
+    return out
 
 
 def _of(rows: np.ndarray | None, ray: np.ndarray) -> np.ndarray:

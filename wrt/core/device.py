@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import wait
 from contextlib import contextmanager
-from functools import partial, wraps
+from functools import cache, partial, wraps
 from math import prod
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -276,6 +276,12 @@ def record_dtype(struct: WarpType) -> np.dtype:
     `upload` and `on_host` do not.
     """
     return np.dtype(struct.numpy_dtype())
+
+
+@cache
+def row_type(kind: WarpType) -> np.dtype:
+    """Return the NumPy type of a row of a Warp type: a struct, a vector or a number."""
+    return record_dtype(kind) if hasattr(kind, "numpy_dtype") else warp_private.row_type(kind)
 
 
 def records(struct: WarpType, count: int) -> np.ndarray:

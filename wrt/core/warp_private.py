@@ -54,13 +54,16 @@ def array_record(array: np.ndarray) -> Record:
     return array_t(array.ctypes.data, ndim=1, shape=array.shape, strides=array.strides)
 
 
-def struct_record(struct: WarpType, arrays: Iterable[np.ndarray]) -> Record:
-    """Return a kernel argument of type `struct` whose first fields are these one-dimensional arrays.
+def struct_record(struct: WarpType, fields: Iterable[object]) -> Record:
+    """Return a kernel argument of type `struct` with these first fields: numbers, one-dimensional arrays, or None for an empty one.
 
-    The caller keeps their memory alive."""
+    The caller keeps the memory of arrays alive."""
     out: Record = struct.ctype()
-    for name, array in zip(struct.vars, arrays, strict=False):
-        setattr(out, name, array_record(array))
+    for name, value in zip(struct.vars, fields, strict=False):
+        if isinstance(value, np.ndarray):
+            setattr(out, name, array_record(value))
+        elif value is not None:
+            setattr(out, name, record_of(value) if isinstance(value, wp.array) else value)
     return out
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
-from typing import Any, Generic, overload
+from typing import Any, Generic, NamedTuple, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -13,23 +12,24 @@ import warp as wp
 
 from wrt.accel.queries.accelerator import Accelerator, snapshot_of
 from wrt.accel.queries.answers import Hits
-from wrt.accel.queries.batches import RAYS_PER_LAUNCH
 from wrt.accel.queries.hit_points import surroundings
-from wrt.accel.queries.rays import rays_of, rays_on
+from wrt.accel.queries.raw_kernel import RawKernel, memory_of
+from wrt.accel.queries.rays import Rays, arrays_on, host_arrays, rays_of
 from wrt.accel.structure import Structure
 from wrt.core.arrays import returned, to_numpy, to_warp
 from wrt.core.checks import as_integer, as_one
-from wrt.core.device import MOST_ROWS, launch_on, made_once, upload
+from wrt.core.device import MOST_ROWS, made_once, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
-from wrt.core.types import Array, ArrayLike, ArrayT, Kernel, NumpyLike, TensorT, WarpArray, WarpStruct
+from wrt.core.types import Array, ArrayLike, ArrayT, NumpyLike, TensorT, WarpArray, WarpType
 from wrt.kernels.hit_lists import FEW, HitLists, copy_hits, list_hit, make_list_hits_kernel
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import Hit
-from wrt.kernels.warp_private import fields_of
 
 ALL = (1 << 30) - 1
 RAYS_AT_ONCE = 1 << 18  # whose lists of the first walk take 32 MiB
+HIT_KINDS = wp.float32, wp.float32, wp.float32, wp.int32  # of HitArrays
+COPY_HITS = RawKernel(copy_hits, RayArrays(), HitLists(), None, HitArrays())
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,26 +72,38 @@ class AllHits(Generic[ArrayT]):
         return f"AllHits({len(self)} rays, {int(self.first[-1])} hits)"
 
 
+class _Lists(NamedTuple):
+    """Fields of HitLists."""
+
+    limit: int
+    crossings: bool
+    vertices: WarpArray | None
+    faces: WarpArray | None
+    first: Array
+    counts: Array
+    rows: Array
+
+
 class ListQuery:
     """A structure in its present state and rays: `of` sets the rays; `all`, `first` and `counts` answer."""
 
     n = 0
-    rays: RayArrays
-    give: Any = to_numpy  # converts Warp arrays to those of the caller's library
+    rays: Rays
+    give: Any = to_numpy  # converts arrays to those of the caller's library
 
     def __init__(self, accel: Accelerator, threads: int | None, crossings: bool = False) -> None:
         self.snapshot = snapshot_of(accel)
         self.threads, self.device = thread_count(threads), self.snapshot.device
-        self.lists: WarpStruct = HitLists()
-        self.lists.crossings = as_one(crossings, bool, "crossings")
+        self.memory: Any = memory_of(self.device)
+        self.crossings, self.mesh = as_one(crossings, bool, "crossings"), (None, None)
         if crossings:
             surfaces = surroundings(self.snapshot).surfaces
-            self.lists.vertices, self.lists.faces = surfaces.vertices, surfaces.faces
+            self.mesh = surfaces.vertices, surfaces.faces
 
     def of(self, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf) -> ListQuery:
         """Set the rays. Raises InputError that names the argument."""
         rays = rays_of(origins, directions, t_min, t_max)
-        self.n, self.rays = len(rays.origins), rays_on(self.device, rays)
+        self.n, self.rays = len(rays.origins), host_arrays(rays) if self.device.is_cpu else arrays_on(self.device, rays)
         self.give = returned(origins, directions) or to_numpy
         return self
 
@@ -99,26 +111,26 @@ class ListQuery:
         """Find the first `limit` hits of each ray."""
         counts, parts = [np.zeros(0, np.int64)], []
         for rays, lists, of_each in self._listed(limit):
-            begin = np.concatenate([[0], np.cumsum(of_each)])
-            parts.append(self._arrays(begin[-1]))
+            first = _begins(of_each)
+            parts.append([self.memory.empty(rows_of(first[-1]), kind) for kind in HIT_KINDS])
             counts.append(of_each)
-            self._copy(rays, lists, begin, parts[-1])
-        first = np.concatenate([[0], np.cumsum(np.concatenate(counts))])
-        hits = parts[0] if len(parts) == 1 else self._joined(parts)
-        return AllHits(self.given(first), *map(self.give, (hits.t, hits.u, hits.v, hits.prim_id)))
+            self._copy(rays, lists, first, parts[-1])
+        if len(parts) == 1:
+            return AllHits(self.given(first), *map(self.give, parts[0]))
+        first = _begins(np.concatenate(counts))
+        hits = [self._joined(kind, arrays) for kind, *arrays in zip(HIT_KINDS, *parts, strict=True)]
+        return AllHits(self.given(first), *map(self.give, hits))
 
     def first(self, k: int) -> Hits[Any]:
         """Find the first k hits of each ray, in arrays (N, k)."""
-        hits = self._arrays(self.n * k)
-        hits.t.fill_(np.inf)
-        hits.u.zero_()
-        hits.v.zero_()
-        hits.prim_id.fill_(-1)
+        rows_of(self.n * k)
+        hits = [self.memory.array(np.full(self.n * k, missing), kind)
+                for missing, kind in zip((np.inf, 0.0, 0.0, -1), HIT_KINDS, strict=True)]
         begin = np.arange(0, self.n * k, k, dtype=np.int64)
         for rays, lists, of_each in self._listed(k):
             self._copy(rays, lists, begin[:len(of_each)], hits)
             begin = begin[len(of_each):]
-        return Hits(*(self.give(array.reshape((self.n, k))) for array in (hits.t, hits.u, hits.v, hits.prim_id)))
+        return Hits(*(self.give(array.reshape((self.n, k))) for array in hits))
 
     def counts(self) -> np.ndarray:
         """Count the hits of each ray, (N,) int64. If no triangle is in several leaves, the first walk has the counts."""
@@ -129,59 +141,52 @@ class ListQuery:
         """Return int64 numbers as an array of the caller's library."""
         return numbers if self.give is to_numpy else self.give(upload(numbers, wp.int64, self.device))
 
-    def _listed(self, limit: int, counting: bool = False) -> Iterator[tuple[Any, list[Any], np.ndarray]]:
+    def _listed(self, limit: int, counting: bool = False) -> Iterator[tuple[object, list[_Lists], np.ndarray]]:
         """Yield parts of the rays with their lists of hits, and the number of hits of each ray, at most `limit`.
 
         A ray has its hits in one of the lists. counting: the numbers are complete, the lists may not be.
         """
         limit = min(limit, ALL)
         for begin in range(0, self.n, RAYS_AT_ONCE):
-            n, rays = min(RAYS_AT_ONCE, self.n - begin), self.rays
-            if n < self.n:
-                rays = RayArrays()
-                for name in fields_of(RayArrays):
-                    setattr(rays, name, getattr(self.rays, name)[begin:begin + n])
-            lists = [self._filled(rays, np.full(n, FEW), limit)]
-            counts = lists[0].count.numpy().astype(np.int64)
-            many = counts > FEW
-            if many.any() and not counting:
-                lists[0].count = upload(np.where(many, 0, counts), wp.int32, self.device)
-                lists.append(self._filled(rays, np.where(many, np.minimum(counts, 2 * limit), 0), limit))
-                counts = np.where(many, lists[1].count.numpy(), counts)
+            n = min(RAYS_AT_ONCE, self.n - begin)
+            rays = self.memory.struct(RayArrays, *(array[begin:begin + n] for array in self.rays))
+            few = self._filled(rays, FEW * np.arange(n + 1), limit)
+            lists, counts = [few], self.memory.numpy(few.counts).astype(np.int64)
+            if counts.max() > FEW and not counting:
+                many = counts > FEW
+                lists[0] = few._replace(counts=self.memory.array(np.where(many, 0, counts), wp.int32))
+                lists.append(self._filled(rays, _begins(np.where(many, np.minimum(counts, 2 * limit), 0)), limit))
+                counts = np.where(many, self.memory.numpy(lists[1].counts), counts)
             yield rays, lists, counts
 
-    def _filled(self, rays: RayArrays, room: np.ndarray, limit: int) -> WarpStruct:
-        """Walk, and return HitLists with space for `room` hits of each ray."""
-        lists: WarpStruct = HitLists()
-        lists.limit, lists.crossings = limit, self.lists.crossings
-        lists.vertices, lists.faces = self.lists.vertices, self.lists.faces
-        first = np.concatenate([[0], np.cumsum(room)])
-        lists.rows = wp.empty(rows_of(first[-1]), dtype=Hit, device=self.device)
-        lists.first = upload(first, wp.int32, self.device)
-        lists.count = wp.zeros(len(room), dtype=wp.int32, device=self.device)
-        self._launch(list_hits_kernel(self.snapshot.structure), len(room), self.snapshot.data, rays, lists)
+    def _filled(self, rays: object, first: np.ndarray, limit: int) -> _Lists:
+        """Walk, and return the lists; that of ray i begins at row first[i] of them."""
+        rows, n = rows_of(first[-1]), len(first) - 1
+        lists = _Lists(limit, self.crossings, *self.mesh, self.memory.array(first, wp.int32),
+                       self.memory.array(np.zeros(n, np.int32), wp.int32), self.memory.empty(rows, Hit))
+        self.memory.launch(list_hits(self.snapshot.structure), n, self.snapshot.data, rays, self.memory.struct(HitLists, *lists),
+                           threads=self.threads)
         return lists
 
-    def _copy(self, rays: RayArrays, lists: list[WarpStruct], begin: np.ndarray, hits: WarpStruct) -> None:
+    def _copy(self, rays: object, lists: list[_Lists], begin: np.ndarray, hits: list[Array]) -> None:
         for each in lists:
-            self._launch(copy_hits, len(rays.origin), rays, each, upload(begin, wp.int32, self.device), hits)
+            self.memory.launch(COPY_HITS, len(each.counts), rays, self.memory.struct(HitLists, *each),
+                               self.memory.array(begin, wp.int32), self.memory.struct(HitArrays, *hits), threads=self.threads)
 
-    def _arrays(self, n: int) -> WarpStruct:
-        empty = partial(wp.empty, rows_of(n), device=self.device)
-        hits: WarpStruct = HitArrays()
-        hits.t, hits.u, hits.v, hits.prim_id = *(empty(dtype=wp.float32) for _ in range(3)), empty(dtype=wp.int32)
-        return hits
-
-    def _joined(self, parts: list[WarpStruct]) -> WarpStruct:
-        out, at = self._arrays(sum(len(part.t) for part in parts)), 0
+    def _joined(self, kind: WarpType, parts: list[Any]) -> Array:
+        out = self.memory.empty(rows_of(sum(map(len, parts))), kind)
+        at = 0
         for part in parts:
-            for name in fields_of(HitArrays):
-                wp.copy(getattr(out, name), getattr(part, name), dest_offset=at, count=len(part.t))
-            at += len(part.t)
+            out[at:at + len(part)] = part
+            at += len(part)
         return out
 
-    def _launch(self, kernel: Kernel, n: int, *inputs: object) -> None:
-        launch_on(self.device, kernel, n, *inputs, None, threads=self.threads, step=RAYS_PER_LAUNCH)
+
+def _begins(counts: np.ndarray) -> np.ndarray:
+    """Return where each of N lists of these lengths begins, and the end of the last, (N + 1,) int64."""
+    out = np.zeros(len(counts) + 1, np.int64)
+    np.cumsum(counts, out=out[1:])
+    return out
 
 
 def rows_of(hits: int) -> int:
@@ -192,9 +197,10 @@ def rows_of(hits: int) -> int:
 
 
 @made_once
-def list_hits_kernel(structure: Structure) -> Kernel:
+def list_hits(structure: Structure) -> RawKernel:
     listing = structure._replace(units=structure.units._replace(lists=True))
-    return make_list_hits_kernel(structure.struct, listing.traversal(any_hit=False, accepts=list_hit))
+    kernel = make_list_hits_kernel(structure.struct, listing.traversal(any_hit=False, accepts=list_hit))
+    return RawKernel(kernel, structure.struct(), RayArrays(), HitLists())
 
 
 @overload

@@ -74,13 +74,25 @@ def rays_of(origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike, t_max: 
 def rays_on(device: Device, rays: Rays) -> RayArrays:
     """Check the rays and return them as Warp arrays on a device."""
     out = RayArrays()
-    for name, array, dtype in zip(fields_of(RayArrays), rays.checked().on(device), (wp.vec3, wp.vec3, wp.float32, wp.float32),
-                                  strict=True):
+    for name, array in zip(fields_of(RayArrays), arrays_on(device, rays), strict=True):
+        setattr(out, name, array)
+    return out
+
+
+def arrays_on(device: Device, rays: Rays) -> Rays:
+    """Check the rays and return them as Warp arrays on a device."""
+    out = []
+    for array, dtype in zip(rays.checked().on(device), (wp.vec3, wp.vec3, wp.float32, wp.float32), strict=True):
         if not isinstance(array, wp.array):
             one = len(array) > 0 and array.strides == (0,)
             array = one_for_all(float(array[0]), len(array), device) if one else upload(array, dtype, device)
-        setattr(out, name, array)
-    return out
+        out.append(array)
+    return Rays(*out)
+
+
+def host_arrays(rays: Rays) -> Rays:
+    """Check the rays and return them as NumPy arrays of float32 without gaps, a stride of 0 meaning one number for all rays."""
+    return Rays(*map(np.asarray, rays.on(wp.get_device("cpu")).checked()))
 
 
 def one_for_all(value: float, n: int, device: Device) -> WarpArray:

@@ -1,0 +1,118 @@
+"""Rays in float64 for a structure in float32: moved and scaled with the mesh; and the points that they hit, in float64."""
+
+import warp as wp
+
+from wrt.kernels.query import FARTHEST
+from wrt.kernels.structs import kernel
+
+vec3l = wp.types.vector(3, wp.int64)
+# A direction whose largest component is within these limits is used as it is; others are multiplied by STEP or 1 / STEP.
+SMALLEST, LARGEST, STEP = 2.0**-30, 2.0**30, 2.0**60
+
+
+@wp.struct
+class Placement:
+    """Place of a structure: its point p is (q - shift) * scale * scale_again, where q is the point in the caller's units.
+
+    The scale is a power of two, in two factors, because one could be beyond float64.
+    """
+
+    shift: wp.vec3d
+    scale: wp.float64
+    scale_again: wp.float64
+    center: wp.vec3d  # of the structure's box, in its own units
+    radius: wp.float64  # half of the box's diagonal
+    near: wp.float64  # origins farther than this from the center move towards it
+
+
+@wp.struct
+class PlacedRays:
+    """Rays of a caller, and the same rays for a structure, by ray."""
+
+    origins: wp.array(dtype=wp.vec3d)
+    directions: wp.array(dtype=wp.vec3d)
+    placed_origins: wp.array(dtype=wp.vec3)
+    placed_directions: wp.array(dtype=wp.vec3)
+    valid: wp.array(dtype=wp.bool)  # False: not finite, too far away, or without direction
+
+
+@wp.struct
+class HitPoints64:
+    """Hits of rays in float64, by hit, and their points."""
+
+    origins: wp.array(dtype=wp.vec3d)  # By ray, as directions.
+    directions: wp.array(dtype=wp.vec3d)
+    vertices: wp.array(dtype=wp.vec3d)
+    faces: wp.array(dtype=vec3l)
+    ray: wp.array(dtype=wp.int64)
+    face: wp.array(dtype=wp.int64)
+    u: wp.array(dtype=wp.float32)
+    v: wp.array(dtype=wp.float32)
+    point: wp.array(dtype=wp.vec3d)
+
+
+@wp.func
+def longest_component(direction: wp.vec3d) -> wp.float64:
+    """Return the largest absolute component; NaN components do not count."""
+    return wp.max(wp.abs(direction[0]), wp.max(wp.abs(direction[1]), wp.abs(direction[2])))
+
+
+@wp.func
+def scaled_near_one(direction: wp.vec3d) -> wp.vec3d:
+    """Scale a direction by a power of two until its largest component is between 2^-30 and 2^30. 0, infinite and NaN stay."""
+    scaled = wp.vec3d(direction)
+    longest = longest_component(scaled)
+    while longest >= wp.float64(LARGEST) and longest < wp.float64(wp.inf):
+        scaled = scaled * wp.float64(wp.static(1.0 / STEP))
+        longest = longest_component(scaled)
+    while longest <= wp.float64(SMALLEST) and longest > wp.float64(0.0):
+        scaled = scaled * wp.float64(STEP)
+        longest = longest_component(scaled)
+    return scaled
+
+
+@kernel
+def place_rays(placement: Placement, rays: PlacedRays, first: int):
+    """Move and scale rays to the place of a structure, and round them to float32.
+
+    A far origin first moves along its ray in float64 to two radii before the structure's center, because rounding would displace it.
+    """
+    i = first + wp.tid()
+    origin = (rays.origins[i] - placement.shift) * placement.scale * placement.scale_again
+    direction = scaled_near_one(rays.directions[i])
+    to_center = placement.center - origin
+    if wp.dot(to_center, to_center) > placement.near * placement.near:
+        unit = direction / wp.length(direction)
+        ahead = wp.dot(to_center, unit) - wp.float64(2.0) * placement.radius
+        if ahead > wp.float64(0.0):
+            origin += unit * ahead
+    longest = longest_component(direction)
+    finite = wp.dot(direction, direction) == wp.dot(direction, direction) and wp.dot(origin, origin) == wp.dot(origin, origin)
+    rays.valid[i] = (finite and longest > wp.float64(0.0) and longest < wp.float64(wp.inf)
+                     and longest_component(origin) <= wp.float64(FARTHEST))
+    rays.placed_origins[i] = wp.vec3(origin)
+    rays.placed_directions[i] = wp.vec3(direction)
+
+
+@kernel
+def locate_hits(hits: HitPoints64, first: int):
+    """Compute where rays hit the planes of their triangles, in float64 (Moeller, Trumbore 1997).
+
+    A ray that misses its triangle in float64 has the point at the u and v from float32.
+    """
+    i = first + wp.tid()
+    ray = hits.ray[i]
+    face = hits.faces[hits.face[i]]
+    corner = hits.vertices[face[0]]
+    e = hits.vertices[face[1]] - corner
+    f = hits.vertices[face[2]] - corner
+    s = hits.origins[ray] - corner
+    p = wp.cross(hits.directions[ray], f)
+    q = wp.cross(s, e)
+    det = wp.dot(e, p)
+    u = wp.dot(s, p) / det
+    v = wp.dot(hits.directions[ray], q) / det
+    if not (u >= wp.float64(0.0) and v >= wp.float64(0.0) and u + v <= wp.float64(1.0)):  # also for NaN
+        u = wp.float64(hits.u[i])
+        v = wp.float64(hits.v[i])
+    hits.point[i] = corner + e * u + f * v

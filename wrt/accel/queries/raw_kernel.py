@@ -1,0 +1,112 @@
+"""Kernels of queries, and the memory that they work on: on the CPU without Warp's arrays and launches.
+
+For a few rays these take longer than the kernel: a Warp array 5 us and a launch 20, where a record by hand takes 1 and a launch 5.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import warp as wp
+
+from wrt.accel.queries.raw_launches import check_raw_launches
+from wrt.core.device import launch_on, load_kernel, row_type, upload
+from wrt.core.threads import run_all
+from wrt.core.types import Device, Kernel, WarpArray, WarpType
+from wrt.core.warp_private import array_record, record_of, struct_record
+from wrt.kernels.warp_private import fields_of
+
+STEP = 16384  # elements of a launch: some milliseconds of work, so that Ctrl-C is answered soon
+
+
+class RawKernel:
+    """A kernel whose last argument is the index of a range's first element. Several threads may launch it at a time.
+
+    Parameters
+    ----------
+    kernel
+        Kernel for one element.
+    *inputs
+        A value of the type of each argument but the last.
+    """
+
+    def __init__(self, kernel: Kernel, *inputs: object) -> None:
+        self.kernel, self.inputs = kernel, inputs
+        self._free: list[wp.Launch] = []  # recorded launches that no thread uses now
+
+    def launch(self, n: int, *inputs: object, threads: int = 1) -> None:
+        """Run the kernel on the CPU over n elements: NumPy arrays, records and Warp structs in. The caller keeps their memory."""
+        load_kernel(self.kernel, wp.get_device("cpu"))
+        records = [array_record(each) if isinstance(each, np.ndarray) else record_of(each) if hasattr(each, "__ctype__") else each
+                   for each in inputs]
+        run_all([partial(self._launch_range, first, min(first + STEP, n), records) for first in range(0, n, STEP)], threads)
+
+    def _launch_range(self, first: int, end: int, records: list[object]) -> None:
+        try:
+            command = self._free.pop()
+        except IndexError:
+            check_raw_launches()
+            command = wp.launch(self.kernel, dim=1, inputs=[*self.inputs, 0], device="cpu", record_cmd=True, record_tape=False)
+        for i, record in enumerate((*records, first)):
+            command.set_param_at_index_from_ctype(i, record)
+        command.set_dim(end - first)
+        command.launch()
+        self._free.append(command)  # not after an error
+
+
+class HostMemory:
+    """Memory of kernels on the CPU: NumPy arrays."""
+
+    def empty(self, n: int, kind: WarpType) -> np.ndarray:
+        """Return an array of n rows of a Warp type."""
+        rows = row_type(kind)
+        return np.empty((n, *rows.shape), rows.base)
+
+    def array(self, values: np.ndarray, kind: WarpType) -> np.ndarray:
+        """Return values as an array of a Warp type."""
+        return np.ascontiguousarray(values, row_type(kind).base)
+
+    def numpy(self, array: np.ndarray) -> np.ndarray:
+        """Return an array's values."""
+        return array
+
+    def struct(self, kind: WarpType, *fields: object) -> object:
+        """Return an argument of a struct's type; None is a field that the kernel does not read."""
+        return struct_record(kind, fields)
+
+    def launch(self, kernel: RawKernel, n: int, *inputs: object, threads: int) -> None:
+        """Run a kernel over n elements."""
+        kernel.launch(n, *inputs, threads=threads)
+
+
+class GpuMemory:
+    """Memory of kernels on a GPU: Warp arrays. Methods as those of `HostMemory`."""
+
+    def __init__(self, device: Device) -> None:
+        self.device = device
+
+    def empty(self, n: int, kind: WarpType) -> WarpArray:
+        return wp.empty(n, dtype=kind, device=self.device)
+
+    def array(self, values: np.ndarray, kind: WarpType) -> WarpArray:
+        return upload(values, kind, self.device)
+
+    def numpy(self, array: WarpArray) -> np.ndarray:
+        return np.asarray(array.numpy())
+
+    def struct(self, kind: WarpType, *fields: object) -> object:
+        out = kind()
+        for name, value in zip(fields_of(kind), fields, strict=False):
+            if value is not None:
+                setattr(out, name, value)
+        return out
+
+    def launch(self, kernel: RawKernel, n: int, *inputs: object, threads: int) -> None:
+        launch_on(self.device, kernel.kernel, n, *inputs, None)
+
+
+def memory_of(device: Device) -> HostMemory | GpuMemory:
+    """Return the memory of kernels on a device."""
+    return GpuMemory(device) if device.is_cuda else HostMemory()
+
