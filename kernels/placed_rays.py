@@ -1,9 +1,9 @@
-"""Rays in float64 for a structure in float32: moved and scaled with the mesh; and the points that they hit, in float64."""
+"""Rays as other libraries have them: in float64, moved and scaled with a mesh, and the points that they hit; or in rows of six."""
 
 import warp as wp
 
 from wrt.kernels.query import FARTHEST
-from wrt.kernels.structs import kernel
+from wrt.kernels.structs import kernel, largest
 
 vec3l = wp.types.vector(3, wp.int64)
 # A direction whose largest component is within these limits is used as it is; others are multiplied by STEP or 1 / STEP.
@@ -51,6 +51,19 @@ class HitPoints64:
     point: wp.array(dtype=wp.vec3d)
 
 
+SPLIT_MISS, SPLIT_VALID, SPLIT_FAR = wp.constant(0), wp.constant(1), wp.constant(2)
+
+
+@wp.struct
+class SplitRays:
+    """Rays in rows of origin and direction, and the same in two arrays, by ray."""
+
+    rays: wp.array(dtype=wp.spatial_vector)
+    origins: wp.array(dtype=wp.vec3)
+    directions: wp.array(dtype=wp.vec3)
+    kind: wp.array(dtype=wp.int8)  # SPLIT_MISS: not finite, or without direction; SPLIT_FAR: beyond FARTHEST; else SPLIT_VALID
+
+
 @wp.func
 def longest_component(direction: wp.vec3d) -> wp.float64:
     """Return the largest absolute component; NaN components do not count."""
@@ -92,6 +105,24 @@ def place_rays(placement: Placement, rays: PlacedRays, first: int):
                      and longest_component(origin) <= wp.float64(FARTHEST))
     rays.placed_origins[i] = wp.vec3(origin)
     rays.placed_directions[i] = wp.vec3(direction)
+
+
+@kernel
+def split_rays(rays: SplitRays, first: int):
+    """Split rows of six numbers into origins and directions."""
+    i = first + wp.tid()
+    row = rays.rays[i]
+    origin = wp.vec3(row[0], row[1], row[2])
+    direction = wp.vec3(row[3], row[4], row[5])
+    rays.origins[i] = origin
+    rays.directions[i] = direction
+    kind = SPLIT_MISS
+    if wp.isfinite(origin) and wp.isfinite(direction):
+        if largest(origin) > FARTHEST:
+            kind = SPLIT_FAR
+        elif largest(direction) > 0.0:
+            kind = SPLIT_VALID
+    rays.kind[i] = wp.int8(kind)
 
 
 @kernel

@@ -17,18 +17,23 @@ from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.all_hits import ListQuery
 from wrt.accel.queries.closest_points import closest_points
 from wrt.accel.queries.contains import odd_crossings
+from wrt.accel.queries.raw_kernel import RawKernel
 from wrt.accel.queries.rays import vectors
 from wrt.accel.scenes.build import build
 from wrt.compat.surfaces import every_hit
 from wrt.core.arrays import float32, real_numbers
 from wrt.core.checks import as_integer, shown
 from wrt.core.errors import InputError
+from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike
+from wrt.core.warp_private import struct_record
+from wrt.kernels.placed_rays import SPLIT_FAR, SPLIT_VALID, SplitRays, split_rays
 from wrt.kernels.query import FARTHEST
 from wrt.scene.values import LARGEST, as_number
 
 MOST_SAMPLES = 1 << 16
 WIDEST = 1 << 15  # pixels
+SPLIT_RAYS = RawKernel(split_rays, SplitRays())
 
 
 class Array(np.ndarray):
@@ -114,7 +119,7 @@ class RaycastingScene:
             and primitive_normals (..., 3), 0 on a miss.
         """
         accel, _, normals = self._scene()
-        shape, good, origins, directions = _asked_rays(rays)
+        shape, good, origins, directions = _asked_rays(rays, nthreads)
         hits = accel.closest_hit(origins, directions, threads=_threads(nthreads))
         geometry_ids, primitive_ids = self._ids(hits.prim_id)
         found = {"t_hit": hits.t, "geometry_ids": geometry_ids, "primitive_ids": primitive_ids,
@@ -130,13 +135,13 @@ class RaycastingScene:
             Segment in units of the direction's length.
         """
         accel = self._scene()[0]
-        shape, good, origins, directions = _asked_rays(rays)
+        shape, good, origins, directions = _asked_rays(rays, nthreads)
         found = accel.any_hit(origins, directions, tnear, tfar, threads=_threads(nthreads))
         return _answer(_spread(found, good, False), shape)
 
     def count_intersections(self, rays: ArrayLike, nthreads: int = 0) -> Answer:
         """Count the surfaces that each ray crosses; one that it meets at an edge or a corner counts once. (...) int32."""
-        shape, good, origins, directions = _asked_rays(rays)
+        shape, good, origins, directions = _asked_rays(rays, nthreads)
         ray, *_ = every_hit(self._scene()[0], origins, directions, _threads(nthreads))
         return _answer(_spread(np.bincount(ray, minlength=len(origins)).astype(np.int32), good, 0), shape)
 
@@ -149,7 +154,7 @@ class RaycastingScene:
             ray_splits (N + 1,): ray i has the rows ray_splits[i] to ray_splits[i + 1]; ray_ids, geometry_ids, primitive_ids (M,),
             all uint32; t_hit (M,); primitive_uvs (M, 2).
         """
-        shape, good, origins, directions = _asked_rays(rays)
+        shape, good, origins, directions = _asked_rays(rays, nthreads)
         ray, face, t, u, v = every_hit(self._scene()[0], origins, directions, _threads(nthreads))
         rows = ray if good is None else np.flatnonzero(good)[ray]
         splits = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=math.prod(shape)))])
@@ -286,12 +291,18 @@ def _normals(mesh: Geometry) -> np.ndarray:
     return np.concatenate([unit, np.zeros((1, 3))]).astype(np.float32)
 
 
-def _asked_rays(value: Any) -> tuple[tuple[int, ...], np.ndarray | None, np.ndarray, np.ndarray]:
+def _asked_rays(value: Any, nthreads: int) -> tuple[tuple[int, ...], np.ndarray | None, np.ndarray, np.ndarray]:
     """Return the leading shape, the mask of rays that can hit something (None: all), and their origins and directions."""
     shape, rays = _rows(value, "rays", 6)
-    good = _finite(rays, "rays") & rays[:, 3:].any(axis=1)
-    rays = rays if good.all() else rays[good]
-    return shape, None if good.all() else good, rays[:, :3], rays[:, 3:]
+    origins, directions = np.empty((2, len(rays), 3), np.float32)
+    kind = np.empty(len(rays), np.int8)
+    SPLIT_RAYS.launch(len(rays), struct_record(SplitRays, (rays, origins, directions, kind)), threads=thread_count(_threads(nthreads)))
+    if kind.max(initial=0) == SPLIT_FAR:
+        _finite(rays, "rays")
+    if kind.min(initial=1) == SPLIT_VALID:
+        return shape, None, origins, directions
+    good = kind == SPLIT_VALID
+    return shape, good, origins[good], directions[good]
 
 
 def _asked_points(value: Any) -> tuple[tuple[int, ...], np.ndarray | None, np.ndarray]:
@@ -303,7 +314,8 @@ def _asked_points(value: Any) -> tuple[tuple[int, ...], np.ndarray | None, np.nd
 
 def _finite(array: np.ndarray, name: str) -> np.ndarray:
     """Return which rows are finite. Raises InputError for finite points beyond the range of wrt's queries."""
-    good = np.isfinite(array).all(axis=1)
+    finite = np.isfinite(array)
+    good = np.ones(len(array), bool) if finite.all() else finite.all(axis=1)
     vectors(array[:, :3] if good.all() else np.where(good[:, None], array[:, :3], 0.0), name, FARTHEST)
     return good
 
