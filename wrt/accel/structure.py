@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import cache
 from typing import Any, NamedTuple, TypeVar, get_type_hints
 
 from wrt.accel.structures import ACCELERATORS
@@ -30,9 +31,15 @@ class NoOptions:
     """Options of a structure that has none."""
 
 
+@cache
+def _types_of(options: type[Any]) -> dict[str, Any]:
+    """Return the types of the fields of a dataclass."""
+    return get_type_hints(options)
+
+
 def options_of(name: str, options: type[T], given: dict[str, object]) -> T:
     """Make the options of a structure. Raises InputError for unknown options, other types and values out of range."""
-    known, types = {field.name: field for field in fields(options)}, get_type_hints(options)  # type: ignore[arg-type]
+    known, types = {field.name: field for field in fields(options)}, _types_of(options)  # type: ignore[arg-type]
     for option, value in given.items():
         if option not in known:
             names = [*known, "triangle", "box"]

@@ -237,8 +237,10 @@ def upload(array: np.ndarray, dtype: WarpType, device: Device) -> WarpArray:
                          f" on a device can have, 2^31 - 1", hint="a binary tree (bvh2) has the fewest")
     if hasattr(dtype, "numpy_dtype"):  # a struct
         assert array.dtype == record_dtype(dtype)
-        rows = np.ascontiguousarray(array).view(np.uint8)
-        return _view_as(wp.array(rows, dtype=wp.uint8, device=device, copy=not rows.flags.writeable), dtype, array.shape)
+        rows = np.ascontiguousarray(array)
+        if device.is_cpu and rows.flags.writeable:
+            return _array_at(rows.ctypes.data, dtype, rows.shape, device, rows)
+        return _view_as(wp.array(rows.view(np.uint8), dtype=wp.uint8, device=device, copy=True), dtype, array.shape)
     array = np.ascontiguousarray(array, dtype=wp.dtype_to_numpy(warp_private.scalar_type(dtype)))
     # Warp cannot share the memory of a read-only array, such as a scene's.
     return wp.array(array, dtype=dtype, device=device, copy=not array.flags.writeable)
@@ -254,9 +256,13 @@ def on_host(array: WarpArray) -> np.ndarray:
 
 
 def _view_as(array: WarpArray, dtype: WarpType, shape: tuple[int, ...]) -> WarpArray:
-    """Return a Warp array of the same memory, which it keeps alive."""
-    out = wp.array(ptr=array.ptr, dtype=dtype, shape=shape, device=array.device)
-    warp_private.keep(out, array)
+    return _array_at(array.ptr, dtype, shape, array.device, array)
+
+
+def _array_at(address: int, dtype: WarpType, shape: tuple[int, ...], device: Device, owner: object) -> WarpArray:
+    """Return a Warp array of the memory at an address, whose owner it keeps alive."""
+    out = wp.array(ptr=address, dtype=dtype, shape=shape, device=device)
+    warp_private.keep(out, owner)
     return out
 
 

@@ -166,12 +166,22 @@ def _run_all(jobs: list[Callable[[], None]], threads: int) -> None:
         raise errors.pop(min(errors))
 
 
+def _run_in_turn(begin: Callable[[T], tuple[Callable[[], object], Callable[[], Iterable[T]]]], waiting: deque[T]) -> None:
+    while waiting:
+        job, after = begin(waiting.popleft())
+        job()
+        waiting.extend(after())
+
+
 def run_growing(begin: Callable[[T], tuple[Callable[[], object], Callable[[], Iterable[T]]]], tasks: Iterable[T], threads: int) -> None:
     """Run all tasks, and the further tasks that they produce, on `threads` threads.
 
     begin(task) returns the job for a thread, and a function to call after it, which returns more tasks. Both calls run on this
-    thread. The first error is raised when all running jobs have ended.
+    thread; so does the job if there is one thread. The first error is raised when all running jobs have ended.
     """
+    if threads == 1:
+        with_stack(partial(_run_in_turn, begin, deque(tasks)))
+        return
     waiting, running = deque(tasks), dict[Future[object], Callable[[], Iterable[T]]]()
     try:
         while waiting or running:

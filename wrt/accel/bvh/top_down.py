@@ -109,5 +109,5 @@ def run_tasks(kernel: Kernel, data: WarpStruct, settings: WarpStruct, n: int, th
 
     root = records(build_records.BuildTask, 1)
     root["end"], root["parent"], root["limit"] = n, -1, room
-    run_growing(begin, [root], threads)
+    run_growing(begin, [root], threads if n > least else 1)
     return max(depths) + 1
