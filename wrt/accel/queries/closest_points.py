@@ -12,6 +12,8 @@ from wrt.accel.queries.accelerator import Accelerator, snapshot_of
 from wrt.accel.queries.contains import contains
 from wrt.accel.queries.hit_points import surroundings
 from wrt.accel.queries.rays import vectors
+from wrt.accel.queries.winding import winding_number
+from wrt.core.checks import require_known
 from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
@@ -22,6 +24,7 @@ from wrt.kernels.wide.closest_point import PointArrays, make_closest_point_kerne
 from wrt.kernels.wide.traverse import WideTraversal
 
 POINTS_PER_LAUNCH = 4096
+SIGNS = ("crossings", "winding")
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,13 +99,16 @@ def closest_points(accel: Accelerator, points: ArrayLike, threads: int | None = 
     return ClosestPoints(*(getattr(out, name).numpy() for name in fields_of(PointArrays)))
 
 
-def signed_distance(accel: Accelerator, points: ArrayLike, threads: int | None = None) -> np.ndarray:
-    """Compute the distance of each point to a closed mesh, negative inside.
+def signed_distance(accel: Accelerator, points: ArrayLike, threads: int | None = None, *, sign: str = "crossings") -> np.ndarray:
+    """Compute the distance of each point to a mesh, negative inside.
 
     Parameters
     ----------
     accel, points, threads
-        See `closest_points`; the mesh must be closed, as for `contains`.
+        See `closest_points`.
+    sign : str
+        What decides on inside: "crossings" is `contains`, for closed meshes; "winding" is a `winding_number` above 0.5, for open
+        meshes and loose triangles, too.
 
     Returns
     -------
@@ -112,10 +118,11 @@ def signed_distance(accel: Accelerator, points: ArrayLike, threads: int | None =
     Raises
     ------
     InputError
-        For a mesh that is not closed, other structures, and points that are not finite.
+        For other structures, for points that are not finite, and for crossings of a mesh that is not closed.
     """
+    require_known(sign, SIGNS, "rule of signs", "sign")
     accel = copy(accel)  # a refit by another thread does not change the copy
-    points = vectors(points, "points", FARTHEST)  # `contains` would return a tensor for a tensor
-    inside = contains(accel, points, threads)
+    points = vectors(points, "points", FARTHEST)  # queries return tensors for tensors
+    inside = contains(accel, points, threads) if sign == "crossings" else winding_number(accel, points, threads) > 0.5
     distance = closest_points(accel, points, threads).distance
     return np.where(inside, -distance, distance)

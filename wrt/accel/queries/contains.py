@@ -21,14 +21,14 @@ from wrt.kernels.query import FARTHEST
 
 
 def finite_faces(geometry: Geometry) -> np.ndarray:
-    """Return the faces whose corners are all finite, (F, 3); no ray hits the others."""
-    return geometry.faces[np.isfinite(geometry.vertices).all(axis=1)[geometry.faces].all(axis=1)]
+    """Return the indices of the faces whose corners are all finite, (F,); no ray hits the others."""
+    return np.flatnonzero(np.isfinite(geometry.vertices).all(axis=1)[geometry.faces].all(axis=1))
 
 
 def open_edges(geometry: Geometry) -> int:
     """Count edges with an odd number of finite faces, vertices of equal coordinates taken as one. 0: the mesh is closed."""
     _, corner = np.unique(geometry.vertices + np.float32(0.0), axis=0, return_inverse=True)  # -0 becomes 0
-    faces = corner.reshape(-1)[finite_faces(geometry)]
+    faces = corner.reshape(-1)[geometry.faces[finite_faces(geometry)]]
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     edges = edges[edges[:, 0] != edges[:, 1]]
     _, count = np.unique(edges, axis=0, return_counts=True)
@@ -45,7 +45,7 @@ def open_edges_of(snapshot: Snapshot) -> int:
 def used_bounds(snapshot: Snapshot) -> tuple[np.ndarray, np.ndarray]:
     """Return the box of all finite faces: low and high, (3,); inf and -inf without faces."""
     geometry = snapshot.mesh
-    used = geometry.vertices[finite_faces(geometry)].reshape(-1, 3)
+    used = geometry.vertices[geometry.faces[finite_faces(geometry)]].reshape(-1, 3)
     return used.min(axis=0, initial=np.inf), used.max(axis=0, initial=-np.inf)
 
 
@@ -82,7 +82,7 @@ def contains(accel: Accelerator, points: ArrayLike, threads: int | None = None) 
     query = ListQuery(accel, threads, crossings=True)
     if count := open_edges_of(query.snapshot):
         raise InputError(f"the mesh is not closed: {count} edges have an odd number of faces"
-                         "; wrt.winding_number tells what is mostly inside")
+                         "; wrt.winding_number is above 0.5 mostly inside")
     inside = odd_crossings(query, rows)
     return inside if give is None else give(upload(inside, wp.bool, query.device))
 

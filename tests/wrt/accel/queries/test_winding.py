@@ -26,25 +26,74 @@ def solid_angles(mesh: wrt.Mesh, points: np.ndarray) -> np.ndarray:
                          ids=lambda mesh: mesh.name)
 def test_it_is_the_sum_of_the_solid_angles(mesh: wrt.Mesh) -> None:
     points = np.random.default_rng(0).uniform(-1.5, 1.5, (500, 3))
-    found = wrt.winding_number(wrt.build(mesh), points, threads=2)
+    found = wrt.winding_number(wrt.build(mesh), points, threads=2, exact=True)
     np.testing.assert_allclose(found, solid_angles(mesh, points), rtol=0.0, atol=1e-12)
 
 
 def test_of_a_closed_mesh_it_is_a_whole_number_and_tells_what_is_inside() -> None:
     accel = wrt.build(shapes.torus(1.0, 0.4, 64, 32))
     points = np.random.default_rng(1).uniform(-1.5, 1.5, (2000, 3))
-    found = wrt.winding_number(accel, points)
+    found = wrt.winding_number(accel, points, exact=True)
     np.testing.assert_allclose(found, np.round(found), atol=1e-9)
     assert np.array_equal(found > 0.5, wrt.contains(accel, points)) and 0.05 < (found > 0.5).mean() < 0.5
+
+
+ERROR = 2e-3  # of the tree: twice the largest that was measured
+
+
+def soup(n: int, size: float, seed: int) -> wrt.Mesh:
+    """Make n loose triangles of that size in a cube."""
+    rng = np.random.default_rng(seed)
+    corners = rng.uniform(-1.0, 1.0, (n, 1, 3)) + size * rng.normal(size=(n, 3, 3))
+    return wrt.Mesh(corners.reshape(-1, 3), np.arange(3 * n).reshape(-1, 3))
+
+
+@pytest.mark.parametrize("mesh", [soup(n, size, n) for n in (0, 1, 2, 8, 9, 17, 2000) for size in (0.02, 1.0)]
+                         + [shapes.torus(1.0, 0.4, 64, 32), shapes.merged([shapes.icosphere(4), shapes.icosphere(4, 0.5)], "twice")],
+                         ids=lambda mesh: f"{len(mesh.faces)} faces")
+def test_the_tree_is_near_the_exact_sum_anywhere_and_at_any_scale(mesh: wrt.Mesh) -> None:
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.uniform(-2.0, 2.0, (500, 3)), 100.0 * rng.normal(size=(100, 3))])
+    if len(mesh.faces):
+        chosen = mesh.vertices[mesh.faces[rng.integers(len(mesh.faces), size=400)]]
+        points = np.concatenate([points, chosen.mean(axis=1) + 1e-3 * rng.normal(size=(400, 3)), chosen[:, 0]])
+    expected = wrt.winding_number(wrt.build(mesh), points, exact=True)
+    for scale in (1.0, 2.0**-90, 2.0**90):
+        found = wrt.winding_number(wrt.build(wrt.Mesh(np.float32(scale) * mesh.vertices, mesh.faces)), scale * points, threads=2)
+        np.testing.assert_allclose(found, expected, rtol=0.0, atol=ERROR)
+
+
+def test_the_tree_does_not_depend_on_threads_and_follows_refits() -> None:
+    mesh = shapes.icosphere(4)
+    accel, points = wrt.build(mesh), np.random.default_rng(2).uniform(-1.2, 1.2, (1000, 3))
+    found = wrt.winding_number(accel, points, threads=1)
+    assert np.array_equal(found, wrt.winding_number(accel, points, threads=2))
+    accel.refit(0.5 * mesh.vertices)
+    np.testing.assert_array_equal(wrt.winding_number(accel, 0.5 * points.astype(np.float32)), found)
+
+
+def test_distances_to_open_meshes_have_the_sign_of_the_winding_number() -> None:
+    ball = shapes.icosphere(4)
+    bowl = wrt.build((ball.vertices, ball.faces[ball.vertices[ball.faces].mean(axis=1)[:, 2] < 0.9]))
+    points = np.random.default_rng(3).uniform(-1.2, 1.2, (1000, 3))
+    signed = wrt.signed_distance(bowl, points, sign="winding")
+    assert np.array_equal(np.abs(signed), wrt.closest_points(bowl, points).distance)
+    sure = np.abs(np.linalg.norm(points, axis=1) - 1.0) > 0.05
+    sure &= points[:, 2] < 0.7
+    assert np.array_equal(signed[sure] < 0.0, np.linalg.norm(points, axis=1)[sure] < 1.0)
+    with refused(None, "not closed"):
+        wrt.signed_distance(bowl, points)
+    with refused("sign", hint="crossings"):
+        wrt.signed_distance(bowl, points, sign="winged")
 
 
 def test_parts_add_up_and_turning_faces_around_turns_the_sign() -> None:
     ball = shapes.icosphere(2)
     points = [[0.0, 0.1, 0.2], [3.0, 0.0, 0.0]]
     many = wrt.build(shapes.merged([shapes.icosphere(2, 1.0 + 0.1 * i) for i in range(9)], "many"))
-    assert np.round(wrt.winding_number(many, points), 9).tolist() == [9.0, 0.0]
+    assert np.round(wrt.winding_number(many, points, exact=True), 9).tolist() == [9.0, 0.0]
     inside_out = wrt.build(wrt.Mesh(ball.vertices, ball.faces[:, ::-1]))
-    assert np.round(wrt.winding_number(inside_out, points), 9).tolist() == [-1.0, 0.0]
+    assert np.round(wrt.winding_number(inside_out, points, exact=True), 9).tolist() == [-1.0, 0.0]
 
 
 def test_an_open_mesh_is_told_by_half() -> None:
@@ -56,12 +105,13 @@ def test_an_open_mesh_is_told_by_half() -> None:
 def test_triangles_with_a_corner_that_is_not_finite_are_left_out() -> None:
     ball = shapes.icosphere(1)
     faces = wp.array(ball.faces.reshape(-1), dtype=wp.int32, device=DEVICE)
-    expected = wrt.winding_number(wrt.build((ball.vertices, ball.faces[(ball.faces != 7).all(axis=1)])), [[0.1, 0.2, 0.3]])
+    expected = wrt.winding_number(wrt.build((ball.vertices, ball.faces[(ball.faces != 7).all(axis=1)])), [[0.1, 0.2, 0.3]], exact=True)
     for value in (np.nan, np.inf):
         points = ball.vertices.copy()
         points[7, 1] = value
         accel = wrt.build(wrt.DeviceGeometry(wp.array(points, dtype=wp.vec3, device=DEVICE), faces), "bvh2", DEVICE)
-        assert wrt.winding_number(accel, [[0.1, 0.2, 0.3]]) == pytest.approx(expected, abs=1e-12)
+        assert wrt.winding_number(accel, [[0.1, 0.2, 0.3]]) == pytest.approx(expected, abs=ERROR)
+        assert wrt.winding_number(accel, [[0.1, 0.2, 0.3]], exact=True) == pytest.approx(expected, abs=1e-12)
 
 
 def test_corners_nothing_and_what_is_refused() -> None:
