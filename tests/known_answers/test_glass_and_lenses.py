@@ -1,26 +1,19 @@
-"""Pictures whose every number is known in closed form, beyond those of tests/kernels/shade/test_whitted.py.
-
-Fresnel's curve, total reflection, a ball lens, a thin lens' circle of confusion, the photometric laws, and furnaces.
-"""
+"""Fresnel's curve, total reflection, a ball lens, and the circle of confusion of a thin lens, in pictures."""
 
 from __future__ import annotations
 
 import math
-from functools import cache
 
 import numpy as np
 import pytest
 
 import wrt
-from tests.data import ROOT
 from wrt.scene.backgrounds import ConstantBackground, GradientBackground
 from wrt.scene.cameras import Camera
-from wrt.scene.lights import DirectionalLight, PointLight
 from wrt.scene.materials import Material
 from wrt.scene.model import Object, Scene, Sphere
 from wrt.scene.settings import Settings
-from wrt.scene.shapes import box, icosphere, quad, torus
-from wrt.scene.values import Color
+from wrt.scene.shapes import box, quad
 
 N = 1.5
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
@@ -157,110 +150,3 @@ def test_the_circle_of_confusion(distance: float) -> None:
     assert light == pytest.approx(20.0**2, rel=0.01)  # blur spreads light and takes none
 
 
-# --- photometric laws -------------------------------------------------------------------------------------------------
-
-
-@cache
-def lit_floor(lights: tuple[PointLight | DirectionalLight, ...]) -> np.ndarray:
-    """Irradiance at the origin on a white floor that faces +y: (3,)."""
-    floor = Object(quad((-1, 0, 1), (2, 0, 0), (0, 0, -2)), (Material(albedo=WHITE),))
-    camera = Camera.look_at((0.3, 0.4, 0.5), (0.0, 0.0, 0.0), fov_y=1e-5)
-    hidden = (PointLight((0, -1e6, 0), BLACK), DirectionalLight((0, 1, 0), BLACK))  # one kernel for both kinds
-    scene = Scene(objects=(floor,), lights=(*lights, *hidden), cameras=(camera,), settings=Settings(filter="box", max_depth=0))
-    return math.pi * wrt.render(scene, size=(2, 2), spp=1).pixels.mean(axis=(0, 1), dtype=np.float64)
-
-
-@pytest.mark.parametrize("power", range(-3, 7))
-def test_the_inverse_square_law_over_ten_decades(power: int) -> None:
-    distance = 10.0**power
-    intensity: Color = (distance**2, 2.0 * distance**2, 0.0)
-    assert np.allclose(lit_floor((PointLight((0.0, distance, 0.0), intensity),)), [1.0, 2.0, 0.0], rtol=1e-4)
-
-
-@pytest.mark.filterwarnings("ignore:the picture is all black:wrt.SceneWarning")
-@pytest.mark.parametrize("degrees", [0.0, 30.0, 60.0, 85.0, 89.9, 90.1, 120.0, 180.0])
-def test_the_cosine_law_to_grazing_light_and_none_from_below(degrees: float) -> None:
-    angle = math.radians(degrees)
-    away = (math.sin(angle), math.cos(angle), 0.0)  # from the floor to the light
-    expected = max(math.cos(angle), 0.0)
-    sun = DirectionalLight((-away[0], -away[1], 0.0), WHITE)
-    bulb = PointLight((5.0 * away[0], 5.0 * away[1], 0.0), (25.0,) * 3)
-    for light in (sun, bulb):
-        assert np.allclose(lit_floor((light,)), expected, rtol=1e-3, atol=1e-6), type(light)
-
-
-def test_lights_add_up() -> None:
-    lights = tuple(PointLight((0.1 * i, 2.0, 0.3), (1.0 + i, 2.0, 0.5 * i)) for i in range(4))
-    assert np.allclose(lit_floor(lights), np.sum([lit_floor((light,)) for light in lights], axis=0), rtol=1e-5)
-
-
-# --- furnaces ---------------------------------------------------------------------------------------------------------
-
-
-@cache
-def furnace(camera: str) -> tuple[np.ndarray, float]:
-    """The shipped scene: radiance 1 from everywhere; its pixels, and the share of light that was cut."""
-    film = wrt.render(wrt.load_scene(ROOT / "scenes" / "furnace.toml"), camera=camera, size=(48, 27), spp=4)
-    return film.pixels, film.stats["lost_throughput_per_sample"]
-
-
-def test_mirrors_in_a_furnace_cannot_be_seen() -> None:
-    assert np.allclose(furnace("main")[0], 1.0, atol=1e-5)
-
-
-def test_a_grey_ball_in_a_furnace_shows_its_albedo() -> None:
-    pixels, _ = furnace("diffuse")
-    assert np.allclose(pixels[13, 24], 0.5, atol=1e-5) and np.allclose(pixels[0, 0], 1.0)
-    edge = ~(np.isclose(pixels, 0.5, atol=1e-5) | np.isclose(pixels, 1.0, atol=1e-5)).all(axis=2)
-    assert 0 < edge.sum() < 0.1 * edge.size and ((pixels[edge] > 0.5) & (pixels[edge] < 1.0)).all()
-
-
-def test_glass_in_a_furnace_is_seen_only_by_what_was_cut() -> None:
-    pixels, lost = furnace("glass")
-    assert (pixels <= 1.0 + 1e-5).all() and 1e-6 < lost < 3e-3
-    assert 1.0 - pixels.mean(dtype=np.float64) == pytest.approx(lost, abs=2e-6)
-
-
-def random_material(rng: np.random.Generator) -> Material:
-    """Any kind, white or coloured, rough or not, blended or not."""
-    kind = str(rng.choice(["diffuse", "mirror", "conductor", "glass", "metallic_roughness"]))
-    transmission, thin = float(rng.choice([0.0, rng.random()])), bool(rng.random() < 0.3)
-    return Material(kind, albedo=WHITE if rng.random() < 0.5 else tuple(rng.random(3)), ior=float(rng.uniform(1.0, 2.5)),
-                    roughness=float(rng.choice([0.0, rng.random()])), metallic=float(rng.random()), transmission=transmission,
-                    thin=thin, absorption=(float(rng.choice([0.0, 0.5])),) * 3, alpha=float(rng.random()),
-                    alpha_mode=str(rng.choice(["opaque", "blend"])))
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_never_more_light_than_comes_in(seed: int) -> None:
-    # Whatever stands in a room of radiance 1: no pixel is above 1, not even of one sample.
-    rng = np.random.default_rng(seed)
-    meshes = (icosphere(1), torus(segments=12, tube_segments=8), box((-0.5,) * 3, (0.5,) * 3))
-    objects, spheres = [], []
-    for _ in range(14):
-        matrix = np.diag([*rng.uniform(0.2, 0.8, 3), 1.0])
-        matrix[:3, 3] = rng.uniform(-1.2, 1.2, 3)
-        objects.append(Object(meshes[rng.integers(3)], (random_material(rng),), matrix))
-        spheres.append(Sphere(tuple(rng.uniform(-1.2, 1.2, 3)), float(rng.uniform(0.1, 0.4)), random_material(rng)))
-    # One of each feature far away, so that all seeds share a kernel.
-    kinds = [Material("glass", thin=True), Material("glass", absorption=(1, 1, 1), roughness=0.5), Material("mirror"),
-             Material("conductor"), Material("metallic_roughness", transmission=0.5), Material(alpha_mode="blend", alpha=0.5)]
-    spheres += [Sphere((1e4, 10.0 * i, 0.0), 1.0, material) for i, material in enumerate(kinds)]
-    camera = Camera.look_at(tuple(rng.normal(size=3) + np.array([0, 0, 6.0])), (0, 0, 0), fov_y=0.6)
-    scene = Scene(objects=tuple(objects), spheres=tuple(spheres), background=WHITE_SKY, cameras=(camera,),
-                  settings=Settings(filter="box", max_depth=8, min_throughput=1e-3))
-    film = wrt.render(scene, size=(40, 40), spp=1)
-    assert film.stats["not_finite"] == 0 and film.stats["rays_per_sample"] > 3.0
-    assert film.pixels.max() <= 1.0 + 2e-5 and film.pixels.min() >= 0.0
-
-
-@pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (0.8, -0.9, 1.1)])
-def test_inside_a_glowing_sphere_a_surface_is_lit_from_all_around(place: Color) -> None:
-    # E = pi L at any place and angle, so that a Lambertian surface has radiance albedo times L.
-    lamp = Sphere((0.0, 0.0, 0.0), 2.0, Material(albedo=BLACK, emission=(3.0, 2.0, 1.0), two_sided=True))
-    square = Object(quad((place[0] - 0.1, place[1], place[2] + 0.1), (0.2, 0, 0), (0, 0, -0.2)), (Material(albedo=(0.5,) * 3),))
-    camera = Camera.look_at((place[0] + 0.1, place[1] + 0.2, place[2]), place, fov_y=0.01)
-    scene = Scene(objects=(square,), spheres=(lamp,), cameras=(camera,), settings=Settings(filter="box"))
-    assert np.allclose(wrt.render(scene, size=(4, 4), spp=4).pixels, [1.5, 1.0, 0.5], rtol=1e-3)
-    away = Camera.look_at((place[0], place[1] + 0.1, place[2]), (place[0], place[1] + 1.0, place[2] + 1.0), fov_y=0.01)
-    assert np.allclose(wrt.render(scene, camera=away, size=(4, 4), spp=1).pixels, [3.0, 2.0, 1.0])

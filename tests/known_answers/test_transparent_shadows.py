@@ -1,4 +1,4 @@
-"""Shadow rays through transparent surfaces, by pictures with a known answer; renderer/test_tinted_shadows.py has more."""
+"""Shadow rays through transparent surfaces, in pictures; test_tinted_shadows.py has the shadows of glass."""
 
 import numpy as np
 import pytest
