@@ -228,7 +228,7 @@ def test_the_command(tmp_path: Path, monkeypatch) -> None:
             (("box.obj", "-o", "box.npz"), ".accel file"), (("none.obj", "-o", "a.accel"), "none.obj"),
             (("box.obj", "-o", "a.accel", "--accel", "x"), "no structure 'x'"),
             (("box.obj", "-o", "a.accel", "--set", "leaf=2"), "leaf is no option"),
-            (("box.obj", "-o", "a.accel", "--set", "max_leaf=2", "--set", "max_leaf=3"), "given twice"),
+            (("box.obj", "-o", "a.accel", "--set", "max_leaf=2", "--set", "max_leaf=3"), "has two values"),
             (("box.obj", "-o", "a.accel", "--set", "max_leaf=many"), "max_leaf"),
             (("box.obj", "-o", "a.accel", "--set", "max_leaf"), "NAME=VALUE")):
         out = command("build", *arguments)

@@ -82,7 +82,7 @@ def test_the_command_and_the_function_say_the_same(measured_by: Callable[[Costs]
 
 
 @pytest.mark.parametrize(("words", "message"), [
-    (("--tune", "--check"), "give one"), (("--tune", "--rays", "9"), "--device, --scene and --rays belong to --check"),
+    (("--tune", "--check"), "give one"), (("--tune", "--rays", "9"), "--device, --scene and --rays need --check"),
     (("--tune", "--device", "cuda:7"), "no device 'cuda:7'")])
 def test_mistakes_of_the_command(words: tuple[str, ...], message: str) -> None:
     result = run("devices", *words)

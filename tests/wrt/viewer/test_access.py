@@ -69,13 +69,13 @@ def test_what_is_no_origin(text: str) -> None:
 
 def test_where_the_token_may_stand() -> None:
     access = Access(frozenset(), 80, "secret")
-    assert access.inside("/secret/") == ("/", "") and access.inside("/secret?a=b") == ("/", "secret/?a=b")
-    assert access.inside("/?a=b&token=secret&c=%20") == ("/", "secret/?a=b&c=+")
-    assert access.inside("/x?token=secret") == ("/x", "") and access.inside("/secret/x/y?z") == ("/x/y", "")
+    assert access.strip_token("/secret/") == ("/", "") and access.strip_token("/secret?a=b") == ("/", "secret/?a=b")
+    assert access.strip_token("/?a=b&token=secret&c=%20") == ("/", "secret/?a=b&c=+")
+    assert access.strip_token("/x?token=secret") == ("/x", "") and access.strip_token("/secret/x/y?z") == ("/x/y", "")
     for target in ("/", "/?token=", "/?token=Secret", "/?token=secret&token=secret", "/secretx/", "//secret/", "secret/", "*", "",
                    "/x/secret/", "http://h/secret/", "/?Token=secret", "/\udcff/", "/?token=%ff", "/%73ecret/"):
         with pytest.raises(Refused):
-            access.inside(target)
+            access.strip_token(target)
 
 
 # --- requests ---------------------------------------------------------------------------------------------------------
@@ -90,7 +90,7 @@ class Served:
         self.warnings: list[str] = []
         self.page = Page(SCENE, Options(threads=1), Place(port=0, **place), spp=1, counter_of=CostCounter.beside,
                          warn=self.warnings.append)
-        self.port, self.token = self.page.server.get_port(), self.page.door.access.token
+        self.port, self.token = self.page.server.get_port(), self.page.guard.access.token
 
 
 @pytest.fixture
@@ -231,7 +231,7 @@ def test_what_is_no_request_is_no_news(served: Served, capfd: pytest.CaptureFixt
 
 
 def test_only_one_port_is_open(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where viser would serve past the door, there is no viewer."""
+    """Where viser would serve past the guard, there is no viewer."""
     import viser
     import websockets.asyncio.server as websockets
     from websockets.asyncio.server import serve
@@ -258,7 +258,7 @@ def test_only_one_port_is_open(served: Served, monkeypatch: pytest.MonkeyPatch) 
         stops = 0
 
     monkeypatch.setattr(viser, "ViserServer", Other)
-    with refused(what="does not let"):
+    with refused(what="cannot be guarded"):
         Page(SCENE, Options(threads=1), Place(port=0))
     assert Other.stops == 1 and websockets.serve is serve
 
@@ -312,7 +312,7 @@ def test_the_share_request_opens_nothing(rendering: Served, monkeypatch: pytest.
         assert not any("Share" in message["type"] for message in somebody.messages)
     assert asked == [] and served.page.server._share_tunnel is None
     shared = [line for line in served.warnings if "share" in line]
-    assert shared == ["viewer: dropped a request to share the viewer on the internet (told once)"]
+    assert shared == ["viewer: dropped a request to share the viewer on the internet (reported once)"]
 
 
 def moves(who: Client, begin: float) -> int:
@@ -399,7 +399,7 @@ def test_a_large_message_ends_the_connection_and_too_many_are_closed(served: Ser
 
 
 def test_pages_can_begin_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each behind its own door."""
+    """Each behind its own guard."""
     pytest.importorskip("viser")
     monkeypatch.setattr("wrt.viewer.refine.Viewer._prepare", lambda self, view: False)
     import websockets.asyncio.server as websockets

@@ -69,7 +69,7 @@ def test_the_command_serves_until_ctrl_c(monkeypatch: pytest.MonkeyPatch) -> Non
     def wait(self: Page) -> None:
         seen.append(self)
         port = self.server.get_port()
-        came = answer(port, f"/{self.door.access.token}/", [f"Host: localhost:{port}"])
+        came = answer(port, f"/{self.guard.access.token}/", [f"Host: localhost:{port}"])
         assert came.startswith(b"HTTP/1.1 200") and answer(port, "/", [f"Host: localhost:{port}"]).startswith(b"HTTP/1.1 403")
         raise KeyboardInterrupt
 
@@ -77,8 +77,8 @@ def test_the_command_serves_until_ctrl_c(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr("wrt.viewer.refine.Viewer._prepare", lambda self, view: True)  # this test compiles nothing
     result = run("view", WHITTED, "--port", 0, "--no-open")
     assert result.code == 0 and result.out == f"{seen[0].url}\n" and seen[0].url.startswith("http://127.0.0.1:")
-    refused = "viewer: refused a request without the token of the printed address (told once)"
-    assert result.err.splitlines() == ["Ctrl-C ends it", refused]
+    refused = "viewer: refused a request without the token of the printed address (reported once)"
+    assert result.err.splitlines() == ["Ctrl-C ends the viewer", refused]
     seen[0].thread.join(10.0)
     assert not seen[0].thread.is_alive()
     assert "no camera 'nobody'" in run("view", WHITTED, "--camera", "nobody", "--port", 0).err
@@ -91,7 +91,7 @@ def test_quiet_and_other_origins(monkeypatch: pytest.MonkeyPatch) -> None:
     def wait(self: Page) -> None:
         port = self.server.get_port()
         answer(port, "/", [f"Host: localhost:{port}"])
-        assert {"https://example.org", "http://localhost:9000"} <= self.door.access.origins
+        assert {"https://example.org", "http://localhost:9000"} <= self.guard.access.origins
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Page, "wait", wait)
@@ -280,7 +280,7 @@ def test_controls_change_the_picture(page: Any, browser_page: Any) -> None:
     assert flat.codes.mean() < bright.codes.mean() - 20.0 and difference(browser_page, flat) < ROUGHLY
     choose(browser_page, "show", "nodes")
     heat = finished(page, browser_page, cost="nodes")
-    until(lambda: "nodes a pixel" in browser_page.inner_text("body"), browser_page)
+    until(lambda: "nodes per pixel" in browser_page.inner_text("body"), browser_page)
     assert heat.mean > 1.0 and difference(browser_page, heat) < ROUGHLY
     choose(browser_page, "show", "picture")
     choose(browser_page, "structure", "bvh8")
@@ -330,11 +330,11 @@ def test_a_second_browser_gets_the_picture_and_leaves_it_to_the_first(page: Any,
     other.goto(browser_page.url)
     until(lambda: page.watching != first, other)
     settle(page, other)
-    assert other.get_by_text("2 browsers look").is_visible()
+    assert other.get_by_text("2 browsers are connected").is_visible()
     assert difference(other, finished(page, other, size=shown.view.size)) < ROUGHLY
     other.close()
     until(lambda: page.watching == first, browser_page)
-    until(lambda: not browser_page.get_by_text("browsers look").is_visible(), browser_page)
+    until(lambda: not browser_page.get_by_text("browsers are connected").is_visible(), browser_page)
     set_number(browser_page, "bounces", "1")
     assert difference(browser_page, finished(page, browser_page, max_depth=1)) < ROUGHLY
 
@@ -373,7 +373,7 @@ def test_the_file_that_a_browser_is_given_leads_to_the_page(page: Any, browser_p
     with cli_view.in_browser(f"{page.url}&fixedDpr=1"):
         until(lambda: page.watching != first, other)
     settle(page, other)
-    assert other.url.startswith(f"{page.url.partition('?')[0]}{page.door.access.token}/")
+    assert other.url.startswith(f"{page.url.partition('?')[0]}{page.guard.access.token}/")
     assert difference(other, finished(page, other, size=shown.view.size)) < ROUGHLY
     other.reload()
     second = page.watching
@@ -384,7 +384,7 @@ def test_the_file_that_a_browser_is_given_leads_to_the_page(page: Any, browser_p
 
 def test_a_page_of_another_origin_neither_sees_nor_steers(page: Any, browser_page: Any) -> None:
     """In a real browser, even with the token: a server of somebody else on another port, and one by another name."""
-    port, token = page.server.get_port(), page.door.access.token
+    port, token = page.server.get_port(), page.guard.access.token
     before = page.server.get_clients().keys()
 
     class Stranger(http.server.BaseHTTPRequestHandler):

@@ -174,7 +174,7 @@ def interrupted_after(count: int, monkeypatch, *options):
 def test_ctrl_c_keeps_the_rows_that_are_done(monkeypatch, tmp_path, rows, undone) -> None:
     path = tmp_path / "stability.md"
     done = interrupted_after(rows, monkeypatch, "-o", path)
-    assert done.code == 130 and done.err.endswith("interrupted: what was done is kept\n") and str(path) in done.out
+    assert done.code == 130 and done.err.endswith("interrupted: the results so far are kept\n") and str(path) in done.out
     for text in (done.out, path.read_text()):
         assert f"Interrupted; not done, or not with all algorithms: {', '.join(undone)}" in text and "A to H" in text
         assert sum(line.lstrip("| ").startswith("E_grid") for line in text.splitlines()) == rows
