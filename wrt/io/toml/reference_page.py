@@ -20,15 +20,11 @@ A scene is a [TOML](https://toml.io) file: `python -m wrt render scene.toml`, `w
 validate scene.toml` reports every mistake with its place. `python -m wrt schema` prints the JSON Schema for editors, and this page with
 `--markdown`.
 
-- World space is right-handed, +y is up. Matrices are 16 numbers, row by row, and act on column vectors.
-- *length* is in the scene's own unit. A scene must be at least 1e-15 units across, and no shape may reach farther than 1e18 from the
-  origin ([known limits](accuracy.md#known-limits)).
-- Angles are in degrees here, and in radians in Python.
-- Colours are linear Rec. 709. One number stands for a grey.
-- *radiance*, *irradiance* and *radiant intensity* share one arbitrary scale: a white diffuse surface that receives the irradiance pi has
-  the radiance 1 and is displayed as white.
+- [Concepts](concepts.md#spaces-and-units) describes spaces and units. Angles are in degrees here, and in radians in Python.
+- Matrices are 16 numbers, row by row, and act on column vectors. One number for a colour is a grey.
+- [Known limits](accuracy.md#known-limits) has the smallest and the largest size of a scene.
 - File names are relative to the scene file.
-- A scene without a camera or without any light gets one, with a message.
+- A scene without a camera, or without any light, gets a default one; a message says so.
 
 ## Example
 """
