@@ -134,13 +134,12 @@ def extent(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class Case:
-    """`given`: the argument of wrt.build. `world`: the world of each ray, (N,) int32, or None if there is only one world.
-    `before`: vertices to build with, before a refit to the vertices of `given`; None: no refit."""
+    """The geometry and the rays of one case."""
 
-    given: Any
+    given: Any  # The argument of wrt.build.
     rays: Rays
-    world: np.ndarray | None = None
-    before: np.ndarray | None = None
+    world: np.ndarray | None = None  # The world of each ray, (N,) int32; None: there is only one world.
+    before: np.ndarray | None = None  # Vertices to build with, before a refit to the vertices of `given`; None: no refit.
 
 
 def plain(rng: Rng) -> Case:
@@ -255,12 +254,11 @@ def filled(rays: Rays, index: np.ndarray, nan: bool) -> Rays:
 
 @dataclass(frozen=True)
 class Way:
-    """A way to pass rays. `order` yields the ray indices of each call. `source`: "numpy", "float64" (with gaps) or "warp".
-    `counters`: count nodes and primitives, which traces one ray at a time."""
+    """A way to pass rays to a structure."""
 
-    order: Callable[[Rays], Iterator[np.ndarray]] = as_they_are
-    source: str = "numpy"
-    counters: bool = False
+    order: Callable[[Rays], Iterator[np.ndarray]] = as_they_are  # Yields the ray indices of each call.
+    source: str = "numpy"  # Or "float64" (with gaps between rows), or "warp".
+    counters: bool = False  # Count nodes and primitives, which traces one ray at a time.
 
 
 WAYS = {

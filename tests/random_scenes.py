@@ -45,13 +45,12 @@ SHAPES: tuple[Callable[[], Mesh], ...] = (
 
 @dataclass(frozen=True)
 class Placed:
-    """An object in every scene of a group. `mesh`, `materials`: indices into Group. `moves`: "", "keys" (a moving transform) or
-    "target" (and a morph). `around`: the object is so large that it encloses the others, and usually the camera."""
+    """An object in every scene of a group."""
 
-    mesh: int
-    materials: tuple[int, ...]
-    moves: str
-    around: bool
+    mesh: int  # An index into Group.meshes.
+    materials: tuple[int, ...]  # Indices into Group.materials.
+    moves: str  # "", "keys" (a moving transform) or "target" (and a morph).
+    around: bool  # The object is so large that it encloses the others, and usually the camera.
 
 
 @dataclass(frozen=True)
