@@ -35,7 +35,7 @@ def test_channels_go_to_numbers_of_texels_that_follow_one_another() -> None:
     for texture in TEXTURES.values():
         fields = [rows.field(name) for name in texture.fields]
         assert [each.end for each in fields[:-1]] == [each.first for each in fields[1:]]
-        assert fields[-1].end - fields[0].first == len(texture.channels) == len(texture.numbers)
+        assert fields[-1].end - fields[0].first == len(texture.channels) == len(texture.components)
         assert texture.channels == sorted(texture.channels)
         seen += texture.fields
     assert sorted(seen) == sorted(fields_of(Texels))
