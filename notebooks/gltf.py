@@ -1,12 +1,12 @@
 # %% [markdown]
 # # Bring your own glTF
-# Blender exports a scene by *File, Export, glTF 2.0*, and wrt renders the exported file. This notebook writes a glTF file itself, so
-# that it needs no download. It shows what wrt does with each part: meshes, materials, camera, lights. To render your own file,
-# change the file's name in the cell that loads it.
+# Blender exports a scene by *File, Export, glTF 2.0*, and wrt renders the exported file. This notebook writes a glTF file itself, so that
+# it needs no download. It shows what wrt does with each part: meshes, materials, camera, lights. To render your own file, change the
+# file's name in the cell that loads it.
 #
-# In Blender's export dialog: format *glTF Binary (.glb)*; under *Include* tick *Cameras* and *Punctual Lights*; under *Transform*
-# leave *+Y Up*; apply modifiers. Materials must be *Principled BSDF*. The export contains its colour, metallic, roughness,
-# transmission, IOR, emission and normal map, but no other shader nodes.
+# In Blender's export dialog: format *glTF Binary (.glb)*; under *Include* tick *Cameras* and *Punctual Lights*; under *Transform* leave
+# *+Y Up*; apply modifiers. Materials must be *Principled BSDF*. The export contains its colour, metallic, roughness, transmission, IOR,
+# emission and normal map, but no other shader nodes.
 #
 # If the environment variable `WRT_QUICK` is set, pictures are smaller. The outputs below were made without it.
 
@@ -33,9 +33,9 @@ folder = Path(workplace.name)
 
 # %% [markdown]
 # ## A glTF file by hand
-# A `.glb` file contains JSON and one block of bytes. The JSON has lists. The list `nodes` is a tree of transforms, whose entries
-# refer to `meshes`, `cameras` and lights. Meshes refer to `accessors` (arrays in the bytes) and `materials`, and materials refer
-# to `textures`. Each reference is an index into a list.
+# A `.glb` file contains JSON and one block of bytes. The JSON has lists. The list `nodes` is a tree of transforms, whose entries refer to
+# `meshes`, `cameras` and lights. Meshes refer to `accessors` (arrays in the bytes) and `materials`, and materials refer to `textures`.
+# Each reference is an index into a list.
 
 # %%
 class Glb:
@@ -88,9 +88,9 @@ class Glb:
 # %% [markdown]
 # ## Materials
 # glTF has one material model, *metallic-roughness*. The base colour is the albedo of a matte surface or the reflectance of a metal.
-# `metallic` blends between the two, and `roughness` blurs reflections. Extensions add transmission (glass), volume (coloured
-# glass), IOR and emissive strength. If a file has a volume, shadow rays go straight through glass and take its colour
-# (`glass_shadows="tinted"`). So objects behind or inside the glass are lit. With `glass_shadows="opaque"` they are in shadow.
+# `metallic` blends between the two, and `roughness` blurs reflections. Extensions add transmission (glass), volume (coloured glass), IOR
+# and emissive strength. If a file has a volume, shadow rays go straight through glass and take its colour (`glass_shadows="tinted"`). So
+# objects behind or inside the glass are lit. With `glass_shadows="opaque"` they are in shadow.
 
 # %%
 glb = Glb()
@@ -124,8 +124,8 @@ len(glb.json["materials"])
 # %% [markdown]
 # ## Objects, a camera, lights
 # glTF is right-handed with +y up; the exporter rotates Blender's +z to +y. A camera looks along its own -z. The extension
-# `KHR_lights_punctual` has point, spot and directional lights. They have no size, so their shadows are sharp. Emissive surfaces
-# have a size; wrt uses them as area lights with soft shadows.
+# `KHR_lights_punctual` has point, spot and directional lights. They have no size, so their shadows are sharp. Emissive surfaces have a
+# size; wrt uses them as area lights with soft shadows.
 
 # %%
 def turned(axis, degrees):
@@ -156,8 +156,7 @@ print(f"{(folder / 'table.glb').stat().st_size / 1e6:.2f} MB, point light of {WA
 
 # %% [markdown]
 # ## Load and look
-# Put the name of your own file here. A glTF file has no sky, so rays that leave the scene see black. The second cell adds a
-# background.
+# Put the name of your own file here. A glTF file has no sky, so rays that leave the scene see black. The second cell adds a background.
 
 # %%
 scene = wrt.load_scene(folder / "table.glb")
@@ -196,8 +195,8 @@ wrt.side_by_side({tonemap: each.to_srgb8()[part] for tonemap, each in shown.item
 #
 # ## A scene around the file
 # A TOML file can contain what glTF cannot express, or what you do not want to change in Blender. It includes the `.glb`, and adds
-# cameras, lights, background and settings. Its table `override` replaces a material of the same name. So you can export the model
-# again without losing these changes.
+# cameras, lights, background and settings. Its table `override` replaces a material of the same name. So you can export the model again
+# without losing these changes.
 
 # %%
 (folder / "table.toml").write_text("""
@@ -229,12 +228,11 @@ print([camera.name for camera in around.cameras])
 wrt.side_by_side({"": wrt.render(around, size=SIZE, spp=2 * SPP)})
 
 # %% [markdown]
-# On the command line, `python -m wrt render table.toml -o table.png --camera close` renders it, and `python -m wrt info table.toml`
-# lists its contents.
+# On the command line, `python -m wrt render table.toml -o table.png --camera close` renders it, and `python -m wrt info table.toml` lists
+# its contents.
 #
 # ## Warnings for unsupported parts
-# A picture that silently lacks something is worse than an error. One warning names everything in a file that wrt does not
-# render:
+# A picture that silently lacks something is worse than an error. One warning names everything in a file that wrt does not render:
 
 # %%
 glb.json["materials"][2]["extensions"] = {"KHR_materials_clearcoat": {"clearcoatFactor": 1.0}}

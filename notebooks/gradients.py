@@ -1,9 +1,9 @@
 # %% [markdown]
 # # Fitting to depth pictures
-# At a fixed triangle, t, u, v and the point of a hit are smooth functions of the triangle's corners and of the ray. Their
-# derivatives have a closed form. `hits.gradients` takes the derivatives of a loss by the hits, and returns its derivatives by
-# vertices, origins and directions. Here they fit first the pose of a teapot, then the shape of a ball, to depth pictures. This needs
-# only NumPy; the last section uses torch.
+# At a fixed triangle, t, u, v and the point of a hit are smooth functions of the triangle's corners and of the ray. Their derivatives
+# have a closed form. `hits.gradients` takes the derivatives of a loss by the hits, and returns its derivatives by vertices, origins and
+# directions. Here they fit first the pose of a teapot, then the shape of a ball, to depth pictures. This needs only NumPy; the last
+# section uses torch.
 #
 # If the environment variable `WRT_QUICK` is set, pictures are smaller and steps fewer. The outputs below were made without it.
 
@@ -62,11 +62,11 @@ _, before = depth_of(accel, rays)
 show(("the picture", target), ("where we begin", before))
 
 # %% [markdown]
-# Each step computes the depth picture and the loss: the mean square difference over the pixels in which both pictures show the
-# teapot. The derivative of the loss by the t of a hit is `2 (t - target) / count`. `hits.gradients` turns it into derivatives by
-# the vertices. The chain rule leads to the pose. A shift moves all vertices alike. A small rotation vector `w` about the center moves
-# a vertex `x` by the cross product of `w` and `x - center`. The optimizer is Adam. `accel.refit` moves the vertices; it keeps the tree
-# and takes a fraction of the time of a build.
+# Each step computes the depth picture and the loss: the mean square difference over the pixels in which both pictures show the teapot.
+# The derivative of the loss by the t of a hit is `2 (t - target) / count`. `hits.gradients` turns it into derivatives by the vertices.
+# The chain rule leads to the pose. A shift moves all vertices alike. A small rotation vector `w` about the center moves a vertex `x` by
+# the cross product of `w` and `x - center`. The optimizer is Adam. `accel.refit` moves the vertices; it keeps the tree and takes a
+# fraction of the time of a build.
 
 # %%
 class Adam:
@@ -115,15 +115,14 @@ print(f"off by {np.degrees(turn.magnitude()):.0e} degrees and {np.linalg.norm(sh
 assert errors[-1][0] < 0.5 * errors[0][0]
 
 # %% [markdown]
-# The derivatives do not contain changes of the outline, because `prim_id` is fixed. A pixel that shows the teapot in only one of the
-# two pictures adds nothing to the gradient. Here most of the teapot's pixels are in both pictures, so this does no harm. A fit
-# that starts farther away needs another term for outlines.
+# The derivatives do not contain changes of the outline, because `prim_id` is fixed. A pixel that shows the teapot in only one of the two
+# pictures adds nothing to the gradient. Here most of the teapot's pixels are in both pictures, so this does no harm. A fit that starts
+# farther away needs another term for outlines.
 #
 # ## A shape
-# Now each vertex moves independently: a ball is fitted to six depth pictures of a body, from six sides. The pictures say nothing
-# about vertices between their rays, and little about motion along the surface. So a linear system with the mesh's Laplacian
-# smooths each gradient over the mesh before the step (Nicolet, Jacobson and Jakob 2021, *Large Steps in Inverse Rendering of
-# Geometry*).
+# Now each vertex moves independently: a ball is fitted to six depth pictures of a body, from six sides. The pictures say nothing about
+# vertices between their rays, and little about motion along the surface. So a linear system with the mesh's Laplacian smooths each
+# gradient over the mesh before the step (Nicolet, Jacobson and Jakob 2021, *Large Steps in Inverse Rendering of Geometry*).
 
 # %%
 def knobbly(mesh):

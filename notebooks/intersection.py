@@ -1,8 +1,7 @@
 # %% [markdown]
 # # The intersection units and their hard cases
-# Does a ray meet a box? Does it meet a triangle? Each test takes about a dozen operations, and one rounding error can make its
-# answer wrong: then a ray slips between two triangles that share an edge. This notebook derives both tests, shows how they fail, and
-# mends them.
+# Does a ray meet a box? Does it meet a triangle? Each test takes about a dozen operations, and one rounding error can make its answer
+# wrong: then a ray slips between two triangles that share an edge. This notebook derives both tests, shows how they fail, and mends them.
 #
 # If the environment variable `WRT_QUICK` is set, there are fewer rays. The outputs below were made without it.
 
@@ -24,10 +23,10 @@ rng = np.random.default_rng(7)
 
 # %% [markdown]
 # ## The box unit: slabs
-# A box is the intersection of three slabs. The ray enters and leaves a slab at the distances $(lo - o)/d$ and $(hi - o)/d$, the
-# smaller one first. It is in the box from the largest of the three entries to the smallest of the three exits (Kay and Kajiya
-# 1986). If the largest entry is behind the smallest exit, the ray misses the box. The reciprocals $1/d$ are computed once per ray.
-# The picture shows, like an X-ray picture, the total length of each ray in thirty boxes:
+# A box is the intersection of three slabs. The ray enters and leaves a slab at the distances $(lo - o)/d$ and $(hi - o)/d$, the smaller
+# one first. It is in the box from the largest of the three entries to the smallest of the three exits (Kay and Kajiya 1986). If the
+# largest entry is behind the smallest exit, the ray misses the box. The reciprocals $1/d$ are computed once per ray. The picture shows,
+# like an X-ray picture, the total length of each ray in thirty boxes:
 
 # %%
 def slabs(o, inverse, lo, hi):
@@ -47,10 +46,10 @@ wrt.side_by_side({"": heatmap(inside.reshape(SIZE[::-1]), "how far each ray runs
 
 # %% [markdown]
 # ### Hard case: a ray in a face
-# A direction without an x component has $1/d_x = \infty$. If the origin is not in one of the two planes, the distances are
-# $-\infty$ or $\infty$, which is right. For a ray in the plane itself, a distance is $0\cdot\infty$ = NaN. If minimum and maximum
-# return NaN, every comparison with it is false, and the ray is lost. The remedy: choose the near and the far plane of each slab by
-# the sign of the direction, and use a minimum and maximum that ignore NaN.
+# A direction without an x component has $1/d_x = \infty$. If the origin is not in one of the two planes, the distances are $-\infty$ or
+# $\infty$, which is right. For a ray in the plane itself, a distance is $0\cdot\infty$ = NaN. If minimum and maximum return NaN, every
+# comparison with it is false, and the ray is lost. The remedy: choose the near and the far plane of each slab by the sign of the
+# direction, and use a minimum and maximum that ignore NaN.
 
 # %%
 o1, d1 = np.float32([[1.0, 0.2, 3.0]]), np.float32([[0.0, 0.0, -1.0]])  # in the face x = 1 of the cube from -1 to 1
@@ -67,9 +66,9 @@ with np.errstate(divide="ignore", invalid="ignore"):
 
 # %% [markdown]
 # ### Hard case: a ray through an edge
-# At an edge of the box, the ray leaves one slab where it enters another. Entry and exit are nearly equal, and rounding decides. Each
-# has three rounding errors (of a subtraction, a reciprocal and a product). Multiplying the exit by $1 + 2\gamma_3$ saves all rays
-# (Ize 2013). Here $\gamma_n = nu/(1-nu)$ and $u = 2^{-24}$. The cell compares rays at edges with the same test in float64:
+# At an edge of the box, the ray leaves one slab where it enters another. Entry and exit are nearly equal, and rounding decides. Each has
+# three rounding errors (of a subtraction, a reciprocal and a product). Multiplying the exit by $1 + 2\gamma_3$ saves all rays (Ize 2013).
+# Here $\gamma_n = nu/(1-nu)$ and $u = 2^{-24}$. The cell compares rays at edges with the same test in float64:
 
 # %%
 n = 20 * RAYS
@@ -93,14 +92,14 @@ print(f"misses that the widened test reports as hits: {extra.sum()}")
 assert not lost["widened"].any()
 
 # %% [markdown]
-# A false hit of a box only costs further tests; a lost ray is a hole in the picture. So wrt's default box unit
-# (`box="conservative"`) never reports a false miss. For boxes of triangles it widens by more than here, because the triangle unit
-# rounds, too (`kernels/units/box.py` derives the factor).
+# A false hit of a box only costs further tests; a lost ray is a hole in the picture. So wrt's default box unit (`box="conservative"`)
+# never reports a false miss. For boxes of triangles it widens by more than here, because the triangle unit rounds, too
+# (`kernels/units/box.py` derives the factor).
 #
 # ## The triangle unit: Moeller and Trumbore
-# Let $e_1 = v_1 - v_0$ and $e_2 = v_2 - v_0$ be edges. A point of the triangle is $v_0 + u\,e_1 + v\,e_2$. A point of the ray is
-# $o + t\,d$. Equating both points gives three linear equations for $t$, $u$ and $v$. Cramer's rule solves them with two cross
-# products. The ray hits the triangle if $u \ge 0$, $v \ge 0$ and $u + v \le 1$.
+# Let $e_1 = v_1 - v_0$ and $e_2 = v_2 - v_0$ be edges. A point of the triangle is $v_0 + u\,e_1 + v\,e_2$. A point of the ray is $o +
+# t\,d$. Equating both points gives three linear equations for $t$, $u$ and $v$. Cramer's rule solves them with two cross products. The
+# ray hits the triangle if $u \ge 0$, $v \ge 0$ and $u + v \le 1$.
 
 # %%
 def moeller_trumbore(o, d, v0, v1, v2):
@@ -150,9 +149,9 @@ wrt.side_by_side({f"{name}: {(ids < 0).sum()} lost": palette[ids].reshape(side, 
                  columns=3, scale=4)
 
 # %% [markdown]
-# The picture "exact" is from the oracle (`wrt.lab.oracle.oracle`): integer arithmetic decides on which side of an edge a ray passes.
-# It takes the float32 directions and corners as exact. No float32 test has the edges exactly in place. But the watertight test
-# leaves no gap: **an edge may be displaced, as long as both of its triangles displace it equally**.
+# The picture "exact" is from the oracle (`wrt.lab.oracle.oracle`): integer arithmetic decides on which side of an edge a ray passes. It
+# takes the float32 directions and corners as exact. No float32 test has the edges exactly in place. But the watertight test leaves no
+# gap: **an edge may be displaced, as long as both of its triangles displace it equally**.
 
 # %%
 for name in TESTS:
@@ -164,9 +163,9 @@ assert (seen["watertight"] >= 0).all() and (seen["moeller_trumbore"] < 0).any()
 # ## Why the watertight test leaks nowhere
 # Woop, Benthin and Wald (2013) transform the corners. A translation and a shear make the ray the z axis, so that x and y suffice. The
 # sign of $a_x b_y - a_y b_x$ gives the side on which the ray passes the edge $ab$. The neighbour triangle has the same edge in the
-# reverse direction, and computes $b_x a_y - b_y a_x$: *the same two products*, subtracted the other way. After rounding, the two
-# results are still exact opposites. Moeller and Trumbore compute $u$ of one triangle and $v$ of its neighbour by different
-# operations, so their rounding errors differ.
+# reverse direction, and computes $b_x a_y - b_y a_x$: *the same two products*, subtracted the other way. After rounding, the two results
+# are still exact opposites. Moeller and Trumbore compute $u$ of one triangle and $v$ of its neighbour by different operations, so their
+# rounding errors differ.
 
 # %%
 n = 50 * RAYS
@@ -179,15 +178,14 @@ assert (one == -other).all()
 
 # %% [markdown]
 # A compiler can break this symmetry. If it fuses a product and the difference into one operation (fused multiply-add), only the other
-# product is rounded, and the two results are no opposites any more. So wrt compiles its kernels without fusing. If an edge function
-# is exactly 0, float64 decides.
+# product is rounded, and the two results are no opposites any more. So wrt compiles its kernels without fusing. If an edge function is
+# exactly 0, float64 decides.
 #
 # ## Lost rays in a picture
-# Random rays rarely meet an edge, but many rays of pictures are not random. Examples are textures whose texels lie on vertices,
-# shadow rays to the corners of lights, and cameras in the middle of symmetric models. Here each pixel's ray is turned to the
-# nearest corner of the triangle that it hits. With $d = v - o$ in float32, the hit must be at $t = 1$. The ray is lost if it
-# passes through the surface there. At an outline it may pass; so only corners with surface on all sides count, where four rays
-# close by all hit.
+# Random rays rarely meet an edge, but many rays of pictures are not random. Examples are textures whose texels lie on vertices, shadow
+# rays to the corners of lights, and cameras in the middle of symmetric models. Here each pixel's ray is turned to the nearest corner of
+# the triangle that it hits. With $d = v - o$ in float32, the hit must be at $t = 1$. The ray is lost if it passes through the surface
+# there. At an outline it may pass; so only corners with surface on all sides count, where four rays close by all hit.
 
 # %%
 hills = terrain(60 if QUICK else 250)
@@ -221,8 +219,8 @@ wrt.side_by_side(pictures, columns=1 if QUICK else 2)
 
 # %% [markdown]
 # ## Lost rays in the hard cases
-# `wrt.lab.hard_cases.cases` has 44 kinds of rays at which rounding errors matter. For most of them the answer is known: a ray that
-# starts inside a closed surface must hit it. The plot shows the lost rays of each test:
+# `wrt.lab.hard_cases.cases` has 44 kinds of rays at which rounding errors matter. For most of them the answer is known: a ray that starts
+# inside a closed surface must hit it. The plot shows the lost rays of each test:
 
 # %%
 CASES = {"A_origin_vertices": "dense sphere, at vertices", "A_far_uniform": "the same, far from 0",
@@ -253,7 +251,7 @@ plt.show()
 # ## Exercises
 # 1. Sort the two distances of a slab by `np.fmin` and `np.fmax` instead of by the sign of the direction. Does the test find the ray in
 #    the face? Does it find a ray in the opposite face?
-# 2. In the magnified pictures, let neighbouring pixels differ by 1000 steps instead of one. Which gaps remain? Why are the gaps at
-#    the vertex the last to vanish?
+# 2. In the magnified pictures, let neighbouring pixels differ by 1000 steps instead of one. Which gaps remain? Why are the gaps at the
+#    vertex the last to vanish?
 # 3. Move the hills far away from 0 (`vertices + 1e4`) and the camera with them. Which test loses more rays now, and which fewer?
 # 4. `python -m wrt stability A B` runs two groups of cases over all tests; `--rays 1000000` takes a while.

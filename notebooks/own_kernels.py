@@ -1,9 +1,9 @@
 # %% [markdown]
 # # Queries in your own kernels
-# `accel.closest_hit` takes arrays of rays. If new rays depend on earlier hits, a kernel of your own is simpler. It queries the
-# structure itself, on the CPU or on CUDA. The function `wrt.ray_query` returns the query functions, and the kernel gets
-# `accel.world` as an argument. The decorator `wrt.kernel` compiles without fused multiply-add, with which rays could be lost at
-# edges. The hits equal those of `accel.closest_hit` to the last bit.
+# `accel.closest_hit` takes arrays of rays. If new rays depend on earlier hits, a kernel of your own is simpler. It queries the structure
+# itself, on the CPU or on CUDA. The function `wrt.ray_query` returns the query functions, and the kernel gets `accel.world` as an
+# argument. The decorator `wrt.kernel` compiles without fused multiply-add, with which rays could be lost at edges. The hits equal those
+# of `accel.closest_hit` to the last bit.
 #
 # If the environment variable `WRT_QUICK` is set, pictures are smaller. The outputs below were made without it.
 
@@ -29,9 +29,8 @@ print(accel)
 
 # %% [markdown]
 # ## Ambient occlusion
-# How much of the sky is visible from a point? The kernel traces one camera ray, then many short rays around the normal at its hit.
-# A ray from `query.ray` has t from 0 to infinity; set `t_min` and `t_max` to change that. The short rays begin a little above the
-# surface.
+# How much of the sky is visible from a point? The kernel traces one camera ray, then many short rays around the normal at its hit. A ray
+# from `query.ray` has t from 0 to infinity; set `t_min` and `t_max` to change that. The short rays begin a little above the surface.
 
 # %%
 @wrt.kernel
@@ -69,8 +68,8 @@ plt.show()
 
 # %% [markdown]
 # ## A LiDAR
-# A LiDAR at a fixed point turns once; its 64 rings have different elevations. Each thread makes one ray, and stores the distance with
-# the error of the instrument. No array of rays is needed.
+# A LiDAR at a fixed point turns once; its 64 rings have different elevations. Each thread makes one ray, and stores the distance with the
+# error of the instrument. No array of rays is needed.
 
 # %%
 @wrt.kernel

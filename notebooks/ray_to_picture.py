@@ -3,8 +3,8 @@
 # To render a picture is to find what the ray through each pixel meets first. This notebook does it step by step in NumPy, then by
 # `wrt.render`. After that, a lens replaces the pinhole, and the blur of the lens is predicted and measured.
 #
-# All shapes are made by formulas or come from `../scenes`. If the environment variable `WRT_QUICK` is set, pictures are smaller and
-# have fewer samples. The outputs below were made without it.
+# All shapes are made by formulas or come from `../scenes`. If the environment variable `WRT_QUICK` is set, pictures are smaller and have
+# fewer samples. The outputs below were made without it.
 
 # %%
 import os
@@ -23,8 +23,8 @@ SIZE, SPP = ((160, 90), 4) if QUICK else ((480, 270), 64)
 # %% [markdown]
 # ## One ray
 # A ray is an origin $o$ and a direction $d$; its points are $o + t\,d$ with $t \ge 0$. An acceleration structure over a mesh finds the
-# first triangle that a ray meets. It returns `prim_id` (the index of the triangle), $t$, and the barycentric coordinates $u$ and $v$
-# of the hit point $(1-u-v)\,v_0 + u\,v_1 + v\,v_2$.
+# first triangle that a ray meets. It returns `prim_id` (the index of the triangle), $t$, and the barycentric coordinates $u$ and $v$ of
+# the hit point $(1-u-v)\,v_0 + u\,v_1 + v\,v_2$.
 
 # %%
 mesh = merged([quad((-3, 0, 3), (6, 0, 0), (0, 0, -6)), teapot(64)], "pot on a floor")
@@ -57,8 +57,8 @@ depth = np.where(hit, hits.t, 0.0)
 wrt.side_by_side({"": heatmap(picture(depth), "distance to the hit (0: none)")})
 
 # %% [markdown]
-# This cell checks the angle of view. The angle between the first and the last ray of the middle column, plus half a pixel at each
-# end, must be `fov_y`.
+# This cell checks the angle of view. The angle between the first and the last ray of the middle column, plus half a pixel at each end,
+# must be `fov_y`.
 
 # %%
 column = picture(directions)[:, SIZE[0] // 2].astype(np.float64)
@@ -68,10 +68,10 @@ print(f"first to last pixel centre: {seen:.3f} degrees; and half a pixel at each
 
 # %% [markdown]
 # ## Light by hand
-# The radiance of a matte surface is proportional to the cosine between its normal and the light, unless an object blocks the light.
-# To find out, trace one more ray, the shadow ray, from the hit to the light. It must not start on the surface itself, because the
-# hit point is rounded. Here it starts $10^{-4}$ above the surface, which suits this scene but not a scene of another size.
-# (`wrt.render` offsets it by a bound on the rounding error instead.)
+# The radiance of a matte surface is proportional to the cosine between its normal and the light, unless an object blocks the light. To
+# find out, trace one more ray, the shadow ray, from the hit to the light. It must not start on the surface itself, because the hit point
+# is rounded. Here it starts $10^{-4}$ above the surface, which suits this scene but not a scene of another size. (`wrt.render` offsets it
+# by a bound on the rounding error instead.)
 
 # %%
 corners = mesh.vertices[mesh.faces]
@@ -97,8 +97,8 @@ print(f"{hit.sum()} of {len(hit)} rays hit; {dark.sum()} of the hits lie in shad
 wrt.side_by_side({"by hand": by_hand})
 
 # %% [markdown]
-# That is a ray tracer, with two flaws. The triangles are visible, because each has one normal. Edges have steps, because each pixel
-# has one ray.
+# That is a ray tracer, with two flaws. The triangles are visible, because each has one normal. Edges have steps, because each pixel has
+# one ray.
 
 # %% [markdown]
 # ## Many rays per pixel
@@ -115,9 +115,9 @@ wrt.side_by_side({f"{spp} ray{'s' * (spp > 1)} per pixel": wrt.render(night, cam
 # %% [markdown]
 # ## From the pinhole to the lens
 # A real camera needs light, and so has a wide aperture with a lens. A thin lens of focal length $f$ focuses light from a point at
-# distance $s$ onto a point at distance $s'$ behind the lens, where $1/s + 1/s' = 1/f$. The sensor is at this distance. So all rays of
-# a pixel pass through one point of the plane in focus, wherever they cross the lens. Points nearer or farther are blurred.
-# `Camera.lens` converts a photographer's settings to the parameters of wrt's camera.
+# distance $s$ onto a point at distance $s'$ behind the lens, where $1/s + 1/s' = 1/f$. The sensor is at this distance. So all rays of a
+# pixel pass through one point of the plane in focus, wherever they cross the lens. Points nearer or farther are blurred. `Camera.lens`
+# converts a photographer's settings to the parameters of wrt's camera.
 
 # %%
 pinhole = night.camera("pinhole")
@@ -130,14 +130,14 @@ wrt.side_by_side({"pinhole": wrt.render(night, camera=pinhole, size=SIZE, spp=SP
 # %% [markdown]
 # ## How large is the blur?
 # Light from a point at distance $z$ reaches a lens of radius $r$ in a cone. In the plane in focus, at distance $s$, this cone has the
-# diameter $2 r\,|z - s| / z$ (similar triangles). The picture's height $H$, in pixels, covers the length $2 s
-# \tan(\mathrm{fov}_y/2)$ of that plane. So the diameter of the blur is
+# diameter $2 r\,|z - s| / z$ (similar triangles). The picture's height $H$, in pixels, covers the length $2 s \tan(\mathrm{fov}_y/2)$ of
+# that plane. So the diameter of the blur is
 #
 # $$c = \frac{2 r\,|z-s|}{z}\cdot\frac{H}{2 s\tan(\mathrm{fov}_y/2)}\ \text{pixels}.$$
 #
-# To test the formula, one small lamp is rendered at several distances. A disc of diameter $c$ has the variance $c^2/16$ along an
-# axis, and variances add. A second picture, through a pinhole, has the variance of the lamp's own size and of the pixel filter.
-# Subtracting it leaves the variance of the blur.
+# To test the formula, one small lamp is rendered at several distances. A disc of diameter $c$ has the variance $c^2/16$ along an axis,
+# and variances add. A second picture, through a pinhole, has the variance of the lamp's own size and of the pixel filter. Subtracting it
+# leaves the variance of the blur.
 
 # %%
 side = SIZE[1]
@@ -181,9 +181,8 @@ for z, m in zip(distances, measured, strict=True):
 
 # %% [markdown]
 # ## What a photographer sets
-# The f-number is $N = f / (2r)$: a larger f-number is a smaller aperture. Twice the f-number halves the blur at every distance.
-# Focusing moves the plane that is sharp. The blur of distant objects hardly depends on their distance, because $|z-s|/z$ approaches
-# 1.
+# The f-number is $N = f / (2r)$: a larger f-number is a smaller aperture. Twice the f-number halves the blur at every distance. Focusing
+# moves the plane that is sharp. The blur of distant objects hardly depends on their distance, because $|z-s|/z$ approaches 1.
 
 # %%
 def photo(f_number, focus_distance):
@@ -196,9 +195,9 @@ wrt.side_by_side({f"f / {n:g}, focused at {s:g}": photo(n, s)
                   for n, s in ((2.25, 4.8), (2.25, 6.0), (2.25, 10.4), (4.5, 6.0), (9.0, 6.0), (18.0, 6.0))}, columns=3)
 
 # %% [markdown]
-# The picture of a lamp out of focus has the shape of the aperture. Six straight blades (`blades=6`) make hexagons. For a lamp behind
-# the plane in focus, the shape is upright; for a lamp in front of the plane, it is rotated by half a turn. Three blades show the
-# difference (here the camera focuses at 7 units).
+# The picture of a lamp out of focus has the shape of the aperture. Six straight blades (`blades=6`) make hexagons. For a lamp behind the
+# plane in focus, the shape is upright; for a lamp in front of the plane, it is rotated by half a turn. Three blades show the difference
+# (here the camera focuses at 7 units).
 
 # %%
 def lamps(spp, **blades):

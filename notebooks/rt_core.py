@@ -1,11 +1,11 @@
 # %% [markdown]
 # # Inside the RT core: counters, heat maps, what if
 # An RT core (ray tracing core of a GPU) has three units. One tests boxes, one tests triangles, and one traverses a hierarchy of boxes.
-# wrt's kernels have the same units, and can count the work of each. This notebook shows the counts of a picture's rays. Then a
-# model turns them into rays per second, and the design of the RT core is varied.
+# wrt's kernels have the same units, and can count the work of each. This notebook shows the counts of a picture's rays. Then a model
+# turns them into rays per second, and the design of the RT core is varied.
 #
-# `docs/rt_core.md` describes the model, its parameters and their sources. Use its results to compare designs. NVIDIA has not
-# published the rates and the node format of RT cores, so absolute numbers are accurate to a factor of 2 at best.
+# `docs/rt_core.md` describes the model, its parameters and their sources. Use its results to compare designs. NVIDIA has not published
+# the rates and the node format of RT cores, so absolute numbers are accurate to a factor of 2 at best.
 #
 # If the environment variable `WRT_QUICK` is set, pictures are smaller and rays fewer. The outputs below were made without it.
 
@@ -46,9 +46,9 @@ wrt.side_by_side({"": wrt.render(scene, size=SIZE, spp=SPP)})
 
 # %% [markdown]
 # ## What does a pixel cost?
-# `wrt.profile` traces the same rays as a render, with counters in the kernel. Nodes have two children here; how many the nodes of
-# Turing (NVIDIA's first GPUs with RT cores) have is not published. The table has one row for each kind of ray and each depth (number
-# of bounces before the ray), with the total cost of these rays:
+# `wrt.profile` traces the same rays as a render, with counters in the kernel. Nodes have two children here; how many the nodes of Turing
+# (NVIDIA's first GPUs with RT cores) have is not published. The table has one row for each kind of ray and each depth (number of bounces
+# before the ray), with the total cost of these rays:
 
 # %%
 profile = wrt.profile(scene, size=SIZE, spp=1, accel="bvh2")
@@ -56,8 +56,8 @@ profile
 
 # %% [markdown]
 # One sample of a pixel is a tree of rays. A hit on a matte surface sends a shadow ray to each light that it faces. A mirror sends one
-# reflected ray, and glass sends a reflected and a refracted ray. So the glass pot has the most rays, and the sky has one per pixel.
-# The heat map "probes" shows the number of rays of each pixel.
+# reflected ray, and glass sends a reflected and a refracted ray. So the glass pot has the most rays, and the sky has one per pixel. The
+# heat map "probes" shows the number of rays of each pixel.
 
 # %%
 profile.heatmap("probes")
@@ -70,15 +70,15 @@ profile.heatmap("probes")
 profile.heatmap("nodes")
 
 # %% [markdown]
-# The map of the stack shows outlines of boxes on the sky and on the floor. The reason: a stack entry is a box that the ray meets and
-# that waits for its visit.
+# The map of the stack shows outlines of boxes on the sky and on the floor. The reason: a stack entry is a box that the ray meets and that
+# waits for its visit.
 
 # %%
 profile.heatmap("stack")
 
 # %% [markdown]
-# The cost of a single ray depends on where it starts. Many camera rays see sky or floor. A reflected or refracted ray starts between
-# the facets, and fetches about three times as many nodes (the legend has the means).
+# The cost of a single ray depends on where it starts. Many camera rays see sky or floor. A reflected or refracted ray starts between the
+# facets, and fetches about three times as many nodes (the legend has the means).
 
 # %%
 rays = profile.rays
@@ -96,9 +96,9 @@ plt.show()
 # %% [markdown]
 # ## From counts to clock cycles
 # A ray occupies the box unit for its box tests, and the triangle unit for its triangle tests. It occupies the L1 cache for its cache
-# lines, the L2 cache for lines that miss the L1, and the DRAM for lines that miss the L2. It also waits for the latency of its
-# fetches and tests; other warps share this time. All these terms overlap, so **the largest term decides** (a roofline model). The
-# cache misses come from a simulation with the addresses that the rays fetched.
+# lines, the L2 cache for lines that miss the L1, and the DRAM for lines that miss the L2. It also waits for the latency of its fetches
+# and tests; other warps share this time. All these terms overlap, so **the largest term decides** (a roofline model). The cache misses
+# come from a simulation with the addresses that the rays fetched.
 
 # %%
 gpu = GPUS["rtx2080ti"]
@@ -118,12 +118,12 @@ ax.legend(title="the longest bar of a colour is the limit")
 plt.show()
 
 # %% [markdown]
-# Latency is the largest term for every kind of ray: with four warps at a time, the core mostly waits. Lanes also wait for each
-# other. With shadow rays in pixel order, lanes are idle for three quarters of the time (SIMT efficiency), because the pixels of a
-# warp have different numbers of shadow rays.
+# Latency is the largest term for every kind of ray: with four warps at a time, the core mostly waits. Lanes also wait for each other.
+# With shadow rays in pixel order, lanes are idle for three quarters of the time (SIMT efficiency), because the pixels of a warp have
+# different numbers of shadow rays.
 #
-# How much do the assumptions matter? Each assumed parameter is varied alone. Each bar is the ratio of the most to the least rays
-# per second.
+# How much do the assumptions matter? Each assumed parameter is varied alone. Each bar is the ratio of the most to the least rays per
+# second.
 
 # %%
 by_name = {row.name: row for row in rows}
@@ -138,8 +138,8 @@ plt.show()
 
 # %% [markdown]
 # ## What if?
-# Each study changes one property of the design, and counts the same rays again. The mesh is a terrain of 20,000 triangles. Its rays
-# start on the surface into random directions (diffuse): incoherent, like rays after a first bounce.
+# Each study changes one property of the design, and counts the same rays again. The mesh is a terrain of 20,000 triangles. Its rays start
+# on the surface into random directions (diffuse): incoherent, like rays after a first bounce.
 
 # %%
 hills = terrain(100)
@@ -161,21 +161,21 @@ def study(name, kinds=("diffuse",)):
 study("width")
 
 # %% [markdown]
-# Wider nodes need fewer successive fetches, about as many box tests, and more triangle tests. If latency is the limit (4 warps), that
-# is faster. If latency is hidden (32 warps), cache lines and bytes are the limit, and eight children are no better than four. Planes
-# of 8 bits nearly halve the bytes of `bvh8`, for 2 % more box tests.
+# Wider nodes need fewer successive fetches, about as many box tests, and more triangle tests. If latency is the limit (4 warps), that is
+# faster. If latency is hidden (32 warps), cache lines and bytes are the limit, and eight children are no better than four. Planes of 8
+# bits nearly halve the bytes of `bvh8`, for 2 % more box tests.
 
 # %% [markdown]
-# **How many entries has the stack?** A short stack that overflows drops its oldest entry. When the stack is empty, the traversal
-# restarts at the root. A trail of one bit per level leads it back to the first node that it has not visited.
+# **How many entries has the stack?** A short stack that overflows drops its oldest entry. When the stack is empty, the traversal restarts
+# at the root. A trail of one bit per level leads it back to the first node that it has not visited.
 
 # %%
 stack = study("stack")
 stack
 
 # %% [markdown]
-# **How many bits has a plane of a box?** Fewer bits make nodes smaller but boxes larger, because planes are rounded outwards: no ray
-# may be lost.
+# **How many bits has a plane of a box?** Fewer bits make nodes smaller but boxes larger, because planes are rounded outwards: no ray may
+# be lost.
 
 # %%
 planes = study("planes")
@@ -195,20 +195,19 @@ plt.show()
 
 # %% [markdown]
 # Four stack entries are nearly as good as any number. Without a stack, a ray fetches twice as many nodes. With planes of 8 or 6 bits,
-# rays fetch the fewest bytes. With 4 bits the boxes are so large that more nodes are fetched, which costs the bytes that each node
-# saves.
+# rays fetch the fewest bytes. With 4 bits the boxes are so large that more nodes are fetched, which costs the bytes that each node saves.
 
 # %% [markdown]
-# **How much do front-to-back order and early stop save?** A ray that visits the nearer child first finds its hit early. It can then
-# skip boxes behind the hit.
+# **How much do front-to-back order and early stop save?** A ray that visits the nearer child first finds its hit early. It can then skip
+# boxes behind the hit.
 
 # %%
 study("order", ("primary", "diffuse"))
 
 # %% [markdown]
-# For primary rays, either alone saves almost nothing; both together save a third of the nodes. Front-to-back order finds the hit
-# early, and the early stop skips what is behind it. Without the early stop, a ray visits the same nodes in any order. Diffuse rays
-# gain less, because most of them reach the sky and have no hit.
+# For primary rays, either alone saves almost nothing; both together save a third of the nodes. Front-to-back order finds the hit early,
+# and the early stop skips what is behind it. Without the early stop, a ray visits the same nodes in any order. Diffuse rays gain less,
+# because most of them reach the sky and have no hit.
 
 # %% [markdown]
 # **How much does sorting save?** The study traces the same rays in the order of the picture, sorted by origin and direction, and
@@ -218,14 +217,14 @@ study("order", ("primary", "diffuse"))
 study("sorting")
 
 # %% [markdown]
-# The numbers of nodes and triangles per ray do not change. Shuffling doubles the number of cache lines; if latency is hidden, this
-# costs more than half of the speed. In the order of the picture, these rays are already sorted by origin. Sorting by direction, too,
-# improves the SIMT efficiency but needs more cache lines.
+# The numbers of nodes and triangles per ray do not change. Shuffling doubles the number of cache lines; if latency is hidden, this costs
+# more than half of the speed. In the order of the picture, these rays are already sorted by origin. Sorting by direction, too, improves
+# the SIMT efficiency but needs more cache lines.
 
 # %% [markdown]
 # ## Box unit against triangle unit
-# How many boxes and triangles per clock cycle should an RT core test? The maps vary both rates. Latency is hidden (32 warps), and the
-# L2 cache already holds the data.
+# How many boxes and triangles per clock cycle should an RT core test? The maps vary both rates. Latency is hidden (32 warps), and the L2
+# cache already holds the data.
 
 # %%
 rates = [rate for rate in whatif.run(whatif.Plan("rates", hills, ("diffuse",), RAYS)) if rate.structure in ("bvh2", "bvh8")]
@@ -247,15 +246,14 @@ plt.show()
 
 # %% [markdown]
 # With two children per node, the triangle rate is never the limit. The box rate is the limit, and from 4 boxes per cycle on, the L2
-# cache. With eight children, a ray tests more triangles, and half a triangle per cycle would be too few. A doubled triangle rate
-# helps only if triangle tests are the limit.
+# cache. With eight children, a ray tests more triangles, and half a triangle per cycle would be too few. A doubled triangle rate helps
+# only if triangle tests are the limit.
 
 # %% [markdown]
 # ## Exercises
 # 1. Let the pot be a mirror. Which heat map changes most, and how does the modelled range of speeds change?
-# 2. Which kind of ray has the most cache misses? Use
-#    `wrt.lab.rtcore.profile_report.work_of(profile, "shadow").misses(gpu, BASE)`.
-# 3. In `study("order")`, a ray crosses few surfaces of the hills. Build a mesh with many layers (several `terrain`s above each other,
-#    by `wrt.Mesh`). How much do order and early stop save now?
+# 2. Which kind of ray has the most cache misses? Use `wrt.lab.rtcore.profile_report.work_of(profile, "shadow").misses(gpu, BASE)`.
+# 3. In `study("order")`, a ray crosses few surfaces of the hills. Build a mesh with many layers (several `terrain`s above each other, by
+#    `wrt.Mesh`). How much do order and early stop save now?
 # 4. RT cores after Turing test triangles at twice the rate. For which structure and rays is that faster in the model? See `doubled` in
 #    the study "rates".

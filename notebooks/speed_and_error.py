@@ -1,11 +1,10 @@
 # %% [markdown]
 # # Speed against error
-# A rendered picture is an estimate: more time gives less error. How fast does the error fall? Can a render estimate its own error?
-# When is the picture good enough? Which errors remain with any number of samples? And how exact is a single hit?
+# A rendered picture is an estimate: more time gives less error. How fast does the error fall? Can a render estimate its own error? When
+# is the picture good enough? Which errors remain with any number of samples? And how exact is a single hit?
 #
-# If the environment variable `WRT_QUICK` is set, pictures are smaller and samples fewer. The outputs below were made without it.
-# Times depend on the machine. All other results are the same everywhere, because samples depend only on pixel, sample index and
-# seed.
+# If the environment variable `WRT_QUICK` is set, pictures are smaller and samples fewer. The outputs below were made without it. Times
+# depend on the machine. All other results are the same everywhere, because samples depend only on pixel, sample index and seed.
 
 # %%
 import os
@@ -27,8 +26,8 @@ room = wrt.load_scene("../scenes/sphere_light.toml")
 
 # %% [markdown]
 # ## Noise
-# Two glowing balls light a room. From each hit, a shadow ray goes to a random point on each ball, so that penumbrae are noisy. Below
-# each picture is its error: the absolute difference from a converged picture, in radiance, averaged over the colour channels.
+# Two glowing balls light a room. From each hit, a shadow ray goes to a random point on each ball, so that penumbrae are noisy. Below each
+# picture is its error: the absolute difference from a converged picture, in radiance, averaged over the colour channels.
 
 # %%
 truth = wrt.render(room, size=SIZE, spp=8 * MOST, seed=99).pixels.astype(np.float64)
@@ -46,9 +45,9 @@ wrt.side_by_side({**pictures, **errors}, columns=3)
 
 # %% [markdown]
 # ## How fast does the error fall?
-# `wrt.lab.bench.error.sweep` renders with 1, 2, 4 ... samples per pixel and several seeds, and compares the pictures with a
-# reference. The seeds give error bars. They also separate noise, which differs between seeds, from bias, which does not. The sweep
-# covers both samplers: independent random numbers, and scrambled Sobol points, which are spread evenly.
+# `wrt.lab.bench.error.sweep` renders with 1, 2, 4 ... samples per pixel and several seeds, and compares the pictures with a reference.
+# The seeds give error bars. They also separate noise, which differs between seeds, from bias, which does not. The sweep covers both
+# samplers: independent random numbers, and scrambled Sobol points, which are spread evenly.
 
 # %%
 small = room.with_settings(size=SMALL)
@@ -83,10 +82,9 @@ for slope in sweep.slopes:
 
 # %% [markdown]
 # ## Can a render estimate its own error?
-# `film.variance` is the variance of each pixel's mean, estimated from the pixel's own samples. For independent samples the estimate
-# is right on average: error over estimated error is normally distributed with standard deviation 1 (the "width" below). Sobol
-# points are spread evenly, so that their mean is more accurate than the spread of the samples suggests. For them the estimated error
-# is too large.
+# `film.variance` is the variance of each pixel's mean, estimated from the pixel's own samples. For independent samples the estimate is
+# right on average: error over estimated error is normally distributed with standard deviation 1 (the "width" below). Sobol points are
+# spread evenly, so that their mean is more accurate than the spread of the samples suggests. For them the estimated error is too large.
 
 # %%
 fig, ax = plt.subplots(figsize=(6.4, 3.2), dpi=80, layout="constrained")
@@ -141,9 +139,9 @@ wrt.side_by_side(shown)
 
 # %% [markdown]
 # ## How exact is a hit?
-# The oracle (`wrt.lab.oracle.oracle`) computes in float64, and in integer arithmetic where float64 is not exact enough. Its $t$ is
-# exact to 14 digits. The plot shows the error of each triangle test's $t$ in float32 steps (ulp) of $t$. The rays start on a terrain
-# into random directions.
+# The oracle (`wrt.lab.oracle.oracle`) computes in float64, and in integer arithmetic where float64 is not exact enough. Its $t$ is exact
+# to 14 digits. The plot shows the error of each triangle test's $t$ in float32 steps (ulp) of $t$. The rays start on a terrain into
+# random directions.
 
 # %%
 hills = terrain(40 if QUICK else 150)
@@ -165,10 +163,10 @@ ax.legend(fontsize=9)
 plt.show()
 
 # %% [markdown]
-# More than half of the watertight test's distances are the float32 value nearest to the exact one. Fewer than one in a thousand is off
-# by ten steps or more. The plane equation and Baldwin and Weber's test compute $t$ from a rounded plane; one in two hundred of their
-# distances is off by a hundred steps. This matters because a new ray must start outside the error of its origin. wrt uses the
-# derived bound of each hit for this, and no fixed epsilon.
+# More than half of the watertight test's distances are the float32 value nearest to the exact one. Fewer than one in a thousand is off by
+# ten steps or more. The plane equation and Baldwin and Weber's test compute $t$ from a rounded plane; one in two hundred of their
+# distances is off by a hundred steps. This matters because a new ray must start outside the error of its origin. wrt uses the derived
+# bound of each hit for this, and no fixed epsilon.
 #
 # ## Exercises
 # 1. Render `scenes/whitted.toml` instead, which has no soft shadows. How fast does Sobol's error fall there, and why faster?

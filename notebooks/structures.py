@@ -3,8 +3,8 @@
 # An acceleration structure saves a ray from being tested against every triangle. Which structure is best, and what does it cost? This
 # notebook builds several structures over the same triangles, traces the same rays, counts their steps, and measures their times.
 #
-# If the environment variable `WRT_QUICK` is set, pictures and meshes are smaller. The outputs below were made without it. Times
-# depend on the machine; counts of steps do not.
+# If the environment variable `WRT_QUICK` is set, pictures and meshes are smaller. The outputs below were made without it. Times depend on
+# the machine; counts of steps do not.
 
 # %%
 import os
@@ -24,8 +24,8 @@ SIZE, SPP, RAYS = ((160, 90), 1, 2_000) if QUICK else ((390, 220), 16, 20_000)
 STRUCTURES = ("bvh2", "kdtree", "octree", "grid")
 
 # %% [markdown]
-# Eric Haines (Ray Tracing News, 1988) described the hard case of a uniform grid, a teapot in a stadium. A few large triangles
-# determine the size of the grid, and all the small triangles are in one place.
+# Eric Haines (Ray Tracing News, 1988) described the hard case of a uniform grid, a teapot in a stadium. A few large triangles determine
+# the size of the grid, and all the small triangles are in one place.
 
 # %%
 scene = wrt.load_scene("../scenes/stadium.toml")
@@ -40,9 +40,9 @@ print({name: f"{extent:.3g}" for name, extent in extents.items()}, f"triangles: 
 
 # %% [markdown]
 # ## Steps of a ray
-# With `counters=True`, a query counts the nodes (in a grid: cells) that each ray fetches, and the triangles that it tests. Each of
-# these is a step. The maps have one ray per pixel: the upper row for the pot alone, the lower row for the pot in the stadium. The
-# colour scale is logarithmic, from 1 to 10,000 steps.
+# With `counters=True`, a query counts the nodes (in a grid: cells) that each ray fetches, and the triangles that it tests. Each of these
+# is a step. The maps have one ray per pixel: the upper row for the pot alone, the lower row for the pot in the stadium. The colour scale
+# is logarithmic, from 1 to 10,000 steps.
 
 # %%
 camera = wrt.Camera.look_at((1.25, 1.0, 1.9), (0.03, 0.42, 0.0), fov_y=np.radians(36))
@@ -71,8 +71,8 @@ fig.colorbar(shown, ax=axes, label="steps of a ray", shrink=0.9)
 plt.show()
 
 # %% [markdown]
-# All structures find the same triangle at the same $t$, to the last bit (the cell checks it). They differ only in cost. The number
-# above each map is its mean.
+# All structures find the same triangle at the same $t$, to the last bit (the cell checks it). They differ only in cost. The number above
+# each map is its mean.
 
 # %%
 for name in STRUCTURES:
@@ -80,8 +80,8 @@ for name in STRUCTURES:
     print(f"{name:7} {alone:6.1f} steps a ray alone, {there:7.1f} in the stadium: {there / alone:6.1f} times")
 
 # %% [markdown]
-# Three structures adapt: they subdivide space where the triangles are, and need only a few more steps. The cells of the grid all have
-# the same size, which depends on the stadium. The whole pot is in one or a few cells, and every ray tests all of its triangles.
+# Three structures adapt: they subdivide space where the triangles are, and need only a few more steps. The cells of the grid all have the
+# same size, which depends on the stadium. The whole pot is in one or a few cells, and every ray tests all of its triangles.
 
 # %%
 cells = np.array(wrt.build(stadium, "grid").built.arrays["n"])
@@ -113,8 +113,8 @@ plt.show()
 
 # %% [markdown]
 # ## Build time and query time
-# `wrt.lab.bench.accel` measures build time, query time and memory, and checks every hit: `differ` and `wrong` must be 0. The mesh is
-# the pot alone.
+# `wrt.lab.bench.accel` measures build time, query time and memory, and checks every hit: `differ` and `wrong` must be 0. The mesh is the
+# pot alone.
 
 # %%
 report = bench.run(bench.Plan((pot,), (*STRUCTURES, "bvh8"), ("diffuse",), rays=RAYS, runs=7))
@@ -122,8 +122,8 @@ assert all(row.differ == row.wrong == 0 for row in report)
 report
 
 # %% [markdown]
-# The more rays, the more a slow build can pay. Each line is the time to build plus the time to trace that number of rays. The lowest
-# line at a number of rays is the best structure for it.
+# The more rays, the more a slow build can pay. Each line is the time to build plus the time to trace that number of rays. The lowest line
+# at a number of rays is the best structure for it.
 
 # %%
 (brute,) = bench.run(bench.Plan((pot,), ("brute_force",), ("diffuse",), rays=RAYS // 20, runs=3))
@@ -144,10 +144,9 @@ for row in report:
 
 # %% [markdown]
 # ## Which tree?
-# A BVH can be built in many ways. The surface area heuristic (SAH) predicts the number of steps of a random line through the root's
-# box, if no hit stops the line. The line meets a node with the probability (area of the node's box) / (area of the root's box).
-# The plot compares six builders over the stadium with its pot: the prediction, and the measured steps of random lines and of the
-# picture's rays.
+# A BVH can be built in many ways. The surface area heuristic (SAH) predicts the number of steps of a random line through the root's box,
+# if no hit stops the line. The line meets a node with the probability (area of the node's box) / (area of the root's box). The plot
+# compares six builders over the stadium with its pot: the prediction, and the measured steps of random lines and of the picture's rays.
 
 # %%
 BUILDERS = ("lbvh", "binned") if QUICK else ("lbvh", "median", "binned", "sweep", "sbvh", "reinsertion")
@@ -175,19 +174,19 @@ ax.legend(loc="upper right", fontsize=9)
 plt.show()
 
 # %% [markdown]
-# The measured lines stop at their first hit, so they take fewer steps than predicted, but they rank the builders in almost the same order. The
-# picture's rays go to the pot and not all over the stadium; their ranking is similar. Two builders ignore areas: `lbvh` (Morton
-# codes) and `median`. Their picture rays take about twice as many steps, because they split the pot by the count of triangles or at
-# a grid of powers of two, and boxes overlap. The maps show where.
+# The measured lines stop at their first hit, so they take fewer steps than predicted, but they rank the builders in almost the same
+# order. The picture's rays go to the pot and not all over the stadium; their ranking is similar. Two builders ignore areas: `lbvh`
+# (Morton codes) and `median`. Their picture rays take about twice as many steps, because they split the pot by the count of triangles or
+# at a grid of powers of two, and boxes overlap. The maps show where.
 
 # %%
 wrt.side_by_side({builder: heatmap(maps[builder], "steps of a ray", top=80.0) for builder in ("lbvh", "binned")})
 
 # %% [markdown]
 # ## Exercises
-# 1. Put two pots into the stadium, far from each other. How many steps does the grid need now? How many would it need with a second
-#    grid inside each full cell?
-# 2. Which structures can follow moving vertices (`accel.refit`)? Twist the pot by a full turn, refit, and compare the steps with those
-#    of a new tree.
+# 1. Put two pots into the stadium, far from each other. How many steps does the grid need now? How many would it need with a second grid
+#    inside each full cell?
+# 2. Which structures can follow moving vertices (`accel.refit`)? Twist the pot by a full turn, refit, and compare the steps with those of
+#    a new tree.
 # 3. `wrt.build(stadium, "bvh8c")` takes half of the memory. How many more steps does it take, and how much more time?
 # 4. From which number of rays on is building and querying a k-d tree faster than `bvh2`, if ever?
