@@ -152,8 +152,7 @@ def mitsuba(how: Reporting, plan: Mitsuba, scene: Path, assignments: Assignments
     """Render SCENE with wrt and with Mitsuba 3 (scalar_rgb and llvm_ad_rgb) on all threads, and compare the times to equal error,
     with and without the start of the process.
 
-    llvm_ad_rgb needs an LLVM library (19 works), named in the environment variable DRJIT_LIBLLVM_PATH.
-    """
+    llvm_ad_rgb needs an LLVM library (19 works), named in the environment variable DRJIT_LIBLLVM_PATH."""
     from wrt.lab.mitsuba import equal_error
     from wrt.renderer.options import Options
 

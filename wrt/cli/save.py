@@ -34,8 +34,7 @@ def save_film(film: Film, output: Path, bits: int | None, layers: Sequence[str] 
     """Write the picture to `output`, or if that fails into a new folder wrt-* in the folder for temporary files (TMPDIR).
 
     Returns the paths written, the numbers of the signals that arrived meanwhile, and the error if writing to `output` failed. Raises
-    InputError if both folders fail.
-    """
+    InputError if both folders fail."""
     with held_interrupts() as signals:
         try:
             return film.save(output, bits=bits, aov=layers), signals, None

@@ -36,8 +36,7 @@ def view(scene: Path, place: Place, open_browser: bool, spp: int, assignments: A
     """Show SCENE in a browser with an orbit camera; the picture gets finer while the camera rests.
 
     The printed address contains a secret token: everybody with the address can watch, and move the camera. Ctrl-C ends the viewer.
-    The viewer needs viser: pip install "wrt[viewer]".
-    """
+    The viewer needs viser: pip install "wrt[viewer]"."""
     from wrt.viewer.page import Page
     from wrt.viewer.server import import_viser, listen
 

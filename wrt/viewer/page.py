@@ -67,8 +67,7 @@ class Page:
     """A server with the panel and one Viewer, which runs until `close`. `url` is the page's address with the token.
 
     spp, counter_of: see Viewer. warn: called once for each kind of refused request or message. Raises InputError if the server cannot
-    listen at `place`.
-    """
+    listen at `place`."""
 
     def __init__(self, scene: Scene, options: Options, place: Place = HERE, spp: int = 1024, *,
                  counter_of: CounterOf | None = None, warn: Callable[[str], None] = to_stderr) -> None:

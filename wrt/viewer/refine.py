@@ -94,8 +94,7 @@ class Viewer:
     def change(self, **changes: Any) -> bool:
         """Request a view with some fields of View changed; return True if it differs. camera: a camera, or a function of the current one.
 
-        Raises InputError for an unknown structure or counter.
-        """
+        Raises InputError for an unknown structure or counter."""
         if "accel" in changes:
             ACCELERATORS.check(changes["accel"], "accel")
         if changes.get("cost"):

@@ -1,4 +1,4 @@
-"""--quick: less of what is not given, said in one line."""
+"""--quick: smaller defaults, which one line on stderr lists."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ WITHOUT_FILES = (plans.Visibility, plans.Units, plans.Peers, plans.HardCases, pl
 
 @pytest.fixture
 def measured(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """The plans that `bench` would carry out, in their order; nothing is measured."""
+    """Collect the plans that `bench` runs, in their order, without measuring."""
     plans: list[Any] = []
 
     def noted(plan: Any, told: Any = None) -> list[Any]:
@@ -49,7 +49,7 @@ def test_a_bench_takes_what_is_given_and_of_all_else_less(measured: list[Any], w
     assert measured == [plans.Units(**plans.Units.QUICK | {"runs": 4})]
     rays = plans.Units.QUICK["rays"]
     assert done.err == f"units --quick: rays {rays} instead of {plans.Units.rays}\n"
-    assert f"--rays {rays} --runs 4" in done.out  # what repeats it
+    assert f"--rays {rays} --runs 4" in done.out  # the command that repeats the measurement
 
 
 def test_without_a_name_all_run_that_need_no_file(measured: list[Any]) -> None:

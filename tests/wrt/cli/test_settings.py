@@ -1,4 +1,4 @@
-"""Settings on the command line: --set, names that --help and completion know, and the hint that max_depth cuts what is seen."""
+"""Settings on the command line: --set, names in --help and completion, and the hint that max_depth darkens pixels."""
 
 from __future__ import annotations
 
@@ -225,7 +225,7 @@ def test_an_unknown_option_suggests_what_is_meant_or_nothing(wrong: str, meant: 
 
 
 def mirrors(albedo: float, **settings: Any) -> Scene:
-    """A mirror over the left half of the picture, in front of a white sky."""
+    """Return a scene with a mirror over the left half of the picture, in front of a white sky."""
     mirror = Material("mirror", albedo=(albedo,) * 3)
     half = Object(quad((-100, -100, 0), (100, 0, 0), (0, 200, 0)), (mirror,))
     return Scene(objects=(half,), background=ConstantBackground((1, 1, 1)), cameras=(Camera.look_at((0, 0, 5), (0, 0, 0)),),
@@ -282,4 +282,4 @@ def test_the_command_line_tells_what_was_cut() -> None:
     assert not hints(run("render", "scene.toml", *small, "-q"))
     assert not hints(run("render", "scene.toml", *small, "--max-depth", 20))
     assert 0.0 < json.loads(run("render", "scene.toml", *small, "--json").out)["visibly_cut"] < 0.5
-    assert len(hints(run("animate", "scene.toml", *small, "--frames", 2, "-o", "a.gif"))) == 1  # once, not each frame
+    assert len(hints(run("animate", "scene.toml", *small, "--frames", 2, "-o", "a.gif"))) == 1  # once, not for each frame

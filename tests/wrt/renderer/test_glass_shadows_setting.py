@@ -1,4 +1,4 @@
-"""Default of `glass_shadows`: "tinted" for a file with solid glass that cannot say otherwise, else "opaque"."""
+"""Default of `glass_shadows`: "tinted" for a glTF file with solid glass, since glTF has no such setting; else "opaque"."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_what_is_in_solid_glass_of_a_gltf_file_is_lit(tmp_path: Path) -> None:
     path = block_with_a_leaf(tmp_path)
     assert wrt.load_scene(path).settings == Settings(glass_shadows="tinted", max_depth=GLASS_DEPTH)
     assert leaf_of(path) == pytest.approx(1.0, rel=1e-5)
-    assert leaf_of(path, glass_shadows="opaque") == 0.0  # what is said outright counts
+    assert leaf_of(path, glass_shadows="opaque") == 0.0  # an explicit setting wins
 
 
 def test_a_gltf_file_without_solid_glass_has_the_settings_of_any_scene(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""What a render tells of itself while it runs."""
+"""Progress of a render on stderr."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_the_time_left_of_work_of_known_size(monkeypatch: pytest.MonkeyPatch) ->
     assert str(left) == ""
     now, left.done = 130.0, 2.0
     assert str(left) == ", about 1:30 left"
-    left.done = 9.0  # more than was thought
+    left.done = 9.0  # more than the expected total
     assert str(left) == ", about 0:00 left"
 
 
@@ -62,7 +62,7 @@ def test_without_a_terminal_there_is_a_line_now_and_then(monkeypatch: pytest.Mon
 
 
 def test_a_process_without_stderr_is_told_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """`print` takes stdout, where data goes, for a stderr that is closed."""
+    """If stderr is closed, `print` would write to stdout, which is for data."""
     monkeypatch.setattr(sys, "stderr", None)
     with progress_reporter(False) as report:
         assert report is None
@@ -111,7 +111,7 @@ def test_on_a_terminal_there_is_a_bar_that_goes_away(monkeypatch: pytest.MonkeyP
         try:
             while data := os.read(main, 65536):
                 seen.append(data)
-        except OSError:  # how Linux tells that the other side is closed
+        except OSError:  # Linux raises OSError when the other side is closed
             pass
 
     reader = threading.Thread(target=read)
@@ -121,7 +121,7 @@ def test_on_a_terminal_there_is_a_bar_that_goes_away(monkeypatch: pytest.MonkeyP
         with progress_reporter(False) as report:
             assert report is not None
             report(Progress(0, 200, 0, 0.0, stage="compile"))
-            time.sleep(0.3)  # it draws itself ten times a second
+            time.sleep(0.3)  # the bar is drawn ten times per second
             report(at(10.0))
     reader.join()
     os.close(main)

@@ -1,4 +1,4 @@
-"""Tiles, passes, threads, Ctrl-C, and what comes back."""
+"""Renders: tiles, passes, threads, Ctrl-C, the resulting film, and errors."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ from wrt.scene.model import Object, Scene, Sphere
 from wrt.scene.settings import DEPTH, Settings
 from wrt.scene.shapes import box, icosphere, quad
 
-SIZE = (37, 22)  # no multiple of any tile
-# One set of features for nearly all tests here: each other one is a kernel to compile.
+SIZE = (37, 22)  # not a multiple of any tile size
+# Nearly all tests here use one set of features, because each further set needs a kernel of its own.
 SCENE = Scene(
     objects=(Object(box(), (Material(albedo=(0.7, 0.6, 0.5)),), name="box"),
              Object(quad((-4, -1, -4), (0, 0, 8), (8, 0, 0)), (Material(albedo=(0.2, 0.4, 0.8)),), name="floor")),
@@ -107,7 +107,7 @@ def test_the_seed_changes_the_noise_and_nothing_else(reference: Film) -> None:
         assert differ.mean() > 0.5
         sigma = np.sqrt(a.variance + b.variance)
         z = np.abs(a.pixels - b.pixels)[sigma > 0] / sigma[sigma > 0]
-        assert np.median(z) < 1.0  # of a normal distribution it is 0.67; these samples are stratified, hence less
+        assert np.median(z) < 1.0  # 0.67 for a normal distribution, less for these stratified samples
 
 
 def test_more_samples_go_on_where_fewer_ended() -> None:
@@ -140,18 +140,18 @@ def test_statistics_and_metadata(reference: Film) -> None:
 
 
 def test_mean_and_variance_are_those_of_the_single_samples() -> None:
-    """Sample i alone is got from two renders that differ by it; float64 from float32 means is exact enough."""
+    """The value of sample i is computed, in float64, from the means of two renders with i and i + 1 samples."""
     films = [render(SCENE, spp=spp) for spp in range(1, 7)]
     totals = np.stack([np.zeros_like(films[0].pixels, np.float64), *(f.pixels.astype(np.float64) * (i + 1)
                                                                        for i, f in enumerate(films))])
     samples = np.diff(totals, axis=0)
     expected = samples.var(axis=0, ddof=1) / 6
     assert np.allclose(films[5].variance, expected, rtol=1e-3, atol=1e-6)
-    assert np.isposinf(films[0].variance).all()  # one sample tells nothing of its variance
+    assert np.isposinf(films[0].variance).all()  # one sample allows no estimate of the variance
 
 
 def test_aovs_are_what_the_pixels_see() -> None:
-    """A square of side 2 at distance 3, seen straight on: depth along the ray, the normal to the viewer."""
+    """A square of side 2 at distance 3 faces the camera: depth along the ray, and the normal towards the camera."""
     scene = Scene(objects=(Object(quad((-1, -1, 0), (2, 0, 0), (0, 2, 0)), (Material(albedo=(0.1, 0.5, 0.9)),)),),
                   lights=SCENE.lights, background=SCENE.background,
                   cameras=(Camera.look_at((0, 0, 3), (0, 0, 0), fov_y=2 * np.arctan(2 / 3)),))  # 4 wide and high at z = 0
@@ -176,7 +176,7 @@ def test_only_the_aovs_that_were_asked_for_come_back() -> None:
 
 
 def test_a_sample_that_is_not_finite_is_black_and_counted() -> None:
-    # Numbers of a scene end at 1e30; a picture's pixels times its scale can still leave float32.
+    # A scene's numbers are at most 1e30; a background picture's pixels times its scale can still exceed float32.
     scene = replace(SCENE, background=EnvironmentBackground(np.full((2, 4, 3), 3e38, np.float32), scale=4.0))
     film = render(scene, spp=4)
     assert film.stats["not_finite"] > 0 and np.isfinite(film.pixels).all() and (film.samples == 4).all()
@@ -208,7 +208,7 @@ def test_names_can_be_written(name: str, expected: str) -> None:
 
 
 class Clock:
-    """A time.perf_counter that a test moves."""
+    """A time.perf_counter that a test advances."""
 
     def __init__(self) -> None:
         self.now = 100.0
@@ -219,7 +219,7 @@ class Clock:
 
 @pytest.fixture
 def passes(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[list[int], Film]]:
-    """The sizes of the passes that a render would take if a sample of all pixels took so many seconds, and its film."""
+    """Return a function that renders without tracing: sizes of the passes, and the film. seconds: time for a sample of all pixels."""
     clock = Clock()
     monkeypatch.setattr(schedule, "time", clock)
 
@@ -231,7 +231,7 @@ def passes(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[list[int], Fi
             sizes.append(count)
             clock.now += count * seconds
 
-        monkeypatch.setattr(Run, "_take", take)
+        monkeypatch.setattr(Run, "_trace_pass", take)
         return sizes, render(SCENE, spp=spp, **options)
 
     return taken
@@ -248,8 +248,8 @@ def test_passes_take_each_sample_once(passes: Any, spp: int, pass_size: int | No
 
 @pytest.mark.parametrize(("limit", "seconds", "expected"), [
     (10.0, 1.0, [1, 3, 6]),  # the last pass fits into the time left
-    (10.0, 3.0, [1, 2, 1]),  # one sample is taken even if the time does not suffice
-    (0.5, 1.0, [1]),  # the first sample is always taken
+    (10.0, 3.0, [1, 2, 1]),  # a pass has at least one sample, even if the time is too short
+    (0.5, 1.0, [1]),  # each pixel gets at least one sample
     (1e9, 1.0, [1, 3, 12, 4]),
     (np.inf, 1.0, [1, 3, 12, 4]),
 ])
@@ -285,7 +285,7 @@ def interrupt(progress: Progress) -> None:
 
 
 def stop(progress: Progress) -> None:
-    if progress.stage == "trace":  # while kernels compile, nothing is there to keep
+    if progress.stage == "trace":  # while kernels compile, there are no samples to keep
         raise KeyboardInterrupt
 
 
@@ -315,7 +315,7 @@ def test_a_picture_that_ends_early_is_even_up_to_what_a_pass_adds() -> None:
 
 
 def test_ctrl_c_does_not_wait_for_the_end_of_a_pass() -> None:
-    """Tiles (the CPU's; a GPU takes all at once) are done whole or not at all: 500 samples or none."""
+    """On the CPU, a tile is traced completely or not at all: 500 samples or none. On a GPU, all tiles are one launch."""
     film = render(SCENE, spp=1000, size=(200, 150), tile_size=8, pass_size=500, progress=interrupt, device="cpu")
     assert film.stats["interrupted"] and np.unique(film.samples).tolist() == [0, 500]
     tiles = [film.samples[y : y + 8, x : x + 8] for y in range(0, 150, 8) for x in range(0, 200, 8)]
@@ -335,7 +335,7 @@ def test_ctrl_c_at_the_very_end_is_not_lost() -> None:
 
 
 def test_ctrl_c_before_the_first_sample(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Run, "_take_aovs", lambda self: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr(Run, "_trace_aovs", lambda self: signal.raise_signal(signal.SIGINT))
     film = render(SCENE, aov=["depth"])
     assert film.stats["interrupted"] and film.stats["samples"] == 0 and not film.pixels.any()
     assert np.isposinf(film.variance).all()
@@ -348,7 +348,7 @@ def test_ctrl_c_while_compiling_does_not_wait_for_the_compiler(monkeypatch: pyte
 
     def compile_for_ever(kernel: Any, device: Any) -> None:
         if next(first, False):
-            time.sleep(0.2)  # until the main thread waits
+            time.sleep(0.2)  # by then the main thread waits
             signal.raise_signal(signal.SIGINT)
         may_end.wait(10.0)
         ended.set()
@@ -489,7 +489,7 @@ def test_a_film_tells_of_itself_in_a_line() -> None:
 
 
 def test_depth_is_the_distance_along_the_ray_and_normals_face_it() -> None:
-    for side in (1.0, -1.0):  # the front of a wall at z = 0, then its back
+    for side in (1.0, -1.0):  # the front, then the back of a wall at z = 0
         wall = Object(quad((-50, -50, 0), (100, 0, 0), (0, 100, 0)), (Material(),))
         camera = Camera.look_at((0, 0, 2 * side), (0, 0, 0), fov_y=1.5, aperture_radius=0.1, focus_distance=2)
         film = render(replace(SCENE, objects=(wall,), cameras=(camera,)), spp=1, size=(16, 16), aov=("depth", "normal"))
@@ -502,7 +502,7 @@ def test_depth_is_the_distance_along_the_ray_and_normals_face_it() -> None:
 def test_progress_is_told_once_of_a_compiler_that_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
     def slow(kernel: Any, device: Any) -> None:
         wait_until(lambda: len([each for each in seen if each.stage == "compile"]) > quick)
-        time.sleep(0.3)  # long enough for another report, were there one
+        time.sleep(0.3)  # long enough for a second report
         load(kernel, device)
 
     load = prepare.load_kernel
@@ -561,6 +561,6 @@ def test_a_tree_is_refined_where_samples_are_many_and_pixels_do_not_tell(tmp_pat
     films = [render(few, aov=["prim_id"], **options)
              for options in ({"checkpoint": path}, {"accel_options": {"builder": "refined"}})]
     assert same(*films) and films[0].stats["accel"]["sah_cost"] > films[1].stats["accel"]["sah_cost"]
-    more = render(few, spp=many, aov=["prim_id"], checkpoint=path, resume=True)  # with the other tree
+    more = render(few, spp=many, aov=["prim_id"], checkpoint=path, resume=True)  # with the tree of the other builder
     assert more.stats["accel"] | {"build_seconds": 0.0} == films[1].stats["accel"] | {"build_seconds": 0.0}
     assert same(more, render(few, spp=many, aov=["prim_id"]))

@@ -1,4 +1,4 @@
-"""What is traced when."""
+"""LocalTracer: order of tiles, pauses between tiles, errors, and early ends."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from wrt.renderer.schedule import LocalTracer
 
 
 class Jobs:
-    """Stands for what a scene was prepared to: `trace` counts what runs."""
+    """Stand-in for a Prepared scene: `trace` counts the running tiles."""
 
     def __init__(self, threads: int, fails_at: int | None = None) -> None:
         self.fails_at, self.lock = fails_at, threading.Lock()

@@ -1,4 +1,4 @@
-"""Who gets into the viewer, and what they can say there. Nothing here needs a browser; tests/wrt/viewer/test_page.py has one."""
+"""Access to the viewer: requests and messages that it accepts or refuses. tests/wrt/viewer/test_page.py uses a browser."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_the_names_of_an_address(host: str, address: str, printed: str, names: t
     access, url = access_for(Place(host, 8080, ["https://Example.org", "http://proxy:9000/"]), address, 8080)
     assert url.startswith(f"http://{printed}:8080/?token=")
     assert access.origins == {f"http://{name}:8080" for name in names} | {"https://example.org", "http://proxy:9000"}
-    access.check(["192.168.1.7:8080"], ["http://192.168.1.7:8080"], "192.168.1.7")  # a number that the connection came to
+    access.check(["192.168.1.7:8080"], ["http://192.168.1.7:8080"], "192.168.1.7")  # the connection's own IP address
     access.check(["example.org"], ["https://example.org"], address)
     for name in ("evil.example:8080", "192.168.1.8:8080", "0.0.0.0:8080"):
         with pytest.raises(Refused):
@@ -82,7 +82,7 @@ def test_where_the_token_may_stand() -> None:
 
 
 class Served:
-    """A page, what it warned of, and its port."""
+    """A page, its warnings, and its port."""
 
     def __init__(self, **place: Any) -> None:
         from wrt.viewer.page import Page
@@ -104,7 +104,7 @@ def rendering() -> Iterator[Served]:
 
 @pytest.fixture
 def served(monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
-    """Makes no pictures, and so compiles nothing."""
+    """Start a page that renders no pictures, so that no kernel is compiled."""
     pytest.importorskip("viser")
     monkeypatch.setattr("wrt.viewer.refine.Viewer._prepare", lambda self, view: False)
     served = Served()
@@ -115,7 +115,7 @@ def served(monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
 
 def test_a_connection_without_a_request_does_not_hold_up_the_end(served: Served) -> None:
     with socket.create_connection(("127.0.0.1", served.port), timeout=PATIENCE) as silent:
-        assert answer(served.port, "/", [])  # so that it has been accepted
+        assert answer(served.port, "/", [])  # by then the silent connection is accepted
         served.page.close()
         assert not served.page.server._websock_server._server_thread.is_alive()
         with contextlib.suppress(ConnectionResetError):
@@ -123,7 +123,7 @@ def test_a_connection_without_a_request_does_not_hold_up_the_end(served: Served)
 
 
 def attempts(port: int, token: str) -> list[tuple[str, list[str]]]:
-    """Requests of strangers: target and headers."""
+    """Return requests without access: target and headers."""
     me, way = f"127.0.0.1:{port}", f"/?token={token}"
     hosts = [[], [f"Host: {me}", f"Host: {me}"], ["Host:"], *([f"Host: {value}"] for value in (
         f"evil.example:{port}", "evil.example", f"EVIL.EXAMPLE:{port}", f"LOCALHOST:{port}", f"localhost.:{port}", "127.0.0.1",
@@ -192,7 +192,7 @@ def test_other_origins_can_be_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_what_is_no_request_is_no_news(served: Served, capfd: pytest.CaptureFixture[str]) -> None:
-    """Not on stdout, and no traceback on stderr."""
+    """Malformed requests print nothing on stdout, and no traceback on stderr."""
     port, token = served.port, served.token
     host = [f"Host: 127.0.0.1:{port}"]
     for request in (b"", b"\r\n\r\n", b"GET\r\n\r\n", b"\x16\x03\x01\x02\x00\x01\x00\x01", b"GET / HTTP/2\r\n\r\n",
@@ -231,7 +231,7 @@ def test_what_is_no_request_is_no_news(served: Served, capfd: pytest.CaptureFixt
 
 
 def test_only_one_port_is_open(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where viser would serve past the guard, there is no viewer."""
+    """If viser would bypass the guard, the viewer does not start."""
     import viser
     import websockets.asyncio.server as websockets
     from websockets.asyncio.server import serve
@@ -292,7 +292,7 @@ def test_what_is_not_heard(message: Any) -> None:
 def test_what_is_no_part_of_a_camera(field: str) -> None:
     for value in NONSENSE:
         if field in ("near", "far") and type(value) in (int, float) and math.isfinite(value):
-            continue  # they are not used
+            continue  # the viewer does not use them
         with pytest.raises(Refused):
             check_message({**CAMERA, field: value}, lambda uuid: None)
 
@@ -307,7 +307,7 @@ def test_the_share_request_opens_nothing(rendering: Served, monkeypatch: pytest.
             somebody.send(type="ShareUrlRequest")
             somebody.send(type="ShareUrlDisconnect")
         somebody.picture()
-        somebody.look(1.0)  # is answered after all that
+        somebody.look(1.0)  # the answer comes after those to the requests above
         somebody.picture()
         assert not any("Share" in message["type"] for message in somebody.messages)
     assert asked == [] and served.page.server._share_tunnel is None
@@ -316,7 +316,7 @@ def test_the_share_request_opens_nothing(rendering: Served, monkeypatch: pytest.
 
 
 def moves(who: Client, begin: float) -> int:
-    """How many of 20 moves of the camera bring new pictures."""
+    """Move the camera 20 times, and return the number of different pictures that arrive."""
     new = set()
     for move in range(20):
         who.look(begin + 0.02 * move)
@@ -399,7 +399,7 @@ def test_a_large_message_ends_the_connection_and_too_many_are_closed(served: Ser
 
 
 def test_pages_can_begin_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each behind its own guard."""
+    """Each page has a guard of its own."""
     pytest.importorskip("viser")
     monkeypatch.setattr("wrt.viewer.refine.Viewer._prepare", lambda self, view: False)
     import websockets.asyncio.server as websockets
@@ -423,7 +423,7 @@ def test_pages_can_begin_together(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_viser_says_nothing_of_those_who_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A picture may be on its way to a browser that is closed meanwhile."""
+    """The page may send a picture to a browser that is being closed."""
     pytest.importorskip("viser")
     monkeypatch.setattr("wrt.viewer.refine.Viewer._prepare", lambda self, view: False)
     with warnings.catch_warnings(record=True) as caught:

@@ -104,7 +104,7 @@ def test_quiet_and_other_origins(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_browsers_command_line_does_not_hold_the_token(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Everybody on the machine can read it."""
+    """All users of the machine can read the command line."""
     pytest.importorskip("viser")
     from wrt.cli import view as cli_view
     from wrt.viewer.page import Page
@@ -150,7 +150,7 @@ def page() -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def browser_page(page: Any) -> Iterator[Any]:
-    """The page in Chromium; its console's errors are the fixture's `mistakes`."""
+    """Open the page in Chromium; `mistakes` collects the errors of its console."""
     api = pytest.importorskip("playwright.sync_api")
     chromium = next((path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None)
     if chromium is None:
@@ -163,23 +163,23 @@ def browser_page(page: Any) -> Iterator[Any]:
         view.mistakes = []
         view.on("console", lambda message: view.mistakes.append(message.text) if message.type == "error" else None)
         view.on("pageerror", lambda error: view.mistakes.append(str(error)))
-        view.goto(f"{page.url}&fixedDpr=1")  # else viser draws coarser where the machine is slow
+        view.goto(f"{page.url}&fixedDpr=1")  # otherwise viser shrinks the canvas on a slow machine
         settle(page, view)
         yield view
         browser.close()
 
 
 def until(condition: Callable[[], Any], browser_page: Any) -> Any:
-    """What the condition gives when it is true at last; the browser's events go on meanwhile."""
+    """Wait until the condition is true, while the browser handles events; return the condition's value."""
     deadline = time.monotonic() + PATIENCE
     while not (value := condition()):
-        assert time.monotonic() < deadline, "it never came about"
+        assert time.monotonic() < deadline, "the condition never held"
         browser_page.wait_for_timeout(50)
     return value
 
 
 def settle(page: Any, browser_page: Any) -> None:
-    """Wait until it looks from the scene's camera, and goes on to: a slow browser begins with viser's own."""
+    """Wait until the view stays at the scene's camera, because a slow browser starts with viser's default camera."""
     for _ in range(2):
         until(lambda: page.watching >= 0 and np.allclose(page.viewer.view.camera.camera_to_world, CAMERA.camera_to_world),
               browser_page)
@@ -187,7 +187,7 @@ def settle(page: Any, browser_page: Any) -> None:
 
 
 def finished(page: Any, browser_page: Any, **view: Any) -> Any:
-    """The picture when it is as fine as it gets, and of the view that is wanted."""
+    """Wait for the finished picture of the view with these fields, and return it."""
 
     def done() -> Any:
         shown = page.viewer.shown
@@ -198,7 +198,7 @@ def finished(page: Any, browser_page: Any, **view: Any) -> Any:
 
 
 def seen(browser_page: Any, shown: Any) -> np.ndarray:
-    """What the browser shows left of the panel, in pixels of the picture, when it has come to rest."""
+    """Return the screen left of the panel, in pixels of the picture, once the screen no longer changes."""
     last, same, deadline = None, 0, time.monotonic() + PATIENCE
     while same < 2:
         assert time.monotonic() < deadline, "the screen never rests"
@@ -208,7 +208,7 @@ def seen(browser_page: Any, shown: Any) -> np.ndarray:
     height, width = shown.codes.shape[:2]
     with Image.open(io.BytesIO(data)) as image:
         pixels = np.asarray(image.convert("RGB").resize((width, height), Image.Resampling.BILINEAR)).astype(float)
-    return pixels[height // 3 :, : width * 7 // 16]  # without viser's message about software rendering
+    return pixels[height // 3 :, : width * 7 // 16]  # below viser's message about software rendering
 
 
 def expected(shown: Any, shift: tuple[int, int] = (0, 0)) -> np.ndarray:
@@ -245,7 +245,7 @@ def test_a_drag_orbits_and_stays_level(page: Any, browser_page: Any) -> None:
     browser_page.mouse.up()
     until(lambda: page.viewer.view.camera is not before.view.camera, browser_page)
     still, deadline = 0, time.monotonic() + PATIENCE
-    while still < 10:  # it swings out
+    while still < 10:  # viser moves the camera on after the drag
         assert time.monotonic() < deadline, "the camera never rests"
         camera = page.viewer.view.camera
         browser_page.wait_for_timeout(100)
@@ -300,7 +300,7 @@ def test_a_click_focuses(page: Any, browser_page: Any) -> None:
     browser_page.mouse.click(150, 440)
     browser_page.locator("xpath=//label[text()='click to focus']/ancestor::*[.//input][1]").locator("input").check()
     until(lambda: page.by_click.value, browser_page)
-    assert page.viewer.view.camera.focus_distance == shown.view.camera.focus_distance  # the first click was none
+    assert page.viewer.view.camera.focus_distance == shown.view.camera.focus_distance  # the first click did not focus
     browser_page.mouse.click(150, 440)
     wanted = page.viewer.renderers.focus_at(page.viewer.view, 150.5 / SIZE["width"], 440.5 / SIZE["height"])
     until(lambda: page.viewer.view.camera.focus_distance == pytest.approx(wanted, rel=0.01), browser_page)
@@ -309,13 +309,13 @@ def test_a_click_focuses(page: Any, browser_page: Any) -> None:
 
 def test_a_browser_that_comes_again_gets_the_picture(page: Any, browser_page: Any) -> None:
     finished(page, browser_page)
-    page.viewer.spp = 1 << 20  # it leaves in the middle of a refinement
+    page.viewer.spp = 1 << 20  # the browser is reloaded during a refinement
     try:
         set_number(browser_page, "bounces", "2")
         until(lambda: page.viewer.shown.view.max_depth == 2, browser_page)
     finally:
         page.viewer.spp = 4
-    browser_page.reload()  # viser may report a camera of its own before it has heard where to begin
+    browser_page.reload()  # viser may report its default camera before it receives the first camera
     until(lambda: page.viewer.shown.done and np.allclose(page.viewer.shown.view.camera.camera_to_world, CAMERA.camera_to_world,
                                                          rtol=0.0, atol=1e-9), browser_page)
     again = finished(page, browser_page, max_depth=2)
@@ -383,7 +383,7 @@ def test_the_file_that_a_browser_is_given_leads_to_the_page(page: Any, browser_p
 
 
 def test_a_page_of_another_origin_neither_sees_nor_steers(page: Any, browser_page: Any) -> None:
-    """In a real browser, even with the token: a server of somebody else on another port, and one by another name."""
+    """In a real browser, even with the token: a page from another port or another host name has no access."""
     port, token = page.server.get_port(), page.guard.access.token
     before = page.server.get_clients().keys()
 
