@@ -44,7 +44,7 @@ def light_kernel(features):
 
 
 def take(scene, point=(0.0, 0.0, 0.0), n=(0.0, 1.0, 0.0), light=0, xi=None, features=ALL_LIGHTS):
-    """Return light samples and their shadow rays as structured arrays; the light after the last is the background."""
+    """Return samples of a light and their shadow rays as structured arrays. The light with index len(lights) is the background."""
     xi = sobol_like(1 << 15, np.random.default_rng(0)) if xi is None else xi
     on_device = upload_scene(scene, DEVICE)
     out, ray = zeros(len(xi), LightSample), zeros(len(xi), Ray)
@@ -54,7 +54,7 @@ def take(scene, point=(0.0, 0.0, 0.0), n=(0.0, 1.0, 0.0), light=0, xi=None, feat
 
 
 def irradiance(scene, point=(0.0, 0.0, 0.0), n=(0.0, 1.0, 0.0), light=0, **rest):
-    """Return the mean of weight times cosine over the samples, unoccluded, (3,)."""
+    """Return the unoccluded irradiance, (3,): the mean of weight times cosine over the samples."""
     out, _ = take(scene, point, n, light, **rest)
     cosine = np.maximum(out["wi"].astype(np.float64) @ np.asarray(n, float), 0.0)
     return (out["weight"] * cosine[:, None]).mean(axis=0)

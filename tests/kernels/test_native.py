@@ -1,4 +1,4 @@
-"""C++ in files: constants come from Python, parts are included, and what changed is compiled again."""
+"""C++ in files: constants come from Python, parts are included, and changed files are compiled again."""
 
 import re
 
@@ -14,7 +14,7 @@ from wrt.kernels.structs import kernel
 
 
 def result(path):
-    """Value that the function of this file returns."""
+    """Return the value of the C++ function in the file `path`."""
 
     @wp.func_native(source(path, SIZE=7, WIDTH=2.0**-120, UNUSED=True))
     def number() -> float: ...
@@ -44,7 +44,7 @@ def test_a_function_has_the_constants_that_it_names(tmp_path):
     path.write_text("    #define HALF 0.5f\n    return HALF * WIDTH;\n")
     assert result(path) == 2.0**-121
     text = source(path, SIZE=7, WIDTH=2.0**-120, SIZES=1)
-    assert "SIZE" not in text and text.count("#undef") == 2  # nothing is left for the next function
+    assert "SIZE" not in text and text.count("#undef") == 2  # No macro stays defined for the next function.
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "kernels").rglob("*.h")), ids=lambda path: path.name)

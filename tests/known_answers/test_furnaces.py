@@ -23,7 +23,7 @@ WHITE_SKY = ConstantBackground(WHITE)
 
 @cache
 def furnace(camera: str) -> tuple[np.ndarray, float]:
-    """The shipped scene: radiance 1 from everywhere; its pixels, and the share of light that was cut."""
+    """Return the pixels of the shipped furnace, whose surroundings have radiance 1, and the share of light that was cut."""
     film = wrt.render(wrt.load_scene(ROOT / "scenes" / "furnace.toml"), camera=camera, size=(48, 27), spp=4)
     return film.pixels, film.stats["lost_throughput_per_sample"]
 
@@ -46,7 +46,7 @@ def test_glass_in_a_furnace_is_seen_only_by_what_was_cut() -> None:
 
 
 def random_material(rng: np.random.Generator) -> Material:
-    """Any kind, white or coloured, rough or not, blended or not."""
+    """Return a material of a random kind: white or coloured, rough or smooth, blended or opaque."""
     kind = str(rng.choice(["diffuse", "mirror", "conductor", "glass", "metallic_roughness"]))
     transmission, thin = float(rng.choice([0.0, rng.random()])), bool(rng.random() < 0.3)
     return Material(kind, albedo=WHITE if rng.random() < 0.5 else tuple(rng.random(3)), ior=float(rng.uniform(1.0, 2.5)),
@@ -57,7 +57,7 @@ def random_material(rng: np.random.Generator) -> Material:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_never_more_light_than_comes_in(seed: int) -> None:
-    # Whatever stands in a room of radiance 1: no pixel is above 1, not even of one sample.
+    # In surroundings of radiance 1, no sample of any objects may exceed 1.
     rng = np.random.default_rng(seed)
     meshes = (icosphere(1), torus(segments=12, tube_segments=8), box((-0.5,) * 3, (0.5,) * 3))
     objects, spheres = [], []
@@ -66,7 +66,7 @@ def test_never_more_light_than_comes_in(seed: int) -> None:
         matrix[:3, 3] = rng.uniform(-1.2, 1.2, 3)
         objects.append(Object(meshes[rng.integers(3)], (random_material(rng),), matrix))
         spheres.append(Sphere(tuple(rng.uniform(-1.2, 1.2, 3)), float(rng.uniform(0.1, 0.4)), random_material(rng)))
-    # One of each feature far away, so that all seeds share a kernel.
+    # A distant object for each feature, so that all seeds share a kernel.
     kinds = [Material("glass", thin=True), Material("glass", absorption=(1, 1, 1), roughness=0.5), Material("mirror"),
              Material("conductor"), Material("metallic_roughness", transmission=0.5), Material(alpha_mode="blend", alpha=0.5)]
     spheres += [Sphere((1e4, 10.0 * i, 0.0), 1.0, material) for i, material in enumerate(kinds)]
@@ -80,7 +80,7 @@ def test_never_more_light_than_comes_in(seed: int) -> None:
 
 @pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (0.8, -0.9, 1.1)])
 def test_inside_a_glowing_sphere_a_surface_is_lit_from_all_around(place: Color) -> None:
-    # E = pi L at any place and angle, so that a Lambertian surface has radiance albedo times L.
+    # The irradiance is pi L at any place and angle, so that a Lambertian surface has the radiance albedo times L.
     lamp = Sphere((0.0, 0.0, 0.0), 2.0, Material(albedo=BLACK, emission=(3.0, 2.0, 1.0), two_sided=True))
     square = Object(quad((place[0] - 0.1, place[1], place[2] + 0.1), (0.2, 0, 0), (0, 0, -0.2)), (Material(albedo=(0.5,) * 3),))
     camera = Camera.look_at((place[0] + 0.1, place[1] + 0.2, place[2]), place, fov_y=0.01)

@@ -21,7 +21,7 @@ WHITE_SKY = ConstantBackground(WHITE)
 
 
 def fresnel(degrees: float, n: float = N) -> float:
-    """Unpolarised reflectance from outside, in float64."""
+    """Return the unpolarised reflectance from outside, in float64."""
     cosine = math.cos(math.radians(degrees))
     inside = math.sqrt(1.0 - (1.0 - cosine**2) / n**2)
     s, p = (cosine - n * inside) / (cosine + n * inside), (n * cosine - inside) / (n * cosine + inside)
@@ -30,12 +30,12 @@ def fresnel(degrees: float, n: float = N) -> float:
 
 # --- Fresnel ----------------------------------------------------------------------------------------------------------
 
-# So dark inside that what enters is lost: only the reflected ray sees the white sky.
+# Light that enters is absorbed: only the reflected ray sees the white sky.
 INK = Material("glass", albedo=WHITE, ior=N, absorption=(1e3, 1e3, 1e3))
 
 
 def reflectance(degrees: float) -> float:
-    """Of the top of a block of dark glass, seen at this angle to its normal."""
+    """Return the reflectance of a block of dark glass, as rendered at this angle to the normal."""
     angle = math.radians(degrees)
     camera = Camera.look_at((0.0, 3.0 * math.cos(angle), 3.0 * math.sin(angle)), (0.0, 0.0, 0.0), up=(1.0, 0.0, 0.0), fov_y=1e-4)
     scene = Scene(objects=(Object(box((-5, -5, -5), (5, 0, 5)), (INK,)),), background=WHITE_SKY, cameras=(camera,),
@@ -52,7 +52,7 @@ def test_a_picture_of_fresnels_curve(degrees: float, value: float) -> None:
 
 
 def test_total_reflection_begins_at_its_angle() -> None:
-    # From inside glass, a strip of one degree across the critical angle: it goes dark where no light comes out any more.
+    # The camera is inside glass and sees a strip of one degree across the critical angle. Beyond that angle, the strip is dark.
     critical = math.degrees(math.asin(1.0 / N))
     assert critical == pytest.approx(41.810, abs=5e-4)
     rows, fov = 1024, math.radians(1.0)
@@ -62,11 +62,11 @@ def test_total_reflection_begins_at_its_angle() -> None:
                   background=WHITE_SKY, cameras=(camera,), settings=Settings(filter="box", max_depth=1))
     column = wrt.render(scene, size=(1, rows), spp=16).pixels[:, 0, 0]
     tangent = (1.0 - 2.0 * (np.arange(rows) + 0.5) / rows) * math.tan(0.5 * fov)
-    degrees = critical + np.degrees(np.arctan(tangent))  # up is towards grazing
+    degrees = critical + np.degrees(np.arctan(tangent))  # Up in the picture is towards grazing.
     lit = column > 0.0
     assert abs(degrees[lit].max() - critical) < 0.002 and abs(degrees[~lit].min() - critical) < 0.002
-    assert not (lit[:-1] & ~lit[1:]).any()  # dark from there on
-    # Below it, radiance comes out of the glass n^-2 as dense: a camera inside sees n^2 of what is let through.
+    assert not (lit[:-1] & ~lit[1:]).any()  # Dark from the critical angle on.
+    # Below the critical angle, a camera inside sees n^2 times the transmitted radiance.
     for i in (rows // 2 + 100, rows - 1):
         outside = math.degrees(math.asin(N * math.sin(math.radians(degrees[i]))))
         assert column[i] == pytest.approx(N**2 * (1.0 - fresnel(outside)), rel=2e-3)
@@ -76,10 +76,10 @@ def test_total_reflection_begins_at_its_angle() -> None:
 
 
 def exit_slopes(distances: list[float]) -> list[float]:
-    """Slope of the ray behind a ball (R = 1, n = 1.5) over its slope at a point so far before the ball's face.
+    """Return the slope of rays behind a ball (R = 1, n = 1.5) over their slope before it, for points at these distances from its face.
 
-    The sky's radiance tells the height of the direction in which a ray leaves: 1 + d_y in a sky from 0 to 2. What is
-    reflected on the way in meets a black wall behind the camera; what is reflected inside is cut by max_depth.
+    The sky has the radiance 1 + d_y, which shows the direction d in which a ray leaves. Light that is reflected at the
+    face meets a black wall behind the camera. Light that is reflected inside is cut by max_depth.
     """
     ball = Sphere((0.0, 0.0, 0.0), 1.0, Material("glass", albedo=WHITE, ior=N))
     found = []
@@ -87,7 +87,7 @@ def exit_slopes(distances: list[float]) -> list[float]:
         wall = Object(quad((-1e3, -1e3, 1.05 + distance), (2e3, 0, 0), (0, 2e3, 0)), (Material(albedo=BLACK),))
         camera = Camera.look_at((0.0, 0.0, 1.0 + distance), (0.0, 0.0, 0.0), fov_y=0.02)
         films = []
-        for top in (2.0, 1.0):  # the second sky is even: it tells what share of light goes through
+        for top in (2.0, 1.0):  # The second sky is constant: its picture is the transmittance.
             sky = GradientBackground(((2.0 - top,) * 3), (top,) * 3)
             scene = Scene(objects=(wall,), spheres=(ball,), background=sky, cameras=(camera,),
                           settings=Settings(filter="box", max_depth=2, min_throughput=0.0))
@@ -99,14 +99,14 @@ def exit_slopes(distances: list[float]) -> list[float]:
 
 
 def test_a_ball_lens_has_its_focus_half_a_radius_behind_it() -> None:
-    # Paraxial optics: focal length n R / (2 (n - 1)) = 1.5 from the centre, 0.5 from the face. A ray from a point at
-    # distance b leaves with 1 - (b + R) / f of its slope, and from the focus parallel to the axis.
+    # In paraxial optics, the focal length is n R / (2 (n - 1)) = 1.5 from the centre, 0.5 from the face. A ray from a point
+    # at distance b leaves with 1 - (b + R) / f of its slope. From the focus, it leaves parallel to the axis.
     distances = [0.1, 0.3, 0.5, 0.8, 1.2]
     found = exit_slopes(distances)
     assert found == pytest.approx([1.0 - (b + 1.0) / 1.5 for b in distances], abs=1e-3)
     gradient, offset = np.polyfit(distances, found, 1)
-    assert -offset / gradient == pytest.approx(0.5, abs=1e-3)  # back focal length
-    assert -1.0 / gradient == pytest.approx(1.5, abs=2e-3)  # focal length
+    assert -offset / gradient == pytest.approx(0.5, abs=1e-3)  # The back focal length.
+    assert -1.0 / gradient == pytest.approx(1.5, abs=2e-3)  # The focal length.
 
 
 # --- a thin lens ------------------------------------------------------------------------------------------------------
@@ -115,10 +115,10 @@ FOCAL, FOCUS, STOP, SENSOR, PIXELS = 0.1, 2.0, 1.4, 0.024, 256
 
 
 def blurred_square(distance: float) -> tuple[float, float, float]:
-    """Diameter of the circle of confusion at this distance along x and y, and light in the picture, in pixels.
+    """Return the diameter of the circle of confusion at this distance along x and y, in pixels, and the sum of the pixels.
 
-    A glowing square that faces the lens is drawn, as wide as 20 pixels of the unblurred picture. Its blurred picture is
-    the convolution of square, disc and pixel: variances add, and a disc of diameter C has C^2 / 16.
+    The scene is a glowing square that faces the lens, 20 pixels wide without blur. The blurred picture is the convolution
+    of square, disc and pixel. The variances add; a disc of diameter C has the variance C^2 / 16.
     """
     image_distance = FOCAL * FOCUS / (FOCUS - FOCAL)
     width = 20.0 * SENSOR / PIXELS * distance / image_distance
@@ -140,13 +140,13 @@ def blurred_square(distance: float) -> tuple[float, float, float]:
 
 @pytest.mark.parametrize("distance", [0.8, 1.2, 2.0, 3.5, 8.0])
 def test_the_circle_of_confusion(distance: float) -> None:
-    # C = f^2 |So / Sa - 1| / (N (So - f)) on the sensor: here 0 to 60 pixels.
+    # On the sensor, C = f^2 |So / Sa - 1| / (N (So - f)): 0 to 60 pixels. So is the focus distance, Sa the distance, N the f-number.
     expected = FOCAL**2 * abs(FOCUS / distance - 1.0) / (STOP * (FOCUS - FOCAL)) * PIXELS / SENSOR
     across, upward, light = blurred_square(distance)
     if distance == FOCUS:
         assert expected == 0.0 and max(across, upward) < 1.0
     else:
         assert across == pytest.approx(expected, rel=0.01) and upward == pytest.approx(expected, rel=0.01)
-    assert light == pytest.approx(20.0**2, rel=0.01)  # blur spreads light and takes none
+    assert light == pytest.approx(20.0**2, rel=0.01)  # Blur keeps the sum of the light.
 
 

@@ -1,6 +1,6 @@
-"""The integrator through whole renders of scenes whose answer is known.
+"""Whole renders of scenes with known radiance: mirrors, glass, lights over floors, and blending.
 
-Kernels are compiled from a scene's features: scenes that share a set of features share `extra` materials, hidden far away.
+A kernel is compiled for a scene's features. Scenes here have distant hidden objects with more features, so that they share kernels.
 """
 
 import numpy as np
@@ -24,18 +24,18 @@ SETTINGS = Settings(size=(8, 8), spp=4, max_depth=30, min_throughput=0.0, filter
 
 
 def moved(mesh, scale=1.0, by=(0.0, 0.0, 0.0)):
-    """The mesh without normals, scaled and moved."""
+    """Return the mesh without normals, scaled and moved."""
     return Mesh(mesh.vertices.astype(np.float64) * scale + by, mesh.faces)
 
 
 def hidden(*materials):
-    """Return tiny triangles far behind every camera here, one for each material."""
+    """Return a tiny triangle for each material, far behind the cameras of this file."""
     return tuple(Object(Mesh([[0, i, 1e4], [1e-3, i, 1e4], [0, i + 1e-3, 1e4]], [[0, 1, 2]]), (material,))
                  for i, material in enumerate(materials))
 
 
 def glow(radiance=1.0):
-    """Return a surface that is only visible: it lights nothing and reflects nothing."""
+    """Return a material that glows for cameras, but is no light and reflects nothing."""
     return Material(albedo=(0.0,) * 3, emission=(radiance,) * 3, emits_light=False)
 
 
@@ -62,7 +62,7 @@ def test_a_box_of_glowing_half_mirrors(depth):
 
 def test_cut_by_throughput():
     film = render(MIRROR_BOX, min_throughput=0.1)
-    assert np.allclose(film.pixels, 1.0 - 0.5**4)  # the fourth reflection would carry 1/16
+    assert np.allclose(film.pixels, 1.0 - 0.5**4)  # The fourth reflection would have the throughput 1/16.
     assert film.stats["cut_by_throughput"] == film.stats["samples"] and film.stats["cut_by_depth"] == 0
     assert film.stats["lost_throughput_per_sample"] == pytest.approx(1.0 / 16.0)
 
@@ -88,32 +88,32 @@ def glass_scene(*objects, camera, background=None, spheres=()):
 
 
 def test_clear_glass_vanishes_in_a_white_room():
-    # What goes in comes out: reflected and refracted parts sum to 1 but for the rays that were cut, which are counted.
+    # Glass is lossless: reflected and refracted light sum to 1, except for the counted rays that are cut.
     balls = (Object(moved(icosphere(2), 0.9, (-1.2, 0.0, 0.0)), (CLEAR,)), Object(moved(box(), 1.0, (0.0, 1.4, 0.0)), (CLEAR,)))
     scene = glass_scene(*balls, spheres=(Sphere((1.2, 0.0, 0.0), 0.9, CLEAR),), background=WHITE_SKY, camera=toward(fov=0.9))
     film = render(scene, size=(12, 12))
     lost = film.stats["lost_throughput_per_sample"]
     assert film.stats["rays_per_sample"] > 3.0
     assert 1e-4 < lost < 0.05 and (film.pixels <= 1.0 + 1e-5).all()
-    # `lost` is the light that the cut rays would have carried, also the rays cut inside glass.
+    # `lost` is the light of all cut rays, also of the rays cut inside glass.
     assert film.pixels.mean(dtype=np.float64) == pytest.approx(1.0 - lost, abs=1e-5)
     flat = render(scene, max_depth=30, camera=toward((0.0, 1.4, 0.0), (0.0, 1.4, 5.0)))
     assert np.allclose(flat.pixels, 1.0, atol=1e-4)
 
 
 def slab_scene(thickness=1.0, degrees=0.0, material=CLEAR, camera=None):
-    """Return a slab before a glowing wall. It is dark behind the camera, so that only light through the slab is visible."""
+    """Return a slab before a glowing wall. The space behind the camera is dark: only light through the slab is visible."""
     slab = box((-50.0, -50.0, -0.5 * thickness), (50.0, 50.0, 0.5 * thickness))
     angle = np.radians(degrees)
     turn = np.eye(4)
     turn[0, 0], turn[0, 2], turn[2, 0], turn[2, 2] = np.cos(angle), np.sin(angle), -np.sin(angle), np.cos(angle)
-    # Small enough that what the slab's face reflects, backwards for a steep slab, does not meet it.
+    # The wall is so small that rays reflected by the face of a steep slab miss it.
     wall = Object(quad((-20.0, -20.0, -60.0), (40.0, 0.0, 0.0), (0.0, 40.0, 0.0)), (glow(),))
     return glass_scene(Object(slab, (material,), turn), wall, camera=camera or toward())
 
 
 def slab_transmittance(cosine, n, inside=1.0):
-    """Return a slab's transmittance with all inner reflections, (1 - R)^2 a / (1 - R^2 a^2), for a transmittance a of one crossing."""
+    """Return a slab's transmittance with all inner reflections, (1 - R)^2 a / (1 - R^2 a^2). `inside` is a, for one crossing."""
     inner = np.sqrt(1.0 - (1.0 - cosine**2) / n**2)
     s, p = (cosine - n * inner) / (cosine + n * inner), (n * cosine - inner) / (n * cosine + inner)
     r = 0.5 * (s * s + p * p)
@@ -128,7 +128,7 @@ def test_a_slab_transmits_twelve_thirteenths():
 
 @pytest.mark.parametrize("degrees", [30.0, 60.0])
 def test_a_slanted_slab(degrees):
-    # A Whitted tracer follows unpolarised light at every boundary: the series is that of the mean reflectance.
+    # A Whitted tracer takes light as unpolarised at every boundary, so that the series has the mean reflectance.
     film = render(slab_scene(degrees=degrees))
     assert film.pixels.mean() == pytest.approx(slab_transmittance(np.cos(np.radians(degrees)), 1.5), abs=2e-4)
 
@@ -145,12 +145,12 @@ def test_absorption_follows_beer_and_lambert():
 
 
 def test_a_slanted_slab_shifts_the_picture():
-    # d = t sin(a) (1 - cos(a) / sqrt(n^2 - sin^2 a)): 0.329142 at 45 degrees. A wall that glows for x > 0 shows it.
+    # The shift is t sin(a) (1 - cos(a) / sqrt(n^2 - sin^2 a)), 0.329142 at 45 degrees. A wall that glows for x > 0 shows it.
     angle, n = np.radians(45.0), 1.5
     shift = np.sin(angle) * (1.0 - np.cos(angle) / np.sqrt(n * n - np.sin(angle) ** 2))
     assert shift == pytest.approx(0.329142, abs=1e-6)
     wall = Object(quad((0.0, -500.0, -60.0), (500.0, 0.0, 0.0), (0.0, 1000.0, 0.0)), (glow(),))
-    # From 2000 away, a strip of 2048 pixels that is one unit wide at the wall: all but parallel rays.
+    # From 2000 away, the rays of a strip of 2048 pixels, one unit wide at the wall, are almost parallel.
     camera = toward(position=(0.0, 0.0, 2000.0), fov=2.0 * np.arctan(0.5 / 2060.0 * 64.0 / 2048.0))
     edges = []
     for degrees in (0.0, 45.0, -45.0):
@@ -159,16 +159,16 @@ def test_a_slanted_slab_shifts_the_picture():
         film = render(scene, size=(2048, 64), crop=(0, 32, 2048, 33), spp=1)
         lit = film.pixels[0, :, 0] > 0.3
         edges.append(0.5 - lit.sum() / 2048.0)
-        assert np.abs(np.diff(lit.astype(int))).sum() <= 3  # one edge, but for a pixel whose sample falls on it
+        assert np.abs(np.diff(lit.astype(int))).sum() <= 3  # One edge, and perhaps a pixel whose sample is on it.
     assert edges[0] == pytest.approx(0.0, abs=1e-3)
     assert abs(edges[1]) == pytest.approx(shift, abs=2e-3)
     assert edges[1] == pytest.approx(-edges[2], abs=2e-3)
-    # The slab's normal leans to +x, so that inside the rays are bent to -x: the glow begins farther to the right.
+    # The slab's normal leans to +x, so that the rays inside are bent to -x. The glow begins farther to the right.
     assert edges[1] > 0.0
 
 
 def test_a_ball_turns_the_world_upside_down():
-    # Through the upper half of a glass ball the lower half of the world is seen.
+    # The upper half of a glass ball shows the lower half of the world.
     scene = glass_scene(spheres=(Sphere((0.0, 0.0, 0.0), 1.0, CLEAR),), camera=toward(fov=0.2),
                         background=GradientBackground((0.0, 0.0, 0.0), (2.0, 2.0, 2.0)))
     film = render(scene, spp=16)
@@ -194,7 +194,7 @@ def floor(albedo=0.5, size=1000.0):
 
 def test_a_grey_ball_in_a_white_room_shows_its_albedo():
     ball = Sphere((0.0, 0.0, 0.0), 1.0, Material(albedo=(0.5, 0.25, 1.0)))
-    # Far from each other: a convex thing by itself shades no part of its own sky.
+    # Ball and mesh are far from each other. A single convex object occludes no part of its own sky.
     mesh = Object(moved(icosphere(3), 1.0, (3000.0, 0.0, 0.0)), (ball.material,))
     scene = lit_scene(mesh, spheres=(ball,))
     for x, target in ((0.0, (0.0, 0.0, 0.0)), (0.0, (0.7, 0.5, 0.0)), (3000.0, (3000.0, 0.2, 0.0))):
@@ -204,7 +204,7 @@ def test_a_grey_ball_in_a_white_room_shows_its_albedo():
 
 @pytest.mark.parametrize("height", [0.5, 2.0, 10.0])
 def test_a_point_light_over_a_floor(height):
-    # L = albedo (sky + I cos / (pi d^2)): inverse square and cosine law at once.
+    # L = albedo (sky + I cos / (pi d^2)): the inverse square law and the cosine law.
     scene = lit_scene(floor(), lights=(PointLight((0.0, height, 0.0), (3.0, 6.0, 9.0)),))
     for x in (0.0, 1.0, 7.0):
         film = render(scene, camera=toward((x, 0.0, 0.0), (x, 30.0, 20.0), fov=1e-3))
@@ -229,7 +229,7 @@ def test_shadows_and_the_ambient_term():
     lid = Object(moved(quad((-1.0, 1.0, 1.0), (2.0, 0.0, 0.0), (0.0, 0.0, -2.0))), (Material(albedo=(0.0,) * 3),))
     scene = lit_scene(floor(), lid, lights=(PointLight((0.0, 2.0, 0.0), (50.0,) * 3),), ambient=(0.3, 0.2, 0.1))
     under = render(scene, camera=toward((0.5, 0.0, 0.0), (9.0, 0.5, 0.0), fov=1e-3), spp=256)
-    # Under the lid the point light is hidden. The sky shows past a 2 x 2 square at height 1, by its form factor.
+    # Under the lid the point light is hidden. The form factor of the lid, 2 x 2 at height 1, gives the hidden part of the sky.
     corner = [(1.5, 1.0), (0.5, 1.0)]
     factor = 0.0
     for x, y in corner:
@@ -238,7 +238,7 @@ def test_shadows_and_the_ambient_term():
     expected = 0.5 * (1.0 - factor + np.array([0.3, 0.2, 0.1]))
     assert np.allclose(under.pixels.mean(axis=(0, 1)), expected, atol=5e-3)
     outside = render(scene, camera=toward((6.0, 0.0, 0.0), (9.0, 5.0, 0.0), fov=1e-3))
-    assert outside.pixels.mean() > 0.5  # light passes the lid's edge
+    assert outside.pixels.mean() > 0.5  # Outside, the point light is visible past the lid's edge.
 
 
 # --- mixtures ---------------------------------------------------------------------------------------------------------
@@ -251,7 +251,7 @@ def test_blending_is_a_weighted_mean():
 
     scene = Scene(objects=(pane(1.0, 0.25, (8.0, 0.0, 0.0)), pane(0.0, 0.5, (0.0, 8.0, 0.0)), pane(-1.0, 1.0, (0.0, 0.0, 8.0))),
                   cameras=(toward(),), settings=SETTINGS, background=WHITE_SKY)
-    for depth in (8, 0):  # to go straight on is no bounce
+    for depth in (8, 0):  # Passing straight on is no bounce.
         film = render(scene, max_depth=depth)
         assert np.allclose(film.pixels, [8.0 * 0.25, 8.0 * 0.75 * 0.5, 8.0 * 0.75 * 0.5], rtol=1e-6)
         assert film.stats["cut_by_depth"] == 0
@@ -276,7 +276,7 @@ def test_a_tree_of_rays_without_end_is_cut_and_told():
     options = {"size": (2, 2), "spp": 1, "min_throughput": 0.0}
     whole, endless = render(scene, max_depth=12, **options), render(scene, max_depth=64, **options)
     assert whole.stats["rays"] < 4 * MAX_RAYS <= endless.stats["rays"] <= 4 * (MAX_RAYS + 200)  # Waiting rays are still traced.
-    for film in (whole, endless):  # All light that is not lost comes from the sky.
+    for film in (whole, endless):  # All light that is not lost comes from the sky of radiance 1.
         assert 0.0 < film.stats["lost_throughput_per_sample"] < 0.2 and film.stats["cut_by_depth"] > 0
         assert film.pixels.mean() + film.stats["lost_throughput_per_sample"] == pytest.approx(1.0, abs=1e-4)
 
@@ -287,7 +287,7 @@ def blended_glass(alpha, **rest):
 
 @pytest.mark.parametrize("alpha", [0.0, 0.3, 1.0])
 def test_blended_solid_glass_is_the_mean_of_the_picture_with_and_without_it(alpha):
-    # Also of what is inside it, and of its absorption: glass of alpha 0 cannot be seen.
+    # The glass has absorption and an object inside. Glass of alpha 0 is invisible.
     inner = Sphere((0.3, 0.0, 0.0), 0.4, Material(albedo=(0.0,) * 3, emission=(0.7, 0.1, 0.1), emits_light=False))
 
     def picture(glass):

@@ -20,7 +20,7 @@ ENVIRONMENT = replace(ALL_LIGHTS, background="environment")
 
 
 def polygon_irradiance(corners, point, n, radiance=1.0):
-    """Lambert's formula for a polygon wholly above the horizon, in float64: E = L/2 sum of angle times edge normal . n."""
+    """Return the irradiance of a polygon above the horizon by Lambert's formula: E = L/2 sum of angle times edge normal . n."""
     to = unit(np.asarray(corners, float) - point)
     following = np.roll(to, -1, axis=0)
     cross = np.cross(to, following)
@@ -51,7 +51,7 @@ def test_spot_falls_off_as_khr_lights_punctual_says(inner, outer):
     angle = angle[np.abs(angle - outer) > 1e-4]
     point = 2.0 * np.stack([np.sin(angle), 0.0 * angle, -np.cos(angle)], axis=1)
     out, _ = take(Scene(lights=(light,)), point, xi=np.zeros((len(angle), 2)))
-    scale = 1.0 / max(0.001, np.cos(inner) - np.cos(outer))  # the extension's reference code
+    scale = 1.0 / max(0.001, np.cos(inner) - np.cos(outer))  # From the reference code of KHR_lights_punctual.
     expected = np.clip((np.cos(angle) - np.cos(outer)) * scale, 0.0, 1.0) ** 2
     if inner == outer:
         expected = (angle < outer).astype(float)
@@ -60,9 +60,9 @@ def test_spot_falls_off_as_khr_lights_punctual_says(inner, outer):
 
 
 def test_parallel_rectangle_by_its_form_factor():
-    # A rectangle a x b at height c, parallel to the surface, with a corner right above the point (any radiation textbook).
+    # The form factor of a rectangle a x b at height c, parallel to the surface, with a corner above the point (textbooks).
     a, b, c = 2.0, 1.5, 1.25
-    scene = Scene(objects=(lamp(quad((0.0, c, 0.0), (a, 0.0, 0.0), (0.0, 0.0, b))),))  # its front faces down
+    scene = Scene(objects=(lamp(quad((0.0, c, 0.0), (a, 0.0, 0.0), (0.0, 0.0, b))),))  # Its front faces down.
     x, y = a / c, b / c
     p, q = np.sqrt(1.0 + x * x), np.sqrt(1.0 + y * y)
     factor = (x / p * np.arctan(y / p) + y / q * np.arctan(x / q)) / (2.0 * np.pi)
@@ -84,7 +84,7 @@ def test_any_triangle_by_lamberts_formula(seed):
 
 
 def test_many_emitters_of_different_size_and_power():
-    # One object, 40 triangles from 1e-3 to 1 in size, three emissions, some dark: chosen by power, none forgotten.
+    # One object has 40 triangles of sizes 1e-3 to 1 with three emissions, or dark. They must be chosen by power.
     rng = np.random.default_rng(7)
     corners = rng.normal(size=(40, 1, 3)) * [1.5, 0.3, 1.5] + [0.0, 3.0, 0.0]
     corners = rounded(corners + rng.normal(size=(40, 3, 3)) * 10.0 ** rng.uniform(-3, 0, (40, 1, 1)) * [1.0, 0.2, 1.0])
@@ -101,7 +101,7 @@ def test_many_emitters_of_different_size_and_power():
 def test_a_ball_of_triangles_and_the_exact_sphere():
     radius, distance = 0.5, 2.0
     exact = np.pi * (radius / distance) ** 2
-    # A convex light occludes none of its faces that turn to the point: the closed form needs no shadows.
+    # A convex light does not occlude its faces that face the point, so that the closed form needs no shadows.
     mesh = icosphere(4)
     ball = Mesh(mesh.vertices * radius + [0.0, distance, 0.0], mesh.faces)
     found = irradiance(Scene(objects=(lamp(ball, (1.0, 1.0, 1.0)),)), xi=sobol_like(1 << 17, np.random.default_rng(8)))
@@ -113,7 +113,7 @@ def test_a_ball_of_triangles_and_the_exact_sphere():
 @pytest.mark.parametrize(("ratio", "degrees"), [(1e-4, 0.0), (0.1, 0.0), (0.5, 0.0), (0.9, 0.0), (0.999, 0.0), (1e-4, 30.0),
                                                 (0.1, 30.0), (0.5, 30.0), (0.8, 30.0)])
 def test_sphere_light_by_its_closed_form(ratio, degrees):
-    # E = pi L (r / d)^2 cos, as long as the sphere is wholly above the horizon.
+    # E = pi L (r / d)^2 cos if the whole sphere is above the horizon.
     assert np.degrees(np.arcsin(ratio)) + degrees <= 90.0
     axis = np.array([np.sin(np.radians(degrees)), np.cos(np.radians(degrees)), 0.0])
     sphere = Sphere(tuple(4.0 * axis), 4.0 * ratio, Material(emission=(2.0, 1.0, 0.5)))
@@ -131,14 +131,14 @@ def test_inside_a_glowing_sphere_the_irradiance_is_pi_l(point, scale):
         at = np.array(point) * scale
         out, ray = take(scene, at, n, xi=rng.random((2000, 2)))
         each = out["weight"] * np.maximum(out["wi"].astype(np.float64) @ n, 0.0)[:, None]
-        assert np.allclose(each, np.pi * np.array([3.0, 2.0, 1.0]), rtol=1e-3)  # each sample alone: there is no noise
+        assert np.allclose(each, np.pi * np.array([3.0, 2.0, 1.0]), rtol=1e-3)  # Each sample has this value: there is no noise.
         structure = build(upload_scene(scene, DEVICE).world.geometry, "bvh")
         assert not structure.any_hit(ray["origin"], ray["direction"], 0.0, ray["t_max"]).any()
         assert structure.any_hit(ray["origin"], ray["direction"], 0.0, 1.02).mean() > 0.999
 
 
 def test_a_glowing_sphere_lights_its_own_inside_but_not_its_own_outside():
-    # At points on the sphere itself, rounded to one side or the other, the normal tells which side is meant.
+    # Points on the sphere are rounded to one side or the other. The normal decides whether the surface is inside.
     rng = np.random.default_rng(4)
     center = np.array([10.0, -3.0, 0.5])
     for n in directions(rng, 40):
@@ -161,7 +161,7 @@ def test_gradient_sky():
     scene = Scene(background=GradientBackground((1.0, 0.0, 0.5), (0.0, 2.0, 0.5)))
     features = replace(ALL_LIGHTS, background="gradient")
     up, down = (irradiance(scene, n=n, features=features) for n in ((0, 1, 0), (0, -1, 0)))
-    # Integral of (y + 1) / 2 times the cosine over the upper hemisphere: pi (2/3 + 1) / 2.
+    # The integral of (y + 1) / 2 times the cosine over the upper hemisphere is pi (2/3 + 1) / 2.
     share = np.pi * (2.0 / 3.0 + 1.0) / 2.0
     bottom, top = np.array([1.0, 0.0, 0.5]), np.array([0.0, 2.0, 0.5])
     assert np.allclose(up, np.pi * bottom + share * (top - bottom), atol=2e-3)

@@ -22,10 +22,10 @@ BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
 @cache
 def lit_floor(lights: tuple[PointLight | DirectionalLight, ...]) -> np.ndarray:
-    """Irradiance at the origin on a white floor that faces +y: (3,)."""
+    """Return the irradiance, (3,), at the origin on a white floor that faces +y."""
     floor = Object(quad((-1, 0, 1), (2, 0, 0), (0, 0, -2)), (Material(albedo=WHITE),))
     camera = Camera.look_at((0.3, 0.4, 0.5), (0.0, 0.0, 0.0), fov_y=1e-5)
-    hidden = (PointLight((0, -1e6, 0), BLACK), DirectionalLight((0, 1, 0), BLACK))  # one kernel for both kinds
+    hidden = (PointLight((0, -1e6, 0), BLACK), DirectionalLight((0, 1, 0), BLACK))  # All tests share a kernel for both kinds of light.
     scene = Scene(objects=(floor,), lights=(*lights, *hidden), cameras=(camera,), settings=Settings(filter="box", max_depth=0))
     return math.pi * wrt.render(scene, size=(2, 2), spp=1).pixels.mean(axis=(0, 1), dtype=np.float64)
 
@@ -41,7 +41,7 @@ def test_the_inverse_square_law_over_ten_decades(power: int) -> None:
 @pytest.mark.parametrize("degrees", [0.0, 30.0, 60.0, 85.0, 89.9, 90.1, 120.0, 180.0])
 def test_the_cosine_law_to_grazing_light_and_none_from_below(degrees: float) -> None:
     angle = math.radians(degrees)
-    away = (math.sin(angle), math.cos(angle), 0.0)  # from the floor to the light
+    away = (math.sin(angle), math.cos(angle), 0.0)  # The direction from the floor to the light.
     expected = max(math.cos(angle), 0.0)
     sun = DirectionalLight((-away[0], -away[1], 0.0), WHITE)
     bulb = PointLight((5.0 * away[0], 5.0 * away[1], 0.0), (25.0,) * 3)

@@ -1,4 +1,4 @@
-"""Shadows through glass: what arrives below a pane is known in closed form."""
+"""Shadows through glass: the transmittance of a pane against closed forms."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from wrt.scene.shapes import box, quad
 
 
 def fresnel(angle: float, ior: float) -> float:
-    """Unpolarised reflectance from outside, by the sine and tangent form of Fresnel's equations."""
+    """Return the unpolarised reflectance from outside, by the sine and tangent form of Fresnel's equations."""
     if angle == 0.0:
         return ((ior - 1.0) / (ior + 1.0)) ** 2
     inside = math.asin(math.sin(angle) / ior)
@@ -28,7 +28,7 @@ def fresnel(angle: float, ior: float) -> float:
 
 
 def floor_below(glass: Material, angle: float, shadows: str, thickness: float = 0.5) -> float:
-    """Radiance (green) of a white floor in parallel light of irradiance pi, over that without the pane between them."""
+    """Return the pane's transmittance for green: a floor's radiance in parallel light with the pane over that without it."""
     pane = box((-10, 1, -10), (10, 1 + thickness, 10)) if not glass.thin else quad((-10, 1, 10), (20, 0, 0), (0, 0, -20))
     floor = Object(quad((-10, 0, 10), (20, 0, 0), (0, 0, -20)), (Material(albedo=(1, 1, 1)),))
     light = DirectionalLight((math.sin(angle), -math.cos(angle), 0), (math.pi,) * 3)
@@ -44,7 +44,7 @@ def floor_below(glass: Material, angle: float, shadows: str, thickness: float = 
 
 @pytest.mark.parametrize("degrees", [0.0, 30.0, 60.0, 80.0])
 def test_solid_glass_tints_by_both_faces_and_the_way_between(degrees: float) -> None:
-    # 60 and 80 degrees lie beyond the critical angle: the unbent ray must not count as totally reflected on its way out.
+    # 60 and 80 degrees are beyond the critical angle. The unbent ray must not be totally reflected at the exit.
     angle = math.radians(degrees)
     glass = Material("glass", albedo=(1.0, 0.8, 1.0), absorption=(0.0, 0.7, 0.0))
     expected = (0.8 * (1.0 - fresnel(angle, 1.5))) ** 2 * math.exp(-0.7 * 0.5 / math.cos(angle))
@@ -73,6 +73,6 @@ def test_absorption_counts_from_where_the_camera_stands_in_the_glass() -> None:
     outside = Camera.look_at((0, 0, 9), (0, 0, 0), fov_y=0.01)
     seen = wrt.render(Scene(spheres=(ball,), cameras=(within,), **white), spp=1, size=(2, 2)).pixels.mean()
     assert seen == pytest.approx(math.exp(-2.0), rel=1e-4)
-    # Through a clear ball within: what is left is 1 on each side.
+    # With a clear ball of radius 1 inside, the ray is in the absorbing glass for a length of 1 on each side.
     seen = wrt.render(Scene(spheres=(ball, inner), cameras=(outside,), **white), spp=1, size=(2, 2)).pixels.mean()
     assert seen == pytest.approx(math.exp(-2.0), rel=1e-3)

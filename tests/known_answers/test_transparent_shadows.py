@@ -20,14 +20,14 @@ from wrt.scene.settings import Settings
 from wrt.scene.shapes import box, quad
 from wrt.scene.values import Color
 
-pytestmark = pytest.mark.filterwarnings("ignore:the picture is all black")  # some are meant to be
+pytestmark = pytest.mark.filterwarnings("ignore:the picture is all black")  # Some pictures must be black.
 
 ONE: Color = (1.0, 1.0, 1.0)
 WHITE = Material(albedo=ONE)
 FLOOR = Object(quad((-10, 0, 10), (20, 0, 0), (0, 0, -20)), (WHITE,))
 SUN = DirectionalLight((0.6, -0.8, 0.0), (np.pi,) * 3)
 SIGMA = {"absorption": (0.5, 0.1, 0.9)}
-# Far away, so that the pictures here share a kernel.
+# Distant objects with the features of all tests, so that the tests share a kernel.
 EXTRA = tuple(Object(quad((1e4, i, 0), (1, 0, 0), (0, 1, 0)), (material,)) for i, material in enumerate(
     (Material("glass", alpha_mode="blend", **SIGMA), Material("glass", thin=True), Material(alpha_mode="mask"))))
 
@@ -57,12 +57,12 @@ def test_panes_of_alpha_0_shade_nothing_up_to_a_number_that_is_counted(count):
     there = count <= MAX_TRANSPARENT
     assert np.allclose(value, float(there), rtol=1e-3)
     assert stats["cut_by_depth"] == (0 if there else stats["samples"])
-    assert stats["lost_throughput_per_sample"] == pytest.approx(float(not there))  # a white floor reflects all of it
+    assert stats["lost_throughput_per_sample"] == pytest.approx(float(not there))  # A white floor reflects all of the lost light.
 
 
 @pytest.mark.parametrize("count", [0, 3, 255, 256])
 def test_an_opaque_pane_behind_clear_ones_is_counted_as_one_more(count):
-    """The ray to it counts. Behind MAX_TRANSPARENT panes no ray looks what follows."""
+    """The ray that hits the opaque pane counts. Behind MAX_TRANSPARENT panes the shadow ray is cut."""
     clear = Material(alpha=0.0, alpha_mode="blend")
     lamp = PointLight((0.0, 3.0, 0.0), ONE)
     value, stats = lit(*(pane(clear, y) for y in np.linspace(1.0, 2.0, count)), pane(WHITE, 2.5), light=lamp)
@@ -90,7 +90,7 @@ def test_a_light_within_blended_glass_shines_out_through_one_face_or_none():
 
 
 def test_absorption_goes_on_behind_a_pane_within_the_glass():
-    # The block's own light path is cut in two by a clear pane: the whole way counts.
+    # A clear pane divides the shadow ray's path through the block. The absorption must be that of the whole path.
     glass = Material("glass", albedo=ONE, ior=1.0, **SIGMA)
     whole, _ = lit(block(glass), shadows="tinted")
     cut, _ = lit(block(glass), pane(Material(alpha=0.0, alpha_mode="blend"), 1.2), shadows="tinted")
@@ -120,13 +120,13 @@ KINDS = [("diffuse", {}), ("mirror", {}), ("conductor", {}), ("glass", {}), ("gl
 @pytest.mark.parametrize("alpha_mode", ["opaque", "mask", "blend"])
 @pytest.mark.parametrize("kind", range(len(KINDS)))
 def test_opaque_is_what_leaves_the_floor_below_it_dark(kind, alpha_mode):
-    """The pane is seen from either side."""
+    """The shadow ray meets the pane from either side."""
     materials = [Material(name, alpha_mode=alpha_mode, alpha=0.5, alpha_cutoff=0.1, **fields) for name, fields in KINDS]
     out = zeros(len(KINDS), wp.bool)
     launch(opaque_kernel, len(KINDS), upload(material_records(tuple(materials), TextureTable()), MaterialRecord, DEVICE), out)
     opaque = out.numpy()
     assert opaque.any() == (alpha_mode != "blend") and not opaque.all()
-    far = [Object(quad((1e4, 10 + i, 0), (1, 0, 0), (0, 1, 0)), (Material(name, **fields),))  # as EXTRA
+    far = [Object(quad((1e4, 10 + i, 0), (1, 0, 0), (0, 1, 0)), (Material(name, **fields),))  # Features of all kinds, as EXTRA has.
            for i, (name, fields) in enumerate(KINDS)]
     below = Object(quad((-10, 1, 10), (0, 0, -20), (20, 0, 0)), (materials[kind],))
     for sheet in (pane(materials[kind]), below):

@@ -66,7 +66,7 @@ def random_points(rng, n):
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
 @pytest.mark.parametrize("kind", ["mesh", "ball", "sphere", "big_sphere"])
 def test_the_shadow_ray_ends_just_before_the_light(kind, scale):
-    # Alone in the scene, a light must not shade itself; a sheet a little before it must.
+    # A light alone in the scene must not occlude itself. A ray that goes 2 % further must hit it.
     rng = np.random.default_rng(9)
     n = 20_000
     ball = icosphere(3)
@@ -85,7 +85,7 @@ def test_the_shadow_ray_ends_just_before_the_light(kind, scale):
     structure = build(upload_scene(scene, DEVICE).world.geometry, "bvh")
     origin, direction = ray["origin"][lit], ray["direction"][lit]
     blocked = structure.any_hit(origin, direction, 0.0, ray["t_max"][lit])
-    # At the rim of a ball the way touches it: a few in ten thousand may graze.
+    # At the silhouette of a ball of triangles, a few shadow rays in ten thousand may graze it.
     assert blocked.mean() <= (5e-4 if kind != "mesh" else 0.0)
     beyond = structure.any_hit(origin, direction, 0.0, 1.02)
     assert beyond.mean() > (0.98 if kind in ("sphere", "ball") else 0.999)
@@ -105,7 +105,7 @@ def radiance_of(background, direction):
 
 
 def bilinear(background, direction):
-    """Look up a picture by the definition in wrt.scene.backgrounds, in float64: middle column along -z, columns towards +x, line 0 up."""
+    """Look up a picture in float64, as wrt.scene.backgrounds defines it: middle column along -z, columns towards +x, row 0 up."""
     image = background.image.astype(np.float64)
     height, width = image.shape[:2]
     c, s = np.cos(-background.rotation), np.sin(-background.rotation)
@@ -124,14 +124,14 @@ def bilinear(background, direction):
 
 def test_environment_directions():
     image = np.zeros((3, 4, 3), np.float32)
-    image[1, :, 0] = [1.0, 2.0, 3.0, 4.0]  # their centers are seen at -135, -45, 45 and 135 degrees from -z
+    image[1, :, 0] = [1.0, 2.0, 3.0, 4.0]  # Their centers are at -135, -45, 45 and 135 degrees from -z.
     image[0], image[2] = 10.0, 20.0
     angle = np.radians([-135.0, -45.0, 45.0, 135.0])
     level = np.stack([np.sin(angle), 0.0 * angle, -np.cos(angle)], axis=1)
     assert np.allclose(radiance_of(EnvironmentBackground(image), level)[:, 0], [1, 2, 3, 4], atol=1e-5)
     poles = radiance_of(EnvironmentBackground(image), [[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
     assert np.allclose(poles, [[10.0] * 3, [20.0] * 3])
-    # A quarter turn counter-clockwise, seen from above, brings what was seen along -z to -x.
+    # A quarter turn counter-clockwise, seen from above, moves the pixel along -z to -x.
     turned = EnvironmentBackground(image, rotation=np.pi / 2)
     plain = radiance_of(EnvironmentBackground(image), [[0.0, 0.0, -1.0]])
     assert np.allclose(radiance_of(turned, [[-1.0, 0.0, 0.0]]), plain, atol=1e-5)
@@ -155,7 +155,7 @@ def sky_with_a_sun(rng, shape=(12, 24)):
 
 
 def sphere_grid(rows=720, columns=1440):
-    """Directions and solid angles of a fine midpoint grid."""
+    """Return the directions and solid angles of a fine midpoint grid on the sphere."""
     theta = np.pi * (np.arange(rows) + 0.5) / rows
     phi = 2.0 * np.pi * (np.arange(columns) + 0.5) / columns
     t, p = np.meshgrid(theta, phi, indexing="ij")
@@ -179,7 +179,7 @@ def test_environment_sampling_is_unbiased(rotation):
                  lambda d: np.maximum(d @ unit(np.array([1.0, 0.2, -0.5])), 0.0) ** 4):
         expected = (test(d) * solid_angle) @ radiance
         assert np.allclose((test(wi)[:, None] * weight).mean(axis=0), expected, rtol=1e-2)
-    # By brightness: the sun, 1/288 of the picture's pixels, draws a good part of the samples.
+    # Samples follow the brightness: the sun, 1/288 of the picture's pixels, gets more than 20 % of the samples.
     bright = radiance_of(background, wi)[:, 0] > 5.0
     assert bright.mean() > 0.2
 

@@ -40,7 +40,7 @@ def highlight_kernel(wi: wp.array(dtype=wp.vec3), wo: wp.vec3, exponent: float, 
 
 
 def fresnel(cosine, eta, k=0.0, f0=(0.0, 0.0, 0.0)):
-    """exact, Schlick, conductor, tint (N, 3), as float64."""
+    """Return the reflectances: exact, Schlick, conductor, each (N,), and tint (N, 3), in float64."""
     cosine = np.atleast_1d(cosine)
     outs = [zeros(len(cosine)) for _ in range(3)] + [zeros(len(cosine), wp.vec3)]
     launch(fresnel_kernel, len(cosine), floats(cosine), float(eta), float(k), wp.vec3(*f0), *outs)
@@ -48,7 +48,7 @@ def fresnel(cosine, eta, k=0.0, f0=(0.0, 0.0, 0.0)):
 
 
 def complex_fresnel(cosine, n):
-    """Unpolarised reflectance of a boundary to the complex index n (numpy's arithmetic, from Snell's law)."""
+    """Return the unpolarised reflectance of a boundary to the complex index n, in complex arithmetic from Snell's law."""
     cosine = np.asarray(cosine, np.complex128)
     sine = np.sqrt(1.0 - cosine**2)
     inner = np.sqrt(1.0 - (sine / n) ** 2)
@@ -66,7 +66,7 @@ def test_dielectric_at_known_angles(degrees, value):
 
 
 def test_brewsters_angle():
-    # tan(theta) = n: the parallel part is 0, and half of the perpendicular part is left.
+    # At tan(theta) = n the parallel reflectance is 0, so that the mean is half of the perpendicular reflectance.
     cosine = np.cos(np.arctan(1.5))
     assert np.degrees(np.arctan(1.5)) == pytest.approx(56.310, abs=1e-3)
     inner = np.sqrt(1.0 - (1.0 - cosine**2) / 2.25)
@@ -108,7 +108,7 @@ def test_schlick_stays_near_the_exact_curve(eta, bound):
     r = ((eta - 1.0) / (eta + 1.0)) ** 2
     assert np.abs(schlick - (r + (1.0 - r) * (1.0 - cosine) ** 5)).max() < 1e-6
     assert exact[0] == pytest.approx(schlick[0], abs=1e-6)
-    assert 0.02 < np.abs(exact - schlick).max() < bound  # the largest error is near 85 degrees
+    assert 0.02 < np.abs(exact - schlick).max() < bound  # The largest error is near 85 degrees.
 
 
 @pytest.mark.parametrize("metal", CONDUCTORS)
@@ -128,7 +128,7 @@ def test_metals_of_any_index_that_a_scene_may_have(eta, k):
     assert np.isfinite(found).all()
     assert (found >= -1e-6).all() and (found <= 1.0 + 1e-5).all()
     if (eta, k) not in ((0.0, 0.0), (1.0, 0.0)):
-        inside = np.abs(np.sqrt(1.0 - cosine**2) - eta) > 1e-3  # away from the critical angle, where the curve is vertical
+        inside = np.abs(np.sqrt(1.0 - cosine**2) - eta) > 1e-3  # Away from the critical angle, where the curve is vertical.
         assert np.abs(found - complex_fresnel(cosine, complex(eta, k)))[inside].max() < 5e-4
 
 
@@ -141,8 +141,8 @@ def test_tint_runs_from_f0_to_white():
 
 @pytest.mark.parametrize("exponent", [0.0, 1.0, 10.0, 100.0, 1e4, 1e5])
 def test_highlight_is_normalised(exponent):
-    # Quadrature over the half vector's angle h: hemispherical reflectance at normal incidence is exactly 1, and so never more.
-    # The direction wi is at 2 h. Its solid angle is 4 cos(h) times the half vector's, while it is above the surface.
+    # Quadrature over the half vector's angle h: the hemispherical reflectance at normal incidence must be 1.
+    # The direction wi is at the angle 2 h. Its solid angle is 4 cos(h) times that of the half vector.
     x, w = np.polynomial.legendre.leggauss(300)
     reach = min(np.pi / 4.0, 12.0 / np.sqrt(exponent + 1.0))
     h, w = 0.5 * reach * (x + 1.0), 0.5 * reach * w
@@ -152,7 +152,7 @@ def test_highlight_is_normalised(exponent):
     solid_angle = 2.0 * np.pi * np.sin(h) * 4.0 * np.cos(h)
     reflectance = (value.numpy() * np.cos(2.0 * h) * solid_angle * w).sum()
     assert reflectance == pytest.approx(1.0, abs=2e-3)
-    assert reflectance <= 1.0 + (1e-5 if exponent < 1e3 else 2e-3)  # pow of float32 is all that may exceed it
+    assert reflectance <= 1.0 + (1e-5 if exponent < 1e3 else 2e-3)  # Only the rounding of power may exceed 1.
 
 
 # --- scatter ----------------------------------------------------------------------------------------------------------
@@ -228,11 +228,11 @@ def test_glass_obeys_snell_and_keeps_energy(front):
     assert np.abs(share - np.where(goes_on, complex_fresnel(np.cos(np.radians(degrees)), eta), 1.0)).max() < 3e-4
     assert np.allclose(out["reflection"], wo * [-1, -1, 1], atol=1e-6)
     refraction = out["refraction"][goes_on].astype(np.float64)
-    assert np.abs(refraction[:, 0] + wo[goes_on, 0] / eta).max() < 1e-6  # sin_t = sin_i / eta, on the other side
+    assert np.abs(refraction[:, 0] + wo[goes_on, 0] / eta).max() < 1e-6  # sin_t = sin_i / eta, on the other side of the normal.
     assert (refraction[:, 2] < 0.0).all() and np.abs(refraction[:, 1]).max() < 1e-7
     assert np.abs(np.linalg.norm(refraction, axis=1) - 1.0).max() < 1e-6
     assert not out["transmitted"][~goes_on].any() and (share[~goes_on] == 1.0).all()
-    # Flux: radiance behind the boundary counts eta^2 fold (PBR, section 9.5.2).
+    # The flux is conserved: behind the boundary it is eta^2 times the radiance (PBR, section 9.5.2).
     assert np.allclose(share + out["transmitted"][:, 0] * eta**2, 1.0, atol=1e-5)
     assert np.allclose(out["transmitted"][:, 1], 0.5 * out["transmitted"][:, 0])
     assert (out["bends"] == goes_on).all()
@@ -251,7 +251,7 @@ def test_thin_glass_sums_the_reflections_of_both_faces():
 
 
 def some_materials():
-    """Return a material of each kind, and the corners of metallic-roughness, with albedo 1: none may absorb light."""
+    """Yield materials of each kind and extremes of metallic_roughness, all with albedo 1. Smooth ones must not absorb light."""
     rest = {"albedo": (1.0, 1.0, 1.0)}
     yield from (Material("mirror", **rest), Material("glass", ior=1.5, **rest), Material("glass", thin=True, **rest))
     yield Material("conductor", roughness=0.5)
@@ -281,7 +281,7 @@ def test_no_kind_creates_energy(material, front):
             assert np.abs(np.linalg.norm(direction, axis=1) - 1.0).max(initial=0.0) < 1e-5
             assert (direction[:, 2] * side > 0.0).all()
         if material.roughness == 0.0 and material.kind != "conductor":
-            assert (total > 1.0 - 1e-4).all()  # what is smooth and white keeps all of it
+            assert (total > 1.0 - 1e-4).all()  # A smooth white surface absorbs nothing.
 
 
 @pytest.mark.parametrize("kind", ["conductor", "glass", "metallic_roughness"])

@@ -71,8 +71,8 @@ def test_fewer_samples_are_the_first_ones_and_the_seed_matters(reference):
 
 
 def test_variance_is_that_of_the_mean(reference):
-    # The pixels' variance over many seeds must be at most the variance that one render reports. It is less, as the samples of a
-    # pixel are more even than random ones.
+    # The variance of pixels over many seeds must be at most the variance that one render reports. It is less, as the samples of a
+    # pixel are more even than random samples.
     films = [render(busy_scene(), seed=seed, threads=2) for seed in range(2, 14)]
     spread = np.var([film.pixels for film in films], axis=0, ddof=1).mean()
     claimed = np.mean([film.variance for film in films])
