@@ -106,7 +106,7 @@ def test_names_and_letters_choose_cases() -> None:
 
 
 def beyond_the_sample(name: str) -> Verdict:
-    return sum(stability.run_more(name, stability.Plan(rays=1000, sample=300), lambda line: None), Verdict())
+    return sum(stability.judge_further(name, stability.Plan(rays=1000, sample=300), lambda line: None), Verdict())
 
 
 def test_rays_beyond_the_sample_are_held_to_what_is_known_of_them() -> None:
@@ -138,7 +138,7 @@ def result():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stability, "SPEED_RAYS", 2000)
         found = stability.run(plan, progress=lines.append)
-    assert any("E_grid" in line and "M rays more" in line for line in lines)
+    assert any("E_grid" in line and "M further rays" in line for line in lines)
     return found, plan
 
 
