@@ -14,7 +14,7 @@ import warp as wp
 from wrt.accel.queries.accelerator import Accelerator, snapshot_of
 from wrt.accel.queries.answers import Hits
 from wrt.accel.queries.batches import RAYS_PER_LAUNCH
-from wrt.accel.queries.hit_points import surroundings
+from wrt.accel.queries.hit_points import device_scene
 from wrt.accel.queries.rays import rays_of, rays_on
 from wrt.accel.structure import Structure
 from wrt.core.arrays import returned, to_numpy, to_warp
@@ -29,17 +29,17 @@ from wrt.kernels.structs import Hit
 from wrt.kernels.warp_private import fields_of
 
 ALL = (1 << 30) - 1
-RAYS_AT_ONCE = 1 << 18  # whose lists of the first walk take 32 MiB
+RAYS_AT_ONCE = 1 << 18  # the hit lists of so many rays take 32 MiB in the first traversal
 
 
 @dataclass(frozen=True, eq=False)
 class AllHits(Generic[ArrayT]):
-    """M hits of N rays in order of t and, where that is equal, of prim_id. Arrays of NumPy, PyTorch or JAX.
+    """M hits of N rays, ray by ray, in order of t and, at equal t, of prim_id. Arrays of NumPy, PyTorch or JAX.
 
     Attributes
     ----------
     first : (N + 1,) int64
-        The hits of ray i are rows first[i] to first[i + 1] of the other arrays.
+        Rows first[i] .. first[i + 1] - 1 of the other arrays are the hits of ray i.
     t, u, v : (M,) float32
         As in `Hits`.
     prim_id : (M,) int32
@@ -63,7 +63,7 @@ class AllHits(Generic[ArrayT]):
 
     @property
     def ray_id(self) -> ArrayT:
-        """Ray of each hit, (M,) int64."""
+        """Index of the ray of each hit, (M,) int64."""
         ray_id: Any = np.repeat(np.arange(len(self)), to_numpy(self.counts))
         give: Any = returned(self.first)
         return ray_id if give is None else give(wp.array(ray_id, dtype=wp.int64, device=to_warp(self.first).device))
@@ -73,11 +73,11 @@ class AllHits(Generic[ArrayT]):
 
 
 class ListQuery:
-    """A structure in its present state and rays: `of` sets the rays; `all`, `first` and `counts` answer."""
+    """Query of a snapshot of a structure for lists of hits. `of` sets the rays; `all`, `first` and `counts` return results."""
 
     n = 0
     rays: RayArrays
-    give: Any = to_numpy  # converts Warp arrays to those of the caller's library
+    give: Any = to_numpy  # converts Warp arrays to arrays of the caller's library
 
     def __init__(self, accel: Accelerator, threads: int | None, crossings: bool = False) -> None:
         self.snapshot = snapshot_of(accel)
@@ -85,7 +85,7 @@ class ListQuery:
         self.lists: WarpStruct = HitLists()
         self.lists.crossings = as_one(crossings, bool, "crossings")
         if crossings:
-            surfaces = surroundings(self.snapshot).surfaces
+            surfaces = device_scene(self.snapshot).surfaces
             self.lists.vertices, self.lists.faces = surfaces.vertices, surfaces.faces
 
     def of(self, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf) -> ListQuery:
@@ -105,7 +105,7 @@ class ListQuery:
             self._copy(rays, lists, begin, parts[-1])
         first = np.concatenate([[0], np.cumsum(np.concatenate(counts))])
         hits = parts[0] if len(parts) == 1 else self._joined(parts)
-        return AllHits(self.given(first), *map(self.give, (hits.t, hits.u, hits.v, hits.prim_id)))
+        return AllHits(self.converted(first), *map(self.give, (hits.t, hits.u, hits.v, hits.prim_id)))
 
     def first(self, k: int) -> Hits[Any]:
         """Find the first k hits of each ray, in arrays (N, k)."""
@@ -121,18 +121,18 @@ class ListQuery:
         return Hits(*(self.give(array.reshape((self.n, k))) for array in (hits.t, hits.u, hits.v, hits.prim_id)))
 
     def counts(self) -> np.ndarray:
-        """Count the hits of each ray, (N,) int64. If no triangle is in several leaves, the first walk has the counts."""
+        """Count the hits of each ray, (N,) int64. If no triangle is in several leaves, the first traversal is enough."""
         counting = self.snapshot.stats.references == len(self.snapshot.geometry)
         return np.concatenate([np.zeros(0, np.int64), *(of_each for _, _, of_each in self._listed(ALL, counting))])
 
-    def given(self, numbers: np.ndarray) -> Array:
-        """Return int64 numbers as an array of the caller's library."""
-        return numbers if self.give is to_numpy else self.give(upload(numbers, wp.int64, self.device))
+    def converted(self, values: np.ndarray) -> Array:
+        """Convert int64 values to an array of the caller's library."""
+        return values if self.give is to_numpy else self.give(upload(values, wp.int64, self.device))
 
     def _listed(self, limit: int, counting: bool = False) -> Iterator[tuple[Any, list[Any], np.ndarray]]:
-        """Yield parts of the rays with their lists of hits, and the number of hits of each ray, at most `limit`.
+        """Yield, for each part of the rays: the rays, one or two lists of their hits, and the number of hits of each ray.
 
-        A ray has its hits in one of the lists. counting: the numbers are complete, the lists may not be.
+        Each ray has its hits in one of the lists, at most `limit`. counting: only the numbers of hits are needed.
         """
         limit = min(limit, ALL)
         for begin in range(0, self.n, RAYS_AT_ONCE):
@@ -150,16 +150,16 @@ class ListQuery:
                 counts = np.where(many, lists[1].count.numpy(), counts)
             yield rays, lists, counts
 
-    def _filled(self, rays: RayArrays, room: np.ndarray, limit: int) -> WarpStruct:
-        """Walk, and return HitLists with space for `room` hits of each ray."""
+    def _filled(self, rays: RayArrays, capacity: np.ndarray, limit: int) -> WarpStruct:
+        """Traverse the structure and return HitLists with space for `capacity` hits of each ray."""
         lists: WarpStruct = HitLists()
         lists.limit, lists.crossings = limit, self.lists.crossings
         lists.vertices, lists.faces = self.lists.vertices, self.lists.faces
-        first = np.concatenate([[0], np.cumsum(room)])
+        first = np.concatenate([[0], np.cumsum(capacity)])
         lists.rows = wp.empty(rows_of(first[-1]), dtype=Hit, device=self.device)
         lists.first = upload(first, wp.int32, self.device)
-        lists.count = wp.zeros(len(room), dtype=wp.int32, device=self.device)
-        self._launch(list_hits_kernel(self.snapshot.structure), len(room), self.snapshot.data, rays, lists)
+        lists.count = wp.zeros(len(capacity), dtype=wp.int32, device=self.device)
+        self._launch(list_hits_kernel(self.snapshot.structure), len(capacity), self.snapshot.data, rays, lists)
         return lists
 
     def _copy(self, rays: RayArrays, lists: list[WarpStruct], begin: np.ndarray, hits: WarpStruct) -> None:
@@ -185,9 +185,9 @@ class ListQuery:
 
 
 def rows_of(hits: int) -> int:
-    """Return the size of an array of hits. Raises InputError above 2^31 - 1, the largest index of a kernel."""
+    """Return the size of an array of hits. Raises InputError above 2^31 - 1, the largest size that kernels can index."""
     if hits > MOST_ROWS:
-        raise InputError(f"{hits} hits are more than an array can have, 2^31 - 1", hint="ask fewer rays at a time")
+        raise InputError(f"{hits} hits do not fit into an array of at most 2^31 - 1", hint="query fewer rays at a time")
     return int(hits)
 
 
@@ -207,8 +207,8 @@ def all_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike, t_mi
              threads: int | None = None, crossings: bool = False) -> AllHits[Any]:
     """Find every hit of each ray in its segment, in order of distance. A ray hits each triangle at most once.
 
-    No ray is lost between two triangles: through their common edge it hits one or both, depending on rounding. n hits take n log n
-    steps, also if many are at the same t.
+    No ray passes between two adjacent triangles: through their common edge it hits one or both, depending on rounding. The time
+    for n hits of a ray grows as n log n, even if many hits have the same t.
 
     Parameters
     ----------
@@ -217,9 +217,9 @@ def all_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike, t_mi
     origins, directions, t_min, t_max, threads
         See `Accelerator.closest_hit`.
     crossings : bool
-        Find crossings of the surface instead: at a shared edge or corner the ray counts as moved aside by an infinitesimal distance.
-        It then hits one triangle where the surface goes on, and none or two at an outline. A ray that begins and ends outside of a
-        closed mesh crosses it an even number of times; with the watertight test, exactly.
+        Find crossings of the surface instead. At a shared edge or corner, the ray counts as shifted by an infinitesimal distance:
+        it hits one triangle inside a surface, and none or two at a silhouette. A ray that begins and ends outside of a closed mesh
+        crosses it an even number of times. With the watertight test this holds without exception.
 
     Returns
     -------
@@ -242,7 +242,7 @@ def count_hits(accel: Accelerator, origins: TensorT, directions: TensorT, t_min:
                threads: int | None = ..., crossings: bool = ...) -> TensorT: ...
 def count_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
                threads: int | None = None, crossings: bool = False) -> object:
-    """Count the hits of each ray in its segment, without memory for them unless the structure has triangles in several leaves.
+    """Count the hits of each ray in its segment. The hits take no memory unless the structure has triangles in several leaves.
 
     Parameters
     ----------
@@ -260,7 +260,7 @@ def count_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike, t_
         Names the argument and what was expected.
     """
     query = ListQuery(accel, threads, crossings).of(origins, directions, t_min, t_max)
-    return query.given(query.counts())
+    return query.converted(query.counts())
 
 
 @overload
@@ -271,7 +271,7 @@ def first_hits(accel: Accelerator, k: int, origins: TensorT, directions: TensorT
                threads: int | None = ..., crossings: bool = ...) -> Hits[TensorT]: ...
 def first_hits(accel: Accelerator, k: int, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0,
                t_max: ArrayLike = np.inf, threads: int | None = None, crossings: bool = False) -> Hits[Any]:
-    """Find the first k hits of each ray in order of distance; the walk ends at the k-th.
+    """Find the first k hits of each ray in order of distance. The traversal ends at the k-th hit.
 
     Parameters
     ----------
@@ -283,7 +283,7 @@ def first_hits(accel: Accelerator, k: int, origins: ArrayLike, directions: Array
     Returns
     -------
     Hits
-        Arrays (N, k); a ray with fewer hits has misses at the end. They have no points and normals.
+        Arrays (N, k); a ray with fewer hits has misses at the end. These Hits have no points and normals.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Answers of a structure: hits, what they cost, and the arrays that take them."""
+"""Results of queries: hits, counters of their cost, and the arrays that receive both."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ ANY_HIT_TYPES = {"out": np.bool_}
 
 @dataclass(frozen=True, eq=False)
 class Counters:
-    """Costs of each ray of a query: `counters.nodes`, `counters.primitives` and the other fields of `counts` are (N,) arrays.
+    """Costs of each ray of a query. `counters.nodes`, `counters.primitives` and the other fields of `counts` are (N,) arrays.
 
     Attributes
     ----------
     counts : (N,) structured array
-        Counts as `kernels.traverse.counters.Counts` has them.
+        Records of `kernels.traverse.counters.Counts`.
     first : (N + 1,) int64
-        The fetches of ray i are rows first[i] to first[i + 1] of `address` and `size`; all 0 without `trace=True`.
+        Rows first[i] .. first[i + 1] - 1 of `address` and `size` are the fetches of ray i; all 0 without `trace=True`.
     address, size : (M,) int64
         Address and size of each fetch in bytes. Addresses of primitives begin at `PRIMITIVE_SPACE`.
     """
@@ -67,11 +67,11 @@ class Hits(HitPoints[ArrayT]):
     t : (N,) float32
         Distance in units of the direction's length; inf on a miss.
     u, v : (N,) float32
-        The point is (1 - u - v) v0 + u v1 + v v2. Both are 0 on a miss and on a sphere.
+        Barycentric coordinates: the point is (1 - u - v) v0 + u v1 + v v2. Both are 0 on a miss and on a sphere.
     prim_id : (N,) int32
         Index of the face, or number of faces plus index of the sphere; -1 on a miss.
     counters : Counters or None
-        Costs of each ray, if the query was asked to count.
+        Costs of each ray, if the query had `counters=True` or `trace=True`.
     source : tuple or None
         Snapshot and rays from which points, normals and ids are computed. Pickled hits have none.
     """
@@ -115,10 +115,10 @@ class Hits(HitPoints[ArrayT]):
 
 def answer_arrays(types: Mapping[str, type], given: list[Any] | None, n: int, device: Device | None,
                   shared: bool = False) -> list[Array]:
-    """Return an array (N,) of each type for the answers: NumPy's (`device` is None) or Warp's; `given` ones are checked.
+    """Return one array (n,) per entry of `types`: of NumPy if `device` is None, else of Warp. Arrays in `given` are checked.
 
-    shared: another library takes them; JAX would copy an array that does not begin with a cache line. Raises InputError that names
-    the array by its key in `types`.
+    shared: begin each array at a cache line, because JAX copies an array that does not. Raises InputError that names the array by
+    its key in `types`.
     """
     if given is None:
         empty = empty_aligned if shared else np.empty
@@ -135,7 +135,7 @@ def answer_arrays(types: Mapping[str, type], given: list[Any] | None, n: int, de
             kind, place = ("NumPy", "writeable and") if device is None else ("Warp", f"on {device},")
             raise InputError(f"must be a {kind} array ({n},) of {np.dtype(dtype)}, {place} without gaps, got {shown(array)}",
                              argument=name)
-    # The arrays have no gaps, so that their bounds tell all.
+    # The arrays are contiguous, so that they overlap exactly if their bounds do.
     for (name, one), (other, two) in combinations(zip(types, given, strict=True), 2) if len(given) > 1 else ():
         if np.may_share_memory(one, two) if device is None else abs((one.ptr or 0) - (two.ptr or 0)) < n * one.strides[0]:
             raise InputError(f"shares memory with {other}", argument=name)

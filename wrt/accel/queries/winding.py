@@ -1,4 +1,4 @@
-"""Winding numbers of points."""
+"""Winding numbers of a mesh around points."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy.typing as npt
 import warp as wp
 
 from wrt.accel.queries.accelerator import Accelerator, snapshot_of
-from wrt.accel.queries.hit_points import surroundings
+from wrt.accel.queries.hit_points import device_scene
 from wrt.accel.queries.rays import vectors
 from wrt.core.arrays import returned
 from wrt.core.device import launch_on, upload
@@ -28,16 +28,16 @@ def winding_number(accel: Accelerator, points: TensorT, threads: int | None = No
 def winding_number(accel: Accelerator, points: ArrayLike, threads: int | None = None) -> object:
     """Compute the generalized winding number of a mesh at each point: the sum of its triangles' solid angles over 4 pi.
 
-    For a closed mesh whose triangles face outwards it is 1 inside and 0 outside, to 1e-9; it adds up where parts overlap, and is
-    negative where triangles face inwards. Around an open mesh it changes smoothly: above 0.5 a point is mostly inside. On a triangle
-    it lies between the values of both sides. Every point costs some 40 ns per triangle.
+    For a closed mesh whose triangles face outwards it is 1 inside and 0 outside, with an error below 1e-9. Overlapping parts add
+    up, and parts that face inwards count negative. Around an open mesh it changes smoothly: above 0.5 a point is mostly inside. On
+    a triangle it lies between the values of both sides. A point takes some 40 ns per triangle.
 
     Parameters
     ----------
     accel : Accelerator
         Structure over one mesh without spheres.
     points : (N, 3) array_like
-        Points, taken as float32.
+        Points, converted to float32.
     threads : int, optional
         Threads on the CPU; one per core by default.
 
@@ -58,7 +58,7 @@ def winding_number(accel: Accelerator, points: ArrayLike, threads: int | None = 
     snapshot = snapshot_of(accel)
     rows, give, device = vectors(points, "points", FARTHEST), returned(points), snapshot.device
     turns = wp.empty(len(rows), dtype=wp.vec3d, device=device)
-    launch_on(device, wind, len(rows), surroundings(snapshot).surfaces, upload(rows, wp.vec3, device), turns, None,
+    launch_on(device, wind, len(rows), device_scene(snapshot).surfaces, upload(rows, wp.vec3, device), turns, None,
               threads=thread_count(threads), step=POINTS_PER_LAUNCH)
     re, im, whole = turns.numpy().reshape(-1, 3).T
     out = whole + np.arctan2(im, re) / (2.0 * np.pi)

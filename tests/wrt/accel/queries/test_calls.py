@@ -1,4 +1,4 @@
-"""Calls with NumPy arrays: what is read in place, what is converted, where the answers go, and what a call costs beside tracing."""
+"""Calls with NumPy arrays: which are read in place or converted, where results go, and the overhead of a call."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def frozen(a: np.ndarray) -> np.ndarray:
 @cpu_only
 @pytest.mark.parametrize("n", [1, MANY])
 def test_the_way_of_a_query_is_short(n: int) -> None:
-    """The Python files between the call and the launch: those that wrt.accel.queries names, and what they use of wrt.core."""
+    """Between call and launch, Python runs only the files that the docstring of wrt.accel.queries names, and wrt.core."""
     accel, rays, files = build(icosphere(3)), some_rays(n), set()
     accel.closest_hit(*rays, threads=1)
 
@@ -119,7 +119,7 @@ def test_one_number_for_all_segments_is_as_an_array_of_it(ball: Accelerator, n: 
         assert isinstance(on_warp.t, wp.array) and bits(on_warp) == bits(asked)
 
 
-# --- where the answers go ---------------------------------------------------------------------------------------------
+# --- where results go -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("as_warp", [False, True])
@@ -159,7 +159,7 @@ def test_room_that_does_not_fit_is_named(ball: Accelerator, field: str, array: A
 
 @pytest.mark.parametrize("as_warp", [False, True])
 def test_arrays_that_share_memory_are_refused(ball: Accelerator, as_warp: bool) -> None:
-    """Also where they have the same bytes as other types, and where only a part is shared; one behind the other is right."""
+    """Arrays of different types or that share only a part are refused, too. Adjacent arrays are accepted."""
     rays: tuple[Any, ...] = some_rays(4)
     memory, own = np.zeros(16, np.float32), [np.zeros(4, np.float32) for _ in range(2)]
     whole: Any = to_warp(memory).to(DEVICE) if as_warp else memory
@@ -220,7 +220,7 @@ def test_the_first_row_that_is_wrong_is_named(ball: Accelerator, n: int, form: s
                 with pytest.raises(InputError, match=message):
                     query(*arrays, threads=threads)  # type: ignore[operator]
     arrays = [array.copy() for array in good]
-    arrays[3][::2] = -np.inf  # an empty segment is no error
+    arrays[3][::2] = -np.inf  # an empty segment is valid
     assert (ball.closest_hit(*arrays).prim_id[::2] == -1).all()
 
 
@@ -297,7 +297,7 @@ def test_rays_in_place_need_no_memory_of_their_size() -> None:
     out, dark = accel.closest_hit(origins, directions), accel.any_hit(origins, directions)
 
     def peak(*arguments: Any, **options: Any) -> float:
-        """Bytes a ray."""
+        """Return the peak memory of a call in bytes per ray."""
         accel.closest_hit(*arguments, threads=1, **options)
         tracemalloc.start()
         try:
@@ -307,7 +307,7 @@ def test_rays_in_place_need_no_memory_of_their_size() -> None:
             tracemalloc.stop()
 
     assert peak(origins, directions, 0.0, 5.0, out=out) < 1.0
-    assert 16.0 <= peak(origins, directions) < 17.0  # the answers
+    assert 16.0 <= peak(origins, directions) < 17.0  # the results
     assert peak(origins.astype(np.float64), np.asfortranarray(directions), np.zeros(n), 5.0, out=out) < 1.0
     assert dark.nbytes == n
 
@@ -325,7 +325,7 @@ def test_a_small_call_wakes_no_thread(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_call_packs_no_launch_and_makes_no_warp_array(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Each costs as much as the rest of a call of one ray.
+    # Each of these costs as much as the rest of a call with one ray.
     accel = build(icosphere(1), "bvh8", device="cpu")
     asked = [some_rays(n) for n in (1, 5000)]
     expected = [(bits(accel.closest_hit(*rays)), accel.any_hit(*rays).tobytes()) for rays in asked]
