@@ -195,11 +195,11 @@ assert np.allclose(film.aov["depth"], 3.0, rtol=1e-6)  # from the middle of a sp
 assert np.allclose(film.pixels[..., 0], 0.25, atol=1e-5)
 
 from wrt.io.toml.reference_page import scene_format
-from wrt.scene.digest import camera_digest
+from wrt.scene.digest import digest
 from wrt.scene.pack import pack, unpack
 
 (back,) = unpack(*pack(scene)).cameras
-assert camera_digest(back) == camera_digest(camera)
+assert digest(back) == digest(camera)
 assert "### Cylinder camera" in scene_format()
 print("all of it works")
 """

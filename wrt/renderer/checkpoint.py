@@ -24,7 +24,7 @@ from wrt.core.write_file import check_writable, replacing
 from wrt.renderer.film_arrays import DeviceFilm
 from wrt.renderer.options import OPTIONS
 from wrt.renderer.plan import Plan
-from wrt.scene.digest import camera_digest, scene_digest
+from wrt.scene.digest import digest
 from wrt.scene.settings import SETTINGS
 
 MAGIC = b"wrt checkpoint 1\n"
@@ -146,8 +146,8 @@ def checkpoint_of(plan: Plan, kind: str) -> Checkpoint | None:
         return None
     identity = {name: getattr(settings, name) for name in SETTINGS if name not in NO_PIXEL}
     identity |= {name: getattr(options, name) for name in OPTIONS if name not in NO_PIXEL}
-    identity |= {"crop": plan.crop, "groups of samples": plan.groups, "scene": scene_digest(plan.scene),
-                 "camera": camera_digest(plan.camera), "device": kind, "version": VERSION, "kernels": plan.kernels_hash()}
+    identity |= {"crop": plan.crop, "groups of samples": plan.groups, "scene": digest(plan.scene),
+                 "camera": digest(plan.camera), "device": kind, "version": VERSION, "kernels": plan.kernels_hash()}
     file = Checkpoint(Path(options.checkpoint), options.checkpoint_every, identity, groups=plan.groups, resume=options.resume)
     samples = 0 if file.saved is None else file.saved.samples[1]
     if samples > max(1, settings.spp // plan.groups):

@@ -14,7 +14,7 @@ from wrt.renderer.pixel_rays import film_rays
 from wrt.renderer.prepare import Prepared
 from wrt.renderer.renderer import Renderer
 from wrt.scene.cameras import CameraKind
-from wrt.scene.digest import camera_digest
+from wrt.scene.digest import digest
 from wrt.scene.model import Scene
 
 TILE_SIZE = 16  # pixels a side; small, because the next view waits until all running tiles end
@@ -100,7 +100,7 @@ class View:
 
     def same(self, other: View) -> bool:
         """Return True if both views have the same pixels."""
-        fields, others = ((v.size, v.max_depth, v.accel, v.cost, camera_digest(v.camera)) for v in (self, other))
+        fields, others = ((v.size, v.max_depth, v.accel, v.cost, digest(v.camera)) for v in (self, other))
         return fields == others
 
 

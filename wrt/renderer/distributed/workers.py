@@ -26,7 +26,7 @@ from wrt.renderer.distributed.installed import INSTALLED, SAME_EVERYWHERE, diffe
 from wrt.renderer.options import Options
 from wrt.renderer.plan import plan_of
 from wrt.renderer.prepare import Prepared, kind_of, prepare
-from wrt.scene.digest import scene_digest
+from wrt.scene.digest import digest
 from wrt.scene.model import Scene
 from wrt.scene.pack import pack, unpack
 
@@ -165,7 +165,7 @@ def packaged(scene: Scene, options: Options, kernels: str) -> tuple[str, Package
     text, arrays = pack(scene)
     package = {"installed": INSTALLED, "kernels": kernels, "options": {name: getattr(options, name) for name in OPTIONS_SENT},
                "scene": text}
-    key = sha256(f"{package}{scene_digest(scene)}".encode()).hexdigest()
+    key = sha256(f"{package}{digest(scene)}".encode()).hexdigest()
     return key, {**package, "arrays": arrays}
 
 
