@@ -166,7 +166,7 @@ def test_cameras_by_name_and_number() -> None:
     for name in ("top", "2", "-1", ""):
         for command in (("render", *SMALL), ("info",)):
             refused(run(*command, "scene.toml", "--camera", name), f"scene.toml: no camera {name!r}",
-                    "cameras are 'front' (number 0), 'side' (number 1)")
+                    "cameras are 'front' (index 0), 'side' (index 1)")
 
 
 def test_a_time_limit_leaves_a_picture_of_whole_samples() -> None:
@@ -269,7 +269,7 @@ def test_a_layer_that_cannot_be_written_is_told_before_any_work(monkeypatch: pyt
     ("nothing.obj", "nothing.obj: no such file"), ("nothing.xyz", "nothing.xyz: no such file"),
     (".", ".: is a directory"), ("/", "/: is a directory"), ("..", "..: is a directory"), ("", ".: is a directory"),
     ("box.txt", "box.txt: is no scene file"), ("empty.toml", "empty.toml: the scene has no shapes"),
-    ("a" * 300 + ".obj", "too long"), ("empty.obj", "empty.obj: holds no triangles"),
+    ("a" * 300 + ".obj", "too long"), ("empty.obj", "empty.obj: has no triangles"),
 ])
 @pytest.mark.parametrize("command", ["render", "info", "validate"])
 def test_a_wrong_scene(command: str, scene: str, message: str) -> None:
@@ -456,7 +456,7 @@ def test_compare_measures_and_fails_past_its_limits() -> None:
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
-    (["a.exr", "nothing.png"], "nothing.png: cannot be read"), (["box.obj", "a.exr"], "box.obj: not an image format"),
+    (["a.exr", "nothing.png"], "nothing.png: cannot be read"), (["box.obj", "a.exr"], "box.obj: is no image file"),
     (["a.exr", "small.exr"], "different sizes, 30x20 and 8x4"), (["broken.png", "a.exr"], "broken.png: cannot be read"),
     (["a.exr", "a.exr", "-o", "d.exr"], "d.exr: must be a .png: a picture of the difference"),
     (["a.exr", "a.exr", "-o", "nowhere/d.png"], "its folder does not exist"),

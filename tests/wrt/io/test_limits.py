@@ -1,4 +1,4 @@
-"""Files of a few bytes that ask for everything: each is refused, with the number and the limit."""
+"""Small files that would take all memory: each is refused, with the number that it demands and the limit."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::wrt.core.errors.SceneWarning")
 
 
 def instanced(count: int, times: int = 1, nodes: int = 1) -> GltfFile:
-    """A triangle at `count` places that no buffer describes."""
+    """A triangle with `count` instances, whose transforms have no buffer."""
     file = GltfFile()
     one = file.view(np.zeros(3, np.float32).tobytes())
     index = {"bufferView": file.view(b"\0\0\0\0"), "componentType": 5125}
@@ -50,7 +50,7 @@ def test_nodes_times_instances_are_counted(tmp_path: Path, monkeypatch: pytest.M
     for file in (instanced(50, 3), instanced(40, 1, 3)):
         with pytest.raises(InputError, match=r"nodes\[\d\].*: 1\d\d (objects|instances); a scene holds at most 100"):
             load_gltf(file.write(tmp_path))
-    hidden = instanced(40, 1, 3)  # they show nothing, but are made all the same
+    hidden = instanced(40, 1, 3)  # instances without triangles count, too
     for node in hidden.json["nodes"]:
         node["scale"] = [0, 1, 1]
     with refused(what="120 instances", place="nodes[2].extensions.EXT_mesh_gpu_instancing.attributes"):
@@ -82,9 +82,9 @@ def test_accessors_beyond_their_buffer(change: dict[str, int], message: Refusal,
     (tube, {"points": [(0.0, 0.0, float(i)) for i in range(2000)], "segments": 4096}),
 ])
 def test_shapes_of_too_many_triangles(shape, arguments: dict) -> None:
-    with pytest.raises(InputError, match=rf": \d+ triangles; at most {MAX_FACES} are made"):
+    with pytest.raises(InputError, match=rf"segments must make at most {MAX_FACES} triangles, got \d+"):
         shape(**arguments)
-    assert 20 * 4**9 <= MAX_FACES and len(icosphere(0).faces) == 20  # its own limit is within
+    assert 20 * 4**9 <= MAX_FACES and len(icosphere(0).faces) == 20  # within the limit of this argument
 
 
 @pytest.mark.parametrize("text", [

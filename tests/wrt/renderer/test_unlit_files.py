@@ -46,7 +46,7 @@ def test_weak_emission_does_not_switch_off_the_light_that_is_added(tmp_path: Pat
 def test_a_lamp_that_lights_the_scene_is_its_only_light_and_that_is_told(tmp_path: Path) -> None:
     pixels, told = rendered(gltf_box(tmp_path, -4, 4, emission=1.0, strength=2000.0, translation=[0, 0, 0]))
     assert 0.0 < np.median(pixels) and len(told) == 1
-    assert told[0].endswith("it has no lights but the emission of 'lamp': what that does not reach is black")
+    assert told[0].endswith("it has no lights but the emission of 'lamp': surfaces that it does not reach are black")
 
 
 def test_a_camera_in_a_closed_box_sees_nothing_and_that_is_told(tmp_path: Path) -> None:

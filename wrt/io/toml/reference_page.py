@@ -11,7 +11,7 @@ from wrt.io.load import schema
 
 Schema = dict[str, Any]
 TOP = "SceneTable"
-SHARED_KEYS = 4  # keys that two tables must share for the page to describe them once
+SHARED_KEYS = 4  # the page describes so many equal keys of two tables once
 WORDS = {"string": "text", "boolean": "true or false", "integer": "whole number"}
 HEAD = """\
 # Scene files
@@ -47,12 +47,12 @@ def scene_format() -> str:
 
 
 def _title(name: str) -> str:
-    """CameraTable: Camera; PointLightTable: Point light."""
+    """Return the title of a table: "Point light" for PointLightTable."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", re.sub(r"(Table|Shape)$", "", name)).capitalize()
 
 
 def _described_before(tables: dict[str, Schema], name: str, before: list[str]) -> tuple[list[str], str]:
-    """Return the keys that an earlier table describes in the same words, if there are several, and the table."""
+    """Return the keys that an earlier table describes in the same words, if they are SHARED_KEYS or more, and that table's name."""
     for each in before:
         there = tables[each]["properties"]
         if len(known := [key for key, value in tables[name]["properties"].items() if there.get(key) == value]) >= SHARED_KEYS:
@@ -66,7 +66,7 @@ def _link(reference: str) -> str:
 
 
 def _places(tables: dict[str, Schema]) -> dict[str, list[str]]:
-    """Each table, in the order of a file, with the keys where it stands."""
+    """Return the places of each table in a file, such as "meshes[].transform"; tables are in the order of the page."""
     places: dict[str, list[str]] = {TOP: []}
 
     def visit(name: str, prefix: str) -> None:
@@ -83,7 +83,7 @@ def _places(tables: dict[str, Schema]) -> dict[str, list[str]]:
 
 
 def _references(value: Any, place: str) -> list[tuple[str, str]]:
-    """Return the tables that a value may be, each with its place: [] marks a list, NAME any key."""
+    """Return the tables that a value may hold, each with its place: [] marks a list, NAME any key."""
     if "$ref" in value:
         return [(value["$ref"], place)]
     parts = [(each, place) for each in (*value.get("anyOf", ()), *value.get("oneOf", ()))]
@@ -142,7 +142,7 @@ def _default(value: Schema) -> str:
 
 
 def _find(value: Any, key: str) -> str:
-    """Return what the value or a part of it has for the key, or ""."""
+    """Return the text of a key of the schema of a value or of its parts, or "" without this key."""
     if key in value:
         return str(value[key])
     inner = [*value.get("anyOf", ()), *([value["items"]] if isinstance(value.get("items"), dict) else [])]

@@ -120,7 +120,7 @@ SPARSE = {"count": 1, "indices": {"bufferView": 1, "componentType": 5121}, "valu
     ({"count": 10**300}, r"accessors\[0\].count: must be an integer of at most 64 bits, got 1000*\.\.\.$"),
     ({"sparse": {**SPARSE, "count": 9}}, r"sparse.count: must be 1 to 4, got 9"),
     ({"sparse": {**SPARSE, "indices": {"bufferView": 1, "componentType": 5126}}}, "must be an unsigned integer type"),
-    ({"sparse": SPARSE}, r"sparse.indices: holds 200, but there are 4 elements"),
+    ({"sparse": SPARSE}, r"sparse.indices: holds the index 200, but there are 4 elements"),
     ({"sparse": {**SPARSE, "values": {"bufferView": 0, "byteOffset": 40}}}, r"sparse.(indices|values)"),
     ({"sparse": {"count": 1}}, r"accessors\[0\].sparse.indices: is required"),
     ({"sparse": SPARSE, "bufferView": None, "count": 2**31 - 1}, r"accessors\[0\].count: must be 1 to"),
@@ -150,7 +150,7 @@ def test_an_accessor_without_data_is_zeros(tmp_path):
     ({"byteLength": 0}, (None, "at least 1", "here: bufferViews[0].byteLength")),
     ({"byteOffset": -4}, (None, "bytes -4", "here: bufferViews[0]")),
     ({"buffer": 3}, (None, "3, but there", "here: bufferViews[0].buffer")),
-    ({"byteStride": 8}, (None, "8, but", "here: bufferViews[0].byteStride")),
+    ({"byteStride": 8}, (None, "8 bytes, but", "here: bufferViews[0].byteStride")),
     ({"byteStride": -12}, (None, "-12", "here: bufferViews[0].byteStride")),
 ])
 def test_views_that_do_not_fit(tmp_path, changes, message):
@@ -167,5 +167,5 @@ def test_floats_that_are_not_finite(tmp_path, bad):
     values = np.zeros((4, 3))
     values[2, 1] = bad
     file.accessor(values)
-    with refused(what="(1 not finite", place="here: accessors[0]"):
+    with refused(what="(1 such elements)", place="here: accessors[0]"):
         read(file, tmp_path, "VEC3")

@@ -1,4 +1,4 @@
-"""Containers, JSON, URIs: what is not a sound glTF file is refused, with the place."""
+"""Containers, JSON, URIs: files that are not sound glTF are refused, with the place of the mistake."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def patched(data: bytes, offset: int, value: int) -> bytes:
     ("a.gltf", b'{"asset": {"version": "2.0"}', "is not valid JSON"),
     ("a.gltf", b"\xff\x00", "is not a glTF file: not UTF-8"),
     ("a.gltf", b"[" * 100000, "is not valid JSON: nested too deeply"),
-    ("a.gltf", b"[]", "holds no object"),
+    ("a.gltf", b"[]", "is not an object"),
     ("a.gltf", b'{"asset": {"version": "2.0"}, "scene": NaN}', "holds NaN"),
     ("a.gltf", b'{"asset": {"version": "2.0"}, "scene": ' + b"9" * 5000 + b"}", "is not valid JSON"),
     ("a.gltf", b"{}", "asset.version: must be a string"),
@@ -148,7 +148,7 @@ def test_required_extensions_that_are_supported(tmp_path):
     assert len(load_gltf(file.write(tmp_path), staged=False).objects) == 1
 
 
-def test_of_variants_the_default_look_is_shown_even_where_they_are_required(tmp_path):
+def test_the_default_look_of_variants_is_shown_even_if_they_are_required(tmp_path):
     file = one_triangle(extensions={"KHR_materials_variants": {"mappings": [{"material": 0, "variants": [0]}]}})
     file.json |= {"extensionsRequired": ["KHR_materials_variants"],
                   "extensions": {"KHR_materials_variants": {"variants": [{"name": "red"}]}}}

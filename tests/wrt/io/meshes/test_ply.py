@@ -99,7 +99,7 @@ def test_every_truncation_is_refused(tmp_path: Path, form: str) -> None:
     (b"3 1 4 5", b"3 1 4 6", "face 0: index 6"),
     (b"3 1 4 5", b"3 1 -4 5", "face 0: index -4"),
     (b"3 1 4 5", b"3 1 4.5 5", "face 0: index 4.5"),
-    (b"3 1 4 5", b"-3 1 4 5", "face 0: a list of -3"),
+    (b"3 1 4 5", b"-3 1 4 5", "face 0: has a list of -3"),
     (b"2.0 1.0", b"nan 1.0", "vertex 5: position"),
     (b"2.0 1.0", b"1e60 1.0", "vertex 5: position"),
     (b"2.0 1.0", b"2.0 one", "line 20: 'one' is not a number"),
@@ -108,8 +108,8 @@ def test_every_truncation_is_refused(tmp_path: Path, form: str) -> None:
     (b"list uchar int v", b"list float int v", "cannot read"),
     (b"vertex_indices", b"corners", "no list vertex_indices"),
     (b"format ascii 1.0", b"format utf8", "line 2: cannot read"),
-    (b"format ascii 1.0\n", b"", "names no format"),
-    (b"vertex 6", b"vertex 99999999999999", "element vertex: truncated"),
+    (b"format ascii 1.0\n", b"", "no line `format`"),
+    (b"vertex 6", b"vertex 99999999999999", "element vertex: is truncated"),
     (b"ply\n", b"PLY?\n", "is not a PLY file"),
 ])
 def test_errors_name_the_place(tmp_path: Path, old: bytes, new: bytes, place: str) -> None:
@@ -138,13 +138,13 @@ def test_same_arrays_as_trimesh(name: str) -> None:
 
 
 @pytest.mark.parametrize(("old", "new", "message"), [
-    (b"element vertex 3", b"element vertex 1000000000000", "element vertex: truncated: the header promises 1000000000000"),
+    (b"element vertex 3", b"element vertex 1000000000000", "element vertex: is truncated: the header announces 1000000000000"),
     (b"element vertex 3", b"element vertex " + b"9" * 5000, "line 4: cannot read 'element vertex 999"),
-    (b"element face 1", b"element face 1000000000000", "element face: truncated: the header promises 1000000000000"),
+    (b"element face 1", b"element face 1000000000000", "element face: is truncated: the header announces 1000000000000"),
     (b"element vertex", b"element nothing 1000000000000\nelement vertex", ""),
-    (b" 3 0 1 2", b" inf 0 1 2", "face 0: a list of inf values"),
-    (b" 3 0 1 2", b" nan 0 1 2", "face 0: a list of nan values"),
-    (b" 3 0 1 2", b" 1e300 0 1 2", "element face: truncated"),
+    (b" 3 0 1 2", b" inf 0 1 2", "face 0: has a list of inf values"),
+    (b" 3 0 1 2", b" nan 0 1 2", "face 0: has a list of nan values"),
+    (b" 3 0 1 2", b" 1e300 0 1 2", "element face: is truncated"),
 ])
 def test_absurd_counts(old: bytes, new: bytes, message: str, tmp_path: Path) -> None:
     data = ply("ascii", [(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)])
@@ -179,7 +179,7 @@ def test_strips(form: str, strips: list[list[int]], tmp_path: Path) -> None:
 
 
 def test_a_strip_faces_one_way(tmp_path: Path) -> None:
-    """A flat sheet of two rows: every triangle has the normal of the first, also after a restart."""
+    """A flat sheet of two rows: every triangle has the normal of the first triangle, also after a restart."""
     points = [(float(i // 2), float(i % 2), 0.0) for i in range(12)]
     data = ply("ascii", points, [(*range(7), -1, *range(5, 12))]).replace(b"element face", b"element tristrips")
     raw = read_ply(write(tmp_path, data))
@@ -204,7 +204,7 @@ def test_a_strip_with_a_wrong_index(bad: str, message: str, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
-def test_a_word_that_is_no_number_is_told_with_its_line(end: str, tmp_path: Path) -> None:
+def test_a_word_that_is_no_number_is_reported_with_its_line(end: str, tmp_path: Path) -> None:
     data = ply("ascii", POINTS, [(0, 1, 2, 3), (1, 4, 5, 2)])
     line = 1 if end == "\r" else data.count(10) - 1
     with pytest.raises(InputError, match=rf"line {line}: 'x4' is not a number"):
