@@ -1,4 +1,4 @@
-"""Only regular files are read; all others are refused at once, as pipes and devices may have no end."""
+"""Only regular files are read. Others are refused at once, because pipes and devices may have no end."""
 
 from __future__ import annotations
 
