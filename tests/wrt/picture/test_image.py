@@ -110,7 +110,7 @@ def test_exr_is_exact_and_mitsuba_agrees(pixels: np.ndarray, tmp_path: Path) -> 
 
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs a file system that takes any name")
 @pytest.mark.parametrize("suffix", [".exr", ".hdr"])
-def test_a_name_that_openimageio_cannot_open_is_told(suffix: str, pixels: np.ndarray, tmp_path: Path) -> None:
+def test_a_name_that_openimageio_cannot_open_is_reported(suffix: str, pixels: np.ndarray, tmp_path: Path) -> None:
     path = tmp_path / os.fsdecode(b"b\xff" + suffix.encode())
     write_image(path, pixels)
     with refused(what="needs a path"):
@@ -376,7 +376,7 @@ def test_what_is_no_picture_is_refused(name: str, tmp_path: Path) -> None:
 
 def test_unknown_suffixes_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text("hello")
-    with refused(what="not an image format", path="a.txt"):
+    with refused(what="is no image file", path="a.txt"):
         read_image(tmp_path / "a.txt")
 
 
