@@ -472,7 +472,7 @@ position = [0, 0, 0]
     ('[materials.m]\n[[meshes]]\nfile = "m.obj"\nmaterial = "m"\ntransform = { axis = [1, 0, 0] }',
      "meshes[0].transform", "both axis and angle"),
     (f'[materials.m]\n[[meshes]]\nfile = "m.obj"\nmaterial = "m"\ntransform = {{ matrix = {[0] * 15 + [1]} }}',
-     "meshes[0]", "singular"),
+     "meshes[0]", "invertible"),
     ('[materials.m]\n[[boxes]]\nlow = [0, 0, 0]\nhigh = [0, 1, 1]\nmaterial = "m"', "boxes[0]", "must be above low"),
     ('[[lights]]\ntype = "spot"\nposition = [0, 0, 0]\ndirection = [0, 1, 0]\nintensity = 1\ninner = 50', "lights[0]",
      "must be at most outer"),

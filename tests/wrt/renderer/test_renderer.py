@@ -438,7 +438,7 @@ def test_a_wrong_value_is_told_by_its_name(options: dict[str, Any], message: Ref
     ({"crop": "0,0,4,4"}, ("each", "int", "crop")), ({"crop": (0, 0, 4.5, 4)}, ("crop[2]", "int")),
     ({"progress": True}, ("progress", "function")), ({"camera": 1.5}, ("camera",)),
     ({"time_limit": "30s"}, ("time_limit",)), ({"accel": None}, ("accel", "str")),
-    ({"aov": 3}, ("aov", "name or several")), ({"aov": [None]}, ("aov[0]", "str")),
+    ({"aov": 3}, ("aov", "one or more names")), ({"aov": [None]}, ("aov[0]", "str")),
     ({"device": 0}, ("device", "str")), ({"accel_options": []}, ("accel_options", "dict")),
 ], ids=str)
 def test_a_value_of_the_wrong_type_is_told_by_its_name(options: dict[str, Any], message: Refusal) -> None:
