@@ -19,7 +19,7 @@ from wrt.accel.queries.ray_query import kernel_argument
 from wrt.accel.queries.rays import vectors
 from wrt.accel.store import check_order, save
 from wrt.accel.structure import Structure, options_of
-from wrt.core.arrays import check_no_gradients, taken
+from wrt.core.arrays import check_no_gradients, from_tensor
 from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.core.seconds import build_clock
@@ -149,7 +149,7 @@ class OneMesh(Accelerator, ABC):
         """
         if not self.can_refit:
             raise InputError(f"a {self.name} cannot be refitted", hint="build it again, or use bvh2")
-        vertices = taken(vertices, "vertices")
+        vertices = from_tensor(vertices, "vertices")
         with self._refitting:
             begin, before = build_clock(), self._snapshot
             if in_place:

@@ -21,7 +21,7 @@ REAL = "iufO"  # NumPy's kinds of real numbers, and objects such as fractions: n
 
 def to_numpy(array: ArrayLike) -> np.ndarray:
     """Return a NumPy array of the same memory, or a copy of an array on a GPU."""
-    array = taken(array, "an array", None)
+    array = from_tensor(array, "an array", None)
     return array.numpy() if isinstance(array, wp.array) else np.asarray(array)
 
 
@@ -31,7 +31,7 @@ def to_warp(array: ArrayLike, dtype: WarpType = None) -> WarpArray:
     dtype: a Warp type, such as vec3 for arrays of three columns; None keeps the array's type.
     """
     if not isinstance(array, np.ndarray):
-        array = taken(array, "an array", dtype)
+        array = from_tensor(array, "an array", dtype)
     if isinstance(array, wp.array):
         return array
     array = np.ascontiguousarray(array)
@@ -44,7 +44,7 @@ def real_numbers(value: object, name: str, shape: str) -> np.ndarray:
     name, shape: the argument's name and expected shape, for the message of InputError. An array on a GPU is copied."""
     if "numpy.ma" in sys.modules and isinstance(value, np.ma.MaskedArray):  # np.ma takes long to import
         raise InputError("must not be a masked array", hint="leave masked rows out, or fill them", argument=name)
-    value = taken(value, name, None)
+    value = from_tensor(value, name, None)
     try:
         array = value.numpy() if isinstance(value, wp.array) else np.asarray(value)
         if array.dtype.kind in REAL:
@@ -79,7 +79,7 @@ def on_cpu(tensor: Tensor) -> bool:
     return bool(tensor.__dlpack_device__()[0] == DLPACK_CPU)
 
 
-def taken(value: object, name: str, dtype: WarpType = wp.vec3) -> Any:
+def from_tensor(value: object, name: str, dtype: WarpType = wp.vec3) -> Any:
     """Return a tensor as an array of the same memory: a NumPy array on the CPU, a Warp array on a GPU. Other values stay unchanged.
 
     dtype: type of the Warp array; None keeps the tensor's type. Raises InputError for the argument `name` if memory cannot be shared."""
@@ -94,7 +94,7 @@ def taken(value: object, name: str, dtype: WarpType = wp.vec3) -> Any:
                          hint="closest_hit of wrt.torch and of wrt.jax has gradients") from error
 
 
-def returned(*arguments: object) -> Callable[[Array], Tensor] | None:
+def to_tensor_like(*arguments: object) -> Callable[[Array], Tensor] | None:
     """Return a function that turns an array into a tensor of the same library as the first tensor in `arguments`, without a copy.
 
     An array on a GPU is copied if that tensor is on the CPU. None without a tensor, or if its library has no `from_dlpack`."""

@@ -21,7 +21,7 @@ from wrt.accel.queries.rays import rays_of
 from wrt.accel.queries.world_ids import check_world
 from wrt.accel.snapshot import Snapshot
 from wrt.accel.structure import Structure, check_units
-from wrt.core.arrays import returned
+from wrt.core.arrays import to_tensor_like
 from wrt.core.checks import shown
 from wrt.core.device import start, upload
 from wrt.core.errors import InputError
@@ -136,7 +136,7 @@ class Accelerator:
         InputError
             Names the argument and what was expected. The arrays of `out` may have been overwritten.
         """
-        threads, rays, give = thread_count(threads), rays_of(origins, directions, t_min, t_max, True), returned(origins, directions)
+        threads, rays, give = thread_count(threads), rays_of(origins, directions, t_min, t_max, True), to_tensor_like(origins, directions)
         if not (out is None or isinstance(out, Hits)):
             raise InputError(f"must be Hits, got {shown(out)}", argument="out")
         given = None if out is None else [out.t, out.u, out.v, out.prim_id]
@@ -185,7 +185,7 @@ class Accelerator:
         InputError
             Names the argument and what was expected.
         """
-        threads, rays, give = thread_count(threads), rays_of(origins, directions, t_min, t_max), returned(origins, directions)
+        threads, rays, give = thread_count(threads), rays_of(origins, directions, t_min, t_max), to_tensor_like(origins, directions)
         given = None if out is None else [out]
         arrays = answer_arrays(ANY_HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None, give is not None)
         snapshot = self._snapshot

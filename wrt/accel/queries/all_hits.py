@@ -17,7 +17,7 @@ from wrt.accel.queries.batches import RAYS_PER_LAUNCH
 from wrt.accel.queries.hit_points import device_scene
 from wrt.accel.queries.rays import rays_of, rays_on
 from wrt.accel.structure import Structure
-from wrt.core.arrays import returned, to_numpy, to_warp
+from wrt.core.arrays import to_numpy, to_tensor_like, to_warp
 from wrt.core.checks import as_integer, as_one
 from wrt.core.device import MOST_ROWS, launch_on, made_once, upload
 from wrt.core.errors import InputError
@@ -65,7 +65,7 @@ class AllHits(Generic[ArrayT]):
     def ray_id(self) -> ArrayT:
         """Index of the ray of each hit, (M,) int64."""
         ray_id: Any = np.repeat(np.arange(len(self)), to_numpy(self.counts))
-        give: Any = returned(self.first)
+        give: Any = to_tensor_like(self.first)
         return ray_id if give is None else give(wp.array(ray_id, dtype=wp.int64, device=to_warp(self.first).device))
 
     def __repr__(self) -> str:
@@ -92,7 +92,7 @@ class ListQuery:
         """Set the rays. Raises InputError that names the argument."""
         rays = rays_of(origins, directions, t_min, t_max)
         self.n, self.rays = len(rays.origins), rays_on(self.device, rays)
-        self.give = returned(origins, directions) or to_numpy
+        self.give = to_tensor_like(origins, directions) or to_numpy
         return self
 
     def all(self, limit: int = ALL) -> AllHits[Any]:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import warp as wp
 
 from wrt.accel.queries.hit_points import HitPoints, Source
-from wrt.core.arrays import taken, to_numpy, to_warp
+from wrt.core.arrays import from_tensor, to_numpy, to_warp
 from wrt.core.checks import shown
 from wrt.core.device import empty_aligned
 from wrt.core.errors import InputError
@@ -124,7 +124,7 @@ def answer_arrays(types: Mapping[str, type], given: list[Any] | None, n: int, de
         empty = empty_aligned if shared else np.empty
         return [empty(n, dtype) if device is None else wp.empty(n, dtype=wp.dtype_from_numpy(dtype), device=device)
                 for dtype in types.values()]
-    given = [taken(array, name, None) for name, array in zip(types, given, strict=True)]
+    given = [from_tensor(array, name, None) for name, array in zip(types, given, strict=True)]
     for (name, dtype), array in zip(types.items(), given, strict=True):
         if device is None:
             fits = isinstance(array, np.ndarray) and array.dtype == dtype and array.flags.carray

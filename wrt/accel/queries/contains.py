@@ -13,7 +13,7 @@ from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.all_hits import ListQuery
 from wrt.accel.queries.rays import vectors
 from wrt.accel.snapshot import Snapshot, once
-from wrt.core.arrays import returned
+from wrt.core.arrays import to_tensor_like
 from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.core.types import ArrayLike, NumpyLike, TensorT, WarpArray
@@ -78,7 +78,7 @@ def contains(accel: Accelerator, points: ArrayLike, threads: int | None = None) 
     InputError
         For a mesh that is not closed, other structures, and points that are not finite.
     """
-    rows, give = vectors(points, "points", FARTHEST), returned(points)
+    rows, give = vectors(points, "points", FARTHEST), to_tensor_like(points)
     query = ListQuery(accel, threads, crossings=True)
     if count := open_edges_of(query.snapshot):
         raise InputError(f"the mesh is not closed: {count} edges have an odd number of faces",

@@ -14,7 +14,7 @@ from wrt.accel.queries.gradients import ONE_MESH, Cotangents, Gradients, adjoint
 from wrt.accel.queries.rays import Rays, rays_on
 from wrt.accel.queries.world_ids import WorldIds, over_worlds
 from wrt.accel.snapshot import Snapshot, once
-from wrt.core.arrays import returned, to_warp
+from wrt.core.arrays import to_tensor_like, to_warp
 from wrt.core.device import launch_on, records, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
@@ -127,7 +127,7 @@ class HitPoints(Generic[ArrayT]):
         snapshot.structure.require_one_mesh(ONE_MESH)
         prim_id: Any = self.prim_id
         found: Gradients[Any] = adjoint(snapshot.mesh, rays.origins, rays.directions, prim_id, Cotangents(t, u, v, point))
-        give: Any = returned(self.t)
+        give: Any = to_tensor_like(self.t)
         return found if give is None else Gradients(*map(give, found))
 
     def _source(self) -> Source:
@@ -159,7 +159,7 @@ class HitPoints(Generic[ArrayT]):
             if name == "point":
                 record(self, point=array)
             return array
-        give: Any = returned(self.t)
+        give: Any = to_tensor_like(self.t)
         return array.numpy() if give is None else give(array)
 
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from wrt.core.arrays import check_no_gradients, float32, real_numbers, taken
+from wrt.core.arrays import check_no_gradients, float32, from_tensor, real_numbers
 from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.core.types import Array, ArrayLike, Device, WarpArray
@@ -60,7 +60,7 @@ def rays_of(origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike, t_max: 
     """
     without: dict[str, Any] = {} if gradients else {"origins": origins, "directions": directions}
     check_no_gradients(t_min=t_min, t_max=t_max, **without)
-    rays: list[Any] = [taken(origins, "origins"), taken(directions, "directions")]
+    rays: list[Any] = [from_tensor(origins, "origins"), from_tensor(directions, "directions")]
     if any(isinstance(array, wp.array) for array in rays):
         if any(not isinstance(array, wp.array) or array.dtype != wp.vec3 for array in rays):
             raise InputError("and directions must both be Warp arrays of vec3, or both NumPy arrays", argument="origins")
@@ -94,7 +94,7 @@ def constant_array(value: float, n: int, device: Device) -> WarpArray:
 
 def _segment_ends(value: ArrayLike, n: int, name: str) -> Array:
     if type(value) is not float:  # a float, the usual case, needs no conversion
-        value = taken(value, name, wp.float32)
+        value = from_tensor(value, name, wp.float32)
     if isinstance(value, wp.array):
         if value.dtype != wp.float32 or value.shape != (n,):
             raise InputError(f"must be ({n},) float32, got {value.shape} {value.dtype.__name__}", argument=name)

@@ -17,7 +17,7 @@ from wrt.accel.queries.all_hits import first_hits
 from wrt.accel.queries.answers import ANY_HIT_TYPES, answer_arrays
 from wrt.accel.queries.hit_points import device_scene
 from wrt.accel.queries.rays import vectors
-from wrt.core.arrays import check_no_gradients, real_numbers, returned, taken, to_numpy
+from wrt.core.arrays import check_no_gradients, from_tensor, real_numbers, to_numpy, to_tensor_like
 from wrt.core.checks import shown
 from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError
@@ -79,7 +79,7 @@ def visible(accel: Accelerator, a: ArrayLike, b: ArrayLike, on_a: ArrayLike | No
     threads, device = thread_count(threads), accel.device
     check_no_gradients(a=a, b=b)
     p, q = (_points(value, name, device) for value, name in ((a, "a"), (b, "b")))
-    n, as_warp, give = len(p), isinstance(taken(a, "a"), wp.array), returned(a, b)
+    n, as_warp, give = len(p), isinstance(from_tensor(a, "a"), wp.array), to_tensor_like(a, b)
     if len(q) != n:
         raise InputError(f"must have as many rows as a ({n}), got {len(q)}", argument="b")
     array: Any = answer_arrays(ANY_HIT_TYPES, None if out is None else [out], n, device if as_warp else None, give is not None)[0]
@@ -149,7 +149,7 @@ def _ignore_own_triangles(accel: Accelerator, rays: tuple[WarpArray, ...], ids: 
 
 def _points(value: ArrayLike, name: str, device: Device) -> WarpArray:
     """Return points as a Warp array on the device. Raises InputError that names the argument."""
-    value = taken(value, name)
+    value = from_tensor(value, name)
     if isinstance(value, wp.array):
         if value.dtype != wp.vec3 or value.ndim != 1:
             raise InputError(f"must be (N,) vec3, got {value.shape} {value.dtype.__name__}", argument=name)

@@ -11,7 +11,7 @@ import warp as wp
 from wrt.accel.queries.accelerator import Accelerator, snapshot_of
 from wrt.accel.queries.hit_points import device_scene
 from wrt.accel.queries.rays import vectors
-from wrt.core.arrays import returned
+from wrt.core.arrays import to_tensor_like
 from wrt.core.device import launch_on, upload
 from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike, NumpyLike, TensorT, WarpArray
@@ -56,7 +56,7 @@ def winding_number(accel: Accelerator, points: ArrayLike, threads: int | None = 
     Jacobson, Kavan and Sorkine-Hornung 2013, "Robust Inside-Outside Segmentation using Generalized Winding Numbers".
     """
     snapshot = snapshot_of(accel)
-    rows, give, device = vectors(points, "points", FARTHEST), returned(points), snapshot.device
+    rows, give, device = vectors(points, "points", FARTHEST), to_tensor_like(points), snapshot.device
     turns = wp.empty(len(rows), dtype=wp.vec3d, device=device)
     launch_on(device, wind, len(rows), device_scene(snapshot).surfaces, upload(rows, wp.vec3, device), turns, None,
               threads=thread_count(threads), step=POINTS_PER_LAUNCH)

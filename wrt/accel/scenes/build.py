@@ -20,7 +20,7 @@ from wrt.accel.scenes.worlds import worlds_over
 from wrt.accel.store import read
 from wrt.accel.structure import default_options
 from wrt.accel.structures import ACCELERATORS
-from wrt.core.arrays import is_tensor, taken, to_numpy
+from wrt.core.arrays import from_tensor, is_tensor, to_numpy
 from wrt.core.checks import as_one, shown
 from wrt.core.errors import InputError
 from wrt.core.types import ArrayLike, PathLike
@@ -204,7 +204,7 @@ def to_mesh_or_scene(mesh: MeshLike) -> Mesh | Scene:
     elif isinstance(mesh, str | os.PathLike):
         mesh = load_mesh(mesh)
     elif isinstance(mesh, tuple) and len(mesh) == 2:
-        vertices, faces = (np.array(to_numpy(taken(each, name, None))) if is_tensor(each) else each  # copy: the caller may modify it
+        vertices, faces = (np.array(to_numpy(from_tensor(each, name, None))) if is_tensor(each) else each  # copy: the caller may modify it
                            for each, name in zip(mesh, ("vertices", "faces"), strict=True))
         mesh = Mesh(vertices, faces)  # type: ignore[arg-type]  # which converts them
     elif type(mesh).__module__.split(".")[0] == "trimesh":
