@@ -211,10 +211,14 @@ WRONG = [
 ]
 
 
+@pytest.fixture
+def unreadable() -> None:
+    """Replace box.obj by an empty file: a command that reads it ends with another error."""
+    Path("box.obj").write_text("")
+
+
 @pytest.mark.parametrize(("arguments", "message"), WRONG, ids=lambda value: str(value)[:40])
-def test_a_wrong_option_is_told_before_the_scene_is_read(arguments: list[str], message: str,
-                                                         monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wrt.io.load.load_scene", lambda path: pytest.fail("the scene was read"))
+def test_a_wrong_option_is_reported_before_the_scene_is_read(arguments: list[str], message: str, unreadable: None) -> None:
     Path("box.png").write_bytes(b"old")
     result = run("render", "box.obj", *arguments)
     refused(result, message)
@@ -233,8 +237,7 @@ def test_a_crop_outside_the_picture(crop: str) -> None:
     ("", "cannot write a file without a suffix"), ("box.obj/a.png", "its folder does not exist"),
     ("a" * 300 + ".png", "too long"),
 ])
-def test_a_wrong_output_is_told_before_any_work(output: str, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wrt.io.load.load_scene", lambda path: pytest.fail("the scene was read"))
+def test_a_wrong_output_is_reported_before_the_scene_is_read(output: str, message: str, unreadable: None) -> None:
     Path("folder.png").mkdir()
     refused(run("render", "box.obj", "-o", output), message)
     assert new_files() == {"folder.png"}
@@ -252,14 +255,12 @@ def unwritable_folder() -> Iterator[Path]:
         pytest.skip("root may write everywhere")
 
 
-def test_an_output_folder_that_cannot_be_written_to(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wrt.io.load.load_scene", lambda path: pytest.fail("the scene was read"))
+def test_an_output_folder_that_cannot_be_written_to(unreadable: None) -> None:
     with unwritable_folder() as closed:
         refused(run("render", "box.obj", "-o", closed / "a.png"), f"error: {closed / 'a.png'}: cannot be written: ")
 
 
-def test_a_layer_that_cannot_be_written_is_told_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wrt.io.load.load_scene", lambda path: pytest.fail("the scene was read"))
+def test_a_layer_that_cannot_be_written_is_reported_before_the_scene_is_read(unreadable: None) -> None:
     Path("a.normal.png").mkdir()
     refused(run("render", "box.obj", "-o", "a.png", "--aov", "depth,normal"), "a.normal.png: is a folder")
     assert new_files() == {"a.normal.png"}
