@@ -24,7 +24,6 @@ from wrt.accel.scenes.build import build
 from wrt.accel.structure import NoOptions
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.device import records
-from wrt.core.errors import InputError
 from wrt.kernels.structs import Primitive
 from wrt.kernels.traverse.common import Units
 from wrt.scene.shapes import icosphere, torus
@@ -81,7 +80,7 @@ def test_unknown_names_and_devices_are_refused() -> None:
 def test_a_row_from_outside_without_a_field_is_refused_by_name(field: str, monkeypatch: pytest.MonkeyPatch) -> None:
     has: dict[str, Any] = {"name": "half", "kernels": ACCELERATORS["bvh2"].kernels, "options": NoOptions}
     monkeypatch.setitem(ACCELERATORS, "half", type("Half", (OneMesh,), {key: has[key] for key in has if key != field}))
-    with pytest.raises(InputError, match=f"structure 'half': class Half has no field '{field}'"):
+    with refused(None, f"'{field}'", place="structure 'half'"):
         build(BALL, "half")
 
 
@@ -92,7 +91,7 @@ def test_a_class_says_whether_it_follows_vertices(name: str) -> None:
         accel.refit(moved)
         assert np.array_equal(accel.geometry.vertices, moved)
     else:
-        with pytest.raises(InputError, match=f"a {accel.name} cannot be refitted"):
+        with refused(what="cannot be refitted"):
             accel.refit(moved)
 
 
@@ -231,7 +230,7 @@ def test_a_zero_among_directions_along_the_axes_is_found() -> None:
     for row in (0, 1, 137, 199):
         wrong = directions.copy()
         wrong[row] = 0.0, -0.0, 0.0
-        with pytest.raises(InputError, match=f"directions must not be zero; row {row} is"):
+        with refused("directions", f"row {row} is"):
             structure.closest_hit(origins, wrong)
 
 
@@ -245,8 +244,7 @@ def test_gradients_that_there_are_not_are_refused_and_not_lost_in_silence() -> N
                                    (structure.any_hit, (down, needed), "directions"),
                                    (structure.any_hit, (plain, down, 0.0, end), "t_max"),
                                    (structure.closest_hit, (plain, down, 0.0, end), "t_max")):
-        message = f"^{name} requires gradients and a wp.Tape is recording.*wp.clone\\({name}"
-        with pytest.raises(InputError, match=message), wp.Tape():
+        with refused(name, f"wp.clone({name}"), wp.Tape():
             query(*arguments)
     with wp.Tape() as tape:
         for rays in ((plain, down), (wp.clone(needed, requires_grad=False), down), (plain.numpy(), down.numpy())):

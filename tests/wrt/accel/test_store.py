@@ -132,9 +132,8 @@ def test_another_mesh_is_refused(saved: Path) -> None:
 ])
 def test_a_damaged_or_foreign_file_is_refused(saved: Path, spoil, message: Refusal) -> None:
     saved.write_bytes(spoil(saved.read_bytes()))
-    with refused(*message) as error:
+    with refused(*message, path=saved):
         load_accel(saved, BALL)
-    assert "ball.accel" in str(error.value)
 
 
 def test_missing_files_and_wrong_suffixes(tmp_path: Path) -> None:
@@ -214,7 +213,7 @@ def test_any_byte_may_be_changed(saved: Path, at: int, value: int) -> None:
     try:
         load_accel(path, BALL).closest_hit(*rays(50))
     except InputError as error:
-        assert "changed.accel" in str(error)
+        assert error.path == path
 
 
 def test_the_command(tmp_path: Path, monkeypatch) -> None:

@@ -233,7 +233,7 @@ def test_integers_of_any_size_are_reported_in_short(field: str, value: int, tmp_
     path.write_text(f"{top}[materials.m]\n{rest}" if "settings" not in field else rest)
     with pytest.raises(InputError) as error:
         load_scene(path)
-    assert len(str(error.value)) < 400 and "a.toml" in str(error.value)
+    assert len(str(error.value)) < 400 and error.value.path == path
 
 
 def test_no_more_than_twenty_mistakes_are_listed(tmp_path: Path) -> None:
@@ -252,7 +252,7 @@ def test_instances_of_a_mesh_are_placed_before_its_transform(tmp_path: Path) -> 
     np.testing.assert_allclose(images, [[0, 0, -2, 1], [0, 0, -2, 1], [0, 0, -1, 1]], atol=1e-12)
     with refused(what="matrix must be invertible", place="meshes[0]: instances[1]"):
         load(tmp_path, CAMERA + SUN + table + "instances = [{}, { matrix = [1,0,0,0, 0,1,0,0, 0,0,0,0, 0,0,0,1] }]\n")
-    with pytest.raises(InputError, match="instances"):
+    with refused(None, "got []", "meshes[0].instances"):
         load(tmp_path, CAMERA + SUN + table + "instances = []\n")
 
 
@@ -484,27 +484,25 @@ def test_errors_name_place_and_reason(tmp_path: Path, text: str, place: str, say
     assert line.startswith(f"{place}: ") and says in line
 
 
-@pytest.mark.parametrize(("data", "says"), [
-    (b"a = 1\nb = [1,\n c]\n", "line 3, column 2: "), (b'a = """x', "end of document: "),
-    (b"a = \n", "line 1, column "),
-    (b'a = "\xff"', "byte 5 is not UTF-8"), (b"a = " + b"[" * 5000 + b"]" * 5000, "is nested too deeply"),
-    (b"a = 1\na = 2\n", "line 2, column "),
+@pytest.mark.parametrize(("data", "place"), [
+    (b"a = 1\nb = [1,\n c]\n", "line 3, column 2"), (b'a = """x', "end of document"),
+    (b"a = \n", "line 1, column 5"),
+    (b'a = "\xff"', None), (b"a = " + b"[" * 5000 + b"]" * 5000, None),
+    (b"a = 1\na = 2\n", "line 2, column 6"),
 ])
-def test_files_that_are_not_toml(tmp_path: Path, data: bytes, says: str) -> None:
+def test_files_that_are_not_toml(tmp_path: Path, data: bytes, place: str | None) -> None:
     path = tmp_path / "scene.toml"
     path.write_bytes(data)
-    with pytest.raises(InputError) as caught:
+    with refused(place=place, path=path):
         load_scene(path)
-    assert str(caught.value).startswith(f"{path}: {says}")
 
 
 def test_paths_that_are_no_scene(tmp_path: Path) -> None:
     (tmp_path / "folder.toml").mkdir()
     (tmp_path / "a.blend").write_text("")
     for name in ("none.toml", "folder.toml", "a.blend", "none"):
-        with pytest.raises(InputError) as caught:
+        with refused(None, ".toml, .gltf, .glb, .obj, .ply, .stl", path=name):
             load_scene(tmp_path / name)
-        assert name in str(caught.value) and ".toml, .gltf, .glb, .obj, .ply, .stl" in str(caught.value)
 
 
 # --- what is added ----------------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ import pytest
 
 from tests.data import DATA, data_path
 from tests.refused import refused
-from wrt.core.errors import InputError, SceneWarning
+from wrt.core.errors import SceneWarning
 from wrt.io.mesh_file import load_mesh
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
@@ -33,18 +33,16 @@ def test_faces_without_area_are_dropped_and_counted(tmp_path: Path) -> None:
 ])
 def test_meshes_without_area_are_refused(tmp_path: Path, text: str, says: str) -> None:
     path = write(tmp_path, text)
-    with pytest.raises(InputError) as caught:
+    with refused(None, says, path=path):
         load_mesh(path)
-    assert str(caught.value).startswith(f"{path}: ") and says in str(caught.value)
 
 
 def test_paths_that_are_no_mesh_file(tmp_path: Path) -> None:
     (tmp_path / "folder.ply").mkdir()
     write(tmp_path, "x", "a.fbx")
     for name, says in (("none.obj", "no such file"), ("folder.ply", "Is a directory"), ("a.fbx", ".obj, .ply, .stl")):
-        with pytest.raises(InputError, match=name) as caught:
+        with refused(None, says, path=name):
             load_mesh(tmp_path / name)
-        assert says in str(caught.value)
 
 
 def test_normals_become_unit_and_bad_ones_zero(tmp_path: Path) -> None:
@@ -82,10 +80,10 @@ def test_large_binary_ply_is_quick() -> None:
 @pytest.mark.parametrize("path", sorted(p for p in DATA.glob("odd/*") if p.suffix.lower() in (".obj", ".ply", ".stl")),
                          ids=lambda path: path.name)
 def test_odd_files_load_or_are_refused(path: Path) -> None:
-    refused = {"empty.obj", "empty.ply", "empty.stl", "stl_empty_bin.stl", "ply_empty_header.ply", "obj_points.obj",
-               "obj_wireframe.obj", "ply_points_bin.ply", "points_emptyface.ply", "face_in_group_name.obj"}
-    if path.name in refused:
-        with pytest.raises(InputError, match=path.name):
+    without_faces = {"empty.obj", "empty.ply", "empty.stl", "stl_empty_bin.stl", "ply_empty_header.ply", "obj_points.obj",
+                     "obj_wireframe.obj", "ply_points_bin.ply", "points_emptyface.ply", "face_in_group_name.obj"}
+    if path.name in without_faces:
+        with refused(path=path):
             load_mesh(path)
         return
     mesh = load_mesh(path)

@@ -12,7 +12,6 @@ import pytest
 from PIL import Image
 
 from tests.refused import refused
-from wrt.core.errors import InputError
 from wrt.picture import image
 from wrt.picture.decode import decode_rgba8
 from wrt.picture.tonemap import to_codes
@@ -74,7 +73,7 @@ def test_bombs_are_refused_by_their_headers(suffix: str, size: tuple[int, int], 
             ".bmp": b"BM" + struct.pack("<IIIIiiHHIIiiII", 70, 0, 54, 40, width, height, 1, 24, 0, 16, 0, 0, 0, 0)}[suffix]
     path = tmp_path / f"a{suffix}"
     path.write_bytes(data)
-    with pytest.raises(InputError, match=rf"a\{suffix}: cannot be read as an image: ") as caught:
+    with refused(path=path) as caught:
         image.read_image(path)
     if max(size) < 2**20 and size[0] * size[1] < 2**27:  # beyond, some libraries have words of their own
         assert f"it is {width}x{height}; at most 32768 pixels a side and" in str(caught.value)
@@ -89,5 +88,5 @@ def test_no_other_format_is_tried(form: str, tmp_path: Path) -> None:
         decode_rgba8(buffer.getvalue())
     for suffix in (".png", ".exr", ".hdr"):
         (tmp_path / f"a{suffix}").write_bytes(buffer.getvalue())
-        with pytest.raises(InputError, match=rf"a\{suffix}: cannot be read as an image: it is no"):
+        with refused(path=f"a{suffix}"):
             image.read_image(tmp_path / f"a{suffix}")

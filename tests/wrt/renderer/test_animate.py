@@ -13,7 +13,6 @@ import wrt
 from tests.command_line import wrt as run
 from tests.data import ROOT
 from tests.refused import refused
-from wrt.core.errors import InputError
 from wrt.renderer.animate import Animation, animate, check_output, frame_path, orbited, save_movie
 from wrt.renderer.options import Options
 from wrt.scene.backgrounds import GradientBackground
@@ -85,7 +84,7 @@ def test_what_cannot_be_animated_is_refused(tmp_path: Path) -> None:
     with refused(what="nothing moves"):
         list(animate(scene_of(None), Animation(2, 0.0), Options()))
     for wrong in ({"frames": 0}, {"degrees": np.inf}, {"rebuild_at": 0.5}):
-        with pytest.raises(InputError, match=next(iter(wrong))):
+        with refused(next(iter(wrong))):
             Animation(**wrong)
     with refused(what="frames go into"):
         check_output(tmp_path / "film.mp4")

@@ -189,40 +189,40 @@ def test_progress_counts_what_was_done_before(path: Path) -> None:
 # --- what is refused --------------------------------------------------------------------------------------------------
 
 
-def refuses(message: str, path: Path, **options: Any) -> None:
+def refuses(what: str, path: Path, **options: Any) -> None:
     before = path.read_bytes() if path.is_file() else None
     there = files(path)
     scene = options.pop("scene", SCENE)
-    with pytest.raises(InputError, match=message):
+    with refused(what=what, path=path):
         render(scene, checkpoint=path, **options)
     assert files(path) == there and (path.read_bytes() if path.is_file() else None) == before
 
 
 def test_a_file_that_is_there_is_never_overwritten(path: Path) -> None:
     path.write_bytes(b"a diary")
-    refuses("a.checkpoint: exists already; resume it", path)
-    refuses("a.checkpoint: is no checkpoint of this version", path, resume=True)
+    refuses("exists already", path)
+    refuses("is no checkpoint", path, resume=True)
     path.write_bytes(pickle.dumps({"seconds": 0}))
     refuses("is no checkpoint", path, resume=True)
     path.unlink()
     path.mkdir()
-    refuses("a.checkpoint: is a folder", path)
-    refuses("a.checkpoint: is a folder", path, resume=True)
+    refuses("is a folder", path)
+    refuses("is a folder", path, resume=True)
 
 
 def test_a_checkpoint_of_another_render_is_refused(path: Path) -> None:
     render(SCENE, spp=1, checkpoint=path)
     refuses("exists already", path)
-    refuses("of another render: seed was 0, is 1$", path, resume=True, seed=1)
-    refuses("of another render: max_depth was 8, is 3$", path, resume=True, max_depth=3)
-    refuses("accel was bvh, is brute-force|accel was bvh, is brute_force", path, resume=True, accel=next(
+    refuses("another render: seed was 0, is 1", path, resume=True, seed=1)
+    refuses("another render: max_depth was 8, is 3", path, resume=True, max_depth=3)
+    refuses("accel was bvh, is brute", path, resume=True, accel=next(
         name for name in wrt.ACCELERATORS if "brute" in name))
-    refuses(r"crop was \[0, 0, 61, 34\], is \[0, 0, 61, 33\]", path, resume=True, crop=(0, 0, 61, 33))
-    refuses("instancing was auto, is never$", path, resume=True, instancing="never")
+    refuses("crop was [0, 0, 61, 34], is [0, 0, 61, 33]", path, resume=True, crop=(0, 0, 61, 33))
+    refuses("instancing was auto, is never", path, resume=True, instancing="never")
     refuses("triangle was watertight, is ", path, resume=True, triangle="moeller_trumbore")
     refuses("groups of samples was 1, is 4", path, resume=True, target_error=0.1)
-    refuses("the camera differs", path, resume=True, camera=Camera.look_at((2, 2, 4.1), (0, 0, 0)))
-    refuses("of another render: the scene differs$", path, resume=True, scene=replace(SCENE, ambient=(0.1, 0.1, 0.1)))
+    refuses("the camera", path, resume=True, camera=Camera.look_at((2, 2, 4.1), (0, 0, 0)))
+    refuses("another render: the scene", path, resume=True, scene=replace(SCENE, ambient=(0.1, 0.1, 0.1)))
     render(replace(SCENE, name="another name"), spp=2, checkpoint=path, resume=True, threads=1, tile_size=5, exposure=2.0)
 
 
@@ -230,9 +230,9 @@ def test_a_stale_checkpoint_is_refused(path: Path, monkeypatch: pytest.MonkeyPat
     render(SCENE, spp=1, checkpoint=path)
     with monkeypatch.context() as patch:
         patch.setattr(Plan, "kernels_hash", lambda self: "0" * 64)
-        refuses("the kernels have another version", path, resume=True)
+        refuses("the kernels", path, resume=True)
     monkeypatch.setattr(module, "VERSION", "99.0")
-    refuses(r"version was .*, is 99\.0", path, resume=True)
+    refuses(", is 99.0", path, resume=True)
 
 
 def test_any_damage_is_noticed(path: Path) -> None:

@@ -9,7 +9,6 @@ import pytest
 
 import wrt
 from tests.refused import refused
-from wrt.core.errors import InputError
 from wrt.scene.digest import digest
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
@@ -103,5 +102,5 @@ material = "m"
     with refused("target", "same faces", place="meshes[0]: motion"):
         wrt.load_scene(path)
     path.write_text(path.read_text().replace('morph = { shape', 'morph = { file = "x.obj", shape'))
-    with pytest.raises(InputError, match="morph"):
+    with refused(what="exactly one", place="meshes[0].morph"):
         wrt.load_scene(path)

@@ -21,7 +21,6 @@ from wrt.accel.queries.answers import Hits
 from wrt.accel.queries.batches import FEWEST
 from wrt.accel.scenes.build import build
 from wrt.core.arrays import to_numpy, to_warp
-from wrt.core.errors import InputError
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 
@@ -171,10 +170,10 @@ def test_arrays_that_share_memory_are_refused(ball: Accelerator, as_warp: bool) 
         return part.view(wp.int32) if as_warp else part.view(np.int32)
 
     t = whole[:4]
-    for room, named in (((t, own[0], t, ids(8)), "out.t and out.v"), ((own[0], own[1], t, ids(0)), "out.v and out.prim_id"),
-                        ((own[0], t, whole[3:7], ids(8)), "out.u and out.v"), ((whole[5:9], own[0], own[1], ids(2)),
-                                                                             "out.t and out.prim_id")):
-        with pytest.raises(InputError, match=named.replace(" and", " shares memory with")):
+    for room, named in (((t, own[0], t, ids(8)), ("out.t", "out.v")), ((own[0], own[1], t, ids(0)), ("out.v", "out.prim_id")),
+                        ((own[0], t, whole[3:7], ids(8)), ("out.u", "out.v")), ((whole[5:9], own[0], own[1], ids(2)),
+                                                                             ("out.t", "out.prim_id"))):
+        with refused(*named):
             ball.closest_hit(*rays, out=Hits(*room))
     room = t, whole[4:8], whole[12:], ids(8)
     assert bits(ball.closest_hit(*rays, out=Hits(*room))) == bits(ball.closest_hit(*rays))
@@ -187,7 +186,7 @@ def test_room_of_another_kind_is_named(ball: Accelerator) -> None:
         ball.closest_hit(*rays, out=np.zeros(3))  # type: ignore[arg-type]
     with refused("out", "NumPy array (3,)"):
         ball.any_hit(*rays, out=np.zeros(3, np.float32))
-    with pytest.raises(InputError, match=rf"out must be a Warp array \(3,\) of bool, on {DEVICE}, without gaps, got an array"):
+    with refused("out", "Warp array (3,)"):
         ball.any_hit(*on_warp, out=np.zeros(3, bool))
     for wrong in (wp.zeros(4, dtype=wp.bool, device=DEVICE), wp.zeros(3, dtype=wp.int32, device=DEVICE),
                   wp.zeros(6, dtype=wp.bool, device=DEVICE)[::2]):
@@ -204,20 +203,20 @@ def test_room_of_another_kind_is_named(ball: Accelerator) -> None:
 def test_the_first_row_that_is_wrong_is_named(ball: Accelerator, n: int, form: str) -> None:
     good = *some_rays(n), np.zeros(n, np.float32), np.ones(n, np.float32)
     last = n - 1
-    for which, value, rows, message in (
-            (0, np.nan, (last,), f"origins must be finite; row {last} is"), (0, -np.inf, (n // 2, last), f"row {n // 2} is"),
-            (0, 1.1e37, (last, 7), r"origins must be within 1e\+37; row 7 is"),
-            (1, np.inf, (0, last), "directions must be finite; row 0 is"),
-            (1, 0.0, (n - 2, last), f"directions must not be zero; row {n - 2} is"),
-            (2, np.nan, (last,), "t_min must not be NaN or below 0"), (2, -1e-30, (last,), "t_min must not be NaN or below 0"),
-            (3, np.nan, (last,), "t_max must not be NaN")):
+    for which, value, rows, *message in (
+            (0, np.nan, (last,), "origins", f"finite; row {last} is"), (0, -np.inf, (n // 2, last), "origins", f"row {n // 2} is"),
+            (0, 1.1e37, (last, 7), "origins", "within 1e+37; row 7 is"),
+            (1, np.inf, (0, last), "directions", "finite; row 0 is"),
+            (1, 0.0, (n - 2, last), "directions", f"zero; row {n - 2} is"),
+            (2, np.nan, (last,), "t_min"), (2, -1e-30, (last,), "t_min", "below 0"),
+            (3, np.nan, (last,), "t_max", "NaN")):
         arrays = [array.copy() for array in good]
         arrays[which][list(rows)] = value
         if form != "as it is":
             arrays = [FORMS[form](array) for array in arrays]
         for threads in (1, 2):
             for query in (ball.closest_hit, ball.any_hit):
-                with pytest.raises(InputError, match=message):
+                with refused(*message):
                     query(*arrays, threads=threads)  # type: ignore[operator]
     arrays = [array.copy() for array in good]
     arrays[3][::2] = -np.inf  # an empty segment is valid
@@ -227,7 +226,7 @@ def test_the_first_row_that_is_wrong_is_named(ball: Accelerator, n: int, form: s
 def test_origins_are_named_before_what_follows(ball: Accelerator) -> None:
     origins, directions = some_rays(MANY)
     origins[-1], directions[0], directions[1] = np.nan, 0.0, np.inf
-    with pytest.raises(InputError, match=f"origins must be finite; row {MANY - 1} is"):
+    with refused("origins", f"row {MANY - 1} is"):
         ball.closest_hit(origins, directions, np.full(MANY, -1.0), threads=2)
     with refused("directions", "row 1"):
         ball.closest_hit(origins[:-1], directions[:-1], threads=2)

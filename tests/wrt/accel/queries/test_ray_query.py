@@ -89,7 +89,7 @@ def test_a_world_of_another_kind_is_told_and_hits_nothing(capfd: pytest.CaptureF
 def test_tests_that_there_are_not(arguments: dict, said: Refusal) -> None:
     with refused(*said):
         wrt.ray_query("bvh", **arguments)
-    with pytest.raises(wrt.InputError, match="triangle and box belong to a structure's name"):
+    with refused(next(iter(arguments))):
         wrt.ray_query(wrt.build(shapes.icosphere(1)), **arguments)
 
 

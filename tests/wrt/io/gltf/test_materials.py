@@ -322,13 +322,13 @@ def test_images_that_are_none():
 
 @pytest.mark.parametrize("size", [(MAX_SIDE + 1, 1), (1, MAX_SIDE + 1)])
 def test_images_beyond_the_limit(size):
-    with pytest.raises(InputError, match=f"it is {size[0]}x{size[1]}; at most {MAX_SIDE} pixels a side"):
+    with refused(what=f"{size[0]}x{size[1]}"):
         decode_rgba8(png_header(*size))
     assert decode_rgba8(png_header(MAX_SIDE, 1)).shape == (1, MAX_SIDE, 4)
 
 
 def test_decompression_bombs():
-    with pytest.raises(InputError, match=f"it is 10000x16000; at most {MAX_SIDE} pixels a side and 134217728 in all are read"):
+    with refused(what="10000x16000"):
         decode_rgba8(png_header(10000, 16000))
     with refused(what="exceeds limit"):
         decode_rgba8(png_header(MAX_SIDE, MAX_SIDE))  # in Pillow's own words

@@ -349,9 +349,8 @@ def test_wrong_primitives(tmp_path, change, message):
     file = one_triangle()
     change(file, file.json["meshes"][0]["primitives"][0])
     path = file.write(tmp_path)
-    with refused(*message) as error:
+    with refused(*message, path=path):
         load_gltf(path)
-    assert str(error.value).startswith(f"{path}: ")
 
 
 # --- cameras and lights -----------------------------------------------------------------------------------------------
