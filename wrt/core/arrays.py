@@ -28,8 +28,7 @@ def to_numpy(array: ArrayLike) -> np.ndarray:
 def to_warp(array: ArrayLike, dtype: WarpType = None) -> WarpArray:
     """Return a Warp array of the same memory, or a copy of a read-only array. NumPy arrays stay on the CPU.
 
-    dtype: a Warp type, such as vec3 for arrays of three columns; None keeps the array's type.
-    """
+    dtype: a Warp type, such as vec3 for arrays of three columns; None keeps the array's type."""
     if not isinstance(array, np.ndarray):
         array = from_tensor(array, "an array", dtype)
     if isinstance(array, wp.array):

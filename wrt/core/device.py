@@ -45,8 +45,7 @@ _making = threading.RLock()
 def made_once(make: Callable[P, T]) -> Callable[P, T]:
     """Cache a function's results. If several threads need a result at once, one calls `make` and the others wait.
 
-    Without a cache, two kernels of the same code would be compiled twice, and two structs of the same fields be different types to Warp.
-    """
+    Without a cache, two kernels of the same code would be compiled twice, and two structs of the same fields be different types to Warp."""
     known: dict[tuple[object, ...], T] = {}
 
     @wraps(make)
@@ -149,8 +148,7 @@ _loaded: WeakKeyDictionary[Kernel, _Loaded] = WeakKeyDictionary()
 def load_kernel(kernel: Kernel, device: Device) -> None:
     """Compile a kernel, or read it from the cache, before threads launch it. One thread compiles it; the others wait.
 
-    Raises InputError if the cache's folder is full or cannot be written to.
-    """
+    Raises InputError if the cache's folder is full or cannot be written to."""
     loaded, place = _loaded.get(kernel) or _loaded.setdefault(kernel, _Loaded()), (device.alias, block_dim(device))
     if place not in loaded.devices:
         with loading(), loaded.lock:
@@ -272,8 +270,7 @@ def empty_aligned(shape: int | tuple[int, ...], dtype: npt.DTypeLike) -> np.ndar
 def record_dtype(struct: WarpType) -> np.dtype:
     """Return the memory layout of a Warp struct as a NumPy type.
 
-    It is cached, because NumPy parses the layout with `ast`: CPython 3.11 raises SystemError if two threads do so at once.
-    """
+    It is cached, because NumPy parses the layout with `ast`: CPython 3.11 raises SystemError if two threads do so at once."""
     return np.dtype(struct.numpy_dtype())
 
 

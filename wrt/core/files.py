@@ -14,8 +14,7 @@ from wrt.core.errors import InputError
 def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
     """Open a regular file for reading.
 
-    Raises InputError, without the path, for a folder, and for a pipe or a device, which may never end. Raises OSError like `open`.
-    """
+    Raises InputError, without the path, for a folder, and for a pipe or a device, which may never end. Raises OSError like `open`."""
     try:
         # Without O_NONBLOCK, opening a pipe waits until something writes to it.
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))

@@ -45,8 +45,7 @@ def held_interrupts() -> Iterator[list[int]]:
     """Defer Ctrl-C during the block; yield a list that collects the numbers of the signals that arrive.
 
     After raise_on_termination, SIGTERM and SIGHUP are deferred, too. Signals that raise no KeyboardInterrupt in this thread are not
-    deferred: outside the main thread, or if the user handles or ignores them.
-    """
+    deferred: outside the main thread, or if the user handles or ignores them."""
     arrived: list[int] = []
     held = []
     if threading.current_thread() is threading.main_thread():

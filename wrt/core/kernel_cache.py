@@ -24,8 +24,7 @@ def shared_headers(key: str, precompile: Callable[[Path], None], leftover: re.Pa
     """Return the folder of the precompiled headers `key`; `precompile` writes them if necessary. Raises OSError if it cannot.
 
     All threads and processes of a user share the folder, because precompiling Warp's headers takes 1.3 s of processor time. Folders of
-    the cache that match `leftover` and were not used for a day are removed.
-    """
+    the cache that match `leftover` and were not used for a day are removed."""
     folder = Path(wp.config.kernel_cache_dir) / f"precompiled-{key}"
     with _lock:
         if folder not in _checked or not folder.is_dir():  # the first call, or the cache was emptied

@@ -14,8 +14,7 @@ class Registry(UserDict[str, T]):
     """Map a name to an entry, or to "module:attribute", which the first lookup imports.
 
     kind: word for an entry in messages. group: group of entry points by which installed packages add entries ("": none). Entry points
-    are read when a name is unknown or all names are needed, and replace no entry of the table.
-    """
+    are read when a name is unknown or all names are needed, and replace no entry of the table."""
 
     def __init__(self, kind: str, places: Mapping[str, T | str], group: str = "") -> None:
         super().__init__(places)  # type: ignore[arg-type]

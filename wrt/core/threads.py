@@ -98,8 +98,7 @@ class Pool(ThreadPoolExecutor):
     """Pool of threads with large stacks, which start when they are needed and stay.
 
     The standard pool refuses tasks after the end of Python's main thread. This pool then runs a task at once in the thread that submits
-    it, or raises InputError if the stack of that thread is small.
-    """
+    it, or raises InputError if the stack of that thread is small."""
 
     def __init__(self, threads: int, name: str = "wrt") -> None:
         super().__init__(threads, name, initializer=partial(setattr, _here, "large", True))
@@ -170,8 +169,7 @@ def run_growing(begin: Callable[[T], tuple[Callable[[], object], Callable[[], It
     """Run all tasks, and the further tasks that they produce, on `threads` threads.
 
     begin(task) returns a job, and a function to call after the job, which returns more tasks. Jobs run on other threads, the two
-    functions on this thread. The first error is raised when all running jobs have ended.
-    """
+    functions on this thread. The first error is raised when all running jobs have ended."""
     waiting, running = deque(tasks), dict[Future[object], Callable[[], Iterable[T]]]()
     try:
         while waiting or running:

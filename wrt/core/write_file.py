@@ -37,8 +37,7 @@ def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
 def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """Open a new file in the folder of `path` for reading and writing; after the block, sync it and rename it to `path`.
 
-    After any failure the new file is removed, and an existing file at `path` is unchanged. Raises InputError if the system refuses.
-    """
+    After any failure the new file is removed, and an existing file at `path` is unchanged. Raises InputError if the system refuses."""
     with _reported(path):
         target = _target(path)
         file = _temporary(target)

@@ -14,8 +14,7 @@ def triangulate(corners: np.ndarray, counts: np.ndarray, vertices: np.ndarray) -
     vertices: (V, 3). Returns (T, 3) integers, indices into `corners`, and (T,), the index of each triangle's polygon. A polygon of n
     corners gives n - 2 triangles, or none for n < 3. Convex polygons become the fan about their first corner. A polygon is concave if
     a triangle of its fan faces against its area vector; it is projected along that vector and cut by ear clipping (mapbox-earcut).
-    Self-intersecting polygons have no right answer; they also give n - 2 triangles.
-    """
+    Self-intersecting polygons have no right answer; they also give n - 2 triangles."""
     counts, corners = np.asarray(counts, dtype=np.int64), np.asarray(corners)
     fan = np.maximum(counts - 2, 0)
     small = np.int32 if max(len(corners), len(counts)) < 1 << 31 else np.int64

@@ -29,8 +29,7 @@ def check_size(width: int, height: int, most: int = MAX_PIXELS) -> None:
 def decode_rgba8(data: bytes, formats: tuple[str, ...] = FORMATS) -> np.ndarray:
     """Decode a picture to (H, W, 4) uint8 codes, row 0 on top. Alpha is 255 in a picture without alpha.
 
-    16-bit channels keep their high byte; colour profiles are ignored. Raises InputError for a broken, truncated or too large picture.
-    """
+    16-bit channels keep their high byte; colour profiles are ignored. Raises InputError for a broken, truncated or too large picture."""
     with _opened(data, formats) as picture:
         if picture.mode.startswith("I"):  # 16-bit grey, which Pillow would clip to 255
             grey = (np.asarray(picture).astype(np.uint32) >> 8).astype(np.uint8)
@@ -42,8 +41,7 @@ def decode_png16(data: bytes) -> np.ndarray:
     """Decode a PNG with 16 bits a channel to (H, W, 3) uint16 codes without alpha. Raises InputError as decode_rgba8 does.
 
     Pillow keeps one byte of each channel of a colour picture: the high one, or the low one if the byte order is declared as swapped.
-    Grey with alpha has four bytes a pixel, read here as RGBA. (OpenImageIO keeps all bytes, but its libpng writes errors to stderr.)
-    """
+    Grey with alpha has four bytes a pixel, read here as RGBA. (OpenImageIO keeps all bytes, but its libpng writes errors to stderr.)"""
     with _opened(data, ("PNG",)) as picture:
         order = picture.tile[0][3] if picture.tile else ""
         if picture.mode.startswith("I"):

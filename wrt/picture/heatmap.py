@@ -58,8 +58,7 @@ def colored(values: np.ndarray, top: float) -> np.ndarray:
 def heatmap(values: np.ndarray, title: str, top: float | None = None) -> np.ndarray:
     """Draw values (h, w) >= 0, row 0 on top, as (H, W, 3) uint8 with a title and a colour scale.
 
-    top: end of the scale, whose colour larger values have, too; None: `top_of(values)`. The mean and the largest value follow the title.
-    """
+    top: end of the scale, whose colour larger values have, too; None: `top_of(values)`. The mean and the largest value follow the title."""
     with needed_by("a heat map"):
         from PIL import Image, ImageDraw
 

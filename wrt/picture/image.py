@@ -72,8 +72,7 @@ def write_image(path: PathLike, pixels: np.ndarray, *, bits: int | None = None, 
 
     EXR keeps NaN and infinite values. In PNG, NaN and -inf are black, +inf is white. HDR has 0 for NaN and negative values, and its
     largest value for +inf. A SceneWarning counts replaced pixels. Raises InputError if the file cannot be written; an existing file
-    then stays unchanged.
-    """
+    then stays unchanged."""
     pixels = np.asarray(pixels, dtype=np.float32)
     if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.size == 0:
         raise InputError(f"must be (H, W, 3), got {pixels.shape}", argument="pixels", path=path)
@@ -97,8 +96,7 @@ def write_exr(path: PathLike, channels: Mapping[str, np.ndarray], metadata: Meta
 
     channels: (H, W) each, all of one size; float16 is stored as half, other types as float. Integers are exact up to 2^24; a SceneWarning
     reports larger integers. (OpenEXR has integer channels, but OpenImageIO's Python binding rounds them beside float channels.)
-    Raises InputError as write_image does.
-    """
+    Raises InputError as write_image does."""
     oiio = _oiio()
     arrays = list(channels.values())
     height, width = arrays[0].shape
@@ -182,8 +180,7 @@ def _warn_replaced(path: PathLike, where: np.ndarray, what: str) -> None:
 def encode_png(codes: np.ndarray, metadata: Metadata | None = None) -> bytes:
     """Encode (H, W, 3) uint8 or uint16 sRGB codes as a PNG file, with metadata in iTXt (UTF-8) entries named `wrt:key`.
 
-    Source: W3C, Portable Network Graphics Specification (third edition); every row has the filter "up".
-    """
+    Source: W3C, Portable Network Graphics Specification (third edition); every row has the filter "up"."""
     if codes.ndim != 3 or codes.shape[2] != 3 or codes.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"codes must be (H, W, 3) uint8 or uint16, got {codes.shape} {codes.dtype}")
     height, width = codes.shape[:2]
@@ -210,8 +207,7 @@ def read_image(path: PathLike) -> np.ndarray:
     """Read the colours of an image file: (H, W, 3) float32, linear.
 
     EXR needs channels R, G, B, or one grey channel. PNG, JPEG and similar files are decoded from sRGB, 16-bit PNG at full precision. Alpha
-    is ignored. Raises InputError for a missing, truncated or too large file, and for a file that is no picture.
-    """
+    is ignored. Raises InputError for a missing, truncated or too large file, and for a file that is no picture."""
     suffix = Path(path).suffix.lower()
     if suffix in LINEAR_SUFFIXES:
         return _pick_colors(read_channels(path), path)
@@ -229,8 +225,7 @@ def read_image(path: PathLike) -> np.ndarray:
 def read_channels(path: PathLike) -> dict[str, np.ndarray]:
     """Read all channels of the first part of an EXR or HDR file, by name: (H, W) float32.
 
-    Raises InputError for a missing, truncated or too large file, and for a file that is no such picture.
-    """
+    Raises InputError for a missing, truncated or too large file, and for a file that is no such picture."""
     with _opened(path) as source:
         spec = source.spec()
         with at(path=path):

@@ -44,8 +44,7 @@ def reinhard(linear: np.ndarray) -> np.ndarray:
     """Apply Reinhard's extended operator to luminance: L (1 + L / W^2) / (1 + L); W = 4 is the lowest luminance that is white.
 
     Chromaticity stays the same, so that a channel of a bright saturated colour can still clip.
-    Source: Reinhard, Stark, Shirley, Ferwerda, "Photographic Tone Reproduction for Digital Images" (2002), equation 4.
-    """
+    Source: Reinhard, Stark, Shirley, Ferwerda, "Photographic Tone Reproduction for Digital Images" (2002), equation 4."""
     bright = luminance(linear)[..., None]
     return linear * ((1.0 + bright / REINHARD_WHITE**2) / (1.0 + bright))
 
@@ -58,8 +57,7 @@ ACES_OUT = np.array([[1.60475, -0.53108, -0.07367], [-0.10208, 1.10813, -0.00605
 def aces(linear: np.ndarray) -> np.ndarray:
     """Apply Stephen Hill's fit of the ACES reference rendering and sRGB output transforms, without extra exposure.
 
-    Source: S. Hill, ACES.hlsl in "Baking Lab" (M. Pettineo and D. Neubelt, 2016).
-    """
+    Source: S. Hill, ACES.hlsl in "Baking Lab" (M. Pettineo and D. Neubelt, 2016)."""
     v = linear @ ACES_IN.T.astype(linear.dtype)
     fitted = (v * (v + 0.0245786) - 0.000090537) / (v * (0.983729 * v + 0.4329510) + 0.238081)
     return fitted @ ACES_OUT.T.astype(linear.dtype)
@@ -88,8 +86,7 @@ def _agx_half(reach: np.ndarray, x_span: float, y_span: float, power: float) -> 
 def agx_contrast(x: np.ndarray) -> np.ndarray:
     """Apply AgX's default contrast: [0, 1] (log2 of exposure) to [0, 1] (display code); mid-grey is exactly 0.5.
 
-    This is the sigmoid itself; the polynomials that are often fitted to it are off by up to 0.006 and miss 0 and 1.
-    """
+    This is the sigmoid itself; the polynomials that are often fitted to it are off by up to 0.006 and miss 0 and 1."""
     x_pivot, y_pivot = AGX_PIVOT
     toe = y_pivot - _agx_half(np.maximum(x_pivot - x, 0.0), x_pivot, y_pivot, AGX_TOE_POWER)
     shoulder = y_pivot + _agx_half(np.maximum(x - x_pivot, 0.0), 1.0 - x_pivot, 1.0 - y_pivot, AGX_SHOULDER_POWER)
@@ -101,8 +98,7 @@ def agx(linear: np.ndarray) -> np.ndarray:
 
     Sources: T. Sobotka, AgX-S2O3 (inset matrix, range, sigmoid), with the slope and powers of the NumPy version in the
     AgX repository; B. Wrensch, "Minimal AgX Implementation" (2023), for undoing the inset after the curve and for the
-    2.2 power that the codes are meant for.
-    """
+    2.2 power that the codes are meant for."""
     inset = linear @ AGX_INSET.T.astype(linear.dtype)
     stops = np.log2(np.maximum(inset / 0.18, 2.0**AGX_MIN_EV))
     x = np.clip((stops - AGX_MIN_EV) / (AGX_MAX_EV - AGX_MIN_EV), 0.0, 1.0)
@@ -122,8 +118,7 @@ def tone_map(pixels: np.ndarray, exposure: float = 0.0, tonemap: str = "none") -
     """Map linear radiance to display-linear light, (..., 3) float32 in [0, 1].
 
     pixels: (..., 3) linear; exposure: stops; tonemap: a name in TONEMAPS. Negative values, -inf and NaN become black; +inf becomes the
-    brightest value of the curve. Raises InputError for an unknown name.
-    """
+    brightest value of the curve. Raises InputError for an unknown name."""
     as_choice(tonemap, TONEMAPS, "tonemap")
     with np.errstate(over="ignore", invalid="ignore"):  # overflow gives +inf, inf * 0 gives NaN: both are replaced below
         exposed = np.asarray(pixels, dtype=np.float32) * np.float32(2.0**exposure)

@@ -20,8 +20,7 @@ class CameraKind:
     """Base class of cameras: a pose and a name.
 
     camera_to_world: (4, 4) rotation and translation; a camera looks along its own -z, +y is up. A subclass adds its parameters as
-    fields, each with `field(metadata=given(...))`.
-    """
+    fields, each with `field(metadata=given(...))`."""
 
     kind: ClassVar[str]  # name in scene files
     device: ClassVar[str]  # module of the device functions, which wrt.kernels.shade.cameras describes
@@ -146,8 +145,7 @@ class Camera(CameraKind):
 
         The sensor is at the image distance s' = f s / (s - f), so that focusing near narrows the view, as in a real camera. The
         aperture's radius is f / (2 f_number). Raises InputError unless focus_distance exceeds focal_length and exactly one of
-        f_number and aperture_radius is given.
-        """
+        f_number and aperture_radius is given."""
         f = as_number(focal_length, "focal_length", low=SMALLEST)
         s = as_number(focus_distance, "focus_distance", low=SMALLEST)
         h = as_number(sensor_height, "sensor_height", low=SMALLEST)
@@ -165,8 +163,7 @@ class Camera(CameraKind):
 class OrthographicCamera(CameraKind):
     """Parallel rays that start at the plane through the camera.
 
-    height: extent of the view from the lower to the upper edge of the picture, in scene units; the width follows from the aspect ratio.
-    """
+    height: extent of the view from the lower to the upper edge of the picture, in scene units; the width follows from the aspect ratio."""
 
     kind = "orthographic"
     device = "wrt.kernels.shade.cameras.orthographic"
@@ -182,8 +179,7 @@ class OrthographicCamera(CameraKind):
 class FisheyeCamera(CameraKind):
     """An equidistant fisheye; black beyond the image circle, whose diameter is the shorter side of the picture.
 
-    The angle to the axis is proportional to the distance from the centre. fov: full angle across the circle in radians.
-    """
+    The angle to the axis is proportional to the distance from the centre. fov: full angle across the circle in radians."""
 
     kind = "fisheye"
     device = "wrt.kernels.shade.cameras.fisheye"
@@ -200,8 +196,7 @@ class FisheyeCamera(CameraKind):
 class PanoramaCamera(CameraKind):
     """All directions around a point, equirectangular, with the camera's axis in the middle.
 
-    A picture of aspect ratio 2:1 can serve as the image of an EnvironmentBackground.
-    """
+    A picture of aspect ratio 2:1 can serve as the image of an EnvironmentBackground."""
 
     kind = "panorama"
     device = "wrt.kernels.shade.cameras.panorama"

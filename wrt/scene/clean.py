@@ -30,8 +30,7 @@ def clean(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None = 
 
     vertices: (V, 3), converted to float32; faces: (F, 3) integers; normals (V, 3), uvs (V, 2) and face_group (F,) or None.
     Remaining faces and vertices keep their order. Faces with a NaN or infinite corner stay, and `Mesh` refuses them. Raises InputError
-    that names the first face with an index outside [0, V).
-    """
+    that names the first face with an index outside [0, V)."""
     vertices = np.asarray(vertices, dtype=np.float32).reshape(-1, 3)
     faces = np.asarray(faces).reshape(-1, 3)
     require_indices(faces, len(vertices))
@@ -60,10 +59,7 @@ def require_indices(faces: np.ndarray, count: int, place: str | None = None) -> 
 
 
 def has_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return (F,) bool, computed exactly: True if the corners of a face are not collinear, or not all finite.
-
-    vertices: (V, 3) float32; faces: (F, 3).
-    """
+    """Return (F,) bool, exact: True if the corners of a face (vertices (V, 3) float32) are not collinear, or not all finite."""
     out = np.ones(len(faces), dtype=bool)
     for first in range(0, len(faces), AT_ONCE):
         part = faces[first:first + AT_ONCE]
@@ -74,8 +70,7 @@ def has_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def corners_have_area(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
     """Return `has_area` of triangles with corners p, q, r, (N, 3) float32 each; fastest if 24 N float64 fit in the cache.
 
-    The cross product of two edges is computed in float64, and again in integers if no component exceeds its rounding error.
-    """
+    The cross product of two edges is computed in float64, and again in integers if no component exceeds its rounding error."""
     a, b, c = (np.array(corner.T, np.float64, order="C") for corner in (p, q, r))
     out = np.ones(len(p), dtype=bool)
     unknown: np.ndarray | slice = slice(None)
@@ -113,8 +108,7 @@ def flip_collinear(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray,
 
     vertices: (V, 3) float32; faces: (F, 3). Returns faces (F, 3) of the same dtype, and source (F,). A returned face lies in the input
     face with the index `source`, and takes its material and group. Faces with two equal corners stay as they are, and so do faces whose
-    longest edge does not belong to exactly two faces.
-    """
+    longest edge does not belong to exactly two faces."""
     return _flipped(vertices, faces)[:2]
 
 

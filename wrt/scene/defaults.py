@@ -29,8 +29,7 @@ _SKY = GradientBackground(bottom=(0.22, 0.21, 0.20), top=(0.50, 0.60, 0.75))
 def bounding_sphere(scene: Scene) -> tuple[np.ndarray, float]:
     """Return the centre (3,) of the scene's box, and the radius of the smallest sphere around it that holds all shapes.
 
-    Raises InputError if the scene has no shapes.
-    """
+    Raises InputError if the scene has no shapes."""
     low, high = scene.bounds()
     center = 0.5 * low + 0.5 * high
     radius = max((math.dist(sphere.center, center) + sphere.radius for sphere in scene.spheres), default=0.0)
@@ -44,8 +43,7 @@ def frame_camera(scene: Scene, aspect: float = 16.0 / 9.0) -> Camera:
     """Return a pinhole camera in three-quarter view that sees the whole bounding sphere of the scene.
 
     aspect: width / height of the picture. The vertical angle of view is 40 degrees; the narrower of the two angles determines the
-    distance. Raises InputError if the scene has no shapes.
-    """
+    distance. Raises InputError if the scene has no shapes."""
     center, radius = bounding_sphere(scene)
     half_angle = math.atan(math.tan(0.5 * FOV_Y) * min(aspect, 1.0))
     radius = max(radius, 1e-9 * float(np.abs(center).max()), SMALLEST)  # a single point has none
@@ -57,8 +55,7 @@ def frame_camera(scene: Scene, aspect: float = 16.0 / 9.0) -> Camera:
 def is_lit(scene: Scene) -> bool:
     """Return True if the scene has a light, a background, an ambient term or enough emission.
 
-    Emission is enough if it would give a white sphere around the scene a radiance of DARK or more.
-    """
+    Emission is enough if it would give a white sphere around the scene a radiance of DARK or more."""
     if scene.lights or scene.background != ConstantBackground(BLACK) or scene.ambient != BLACK:
         return True
     power = _emitted_power(scene)
@@ -91,8 +88,7 @@ def stage(scene: Scene) -> tuple[Scene, list[str]]:
     """Return the scene with a camera and lights, and a sentence on each addition.
 
     A scene without a camera gets one that frames it. A scene that is not lit (`is_lit`) gets a key light from above the first camera's
-    right shoulder and a pale sky. Raises InputError for a scene without cameras and shapes, and for a scene that is too small.
-    """
+    right shoulder and a pale sky. Raises InputError for a scene without cameras and shapes, and for a scene that is too small."""
     require_size(scene)
     added = []
     if not scene.cameras:

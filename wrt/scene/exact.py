@@ -27,8 +27,7 @@ TRIPLE = 10.0 * UNIT
 class Place(IntEnum):
     """Location of the intersection of a line with the plane of a triangle; INSIDE, EDGE and VERTEX are hits.
 
-    COPLANAR: the line lies in the plane; a line parallel to the plane is OUTSIDE. DEGENERATE: the triangle has no area.
-    """
+    COPLANAR: the line lies in the plane; a line parallel to the plane is OUTSIDE. DEGENERATE: the triangle has no area."""
 
     OUTSIDE = 0
     INSIDE = 1
@@ -42,8 +41,7 @@ class Place(IntEnum):
 class Crossings:
     """Intersections of N lines with the planes of N triangles, (N,) each.
 
-    place: int8, of Place; t, u, v: float64, inf or NaN for a line parallel to the plane; t_error: bound on |t - exact t|; slope: d.N.
-    """
+    place: int8, of Place; t, u, v: float64, inf or NaN for a line parallel to the plane; t_error: bound on |t - exact t|; slope: d.N."""
 
     place: np.ndarray
     t: np.ndarray
@@ -129,8 +127,7 @@ def triangle_crossings(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, np.nda
 
     `place` is exact. For hits the relative error of t (bound: t_error) and the errors of u and v are at most ACCURATE.
 
-    all_rows: compute misses as accurately as hits, and distinguish COPLANAR and DEGENERATE from OUTSIDE.
-    """
+    all_rows: compute misses as accurately as hits, and distinguish COPLANAR and DEGENERATE from OUTSIDE."""
     a, b, c = (corner - o for corner in v)
     weights = np.empty((3, o.shape[1]))
     bounds = np.empty_like(weights)
@@ -168,8 +165,7 @@ def triangle_crossings(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, np.nda
 class SphereCrossings:
     """Intersections of N lines with spheres: entry t[0] and exit t[1], float64 (2, N), and bounds on their errors.
 
-    t is NaN on a miss. A line that touches its sphere has equal t[0] and t[1].
-    """
+    t is NaN on a miss. A line that touches its sphere has equal t[0] and t[1]."""
 
     hit: np.ndarray
     touching: np.ndarray
@@ -180,8 +176,7 @@ class SphereCrossings:
 def sphere_crossings(o: np.ndarray, d: np.ndarray, center: np.ndarray, radius: np.ndarray) -> SphereCrossings:
     """Intersect line i with sphere i. o, d, center: (3, N), radius: (N,) > 0, float64 that hold float32 values.
 
-    The sign of the discriminant is exact: a line that touches the sphere hits it. The relative error of t is at most ACCURATE.
-    """
+    The sign of the discriminant is exact: a line that touches the sphere hits it. The relative error of t is at most ACCURATE."""
     f = o - center
     a, b, ff, rr = (d * d).sum(axis=0), (d * f).sum(axis=0), (f * f).sum(axis=0), radius * radius
     cross = np.stack([d[j] * f[k] - d[k] * f[j] for j, k in ((1, 2), (2, 0), (0, 1))])

@@ -53,8 +53,7 @@ def given(form: str, about: str, unit: str = "", **limits: Any) -> dict[str, Any
     """Return the `metadata` that describes a dataclass field.
 
     - form: a key of FORMS; about: text in the reference of scene files; unit: "" if the form implies it, or without a unit.
-    - limits: ge, gt, le, lt of numbers, angles (in degrees) and colours, or the allowed values (among).
-    """
+    - limits: ge, gt, le, lt of numbers, angles (in degrees) and colours, or the allowed values (among)."""
     return {"form": form, "about": about, "unit": unit, "limits": limits}
 
 
@@ -74,8 +73,7 @@ def check_fields(thing: object, at: str) -> None:
 class Kind:
     """Base of frozen dataclasses whose fields are described by `field(metadata=given(...))`, except `name: str = ""`.
 
-    kind: name of the class in scene files, in the table of kinds and in the table of device functions; what: name in messages.
-    """
+    kind: name of the class in scene files, in the table of kinds and in the table of device functions; what: name in messages."""
 
     kind: ClassVar[str]
     what: ClassVar[str]

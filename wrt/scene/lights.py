@@ -50,8 +50,7 @@ class SpotLight(Light):
     """A point light limited to a cone.
 
     The light has its full intensity up to the angle `inner` from the axis, and none beyond `outer`. Between these half angles (radians)
-    a factor falls from 1 to 0: the square of a linear ramp in the cosine, as KHR_lights_punctual recommends.
-    """
+    a factor falls from 1 to 0: the square of a linear ramp in the cosine, as KHR_lights_punctual recommends."""
 
     kind = "spot"
     position: Color = field(metadata=given("point", "position"))

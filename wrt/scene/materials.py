@@ -70,8 +70,7 @@ class MaterialKind(NamedTuple):
     - about: text in the reference of scene files.
     - uses: fields that this kind reads and some other kind does not. A kind that does not use a field has 0 in its place on the device,
       and refuses the field in a scene file.
-    - scatters: `albedo` is diffuse, at least in part; reflects: spawns reflected rays; clear: transmits light without `transmission`.
-    """
+    - scatters: `albedo` is diffuse, at least in part; reflects: spawns reflected rays; clear: transmits light without `transmission`."""
 
     about: str
     uses: tuple[str, ...] = ()

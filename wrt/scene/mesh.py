@@ -90,8 +90,7 @@ class Mesh:
         """Return the triangles of a trimesh mesh, or of a whole trimesh scene in world space.
 
         The result has the texture coordinates of the mesh, if there are any, and its vertex normals if `smooth`. Faces without area
-        stay, but rays never hit them. Raises InputError for any other object, and for arrays that `Mesh` refuses.
-        """
+        stay, but rays never hit them. Raises InputError for any other object, and for arrays that `Mesh` refuses."""
         with needed_by("a mesh of trimesh"):
             import trimesh
 

@@ -184,8 +184,7 @@ class Scene:
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the lowest and the highest corner, (3,) float64 each, of the box around all shapes in world space.
 
-        The box may be too large if the objects have more than 2^26 vertices together. Raises InputError if the scene has no shapes.
-        """
+        The box may be too large if the objects have more than 2^26 vertices together. Raises InputError if the scene has no shapes."""
         corners: list[np.ndarray] = []
         for points, transform in self.outlines():
             points = points @ transform[:3, :3].T + transform[:3, 3]
@@ -201,8 +200,7 @@ class Scene:
         """Yield for each object with faces its transform, after points (N, 3) float64 in object space whose convex hull holds its mesh.
 
         The points are the vertices of the mesh. For a shared mesh they are the corners of its box if all objects together have more
-        than MANY_VERTICES. Otherwise a file with one large mesh at many nodes would take hours.
-        """
+        than MANY_VERTICES. Otherwise a file with one large mesh at many nodes would take hours."""
         shown = [thing for thing in self.objects if len(thing.mesh.faces)]
         times = Counter(id(thing.mesh) for thing in shown)
         many = sum(len(thing.mesh.vertices) for thing in shown) > MANY_VERTICES
@@ -219,8 +217,7 @@ class Scene:
     def with_settings(self, **changes: Unpack[SettingChanges]) -> Scene:
         """Return a copy of the scene with changed settings. A setting of None keeps the scene's value.
 
-        Raises InputError for an unknown setting and for a wrong value.
-        """
+        Raises InputError for an unknown setting and for a wrong value."""
         for name in changes:
             if name not in SETTINGS:
                 raise unknown(name, "setting", SETTINGS, argument=name)

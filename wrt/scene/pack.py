@@ -32,8 +32,7 @@ LEFT_OUT: dict[type, tuple[str, ...]] = {Object: ("motion",)}  # a single pictur
 def pack(scene: object, left_out: dict[type, tuple[str, ...]] = LEFT_OUT) -> tuple[str, list[np.ndarray]]:
     """Return the JSON text of a scene, and the arrays to which the text refers. Shared meshes, materials and textures are stored once.
 
-    left_out: fields to store as None, by their class (object: of every class).
-    """
+    left_out: fields to store as None, by their class (object: of every class)."""
     packer = _Packer(left_out)
     packer.plain(scene)
     return json.dumps(packer.things), packer.arrays
@@ -42,8 +41,7 @@ def pack(scene: object, left_out: dict[type, tuple[str, ...]] = LEFT_OUT) -> tup
 def unpack(text: str, arrays: list[np.ndarray]) -> Scene:
     """Return the packed scene, bit for bit and with the same sharing; it uses `arrays` without a copy. Raises InputError for other texts.
 
-    Constructors are bypassed, because they would round the pose of a camera once more.
-    """
+    Constructors are bypassed, because they would round the pose of a camera once more."""
     things: list[Any] = []
     known = kinds()
 

@@ -22,8 +22,7 @@ MAX_FACES = 1 << 23  # triangles of one shape: a short scene file must not fill 
 def quad(corner: Point = (-0.5, -0.5, 0.0), edge_u: Point = (1.0, 0.0, 0.0), edge_v: Point = (0.0, 1.0, 0.0)) -> Mesh:
     """Return a parallelogram of two triangles whose front is towards cross(edge_u, edge_v).
 
-    On the front, with edge_u to the right and edge_v up, an image is upright: uv is (0, 1) at `corner` and (0, 0) at the end of edge_v.
-    """
+    On the front, with edge_u to the right and edge_v up, an image is upright: uv is (0, 1) at `corner` and (0, 0) at the end of edge_v."""
     origin, u, v = (np.array(as_vector(value, "quad: " + name))
                     for value, name in ((corner, "corner"), (edge_u, "edge_u"), (edge_v, "edge_v")))
     if not np.linalg.norm(np.cross(u, v)) > 0.0:
@@ -140,8 +139,7 @@ def prism(sides: int = 3, radius: float = 1.0, length: float = 2.0) -> Mesh:
 def tube(points: Sequence[Point] | np.ndarray, radius: float | Point = 0.1, segments: int = 24) -> Mesh:
     """Return a round tube along a polyline, with flat ends; `radius` is one number, or one for each point.
 
-    Its rings turn as little as possible from point to point (parallel transport). u runs around the tube, v along it.
-    """
+    Its rings turn as little as possible from point to point (parallel transport). u runs around the tube, v along it."""
     line = np.asarray(points, dtype=np.float64)
     if line.ndim != 2 or line.shape[1:] != (3,) or len(line) < 2 or not np.isfinite(line).all():
         raise InputError("must be two or more finite points (x, y, z)", argument="points", place="tube")
@@ -183,8 +181,7 @@ def tube(points: Sequence[Point] | np.ndarray, radius: float | Point = 0.1, segm
 def teapot(segments: int = 64) -> Mesh:
     """Return a pot with lid, spout and handle, about 2 units wide and 1 high, on y = 0. Its parts are closed meshes that overlap.
 
-    The outlines are this project's own: body and lid are lathes, spout and handle are tubes.
-    """
+    The outlines are this project's own: body and lid are lathes, spout and handle are tubes."""
     _require_segments("teapot", segments)
     rows = max(segments // 2, 8)
     t = np.linspace(0.0, 1.0, rows)

@@ -49,8 +49,7 @@ def as_number(value: object, what: str, *, low: float = -math.inf, high: float =
 def as_transform(value: object, what: str) -> np.ndarray:
     """Return a (4, 4) float64 affine matrix that acts on column vectors.
 
-    Raises InputError unless the matrix is finite, (4, 4) and affine. It may be singular: glTF files hide nodes by a scale of 0.
-    """
+    Raises InputError unless the matrix is finite, (4, 4) and affine. It may be singular: glTF files hide nodes by a scale of 0."""
     matrix = as_array(value, np.float64, what)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise wrong(what, f"must be a finite 4x4 matrix, got shape {matrix.shape}")

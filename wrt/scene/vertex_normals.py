@@ -14,8 +14,7 @@ def smooth(mesh: Mesh) -> Mesh:
 
     Vertices at exactly the same position get the same normal, so that texture seams do not show. With these weights the normal
     does not depend on the triangulation (Thuermer and Wuethrich, "Computing vertex normals from polygonal facets", 1998). A sum that
-    cancels out gives a zero normal (flat shading). A mesh with normals is returned unchanged.
-    """
+    cancels out gives a zero normal (flat shading). A mesh with normals is returned unchanged."""
     if mesh.normals is not None:
         return mesh
     points = mesh.vertices.astype(np.float64)[mesh.faces]

@@ -30,8 +30,7 @@ class Accessors:
         """Return accessor `index` as an array (count, width of `kind`): float32, or the accessor's integer type if not normalised.
 
         kind: "SCALAR", "VEC2", "VEC3" or "VEC4". Raises InputError at `place` if the accessor has another kind, does not fit into its
-        buffer view, or holds a float that is not finite.
-        """
+        buffer view, or holds a float that is not finite."""
         accessor = self._document.item("accessors", index, place)
         if accessor.type != kind:
             raise InputError(f"must be of type {kind}, but accessors[{index}] is {short(accessor.type)}", place=place)

@@ -117,8 +117,7 @@ def _uv_transform(transform: TextureTransform, place: str) -> np.ndarray:
     """Return the (2, 3) matrix that scales, then rotates, then offsets (u, v, 1).
 
     A positive rotation is counter-clockwise in the image, with v downwards, as in the prose, the example and the sample models of
-    KHR_texture_transform. The GLSL listing in that specification rotates the other way.
-    """
+    KHR_texture_transform. The GLSL listing in that specification rotates the other way."""
     offset_u, offset_v = exactly(transform.offset, 2, f"{place}.offset")
     scale_u, scale_v = exactly(transform.scale, 2, f"{place}.scale")
     cosine, sine = math.cos(transform.rotation), math.sin(transform.rotation)

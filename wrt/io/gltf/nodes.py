@@ -15,8 +15,7 @@ from wrt.scene.values import as_transform
 def walk(document: Document) -> Iterator[tuple[int, GltfObject, np.ndarray]]:
     """Yield index, node and matrix to world space, (4, 4) float64, of each node of the default scene, parents before children.
 
-    Raises InputError if any node of the file has two parents or is its own ancestor.
-    """
+    Raises InputError if any node of the file has two parents or is its own ancestor."""
     _check_forest(document)
     stack = [(index, place, np.eye(4)) for index, place in reversed(_roots(document))]
     seen: set[int] = set()

@@ -37,8 +37,7 @@ def load_gltf(path: PathLike, *, staged: bool = True) -> Scene:
 
     staged: add a camera or lights to a file without them (wrt.scene.defaults), and refuse a file without triangles; False for a file
     that a scene file includes. One SceneWarning names everything left out or added. Settings are the defaults, but glass_shadows is
-    "tinted" if the file has solid glass (KHR_materials_volume). Raises InputError with the file and the place in its JSON.
-    """
+    "tinted" if the file has solid glass (KHR_materials_volume). Raises InputError with the file and the place in its JSON."""
     with at(path=path):
         document = Document(path)
         scene = _Reader(document).scene()

@@ -120,8 +120,7 @@ def read_as(hint: Any, raw: object, place: str) -> Any:
     """Convert the JSON value `raw` to the type `hint`: a scalar, a list, a dict, or a dataclass (here or of pygltflib).
 
     Unknown keys and `extras` are left out; null counts as a missing key. Raises InputError with the place of a value of another type, of
-    a number that is not finite, or of a required key that is missing.
-    """
+    a number that is not finite, or of a required key that is missing."""
     hint = _without_none(hint)
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if hint in _SCALARS:

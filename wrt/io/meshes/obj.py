@@ -119,8 +119,7 @@ class _Text:
     def triples(self) -> tuple[np.ndarray, np.ndarray]:
         """Return zero-based v, vt, vn (-1: none) of the distinct corners, (U, 3) int64; and for each corner its row there, (C,) int32.
 
-        The rows are sorted by v first, so that the vertices keep the order of the file.
-        """
+        The rows are sorted by v first, so that the vertices keep the order of the file."""
         index = np.frombuffer(self.corners, np.int32)
         triples = np.zeros((len(self.distinct), 3), dtype=np.int64)
         keys = list(_WIDTHS)
@@ -164,8 +163,7 @@ def read(path: Path) -> RawMesh:
     (flat shading), a corner without a texture coordinate gets (0, 0). If faces refer to vt or vn lines and the file has none, their
     indices are left out with a SceneWarning. Groups are the spans of `usemtl`, else of `g`, else of `o`; faces before the first span
     are in the group "". Vertex colours, lines, points and curves are not read. Raises InputError with the line for words that are no
-    numbers, indices out of range and positions that are not finite.
-    """
+    numbers, indices out of range and positions that are not finite."""
     text = _Text()
     text.read(utf8(read_file(path)))
     positions = text.array("v")

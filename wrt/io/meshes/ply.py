@@ -58,8 +58,7 @@ def read(path: Path) -> RawMesh:
     The triangles of `tristrips` follow the faces; -1 begins a new strip. Vertex normals are nx, ny, nz. Texture coordinates are a
     vertex's u, v (or s, t or texture_u, texture_v), else the `texcoord` lists of faces; a vertex is split if its faces disagree. Colours
     and other properties are not read. Raises InputError with the header's line, or with the element and row of a value that is missing,
-    not a number, or out of range.
-    """
+    not a number, or out of range."""
     elements = {element.name: element for element in _Source(path).elements}
     if "vertex" not in elements or not {"x", "y", "z"} <= elements["vertex"].values.keys():
         raise InputError(f"has no vertices with x, y and z (its elements: {', '.join(elements) or 'none'})")

@@ -25,8 +25,7 @@ def read(path: Path) -> RawMesh:
     """Read the triangles of an STL file in the order of the file. Triangles share no vertices.
 
     The solids of a text file become groups. Facet normals are not read, because the winding gives the same direction. Raises InputError
-    for a file that is truncated or no STL file, and for a position that is not finite.
-    """
+    for a file that is truncated or no STL file, and for a position that is not finite."""
     data = read_file(path)
     groups: tuple[str, ...] = ()
     sizes: list[int] = []

@@ -39,8 +39,7 @@ def build(table: tables.SceneTable, path: Path) -> Scene:
     """Make the scene of a checked scene file at `path`; the names of files in it are relative to the folder of `path`.
 
     A file that is named twice is read once, and its mesh or texture is shared. Raises one InputError that lists all unknown names,
-    unusable files and values that the scene refuses.
-    """
+    unusable files and values that the scene refuses."""
     builder = _Builder(path)
     with at(path=path):
         scene = builder.scene(table)

@@ -10,8 +10,6 @@ from wrt.io.toml.kinds import TYPES, described
 from wrt.io.toml.values import Angle, Scale2, Table, Wraps, require_one
 from wrt.scene.materials import MATERIALS, Checkerboard, Material, kinds_that_use
 
-# --- textures ---------------------------------------------------------------------------------------------------------
-
 _checkerboard: Any = create_model("_Checkerboard", __base__=Table, **described(Checkerboard))
 
 
@@ -45,9 +43,6 @@ class ColorTextureTable(_PlacedImage):
         if self.checkerboard is not None and len(self.model_fields_set) > 1:
             raise ValueError("a checkerboard takes no other keys beside it; its scale is a key of the checkerboard")
         return self
-
-
-# --- materials --------------------------------------------------------------------------------------------------------
 
 
 class MaterialTable(Table):

@@ -113,8 +113,7 @@ def _text(value: object) -> str:
 def _place(location: Sequence[str | int], data: Any, missing: bool) -> tuple[str, Any]:
     """Return the place of a mistake in the file, such as "meshes[0].file", and the table that holds its last key.
 
-    pydantic's location also names members of unions. Parts that are not keys of the file are left out, except a missing last key.
-    """
+    pydantic's location also names members of unions. Parts that are not keys of the file are left out, except a missing last key."""
     place, parent = "", data
     for i, part in enumerate(location):
         if isinstance(part, str) and isinstance(data, dict) and (part in data or (missing and i == len(location) - 1)):

@@ -32,8 +32,6 @@ SettingsTable: Any = create_model(
     "SettingsTable", __base__=Table, __doc__="Defaults of a render; the command line overrides them.",
     **described(Settings))
 
-# --- shapes -----------------------------------------------------------------------------------------------------------
-
 
 class TransformTable(Table):
     """Scales first, then rotates, then translates; or a matrix."""
@@ -185,9 +183,6 @@ class MeshTable(Table):
         if self.material is None and not self.materials and not self.parts:
             raise ValueError("needs a material (or materials, or parts)")
         return self
-
-
-# --- lights -----------------------------------------------------------------------------------------------------------
 
 
 class RectangleLightTable(TypedTable):

@@ -16,8 +16,7 @@ if TYPE_CHECKING:
 def transform(table: TransformTable | None) -> np.ndarray:
     """Return the matrix (4, 4) float64 of a table: scale, then rotate, then translate. None gives the identity.
 
-    Raises InputError for a singular matrix.
-    """
+    Raises InputError for a singular matrix."""
     matrix = np.eye(4)
     if table is None:
         return matrix
