@@ -9,8 +9,6 @@ from pathlib import Path
 
 import warp as wp
 
-from wrt.kernels.native import literal
-
 FOLDER = Path(__file__).parent
 LINE = re.compile(r'#include "(\w+\.h)"|#pragma once')
 
@@ -19,7 +17,8 @@ def constants(numbers: Mapping[str, float], struct: str = "") -> str:
     """Return the C++ definitions of constants in namespace wrt; if `struct` is set, as static members of a struct of that name."""
     kinds = {name: "float" if isinstance(value, float) else "unsigned" if value >= 2**31 else "int"
              for name, value in numbers.items()}
-    lines = [f"constexpr {kinds[name]} {name} = {literal(value)};" for name, value in numbers.items()]
+    lines = [f"constexpr {kinds[name]} {name} = " + (f"{value.hex()}f;" if isinstance(value, float) else f"{int(value)};")
+             for name, value in numbers.items()]
     body = "struct " + struct + " {\n" + "".join(f"static {line}\n" for line in lines) + "};" if struct else "\n".join(lines)
     return f"namespace wrt {{\n{body}\n}}\n"
 

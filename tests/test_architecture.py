@@ -69,8 +69,7 @@ LABORATORY = re.compile(r"\bwrt[./]lab\b|\bkernels[./]study\b")
 NAME_THE_LABORATORY = ("wrt/lab/", "kernels/study/", "wrt/cli/", "wrt/testing.py", "wrt/__init__.py")
 # For each module and folder of kernels/, the others that it may import.
 BELOW_KERNELS = {
-    "native": set(),
-    "headers": {"native"},
+    "headers": set(),
     "launches": set(),
     "launch_probe": {"launches", "structs"},
     "memory": set(),
@@ -87,7 +86,7 @@ BELOW_KERNELS = {
     "shade": {"warp_private", "headers", "memory", "rows", "query", "traverse", "units", "structs"},
     "loops": {"shade", "launches", "memory", "rows", "query", "traverse", "units", "structs"},
     "build": {"wide", "traverse", "units", "structs"},
-    "study": {"native", "query", "shade", "wide", "build", "traverse", "units", "structs"},
+    "study": {"headers", "query", "shade", "wide", "build", "traverse", "units", "structs"},
 }
 LIBRARIES_OF_KERNELS = {"warp", "dataclasses", "functools", "re", "typing", "collections", "math", "pathlib"}
 # Limits. Lower them after a change that allows it. Only MOST_LINES may rise, by a commit that says what needs the lines.

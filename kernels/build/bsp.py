@@ -203,8 +203,8 @@ def count_below(tools: BspTools, task: BspTask, split: BspSplit) -> int:
 
 @wp.func
 def divide(tools: BspTools, task: BspTask, split: BspSplit, base: int, middle: int, size: int) -> wp.vec2i:
-    """Store the pieces below the plane, clipped, from index `base` on, those above it from `middle` on, their new points from `size` on.
-    Return the ends (pieces, points), or (-1, -1) if the array of points is too short."""
+    """Clip the task's pieces to both sides of the plane. Store lower pieces from index `base` on, upper pieces from `middle` on, and new
+    points from `size` on. Return the ends (pieces, points), or (-1, -1) if the array of points is too short."""
     pieces = tools.pieces
     low = int(base)
     high = int(middle)

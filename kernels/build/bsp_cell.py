@@ -235,7 +235,7 @@ def clip_cell(cells: Cells, slot: int, to: int, n: wp.vec3d, d: wp.float64, eps:
                     cells.points[base + size] = c
                     size = size + 1
                 if s_p >= zero and leaves == 0 and n_rim < MAX_FACES:
-                    rim[n_rim] = c  # at each corner of the cut, the outline of one face leaves the kept side, and that of another enters
+                    rim[n_rim] = c  # store each corner of the cut once: two outlines of faces cross the plane there, in opposite directions
                     center += c
                     n_rim = n_rim + 1
                     leaves = 1

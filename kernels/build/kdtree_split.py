@@ -81,7 +81,7 @@ def split_cost(options: KdOptions, scale: wp.float64, face: wp.vec2d, below: wp.
 
 @wp.func
 def cheapest_split(work: KdWork, task: KdTask, options: KdOptions) -> KdSplit:
-    """Find the plane of least SAH cost, of those whose references are within the budget and, with by_cost, that are cheaper than a leaf."""
+    """Find the plane of least SAH cost whose references are within the budget. With by_cost, it must also be cheaper than a leaf."""
     best = KdSplit()
     best.axis = -1
     n = task.count / 6

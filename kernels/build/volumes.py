@@ -60,7 +60,7 @@ def fit_spheres(nodes: wp.array(dtype=Bvh2Node), spans: wp.array(dtype=wp.vec2i)
 @kernel
 def fit_kdops(order: wp.array(dtype=wp.int32), cut_lo: wp.array(dtype=wp.vec4), cut_hi: wp.array(dtype=wp.vec4),
               out: wp.array(dtype=KdopNode)):
-    """Compute the diagonal planes of all nodes in `out` from those of the primitives (cut_lo, cut_hi, indexed by prim_id), in one thread.
+    """Compute the diagonal planes of all nodes in `out`, in one thread. cut_lo, cut_hi: planes of the primitives, indexed by prim_id.
     The boxes and links of `out` are already set. A missing child gets an empty 14-DOP."""
     n = out.shape[0]
     for k in range(n):

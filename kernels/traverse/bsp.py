@@ -93,7 +93,7 @@ def reach_of(box: BoxRay, ray: Ray, t_max: float, lo: wp.vec3, hi: wp.vec3, exte
 
 @cache
 def make_struct(record: Any) -> Any:
-    """Make the structure's type, for primitives stored as `record`. `first` and `count` describe the root as those of a node a child."""
+    """Make the structure's type, for primitives stored as `record`. `first` and `count` describe the root, as they do a node's child."""
 
     @wp.struct
     class Bsp:

@@ -10,7 +10,7 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.memory import put_number
+from wrt.kernels.memory import put_int, put_number
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import NO_HIT, Hit, Surfaces
 from wrt.kernels.traverse.common import Probe, Units, make_better, sphere_hit
@@ -55,7 +55,6 @@ from wrt.kernels.wide.packets import (
     slot_at,
     spheres_of,
     store_bits,
-    store_slot,
     write_hits,
     write_occluded,
 )
@@ -312,9 +311,9 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
 
     @packet_kernel
     def trace(accel: WideBvh, surfaces: Surfaces, rays: rays_struct, out: out_type, scratch: Scratch, first: int, end: int):
-        store_slot(scratch.report, FAILED, 0)
-        store_slot(scratch.report, PAUSED, 0)
-        store_slot(scratch.report, ANY_REFUSED, 0)
+        put_int(scratch.report, FAILED, 0)
+        put_int(scratch.report, PAUSED, 0)
+        put_int(scratch.report, ANY_REFUSED, 0)
         for block in range(first, end, wp.static(PACKETS * LANES)):
             single_rays = wp.uint64(0)
             packets = wp.min((end - block + LANES - 1) / LANES, PACKETS)  # Not a constant: Warp would unroll the loop over the walk.
@@ -324,7 +323,7 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
                 active = set_up(rays, block + LANES * p, count, wp.static(far_pad(units.box)), scratch, base)
                 store_bits(scratch.packets, base + ACTIVE, active)
                 if bits(scratch.packets, base + REFUSED) != 0:
-                    store_slot(scratch.report, ANY_REFUSED, 1)
+                    put_int(scratch.report, ANY_REFUSED, 1)
             for p in range(packets):
                 base = PACKET_SIZE * p
                 active = bits(scratch.packets, base + ACTIVE)
@@ -334,10 +333,10 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
                     failed = wp.where(coherent, 0, slot_at(scratch.report, FAILED) + 1)
                     if failed == MAX_FAILED:  # After this pause, a single failure starts the next pause.
                         failed = failed - 1
-                        store_slot(scratch.report, PAUSED, PAUSE)
-                    store_slot(scratch.report, FAILED, failed)
+                        put_int(scratch.report, PAUSED, PAUSE)
+                    put_int(scratch.report, FAILED, failed)
                 else:
-                    store_slot(scratch.report, PAUSED, wp.max(paused - 1, 0))
+                    put_int(scratch.report, PAUSED, wp.max(paused - 1, 0))
                     active = active & wp.static(COHERENT - 1)
                     active = rays_meeting_root(accel, scratch, base, active)
                     single_rays = single_rays | (wp.uint64(active) << wp.uint64(LANES * p))

@@ -186,7 +186,3 @@ def store_bits(packet: wp.array(dtype=wp.float32), i: int, value: int) -> None: 
 
 @wp.func_native("return slots.data[(long long)i];")
 def slot_at(slots: wp.array(dtype=wp.int32), i: int) -> int: ...
-
-
-@wp.func_native("slots.data[(long long)i] = value;")
-def store_slot(slots: wp.array(dtype=wp.int32), i: int, value: int) -> None: ...
