@@ -165,8 +165,8 @@ def test_cameras_by_name_and_number() -> None:
         assert read_metadata("a.png")["camera"] == expected
     for name in ("top", "2", "-1", ""):
         for command in (("render", *SMALL), ("info",)):
-            refused(run(*command, "scene.toml", "--camera", name), f"scene.toml: no camera {name!r}",
-                    "cameras are 'front' (index 0), 'side' (index 1)")
+            refused(run(*command, "scene.toml", "--camera", name), f"scene.toml: the scene has no camera {name!r}",
+                    "its cameras are 'front' (index 0), 'side' (index 1)")
 
 
 def test_a_time_limit_leaves_a_picture_of_whole_samples() -> None:

@@ -140,7 +140,7 @@ def test_a_kernel_that_cannot_be_loaded_is_one_message_after_a_second_try(cache:
     monkeypatch.setattr(type(COUNT_UP.module), "load", lambda *args, **options: tried.append(1) or _raise())
     with pytest.raises(InputError) as told:
         answer()
-    assert told.value.path == str(cache) and "kernels cannot be compiled: Failed to load CPU module; WARP" in str(told.value)
+    assert told.value.path == str(cache) and "kernels cannot be compiled: Failed to load CPU module; set WARP" in str(told.value)
     assert len(tried) == 2
 
 
