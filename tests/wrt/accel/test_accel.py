@@ -244,7 +244,7 @@ def test_gradients_that_there_are_not_are_refused_and_not_lost_in_silence() -> N
                                    (structure.any_hit, (down, needed), "directions"),
                                    (structure.any_hit, (plain, down, 0.0, end), "t_max"),
                                    (structure.closest_hit, (plain, down, 0.0, end), "t_max")):
-        with refused(name, f"wp.clone({name}"), wp.Tape():
+        with refused(name, "wp.Tape", hint=f"wp.clone({name}"), wp.Tape():
             query(*arguments)
     with wp.Tape() as tape:
         for rays in ((plain, down), (wp.clone(needed, requires_grad=False), down), (plain.numpy(), down.numpy())):
