@@ -17,6 +17,7 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.ray_query import kernel_argument
 from wrt.accel.queries.rays import vectors
+from wrt.accel.snapshot import Snapshot
 from wrt.accel.store import check_order, save
 from wrt.accel.structure import Structure, options_of
 from wrt.core.arrays import check_no_gradients, from_tensor
@@ -85,8 +86,8 @@ class OneMesh(Accelerator, ABC):
 
     def _over(self, geometry: Geometry, built: Built | None = None, built_cost: float = np.nan) -> Self:
         """Return a copy over another geometry, with the arrays of `built`. Queries of `self` still use the old geometry."""
-        other = copy(self)
-        other._snapshot = self._snapshot.over(geometry)
+        other, old = copy(self), self._snapshot
+        other._snapshot = Snapshot(old.structure, old.device, old.surfaces, old.attributes, geometry)
         if built is not None:
             other._install(built, build_clock(), built_cost)
         return other

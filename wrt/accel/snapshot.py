@@ -53,10 +53,6 @@ class Snapshot:
         assert self.built is not None
         return self.built
 
-    def over(self, geometry: Geometry | InstancedGeometry) -> Snapshot:
-        """Return a snapshot over another geometry, with nothing built yet."""
-        return Snapshot(self.structure, self.device, self.surfaces, self.attributes, geometry)
-
     def counting(self, data: WarpStruct) -> Snapshot:
         """Return the snapshot with `data` in place of its own data, for kernels that count."""
         units = self.structure.units._replace(counters=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import warp as wp
@@ -25,18 +24,14 @@ class Root(NamedTuple):
     sah_cost: float
 
 
-@dataclass(eq=False)
 class Fitting:
     """Scratch arrays on a device for fitting the boxes of a tree to its primitives. primitives, nodes: their numbers."""
 
-    device: Device
-    primitives: int
-    nodes: int
-
-    def __post_init__(self) -> None:
-        self.low, self.high = (wp.empty(self.primitives, dtype=wp.vec3, device=self.device) for _ in range(2))
-        self.arrived = wp.zeros(self.nodes, dtype=wp.int32, device=self.device)
-        self.summaries = wp.empty(self.nodes, dtype=kernels.SubtreeSummary, device=self.device)
+    def __init__(self, device: Device, primitives: int, nodes: int) -> None:
+        self.device, self.primitives, self.nodes = device, primitives, nodes
+        self.low, self.high = (wp.empty(primitives, dtype=wp.vec3, device=device) for _ in range(2))
+        self.arrived = wp.zeros(nodes, dtype=wp.int32, device=device)
+        self.summaries = wp.empty(nodes, dtype=kernels.SubtreeSummary, device=device)
 
     def find_bounds(self, shape: WarpStruct, threads: int = 1) -> None:
         """Compute the box of each primitive of a kernels.build.shape.Shape."""

@@ -139,8 +139,8 @@ class Accelerator:
         threads, rays, give = thread_count(threads), rays_of(origins, directions, t_min, t_max, True), to_tensor_like(origins, directions)
         if not (out is None or isinstance(out, Hits)):
             raise InputError(f"must be Hits, got {shown(out)}", argument="out")
-        given = None if out is None else [out.t, out.u, out.v, out.prim_id]
-        t, u, v, prim_id = arrays = answer_arrays(HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None,
+        callers = None if out is None else [out.t, out.u, out.v, out.prim_id]
+        t, u, v, prim_id = arrays = answer_arrays(HIT_TYPES, callers, len(rays.origins), self.device if rays.as_warp else None,
                                              give is not None)
         snapshot = self._snapshot  # read once, because a refit may replace it during the query
         worlds = check_world(snapshot, world, len(t))
@@ -186,8 +186,8 @@ class Accelerator:
             Names the argument and what was expected.
         """
         threads, rays, give = thread_count(threads), rays_of(origins, directions, t_min, t_max), to_tensor_like(origins, directions)
-        given = None if out is None else [out]
-        arrays = answer_arrays(ANY_HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None, give is not None)
+        callers, device = None if out is None else [out], self.device if rays.as_warp else None
+        arrays = answer_arrays(ANY_HIT_TYPES, callers, len(rays.origins), device, give is not None)
         snapshot = self._snapshot
         trace_query(snapshot, Query(rays, arrays, threads, check_world(snapshot, world, len(arrays[0]))))
         return arrays[0] if give is None else give(arrays[0])

@@ -52,20 +52,20 @@ def check_raw_launches() -> None:
 
 @made_once
 def _test_once() -> None:
-    memory, given = np.full(256, GUARD, np.int32), np.arange(256, dtype=np.float32)
+    memory, source = np.full(256, GUARD, np.int32), np.arange(256, dtype=np.float32)
     try:
         for what, passes in (("records of arrays", _has_records), ("arguments of launches", _has_arguments),
                              ("launches by kernels", _launches_itself)):
-            if not passes(memory, given):
+            if not passes(memory, source):
                 raise warp_private.refusal(what)
     except (AttributeError, TypeError) as error:
         raise warp_private.refusal(str(error)) from error
 
 
-def _has_records(memory: np.ndarray, given: np.ndarray) -> bool:
+def _has_records(memory: np.ndarray, source: np.ndarray) -> bool:
     """Return whether hand-made records of arrays equal the records that Warp makes. This runs before any launch."""
-    one_for_all = np.ndarray(given.shape, np.float32, given, strides=(0,))
-    for array in (given[8:], one_for_all):
+    constant = np.ndarray(source.shape, np.float32, source, strides=(0,))
+    for array in (source[8:], constant):
         same = wp.array(ptr=array.ctypes.data, dtype=wp.float32, shape=array.shape, strides=array.strides, device="cpu")
         if bytes(warp_private.array_record(array)) != bytes(warp_private.record_of(same)):
             return False
@@ -74,39 +74,39 @@ def _has_records(memory: np.ndarray, given: np.ndarray) -> bool:
     return bytes(warp_private.struct_record(Canary, [memory])) == bytes(warp_private.record_of(canary))
 
 
-def _has_arguments(memory: np.ndarray, given: np.ndarray) -> bool:
+def _has_arguments(memory: np.ndarray, source: np.ndarray) -> bool:
     """Return whether a launch receives hand-made arguments and the size that set_dim sets."""
     first, end = 3, 11
-    command = _command(memory, given, Launch())
+    command = _command(memory, source, Launch())
     command.set_param_at_index_from_ctype(3, first)
     command.set_param_at_index_from_ctype(4, end)
     command.set_dim((end - first) // PER_THREAD)
     command.launch()
-    return _wrote(memory, given, first, end)
+    return _wrote(memory, source, first, end)
 
 
-def _launches_itself(memory: np.ndarray, given: np.ndarray) -> bool:
+def _launches_itself(memory: np.ndarray, source: np.ndarray) -> bool:
     """Return whether a kernel that launches another kernel passes the range on: as two arguments, and as the size of the launch."""
     first, end = 20, 42
     launches = Launches()
-    command = _command(memory, given, launches.of(_command(memory, given, Launch()), PER_THREAD))
+    command = _command(memory, source, launches.of(_command(memory, source, Launch()), PER_THREAD))
     command.set_param_at_index_from_ctype(3, first)
     command.set_param_at_index_from_ctype(4, end)
     command.launch()
-    return _wrote(memory, given, first, end)
+    return _wrote(memory, source, first, end)
 
 
-def _command(memory: np.ndarray, given: np.ndarray, launch: WarpStruct) -> wp.Launch:
+def _command(memory: np.ndarray, source: np.ndarray, launch: WarpStruct) -> wp.Launch:
     """Record a launch of `probe` with one thread and hand-made records of the inner words of both arrays."""
     command = wp.launch(probe, dim=1, inputs=[Canary(), None, launch, 0, 0], device="cpu", record_cmd=True, record_tape=False)
     command.set_param_at_index_from_ctype(0, warp_private.struct_record(Canary, [memory[GUARDS:-GUARDS]]))
-    command.set_param_at_index_from_ctype(1, warp_private.array_record(given[GUARDS:-GUARDS]))
+    command.set_param_at_index_from_ctype(1, warp_private.array_record(source[GUARDS:-GUARDS]))
     return command
 
 
-def _wrote(memory: np.ndarray, given: np.ndarray, first: int, end: int) -> bool:
+def _wrote(memory: np.ndarray, source: np.ndarray, first: int, end: int) -> bool:
     """Return whether the kernel wrote the words [first, end) and no others; reset the memory."""
     expected = np.full_like(memory, GUARD)
-    expected[GUARDS + first : GUARDS + end] = given[GUARDS + first : GUARDS + end] + end
+    expected[GUARDS + first : GUARDS + end] = source[GUARDS + first : GUARDS + end] + end
     written, memory[:] = memory.copy(), GUARD
     return np.array_equal(written, expected)

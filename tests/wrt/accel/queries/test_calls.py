@@ -143,7 +143,7 @@ def test_answers_go_where_the_caller_says(ball: Accelerator, n: int, as_warp: bo
 @pytest.mark.parametrize(("field", "array", "message"), [
     ("t", np.zeros(4, np.float32), ("out.t", "NumPy array (3,)")),
     ("t", np.zeros(3), ("out.t", "float32")),
-    ("u", np.zeros((3, 1), np.float32), ("out.u", "(3,)")), ("v", np.zeros(6, np.float32)[::2], ("out.v", "gaps")),
+    ("u", np.zeros((3, 1), np.float32), ("out.u", "(3,)")), ("v", np.zeros(6, np.float32)[::2], ("out.v", "contiguous")),
     ("v", frozen(np.zeros(3, np.float32)), ("out.v", "writeable")), ("prim_id", np.zeros(3, np.int64), ("out.prim_id", "int32")),
     ("prim_id", [0, 0, 0], ("out.prim_id", "NumPy array")), ("t", None, ("out.t", "NumPy array")),
     ("t", "warp", ("out.t", "NumPy array (3,)")),
