@@ -16,13 +16,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.geometry import Geometry
 from wrt.accel.queries.all_hits import all_hits
 from wrt.accel.structure import Structure
 from wrt.core.device import load_kernel, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
-from wrt.core.types import Device, JsonObject, Kernel
+from wrt.core.types import JsonObject, Kernel
 from wrt.kernels.shade.surface import make_surface_at
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.study.respawn import Respawn, make_respawn_kernel
@@ -215,16 +214,6 @@ def _is_refused(case: HardCase, algorithm: Algorithm) -> bool:
     return True
 
 
-def _surfaces(geometry: Geometry, device: Device) -> Surfaces:
-    surfaces = Surfaces()
-    surfaces.n_triangles = len(geometry.faces)
-    surfaces.vertices = upload(geometry.vertices, wp.vec3, device)
-    surfaces.faces = upload(geometry.faces, wp.vec3i, device)
-    surfaces.spheres = upload(geometry.spheres, wp.vec4, device)
-    surfaces.prim_material = wp.zeros(len(geometry), dtype=wp.int32, device=device)
-    return surfaces
-
-
 @cache
 def _respawn_kernel(structure: Structure) -> Kernel:
     surface_at = make_surface_at(structure.units.spheres, False, False, False)
@@ -241,7 +230,11 @@ def respawn(algorithm: Own, case: HardCase) -> tuple[np.ndarray, np.ndarray]:
     out.direction = upload(case.next_directions, wp.vec3, accel.device)
     out.exclude = 1
     out.first_prim_id, out.next_prim_id = (wp.empty(n, dtype=wp.int32, device=accel.device) for _ in range(2))
-    surfaces = _surfaces(case.geometry, accel.device)
+    surfaces, geometry = Surfaces(), case.geometry
+    surfaces.n_triangles = len(geometry.faces)
+    surfaces.vertices, surfaces.faces = upload(geometry.vertices, wp.vec3, accel.device), upload(geometry.faces, wp.vec3i, accel.device)
+    surfaces.spheres = upload(geometry.spheres, wp.vec4, accel.device)
+    surfaces.prim_material = wp.zeros(len(geometry), dtype=wp.int32, device=accel.device)
     wp.launch(kernel, dim=n, inputs=[accel.data, surfaces, case.on(accel.device), out, 0], device=accel.device)
     return out.first_prim_id.numpy(), out.next_prim_id.numpy()
 

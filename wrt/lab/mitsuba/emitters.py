@@ -11,7 +11,7 @@ import numpy as np
 
 from wrt.core.errors import InputError
 from wrt.lab.mitsuba.bsdfs import Plugin, refuse, rgb
-from wrt.scene.backgrounds import Background, ConstantBackground, EnvironmentBackground, GradientBackground
+from wrt.scene.backgrounds import Background, EnvironmentBackground, GradientBackground
 from wrt.scene.lights import Light, SpotLight
 
 # Rows of a gradient's picture: linear interpolation of a cosine over steps of pi / 1024 has an error of at most 1.2e-6.
@@ -67,10 +67,6 @@ def background_emitter(mi: ModuleType, background: Background) -> Plugin | None:
     return BACKGROUNDS[background.kind](mi, background)
 
 
-def _constant(mi: ModuleType, background: ConstantBackground) -> Plugin | None:
-    return {"type": "constant", "radiance": rgb(background.color)} if max(background.color) > 0.0 else None
-
-
 def _gradient(mi: ModuleType, background: GradientBackground) -> Plugin:
     height = np.cos(np.linspace(0.0, math.pi, GRADIENT_ROWS))[:, None]
     share = 0.5 * (height + 1.0)
@@ -95,5 +91,5 @@ def _environment(mi: ModuleType, background: EnvironmentBackground) -> Plugin:
 
 
 BACKGROUNDS: dict[str, Callable[[Any, Any], Plugin | None]] = {
-    "constant": _constant, "gradient": _gradient, "environment": _environment,
-}
+    "constant": lambda mi, sky: {"type": "constant", "radiance": rgb(sky.color)} if max(sky.color) > 0.0 else None,
+    "gradient": _gradient, "environment": _environment}

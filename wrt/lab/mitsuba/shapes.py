@@ -40,7 +40,8 @@ def object_parts(mi: ModuleType, thing: Object, object_id: int) -> Iterator[tupl
     for index in np.unique(of_face).tolist():
         material = thing.materials[index]
         chosen = np.flatnonzero(of_face == index)
-        triangles = _select(world, chosen)
+        used, faces = np.unique(world.faces[chosen], return_inverse=True)
+        triangles = world if len(chosen) == len(world.faces) else world.of(used, faces)
         if material.textures and triangles.uvs is None:
             triangles = triangles._replace(uvs=np.zeros((len(triangles.vertices), 2), np.float32))
         name = f"object{object_id}_{index}"
@@ -90,14 +91,6 @@ def _to_world(thing: Object) -> Triangles:
     assert corners.normals is not None
     own = np.repeat(_face_normals(corners), 3, axis=0)
     return corners._replace(normals=np.where(np.any(corners.normals, axis=1, keepdims=True), corners.normals, own))
-
-
-def _select(triangles: Triangles, chosen: np.ndarray) -> Triangles:
-    """Return the chosen faces, and only the vertices that these faces use."""
-    if len(chosen) == len(triangles.faces):
-        return triangles
-    used, faces = np.unique(triangles.faces[chosen], return_inverse=True)
-    return triangles.of(used, faces)
 
 
 def _face_normals(triangles: Triangles) -> np.ndarray:

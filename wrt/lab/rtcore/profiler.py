@@ -261,7 +261,10 @@ class Profiler:
     def _gather(self, tiles: list[_Tile]) -> Rays:
         rays = np.concatenate([tile.rays for tile in tiles])
         counts = np.concatenate([tile.counts for tile in tiles])
-        pixel = np.concatenate([np.repeat(self._pixels(tile.rectangle), tile.used) for tile in tiles])
+        x0, y0, x1, y1 = self.plan.crop
+        index = np.arange((y1 - y0) * (x1 - x0)).reshape(y1 - y0, x1 - x0)
+        pixel = np.concatenate([np.repeat(index[y - y0:y - y0 + height, x - x0:x - x0 + width].ravel(), tile.used)
+                                for tile in tiles for x, y, width, height in [tile.rectangle]])
         label = rays["label"]
         path = np.maximum.accumulate(np.where(label > 0, np.arange(len(rays)), 0))  # for a shadow ray, the last path ray before it
         shadow = KINDS.index("shadow")
@@ -273,10 +276,3 @@ class Profiler:
         fetches = np.concatenate(trace) if trace else np.zeros(0, np.int64)
         return Rays(rays, counts, pixel, kind, depth, np.concatenate([tile.lines for tile in tiles]), np.flatnonzero(kept),
                     np.concatenate([[0], np.cumsum(length)]), fetches // int(SIZE_RANGE), fetches % int(SIZE_RANGE))
-
-    def _pixels(self, rectangle: Rectangle) -> np.ndarray:
-        """Return the indices of a tile's pixels within the crop, row by row."""
-        x0, y0, x1, _ = self.plan.crop
-        x, y, width, height = rectangle
-        column, row = np.meshgrid(np.arange(x - x0, x - x0 + width), np.arange(y - y0, y - y0 + height))
-        return (row * (x1 - x0) + column).ravel().astype(np.int64)
