@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 Decorator: TypeAlias = Callable[[Callable[..., None]], Callable[..., None]]
 Parsed: TypeAlias = Any  # The value of an option, which click has converted to the option's type.
 Assignments: TypeAlias = tuple[tuple[str, bool | int | float | str], ...]  # The names and values of all --set options.
-DIGITS = "[0-9]{1,9}"  # A pixel coordinate; Python raises an error for thousands of digits.
+DIGITS = "[0-9]{1,9}"  # A pixel coordinate. Longer numbers are an error, as Python refuses thousands of digits.
 HINT_SHARE = 0.003  # Smallest share of dark pixels for a hint: 26x26 pixels of 640x360. Fewer look like noise.
 
 
@@ -124,12 +124,6 @@ class Setting(click.ParamType):
         return name, parsed if isinstance(parsed, bool | int | float | str) and name != "size" else text  # "0x360" is a size
 
 
-SET = click.option(
-    "--set", "assignments", type=Setting(), multiple=True,
-    help="Change a setting of the scene, such as glass_shadows=tinted; repeatable. The settings are size, spp, max_depth,"
-         " min_throughput, filter, fresnel, glass_shadows, sampler, exposure and tonemap (docs/scene_format.md)")
-
-
 # Options and arguments that several commands share, by the name of the command function's parameter.
 SHARED = {
     "scene": click.argument("scene", type=click.Path(path_type=Path)),
@@ -138,7 +132,10 @@ SHARED = {
     "max_depth": click.option("--max-depth", type=int, help="Bounces after the first hit  [default: the scene's, or 8; 64 with glass]"),
     "crop": click.option("--crop", type=CROP, help="Render only this rectangle, in pixels from the top left"),
     "camera": click.option("--camera", help="Name or index of a camera in the scene  [default: the first]"),
-    "assignments": SET,
+    "assignments": click.option(
+        "--set", "assignments", type=Setting(), multiple=True,
+        help="Change a setting of the scene, such as glass_shadows=tinted; repeatable. The settings are size, spp, max_depth,"
+             " min_throughput, filter, fresnel, glass_shadows, sampler, exposure and tonemap (docs/scene_format.md)"),
     "seed": click.option("--seed", type=int, default=0, show_default=True, help="Seed of the samples: another seed gives other noise"),
     "device": click.option("--device", default="cpu", show_default=True, help="cpu, cuda:0 ... (`devices` lists them)"),
     "threads": click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]"),

@@ -52,7 +52,7 @@ class DeviceFilm:
         self._read: dict[int, np.ndarray] | None = None  # in a snapshot: host copies of arrays, by device address
 
     def snapshot(self) -> DeviceFilm:
-        """Return the film for reading, which copies each array from a GPU only once, at its first use."""
+        """Return a copy of this object for reading. It copies each array from a GPU only once, at the first use."""
         out = copy(self)
         out._read = {}
         return out
@@ -65,11 +65,6 @@ class DeviceFilm:
     def put(self, array: WarpArray, values: np.ndarray) -> None:
         """Write values, (H, W) or (H, W, 3), to a device array."""
         array.assign(values.reshape(array.shape[0], *values.shape[2:]))
-
-    @property
-    def rays(self) -> int:
-        """Number of rays traced so far."""
-        return int(self.groups[0].rays.numpy().sum())
 
     def view(self, array: WarpArray) -> np.ndarray:
         """Return a device array with one entry for each pixel as (H, W) or (H, W, 3). On the CPU, this makes no copy."""
@@ -86,7 +81,7 @@ class DeviceFilm:
 
     def count(self, name: str) -> int:
         """Return the sum over all pixels of an array of counts in SHARED, such as "rays"."""
-        return int(self.picture(getattr(self.groups[0], name)).sum(dtype=np.int64))
+        return int(self.view(getattr(self.groups[0], name)).sum(dtype=np.int64))
 
     def lost_throughput(self) -> float:
         """Return the throughput of all rays that were cut, summed over all samples."""

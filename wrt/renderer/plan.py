@@ -26,7 +26,7 @@ from wrt.scene.cameras import CameraKind
 from wrt.scene.model import Scene
 from wrt.scene.settings import SettingChanges, Settings
 
-AIMED = ("size", "spp", "max_depth", "min_throughput", "exposure", "tonemap")  # settings that do not change the kernels
+AIMED = ("size", "spp", "max_depth", "min_throughput", "exposure", "tonemap")  # settings that the kernels do not depend on
 
 
 @made_once

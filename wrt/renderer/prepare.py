@@ -27,10 +27,10 @@ from wrt.renderer.waves import CAPACITY, SceneRecords, Waves
 from wrt.scene.cameras import CameraKind
 from wrt.scene.settings import SettingChanges
 
-TILE_SIZE = 32  # smallest side on the CPU
-TILES_EACH = 8  # smallest number of tiles for each thread
-PREPARING = "wrt prepares"  # name of the threads that compile and build
-PREPARING_REPORTED = 1.0  # seconds of compiling and building after which `progress` is called
+TILE_SIZE = 32  # Smallest side of a tile on the CPU, in pixels.
+TILES_EACH = 8  # Tiles of a pass for each thread, or more.
+PREPARING = "wrt prepares"  # Name of the threads that compile and build.
+PREPARING_REPORTED = 1.0  # Seconds of compiling and building after which `progress` is called.
 
 
 @dataclass(frozen=True, eq=False)

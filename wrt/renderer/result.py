@@ -11,7 +11,6 @@ from wrt.core.version import VERSION
 from wrt.picture.film import Film
 from wrt.renderer.film_arrays import DeviceFilm
 from wrt.renderer.plan import Plan
-from wrt.scene.model import Scene
 
 Facts = dict[str, Any]  # entries of a film's stats
 
@@ -22,12 +21,14 @@ def film_of(plan: Plan, arrays: DeviceFilm, seed: int, aov: dict[str, np.ndarray
     options, settings, samples = plan.options, plan.scene.settings, arrays.samples()
     total = max(int(samples.sum()), 1)
     rays = arrays.count("rays")
+    ior = max((m.ior for m in plan.scene.materials if m.kind == "glass" or m.transmission > 0.0), default=1.0)
+    most_by_throughput = settings.min_throughput * ior**2  # inside glass, radiance is larger by ior^2
     stats: dict[str, Any] = {
         "seconds": seconds, "rays": rays, "rays_per_sample": rays / total,
         "rays_per_second": rays / seconds["trace"] if seconds["trace"] > 0.0 else 0.0,
         "cut_by_depth": arrays.count("cut_depth"), "cut_by_throughput": arrays.count("cut_throughput"),
         "lost_throughput_per_sample": arrays.lost_throughput() / total,
-        "visibly_cut": arrays.visibly_cut(_most_cut_by_throughput(plan.scene)) if plan.features.reflection else 0.0,
+        "visibly_cut": arrays.visibly_cut(most_by_throughput) if plan.features.reflection else 0.0,
         "not_finite": arrays.count("not_finite"), "samples": int(samples.sum()), **facts,
     }
     if options.target_error is not None:
@@ -51,9 +52,3 @@ def bare_film(plan: Plan, arrays: DeviceFilm) -> Film:
 def plain_text(name: str) -> str:
     """Return a name that UTF-8 can encode: lone surrogates, which glTF files and file names may contain, become "?"."""
     return name.encode("utf-8", "replace").decode()
-
-
-def _most_cut_by_throughput(scene: Scene) -> float:
-    """Return an upper bound of the throughput of a ray that min_throughput cuts. Inside glass, radiance is larger by ior^2."""
-    glass = [m.ior for m in scene.materials if m.kind == "glass" or m.transmission > 0.0]
-    return scene.settings.min_throughput * max(glass, default=1.0) ** 2

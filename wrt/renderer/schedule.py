@@ -284,5 +284,5 @@ class Run:
         note = "" if self.checkpoint is None else self.checkpoint.problem
         if silent > SILENT and not note:
             note = f"a worker has not answered for {silent:.0f} s"
-        plan.options.progress(Progress(done * plan.groups, total, self.arrays.rays, self._elapsed(), note=note,
+        plan.options.progress(Progress(done * plan.groups, total, self.arrays.count("rays"), self._elapsed(), note=note,
                                        picture=lambda: bare_film(plan, self.arrays.snapshot())))

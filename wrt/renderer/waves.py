@@ -30,7 +30,7 @@ from wrt.kernels.wide.batch import BatchTraversal
 from wrt.renderer.film_arrays import AovFilm, DeviceFilm
 from wrt.renderer.tiles import Work
 
-# Largest number of samples in a wave. With 4,096 to 32,768 samples, a render is 0.92 to 1.06 times as fast, depending on the scene.
+# Largest number of samples in a wave. With 4,096 to 32,768, renders are 0.92 to 1.06 times as fast as with 16,384, depending on the scene.
 CAPACITY = 16384
 MAX_SLOTS = 1 << 18  # Largest number of stack entries, and of shadow rays, of all samples of a wave together.
 ALL = 1 << 30  # Block size of a kernel whose only thread traces all rays.

@@ -22,7 +22,7 @@ PORTS = {"http": 80, "https": 443}  # default ports, which browsers leave out of
 
 
 class Refused(Exception):
-    """A refused request or message. kind: of the refusal, reported once; message: for the user who started the viewer."""
+    """A refused request or message. kind: kind of refusal, which is reported once; message: for the user who started the viewer."""
 
     def __init__(self, kind: str, message: str) -> None:
         super().__init__(message)

@@ -185,7 +185,7 @@ class Guard:
         return answer
 
     def _checking_version(self, handler: Handler) -> Handler:
-        """Return viser's handler, for browsers whose page has viser's version alone; viser reports other versions on stdout."""
+        """Return viser's handler for browsers with this version of viser; viser would report other versions on stdout."""
         import viser
 
         async def check(connection: ServerConnection) -> None:

@@ -205,7 +205,7 @@ def test_resume_without_a_checkpoint_says_that_it_begins() -> None:
     (["--checkpoint-file", "box.obj"], "box.obj: exists already; resume it (--resume"),
     (["--checkpoint-file", "box.obj", "--resume"], "box.obj: is no checkpoint of this version"),
 ])
-def test_what_is_refused_before_the_work(arguments: list[str], message: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_checkpoint_options_are_refused_early(arguments: list[str], message: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("wrt.renderer.renderer.prepare", lambda *_: pytest.fail("the work began"))
     result = run("render", "box.obj", *SMALL, "-o", "a.png", *arguments)
     assert result.code == 2 and message in result.err and result.out == "" and new_files() == set()
@@ -230,7 +230,7 @@ def full(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("full")
-def test_a_picture_that_cannot_be_written_is_kept_elsewhere() -> None:
+def test_a_picture_that_cannot_be_written_goes_to_another_folder() -> None:
     result = run("render", "box.obj", *SMALL, "-o", "a.exr", "--aov", "depth", "--checkpoint", "60s")
     place = Path(result.out.strip())
     assert result.code == 2 and place.parent.parent == Path("tmp").resolve() and place.name == "a.exr"
@@ -241,7 +241,7 @@ def test_a_picture_that_cannot_be_written_is_kept_elsewhere() -> None:
 
 
 @pytest.mark.parametrize("place", ["nowhere", "tmp"])
-def test_where_no_place_takes_it_the_first_error_is_reported(place: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_if_both_folders_fail_the_first_error_is_reported(place: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(self: film.Film, path: Any, **options: Any) -> list[Path]:
         raise InputError("cannot be written: No space left on device", path=path)
 
@@ -252,7 +252,7 @@ def test_where_no_place_takes_it_the_first_error_is_reported(place: str, monkeyp
     assert new_files() == set() and not list(Path("tmp").iterdir())
 
 
-def test_a_folder_in_the_place_of_the_checkpoint_costs_only_the_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_at_the_checkpoints_path_prevents_only_the_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
     save = Checkpoint.save
 
     def taken(self: Checkpoint, *arguments: Any) -> None:

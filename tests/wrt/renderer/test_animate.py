@@ -69,7 +69,7 @@ def test_a_turntable_keeps_its_structure_and_ends_where_it_began() -> None:
     assert not np.array_equal(films[1].pixels, films[2].pixels)
 
 
-def test_the_camera_goes_round_what_it_looks_at() -> None:
+def test_the_camera_orbits_the_point_it_looks_at() -> None:
     for degrees in (30.0, 90.0, 180.0, 360.0):
         camera = orbited(CAMERA, np.zeros(3), degrees)
         pose = camera.camera_to_world
@@ -80,7 +80,7 @@ def test_the_camera_goes_round_what_it_looks_at() -> None:
     np.testing.assert_allclose(orbited(away, np.zeros(3), 90.0).camera_to_world[:3, 3], (0.0, 0.0, 6.0), atol=1e-12)
 
 
-def test_what_cannot_be_animated_is_refused(tmp_path: Path) -> None:
+def test_wrong_animations_are_refused(tmp_path: Path) -> None:
     with refused(what="nothing moves"):
         list(animate(scene_of(None), Animation(2, 0.0), Options()))
     for wrong in ({"frames": 0}, {"degrees": np.inf}, {"rebuild_at": 0.5}):
@@ -126,7 +126,7 @@ def test_the_command_writes_frames_and_movies(tmp_path: Path) -> None:
     assert refused.code == 2 and "fps" in refused.err and not (tmp_path / "x.gif").exists()
 
 
-def test_a_still_floor_is_not_told_to_move(tmp_path: Path) -> None:
+def test_one_frame_of_a_still_scene_is_allowed(tmp_path: Path) -> None:
     """A single frame needs no motion."""
     floor = Scene((Object(quad(), (GREY,)),), cameras=(CAMERA,), settings=Settings(size=(8, 8), spp=1))
     assert len(list(animate(floor, Animation(1, 0.0), Options()))) == 1

@@ -86,8 +86,8 @@ def files(path: Path) -> list[str]:
     ({"tile_size": 3, "threads": 1}, {"pass_size": 24}),
     ({"pass_size": 1}, {"tile_size": 1}),
 ], ids=str)
-def test_a_resumed_render_is_that_of_one_go(first: dict[str, Any], then: dict[str, Any], path: Path, whole: Film,
-                                            monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_resumed_render_equals_an_uninterrupted_one(first: dict[str, Any], then: dict[str, Any], path: Path, whole: Film,
+                                                      monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(LocalTracer, "trace", slowly(LocalTracer.trace))
     part = render(SCENE, checkpoint=path, progress=stop_at(0.3), aov="depth", **first)
     assert part.stats["interrupted"] and part.stats["checkpoint"] == str(path) and part.stats["resumed"] is None
@@ -139,7 +139,7 @@ def test_many_resumes_with_a_target_error(path: Path, monkeypatch: pytest.Monkey
     assert same(finer, render(SCENE, target_error=0.006)) and finer.stats["samples"] > film.stats["samples"]
 
 
-def test_more_samples_go_on_from_a_finished_render(path: Path, whole: Film) -> None:
+def test_a_finished_render_can_resume_with_more_samples(path: Path, whole: Film) -> None:
     render(SCENE, spp=10, checkpoint=path)
     assert same(render(SCENE, checkpoint=path, resume=True, aov="depth"), whole)
     again = render(SCENE, checkpoint=path, resume=True, aov="depth")
@@ -164,7 +164,7 @@ def test_a_crop_and_groups(path: Path) -> None:
     assert same(render(SCENE, checkpoint=path, resume=True, **options), render(SCENE, **options))
 
 
-def test_ctrl_c_before_anything_keeps_what_was_there(path: Path, whole: Film, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_before_the_first_new_sample_keeps_the_checkpoint(path: Path, whole: Film, monkeypatch: pytest.MonkeyPatch) -> None:
     render(SCENE, spp=10, checkpoint=path)
     with monkeypatch.context() as patch:
         patch.setattr(Run, "_trace_aovs", lambda self: signal.raise_signal(signal.SIGINT))
@@ -173,17 +173,17 @@ def test_ctrl_c_before_anything_keeps_what_was_there(path: Path, whole: Film, mo
     assert same(render(SCENE, checkpoint=path, resume=True, aov="depth"), whole)
 
 
-def test_resume_begins_anew_where_there_is_nothing(path: Path, whole: Film) -> None:
+def test_resume_without_a_checkpoint_starts_from_the_beginning(path: Path, whole: Film) -> None:
     film = render(SCENE, checkpoint=path, resume=True, aov="depth")
     assert same(film, whole) and film.stats["resumed"] is None
 
 
-def test_progress_counts_what_was_done_before(path: Path) -> None:
+def test_progress_includes_the_work_before_a_resume(path: Path) -> None:
     render(SCENE, spp=12, checkpoint=path)
-    told: list[Progress] = []
-    film = render(SCENE, checkpoint=path, resume=True, progress=told.append)
-    assert told[0].done >= film.stats["samples"] // 2 and told[-1].done == told[-1].total == film.stats["samples"]
-    assert told[0].seconds >= film.stats["resumed"]["seconds"] and told[-1].rays == film.stats["rays"]
+    reported: list[Progress] = []
+    film = render(SCENE, checkpoint=path, resume=True, progress=reported.append)
+    assert reported[0].done >= film.stats["samples"] // 2 and reported[-1].done == reported[-1].total == film.stats["samples"]
+    assert reported[0].seconds >= film.stats["resumed"]["seconds"] and reported[-1].rays == film.stats["rays"]
 
 
 # --- what is refused --------------------------------------------------------------------------------------------------
@@ -198,7 +198,7 @@ def refuses(what: str, path: Path, **options: Any) -> None:
     assert files(path) == there and (path.read_bytes() if path.is_file() else None) == before
 
 
-def test_a_file_that_is_there_is_never_overwritten(path: Path) -> None:
+def test_an_existing_file_is_never_overwritten(path: Path) -> None:
     path.write_bytes(b"a diary")
     refuses("exists already", path)
     refuses("is no checkpoint", path, resume=True)
@@ -310,9 +310,9 @@ def test_a_checkpoint_is_of_one_seed(path: Path) -> None:
 # --- the disk ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_disk_that_fills_up_costs_neither_the_render_nor_the_last_checkpoint(path: Path, whole: Film,
-                                                                              monkeypatch: pytest.MonkeyPatch) -> None:
-    told: list[Progress] = []
+def test_a_full_disk_spoils_neither_the_render_nor_the_last_checkpoint(path: Path, whole: Film,
+                                                                      monkeypatch: pytest.MonkeyPatch) -> None:
+    reported: list[Progress] = []
     failures = iter([False, True, True, True])
 
     def sometimes(descriptor: int) -> None:
@@ -321,10 +321,10 @@ def test_a_disk_that_fills_up_costs_neither_the_render_nor_the_last_checkpoint(p
 
     monkeypatch.setattr(os, "fsync", sometimes)
     monkeypatch.setattr(LocalTracer, "trace", slowly(LocalTracer.trace))
-    film = render(SCENE, checkpoint=path, checkpoint_every=1e-9, aov="depth", progress=told.append)
-    notes = {progress.note for progress in told}
+    film = render(SCENE, checkpoint=path, checkpoint_every=1e-9, aov="depth", progress=reported.append)
+    notes = {progress.note for progress in reported}
     assert same(film, whole) and notes == {"", f"the checkpoint is not saved: {path}: cannot be written: No space left on device"}
-    assert told[-1].note == "" and film.stats["checkpoint"] == str(path) and files(path) == [path.name]
+    assert reported[-1].note == "" and film.stats["checkpoint"] == str(path) and files(path) == [path.name]
 
     failures = iter([True] * 10000)
     saved = path.read_bytes()
@@ -334,7 +334,7 @@ def test_a_disk_that_fills_up_costs_neither_the_render_nor_the_last_checkpoint(p
     assert path.read_bytes() == saved and files(path) == [path.name]
 
 
-def test_a_folder_that_is_taken_away_costs_nothing_but_the_checkpoint(tmp_path: Path, whole: Film) -> None:
+def test_a_removed_folder_prevents_only_the_checkpoint(tmp_path: Path, whole: Film) -> None:
     folder = tmp_path / "folder"
     folder.mkdir()
 
@@ -346,7 +346,7 @@ def test_a_folder_that_is_taken_away_costs_nothing_but_the_checkpoint(tmp_path: 
     assert same(film, whole) and film.stats["checkpoint"] is None and not folder.exists()
 
 
-def test_two_renders_of_one_checkpoint_leave_it_whole(path: Path, whole: Film) -> None:
+def test_two_renders_with_one_checkpoint_leave_it_complete(path: Path, whole: Film) -> None:
     """Each render replaces the other's checkpoint, and can resume from it."""
     inner: list[Film] = []
 
@@ -368,7 +368,7 @@ def test_a_checkpoint_that_appears_while_kernels_are_compiled_is_not_overwritten
     assert path.read_bytes() == b"of another render" and files(path) == [path.name]
 
 
-def test_when_the_next_is_due(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_when_a_checkpoint_is_due(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now = 100.0
     monkeypatch.setattr(module.time, "monotonic", lambda: now)
     film, file = checkpoint_of(path, 1)
@@ -386,7 +386,7 @@ def test_when_the_next_is_due(path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     ("m2", 0x7FA00000, 1, True), ("m2", 0x7F800000, 1, True), ("mean", 0x7F7FFFFF, 4, True), ("mean", 0x7FA00000, 1, False),
     ("mean", 0xFF800000, 4, False),
 ], ids=["m2 no number", "m2 infinite", "mean huge", "mean no number", "mean infinite"])
-def test_a_film_by_a_stranger_is_read_without_a_word_or_refused(name: str, bits: int, groups: int, sound: bool, path: Path) -> None:
+def test_arbitrary_bits_in_a_film_are_read_or_refused(name: str, bits: int, groups: int, sound: bool, path: Path) -> None:
     """The checksum is valid, but one number in the file has arbitrary bits."""
     film, file = checkpoint_of(path, groups)
     rng = np.random.default_rng(0)

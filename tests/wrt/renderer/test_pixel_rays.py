@@ -12,7 +12,7 @@ from wrt.scene.cameras import CAMERAS, CameraKind
 from wrt.scene.shapes import box
 
 
-def test_they_hit_what_the_picture_shows() -> None:
+def test_camera_rays_hit_what_the_picture_shows() -> None:
     mesh = box()
     camera = wrt.Camera.look_at((1.5, 2.0, 2.5), (0.1, 0.0, 0.0), aperture_radius=0.2)  # a lens; the rays go through its centre
     scene = wrt.Scene(objects=(wrt.Object(mesh, (wrt.Material(),)),), cameras=(camera,))
@@ -61,7 +61,7 @@ def test_the_corners_are_where_the_angle_of_view_ends() -> None:
     np.testing.assert_allclose(directions, expected, atol=1e-7)
 
 
-@pytest.mark.parametrize(("camera", "size", "told"), [(None, (4, 4), ("camera", "amera")), (SCENE.cameras[0], (0, 4), ("size",))])
-def test_mistakes_are_named(camera: wrt.Camera, size: tuple[int, int], told: Refusal) -> None:
-    with refused(*told):
+@pytest.mark.parametrize(("camera", "size", "reported"), [(None, (4, 4), ("camera", "amera")), (SCENE.cameras[0], (0, 4), ("size",))])
+def test_mistakes_are_named(camera: wrt.Camera, size: tuple[int, int], reported: Refusal) -> None:
+    with refused(*reported):
         wrt.camera_rays(camera, size)

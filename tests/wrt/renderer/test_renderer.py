@@ -109,7 +109,7 @@ def test_the_seed_changes_the_noise_and_nothing_else(reference: Film) -> None:
         assert np.median(z) < 1.0  # 0.67 for a normal distribution, less for these stratified samples
 
 
-def test_more_samples_go_on_where_fewer_ended() -> None:
+def test_a_long_render_begins_with_the_samples_of_a_short_one() -> None:
     """The first samples of a long render are those of a short one: sample 3 is (4 mean_4 - 3 mean_3), in its range."""
     three, four = (render(SCENE, spp=spp).pixels.astype(np.float64) for spp in (3, 4))
     last = 4.0 * four - 3.0 * three
@@ -167,7 +167,7 @@ def test_aovs_are_what_the_pixels_see() -> None:
     assert np.allclose(film.aov["albedo"][inside], (0.1, 0.5, 0.9), atol=1e-6) and not film.aov["albedo"][~inside].any()
 
 
-def test_only_the_aovs_that_were_asked_for_come_back() -> None:
+def test_only_requested_aovs_are_returned() -> None:
     film = render(SCENE, spp=1, aov=["normal", "depth"])
     assert film.aov.keys() == {"normal", "depth"}
     assert film.aov["normal"].dtype == film.aov["depth"].dtype == np.float32
@@ -181,7 +181,7 @@ def test_a_sample_that_is_not_finite_is_black_and_counted() -> None:
     assert film.stats["not_finite"] > 0 and np.isfinite(film.pixels).all() and (film.samples == 4).all()
 
 
-def test_cameras_by_name_number_and_themselves() -> None:
+def test_cameras_by_name_index_and_object() -> None:
     first, second = (render(SCENE, spp=1, camera=camera) for camera in ("first", "second"))
     assert not np.array_equal(first.pixels, second.pixels)
     assert second.metadata["camera"] == "second"
@@ -266,12 +266,12 @@ def test_a_time_limit_leaves_a_whole_picture() -> None:
 
 
 def test_progress_goes_from_nothing_to_all() -> None:
-    told: list[Progress] = []
-    film = render(SCENE, spp=9, progress=told.append)
-    done = [progress.done for progress in told]
-    assert done == sorted(done) and told[-1].done == told[-1].total == film.stats["samples"]
-    assert told[-1].rays == film.stats["rays"]
-    assert all(progress.seconds >= 0.0 and progress.total == told[0].total for progress in told)
+    reported: list[Progress] = []
+    film = render(SCENE, spp=9, progress=reported.append)
+    done = [progress.done for progress in reported]
+    assert done == sorted(done) and reported[-1].done == reported[-1].total == film.stats["samples"]
+    assert reported[-1].rays == film.stats["rays"]
+    assert all(progress.seconds >= 0.0 and progress.total == reported[0].total for progress in reported)
     assert Progress(50, 200, 10, 2.0).seconds_left == 6.0 and Progress(0, 200, 0, 0.0).seconds_left == float("inf")
 
 
@@ -290,7 +290,7 @@ def stop(progress: Progress) -> None:
 
 @pytest.mark.parametrize("progress", [interrupt, stop])
 @pytest.mark.parametrize("pass_size", [None, 3])
-def test_ctrl_c_keeps_what_there_is(progress: Callable[[Progress], None], pass_size: int | None) -> None:
+def test_ctrl_c_returns_the_samples_so_far(progress: Callable[[Progress], None], pass_size: int | None) -> None:
     film = render(SCENE, spp=1000, size=(200, 150), tile_size=8, progress=progress, pass_size=pass_size, aov=["depth"])
     assert film.stats["interrupted"] and not film.stats["timed_out"]
     assert film.samples.max() - film.samples.min() <= (pass_size or 1) and film.samples.max() < 1000
@@ -383,7 +383,7 @@ def test_an_error_in_a_progress_callback_comes_through() -> None:
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_who_handles_ctrl_c_goes_on_handling_it() -> None:
+def test_a_users_handler_of_ctrl_c_stays() -> None:
     came: list[int] = []
     before = signal.signal(signal.SIGINT, lambda number, frame: came.append(number))
     try:
@@ -422,7 +422,7 @@ def test_renders_in_other_threads(reference: Film) -> None:
     *(({"crop": crop}, ("crop", "within the picture")) for crop in (
         (0, 0, 38, 22), (0, 0, 37, 23), (-1, 0, 5, 5), (5, 5, 5, 6), (6, 5, 5, 6), (40, 40, 50, 50))),
 ], ids=str)
-def test_a_wrong_value_is_told_by_its_name(options: dict[str, Any], message: Refusal) -> None:
+def test_the_error_names_the_argument_with_a_wrong_value(options: dict[str, Any], message: Refusal) -> None:
     with refused(*message):
         render(SCENE, **options)
 
@@ -440,7 +440,7 @@ def test_a_wrong_value_is_told_by_its_name(options: dict[str, Any], message: Ref
     ({"aov": 3}, ("aov", "one or more names")), ({"aov": [None]}, ("aov[0]", "str")),
     ({"device": 0}, ("device", "str")), ({"accel_options": []}, ("accel_options", "dict")),
 ], ids=str)
-def test_a_value_of_the_wrong_type_is_told_by_its_name(options: dict[str, Any], message: Refusal) -> None:
+def test_the_error_names_the_argument_of_a_wrong_type(options: dict[str, Any], message: Refusal) -> None:
     with refused(*message):
         render(SCENE, **options)
 
@@ -482,7 +482,7 @@ def test_an_unknown_setting_is_refused_by_name() -> None:
         SCENE.with_settings(fov=4)  # type: ignore[call-arg]
 
 
-def test_a_film_tells_of_itself_in_a_line() -> None:
+def test_the_repr_of_a_film_is_one_line() -> None:
     text = repr(render(SCENE, spp=2, size=(12, 7), aov="depth"))
     assert text.startswith("Film(12x7, 2 spp, mean radiance 0.") and text.endswith(", aov: depth)")
 
@@ -498,7 +498,7 @@ def test_depth_is_the_distance_along_the_ray_and_normals_face_it() -> None:
         assert np.array_equal(film.aov["normal"], np.broadcast_to(np.float32((0, 0, side)), (16, 16, 3)))
 
 
-def test_progress_is_told_once_of_a_compiler_that_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slow_compiling_is_reported_once(monkeypatch: pytest.MonkeyPatch) -> None:
     def slow(kernel: Any, device: Any) -> None:
         wait_until(lambda: len([each for each in seen if each.stage == "compile"]) > quick)
         time.sleep(0.3)  # long enough for a second report
@@ -511,11 +511,11 @@ def test_progress_is_told_once_of_a_compiler_that_takes_long(monkeypatch: pytest
     quick = len([each for each in seen if each.stage == "compile"])
     monkeypatch.setattr(prepare, "load_kernel", slow)
     render(SCENE, spp=2, progress=seen.append)
-    told = [each for each in seen if each.stage == "compile"]
-    assert len(told) == quick + 1 and (told[-1].done, told[-1].rays) == (0, 0) and seen[-1].stage == "trace"
+    reported = [each for each in seen if each.stage == "compile"]
+    assert len(reported) == quick + 1 and (reported[-1].done, reported[-1].rays) == (0, 0) and seen[-1].stage == "trace"
 
 
-def test_progress_is_told_of_a_structure_that_is_slow_to_build(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slow_building_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     def slow(geometry: Any, accel: str, device: str, threads: int, *, progress: Any, **options: Any) -> Any:
         for percent in (25, 50, 100):
             progress(percent / 100)
@@ -527,8 +527,8 @@ def test_progress_is_told_of_a_structure_that_is_slow_to_build(monkeypatch: pyte
     monkeypatch.setattr(prepare, "build", slow)
     seen: list[Progress] = []
     render(SCENE, spp=1, accel="bsp", progress=seen.append)
-    told = [(each.done, each.total) for each in seen if each.stage == "build"]
-    assert told == [(25, 100), (50, 100), (100, 100)] and seen[-1].stage == "trace"
+    reported = [(each.done, each.total) for each in seen if each.stage == "build"]
+    assert reported == [(25, 100), (50, 100), (100, 100)] and seen[-1].stage == "trace"
 
 
 def test_a_picture_larger_than_the_memory_is_refused_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -543,7 +543,7 @@ def test_a_scene_without_a_camera_is_refused() -> None:
         render(replace(SCENE, cameras=()))
 
 
-def test_a_tree_is_refined_where_samples_are_many_and_pixels_do_not_tell(tmp_path: Path) -> None:
+def test_a_tree_is_refined_for_many_samples_without_changing_pixels(tmp_path: Path) -> None:
     ball = Object(icosphere(4), (Material(),))
     few = replace(SCENE, objects=(*SCENE.objects, ball)).with_settings(size=(40, 20), spp=2)
     many = 8 * len(ball.mesh.faces) // 800 + 1

@@ -37,7 +37,7 @@ class Jobs:
 
 @pytest.mark.parametrize("threads", [1, 3])
 @pytest.mark.parametrize("every", [1, 2, 1000])
-def test_tiles_rest_where_that_is_due_and_each_is_traced_once(threads: int, every: int) -> None:
+def test_tiles_pause_when_due_and_each_is_traced_once(threads: int, every: int) -> None:
     jobs, asked, steps = Jobs(threads), [0], list[tuple[int, bool]]()
 
     def due() -> bool:
@@ -62,7 +62,7 @@ def test_a_tile_that_fails_ends_the_others() -> None:
     assert jobs.running == 0 and len(jobs.done) < 1000
 
 
-def test_who_does_not_go_on_waits_for_the_tiles_that_run() -> None:
+def test_closing_early_waits_for_the_running_tiles() -> None:
     jobs = Jobs(2)
     work: Any = list(range(10_000))
     steps = LocalTracer(jobs.prepared).trace(None, work, lambda: False)  # type: ignore[arg-type]

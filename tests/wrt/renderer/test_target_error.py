@@ -47,7 +47,7 @@ def reference(renderer: Renderer, spp: int, seeds: int = 8) -> tuple[np.ndarray,
 
 
 @pytest.mark.parametrize("target", [0.05, 0.01, 0.003])
-def test_it_stops_at_the_first_power_of_two_that_is_good_enough(target: float) -> None:
+def test_the_render_stops_at_the_first_power_of_two_below_the_target(target: float) -> None:
     film = render(SCENE, target_error=target)
     taken = film.metadata["spp"]
     assert (film.samples == taken).all() and taken % GROUPS == 0 and math.log2(taken // GROUPS).is_integer()
@@ -104,7 +104,7 @@ def test_a_black_picture_has_no_error_at_all() -> None:
     assert film.metadata["spp"] == GROUPS and film.stats["estimated_error"] == 0.0
 
 
-def test_what_is_not_known_is_not_called_small(tmp_path: Any) -> None:
+def test_the_error_is_infinite_until_every_pixel_has_samples(tmp_path: Any) -> None:
     def at_once(progress: Any) -> None:
         if progress.stage == "trace":
             raise KeyboardInterrupt
@@ -120,7 +120,7 @@ def test_what_is_not_known_is_not_called_small(tmp_path: Any) -> None:
     assert (aov_to_srgb8("variance", one.variance) == 255).all()
 
 
-def test_time_limit_and_interrupt_end_it_as_well() -> None:
+def test_time_limit_and_interrupt_end_a_render_with_a_target() -> None:
     film = render(SCENE, target_error=1e-9, time_limit=0.2)
     assert film.stats["timed_out"] and not film.stats["target_reached"] and film.metadata["spp"] >= GROUPS
 
@@ -204,7 +204,7 @@ def test_the_estimate_is_the_true_error_in_five_scenes(name: str) -> None:
         assert estimated == pytest.approx(true, rel=0.2), spp
 
 
-def test_stopping_does_not_flatter() -> None:
+def test_stopping_by_the_estimate_does_not_bias_the_error() -> None:
     # A render could stop when its estimate is too low by chance. Over many seeds, this does not bias the error.
     target, truth = 0.01, truth_of_scene()
     films = [renderer_of(sampled("sobol"), target).run(seed=seed, spp=MAX_SPP) for seed in range(24)]
@@ -214,7 +214,7 @@ def test_stopping_does_not_flatter() -> None:
     assert true < target and estimated == pytest.approx(true, rel=0.2)
 
 
-def test_the_spread_of_one_sequences_samples_is_no_honest_estimate() -> None:
+def test_the_variance_of_one_sequence_overestimates_the_error() -> None:
     # Evenly spread samples have a much smaller error than their variance suggests; random samples do not.
     ratio = {}
     for sampler in ("sobol", "independent"):
@@ -227,6 +227,6 @@ def test_the_spread_of_one_sequences_samples_is_no_honest_estimate() -> None:
     assert ratio["independent"] == pytest.approx(1.0, rel=0.2)
 
 
-def test_it_is_honest_for_independent_samples_too() -> None:
+def test_the_estimate_is_the_true_error_for_independent_samples() -> None:
     estimated, true = compared(sampled("independent"), 64, 8, *truth_of_scene())
     assert estimated == pytest.approx(true, rel=0.2)

@@ -176,7 +176,7 @@ def test_each_glowing_object_is_a_light() -> None:
     assert len(light_records(dark, flatten_joined(dark))[0]) == 0
 
 
-def test_beyond_some_number_all_are_one_light_by_power() -> None:
+def test_many_emissive_objects_are_one_light_sampled_by_power() -> None:
     count = MAX_MESH_LIGHTS + 4
     scene = lamps(count)
     rows, emitters, cdf = light_records(scene, flatten_joined(scene))
@@ -236,17 +236,17 @@ def test_normals_of_emitters_are_those_of_the_device_to_the_last_bit() -> None:
     assert (expected[:1000] == 0.0).all() and (np.linalg.norm(expected, axis=1) > 0.99).mean() > 0.9
 
 
-def test_emission_that_light_samples_cannot_reach_is_told_once() -> None:
+def test_emission_that_lights_nothing_is_reported_once() -> None:
     picture = Texture(np.zeros((2, 3, 4), np.uint8))
     glowing = [Material(name="sign", emission=(1, 1, 1), emission_texture=picture),
                Material(name="veil", emission=(1, 1, 1), alpha_mode="blend"), Material(emission=(1, 1, 1), alpha_mode="mask"),
                Material(name="meant", emission=(1, 1, 1), emission_texture=picture, emits_light=False),
                Material(name="lamp", emission=(1, 1, 1)), Material(name="dark", alpha_mode="blend")]
     objects = tuple(Object(quad(), (material,)) for material in glowing)
-    with pytest.warns(SceneWarning) as told:
+    with pytest.warns(SceneWarning) as reported:
         upload_scene(Scene(objects=objects), DEVICE)
-    assert len(told) == 1
-    assert "seen but lights nothing" in str(told[0].message) and "materials 'sign', 'veil', '2' (" in str(told[0].message)
+    assert len(reported) == 1
+    assert "seen but lights nothing" in str(reported[0].message) and "materials 'sign', 'veil', '2' (" in str(reported[0].message)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         upload_scene(Scene(objects=objects[3:]), DEVICE)

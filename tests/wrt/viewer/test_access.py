@@ -62,7 +62,7 @@ def test_the_names_of_an_address(host: str, address: str, printed: str, names: t
 
 @pytest.mark.parametrize("text", ["*", "null", "example.org", "https://", "ftp://example.org", "https://example.org/path", "",
                                   "http://user@example.org", "http://a:0", "http://a:65536", "https://example.org?x", "http://a b"])
-def test_what_is_no_origin(text: str) -> None:
+def test_text_that_is_no_origin_is_refused(text: str) -> None:
     with refused(what="origin"):
         as_origin(text)
 
@@ -142,7 +142,7 @@ def attempts(port: int, token: str) -> list[tuple[str, list[str]]]:
             + [(target, [f"Host: {me}"]) for target in targets] + [("/", [f"Host: {me}", *headers]) for headers in carried])
 
 
-def test_strangers_get_nothing(served: Served, capfd: pytest.CaptureFixture[str]) -> None:
+def test_requests_without_access_get_nothing(served: Served, capfd: pytest.CaptureFixture[str]) -> None:
     tries = attempts(served.port, served.token)
     assert len(tries) >= 50
     for target, headers in tries:
@@ -191,7 +191,7 @@ def test_other_origins_can_be_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
         Served(allow_origins=["*"])
 
 
-def test_what_is_no_request_is_no_news(served: Served, capfd: pytest.CaptureFixture[str]) -> None:
+def test_malformed_requests_print_nothing(served: Served, capfd: pytest.CaptureFixture[str]) -> None:
     """Malformed requests print nothing on stdout, and no traceback on stderr."""
     port, token = served.port, served.token
     host = [f"Host: 127.0.0.1:{port}"]
@@ -266,7 +266,7 @@ def test_only_one_port_is_open(served: Served, monkeypatch: pytest.MonkeyPatch) 
 # --- messages ---------------------------------------------------------------------------------------------------------
 
 
-def test_what_a_browser_says_is_heard() -> None:
+def test_a_browsers_messages_are_allowed() -> None:
     check_message(CAMERA, lambda uuid: None)
     check_message(CLICK, lambda uuid: None)
 
@@ -283,13 +283,13 @@ def test_what_a_browser_says_is_heard() -> None:
     {**CAMERA, "image_width": 16385}, {**CAMERA, "image_width": 64.0}, {**CAMERA, "image_height": -1},
     {**CAMERA, "position": [1e10, 0, 0]},
 ], ids=lambda message: None)
-def test_what_is_not_heard(message: Any) -> None:
+def test_other_messages_are_refused(message: Any) -> None:
     with pytest.raises(Refused):
         check_message(message, lambda uuid: None)
 
 
 @pytest.mark.parametrize("field", CAMERA)
-def test_what_is_no_part_of_a_camera(field: str) -> None:
+def test_invalid_fields_of_a_camera_are_refused(field: str) -> None:
     for value in NONSENSE:
         if field in ("near", "far") and type(value) in (int, float) and math.isfinite(value):
             continue  # the viewer does not use them
@@ -324,7 +324,7 @@ def moves(who: Client, begin: float) -> int:
     return len(new)
 
 
-def test_bad_values_stop_nobodys_pictures(rendering: Served, capfd: pytest.CaptureFixture[str]) -> None:
+def test_invalid_values_do_not_stop_pictures(rendering: Served, capfd: pytest.CaptureFixture[str]) -> None:
     served, page = rendering, rendering.page
     with client(page.url) as bad, client(page.url) as good:
         for who in (bad, good):
@@ -422,7 +422,7 @@ def test_pages_can_begin_together(monkeypatch: pytest.MonkeyPatch) -> None:
             served.page.close()
 
 
-def test_viser_says_nothing_of_those_who_left(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_viser_does_not_warn_of_disconnected_browsers(monkeypatch: pytest.MonkeyPatch) -> None:
     """The page may send a picture to a browser that is being closed."""
     pytest.importorskip("viser")
     monkeypatch.setattr("wrt.viewer.refine.Viewer._prepare", lambda self, view: False)

@@ -69,7 +69,7 @@ def test_other_kinds_turn_and_are_written_too(tmp_path: Path, camera: CameraKind
     np.testing.assert_allclose(found.camera_to_world, turned.camera_to_world, atol=1e-11)
 
 
-def test_what_is_up() -> None:
+def test_the_up_axis_of_the_viewport() -> None:
     upright = Camera.look_at((3, 2, 1), (0, 0, 0))
     assert up_of(upright).tolist() == [0.0, 1.0, 0.0]
     for camera in (Camera.look_at((0, 5, 0), (0, 0, 0), up=(0, 0, -1)), Camera.look_at((3, 2, 1), (0, 0, 0), up=(0, 0, 1)),
@@ -77,7 +77,7 @@ def test_what_is_up() -> None:
         np.testing.assert_array_equal(up_of(camera), camera.camera_to_world[:3, 1])
 
 
-def test_what_is_orbited() -> None:
+def test_the_orbited_point() -> None:
     np.testing.assert_allclose(orbited_point(SCENE, CAMERA), CAMERA.camera_to_world[:3] @ (0, 0, -4.0, 1))  # the point in focus
     assert unit_of(SCENE, CAMERA) == pytest.approx(4.0)
     plain = Camera.look_at((3, 2, 50), (0, 0, 0))  # the camera has no focus

@@ -62,7 +62,7 @@ def test_a_render_is_shown_in_place_and_finished_in_the_end(shown: list[tuple[st
     assert np.array_equal(picture_of(shown[-1][1]), film.to_srgb8()) and "100%" in shown[-1][1]
 
 
-def test_an_interrupt_keeps_what_there_is(shown: list[tuple[str, str]]) -> None:
+def test_an_interrupt_keeps_the_picture_so_far(shown: list[tuple[str, str]]) -> None:
     view = LiveView(every=0.0)
 
     def progress(p: Progress) -> None:

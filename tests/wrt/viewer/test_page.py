@@ -49,7 +49,7 @@ def test_without_viser_there_is_one_message(monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.parametrize(("host", "port", "part"), [
     ("127.0.0.1", None, "(Address already in use);"), ("no.such.host.invalid", 0, "no.such.host.invalid")])
-def test_where_nobody_can_listen(host: str, port: int | None, part: str) -> None:
+def test_an_address_that_cannot_be_listened_on(host: str, port: int | None, part: str) -> None:
     pytest.importorskip("viser")
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
@@ -307,7 +307,7 @@ def test_a_click_focuses(page: Any, browser_page: Any) -> None:
     assert page.focus.value == page.viewer.view.camera.focus_distance != shown.view.camera.focus_distance
 
 
-def test_a_browser_that_comes_again_gets_the_picture(page: Any, browser_page: Any) -> None:
+def test_a_reloaded_page_gets_the_picture(page: Any, browser_page: Any) -> None:
     finished(page, browser_page)
     page.viewer.spp = 1 << 20  # the browser is reloaded during a refinement
     try:
@@ -339,7 +339,7 @@ def test_a_second_browser_gets_the_picture_and_leaves_it_to_the_first(page: Any,
     assert difference(browser_page, finished(page, browser_page, max_depth=1)) < ROUGHLY
 
 
-def test_what_is_saved(page: Any, browser_page: Any, tmp_path: Path) -> None:
+def test_saved_files(page: Any, browser_page: Any, tmp_path: Path) -> None:
     shown = finished(page, browser_page)
     for name, suffix in (("picture as PNG", ".png"), ("picture as EXR", ".exr")):
         with browser_page.expect_download() as download:
@@ -364,7 +364,7 @@ def test_what_is_saved(page: Any, browser_page: Any, tmp_path: Path) -> None:
     assert browser_page.mistakes == []
 
 
-def test_the_file_that_a_browser_is_given_leads_to_the_page(page: Any, browser_page: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_private_file_forwards_to_the_page(page: Any, browser_page: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     from wrt.cli import view as cli_view
 
     shown = finished(page, browser_page)
@@ -382,7 +382,7 @@ def test_the_file_that_a_browser_is_given_leads_to_the_page(page: Any, browser_p
     until(lambda: page.watching == first, browser_page)
 
 
-def test_a_page_of_another_origin_neither_sees_nor_steers(page: Any, browser_page: Any) -> None:
+def test_a_page_of_another_origin_has_no_access(page: Any, browser_page: Any) -> None:
     """In a real browser, even with the token: a page from another port or another host name has no access."""
     port, token = page.server.get_port(), page.guard.access.token
     before = page.server.get_clients().keys()

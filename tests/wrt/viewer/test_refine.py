@@ -68,7 +68,7 @@ def turned(degrees: float) -> Camera:
     return Camera.look_at((2 * np.cos(angle), 2, 4 + np.sin(angle)), (0, 0, 0), aperture_radius=0.05, focus_distance=4.0)
 
 
-def test_it_is_coarse_first_and_in_the_end_the_picture_itself() -> None:
+def test_pictures_get_finer_and_end_with_that_of_render() -> None:
     eye = Eye()
     last = eye.see(size=(61, 34))
     scales = [shown.scale for shown in eye.pictures]
@@ -123,7 +123,7 @@ def test_a_camera_that_never_rests_is_followed() -> None:
     assert len({shown.view for shown in eye.pictures}) == 6
 
 
-def test_what_takes_too_long_is_given_up_unseen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_first_picture_is_abandoned(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "PATIENCE", -1.0)
     eye = Eye()
     eye.see(size=(61, 34))
@@ -200,7 +200,7 @@ def test_another_tone_traces_no_ray(monkeypatch: pytest.MonkeyPatch) -> None:
         eye.viewer.tone(0.0, "sepia")
 
 
-def test_who_comes_later_sees_it_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_again_shows_the_last_picture_once_more(monkeypatch: pytest.MonkeyPatch) -> None:
     eye = Eye()
     for changes in ({"size": (61, 34)}, {"cost": "nodes"}):
         last = eye.see(**changes)
@@ -229,7 +229,7 @@ def test_a_heat_map_is_the_profile_of_the_picture() -> None:
     assert isinstance(eye.viewer.picture(), Film)
 
 
-def test_what_a_click_focuses_on() -> None:
+def test_the_focus_at_a_clicked_point() -> None:
     eye = Eye()
     assert eye.viewer.renderers.focus_at(eye.viewer.view, 0.5, 0.5) is None  # nothing is built yet
     eye.see(size=(61, 34))
@@ -241,7 +241,7 @@ def test_what_a_click_focuses_on() -> None:
     assert eye.viewer.renderers.focus_at(eye.viewer.view, 0.5, 0.0) is None  # sky
 
 
-def test_what_there_is_not_is_refused_and_what_cannot_be_built_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unknown_names_are_refused_and_build_errors_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     eye = Eye()
     for changes, message in (({"accel": "bhv"}, ("accel", "no structure 'bhv'")), ({"cost": "fees"}, ("cost", "no counter 'fees'"))):
         with refused(*message):
@@ -285,7 +285,7 @@ def test_a_thread_follows_until_it_is_stopped() -> None:
     assert not thread.is_alive()
 
 
-def test_a_renderer_aims_elsewhere_with_what_it_has() -> None:
+def test_a_renderer_takes_another_camera_that_its_kernels_support() -> None:
     renderer = Renderer(PINHOLE, Options())
     other = Camera.look_at((-3, 1, 4), (0, 0, 0))
     renderer.aim(other, size=(20, 31), spp=2, max_depth=1)

@@ -58,7 +58,7 @@ def row_of(name: str, ways: dict[str, Prepared], plan: Plan) -> Row:
     loop, waves = (seconds[way] * 1e9 / samples for way in ("loop", "waves"))
     pixels = [np.asarray(films[way].groups[0].mean.numpy()).view(np.int32) for way in ways]
     differ = int((pixels[0] != pixels[1]).reshape(len(pixels[0]), -1).any(axis=1).sum())
-    return Row(scene=name, triangles=ways["waves"].facts()["triangles"], rays=films["waves"].rays / samples, loop=loop.tolist(),
+    return Row(scene=name, triangles=ways["waves"].facts()["triangles"], rays=films["waves"].count("rays") / samples, loop=loop.tolist(),
                waves=waves.tolist(), ratio=(loop / waves).tolist(), ratio_median=float(np.median(loop / waves)), differ=differ)
 
 
