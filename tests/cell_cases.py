@@ -1,8 +1,13 @@
 """Hard cases for structures that cut space into cells: flat, distant, huge and degenerate geometries, grazing rays, random lines."""
 
+from dataclasses import replace
+from itertools import product
+
 import numpy as np
 
+from tests.refused import refused
 from wrt.accel.geometry import Geometry
+from wrt.accel.scenes.build import build
 from wrt.scene.mesh import Mesh
 
 NO_SPHERES = np.zeros((0, 4), np.float32)
@@ -80,3 +85,23 @@ def assert_same(found, expected):
     for name in ("prim_id", "t", "u", "v"):
         a, b = getattr(found, name).view(np.int32), getattr(expected, name).view(np.int32)
         assert np.array_equal(a, b), f"{(a != b).sum()} of {len(a)} rays differ in {name}"
+
+
+def assert_rays_at_corners_agree(accel, geometry, corner, size, rng):
+    """Check rays along the axes and diagonals of cells of this size, through points `corner`, against brute force."""
+    brute = build(geometry, "brute_force")
+    steps = np.array([d for d in product([-1.0, -0.0, 0.0, 1.0], repeat=3) if np.any(d)])
+    direction = (steps[rng.integers(len(steps), size=len(corner))] * size).astype(np.float32)
+    origin = (corner - 8 * direction).astype(np.float32)
+    origin[: len(origin) // 2] = corner[: len(origin) // 2]
+    assert_same(accel.closest_hit(origin, direction), brute.closest_hit(origin, direction))
+    assert np.array_equal(accel.any_hit(origin, direction, 0.1, 3.0), brute.any_hit(origin, direction, 0.1, 3.0))
+
+
+def assert_damage_is_refused(accel, name, change):
+    """Check that a structure is restored from its arrays, and refuses them after `change` of the array `name`."""
+    arrays = {key: np.array(value) for key, value in accel.built.arrays.items()}
+    change(arrays[name])
+    type(accel).restore(accel.built, accel.geometry)
+    with refused(what="damaged"):
+        type(accel).restore(replace(accel.built, arrays=arrays), accel.geometry)

@@ -43,15 +43,11 @@ def make_compute_normals(features: Features) -> Any:
 
 
 def make_wave_normals(features: Features, shading_normal: Any) -> tuple[Any, Any]:
-    """Return compute_normals, and normal_at(wave, surfaces, surface, texels, wo, i) -> vec3 for hit i of the block.
+    """Return compute_normals or None, and normal_at(wave, surfaces, surface, texels, wo, i) -> vec3 for hit i of the block.
 
     normal_at loads the result of compute_normals. Without a result, it calls `shading_normal` (from make_shading)."""
     vectorised = normal_rows(features) == NORMALS
     load_normal = NORMALS.load()
-
-    @wp.func
-    def compute_no_normals(rows: wp.array(dtype=wp.float32), count: int):
-        pass
 
     @wp.func
     def normal_at(wave: Wave, surfaces: Surfaces, s: Surface, texels: Texels, wo: wp.vec3, i: int) -> wp.vec3:
@@ -62,4 +58,4 @@ def make_wave_normals(features: Features, shading_normal: Any) -> tuple[Any, Any
                 return shading_normal(surfaces, s, texels, wo)
         return load_normal(wave.block.rows, i)
 
-    return make_compute_normals(features) if vectorised else compute_no_normals, normal_at
+    return make_compute_normals(features) if vectorised else None, normal_at

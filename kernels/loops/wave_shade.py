@@ -146,9 +146,12 @@ def make_block_functions(features: Features, shading: Shading, step: Step) -> Bl
 
     @wp.func
     def prepare(wave: Wave, surfaces: Surfaces, lighting: Lighting, first: int, end: int):
-        compute_surfaces(wave, surfaces, first, end, wave.progress[0].hits)
-        sample_textures(surfaces, wave.block.rows, end - first)
-        compute_normals(wave.block.rows, end - first)
+        if wp.static(compute_surfaces is not None):
+            compute_surfaces(wave, surfaces, first, end, wave.progress[0].hits)
+        if wp.static(sample_textures is not None):
+            sample_textures(surfaces, wave.block.rows, end - first)
+        if wp.static(compute_normals is not None):
+            compute_normals(wave.block.rows, end - first)
         if wp.static(needs_keys):
             store_keys(wave, first, end)
         if wp.static(features.rough):

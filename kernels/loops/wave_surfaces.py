@@ -120,17 +120,13 @@ def make_hit_surface(has: Attributes, spheres: bool) -> Any:
 
 
 def make_wave_surfaces(features: Features, surface_at: Any) -> tuple[Any, Any]:
-    """Return compute_surfaces and hit_surface. In scenes with instances, hit_surface calls `surface_at` and no rows are used."""
-
-    @wp.func
-    def compute_no_surfaces(wave: Wave, surfaces: Surfaces, first: int, end: int, hits: int):
-        pass
+    """Return compute_surfaces and hit_surface. In scenes with instances, these are None and a function that calls `surface_at`."""
 
     @wp.func
     def single_hit_surface(wave: Wave, surfaces: Surfaces, i: int, k: int) -> Surface:
         return surface_at(surfaces, load_render_ray(wave.queue.rays, k), load_hit(wave.queue.hits, k))
 
     if features.instances:
-        return compute_no_surfaces, single_hit_surface
+        return None, single_hit_surface
     has = Attributes(features)
     return make_compute_surfaces(has), make_hit_surface(has, features.spheres)

@@ -17,11 +17,6 @@ def textures_vectorised(features: Features) -> bool:
     return features.textures and not features.checkerboards and not features.instances
 
 
-@wp.func
-def sample_nothing(surfaces: Surfaces, rows: wp.array(dtype=wp.float32), count: int):
-    pass
-
-
 def make_sample_texture(name: str, texture: MaterialTexture) -> Any:
     """Return sample_texture(surfaces, rows, count): sample one texture at `count` hits on triangles; store it in the rows TEXELS."""
     material, u, v = (rows.first * BLOCK for rows in (HITS.field("material"), SURFACES.field("u"), SURFACES.field("v")))
@@ -54,13 +49,14 @@ def make_link(sample: Any, sample_others: Any) -> Any:
 
 
 def make_wave_textures(features: Features, look_up: Any) -> tuple[Any, Any]:
-    """Return sample(surfaces, rows, count), and texels_at(wave, surfaces, surface, i) -> Texels of hit i of the block.
+    """Return sample(surfaces, rows, count) or None, and texels_at(wave, surfaces, surface, i) -> Texels of hit i of the block.
 
     texels_at loads the result of `sample`. Without a result, it calls `look_up` (from make_shading)."""
     textures = textures_of(features) if textures_vectorised(features) else {}
-    sample = sample_nothing
+    sample = None
     for name, texture in textures.items():
-        sample = make_link(make_sample_texture(name, texture), sample)
+        sample_one = make_sample_texture(name, texture)
+        sample = make_link(sample_one, sample) if sample else sample_one
     load = TEXELS.load(*(field for name in TEXTURES.keys() - textures.keys() for field in TEXTURES[name].fields))
 
     @wp.func

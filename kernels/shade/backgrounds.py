@@ -170,14 +170,12 @@ def make_sky_point(features: Features) -> Any:
 def make_sky_sample(features: Features) -> Any:
     """Return sky_sample(b, n, point) -> LightSample of the background at a surface with normal n. `point` comes from sky_point."""
     kind = BACKGROUNDS[features.background]
-    radiance, by_kind = kind.radiance, kind.sample
-    of_cosine = by_kind is None
-    sample_of_kind = no_sample if of_cosine else by_kind
+    radiance, sample_of_kind = kind.radiance, kind.sample
 
     @wp.func
     def sky_sample(b: Background, n: wp.vec3, point: wp.vec3) -> LightSample:
         sample = LightSample()
-        if wp.static(of_cosine):
+        if wp.static(sample_of_kind is None):
             sample.wi = rotated_to(point, n)
             cosine = wp.max(wp.dot(sample.wi, n), 1.0e-9)
             sample.weight = radiance(b, sample.wi) * (PI / cosine)
@@ -188,8 +186,3 @@ def make_sky_sample(features: Features) -> Any:
         return sample
 
     return sky_sample
-
-
-@wp.func
-def no_sample(b: Background, xi: wp.vec2) -> LightSample:
-    return LightSample()

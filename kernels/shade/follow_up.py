@@ -45,9 +45,9 @@ def add_cuts(before: Sample, next: FollowUp) -> Sample:
     return out
 
 
-def make_lost(features: Features) -> Any:
-    """Return lost(surfaces, path, verdict) -> what the path adds to Sample.lost."""
-    Path = make_path(features.counting)
+def make_follow_up(features: Features) -> Any:
+    """Return follow_up(surfaces, shaded, limits, traced) -> FollowUp; `traced` is the sample's number of rays without shadow rays."""
+    Path, Shaded = make_path(features.counting), make_shaded(features.counting)
 
     @wp.func
     def lost(surfaces: Surfaces, path: Path, verdict: int) -> float:
@@ -59,14 +59,6 @@ def make_lost(features: Features) -> Any:
             if path.medium >= 0:  # Inside glass the radiance is ior^2 times as high, and `scatter` divided by ior^2.
                 lost = lost * surfaces.materials[path.medium].ior * surfaces.materials[path.medium].ior
         return lost
-
-    return lost
-
-
-def make_follow_up(features: Features) -> Any:
-    """Return follow_up(surfaces, shaded, limits, traced) -> FollowUp; `traced` is the sample's number of rays without shadow rays."""
-    Path, Shaded = make_path(features.counting), make_shaded(features.counting)
-    lost = make_lost(features)
 
     @wp.func
     def verdict_of(path: Path, limits: Limits, traced: int) -> int:

@@ -157,19 +157,6 @@ def make_transparency(features: Features, is_solid: Any) -> Any:
     return transparency
 
 
-def make_choose_facet(features: Features) -> Any:
-    """Return choose_facet(key, index) -> vec3: the cap_point that places a microfacet; 0 if no material is rough."""
-    sample_2d = make_sample_2d(features)
-
-    @wp.func
-    def choose_facet(key: wp.uint32, index: wp.uint32) -> wp.vec3:
-        if wp.static(features.rough):
-            return cap_point(sample_2d(key, index, FACET))
-        return wp.vec3()
-
-    return choose_facet
-
-
 def make_straight_on(features: Features, is_solid: Any) -> Any:
     """Return straight_on(surfaces, path, m, surface, share, distance) -> Path behind a blended surface."""
     Path = make_path(features.counting)
@@ -191,25 +178,18 @@ def make_straight_on(features: Features, is_solid: Any) -> Any:
     return straight_on
 
 
-def make_medium_at(is_solid: Any) -> Any:
-    """Return medium_at(m, surface, medium) -> material of the solid glass on the ray's side of a surface, or OUTSIDE."""
-
-    @wp.func
-    def medium_at(m: Material, s: Surface, medium: int) -> int:
-        """Correct `medium` at a surface of solid glass: a ray that meets its back face must be inside it."""
-        if not is_solid(m):
-            return medium
-        return wp.where(s.front == 0, s.material, wp.where(medium == UNKNOWN, OUTSIDE, medium))
-
-    return medium_at
-
-
 def make_shade(features: Features, shading: Shading) -> Any:
     """Return shade(surfaces, lighting, path, surface, texels, t, facet) -> Shaded."""
     Path, Shaded = make_path(features.counting), make_shaded(features.counting)
     child = make_paths(features.counting).child
-    transparency, medium_at = make_transparency(features, shading.is_solid), make_medium_at(shading.is_solid)
-    straight_on = make_straight_on(features, shading.is_solid)
+    transparency, straight_on = make_transparency(features, shading.is_solid), make_straight_on(features, shading.is_solid)
+
+    @wp.func
+    def medium_at(m: Material, s: Surface, medium: int) -> int:
+        """Correct `medium` at a surface of solid glass: a ray that meets its back face must be inside it."""
+        if not shading.is_solid(m):
+            return medium
+        return wp.where(s.front == 0, s.material, wp.where(medium == UNKNOWN, OUTSIDE, medium))
 
     @wp.func
     def shade(surfaces: Surfaces, lighting: Lighting, arriving: Path, surface: Surface, texels: Texels, t: float,
@@ -251,9 +231,26 @@ def make_shade(features: Features, shading: Shading) -> Any:
     return shade
 
 
-def make_shadow_request(features: Features, reflected_light: Any) -> Any:
-    """Return shadow_request(shaded, sample) -> ShadowRequest. `reflected_light` comes from make_reflected_light."""
-    Shaded = make_shaded(features.counting)
+class Step(NamedTuple):
+    """The device functions that both loops call at a hit."""
+
+    choose_facet: Any  # (key, index) -> vec3, a cap_point: the facet for `shade`, in sample `index` at the path with this key.
+    shade: Any  # (surfaces, lighting, path, surface, texels, t, facet) -> Shaded.
+    extra_lights: int  # 1 if the background is sampled: it is light number lighting.count. Else 0.
+    sample_light: Any  # (lighting, surfaces, i, surface, point) -> LightSample of light i; `point` comes from LightPoints.
+    shadow_request: Any  # (shaded, sample) -> ShadowRequest.
+
+
+def make_step(features: Features, shading: Shading) -> Step:
+    """Return the Step of a scene."""
+    Shaded, sample_2d = make_shaded(features.counting), make_sample_2d(features)
+    sample_light, reflected_light = make_reflected_light(features)
+
+    @wp.func
+    def choose_facet(key: wp.uint32, index: wp.uint32) -> wp.vec3:
+        if wp.static(features.rough):
+            return cap_point(sample_2d(key, index, FACET))
+        return wp.vec3()
 
     @wp.func
     def shadow_request(shaded: Shaded, sample: LightSample) -> ShadowRequest:
@@ -265,21 +262,4 @@ def make_shadow_request(features: Features, reflected_light: Any) -> Any:
             out.end = sample.end
         return out
 
-    return shadow_request
-
-
-class Step(NamedTuple):
-    """The device functions that both loops call at a hit."""
-
-    choose_facet: Any  # (key, index) -> vec3: facet for `shade`, at the hit of the path with this key, in sample `index`.
-    shade: Any  # (surfaces, lighting, path, surface, texels, t, facet) -> Shaded.
-    extra_lights: int  # 1 if the background is sampled: it is light number lighting.count. Else 0.
-    sample_light: Any  # (lighting, surfaces, i, surface, point) -> LightSample of light i; `point` comes from LightPoints.
-    shadow_request: Any  # (shaded, sample) -> ShadowRequest.
-
-
-def make_step(features: Features, shading: Shading) -> Step:
-    """Return the Step of a scene."""
-    sample_light, reflected_light = make_reflected_light(features)
-    return Step(make_choose_facet(features), make_shade(features, shading), 1 if features.sky_light else 0,
-                sample_light, make_shadow_request(features, reflected_light))
+    return Step(choose_facet, make_shade(features, shading), 1 if features.sky_light else 0, sample_light, shadow_request)

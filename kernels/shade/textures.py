@@ -47,14 +47,6 @@ def texel_place(at: float, size: int) -> float:
 
 
 @wp.func
-def texture_uv(texture: Texture, uv: wp.vec2) -> wp.vec2:
-    """Transform texture coordinates by the texture's 2 x 3 matrix."""
-    u = texture.row_u[0] * uv[0] + texture.row_u[1] * uv[1] + texture.row_u[2]
-    v = texture.row_v[0] * uv[0] + texture.row_v[1] * uv[1] + texture.row_v[2]
-    return wp.vec2(u, v)
-
-
-@wp.func
 def picture(surfaces: Surfaces, texture: Texture, u: float, v: float) -> wp.vec4:
     """Return the bilinearly interpolated linear RGBA of a picture at texture coordinates (u, v)."""
     x = texel_place(u, texture.width)
@@ -90,14 +82,15 @@ def make_sample_texture(pictures: bool, checkerboards: bool) -> Any:
         if index < 0:
             return wp.vec4(1.0, 1.0, 1.0, 1.0)
         texture = surfaces.textures[index]
-        at = texture_uv(texture, uv)
+        u = texture.row_u[0] * uv[0] + texture.row_u[1] * uv[1] + texture.row_u[2]
+        v = texture.row_v[0] * uv[0] + texture.row_v[1] * uv[1] + texture.row_v[2]
         result = wp.vec4(1.0, 1.0, 1.0, 1.0)
         if wp.static(checkerboards):
             if texture.width == 0:
-                result = checkerboard(texture, at[0], at[1])
+                result = checkerboard(texture, u, v)
         if wp.static(pictures):
             if texture.width > 0:
-                result = picture(surfaces, texture, at[0], at[1])
+                result = picture(surfaces, texture, u, v)
         return result
 
     return sample_texture

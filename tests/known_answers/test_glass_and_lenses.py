@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import wrt
+from tests.fresnel import fresnel
 from wrt.scene.backgrounds import ConstantBackground, GradientBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.materials import Material
@@ -18,14 +19,6 @@ from wrt.scene.shapes import box, quad
 N = 1.5
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 WHITE_SKY = ConstantBackground(WHITE)
-
-
-def fresnel(degrees: float, n: float = N) -> float:
-    """Return the unpolarised reflectance from outside, in float64."""
-    cosine = math.cos(math.radians(degrees))
-    inside = math.sqrt(1.0 - (1.0 - cosine**2) / n**2)
-    s, p = (cosine - n * inside) / (cosine + n * inside), (n * cosine - inside) / (n * cosine + inside)
-    return 0.5 * (s * s + p * p)
 
 
 # --- Fresnel ----------------------------------------------------------------------------------------------------------
@@ -47,7 +40,7 @@ def reflectance(degrees: float) -> float:
     (0.0, 0.04), (45.0, 0.05024), (60.0, 0.08919), (80.0, 0.38770),
     (math.degrees(math.atan(N)), 0.5 * ((N**2 - 1.0) / (N**2 + 1.0)) ** 2)])  # Brewster's angle: no p-polarised light
 def test_a_picture_of_fresnels_curve(degrees: float, value: float) -> None:
-    assert value == pytest.approx(fresnel(degrees), abs=1e-5)
+    assert value == pytest.approx(fresnel(math.cos(math.radians(degrees)), N), abs=1e-5)
     assert reflectance(degrees) == pytest.approx(value, abs=2e-5)
 
 
@@ -68,8 +61,8 @@ def test_total_reflection_begins_at_its_angle() -> None:
     assert not (lit[:-1] & ~lit[1:]).any()  # Dark from the critical angle on.
     # Below the critical angle, a camera inside sees n^2 times the transmitted radiance.
     for i in (rows // 2 + 100, rows - 1):
-        outside = math.degrees(math.asin(N * math.sin(math.radians(degrees[i]))))
-        assert column[i] == pytest.approx(N**2 * (1.0 - fresnel(outside)), rel=2e-3)
+        outside = math.asin(N * math.sin(math.radians(degrees[i])))
+        assert column[i] == pytest.approx(N**2 * (1.0 - fresnel(math.cos(outside), N)), rel=2e-3)
 
 
 # --- a ball lens ------------------------------------------------------------------------------------------------------
@@ -92,7 +85,7 @@ def exit_slopes(distances: list[float]) -> list[float]:
             scene = Scene(objects=(wall,), spheres=(ball,), background=sky, cameras=(camera,),
                           settings=Settings(filter="box", max_depth=2, min_throughput=0.0))
             films.append(wrt.render(scene, size=(2, 64), spp=64).pixels[..., 0].mean(axis=1, dtype=np.float64))
-        assert np.allclose(films[1], (1.0 - fresnel(0.0)) ** 2, atol=1e-4)
+        assert np.allclose(films[1], (1.0 - fresnel(1.0, N)) ** 2, atol=1e-4)
         slope = (1.0 - 2.0 * (np.arange(64) + 0.5) / 64) * math.tan(0.01)
         found.append(float(np.polyfit(slope, films[0] / films[1] - 1.0, 1)[0]))
     return found

@@ -6,6 +6,7 @@ A kernel is compiled for a scene's features. Scenes here have distant hidden obj
 import numpy as np
 import pytest
 
+from tests.fresnel import fresnel
 from wrt.kernels.shade.follow_up import MAX_RAYS
 from wrt.kernels.shade.shadows import MAX_TRANSPARENT
 from wrt.renderer.render import render
@@ -114,9 +115,7 @@ def slab_scene(thickness=1.0, degrees=0.0, material=CLEAR, camera=None):
 
 def slab_transmittance(cosine, n, inside=1.0):
     """Return a slab's transmittance with all inner reflections, (1 - R)^2 a / (1 - R^2 a^2). `inside` is a, for one crossing."""
-    inner = np.sqrt(1.0 - (1.0 - cosine**2) / n**2)
-    s, p = (cosine - n * inner) / (cosine + n * inner), (n * cosine - inner) / (n * cosine + inner)
-    r = 0.5 * (s * s + p * p)
+    r = fresnel(cosine, n)
     return (1.0 - r) ** 2 * inside / (1.0 - (r * inside) ** 2)
 
 

@@ -1,4 +1,4 @@
-"""Shadow rays through transparent surfaces, in pictures; test_tinted_shadows.py has the shadows of glass."""
+"""Shadow rays through transparent surfaces, in pictures with a known answer."""
 
 import numpy as np
 import pytest
@@ -6,16 +6,18 @@ import pytest
 from tests.kernel_tools import DEVICE, launch, zeros  # isort: skip (starts Warp)
 import warp as wp
 
+from tests.fresnel import fresnel
 from wrt.core.device import upload
 from wrt.kernels.shade.shadows import MAX_TRANSPARENT, is_opaque
 from wrt.kernels.structs import Material as MaterialRecord
 from wrt.kernels.structs import kernel
 from wrt.renderer.render import render
 from wrt.renderer.upload import TextureTable, material_records
+from wrt.scene.backgrounds import ConstantBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import DirectionalLight, PointLight
 from wrt.scene.materials import Material
-from wrt.scene.model import Object, Scene
+from wrt.scene.model import Object, Scene, Sphere
 from wrt.scene.settings import Settings
 from wrt.scene.shapes import box, quad
 from wrt.scene.values import Color
@@ -131,3 +133,48 @@ def test_opaque_is_what_leaves_the_floor_below_it_dark(kind, alpha_mode):
     below = Object(quad((-10, 1, 10), (0, 0, -20), (20, 0, 0)), (materials[kind],))
     for sheet in (pane(materials[kind]), below):
         assert lit(sheet, *far, shadows="tinted")[0].any() != opaque[kind]
+
+
+# --- glass ------------------------------------------------------------------------------------------------------------
+
+
+def transmittance(glass, angle, shadows):
+    """Return the transmittance of a pane or block for green, in parallel light at this angle to its normal."""
+    light = DirectionalLight((np.sin(angle), -np.cos(angle), 0.0), (np.pi,) * 3)
+    body = pane(glass) if glass.thin else block(glass)
+    return lit(body, light=light, shadows=shadows)[0][1] / lit(light=light, shadows=shadows)[0][1]
+
+
+@pytest.mark.parametrize("degrees", [0.0, 30.0, 60.0, 80.0])
+def test_solid_glass_tints_by_both_faces_and_the_way_between(degrees):
+    # 60 and 80 degrees are beyond the critical angle. The unbent ray must not be totally reflected at the exit.
+    angle = np.radians(degrees)
+    glass = Material("glass", albedo=(1.0, 0.8, 1.0), absorption=(0.0, 0.7, 0.0))
+    expected = (0.8 * (1.0 - fresnel(np.cos(angle), 1.5))) ** 2 * np.exp(-0.7 * 0.5 / np.cos(angle))
+    assert transmittance(glass, angle, "tinted") == pytest.approx(expected, rel=1e-4)
+
+
+def test_solid_glass_is_opaque_to_shadow_rays_by_default():
+    assert transmittance(Material("glass"), 0.5, "opaque") == 0.0
+
+
+@pytest.mark.parametrize("degrees", [0.0, 70.0])
+def test_a_thin_pane_always_lets_light_through(degrees):
+    angle = np.radians(degrees)
+    r = fresnel(np.cos(angle), 1.5)
+    expected = 0.8 * (1.0 - 2.0 * r / (1.0 + r))
+    glass = Material("glass", albedo=(1.0, 0.8, 1.0), thin=True)
+    assert np.isclose(transmittance(glass, angle, "opaque"), expected, rtol=1e-4)
+
+
+def test_absorption_counts_from_where_the_camera_stands_in_the_glass():
+    ball = Sphere((0, 0, 0), 2.0, Material("glass", albedo=(1, 1, 1), ior=1.0, absorption=(1.0, 1.0, 1.0)))
+    inner = Sphere((0, 0, 0), 1.0, Material("glass", albedo=(1, 1, 1), ior=1.0))
+    white = {"background": ConstantBackground((1, 1, 1)), "settings": Settings(filter="box")}
+    within = Camera.look_at((0, 0, 0), (0, 0, -1), fov_y=0.01)
+    outside = Camera.look_at((0, 0, 9), (0, 0, 0), fov_y=0.01)
+    seen = render(Scene(spheres=(ball,), cameras=(within,), **white), spp=1, size=(2, 2)).pixels.mean()
+    assert seen == pytest.approx(np.exp(-2.0), rel=1e-4)
+    # With a clear ball of radius 1 inside, the ray is in the absorbing glass for a length of 1 on each side.
+    seen = render(Scene(spheres=(ball, inner), cameras=(outside,), **white), spp=1, size=(2, 2)).pixels.mean()
+    assert seen == pytest.approx(np.exp(-2.0), rel=1e-3)

@@ -1,11 +1,10 @@
 """The grid's builder: every cell lists the primitives in it, for any input."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.cell_cases import CASES, points_of, random_lines, segments, triangles
+from tests.cell_cases import CASES, assert_damage_is_refused, points_of, random_lines, segments, triangles
 from tests.refused import refused
 from wrt.accel.cells import grid as module
 from wrt.accel.scenes.build import build
@@ -109,13 +108,6 @@ def test_random_lines_cost_what_the_statistics_expect():
     assert abs(cost.mean() - grid.stats.sah_cost) < 3.0 * cost.std() / np.sqrt(n)
 
 
-def spoilt(name, change):
-    grid = build(icosphere(2), "grid")
-    arrays = {key: np.array(value) for key, value in grid.built.arrays.items()}
-    change(arrays[name])
-    return grid, replace(grid.built, arrays=arrays)
-
-
 @pytest.mark.parametrize(("name", "change"), [
     ("cells", lambda a: a["first"].__setitem__(5, -1)), ("cells", lambda a: a["count"].__setitem__(5, 1 << 30)),
     ("cells", lambda a: a["count"].__setitem__(5, -1)), ("references", lambda a: a.__setitem__(3, 320)),
@@ -125,7 +117,4 @@ def spoilt(name, change):
     ("pad", lambda a: a.__setitem__((), np.nan)), ("mailbox", lambda a: a.__setitem__((), 2)),
 ])
 def test_arrays_from_a_file_are_checked(name, change):
-    grid, built = spoilt(name, change)
-    type(grid).restore(grid.built, grid.geometry)
-    with refused(what="damaged"):
-        type(grid).restore(built, grid.geometry)
+    assert_damage_is_refused(build(icosphere(2), "grid"), name, change)

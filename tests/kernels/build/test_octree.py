@@ -1,12 +1,10 @@
 """The octree's builder: for any input, every leaf lists the primitives in it, and the tree stays within its limits."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.cell_cases import CASES, points_of, random_lines, segments, triangles
-from tests.refused import refused
+from tests.cell_cases import CASES, assert_damage_is_refused, points_of, random_lines, segments, triangles
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
 from wrt.scene.shapes import icosphere
@@ -141,9 +139,4 @@ def test_random_lines_cost_what_the_statistics_expect():
     ("pad", lambda a: a.__setitem__((), np.nan)), ("mailbox", lambda a: a.__setitem__((), 2)),
 ])
 def test_arrays_from_a_file_are_checked(name, change):
-    octree = build(icosphere(2), "octree")
-    arrays = {key: np.array(value) for key, value in octree.built.arrays.items()}
-    change(arrays[name])
-    type(octree).restore(octree.built, octree.geometry)
-    with refused(what="damaged"):
-        type(octree).restore(replace(octree.built, arrays=arrays), octree.geometry)
+    assert_damage_is_refused(build(icosphere(2), "octree"), name, change)

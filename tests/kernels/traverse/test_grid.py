@@ -1,13 +1,12 @@
 """Hard cases of the grid's walk: rays in the planes and through the corners of cells, far rays, and grazing rays."""
 
-from itertools import product
 
 import numpy as np
 import pytest
 
 from tests.kernel_tools import rounded, unit  # isort: skip (starts Warp)
 
-from tests.cell_cases import assert_same, soup
+from tests.cell_cases import assert_rays_at_corners_agree, assert_same, soup
 from wrt.accel.scenes.build import build
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
@@ -24,17 +23,9 @@ def corner_planes(grid):
 def test_rays_in_faces_and_through_edges_and_corners_of_cells(mailbox):
     rng = np.random.default_rng(1)
     geometry = soup(rng)
-    grid, brute = build(geometry, "grid", mailbox=mailbox), build(geometry, "brute_force")
-    planes = corner_planes(grid)
-    n = 20_000
-    corner = np.stack([rng.choice(p, n) for p in planes], axis=1)
-    size = np.array(grid.data.size)
-    steps = np.array([d for d in product([-1.0, -0.0, 0.0, 1.0], repeat=3) if np.any(d)])
-    direction = (steps[rng.integers(len(steps), size=n)] * size).astype(np.float32)  # Diagonals from corner to corner of cells.
-    origin = (corner - 8 * direction).astype(np.float32)
-    origin[: n // 2] = corner[: n // 2]
-    assert_same(grid.closest_hit(origin, direction), brute.closest_hit(origin, direction))
-    assert np.array_equal(grid.any_hit(origin, direction, 0.1, 3.0), brute.any_hit(origin, direction, 0.1, 3.0))
+    grid = build(geometry, "grid", mailbox=mailbox)
+    corner = np.stack([rng.choice(plane, 20_000) for plane in corner_planes(grid)], axis=1)
+    assert_rays_at_corners_agree(grid, geometry, corner, np.array(grid.data.size), rng)
 
 
 def test_a_hit_in_a_later_cell_does_not_end_the_walk():

@@ -1,13 +1,12 @@
 """Hard cases of the octree's walk: rays in the planes and through the corners of cells. It visits few nodes."""
 
-from itertools import product
 
 import numpy as np
 import pytest
 
 from tests.kernel_tools import rounded, unit  # isort: skip (starts Warp)
 
-from tests.cell_cases import assert_same, soup
+from tests.cell_cases import assert_rays_at_corners_agree, assert_same, soup
 from tests.rewalk import PRIMITIVES
 from wrt.accel.scenes.build import build
 from wrt.scene.shapes import icosphere
@@ -17,17 +16,11 @@ from wrt.scene.shapes import icosphere
 def test_rays_in_faces_and_through_edges_and_corners_of_cells(mailbox):
     rng = np.random.default_rng(1)
     geometry = soup(rng)
-    octree, brute = build(geometry, "octree", mailbox=mailbox), build(geometry, "brute_force")
+    octree = build(geometry, "octree", mailbox=mailbox)
     lo, hi = np.array(octree.data.lo, np.float32), np.array(octree.data.hi, np.float32)
     size = np.float32(octree.data.size) * np.float32(1 << int(octree.data.levels) - 4)
-    n = 20_000
-    corner = np.minimum(lo + rng.integers(0, 17, (n, 3)).astype(np.float32) * size, hi)
-    steps = np.array([d for d in product([-1.0, -0.0, 0.0, 1.0], repeat=3) if np.any(d)])
-    direction = (steps[rng.integers(len(steps), size=n)] * size).astype(np.float32)  # Diagonals from corner to corner of cells.
-    origin = (corner - 8 * direction).astype(np.float32)
-    origin[: n // 2] = corner[: n // 2]
-    assert_same(octree.closest_hit(origin, direction), brute.closest_hit(origin, direction))
-    assert np.array_equal(octree.any_hit(origin, direction, 0.1, 3.0), brute.any_hit(origin, direction, 0.1, 3.0))
+    corner = np.minimum(lo + rng.integers(0, 17, (20_000, 3)).astype(np.float32) * size, hi)
+    assert_rays_at_corners_agree(octree, geometry, corner, size, rng)
 
 
 def test_rays_in_planes_visit_the_cells_that_the_box_test_enters():
