@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from tests.cell_cases import CASES, assert_damage_is_refused, points_of, random_lines, segments, triangles
+from tests.refused import refused
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
 from wrt.scene.shapes import icosphere
