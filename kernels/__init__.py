@@ -1,4 +1,4 @@
-"""The device code: see kernels/README.md. It is imported as wrt.kernels only."""
+"""The device code; kernels/README.md describes it. Import the package as wrt.kernels only."""
 
-if __name__ != "wrt.kernels":  # a second copy of a struct type fails at launch, with a message that helps nobody
-    raise ImportError("import wrt.kernels, not kernels")
+if __name__ != "wrt.kernels":  # `kernels` would define each struct type a second time, and launches reject a second type
+    raise ImportError(f"the package was imported as {__name__!r}: import wrt.kernels instead")

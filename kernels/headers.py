@@ -1,7 +1,7 @@
-"""C++ headers beside the kernels: whole functions in namespace `wrt`, which an editor, g++ and Clang can read alone.
-A module of Warp takes C++ for the CPU before its kernels (wp.ModuleBuildOptions), as text: Warp hashes it, so that a changed header is
-compiled again. A native function (wp.func_native) is then one call. Constants shared with Python are in one more header, `layout.h`, which
-Python writes (`constants`)."""
+"""C++ headers beside the kernels: functions in namespace `wrt`. Editors, g++ and Clang can parse each header alone.
+wp.ModuleBuildOptions puts the text of headers before the CPU code of a Warp module. Warp hashes the text, so a changed header recompiles
+the module. A native function (wp.func_native) then consists of one call. Constants shared with Python are in `layout.h`, which is not a
+file: `constants` writes its text."""
 
 import re
 from collections.abc import Mapping
@@ -9,24 +9,23 @@ from pathlib import Path
 
 import warp as wp
 
-from wrt.kernels.native import literal
-
 FOLDER = Path(__file__).parent
 LINE = re.compile(r'#include "(\w+\.h)"|#pragma once')
 
 
 def constants(numbers: Mapping[str, float], struct: str = "") -> str:
-    """Write numbers as C++ constants in namespace wrt, or as members of the struct `struct`, for templates."""
+    """Return the C++ definitions of constants in namespace wrt; if `struct` is set, as static members of a struct of that name."""
     kinds = {name: "float" if isinstance(value, float) else "unsigned" if value >= 2**31 else "int"
              for name, value in numbers.items()}
-    lines = [f"constexpr {kinds[name]} {name} = {literal(value)};" for name, value in numbers.items()]
+    lines = [f"constexpr {kinds[name]} {name} = " + (f"{value.hex()}f;" if isinstance(value, float) else f"{int(value)};")
+             for name, value in numbers.items()]
     body = "struct " + struct + " {\n" + "".join(f"static {line}\n" for line in lines) + "};" if struct else "\n".join(lines)
     return f"namespace wrt {{\n{body}\n}}\n"
 
 
 def text_of(*files: str, **written: str) -> str:
-    """Return the text of headers ("wide/packet.h" of this folder), each after its includes from its own folder. written: texts of headers
-    that are not files ("layout" for layout.h)."""
+    """Return the text of headers, each once and after the headers that it includes. The paths `files` are below this folder, such as
+    "wide/packet.h". The texts `written` are of headers that are not files, by stem ("layout" for layout.h)."""
     out: list[str] = []
     seen: set[Path] = set()
     for file in files:
@@ -46,9 +45,9 @@ def _add(path: Path, written: Mapping[str, str], out: list[str], seen: set[Path]
         else:
             if found[1]:
                 _add(path.parent / found[1], written, out, seen)
-            out.append(f'#line {number + 1} "{path.relative_to(FOLDER.parent)}"\n')  # for the compiler's messages
+            out.append(f'#line {number + 1} "{path.relative_to(FOLDER.parent)}"\n')  # compiler messages name the header and its line
 
 
 def with_headers(*files: str, **written: str) -> wp.ModuleBuildOptions:
-    """Return the headers' text as a module of Warp takes it ("extra_build_options"), for the CPU."""
+    """Return the headers as the Warp module option "extra_build_options"; the headers apply to CPU code only."""
     return wp.ModuleBuildOptions(extra_cpu_preamble=text_of(*files, **written))

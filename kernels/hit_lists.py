@@ -1,4 +1,4 @@
-"""All hits of rays: a walk fills one list a ray, then the list is sorted."""
+"""All hits of rays: the traversal fills one list per ray, then each list is sorted."""
 
 from typing import Any
 
@@ -8,19 +8,19 @@ from wrt.kernels.query import HitArrays, RayArrays, direction_scale, load_ray, s
 from wrt.kernels.structs import Hit, Ray, kernel
 from wrt.kernels.units.triangle import is_crossed, to_ray_space, triangle_ray
 
-FEW = wp.constant(8)  # most rays have at most so many hits, and sorting them takes no time
+FEW = wp.constant(8)  # hits: most rays have no more, and sorting so few takes no measurable time
 
 
 @wp.struct
 class HitLists:
-    """Lists of hits, which a traversal unit with Units.lists gets in place of Surfaces."""
+    """Lists of hits. A traversal unit with Units.lists gets them as its argument `surfaces`."""
 
-    limit: int  # Largest number of hits asked for of a ray; below 2^30.
+    limit: int  # Largest number of hits to return for a ray; below 2^30.
     crossings: bool  # True: list only triangles that the ray crosses (units.triangle.is_crossed).
-    vertices: wp.array(dtype=wp.vec3)  # Read with `crossings` only, as `faces`.
+    vertices: wp.array(dtype=wp.vec3)  # vertices and faces are read only if `crossings` is True.
     faces: wp.array(dtype=wp.vec3i)
-    first: wp.array(dtype=wp.int32)  # The list of ray i is rows[first[i]] .. rows[first[i + 1] - 1].
-    count: wp.array(dtype=wp.int32)  # Hits of ray i; more than fit: see list_hit.
+    first: wp.array(dtype=wp.int32)  # Ray i has room for the hits rows[first[i]] .. rows[first[i + 1] - 1].
+    count: wp.array(dtype=wp.int32)  # Number of hits of ray i; above the list's length, the list is incomplete (list_hit).
     rows: wp.array(dtype=Hit)
 
 
@@ -31,7 +31,7 @@ def is_before(a: Hit, b: Hit) -> bool:
 
 @wp.func
 def sort_hits(rows: wp.array(dtype=Hit), first: int, count: int):
-    """Sort by t and, at equal t, by prim_id, in place: heapsort (Williams 1964, "Algorithm 232"), n log n for any order."""
+    """Sort rows[first : first + count] in place by t, then by prim_id. Heapsort (Williams 1964, "Algorithm 232"): n log n steps."""
     begin = count / 2
     end = int(count)
     while end > 1:
@@ -58,8 +58,8 @@ def sort_hits(rows: wp.array(dtype=Hit), first: int, count: int):
 
 @wp.func
 def sort_and_trim(rows: wp.array(dtype=Hit), first: int, count: int, limit: int) -> int:
-    """Sort a list, and keep its first hits, at most `limit`, each once; return their number. Some structures hold a triangle in several
-    leaves."""
+    """Sort a list, drop repeated hits, and cut the list to `limit` hits; return the number of hits left.
+    Hits repeat because some structures store a triangle in several leaves."""
     sort_hits(rows, first, count)
     kept = int(0)
     last = int(-1)
@@ -74,8 +74,8 @@ def sort_and_trim(rows: wp.array(dtype=Hit), first: int, count: int, limit: int)
 
 @wp.func
 def list_hit(lists: HitLists, ray: Ray, hit: Hit, best: Hit) -> Hit:
-    """Append a hit to the list of its ray. The returned `best` stays a miss, and limits the walk.
-    If the list is too short, count[i] exceeds its length. One for count[i] hits, or for 2 limit, then holds all."""
+    """Append a hit to the list of its ray. The returned `best` stays a miss; the walk may stop beyond its t.
+    If the list is too short, count[i] exceeds the list's length. A list for count[i] or 2 limit hits, whichever is less, suffices."""
     if lists.crossings:
         shear = triangle_ray(ray)
         face = lists.faces[hit.prim_id]
@@ -94,14 +94,14 @@ def list_hit(lists: HitLists, ray: Ray, hit: Hit, best: Hit) -> Hit:
             n = sort_and_trim(lists.rows, first, n, lists.limit)
             if n == lists.limit:
                 best.t = lists.rows[first + n - 1].t
-    elif n >= 2 * lists.limit:  # 2 limit is room enough for all
+    elif n >= 2 * lists.limit:  # stop the walk: a list of 2 limit hits is long enough, so the exact count does not matter
         best.t = float(-wp.inf)
     lists.count[ray.slot] = n
     return best
 
 
 def make_list_hits_kernel(accel_struct: Any, traverse: Any) -> Any:
-    """Make the kernel that fills the list of each ray; traverse: made with Units.lists and accepts=list_hit."""
+    """Make the kernel that fills the list of each ray; `traverse` is made with Units.lists and accepts=list_hit."""
 
     @kernel
     def list_hits(accel: accel_struct, rays: RayArrays, lists: HitLists, start: int):
@@ -118,7 +118,7 @@ def make_list_hits_kernel(accel_struct: Any, traverse: Any) -> Any:
 
 @kernel
 def copy_hits(rays: RayArrays, lists: HitLists, begin: wp.array(dtype=wp.int32), hits: HitArrays, start: int):
-    """Copy the list of ray i to hits[begin[i]] and on, with t in the caller's units."""
+    """Copy the list of ray i to the entries of `hits` from begin[i] on, with t in units of the caller's direction."""
     i = start + wp.tid()
     scale = direction_scale(rays.direction[i])
     for k in range(lists.count[i]):

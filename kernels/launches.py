@@ -1,26 +1,27 @@
-"""Launches made by a CPU kernel: a loop over kernels without Python, and without its lock.
-Warp does not document how it calls a CPU kernel: a C function of two addresses, of the launch's size (launch_bounds_t) and of its
-arguments. The self-test of wrt.accel.queries.raw_launches checks it."""
+"""Launches made by a CPU kernel: a kernel that launches other kernels in a loop needs neither Python nor its global lock.
+Warp calls a CPU kernel as a C function with two addresses: of the launch size (launch_bounds_t), and of the arguments. Warp does not
+document this. The self-test of wrt.accel.queries.raw_launches checks it."""
 
 import warp as wp
 
 
 @wp.struct
 class Launch:
-    """A CPU kernel with its arguments, by addresses that wrt.accel.queries.raw_launches keeps alive. One thread at a time may use it."""
+    """Addresses of a CPU kernel and of its arguments. wrt.accel.queries.raw_launches keeps the memory alive that they point to.
+    Only one thread at a time may use a Launch, because it changes the arguments."""
 
     entry: wp.uint64  # Address of the machine code.
     bounds: wp.uint64  # Address of the launch's size.
     args: wp.uint64  # Address of the arguments.
     tail: wp.uint64  # Address of the last argument.
-    block: int  # Rays of each thread, for a kernel that takes a range of them.
+    block: int  # Number of rays that one thread processes, for run_range.
 
 
 @wp.func_native("""
     ((void (*)(void*, void*))launch.entry)((void*)launch.bounds, (void*)launch.args);
 """)
 def run(launch: Launch) -> None:
-    """Run with the arguments set before."""
+    """Run the kernel with its present arguments."""
 
 
 @wp.func_native("*(int*)launch.tail = last;")
@@ -39,13 +40,13 @@ def set_range(launch: Launch, first: int, end: int) -> None: ...
 
 @wp.func
 def run_with(launch: Launch, last: int):
-    """Run with this last argument, an int."""
+    """Run the kernel with `last` as its last argument, which is an int."""
     set_last(launch, last)
     run(launch)
 
 
 @wp.func
 def run_range(launch: Launch, first: int, end: int):
-    """Run for rays first .. end - 1, the kernel's last two arguments."""
+    """Run the kernel for rays first .. end - 1; `first` and `end` are its last two arguments."""
     set_range(launch, first, end)
     run(launch)

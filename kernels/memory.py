@@ -1,15 +1,15 @@
-"""Access to arrays without gaps, for loops that run in lanes on one CPU thread.
+"""Access to contiguous arrays, for loops that the compiler vectorises on one CPU thread.
 
-The compiler vectorises a plain Warp loop, sixteen lanes on some CPUs and a tenth of the time, if
-- it is a `while` with a counter;
-- it has no branches (wp.where is none), and calls nothing that branches;
-- it accesses arrays by the functions here, and no table at a computed index;
-- vectors of three are made, selected and normalised by component (where_vec3, structs.unit), and there are none of two: LLVM keeps two
-  numbers together, as a vector of its own;
-- indices in one array differ by constants, or too many ranges would have to be compared. In C++, an index that is a multiple of a variable
-  is vectorised only for multiples of 1 (shade/film.h).
+With sixteen lanes, a vectorised loop takes a tenth of the time. The compiler vectorises a plain Warp loop if
+- the loop is a `while` with a counter;
+- the loop and the functions that it calls have no branches (wp.where is not a branch);
+- the loop accesses arrays by the functions of this file, and reads no table at a computed index;
+- vectors of three are made, selected and normalised by component (where_vec3, structs.unit);
+- there are no vectors of two: LLVM keeps their two numbers together in a vector of its own;
+- the indices into one array differ by constants: else the loop would have to test too many address ranges for overlap.
 
-Add `-Rpass=loop-vectorize` to wp.config.cpu_compiler_flags to see which loops are vectorised.
+In C++, an index `stride * i` is vectorised only for the stride 1 (shade/film.h). To list the vectorised loops, add
+`-Rpass=loop-vectorize` to wp.config.cpu_compiler_flags.
 """
 
 from typing import Any
@@ -19,7 +19,7 @@ import warp as wp
 
 @wp.func_native("return array.data[(long long)i][k];")
 def number_of_vec2(array: wp.array(dtype=wp.vec2), i: int, k: int) -> float:
-    """Component k of entry i."""
+    """Return component k of entry i."""
 
 
 @wp.func_native("array.data[(long long)i] = value;")
@@ -44,4 +44,4 @@ def put_in_vec3(array: wp.array(dtype=wp.vec3), i: int, k: int, value: float) ->
 
 @wp.func_native("__builtin_prefetch(array.data + (long long)i);")
 def prefetch(array: wp.array(dtype=Any), i: int) -> None:
-    """Prefetch the cache line of entry i (CPU)."""
+    """Prefetch the cache line of entry i; for the CPU only."""

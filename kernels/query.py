@@ -1,4 +1,4 @@
-"""Kernels of ray queries: arrays of rays in, hits out."""
+"""Kernels of ray queries: they read arrays of rays and write arrays of hits."""
 
 from typing import Any
 
@@ -6,16 +6,16 @@ import warp as wp
 
 from wrt.kernels.structs import Hit, Ray, Surfaces, kernel
 
-LARGEST = wp.constant(3.4028234663852886e38)  # of float32
-FARTHEST = 1e37  # largest coordinate of an origin in NumPy arrays: differences stay finite
-# Lengths of directions that are not scaled, and the factors for shorter and longer ones: see direction_scale.
+LARGEST = wp.constant(3.4028234663852886e38)  # Largest finite float32.
+FARTHEST = 1e37  # Largest absolute coordinate of an origin in a NumPy array: the difference of two coordinates stays finite.
+# Function direction_scale multiplies directions shorter than SHORTEST by LENGTHEN, and directions longer than LONGEST by SHORTEN.
 SHORTEST, LONGEST = 2.0**-64, 2.0**64
 LENGTHEN, SHORTEN = 2.0**96, 2.0**-64
 
 
 @wp.struct
 class RayArrays:
-    """Rays of a caller; t_min and t_max may have a stride of 0: one value for all."""
+    """Rays of a query in world space; t is in units of the direction's length. A stride of 0 in t_min or t_max: one value for all rays."""
 
     origin: wp.array(dtype=wp.vec3)
     direction: wp.array(dtype=wp.vec3)
@@ -25,18 +25,18 @@ class RayArrays:
 
 @wp.struct
 class RenderRays:
-    """Rays of a picture, whose directions are used unscaled."""
+    """Rays of a picture, in world space. The traversal uses their directions as they are, without direction_scale."""
 
     origin: wp.array(dtype=wp.vec3)
     direction: wp.array(dtype=wp.vec3)
     t_min: wp.array(dtype=wp.float32)
     t_max: wp.array(dtype=wp.float32)
-    exclude: wp.array(dtype=wp.int32)  # As Ray.exclude_plus_one.
+    exclude: wp.array(dtype=wp.int32)  # Values of Ray.exclude_plus_one.
 
 
 @wp.struct
 class HitArrays:
-    """Hits; a miss has t = inf and prim_id = -1."""
+    """Hits, one per ray: see structs.Hit. A miss has t = inf and prim_id = -1."""
 
     t: wp.array(dtype=wp.float32)
     u: wp.array(dtype=wp.float32)
@@ -46,9 +46,9 @@ class HitArrays:
 
 @wp.func
 def direction_scale(direction: wp.vec3) -> float:
-    """Power of two that brings a very short or long direction to where 1 / d is neither denormal nor infinite, else 1. The factor is
-    exact, but components that become denormal are off by 2^-150, where the longest is at least 1. The scaled direction is between 2^-64
-    and 2^64, for denormal ones too."""
+    """Return a power of two by which to multiply a very short or long direction d; 1 for other directions.
+    It keeps the longest component between 2^-64 and 2^64, so that its reciprocal is neither denormal nor infinite. The product is exact,
+    except in components that become denormal. These are off by up to 2^-150, and then the longest component is at least 1."""
     longest = wp.abs(direction[0])
     longest = wp.where(wp.abs(direction[1]) > longest, wp.abs(direction[1]), longest)
     longest = wp.where(wp.abs(direction[2]) > longest, wp.abs(direction[2]), longest)
@@ -58,8 +58,8 @@ def direction_scale(direction: wp.vec3) -> float:
 
 @wp.func
 def scaled_ray(origin: wp.vec3, direction: wp.vec3, t_min: float, t_max: float) -> Ray:
-    """Make a ray with its direction scaled: its t times `direction_scale` is in the caller's units. The segment ends where t in the
-    caller's units exceeds float32, so that no traversal returns such a hit."""
+    """Make a ray with a scaled direction. The ray's t times `direction_scale` is t in units of the caller's direction.
+    The segment ends where the caller's t would exceed the largest float32, so no traversal returns a hit beyond."""
     scale = direction_scale(direction)
     inverse = wp.where(scale > 1.0, wp.static(1.0 / LENGTHEN), wp.where(scale < 1.0, wp.static(1.0 / SHORTEN), 1.0))
     ray = Ray()
@@ -78,7 +78,7 @@ def load_ray(rays: RayArrays, i: int) -> Ray:
 
 
 def make_closest_hit_kernel(accel_struct: Any, traverse: Any) -> Any:
-    """Make the kernel for rays first .. first + dim - 1; a hit whose t exceeds float32 is a miss."""
+    """Make the kernel that stores the closest hits of rays first .. first + dim - 1, for the launch size dim."""
 
     @kernel
     def closest_hit(accel: accel_struct, surfaces: Surfaces, rays: RayArrays, hits: HitArrays, first: int):
@@ -91,7 +91,7 @@ def make_closest_hit_kernel(accel_struct: Any, traverse: Any) -> Any:
 
 
 def make_any_hit_kernel(accel_struct: Any, traverse: Any) -> Any:
-    """Make the kernel that stores True for each ray that hits anything."""
+    """Make the kernel that stores, for rays first .. first + dim - 1, whether they hit anything."""
 
     @kernel
     def any_hit(accel: accel_struct, surfaces: Surfaces, rays: RayArrays, occluded: wp.array(dtype=wp.bool), first: int):
@@ -104,15 +104,15 @@ def make_any_hit_kernel(accel_struct: Any, traverse: Any) -> Any:
 
 @wp.struct
 class Worlds:
-    """The world of each ray."""
+    """The world of each ray, in a structure that holds several scenes ("worlds")."""
 
-    id: wp.array(dtype=wp.int32)  # By ray; with a stride of 0, one for all.
-    root: wp.array(dtype=wp.int32)  # Root node, by world.
+    id: wp.array(dtype=wp.int32)  # Index of each ray's world; with a stride of 0, one world for all rays.
+    root: wp.array(dtype=wp.int32)  # Index of each world's root node.
 
 
 @wp.func
 def load_ray_of_world(rays: RayArrays, worlds: Worlds, i: int) -> Ray:
-    """Load a ray with its world's root; a ray whose world does not exist hits nothing."""
+    """Load a ray and set first_prim to the root node of its world. If the world does not exist, the ray hits nothing."""
     ray = load_ray(rays, i)
     world = worlds.id[i]
     if world >= 0 and world < worlds.root.shape[0]:
@@ -123,7 +123,7 @@ def load_ray_of_world(rays: RayArrays, worlds: Worlds, i: int) -> Ray:
 
 
 def make_worlds_kernel(accel_struct: Any, traverse: Any, any_hit: bool) -> Any:
-    """Make the kernel that traces each ray in its own world; out: HitArrays, or for any hit an array of bool."""
+    """Make the kernel that traces each ray in its own world. Its argument `out` is HitArrays or, with any_hit, an array of bool."""
     out_type = wp.array(dtype=wp.bool) if any_hit else HitArrays
 
     @kernel
@@ -151,7 +151,7 @@ def load_render_ray(rays: RenderRays, i: int) -> Ray:
 
 @wp.func
 def store_render_ray(rays: RenderRays, i: int, ray: Ray):
-    """Store a ray but for t_min, which is 0 throughout."""
+    """Store all fields of a ray except t_min, which is 0 for all rays of a picture."""
     rays.origin[i] = ray.origin
     rays.direction[i] = ray.direction
     rays.t_max[i] = ray.t_max
@@ -170,7 +170,7 @@ def load_hit(hits: HitArrays, i: int) -> Hit:
 
 @wp.func
 def store_hit(hits: HitArrays, i: Any, hit: Any, scale: float):
-    """Store a hit, with t multiplied by `scale`; i: int or int64, hit: a record with the fields of a Hit."""
+    """Store a hit with t multiplied by `scale`; i is int or int64, `hit` a Hit or a QueryHit."""
     hits.t[i] = hit.t * scale
     hits.u[i] = hit.u
     hits.v[i] = hit.v
@@ -178,7 +178,7 @@ def store_hit(hits: HitArrays, i: Any, hit: Any, scale: float):
 
 
 def make_render_rays_kernel(accel_struct: Any, traverse: Any, any_hit: bool) -> Any:
-    """Make the kernel that traces rays first .. end - 1 of a picture one at a time; out: as make_worlds_kernel."""
+    """Make the kernel that traces rays first .. end - 1 of a picture, one ray per thread. Its `out` is HitArrays or, with any_hit, bool."""
     out_type = wp.array(dtype=wp.bool) if any_hit else HitArrays
 
     @kernel

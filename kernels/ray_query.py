@@ -1,6 +1,6 @@
 """Ray queries in a user's kernel: records and functions.
-The functions call the traversal units for one ray, with the scaling of extreme directions. Hits have the bits of Accelerator.closest_hit,
-if the kernel is compiled without fused multiply-add (structs.kernel)."""
+The functions scale very short and long directions (query.direction_scale) and traverse the structure for one ray. In a kernel without fused
+multiply-add (structs.kernel), their hits equal those of Accelerator.closest_hit to the last bit."""
 
 from typing import Any
 
@@ -15,9 +15,9 @@ class QueryRay:
     """A ray in world space, and its closed segment [t_min, t_max]. A ray that is not finite, or whose direction is 0, hits nothing."""
 
     origin: wp.vec3
-    direction: wp.vec3  # Any length.
-    t_min: float  # In units of |direction|, as t_max; >= 0.
-    t_max: float
+    direction: wp.vec3  # Any length but 0.
+    t_min: float  # At least 0, in units of |direction|.
+    t_max: float  # In units of |direction|; may be inf.
 
 
 @wp.struct
@@ -28,12 +28,12 @@ class QueryHit:
     u: float
     v: float
     prim_id: int  # Index of the primitive; -1 on a miss.
-    scaled_t: float  # t in the traversal's units, for next_hit.
+    scaled_t: float  # t / direction_scale, the t of the scaled ray; next_hit reads it.
 
 
 @wp.func
 def query_ray(origin: wp.vec3, direction: wp.vec3) -> QueryRay:
-    """Make a ray from the origin to infinity."""
+    """Make a ray from `origin` to infinity: t_min = 0, t_max = inf."""
     ray = QueryRay()
     ray.origin = origin
     ray.direction = direction
@@ -41,23 +41,25 @@ def query_ray(origin: wp.vec3, direction: wp.vec3) -> QueryRay:
     return ray
 
 
-# In float32, (1 + 2^-12)^2 is 1 + 2^-11; a fused subtraction leaves 2^-24. volatile keeps the compiler, which never fuses, from folding
-# it.
+# y = 1 + 2^-12: in float32, y * y rounds to 1 + 2^-11, so y * y - (1 + 2^-11) is 0. A fused multiply-add returns 2^-24. Constant folding
+# never fuses; volatile prevents the folding.
 @wp.func_native("""
 #if !defined(WRT_INLINE) && !defined(__CUDA_ARCH__)
-    return true;  // made by wp.kernel, without the headers of wide/
+    return true;  // a kernel made by wp.kernel lacks the headers of wide/
 #endif
     volatile float x = 1.000244140625f;
     const float y = x;
     return y * y - 1.00048828125f != 0.0f;
 """)
 def fused() -> bool:
-    """Test whether this kernel is compiled with fused multiply-add, which would lose rays at edges."""
+    """Test whether this kernel is compiled with fused multiply-add, with which rays slip between neighbouring triangles.
+    Also True on a CPU if the kernel was made by wp.kernel."""
 
 
 @wp.func_native("""
-    static const char* const why[] = {"a kernel that asks for hits must be made with wrt.kernel: fused multiply-add loses rays",
-                                      "accel.world is of another structure or triangle test than the kernel's wrt.ray_query"};
+    static const char* const why[] = {"the rays of a kernel hit nothing, because a kernel with ray queries must be made with wrt.kernel",
+                                      "the rays of a kernel hit nothing, because accel.world is of another structure or triangle test"
+                                      " than the kernel's functions: make them with wrt.ray_query(accel)"};
     static bool warned[2];
     if (!warned[reason]) printf("wrt: %s\\n", why[reason]);
     warned[reason] = true;
@@ -67,7 +69,7 @@ def warn_once(reason: int) -> None: ...
 
 @wp.func
 def traversal_ray(ray: QueryRay, is_other: bool) -> Ray:
-    """Make the traversal's ray; if the kernel is not compiled as required, or the world is another one, a ray that hits nothing."""
+    """Make the ray for the traversal. If the kernel has fused multiply-add, or is_other (the World is of another type), it hits nothing."""
     out = scaled_ray(ray.origin, ray.direction, ray.t_min, ray.t_max)
     if is_other or fused():
         warn_once(wp.where(is_other, 1, 0))
@@ -87,33 +89,33 @@ def make_query_hit(hit: Hit, direction: wp.vec3) -> QueryHit:
 
 
 def make_ray_query(accel_struct: Any, closest: Any, any_of: Any, resuming: Any, kind: int) -> tuple[Any, Any, Any, Any]:
-    """Make World, closest_hit, any_hit, next_hit from traversal units; `resuming` is made with Units.resumes. A World must have the same
-    `kind`, a number of these units."""
+    """Make World, closest_hit, any_hit and next_hit from three traversals; `resuming` is made with Units.resumes.
+    The integer `kind` identifies these traversals: a World with another `kind` is rejected at run time."""
 
     @wp.struct
     class World:
         """A structure and its surfaces, as one argument of a kernel."""
 
-        kind: int  # Compared by wrt, because Warp does not compare the types of records.
+        kind: int  # The functions compare it with theirs, because Warp does not compare the types of structs.
         accel: accel_struct
         surfaces: Surfaces
 
     @wp.func
     def closest_hit(world: World, ray: QueryRay) -> QueryHit:
-        """Closest hit in the segment; the lowest prim_id at equal t."""
+        """Return the closest hit in the ray's segment; of hits at equal t, the one with the lowest prim_id."""
         return make_query_hit(closest(world.accel, world.surfaces, traversal_ray(ray, world.kind != kind)), ray.direction)
 
     @wp.func
     def any_hit(world: World, ray: QueryRay) -> bool:
-        """Return True if anything is hit in the segment."""
+        """Return True if the ray hits anything in its segment."""
         hit = any_of(world.accel, world.surfaces, traversal_ray(ray, world.kind != kind))
         return hit.prim_id >= 0
 
     @wp.func
     def next_hit(world: World, ray: QueryRay, hit: QueryHit) -> QueryHit:
-        """Next hit of this ray after `hit`, in the order of t and, at equal t, of prim_id. From the closest hit on, calls return each hit
-        of the segment once. Each call walks from the root and repeats the tests at the same t: k hits at one t take k^2 tests. With
-        storage for them, `wrt.all_hits` takes k log k steps."""
+        """Return the next hit of this ray after `hit`, in the order of t and, at equal t, of prim_id. Start with the closest hit, and
+        repeated calls return each hit of the segment once. Each call starts at the root and repeats the tests at the same t, so k hits at
+        one t take k^2 tests. The function `wrt.all_hits` stores the hits, and takes k log k steps."""
         going = traversal_ray(ray, world.kind != kind)
         going.t_min = hit.scaled_t
         going.slot = hit.prim_id + 1

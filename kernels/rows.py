@@ -1,7 +1,7 @@
-"""Structs in rows, for loops that run in lanes (kernels.memory).
-A struct of 9 numbers takes 9 rows of a block; column i holds entry i. A loop over i then reads and writes neighbours, which the compiler
-vectorises; in an array of structs they would be 9 numbers apart. Functions `load` and `store` are C++ generated from the struct's fields,
-one copy a number; tests/kernels/test_rows.py prints it."""
+"""Structs stored as a structure of arrays, for vectorised loops (kernels.memory).
+A struct of 9 numbers takes 9 rows of a two-dimensional block; column i holds struct i. A loop over i then accesses consecutive addresses,
+which the compiler vectorises. In an array of structs, equal fields would be 9 numbers apart. Functions `load` and `store` are C++ generated
+from the struct's fields, one copy per number (example: tests/kernels/test_rows.py)."""
 
 from functools import cache
 from typing import Any, NamedTuple
@@ -12,7 +12,7 @@ from wrt.kernels.warp_private import fields_of
 
 
 def numbers_of(dtype: Any, name: str) -> list[str]:
-    """Return the numbers of a struct, vector or number as C++, in order: "name.point[0]", "name.point[1]" ..."""
+    """Return C++ expressions for all numbers of a variable `name` of this type, in order: "name.point[0]", "name.point[1]" ..."""
     if hasattr(dtype, "numpy_dtype"):
         return [number for field, kind in fields_of(dtype).items() for number in numbers_of(kind, f"{name}.{field}")]
     size = wp.types.type_size(dtype)
@@ -20,15 +20,15 @@ def numbers_of(dtype: Any, name: str) -> list[str]:
 
 
 class Rows(NamedTuple):
-    """The rows of a block that hold structs (or vectors) of one type, in 4 bytes a number with all bits."""
+    """The rows of a block that hold structs (or vectors) of one type. Each number takes 4 bytes and keeps its bits, integers too."""
 
     dtype: Any
-    length: int  # Entries of the block: numbers in a row.
-    first: int = 0  # Row of the struct's first number.
+    length: int  # Columns of the block: the number of structs that it holds.
+    first: int = 0  # Index of the row with the struct's first number.
 
     @property
     def end(self) -> int:
-        """The row behind the last."""
+        """Index of the row behind the struct's last row."""
         return self.first + len(numbers_of(self.dtype, "value"))
 
     def field(self, name: str) -> "Rows":
@@ -38,18 +38,19 @@ class Rows(NamedTuple):
         return Rows(fields[name], self.length, self.first + sum(len(numbers_of(fields[each], "")) for each in before))
 
     def text(self, line: str, without: tuple[str, ...] = ()) -> str:
-        """Return the line of C++ for each {number} and its {place}, except in the fields `without`."""
+        """Return the template `line` once per number of the struct, except in the fields `without`: {number} is the number's C++
+        expression, {place} its address in column i."""
         left_out = tuple(f"value.{name}{end}" for name in without for end in ("[", ".", ";"))
         return "".join(f"    {line}\n".format(number=number, place=f"rows.data + {row * self.length}ll + i")
                        for row, number in enumerate(numbers_of(self.dtype, "value"), self.first)
                        if not f"{number};".startswith(left_out))
 
     def load(self, *without: str) -> Any:
-        """Make load(rows, i) -> entry i; the fields `without` are 0."""
+        """Make load(rows, i), which returns struct i with 0 in the fields `without`."""
         return make_load(self, without)
 
     def store(self, *without: str) -> Any:
-        """Make store(rows, i, value); it leaves the rows of the fields `without` as they are."""
+        """Make store(rows, i, value), which writes struct i except for the fields `without`."""
         return make_store(self, without)
 
 

@@ -1,4 +1,4 @@
-"""Records that the units exchange on the device, and `kernel`, which compiles all kernels with the same options.
+"""Structs that the parts of the device code exchange, and `kernel`, which compiles all kernels with the same options.
 Rays and hits are in world space."""
 
 from typing import TYPE_CHECKING, Any
@@ -7,25 +7,24 @@ import warp as wp
 
 from wrt.kernels.headers import with_headers
 
-NO_HIT = wp.constant(0x7FFFFFFF)  # prim_id of a miss inside a walk: larger than any other, so that a hit at equal t wins.
-INF = wp.constant(float("inf"))
-EPSILON = wp.constant(2.0**-24)  # the unit roundoff of float32
+NO_HIT = wp.constant(0x7FFFFFFF)  # prim_id of a miss during traversal: larger than every index, so that a hit at equal t wins
+EPSILON = wp.constant(2.0**-24)  # unit roundoff u of float32
 
-# A fused multiply-add rounds once where its mirror image rounds twice. The edge tests of two neighbouring triangles would no longer be
-# exact negatives, and a ray could slip between them.
+# No fused multiply-add: it rounds a b - c d and c d - a b differently. The edge tests of two neighbouring triangles would no longer be
+# exact negatives, and a ray could slip between the triangles.
 #
-# The headers hold the box and edge tests in lanes, for the walks of wide trees on a CPU.
+# The headers contain vectorised box and edge tests for the traversal of wide BVHs on a CPU.
 MODULE_OPTIONS = {"fuse_fp": False, "enable_backward": False, "extra_build_options": with_headers("wide/triangle.h")}
 
 
-if TYPE_CHECKING:  # type checkers do not read device code: its annotations are Warp's
+if TYPE_CHECKING:  # type checkers skip device code, because Warp's annotations are not Python types
     from typing import no_type_check as kernel
     from typing import no_type_check as noinline
 else:
     def kernel(function, **options):
         """Make a Warp kernel in a module of its own, without fused multiply-add and without code for gradients.
-        In wrt's own modules, kernels are compiled in release mode, whatever wp.config.mode is: in debug mode, a kernel of Warp 1.19 ends
-        the process when several threads launch it. A user's kernel follows wp.config.mode."""
+        Kernels of wrt are compiled in release mode, whatever wp.config.mode is: in debug mode, a kernel of Warp 1.19 ends the process if
+        several threads launch it. Kernels of a user follow wp.config.mode."""
         own = {"mode": "release"} if str(function.__module__).startswith("wrt.") else {}  # __module__ is None in code made by exec
         return wp.kernel(function, module="unique", module_options=MODULE_OPTIONS | own | options, enable_backward=False)
 
@@ -42,55 +41,55 @@ else:
 #endif
 """)
 def on_cuda() -> bool:
-    """Test for CUDA, where the same arithmetic may have a faster form."""
+    """Test whether the code runs on CUDA, to choose a faster form of the same arithmetic."""
 
 
 def size_of(struct: Any) -> int:
-    """Return the bytes of a record."""
+    """Return the size of a struct in bytes."""
     return int(struct.numpy_dtype()["itemsize"])
 
 
 @wp.func
 def gamma(n: float) -> float:
-    """Relative bound on n successive rounding errors, n u / (1 - n u) (Higham 2002, lemma 3.1)."""
+    """Bound the relative error of n successive roundings: n u / (1 - n u) (Higham 2002, lemma 3.1)."""
     return n * EPSILON / (1.0 - n * EPSILON)
 
 
 @wp.func
 def largest(v: wp.vec3) -> float:
-    """Largest absolute component."""
+    """Return the largest absolute component."""
     return wp.max(wp.max(wp.abs(v[0]), wp.abs(v[1])), wp.abs(v[2]))
 
 
 @wp.func
 def lift(v: wp.vec3) -> float:
-    """Power of two that brings a very short vector to where its square is no denormal, else 1: an exact factor."""
+    """Return the factor 2^80 for a vector with all components below 2^-40, whose square could be denormal; else 1. The product is exact."""
     return wp.where(largest(v) < wp.static(2.0**-40), wp.static(2.0**80), 1.0)
 
 
 @wp.struct
 class Ray:
     """The points origin + t * direction for t_min <= t <= t_max; direction need not have unit length.
-    `make_ray` makes one that reaches to infinity. Ray() is all zeros: its segment is empty until t_max is set."""
+    `make_ray` makes a ray that reaches to infinity. In Ray(), all fields are 0: set at least direction and t_max."""
 
     origin: wp.vec3
     direction: wp.vec3
     t_min: float
     t_max: float
-    exclude_plus_one: int  # 1 + prim_id of the triangle that the ray starts on, which it does not hit; 0: none.
-    slot: int  # Index of its counters, if counters are compiled in.
-    first_prim: int  # Inside an instance: added to its primitives' prim_id. Above instances: root node of the ray's world.
+    exclude_plus_one: int  # 1 + prim_id of the triangle that the ray starts on and must not hit; 0: no such triangle.
+    slot: int  # Index of the ray's counters or hit list. With Units.resumes: lowest prim_id of a hit at t_min.
+    first_prim: int  # Inside an instance: the offset to add to prim_id. Above instances: root node of the ray's world.
 
 
 @wp.func
 def any_positive(v: wp.vec3) -> bool:
-    """Test whether a component is above 0; NaN is not. wp.max takes three times as long."""
+    """Test whether a component is above 0, False for NaN. A test with wp.max takes three times as long."""
     return v[0] > 0.0 or v[1] > 0.0 or v[2] > 0.0
 
 
 @wp.func
 def unit(v: wp.vec3) -> wp.vec3:
-    """Normalise v without wp.normalize's branch, for loops in lanes; (0, 0, 0) stays."""
+    """Normalise v; (0, 0, 0) stays. Unlike wp.normalize, it has no branch, so loops with it are vectorised."""
     length = wp.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
     return wp.vec3(wp.where(length > 0.0, v[0] / length, 0.0), wp.where(length > 0.0, v[1] / length, 0.0),
                    wp.where(length > 0.0, v[2] / length, 0.0))
@@ -98,8 +97,8 @@ def unit(v: wp.vec3) -> wp.vec3:
 
 @wp.func
 def make_ray(origin: wp.vec3, direction: wp.vec3) -> Ray:
-    """Make the ray from origin to infinity (t_min = 0, t_max = inf) that excludes no triangle. World space; the direction's length is
-    between 2^-64 and 2^64 (kernels.query.direction_scale brings others there)."""
+    """Make the ray from origin to infinity (t_min = 0, t_max = inf) that excludes no triangle, in world space.
+    The direction's length must be between 2^-64 and 2^64; for other lengths see kernels.query.direction_scale."""
     ray = Ray()
     ray.origin = origin
     ray.direction = direction
@@ -111,7 +110,8 @@ def make_ray(origin: wp.vec3, direction: wp.vec3) -> Ray:
 
 @wp.struct
 class Hit:
-    """The point (1 - u - v) v0 + u v1 + v v2 on triangle prim_id; a miss has prim_id = NO_HIT."""
+    """A hit: the point (1 - u - v) v0 + u v1 + v v2 on triangle prim_id.
+    A miss has prim_id = NO_HIT during traversal, and -1 in the result of a traversal."""
 
     t: float
     u: float
@@ -121,8 +121,8 @@ class Hit:
 
 @wp.struct
 class Primitive:
-    """A triangle by its corners, or by one corner and two edges (v1, v2); 40 bytes.
-    If prim_id >= the number of triangles, it is sphere prim_id - n_triangles, and the rest is not read."""
+    """A triangle by its corners v0, v1, v2, or by the corner v0 and the edges v1, v2 from it; 40 bytes.
+    If prim_id >= n_triangles, the record stands for sphere prim_id - n_triangles, and v0, v1, v2 are not read."""
 
     v0: wp.vec3
     v1: wp.vec3
@@ -132,7 +132,7 @@ class Primitive:
 
 @wp.struct
 class PlanePrimitive:
-    """A triangle by three planes (x, y, z: normal, w: offset), for tests that precompute; 52 bytes. Spheres as in Primitive."""
+    """A triangle by three planes (x, y, z: normal, w: offset), for tests with precomputed data; 52 bytes. Spheres: as in Primitive."""
 
     a: wp.vec4
     b: wp.vec4
@@ -142,9 +142,9 @@ class PlanePrimitive:
 
 @wp.struct
 class Texture:
-    """An image in the shared array of texels, or a checkerboard (width = 0)."""
+    """An image in the shared array Surfaces.texels, or a checkerboard of two colours (width = 0)."""
 
-    first: int  # Its first texel; rows of `width` texels follow.
+    first: int  # Index of the image's first texel in Surfaces.texels; the image has `height` rows of `width` texels.
     width: int
     height: int
     srgb: int
@@ -158,7 +158,7 @@ class Texture:
 
 @wp.struct
 class Material:
-    """The fields of wrt.scene.materials.Material; textures are indices, -1 for none."""
+    """A material: wrt.scene.materials.Material describes the fields. A texture is an index into Surfaces.textures, or -1 for none."""
 
     kind: int
     albedo: wp.vec3
@@ -187,16 +187,16 @@ class Material:
 
 @wp.struct
 class Instance:
-    """A mesh in one place: the primitives from first_prim up to the next instance's."""
+    """A mesh placed in the scene. Its primitives have the prim_id from first_prim up to the first_prim of the next instance."""
 
     first_prim: int
-    first_face: int  # Index of its first face in Surfaces.faces.
-    first_material: int  # Index of its first material in Surfaces.prim_material.
-    material_step: int  # 1, or 0 if one material serves the whole mesh.
-    world_x: wp.vec4d  # Rows of the affine map from the mesh to the world: world_x, world_y, world_z.
+    first_face: int  # Index of the mesh's first face in Surfaces.faces.
+    first_material: int  # Index of the instance's first material in Surfaces.prim_material.
+    material_step: int  # Either 1, or 0 if one material serves the whole mesh.
+    world_x: wp.vec4d  # world_x, world_y, world_z: rows of the affine map from the mesh's space to world space.
     world_y: wp.vec4d
     world_z: wp.vec4d
-    normal_x: wp.vec3  # Columns of the inverse, up to a positive factor, which map normals: normal_x, normal_y, normal_z.
+    normal_x: wp.vec3  # normal_x, normal_y, normal_z: columns of the map's inverse, times a positive factor, to transform normals.
     normal_y: wp.vec3
     normal_z: wp.vec3
     handedness: float  # -1 for a mirroring map, else 1.
@@ -205,17 +205,17 @@ class Instance:
 @wp.struct
 class Surfaces:
     """Attributes of primitives, read after a hit.
-    With instances, vertices, normals and faces are stored once a mesh, in its own space. Without (length 0), they are in world space, and
-    prim_id indexes faces and materials. Unused arrays of a scene have length 1."""
+    With instances, vertices, normals and faces are stored once per mesh, in the mesh's space. Without instances (length 0), they are in
+    world space, and prim_id indexes faces and prim_material. Arrays that a scene does not use have length 1."""
 
-    n_triangles: int  # Primitives from this prim_id on are spheres.
+    n_triangles: int  # Primitives with prim_id >= n_triangles are spheres.
     vertices: wp.array(dtype=wp.vec3)
     faces: wp.array(dtype=wp.vec3i)
-    normals: wp.array(dtype=wp.vec3)  # Per vertex.
-    uvs: wp.array(dtype=wp.vec2)  # Per vertex.
+    normals: wp.array(dtype=wp.vec3)  # One per vertex.
+    uvs: wp.array(dtype=wp.vec2)  # One per vertex.
     spheres: wp.array(dtype=wp.vec4)  # (center, radius)
-    instances: wp.array(dtype=Instance)  # In the order of first_prim.
-    prim_material: wp.array(dtype=wp.int32)
+    instances: wp.array(dtype=Instance)  # Ascending by first_prim.
+    prim_material: wp.array(dtype=wp.int32)  # Indices into `materials`.
     materials: wp.array(dtype=Material)
     textures: wp.array(dtype=Texture)
     texels: wp.array(dtype=wp.uint32)
@@ -224,7 +224,7 @@ class Surfaces:
 
 @wp.struct
 class Light:
-    """One light of a kind that the kernel is made for; fields that its kind does not name are not read.
+    """A light. The list names the fields that each kind of light uses; other fields are not read.
 
     - Point, spot: position, color = radiant intensity.
     - Directional: direction of travel, color = irradiance.
@@ -232,7 +232,7 @@ class Light:
     - Mesh: emitters first .. first + count - 1.
     """
 
-    kind: int  # Index among the kernel's kinds of lights.
+    kind: int  # Index into the list of light kinds that the kernel is compiled for.
     position: wp.vec3
     direction: wp.vec3
     color: wp.vec3
@@ -246,20 +246,20 @@ class Light:
 
 @wp.struct
 class Emitter:
-    """An emitting triangle: corners and unit normal in the space of its mesh."""
+    """An emitting triangle: corners and unit normal in the space of the mesh."""
 
     v0: wp.vec3
     v1: wp.vec3
     v2: wp.vec3
     normal: wp.vec3
-    material: int  # Index of its material.
-    instance: int  # Index of its instance, if the scene has instances.
-    pdf_area: float  # Probability density, per area, of a point on it among its light's points.
+    material: int  # Index of the triangle's material.
+    instance: int  # Index of the triangle's instance, if the scene has instances.
+    pdf_area: float  # Probability density, per unit area, with which sampling the light returns a point of this triangle.
 
 
 @wp.struct
 class Background:
-    """Radiance from outside: a constant (bottom = top), a gradient in y, or an image with tables for importance sampling."""
+    """Radiance of rays that leave the scene: a constant (bottom = top), a gradient in y, or an image with tables to sample it."""
 
     bottom: wp.vec3
     top: wp.vec3
@@ -274,12 +274,12 @@ class Background:
 
 @wp.struct
 class Lighting:
-    """All sources of light but emitting surfaces that a ray hits."""
+    """The sources of light that shading samples, the background, and the ambient term."""
 
-    count: int
+    count: int  # Number of lights.
     lights: wp.array(dtype=Light)
     emitters: wp.array(dtype=Emitter)
-    emitter_cdf: wp.array(dtype=wp.float32)  # Per emitter: cumulative share of its light's power, itself included.
+    emitter_cdf: wp.array(dtype=wp.float32)  # Share of the light's power in its emitters up to and including this one.
     background: Background
     ambient: wp.vec3
 
@@ -295,10 +295,10 @@ class Limits:
 
 @wp.struct
 class Film:
-    """One entry a pixel, in row order: running mean and sum of squared deviations (Welford 1962), samples, and costs.
-    The arrays hold the rectangle of the image that begins at (x, y) and is `columns` pixels wide."""
+    """Running mean, sum of squared deviations (Welford 1962), number of samples, and cost of each pixel, row by row.
+    The arrays hold the rectangle of the image that begins at pixel (x, y) and is `columns` pixels wide."""
 
-    width: int  # Of the whole image, as height.
+    width: int  # width, height: size of the whole image in pixels.
     height: int
     x: int
     y: int
@@ -306,17 +306,17 @@ class Film:
     mean: wp.array(dtype=wp.vec3)
     m2: wp.array(dtype=wp.vec3)
     samples: wp.array(dtype=wp.int32)
-    rays: wp.array(dtype=wp.int64)  # Closest-hit and any-hit rays.
-    cut_depth: wp.array(dtype=wp.int32)  # Rays not followed because of max_depth.
-    cut_throughput: wp.array(dtype=wp.int32)  # Rays not followed because of min_throughput.
-    lost: wp.array(dtype=wp.float32)  # Throughput, mean over the channels, of the rays that were not followed.
-    not_finite: wp.array(dtype=wp.int32)  # Samples that were NaN or infinite, and count as 0.
+    rays: wp.array(dtype=wp.int64)  # Number of closest-hit and any-hit rays.
+    cut_depth: wp.array(dtype=wp.int32)  # Number of rays cut by max_depth.
+    cut_throughput: wp.array(dtype=wp.int32)  # Number of rays cut by min_throughput.
+    lost: wp.array(dtype=wp.float32)  # Sum of the throughputs of the cut rays, each averaged over the colour channels.
+    not_finite: wp.array(dtype=wp.int32)  # Number of samples that were NaN or infinite; they enter the mean as 0.
     filter_icdf: wp.array(dtype=wp.float32)
 
 
 @wp.struct
 class AovFilm:
-    """What the ray through a pixel's centre hits first; width .. columns as in Film."""
+    """The first hit of the ray through each pixel's centre; width, height, x, y and columns are as in Film."""
 
     width: int
     height: int

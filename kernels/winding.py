@@ -6,27 +6,29 @@ import warp as wp
 from wrt.kernels.structs import Surfaces, kernel
 from wrt.kernels.traverse.stack import make_uninitialized
 
-FEW, MANY = wp.constant(wp.float64(2.0**-900)), wp.constant(wp.float64(2.0**900))  # beyond these sizes, a product is scaled to size 1
+# A product below SMALLEST or above LARGEST is scaled to size 1, so that it neither under- nor overflows.
+SMALLEST, LARGEST = wp.constant(wp.float64(2.0**-900)), wp.constant(wp.float64(2.0**900))
 
 
 @wp.struct
 class Turns:
-    """A sum of angles in [-pi, pi], as a product of complex numbers; it needs no function of the C library, whose last bits differ."""
+    """A sum of angles in [-pi, pi], as the argument of a product of complex numbers plus whole turns.
+    Unlike atan2 of the C library, it has the same bits on all machines."""
 
-    re: wp.float64  # Product: re + i im.
+    re: wp.float64  # The product is re + i im.
     im: wp.float64
-    whole: wp.float64  # Whole turns that the product's argument has lost.
+    whole: wp.float64  # Number of whole turns to add to the product's argument.
 
 
 @wp.func
 def corner(surfaces: Surfaces, vertex: int, point: wp.vec3) -> wp.vec3d:
-    """Vector from the point to a vertex, in float64."""
+    """Return the vector from the point to a vertex, in float64."""
     return wp.vec3d(surfaces.vertices[vertex]) - wp.vec3d(point)
 
 
 @wp.func
 def add_angle(turns: Turns, re: wp.float64, im: wp.float64) -> Turns:
-    """Add the angle of the number re + i im."""
+    """Add the argument of the complex number re + i im."""
     zero = wp.float64(0.0)
     if re == zero and im == zero:  # the point is on an edge
         return turns
@@ -39,7 +41,7 @@ def add_angle(turns: Turns, re: wp.float64, im: wp.float64) -> Turns:
     if turns.im < zero and im < zero and out.im >= zero:
         out.whole = turns.whole - wp.float64(1.0)
     size = wp.max(wp.abs(out.re), wp.abs(out.im))
-    if size < FEW or size > MANY:
+    if size < SMALLEST or size > LARGEST:
         out.re = out.re / size
         out.im = out.im / size
     return out

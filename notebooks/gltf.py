@@ -1,14 +1,14 @@
 # %% [markdown]
 # # Bring your own glTF
-# A scene made in Blender becomes a picture here by way of glTF 2.0: *File, Export, glTF 2.0*. This notebook makes such a file by
-# itself, so that it runs without any download, and shows what wrt does with each part: meshes, materials, camera, lights. Then
-# put your own file's name into the cell that loads it.
+# Blender exports a scene by *File, Export, glTF 2.0*, and wrt renders the exported file. This notebook writes a glTF file itself, so that
+# it needs no download. It shows what wrt does with each part: meshes, materials, camera, lights. To render your own file, change the
+# file's name in the cell that loads it.
 #
-# In Blender's export dialog: format *glTF Binary (.glb)*; under *Include* tick *Cameras* and *Punctual Lights*; under *Transform*
-# leave *+Y Up*; apply modifiers. Materials must be *Principled BSDF*: colour, metallic, roughness, transmission, IOR, emission
-# and a normal map go with it, node trees do not.
+# In Blender's export dialog: format *glTF Binary (.glb)*; under *Include* tick *Cameras* and *Punctual Lights*; under *Transform* leave
+# *+Y Up*; apply modifiers. Materials must be *Principled BSDF*. The export contains its colour, metallic, roughness, transmission, IOR,
+# emission and normal map, but no other shader nodes.
 #
-# With `WRT_QUICK` in the environment, pictures are smaller; the outputs below are of the full setting.
+# If the environment variable `WRT_QUICK` is set, pictures are smaller. The outputs below were made without it.
 
 # %%
 import io
@@ -28,18 +28,18 @@ from wrt.scene.shapes import box, icosphere, quad, teapot, torus
 
 QUICK = "WRT_QUICK" in os.environ
 SIZE, SPP = ((160, 90), 4) if QUICK else ((480, 270), 48)
-workplace = tempfile.TemporaryDirectory()  # for the files that this notebook makes; gone when the kernel ends
+workplace = tempfile.TemporaryDirectory()  # for the files that this notebook makes; deleted when the kernel ends
 folder = Path(workplace.name)
 
 # %% [markdown]
 # ## A glTF file by hand
-# A `.glb` is JSON and one block of bytes. The JSON has lists: `nodes` (places in the world, in a tree) that point to `meshes`,
-# `cameras`, lights; meshes point to `accessors` (arrays in the bytes) and `materials`; materials point to `textures`. Everything
-# points by its number in a list.
+# A `.glb` file contains JSON and one block of bytes. The JSON has lists. The list `nodes` is a tree of transforms, whose entries refer to
+# `meshes`, `cameras` and lights. Meshes refer to `accessors` (arrays in the bytes) and `materials`, and materials refer to `textures`.
+# Each reference is an index into a list.
 
 # %%
 class Glb:
-    """Collects the lists of a glTF file, and the bytes; every method returns the number of what it added."""
+    """The lists of a glTF file, and its bytes. Each method that adds an item returns the item's index."""
 
     def __init__(self):
         self.json = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": []}], "extensionsUsed": []}
@@ -87,10 +87,10 @@ class Glb:
 
 # %% [markdown]
 # ## Materials
-# All of glTF's materials are one: *metallic-roughness*. The base colour is what a matte surface scatters, or what a metal
-# reflects; `metallic` chooses between the two; `roughness` blurs reflections. Extensions add to it: transmission (glass), volume
-# (coloured glass), IOR, emissive strength. In a file with a volume, shadow rays go through glass and take its colour
-# (`glass_shadows="tinted"`): what stands behind it, or in it, is lit. `glass_shadows="opaque"` is for a heavy shadow.
+# glTF has one material model, *metallic-roughness*. The base colour is the albedo of a matte surface or the reflectance of a metal.
+# `metallic` blends between the two, and `roughness` blurs reflections. Extensions add transmission (glass), volume (coloured glass), IOR
+# and emissive strength. If a file has a volume, shadow rays go straight through glass and take its colour (`glass_shadows="tinted"`). So
+# objects behind or inside the glass are lit. With `glass_shadows="opaque"` they are in shadow.
 
 # %%
 glb = Glb()
@@ -122,14 +122,14 @@ lamp = material("lamp", (0, 0, 0), 0.0, 1.0, emissiveFactor=[1.0, 0.85, 0.6],
 len(glb.json["materials"])
 
 # %% [markdown]
-# ## Things, a camera, lights
-# glTF is right-handed with +y up; the exporter turns Blender's +z up into that. A camera looks along its own -z.
-# `KHR_lights_punctual` has point, spot and directional lights, without size: their shadows are sharp. Emissive surfaces have a
-# size, and wrt takes them as lights: soft shadows.
+# ## Objects, a camera, lights
+# glTF is right-handed with +y up; the exporter rotates Blender's +z to +y. A camera looks along its own -z. The extension
+# `KHR_lights_punctual` has point, spot and directional lights. They have no size, so their shadows are sharp. Emissive surfaces have a
+# size; wrt uses them as area lights with soft shadows.
 
 # %%
 def turned(axis, degrees):
-    """A quaternion x, y, z, w."""
+    """Return a rotation as a quaternion x, y, z, w."""
     half = np.radians(degrees) / 2
     return [*(np.sin(half) * np.array(axis, float)).tolist(), float(np.cos(half))]
 
@@ -145,7 +145,7 @@ pose = wrt.Camera.look_at((0.6, 1.35, 3.7), (0.0, 0.42, 0.0)).camera_to_world
 glb.node(name="Camera", matrix=pose.T.reshape(-1).tolist(),
          camera=glb.add("cameras", type="perspective", perspective={"yfov": float(np.radians(31)), "znear": 0.1}))
 
-WATTS = 60.0  # of a point light in Blender; the exporter's "Standard" lighting writes candela: 683 lumen to a watt, over 4 pi
+WATTS = 60.0  # of a point light in Blender; the exporter's "Standard" lighting writes candela: 683 lumen per watt, over 4 pi sr
 candela = 683 * WATTS / (4 * np.pi)
 glb.json["extensions"] = {"KHR_lights_punctual": {"lights": [{"type": "point", "color": [1, 0.9, 0.8], "intensity": candela}]}}
 glb.json["extensionsUsed"] = ["KHR_lights_punctual", "KHR_materials_transmission", "KHR_materials_volume", "KHR_materials_ior",
@@ -156,8 +156,7 @@ print(f"{(folder / 'table.glb').stat().st_size / 1e6:.2f} MB, point light of {WA
 
 # %% [markdown]
 # ## Load and look
-# Here is the place for your own file's name. glTF knows no sky: what rays see that leave the scene is black, until it is said
-# otherwise.
+# Put the name of your own file here. A glTF file has no sky, so rays that leave the scene see black. The second cell adds a background.
 
 # %%
 scene = wrt.load_scene(folder / "table.glb")
@@ -170,8 +169,8 @@ print(f"mean radiance {film.pixels.mean():.1f}")
 wrt.side_by_side({"": film})
 
 # %% [markdown]
-# Much too bright, but for the lamp's soft light in the shadow: the point light is in photometric units (candela), emission and
-# colours are near 1, and wrt takes all of them as they stand. Export with *Lighting Mode: Unitless*, which leaves the 683 out:
+# The picture is much too bright, except where only the lamp lights the shadow. The point light has photometric units (candela), but
+# emission and colours are near 1. wrt does not convert units. Export with *Lighting Mode: Unitless*, which omits the factor 683:
 
 # %%
 glb.json["extensions"]["KHR_lights_punctual"]["lights"][0]["intensity"] /= 683
@@ -183,8 +182,8 @@ wrt.side_by_side({"": film})
 
 # %% [markdown]
 # ## From radiance to a picture
-# The film holds linear radiance; how it is shown is decided afterwards, and costs nothing. `none` clips what is brighter than 1;
-# the curves bend it down. Blender's default is AgX, too.
+# The film holds linear radiance. Exposure and tone mapping are applied afterwards, without a new render. The tone curve `none` clips
+# values above 1; the other curves compress them. Blender's default is AgX, too.
 
 # %%
 part = np.s_[SIZE[1] // 5:, SIZE[0] // 2:SIZE[0] * 17 // 20]
@@ -195,9 +194,9 @@ wrt.side_by_side({tonemap: each.to_srgb8()[part] for tonemap, each in shown.item
 # `film.save("table.exr")` keeps the radiance itself, for any other program.
 #
 # ## A scene around the file
-# What glTF cannot say, or what you do not want to change in Blender, stands in a TOML file around it: it includes the `.glb`, and
-# adds cameras, lights, background and settings; `override` replaces a material of the same name. So the model can be exported
-# again and again.
+# A TOML file can contain what glTF cannot express, or what you do not want to change in Blender. It includes the `.glb`, and adds
+# cameras, lights, background and settings. Its table `override` replaces a material of the same name. So you can export the model again
+# without losing these changes.
 
 # %%
 (folder / "table.toml").write_text("""
@@ -229,26 +228,25 @@ print([camera.name for camera in around.cameras])
 wrt.side_by_side({"": wrt.render(around, size=SIZE, spp=2 * SPP)})
 
 # %% [markdown]
-# On the command line: `python -m wrt render table.toml -o table.png --camera close`, and `python -m wrt info table.toml` for what
-# is in it.
+# On the command line, `python -m wrt render table.toml -o table.png --camera close` renders it, and `python -m wrt info table.toml` lists
+# its contents.
 #
-# ## What is left out is told
-# A picture that silently lacks something is worse than an error. Everything in a file that wrt does not draw is named in one
-# warning:
+# ## Warnings for unsupported parts
+# A picture that silently lacks something is worse than an error. One warning names everything in a file that wrt does not render:
 
 # %%
 glb.json["materials"][2]["extensions"] = {"KHR_materials_clearcoat": {"clearcoatFactor": 1.0}}
 glb.json["animations"] = [{"name": "spin", "channels": [], "samplers": []}]
 glb.write(folder / "table.glb")
-with warnings.catch_warnings(record=True) as told:
+with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
     wrt.load_scene(folder / "table.glb")
-for warning in told:
+for warning in caught:
     print(warning.category.__name__, "-", str(warning.message).split("table.glb: ")[1])
-assert len(told) == 1
+assert len(caught) == 1
 
 # %% [markdown]
-# And a file that is broken is one clear error, with the place in its JSON:
+# A broken file raises one error, with the place in its JSON:
 
 # %%
 glb.json["nodes"][1]["mesh"] = 99
@@ -263,5 +261,5 @@ except wrt.InputError as error:
 # 1. Load a file of your own. Which warnings does it give? Which of them can you see in the picture?
 # 2. glTF has no depth of field. Add an aperture to `cameras.close` in the TOML file (in place of `fov_y`: `focal_length`,
 #    `sensor_height`, `f_number` and `focus_distance`, as in `scenes/lens.toml`), and focus on the spout.
-# 3. Make the glass ball hollow: a second, smaller sphere in it with its faces turned round.
-# 4. Let a checkerboard be the wood's roughness (`metallicRoughnessTexture`: green is roughness, blue is metallic).
+# 3. Make the glass ball hollow: put a second, smaller sphere into it, with the corners of its faces in reverse order.
+# 4. Use a checkerboard as the wood's roughness (`metallicRoughnessTexture`: green is roughness, blue is metallic).

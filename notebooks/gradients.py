@@ -1,11 +1,11 @@
 # %% [markdown]
 # # Fitting to depth pictures
-# A hit answers *where*; its derivatives answer *what would move it*. At a fixed triangle, t, u, v and the point of a hit are
-# smooth functions of the triangle's corners and of the ray, with derivatives in closed form: `hits.gradients` takes the
-# derivatives of a number by the hits and gives those by vertices, origins and directions. Here they fit first the pose of a
-# teapot, then the shape of a ball, to pictures of depth. NumPy is enough; the last section has the same with torch.
+# At a fixed triangle, t, u, v and the point of a hit are smooth functions of the triangle's corners and of the ray. Their derivatives
+# have a closed form. `hits.gradients` takes the derivatives of a loss by the hits, and returns its derivatives by vertices, origins and
+# directions. Here they fit first the pose of a teapot, then the shape of a ball, to depth pictures. This needs only NumPy; the last
+# section uses torch.
 #
-# With `WRT_QUICK` in the environment, pictures are smaller and steps fewer; the outputs below are of the full setting.
+# If the environment variable `WRT_QUICK` is set, pictures are smaller and steps fewer. The outputs below were made without it.
 
 # %%
 import os
@@ -40,7 +40,7 @@ def show(*pictures, colors="viridis", **limits):
 
 # %% [markdown]
 # ## A pose
-# The picture is of a teapot in a pose that we then forget. It is 2 long; we begin 17 degrees and 0.15 off.
+# The target picture shows a teapot of length 2 in an unknown pose. The fit starts from a pose that is 17 degrees and 0.15 units off.
 
 # %%
 teapot = shapes.teapot()
@@ -62,11 +62,11 @@ _, before = depth_of(accel, rays)
 show(("the picture", target), ("where we begin", before))
 
 # %% [markdown]
-# Each step asks for the depth and compares: the number to be made small is the mean square difference, over the pixels in which
-# both pictures have the teapot. Its derivative by each hit is `2 (t - target) / count`; `hits.gradients` carries it to the
-# vertices, and the chain rule to the pose: a shift moves all vertices alike, a turn about the center moves a vertex `x` by `w x
-# (x - center)`. Moving the vertices is `accel.refit`, which keeps the tree and takes a fraction of the time of a build. The
-# steps are Adam's.
+# Each step computes the depth picture and the loss: the mean square difference over the pixels in which both pictures show the teapot.
+# The derivative of the loss by the t of a hit is `2 (t - target) / count`. `hits.gradients` turns it into derivatives by the vertices.
+# The chain rule leads to the pose. A shift moves all vertices alike. A small rotation vector `w` about the center moves a vertex `x` by
+# the cross product of `w` and `x - center`. The optimizer is Adam. `accel.refit` moves the vertices; it keeps the tree and takes a
+# fraction of the time of a build.
 
 # %%
 class Adam:
@@ -115,14 +115,14 @@ print(f"off by {np.degrees(turn.magnitude()):.0e} degrees and {np.linalg.norm(sh
 assert errors[-1][0] < 0.5 * errors[0][0]
 
 # %% [markdown]
-# What the derivatives do not know is the outline: `prim_id` is fixed, so a pixel that only one of the pictures has pulls at
-# nothing. Where most of a picture is inside of the outline, as here, that does no harm; a fit from far away needs a term for
-# outlines too.
+# The derivatives do not contain changes of the outline, because `prim_id` is fixed. A pixel that shows the teapot in only one of the two
+# pictures adds nothing to the gradient. Here most of the teapot's pixels are in both pictures, so this does no harm. A fit that starts
+# farther away needs another term for outlines.
 #
 # ## A shape
-# Now each vertex moves by itself: a ball becomes the body of six depth pictures, from six sides. Pictures say nothing about
-# vertices between their rays, and little along the surface; so each gradient is smoothed over the mesh before it is a step
-# (Nicolet, Jacobson and Jakob 2021, *Large Steps in Inverse Rendering of Geometry*): a linear system with the mesh's Laplacian.
+# Now each vertex moves independently: a ball is fitted to six depth pictures of a body, from six sides. The pictures say nothing about
+# vertices between their rays, and little about motion along the surface. So a linear system with the mesh's Laplacian smooths each
+# gradient over the mesh before the step (Nicolet, Jacobson and Jakob 2021, *Large Steps in Inverse Rendering of Geometry*).
 
 # %%
 def knobbly(mesh):
@@ -173,7 +173,7 @@ show(("the ball", shaded(start, aslant)), ("fitted", shaded(fit, aslant)), ("the
 
 # %% [markdown]
 # ## With torch, JAX or a tape of Warp
-# The same derivatives stand behind `wrt.torch.closest_hit` (extra `torch`), which follows the vertices by itself:
+# The function `wrt.torch.closest_hit` (extra `torch`) uses the same derivatives. Each call refits the structure to the vertices:
 #
 # ```python
 # vertices = torch.tensor(ball.vertices, requires_grad=True)
@@ -187,5 +187,5 @@ show(("the ball", shaded(start, aslant)), ("fitted", shaded(fit, aslant)), ("the
 #     optimizer.step()
 # ```
 #
-# `wrt.jax.closest_hit` is the same under `jax.grad` and `jax.jit`. While a `wp.Tape` records, `accel.refit(points)` and
-# `accel.closest_hit(origins, directions)` with Warp arrays that require gradients are on it.
+# `wrt.jax.closest_hit` does the same under `jax.grad` and `jax.jit`. A `wp.Tape` records `accel.refit(points)` and
+# `accel.closest_hit(origins, directions)` with Warp arrays that require gradients.

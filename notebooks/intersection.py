@@ -1,9 +1,9 @@
 # %% [markdown]
 # # The intersection units and their hard cases
-# Does a ray meet a box? A triangle? Both take a dozen operations, and both are easily wrong by one rounding error: then a ray
-# slips between two triangles that share an edge. Here the two tests are derived, broken, and mended.
+# Does a ray meet a box? Does it meet a triangle? Each test takes about a dozen operations, and one rounding error can make its answer
+# wrong: then a ray slips between two triangles that share an edge. This notebook derives both tests, shows how they fail, and mends them.
 #
-# With `WRT_QUICK` in the environment, there are fewer rays; the outputs below are of the full setting.
+# If the environment variable `WRT_QUICK` is set, there are fewer rays. The outputs below were made without it.
 
 # %%
 import os
@@ -23,9 +23,10 @@ rng = np.random.default_rng(7)
 
 # %% [markdown]
 # ## The box unit: slabs
-# A box is the intersection of three slabs. The ray is in a slab between two distances, $(lo - o)/d$ and $(hi - o)/d$, sorted; it
-# is in the box from the largest of the three entries to the smallest of the three exits, if there is anything between (Kay and
-# Kajiya 1986). The reciprocals $1/d$ are taken once a ray. How long is a ray in thirty boxes together? A picture as by X-rays:
+# A box is the intersection of three slabs. The ray enters and leaves a slab at the distances $(lo - o)/d$ and $(hi - o)/d$, the smaller
+# one first. It is in the box from the largest of the three entries to the smallest of the three exits (Kay and Kajiya 1986). If the
+# largest entry is behind the smallest exit, the ray misses the box. The reciprocals $1/d$ are computed once per ray. The picture shows,
+# like an X-ray picture, the total length of each ray in thirty boxes:
 
 # %%
 def slabs(o, inverse, lo, hi):
@@ -45,10 +46,10 @@ wrt.side_by_side({"": heatmap(inside.reshape(SIZE[::-1]), "how far each ray runs
 
 # %% [markdown]
 # ### Hard case: a ray in a face
-# A direction without an x component has $1/d_x = \infty$. That is fine, as long as the origin is off the planes: the distances
-# are $-\infty$ and $\infty$. A ray that runs in the plane itself has $0\cdot\infty$ = NaN, and what happens then depends on how
-# the slabs are written. If NaN is handed on, no comparison with it is true, and the ray is lost. What is right: choose the near
-# and the far plane of each slab by the sign of the direction, and let a NaN say nothing.
+# A direction without an x component has $1/d_x = \infty$. If the origin is not in one of the two planes, the distances are $-\infty$ or
+# $\infty$, which is right. For a ray in the plane itself, a distance is $0\cdot\infty$ = NaN. If minimum and maximum return NaN, every
+# comparison with it is false, and the ray is lost. The remedy: choose the near and the far plane of each slab by the sign of the
+# direction, and use a minimum and maximum that ignore NaN.
 
 # %%
 o1, d1 = np.float32([[1.0, 0.2, 3.0]]), np.float32([[0.0, 0.0, -1.0]])  # in the face x = 1 of the cube from -1 to 1
@@ -56,18 +57,18 @@ with np.errstate(divide="ignore", invalid="ignore"):
     a, b = (-1 - o1) / d1, (1 - o1) / d1
     print("distances to the planes:", a[0], b[0])
     enter, leave = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
-    print(f"NaN handed on:    enters at {enter[0]}, leaves at {leave[0]}, hit: {bool((enter <= leave)[0])}")
+    print(f"NaN propagates: enters at {enter[0]}, leaves at {leave[0]}, hit: {bool((enter <= leave)[0])}")
     backwards = np.signbit(d1)
     near, far = np.where(backwards, b, a), np.where(backwards, a, b)
-    enter, leave = np.fmax.reduce(near, axis=1), np.fmin.reduce(far, axis=1)  # fmax and fmin pass over NaN
+    enter, leave = np.fmax.reduce(near, axis=1), np.fmin.reduce(far, axis=1)  # fmax and fmin ignore NaN
     assert (enter <= leave).all()
-    print(f"NaN says nothing: enters at {enter[0]}, leaves at {leave[0]}, hit: {bool((enter <= leave)[0])}")
+    print(f"NaN is ignored: enters at {enter[0]}, leaves at {leave[0]}, hit: {bool((enter <= leave)[0])}")
 
 # %% [markdown]
 # ### Hard case: a ray through an edge
-# At an edge of the box the ray enters one slab where it leaves another: entry and exit are nearly equal, and rounding decides.
-# Each carries three rounding errors (a subtraction, a reciprocal, a product). Widening the exit by $1 + 2\gamma_3$, $\gamma_n =
-# nu/(1-nu)$, $u = 2^{-24}$, is enough to lose nothing (Ize 2013). Rays aimed at edges, against the same slabs in float64:
+# At an edge of the box, the ray leaves one slab where it enters another. Entry and exit are nearly equal, and rounding decides. Each has
+# three rounding errors (of a subtraction, a reciprocal and a product). Multiplying the exit by $1 + 2\gamma_3$ saves all rays (Ize 2013).
+# Here $\gamma_n = nu/(1-nu)$ and $u = 2^{-24}$. The cell compares rays at edges with the same test in float64:
 
 # %%
 n = 20 * RAYS
@@ -84,25 +85,25 @@ hit = enter <= leave
 enter, leave = slabs(o, 1 / d, lo, hi)
 u = 2.0**-24
 wide = leave * np.float32(1 + 2 * 3 * u / (1 - 3 * u))
-lost = {"as it is": hit & ~(enter <= leave), "widened": hit & ~(enter <= wide)}
+lost = {"plain": hit & ~(enter <= leave), "widened": hit & ~(enter <= wide)}
 extra = ~hit & (enter <= wide)
 print(f"{hit.sum()} of {n} rays meet the cube; lost: " + ", ".join(f"{name} {rays.sum()}" for name, rays in lost.items()))
-print(f"let in for nothing by the widened test: {extra.sum()}")
+print(f"misses that the widened test reports as hits: {extra.sum()}")
 assert not lost["widened"].any()
 
 # %% [markdown]
-# A box is only a reason to look closer: a ray that is let in for nothing costs a test, a ray that is lost is a hole in the
-# picture. So wrt's default box unit (`box="conservative"`) errs on the safe side only: for boxes of triangles it widens by more
-# than here, since the triangle unit rounds as well (`kernels/units/box.py` counts the errors).
+# A false hit of a box only costs further tests; a lost ray is a hole in the picture. So wrt's default box unit (`box="conservative"`)
+# never reports a false miss. For boxes of triangles it widens by more than here, because the triangle unit rounds, too
+# (`kernels/units/box.py` derives the factor).
 #
 # ## The triangle unit: Moeller and Trumbore
-# A point of the triangle is $v_0 + u\,e_1 + v\,e_2$ with the edges $e_1 = v_1 - v_0$ and $e_2 = v_2 - v_0$; a point of the ray is
-# $o + t\,d$. That they are the same point is three linear equations for $t$, $u$, $v$, and Cramer's rule solves them with two
-# cross products. The hit counts where $u \ge 0$, $v \ge 0$ and $u + v \le 1$.
+# Let $e_1 = v_1 - v_0$ and $e_2 = v_2 - v_0$ be edges. A point of the triangle is $v_0 + u\,e_1 + v\,e_2$. A point of the ray is $o +
+# t\,d$. Equating both points gives three linear equations for $t$, $u$ and $v$. Cramer's rule solves them with two cross products. The
+# ray hits the triangle if $u \ge 0$, $v \ge 0$ and $u + v \le 1$.
 
 # %%
 def moeller_trumbore(o, d, v0, v1, v2):
-    """t, u, v of rays (N, 3) against one triangle, wherever they meet its plane (1997)."""
+    """Return t, u, v where rays (N, 3) meet the plane of one triangle (1997)."""
     e1, e2, s = v1 - v0, v2 - v0, o - v0
     p, q = np.cross(d, e2), np.cross(s, e1)
     determinant = p @ e1
@@ -118,8 +119,8 @@ wrt.side_by_side({"the weights of the three corners as red, green, blue": codes.
 
 # %% [markdown]
 # ## Hard case: where triangles meet
-# Put a corner under the microscope that eight triangles share. Each pixel below is a ray whose direction is *one float32 step*
-# beside its neighbour's. The colour tells which triangle is hit; black is none: the ray has passed through the surface.
+# These pictures magnify a corner that eight triangles share. The directions of neighbouring pixels differ by *one float32 step*. The
+# colour shows which triangle the ray hits. Black is a miss: the ray has passed through the surface.
 
 # %%
 angles = 2 * np.pi * np.arange(8) / 8
@@ -141,30 +142,30 @@ palette = np.rint(255 * plt.get_cmap("Set2")(np.arange(8))[:, :3]).astype(np.uin
 palette = np.concatenate([palette, np.zeros((1, 3), np.uint8)])  # prim_id -1, a miss: the last one
 
 exact = closest(fan, origins, directions)
-seen = {"exactly": exact.prim_id}
+seen = {"exact": exact.prim_id}
 for test in TESTS:
     seen[test] = wrt.build(fan, "brute_force", triangle=test).closest_hit(origins, directions).prim_id
 wrt.side_by_side({f"{name}: {(ids < 0).sum()} lost": palette[ids].reshape(side, side, 3) for name, ids in seen.items()},
                  columns=3, scale=4)
 
 # %% [markdown]
-# "exactly" is the oracle: whole numbers decide on which side of an edge a ray passes (`wrt.lab.oracle.oracle`; directions and
-# corners are float32 values, and taken as exact). No test in float32 finds the edges to the last step. But the watertight test
-# leaves no gap: **an edge may lie beside its place, as long as both of its triangles agree on where**.
+# The picture "exact" is from the oracle (`wrt.lab.oracle.oracle`): integer arithmetic decides on which side of an edge a ray passes. It
+# takes the float32 directions and corners as exact. No float32 test has the edges exactly in place. But the watertight test leaves no
+# gap: **an edge may be displaced, as long as both of its triangles displace it equally**.
 
 # %%
 for name in TESTS:
-    print(f"{name:17} another triangle than the exact one: {(seen[name] != exact.prim_id).mean():.1%} of the rays;"
+    print(f"{name:17} another triangle than the oracle's: {(seen[name] != exact.prim_id).mean():.1%} of the rays;"
           f" lost: {(seen[name] < 0).sum()}")
 assert (seen["watertight"] >= 0).all() and (seen["moeller_trumbore"] < 0).any()
 
 # %% [markdown]
 # ## Why the watertight test leaks nowhere
-# Woop, Benthin and Wald (2013) look along the ray: corners are moved so that the ray is the axis, and sheared so that only x and
-# y are left. The ray passes an edge $ab$ on the side that the sign of $a_x b_y - a_y b_x$ tells. The triangle on the other side
-# of the edge goes through it backwards, and computes $b_x a_y - b_y a_x$: *the same two products*, subtracted the other way.
-# Rounded, the one is still exactly minus the other. Moeller and Trumbore's $u$ of one triangle and $v$ of its neighbour are
-# rounded along different ways.
+# Woop, Benthin and Wald (2013) transform the corners. A translation and a shear make the ray the z axis, so that x and y suffice. The
+# sign of $a_x b_y - a_y b_x$ gives the side on which the ray passes the edge $ab$. The neighbour triangle has the same edge in the
+# reverse direction, and computes $b_x a_y - b_y a_x$: *the same two products*, subtracted the other way. After rounding, the two results
+# are still exact opposites. Moeller and Trumbore compute $u$ of one triangle and $v$ of its neighbour by different operations, so their
+# rounding errors differ.
 
 # %%
 n = 50 * RAYS
@@ -172,19 +173,19 @@ a, b = rng.normal(size=(2, n, 2)).astype(np.float32)
 b = np.where(rng.random((n, 1)) < 0.5, b, a * rng.normal(size=(n, 1)).astype(np.float32))  # half: the ray is on the edge, nearly
 one = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 other = b[:, 0] * a[:, 1] - b[:, 1] * a[:, 0]
-print(f"edges seen from both sides: {n}; not exactly opposite: {(one != -other).sum()}")
+print(f"edges tested from both triangles: {n}; results that are not exact opposites: {(one != -other).sum()}")
 assert (one == -other).all()
 
 # %% [markdown]
-# It takes care to keep it so: a compiler that fuses a product and a difference into one operation rounds one product and not the
-# other, and the two sides differ. wrt switches that off for its kernels. And where an edge function is exactly 0, float64
-# decides.
+# A compiler can break this symmetry. If it fuses a product and the difference into one operation (fused multiply-add), only the other
+# product is rounded, and the two results are no opposites any more. So wrt compiles its kernels without fusing. If an edge function is
+# exactly 0, float64 decides.
 #
-# ## What leaks in a picture
-# Rays at random meet an edge hardly ever; pictures have rays that are not random: textures whose texels lie on vertices, shadow
-# rays to the corners of lights, cameras in the middle of symmetric models. Here each pixel's ray is turned to the nearest corner
-# of the triangle that it hits: $d = v - o$ in float32, so that the hit is at $t = 1$. What is asked is whether the ray stops
-# there. At an outline it need not; so only corners count with surface on all sides: four rays close by all hit.
+# ## Lost rays in a picture
+# Random rays rarely meet an edge, but many rays of pictures are not random. Examples are textures whose texels lie on vertices, shadow
+# rays to the corners of lights, and cameras in the middle of symmetric models. Here each pixel's ray is turned to the nearest corner of
+# the triangle that it hits. With $d = v - o$ in float32, the hit must be at $t = 1$. The ray is lost if it passes through the surface
+# there. At an outline it may pass; so only corners with surface on all sides count, where four rays close by all hit.
 
 # %%
 hills = terrain(60 if QUICK else 250)
@@ -217,9 +218,9 @@ for test in TESTS[:2]:
 wrt.side_by_side(pictures, columns=1 if QUICK else 2)
 
 # %% [markdown]
-# ## How many, over the hard cases
-# `wrt.lab.hard_cases.cases` has 44 kinds of hard rays, most of them with a proof of what the answer must be: a ray that starts
-# inside a closed surface must hit it. Lost rays of each test:
+# ## Lost rays in the hard cases
+# `wrt.lab.hard_cases.cases` has 44 kinds of rays at which rounding errors matter. For most of them the answer is known: a ray that starts
+# inside a closed surface must hit it. The plot shows the lost rays of each test:
 
 # %%
 CASES = {"A_origin_vertices": "dense sphere, at vertices", "A_far_uniform": "the same, far from 0",
@@ -230,7 +231,7 @@ for case in (generate(name, RAYS) for name in CASES):
         found = wrt.build(case.geometry, "bvh2", triangle=test).closest_hit(case.origins, case.directions, case.t_min, case.t_max)
         shares[test].append((found.prim_id < 0).mean())
         if test == "watertight":
-            assert judge(case, found, 200).ok  # against the oracle: no ray lost, invented, or given to a wrong triangle
+            assert judge(case, found, 200).ok  # compared with the oracle: no hit lost, invented or on a wrong triangle
 
 fig, ax = plt.subplots(figsize=(7.2, 3.0), dpi=80, layout="constrained")
 for i, test in enumerate(TESTS):
@@ -244,12 +245,13 @@ ax.legend()
 plt.show()
 
 # %% [markdown]
-# The watertight test loses nothing anywhere. The other tests are there to be compared: `triangle="moeller_trumbore"` and its like
-# are a named choice, never the default. 114 million rays of all cases, with Embree and others beside: `docs/accuracy.md`.
+# The watertight test loses no ray in any case, and is wrt's default. The other tests are for comparison; select one by its name, such as
+# `triangle="moeller_trumbore"`. `docs/accuracy.md` compares 114 million rays of all cases with Embree and other libraries.
 #
 # ## Exercises
-# 1. Sort the two distances of a slab by `np.fmin` and `np.fmax` instead of by the sign of the direction. Is the ray in the face
-#    found? And one in the opposite face?
-# 2. Under the microscope: let a pixel be 1000 steps instead of one. Which gaps remain? Why are those of the vertex the last?
-# 3. Move the hills far away from 0 (`vertices + 1e4`) and the camera with them. Which test loses more now, and which less?
+# 1. Sort the two distances of a slab by `np.fmin` and `np.fmax` instead of by the sign of the direction. Does the test find the ray in
+#    the face? Does it find a ray in the opposite face?
+# 2. In the magnified pictures, let neighbouring pixels differ by 1000 steps instead of one. Which gaps remain? Why are the gaps at the
+#    vertex the last to vanish?
+# 3. Move the hills far away from 0 (`vertices + 1e4`) and the camera with them. Which test loses more rays now, and which fewer?
 # 4. `python -m wrt stability A B` runs two groups of cases over all tests; `--rays 1000000` takes a while.

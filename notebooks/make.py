@@ -1,7 +1,7 @@
-"""Make the notebooks anew from their .py: `python notebooks/make.py [NAME ...]` runs each and writes its .ipynb, outputs included.
+"""Make the notebooks from their scripts: `python notebooks/make.py [NAME ...]` runs each .py and writes its .ipynb with outputs.
 
-The .py (jupytext, percent format) are what is edited; the .ipynb beside them hold the same cells and what they show. Nothing
-that depends on the run or the machine is kept, so that a diff shows what changed.
+Edit only the .py (jupytext, percent format); the .ipynb has the same cells and their outputs. It contains no times of the run and
+no names of the machine, so that a diff shows only changed cells and outputs.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from nbclient import NotebookClient
 FOLDER = Path(__file__).resolve().parent
 METADATA = {"kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
             "language_info": {"name": "python"}}
-QUICK = "WRT_QUICK"  # in the environment: smaller pictures and fewer rays, the same steps
-TIMEOUT = 600  # seconds a cell
+QUICK = "WRT_QUICK"  # environment variable for smaller pictures and fewer rays
+TIMEOUT = 600  # seconds per cell
 
 
 def scripts() -> list[Path]:
-    """The sources of all notebooks."""
+    """Return the paths of the scripts of all notebooks."""
     return sorted(path for path in FOLDER.glob("*.py") if path.name != Path(__file__).name)
 
 
 def read(script: Path) -> Any:
-    """The notebook that a .py is, without outputs."""
+    """Return the notebook of a script, without outputs."""
     notebook = jupytext.read(script, fmt="py:percent")
     notebook.metadata = nbformat.from_dict(METADATA)
     for i, cell in enumerate(notebook.cells):
@@ -40,25 +40,25 @@ def read(script: Path) -> Any:
 
 
 def execute(notebook: Any, quick: bool) -> Any:
-    """Run all cells in a fresh kernel; raises CellExecutionError where one fails."""
+    """Run all cells in a fresh kernel and return the notebook; raise CellExecutionError if a cell fails."""
     environment = {name: value for name, value in os.environ.items() if name != QUICK}
-    path = os.pathsep.join(filter(None, [str(FOLDER.parent), environment.get("PYTHONPATH")]))  # wrt of this checkout
+    path = os.pathsep.join(filter(None, [str(FOLDER.parent), environment.get("PYTHONPATH")]))  # imports wrt from this checkout
     environment |= {"PYTHONPATH": path, **({QUICK: "1"} if quick else {})}
     client = NotebookClient(notebook, timeout=TIMEOUT, kernel_name="python3", record_timing=False,
                             resources={"metadata": {"path": str(FOLDER)}})
     client.execute(env=environment)
-    notebook.metadata = nbformat.from_dict(METADATA)  # without the version that ran it
+    notebook.metadata = nbformat.from_dict(METADATA)  # drops the version of Python that ran it
     for cell in notebook.cells:
         if "outputs" in cell:
             cell.outputs = merged(cell.outputs)
         for output in cell.get("outputs", []):
             if {"image/png", "image/jpeg"} <= output.get("data", {}).keys():
-                del output["data"]["image/jpeg"]  # the same picture once more
+                del output["data"]["image/jpeg"]  # a copy of the PNG picture
     return notebook
 
 
 def merged(outputs: list[Any]) -> list[Any]:
-    """Text that came in several parts, as the clock had it, in one."""
+    """Join successive outputs of one text stream; the kernel splits them at arbitrary times."""
     out: list[Any] = []
     for output in outputs:
         if out and output.output_type == out[-1].output_type == "stream" and output.name == out[-1].name:

@@ -1,11 +1,11 @@
 # %% [markdown]
-# # Hits from your own kernels
-# `accel.closest_hit` takes arrays of rays. When rays depend on what the last ones met, arrays are a detour: here kernels of our own
-# ask the structure themselves, on the CPU or on CUDA. `wrt.ray_query` gives the functions, `accel.world` is the argument, and
-# `wrt.kernel` compiles without fused multiply-add, on which the promise rests that no ray is lost at an edge. The answers have the
-# bits of `closest_hit`.
+# # Queries in your own kernels
+# `accel.closest_hit` takes arrays of rays. If new rays depend on earlier hits, a kernel of your own is simpler. It queries the structure
+# itself, on the CPU or on CUDA. The function `wrt.ray_query` returns the query functions, and the kernel gets `accel.world` as an
+# argument. The decorator `wrt.kernel` compiles without fused multiply-add, with which rays could be lost at edges. The hits equal those
+# of `accel.closest_hit` to the last bit.
 #
-# With `WRT_QUICK` in the environment, pictures are smaller; the outputs below are of the full setting.
+# If the environment variable `WRT_QUICK` is set, pictures are smaller. The outputs below were made without it.
 
 # %%
 import os
@@ -29,8 +29,8 @@ print(accel)
 
 # %% [markdown]
 # ## Ambient occlusion
-# How much of the sky does a point see? One ray to the point, then many short ones around its normal. `query.ray` is a ray from 0 to
-# infinity; its `t_min` and `t_max` can be set. The new rays begin a little above the surface.
+# How much of the sky is visible from a point? The kernel traces one camera ray, then many short rays around the normal at its hit. A ray
+# from `query.ray` has t from 0 to infinity; set `t_min` and `t_max` to change that. The short rays begin a little above the surface.
 
 # %%
 @wrt.kernel
@@ -44,7 +44,7 @@ def ambient_occlusion(world: query.World, origins: wp.array(dtype=wp.vec3), dire
         n = wp.where(wp.dot(n, directions[i]) > 0.0, -n, n)
         point = origins[i] + hit.t * directions[i] + 1.0e-4 * n
         for _ in range(samples):
-            ray = query.ray(point, n + wp.sample_unit_sphere_surface(random))  # by the cosine
+            ray = query.ray(point, n + wp.sample_unit_sphere_surface(random))  # density: the cosine
             ray.t_max = reach / wp.length(ray.direction)
             if not query.any_hit(world, ray):
                 open[i] += 1.0 / float(samples)
@@ -68,8 +68,8 @@ plt.show()
 
 # %% [markdown]
 # ## A LiDAR
-# A scanner at a point turns once; its 64 rings look up and down. Each thread is one shot: it makes its own ray, and the answer is a
-# distance with the error of the instrument. No array of rays is ever made.
+# A LiDAR at a fixed point turns once; its 64 rings have different elevations. Each thread makes one ray, and stores the distance with the
+# error of the instrument. No array of rays is needed.
 
 # %%
 @wrt.kernel
@@ -88,16 +88,16 @@ wp.launch(scan, dim=(rings, steps), inputs=[accel.world, wp.vec3(0.0, 1.2, 3.0),
 seen = np.where(np.isfinite(distance.numpy()), distance.numpy(), np.nan)
 plt.figure(figsize=(9.0, 2.2), dpi=80)
 plt.imshow(seen, cmap="viridis", aspect="auto", origin="lower", extent=(0.0, 360.0, -40.0, 10.0))
-plt.colorbar(label="distance")
+plt.colorbar(label="distance, scene units")
 plt.xlabel("azimuth in degrees")
-plt.ylabel("elevation")
+plt.ylabel("elevation in degrees")
 plt.show()
-print(f"{np.isfinite(seen).mean():.0%} of the shots come back")
+print(f"{np.isfinite(seen).mean():.0%} of the rays hit")
 
 # %% [markdown]
 # ## Hit after hit
-# `query.next_hit` goes on behind a hit: in the order of distance and, where that is equal, of the triangle's number, so that
-# nothing is lost and nothing comes twice. Here the kernel adds up how far a ray is within the ring.
+# `query.next_hit` returns the next hit of the same ray, in the order of distance. Hits at the same distance are in the order of
+# `prim_id`, so that no hit is lost or repeated. Here the kernel adds up the length of each ray inside the ring.
 
 # %%
 @wrt.kernel
@@ -123,13 +123,13 @@ inside, walls = (wp.zeros(len(origins), dtype=kind, device="cpu") for kind in (f
 wp.launch(thickness, dim=len(origins), inputs=[ring.world, origins, directions, inside, walls], device="cpu")
 plt.figure(figsize=(7.0, 4.0), dpi=80)
 plt.imshow(inside.numpy().reshape(SIZE[::-1]), cmap="bone")
-plt.colorbar(label="length within the ring")
+plt.colorbar(label="length in the ring, scene units")
 plt.axis("off")
 plt.show()
 
 # %% [markdown]
-# The same from NumPy: `wrt.all_hits` has every hit of every ray, `wrt.first_hits` the first k, and `wrt.count_hits` only their
-# number.
+# From NumPy, `wrt.all_hits` returns every hit of every ray, `wrt.first_hits` the first k hits, and `wrt.count_hits` only the number of
+# hits.
 
 # %%
 found = wrt.all_hits(ring, *rays)

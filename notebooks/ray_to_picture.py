@@ -1,10 +1,10 @@
 # %% [markdown]
 # # From a ray to a picture: pinhole, lens, depth of field
-# A picture is a question asked once for every pixel: what does the ray through it meet first? Here that question is asked by
-# hand, then by `wrt.render`; then the pinhole becomes a lens, and the blur that a lens makes is predicted and measured.
+# To render a picture is to find what the ray through each pixel meets first. This notebook does it step by step in NumPy, then by
+# `wrt.render`. After that, a lens replaces the pinhole, and the blur of the lens is predicted and measured.
 #
-# Everything here is made by formulas or stands in `../scenes`. With `WRT_QUICK` in the environment, pictures are smaller and have
-# fewer samples; the outputs below are of the full setting.
+# All shapes are made by formulas or come from `../scenes`. If the environment variable `WRT_QUICK` is set, pictures are smaller and have
+# fewer samples. The outputs below were made without it.
 
 # %%
 import os
@@ -22,9 +22,9 @@ SIZE, SPP = ((160, 90), 4) if QUICK else ((480, 270), 64)
 
 # %% [markdown]
 # ## One ray
-# A ray is an origin $o$ and a direction $d$; its points are $o + t\,d$ with $t \ge 0$. An acceleration structure over a mesh
-# answers which triangle a ray meets first: `prim_id`, the index of the triangle, $t$, and where in the triangle: $(1-u-v)\,v_0 +
-# u\,v_1 + v\,v_2$.
+# A ray is an origin $o$ and a direction $d$; its points are $o + t\,d$ with $t \ge 0$. An acceleration structure over a mesh finds the
+# first triangle that a ray meets. It returns `prim_id` (the index of the triangle), $t$, and the barycentric coordinates $u$ and $v$ of
+# the hit point $(1-u-v)\,v_0 + u\,v_1 + v\,v_2$.
 
 # %%
 mesh = merged([quad((-3, 0, 3), (6, 0, 0), (0, 0, -6)), teapot(64)], "pot on a floor")
@@ -37,10 +37,9 @@ print("by the ray:     ", np.round([0.0, 0.4, 3.0 - t], 4))
 print("by the triangle:", np.round((1 - u - v) * v0 + u * v1 + v * v2, 4))
 
 # %% [markdown]
-# ## One ray a pixel
-# A pinhole camera sends all its rays from one point. The ray of a pixel goes through the pixel's centre on a screen in front of
-# it, which is as high as the vertical angle of view tells: $2\tan(\mathrm{fov}_y/2)$ at distance 1. `camera_rays` gives one ray a
-# pixel.
+# ## One ray per pixel
+# All rays of a pinhole camera start at one point. The ray of a pixel goes through the pixel's centre on a screen at distance 1. The
+# vertical angle of view gives the height of the screen, $2\tan(\mathrm{fov}_y/2)$. `camera_rays` returns one ray per pixel.
 
 # %%
 camera = wrt.Camera.look_at((1.3, 1.5, 2.6), (0.05, 0.4, 0.0), fov_y=np.radians(32))
@@ -58,8 +57,8 @@ depth = np.where(hit, hits.t, 0.0)
 wrt.side_by_side({"": heatmap(picture(depth), "distance to the hit (0: none)")})
 
 # %% [markdown]
-# The height of the view can be checked against the angle: the directions of the middle column's ends, moved half a pixel
-# outwards, enclose `fov_y`.
+# This cell checks the angle of view. The angle between the first and the last ray of the middle column, plus half a pixel at each end,
+# must be `fov_y`.
 
 # %%
 column = picture(directions)[:, SIZE[0] // 2].astype(np.float64)
@@ -69,10 +68,10 @@ print(f"first to last pixel centre: {seen:.3f} degrees; and half a pixel at each
 
 # %% [markdown]
 # ## Light by hand
-# A matte surface shows the cosine between its normal and the light, unless something stands between them: one more ray, the
-# shadow ray, from the hit to the light. It must not start on the surface itself, for the hit is rounded; here it is lifted by
-# $10^{-4}$, which is right for this scene and wrong for another size. (`wrt.render` leaves a surface by the bound of the rounding
-# errors instead.)
+# The radiance of a matte surface is proportional to the cosine between its normal and the light, unless an object blocks the light. To
+# find out, trace one more ray, the shadow ray, from the hit to the light. It must not start on the surface itself, because the hit point
+# is rounded. Here it starts $10^{-4}$ above the surface, which suits this scene but not a scene of another size. (`wrt.render` offsets it
+# by a bound on the rounding error instead.)
 
 # %%
 corners = mesh.vertices[mesh.faces]
@@ -98,27 +97,27 @@ print(f"{hit.sum()} of {len(hit)} rays hit; {dark.sum()} of the hits lie in shad
 wrt.side_by_side({"by hand": by_hand})
 
 # %% [markdown]
-# That is a ray tracer. Two things are missing: the triangles show, since each has one normal; and edges have steps, since each
-# pixel has one ray.
+# That is a ray tracer, with two flaws. The triangles are visible, because each has one normal. Edges have steps, because each pixel has
+# one ray.
 
 # %% [markdown]
-# ## Many rays a pixel
-# `wrt.render` takes the mean over `spp` rays a pixel, spread evenly over the pixel (and somewhat beyond it: a filter). It does
-# all else as well: normals that vary over a triangle, mirrors, glass, lights of every kind. The pot of `scenes/lens.toml`, each
-# pixel of the picture drawn as a square:
+# ## Many rays per pixel
+# `wrt.render` averages `spp` rays per pixel. The pixel filter spreads them evenly over the pixel and a little beyond. `wrt.render` also
+# has normals that vary over a triangle, mirrors, glass, and lights of every kind. The pictures show the pot of `scenes/lens.toml`,
+# magnified so that each pixel is a square:
 
 # %%
 night = wrt.load_scene("../scenes/lens.toml")
 crop = tuple(round(x * SIZE[0] / 480) for x in (160, 158, 230, 208))
-wrt.side_by_side({f"{spp} ray{'s' * (spp > 1)} a pixel": wrt.render(night, camera="pinhole", size=SIZE, spp=spp, crop=crop)
+wrt.side_by_side({f"{spp} ray{'s' * (spp > 1)} per pixel": wrt.render(night, camera="pinhole", size=SIZE, spp=spp, crop=crop)
                   for spp in (1, 4, SPP)}, columns=3, scale=4)
 
 # %% [markdown]
 # ## From the pinhole to the lens
-# A real camera needs light, and so has a hole with a width, and a lens in it. A thin lens of focal length $f$ brings together
-# again what starts at distance $s$, at the distance $s'$ behind it with $1/s + 1/s' = 1/f$: there the sensor stands. So all rays
-# of a pixel cross in one point of the plane in focus, wherever on the lens they pass; what is nearer or farther is spread.
-# `Camera.lens` turns what a photographer sets into what a ray tracer needs.
+# A real camera needs light, and so has a wide aperture with a lens. A thin lens of focal length $f$ focuses light from a point at
+# distance $s$ onto a point at distance $s'$ behind the lens, where $1/s + 1/s' = 1/f$. The sensor is at this distance. So all rays of a
+# pixel pass through one point of the plane in focus, wherever they cross the lens. Points nearer or farther are blurred. `Camera.lens`
+# converts a photographer's settings to the parameters of wrt's camera.
 
 # %%
 pinhole = night.camera("pinhole")
@@ -130,15 +129,15 @@ wrt.side_by_side({"pinhole": wrt.render(night, camera=pinhole, size=SIZE, spp=SP
 
 # %% [markdown]
 # ## How large is the blur?
-# A point at distance $z$ sends a cone of light to the lens of radius $r$. Seen in the plane in focus, at distance $s$, this cone
-# has the diameter $2 r\,|z - s| / z$ (similar triangles), and the picture shows $2 s \tan(\mathrm{fov}_y/2)$ of that plane over
-# its height:
+# Light from a point at distance $z$ reaches a lens of radius $r$ in a cone. In the plane in focus, at distance $s$, this cone has the
+# diameter $2 r\,|z - s| / z$ (similar triangles). The picture's height $H$, in pixels, covers the length $2 s \tan(\mathrm{fov}_y/2)$ of
+# that plane. So the diameter of the blur is
 #
 # $$c = \frac{2 r\,|z-s|}{z}\cdot\frac{H}{2 s\tan(\mathrm{fov}_y/2)}\ \text{pixels}.$$
 #
-# Is it so? One small lamp alone is photographed at several distances. A disc of diameter $c$ has the variance $c^2/16$ along an
-# axis, and variances add: what the lamp's own size and the pixel filter contribute is the variance of its picture through a
-# pinhole. That is taken off.
+# To test the formula, one small lamp is rendered at several distances. A disc of diameter $c$ has the variance $c^2/16$ along an axis,
+# and variances add. A second picture, through a pinhole, has the variance of the lamp's own size and of the pixel filter. Subtracting it
+# leaves the variance of the blur.
 
 # %%
 side = SIZE[1]
@@ -151,7 +150,7 @@ position, axis = lens.camera_to_world[:3, 3], -lens.camera_to_world[:3, 2]
 
 
 def spread(camera, z, spp):
-    """The variance along an axis, in pixels^2, of the picture of a lamp on the axis at distance z."""
+    """Return the variance along an image axis, in pixels^2, of the picture of a lamp at distance z."""
     here = replace(lamp, center=position + z * axis, radius=0.004 * z, material=bright)
     scene = replace(night, objects=(pot,), spheres=(replace(steel, center=away[:3, 3]), here))
     light = wrt.render(scene, camera=camera, size=(side, side), spp=spp).pixels[..., 0].astype(np.float64)
@@ -182,13 +181,12 @@ for z, m in zip(distances, measured, strict=True):
 
 # %% [markdown]
 # ## What a photographer sets
-# The f-number is $N = f / (2r)$: a larger one is a smaller hole. Twice the number halves the blur, everywhere and in proportion.
-# Focusing moves the plane that is sharp. Note how little the blur of far things changes beyond some distance: $|z-s|/z$ goes to
-# 1.
+# The f-number is $N = f / (2r)$: a larger f-number is a smaller aperture. Twice the f-number halves the blur at every distance. Focusing
+# moves the plane that is sharp. The blur of distant objects hardly depends on their distance, because $|z-s|/z$ approaches 1.
 
 # %%
 def photo(f_number, focus_distance):
-    spp = 2 * SPP if f_number < 4.0 else SPP  # the wider the hole, the more there is to average
+    spp = 2 * SPP if f_number < 4.0 else SPP  # a wider aperture needs more samples
     setting = wrt.Camera.lens(0.9, focus_distance, 0.40, f_number=f_number)
     return wrt.render(night, camera=replace(lens, **setting), size=tuple(x * 2 // 3 for x in SIZE), spp=spp)
 
@@ -197,8 +195,9 @@ wrt.side_by_side({f"f / {n:g}, focused at {s:g}": photo(n, s)
                   for n, s in ((2.25, 4.8), (2.25, 6.0), (2.25, 10.4), (4.5, 6.0), (9.0, 6.0), (18.0, 6.0))}, columns=3)
 
 # %% [markdown]
-# The picture of a lamp out of focus is the shape of the hole. Six straight blades (`blades=6`) make hexagons; behind the plane in
-# focus a lamp's picture is as the hole stands, in front of it half a turn around, which three blades show (focused at 7).
+# The picture of a lamp out of focus has the shape of the aperture. Six straight blades (`blades=6`) make hexagons. For a lamp behind the
+# plane in focus, the shape is upright; for a lamp in front of the plane, it is rotated by half a turn. Three blades show the difference
+# (here the camera focuses at 7 units).
 
 # %%
 def lamps(spp, **blades):
@@ -211,8 +210,8 @@ wrt.side_by_side({"round": lamps(4 * SPP), "three blades": lamps(4 * SPP, blades
 
 # %% [markdown]
 # ## Exercises
-# 1. In "light by hand", leave out the lift of $10^{-4}$. Which pixels change, and why not all of them?
-# 2. Let the shaded picture use normals that vary: `mesh.normals` is None for `pot on a floor`, but `teapot().normals` is not. The
-#    normal at a hit is the mean of the three corners' with the weights $1-u-v$, $u$ and $v$.
-# 3. At which f-number is the lamp at distance 24 blurred by one pixel? Predict it, then look.
+# 1. In "Light by hand", remove the offset of $10^{-4}$. Which pixels change, and why not all of them?
+# 2. Use varying normals in the picture that is shaded by hand. `mesh.normals` is None for `pot on a floor`, but `teapot().normals` is
+#    not. The normal at a hit is the mean of the normals at the three corners, with the weights $1-u-v$, $u$ and $v$.
+# 3. At which f-number is the lamp at distance 24 blurred by one pixel? Predict it, then measure it.
 # 4. `Camera.lens` lets `fov_y` depend on `focus_distance` ("focus breathing"). By how much does it change from 4.8 to 10.4?

@@ -1,13 +1,13 @@
 # %% [markdown]
 # # Inside the RT core: counters, heat maps, what if
-# An RT core has a unit that tests boxes, a unit that tests triangles, and a unit that walks a hierarchy of boxes with them. wrt's
-# kernels have the same split, and can count what each unit does. Here the counts of a picture are looked at ray by ray; a model
-# turns them into rays a second; and then the design is changed.
+# An RT core (ray tracing core of a GPU) has three units. One tests boxes, one tests triangles, and one traverses a hierarchy of boxes.
+# wrt's kernels have the same units, and can count the work of each. This notebook shows the counts of a picture's rays. Then a model
+# turns them into rays per second, and the design of the RT core is varied.
 #
-# The model, its parameters and their sources: `docs/rt_core.md`. Its results are for comparing designs. Rates and node format of
-# real RT cores were never published: absolute numbers are good to a factor of 2 at best.
+# `docs/rt_core.md` describes the model, its parameters and their sources. Use its results to compare designs. NVIDIA has not published
+# the rates and the node format of RT cores, so absolute numbers are accurate to a factor of 2 at best.
 #
-# With `WRT_QUICK` in the environment, pictures are smaller and rays fewer; the outputs below are of the full setting.
+# If the environment variable `WRT_QUICK` is set, pictures are smaller and rays fewer. The outputs below were made without it.
 
 # %%
 import os
@@ -30,8 +30,8 @@ QUICK = "WRT_QUICK" in os.environ
 SIZE, SPP, RAYS = ((160, 90), 1, 1024) if QUICK else ((480, 270), 32, 16384)
 
 # %% [markdown]
-# A pot of cut glass and a mirror ring on the checkerboard of `scenes/whitted.toml`, without vertex normals, so that each facet
-# reflects and refracts by itself.
+# The scene is a glass pot and a mirror ring on the checkerboard of `scenes/whitted.toml`. Both meshes have no vertex normals, so that
+# each facet reflects and refracts like cut glass.
 
 # %%
 balls = wrt.load_scene("../scenes/whitted.toml")
@@ -46,37 +46,39 @@ wrt.side_by_side({"": wrt.render(scene, size=SIZE, spp=SPP)})
 
 # %% [markdown]
 # ## What does a pixel cost?
-# `wrt.profile` traces the same rays as a render does, with the counters compiled in: without them the machine code holds no trace
-# of counting. Nodes have two children here; how many Turing's have was not published. Rays of every kind at every depth (bounces
-# behind them), with what they cost together:
+# `wrt.profile` traces the same rays as a render, with counters in the kernel. Nodes have two children here; how many the nodes of Turing
+# (NVIDIA's first GPUs with RT cores) have is not published. The table has one row for each kind of ray and each depth (number of bounces
+# before the ray), with the total cost of these rays:
 
 # %%
 profile = wrt.profile(scene, size=SIZE, spp=1, accel="bvh2")
 profile
 
 # %% [markdown]
-# One sample of a pixel is a tree of rays: a matte hit sends a shadow ray to each light that it faces, a mirror one ray on, glass
-# two. So the glass pot takes most rays, and the sky one a pixel.
+# One sample of a pixel is a tree of rays. A hit on a matte surface sends a shadow ray to each light that it faces. A mirror sends one
+# reflected ray, and glass sends a reflected and a refracted ray. So the glass pot has the most rays, and the sky has one per pixel. The
+# heat map "probes" shows the number of rays of each pixel.
 
 # %%
 profile.heatmap("probes")
 
 # %% [markdown]
-# The nodes that these rays fetch: rays among the facets cost more each, so that this map has more contrast than that of the rays.
+# The next heat map shows the nodes that these rays fetch. Each ray between the facets costs more than others, so this map has more
+# contrast than the map of rays.
 
 # %%
 profile.heatmap("nodes")
 
 # %% [markdown]
-# The stack shows the boxes themselves: the children that wait are boxes that the ray meets, and their outlines are on the sky and
-# on the floor.
+# The map of the stack shows outlines of boxes on the sky and on the floor. The reason: a stack entry is a box that the ray meets and that
+# waits for its visit.
 
 # %%
 profile.heatmap("stack")
 
 # %% [markdown]
-# What a ray costs by itself depends on where it starts. Many rays from the eye see sky or floor; one that is reflected or
-# refracted starts among the facets, and fetches about three times the nodes (means in the legend).
+# The cost of a single ray depends on where it starts. Many camera rays see sky or floor. A reflected or refracted ray starts between the
+# facets, and fetches about three times as many nodes (the legend has the means).
 
 # %%
 rays = profile.rays
@@ -87,16 +89,16 @@ for i, kind in enumerate(KINDS):
     chosen = per_ray[rays.kind == i]
     if len(chosen):
         ax.stairs(np.histogram(chosen, edges)[0] / len(chosen), edges, label=f"{kind}, mean {chosen.mean():.2f}", linewidth=1.8)
-ax.set(xlabel="nodes that a ray fetches", ylabel="share of the rays", xlim=(0, np.percentile(per_ray, 99.8)), yscale="log")
+ax.set(xlabel="nodes that a ray fetches", ylabel="share of the rays of that kind", xlim=(0, np.percentile(per_ray, 99.8)), yscale="log")
 ax.legend(title="kind of ray")
 plt.show()
 
 # %% [markdown]
-# ## From counts to clocks
-# A ray takes of an RT core at least what its boxes take of the box unit, its triangles of the triangle unit, its cache lines of
-# the L1, what misses there of the L2, and so on; and it waits for its longest chain of fetches and tests, over as many warps as
-# wait at the same time. These overlap, so that **the largest term decides**: a roofline. What misses the caches is simulated,
-# with the addresses that the rays fetched.
+# ## From counts to clock cycles
+# A ray occupies the box unit for its box tests, and the triangle unit for its triangle tests. It occupies the L1 cache for its cache
+# lines, the L2 cache for lines that miss the L1, and the DRAM for lines that miss the L2. It also waits for the latency of its fetches
+# and tests; other warps share this time. All these terms overlap, so **the largest term decides** (a roofline model). The cache misses
+# come from a simulation with the addresses that the rays fetched.
 
 # %%
 gpu = GPUS["rtx2080ti"]
@@ -111,17 +113,17 @@ for i, row in enumerate(rows):
     ax.barh(y, [row.clocks[name] for name in TERMS], height, label=f"{row.name}: {row.rays_per_second / 1e9:.1f} Grays/s")
 ax.set_yticks(np.arange(len(TERMS)), TERMS)
 ax.invert_yaxis()
-ax.set(xlabel=f"clocks a ray and RT core ({BASE.boxes:g} boxes or {BASE.triangles:g} triangle a clock, {BASE.warps} warps)")
-ax.legend(title="the longest bar of a colour decides")
+ax.set(xlabel=f"cycles per ray and RT core ({BASE.boxes:g} boxes or {BASE.triangles:g} triangle per cycle, {BASE.warps} warps)")
+ax.legend(title="the longest bar of a colour is the limit")
 plt.show()
 
 # %% [markdown]
-# Latency decides for every kind of ray: with four warps at a time, the core mostly waits. And lanes wait for each other: of
-# shadow rays as they come, three quarters of the lanes' time is lost (SIMT efficiency), since the pixels of a warp have different
-# numbers of them.
+# Latency is the largest term for every kind of ray: with four warps at a time, the core mostly waits. Lanes also wait for each other.
+# With shadow rays in pixel order, lanes are idle for three quarters of the time (SIMT efficiency), because the pixels of a warp have
+# different numbers of shadow rays.
 #
-# What of this is assumed, and how much hangs on it? Each assumption is swept alone; the bar is the factor from the least to the
-# most rays a second.
+# How much do the assumptions matter? Each assumed parameter is varied alone. Each bar is the ratio of the most to the least rays per
+# second.
 
 # %%
 by_name = {row.name: row for row in rows}
@@ -131,13 +133,13 @@ for ax, name in zip(axes, ("primary", "secondary"), strict=True):
     factors = by_name[name].factors
     ax.barh(list(factors), list(factors.values()), color="C0" if name == "primary" else "C1")
     ax.invert_yaxis()
-    ax.set(title=f"{name} rays", xlabel="most over least", xlim=(1.0, 1.05 * most))
+    ax.set(title=f"{name} rays", xlabel="most over least rays per second", xlim=(1.0, 1.05 * most))
 plt.show()
 
 # %% [markdown]
 # ## What if?
-# One thing of the design is changed, the same rays are counted again. Hills of 20,000 triangles, with rays that start on them
-# into all directions (diffuse): incoherent, as after a first bounce.
+# Each study changes one property of the design, and counts the same rays again. The mesh is a terrain of 20,000 triangles. Its rays start
+# on the surface into random directions (diffuse): incoherent, like rays after a first bounce.
 
 # %%
 hills = terrain(100)
@@ -148,34 +150,32 @@ wrt.side_by_side({"": heatmap(counters.nodes.reshape(SIZE[::-1]), "the hills: no
 # %%
 def study(name, kinds=("diffuse",)):
     rows = whatif.run(whatif.Plan(name, hills, kinds, RAYS))
-    assert all(row.differ == 0 for row in rows)  # a design may cost more; it may not find other hits
+    assert all(row.differ == 0 for row in rows)  # a design may cost more, but must find the same hits
     return rows
 
 
 # %% [markdown]
-# **How wide is a node, and in which format?** `bvh8c` holds eight boxes with planes of 8 bits; spheres and 14-DOPs bound
-# otherwise.
+# **How many children has a node, and in which format?** `bvh8c` stores the eight boxes of `bvh8` with planes of 8 bits.
 
 # %%
 study("width")
 
 # %% [markdown]
-# Wider nodes: fewer fetches, one after another, about as many boxes, and more triangles. Where latency decides (4 warps), that
-# pays; where it is hidden (32 warps), lines and bytes count, and eight children gain nothing over four. Planes of 8 bits nearly
-# halve the bytes of `bvh8` for 2 % more boxes. Spheres fit so badly that rays test 1.7 times as many; 14-DOPs fit best, and are
-# too large.
+# Wider nodes need fewer successive fetches, about as many box tests, and more triangle tests. If latency is the limit (4 warps), that is
+# faster. If latency is hidden (32 warps), cache lines and bytes are the limit, and eight children are no better than four. Planes of 8
+# bits nearly halve the bytes of `bvh8`, for 2 % more box tests.
 
 # %% [markdown]
-# **How many entries has the stack?** A short one that overflows forgets its oldest entry. When it runs out, the walk starts again
-# at the root, and follows a trail of one bit a level to where it was.
+# **How many entries has the stack?** A short stack that overflows drops its oldest entry. When the stack is empty, the traversal restarts
+# at the root. A trail of one bit per level leads it back to the first node that it has not visited.
 
 # %%
 stack = study("stack")
 stack
 
 # %% [markdown]
-# **How many bits has a plane of a box?** Fewer make nodes smaller and boxes larger (they are rounded outwards: no ray may be
-# lost).
+# **How many bits has a plane of a box?** Fewer bits make nodes smaller but boxes larger, because planes are rounded outwards: no ray may
+# be lost.
 
 # %%
 planes = study("planes")
@@ -184,9 +184,9 @@ planes
 # %%
 fig, axes = plt.subplots(1, 2, figsize=(7.4, 2.8), dpi=80, layout="constrained")
 axes[0].plot([row.variant for row in stack], [row.nodes for row in stack], "o-")
-axes[0].set(title="stack", ylabel="nodes a ray")
-axes[1].plot([row.variant for row in planes], [row.nodes / planes[0].nodes for row in planes], "o-", label="nodes a ray")
-axes[1].plot([row.variant for row in planes], [row.bytes / planes[0].bytes for row in planes], "s-", label="bytes a ray")
+axes[0].set(title="stack", ylabel="nodes per ray")
+axes[1].plot([row.variant for row in planes], [row.nodes / planes[0].nodes for row in planes], "o-", label="nodes per ray")
+axes[1].plot([row.variant for row in planes], [row.bytes / planes[0].bytes for row in planes], "s-", label="bytes per ray")
 axes[1].set(title="planes of boxes", ylabel="relative to fp32", ylim=(0, None))
 axes[1].legend()
 for ax in axes:
@@ -194,37 +194,37 @@ for ax in axes:
 plt.show()
 
 # %% [markdown]
-# Four entries are nearly as good as any number, and without a stack a ray fetches twice the nodes. Planes of 8 or 6 bits fetch
-# least; at 4 bits the boxes have grown so much that what is saved on a node goes into more nodes.
+# Four stack entries are nearly as good as any number. Without a stack, a ray fetches twice as many nodes. With planes of 8 or 6 bits,
+# rays fetch the fewest bytes. With 4 bits the boxes are so large that more nodes are fetched, which costs the bytes that each node saves.
 
 # %% [markdown]
-# **What are the order of children and the early stop worth?** A ray that visits the nearer child first finds its hit soon, and
-# need not look behind it.
+# **How much do front-to-back order and early stop save?** A ray that visits the nearer child first finds its hit early. It can then skip
+# boxes behind the hit.
 
 # %%
 study("order", ("primary", "diffuse"))
 
 # %% [markdown]
-# For primary rays each by itself is worth next to nothing, and both together a third of the nodes: order finds the hit early, and
-# only the early stop makes use of that. Who never stops visits the same nodes in any order. Diffuse rays gain less: most leave
-# for the sky, and there is nothing to stop at.
+# For primary rays, either alone saves almost nothing; both together save a third of the nodes. Front-to-back order finds the hit early,
+# and the early stop skips what is behind it. Without the early stop, a ray visits the same nodes in any order. Diffuse rays gain less,
+# because most of them reach the sky and have no hit.
 
 # %% [markdown]
-# **What is sorting worth?** The same rays as the picture makes them, sorted by origin and direction, and shuffled. The work is
-# the same; what changes is what the lanes of a warp share.
+# **How much does sorting save?** The study traces the same rays in the order of the picture, sorted by origin and direction, and
+# shuffled. The work of each ray is the same. Only the memory that the lanes of a warp share changes.
 
 # %%
 study("sorting")
 
 # %% [markdown]
-# Nodes and triangles a ray are the same to the last digit; lines double when the rays are shuffled, and where latency is hidden
-# that costs more than half of the speed. As they come, these rays are sorted already, by where they start: sorting by direction
-# as well helps the lanes (SIMT) and hurts the lines.
+# The numbers of nodes and triangles per ray do not change. Shuffling doubles the number of cache lines; if latency is hidden, this costs
+# more than half of the speed. In the order of the picture, these rays are already sorted by origin. Sorting by direction, too, improves
+# the SIMT efficiency but needs more cache lines.
 
 # %% [markdown]
 # ## Box unit against triangle unit
-# How many boxes and triangles a clock should an RT core test? A map over both rates, with latency hidden (32 warps) and a warm
-# L2.
+# How many boxes and triangles per clock cycle should an RT core test? The maps vary both rates. Latency is hidden (32 warps), and the L2
+# cache already holds the data.
 
 # %%
 rates = [rate for rate in whatif.run(whatif.Plan("rates", hills, ("diffuse",), RAYS)) if rate.structure in ("bvh2", "bvh8")]
@@ -239,21 +239,21 @@ for ax, structure in zip(axes, ("bvh2", "bvh8"), strict=True):
     for x, b in enumerate(boxes):
         for y, t in enumerate(triangles):
             ax.text(x, y, f"{speeds[y][x] / 1e9:.1f}\n{at[b, t].limit}", ha="center", va="center", fontsize=9)
-    ax.set(title=f"{structure}: Grays/s, and what limits", xlabel="boxes a clock", ylabel="triangles a clock",
+    ax.set(title=f"{structure}: Grays/s, and what limits", xlabel="boxes per cycle", ylabel="triangles per cycle",
            xticks=range(len(boxes)), xticklabels=[f"{b:g}" for b in boxes],
            yticks=range(len(triangles)), yticklabels=[f"{t:g}" for t in triangles])
 plt.show()
 
 # %% [markdown]
-# With two children a node, no triangle rate limits: boxes do, and from 4 a clock on the L2. With eight there are more triangles a
-# ray, and half a triangle a clock would be too few. Twice the triangle rate pays only where triangles are what limits.
+# With two children per node, the triangle rate is never the limit. The box rate is the limit, and from 4 boxes per cycle on, the L2
+# cache. With eight children, a ray tests more triangles, and half a triangle per cycle would be too few. A doubled triangle rate helps
+# only if triangle tests are the limit.
 
 # %% [markdown]
 # ## Exercises
-# 1. Let the pot be a mirror. Which heat map changes most, and what happens to the range of the model?
-# 2. Which kind of ray is the hardest for the caches?
-#    `wrt.lab.rtcore.profile_report.work_of(profile, "shadow").misses(gpu, BASE)` tells.
-# 3. `study("order")` with hills seen from above has little depth. Build a mesh with much (several `terrain`s above each other, by
-#    `wrt.Mesh`), and look at what order and early stop save.
-# 4. Later RT cores than Turing's test triangles at twice the rate. For which structure and rays does the model agree that it
-#    pays? The study "rates" tells (`doubled`).
+# 1. Let the pot be a mirror. Which heat map changes most, and how does the modelled range of speeds change?
+# 2. Which kind of ray has the most cache misses? Use `wrt.lab.rtcore.profile_report.work_of(profile, "shadow").misses(gpu, BASE)`.
+# 3. In `study("order")`, a ray crosses few surfaces of the hills. Build a mesh with many layers (several `terrain`s above each other, by
+#    `wrt.Mesh`). How much do order and early stop save now?
+# 4. RT cores after Turing test triangles at twice the rate. For which structure and rays is that faster in the model? See `doubled` in
+#    the study "rates".

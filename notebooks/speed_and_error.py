@@ -1,11 +1,10 @@
 # %% [markdown]
 # # Speed against error
-# A picture is an estimate: more time, less error. How fast does the error fall, can a picture tell its own error, when is it good
-# enough, and which errors does no number of samples take away? And beneath the picture: how exact is a single hit?
+# A rendered picture is an estimate: more time gives less error. How fast does the error fall? Can a render estimate its own error? When
+# is the picture good enough? Which errors remain with any number of samples? And how exact is a single hit?
 #
-# With `WRT_QUICK` in the environment, pictures are smaller and samples fewer; the outputs below are of the full setting. Seconds
-# are of the machine that ran this; everything else is the same everywhere, since samples are a function of pixel, number and
-# seed.
+# If the environment variable `WRT_QUICK` is set, pictures are smaller and samples fewer. The outputs below were made without it. Times
+# depend on the machine. All other results are the same everywhere, because samples depend only on pixel, sample index and seed.
 
 # %%
 import os
@@ -26,9 +25,9 @@ MOST, REPEATS, RAYS = (8, 3, 1_000) if QUICK else (64, 5, 20_000)
 room = wrt.load_scene("../scenes/sphere_light.toml")
 
 # %% [markdown]
-# ## What noise looks like
-# Two glowing balls light a room. At each point a shadow ray goes to a random place on each ball, so that half shadows are noisy.
-# Below each picture its distance from a converged one (mean over the channels of the absolute difference, in radiance).
+# ## Noise
+# Two glowing balls light a room. From each hit, a shadow ray goes to a random point on each ball, so that penumbrae are noisy. Below each
+# picture is its error: the absolute difference from a converged picture, in radiance, averaged over the colour channels.
 
 # %%
 truth = wrt.render(room, size=SIZE, spp=8 * MOST, seed=99).pixels.astype(np.float64)
@@ -41,14 +40,14 @@ for spp in (1, 4, 16):
 wrt.side_by_side({**pictures, **errors}, columns=3)
 
 # %% [markdown]
-# Most of the error stands at the outlines of the lamps, where a pixel holds something very bright and something dark; half
-# shadows come second.
+# Most of the error is at the outlines of the lamps, where one pixel contains very bright and dark parts. The penumbrae have the next
+# largest error.
 
 # %% [markdown]
-# ## How fast does it fall?
-# `wrt.lab.bench.error.sweep` renders with 1, 2, 4 ... samples and several seeds, and holds everything against a reference of
-# its own. From the seeds come error bars; the error is split into noise, which seeds do not share, and bias, which they do. Here
-# with both samplers: random numbers, and scrambled Sobol points, which are spread evenly.
+# ## How fast does the error fall?
+# `wrt.lab.bench.error.sweep` renders with 1, 2, 4 ... samples per pixel and several seeds, and compares the pictures with a reference.
+# The seeds give error bars. They also separate noise, which differs between seeds, from bias, which does not. The sweep covers both
+# samplers: independent random numbers, and scrambled Sobol points, which are spread evenly.
 
 # %%
 small = room.with_settings(size=SMALL)
@@ -82,10 +81,10 @@ for slope in sweep.slopes:
     print(f"{slope.variant:22} squared error falls as the samples to the power {slope.mse.value:.2f}; theory: {slope.theory}")
 
 # %% [markdown]
-# ## Can a picture tell its own error?
-# `film.variance` is the variance of each pixel's mean, estimated from the pixel's own samples. For independent samples that is
-# exact on average: error over estimated error is normally distributed with width 1. Sobol points keep away from each other, so
-# that their mean is better than the spread of the samples says, and the estimate is too cautious.
+# ## Can a render estimate its own error?
+# `film.variance` is the variance of each pixel's mean, estimated from the pixel's own samples. For independent samples the estimate is
+# right on average: error over estimated error is normally distributed with standard deviation 1 (the "width" below). Sobol points are
+# spread evenly, so that their mean is more accurate than the spread of the samples suggests. For them the estimated error is too large.
 
 # %%
 fig, ax = plt.subplots(figsize=(6.4, 3.2), dpi=80, layout="constrained")
@@ -104,9 +103,9 @@ ax.legend(fontsize=9)
 plt.show()
 
 # %% [markdown]
-# ## When is it good enough?
-# `target_error` renders until the estimated error of the whole picture is low enough. For that it splits the samples over four
-# independent sequences: their spread tells the error of Sobol points as well.
+# ## When is the picture good enough?
+# With `target_error`, wrt renders until the estimated error of the whole picture is below the target. It splits the samples into four
+# independent sequences, whose spread estimates the error of Sobol points, too.
 
 # %%
 for target in (0.1, 0.05) if QUICK else (0.04, 0.02, 0.01):
@@ -116,11 +115,11 @@ for target in (0.1, 0.05) if QUICK else (0.04, 0.02, 0.01):
     print(f"target {target}: {film.samples.max():4} samples a pixel, estimated error {estimated:.5f}, true {true:.5f}")
 
 # %% [markdown]
-# It looks when each sequence has 1, 2, 4, 8 ... samples, when it is as even as it can be; so the error is often well below the
-# target.
+# wrt checks the error when each sequence has 1, 2, 4, 8 ... samples, because a Sobol sequence is most even then. So the final error is
+# often well below the target.
 #
-# ## Errors that stay
-# Noise falls with the samples, bias does not. With `max_depth=0` the mirror ball is black, whatever the seed: that error stays.
+# ## Errors that remain
+# More samples reduce noise, but not bias. With `max_depth=0` the mirror ball is black for every seed, and this error remains.
 
 # %%
 ax = axes()
@@ -135,15 +134,14 @@ shown = {f"max_depth {depth}": wrt.render(room, size=SIZE, spp=16, max_depth=dep
 wrt.side_by_side(shown)
 
 # %% [markdown]
-# One bounce is all that this scene needs: there is one mirror, and nothing in it that reflects. At one sample a pixel nobody
-# would notice the missing bounce; at 64 it is most of the error. To know which error a picture has is to know what to spend time
-# on.
+# This scene needs only one bounce: there is one mirror, and it shows nothing that reflects. With one sample per pixel, noise hides the
+# missing bounce; with 64, the missing bounce is most of the error. So find out which error a picture has before you spend time on it.
 
 # %% [markdown]
-# ## Beneath the picture: how exact is a hit?
-# The oracle (`wrt.lab.oracle.oracle`) answers in float64, and where that is not enough in whole numbers: its $t$ is exact to 14
-# digits. Held against it, the error of each triangle test's $t$ in float32 steps (ulp) of $t$, over rays that start on hills into
-# all directions.
+# ## How exact is a hit?
+# The oracle (`wrt.lab.oracle.oracle`) computes in float64, and in integer arithmetic where float64 is not exact enough. Its $t$ is exact
+# to 14 digits. The plot shows the error of each triangle test's $t$ in float32 steps (ulp) of $t$. The rays start on a terrain into
+# random directions.
 
 # %%
 hills = terrain(40 if QUICK else 150)
@@ -165,13 +163,13 @@ ax.legend(fontsize=9)
 plt.show()
 
 # %% [markdown]
-# More than half of the watertight test's distances are the float32 value nearest to the exact one, and fewer than one in a
-# thousand is ten steps off; the plane equation and Baldwin and Weber's map find $t$ in the same way, from a rounded plane, and
-# are a hundred steps off once in two hundred hits. What that is good for: a new ray must leave the surface by as much as its
-# start may be wrong. wrt takes the derived bound for that, ray by ray, and no fixed epsilon.
+# More than half of the watertight test's distances are the float32 value nearest to the exact one. Fewer than one in a thousand is off by
+# ten steps or more. The plane equation and Baldwin and Weber's test compute $t$ from a rounded plane; one in two hundred of their
+# distances is off by a hundred steps. This matters because a new ray must start outside the error of its origin. wrt uses the derived
+# bound of each hit for this, and no fixed epsilon.
 #
 # ## Exercises
 # 1. Render `scenes/whitted.toml` instead, which has no soft shadows. How fast does Sobol's error fall there, and why faster?
-# 2. `error.KNOBS` names what `sweep` can turn. Which knobs change nothing of this scene's pixels (`sweep.same_pixels`)?
+# 2. `error.KNOBS` names the settings that `sweep` can vary. Which of them do not change this scene's pixels (`sweep.same_pixels`)?
 # 3. How many samples does the independent sampler need for `target_error=0.01`?
-# 4. `python -m wrt bench units` measures what the tests cost beside each other. Is exactness paid for with time?
+# 4. `python -m wrt bench units` compares the times of the triangle tests. Are more exact tests slower?

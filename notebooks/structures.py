@@ -1,10 +1,10 @@
 # %% [markdown]
 # # Acceleration structures: the teapot in a stadium
-# A ray could be tested against every triangle. A structure leaves nearly all of them out: but which structure, and at which
-# price? Here they are built over the same triangles, asked the same rays, counted step by step, and timed.
+# An acceleration structure saves a ray from being tested against every triangle. Which structure is best, and what does it cost? This
+# notebook builds several structures over the same triangles, traces the same rays, counts their steps, and measures their times.
 #
-# With `WRT_QUICK` in the environment, pictures and meshes are smaller; the outputs below are of the full setting. Times are of
-# the machine that ran this; counts of steps are the same everywhere.
+# If the environment variable `WRT_QUICK` is set, pictures and meshes are smaller. The outputs below were made without it. Times depend on
+# the machine; counts of steps do not.
 
 # %%
 import os
@@ -24,8 +24,8 @@ SIZE, SPP, RAYS = ((160, 90), 1, 2_000) if QUICK else ((390, 220), 16, 20_000)
 STRUCTURES = ("bvh2", "kdtree", "octree", "grid")
 
 # %% [markdown]
-# Eric Haines (Ray Tracing News, 1988) asked what a structure of equal cells does with a teapot in a stadium: a few large
-# triangles say how large space is, and all the small ones are in one place.
+# Eric Haines (Ray Tracing News, 1988) described the hard case of a uniform grid, a teapot in a stadium. A few large triangles determine
+# the size of the grid, and all the small triangles are in one place.
 
 # %%
 scene = wrt.load_scene("../scenes/stadium.toml")
@@ -39,9 +39,10 @@ extents = {mesh.name: np.ptp(mesh.vertices, axis=0).max() for mesh in (pot, stad
 print({name: f"{extent:.3g}" for name, extent in extents.items()}, f"triangles: {len(pot.faces)} and {len(stadium.faces)}")
 
 # %% [markdown]
-# ## What a step is, and where they are
-# `counters=True` counts for each ray: nodes fetched (of a grid: cells) and triangles tested. One ray a pixel, once at the pot
-# alone, once at the pot on the pitch. The scale is logarithmic: from dark to bright a factor of ten thousand.
+# ## Steps of a ray
+# With `counters=True`, a query counts the nodes (in a grid: cells) that each ray fetches, and the triangles that it tests. Each of these
+# is a step. The maps have one ray per pixel: the upper row for the pot alone, the lower row for the pot in the stadium. The colour scale
+# is logarithmic, from 1 to 10,000 steps.
 
 # %%
 camera = wrt.Camera.look_at((1.25, 1.0, 1.9), (0.03, 0.42, 0.0), fov_y=np.radians(36))
@@ -50,7 +51,7 @@ origins, directions = wrt.camera_rays(camera, half)
 
 
 def steps(accel):
-    """Nodes and triangles a ray, and what is hit."""
+    """Return the number of nodes and triangles of each ray, and the hits."""
     hits = accel.closest_hit(origins, directions, counters=True)
     return hits.counters.nodes + hits.counters.primitives, hits
 
@@ -70,8 +71,8 @@ fig.colorbar(shown, ax=axes, label="steps of a ray", shrink=0.9)
 plt.show()
 
 # %% [markdown]
-# All of them find the same triangle at the same $t$, to the last bit (the cell checks it): a structure may only cost more or
-# less. The number above each map is its mean.
+# All structures find the same triangle at the same $t$, to the last bit (the cell checks it). They differ only in cost. The number above
+# each map is its mean.
 
 # %%
 for name in STRUCTURES:
@@ -79,8 +80,8 @@ for name in STRUCTURES:
     print(f"{name:7} {alone:6.1f} steps a ray alone, {there:7.1f} in the stadium: {there / alone:6.1f} times")
 
 # %% [markdown]
-# Three of them adapt: they cut space where the triangles are, and pay a few steps more to come there. The grid's cells are all
-# alike, and as large as the stadium makes them: the whole view is in one or a few of them, and every ray tests all of the pot.
+# Three structures adapt: they subdivide space where the triangles are, and need only a few more steps. The cells of the grid all have the
+# same size, which depends on the stadium. The whole pot is in one or a few cells, and every ray tests all of its triangles.
 
 # %%
 cells = np.array(wrt.build(stadium, "grid").built.arrays["n"])
@@ -89,8 +90,8 @@ print(f"{cells[0]} x {cells[1]} x {cells[2]} cells, each {width:.1f} wide; the p
 
 # %% [markdown]
 # ## How fine should cells be?
-# Even without a stadium the right size of a grid's cells is a compromise: with few cells a ray tests many triangles, with many it
-# walks through many cells, and memory grows. The default is 2 cells a triangle.
+# Even without a stadium, the size of a grid's cells is a compromise. With few cells, a ray tests many triangles. With many cells, it
+# crosses many of them, and memory grows. The default is 2 cells per triangle.
 
 # %%
 densities = [0.03, 0.1, 0.5, 2.0, 8.0, 30.0, 100.0]
@@ -111,8 +112,8 @@ axes[1].set(xlabel="cells a triangle", ylabel="bytes a triangle")
 plt.show()
 
 # %% [markdown]
-# ## Build against search
-# The report of `wrt.lab.bench.accel` measures both, with memory, and checks every answer: `differ` and `wrong` must be 0. Here the
+# ## Build time and query time
+# `wrt.lab.bench.accel` measures build time, query time and memory, and checks every hit: `differ` and `wrong` must be 0. The mesh is the
 # pot alone.
 
 # %%
@@ -121,8 +122,8 @@ assert all(row.differ == row.wrong == 0 for row in report)
 report
 
 # %% [markdown]
-# A structure has paid for itself when the rays are many enough: seconds to build, and seconds for each ray. The line that is
-# lowest at a number of rays is the one to take for so many.
+# The more rays, the more a slow build can pay. Each line is the time to build plus the time to trace that number of rays. The lowest line
+# at a number of rays is the best structure for it.
 
 # %%
 (brute,) = bench.run(bench.Plan((pot,), ("brute_force",), ("diffuse",), rays=RAYS // 20, runs=3))
@@ -143,9 +144,9 @@ for row in report:
 
 # %% [markdown]
 # ## Which tree?
-# A BVH can be built in many ways. The surface area heuristic (SAH) predicts what a random line through the root's box costs if
-# nothing stops it: each node is met with the probability (area of its box) / (area of the root's). Six builders over the stadium
-# with its pot, the prediction, and what such lines and the picture's rays really take:
+# A BVH can be built in many ways. The surface area heuristic (SAH) predicts the number of steps of a random line through the root's box,
+# if no hit stops the line. The line meets a node with the probability (area of the node's box) / (area of the root's box). The plot
+# compares six builders over the stadium with its pot: the prediction, and the measured steps of random lines and of the picture's rays.
 
 # %%
 BUILDERS = ("lbvh", "binned") if QUICK else ("lbvh", "median", "binned", "sweep", "sbvh", "reinsertion")
@@ -173,19 +174,19 @@ ax.legend(loc="upper right", fontsize=9)
 plt.show()
 
 # %% [markdown]
-# Lines stop at their first hit, so that they cost less than the prediction; but the builders keep its order. The picture's rays,
-# which go to the pot and not all over the stadium, keep it only roughly. The two builders that do not ask for areas (Morton
-# codes, medians) cost about twice the steps where it matters: they cut the pot where the count or a grid of powers of two says,
-# and boxes overlap. The maps show where.
+# The measured lines stop at their first hit, so they take fewer steps than predicted, but they rank the builders in almost the same
+# order. The picture's rays go to the pot and not all over the stadium; their ranking is similar. Two builders ignore areas: `lbvh`
+# (Morton codes) and `median`. Their picture rays take about twice as many steps, because they split the pot by the count of triangles or
+# at a grid of powers of two, and boxes overlap. The maps show where.
 
 # %%
 wrt.side_by_side({builder: heatmap(maps[builder], "steps of a ray", top=80.0) for builder in ("lbvh", "binned")})
 
 # %% [markdown]
 # ## Exercises
-# 1. Put two pots into the stadium, far from each other. What does the grid do now? And what would a grid within a cell of the
-#    grid do?
-# 2. Which structures can follow moving vertices (`accel.refit`)? Twist the pot by a turn, refit, and compare the steps with a new
-#    tree's.
-# 3. `wrt.build(stadium, "bvh8c")`: half of the memory. What does it cost in steps, and in time?
-# 4. Find the number of rays from which a k-d tree's build has paid for itself against `bvh2`'s, if ever.
+# 1. Put two pots into the stadium, far from each other. How many steps does the grid need now? How many would it need with a second grid
+#    inside each full cell?
+# 2. Which structures can follow moving vertices (`accel.refit`)? Twist the pot by a full turn, refit, and compare the steps with those of
+#    a new tree.
+# 3. `wrt.build(stadium, "bvh8c")` takes half of the memory. How many more steps does it take, and how much more time?
+# 4. From which number of rays on is building and querying a k-d tree faster than `bvh2`, if ever?

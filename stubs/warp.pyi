@@ -1,5 +1,5 @@
-"""Warp as the type checker is to see it: device code is not checked (its annotations are Warp's, not types); arrays and devices are
-classes whose attributes are Any, and all else is Any."""
+"""Warp's types for mypy. Device code is not checked, because its annotations are Warp's, not Python's. Arrays and devices are classes
+with attributes of type Any; everything else is Any."""
 
 from collections.abc import Callable
 from typing import Any, Generic

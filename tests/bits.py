@@ -1,4 +1,4 @@
-"""The bits of shipped scenes' pixels and of hits: `python -m tests.bits` prints what tests/bits.txt holds."""
+"""Hash the pixels of the shipped scenes and the hits of the structures: `python -m tests.bits > tests/bits.txt` stores the hashes."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ def pixels(scene: Path) -> str:
 
 
 def kernels(scene: Path) -> list[Any]:
-    """Those that `pixels` runs."""
+    """Return the kernels that `pixels` runs."""
     found: list[Any] = plan_of(wrt.load_scene(scene), Options(device=device.NAME)).kernels
     return found
 
 
 def library_calls(kernel: Any) -> set[str]:
-    """What a kernel's object file asks the C library for, of functions that each library rounds in its own way."""
+    """Return the functions of NAMES that a kernel's object file calls: C libraries differ in how they round their results."""
     load_kernel(kernel, DEVICE)
     folder = Path(wp.config.kernel_cache_dir) / kernel.module.get_module_identifier(block_dim(DEVICE))
     files = [path for path in folder.iterdir() if path.suffix in (".o", ".cubin")]  # several where there are several GPUs
@@ -52,7 +52,7 @@ def library_calls(kernel: Any) -> set[str]:
 
 
 def hits(accel: str) -> str:
-    """Of primary rays and of random ones, at a torus with a bump beside it: no face is a mirror image of another."""
+    """Return a hash of the hits of random and primary rays on a torus."""
     mesh = shapes.torus(1.0, 0.4, 64, 32)
     rng = np.random.default_rng(1)
     origins = rng.normal(size=(RAYS, 3)) * 2.0
@@ -66,7 +66,7 @@ def hits(accel: str) -> str:
 
 
 def primary_rays(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Of a pinhole, rounded once from float64: wrt.camera_rays gives what the device makes of them."""
+    """Return origins and directions, (N, 3) float32, of a pinhole camera. Computed in float64, so that no device code plays a part."""
     pose = wrt.Camera.look_at((0.0, 2.0, 4.0), (0.0, 0.0, 0.0)).camera_to_world
     tan_y = math.tan(0.5 * 0.6)
     x = (2.0 * (np.arange(width) + 0.5) / width - 1.0) * tan_y * width / height

@@ -1,4 +1,4 @@
-"""Pictures by both loops of the renderer, by waves of samples and by one ray at a time, to be compared bit by bit."""
+"""Render with both loops of the renderer, waves of samples and one ray at a time, to compare their films bit by bit."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from wrt.renderer.tiles import Rectangle, Work
 
 
 def one_ray_at_a_time(ready: Prepared) -> Prepared:
-    """With the loop that CUDA has."""
+    """Return a copy that renders with the one-ray-at-a-time loop, the only loop on CUDA."""
     plan = ready.plan
     makes = (render_kernel, aov_kernel) if plan.options.aov else (render_kernel,)
     kernels = [make(plan.features, plan.structure) for make in makes]
@@ -26,32 +26,32 @@ def one_ray_at_a_time(ready: Prepared) -> Prepared:
     return replace(ready, waves=None, kernels=kernels)
 
 
-def film_of(ready: Prepared, rectangle: Rectangle, *parts: tuple[int, int], groups: int = 1,
+def film_of(ready: Prepared, rectangle: Rectangle, *launches: tuple[int, int], groups: int = 1,
             seed: int = 5) -> dict[str, np.ndarray]:
-    """Everything that samples change. parts: the first sample of each pixel and their number, one launch after another."""
+    """Return all arrays of the film, by name. launches: the first sample and the number of samples per pixel of each launch."""
     film = DeviceFilm(ready.plan.scene.settings, ready.plan.crop, ready.device, seed, groups)
     trace = ready.launch(film)
-    for first, n in parts:
+    for first, n in launches:
         assert trace(Work(rectangle, first, n)) == rectangle[2] * rectangle[3] * n
     return {name: film.picture(array) for name, array in film.arrays()}
 
 
 def aovs_of(ready: Prepared, rectangle: Rectangle) -> dict[str, np.ndarray]:
-    """All AOVs."""
+    """Return all AOVs as pictures, by name."""
     film = AovFilm(ready.plan.scene.settings, ready.plan.crop, ready.device)
     ready.launch(film)(Work(rectangle, 0, 1))
     return {name: film.picture(name) for name in OF_AOVS}
 
 
 def differences(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> list[str]:
-    """The arrays that have not the same bits."""
+    """Return the names of the arrays whose bits differ."""
     assert one.keys() == other.keys()
     return [name for name, values in one.items() if values.tobytes() != other[name].tobytes()]
 
 
 @contextmanager
 def small_waves(capacity: int) -> Iterator[None]:
-    """Waves that are made in the block have so many samples at most."""
+    """Limit the waves that the block creates to `capacity` samples."""
     before, waves.CAPACITY = waves.CAPACITY, capacity
     try:
         yield

@@ -1,8 +1,13 @@
-"""What is hard for structures that cut space into cells: geometries without height, far away, huge; rays that graze; lines."""
+"""Hard cases for structures that cut space into cells: flat, distant, huge and degenerate geometries, grazing rays, random lines."""
+
+from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
+from tests.refused import refused
 from wrt.accel.geometry import Geometry
+from wrt.accel.scenes.build import build
 from wrt.scene.mesh import Mesh
 
 NO_SPHERES = np.zeros((0, 4), np.float32)
@@ -27,7 +32,7 @@ CASES = {
 
 
 def points_of(geometry, rng):
-    """A random point of each primitive (N, 3) float64."""
+    """Return one random surface point of each primitive, (N, 3) float64."""
     weight = rng.dirichlet([0.3, 0.3, 0.3], len(geometry.faces))
     point = (weight[:, :, None] * geometry.vertices[geometry.faces].astype(np.float64)).sum(axis=1)
     around = rng.normal(size=(len(geometry.spheres), 3))
@@ -36,13 +41,13 @@ def points_of(geometry, rng):
 
 
 def soup(rng, n=600, size=0.15):
-    """Triangles, and 40 spheres."""
+    """Return n random triangles and 40 spheres."""
     corners = rng.uniform(-1.0, 1.0, (n, 1, 3)) + size * rng.normal(size=(n, 3, 3))
     return triangles(corners, np.concatenate([rng.uniform(-1.0, 1.0, (40, 3)), rng.uniform(0.02, 0.3, (40, 1))], axis=1))
 
 
 def grazing(rng, n):
-    """Long thin triangles in three planes, on top of each other, and rays that all but lie in the planes."""
+    """Return thin triangles in three planes, at most 1e-6 apart, and n rays that are nearly parallel to the planes."""
     corners = rng.uniform(-1.0, 1.0, (200, 3, 3))
     corners[:, :, 1] = rng.choice([0.0, 1e-7, 1e-6], (200, 1))
     corners[:, 2] = corners[:, 1] + 0.01 * rng.normal(size=(200, 3)) * [1.0, 0.0, 1.0]
@@ -54,14 +59,14 @@ def grazing(rng, n):
 
 
 def segments(rng, n=400):
-    """Triangles without area: they are listed where they are, and never hit, so that a line is walked to its end."""
+    """Return n triangles without area. Cells list them, but rays never hit them, so that a traversal visits every cell of a line."""
     ends = rng.uniform(-1.0, 1.0, (n, 2, 3)) * [1.0, 0.5, 2.0]
     first = 2 * np.arange(n)
     return Geometry.of(Mesh(ends.reshape(-1, 3), np.stack([first, first + 1, first], axis=1)))
 
 
 def random_lines(lo, hi, n, rng):
-    """Uniform lines through a box: a point on its surface, by area, and a direction inwards by the cosine."""
+    """Return uniform random lines through a box: points on its surface, uniform in area, with cosine-distributed inward directions."""
     extent = hi - lo
     area = np.array([extent[1] * extent[2], extent[2] * extent[0], extent[0] * extent[1]])
     axis = rng.choice(3, n, p=area / area.sum())
@@ -80,3 +85,23 @@ def assert_same(found, expected):
     for name in ("prim_id", "t", "u", "v"):
         a, b = getattr(found, name).view(np.int32), getattr(expected, name).view(np.int32)
         assert np.array_equal(a, b), f"{(a != b).sum()} of {len(a)} rays differ in {name}"
+
+
+def assert_rays_at_corners_agree(accel, geometry, corner, size, rng):
+    """Check rays along the axes and diagonals of cells of this size, through points `corner`, against brute force."""
+    brute = build(geometry, "brute_force")
+    steps = np.array([d for d in product([-1.0, -0.0, 0.0, 1.0], repeat=3) if np.any(d)])
+    direction = (steps[rng.integers(len(steps), size=len(corner))] * size).astype(np.float32)
+    origin = (corner - 8 * direction).astype(np.float32)
+    origin[: len(origin) // 2] = corner[: len(origin) // 2]
+    assert_same(accel.closest_hit(origin, direction), brute.closest_hit(origin, direction))
+    assert np.array_equal(accel.any_hit(origin, direction, 0.1, 3.0), brute.any_hit(origin, direction, 0.1, 3.0))
+
+
+def assert_damage_is_refused(accel, name, change):
+    """Check that a structure is restored from its arrays, and refuses them after `change` of the array `name`."""
+    arrays = {key: np.array(value) for key, value in accel.built.arrays.items()}
+    change(arrays[name])
+    type(accel).restore(accel.built, accel.geometry)
+    with refused(what="damaged"):
+        type(accel).restore(replace(accel.built, arrays=arrays), accel.geometry)

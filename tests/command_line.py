@@ -1,4 +1,4 @@
-"""The command line called in this process, as a shell would see it."""
+"""Run `python -m wrt` within the test's process, and return its exit code, stdout and stderr."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ f 1 5 8 4
 
 
 class Result(NamedTuple):
-    """What is left of a command: exit code, stdout, stderr."""
+    """The exit code, stdout and stderr of a command."""
 
     code: int
     out: str
@@ -40,12 +40,12 @@ class Result(NamedTuple):
 
     @property
     def errors(self) -> list[str]:
-        """The lines of stderr that tell an error."""
+        """The lines of stderr that begin with "error:"."""
         return [line for line in self.err.splitlines() if line.lower().startswith("error:")]
 
 
 def wrt(*arguments: object) -> Result:
-    """`python -m wrt arguments` without a new process. An exception that main() lets through goes on: it is a traceback."""
+    """Run `python -m wrt ARGUMENTS`. Exceptions that main() does not catch, a user's traceback, pass through to the test."""
     out, err = io.StringIO(), io.StringIO()
     with contextlib.ExitStack() as stack:
         stack.enter_context(mock.patch.object(sys, "argv", ["wrt", *map(str, arguments)]))
@@ -61,9 +61,9 @@ def wrt(*arguments: object) -> Result:
 
 @contextlib.contextmanager
 def largest_file(size: int) -> Iterator[None]:
-    """No file may become larger than this: what a full disk looks like from here (Python ignores the signal that goes with it).
+    """Limit files to `size` bytes, which simulates a full disk: a write beyond the limit raises OSError.
 
-    An error does not wait for the compiler, and LLVM ends the process where it cannot write: those of earlier tests come first.
+    First wait for the compilations of earlier tests: LLVM ends the process when it cannot write.
     """
     import resource
 
@@ -81,5 +81,5 @@ def largest_file(size: int) -> Iterator[None]:
 
 
 def without_compiling(err: str) -> str:
-    """stderr without the line that is there or not, as the kernel cache has it."""
+    """Return stderr without the line about compiling, which depends on the kernel cache."""
     return err.replace(f"{COMPILING}\n", "")

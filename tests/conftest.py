@@ -1,4 +1,4 @@
-"""What all tests start from."""
+"""Options of pytest for the device that tests run on, and Ctrl-C in runs in the background."""
 
 import signal
 
@@ -7,9 +7,9 @@ import pytest
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     group = parser.getgroup("device")
-    group.addoption("--device", default="cpu", help="of what names none: cuda:0, a virtual GPU (tests/virtual_gpu)  [default: cpu]")
+    group.addoption("--device", default="cpu", help="default device: cpu, or cuda:0, a virtual GPU (tests/virtual_gpu)  [default: cpu]")
     group.addoption("--real-gpu", action="store_true", help="--device is one of this machine's GPUs, not a virtual one")
-    group.addoption("--thread-seed", type=int, default=0, help="of the order in which a virtual GPU runs threads")
+    group.addoption("--thread-seed", type=int, default=0, help="seed of the random order in which a virtual GPU runs threads")
 
 
 def pytest_report_header(config: pytest.Config) -> list[str]:
@@ -22,10 +22,6 @@ def pytest_configure(config: pytest.Config) -> None:
         from tests import device
 
         device.use(config.getoption("--device"), real=config.getoption("--real-gpu"), seed=config.getoption("--thread-seed"))
-    _hear_interrupts()
-
-
-def _hear_interrupts() -> None:
-    """Ctrl-C means what it means at a terminal: a shell that runs tests in the background has it ignored, by their children too."""
+    # A shell starts programs in the background with Ctrl-C ignored, and their children inherit that; tests of Ctrl-C need it.
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)

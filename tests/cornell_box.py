@@ -1,6 +1,6 @@
-"""The Cornell box of the data set as a scene file of ours: an OBJ file whose groups get materials, and a camera.
+"""A scene file (TOML) for the Cornell box of the data set: materials for the groups of its OBJ file, and a camera.
 
-The mesh stays where it is; the written TOML names it by path. Run as a program to write it:
+The scene file names the OBJ file by its absolute path. Run as a program to write it:
 
     python -m tests.cornell_box out/cornell_box.toml && python -m wrt render out/cornell_box.toml
 """
@@ -12,7 +12,7 @@ from pathlib import Path
 
 from tests.data import DATA
 
-# Albedos as renderers that work in RGB have them; the lamp is warm and as bright as its small size asks for.
+# Albedos and emission are the usual RGB values of this scene.
 SCENE = """\
 # The Cornell box, lit by its lamp alone.
 title = "cornell box"

@@ -1,4 +1,4 @@
-"""Where the meshes and scenes by others are: never in this project, so a test that wants one may have to skip."""
+"""Paths of meshes and scenes by others. The project does not contain them; a test that needs a missing file skips."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ DATA = Path(os.environ.get("WRT_DATA", ROOT.parent / "shared" / "data"))
 
 
 def data_path(name: str) -> Path:
-    """The path of a file or folder of the data set; skips the test where it is missing."""
+    """Return the path of a file or folder of the data set; skip the test if it is missing."""
     path = DATA / name
     if not path.exists():
         pytest.skip(f"needs {name} from the data set (set WRT_DATA to its folder)")

@@ -1,4 +1,4 @@
-"""The device that tests run on: the CPU, or what `pytest --device` names."""
+"""The device that tests run on: the CPU, or the device that `pytest --device` names."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ from typing import Any
 
 NAME = "cpu"
 IS_VIRTUAL = False
-# Where functions have "cpu" as their default device.
+# Modules with functions whose default device is "cpu".
 MODULES = ("wrt.accel.base", "wrt.accel.scenes.build", "wrt.accel.instances", "wrt.accel.store", "wrt.compat.open3d",
            "wrt.compat.trimesh", "wrt.renderer.compile", "wrt.renderer.options", "wrt.lab.bench.rasterizer", "wrt.lab.plans")
 
 
 def use(name: str, *, real: bool = False, seed: int = 0) -> None:
-    """Before Warp starts: run on that device what names none. real: of this machine; else a virtual one (tests/virtual_gpu), whose
-    threads run in an order by `seed`."""
+    """Make `name` the default device of all functions and commands; call before Warp starts.
+
+    real: use a GPU of this machine instead of a virtual GPU (tests/virtual_gpu), whose threads run in an order drawn by `seed`."""
     global NAME, IS_VIRTUAL
     if not real:
         from tests.virtual_gpu import install
 
         install(seed=seed)
-        here = Path(__file__).parent  # processes that tests start find it too
+        here = Path(__file__).parent  # so that processes which tests start have the virtual GPU, too
         paths = [str(here / "virtual_gpu" / "in_every_process"), str(here.parent), os.environ.get("PYTHONPATH", "")]
         os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
     from wrt.core.device import start
@@ -51,7 +52,7 @@ def _set_default(function: FunctionType, name: str) -> None:
 
 
 def _set_option(command: Any, name: str) -> None:
-    """Of a command and those below it."""
+    """Set the default of --device of a command and its subcommands."""
     for each in getattr(command, "commands", {}).values():
         _set_option(each, name)
     for parameter in command.params:

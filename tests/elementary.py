@@ -1,8 +1,7 @@
-"""The elementary functions of shading, measured: `python -m tests.elementary` (half an hour) prints the time a call and the largest
-errors. One argument: of all 2^32 floats; two: random ones and the special values of IEEE 754.
+"""Measure the elementary functions of shading: `python -m tests.elementary` (half an hour) prints times per call and largest errors.
 
-The truth is the C library's in float64, whose own error is below 2^-27 of an ulp of float32; test_elementary.py holds the worst
-arguments to 60 decimal digits.
+Functions of one argument are tested with all 2^32 floats; functions of two with random and special values. The reference is the C
+library in float64, whose error is below 2^-27 ulp of float32; test_elementary.py checks the worst arguments with 60 decimal digits.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ TWO = ("atan2", "power")
 
 @wp.func
 def ulps(found: float, exact: wp.float64) -> float:
-    """The distance in units of float32's last place at `exact`; an infinity is 2^128, zeros have signs, NaN is met by NaN alone."""
+    """Return |found - exact| in ulp of float32 at `exact`. Infinities count as 2^128; inf for a wrong sign of 0, or NaN on one side."""
     if wp.isnan(exact) or wp.isnan(found):
         return wp.where(wp.isnan(exact) == wp.isnan(found), 0.0, wp.inf)
     largest = wp.float64(wp.static(2.0**128))
@@ -57,7 +56,7 @@ def error_of_one(which: int, x: float) -> float:
 
 @kernel
 def sweep(first: wp.uint32, stride: wp.uint32, count: int, which: int, error: wp.array(dtype=float), at: wp.array(dtype=float)):
-    """The largest error of each thread's `count` floats, whose bits are first, first + stride ..., and where it is."""
+    """Write the largest error over the `count` floats of each thread, in ulp, and its argument. Their bits: first, first + stride ..."""
     i = wp.tid()
     worst = wp.float32(-1.0)
     for j in range(count):
@@ -79,7 +78,7 @@ def pairs(x: wp.array(dtype=float), y: wp.array(dtype=float), which: int, error:
 
 
 def worst_of_one(name: str, stride: int = 1, first: int = 0) -> tuple[float, float]:
-    """The largest error in ulp over the floats first, first + stride ... (by their bits), and an argument that has it."""
+    """Return the largest error in ulp, and its argument, over the floats whose bits are first, first + stride ..."""
     threads = 1 << 12
     count = (2**32 // stride) // threads
     error, at = zeros(threads), zeros(threads)
@@ -96,7 +95,7 @@ def worst_of_two(name: str, x: np.ndarray, y: np.ndarray) -> tuple[float, float,
 
 
 def special_pairs() -> tuple[np.ndarray, np.ndarray]:
-    """All pairs of zeros, infinities, NaN, the least and the largest numbers, integers, and neighbours of 1."""
+    """Return all pairs (x, y) of zeros, infinities, NaN, the smallest and largest floats, integers, and neighbours of 1."""
     some = np.array([0.0, 2.0**-149, 2.0**-126, 2.0**-24, 0.5, 1.0 - 2.0**-24, 1.0, 1.0 + 2.0**-23, 1.5, 2.0, 3.0, 4.0, 127.0,
                      128.0, 149.0, 150.0, 2.0**23 - 0.5, 2.0**23 + 1.0, 2.0**24 - 1.0, 2.0**24, 2.0**24 + 2.0, 2.0**32,
                      2.0**128 - 2.0**104, np.inf, np.nan], dtype=np.float32)
@@ -105,7 +104,8 @@ def special_pairs() -> tuple[np.ndarray, np.ndarray]:
 
 
 def random_pairs(name: str, n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """A quarter each: any bits; pairs of like size (power: a base next to 1); results all over their range; shading's."""
+    """Return n pairs (x, y), a quarter of each kind: random bits; similar sizes (power: bases near 1); results over the whole
+    range; arguments that shading has."""
     rng = np.random.default_rng(seed)
     m = n // 4
     any_x, any_y = rng.integers(0, 2**32, size=(2, m), dtype=np.uint32).view(np.float32)
@@ -126,7 +126,8 @@ def random_pairs(name: str, n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def series(name: str) -> tuple[Callable[[float], float], float, float]:
-    """What a polynomial stands for in wrt.kernels.shade.elementary: a function without its first terms, and where it is needed."""
+    """Return the function that a polynomial of wrt.kernels.shade.elementary approximates (a power series without its first terms),
+    and the ends of its interval."""
 
     def total(term: Callable[[int], float]) -> Callable[[float], float]:
         terms = [term(i) for i in range(60)]
@@ -143,8 +144,9 @@ def series(name: str) -> tuple[Callable[[float], float], float, float]:
 
 
 def derived(name: str, n: int) -> np.ndarray:
-    """n coefficients, the lowest power first. What they multiply vanishes at 0, where their own error counts nothing: so the points
-    are Chebyshev's of one degree more, moved so that the first of them is 0, which is left out."""
+    """Return the n coefficients of the polynomial, lowest power first, by interpolation at Chebyshev points.
+
+    On intervals from 0, its factor vanishes there, and so does its error: the n points are those of n + 1, shifted, without 0."""
     function, low, high = series(name)
     if low == 0.0:
         cosines = np.cos(pi * (2.0 * np.arange(n + 1) + 1.0) / (2.0 * n + 2.0))
@@ -157,7 +159,7 @@ def derived(name: str, n: int) -> np.ndarray:
 # --- time ------------------------------------------------------------------------------------------------------------
 
 
-# Each with the C library's: of the angles, cosines, attenuations and highlights that shading has.
+# Ranges of arguments in shading, for each function and its counterpart of the C library.
 ANGLES, COSINES, DEPTHS = (-6.0, 6.0), (-1.0, 1.0), (-8.0, 0.0)
 
 
@@ -230,7 +232,7 @@ def timed(call: Any) -> Any:
 
 
 def nanoseconds(name: str, runs: int = 9) -> tuple[float, float]:
-    """A call's processor time on one core, ours and the library's: medians, by turns."""
+    """Return the median processor time of a call in ns, of wrt's function and of the C library's, measured in turns."""
     own, library, (low, high) = CALLS[name]
     kernels = [timed(own), timed(library)]
     x, y = (floats(each) for each in np.random.default_rng(0).uniform(low, high, size=(2, 4096)))
@@ -248,7 +250,7 @@ def nanoseconds(name: str, runs: int = 9) -> tuple[float, float]:
 
 def main() -> None:
     for name in CALLS:
-        print("{}: {:.1f} ns a call, the library's {:.1f}".format(name, *nanoseconds(name)), flush=True)
+        print("{}: {:.1f} ns per call, C library {:.1f} ns".format(name, *nanoseconds(name)), flush=True)
     for name in TWO:
         for pairs_of in (special_pairs(), random_pairs(name, 1 << 26, 0)):
             found = worst_of_two(name, *pairs_of)

@@ -1,4 +1,4 @@
-"""Small glTF files, made on the spot: arrays become accessors, and the JSON is a plain dict that a test may change."""
+"""Build small glTF files: arrays become accessors, and the JSON is a plain dict that a test may change."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
 
 
 class GltfFile:
-    """One buffer, and helpers that append to it and to the JSON's arrays; each returns the index of what it added."""
+    """The JSON and the buffer of a glTF file. Methods append to both, and return the index of the new item in its JSON array."""
 
     def __init__(self) -> None:
         self.json: dict[str, Any] = {"asset": {"version": "2.0"}}
@@ -51,7 +51,7 @@ class GltfFile:
         return self.add("meshes", {"primitives": list(primitives), **rest})
 
     def node(self, **fields: Any) -> int:
-        """A node of the default scene, unless some node calls it its child."""
+        """Add a node: a root of the default scene, unless another node lists it as a child."""
         return self.add("nodes", fields)
 
     def image(self, pixels: np.ndarray, format: str = "PNG") -> int:
@@ -59,7 +59,7 @@ class GltfFile:
         return self.add("images", {"bufferView": view, "mimeType": f"image/{format.lower()}"})
 
     def write(self, folder: Path, name: str = "file.glb") -> Path:
-        """A .glb, or a .gltf with its buffer as a data: URI."""
+        """Write a .glb, or a .gltf with its buffer as a data: URI; return the path."""
         document = dict(self.json)
         if self.binary:
             document.setdefault("buffers", [{"byteLength": len(self.binary)}])
@@ -91,14 +91,14 @@ def encode(pixels: np.ndarray, format: str = "PNG") -> bytes:
 
 
 def one_triangle(**primitive: Any) -> GltfFile:
-    """A file with one node that shows one triangle; keywords go into its primitive."""
+    """Return a file with one node that shows one triangle; keywords become fields of its primitive."""
     file = GltfFile()
     file.node(mesh=file.mesh(file.primitive(**primitive), name="thing"), name="place")
     return file
 
 
 def one_material(material: dict[str, Any]) -> GltfFile:
-    """A textured quad of that material."""
+    """Return a file with one quad with texture coordinates and that material."""
     file = GltfFile()
     quad = file.primitive([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [0, 1, 2, 0, 2, 3],
                           material=file.add("materials", material))
@@ -108,7 +108,7 @@ def one_material(material: dict[str, Any]) -> GltfFile:
 
 
 def with_light(light: Any, **node: Any) -> GltfFile:
-    """A triangle, and a node with that punctual light; keywords go into the light's node."""
+    """Return a file with a triangle, and a node with that punctual light; keywords become fields of the light's node."""
     file = one_triangle()
     file.json["extensions"] = {"KHR_lights_punctual": {"lights": [light]}}
     file.node(extensions={"KHR_lights_punctual": {"light": 0}}, **node)
@@ -116,7 +116,7 @@ def with_light(light: Any, **node: Any) -> GltfFile:
 
 
 def load_warned(path: Path, **options: Any) -> tuple[Any, list[str]]:
-    """The scene of a glTF file and the text of each warning, all of which must be SceneWarnings."""
+    """Return the scene of a glTF file, and the texts of its warnings; all warnings must be SceneWarnings."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         scene = load_gltf(path, **options)
@@ -125,7 +125,7 @@ def load_warned(path: Path, **options: Any) -> tuple[Any, list[str]]:
 
 
 def rich_file() -> GltfFile:
-    """A small file that uses nearly all that the reader reads."""
+    """Return a small file that uses nearly every feature that the reader supports."""
     file = with_light({"type": "spot", "spot": {"innerConeAngle": 0.1}}, translation=[0, 1, 0], rotation=[0, 0, 0, 1])
     rows, values = file.view(bytes([1])), file.view(np.ones(3, np.float32).tobytes())
     texture = {"index": file.add("textures", {"source": file.image(np.zeros((2, 2, 4), np.uint8)), "sampler": 0})}

@@ -1,4 +1,4 @@
-"""Small launches on the device of the tests, for tests of single device functions."""
+"""Helpers to launch kernels on the tests' device: arrays, launches, random directions."""
 
 import numpy as np
 import pytest
@@ -9,11 +9,11 @@ from wrt.core.device import start  # isort: skip (before warp: it silences Warp'
 import warp as wp
 
 DEVICE = start(device.NAME)
-cpu_only = pytest.mark.skipif(DEVICE.is_cuda, reason="of code that runs on the CPU alone")
+cpu_only = pytest.mark.skipif(DEVICE.is_cuda, reason="tests code for the CPU only")
 
 
 def vec3s(rows) -> wp.array:
-    """Rows of three numbers as a Warp array of vec3."""
+    """Return (N, 3) numbers as a Warp array of vec3."""
     return wp.array(np.ascontiguousarray(rows, dtype=np.float32).reshape(-1, 3), dtype=wp.vec3, device=DEVICE)
 
 
@@ -38,28 +38,28 @@ def zeros(n: int, dtype=wp.float32) -> wp.array:
 
 
 def launch(kernel, n: int, *arguments) -> None:
-    """Run `kernel` over n threads; its last arguments are usually the arrays that it fills."""
+    """Launch `kernel` with n threads."""
     wp.launch(kernel, dim=n, inputs=list(arguments), device=DEVICE)
 
 
 def unit(rows: np.ndarray) -> np.ndarray:
-    """Rows scaled to unit length, in float64."""
+    """Return the rows scaled to unit length, float64."""
     rows = np.asarray(rows, dtype=np.float64)
     return rows / np.linalg.norm(rows, axis=-1, keepdims=True)
 
 
 def rounded(rows: np.ndarray) -> np.ndarray:
-    """The float32 values that a device sees, back in float64: an oracle must start from the same numbers."""
+    """Round to float32 and return float64, so that an oracle starts from the same numbers as the device."""
     return np.asarray(rows, dtype=np.float32).astype(np.float64)
 
 
 def directions(rng: np.random.Generator, n: int) -> np.ndarray:
-    """n unit vectors, uniform over the sphere, as float32 values in float64."""
+    """Return n unit vectors, uniform over the sphere: float64 that float32 holds exactly."""
     return rounded(unit(rng.normal(size=(n, 3))))
 
 
 def sobol_like(n: int, rng: np.random.Generator) -> np.ndarray:
-    """n points of the unit square, evenly spread (a rotated rank-1 lattice): for integrals with little noise."""
+    """Return n evenly spread points of the unit square, (n, 2): a randomly shifted rank-1 lattice, for integrals with little noise."""
     i = np.arange(n)
     golden = (np.sqrt(5.0) - 1.0) / 2.0
     points = np.stack([(i + 0.5) / n, np.mod(i * golden, 1.0)], axis=1)

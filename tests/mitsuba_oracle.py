@@ -1,4 +1,4 @@
-"""Mitsuba 3 as an independent oracle: the same scene, rays and camera, answered by someone else's code."""
+"""Mitsuba 3 as an independent oracle: render and trace the scenes, rays and cameras of wrt."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from wrt.scene.model import Scene
 
 
 def to_mitsuba(scene: Scene, camera: CameraKind | str | int | None = None, integrator: str = "auto") -> Any:
-    """The scene as a `mitsuba.Scene` of variant scalar_rgb."""
+    """Translate the scene to a `mitsuba.Scene` of variant scalar_rgb."""
     with mitsuba() as mi:
         return translate(mi, scene, camera, integrator).scene
 
 
 class Rendering(NamedTuple):
-    """pixels: (H, W, 3) float32 linear radiance; variance of their means: (H, W, 3) float64 or None; spp taken."""
+    """pixels: (H, W, 3) float32 linear radiance; variance of these means: (H, W, 3) float64 or None; spp: samples per pixel."""
 
     pixels: np.ndarray
     variance: np.ndarray | None
@@ -33,9 +33,9 @@ class Rendering(NamedTuple):
 
 def render_mitsuba(scene: Scene, camera: CameraKind | str | int | None = None, *, seed: int = 0, integrator: str = "auto",
                    **settings: Any) -> Rendering:
-    """Render with Mitsuba; settings: those of the scene to change. spp is rounded up to whole passes.
+    """Render with Mitsuba; settings: settings of the scene to change. spp is rounded up to a multiple of the samples per pass.
 
-    The variance of the mean is estimated from passes with different seeds (32 or more where spp allows), None for one pass.
+    The variance of the mean is estimated from 32 or more passes (fewer if spp is below 32) with different seeds; None for one pass.
     """
     scene = scene.with_settings(**settings)
     per_pass = max(1, scene.settings.spp // 32)
@@ -58,7 +58,7 @@ class MeshHits(NamedTuple):
 
 
 def trace_mitsuba(mesh: Mesh, origins: np.ndarray, directions: np.ndarray, t_max: float = math.inf) -> MeshHits:
-    """Closest hits of rays (N, 3) with a mesh in its own space, by Embree inside Mitsuba, about 5 microseconds a ray.
+    """Return the closest hits of rays (N, 3) with a mesh, in its object space, by Embree inside Mitsuba: about 5 microseconds a ray.
 
     The hit point is (1 - u - v) * v0 + u * v1 + v * v2. Rays are rounded to float32.
     """
@@ -81,13 +81,12 @@ def trace_mitsuba(mesh: Mesh, origins: np.ndarray, directions: np.ndarray, t_max
 
 
 class Aovs(NamedTuple):
-    """What the rays through the pixel centres hit, (H, W, ...); alpha is ignored, normals point outside.
+    """The closest hits of the rays through the pixel centres, (H, W, ...). Alpha is ignored; normals point outside.
 
-    depth: float32 distance from the camera, inf on a miss; position, geometric_normal, shading_normal: (H, W, 3)
-    float32 in world space, zero on a miss; uv: (H, W, 2); object_id: int32 index into scene.objects, then (from
-    len(objects)) into scene.spheres, -1 on a miss; prim_id: int32, counted through the faces of all objects in order,
-    then the spheres, -1 on a miss.
-    """
+    - depth: float32 distance from the camera, inf on a miss.
+    - position, geometric_normal, shading_normal: (H, W, 3) float32 in world space, zero on a miss; uv: (H, W, 2) float32.
+    - object_id: int32 index into scene.objects followed by scene.spheres, -1 on a miss.
+    - prim_id: int32 index into the faces of all objects followed by the spheres, -1 on a miss."""
 
     depth: np.ndarray
     position: np.ndarray
@@ -99,10 +98,7 @@ class Aovs(NamedTuple):
 
 
 def aov_mitsuba(scene: Scene, camera: CameraKind | str | int | None = None, size: tuple[int, int] | None = None) -> Aovs:
-    """Depth, normals and ids at the pixel centres, from wrt.camera_rays (Mitsuba's own camera is not used).
-
-    Materials and lights play no part, so that any scene will do.
-    """
+    """Trace the pixel centres' rays of wrt.camera_rays with Mitsuba. Materials and lights play no part, so any scene will do."""
     plain = Material()
     shapes_only = Scene(
         objects=tuple(replace(thing, materials=(plain,), face_material=None) for thing in scene.objects),

@@ -1,6 +1,6 @@
-"""Two pbrt-v3 scenes of the data set as scene files of ours: what a user would write to render them.
+"""Translate two pbrt-v3 scenes of the data set to wrt's scene files (TOML), as a user would write them.
 
-The meshes stay where they are; the written TOML names them by path. Run as a program to write one:
+The scene files name the meshes by their absolute paths. Run as a program to write one:
 
     python -m tests.pbrt_scene kitchen out/kitchen.toml && python -m wrt render out/kitchen.toml
 """
@@ -16,7 +16,7 @@ import numpy as np
 
 from tests.data import DATA
 
-# What the files call "remaproughness false" makes uroughness GGX's alpha; wrt's roughness is its square root.
+# The files set "remaproughness false", so uroughness is GGX's alpha; wrt's roughness is the square root of alpha.
 BY_TYPE = {
     "matte": lambda p: {"kind": "diffuse", "albedo": p.get("Kd", [0.5] * 3)},
     "substrate": lambda p: {"kind": "metallic_roughness", "albedo": p.get("Kd", [0.5] * 3), "roughness": _roughness(p)},
@@ -32,7 +32,7 @@ def _roughness(parameters: dict[str, list[float]]) -> float:
 
 
 def _parameters(text: str) -> dict[str, list[float]]:
-    """`"rgb Kd" [ 1 2 3 ]` and the like; strings (textures, types) are left out."""
+    """Parse parameters such as `"rgb Kd" [ 1 2 3 ]` to lists by name; strings (textures, types) are left out."""
     found = re.findall(r'"(?:rgb|float|point|integer) (\w+)" \[([^\]]*)\]', text)
     return {name: [float(number) for number in values.split()] for name, values in found}
 
@@ -45,14 +45,15 @@ def materials(text: str) -> dict[str, dict[str, object]]:
 
 
 def camera(text: str) -> tuple[str, tuple[int, int]]:
-    """The camera's table and the picture's size. pbrt looks along +z; its matrix is world to camera, by columns."""
+    """Return the camera's TOML table, and the picture's width and height. pbrt looks along +z; its matrix maps world to camera
+    space, and is stored by columns."""
     numbers = re.search(r"^Transform \[([^\]]*)\]", text, re.MULTILINE)
     assert numbers
     world_to_camera = np.array([float(x) for x in numbers[1].split()]).reshape(4, 4).T
     pose = np.linalg.inv(world_to_camera)
     width, height = (int(re.search(rf'"integer {axis}resolution" \[ (\d+) \]', text)[1]) for axis in "xy")  # type: ignore[index]
     half = math.tan(math.radians(float(re.search(r'"float fov" \[ ([\d.]+) \]', text)[1]) / 2.0))  # type: ignore[index]
-    fov_y = 2.0 * math.degrees(math.atan(half * max(1.0, height / width)))  # pbrt's is that of the shorter side
+    fov_y = 2.0 * math.degrees(math.atan(half * max(1.0, height / width)))  # pbrt's fov is for the shorter side
     position, forward, up = pose[:3, 3], pose[:3, 2], pose[:3, 1]
     table = (f"[cameras.main]\nposition = {position.tolist()}\ntarget = {(position + forward).tolist()}\n"
              f"up = {up.tolist()}\nfov_y = {fov_y:.4f}\n")

@@ -1,4 +1,4 @@
-"""What wrt wrote about a picture into its file, read by others: by Pillow, by OpenImageIO, and line by line."""
+"""Read the metadata that wrt writes to picture files with independent readers: Pillow, OpenImageIO, and a parser of HDR headers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from wrt.picture.image import METADATA_PREFIX
 
 
 def read_metadata(path: str | Path) -> dict[str, str]:
-    """As text by key."""
+    """Return wrt's metadata: text by key, without the prefix."""
     suffix = Path(path).suffix.lower()
     if suffix == ".png":
         with Image.open(path) as picture:

@@ -1,4 +1,4 @@
-"""Instances of geometries, put together by hand."""
+"""Build an InstancedGeometry from geometries and transforms, without a scene."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from wrt.accel.instanced_geometry import InstancedGeometry
 
 
 def place(*meshes: tuple[Geometry, np.ndarray]) -> InstancedGeometry:
-    """Instances of geometries without spheres, each a pair of a geometry and its (4, 4) or (3, 4) transform to the world.
-    The same geometry given twice is one part."""
+    """Return instances of geometries without spheres: pairs of a geometry and its (4, 4) or (3, 4) object-to-world transform.
+    Pairs with the same geometry object share it."""
     parts = {id(geometry): geometry for geometry, _ in meshes}
     index = {key: i for i, key in enumerate(parts)}
     counts = np.array([len(geometry.faces) for geometry, _ in meshes], np.int64)

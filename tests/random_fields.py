@@ -1,7 +1,7 @@
-"""Random values for the fields of scene descriptions: whatever `wrt.scene.kinds.given` describes can be drawn.
+"""Random values for the fields of scene descriptions that `wrt.scene.kinds.given` declares.
 
-A value is drawn in two steps. The first draws all that decides which kernels a scene needs (whether a field is used, flags,
-choices, kinds of textures). It is the same for all scenes of a group, and gives a function that draws the numbers of one scene.
+A value is drawn in two steps. The first, with the generator of a group of scenes, draws what selects kernels: whether a field has
+its default, flags, choices, kinds of textures. It returns a `Draw`, which draws the numbers of one scene with that scene's generator.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from wrt.scene.kinds import Limits, forms
 from wrt.scene.materials import WRAPS, Texture
 
 Rng = np.random.Generator
-Draw = Callable[[Rng], Any]  # of one scene's generator
-LOW, HIGH = 0.02, 10.0  # of numbers without limits, which are drawn evenly on a logarithmic scale
-TRIES = 100
+Draw = Callable[[Rng], Any]
+LOW, HIGH = 0.02, 10.0  # range of numbers without limits, which are log-uniform
+TRIES = 100  # draws until the values go together
 
 
 def number(group: Rng, limits: Limits) -> Draw:
-    """Never the lower limit: 0 is often what turns a feature off. Sometimes the upper one."""
+    """Draw a number: sometimes the upper limit, never the lower, because 0 often turns a feature off."""
     low = max(limits.get("ge", -math.inf), limits.get("gt", -math.inf))
     high = min(limits.get("le", math.inf), limits.get("lt", math.inf))
     if low < 0.0:
@@ -42,7 +42,7 @@ def angle(group: Rng, limits: Limits) -> Draw:
 
 
 def color(group: Rng, limits: Limits) -> Draw:
-    """Not black; one channel is often 0. Where there is no limit, it is sometimes the brightest there is."""
+    """Draw a colour, (3,), never black, often with one channel 0. Colours without an upper limit are sometimes as bright as allowed."""
     most = min(limits.get("le", 3.0), 3.0)
 
     def draw(rng: Rng) -> np.ndarray:
@@ -55,7 +55,7 @@ def color(group: Rng, limits: Limits) -> Draw:
 
 
 def image(group: Rng, limits: Limits) -> Draw:
-    """A few bright pixels among dark and black ones, sometimes so bright that sums are infinite."""
+    """Draw an image, (H, W, 3) float32: mostly dark or black, one pixel bright, sometimes so bright that sums overflow."""
 
     def draw(rng: Rng) -> np.ndarray:
         out = 2.0 * rng.random((rng.integers(1, 8), rng.integers(1, 12), 3)) ** 4
@@ -67,7 +67,7 @@ def image(group: Rng, limits: Limits) -> Draw:
 
 
 def picture(rng: Rng) -> Texture:
-    """Of few pixels, whose alpha is mostly 0 or 255; mapped by any affine map, sometimes so that no number tells where."""
+    """Draw a texture of few pixels, alpha mostly 0 or 255, with a random affine map of uv, sometimes beyond float32's precision."""
     pixels = rng.integers(0, 256, (*rng.integers(1, 9, 2), 4), dtype=np.uint8)
     ends = rng.random(pixels.shape[:2]) < 0.6
     pixels[ends, 3] = rng.choice([0, 255], ends.sum())
@@ -84,7 +84,7 @@ def fixed(value: Any) -> Draw:
     return lambda rng: value
 
 
-# A function for each of wrt.scene.kinds.FORMS: of the group's generator and the field's limits. None: scenes draw it otherwise.
+# For each form in wrt.scene.kinds.FORMS, a function of the group's generator and the field's limits. None: random_scenes draws it.
 DRAWS: dict[str, Callable[[Rng, Limits], Draw] | None] = {
     "point": lambda group, limits: lambda rng: rng.uniform(-4.0, 4.0, 3),
     "direction": lambda group, limits: lambda rng: rng.normal(size=3),
@@ -101,7 +101,7 @@ DRAWS: dict[str, Callable[[Rng, Limits], Draw] | None] = {
 
 
 def sketch(group: Rng, kind: Any, odds: Mapping[str, float] = {}, /, **given: Any) -> Draw:
-    """A function that makes a `kind` with random fields. odds: of a field not to keep its default, 0.5 if it is not named."""
+    """Return a Draw of `kind` with random fields. odds: probability that a field differs from its default, by name, else 0.5."""
     for _ in range(TRIES):
         draws: dict[str, Draw] = {}
         for name, each in forms(kind).items():
@@ -113,13 +113,13 @@ def sketch(group: Rng, kind: Any, odds: Mapping[str, float] = {}, /, **given: An
             for _ in range(TRIES):
                 try:
                     return kind(**given, **{name: draw(rng) for name, draw in draws.items()})
-                except InputError as error:  # values that do not go together
+                except InputError as error:  # these values do not go together
                     refused = error
             raise refused
 
         try:
             make(np.random.default_rng(0))
-        except InputError:  # nor do the choices
+        except InputError:  # no values go with the group's choices
             continue
         return make
     raise AssertionError(f"no {kind.__name__} can be drawn")

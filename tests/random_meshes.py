@@ -1,8 +1,7 @@
-"""Random meshes and rays, through every structure in every way there is: `python -m tests.random_meshes --count 10000`.
+"""Check every structure with random meshes and rays: `python -m tests.random_meshes --count 10000`.
 
-All structures have the bits of brute force, whichever way the rays come: alone or many at a time, in an order that makes packets
-or one that makes none, from NumPy or Warp. The number of a case's group decides what it is over; `--only GROUP SEED` does one
-again.
+All structures must return the bits of brute force, however the rays are passed: few or many a call, in orders with and without
+packets, from NumPy or Warp. A case's group selects its kind of geometry (KINDS); `--only GROUP SEED` repeats a case.
 """
 
 from __future__ import annotations
@@ -31,9 +30,10 @@ from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene, Sphere
 
 Rng = np.random.Generator
-Triangles = np.ndarray  # (N, 3, 3) float64: corners
-PACKET, PACKETS = 16, 4  # rays of a packet, and packets of a call after which none is tried for a while
-MANY = 1100, 1400  # rays of a call that are traced where they are, as a few are not
+Triangles = np.ndarray  # (N, 3, 3) float64: corners.
+PACKET = 16  # Rays.
+PACKETS = 4  # Packets in a call: after more packets that fall apart, wrt traces the next rays without packets.
+MANY = 1100, 1400  # Rays of a call: enough to be traced without copies of the arrays.
 
 # --- meshes: around the origin, of size 1 -----------------------------------------------------------------------------
 
@@ -43,13 +43,13 @@ def soup(rng: Rng, n: int) -> Triangles:
 
 
 def shared_corners(rng: Rng, n: int) -> Triangles:
-    """Neighbours at edges and corners; some triangles are there twice, some are points or lines."""
+    """Return triangles that share edges and corners; some are duplicates, some degenerate to points or lines."""
     corners = rng.uniform(-1.0, 1.0, (3 + n // 3, 3))
     return corners[rng.integers(0, len(corners), (n, 3))]
 
 
 def grid(rng: Rng, n: int) -> Triangles:
-    """A height field over whole numbers, often flat: boxes without thickness, edges along the axes."""
+    """Return a height field with integer heights, often flat: boxes without thickness, edges along the axes."""
     side = max(1, round((n / 2) ** 0.5))
     heights = rng.integers(0, rng.integers(1, 4), (side + 1, side + 1))
     x, y = np.mgrid[:side, :side].reshape(2, -1)
@@ -58,19 +58,19 @@ def grid(rng: Rng, n: int) -> Triangles:
 
 
 def stack(rng: Rng, n: int) -> Triangles:
-    """Sheets over each other, some at the same place."""
+    """Return parallel flat sheets, some at the same height."""
     sheets = [grid(rng, max(2, n // 5)) * (1.0, 1.0, 0.0) + (0.0, 0.0, z) for z in rng.integers(-2, 3, 5) / 4.0]
     return np.concatenate(sheets)
 
 
 def slivers(rng: Rng, n: int) -> Triangles:
-    """Needles around a few lines."""
+    """Return needles: n triangles, each close to a line."""
     begin, along = rng.uniform(-1.0, 1.0, (2, n, 1, 3))
     return begin + along * rng.uniform(-1.0, 1.0, (n, 3, 1)) + rng.normal(0.0, 10.0 ** rng.uniform(-8.0, -2.0), (n, 3, 3))
 
 
 def fan(rng: Rng, n: int) -> Triangles:
-    """All at one corner, often in one plane."""
+    """Return triangles that share one corner, often all in one plane."""
     angle = np.linspace(0.0, 2.0 * np.pi, n + 3)
     rim = np.stack([np.cos(angle), np.sin(angle), rng.integers(0, 2) * rng.uniform(-0.5, 0.5, len(angle))], axis=1)
     return np.stack([np.zeros((n + 2, 3)), rim[:-1], rim[1:]], axis=1)
@@ -89,7 +89,7 @@ MESHES: dict[str, Callable[[Rng, int], Triangles]] = {
 
 
 def triangles(rng: Rng) -> Triangles:
-    """One kind or two together, in any order of faces and corners."""
+    """Return one kind of MESHES or two together, faces shuffled, some turned over or duplicated, sometimes rotated."""
     size = [4, 30, 80, 600][rng.choice(4, p=[0.2, 0.4, 0.37, 0.03])]
     kinds = rng.choice([*MESHES], rng.integers(1, 3))
     out = np.concatenate([MESHES[kind](rng, int(rng.integers(1, size + 1))) for kind in kinds])
@@ -104,7 +104,7 @@ def triangles(rng: Rng) -> Triangles:
 
 
 def mesh_of(rng: Rng) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces: of any size, and anywhere."""
+    """Return vertices (V, 3) float32 and faces (F, 3) int32 of a mesh of random size and position."""
     corners = triangles(rng)
     if rng.random() < 0.3:
         corners = corners + rng.normal(size=3) * 10.0 ** rng.uniform(0.0, 4.0)
@@ -117,7 +117,7 @@ def mesh_of(rng: Rng) -> tuple[np.ndarray, np.ndarray]:
 
 
 def balls(rng: Rng, vertices: np.ndarray) -> np.ndarray:
-    """(S, 4) float32, of the mesh's size, some at its corners."""
+    """Return spheres within the box of the vertices: centre and radius, (S, 4) float32."""
     low, high = extent(vertices)
     centers = rng.uniform(low, high, (rng.integers(1, 9), 3))
     radii = np.max(high - low) * 10.0 ** rng.uniform(-2.0, 0.0, (len(centers), 1))
@@ -129,17 +129,17 @@ def extent(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return (good.min(axis=0), good.max(axis=0)) if len(good) else (-np.ones(3), np.ones(3))
 
 
-# --- what a case is over ----------------------------------------------------------------------------------------------
+# --- kinds of geometry ------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Case:
-    """given: for wrt.build; world: of each ray, where there are several; before: vertices to build over, and to refit from."""
+    """The geometry and the rays of one case."""
 
-    given: Any
+    given: Any  # The argument of wrt.build.
     rays: Rays
-    world: np.ndarray | None = None
-    before: np.ndarray | None = None
+    world: np.ndarray | None = None  # The world of each ray, (N,) int32; None: there is only one world.
+    before: np.ndarray | None = None  # Vertices to build with, before a refit to the vertices of `given`; None: no refit.
 
 
 def plain(rng: Rng) -> Case:
@@ -170,7 +170,7 @@ def placement(rng: Rng, size: float) -> np.ndarray:
 
 
 def placed(rng: Rng, spheres: bool) -> Scene:
-    """Up to three meshes, each shown up to four times."""
+    """Return a scene with one to three meshes, each with one to four instances."""
     grey, objects = (Material(),), []
     for _ in range(rng.integers(1, 4)):
         vertices, faces = mesh_of(rng)
@@ -197,14 +197,14 @@ def worlds(rng: Rng) -> Case:
     return Case(scenes, rays, rng.integers(0, len(scenes), RAYS).astype(np.int32))
 
 
-OVER: dict[str, Callable[[Rng], Case]] = {
+KINDS: dict[str, Callable[[Rng], Case]] = {
     "plain": plain, "with spheres": with_spheres, "instances": instances, "worlds": worlds}
 
-# --- ways -------------------------------------------------------------------------------------------------------------
+# --- ways to pass rays ------------------------------------------------------------------------------------------------
 
 
 def in_packets(rays: Rays) -> Iterator[np.ndarray]:
-    """Calls of a few packets, each of rays that run the same way along every axis."""
+    """Yield calls of up to PACKETS packets: the rays of a packet have directions in the same octant."""
     octants = np.signbit(rays.directions) @ (1, 2, 4)
     blocks = [np.resize(of, -(-len(of) // PACKET) * PACKET).reshape(-1, PACKET)
               for of in (np.flatnonzero(octants == octant) for octant in range(8)) if len(of)]
@@ -214,14 +214,15 @@ def in_packets(rays: Rays) -> Iterator[np.ndarray]:
 
 
 def alike(rays: Rays) -> Iterator[np.ndarray]:
-    """Packets of one ray, many times: around it there is no room for what rounding may leave out. Two others are of no length."""
+    """Yield calls of packets that repeat one ray: their bounds have no slack that could hide rounding errors. Two rays of each
+    packet are the empty rays."""
     together = np.repeat(np.arange(len(rays)), PACKET)
     together[::PACKET], together[5::PACKET] = EMPTY, EMPTY - 1
     yield from np.split(together, range(PACKET * PACKETS, len(together), PACKET * PACKETS))
 
 
 def without_packets(rays: Rays) -> Iterator[np.ndarray]:
-    """With two rays that run against each other in each packet's worth of rays."""
+    """Yield one call with two opposite rays among every PACKET rays, so that no packets form."""
     index = np.resize(np.arange(len(rays)), -(-len(rays) // (PACKET - 2)) * (PACKET - 2)).reshape(-1, PACKET - 2)
     against = np.tile([AGAINST, AGAINST - 1], (len(index), 1))
     yield np.concatenate([index, against], axis=1).ravel()
@@ -235,44 +236,44 @@ def as_they_are(rays: Rays) -> Iterator[np.ndarray]:
     yield np.arange(len(rays))
 
 
-AGAINST = -1  # and -2: no rays of the case, but two that run against each other; in Warp arrays they are not finite
-EMPTY = -3  # and -4: the same two, of no length
+# Indices of further rays, which are not rays of the case.
+AGAINST = -1  # And -2: two rays of opposite directions; from Warp arrays, their directions are NaN.
+EMPTY = -3  # And -4: the same rays with t_max < t_min.
 
 
-def filled(rays: Rays, index: np.ndarray, nothing: bool) -> Rays:
-    """The rays of an index."""
+def filled(rays: Rays, index: np.ndarray, nan: bool) -> Rays:
+    """Return the rays of `index`, negative indices for the further rays. nan: make the directions of the further rays NaN."""
     out = Rays(*(array[np.maximum(index, 0)] for array in (rays.origins, rays.directions, rays.t_min, rays.t_max)))
     for extra, sign, end in ((AGAINST, 1.0, np.inf), (AGAINST - 1, -1.0, np.inf), (EMPTY, 1.0, -1.0), (EMPTY - 1, -1.0, -1.0)):
         rows = index == extra
         out.origins[rows], out.directions[rows], out.t_min[rows], out.t_max[rows] = 0.0, sign, 0.0, end
-        if nothing:
+        if nan:
             out.directions[rows] = np.nan
     return out
 
 
 @dataclass(frozen=True)
 class Way:
-    """order: calls, each of the rays of an index; of: "numpy", "float64" (with gaps) or "warp"; counters: the walk that counts, of
-    one ray after another."""
+    """A way to pass rays to a structure."""
 
-    order: Callable[[Rays], Iterator[np.ndarray]] = as_they_are
-    of: str = "numpy"
-    counters: bool = False
+    order: Callable[[Rays], Iterator[np.ndarray]] = as_they_are  # Yields the ray indices of each call.
+    source: str = "numpy"  # Or "float64" (with gaps between rows), or "warp".
+    counters: bool = False  # Count nodes and primitives, which traces one ray at a time.
 
 
 WAYS = {
     "as they are": Way(), "packets": Way(in_packets), "alike": Way(alike), "no packets": Way(without_packets), "many": Way(many),
-    "float64": Way(of="float64"), "warp": Way(without_packets, "warp"), "many of warp": Way(many, "warp"),
+    "float64": Way(source="float64"), "warp": Way(without_packets, "warp"), "many of warp": Way(many, "warp"),
     "counting": Way(counters=True),
 }
 
 
-def asked(accel: Any, rays: Rays, way: Way, world: np.ndarray | None) -> tuple[Any, np.ndarray]:
-    """closest_hit and any_hit, as NumPy's. Where all rays have the same ends, they are given once."""
+def query(accel: Any, rays: Rays, way: Way, world: np.ndarray | None) -> tuple[Any, np.ndarray]:
+    """Return closest_hit and any_hit as NumPy arrays. t_min and t_max are passed as numbers if they are the same for all rays."""
     arrays = [rays.origins, rays.directions, rays.t_min, rays.t_max]
-    if way.of == "float64":
+    if way.source == "float64":
         arrays = [np.repeat(array.astype(np.float64), 2, axis=0)[::2] for array in arrays]
-    if way.of == "warp":
+    if way.source == "warp":
         arrays = [wp.array(array, dtype=dtype, device=accel.device)
                   for array, dtype in zip(arrays, (wp.vec3, wp.vec3, wp.float32, wp.float32), strict=True)]
     elif len(rays):
@@ -283,29 +284,29 @@ def asked(accel: Any, rays: Rays, way: Way, world: np.ndarray | None) -> tuple[A
     return hits, occluded.numpy() if isinstance(occluded, wp.array) else occluded
 
 
-# Where there is a kernel for many rays at a time, each case tries all ways; of the other structures, and of their ways, this share.
-ALL_WAYS, SOME = ("bvh8",), 0.4
+ALL_WAYS = ("bvh8",)  # structures with a kernel for many rays at a time: every case tries all ways
+SOME = 0.4  # probability of another structure to be in a case, and of each of its ways
 FIELDS = "t", "u", "v", "prim_id"
 
 
 def differences(accel: Any, rays: Rays, world: np.ndarray | None, expected: Any, way: Way) -> Iterator[str]:
-    """What a way gives that is not expected."""
+    """Yield a description of each difference between the answers by a way and the expected hits."""
     for index in way.order(rays):
         of_each = None if world is None else world[np.maximum(index, 0)]
-        hits, occluded = asked(accel, filled(rays, index, way.of == "warp"), way, of_each)
-        if ((hits.prim_id >= 0) | occluded)[(index <= EMPTY) | ((index < 0) & (way.of == "warp"))].any():
-            yield "a ray that is not finite, or of no length, hits something"
+        hits, occluded = query(accel, filled(rays, index, way.source == "warp"), way, of_each)
+        if ((hits.prim_id >= 0) | occluded)[(index <= EMPTY) | ((index < 0) & (way.source == "warp"))].any():
+            yield "a ray that is not finite, or whose t_max < t_min, hits something"
         real, rows = index >= 0, index[index >= 0]
         for name in FIELDS:
             got, wanted = getattr(hits, name)[real], getattr(expected, name)[rows]
             if bad := np.flatnonzero(got.view(np.int32) != wanted.view(np.int32)).tolist():
-                yield f"{name} of ray {rows[bad[0]]} ({len(bad)}): {got[bad[0]]} for {wanted[bad[0]]}"
+                yield f"{name} of ray {rows[bad[0]]} ({len(bad)} rays differ): {got[bad[0]]}, expected {wanted[bad[0]]}"
         if bad := np.flatnonzero(occluded[real] != (expected.prim_id[rows] >= 0)).tolist():
-            yield f"any_hit of ray {rows[bad[0]]} ({len(bad)})"
+            yield f"any_hit of ray {rows[bad[0]]} ({len(bad)} rays differ)"
 
 
 def all_hits(accel: Any, rays: Rays, crossings: bool) -> list[np.ndarray]:
-    """Lists of all hits, their numbers, and the first three."""
+    """Return the arrays of wrt.all_hits, of the first three hits, and of wrt.count_hits."""
     arguments = rays.origins, rays.directions, rays.t_min, rays.t_max
     every = wrt.all_hits(accel, *arguments, crossings=crossings)
     first = wrt.first_hits(accel, 3, *arguments, crossings=crossings)
@@ -315,11 +316,11 @@ def all_hits(accel: Any, rays: Rays, crossings: bool) -> list[np.ndarray]:
 
 @cache
 def own_kernel(name: str) -> Any:
-    """A kernel of a user's own: the closest hit, the one after it, and whether there is any."""
+    """Make a kernel as a user would write it: the closest hit, the next hit, and any_hit."""
     query = wrt.ray_query(name)
 
     @wrt.kernel
-    def ask(world: query.World, rays: RayArrays, hits: HitArrays, later: HitArrays, occluded: wp.array(dtype=wp.bool)):
+    def trace(world: query.World, rays: RayArrays, hits: HitArrays, later: HitArrays, occluded: wp.array(dtype=wp.bool)):
         i = wp.tid()
         ray = query.ray(rays.origin[i], rays.direction[i])
         ray.t_min = rays.t_min[i]
@@ -331,11 +332,11 @@ def own_kernel(name: str) -> Any:
             hit = query.next_hit(world, ray, hit)
         store_hit(later, i, hit, 1.0)
 
-    return ask
+    return trace
 
 
 def by_own_kernel(accel: Any, name: str, rays: Rays) -> list[np.ndarray]:
-    """The first two hits of each ray, (N, 2) of each of FIELDS, and any_hit."""
+    """Return the first two hits of each ray, an array (N, 2) for each of FIELDS, and any_hit, (N,) bool."""
     given, hits, later = RayArrays(), HitArrays(), HitArrays()
     for field, array in zip(fields_of(RayArrays), (rays.origins, rays.directions, rays.t_min, rays.t_max), strict=True):
         setattr(given, field, wp.array(array, dtype=wp.vec3 if array.ndim == 2 else wp.float32, device=accel.device))
@@ -356,8 +357,8 @@ def same_bits(one: list[np.ndarray], other: list[np.ndarray]) -> bool:
 
 @dataclass(frozen=True)
 class Scope:
-    """The structures that are asked, those whose rays are counted, those that list all hits, and those that a kernel of a user's
-    own asks. Each of them compiles kernels."""
+    """The structures to check; of these, the structures to check with counters, with lists of all hits, and with a user's kernel.
+    Each combination compiles kernels."""
 
     structures: Collection[str] = tuple(STRUCTURES)
     counting: Collection[str] = tuple(STRUCTURES)
@@ -366,7 +367,7 @@ class Scope:
 
 
 def options_of(rng: Rng, name: str) -> dict[str, Any]:
-    """A builder and a size of leaves, where structures of that name have them."""
+    """Return random options `builder` and `max_leaf`, if structures of that name have them."""
     has, options = {each.name for each in fields(wrt.ACCELERATORS[name].options)}, dict[str, Any]()
     if "builder" in has and rng.random() < 0.7:
         options["builder"] = str(rng.choice([*BVH_BUILDERS]))
@@ -376,7 +377,7 @@ def options_of(rng: Rng, name: str) -> dict[str, Any]:
 
 
 def built(rng: Rng, name: str, case: Case) -> Any:
-    """A structure over what the case gives, sometimes by a refit."""
+    """Build a structure over the case's geometry, by a refit if the case has vertices before it."""
     options = options_of(rng, name)
     if case.before is not None and wrt.ACCELERATORS[name].can_refit:
         accel = wrt.build(replace(case.given, vertices=case.before), name, threads=1, **options)
@@ -386,10 +387,10 @@ def built(rng: Rng, name: str, case: Case) -> Any:
 
 
 def problems(number: int, seed: int, scope: Scope) -> Iterator[str]:
-    """What of a case is not as it must be."""
+    """Yield a description of each difference of a case from brute force."""
     rng = np.random.default_rng((number, seed))
-    over = [*OVER][number % len(OVER)]
-    case = OVER[over](rng)
+    kind = [*KINDS][number % len(KINDS)]
+    case = KINDS[kind](rng)
     with_world = {} if case.world is None else {"world": case.world}
     brute = wrt.build(case.given, "brute_force", threads=1)
 
@@ -399,28 +400,28 @@ def problems(number: int, seed: int, scope: Scope) -> Iterator[str]:
     segments = at_their_hits(rng, case.rays, truth(case.rays))
     sets = [(rays, truth(rays)) for rays in (case.rays, segments)]
     crossings = bool(rng.random() < 0.3 and np.isfinite(getattr(case.given, "vertices", np.nan)).all())
-    lists = [all_hits(brute, rays, crossings) for rays, _ in sets] if over == "plain" and scope.listing else []
+    lists = [all_hits(brute, rays, crossings) for rays, _ in sets] if kind == "plain" and scope.listing else []
     for name in scope.structures:
         if name not in ALL_WAYS and rng.random() >= SOME:
             continue
-        with np.errstate(invalid="ignore"):  # of faces that are not finite
+        with np.errstate(invalid="ignore"):  # faces may not be finite
             accel = built(rng, name, case)
         for which, (rays, expected) in enumerate(sets):
             for way, how in WAYS.items():
                 if (name in scope.counting if how.counters else name in ALL_WAYS or rng.random() < SOME):
                     for what in differences(accel, rays, case.world, expected, how):
-                        yield f"{name} over {over}, rays {which}, {way}: {what}"
-            if over == "plain" and name in scope.listing and not same_bits(all_hits(accel, rays, crossings), lists[which]):
+                        yield f"{name}, {kind}, rays {which}, {way}: {what}"
+            if kind == "plain" and name in scope.listing and not same_bits(all_hits(accel, rays, crossings), lists[which]):
                 yield f"{name}, rays {which}: all hits, crossings {crossings}"
-            if over == "plain" and name in scope.own:
+            if kind == "plain" and name in scope.own:
                 two = wrt.first_hits(accel, 2, rays.origins, rays.directions, rays.t_min, rays.t_max)
                 wanted = [*(getattr(two, field) for field in FIELDS), expected.prim_id >= 0]
                 if not same_bits(by_own_kernel(accel, name, rays), wanted):
-                    yield f"{name}, rays {which}: a kernel of one's own"
+                    yield f"{name}, rays {which}: a user's kernel"
 
 
 def check(number: int, seed: int, scope: Scope = Scope()) -> str:
-    """The first that differs, and how many do; "" where nothing does."""
+    """Return a description of the first difference and the number of the others; "" without any."""
     found = [*problems(number, seed, scope)]
     return f"{found[0]} and {len(found) - 1} more" if found else ""
 

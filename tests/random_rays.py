@@ -1,4 +1,4 @@
-"""Random rays at triangles: from anywhere, at their corners and edges, along the axes, from their surfaces, as bundles."""
+"""Random rays at triangles: through their interior, corners and edges, along the axes, from their surfaces, and as bundles."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 
 Rng = np.random.Generator
 RAYS = 64
-FARTHEST = 1e37  # coordinate of an origin
+FARTHEST = 1e37  # largest absolute coordinate of an origin
 
 
 @dataclass(frozen=True)
 class Rays:
-    """origins, directions: (N, 3) float32; t_min, t_max: (N,) float32."""
+    """origins, directions: (N, 3) float32; t_min, t_max: (N,) float32 in units of |direction|."""
 
     origins: np.ndarray
     directions: np.ndarray
@@ -28,7 +28,7 @@ class Rays:
 
 @dataclass(frozen=True)
 class Target:
-    """corners: (T, 3, 3) float64, finite, one triangle at least; low, size: of the box around them."""
+    """corners: (T, 3, 3) float64, finite, T >= 1; low, size: (3,) least corner and extent of the box around them, slightly padded."""
 
     corners: np.ndarray
     low: np.ndarray
@@ -65,7 +65,7 @@ def unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-Bundle = tuple[np.ndarray, np.ndarray]  # origins and directions
+Bundle = tuple[np.ndarray, np.ndarray]  # origins and directions, (n, 3) float64
 
 
 def inwards(rng: Rng, target: Target, n: int) -> Bundle:
@@ -88,7 +88,7 @@ def at_edges(rng: Rng, target: Target, n: int) -> Bundle:
 
 
 def along_axes(rng: Rng, target: Target, n: int) -> Bundle:
-    """In the planes of corners; components of 0 have any sign."""
+    """Return axis-parallel rays through corners; the zeros of their directions have random signs."""
     axes = np.zeros((n, 3)) * rng.choice([-1.0, 1.0], (n, 3))
     axes[np.arange(n), rng.integers(0, 3, n)] = rng.choice([-1.0, 1.0], n)
     origins = np.where(axes == 0.0, target.corner(rng, n), target.low + 0.5 * target.size - 2.0 * np.max(target.size) * axes)
@@ -96,7 +96,7 @@ def along_axes(rng: Rng, target: Target, n: int) -> Bundle:
 
 
 def in_a_plane(rng: Rng, target: Target, n: int) -> Bundle:
-    """Of the axes: one component is 0."""
+    """Return rays at edges, moved into an axis-parallel plane through a corner: one component of their direction is 0 or -0."""
     origins, directions = at_edges(rng, target, n)
     axis, rows = rng.integers(0, 3, n), np.arange(n)
     origins[rows, axis], directions[rows, axis] = target.corner(rng, n)[rows, axis], rng.choice([-0.0, 0.0], n)
@@ -104,7 +104,7 @@ def in_a_plane(rng: Rng, target: Target, n: int) -> Bundle:
 
 
 def nearly_along_axes(rng: Rng, target: Target, n: int) -> Bundle:
-    """Through surfaces, with components so small that products of them underflow."""
+    """Return rays along an axis through surfaces, with other components so small that products of them underflow."""
     origins, axes = along_axes(rng, target, n)
     origins = np.where(axes == 0.0, target.on_surface(rng, n), origins)
     return origins, np.where(axes == 0.0, rng.normal(size=(n, 3)) * 10.0 ** rng.uniform(-46.0, -20.0, (n, 3)), axes)
@@ -116,7 +116,7 @@ def from_surfaces(rng: Rng, target: Target, n: int) -> Bundle:
 
 
 def edge_on(rng: Rng, target: Target, n: int) -> Bundle:
-    """Along edges, and in the planes of triangles."""
+    """Return rays along edges, and other rays in the planes of triangles."""
     triangles = target.some(rng, n)
     a, b = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     directions = a + rng.choice([0.0, 0.0, 1.0, -0.5], (n, 1)) * b
@@ -124,7 +124,7 @@ def edge_on(rng: Rng, target: Target, n: int) -> Bundle:
 
 
 def camera(rng: Rng, target: Target, n: int) -> Bundle:
-    """From one point, next to each other."""
+    """Return coherent rays from one point."""
     origin, aim = target.outside(rng, 1), target.inside(rng, 1)
     spread = np.max(target.size) * 10.0 ** rng.uniform(-3.0, 0.0)
     return np.repeat(origin, n, axis=0), aim - origin + spread * rng.uniform(-1.0, 1.0, (n, 3))
@@ -141,7 +141,7 @@ BUNDLES: dict[str, Callable[[Rng, Target, int], Bundle]] = {
 
 
 def rays_of(rng: Rng, corners: np.ndarray) -> Rays:
-    """RAYS rays of a few kinds, at triangles (T, 3, 3). Their directions are of all lengths."""
+    """Return RAYS rays of one to four kinds at triangles (T, 3, 3); their directions have any length, often 1."""
     target = Target.of(corners)
     kinds = rng.choice([*BUNDLES], rng.integers(1, 5))
     parts = [BUNDLES[kind](rng, target, len(part)) for kind, part in
@@ -162,7 +162,7 @@ def rays_of(rng: Rng, corners: np.ndarray) -> Rays:
 
 
 def at_their_hits(rng: Rng, rays: Rays, hits: Any) -> Rays:
-    """The same rays in segments that begin or end at their hits, before them or behind them; others anywhere."""
+    """Return the rays as segments that begin or end at, before or behind their hits; a miss counts as a hit at t = 1."""
     n = len(rays)
     t = np.where(hits.prim_id >= 0, hits.t, np.float32(1.0))
     with np.errstate(over="ignore"):

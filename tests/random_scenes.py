@@ -1,7 +1,7 @@
-"""Random scenes, by both loops of the renderer: `python -m tests.random_scenes --count 10000 --seed 0`.
+"""Compare both loops of the renderer on random scenes: `python -m tests.random_scenes --count 10000 --seed 0`.
 
-Scenes come in groups that share their kernels: the number of the group decides all that a kernel is compiled from, and the seed of
-a scene all else. `--only GROUP SEED` renders one of them again.
+The scenes of a group share their kernels: the group's number determines everything that selects a kernel, and the scene's seed
+everything else. `--only GROUP SEED` repeats a case.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from wrt.scene.settings import Settings
 
 ODDS_OF_MATERIAL = {**dict.fromkeys(SLOTS, 0.25), "emission": 0.4, "emits_light": 0.3, "alpha_mode": 0.5, "transmission": 0.4}
 DEPTHS = 1, 2, 3, 4, 5, 24  # bounces
-MOST_RAYS = 5  # bounces up to which every ray is followed: beyond, a sample could have millions
+MOST_RAYS = 5  # largest max_depth for min_throughput = 0: with more bounces, a sample could have millions of rays
 SHAPES: tuple[Callable[[], Mesh], ...] = (
     shapes.quad, shapes.box, shapes.prism, lambda: shapes.icosphere(0), lambda: shapes.icosphere(1),
     lambda: shapes.torus(0.7, 0.3, 7, 5))
@@ -45,18 +45,17 @@ SHAPES: tuple[Callable[[], Mesh], ...] = (
 
 @dataclass(frozen=True)
 class Placed:
-    """An object of all scenes of a group. mesh, materials: indices; moves: through keys, or also to another mesh; around: so large
-    that the others, and mostly the camera, are within it."""
+    """An object in every scene of a group."""
 
-    mesh: int
-    materials: tuple[int, ...]
-    moves: str
-    around: bool
+    mesh: int  # An index into Group.meshes.
+    materials: tuple[int, ...]  # Indices into Group.materials.
+    moves: str  # "", "keys" (a moving transform) or "target" (and a morph).
+    around: bool  # The object is so large that it encloses the others, and usually the camera.
 
 
 @dataclass(frozen=True)
 class Group:
-    """What decides on kernels. meshes: whether each is smooth, and whether it has uvs; spheres: their materials."""
+    """The properties that the scenes of a group share. meshes: (is smooth, has uvs) of each mesh; spheres: material of each sphere."""
 
     materials: list[Draw]
     meshes: list[tuple[bool, bool]]
@@ -71,12 +70,12 @@ class Group:
 
 
 def some_of(rng: Rng, names: Any, number: int) -> list[str]:
-    """The name that has its turn, so that few groups have them all, and others."""
+    """Return the name whose turn it is, so that successive groups cover all names, and a random 40 % of the others."""
     return [name for i, name in enumerate(names) if i == number % len(names) or rng.random() < 0.4]
 
 
 def is_cut_out(material: Material) -> bool:
-    """By a texture, which spheres cannot be."""
+    """Return whether a texture's alpha cuts holes: not supported on spheres."""
     return material.alpha_mode == "mask" and material.albedo_texture is not None
 
 
@@ -90,7 +89,7 @@ def group_of(number: int) -> Group:
     meshes = [(bool(smooth and rng.random() < 0.6), bool(rng.random() < 0.8)) for _ in range(rng.integers(2, 5))]
     placed_meshes = [*range(len(meshes)), *([0, 0] if instances else [])]
     owners: list[list[int]] = [[] for _ in placed_meshes]
-    for i in range(max(len(materials), len(owners))):  # each material is somewhere, and each object has one
+    for i in range(max(len(materials), len(owners))):  # so that each material is used, and each object has one
         owners[i % len(owners)].append(i % len(materials))
     ways = ["", "", "keys", "keys" if instances else "target"]
     around = 1 if rng.random() < 0.7 else -1
@@ -118,7 +117,7 @@ def rotation(rng: Rng) -> np.ndarray:
 
 
 def placement(rng: Rng) -> np.ndarray:
-    """Turned, scaled, often mirrored, sometimes sheared."""
+    """Return a (4, 4) transform that rotates, scales, often mirrors, and sometimes shears."""
     matrix = np.eye(4)
     matrix[:3, :3] = rotation(rng) * np.exp(rng.normal(0.4, 0.4, 3 if rng.random() < 0.5 else 1))
     if rng.random() < 0.2:
@@ -128,13 +127,13 @@ def placement(rng: Rng) -> np.ndarray:
 
 
 def soup(rng: Rng) -> Mesh:
-    """Triangles anywhere; some share their corners, so that some have no area, or are there twice."""
+    """Return random triangles that share corners; some have no area, some are duplicates."""
     corners = rng.normal(0.0, 0.8, (rng.integers(3, 12), 3))
     return Mesh(corners, rng.integers(0, len(corners), (rng.integers(1, 20), 3)))
 
 
 def mesh_of(rng: Rng, smooth: bool, has_uvs: bool) -> Mesh:
-    """Around the origin, with edges of about 1. Normals are those of a ball, some turned aside; where one is 0 it is flat."""
+    """Return a mesh around the origin with edges of length about 1. Its normals are a ball's, perturbed; 10 % are zero (flat)."""
     mesh = soup(rng) if rng.random() < 0.25 else SHAPES[rng.integers(len(SHAPES))]()
     normals = mesh.vertices + rng.normal(0.0, 0.2, mesh.vertices.shape)
     normals[rng.random(len(normals)) < 0.1] = 0.0
@@ -160,7 +159,7 @@ def object_of(rng: Rng, placed: Placed, mesh: Mesh, materials: list[Material], w
 
 
 def plan_of_scene(number: int, seed: int) -> Plan:
-    """The scene of that seed in a group, and how it is to be rendered."""
+    """Return the plan to render the scene with that seed in group `number`."""
     group, rng = group_of(number), np.random.default_rng((number, seed))
     size, far = (1.0, 0.0) if rng.random() < 0.6 else (10.0 ** rng.uniform(-3.0, 3.0), 100.0)
     world = np.diag([size, size, size, 1.0])
@@ -185,18 +184,19 @@ def plan_of_scene(number: int, seed: int) -> Plan:
 
 @dataclass(frozen=True)
 class Outcome:
-    """differ: the arrays that have not the same bits; film: of one ray at a time, of the samples that were taken."""
+    """differ: names of the arrays whose bits differ; film: the arrays by the loop of one ray at a time."""
 
     differ: list[str]
     film: dict[str, np.ndarray]
 
 
 def render(number: int, seed: int) -> Outcome:
+    """Render the case with both loops, and compare their films and AOVs."""
     plan, rng = plan_of_scene(number, seed), np.random.default_rng((number, seed, 1))
     same_kernels = plan_of_scene(number, 0).features
     assert plan.features == same_kernels, f"scenes {seed} and 0 of group {number} need different kernels"
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", SceneWarning)  # of what is seen but lights nothing, and the like
+        warnings.simplefilter("ignore", SceneWarning)  # for example of emissive materials that light nothing
         ready = prepare(plan, start("cpu"))
     alone = one_ray_at_a_time(ready)
     width, height = plan.scene.settings.size
@@ -204,17 +204,17 @@ def render(number: int, seed: int) -> Outcome:
     rectangle = x, y, width - x, height - y
     samples, groups, random_seed = int(rng.integers(1, 4)), int(rng.integers(1, 3)), int(rng.integers(1 << 32))
     expected = film_of(alone, rectangle, (0, samples), groups=groups, seed=random_seed)
-    # What groups share is added up in the order of the launches.
-    parts = [(0, samples)] if groups > 1 or rng.random() < 0.5 else [(i, 1) for i in range(samples)]
+    # Sums that the groups share depend on the order of the launches, so with several groups there is one launch.
+    launches = [(0, samples)] if groups > 1 or rng.random() < 0.5 else [(i, 1) for i in range(samples)]
     with small_waves(int(rng.choice([64, 100, 16384]))):
-        differ = differences(film_of(ready, rectangle, *parts, groups=groups, seed=random_seed), expected)
+        differ = differences(film_of(ready, rectangle, *launches, groups=groups, seed=random_seed), expected)
         if plan.options.aov:
             differ += differences(aovs_of(ready, rectangle), aovs_of(alone, rectangle))
     return Outcome(differ, expected)
 
 
 def check(number: int, seed: int) -> str:
-    """What differs; "" where nothing does."""
+    """Return the names of the arrays that differ, "" without any."""
     return ", ".join(render(number, seed).differ)
 
 

@@ -1,4 +1,4 @@
-"""Expect a refusal, and look at the fields of its error: messages may be written better without a change of tests."""
+"""Expect an InputError, and check its fields instead of its sentence, so that a better message needs no change of tests."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ Refusal: TypeAlias = tuple[Any, ...]  # positional arguments of `refused`, in a 
 @contextlib.contextmanager
 def refused(argument: str | None = None, what: str = "", place: str | None = None, path: str | os.PathLike[str] | None = None,
             hint: str = "") -> Iterator[pytest.ExceptionInfo[InputError]]:
-    """Expect an InputError for that argument, None for an error of no argument.
+    """Expect an InputError whose field `argument` is `argument` (None: an error that names no argument).
 
-    `what` and `hint` are key words within those fields. `place` is the whole field; `path` is the whole field or the name of the file.
+    `what` and `hint` must occur in the fields of these names. `place` is the whole field; `path` is the whole field or a file name.
+    None for `place` or `path`: the field is not checked.
     """
     with pytest.raises(InputError) as caught:
         yield caught

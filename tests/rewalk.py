@@ -1,7 +1,7 @@
-"""Walks in plain Python of the structures that the model of the RT core stands on; their counters must come out exactly.
+"""Traversals in plain Python of the structures that the RT core model uses; kernels must have exactly the same counters.
 
-REWALK[name](structure, ray) gives the `Walk` of one ray. The answers of the triangle unit come from testing every primitive
-(`rays`), so that a walk knows of the code that it checks only the layout of the structure's arrays and the pads of its boxes.
+REWALK[name](structure, ray) traverses with one ray and returns its `Walk`. The hits with triangles come from brute force (`rays`).
+So a traversal shares with the code under test only the layout of the arrays and the constants that pad the boxes.
 """
 
 from collections.abc import Callable
@@ -17,13 +17,13 @@ from wrt.kernels.units.box import FAR_PAD
 from wrt.kernels.wide.lanes import LANE_PAD
 
 INF = np.float32(np.inf)
-PRIMITIVES = 1 << 40
+PRIMITIVES = 1 << 40  # address of the first primitive in a trace
 PRIMITIVE_BYTES = 40
 
 
 @dataclass
 class Walk:
-    """The counters of one ray, and what it fetched: (address, bytes)."""
+    """The counters of one ray. stack: the largest number of entries; trace: (address, bytes) of each fetch."""
 
     nodes: int = 0
     boxes: int = 0
@@ -48,7 +48,7 @@ class Walk:
 
 @dataclass
 class WalkRay:
-    """One ray; hits: what the triangle unit says of each primitive on it, prim_id -> t; best: (t, prim_id) so far."""
+    """One ray. hits: all its hits, t by prim_id; best: (t, prim_id) of the closest hit so far."""
 
     origin: np.ndarray
     direction: np.ndarray
@@ -63,7 +63,7 @@ class WalkRay:
             self.inv_dir = np.float32(1.0) / self.direction
 
     def test(self, walk: Walk, accel, index: int) -> None:
-        """Record `index` of the primitives is tested."""
+        """Test the primitive in record `index`."""
         walk.primitives += 1
         walk.trace.append((PRIMITIVES + index * PRIMITIVE_BYTES, PRIMITIVE_BYTES))
         prim_id = int(prim_ids(accel)[index])
@@ -71,7 +71,7 @@ class WalkRay:
             self.best = min(self.best, (self.hits[prim_id], prim_id))
 
     def enter(self, lo: np.ndarray, hi: np.ndarray) -> np.float32:
-        """Where the ray enters a box before its best hit, by conservative slabs in float32; inf if it does not."""
+        """Return the t at which the ray enters a box before its best hit, else inf: the conservative slab test in float32."""
         backwards = self.inv_dir < 0.0
         with np.errstate(invalid="ignore", over="ignore"):
             near = (np.where(backwards, hi, lo) - self.origin) * self.inv_dir
@@ -82,7 +82,7 @@ class WalkRay:
 
 
 def prim_ids(accel) -> np.ndarray:
-    """The prim_id of every record; a wide structure keeps one number of so many records as a row."""
+    """Return the prim_id of every record; wide structures store blocks of `width` records, field by field."""
     primitives = accel.data.primitives.numpy()
     if primitives.dtype.names:
         return primitives["prim_id"]
@@ -90,7 +90,7 @@ def prim_ids(accel) -> np.ndarray:
 
 
 def rays(geometry, origins, directions, t_min=0.0, t_max=np.inf, capacity=256) -> list[WalkRay]:
-    """The rays with all their hits, found by testing every primitive with the default unit."""
+    """Return the rays with all their hits, by brute force with the default units."""
     from wrt.accel.scenes.build import build
 
     yardstick = build(geometry, "brute_force")
@@ -152,7 +152,9 @@ def bvh2(accel, ray: WalkRay) -> Walk:
 
 
 def wide(accel, ray: WalkRay) -> Walk:
-    """A child's reference is 0 for none, an inner node, or ~(64 * begin + primitives - 1); begin counts rows, or primitives."""
+    """Traverse a wide BVH. A child's reference is 0 (no child), an inner node, or ~(64 * begin + primitives - 1) for a leaf.
+
+    `begin` counts blocks of `width` primitives, but in a compressed BVH single primitives."""
     walk, stack, width = Walk(), [], accel.width
     tree, references = accel._tree(accel.built), accel._references(accel.built)
     unit, size = (1, 96) if accel.compressed else (width, 32 * width)
@@ -180,7 +182,8 @@ def wide(accel, ray: WalkRay) -> Walk:
 
 
 def enter_lane(ray: WalkRay, lo: np.ndarray, hi: np.ndarray) -> np.float32:
-    """As WalkRay.enter, with far planes by widened reciprocals, and no box beyond float32."""
+    """Return the t at which the ray enters a box, as WalkRay.enter does, but pad the reciprocals of the far planes, and end the ray
+    at the largest float32."""
     backwards = ray.inv_dir < 0.0
     with np.errstate(invalid="ignore", over="ignore"):
         near = (np.where(backwards, hi, lo) - ray.origin) * ray.inv_dir
@@ -190,7 +193,9 @@ def enter_lane(ray: WalkRay, lo: np.ndarray, hi: np.ndarray) -> np.float32:
 
 
 def visit_order(walk: Walk, stack: list[tuple[np.float32, int]], entered: list[tuple[np.float32, int]]) -> int:
-    """Push all but the nearest, never one above a farther one that is above the rest; at equal t by the reference, unsigned."""
+    """Push all entries but the nearest, and return the nearest's reference. Entries are compared by t, then by unsigned reference.
+
+    The order on the stack is the kernels', which is not a full sort: each new entry is only compared with the one below it."""
     def key(entry: tuple[np.float32, int]) -> tuple[np.float32, int]:
         return entry[0], entry[1] % (1 << 32)
 

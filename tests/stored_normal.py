@@ -1,6 +1,6 @@
-"""A triangle test with a record of its own: Moeller and Trumbore's with a stored normal, which saves a cross product.
+"""A triangle test with its own record in memory: Moeller-Trumbore with a stored normal, which saves a cross product per test.
 
-docs/extending.md links here, and tests/test_extending.py builds structures with it.
+docs/extending.md links to this file, and tests/test_extending.py builds structures with this test.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Which structures a test takes: all, or, where each costs a kernel of its own, one of each family now and the rest when asked."""
+"""Structures to parametrise tests with: all, or, where each structure compiles a kernel, FAMILIES and the others as slow tests."""
 
 from __future__ import annotations
 
@@ -13,5 +13,5 @@ FAMILIES = ("bvh2", "bvh8", "grid", "kdtree")
 
 
 def families_first(names: list[str] = STRUCTURES) -> list[Any]:
-    """Test parameters; structures outside FAMILIES are marked slow."""
+    """Return the names as test parameters; structures outside FAMILIES are marked slow."""
     return [name if name in FAMILIES else pytest.param(name, marks=pytest.mark.slow) for name in names]

@@ -1,4 +1,4 @@
-"""The house rules that a reader relies on: who imports whom, how large things are, and that everything is packaged."""
+"""Rules of the architecture: allowed imports between folders, limits on size, and what `import wrt` provides."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.data import ROOT
 
 KERNELS = sorted((ROOT / "kernels").rglob("*.py"))
 HOST = sorted(path for path in (ROOT / "wrt").rglob("*.py") if not path.is_relative_to(ROOT / "wrt" / "kernels"))
-# The folders of wrt/, and from which others each may import. `kernels` stands at the top of the project.
+# For each folder of wrt/, the other folders that its modules may import. `kernels` is the folder kernels/, imported as wrt.kernels.
 BELOW_WRT = {
     "core": set(),
     "scene": {"core"},
@@ -32,22 +32,22 @@ BELOW_WRT = {
     "lab": {"renderer", "accel", "kernels", "io", "scene", "picture", "core"},
     "cli": {"lab", "viewer", "renderer", "accel", "io", "scene", "picture", "core"},
 }
-# The rooms of wrt/accel in their order: each imports from itself and from those before it. What is named nowhere is a structure. A
-# structure is asked by its methods, so queries stand below the structures.
-ROOMS_OF_ACCEL = (
-    {"triangle_data", "geometry", "device_geometry", "instanced_geometry", "flat_scene"},  # what is hit
-    {"structures", "structure", "built", "snapshot"},  # kinds of structures, and a structure at one time
+# The layers of wrt/accel, lowest first: a module imports from its own layer and from lower layers. A module that is named nowhere is
+# in the layer of "bvh". Queries are below the structures, because the methods of structures call them.
+LAYERS_OF_ACCEL = (
+    {"triangle_data", "geometry", "device_geometry", "instanced_geometry", "flat_scene"},  # geometry
+    {"structures", "structure", "built", "snapshot"},  # kinds of structures, and the state of a structure
     {"queries"},
     {"store", "base", "epo", "tensors"},
     {"bvh", "cells", "brute_force"},
     {"top_level", "instances"},
     {"scenes"},
 )
-MESHES = {"wrt.scene.mesh", "wrt.scene.clean", "wrt.scene.values"}  # no scenes: what the rooms before the last may use of wrt.scene
-# Private names of others that are used all the same, and why.
+MESHES = {"wrt.scene.mesh", "wrt.scene.clean", "wrt.scene.values"}  # the modules of wrt.scene that layers below "scenes" may import
+# Names with an underscore that other modules may use, and why.
 PRIVATE = {"_replace": "public, of a NamedTuple"}
-SET_FROM_OUTSIDE = {"requires_grad": "Warp's, of an array", "path": "of an InputError with another message"}
-# The modules directly in wrt/, likewise. What type checkers alone see of __init__ does not count.
+SET_FROM_OUTSIDE = {"requires_grad": "of Warp's arrays", "path": "of an InputError with another message"}
+# For each module directly in wrt/, the folders that it may import; imports under TYPE_CHECKING do not count.
 IN_WRT = {
     "__init__": {"core"},
     "__main__": {"cli", "core"},
@@ -56,7 +56,7 @@ IN_WRT = {
     "testing": {"lab"},
     "torch": {"accel", "core"},
 }
-# Of kernels/, the parts that each folder of wrt/ may import. The others import none.
+# For each folder of wrt/, the parts of kernels/ that it may import; folders that are not listed import none.
 KERNELS_OF_HOST = {
     "accel": {"launch_probe", "launches", "hit_lists", "query", "ray_query", "winding", "build", "shade", "traverse", "wide",
               "units", "warp_private", "structs"},
@@ -64,13 +64,12 @@ KERNELS_OF_HOST = {
     "renderer": {"launches", "query", "loops", "shade", "traverse", "wide", "warp_private", "structs"},
     "lab": {"query", "study", "shade", "traverse", "units", "warp_private", "structs"},
 }
-# The laboratory: only these of the product may name it, and only the laboratory its device code.
+# The laboratory, wrt/lab and kernels/study: only files under these paths may name it.
 LABORATORY = re.compile(r"\bwrt[./]lab\b|\bkernels[./]study\b")
 NAME_THE_LABORATORY = ("wrt/lab/", "kernels/study/", "wrt/cli/", "wrt/testing.py", "wrt/__init__.py")
-# The folders of kernels/, and from which others each may import; `structs` is below all of them.
+# For each module and folder of kernels/, the others that it may import.
 BELOW_KERNELS = {
-    "native": set(),
-    "headers": {"native"},
+    "headers": set(),
     "launches": set(),
     "launch_probe": {"launches", "structs"},
     "memory": set(),
@@ -88,14 +87,14 @@ BELOW_KERNELS = {
     "shade": {"warp_private", "headers", "memory", "rows", "query", "traverse", "units", "structs"},
     "loops": {"shade", "launches", "memory", "rows", "query", "traverse", "units", "structs"},
     "build": {"wide", "traverse", "units", "structs"},
-    "study": {"native", "query", "shade", "wide", "build", "traverse", "units", "structs"},
+    "study": {"headers", "query", "shade", "wide", "build", "traverse", "units", "structs"},
 }
 LIBRARIES_OF_KERNELS = {"warp", "dataclasses", "functools", "re", "typing", "collections", "math", "pathlib"}
-# Ceilings, lowered where less is reached. Only that of all lines may rise, by a commit that says for what.
-LONGEST_FUNCTION = 100  # lines
-LONG_FUNCTIONS = 10  # that have more than 60 lines
-LONG_SIGNATURES = 3  # with more than 7 parameters
-MOST_LINES = 47_100  # of wrt and kernels, with headers
+# Limits. Lower them after a change that allows it. Only MOST_LINES may rise, by a commit that says what needs the lines.
+LONGEST_FUNCTION = 100  # Lines.
+LONG_FUNCTIONS = 10  # Functions with more than 60 lines.
+LONG_SIGNATURES = 3  # Functions with more than 7 parameters.
+MOST_LINES = 47_100  # Lines of wrt/ and kernels/, C++ headers included
 
 
 def module(path: Path) -> str:
@@ -113,7 +112,7 @@ def tree(path: Path) -> ast.Module:
 
 @cache
 def imports(path: Path) -> frozenset[str]:
-    """Every module that a file imports, anywhere in it, if only for its types."""
+    """Return every module that a file imports, also within functions and under TYPE_CHECKING."""
     return imported(tree(path))
 
 
@@ -129,13 +128,13 @@ def imported(code: ast.Module) -> frozenset[str]:
 
 
 def run_time(path: Path) -> ast.Module:
-    """A file without what only type checkers see."""
+    """Return the syntax tree of a file without its blocks `if TYPE_CHECKING`."""
     body = [node for node in tree(path).body if not (isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING")]
     return ast.Module(body, [])
 
 
 def strings(path: Path) -> Iterator[str]:
-    """The texts of a file that are no docstrings."""
+    """Yield the string literals of a file, without docstrings."""
     documented = (node for node in ast.walk(tree(path)) if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef))
     docstrings = {id(node.body[0].value) for node in documented if node.body and isinstance(node.body[0], ast.Expr)}
     for node in ast.walk(tree(path)):
@@ -148,7 +147,7 @@ def ids(path: Path) -> str:
 
 
 def each(paths: list[Path]) -> Callable[[Callable[[Path], None]], Callable[[], None]]:
-    """Make one test of all paths, which names the one that fails: two thousand tests of a millisecond take ten seconds."""
+    """Turn a check of one path into one test over all paths, which names the path that fails: 2,000 separate tests take 10 s."""
 
     def decorate(check: Callable[[Path], None]) -> Callable[[], None]:
         def over_all() -> None:
@@ -165,7 +164,7 @@ def each(paths: list[Path]) -> Callable[[Callable[[Path], None]], Callable[[], N
 
 
 def folder(name: str, below: str) -> str:
-    """The part of a module's name that follows `below`: wrt.accel.bvh.tree below wrt is in accel."""
+    """Return the name after the prefix `below`: "accel" for wrt.accel.bvh.tree below wrt."""
     rest = name.removeprefix(below).strip(".")
     return rest.split(".")[0]
 
@@ -177,17 +176,17 @@ def test_host_folders_import_downward_only(path: Path) -> None:
     assert there - {here, ""} <= BELOW_WRT[here]
 
 
-def room(name: str) -> int:
-    """The place of a module of wrt.accel in ROOMS_OF_ACCEL."""
-    places = {each: i for i, names in enumerate(ROOMS_OF_ACCEL) for each in names}
+def layer(name: str) -> int:
+    """Return the index of a module of wrt.accel in LAYERS_OF_ACCEL."""
+    places = {each: i for i, names in enumerate(LAYERS_OF_ACCEL) for each in names}
     return places.get(folder(name, "wrt.accel"), places["bvh"])
 
 
 @each([path for path in HOST if path.is_relative_to(ROOT / "wrt" / "accel")])
-def test_rooms_of_accel_import_downward_only(path: Path) -> None:
-    here = room(module(path))
-    assert max((room(name) for name in imports(path) if name.startswith("wrt.accel.")), default=0) <= here
-    if here < room("wrt.accel.scenes"):
+def test_layers_of_accel_import_downward_only(path: Path) -> None:
+    here = layer(module(path))
+    assert max((layer(name) for name in imports(path) if name.startswith("wrt.accel.")), default=0) <= here
+    if here < layer("wrt.accel.scenes"):
         assert {name for name in imports(path) if name.startswith(("wrt.scene", "wrt.io"))} <= MESHES
 
 
@@ -199,7 +198,7 @@ def test_a_query_imports_no_scene_and_no_reader() -> None:
 
 @each([p for p in HOST if folder(module(p), "wrt") in ("accel", "renderer", "compat")])
 def test_private_names_are_used_where_they_are_made(path: Path) -> None:
-    """x._name, where x is another object, only in the module that makes the name."""
+    """`x._name`, where x is not self, is allowed only in the module that defines `_name`."""
     nodes = list(ast.walk(tree(path)))
     made = {node.name for node in nodes if isinstance(node, ast.FunctionDef)} | {
         node.attr for node in nodes if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store)
@@ -211,14 +210,14 @@ def test_private_names_are_used_where_they_are_made(path: Path) -> None:
 
 @cache
 def fields_of_records() -> frozenset[str]:
-    """The fields of all records of device code."""
+    """Return the names of the fields of all structs of device code."""
     classes = [node for path in KERNELS for node in ast.walk(tree(path)) if isinstance(node, ast.ClassDef)]
     return frozenset(ast.unparse(each.target) for node in classes for each in node.body if isinstance(each, ast.AnnAssign))
 
 
 @each([p for p in HOST if folder(module(p), "wrt") in ("accel", "renderer", "compat")])
 def test_objects_set_their_own_fields(path: Path) -> None:
-    """x.name = ..., where x is another object, only of device code's records, and of private names that this module makes."""
+    """`x.name = ...`, where x is not self, is allowed only for the fields of device code's structs, and for private names."""
     for node in ast.walk(tree(path)):
         if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store) and ast.unparse(node.value) not in ("self", "cls"):
             allowed = node.attr in fields_of_records() or node.attr.startswith("_") or node.attr in SET_FROM_OUTSIDE
@@ -262,7 +261,7 @@ def test_kernels_import_downward_only_and_never_the_host_side(path: Path) -> Non
 
 
 def test_kernels_call_nothing_whose_bits_are_the_compilers() -> None:
-    """The C library's functions, and what of Warp calls them; wrt.kernels.shade.elementary has the project's own."""
+    """Device code uses no function of the C library, and none of Warp's that calls one: wrt.kernels.shade.elementary replaces them."""
     theirs = {"acos", "asin", "atan", "atan2", "cbrt", "cos", "cosh", "curlnoise", "erf", "erfc", "erfcinv", "erfinv", "exp", "log",
               "log10", "log2", "noise", "pnoise", "poisson", "pow", "quat_from_axis_angle", "quat_rpy", "quat_slerp",
               "quat_to_axis_angle", "randn", "sample_triangle", "sample_unit_disk", "sample_unit_hemisphere",
@@ -272,7 +271,7 @@ def test_kernels_call_nothing_whose_bits_are_the_compilers() -> None:
         for node in ast.walk(tree(path)):
             if isinstance(node, ast.Attribute) and ast.unparse(node.value) == "wp":
                 assert node.attr not in theirs, f"{path}: wp.{node.attr}"
-            elif isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow):  # a power of constants is Python's
+            elif isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow):  # Python evaluates a power of constants
                 ast.literal_eval(ast.unparse(node.left)), ast.literal_eval(ast.unparse(node.right))
         assert "warp" not in {node.module for node in ast.walk(tree(path)) if isinstance(node, ast.ImportFrom)}
     for path in (ROOT / "kernels").rglob("*.h"):
@@ -285,7 +284,7 @@ def test_kernels_have_no_postponed_annotations(path: Path) -> None:
 
 
 def circles() -> Iterator[list[str]]:
-    """Groups of modules that import each other in a loop (Tarjan 1972)."""
+    """Yield the groups of modules that import each other in a circle: strongly connected components (Tarjan 1972)."""
     edges = {name: sorted(imports(path) & FILES.keys() - {name}) for name, path in FILES.items()}
     number: dict[str, int] = {}
     low: dict[str, int] = {}
@@ -306,7 +305,7 @@ def circles() -> Iterator[list[str]]:
             if len(group) > 1:
                 yield group
 
-    # The face of the package names what is public, each by its home, for type checkers: it is not imported from below.
+    # wrt/__init__.py imports all public names under TYPE_CHECKING, which makes no circles at run time.
     edges["wrt"] = []
     for name in edges:
         if name not in number:
@@ -324,7 +323,7 @@ def test_nothing_imports_the_command_line(path: Path) -> None:
 
 def test_the_package_shows_its_folders() -> None:
     top = sorted((ROOT / "wrt").iterdir())
-    assert len([path for path in top if path.is_dir() and path.name != "__pycache__"]) <= 11  # compat: others' classes
+    assert len([path for path in top if path.is_dir() and path.name != "__pycache__"]) <= 11
     assert len([path for path in top if path.suffix == ".py"]) <= 6
     for path in {path.parent for path in (*HOST, *KERNELS)}:
         assert ast.get_docstring(tree(path / "__init__.py")), f"{path} does not say what is in it"
@@ -342,7 +341,7 @@ def test_nothing_is_too_large_to_read(path: Path) -> None:
 
 
 def functions() -> Iterator[tuple[str, ast.FunctionDef | ast.AsyncFunctionDef]]:
-    """All functions and methods by file and name, those within others too; kernels are functions."""
+    """Yield "file name" and syntax tree of every function, method, kernel and nested function."""
     for path in (*HOST, *KERNELS):
         for node in ast.walk(tree(path)):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
@@ -350,7 +349,7 @@ def functions() -> Iterator[tuple[str, ast.FunctionDef | ast.AsyncFunctionDef]]:
 
 
 def test_functions_are_short() -> None:
-    """Of a function that makes others, the lines of all count."""
+    """The lines of nested functions count as lines of the outer function."""
     lengths = [(name, (node.end_lineno or 0) - node.lineno + 1) for name, node in functions()]
     assert [name for name, length in lengths if length > LONGEST_FUNCTION] == []
     long = [name for name, length in lengths if length > 60]
@@ -358,7 +357,7 @@ def test_functions_are_short() -> None:
 
 
 def test_the_sources_stay_small() -> None:
-    """A change that needs more lines raises the ceiling, and its message says by how much and for what."""
+    """A change that needs more lines raises MOST_LINES, and its commit message says by how much and for what."""
     headers = (ROOT / "kernels").rglob("*.h")
     assert sum(path.read_text("utf-8").count("\n") for path in (*HOST, *KERNELS, *headers)) <= MOST_LINES
 
@@ -377,7 +376,7 @@ def test_kernels_refuse_a_second_name() -> None:
 
 
 def copied(to: Path) -> None:
-    """The package as a place without symbolic links holds it: device code beside it, and nothing in it."""
+    """Copy the package without the symbolic link wrt/kernels: kernels/ is beside wrt/, as on systems without links."""
     for path in (*HOST, *KERNELS, *(ROOT / "kernels").rglob("*.h")):
         target = to / path.relative_to(ROOT)
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -404,7 +403,7 @@ def test_a_clone_called_wrt_does_not_hide_the_package(tmp_path: Path) -> None:
     (site / "wrt.pth").write_text(str(tmp_path / "wrt"))  # what an editable install writes
     start = f"import site; site.addsitedir({str(site)!r}); "
     assert run(start + "import wrt; print(wrt.__version__)", tmp_path) == "0.1.0"
-    assert sysconfig.get_path("purelib")  # where pip would write it
+    assert sysconfig.get_path("purelib")  # the folder to which pip would write wrt.pth
 
 
 def test_help_imports_nothing_heavy() -> None:

@@ -1,6 +1,6 @@
-"""Bits are a contract: shipped scenes' pixels and hits are to the last bit what tests/bits.txt holds.
+"""The pixels of the shipped scenes and the hits of all structures have the bits whose hashes are in tests/bits.txt.
 
-A change that means to alter them says so in CHANGELOG.md, and brings a new tests/bits.txt (`python -m tests.bits`).
+A change that alters them on purpose says so in CHANGELOG.md, and updates the file: `python -m tests.bits > tests/bits.txt`.
 """
 
 from pathlib import Path
@@ -28,7 +28,7 @@ def test_hits_keep_their_bits(accel: str) -> None:
 @pytest.mark.parametrize("scene", bits.SCENES, ids=lambda path: path.stem)
 def test_pixels_keep_their_bits(scene: Path) -> None:
     assert bits.pixels(scene) == bits.stored()[scene.stem]
-    assert not set().union(*map(bits.library_calls, bits.kernels(scene)))  # so these are the bits of every machine
+    assert not set().union(*map(bits.library_calls, bits.kernels(scene)))  # so that every machine has these bits
 
 
 @kernel

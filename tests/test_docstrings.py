@@ -1,4 +1,4 @@
-"""Docstrings of what users call: numpydoc sections that describe every parameter, and results and errors where there are some."""
+"""Docstrings of the public interface: numpydoc sections describe every parameter, the result, and the errors."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ import wrt
 MODULES = ("wrt.torch", "wrt.jax", "wrt.sensors", "wrt.testing", "wrt.compat.trimesh", "wrt.compat.open3d", "wrt.picture.metrics")
 CLASSES = ("wrt.accel.base:OneMesh", "wrt.accel.instances:Instances", "wrt.accel.queries.answers:Hits", "wrt.picture.film:Film",
            "wrt.compat.trimesh:RayMeshIntersector", "wrt.compat.open3d:RaycastingScene")
-WITHOUT_SECTIONS = ("wrt.kernels.structs",)  # modules that are not yet done
-NOT_CALLED = ("pytest_addoption", "pytest_generate_tests", "located")  # by users
-PLAIN = re.compile(r"(float|int|str|bool|None|\w*(Mesh|Scene|Film|Hits|Refit)\w*|list\[str\]|[\s|])+")  # a name that says all
+WITHOUT_SECTIONS = ("wrt.kernels.structs",)  # modules whose docstrings have no sections yet
+NOT_CALLED = ("pytest_addoption", "pytest_generate_tests", "located")  # functions that users do not call
+# Types of results that need no section Returns.
+PLAIN = re.compile(r"(float|int|str|bool|None|\w*(Mesh|Scene|Film|Hits|Refit)\w*|list\[str\]|[\s|])+")
 
 
 def callables() -> Iterator[tuple[str, Callable[..., object], str]]:
-    """Yield public functions and methods: name, function, and the docstring of the class or ""."""
+    """Yield the name, the function, and the docstring of the class (else "") of all public functions and methods."""
     for home, names in [("wrt", wrt.__all__), *((each, None) for each in MODULES)]:
         module = importlib.import_module(home)
         for name in names or getattr(module, "__all__", vars(module)):
@@ -38,19 +39,19 @@ def callables() -> Iterator[tuple[str, Callable[..., object], str]]:
 
 
 def section(docstring: str, title: str) -> str:
-    """Return the text below a title of numpydoc, up to the next title; "" without one."""
+    """Return the text of a numpydoc section, "" without one."""
     match = re.search(rf"^{title}\n-+\n(.*?)(?=^\w[^\n]*\n-+\n|\Z)", inspect.cleandoc(docstring), re.S | re.M)
     return match[1] if match else ""
 
 
 def described(docstring: str) -> set[str]:
-    """Return the names in the section Parameters: `a, b : type`, or without a type."""
+    """Return the names in the section Parameters, whose entries are `a, b : type` or `a, b`."""
     rows = re.findall(r"^(\S[^\n:]*?)(?: :[^\n]*)?$", section(docstring, "Parameters"), re.M)
     return {name.strip(" *") for row in rows for name in row.split(",")}
 
 
 def parameters(function: Callable[..., object]) -> set[str]:
-    """Return the names of the parameters; of `**options: Unpack[Some]`, those in Some unless `options` is described."""
+    """Return the names of the parameters. `**options: Unpack[Some]` stands for the fields of Some, unless `options` is described."""
     found = set()
     for name, each in inspect.signature(function).parameters.items():
         if each.kind is each.VAR_KEYWORD and name not in described(function.__doc__ or ""):
@@ -65,7 +66,7 @@ def parameters(function: Callable[..., object]) -> set[str]:
 def test_parameters_and_results_are_described(name: str, function: Callable[..., object], of_class: str) -> None:
     docstring = function.__doc__ or ""
     missing = parameters(function) - described(docstring) - described(of_class)
-    # The first line may describe the one argument of a method.
+    # A method's first line may describe its only argument.
     first = docstring.split("\n")[0]
     assert docstring and (not missing or (of_class and len(missing) == 1 and (missing <= set(re.findall(r"\w+", first))))), missing
     result = str(inspect.signature(function).return_annotation)

@@ -1,4 +1,4 @@
-"""README and docs/: command lines parse and run, Python runs, links lead somewhere, and plots and tables agree with their data."""
+"""README and docs/: command lines parse and run, Python blocks run, links lead to files, plots and tables agree with their data."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from wrt.cli.main import cli
 from wrt.io.mesh_file import load_mesh
 
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "kernels" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-NOTES = sorted((ROOT / "docs" / "lab_notes").glob("*.md"))  # commands and Python in them are of their day
-# Commands that CI itself runs (.ci/run), or that have a test of their own.
+NOTES = sorted((ROOT / "docs" / "lab_notes").glob("*.md"))  # dated: their commands and Python are not run
+# Commands of other programs, and commands of wrt that have their own tests or that .ci/run runs.
 OTHERS = ("pip install ", "pytest", "python -m pdoc ", "dask ", "python -m tests.fuzz ", "python -m tests.virtual_gpu ",
           "openssl req ", "export DASK_", "ulimit -v ", "timeout -k ", "prlimit ")
-# Placeholders in command lines, and the files of the test's folder that replace them.
+# Placeholders in command lines, and the files of the fixture `folder` that replace them.
 STANDS_FOR = {"MESH...": "model.ply", "MESH": "model.ply", "SCENE": "scenes/whitted.toml", "FILE.gif": "file.gif", "STUDY": "order",
               "bunny.ply": "model.ply", "FOLDER|FILE.gif|.png": "frames", "FOLDER": "folder"}
-# Options that make a command cheap, added behind its own. Commands in neither table are only parsed.
+# Options to append to a command so that it takes little time. Commands in neither CHEAP nor SLOW are parsed, but not run.
 CHEAP = {
     "render": ("--size", "32x18", "--spp", "4"), "info": (), "compile": (), "compare": (), "validate": (), "schema": (),
     "devices": (),
@@ -62,7 +62,7 @@ def page_id(path: Path) -> str:
 
 
 def command_lines(text: str) -> list[str]:
-    """Return the commands of shell blocks, and of text between backquotes that begins with the program's name."""
+    """Return the commands in shell blocks, and in text between backquotes that begins with `wrt` or `python -m wrt`."""
     blocks = re.findall(r"^```(?:sh|bash|console)\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
     prose = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
     spans = [re.sub(r"\s+", " ", span) for span in re.findall(r"`([^`]+)`", prose)]
@@ -99,7 +99,7 @@ COMMANDS = [(page, line) for page, line in LINES if arguments(line) is not None]
 def test_there_are_command_lines() -> None:
     assert len(COMMANDS) >= 25 and {page for page, _ in COMMANDS} >= {"README.md", "docs/viewer.md", "docs/rt_core.md"}
     shown = {command_of(arguments(line) or [])[0] for _, line in COMMANDS}
-    assert shown - CHEAP.keys() - SLOW.keys() == {"view"}  # which waits for a browser: tests/wrt/viewer/test_page.py
+    assert shown - CHEAP.keys() - SLOW.keys() == {"view"}  # `view` waits for a browser; tests/wrt/viewer/test_page.py runs it
     known = {name for name, command in cli.commands.items() if not isinstance(command, click.Group)}
     assert known <= shown  # no command is left out of the documentation
 
@@ -110,20 +110,20 @@ def test_other_commands_are_those_of_installing_and_testing(page: str, line: str
 
 
 @pytest.mark.parametrize(("page", "line"), COMMANDS)
-def test_a_command_line_is_one(page: str, line: str) -> None:
+def test_a_command_line_is_valid(page: str, line: str) -> None:
     """The command and its options exist, and their values have the right types."""
     words = arguments(line) or []
     name, command = command_of(words)
     try:
-        # With the group's settings: click keeps the help option that it makes first, and other tests in this process ask for -h.
+        # The group's settings add -h to the help option, which click creates once and caches; other tests in this process use -h.
         command.make_context(name, words[len(name.split()) :], resilient_parsing=False, **cli.context_settings)
     except click.exceptions.MissingParameter:
-        assert re.fullmatch(r"(python -m )?wrt [a-z ]+", line), f"{page}: {line}"  # the text speaks of the command as such
+        assert re.fullmatch(r"(python -m )?wrt [a-z ]+", line), f"{page}: {line}"  # text may name a command without its arguments
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a reader's folder: the scenes, a mesh, a glTF file with three cameras, a scene, two pictures."""
+    """Return a folder with the files that command lines name: the scenes, a mesh, a glTF file with three cameras, two pictures."""
     folder = tmp_path_factory.mktemp("documentation")
     shutil.copytree(ROOT / "scenes", folder / "scenes")
     shutil.copy(ROOT / "scenes" / "whitted.toml", folder / "scene.toml")
@@ -151,7 +151,7 @@ def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
 
 
 def runs(commands: dict[str, tuple[str, ...]]) -> list[tuple[str, ...]]:
-    """Return the distinct argument lists of complete lines, with the cheap options behind them."""
+    """Return the distinct argument lists of the command lines that are complete, with the options of `commands` appended."""
     out = set()
     for line in {line for page, line in COMMANDS if page != "CHANGELOG.md"}:
         words = arguments(line) or []
@@ -167,11 +167,11 @@ def test_a_command_line_runs(words: tuple[str, ...], folder: Path, tmp_path: Pat
     shutil.copytree(folder, tmp_path / "here")
     monkeypatch.chdir(tmp_path / "here")
     if "--accel" in words and "runs" in words:
-        pytest.skip("the structure that docs/extending.md makes: tests/test_extending.py runs it")
+        pytest.skip("the structure of docs/extending.md: tests/test_extending.py runs it")
     if words[0] == "profile":
-        Path(words[1]).write_text(MIRRORS, encoding="utf-8")  # the kernel that counts its rays serves other tests too
+        Path(words[1]).write_text(MIRRORS, encoding="utf-8")  # a scene whose counting kernel other tests compile, too
     if "--cluster" in words or any("cuda" in word for word in words):
-        pytest.skip("test_dask.py runs it where there is a scheduler; two GPUs are not needed for a test")
+        pytest.skip("needs a scheduler (test_dask.py has one), or GPUs")
     result = run(*words)
     assert result.code == 0, result.err
 
@@ -196,7 +196,7 @@ def test_python_runs(page: str, folder: Path, tmp_path: Path, monkeypatch: pytes
     rays = np.tile(np.array([0.1, 0.2, 5.0], np.float32), (3, 1)), np.tile(np.array([0.0, 0.0, -1.0], np.float32), (3, 1))
     names: dict[str, Any] = {"wrt": wrt, "scene": scene, "origins": rays[0], "directions": rays[1], "camera": scene.camera()}
     if page == "README.md":
-        names = {}  # its example needs nothing but a checkout
+        names = {}  # the example needs only a checkout
     blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
     assert blocks
     for i, block in enumerate(blocks):
@@ -222,13 +222,13 @@ def functions_of(thing: Any) -> Iterator[tuple[str, Any]]:
                                     "wrt.accel.scenes.build", "wrt.accel.queries.gradients", "wrt.accel.instances",
                                     "wrt.compat.open3d", "wrt.compat.trimesh", "wrt.torch", "wrt.jax", "wrt.sensors",
                                     "wrt.testing"])
-def test_everything_public_says_what_it_is(module: str) -> None:
+def test_everything_public_has_a_docstring(module: str) -> None:
     silent = []
     public = importlib.import_module(module)
     own = [name for name, thing in vars(public).items() if not name.startswith("_") and getattr(thing, "__module__", "") == module]
     for name in set(getattr(public, "__all__", own)) - {"__version__"}:
         thing = getattr(public, name)
-        if not thing.__doc__ or thing.__doc__.startswith(f"{name}("):  # what a dataclass has by itself
+        if not thing.__doc__ or thing.__doc__.startswith(f"{name}("):  # the docstring that dataclasses generate
             silent.append(name)
         if inspect.isclass(thing):
             silent += [f"{name}.{each}" for each, _ in functions_of(thing) if not inspect.getdoc(vars(thing)[each])]
@@ -246,7 +246,7 @@ def plots() -> dict[str, Any]:
 
 
 def test_plots_show_the_data_beside_them(plots: dict[str, Any]) -> None:
-    """`python docs/plots/make.py` changes no file, each plot stands on a page, and each CSV file says how to measure it again."""
+    """`python docs/plots/make.py` changes no file, a page shows each plot, and each CSV file says how to measure its data."""
     drawn = {f"{plot.__name__}.svg": plot() for plot in plots["PLOTS"]}
     assert drawn == {file.name: file.read_text(encoding="utf-8") for file in PLOTS.glob("*.svg")}
     pages = "".join(page.read_text(encoding="utf-8") for page in PAGES)
@@ -257,7 +257,7 @@ def test_plots_show_the_data_beside_them(plots: dict[str, Any]) -> None:
 
 
 def cells(page: str, row: str) -> list[str]:
-    """Return the cells of the first table line of a page that begins with `row`, without stars and thousands separators."""
+    """Return the cells behind the first of the table row that begins with `row`, without stars and thousands separators."""
     text = re.sub(r"[*,]", "", (ROOT / "docs" / page).read_text(encoding="utf-8"))
     line = re.search(rf"^\| {re.escape(row.replace(',', ''))}\b[^|]*\|(.*)\|$", text, re.MULTILINE)
     assert line, f"{page}: {row}"
@@ -265,7 +265,7 @@ def cells(page: str, row: str) -> list[str]:
 
 
 def test_tables_have_the_sums_and_means_of_the_data(plots: dict[str, Any]) -> None:
-    """Geometric means of speed in performance.md; wrong rays in accuracy.md and testing.md."""
+    """The tables of performance.md have geometric means of the speeds; those of accuracy.md and testing.md sums of wrong rays."""
     speeds, groups, libraries = (plots["read"](name) for name in ("peers", "hard_cases", "libraries"))
     for row, rival in (("Embree robust, best mode", "embree_best"), ("Embree robust, one", "embree_robust"),
                        ("Embree fast", "embree_fast"), ("Warp's mesh query", "warp")):
@@ -307,7 +307,7 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 @pytest.mark.parametrize("file", ["README.md", "units/triangle.py", "units/box.py", "loops/one_ray.py", "loops/wave.py"])
 def test_the_device_code_names_files_that_exist(file: str) -> None:
-    """Files and tests that docstrings of device code name exist."""
+    """Files and tests that a README or a docstring of device code names exist."""
     text = (ROOT / "kernels" / file).read_text(encoding="utf-8")
     if file.endswith(".py"):
         text = ast.get_docstring(ast.parse(text)) or ""

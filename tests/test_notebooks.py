@@ -1,4 +1,4 @@
-"""The notebooks run, hold what their .py say, and show nothing of the machine that ran them."""
+"""The notebooks run, have the cells of their scripts (.py), and show no paths of the machine that ran them."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from tests.data import ROOT
 
 nbformat = pytest.importorskip("nbformat")
 for needed in ("jupytext", "nbclient", "ipykernel", "matplotlib"):
-    pytest.importorskip(needed, reason="the extras notebooks and dev bring what runs notebooks")
+    pytest.importorskip(needed, reason="needs the extras notebooks and dev")
 
 SCRIPTS = [path for path in sorted((ROOT / "notebooks").glob("*.py")) if path.name != "make.py"]
 LARGEST = 1_000_000  # bytes of a notebook
-# Of a home, a checkout, a temporary or an installed file; "scenes/lens.toml" and "a / b" are none.
+# Absolute paths of files, but neither "scenes/lens.toml" nor "a / b".
 ABSOLUTE = re.compile(r"(?<![\w.)])(/(home|root|tmp|usr|opt|work|var|Users|private|mnt)/|[A-Z]:\\)")
 
 
@@ -34,7 +34,7 @@ MAKE = load_make()
 
 
 def texts(notebook: Any) -> list[str]:
-    """All text of all outputs; pictures have none."""
+    """Return the texts of all outputs but pictures."""
     found = []
     for cell in notebook.cells:
         for output in cell.get("outputs", []):
@@ -56,7 +56,7 @@ def test_a_notebook_runs(script: Path) -> None:
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
-def test_a_notebook_is_its_script_and_what_it_shows(script: Path) -> None:
+def test_a_notebook_has_the_cells_of_its_script_and_outputs(script: Path) -> None:
     path = script.with_suffix(".ipynb")
     notebook, source = nbformat.read(path, 4), MAKE.read(script)
     nbformat.validate(notebook)
@@ -82,14 +82,14 @@ def test_a_notebook_uses_the_public_interface(script: Path) -> None:
     assert not re.search(r"wrt\.kernels|import _|\._[a-z]", source) and "WRT_QUICK" in source
 
 
-def test_what_an_absolute_path_is() -> None:
+def test_absolute_paths_are_found() -> None:
     for text in (f"a file {Path('/home/me/x.png')}", '"/tmp/abc"', "C:\\Users\\me"):
         assert ABSOLUTE.search(text)
     for text in ("../scenes/lens.toml", "f / 2.25", "nodes/tmp/x", "</tr>", "0.25 [0.2, 0.3] 1/2"):
         assert not ABSOLUTE.search(text)
 
 
-def test_the_kernel_gets_this_checkout(tmp_path: Path) -> None:
+def test_the_jupyter_kernel_imports_this_checkout() -> None:
     notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(
         "import os, wrt\nprint(wrt.__file__)\nprint('WRT_QUICK' in os.environ)")])
     output = MAKE.execute(notebook, quick=False).cells[0].outputs[0].text.splitlines()

@@ -1,5 +1,4 @@
-"""More than a hundred random scenes have the same bits by both loops of the renderer. Ten thousand:
-`python -m tests.random_scenes`."""
+"""Both loops of the renderer give the same bits for 125 random scenes. `python -m tests.random_scenes` compares ten thousand."""
 
 from __future__ import annotations
 
@@ -13,16 +12,16 @@ from wrt.scene.cameras import CAMERAS
 from wrt.scene.kinds import FORMS, forms
 from wrt.scene.settings import Settings
 
-# Together they have all that there is. Where a new row of a table or a new switch is in none of them, take other groups.
+# Together these groups use every feature. If a new feature is in none of them, choose other groups.
 GROUPS = 15, 28, 45, 140, 146
-SCENES = 25  # of each
+SCENES = 25  # in each group
 
 
 def test_every_form_of_a_field_is_drawn() -> None:
     assert random_fields.DRAWS.keys() == FORMS.keys()
 
 
-def test_the_groups_have_all_that_there_is() -> None:
+def test_the_groups_use_every_feature() -> None:
     plans = [plan_of_scene(group, 0) for group in GROUPS]
     on_off = [switches(plan.features) for plan in plans]
     assert {name for name in on_off[0] if not any(each[name] for each in on_off)} == set()
@@ -38,7 +37,7 @@ def test_the_groups_have_all_that_there_is() -> None:
 def test_both_loops_give_the_same_bits(group: int) -> None:
     outcomes = [render(group, seed) for seed in range(SCENES)]
     assert {seed: outcome.differ for seed, outcome in enumerate(outcomes) if outcome.differ} == {}
-    assert sum(map(is_lit, outcomes)) > SCENES / 4 and any(map(goes_on, outcomes))  # there is something to differ
+    assert sum(map(is_lit, outcomes)) > SCENES / 4 and any(map(goes_on, outcomes))  # the comparison is not of black pictures
 
 
 def is_lit(outcome: Outcome) -> bool:
@@ -46,5 +45,5 @@ def is_lit(outcome: Outcome) -> bool:
 
 
 def goes_on(outcome: Outcome) -> bool:
-    """Whether rays follow those of the camera, here two a sample at most."""
+    """Return whether a pixel has more than 6 rays: two camera rays for each of three samples at most, so that some bounce."""
     return bool(outcome.film["rays"].max() > 6)

@@ -1,4 +1,4 @@
-"""The images beside the scenes are what their script makes."""
+"""scenes/textures/make.py writes the images in scenes/textures."""
 
 from __future__ import annotations
 
@@ -22,5 +22,5 @@ def test_images_are_what_the_script_makes(tmp_path: Path) -> None:
     assert names == {path.name for path in tmp_path.iterdir()} and len(names) == 7
     for name in names:
         read = read_image if name.endswith(".hdr") else lambda path: decode_rgba8(path.read_bytes()) / np.float32(255.0)
-        # The formulas end in rounding: another machine's sine may tip a value to the next code.
+        # Values are rounded to codes: another machine's sine may round to a neighbour.
         np.testing.assert_allclose(read(tmp_path / name), read(TEXTURES / name), atol=1.01 / 255.0, rtol=1.0 / 128.0, err_msg=name)

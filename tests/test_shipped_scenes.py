@@ -1,4 +1,4 @@
-"""The scenes that ship: each loads and renders, and together they need every feature there is."""
+"""The shipped scenes load and render, and together need every feature of the renderer."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ SCENES = sorted((ROOT / "scenes").glob("*.toml"))
 @cache
 def load(path: Path) -> Scene:
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # what ships loads without a word
+        warnings.simplefilter("error")  # a shipped scene must load without warnings
         return wrt.load_scene(path)
 
 
@@ -49,7 +49,7 @@ def test_every_feature_has_a_scene_that_needs_it(name: str) -> None:
 
 
 def without(features: Features, name: str) -> Features:
-    """With one switch off."""
+    """Return the features with one switch off."""
     if hasattr(features, name):
         return replace(features, **{name: False})
     return replace(features, materials=tuple(kind for kind in features.materials if kind != name),
@@ -72,7 +72,7 @@ def test_every_feature_changes_the_code_of_a_scene_that_needs_it(name: str) -> N
 
 
 @pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
-def test_a_scene_says_what_it_is_for(path: Path) -> None:
+def test_a_scene_begins_with_a_comment_and_has_the_common_size(path: Path) -> None:
     assert path.read_text().startswith("# ")
     assert load(path).settings.size == (640, 360)
 
@@ -87,8 +87,8 @@ def test_a_scene_renders(path: Path) -> None:
     assert visibly_cut == (path.stem in ("frosted", "metallic_roughness"))  # as docs/concepts.md says
 
 
-# Seconds each: four that together need most features, each with the camera that needs most, and for Hopper the first of them; the
-# others by a command.
+# Compiling takes seconds each. These four scenes together need most features; each is compiled for the camera that needs most of
+# them, and the first also for Hopper (sm_90). The slow tests compile all scenes and cameras.
 COMPILED = ("metallic_roughness", "environment", "instances", "lens")
 
 

@@ -1,5 +1,5 @@
-"""What is no part of Warp's documents is named in few places, so that the next version of Warp is a known amount of work: one file
-of the host, one of device code, one of the virtual GPU, and a few words of native code. docs/warp.md lists them."""
+"""Only three Python files name undocumented parts of Warp, one each of host code, device code and the virtual GPU; native code uses
+few words of Warp's C++. So the work for the next version of Warp is known; docs/warp.md lists these files and words."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ SOURCES = sorted(path for folder in ("wrt", "kernels") for path in (ROOT / folde
                  if not path.is_relative_to(ROOT / "wrt" / "kernels"))
 FOR_INSIDES = {"wrt/core/warp_private.py", "kernels/warp_private.py"}
 VIRTUAL_GPU = sorted((ROOT / "tests" / "virtual_gpu").rglob("*.py"))
-# Attributes of Warp's objects that look public, and are not documented.
+# Attributes of Warp's objects without an underscore that Warp does not document.
 UNDOCUMENTED = {"adj", "codegen", "ctype", "execs", "get_kernel_hooks", "get_module_hash", "get_module_identifier", "hash_module",
                 "hashers", "hooks", "launch_bounds_t", "native_func", "params", "params_addr", "runtime", "array_t", "vars"}
-# Names that begin with an underscore and that no file of the project makes, but another library or Python, by what they are of.
+# Names with an underscore that files may use although the project does not define them, and their owners.
 OF_OTHERS = {"_replace": "NamedTuple", "_asdict": "NamedTuple", "_fields": "NamedTuple", "_exit": "os", "_getframe": "sys",
              "_run_exitfuncs": "atexit", "_gui_input_handle_from_uuid": "viser", "_connected": "viser", "_obj": "ctypes.byref"}
-CLICK = {"wrt/cli/common.py", "wrt/cli/reporting.py", "wrt/cli/measure.py"}  # its commands have `params`, too
+CLICK = {"wrt/cli/common.py", "wrt/cli/reporting.py", "wrt/cli/measure.py"}  # files that use `params` of click's commands
 TEXTS = re.compile(r"\b_?wp_|WP_[A-Z]|Warp CUDA|NVIDIA CUDA")
-# Words of Warp's C++ that native code of kernels may use.
+# Words of Warp's C++ that the native code of kernels/ may use.
 NATIVE = {"wp::vec_t", "wp::float32", "wp::float64", "wp::uint64", "wp::launch_bounds_t", "WP_TILE_BLOCK_DIM"}
 
 
 def made_here() -> frozenset[str]:
-    """Every name that a file of the project defines or sets."""
+    """Return every name that a file of the project defines or assigns."""
     names = set()
     for path in SOURCES:
         for node in ast.walk(ast.parse(path.read_text())):
@@ -44,7 +44,7 @@ OURS = made_here()
 
 
 def insides(source: str, file: str = "") -> Iterator[str]:
-    """The names and texts of Warp's insides in a source of Python."""
+    """Yield the undocumented names of Warp, and strings about them, in Python source."""
     tree = ast.parse(source)
     prose = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
     for node in ast.walk(tree):
@@ -59,7 +59,7 @@ def insides(source: str, file: str = "") -> Iterator[str]:
                 yield ast.unparse(node)
         elif isinstance(node, ast.Constant) and isinstance(node.value, str | bytes) and id(node) not in prose:
             text = node.value if isinstance(node.value, str) else node.value.decode(errors="replace")
-            if "\n" not in text and not file.startswith("kernels/"):  # native code is looked at below
+            if "\n" not in text and not file.startswith("kernels/"):  # native_words() looks at native code
                 yield from TEXTS.findall(text)
 
 
@@ -82,7 +82,7 @@ def test_insides_of_warp_are_named_in_their_files_only(path: Path) -> None:
 @pytest.mark.parametrize("path", [path for path in VIRTUAL_GPU if path.name != "warp_private.py" and "test_" not in path.name],
                          ids=lambda path: path.name)
 def test_the_virtual_gpu_imports_no_private_module_elsewhere(path: Path) -> None:
-    """Except Warp's C functions: the virtual GPU's driver has methods in their place."""
+    """Strings such as "wp_..." are allowed: the virtual GPU implements Warp's C functions."""
     assert [each for each in insides(path.read_text()) if each.startswith("warp.") or "." in each] == []
 
 

@@ -1,13 +1,13 @@
-"""wrt: a Whitted ray tracer on NVIDIA Warp, a model of the RT-core split, and a laboratory for both.
+"""wrt: a Whitted ray tracer on NVIDIA Warp, a software model of RT cores, and tools to measure both.
 
-Rays by themselves: load_mesh, Mesh, DeviceGeometry, build, ACCELERATORS, load_accel, camera_rays; all_hits, count_hits,
-first_hits, contains, winding_number, visible; closest_points, signed_distance.
-Rays from kernels of your own: kernel, ray_query. Gradients: Hits.gradients, and the modules torch, jax.
+Ray queries without a picture: load_mesh, Mesh, DeviceGeometry, build, ACCELERATORS, load_accel, camera_rays; all_hits,
+count_hits, first_hits, contains, winding_number, visible; closest_points, signed_distance.
+Ray queries from your own Warp kernels: kernel, ray_query. Gradients: Hits.gradients, and the modules torch, jax.
 Pictures: load_scene, render, Film, Options, Progress, LiveView, side_by_side.
 Scenes in Python: Scene, Settings, Object, Sphere, Material, Texture, Checkerboard, Motion; Camera, OrthographicCamera,
 FisheyeCamera, PanoramaCamera; PointLight, DirectionalLight, SpotLight; ConstantBackground, GradientBackground,
 EnvironmentBackground.
-What a picture costs: profile. What is fastest on a device: tune. What goes wrong: InputError, SceneWarning.
+Costs of a picture: profile. The fastest structure on a device: tune. Errors and warnings: InputError, SceneWarning.
 Further modules: sensors, compat (trimesh, open3d), testing.
 """
 
@@ -25,7 +25,7 @@ from wrt.core.version import VERSION as __version__
 if not Path(__file__).is_file():
     raise ImportError("wrt cannot be imported from a zip file, because it reads files beside its code: unpack or install it")
 
-# Type checkers and editors see these imports. At run time __getattr__ makes each on first use.
+# Type checkers and editors read these imports. At run time __getattr__ imports each name on first use.
 if TYPE_CHECKING:
     from wrt import compat as compat
     from wrt import jax as jax
@@ -81,7 +81,7 @@ if TYPE_CHECKING:
 
 
 def _public() -> dict[str, str]:
-    """Return the module of each public name from the imports above."""
+    """Return {public name: its module}, from the imports under TYPE_CHECKING in this file."""
     imports = [node for node in ast.walk(ast.parse(Path(__file__).read_bytes())) if isinstance(node, ast.ImportFrom)]
     return {each.name: node.module or "" for node in imports for each in node.names if each.asname == each.name}
 
@@ -92,13 +92,13 @@ __all__ = ["__version__", *(name for name in _HOME if name not in _MODULES)]
 
 
 def _find_kernels() -> None:
-    """Load wrt.kernels from kernels/ if the symbolic link wrt/kernels is not there: in a source distribution, or on Windows."""
+    """Load wrt.kernels from kernels/ if the symbolic link wrt/kernels is missing, as in a source distribution or on Windows."""
     folder = Path(__file__).resolve().parent.parent / "kernels"
     if (Path(__file__).parent / "kernels").is_dir() or not folder.is_dir():
         return
     spec = importlib.util.spec_from_file_location("wrt.kernels", folder / "__init__.py", submodule_search_locations=[str(folder)])
     if spec is None or spec.loader is None:
-        raise ImportError(f"{folder} is no package")
+        raise ImportError(f"{folder} is not a Python package")
     module = importlib.util.module_from_spec(spec)
     sys.modules["wrt.kernels"] = module
     spec.loader.exec_module(module)

@@ -22,17 +22,17 @@ def closest_hit(accel: OneMesh, vertices: ArrayLike | None, origins: ArrayLike, 
                 t_max: ArrayLike = np.inf, *, rebuild_at: float = 2.0) -> HitTensors[Array]:
     """Find the closest hit of each ray, with gradients, also in jax.jit, jax.grad and jax.vmap.
 
-    A callback on the host asks the structure, which is a constant of the traced function. JAX wraps errors of the callback.
+    A callback on the host queries the structure, which is a constant of the traced function. JAX wraps exceptions of the callback.
 
     Parameters
     ----------
     accel, vertices, origins, directions, t_min, t_max, rebuild_at
-        See `wrt.torch.closest_hit`; arrays of JAX.
+        See `wrt.torch.closest_hit`, with JAX arrays in place of tensors.
 
     Returns
     -------
     HitTensors
-        Arrays of JAX.
+        JAX arrays.
 
     Raises
     ------
@@ -40,49 +40,49 @@ def closest_hit(accel: OneMesh, vertices: ArrayLike | None, origins: ArrayLike, 
         Names the argument and what was expected; also without JAX.
     """
     jnp = library("jax", "jax.numpy")
-    given = (jnp.asarray(each) for each in (() if vertices is None else (vertices,)) + (origins, directions))
-    *shape, o, d = (each.astype(np.float32) if each.dtype.kind in "iu" else each for each in given)
+    inputs = (jnp.asarray(each) for each in (() if vertices is None else (vertices,)) + (origins, directions))
+    *points, o, d = (each.astype(np.float32) if each.dtype.kind in "iu" else each for each in inputs)
     if o.shape != d.shape or o.shape[1:] != (3,):
         raise InputError(f"and directions must both be (N, 3), got {o.shape} and {d.shape}", argument="origins")
     ends = (jnp.asarray(each, np.float32) for each in (t_min, t_max))
-    return _function()(accel, rebuild_at, *shape or [None], o, d, *ends)
+    return _function()(accel, rebuild_at, *points or [None], o, d, *ends)
 
 
 @cache
 def _function() -> Any:
-    """Make closest_hit(accel, rebuild_at, vertices or None, origins, directions, t_min, t_max) with a custom derivative."""
+    """Make the JAX function closest_hit(accel, rebuild_at, vertices or None, origins, directions, t_min, t_max) with its gradient."""
     jax = library("jax")
 
     def on_host(function: Any, shapes: Any, *arrays: Any) -> Any:
         return jax.pure_callback(lambda *each: function(*jax.tree.map(np.asarray, each)), shapes, *arrays, vmap_method="sequential")
 
     def closest_hit(accel: OneMesh, rebuild_at: float, vertices: Any, *rays: Any) -> HitTensors:
-        def ask(vertices: Any, *rays: Any) -> HitTensors:
+        def query(vertices: Any, *rays: Any) -> HitTensors:
             hits = hits_of(accel, vertices, rays, rebuild_at)
             return HitTensors(hits.t, hits.u, hits.v, hits.point, hits.prim_id)
 
         n = len(rays[0])
         one, three, index = (jax.ShapeDtypeStruct(*each) for each in (((n,), np.float32), ((n, 3), np.float32), ((n,), np.int32)))
-        return on_host(ask, HitTensors(one, one, one, three, index), vertices, *rays)
+        return on_host(query, HitTensors(one, one, one, three, index), vertices, *rays)
 
-    def forward(accel: OneMesh, rebuild_at: float, *given: Any) -> tuple[HitTensors, Any]:
-        hits = closest_hit(accel, rebuild_at, *given)
-        return hits, (*given, hits.prim_id)
+    def forward(accel: OneMesh, rebuild_at: float, *inputs: Any) -> tuple[HitTensors, Any]:
+        hits = closest_hit(accel, rebuild_at, *inputs)
+        return hits, (*inputs, hits.prim_id)
 
-    def backward(accel: OneMesh, rebuild_at: float, kept: Any, cotangents: HitTensors) -> Any:
-        vertices, origins, directions, *ends, prim_id = kept
-        leaves = vertices, origins, directions
+    def backward(accel: OneMesh, rebuild_at: float, residuals: Any, cotangents: HitTensors) -> Any:
+        vertices, origins, directions, *ends, prim_id = residuals
+        inputs = vertices, origins, directions
 
-        def ask(leaves: Any, prim_id: Any, cotangents: Any) -> Any:
-            vertices, origins, directions = leaves
-            shape = accel.geometry
+        def gradients(inputs: Any, prim_id: Any, cotangents: Any) -> Any:
+            vertices, origins, directions = inputs
+            geometry = accel.geometry
             if vertices is not None:
-                shape = Geometry(vertices.astype(np.float32), shape.faces, shape.spheres)
-            found = adjoint(shape, origins, directions, prim_id, Cotangents(*cotangents))
-            return tuple(leaf if leaf is None else each.astype(leaf.dtype) for each, leaf in zip(found, leaves, strict=True))
+                geometry = Geometry(vertices.astype(np.float32), geometry.faces, geometry.spheres)
+            found = adjoint(geometry, origins, directions, prim_id, Cotangents(*cotangents))
+            return tuple(x if x is None else each.astype(x.dtype) for each, x in zip(found, inputs, strict=True))
 
-        shapes = jax.tree.map(lambda each: jax.ShapeDtypeStruct(each.shape, each.dtype), leaves)
-        return *on_host(ask, shapes, leaves, prim_id, cotangents[:4]), *map(jax.numpy.zeros_like, ends)
+        shapes = jax.tree.map(lambda each: jax.ShapeDtypeStruct(each.shape, each.dtype), inputs)
+        return *on_host(gradients, shapes, inputs, prim_id, cotangents[:4]), *map(jax.numpy.zeros_like, ends)
 
     function = jax.custom_vjp(closest_hit, nondiff_argnums=(0, 1))
     function.defvjp(forward, backward)

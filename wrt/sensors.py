@@ -1,4 +1,4 @@
-"""Sensors as arrays of rays, and pictures of their hits: cameras by their intrinsics, and LiDARs.
+"""Cameras and LiDARs as arrays of rays, and images of their hits.
 
 >>> sensor = wrt.sensors.pinhole(K, (640, 480), camera_to_world)
 >>> hits = accel.closest_hit(sensor.origins, sensor.directions)
@@ -24,21 +24,21 @@ if TYPE_CHECKING:
 __all__ = ["Sensor", "pinhole", "raster_lidar", "rotating_lidar", "with_range_noise"]
 
 TURN = 2.0 * np.pi
-RIGID = 1e-5  # largest error of the rotation matrix R of a pose: R R^T - I
+MAX_ROTATION_ERROR = 1e-5  # largest entry of |R R^T - I| for the rotation matrix R of a pose
 
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """Rays of a sensor, and the layout of its pictures.
+    """Rays of a sensor, one per pixel, and the shape of its images.
 
     Parameters
     ----------
     origins, directions
-        (N, 3) float32 each, in world space, row by row.
+        (N, 3) float32 each, in world space: one image row after another.
     shape
-        Rows and columns of a picture; N is their product.
+        Number of rows and of columns of an image; N is their product.
     axis
-        (3,) float64, unit direction in world space along which depth is measured.
+        (3,) float64, unit vector in world space along which `depth` measures.
     """
 
     origins: np.ndarray
@@ -47,29 +47,29 @@ class Sensor:
     axis: np.ndarray
 
     def picture(self, values: ArrayLike) -> np.ndarray:
-        """Return (rows, columns, ...) of values for each ray, (N, ...), such as hits.prim_id, hits.object or hits.normal.
+        """Reshape one value per ray, (N, ...), such as hits.prim_id or hits.normal, to an image (rows, columns, ...).
 
-        Raises InputError for another number of values.
+        Raises InputError if there is not one value per ray.
         """
         values = to_numpy(values)
         if values.shape[:1] != (len(self.origins),):
-            raise InputError(f"must be one a ray, ({len(self.origins)}, ...), got {values.shape}", argument="values")
+            raise InputError(f"must have one row per ray, ({len(self.origins)}, ...), got {values.shape}", argument="values")
         return values.reshape(*self.shape, *values.shape[1:])
 
     def range(self, hits: Hits) -> np.ndarray:
-        """Return distances from the sensor, (rows, columns) float32 in scene units; inf on a miss."""
+        """Return the distance of each hit from the sensor, (rows, columns) float32 in scene units; inf on a miss."""
         return self._scaled(hits, np.linalg.norm(self.directions.astype(np.float64), axis=1))
 
     def depth(self, hits: Hits) -> np.ndarray:
-        """Return distances along the sensor's axis, (rows, columns) float32 in scene units; inf on a miss, negative behind it.
+        """Return the distance of each hit along the sensor's axis, (rows, columns) float32 in scene units.
 
-        For a camera this is z in its frame, as in depth images.
+        It is inf on a miss and negative behind the sensor. For a camera it is z in the camera's frame, as in depth images.
         """
         return self._scaled(hits, self.directions.astype(np.float64) @ self.axis)
 
     def _scaled(self, hits: Hits, factor: np.ndarray) -> np.ndarray:
         if not hasattr(hits, "t"):
-            raise InputError(f"must be those of closest_hit, got {shown(hits)}", argument="hits")
+            raise InputError(f"must be the Hits that closest_hit returned, got {shown(hits)}", argument="hits")
         t = self.picture(hits.t).astype(np.float64)
         scaled = np.where(np.isfinite(t), t, 0.0) * factor.reshape(self.shape)
         return np.where(np.isfinite(t), scaled, np.inf).astype(np.float32)
@@ -81,12 +81,12 @@ def pinhole(intrinsics: ArrayLike, size: tuple[int, int] | str, pose: ArrayLike 
     Parameters
     ----------
     intrinsics
-        K, (3, 3) in pixels, as in OpenCV: x right, y down, z forward, (0, 0) is the centre of the top left pixel. The point p of the
-        camera's frame projects to K p / z.
+        K, (3, 3) in pixels. The camera's frame is that of OpenCV: x right, y down, z forward. A point p in this frame projects to
+        K p / z, with (0, 0) at the centre of the top left pixel.
     size
-        Width and height, or text such as "640x480".
+        Width and height in pixels, or text such as "640x480".
     pose
-        (4, 4), camera to world, rotation and translation. None: the identity.
+        (4, 4), camera to world: a rotation and a translation. None: the identity.
 
     Returns
     -------
@@ -96,7 +96,7 @@ def pinhole(intrinsics: ArrayLike, size: tuple[int, int] | str, pose: ArrayLike 
     Raises
     ------
     InputError
-        If an argument has another form, or the rays leave the range of float32.
+        If an argument does not have this form, or the rays exceed the range of float32.
     """
     k = as_array(intrinsics, np.float64, "intrinsics")
     if k.shape != (3, 3) or not np.isfinite(k).all() or not np.array_equal(k[2], [0.0, 0.0, 1.0]) or k[1, 0] != 0.0:
@@ -121,9 +121,9 @@ def rotating_lidar(elevations: ArrayLike, steps: int, pose: ArrayLike | None = N
     steps
         Number of columns.
     pose
-        (4, 4), sensor to world, rotation and translation. None: the identity.
+        (4, 4), sensor to world: a rotation and a translation. None: the identity.
     start, turn
-        Azimuth of column i is start + i turn / steps, in radians, counter-clockwise seen from above.
+        Column i has the azimuth start + i turn / steps in radians, counter-clockwise seen from above.
 
     Returns
     -------
@@ -133,7 +133,7 @@ def rotating_lidar(elevations: ArrayLike, steps: int, pose: ArrayLike | None = N
     Raises
     ------
     InputError
-        If an argument has another form, or the rays leave the range of float32.
+        If an argument does not have this form, or the rays exceed the range of float32.
     """
     rows = as_array(elevations, np.float64, "elevations")
     if rows.ndim != 1 or not len(rows) or not (np.abs(rows) <= 0.5 * np.pi).all():
@@ -151,7 +151,7 @@ def raster_lidar(fov: tuple[float, float], size: tuple[int, int] | str, pose: Ar
     Parameters
     ----------
     fov
-        Angles from the first column to the last and from the first row to the last, in radians.
+        Field of view in radians: the angle from the first column to the last, and from the first row to the last.
     size
         Columns and rows, or text such as "240x80".
     pose
@@ -179,20 +179,21 @@ def raster_lidar(fov: tuple[float, float], size: tuple[int, int] | str, pose: Ar
 
 
 def with_range_noise(ranges: ArrayLike, seed: int, constant: float = 0.0, proportional: float = 0.0, dropout: float = 0.0) -> np.ndarray:
-    """Add the noise of a range sensor, independent for each element.
+    """Add the noise of a range sensor to ranges, independently for each element.
 
-    A range r becomes normally distributed around r, but not below 0, with the deviation sqrt(constant^2 + (proportional r)^2).
+    The error of a range r is normally distributed with the standard deviation sqrt(constant^2 + (proportional r)^2). A result
+    below 0 becomes 0.
 
     Parameters
     ----------
     ranges
-        True ranges, 0 or more, of any shape; inf on a miss, which stays.
+        True ranges in scene units, 0 or more, of any shape; a miss is inf and stays inf.
     seed
         The same seed and shape give the same noise.
     constant, proportional
-        Deviation in scene units, and as a share of r.
+        Parts of the standard deviation: one in scene units, and one as a fraction of r.
     dropout
-        Probability that a hit is lost (inf).
+        Probability, 0 to 1, that a hit becomes a miss (inf).
 
     Returns
     -------
@@ -211,27 +212,27 @@ def with_range_noise(ranges: ArrayLike, seed: int, constant: float = 0.0, propor
         raise InputError(f"must be 0 to 1, got {dropout:g}", argument="dropout")
     rng = np.random.default_rng(as_integer(seed, "seed", 0, (1 << 63) - 1))
     normal, lost = rng.standard_normal(ranges.shape), rng.random(ranges.shape) < dropout
-    there = np.isfinite(ranges) & ~lost
-    r = np.where(there, ranges, 0.0)
-    noisy = np.where(there, np.maximum(r + np.hypot(constant, proportional * r) * normal, 0.0), np.inf)
+    hit = np.isfinite(ranges) & ~lost
+    r = np.where(hit, ranges, 0.0)
+    noisy = np.where(hit, np.maximum(r + np.hypot(constant, proportional * r) * normal, 0.0), np.inf)
     return as_array(noisy, np.float32, "ranges").reshape(shape)
 
 
 def _spherical(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
-    """Return (rows, columns, 3) unit vectors, x forward, y left, z up."""
+    """Return unit vectors (rows, columns, 3) in a frame with x forward, y left, z up. Angles are in radians."""
     level = np.cos(elevation)
     return np.stack(np.broadcast_arrays(level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)), axis=-1)
 
 
 def _sensor(directions: np.ndarray, pose: ArrayLike | None, axis: int) -> Sensor:
-    """Place directions, (rows, columns, 3) in the sensor's frame; axis: index of the frame's axis of depth."""
+    """Make a sensor from directions (rows, columns, 3) in its own frame. axis: index of the frame's axis that measures depth."""
     matrix = as_transform(np.eye(4) if pose is None else pose, "pose")
     rotation = matrix[:3, :3]
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID or np.linalg.det(rotation) < 0.0:
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > MAX_ROTATION_ERROR or np.linalg.det(rotation) < 0.0:
         raise InputError("must be a rotation and a translation", argument="pose")
     with np.errstate(over="ignore"):
         turned = (directions.reshape(-1, 3) @ rotation.T).astype(np.float32)
         origins = np.tile(matrix[:3, 3].astype(np.float32), (len(turned), 1))
     if not (np.isfinite(turned).all() and np.isfinite(origins).all()):
-        raise InputError("rays of this sensor and pose are beyond float32")
+        raise InputError("rays of this sensor and pose exceed the range of float32")
     return Sensor(origins, turned, (directions.shape[0], directions.shape[1]), rotation[:, axis].copy())

@@ -1,4 +1,4 @@
-"""Makes the three pictures of README.md with wrt itself: `PYTHONPATH=. python docs/images/make.py`."""
+"""Render the three pictures of README.md: `PYTHONPATH=. python docs/images/make.py`."""
 
 import tempfile
 from pathlib import Path
@@ -41,13 +41,13 @@ radiance = 14
 """
 
 
-def arc(radius: float, height: float, bulge: float, rise: float, way: int) -> list[tuple[float, float]]:
-    """Points of a wall that swells out half way up."""
-    return [(radius + bulge * np.sin(np.pi * s), height + rise * s) for s in np.linspace(0.0, 1.0, 24)[::way]]
+def arc(radius: float, height: float, bulge: float, rise: float, step: int) -> list[tuple[float, float]]:
+    """Return profile points (radius, height) of a wall that bulges at half its height, bottom up if step is 1, top down if -1."""
+    return [(radius + bulge * np.sin(np.pi * s), height + rise * s) for s in np.linspace(0.0, 1.0, 24)[::step]]
 
 
 def glass(folder: Path) -> Path:
-    """A glTF file of its own making: a vase of tinted glass, one ball of metal and one of clay."""
+    """Write a glTF file (a vase of tinted glass, a metal ball and a clay ball) and a scene with it; return the scene's path."""
     gltf = GltfFile()
     vase = lathe([(0.0, 0.0), (0.42, 0.0), (0.42, 0.0), *arc(0.42, 0.0, 0.38, 1.75, 1), *arc(0.34, 0.16, 0.38, 1.59, -1),
                   (0.34, 0.16), (0.0, 0.16)], 96)

@@ -1,1 +1,1 @@
-"""Inner loops of the builders: most run on the host, lbvh, fit and shape on any device."""
+"""Kernels of the builders of acceleration structures: lbvh, fit and shape run on any device, the others on the CPU."""

@@ -1,4 +1,4 @@
-"""Binned SAH splits of a range of records."""
+"""Binned SAH splits of a range of primitives (BuildRecord)."""
 
 import warp as wp
 
@@ -23,7 +23,7 @@ from wrt.kernels.build.records import (
 
 BIN_COUNT = 32
 BINS = wp.constant(BIN_COUNT)
-# Bins of all three axes. (An array's stride would be read from memory each time.)
+# Matrices and vectors hold the bins of all three axes. With arrays, each access would read the array's stride from memory.
 BinBoxes = wp.types.matrix((3 * BIN_COUNT, 8), wp.float32)
 BinCounts = wp.types.vector(3 * BIN_COUNT, wp.int32)
 BinCosts = wp.types.vector(BIN_COUNT, wp.float32)
@@ -31,9 +31,8 @@ BinCosts = wp.types.vector(BIN_COUNT, wp.float32)
 
 @wp.struct
 class Bins:
-    """Bins of centroids along each axis, from `origin` on, 1 / scale long.
-    An axis that cannot separate the centroids has scale 0: they coincide, or are so close together or far apart that it over- or
-    underflows."""
+    """Bins of centroids along each axis. Bin k of an axis begins at origin + k / scale.
+    The scale is 0 on an axis that cannot separate the centroids: these coincide, or the scale would over- or underflow."""
 
     count: int
     origin: wp.vec3
@@ -42,7 +41,7 @@ class Bins:
 
 @wp.struct
 class Split:
-    """The chosen split: records whose bin along `axis` is below `bin` go left; axis < 0: no split."""
+    """The best split: records whose bin along `axis` is below `bin` go to the left side; axis < 0: no split."""
 
     axis: int
     bin: int
@@ -53,13 +52,13 @@ class Split:
 
 @wp.func
 def bin_of(center: wp.vec3, axis: int, bins: Bins) -> int:
-    """Bin of a centroid. Binning and partition share this function, so that they agree to the last bit."""
+    """Return the bin of a centroid along an axis. Binning and partition share this function, so that they agree to the last bit."""
     return wp.clamp(int((center[axis] - bins.origin[axis]) * bins.scale[axis]), 0, bins.count - 1)
 
 
 @wp.func
 def bins_of(task: BuildTask) -> Bins:
-    """Make the bins of a range, fewer of them for few records."""
+    """Make the bins of a range: 8, plus one for every 8 records, at most BIN_COUNT."""
     out = Bins()
     out.count = wp.min(8 + (task.end - task.begin) / 8, BINS)
     low = low_of(task.measures.centers)
@@ -75,7 +74,7 @@ def bins_of(task: BuildTask) -> Bins:
 @wp.func
 def binned_split(data: BuildData, task: BuildTask, bins: Bins) -> Split:
     """Find the cheapest split between two bins (Wald 2007, "On fast Construction of SAH-based Bounding Volume Hierarchies").
-    The cost is the sum over both sides of half area times count, in units of area_scale."""
+    The cost is the sum over both sides of half surface area times number of records, with sides scaled by area_scale."""
     scale = area_scale(task.measures.box)
     count = BinCounts()
     box = BinBoxes()
@@ -124,9 +123,9 @@ def binned_split(data: BuildData, task: BuildTask, bins: Bins) -> Split:
 
 @wp.func
 def partition_by_bin(data: BuildData, task: BuildTask, bins: Bins, split: Split) -> Halves:
-    """Partition the records: those of the left side go to the front.
-    Lomuto's partition, without its branch, which no processor could predict: a record that stays on its side is swapped with one of the
-    same side."""
+    """Partition the records in place, with the left side in front; return both halves with their bounds.
+    Lomuto's partition, without its unpredictable branch. Every record is swapped with the first record of the right side. If it belongs to
+    the left side, the right side then begins behind it."""
     middle = int(task.begin)
     empty = empty_row()
     centers_0 = empty_row()
@@ -151,7 +150,7 @@ def partition_by_bin(data: BuildData, task: BuildTask, bins: Bins, split: Split)
 
 @wp.func
 def split_binned(data: BuildData, task: BuildTask) -> Halves:
-    """Split between the two best bins; in halves by number if no axis separates the centroids or the tree gets too deep."""
+    """Split at the cheapest boundary between bins. If no axis separates the centroids, or the tree gets too deep, split by number."""
     n = task.end - task.begin
     if n > 2 and task.depth + balanced_depth(n) < MAX_DEPTH:
         bins = bins_of(task)

@@ -1,6 +1,6 @@
-"""The BSP builder, on the CPU: it splits cells and clips their primitives until no split pays.
-The host launches it once for the top of the tree, then on all cores for each deferred cell. A launch works depth first: it holds only the
-pieces along one path."""
+"""The BSP builder, on the CPU: it splits cells, and clips their primitives, until no split is cheaper than a leaf.
+The host launches it once for the top of the tree, then on all cores for each deferred cell. A launch works depth first, so that it stores
+only the pieces (clipped primitives) along one path."""
 
 import warp as wp
 
@@ -20,12 +20,12 @@ from wrt.kernels.build.bsp_split import (
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse.bsp import INNER, STACK_SIZE, BspNode
 
-MAX_CORNERS = wp.constant(16)  # a piece that would get more corners keeps those it has, and sticks out of its cell
+MAX_CORNERS = wp.constant(16)  # a piece that would get more corners is not clipped further, and sticks out of its cell
 CELL_SLOTS = STACK_SIZE + 1
 CURRENT = wp.constant(STACK_SIZE)  # slot of the cell that is being split
-DEFERRED = wp.constant(-2)  # count of a child built by a later launch; `first` is its index among the deferred cells
+DEFERRED = wp.constant(-2)  # `count` of a child that a later launch builds; `first` is its index in BspOutput.deferred
 
-# Indices of a launch's results. FULL: an array was too short, and the output is unusable.
+# Indices in BspOutput.results. FULL: 1 if an array was too short, and the output is unusable.
 N_NODES = wp.constant(0)
 N_ORDER = wp.constant(1)
 N_DEFERRED = wp.constant(2)
@@ -39,15 +39,15 @@ N_RESULTS = 8
 
 @wp.struct
 class BspTask:
-    """A cell to build, of the pieces begin .. end - 1."""
+    """A cell to build. It contains the pieces begin .. end - 1."""
 
     begin: int
     end: int
-    points_end: int  # End of its pieces' points.
-    parent: int  # Node whose child `side` it is; < 0: it is the root.
-    side: int
+    points_end: int  # Index behind the last point of the pieces.
+    parent: int  # Index of the parent node; < 0: the cell is the root.
+    side: int  # Side of the parent's plane: 0 below, 1 above.
     depth: int
-    budget: int  # Most references of its leaves.
+    budget: int  # Largest number of references in all leaves of the cell.
 
 
 @wp.struct
@@ -55,16 +55,16 @@ class BspOutput:
     """Results of a launch."""
 
     nodes: wp.array(dtype=BspNode)
-    order: wp.array(dtype=wp.int32)  # prim_id of the leaves' primitives.
-    deferred: wp.array(dtype=BspTask)  # Cells for later launches.
-    deferred_cells: Cells
-    results: wp.array(dtype=wp.int32)  # N_RESULTS numbers.
-    cost: wp.array(dtype=wp.float64)  # cost[0]: expected nodes and primitives of a line that meets a root box of surface 1.
+    order: wp.array(dtype=wp.int32)  # prim_id of the primitives, leaf after leaf.
+    deferred: wp.array(dtype=BspTask)  # Tasks for later launches.
+    deferred_cells: Cells  # Cells of the deferred tasks.
+    results: wp.array(dtype=wp.int32)  # N_RESULTS counts and flags.
+    cost: wp.array(dtype=wp.float64)  # cost[0]: expected number of nodes and primitives that a line through the root box visits.
 
 
 @wp.func
 def copy_piece(source: Pieces, i: int, target: Pieces, to: int):
-    """Copy all of a piece but its points, which it shares."""
+    """Copy all fields of piece i to piece `to`. The copy shares the points of piece i."""
     target.prim_id[to] = source.prim_id[i]
     target.first[to] = source.first[i]
     target.count[to] = source.count[i]
@@ -76,7 +76,8 @@ def copy_piece(source: Pieces, i: int, target: Pieces, to: int):
 
 @wp.func
 def clip_piece(pieces: Pieces, i: int, to: int, size: int, split: BspSplit, side: int) -> int:
-    """Clip piece i to one side (0 below, 1 above) as piece `to`, with its points at `size` and on; return the new size."""
+    """Clip piece i to one side of a plane (0 below, 1 above), and store it as piece `to`, with its points from index `size` on.
+    Return the new number of points."""
     copy_piece(pieces, i, pieces, to)
     count = pieces.count[i]
     first = pieces.first[i]
@@ -104,7 +105,7 @@ def clip_piece(pieces: Pieces, i: int, to: int, size: int, split: BspSplit, side
             hi = wp.max(hi, c)
             n = n + 1
     if n == 0:
-        return size  # spheres are not clipped
+        return size  # the piece is a sphere; spheres are not clipped
     center = wp.float64(0.5) * (lo + hi)
     radius = zero
     for k in range(n):
@@ -137,7 +138,7 @@ def scope_of(tools: BspTools, task: BspTask, slot: int) -> Scope:
 
 @wp.func
 def choose(tools: BspTools, scope: Scope, depth: int) -> BspSplit:
-    """Choose the cheapest split; axis < 0: none is cheaper than a leaf."""
+    """Return the cheapest split; axis < 0: no split is cheaper than a leaf."""
     best = BspSplit()
     best.axis = -1
     best.cost = tools.options.cost_intersection * wp.float64(scope.end - scope.begin)
@@ -149,7 +150,7 @@ def choose(tools: BspTools, scope: Scope, depth: int) -> BspSplit:
 
 @wp.func
 def link(output: BspOutput, task: BspTask, first: int, count: int):
-    """Link a child's result to its parent."""
+    """Store `first` and `count` of a finished cell in its parent node, or as the root's."""
     if task.parent < 0:
         output.results[ROOT_FIRST] = first
         output.results[ROOT_COUNT] = count
@@ -176,7 +177,7 @@ def write_leaf(tools: BspTools, output: BspOutput, task: BspTask):
 
 @wp.func
 def write_node(output: BspOutput, task: BspTask, split: BspSplit, tolerance: float) -> int:
-    """Write an inner node, whose children are empty until they link themselves; return its index."""
+    """Write an inner node, and return its index. Both children are empty leaves until `link` sets them."""
     index = output.results[N_NODES]
     node = BspNode()
     node.normal = wp.vec3(split.normal)
@@ -191,7 +192,7 @@ def write_node(output: BspOutput, task: BspTask, split: BspSplit, tolerance: flo
 
 @wp.func
 def count_below(tools: BspTools, task: BspTask, split: BspSplit) -> int:
-    """Count the pieces listed below the plane."""
+    """Return the number of pieces that are listed below the plane."""
     n = int(0)
     for i in range(task.begin, task.end):
         sides = sides_of(extent_on(tools.pieces, i, split), split)
@@ -202,8 +203,8 @@ def count_below(tools: BspTools, task: BspTask, split: BspSplit) -> int:
 
 @wp.func
 def divide(tools: BspTools, task: BspTask, split: BspSplit, base: int, middle: int, size: int) -> wp.vec2i:
-    """Write the pieces below the plane from `base`, those above it from `middle`, clipped, with new points from `size`. Returns where
-    pieces and points end, or (-1, -1) if there is no space for the points."""
+    """Clip the task's pieces to both sides of the plane. Store lower pieces from index `base` on, upper pieces from `middle` on, and new
+    points from `size` on. Return the ends (pieces, points), or (-1, -1) if the array of points is too short."""
     pieces = tools.pieces
     low = int(base)
     high = int(middle)
@@ -227,7 +228,7 @@ def divide(tools: BspTools, task: BspTask, split: BspSplit, base: int, middle: i
 
 @wp.func
 def start_pieces(source: Pieces, begin: int, end: int, target: Pieces) -> int:
-    """Copy pieces with their points to the front of `target`; return the number of points, or -1 without space for them."""
+    """Copy pieces with their points to the front of `target`; return the number of points, or -1 if `target` is too short."""
     size = int(0)
     for i in range(begin, end):
         count = source.count[i]
@@ -243,7 +244,7 @@ def start_pieces(source: Pieces, begin: int, end: int, target: Pieces) -> int:
 
 @wp.func
 def start_root(task: BspTask, n_points: int) -> BspTask:
-    """Make the launch's own task, over the pieces of start_pieces."""
+    """Make a launch's first task, for the pieces that start_pieces has copied."""
     task.end = task.end - task.begin
     task.begin = 0
     task.points_end = n_points
@@ -253,7 +254,7 @@ def start_root(task: BspTask, n_points: int) -> BspTask:
 
 @wp.func
 def defer(tools: BspTools, output: BspOutput, task: BspTask, slot: int):
-    """Leave this cell to a later launch."""
+    """Append a cell to the deferred cells, for a later launch."""
     left = output.results[N_DEFERRED]
     output.deferred[left] = task
     copy_cell(tools.cells, slot, output.deferred_cells, left)
@@ -263,7 +264,7 @@ def defer(tools: BspTools, output: BspOutput, task: BspTask, slot: int):
 
 @wp.func
 def child_of(task: BspTask, index: int, side: int, pieces: wp.vec3i, points_end: int) -> BspTask:
-    """Make the task of a side of node `index`; pieces: where those below the plane begin, those above it begin, and all end."""
+    """Make the task of one side of node `index`. The side has the pieces from index pieces[side] to pieces[side + 1] - 1."""
     child = BspTask()
     child.begin = pieces[side]
     child.end = pieces[side + 1]
@@ -277,7 +278,7 @@ def child_of(task: BspTask, index: int, side: int, pieces: wp.vec3i, points_end:
 
 @wp.func
 def clip_to_side(cells: Cells, split: BspSplit, side: int, to: int):
-    """Clip the cell at CURRENT to one side of the plane, as cell `to`."""
+    """Clip the cell in slot CURRENT to one side of the plane, and store it in slot `to`."""
     sign = wp.where(side == 0, wp.float64(-1.0), wp.float64(1.0))
     clip_cell(cells, CURRENT, to, sign * split.normal, sign * split.offset, split.pad)
 
@@ -285,7 +286,7 @@ def clip_to_side(cells: Cells, split: BspSplit, side: int, to: int):
 @kernel
 def build_cells(source: Pieces, tasks: wp.array(dtype=BspTask), cells: Cells, which: int, tools: BspTools,
                 stack: wp.array(dtype=BspTask), output: BspOutput):
-    """Build the subtree of tasks[which], whose cell is in slot `which`; at depth 0 the cell is the root box."""
+    """Build the subtree of tasks[which]. Slot `which` of `cells` has the task's cell; at depth 0, the cell is the root box."""
     keep = tools.options.keep
     size = start_pieces(source, tasks[which].begin, tasks[which].end, tools.pieces)
     if size < 0:
@@ -318,7 +319,7 @@ def build_cells(source: Pieces, tasks: wp.array(dtype=BspTask), cells: Cells, wh
             write_leaf(tools, output, task)
             continue
 
-        # Pieces of deferred cells must stay. Without such, pieces beyond this cell's own are done with.
+        # The pieces of deferred cells must stay. If no cells are deferred, the pieces behind this cell's own are free.
         base = wp.where(keep > 0, used, task.end)
         if keep == 0:
             size = task.points_end

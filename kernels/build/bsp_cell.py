@@ -1,6 +1,7 @@
-"""The cells of a BSP tree during its build: convex polyhedra in float64, their surfaces, and their cuts by planes.
-A cell is a list of faces: convex polygons, counterclockwise from outside. Cells only steer the surface area heuristic; the listing of
-primitives, and so the hits, never depend on them. Rounding in a sliver, or a cell with too many faces, costs quality and no hit."""
+"""The cells of a BSP tree during its build: convex polyhedra in float64, their surface areas, and their cuts by planes.
+A cell is a list of faces, convex polygons with corners counterclockwise from outside. Cells only serve the surface area heuristic: whether
+a leaf lists a primitive does not depend on them. So rounding in a sliver, or a cell with too many faces, worsens the tree but loses no
+hit."""
 
 import warp as wp
 
@@ -10,36 +11,38 @@ MAX_POINTS = wp.constant(288)  # a convex polyhedron with f faces has at most 6 
 
 @wp.struct
 class Cells:
-    """Cells in slots s. The points of face f begin at s * MAX_POINTS + first[s * (MAX_FACES + 1) + f], and end where face f + 1 begins."""
+    """Cells, each in a slot s. The points of face f begin at s * MAX_POINTS + first[s * (MAX_FACES + 1) + f], and end where face f + 1
+    begins."""
 
     n_faces: wp.array(dtype=wp.int32)
     first: wp.array(dtype=wp.int32)
     points: wp.array(dtype=wp.vec3d)
-    area: wp.array(dtype=wp.float64)  # Of face f: area[s * MAX_FACES + f].
+    area: wp.array(dtype=wp.float64)  # Face f has the area area[s * MAX_FACES + f].
 
 
 @wp.func
 def plane_side(n: wp.vec3d, d: wp.float64, p: wp.vec3d) -> wp.float64:
-    """Value n . p + d of the plane, above 0 on the side that the normal points to."""
+    """Return n . p + d, the plane's value at a point: positive on the side that the normal points to."""
     return n[0] * p[0] + n[1] * p[1] + n[2] * p[2] + d
 
 
 @wp.func
 def snapped_side(n: wp.vec3d, d: wp.float64, eps: wp.float64, p: wp.vec3d) -> wp.float64:
-    """Value of the plane, but 0 within eps: a face in the plane has all its corners there."""
+    """Return the plane's value at a point, or 0 for values within eps: so all corners of a face in the plane have the value 0."""
     s = plane_side(n, d, p)
     return wp.where(wp.abs(s) > eps, s, wp.float64(0.0))
 
 
 @wp.func
 def crossing(p: wp.vec3d, q: wp.vec3d, s_p: wp.float64, s_q: wp.float64) -> wp.vec3d:
-    """Intersection of the segment from p to q with the plane; s_p and s_q are of opposite sign."""
+    """Return the intersection of the segment from p to q with a plane, whose values s_p at p and s_q at q have opposite signs."""
     return p + (s_p / (s_p - s_q)) * (q - p)
 
 
 @wp.func
 def turn(x: wp.float64, y: wp.float64) -> wp.float64:
-    """Monotone function of the angle of (x, y), from -2 at -pi to 2 at pi; not for the origin. All machines agree on it, unlike atan2."""
+    """Return a monotone function of the angle of (x, y), from -2 at -pi to 2 at pi; (x, y) must not be 0.
+    Unlike atan2, it has the same bits on all machines."""
     a = wp.float64(1.0) - x / (wp.abs(x) + wp.abs(y))
     return wp.where(y < wp.float64(0.0), -a, a)
 
@@ -52,7 +55,7 @@ def box_cell(cells: Cells, slot: int, lo: wp.vec3d, hi: wp.vec3d):
         a = (axis + 1) % 3
         b = (axis + 2) % 3
         for k in range(4):
-            # The square (0,0), (1,0), (1,1), (0,1) is counterclockwise about +axis; the low face takes it backwards.
+            # The square (0,0), (1,0), (1,1), (0,1) is counterclockwise about +axis; the low face has the reverse order.
             i = wp.where(face % 2 == 1, k, 3 - k)
             p = wp.vec3d()
             p[axis] = wp.where(face % 2 == 1, hi[axis], lo[axis])
@@ -67,14 +70,14 @@ def box_cell(cells: Cells, slot: int, lo: wp.vec3d, hi: wp.vec3d):
 
 @wp.func
 def points_of(cells: Cells, slot: int, face: int) -> wp.vec2i:
-    """Range of a face's points."""
+    """Return the range (begin, end) of a face's points."""
     first = slot * (MAX_FACES + 1) + face
     return wp.vec2i(slot * MAX_POINTS + cells.first[first], slot * MAX_POINTS + cells.first[first + 1])
 
 
 @wp.func
 def measure_cell(cells: Cells, slot: int):
-    """Compute the areas of the faces."""
+    """Compute and store the areas of a cell's faces."""
     for face in range(cells.n_faces[slot]):
         points = points_of(cells, slot, face)
         origin = cells.points[points[0]]
@@ -86,7 +89,7 @@ def measure_cell(cells: Cells, slot: int):
 
 @wp.func
 def cell_area(cells: Cells, slot: int) -> wp.float64:
-    """Surface of a cell."""
+    """Return the surface area of a cell."""
     total = wp.float64(0.0)
     for face in range(cells.n_faces[slot]):
         total += cells.area[slot * MAX_FACES + face]
@@ -106,14 +109,14 @@ def copy_cell(source: Cells, slot: int, target: Cells, to: int):
 
 @wp.struct
 class CutFace:
-    """A face cut by a plane; distances are multiplied by the normal's length."""
+    """A face cut by a plane."""
 
-    above: wp.vec3d  # Twice the area vector of its part above the plane.
-    down: wp.vec3d  # Where an edge crosses the plane downwards, if `crossed`.
-    up: wp.vec3d  # Where an edge crosses it upwards, if `crossed`.
+    above: wp.vec3d  # Twice the area vector of the face's part above the plane.
+    down: wp.vec3d  # Point where an edge crosses the plane downwards, if `crossed`.
+    up: wp.vec3d  # Point where an edge crosses the plane upwards, if `crossed`.
     crossed: bool
-    highest: wp.float64  # Largest distance of a corner, at least 0.
-    lowest: wp.float64  # Smallest distance of a corner, at most 0.
+    highest: wp.float64  # Largest value of the plane at a corner, at least 0.
+    lowest: wp.float64  # Smallest value of the plane at a corner, at most 0.
 
 
 @wp.func
@@ -149,15 +152,16 @@ def cut_face(cells: Cells, points: wp.vec2i, n: wp.vec3d, d: wp.float64, eps: wp
 
 @wp.func
 def split_areas(cells: Cells, slot: int, n: wp.vec3d, d: wp.float64, eps: wp.float64) -> wp.vec2d:
-    """Surfaces of the parts of a cell below and above a plane, each with the cut itself.
-    The cut is a convex polygon with an edge for each face that the plane meets. Its area is the sum of the triangles of these edges with
-    one of its points, in any order. If the plane is in a face, or the cell has no volume, one part has no volume: both sides of the cut."""
+    """Return the surface areas (below, above) of a cell's parts on both sides of a plane; each includes the cut.
+    The cut is a convex polygon with an edge for each face that the plane crosses. Its area is the sum of the triangles of these edges with
+    a point of the polygon, in any order. If the plane contains a face, or the cell has no volume, one part has no volume, and counts the
+    cut twice."""
     zero = wp.float64(0.0)
     half = wp.float64(0.5)
     below = wp.float64(0.0)
     above = wp.float64(0.0)
     closing = wp.float64(0.0)
-    within = wp.float64(0.0)  # faces in the plane
+    within = wp.float64(0.0)  # area of the faces in the plane
     cut = wp.vec3d()
     on_cut = wp.vec3d()
     met = bool(False)
@@ -186,7 +190,7 @@ def split_areas(cells: Cells, slot: int, n: wp.vec3d, d: wp.float64, eps: wp.flo
 
 @wp.func
 def order_by_angle(rim: wp.array(dtype=wp.vec3d), count: int, center: wp.vec3d, n: wp.vec3d):
-    """Sort the corners of the cut by their angle, counterclockwise about -n."""
+    """Sort the corners `rim` of a cut by their angle around `center`, counterclockwise about -n."""
     x_axis = wp.normalize(rim[0] - center)
     y_axis = wp.cross(x_axis, n)
     angle = wp.zeros(shape=48, dtype=wp.float64)
@@ -204,7 +208,7 @@ def order_by_angle(rim: wp.array(dtype=wp.vec3d), count: int, center: wp.vec3d, 
 
 @wp.func
 def clip_cell(cells: Cells, slot: int, to: int, n: wp.vec3d, d: wp.float64, eps: wp.float64):
-    """Copy the part of a cell with n . p + d >= 0 to another slot; the whole cell if the part does not fit."""
+    """Copy the part of a cell with n . p + d >= 0 to slot `to`. If it has too many faces or points for a slot, copy the whole cell."""
     zero = wp.float64(0.0)
     rim = wp.zeros(shape=48, dtype=wp.vec3d)
     n_rim = int(0)
@@ -227,11 +231,11 @@ def clip_cell(cells: Cells, slot: int, to: int, n: wp.vec3d, d: wp.float64, eps:
             s_q = snapped_side(n, d, eps, q)
             if (s_p >= zero) != (s_q >= zero):
                 c = crossing(p, q, s_p, s_q)
-                if s_p != zero and s_q != zero:  # else one of the two is the crossing
+                if s_p != zero and s_q != zero:  # else p or q is the crossing
                     cells.points[base + size] = c
                     size = size + 1
                 if s_p >= zero and leaves == 0 and n_rim < MAX_FACES:
-                    rim[n_rim] = c  # at each corner of the cut, one face leaves the kept side and another enters it
+                    rim[n_rim] = c  # store each corner of the cut once: two outlines of faces cross the plane there, in opposite directions
                     center += c
                     n_rim = n_rim + 1
                     leaves = 1

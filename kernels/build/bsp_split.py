@@ -1,11 +1,11 @@
 """The BSP builder's search for a split, on the CPU: planes through faces and edges, and planes across an axis.
 
-Ize, Wald and Parker 2008, "Ray Tracing with the BSP Tree". Of triangles in a cell it tries the plane of the face, and the planes through
-each edge at right angles to the face. It tries planes across an axis at the ends of pieces. The surface area heuristic over the parts of
-the convex cell decides. Triangles are clipped to their cells.
+Ize, Wald and Parker 2008, "Ray Tracing with the BSP Tree". One kind of candidates are the planes of triangles in the cell, and the planes
+through their edges at right angles to the triangles. The other kind are planes across an axis at the ends of pieces. The surface area
+heuristic chooses, with the surface areas of both parts of the convex cell. Triangles are clipped to their cells.
 
-All is float64 but the planes, which are rounded to float32 before the trial. So a plane does exactly what it does in the traversal unit
-(kernels.traverse.bsp), whose proof gives the tolerances.
+Computations are in float64, but planes are rounded to float32 before they are tried. So a plane is the same here as in the traversal
+(kernels.traverse.bsp). The proof there gives the tolerances.
 """
 
 import warp as wp
@@ -13,13 +13,13 @@ import warp as wp
 from wrt.kernels.build.bsp_cell import Cells, plane_side, split_areas
 from wrt.kernels.traverse.bsp import PLANE, SMALLEST
 
-EXACT = wp.constant(24)  # With at most EXACT primitives, a plane is tried at both ends of each;
-STEPS = wp.constant(32)  # with more, at STEPS even steps.
+EXACT = wp.constant(24)  # In a cell of at most EXACT pieces, planes across an axis are tried at both ends of each piece.
+STEPS = wp.constant(32)  # In a larger cell, such planes are tried at STEPS equal steps.
 U = wp.constant(wp.float64(2.0**-24))
-OUTWARDS = wp.constant(wp.float64(1.0 + 2.0**-20))  # covers rounding down, in float64 or to float32
-FLAT = wp.constant(wp.float64(2.0**-16))  # a piece lies in a plane if it is within this part of its cell's size
+OUTWARDS = wp.constant(wp.float64(1.0 + 2.0**-20))  # Factor that outweighs rounding down, in float64 or to float32.
+FLAT = wp.constant(wp.float64(2.0**-16))  # A piece lies in a plane if its distance is at most this fraction of its cell's size.
 NO_SIZE = wp.constant(wp.float64(1e-200))
-NO_AREA = wp.constant(wp.float64(1e-30))  # of a triangle, relative to the square of its extent
+NO_AREA = wp.constant(wp.float64(1e-30))  # A triangle with a smaller area, relative to its squared extent, gives no planes.
 
 
 @wp.struct
@@ -27,12 +27,12 @@ class Pieces:
     """Primitives clipped to cells: convex polygons, or whole spheres."""
 
     prim_id: wp.array(dtype=wp.int32)
-    first: wp.array(dtype=wp.int32)  # Its polygon is points[first[i]] .. points[first[i] + count[i] - 1].
-    count: wp.array(dtype=wp.int32)  # 0: a sphere.
+    first: wp.array(dtype=wp.int32)  # The polygon of piece i is points[first[i]] .. points[first[i] + count[i] - 1].
+    count: wp.array(dtype=wp.int32)  # Number of corners; 0 for a sphere.
     lo: wp.array(dtype=wp.vec3d)
     hi: wp.array(dtype=wp.vec3d)
-    ball: wp.array(dtype=wp.vec4d)  # A ball around it (center, radius).
-    extent: wp.array(dtype=wp.float64)  # Of the whole primitive, along an axis.
+    ball: wp.array(dtype=wp.vec4d)  # A sphere around the piece: (center, radius).
+    extent: wp.array(dtype=wp.float64)  # Largest extent of the whole primitive along an axis.
     points: wp.array(dtype=wp.vec3d)
 
 
@@ -43,60 +43,60 @@ class BspOptions:
     cost_intersection: wp.float64
     cost_axis: wp.float64
     cost_plane: wp.float64
-    samples: int  # Triangles of a cell whose planes are tried.
+    samples: int  # Number of triangles per cell whose planes are tried.
     max_depth: int
-    keep: int  # If not 0, cells of at most so many pieces are deferred to later launches.
-    lo: wp.vec3d  # The root box: lo, hi.
+    keep: int  # If not 0, cells with at most so many pieces are deferred to later launches.
+    lo: wp.vec3d  # lo, hi: the root box.
     hi: wp.vec3d
 
 
 @wp.struct
 class BspTools:
-    """Arguments of a trial split."""
+    """Arrays and options for the trial of splits."""
 
     pieces: Pieces
     cells: Cells
-    corners: wp.array(dtype=wp.vec3d)  # Three for each triangle.
+    corners: wp.array(dtype=wp.vec3d)  # Triangle i has the corners 3 i, 3 i + 1, 3 i + 2.
     options: BspOptions
 
 
 @wp.struct
 class BspSplit:
-    """A plane and its cost."""
+    """A plane normal . p + offset = 0, and its SAH cost."""
 
     normal: wp.vec3d
     offset: wp.float64
-    axis: int
-    pad: wp.float64  # A piece within this distance beyond the plane is not listed there.
-    low_flat: bool  # True if pieces in the plane go below.
+    axis: int  # As BspNode.axis.
+    pad: wp.float64  # A piece that extends beyond the plane by at most `pad` is not listed on that side.
+    low_flat: bool  # True if pieces in the plane are listed below the plane, else above.
     cost: wp.float64
 
 
 @wp.struct
 class Scope:
-    """A cell to split, of the pieces begin .. end - 1."""
+    """A cell to split. It contains the pieces begin .. end - 1."""
 
     begin: int
     end: int
-    lo: wp.vec3d  # Box of the pieces: lo, hi.
+    lo: wp.vec3d  # lo, hi: box of the pieces.
     hi: wp.vec3d
-    far: wp.vec3d  # Largest absolute coordinates.
+    far: wp.vec3d  # Largest absolute coordinate on each axis.
     extent: wp.float64  # Largest extent of a primitive.
-    slot: int  # Of the cell.
-    area: wp.float64  # Surface of the cell.
-    budget: int  # Most references of its subtree.
+    slot: int  # Slot of the cell in `Cells`.
+    area: wp.float64  # Surface area of the cell.
+    budget: int  # Largest number of references in the cell's subtree.
 
 
 @wp.func
 def plane_noise(split: BspSplit, far: wp.vec3d) -> wp.float64:
-    """Sum |n_i| far_i + |d|, to which rounding errors of the plane and its values are relative."""
+    """Return sum |n_i| far_i + |d|. Rounding errors of the plane and of its values are proportional to it."""
     return wp.dot(wp.abs(split.normal), far) + wp.abs(split.offset)
 
 
 @wp.func
 def plane_tolerance(split: BspSplit, scope: Scope) -> float:
-    """Half of the plane's thickness in the traversal unit.
-    It sums the builder's own pad, 8 u sqrt(3) of the longest extent, and 4 u of the noise, a little more for its own rounding."""
+    """Return BspNode.tolerance: the builder's own pad, plus 8 u sqrt(3) times the largest extent, plus 4 u times plane_noise.
+    The sum is rounded up."""
     noise = plane_noise(split, scope.far)
     total = split.pad + wp.float64(14.0) * U * scope.extent + wp.float64(4.0) * U * noise
     return float(total * OUTWARDS) + SMALLEST
@@ -104,7 +104,7 @@ def plane_tolerance(split: BspSplit, scope: Scope) -> float:
 
 @wp.func
 def extent_on(pieces: Pieces, i: int, split: BspSplit) -> wp.vec2d:
-    """Lowest and highest value of the plane on a piece, or on its ball if that is enough to tell the side."""
+    """Return the lowest and highest value of the plane on a piece, or on the piece's sphere `ball` if that suffices to find its side."""
     if split.axis < wp.static(PLANE):
         return wp.vec2d(pieces.lo[i][split.axis] + split.offset, pieces.hi[i][split.axis] + split.offset)
     ball = pieces.ball[i]
@@ -128,16 +128,16 @@ def extent_on(pieces: Pieces, i: int, split: BspSplit) -> wp.vec2d:
 
 @wp.func
 def sides_of(extent: wp.vec2d, split: BspSplit) -> int:
-    """Sides on which a piece is listed: 1 below, 2 above, 3 both, 0 in the plane."""
+    """Return the sides of the plane on which a piece is listed: 1 below, 2 above, 3 both; 0 for a piece in the plane."""
     return wp.where(extent[0] < -split.pad, 1, 0) + wp.where(extent[1] > split.pad, 2, 0)
 
 
 @wp.func
 def cheaper(tools: BspTools, scope: Scope, trial: BspSplit, best: BspSplit) -> BspSplit:
-    """Return the cheaper of two splits; counting stops once the trial has lost."""
+    """Compute the cost of a trial split, and return the cheaper of `trial` and `best`. Stop early if the trial costs more."""
     if not wp.isfinite(trial.offset):
         return best
-    # The traversal unit visits slivers thinner than its tolerance together: a plane that makes some gains nothing.
+    # A ray within a plane's tolerance visits both sides, so cutting off a sliver thinner than the tolerance saves nothing.
     size = scope.hi - scope.lo
     trial.pad = wp.max(FLAT * wp.max(size), wp.float64(2.0) * U * plane_noise(trial, scope.far))
     areas = split_areas(tools.cells, scope.slot, trial.normal, trial.offset, trial.pad)
@@ -187,7 +187,7 @@ def across_axis(axis: int, position: wp.float64) -> BspSplit:
 
 @wp.func
 def best_across(tools: BspTools, scope: Scope, best: BspSplit) -> BspSplit:
-    """Return the cheapest of `best` and the planes across an axis, at the ends of every piece or at even steps."""
+    """Return the cheapest of `best` and the planes across an axis, at the ends of each piece or at equal steps (EXACT, STEPS)."""
     for axis in range(3):
         if scope.end - scope.begin <= EXACT:
             for i in range(scope.begin, scope.end):
@@ -205,7 +205,7 @@ def best_across(tools: BspTools, scope: Scope, best: BspSplit) -> BspSplit:
 
 @wp.func
 def plane_through(n: wp.vec3d, p: wp.vec3d) -> BspSplit:
-    """Make the plane at right angles to n (not 0) through p, rounded to float32."""
+    """Make the plane through p with the normal n, which must not be 0; round it to float32."""
     split = BspSplit()
     unit = wp.normalize(n)
     split.normal = wp.vec3d(wp.vec3(unit))
@@ -216,7 +216,7 @@ def plane_through(n: wp.vec3d, p: wp.vec3d) -> BspSplit:
 
 @wp.func
 def best_plane(tools: BspTools, scope: Scope, best: BspSplit) -> BspSplit:
-    """Return the cheapest of `best` and the planes of triangles evenly spread over the cell's list: face and three edges."""
+    """Return the cheapest of `best` and the planes (face, three edges) of `samples` triangles, evenly spread over the cell's list."""
     n = scope.end - scope.begin
     tried = wp.min(n, tools.options.samples)
     for k in range(tried):
@@ -224,7 +224,7 @@ def best_plane(tools: BspTools, scope: Scope, best: BspSplit) -> BspSplit:
         if tools.pieces.count[i] == 0:
             continue
         corner = 3 * tools.pieces.prim_id[i]
-        # scaled to 1: no product over- or underflows
+        # Scale the triangle to extent 1, so that no product over- or underflows.
         scale = wp.float64(1.0) / wp.max(tools.pieces.extent[i], NO_SIZE)
         edge_0 = (tools.corners[corner + 1] - tools.corners[corner]) * scale
         edge_1 = (tools.corners[corner + 2] - tools.corners[corner + 1]) * scale

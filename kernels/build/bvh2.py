@@ -1,6 +1,6 @@
 """The inner loop of top-down builders of binary BVHs, on the CPU: it splits ranges of primitives in place.
-In the end the records are in the order of the leaves. The host launches it for the root, then on all cores for the deferred ranges.
-Builders differ in how they split a range: SPLIT is the table of splits."""
+At the end, the records are in the order of the leaves. The host launches it for the root, then on all cores for the deferred ranges. The
+builders differ in the function that splits a range: SPLIT is the table of these functions."""
 
 from functools import cache
 from typing import Any
@@ -34,7 +34,7 @@ from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node
 
 @wp.func
 def choose_median(data: BuildData, task: BuildTask) -> int:
-    """Partition the records at the median centroid of the axis with the widest spread; return the first record of the right side.
+    """Partition the records at the median centroid along the axis on which centroids spread most; return the first index of the right side.
     Half the records go to each side: Hoare 1961, "Algorithm 65: Find", with the middle element as the pivot."""
     e = 0.5 * high_of(task.measures.centers) - 0.5 * low_of(task.measures.centers)
     axis = wp.where(e[1] > e[0], 1, 0)
@@ -68,8 +68,9 @@ def choose_median(data: BuildData, task: BuildTask) -> int:
 
 @wp.func
 def choose_sweep(data: BuildData, task: BuildTask) -> int:
-    """Partition at the cheapest of all splits in centroid order along an axis; return the first record of the right side.
-    MacDonald and Booth 1990, "Heuristics for ray tracing using space subdivision". A stable partition keeps the three orders."""
+    """Partition at the cheapest split, of all splits in the order of centroids along an axis; return the first index of the right side.
+    MacDonald and Booth 1990, "Heuristics for ray tracing using space subdivision". A stable partition keeps both sides sorted along all
+    three axes."""
     n = data.boxes.shape[0]
     scale = area_scale(task.measures.box)
     best_axis = int(0)
@@ -114,7 +115,7 @@ def choose_sweep(data: BuildData, task: BuildTask) -> int:
 
 
 def split_at(choose: Any) -> Any:
-    """Make the split of a range from a partition."""
+    """Make split(data, task) -> Halves from choose(data, task), which partitions a range and returns the right side's first index."""
 
     @wp.func
     def split(data: BuildData, task: BuildTask) -> Halves:
@@ -132,7 +133,7 @@ SPLIT = {
 
 @wp.func
 def child_of(task: BuildTask, halves: Halves, side: int) -> BuildTask:
-    """Task of one side of a split range."""
+    """Return the task of one side of a split range."""
     child = BuildTask()
     child.begin = wp.where(side == 0, task.begin, halves.middle)
     child.end = child.begin + wp.where(side == 0, halves.count_0, halves.count_1)
@@ -150,7 +151,7 @@ def child_of(task: BuildTask, halves: Halves, side: int) -> BuildTask:
 
 @wp.func
 def split_pays(options: BuildOptions, task: BuildTask, halves: Halves) -> bool:
-    """Test whether two leaves cost less than one."""
+    """Test whether a node with two leaves has a lower SAH cost than one leaf."""
     scale = area_scale(task.measures.box)
     area = row_area(task.measures.box, scale)
     parts = (row_area(halves.left.box, scale) * row_count(options, halves.count_0)
@@ -161,7 +162,7 @@ def split_pays(options: BuildOptions, task: BuildTask, halves: Halves) -> bool:
 
 @wp.func
 def write_node(data: BuildData, task: BuildTask, halves: Halves):
-    """Write the inner node of a split range; both sides count as leaves until they link themselves."""
+    """Write the inner node of a split range. Both children are leaves until link_to_parent makes them inner nodes."""
     data.used[task.slot] = wp.uint8(1)
     node = Bvh2Node()
     node.lo_0 = low_of(halves.left.box)
@@ -177,23 +178,23 @@ def write_node(data: BuildData, task: BuildTask, halves: Halves):
 
 @wp.func
 def mark_leaf(left: wp.array(dtype=wp.uint8), begin: int, end: int):
-    """Mark these records as a leaf's: the host drops the others."""
+    """Mark the records begin .. end - 1 as records of a leaf; the host removes unmarked records."""
     for i in range(begin, end):
         left[i] = wp.uint8(1)
 
 
 @cache
 def make_build_ranges(split: Any, place: Any = None) -> Any:
-    """Make a builder's kernel from split(data, task) -> Halves. With spatial splits, place(data, task, halves) -> Halves moves the records
-    to their sides once the range is known not to be a leaf; other splits have done so."""
+    """Make a builder's kernel from split(data, task) -> Halves, which moves the records to their sides. With spatial splits, it does not:
+    place(data, task, halves) -> Halves moves them, once the range is known not to become a leaf."""
 
     @kernel
     def build_ranges(data: BuildData, tasks: wp.array(dtype=BuildTask), options: BuildOptions, stop_size: int,
                      deferred: wp.array(dtype=BuildTask), n_deferred: wp.array(dtype=wp.int32),
                      max_depth: wp.array(dtype=wp.int32)):
-        """Build the subtree of each task, and append ranges of at most stop_size records to deferred.
-        Every task has at least two records. A range with space for n records owns the node slots slot .. slot + n - 2; the host removes
-        unused ones. A whole subtree (stop_size 0) uses the first of them."""
+        """Build the subtree of each task, except for ranges of at most stop_size records, which are appended to `deferred`.
+        A task has at least two records. A range with space for n records owns the node slots slot .. slot + n - 2; the host removes unused
+        slots. If no ranges are deferred (stop_size 0), a subtree uses its first slots without gaps."""
         stack = wp.zeros(shape=wp.static(STACK_SIZE + 2), dtype=BuildTask)
         stack[0] = tasks[wp.tid()]
         size = int(1)

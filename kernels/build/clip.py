@@ -1,7 +1,7 @@
-"""Clipping a triangle to an axis-aligned cell: the box of the clipped polygon, for builders on the CPU.
-Sutherland and Hodgman 1974, "Reentrant Polygon Clipping", in float64. Conservative: the triangle unit accepts hits beside the triangle
-within some u of its extent. So the cell grows by twice that, and the box of the result by as much again. A leaf without the triangle then
-never holds such a hit."""
+"""Clip triangles to axis-aligned cells and return the boxes of the clipped polygons, for builders on the CPU.
+Sutherland and Hodgman 1974, "Reentrant Polygon Clipping", in float64. The triangle unit accepts hits slightly beside a triangle: within a
+few u of its extent. So the cell grows by twice this distance, and the resulting box grows by the same amount again. Then no hit on the
+triangle lies in a leaf that does not list the triangle."""
 
 import warp as wp
 
@@ -10,23 +10,23 @@ from wrt.kernels.units.box import PAD_COORDINATE, PAD_EXTENT
 
 CLIP_EXTENT = wp.constant(wp.float64(2.0 * PAD_EXTENT))
 CLIP_COORDINATE = wp.constant(wp.float64(PAD_COORDINATE))
-MAX_CORNERS = 12  # a triangle's, and one more for each of six planes; rounding may add some
+MAX_CORNERS = 12  # 3 of a triangle, 1 more for each of six planes, and 3 in case that rounding adds some
 
 
 @wp.struct
 class Clippable:
-    """The primitives by prim_id."""
+    """The primitives of a scene: faces, lo, hi and exact are indexed by prim_id."""
 
     vertices: wp.array(dtype=wp.vec3)
-    faces: wp.array(dtype=wp.vec3i)  # Of the triangles.
-    lo: wp.array(dtype=wp.vec3)  # Padded boxes: lo, hi.
+    faces: wp.array(dtype=wp.vec3i)
+    lo: wp.array(dtype=wp.vec3)  # lo, hi: the primitives' padded boxes.
     hi: wp.array(dtype=wp.vec3)
-    exact: wp.array(dtype=wp.uint8)  # 1: clip the triangle; 0: clip its box (spheres, and sizes at the ends of float32).
+    exact: wp.array(dtype=wp.uint8)  # 1: clip the triangle; 0: clip its box (for spheres, and for triangles near float32's limits).
 
 
 @wp.struct
 class Box:
-    """A box; empty: lo = inf, hi = -inf."""
+    """A box; an empty box has lo = inf, hi = -inf."""
 
     lo: wp.vec3
     hi: wp.vec3
@@ -42,7 +42,7 @@ def empty_box() -> Box:
 
 @wp.func
 def within_cell(lo: wp.vec3, hi: wp.vec3, cell_lo: wp.vec3, cell_hi: wp.vec3) -> Box:
-    """Intersect a box with a cell; the result is empty if it has no inside."""
+    """Return the intersection of a box with a cell, or an empty box if the intersection has no volume."""
     box = Box()
     box.lo = wp.max(lo, cell_lo)
     box.hi = wp.min(hi, cell_hi)
@@ -54,8 +54,8 @@ def within_cell(lo: wp.vec3, hi: wp.vec3, cell_lo: wp.vec3, cell_hi: wp.vec3) ->
 @wp.func
 def cut_by_plane(polygon: wp.array(dtype=wp.vec3d), n: int, clipped: wp.array(dtype=wp.vec3d), axis: int, sign: wp.float64,
                  wall: wp.float64) -> int:
-    """Clip a polygon of n corners to one side of a plane across an axis (sign 1: above), in place; return its number of corners. At most
-    MAX_CORNERS remain; clipped: scratch."""
+    """Clip a polygon of n corners, in place, to the side of the plane p[axis] = wall that `sign` selects (1 above, -1 below).
+    Return the new number of corners, at most MAX_CORNERS; further corners are dropped. The array `clipped` is scratch."""
     m = int(0)
     last = polygon[n - 1]
     last_inside = sign * (last[axis] - wall)
@@ -79,8 +79,8 @@ def cut_by_plane(polygon: wp.array(dtype=wp.vec3d), n: int, clipped: wp.array(dt
 
 @wp.func
 def clip_triangle(polygon: wp.array(dtype=wp.vec3d), clipped: wp.array(dtype=wp.vec3d), lo: wp.vec3d, hi: wp.vec3d) -> int:
-    """Clip the triangle at the front of `polygon` to the box lo, hi, in place; return the number of corners. MAX_CORNERS means unfinished,
-    as there may be more; clipped: scratch."""
+    """Clip the triangle at the front of `polygon` to the box lo .. hi, in place; return the number of corners.
+    If it is MAX_CORNERS, corners may be missing, and the polygon is not usable. The array `clipped` is scratch."""
     low = wp.min(wp.min(polygon[0], polygon[1]), polygon[2])
     high = wp.max(wp.max(polygon[0], polygon[1]), polygon[2])
     n = int(3)
@@ -98,7 +98,7 @@ def clip_triangle(polygon: wp.array(dtype=wp.vec3d), clipped: wp.array(dtype=wp.
 
 @wp.func
 def clip_to_cell(shapes: Clippable, prim_id: int, cell_lo: wp.vec3, cell_hi: wp.vec3) -> Box:
-    """Box of the part of a primitive in the cell, grown by its margin, within the cell; or an empty box."""
+    """Return the box of a primitive's part in a cell, grown by the margin and cut off at the cell; empty if there is no such part."""
     if shapes.exact[prim_id] == wp.uint8(0):
         return within_cell(shapes.lo[prim_id], shapes.hi[prim_id], cell_lo, cell_hi)
     polygon = wp.zeros(shape=wp.static(MAX_CORNERS), dtype=wp.vec3d)
@@ -128,15 +128,9 @@ def clip_to_cell(shapes: Clippable, prim_id: int, cell_lo: wp.vec3, cell_hi: wp.
 
 
 @kernel
-def clip_references(
-    shapes: Clippable,
-    prim_id: wp.array(dtype=wp.int32),
-    cell_lo: wp.vec3,
-    cell_hi: wp.vec3,
-    lo: wp.array(dtype=wp.vec3),
-    hi: wp.array(dtype=wp.vec3),
-):
-    """Store the box of the part of each primitive in the cell."""
+def clip_references(shapes: Clippable, prim_id: wp.array(dtype=wp.int32), cell_lo: wp.vec3, cell_hi: wp.vec3,
+                    lo: wp.array(dtype=wp.vec3), hi: wp.array(dtype=wp.vec3)):
+    """Store clip_to_cell's box lo[i], hi[i] of each primitive prim_id[i]."""
     i = wp.tid()
     box = clip_to_cell(shapes, prim_id[i], cell_lo, cell_hi)
     lo[i] = box.lo

@@ -1,7 +1,7 @@
-"""The end-point overlap (EPO) of a bounding volume hierarchy, by triangle, on the CPU.
+"""The end-point overlap (EPO) of a bounding volume hierarchy, for each triangle, on the CPU.
 Aila, Karras and Laine 2013, "On Quality Metrics of Bounding Volume Hierarchies". A ray that ends at a point of the surface visits every
-node whose box holds the point, in vain if the point's triangle is not below. Clipping each triangle to those boxes, in float64, gives the
-share of its area in them."""
+node whose box contains the point. The visit is in vain if the point's triangle is not in the node's subtree. The EPO of a triangle is its
+area in boxes of such nodes, computed by clipping in float64."""
 
 import warp as wp
 
@@ -12,36 +12,29 @@ from wrt.kernels.traverse.bvh2 import STACK_SIZE
 
 @wp.struct
 class Children:
-    """Children of all nodes, `width` a node, the root's first."""
+    """The children of all nodes: child k of node i has the index i * width + k; node 0 is the root."""
 
     width: int
     lo: wp.array(dtype=wp.vec3)
     hi: wp.array(dtype=wp.vec3)
-    first: wp.array(dtype=wp.int32)  # Of a leaf: its first primitive in `order`; else the inner node.
-    count: wp.array(dtype=wp.int32)  # > 0: a leaf's primitives; 0: an inner node; < 0: no child.
-    order: wp.array(dtype=wp.int32)  # prim_id of the leaves' primitives.
-
-
-@wp.struct
-class Corners:
-    v0: wp.vec3d
-    v1: wp.vec3d
-    v2: wp.vec3d
+    first: wp.array(dtype=wp.int32)  # Index in `order` of a leaf's first primitive, or index of an inner node.
+    count: wp.array(dtype=wp.int32)  # Number of a leaf's primitives; 0: an inner node; < 0: no child.
+    order: wp.array(dtype=wp.int32)  # prim_id of the primitives, leaf after leaf.
 
 
 @wp.func
-def area_inside(triangle: Corners, lo: wp.vec3d, hi: wp.vec3d) -> wp.float64:
-    """Area of the part of the triangle in the closed box; below 0 if they do not touch."""
-    low = wp.min(wp.min(triangle.v0, triangle.v1), triangle.v2)
-    high = wp.max(wp.max(triangle.v0, triangle.v1), triangle.v2)
+def area_inside(v0: wp.vec3d, v1: wp.vec3d, v2: wp.vec3d, lo: wp.vec3d, hi: wp.vec3d) -> wp.float64:
+    """Return the area of a triangle's part in the closed box lo .. hi; -1 if they do not touch."""
+    low = wp.min(wp.min(v0, v1), v2)
+    high = wp.max(wp.max(v0, v1), v2)
     for axis in range(3):
         if not (low[axis] <= hi[axis] and high[axis] >= lo[axis]):
             return wp.float64(-1.0)
     polygon = wp.zeros(shape=wp.static(MAX_CORNERS), dtype=wp.vec3d)
     clipped = wp.zeros(shape=wp.static(MAX_CORNERS), dtype=wp.vec3d)
-    polygon[0] = triangle.v0
-    polygon[1] = triangle.v1
-    polygon[2] = triangle.v2
+    polygon[0] = v0
+    polygon[1] = v1
+    polygon[2] = v2
     n = clip_triangle(polygon, clipped, lo, hi)
     if n == 0:
         return wp.float64(-1.0)
@@ -53,7 +46,7 @@ def area_inside(triangle: Corners, lo: wp.vec3d, hi: wp.vec3d) -> wp.float64:
 
 @wp.func
 def belongs(tree: Children, child: int, prim_id: int) -> int:
-    """Return 1 if the primitive is in this leaf, else 0."""
+    """Return 1 if the leaf `child` lists the primitive, else 0."""
     for i in range(tree.first[child], tree.first[child] + tree.count[child]):
         if tree.order[i] == prim_id:
             return 1
@@ -63,18 +56,16 @@ def belongs(tree: Children, child: int, prim_id: int) -> int:
 @kernel
 def end_point_overlap(tree: Children, vertices: wp.array(dtype=wp.vec3), faces: wp.array(dtype=wp.vec3i), first: int,
                       out: wp.array(dtype=wp.float64)):
-    """Store the area of triangle i in boxes that it does not belong to: of inner nodes above other triangles only, and of other leaves.
-    A leaf's area counts once a primitive. The walk goes depth first through all boxes that the triangle meets; a node's share is known
-    once its subtree is done."""
+    """Store the area of triangle i in the boxes of nodes whose subtrees do not contain the triangle. In a leaf, the area counts once for
+    each primitive. The walk visits all boxes that the triangle meets, depth first. At a subtree's end, it adds the box of its root."""
     i = first + wp.tid()
     face = faces[i]
-    triangle = Corners()
-    triangle.v0 = wp.vec3d(vertices[face[0]])
-    triangle.v1 = wp.vec3d(vertices[face[1]])
-    triangle.v2 = wp.vec3d(vertices[face[2]])
+    v0 = wp.vec3d(vertices[face[0]])
+    v1 = wp.vec3d(vertices[face[1]])
+    v2 = wp.vec3d(vertices[face[2]])
     lane = wp.zeros(shape=wp.static(STACK_SIZE + 1), dtype=wp.int32)
     end = wp.zeros(shape=wp.static(STACK_SIZE + 1), dtype=wp.int32)
-    below = wp.zeros(shape=wp.static(STACK_SIZE + 1), dtype=wp.int32)  # 1 if the triangle is below
+    below = wp.zeros(shape=wp.static(STACK_SIZE + 1), dtype=wp.int32)  # 1 if the subtree contains the triangle
     area = wp.zeros(shape=wp.static(STACK_SIZE + 1), dtype=wp.float64)
     end[0] = tree.width
     level = int(0)
@@ -93,7 +84,7 @@ def end_point_overlap(tree: Children, vertices: wp.array(dtype=wp.vec3), faces: 
         count = tree.count[child]
         if count < 0:
             continue
-        inside = area_inside(triangle, wp.vec3d(tree.lo[child]), wp.vec3d(tree.hi[child]))
+        inside = area_inside(v0, v1, v2, wp.vec3d(tree.lo[child]), wp.vec3d(tree.hi[child]))
         if inside < wp.float64(0.0):
             continue
         if count > 0:

@@ -1,6 +1,6 @@
-"""Boxes of a binary BVH from its leaves up, in one launch, on the CPU and on CUDA: for builds and refits.
-A thread begins at each node without inner children. The last thread that reaches a node goes on, and reads what the others wrote below.
-(Karras 2012, "Maximizing Parallelism in the Construction of BVHs, Octrees, and k-d Trees", section 4)."""
+"""Compute the boxes of a binary BVH from the leaves to the root, in one launch, on the CPU and on CUDA: for builds and refits.
+Karras 2012, "Maximizing Parallelism in the Construction of BVHs, Octrees, and k-d Trees", section 4. One thread begins at each node without
+inner children. At a node, the first thread to arrive ends. The last one continues, and reads the results that other threads wrote below."""
 
 import warp as wp
 
@@ -15,31 +15,31 @@ NO_PARENT = wp.constant(-1)
 
 @wp.struct
 class SubtreeSummary:
-    """Summary of a subtree, which a node hands to its parent."""
+    """Properties of a subtree, which its parent reads."""
 
-    cost: wp.float64  # Half surfaces of its boxes, times the SAH cost of a visit.
-    unit_cost: wp.float64  # The same with a cost of 1 for a node and for a primitive.
+    cost: wp.float64  # SAH cost: sum over nodes and leaves of half surface area times cost of a visit.
+    unit_cost: wp.float64  # SAH cost if a node and a primitive both cost 1.
     lo: wp.vec3
     hi: wp.vec3
-    size: int  # Primitives.
-    inner_nodes: int  # Inner nodes, itself included; 0: it becomes a leaf.
-    height: int  # Inner nodes on the longest path.
+    size: int  # Number of primitives.
+    inner_nodes: int  # Number of inner nodes, including the subtree's root; 0: the subtree becomes a leaf.
+    height: int  # Number of inner nodes on the longest path.
 
 
 @wp.struct
 class Tree:
-    """A binary tree whose boxes are fitted; the root is first, the other nodes in any order."""
+    """A binary tree whose boxes are to be fitted. Node 0 is the root; other nodes are in any order."""
 
     nodes: wp.array(dtype=Bvh2Node)  # A missing child has first = count = 0.
-    parents: wp.array(dtype=wp.int32)  # NO_PARENT for the root.
-    order: wp.array(dtype=wp.int32)  # prim_id of the leaves' primitives.
-    low: wp.array(dtype=wp.vec3)  # By prim_id, as high.
+    parents: wp.array(dtype=wp.int32)  # Index of each node's parent; NO_PARENT for the root.
+    order: wp.array(dtype=wp.int32)  # prim_id of the primitives, leaf after leaf.
+    low: wp.array(dtype=wp.vec3)  # low, high: boxes of the primitives, indexed by prim_id.
     high: wp.array(dtype=wp.vec3)
-    arrived: wp.array(dtype=wp.int32)  # Scratch: 0 for each node, before and after.
-    summaries: wp.array(dtype=SubtreeSummary)  # Scratch, one entry a node.
+    arrived: wp.array(dtype=wp.int32)  # Scratch: number of threads that reached each node; 0 before and after the launch.
+    summaries: wp.array(dtype=SubtreeSummary)  # Scratch, one entry per node.
 
 
-# A thread's writes are visible to others before they hear of them.
+# Memory fence: a thread's writes before the fence are visible to other threads before its writes after the fence.
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
     __threadfence();
@@ -48,40 +48,14 @@ class Tree:
 def fence() -> None: ...
 
 
-Numbers = wp.types.vector(11, wp.float64)
-
-
-# It bypasses the L1 cache, which another multiprocessor's writes do not reach. (A native function cannot return a record.)
+# Volatile loads bypass the L1 cache, which does not see writes of other multiprocessors. (A native function cannot return a struct.)
 @wp.func_native("""
-    const volatile auto* from = summaries.data + i;
-    wp::vec_t<11, wp::float64> out;
-    out.c[0] = from->cost;
-    out.c[1] = from->unit_cost;
-    for (int k = 0; k < 3; ++k) {
-        out.c[2 + k] = from->lo.c[k];
-        out.c[5 + k] = from->hi.c[k];
-    }
-    out.c[8] = from->size;
-    out.c[9] = from->inner_nodes;
-    out.c[10] = from->height;
-    return out;
+    const volatile int* const from = (const volatile int*)(summaries.data + i);
+    int words[sizeof(out) / sizeof(int)];
+    for (unsigned k = 0; k < sizeof(out) / sizeof(int); ++k) words[k] = from[k];
+    memcpy(&out, words, sizeof(out));
 """)
-def read_numbers(summaries: wp.array(dtype=SubtreeSummary), i: int) -> Numbers: ...
-
-
-@wp.func
-def read_summary(summaries: wp.array(dtype=SubtreeSummary), i: int) -> SubtreeSummary:
-    """Read the summary that another thread wrote."""
-    x = read_numbers(summaries, i)
-    out = SubtreeSummary()
-    out.cost = x[0]
-    out.unit_cost = x[1]
-    out.lo = wp.vec3(float(x[2]), float(x[3]), float(x[4]))
-    out.hi = wp.vec3(float(x[5]), float(x[6]), float(x[7]))
-    out.size = int(x[8])
-    out.inner_nodes = int(x[9])
-    out.height = int(x[10])
-    return out
+def load_summary(summaries: wp.array(dtype=SubtreeSummary), i: int, out: wp.ref[SubtreeSummary]) -> None: ...
 
 
 @wp.func
@@ -91,16 +65,17 @@ def inner_child_count(node: Bvh2Node) -> int:
 
 @wp.func
 def area_of(lo: wp.vec3, hi: wp.vec3) -> wp.float64:
-    """Half the surface; 0 for an empty box. In float64, so that no float32 overflows."""
+    """Return half the surface area of a box, 0 for an empty box; in float64, because float32 could overflow."""
     return half_area(wp.max(wp.vec3d(hi) - wp.vec3d(lo), wp.vec3d()))
 
 
 @wp.func
 def child_summary(tree: Tree, options: BuildOptions, first: int, count: int) -> SubtreeSummary:
-    """Summary of a child: an inner node's is stored, a leaf's comes from its primitives."""
-    if count == 0 and first > 0:
-        return read_summary(tree.summaries, first)
+    """Return the summary of a child: of an inner node, another thread has stored it; of a leaf, compute it from the primitives."""
     out = SubtreeSummary()
+    if count == 0 and first > 0:
+        load_summary(tree.summaries, first, out)
+        return out
     out.lo = wp.vec3(wp.inf, wp.inf, wp.inf)
     out.hi = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
     for j in range(first, first + count):
@@ -115,7 +90,7 @@ def child_summary(tree: Tree, options: BuildOptions, first: int, count: int) -> 
 
 @wp.func
 def merge_summaries(options: BuildOptions, a: SubtreeSummary, b: SubtreeSummary, root: bool) -> SubtreeSummary:
-    """Summary of a node with these children; it becomes a leaf if that costs no more."""
+    """Return the summary of a node with the children a and b. The node becomes a leaf if a leaf costs no more and it is not the root."""
     out = SubtreeSummary()
     out.lo = lower(a.lo, b.lo)
     out.hi = upper(a.hi, b.hi)
@@ -136,7 +111,7 @@ def merge_summaries(options: BuildOptions, a: SubtreeSummary, b: SubtreeSummary,
 
 @kernel
 def fit(tree: Tree, options: BuildOptions):
-    """Fit a node a thread; options.max_leaf 0: no node becomes a leaf. The result does not depend on the threads' order."""
+    """Fit the tree, with one thread per node. If options.max_leaf is 0, no node becomes a leaf. The order of threads does not matter."""
     i = wp.tid()
     if inner_child_count(tree.nodes[i]) > 0:
         return
@@ -164,7 +139,7 @@ def fit(tree: Tree, options: BuildOptions):
 
 @kernel
 def find_parents(nodes: wp.array(dtype=Bvh2Node), parents: wp.array(dtype=wp.int32)):
-    """Store each node's parent, a node a thread; nodes without a parent are left alone."""
+    """Store the parent of each node's inner children, with one thread per node. The root's entry is not written."""
     i = wp.tid()
     node = nodes[i]
     if node.count_0 == 0 and node.first_0 > 0:

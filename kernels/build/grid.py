@@ -1,6 +1,6 @@
-"""The grid builder's inner loops, on the CPU: count the cells of each primitive, list them, sort them by cell.
-Counting and listing run over ranges of primitives on all cores. The sort is one pass in the order of the primitives: the lists do not
-depend on the number of threads."""
+"""The grid builder's inner loops, on the CPU: count the cells of each primitive, list the cells, sort primitives by cell.
+Counting and listing run on all cores, each on a range of primitives. The sort is one pass in the order of the primitives, so the result
+does not depend on the number of threads."""
 
 import warp as wp
 
@@ -11,7 +11,7 @@ from wrt.kernels.traverse.grid import GridCell, GridLayout, grid_plane, slab_of
 
 @wp.func
 def slabs_of(layout: GridLayout, lo: wp.vec3, hi: wp.vec3, axis: int) -> wp.vec2i:
-    """First and last closed slab that [lo, hi] meets."""
+    """Return the first and the last slab, which are closed, that the interval [lo[axis], hi[axis]] meets."""
     first = slab_of(layout, axis, lo[axis])
     last = slab_of(layout, axis, hi[axis])
     if last < layout.n[axis] - 1 and grid_plane(layout, axis, last + 1) <= hi[axis]:
@@ -25,15 +25,9 @@ def slab_lo(layout: GridLayout, x: int, y: int, z: int) -> wp.vec3:
 
 
 @kernel
-def list_cells(
-    source: CellSource,
-    layout: GridLayout,
-    first: int,
-    begin: wp.array(dtype=wp.int64),
-    count: wp.array(dtype=wp.int32),
-    cells: wp.array(dtype=wp.int32),
-):
-    """List the cells of primitive first + tid from begin[i] on; without an array of cells, write only their number to `count`."""
+def list_cells(source: CellSource, layout: GridLayout, first: int, begin: wp.array(dtype=wp.int64), count: wp.array(dtype=wp.int32),
+               cells: wp.array(dtype=wp.int32)):
+    """Write the cells that primitive i = first + tid meets to `cells`, from begin[i] on. If `cells` is empty, write only count[i]."""
     i = first + wp.tid()
     lo = source.lo[i]
     hi = source.hi[i]
@@ -49,7 +43,7 @@ def list_cells(
     n = int(0)
     for k in range(z[0], z[1] + 1):
         for j in range(y[0], y[1] + 1):
-            # Skip a row that the triangle misses as a whole: most rows under a large triangle.
+            # Skip a row of cells that the triangle misses: these are most rows in the box of a large triangle.
             if exact and x[1] - x[0] > 1:
                 if not meets_cell(triangle, slab_lo(layout, x[0], j, k), slab_lo(layout, x[1] + 1, j + 1, k + 1)):
                     continue
@@ -65,13 +59,9 @@ def list_cells(
 
 
 @kernel
-def sort_by_cell(
-    begin: wp.array(dtype=wp.int64),
-    cell_of: wp.array(dtype=wp.int32),
-    cells: wp.array(dtype=GridCell),
-    references: wp.array(dtype=wp.int32),
-):
-    """Sort the primitives by cell, ascending within a cell: a counting sort in one thread. cells: zeroed."""
+def sort_by_cell(begin: wp.array(dtype=wp.int64), cell_of: wp.array(dtype=wp.int32), cells: wp.array(dtype=GridCell),
+                 references: wp.array(dtype=wp.int32)):
+    """Sort the primitives by cell, and within a cell by index: a counting sort in one thread. All `cells` must be 0 before."""
     for r in range(cell_of.shape[0]):
         cells[cell_of[r]].count += 1
     total = int(0)

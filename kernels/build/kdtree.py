@@ -1,7 +1,7 @@
-"""The k-d tree builder's inner loop: a subtree by the surface area heuristic with perfect splits, on the CPU.
-Wald and Havran 2006 (kernels.build.kdtree_split). The faces are events, sorted once for the subtree, and a sweep over them finds the best
-plane. A split keeps their order. References on one side only are handed down; references that straddle the plane are clipped to both
-cells, sorted, and merged in. The host launches this once a subtree, on all cores."""
+"""The k-d tree builder's inner loop, on the CPU: it builds a subtree by the surface area heuristic, trying all planes.
+Wald and Havran 2006 (kernels.build.kdtree_split). The faces of the references' boxes are events. They are sorted once per subtree, and a
+sweep over them finds the best plane. A split preserves the order of events. References that straddle the plane are clipped to both cells,
+and their events sorted and merged with the others. The host launches one subtree per task, on all cores."""
 
 import warp as wp
 
@@ -14,7 +14,7 @@ from wrt.kernels.traverse.kdtree import LEAF, STACK_SIZE, KdNode
 BOTH = wp.constant(wp.uint8(0))
 LEFT = wp.constant(wp.uint8(1))
 RIGHT = wp.constant(wp.uint8(2))
-RUN = wp.constant(8)  # events sorted by insertion, before runs are merged
+RUN = wp.constant(8)  # length of the runs of events that are sorted by insertion, then merged
 
 
 @wp.struct
@@ -24,29 +24,29 @@ class KdTotals:
     nodes: int
     leaves: int
     references: int
-    depth: int  # Nodes on the longest path.
-    cost: wp.float64  # Sum of half areas: of each inner node once, of a leaf once a reference.
+    depth: int  # Number of nodes on the longest path.
+    cost: wp.float64  # Sum of half surface areas: of each inner node, and of each leaf times its number of references.
 
 
 @wp.struct
 class KdOutput:
-    """The subtree."""
+    """The output of build_subtree; `budget` is KdTask.budget of the subtree."""
 
-    nodes: wp.array(dtype=KdNode)  # The root first; 2 budget entries.
-    references: wp.array(dtype=wp.int32)  # prim_id in the order of the leaves; budget entries.
-    totals: wp.array(dtype=KdTotals)  # One entry.
+    nodes: wp.array(dtype=KdNode)  # Length 2 * budget; the root first.
+    references: wp.array(dtype=wp.int32)  # Length `budget`; prim_id of the primitives, leaf after leaf.
+    totals: wp.array(dtype=KdTotals)  # Length 1.
 
 
 @wp.func
 def before(a: KdEvent, b: KdEvent) -> bool:
-    """Order of the sweep: by position, then by axis, ends before begins."""
+    """Test whether a precedes b in the sweep: by position, then by axis, with ends before begins."""
     return a.position < b.position or (a.position == b.position and (a.code & 7) < (b.code & 7))
 
 
 @wp.func
 def merge(a: wp.array(dtype=KdEvent), range_a: wp.vec2i, b: wp.array(dtype=KdEvent), range_b: wp.vec2i,
           out: wp.array(dtype=KdEvent), first: int):
-    """Merge two sorted lists into one at out[first]; a range is (begin, end)."""
+    """Merge the sorted ranges (begin, end) of a and b, and write the result to `out` from index `first` on."""
     i = int(range_a[0])
     j = int(range_b[0])
     k = int(first)
@@ -65,7 +65,7 @@ def merge(a: wp.array(dtype=KdEvent), range_a: wp.vec2i, b: wp.array(dtype=KdEve
 
 @wp.func
 def sort(events: wp.array(dtype=KdEvent), first: int, count: int, scratch: wp.array(dtype=KdEvent)):
-    """Sort events[first : first + count]: short runs by insertion, then merges; scratch is used from 0 on."""
+    """Sort events[first : first + count]: sort runs of RUN events by insertion, then merge them. The array `scratch` is overwritten."""
     for run in range((count + RUN - 1) / RUN):
         begin = first + run * RUN
         for i in range(begin + 1, wp.min(begin + RUN, first + count)):
@@ -82,7 +82,7 @@ def sort(events: wp.array(dtype=KdEvent), first: int, count: int, scratch: wp.ar
             middle = wp.min(begin + width, first + count)
             end = wp.min(middle + width, first + count)
             if middle < end and before(events[middle], events[middle - 1]):
-                # Only the left run moves away: merged events never overtake the right run.
+                # Only the left run is copied to scratch: the merge never overwrites an event of the right run before it is read.
                 for i in range(begin, middle):
                     scratch[i - begin] = events[i]
                 merge(scratch, wp.vec2i(0, middle - begin), events, wp.vec2i(middle, end), events, begin)
@@ -91,7 +91,7 @@ def sort(events: wp.array(dtype=KdEvent), first: int, count: int, scratch: wp.ar
 
 @wp.func
 def add_events(events: wp.array(dtype=KdEvent), count: int, lo: wp.vec3, hi: wp.vec3, reference: int) -> int:
-    """Append the six faces of a box; return the new count."""
+    """Append the events of the six faces of a reference's box; return the new count."""
     event = KdEvent()
     for axis in range(3):
         event.position = hi[axis]
@@ -105,7 +105,7 @@ def add_events(events: wp.array(dtype=KdEvent), count: int, lo: wp.vec3, hi: wp.
 
 @wp.func
 def moved(corner: wp.vec3, split: KdSplit) -> wp.vec3:
-    """Move a corner of the cell into the splitting plane."""
+    """Return a corner of the cell, moved into the splitting plane."""
     out = corner
     out[split.axis] = split.position
     return out
@@ -113,7 +113,7 @@ def moved(corner: wp.vec3, split: KdSplit) -> wp.vec3:
 
 @wp.func
 def mark_sides(work: KdWork, task: KdTask, split: KdSplit):
-    """Store the side of each reference. Every box has an inside: it begins before it ends."""
+    """Store the side (LEFT, RIGHT, BOTH) of each reference. Every box has a volume, so it begins before it ends."""
     begins = 2 * split.axis + 1
     for i in range(task.first, task.first + task.count):
         event = work.events[i]
@@ -127,7 +127,7 @@ def mark_sides(work: KdWork, task: KdTask, split: KdSplit):
 
 @wp.func
 def divide(shapes: Clippable, work: KdWork, task: KdTask, split: KdSplit) -> wp.vec2i:
-    """Replace a task's events by those of both children, the right one's first; return the numbers (right, left)."""
+    """Replace a task's events by the events of the right child, then the left child; return their numbers (right, left)."""
     middle_hi = moved(task.hi, split)
     middle_lo = moved(task.lo, split)
     kept_left = int(0)
@@ -144,7 +144,7 @@ def divide(shapes: Clippable, work: KdWork, task: KdTask, split: KdSplit) -> wp.
         elif side == RIGHT:
             work.kept_right[kept_right] = event
             kept_right = kept_right + 1
-        elif (event.code & 7) == 1:  # once for each reference that straddles the plane
+        elif (event.code & 7) == 1:  # one of six events of a reference that straddles the plane: the begin on axis 0
             box = clip_to_cell(shapes, work.prim_id[reference], task.lo, middle_hi)
             if box.lo[0] < box.hi[0]:
                 fresh_left = add_events(work.fresh_left, fresh_left, box.lo, box.hi, reference)
@@ -178,7 +178,7 @@ def write_leaf(out: KdOutput, work: KdWork, task: KdTask, totals: KdTotals) -> K
 
 @kernel
 def build_subtree(shapes: Clippable, work: KdWork, root: KdTask, options: KdOptions, out: KdOutput):
-    """Build the subtree of one cell, with the references of `work`, in one thread."""
+    """Build the subtree of the cell `root`, whose references are in `work`, in one thread."""
     stack = wp.zeros(shape=wp.static(STACK_SIZE + 2), dtype=KdTask)
     count = int(0)
     for i in range(work.prim_id.shape[0]):
@@ -208,7 +208,7 @@ def build_subtree(shapes: Clippable, work: KdWork, root: KdTask, options: KdOpti
         out.nodes[task.slot] = node
         totals.cost += half_area(wp.vec3d(task.hi) - wp.vec3d(task.lo))
 
-        # The rest of the budget is shared in proportion to the references.
+        # Each child's budget is its number of references, plus a proportional part of what remains of the cell's budget.
         left = wp.max(split.n_left, 1)
         right = wp.max(split.n_right, 1)
         spare = wp.float64(task.budget - left - right) * (wp.float64(right) / wp.float64(left + right))

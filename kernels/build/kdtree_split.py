@@ -1,7 +1,7 @@
 """The k-d tree's split: the plane of least cost by the surface area heuristic (SAH).
-Wald and Havran 2006, "On building fast kd-Trees for Ray Tracing, and on doing that in O(N log N)". Every face of every reference's box is
-a candidate, and a sweep over the sorted faces finds the best. Larger cells, above `perfect_below` references, are first split between bins
-at the same costs (wrt.accel.cells.kdtree_build.binned_split)."""
+Wald and Havran 2006, "On building fast kd-Trees for Ray Tracing, and on doing that in O(N log N)". The candidates are all faces of the
+references' boxes; a sweep over the sorted faces finds the best. Cells with more than `perfect_below` references are split between bins, at
+the same costs (wrt.accel.cells.kdtree_build.binned_split)."""
 
 import warp as wp
 
@@ -18,14 +18,14 @@ class KdEvent:
 
 @wp.struct
 class KdOptions:
-    """When a cell becomes a leaf, and the SAH costs."""
+    """Conditions under which a cell becomes a leaf, and the SAH costs."""
 
-    max_leaf: int  # A cell with so many references is a leaf.
-    max_depth: int  # A cell at this depth is a leaf.
-    by_cost: int  # 1: a cell is a leaf if no split costs less.
+    max_leaf: int  # A cell with at most so many references becomes a leaf.
+    max_depth: int  # A cell at this depth becomes a leaf.
+    by_cost: int  # 1: a cell becomes a leaf if no split costs less than the leaf.
     cost_traversal: wp.float64
     cost_intersection: wp.float64
-    empty_bonus: wp.float64  # Part of the cost that a split saves if it cuts off empty space.
+    empty_bonus: wp.float64  # Fraction by which the cost of a split is reduced if one side is empty.
 
 
 @wp.struct
@@ -34,23 +34,23 @@ class KdTask:
 
     lo: wp.vec3
     hi: wp.vec3
-    first: int  # First of its events.
-    count: int  # Number of its events.
-    budget: int  # Most references of its leaves; an empty leaf counts as one.
+    first: int  # Index of the cell's first event.
+    count: int  # Number of the cell's events: six per reference.
+    budget: int  # Largest number of references in all leaves of the cell; an empty leaf counts as one.
     depth: int
-    slot: int  # Index of its node.
+    slot: int  # Index of the cell's node.
 
 
 @wp.struct
 class KdWork:
-    """Scratch of one subtree of n references."""
+    """Input and scratch of one subtree: prim_id, lo, hi and side have an entry for each of n references."""
 
-    prim_id: wp.array(dtype=wp.int32)  # Of each reference, as side (n).
-    lo: wp.array(dtype=wp.vec3)  # Boxes of the references in the root's cell: lo, hi (n).
+    prim_id: wp.array(dtype=wp.int32)
+    lo: wp.array(dtype=wp.vec3)  # lo, hi: boxes of the references, clipped to the root's cell.
     hi: wp.array(dtype=wp.vec3)
-    side: wp.array(dtype=wp.uint8)
-    events: wp.array(dtype=KdEvent)  # A stack of the events of all pending cells (6 budget).
-    kept_left: wp.array(dtype=KdEvent)  # Events of one split, from here to scratch (6 n each).
+    side: wp.array(dtype=wp.uint8)  # Scratch.
+    events: wp.array(dtype=KdEvent)  # The events of all pending cells, as a stack; length 6 * budget.
+    kept_left: wp.array(dtype=KdEvent)  # From here on: events of one split, length 6 n each. Kept events are copied, fresh ones clipped.
     kept_right: wp.array(dtype=KdEvent)
     fresh_left: wp.array(dtype=KdEvent)
     fresh_right: wp.array(dtype=KdEvent)
@@ -59,7 +59,7 @@ class KdWork:
 
 @wp.struct
 class KdSplit:
-    """A plane; axis < 0: none. References that straddle it count on both sides."""
+    """A splitting plane; axis < 0: no split. References that straddle the plane count in both n_left and n_right."""
 
     axis: int
     position: float
@@ -71,9 +71,9 @@ class KdSplit:
 @wp.func
 def split_cost(options: KdOptions, scale: wp.float64, face: wp.vec2d, below: wp.float64, above: wp.float64, left: wp.float64,
                right: wp.float64) -> wp.float64:
-    """SAH cost of a plane with `left` and `right` references, at distances `below` and `above` from the cell's ends.
-    Its `face` is the cell's extent along the two other axes; `scale` is the cost of a reference over the cell's half area. The host calls
-    `split_cost.func` with arrays."""
+    """Return the SAH cost of a plane at the distances `below` and `above` from the cell's ends, with `left` and `right` references.
+    The pair `face` is the cell's extent along the two other axes; `scale` is cost_intersection divided by the cell's half surface area. The
+    host calls `split_cost.func` with arrays."""
     caps = face[0] * face[1]
     rim = face[0] + face[1]
     return options.cost_traversal + scale * ((below * rim + caps) * left + (above * rim + caps) * right)
@@ -81,7 +81,7 @@ def split_cost(options: KdOptions, scale: wp.float64, face: wp.vec2d, below: wp.
 
 @wp.func
 def cheapest_split(work: KdWork, task: KdTask, options: KdOptions) -> KdSplit:
-    """Find the plane of least expected cost whose references are within the budget; with by_cost, only one cheaper than a leaf."""
+    """Find the plane of least SAH cost whose references are within the budget. With by_cost, it must also be cheaper than a leaf."""
     best = KdSplit()
     best.axis = -1
     n = task.count / 6

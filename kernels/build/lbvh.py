@@ -1,6 +1,7 @@
-"""A binary BVH along a Morton curve, a thread a node, on the CPU and on CUDA. Karras 2012, "Maximizing Parallelism in the Construction of
-BVHs, Octrees, and k-d Trees". Primitives are sorted by the Morton code of their middle; each inner node finds its own range of them and
-its split. Then `fit` makes boxes and leaves from the bottom up, and `write_nodes` writes the remaining nodes in walk order."""
+"""Build a binary BVH along a Morton curve, with one thread per node, on the CPU and on CUDA.
+Karras 2012, "Maximizing Parallelism in the Construction of BVHs, Octrees, and k-d Trees". Primitives are sorted by the Morton code of
+their boxes' middles. Each inner node computes its range of primitives and its split. Then `fit.fit` makes boxes and leaves from the bottom
+up, and `write_nodes` writes the remaining nodes in depth-first order."""
 
 import warp as wp
 
@@ -8,29 +9,29 @@ from wrt.kernels.build.fit import NO_PARENT, SubtreeSummary, Tree
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse.bvh2 import Bvh2Node
 
-PARTS = 1024  # threads that measure the middles
-MOST_BITS = 21  # of a coordinate
-KEY_BITS = 63
+PARTS = 1024  # number of threads of `measure`
+MOST_BITS = 21  # largest number of bits of a coordinate in a Morton code
+KEY_BITS = 63  # largest number of bits of a key
 
 
 def bits_of(n: int) -> tuple[int, int]:
-    """Return the bits of a primitive's index and of a coordinate in the keys of n primitives.
-    Keys differ, so that no path is longer than a node for each bit: with one bit unused, it fits on the traversal's stack. A coordinate
-    has fewer bits for more primitives: 14 for a million."""
-    number = max(n - 1, 1).bit_length()
-    return number, min(MOST_BITS, (KEY_BITS - number) // 3)
+    """Return the numbers of bits that a primitive's index and a coordinate have in the keys of n primitives.
+    A key contains the index, so all keys differ, and no path has more nodes than a key has bits. With KEY_BITS, a path fits on the stack of
+    the traversal. For more primitives, a coordinate has fewer bits: 14 for a million."""
+    index_bits = max(n - 1, 1).bit_length()
+    return index_bits, min(MOST_BITS, (KEY_BITS - index_bits) // 3)
 
 
 @wp.func
 def middle_of(low: wp.vec3, high: wp.vec3) -> wp.vec3:
-    """Middle of a box; 0 if it is not finite."""
+    """Return the middle of a box; (0, 0, 0) if the middle is not finite."""
     middle = 0.5 * low + 0.5 * high
     return wp.where(wp.isfinite(middle), middle, wp.vec3(0.0, 0.0, 0.0))
 
 
 @kernel
 def measure(low: wp.array(dtype=wp.vec3), high: wp.array(dtype=wp.vec3), ends: wp.array(dtype=wp.vec3)):
-    """Store the bounds of all middles in `ends`, empty before. Each thread takes every PARTS-th."""
+    """Store the bounds of all middles in ends[0] and ends[1], which must be empty before (inf, -inf). Launch PARTS threads."""
     i = wp.tid()
     a = wp.vec3(wp.inf, wp.inf, wp.inf)
     b = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
@@ -44,7 +45,7 @@ def measure(low: wp.array(dtype=wp.vec3), high: wp.array(dtype=wp.vec3), ends: w
 
 @wp.func
 def spread(x: wp.uint64) -> wp.uint64:
-    """Spread 21 bits, with two zeros after each."""
+    """Spread the lowest 21 bits of x: bit k moves to bit 3 k."""
     x = (x | (x << wp.uint64(32))) & wp.uint64(0x1F00000000FFFF)
     x = (x | (x << wp.uint64(16))) & wp.uint64(0x1F0000FF0000FF)
     x = (x | (x << wp.uint64(8))) & wp.uint64(0x100F00F00F00F00F)
@@ -64,7 +65,7 @@ def cell_of(x: float, begin: float, end: float, bits: int) -> wp.uint64:
 @kernel
 def write_keys(low: wp.array(dtype=wp.vec3), high: wp.array(dtype=wp.vec3), ends: wp.array(dtype=wp.vec3), bits: wp.vec2i,
                keys: wp.array(dtype=wp.uint64), order: wp.array(dtype=wp.int32), first: int):
-    """Write the keys of primitives first .. first + dim - 1: Morton code of the middle, then index; bits: bits_of."""
+    """Write the keys of primitives first .. first + dim - 1. A key is the Morton code of the middle, then the index; bits: see bits_of."""
     i = first + wp.tid()
     middle = middle_of(low[i], high[i])
     a = ends[0]
@@ -77,7 +78,7 @@ def write_keys(low: wp.array(dtype=wp.vec3), high: wp.array(dtype=wp.vec3), ends
 
 @wp.func
 def differ(keys: wp.array(dtype=wp.uint64), n: int, i: int, j: int) -> wp.uint64:
-    """Bits in which two keys differ; the highest of all if there is no key j."""
+    """Return the XOR of keys i and j, or only the highest bit set if there is no key j."""
     if j < 0 or j >= n:
         return wp.uint64(0x8000000000000000)
     return keys[i] ^ keys[j]
@@ -85,14 +86,14 @@ def differ(keys: wp.array(dtype=wp.uint64), n: int, i: int, j: int) -> wp.uint64
 
 @wp.func
 def nearer(a: wp.uint64, b: wp.uint64) -> bool:
-    """Test whether the highest bit of a is below that of b: keys that differ in a share a longer prefix."""
+    """Test whether the highest bit set in a is below the highest bit set in b: two keys with the XOR a share the longer prefix."""
     return a < b and a < (a ^ b)
 
 
 @kernel
 def link(keys: wp.array(dtype=wp.uint64), nodes: wp.array(dtype=Bvh2Node), parents: wp.array(dtype=wp.int32), first: int):
-    """Find the two children of each inner node first .. first + dim - 1, and write the node and its children's entries in `parents`.
-    dim: number of threads; each takes one node. keys: ascending, at least two. nodes: one fewer than keys. A leaf is one primitive."""
+    """Write the inner nodes first .. first + dim - 1, one per thread, and their children's entries in `parents`. A leaf is one primitive.
+    There are at least two `keys`, in ascending order, and one node fewer than keys."""
     i = first + wp.tid()
     n = nodes.shape[0] + 1
     # Node i begins or ends at key i, and extends to the side whose neighbour shares the longer prefix.
@@ -109,7 +110,7 @@ def link(keys: wp.array(dtype=wp.uint64), nodes: wp.array(dtype=Bvh2Node), paren
         if nearer(differ(keys, n, i, i + (length + step) * d), outside):
             length = length + step
         step = step / 2
-    # The split is behind the last key that shares more with key i than the other end does.
+    # The split is behind the last key that shares a longer prefix with key i than the key at the range's other end does.
     j = i + length * d
     whole = differ(keys, n, i, j)
     split = int(0)
@@ -139,8 +140,8 @@ def link(keys: wp.array(dtype=wp.uint64), nodes: wp.array(dtype=Bvh2Node), paren
 
 @kernel
 def write_nodes(tree: Tree, nodes: wp.array(dtype=Bvh2Node), parents: wp.array(dtype=wp.int32), first: int):
-    """Write the nodes that `fit` kept of first .. first + dim - 1: a parent before its children, left before right.
-    A node's index is the number of nodes before it in that order: on the way to the root, each parent and each left sibling's nodes."""
+    """Write the nodes first .. first + dim - 1 that are still inner nodes after `fit`, in depth-first order, left before right.
+    A node's new index is the number of nodes before it in this order: all its ancestors, and all nodes of their left siblings' subtrees."""
     i = first + wp.tid()
     slot = int(0)
     at = int(i)

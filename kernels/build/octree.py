@@ -1,6 +1,6 @@
-"""The octree builder's inner loops, on the CPU: find the octants of each reference, one level at a time.
-Octants are found over ranges of references on all cores. Cells are counted and filled in the order of the references: the tree does not
-depend on the number of threads."""
+"""The octree builder's inner loops, on the CPU: find the octants that each reference meets, one level of the tree at a time.
+Kernel find_octants runs on all cores, each on a range of references. The references of a cell are counted and copied in their order, so
+the tree does not depend on the number of threads."""
 
 import warp as wp
 
@@ -11,8 +11,8 @@ from wrt.kernels.traverse.octree import OctreeLayout, octant_corner, octree_plan
 
 @wp.func
 def octants_of_box(lo: wp.vec3, hi: wp.vec3, middle: wp.vec3, end: wp.vec3) -> int:
-    """Mask of the closed octants that a box meets, if it meets their cell; middle: the planes between them. The planes `end` close the
-    root's cell: an upper half that begins there has nothing that the lower half does not have."""
+    """Return the mask of the octants, which are closed, that a box meets. The box meets their cell. The planes `middle` divide the cell.
+    The planes `end` bound the root's cell: an upper half that begins at `end` is empty."""
     mask = int(0xFF)
     for axis in range(3):
         upper = wp.where(axis == 0, 0xAA, wp.where(axis == 1, 0xCC, 0xF0))
@@ -25,17 +25,17 @@ def octants_of_box(lo: wp.vec3, hi: wp.vec3, middle: wp.vec3, end: wp.vec3) -> i
 
 @wp.struct
 class SplitCells:
-    """The cells to split."""
+    """The cells of one level that are to be split."""
 
-    half: int  # Half their edge, in finest cells.
+    half: int  # Half the edge of these cells, in finest cells.
     corners: wp.array(dtype=wp.vec3i)  # Lowest corner of each cell.
-    cell_of: wp.array(dtype=wp.int32)  # Cell of each reference.
+    cell_of: wp.array(dtype=wp.int32)  # Index of each reference's cell.
 
 
 @kernel
 def find_octants(source: CellSource, layout: OctreeLayout, first: int, cells: SplitCells, references: wp.array(dtype=wp.int32),
                  masks: wp.array(dtype=wp.int32)):
-    """Store the mask of the octants that reference first + tid meets in its cell."""
+    """Store masks[r], the mask of the octants of its cell that reference r = first + tid meets."""
     half = cells.half
     r = first + wp.tid()
     i = references[r]
@@ -57,13 +57,8 @@ def find_octants(source: CellSource, layout: OctreeLayout, first: int, cells: Sp
 
 
 @kernel
-def count_octants(
-    first: int,
-    begin: wp.array(dtype=wp.int32),
-    masks: wp.array(dtype=wp.int32),
-    count: wp.array2d(dtype=wp.int32),
-):
-    """Count the references of each octant of cell first + tid, which has the references begin[cell] .. begin[cell + 1] - 1."""
+def count_octants(first: int, begin: wp.array(dtype=wp.int32), masks: wp.array(dtype=wp.int32), count: wp.array2d(dtype=wp.int32)):
+    """Count the references of each octant of cell first + tid. A cell has the references begin[cell] .. begin[cell + 1] - 1."""
     cell = first + wp.tid()
     for r in range(begin[cell], begin[cell + 1]):
         for octant in range(8):
@@ -71,15 +66,10 @@ def count_octants(
 
 
 @kernel
-def fill_octants(
-    first: int,
-    begin: wp.array(dtype=wp.int32),
-    masks: wp.array(dtype=wp.int32),
-    references: wp.array(dtype=wp.int32),
-    next_place: wp.array2d(dtype=wp.int32),
-    out: wp.array(dtype=wp.int32),
-):
-    """Copy the references of cell first + tid to its octants, for octant k to next_place[cell, k] and on; below 0: not split."""
+def fill_octants(first: int, begin: wp.array(dtype=wp.int32), masks: wp.array(dtype=wp.int32), references: wp.array(dtype=wp.int32),
+                 next_place: wp.array2d(dtype=wp.int32), out: wp.array(dtype=wp.int32)):
+    """Copy the references of each octant k of cell first + tid to `out`, from index next_place[cell, k] on.
+    If next_place[cell, 0] < 0, the cell is not split, and nothing is copied."""
     cell = first + wp.tid()
     if next_place[cell, 0] < 0:
         return

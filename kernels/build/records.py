@@ -1,13 +1,13 @@
-"""Records, ranges and bounds of the top-down builders of binary BVHs."""
+"""Records of primitives, ranges of records, and their bounds, for the top-down builders of binary BVHs."""
 
 import warp as wp
 
 from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node
 from wrt.kernels.wide.lanes import row_type
 
-# From this depth on, ranges are halved by number whatever the SAH says: that takes ceil(log2(n)) more levels.
+# Depth limit. A range that could exceed it is split by number of records instead of the SAH: that takes ceil(log2(n)) more levels.
 MAX_DEPTH = wp.constant(STACK_SIZE - 2)
-# A box in one vector: low corner, negated high corner, two unused lanes. The lower lanes of two rows are the box around both.
+# A box as one vector: low corner, negated high corner, two unused entries. The entry-wise minimum of two rows is the box around both.
 Row = row_type(8)
 
 
@@ -22,7 +22,7 @@ class BuildRecord:
 
 @wp.struct
 class Measures:
-    """The bounds of some records: of their boxes and of their centroids."""
+    """Bounds of a range of records: around their boxes, and around their centroids."""
 
     box: Row
     centers: Row
@@ -30,11 +30,11 @@ class Measures:
 
 @wp.struct
 class BuildTask:
-    """A range of records that becomes a child of `parent` (-1: the root): a leaf, or the inner node `slot`."""
+    """A range of records begin .. end - 1, which becomes a child of node `parent` (-1: the root): a leaf, or the inner node `slot`."""
 
     begin: int
     end: int
-    limit: int  # End of the range's space (spatial splits).
+    limit: int  # With spatial splits: end of the range's space, which may be larger than the range.
     slot: int
     parent: int
     side: int
@@ -46,43 +46,43 @@ class BuildTask:
 class BuildOptions:
     """Limits and costs of a builder."""
 
-    max_leaf: int  # Most primitives of a leaf.
-    row: int  # Primitives tested at once.
+    max_leaf: int  # Largest number of primitives in a leaf.
+    row: int  # Number of primitives that are tested at once.
     cost_traversal: float  # SAH cost of a node.
     cost_intersection: float  # SAH cost of a row of primitives.
 
 
 @wp.struct
 class BuildData:
-    """Arrays of a builder, one entry a record if not said otherwise; the sweep and spatial splits use scratch arrays of their own."""
+    """Arrays of a builder, with one entry per record unless a comment says otherwise. Some serve only the sweep or the spatial splits."""
 
-    records: wp.array(dtype=BuildRecord)  # Rearranged by the build.
+    records: wp.array(dtype=BuildRecord)  # The build reorders them.
     nodes: wp.array(dtype=Bvh2Node)
-    used: wp.array(dtype=wp.uint8)
-    boxes: wp.array(dtype=BuildRecord)  # Sweep: the records in their first order. Spatial splits: scratch.
-    order: wp.array(dtype=wp.int32)  # Sweep: for each axis, one after another, indices into boxes by centroid.
+    used: wp.array(dtype=wp.uint8)  # 1 for each slot of `nodes` that has a node.
+    boxes: wp.array(dtype=BuildRecord)  # Sweep: the records in their original order. Spatial splits: scratch.
+    order: wp.array(dtype=wp.int32)  # Sweep: for each of the three axes, the indices into `boxes` sorted by centroid.
     area: wp.array(dtype=wp.float32)  # Sweep: scratch.
     left: wp.array(dtype=wp.uint8)  # Sweep: scratch. Spatial splits: 1 for records in leaves.
     scratch: wp.array(dtype=wp.int32)  # Sweep: scratch.
-    corners: wp.array(dtype=wp.vec3)  # Spatial splits: of triangle i from 3 i on; spheres, which follow, are clipped by their boxes.
-    scale: float  # Spatial splits: area_scale of the scene.
-    min_overlap: float  # Overlap of an object split's sides from which a spatial split is tried, in units of `scale`.
+    corners: wp.array(dtype=wp.vec3)  # Spatial splits: triangle i has the corners from 3 i on. Spheres have none: their boxes are clipped.
+    scale: float  # Spatial splits: area_scale of the scene's box.
+    min_overlap: float  # Overlap of the sides of an object split, as row_area with `scale`, above which a spatial split is tried.
 
 
 @wp.struct
 class Halves:
-    """A split range."""
+    """A split range of records: the left and the right side."""
 
-    middle: int  # Where the right side begins.
-    count_0: int  # Records of the left side.
-    count_1: int  # Records of the right side.
+    middle: int  # Index of the first record of the right side.
+    count_0: int  # Number of records on the left side.
+    count_1: int  # Number of records on the right side.
     left: Measures
     right: Measures
 
 
 @wp.func
 def row_count(options: BuildOptions, n: int) -> float:
-    """Rows that n primitives fill."""
+    """Return the number of rows that n primitives fill."""
     return float((n + options.row - 1) / options.row)
 
 
@@ -108,7 +108,7 @@ def high_of(row: Row) -> wp.vec3:
 
 @wp.func
 def lower(a: Row, b: Row) -> Row:
-    """Lower value of each lane. Warp's minimum minds NaN, which takes three times as long."""
+    """Return the entry-wise minimum. wp.min also handles NaN, and takes three times as long."""
     out = Row()
     for k in range(8):
         out[k] = wp.where(b[k] < a[k], b[k], a[k])
@@ -117,14 +117,14 @@ def lower(a: Row, b: Row) -> Row:
 
 @wp.func
 def area_scale(box: Row) -> float:
-    """Factor that scales a box's longest side to 1, so that areas neither under- nor overflow: the scale of `row_area`."""
+    """Return the factor that scales half of a box's longest side to 1: with it, `row_area` neither under- nor overflows."""
     e = 0.5 * high_of(box) - 0.5 * low_of(box)
     return 1.0 / wp.max(wp.max(wp.max(e[0], e[1]), e[2]), 2.0**-126.0)
 
 
 @wp.func
 def row_area(box: Row, scale: float) -> float:
-    """Half the surface of a box, its sides multiplied by `scale`; 0 for an empty box."""
+    """Return half the surface area of a box with half its sides multiplied by `scale`; 0 for an empty box."""
     half = 0.5 * scale * box
     x = -(half[0] + half[3])
     y = -(half[1] + half[4])
@@ -142,7 +142,7 @@ def center_of(record: BuildRecord) -> wp.vec3:
 
 @wp.func
 def balanced_depth(n: int) -> int:
-    """Depth of a balanced tree over n primitives: ceil(log2(n))."""
+    """Return the depth of a balanced tree over n primitives: ceil(log2(n))."""
     result = int(0)
     while result < 31 and (1 << result) < n:  # 1 << 31 is negative
         result = result + 1
@@ -151,7 +151,7 @@ def balanced_depth(n: int) -> int:
 
 @wp.func
 def measure(data: BuildData, begin: int, end: int) -> Measures:
-    """Bounds of the records begin .. end - 1."""
+    """Return the bounds of the records begin .. end - 1."""
     out = Measures()
     out.box = empty_row()
     out.centers = empty_row()
@@ -165,7 +165,7 @@ def measure(data: BuildData, begin: int, end: int) -> Measures:
 
 @wp.func
 def unmeasured_halves(task: BuildTask, middle: int) -> Halves:
-    """Halves of a range, without their bounds."""
+    """Return the halves of a range, without their bounds."""
     out = Halves()
     out.middle = middle
     out.count_0 = middle - task.begin
@@ -175,7 +175,7 @@ def unmeasured_halves(task: BuildTask, middle: int) -> Halves:
 
 @wp.func
 def measure_halves(data: BuildData, task: BuildTask, middle: int) -> Halves:
-    """Halves of a range, with their bounds."""
+    """Return the halves of a range, with their bounds."""
     out = unmeasured_halves(task, middle)
     out.left = measure(data, task.begin, middle)
     out.right = measure(data, middle, task.end)
@@ -184,7 +184,7 @@ def measure_halves(data: BuildData, task: BuildTask, middle: int) -> Halves:
 
 @wp.func
 def link_to_parent(nodes: wp.array(dtype=Bvh2Node), task: BuildTask, first: int, count: int):
-    """Link a range's result to its parent: a leaf (count > 0), or the inner node `first`."""
+    """Store a finished range in its parent node: a leaf (count > 0), or the inner node `first` (count = 0)."""
     if task.parent >= 0:
         if task.side == 0:
             nodes[task.parent].first_0 = first

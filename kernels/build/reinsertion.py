@@ -1,7 +1,7 @@
-"""The inner loops of the optimiser by reinsertion, on the CPU.
-Meister and Bittner 2018, "Parallel Reinsertion for Bounding Volume Hierarchy Optimization". A subtree is taken out with its parent, and
-put back where the sum of all boxes' areas becomes smallest. Searches for many subtrees read the same tree on all cores. The moves are then
-made one after another, the best first, unless an earlier one is in the way."""
+"""The inner loops that optimise a binary BVH by reinsertion, on the CPU.
+Meister and Bittner 2018, "Parallel Reinsertion for Bounding Volume Hierarchy Optimization". A subtree is removed together with its parent
+node, and inserted where the sum of all boxes' areas becomes smallest. All cores search places for many subtrees in the same tree. Then one
+thread makes the moves, the best first, and skips moves that conflict with an earlier one."""
 
 import warp as wp
 
@@ -15,7 +15,7 @@ QUEUE_SIZE = wp.constant(QUEUE)
 
 @wp.struct
 class Link:
-    """A node of the tree during optimisation."""
+    """A node of the tree during the optimisation."""
 
     left: int  # -1: a leaf.
     right: int
@@ -26,11 +26,11 @@ class Link:
 
 @wp.struct
 class Move:
-    """The move of subtree `node` beside `target`."""
+    """The move of the subtree `node`, which makes `target` its sibling."""
 
     node: int
     target: int
-    gain: float  # Decrease of the sum of areas; 0: it stays.
+    gain: float  # Decrease of the sum of areas; 0: the subtree stays.
 
 
 @wp.func
@@ -45,9 +45,9 @@ def joined_area(a: Link, b: Link, scale: float) -> float:
 
 @kernel
 def find_moves(links: wp.array(dtype=Link), moves: wp.array(dtype=Move), first: int, scale: float):
-    """Find the best target of each move's node: branch and bound over the rest of the tree (section 3.1).
-    From the node upwards, it searches the subtree beside each ancestor. `saved` is the area that the boxes on the way lose without the
-    node. A place costs the area of the new parent's box, and the growth of the boxes above."""
+    """Find the best target for the node of each move, by branch and bound over the rest of the tree (section 3.1).
+    The search visits the sibling subtree of the node and of each ancestor, upwards. The variable `saved` is the area by which the boxes up
+    to this ancestor shrink without the node. An insertion costs the area of the new parent's box, and the growth of the boxes above it."""
     i = first + wp.tid()
     move = moves[i]
     node = links[move.node]
@@ -55,10 +55,10 @@ def find_moves(links: wp.array(dtype=Link), moves: wp.array(dtype=Move), first: 
     target = int(-1)
     parent = links[node.parent]
     own_area = area_of(node.lo, node.hi, scale)
-    saved = area_of(parent.lo, parent.hi, scale)  # the parent itself goes
+    saved = area_of(parent.lo, parent.hi, scale)  # the parent node is removed
     pivot = int(node.parent)
     child = int(move.node)
-    # Box of the pivot without the node, empty at first.
+    # lo, hi: box of the pivot without the node.
     lo = wp.vec3(wp.inf, wp.inf, wp.inf)
     hi = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
     stack = wp.zeros(shape=wp.static(QUEUE), dtype=wp.int32)
@@ -77,7 +77,7 @@ def find_moves(links: wp.array(dtype=Link), moves: wp.array(dtype=Move), first: 
             place = links[at]
             joined = joined_area(place, node, scale)
             gain = left - joined
-            # The place beside its old sibling changes nothing.
+            # With its old sibling as target, the move would change nothing.
             if gain > best and not (pivot == node.parent and at == sibling):
                 best = gain
                 target = at
@@ -96,7 +96,7 @@ def find_moves(links: wp.array(dtype=Link), moves: wp.array(dtype=Move), first: 
         if pivot < 0:
             break
         if links[child].parent >= 0 and child != node.parent:
-            # The box of `child` shrinks around the rest of it.
+            # Without the node, the box of `child` shrinks to lo .. hi.
             saved = saved + area_of(links[child].lo, links[child].hi, scale) - area_of(lo, hi, scale)
     move.target = target
     move.gain = wp.where(target >= 0, best, 0.0)
@@ -114,7 +114,7 @@ def replace_child(links: wp.array(dtype=Link), parent: int, old: int, new: int):
 
 @wp.func
 def refit_up(links: wp.array(dtype=Link), areas: wp.array(dtype=wp.float32), start: int, scale: float):
-    """Refit boxes and areas from a node towards the root, until one does not change."""
+    """Refit boxes and areas from a node towards the root; stop at the first box that does not change."""
     i = int(start)
     while i >= 0:
         link = links[i]
@@ -133,7 +133,7 @@ def refit_up(links: wp.array(dtype=Link), areas: wp.array(dtype=wp.float32), sta
 @kernel
 def make_moves(links: wp.array(dtype=Link), areas: wp.array(dtype=wp.float32), moves: wp.array(dtype=Move),
                touched: wp.array(dtype=wp.uint8), scale: float):
-    """Make the moves in order; one that touches a node changed by an earlier move waits for another round."""
+    """Make the moves in order. Skip a move that involves a node of an earlier move (touched); a later round may find it again."""
     for m in range(moves.shape[0]):
         move = moves[m]
         if move.gain > 0.0:
@@ -143,7 +143,7 @@ def make_moves(links: wp.array(dtype=Link), areas: wp.array(dtype=wp.float32), m
             above = links[move.target].parent
             taken = int(touched[move.node]) + int(touched[parent]) + int(touched[sibling]) + int(touched[move.target])
             taken = taken + int(touched[grandparent]) + int(touched[above])
-            # An earlier move may have put the target below the node.
+            # An earlier move may have put the target into the node's subtree: then i ends at move.node, else below 0.
             i = int(move.target)
             while i >= 0 and i != move.node:
                 i = links[i].parent
@@ -172,17 +172,17 @@ def make_moves(links: wp.array(dtype=Link), areas: wp.array(dtype=wp.float32), m
 class Walk:
     """Scratch of walks over the tree."""
 
-    order: wp.array(dtype=wp.int32)  # Nodes, parents first.
-    level: wp.array(dtype=wp.int32)  # Of each node, from 1.
-    count: wp.array(dtype=wp.int32)  # Records of each node.
+    order: wp.array(dtype=wp.int32)  # Node indices, parents before children.
+    level: wp.array(dtype=wp.int32)  # Level of each node; the root's is 1.
+    count: wp.array(dtype=wp.int32)  # Number of records in each subtree.
     cost: wp.array(dtype=wp.float32)  # SAH cost of each subtree.
-    depth: wp.array(dtype=wp.int32)
+    depth: wp.array(dtype=wp.int32)  # depth[0]: number of inner nodes on the longest path.
 
 
 @kernel
 def order_nodes(links: wp.array(dtype=Link), walk: Walk):
-    """Order the nodes, parents first and left before right, and store the depth: inner nodes on the longest path."""
-    stack = int(walk.order.shape[0])  # the end of the order serves as the stack: both together always fit
+    """Store the nodes in depth-first order, left before right, in walk.order; store walk.level and walk.depth."""
+    stack = int(walk.order.shape[0])  # the end of walk.order is the stack: stack and finished nodes together always fit
     stack = stack - 1
     walk.order[stack] = 0
     walk.level[0] = 1
@@ -204,7 +204,7 @@ def order_nodes(links: wp.array(dtype=Link), walk: Walk):
 
 @kernel
 def choose_leaves(links: wp.array(dtype=Link), walk: Walk, options: BuildOptions, scale: float):
-    """Turn subtrees into leaves if those cost no more, from the bottom up; such a node gets left = -2 - left."""
+    """Turn a subtree into a leaf where the leaf costs no more, from the bottom up. To mark it, replace its root's left by -2 - left."""
     n = walk.order.shape[0]
     for k in range(n):
         i = walk.order[n - 1 - k]

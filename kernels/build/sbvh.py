@@ -1,7 +1,7 @@
-"""The inner loop of the builder with spatial splits, on the CPU.
+"""The inner loop of the builder of binary BVHs with spatial splits, on the CPU.
 Stich, Friedrich and Dietrich 2009, "Spatial Splits in Bounding Volume Hierarchies". If the sides of the best object split overlap, a plane
-may split the range instead, and both sides then list the primitives that it cuts. A range has spare space, which its sides share in
-proportion, so that subtrees can be built on all cores."""
+may split the range instead; then both sides list the primitives that the plane cuts. The array has spare space for the additional
+references. The two sides of a range share its spare space in proportion to their sizes, so that all cores can build subtrees."""
 
 import warp as wp
 
@@ -29,7 +29,7 @@ from wrt.kernels.units.box import box_pad, padded_hi, padded_lo
 
 @wp.func
 def crossing(a: wp.vec3, b: wp.vec3, axis: int, plane: float) -> wp.vec3:
-    """Intersection of the edge a b with a plane between its ends: float64, rounded once, far within the pads added later."""
+    """Return the intersection of the edge a b with a plane between its ends. It is rounded once; this error is far below the pads."""
     s = (wp.float64(plane) - wp.float64(a[axis])) / (wp.float64(b[axis]) - wp.float64(a[axis]))
     p = wp.vec3d(a) + s * (wp.vec3d(b) - wp.vec3d(a))
     return wp.vec3(p)
@@ -37,12 +37,12 @@ def crossing(a: wp.vec3, b: wp.vec3, axis: int, plane: float) -> wp.vec3:
 
 @wp.func
 def clip_reference(record: BuildRecord, axis: int, low: float, high: float, corners: wp.array(dtype=wp.vec3)) -> BuildRecord:
-    """Clip a reference to the part between two planes; lo > hi if nothing remains.
+    """Clip a reference to the part between two planes across an axis; the result has lo > hi if nothing remains.
 
-    Conservative: the planes move outwards by the pads of the triangle's box; the clipped part is padded like that box, and stays within
-    the reference's box. A hit is within these pads of the triangle, and so of a part of it. A hit's t is clamped to the triangle's own
-    box, though, and on a ray that grazes a triangle in an axis plane the clamp moves far. So a triangle no thicker than its pads is
-    clipped by its box.
+    Conservative: the planes move outwards by the pads of the triangle's box. The box of the clipped part gets the same pads, and is cut off
+    at the reference's box. A hit is within these pads of the triangle, and so of one of its parts. But t is clamped to the triangle's box,
+    which moves it far if the ray grazes a triangle that lies in an axis plane. So of a triangle no thicker than its pads, the box is
+    clipped instead.
     """
     out = record
     out.lo[axis] = wp.max(record.lo[axis], low)
@@ -86,14 +86,14 @@ def is_empty(box: BuildRecord) -> bool:
 
 @wp.func
 def plane_of(low: float, high: float, k: int) -> float:
-    """Plane between bins k - 1 and k of a range's box."""
+    """Return the coordinate of the plane between bins k - 1 and k of a range whose box extends from `low` to `high`."""
     f = float(k) / float(BINS)
     return low * (1.0 - f) + high * f
 
 
 @wp.func
 def spatial_bin(low: float, high: float, x: float) -> int:
-    """Bin of a coordinate: the last one that begins at or before it, by the planes themselves."""
+    """Return the last bin that begins at or before the coordinate x. The result is consistent with `plane_of` to the last bit."""
     k = wp.clamp(int(float(BINS) * ((x - low) / (high - low))), 0, BINS - 1)
     while k > 0 and x < plane_of(low, high, k):
         k = k - 1
@@ -104,8 +104,8 @@ def spatial_bin(low: float, high: float, x: float) -> int:
 
 @wp.func
 def spatial_split(records: wp.array(dtype=BuildRecord), task: BuildTask, corners: wp.array(dtype=wp.vec3), best: Split) -> Split:
-    """Find the cheapest plane between two bins that costs less than `best`; each side must hold fewer references than the range. A
-    reference is clipped to every bin that it reaches into."""
+    """Return the cheapest plane between two bins, or `best` if no plane costs less. Each side must have fewer references than the range.
+    A reference is clipped to each bin that it meets."""
     scale = area_scale(task.measures.box)
     n = task.end - task.begin
     for axis in range(3):
@@ -156,7 +156,7 @@ def spatial_split(records: wp.array(dtype=BuildRecord), task: BuildTask, corners
 
 @wp.struct
 class Sides:
-    """The boxes and counts of references on both sides of a plane; a reference that it cuts is in both."""
+    """Boxes and numbers of the references on both sides of a plane. A reference that the plane cuts counts on both sides."""
 
     left: Row
     right: Row
@@ -166,7 +166,7 @@ class Sides:
 
 @wp.func
 def measure_sides(data: BuildData, task: BuildTask, axis: int, plane: float) -> Sides:
-    """Measure both sides of a plane."""
+    """Return the boxes and numbers of references on both sides of a plane across an axis."""
     parts = Sides()
     parts.left = empty_row()
     parts.right = empty_row()
@@ -192,7 +192,7 @@ def measure_sides(data: BuildData, task: BuildTask, axis: int, plane: float) -> 
 
 @wp.func
 def cheaper_side(parts: Sides, box: Row, scale: float) -> int:
-    """Choose a side for a reference with this box: -1 left, 1 right, 0: both (section 4.4, "reference unsplitting")."""
+    """Return the cheapest side for a reference with this box: -1 left, 1 right, 0 both (section 4.4, "reference unsplitting")."""
     area_0 = row_area(parts.left, scale)
     area_1 = row_area(parts.right, scale)
     both = area_0 * float(parts.n_left) + area_1 * float(parts.n_right)
@@ -205,8 +205,8 @@ def cheaper_side(parts: Sides, box: Row, scale: float) -> int:
 
 @wp.func
 def partition_by_plane(data: BuildData, task: BuildTask, split: Split) -> wp.vec2i:
-    """Copy references left of the plane to data.boxes[begin ..], those right of it to data.boxes[.. limit - 1] backwards; return both
-    counts. A reference on both sides is split, unless it costs less whole or no space is left."""
+    """Copy references left of the plane to data.boxes from task.begin upwards, the others from task.limit - 1 downwards.
+    Return both numbers. A reference that the plane cuts is split, unless it costs less on one side, or no space is left."""
     scale = area_scale(task.measures.box)
     plane = plane_of(task.measures.box[split.axis], -task.measures.box[3 + split.axis], split.bin)
     parts = measure_sides(data, task, split.axis, plane)
@@ -250,8 +250,7 @@ def partition_by_plane(data: BuildData, task: BuildTask, split: Split) -> wp.vec
 
 @wp.func
 def object_split(data: BuildData, task: BuildTask) -> wp.vec2i:
-    """Copy references by centroid, left ones to data.boxes[begin ..], right ones to data.boxes[.. limit - 1] backwards; return both
-    counts."""
+    """Copy references to data.boxes, as partition_by_plane does, but to the left or right by their centroids' bins; return both numbers."""
     n = task.end - task.begin
     middle = task.begin + n / 2
     if n > 2 and task.depth + balanced_depth(n) < MAX_DEPTH:
@@ -286,7 +285,7 @@ def box_of(records: wp.array(dtype=BuildRecord), begin: int, end: int) -> Row:
 
 @wp.func
 def copied_halves(data: BuildData, counts: wp.vec2i, task: BuildTask) -> Halves:
-    """Halves of the references in data.boxes, with their boxes."""
+    """Return the halves that were copied to data.boxes, with their boxes but without `middle` and the bounds of centroids."""
     out = Halves()
     out.count_0 = counts[0]
     out.count_1 = counts[1]
@@ -297,7 +296,7 @@ def copied_halves(data: BuildData, counts: wp.vec2i, task: BuildTask) -> Halves:
 
 @wp.func
 def split_references(data: BuildData, task: BuildTask) -> Halves:
-    """Take the cheaper of the best object split and, if its sides overlap, the best plane; both sides are in data.boxes."""
+    """Split by the best object split or, if its sides overlap and a plane costs less, by the best plane. Copy both sides to data.boxes."""
     scale = area_scale(task.measures.box)
     halves = copied_halves(data, object_split(data, task), task)
     n = task.end - task.begin
@@ -320,7 +319,7 @@ def split_references(data: BuildData, task: BuildTask) -> Halves:
 
 @wp.func
 def share_space(data: BuildData, task: BuildTask, halves: Halves) -> Halves:
-    """Copy both sides back to data.records; they share the free space in proportion to their counts."""
+    """Copy both sides back to data.records, with free space behind each in proportion to its number of references."""
     free = task.limit - task.begin - halves.count_0 - halves.count_1
     share = int(wp.int64(free) * wp.int64(halves.count_0) / wp.int64(halves.count_0 + halves.count_1))
     middle = task.begin + halves.count_0 + share

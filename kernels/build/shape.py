@@ -1,5 +1,5 @@
-"""Boxes and records of triangles and spheres, made on any device.
-They have the bits of the host's (Geometry.bounds, the layout "corners"), so that a mesh that moves on a GPU stays there."""
+"""Compute the boxes and records of triangles and spheres on any device, so that a moving mesh need not leave the GPU.
+The results have the bits of the host's functions (Geometry.bounds, wrt.accel.triangle_data.corners)."""
 
 from typing import Any
 
@@ -9,14 +9,14 @@ from wrt.kernels.structs import Primitive, kernel
 from wrt.kernels.units.box import box_pad, padded_hi, padded_lo
 from wrt.kernels.units.triangle import lower, upper
 
-SPLIT = wp.constant(wp.float64(2.0**27 + 1.0))  # Dekker's, for float64
-DOUBT = wp.constant(wp.float64(2.0**-50))  # as in wrt.scene.clean.corners_have_area
+SPLIT = wp.constant(wp.float64(2.0**27 + 1.0))  # Dekker's factor that splits a float64 into two halves
+DOUBT = wp.constant(wp.float64(2.0**-50))  # bound on the relative error of a float64 area, as in wrt.scene.clean.corners_have_area
 Terms = wp.types.vector(16, wp.float64)
 
 
 @wp.struct
 class Shape:
-    """The fields of wrt.accel.geometry.Geometry: faces are primitives 0 .. F - 1, spheres the next ones."""
+    """The arrays of wrt.accel.geometry.Geometry. The F faces are the primitives 0 .. F - 1; spheres follow."""
 
     vertices: wp.array(dtype=wp.vec3)
     faces: wp.array(dtype=wp.vec3i)
@@ -25,7 +25,7 @@ class Shape:
 
 @kernel
 def bounds(shape: Shape, low: wp.array(dtype=wp.vec3), high: wp.array(dtype=wp.vec3), first: int):
-    """Store the padded boxes of primitives first .. first + dim - 1; all of space for one that is not finite."""
+    """Store the padded boxes of primitives first .. first + dim - 1. The box of a primitive that is not finite is all of space."""
     i = first + wp.tid()
     n = shape.faces.shape[0]
     lo = wp.vec3()
@@ -37,7 +37,7 @@ def bounds(shape: Shape, low: wp.array(dtype=wp.vec3), high: wp.array(dtype=wp.v
         c = shape.vertices[face[2]]
         lo = lower(lower(a, b), c)
         hi = upper(upper(a, b), c)
-        if not wp.isfinite(a + b + c):  # or a sum beyond float32: then a few boxes are larger than necessary
+        if not wp.isfinite(a + b + c):  # a single test for most triangles; a sum beyond float32 also gets here
             if not (wp.isfinite(a) and wp.isfinite(b) and wp.isfinite(c)):
                 lo = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
                 hi = wp.vec3(wp.inf, wp.inf, wp.inf)
@@ -52,13 +52,13 @@ def bounds(shape: Shape, low: wp.array(dtype=wp.vec3), high: wp.array(dtype=wp.v
 
 @wp.func
 def half_area(extent: Any) -> Any:
-    """Half the surface of a box of this extent, in either precision. The host calls half_area.func with (3, ...) arrays."""
+    """Return half the surface area of a box with this extent (vec3 or vec3d). The host calls half_area.func with (3, ...) arrays."""
     return extent[0] * extent[1] + extent[1] * extent[2] + extent[2] * extent[0]
 
 
 @wp.func
 def two_sum(a: wp.float64, b: wp.float64) -> wp.vec2d:
-    """Sum as rounded, and its rounding error (Knuth)."""
+    """Return the rounded sum a + b and its rounding error (Knuth)."""
     s = a + b
     t = s - a
     return wp.vec2d(s, (a - (s - t)) + (b - t))
@@ -66,7 +66,7 @@ def two_sum(a: wp.float64, b: wp.float64) -> wp.vec2d:
 
 @wp.func
 def two_product(a: wp.float64, b: wp.float64) -> wp.vec2d:
-    """Product as rounded, and its rounding error (Dekker)."""
+    """Return the rounded product a b and its rounding error (Dekker)."""
     p = a * b
     c = SPLIT * a
     a_high = c - (c - a)
@@ -79,7 +79,7 @@ def two_product(a: wp.float64, b: wp.float64) -> wp.vec2d:
 
 @wp.func
 def is_zero(terms: Terms) -> bool:
-    """Test whether the exact sum is 0 (Shewchuk 1997, "Adaptive Precision Floating-Point Arithmetic", grow-expansion)."""
+    """Test whether the exact sum of the terms is 0 (Shewchuk 1997, "Adaptive Precision Floating-Point Arithmetic", grow-expansion)."""
     parts = Terms()
     for n in range(16):
         q = terms[n]
@@ -96,7 +96,7 @@ def is_zero(terms: Terms) -> bool:
 
 @wp.func
 def with_products(terms: Terms, place: int, e: wp.vec2d, f: wp.vec2d, sign: wp.float64) -> Terms:
-    """Store the exact product of two sums of two as eight terms, from `place` on."""
+    """Store the exact product sign (e[0] + e[1]) (f[0] + f[1]) as eight terms, from index `place` on."""
     out = terms
     for i in range(2):
         for j in range(2):
@@ -108,8 +108,8 @@ def with_products(terms: Terms, place: int, e: wp.vec2d, f: wp.vec2d, sign: wp.f
 
 @wp.func
 def exactly_across(a: wp.vec3, b: wp.vec3, c: wp.vec3, i: int, j: int) -> bool:
-    """Test exactly whether component k of (b - a) x (c - a) differs from 0; i, j: the two axes beside k. All numbers are multiples of
-    2^-298, below 2^258."""
+    """Test exactly whether component k of (b - a) x (c - a) differs from 0, where i and j are the two other axes.
+    Nothing under- or overflows: all numbers are multiples of 2^-298 and below 2^258."""
     e_i = two_sum(wp.float64(b[i]), -wp.float64(a[i]))
     e_j = two_sum(wp.float64(b[j]), -wp.float64(a[j]))
     f_i = two_sum(wp.float64(c[i]), -wp.float64(a[i]))
@@ -120,7 +120,7 @@ def exactly_across(a: wp.vec3, b: wp.vec3, c: wp.vec3, i: int, j: int) -> bool:
 
 @wp.func
 def surely_across(a: wp.vec3, b: wp.vec3, c: wp.vec3, i: int, j: int) -> bool:
-    """Test the same in float64; False if in doubt."""
+    """Test as `exactly_across` does, but in float64; return False if rounding errors could change the result."""
     left = (wp.float64(b[i]) - wp.float64(a[i])) * (wp.float64(c[j]) - wp.float64(a[j]))
     right = (wp.float64(b[j]) - wp.float64(a[j])) * (wp.float64(c[i]) - wp.float64(a[i]))
     return not wp.abs(left - right) <= DOUBT * (wp.abs(left) + wp.abs(right))
@@ -128,7 +128,7 @@ def surely_across(a: wp.vec3, b: wp.vec3, c: wp.vec3, i: int, j: int) -> bool:
 
 @wp.func
 def has_area(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> bool:
-    """Test that the corners are not on one line, as wrt.scene.clean.has_area; True if one is not finite."""
+    """Test whether the corners are not on one line, as wrt.scene.clean.has_area does; True if a corner is not finite."""
     if surely_across(a, b, c, 1, 2) or surely_across(a, b, c, 2, 0) or surely_across(a, b, c, 0, 1):
         return True
     if not (wp.isfinite(a) and wp.isfinite(b) and wp.isfinite(c)):
@@ -138,7 +138,7 @@ def has_area(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> bool:
 
 @kernel
 def write_corners(shape: Shape, order: wp.array(dtype=wp.int32), out: wp.array(dtype=Primitive), first: int):
-    """Write the records first .. first + dim - 1 of the layout "corners"; order: their prim_id."""
+    """Write the records first .. first + dim - 1 in the layout "corners"; order[i] is the prim_id of record i."""
     i = first + wp.tid()
     record = Primitive()
     record.prim_id = order[i]
@@ -154,7 +154,7 @@ def write_corners(shape: Shape, order: wp.array(dtype=wp.int32), out: wp.array(d
 
 @kernel
 def count_outside(faces: wp.array(dtype=wp.vec3i), n_vertices: int, count: wp.array(dtype=wp.int32), first: int):
-    """Count the faces with an index that is not a vertex."""
+    """Add to count[0] the number of faces with an index outside 0 .. n_vertices - 1."""
     face = faces[first + wp.tid()]
     for k in range(3):
         if face[k] < 0 or face[k] >= n_vertices:

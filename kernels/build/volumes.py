@@ -1,4 +1,4 @@
-"""The inner loops that fit spheres and k-DOPs to a finished binary tree, on the CPU."""
+"""The inner loops that fit bounding spheres and 14-DOPs to a finished binary tree, on the CPU."""
 
 import warp as wp
 
@@ -13,7 +13,7 @@ ROUND_UP = wp.constant(wp.float64(1.0 + 2.0**-22))
 
 @wp.func
 def farthest(lo: wp.vec3, hi: wp.vec3, center: wp.vec3d) -> wp.vec3d:
-    """Vector from the center to the farthest corner of a box."""
+    """Return the vector from `center` to the farthest corner of a box."""
     a = wp.vec3d(lo) - center
     b = wp.vec3d(hi) - center
     out = b
@@ -26,17 +26,17 @@ def farthest(lo: wp.vec3, hi: wp.vec3, center: wp.vec3d) -> wp.vec3d:
 @kernel
 def fit_spheres(nodes: wp.array(dtype=Bvh2Node), spans: wp.array(dtype=wp.vec2i), order: wp.array(dtype=wp.int32),
                 lo: wp.array(dtype=wp.vec3), hi: wp.array(dtype=wp.vec3), out: wp.array(dtype=SphereNode), first: int):
-    """Fit spheres around the boxes lo, hi (by prim_id) below each child of out[first + tid].
-    Child 2 i + side has the records spans[.][0] .. spans[.][1] - 1. Badoiu and Clarkson 2003, "Smaller core-sets for balls": the center
-    starts in the middle of the box. In round i it moves 1 / (i + 1) of the way to the farthest corner; the best round counts. The radius
-    is rounded up."""
+    """Fit a sphere for each child of node i = first + tid, around the boxes lo, hi (indexed by prim_id) of the child's primitives.
+    Badoiu and Clarkson 2003, "Smaller core-sets for balls". The center begins in the middle of the child's box. In round r it moves
+    1 / (r + 1) of the way to the farthest corner. The smallest sphere of all rounds is stored, with its radius rounded up. Child `side` has
+    the primitives order[span[0]] .. order[span[1] - 1], with span = spans[2 i + side]."""
     i = first + wp.tid()
     for side in range(2):
         node_lo = wp.where(side == 0, nodes[i].lo_0, nodes[i].lo_1)
         node_hi = wp.where(side == 0, nodes[i].hi_0, nodes[i].hi_1)
         best = wp.vec4(0.0, 0.0, 0.0, -1.0)
         if node_lo[0] < wp.inf:
-            # A box that is not finite has no middle: its sphere is all of space.
+            # If the box is not finite, it has no middle, and the sphere remains all of space.
             best = wp.vec4(0.0, 0.0, 0.0, wp.inf)
             center = 0.5 * node_lo + 0.5 * node_hi
             for r in range(ROUNDS + 1):
@@ -60,8 +60,8 @@ def fit_spheres(nodes: wp.array(dtype=Bvh2Node), spans: wp.array(dtype=wp.vec2i)
 @kernel
 def fit_kdops(order: wp.array(dtype=wp.int32), cut_lo: wp.array(dtype=wp.vec4), cut_hi: wp.array(dtype=wp.vec4),
               out: wp.array(dtype=KdopNode)):
-    """Fit diagonal planes around those of the primitives (cut_lo, cut_hi, by prim_id), from the leaves up. One thread.
-    `out` has its boxes and links. Missing children get no planes."""
+    """Compute the diagonal planes of all nodes in `out`, in one thread. cut_lo, cut_hi: planes of the primitives, indexed by prim_id.
+    The boxes and links of `out` are already set. A missing child gets an empty 14-DOP."""
     n = out.shape[0]
     for k in range(n):
         i = n - 1 - k

@@ -1,7 +1,7 @@
-"""The collapse of a binary BVH into a wide one of least expected cost.
-Ylitie, Karras and Laine 2017, "Efficient Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs", section 3.1. From the bottom up,
-it finds the least cost of a subtree as at most k roots, for k up to the width. From the top down, it writes the nodes of the best choice.
-A leaf costs as much as the rows of primitives that it fills."""
+"""Collapse a binary BVH into a wide BVH of least SAH cost.
+Ylitie, Karras and Laine 2017, "Efficient Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs", section 3.1. A subtree of the
+binary BVH may become up to k children ("roots") of a wide node. From the bottom up, `subtree_costs` finds the least cost of each subtree
+for each k. From the top down, `collapse` writes the best choice. A leaf's cost is proportional to the rows of primitives that it fills."""
 
 import warp as wp
 
@@ -17,43 +17,43 @@ MAX_WIDTH = wp.constant(8)
 class CollapseOptions:
     """Limits and SAH costs of a wide tree."""
 
-    width: int  # Children of a node, and primitives of a row.
-    max_leaf: int  # Most primitives of a leaf.
-    cost_traversal: float  # Of a node.
-    cost_intersection: float  # Of a row of primitives.
-    stack: int  # Entries of a traversal's stack.
+    width: int  # Number of children of a node, and of primitives in a row.
+    max_leaf: int  # Largest number of primitives in a leaf.
+    cost_traversal: float  # Cost of a node.
+    cost_intersection: float  # Cost of a row of primitives.
+    stack: int  # Number of entries on the traversal's stack.
 
 
 @wp.struct
 class Subtrees:
-    """Costs of the binary nodes' subtrees; cost and choice have an entry for each number of roots 1 .. MAX_WIDTH."""
+    """Least costs of the binary nodes' subtrees. For node i and k roots, `cost` and `choice` have the entry i * MAX_WIDTH + k - 1."""
 
-    size: wp.array(dtype=wp.int32)  # Primitives.
-    height: wp.array(dtype=wp.int32)
+    size: wp.array(dtype=wp.int32)  # Number of primitives.
+    height: wp.array(dtype=wp.int32)  # Number of inner nodes on the longest path.
     cost: wp.array(dtype=wp.float32)
-    choice: wp.array(dtype=wp.uint8)  # Of k roots: roots of the left child. Of one root: 1 for a leaf. Fewer roots win at equal cost.
+    choice: wp.array(dtype=wp.uint8)  # k > 1: number of roots in the left child. k = 1: 1 for a leaf, 0 for an inner node.
 
 
 @wp.struct
 class WideTree:
-    """The wide tree; children without a node have an empty box."""
+    """The wide tree. A missing child has the reference EMPTY and an empty box."""
 
-    children: wp.array(dtype=wp.int32)  # References, `width` a node (kernels.wide.references).
-    lo: wp.array(dtype=wp.vec3)  # Boxes of the children: lo, hi.
+    children: wp.array(dtype=wp.int32)  # References, `width` per node (kernels.wide.references).
+    lo: wp.array(dtype=wp.vec3)  # lo, hi: boxes of the children.
     hi: wp.array(dtype=wp.vec3)
-    source: wp.array(dtype=wp.int32)  # Scratch: children of one node as 2 * binary node + side.
-    order: wp.array(dtype=wp.int32)  # prim_id of each lane; rows are filled up with -1.
-    count: wp.array(dtype=wp.int32)  # Nodes, rows, leaves, depth, most entries on a traversal's stack.
+    source: wp.array(dtype=wp.int32)  # Scratch: the children of one node, each as 2 * binary node + side.
+    order: wp.array(dtype=wp.int32)  # prim_id of each primitive, row after row; -1 in the unused entries of a row.
+    count: wp.array(dtype=wp.int32)  # Numbers of nodes, rows, leaves; depth; largest number of entries on a traversal's stack.
 
 
 @wp.struct
 class WideTask:
-    """A binary node that becomes the wide node `slot`."""
+    """The binary node `node`, which becomes the wide node `slot`."""
 
     node: int
     slot: int
-    free_entries: int  # Entries of the stack that are left below it.
-    depth: int  # 1 at the root.
+    free_entries: int  # Number of stack entries that are free when a traversal visits the node.
+    depth: int  # Depth of the wide node; the root's is 1.
 
 
 @wp.func
@@ -68,7 +68,7 @@ def high_of(node: Bvh2Node, side: int) -> wp.vec3:
 
 @wp.func
 def area_of(node: Bvh2Node, side: int) -> float:
-    """Half the surface of a child's box: 0 for an empty one, at most 1e30."""
+    """Return half the surface area of a child's box: 0 for an empty box, at most 1e30."""
     return wp.min(half_area(wp.max(high_of(node, side) - low_of(node, side), wp.vec3())), 1.0e30)
 
 
@@ -84,7 +84,7 @@ def count_of(node: Bvh2Node, side: int) -> int:
 
 @wp.func
 def child_size(trees: Subtrees, node: Bvh2Node, side: int) -> int:
-    """Primitives of a child."""
+    """Return the number of primitives in a child."""
     n = count_of(node, side)
     if n == 0:
         n = trees.size[first_of(node, side)]
@@ -98,7 +98,7 @@ def leaf_cost(options: CollapseOptions, area: float, count: int) -> float:
 
 @wp.func
 def child_cost(trees: Subtrees, options: CollapseOptions, node: Bvh2Node, side: int, k: int) -> float:
-    """Least cost of a child as at most k roots."""
+    """Return the least cost of a child as at most k roots."""
     n = count_of(node, side)
     if n > 0:
         return leaf_cost(options, area_of(node, side), n)
@@ -107,14 +107,13 @@ def child_cost(trees: Subtrees, options: CollapseOptions, node: Bvh2Node, side: 
 
 @kernel
 def subtree_costs(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, trees: Subtrees):
-    """Compute the costs of all subtrees from the last node to the first: parents stand before their children. One thread.
-    The cost of one root includes its own box's area, which is in its parent: the parent adds it."""
+    """Compute the costs of all subtrees in one thread, from the last node to the first: parents have lower indices than their children.
+    The cost of a subtree as one root depends on its box, which its parent holds. So it is computed at the parent."""
     n_nodes = nodes.shape[0]
     for j in range(n_nodes):
         i = n_nodes - 1 - j
         node = nodes[i]
         height = int(0)
-        # The cost of a child as one root needs its box, which this node has.
         for side in range(2):
             if count_of(node, side) == 0:
                 c = first_of(node, side)
@@ -144,7 +143,7 @@ def subtree_costs(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, tre
 
 @wp.func
 def write_roots(nodes: wp.array(dtype=Bvh2Node), trees: Subtrees, i: int, k: int, source: wp.array(dtype=wp.int32)) -> int:
-    """Write the at most k roots that replace the children of binary node i to `source`; return their number, at least two."""
+    """Write the cheapest choice of at most k roots for binary node i to `source`; return their number, at least two."""
     node_of = wp.zeros(shape=wp.static(8), dtype=wp.int32)
     side_of = wp.zeros(shape=wp.static(8), dtype=wp.int32)
     k_of = wp.zeros(shape=wp.static(8), dtype=wp.int32)
@@ -186,7 +185,7 @@ def write_roots(nodes: wp.array(dtype=Bvh2Node), trees: Subtrees, i: int, k: int
 
 @wp.func
 def write_primitives(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), parent: int, side: int, out: WideTree, slot: int):
-    """Write the primitives of a child's subtree to order[slot ..]."""
+    """Write the prim_id of all primitives in a child's subtree to out.order, from index `slot` on."""
     stack = wp.zeros(shape=wp.static(STACK_SIZE + 2), dtype=wp.int32)
     stack[0] = 2 * parent + side
     size = int(1)
@@ -210,7 +209,7 @@ def write_primitives(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.i
 def write_in_order(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, out: WideTree, base: int, n: int):
     """Sort the n children of the wide node at `base` for any-hit rays, and write their references and boxes.
     An any-hit ray visits the last slot first. So the slots hold, from the first to the last: empty slots, inner nodes, leaves. Inner nodes
-    and leaves are each sorted by ascending box area. out.source names the binary node and side that hold the box of each child."""
+    are sorted by ascending box area, and so are leaves. The box of child i is in the binary node and side out.source[i]."""
     reference = wp.zeros(shape=wp.static(8), dtype=wp.int32)
     source = wp.zeros(shape=wp.static(8), dtype=wp.int32)
     area = wp.zeros(shape=wp.static(8), dtype=wp.float32)
@@ -241,9 +240,9 @@ def write_in_order(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, ou
 
 @wp.func
 def choose_roots(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, trees: Subtrees, task: WideTask, out: WideTree) -> int:
-    """Write the sources of the children of a wide node; return their number.
-    A node of k children leaves k - 1 on the stack during the walk of the last. The binary tree below needs one entry a level: the node
-    takes fewer children if its best choice leaves too few."""
+    """Choose the children of a wide node, and write them to out.source; return their number.
+    A node with n children leaves up to n - 1 entries on the stack while a traversal visits its last child. The subtree below needs one free
+    entry per level of the binary tree. If the best choice leaves too few free entries, the node gets fewer children."""
     k = int(options.width)
     n = int(0)
     while True:
@@ -262,7 +261,8 @@ def choose_roots(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, tree
 @wp.func
 def write_rows(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), code: int, count: int, width: int,
                out: WideTree) -> int:
-    """Append the leaf of a source with `count` primitives to the rows; return the rows that it fills."""
+    """Append a leaf to the rows in out.order; return the number of rows that it fills. The leaf has the `count` primitives of `code`, which
+    is an entry of out.source."""
     rows = (count + width - 1) / width
     first = out.count[1] * width
     write_primitives(nodes, order, code / 2, code % 2, out, first)
@@ -274,7 +274,7 @@ def write_rows(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32),
 @kernel
 def collapse(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), options: CollapseOptions, trees: Subtrees,
              out: WideTree):
-    """Write the wide tree, depth first, and its totals to out.count. One thread."""
+    """Write the wide tree in one thread, depth first, and its totals to out.count."""
     stack = wp.zeros(shape=wp.static(8 * STACK_SIZE), dtype=WideTask)
     root = WideTask()
     root.free_entries = options.stack
@@ -295,7 +295,7 @@ def collapse(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), o
         free_entries = task.free_entries - (n - 1)
         least_free = wp.min(least_free, free_entries)
         for j in range(n):
-            # The last child is popped first: it gets the next slots.
+            # The inner children of a node get consecutive slots. The last of them is popped first, so its children get the next slots.
             code = out.source[j]
             node = nodes[code / 2]
             side = code % 2
@@ -325,8 +325,8 @@ def collapse(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), o
 @kernel
 def refit(children: wp.array(dtype=wp.int32), order: wp.array(dtype=wp.int32), width: int, low: wp.array(dtype=wp.vec3),
           high: wp.array(dtype=wp.vec3), lo: wp.array(dtype=wp.vec3), hi: wp.array(dtype=wp.vec3)):
-    """Refit the boxes of all children to moved primitives, from the last node to the first. One thread.
-    low, high: a box for each prim_id, and an empty one for lanes without (order -1)."""
+    """Refit the boxes lo, hi of all children to moved primitives in one thread, from the last node to the first.
+    The arrays low, high have a box for each prim_id, then an empty box for entries of `order` without a primitive (-1)."""
     n = children.shape[0]
     none = low.shape[0] - 1
     for k in range(n):

@@ -1,9 +1,9 @@
-"""One ray at a time: pictures on CUDA, and on a CPU where rays are counted or logged.
+"""One ray at a time: the render loop on CUDA, and on a CPU if rays are counted or logged.
 
-A thread follows a camera ray and all its children: trace, shade (shade/step.py), push the new paths on a small stack. A GPU hides
-the latency of one thread behind thousands of others. A CPU cannot, so wave.py traces and shades the rays of many samples together.
-Both loops share the step and the follow-up, and take a sample's paths in the same order. Their films have the same bits
-(tests/wrt/renderer/test_waves.py, tests/test_random_scenes.py)."""
+A thread follows a camera ray and all its children: it traces a ray, shades the hit (shade/step.py), and pushes the new paths on a
+small stack. A GPU hides the latency of one thread behind thousands of other threads. A CPU cannot, so wave.py traces and shades the
+rays of many samples together. Both loops share the step and the follow-up, and take a sample's paths in the same order. So their films
+have the same bits (tests/wrt/renderer/test_waves.py, tests/test_random_scenes.py)."""
 
 from typing import Any
 
@@ -17,36 +17,36 @@ from wrt.kernels.shade.follow_up import FOLLOWED, add_cuts, make_follow_up
 from wrt.kernels.shade.paths import make_path, make_paths
 from wrt.kernels.shade.sampling import hash_pair, make_sample_2d, quantile
 from wrt.kernels.shade.shading import make_cutout, make_shading
-from wrt.kernels.shade.shadows import Shadow, make_transmittance
-from wrt.kernels.shade.step import Sample, Step, add_light, add_surface_light, make_shaded, make_step, receives_light
+from wrt.kernels.shade.shadows import make_transmittance
+from wrt.kernels.shade.step import DirectLight, Sample, Step, add_light, add_surface_light, make_shaded, make_step, receives_light
 from wrt.kernels.structs import AovFilm, Film, Hit, Lighting, Limits, Ray, Surfaces, any_positive, kernel
 
 
 @wp.struct
 class Tile:
-    """A rectangle of pixels and the samples to add to each."""
+    """A rectangle of pixels, and the samples to add to each pixel."""
 
-    x: int
-    y: int
-    width: int
+    x: int  # The left column in the picture.
+    y: int  # The top line.
+    width: int  # In pixels.
     first_sample: int
     n_samples: int
-    threads: int  # That share the samples of a pixel: 1 or n_samples.
-    samples: wp.array(dtype=Sample)  # With a thread for each sample: by thread.
+    threads: int  # Number of threads that share the samples of a pixel: 1 or n_samples.
+    samples: wp.array(dtype=Sample)  # The result of each thread, if threads > 1.
 
 
 def make_direct_light(features: Features, accel_struct: Any, transmittance: Any, step: Step) -> Any:
-    """Return the function that traces one shadow ray to each light, and to the background if it is sampled."""
+    """Return direct_light, which traces one shadow ray to each light, and to the background if it is sampled."""
     Shaded = make_shaded(features.counting)
     light_point = make_light_points(features).point
 
     @wp.func
-    def direct_light(accel: accel_struct, surfaces: Surfaces, lighting: Lighting, shaded: Shaded, index: wp.uint32) -> Shadow:
-        """Sum the unoccluded light; `cut` and `lost` count the shadow rays that MAX_TRANSPARENT ended."""
-        out = Shadow()
+    def direct_light(accel: accel_struct, surfaces: Surfaces, lighting: Lighting, shaded: Shaded, index: wp.uint32) -> DirectLight:
+        """Return the sum of the light that arrives; `cut` and `lost` count the shadow rays that MAX_TRANSPARENT cut."""
+        out = DirectLight()
         for i in range(lighting.count + wp.static(step.extra_lights)):
             point = light_point(lighting, shaded.key, index, i)
-            request = step.shadow_request(shaded, step.choose(lighting, surfaces, i, shaded.surface, point))
+            request = step.shadow_request(shaded, step.sample_light(lighting, surfaces, i, shaded.surface, point))
             if any_positive(request.value):
                 out = add_light(out, request.value, shaded.scatter, transmittance(accel, surfaces, request.ray, request.end))
         return out
@@ -55,7 +55,7 @@ def make_direct_light(features: Features, accel_struct: Any, transmittance: Any,
 
 
 def make_radiance(features: Features, accel_struct: Any, closest_hit: Any, any_hit: Any) -> Any:
-    """Return the function that follows one camera ray with all its children. Waiting paths are on a stack, the next one on top."""
+    """Return `radiance`, which follows one camera ray with all its children. Waiting paths are on a stack."""
     Path = make_path(features.counting)
     paths, shading = make_paths(features.counting), make_shading(features)
     step, follow_up = make_step(features, shading), make_follow_up(features)
@@ -97,7 +97,7 @@ def make_radiance(features: Features, accel_struct: Any, closest_hit: Any, any_h
             if next.refracted == FOLLOWED:
                 stack[size] = shaded.refracted
                 size = size + 1
-            direct = Shadow()
+            direct = DirectLight()
             if wp.static(features.direct_light):
                 if receives_light(shaded.scatter):
                     direct = direct_light(accel, surfaces, lighting, shaded, index)
@@ -108,20 +108,20 @@ def make_radiance(features: Features, accel_struct: Any, closest_hit: Any, any_h
 
 
 def make_traversals(features: Features, structure: Any) -> Any:
-    """Return closest_hit and any_hit of a structure (wrt.accel.structure.Structure), which test the alpha of cut-outs at each
-    hit."""
+    """Return closest_hit and any_hit of a structure (wrt.accel.structure.Structure), which ignore hits on the clear parts of
+    cut-outs."""
     accepts = make_cutout(features)
     return structure.traversal(any_hit=False, accepts=accepts), structure.traversal(any_hit=True, accepts=accepts)
 
 
 def make_camera_sample(features: Features, camera_kind: Any) -> Any:
-    """Return the function for the camera ray of one sample of a pixel."""
+    """Return camera_sample(camera, film, x, y, xi, lens_xi) -> Ray of one sample of the pixel in column x and line y."""
     camera_struct = camera_kind.Camera
     camera_ray = camera_kind.make_camera_ray(features)
 
     @wp.func
     def camera_sample(camera: camera_struct, film: Film, x: int, y: int, xi: wp.vec2, lens_xi: wp.vec2) -> Ray:
-        # The filter is sampled by importance, so that each sample has weight 1 and belongs to this pixel alone.
+        # The pixel filter is sampled by importance: each sample has weight 1 and belongs to this pixel alone.
         offset = wp.vec2(xi[0] - 0.5, xi[1] - 0.5)
         if wp.static(features.filter):
             offset = wp.vec2(quantile(film.filter_icdf, xi[0]), quantile(film.filter_icdf, xi[1]))
@@ -132,10 +132,10 @@ def make_camera_sample(features: Features, camera_kind: Any) -> Any:
 
 
 def make_render_kernel(features: Features, structure: Any, camera_kind: Any) -> Any:
-    """Return the kernel that renders a tile with one thread a pixel, or one a sample (then add_samples adds them up).
+    """Return the kernel that renders a tile with one thread for each pixel, or one thread for each sample (see add_samples).
 
-    The code has only what `features` asks for. `camera_kind` is a module as kernels/shade/cameras describes it. With
-    features.counting, `structure` must be one of kernels.study.ray_log, and every ray is logged."""
+    kernels/shade/cameras describes the module `camera_kind`. With features.counting, every ray is logged, and `structure` must come
+    from kernels.study.ray_log."""
     accel_struct = structure.struct
     closest_hit, any_hit = make_traversals(features, structure)
     camera_struct = camera_kind.Camera
@@ -163,7 +163,7 @@ def make_render_kernel(features: Features, structure: Any, camera_kind: Any) -> 
                 lens_xi = sample_2d(key, index, 1)
             ray = camera_sample(camera, film, x, y, sample_2d(key, index, 0), lens_xi)
             sample = Sample()
-            if ray.t_max > 0.0:  # else the film gets no light here
+            if ray.t_max > 0.0:  # Else this film point gets no light.
                 sample = radiance(accel, surfaces, lighting, limits, ray, key, index)
             if tile.threads > 1:
                 tile.samples[tid] = sample
@@ -177,7 +177,7 @@ def make_render_kernel(features: Features, structure: Any, camera_kind: Any) -> 
 
 @kernel
 def add_samples(film: Film, tile: Tile):
-    """Add tile.samples to the pixels of a tile, in the samples' order."""
+    """Add tile.samples to the pixels of a tile, with one thread for each pixel and in the samples' order."""
     tid = wp.tid()
     at = (tile.y + tid / tile.width - film.y) * film.columns + tile.x + tid % tile.width - film.x
     pixel = load_pixel(film, at)
@@ -187,7 +187,7 @@ def add_samples(film: Film, tile: Tile):
 
 
 def make_aov_kernel(features: Features, structure: Any, camera_kind: Any) -> Any:
-    """Return the kernel that traces a ray from the lens' centre through each pixel's centre and writes its AOVs."""
+    """Return the kernel that writes the AOVs of the rays through the lens' centre and each pixel's centre."""
     camera_struct = camera_kind.Camera
     camera_ray = camera_kind.make_camera_ray()
     accel_struct = structure.struct

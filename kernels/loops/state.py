@@ -1,6 +1,7 @@
-"""The state of a wave: arrays by pixel, sample, place in a queue, or hit. The host writes Task and Pixels.order, kernels the rest.
+"""The state of a wave: arrays with one entry for each pixel, sample, place in a queue, or hit.
 
-wrt/renderer/waves.py allocates room for `capacity` samples. Sample s belongs to pixel s / task.samples of the wave."""
+The host writes Task and Pixels.order; kernels write the other arrays. wrt/renderer/waves.py allocates the arrays for up to `capacity`
+samples. Sample s belongs to pixel s / task.samples of the wave."""
 
 import warp as wp
 
@@ -12,113 +13,115 @@ from wrt.kernels.shade.step import PendingLight, Sample
 
 Path = make_path(False)
 ray_of = make_paths(False).ray_of
-BLOCK = 64  # Hits, or missed rays, that vectorised loops take at a time.
+BLOCK = 64  # Number of hits or missed rays that vectorised loops process together.
 
 
 @wp.struct
 class Task:
-    """The pixels and samples that a wave takes: those of one tile."""
+    """The pixels and samples of a wave, all in one tile."""
 
     x: int  # The tile's left column in the picture.
     y: int  # The tile's top line.
-    width: int  # Of the tile.
-    pixels: int  # How many entries of Pixels.order.
+    width: int  # Width of the tile in pixels.
+    pixels: int  # Number of pixels: entries of Pixels.order.
     first_sample: int  # Index of the first sample of each pixel.
-    samples: int  # Samples of each pixel.
+    samples: int  # Number of samples of each pixel.
 
 
 @wp.struct
 class Progress:
-    """Counts of the wave that is under way."""
+    """Counters of the wave in progress."""
 
     fresh: int  # 1 while camera rays are traced and shaded, then 0.
-    begun: int  # Place in the queue behind the last camera ray.
-    hits: int  # Hits among the rays that are shaded.
-    queued: int  # Rays that are traced next.
-    receivers: int  # Surfaces that wait for shadow rays.
+    begun: int  # The queue's first place behind the camera rays.
+    hits: int  # Number of hits among the rays that are being shaded.
+    queued: int  # Number of rays that are traced next.
+    receivers: int  # Number of surfaces that wait for shadow rays.
 
 
 @wp.struct
 class Pixels:
-    """The wave's pixels: arrays by pixel p."""
+    """The wave's pixels: arrays indexed by pixel p."""
 
-    order: wp.array(dtype=wp.int32)  # Index in the tile, y * width + x.
-    key: wp.array(dtype=wp.uint32)  # Seed of the samples.
-    film_index: wp.array(dtype=wp.int32)  # Index in the film.
+    order: wp.array(dtype=wp.int32)  # The pixel's index in the tile, y * width + x.
+    key: wp.array(dtype=wp.uint32)  # Seed of the pixel's samples.
+    film_index: wp.array(dtype=wp.int32)  # The pixel's index in the film.
 
 
 @wp.struct
 class Samples:
-    """The wave's samples: arrays by sample s.
+    """The wave's samples: arrays indexed by sample s.
 
-    Paths are stacked: paths[level * capacity + s], level < pending, wait. At level `pending` is the queued path."""
+    Each sample has a stack of paths: the waiting paths are paths[level * capacity + s] for level < pending[s]. The path at level
+    pending[s] is the one whose ray is queued."""
 
-    film_point: wp.array(dtype=wp.vec2)  # In pixels.
-    lens_point: wp.array(dtype=wp.vec2)  # In [0, 1)^2.
+    film_point: wp.array(dtype=wp.vec2)  # Point in the picture, in pixels.
+    lens_point: wp.array(dtype=wp.vec2)  # The lens sample, in [0, 1)^2.
     total: wp.array(dtype=Sample)  # The light so far.
-    traced_rays: wp.array(dtype=wp.int32)  # So far, without shadow rays.
-    pending: wp.array(dtype=wp.int32)  # Paths that wait.
+    traced_rays: wp.array(dtype=wp.int32)  # Number of rays so far, without shadow rays.
+    pending: wp.array(dtype=wp.int32)  # Number of waiting paths.
     paths: wp.array(dtype=Path)
 
 
 @wp.struct
 class RayQueue:
-    """The queue of rays: arrays by place k."""
+    """The queue of rays: arrays indexed by place k."""
 
-    sample: wp.array(dtype=wp.int32)  # The sample of the ray.
+    sample: wp.array(dtype=wp.int32)  # Index of the ray's sample.
     rays: RenderRays
     hits: HitArrays
 
 
 @wp.struct
 class Outcomes:
-    """The queued rays by what they hit."""
+    """The traced rays of the queue, sorted into hits and misses."""
 
-    hit_rays: wp.array(dtype=wp.int32)  # Their places in the queue.
-    missed_rays: wp.array(dtype=wp.int32)  # Their places in the queue.
+    hit_rays: wp.array(dtype=wp.int32)  # Places in the queue of the rays that hit.
+    missed_rays: wp.array(dtype=wp.int32)  # Places in the queue of the rays that missed.
     resumed_samples: wp.array(dtype=wp.int32)  # Samples of missed rays that have other paths waiting.
 
 
 @wp.struct
 class Receivers:
-    """The surfaces that wait for shadow rays: arrays by receiver a, and `shadow` by light * capacity + a."""
+    """The surfaces that wait for shadow rays: arrays indexed by receiver a, and `shadow` by light * capacity + a."""
 
-    sample: wp.array(dtype=wp.int32)
+    sample: wp.array(dtype=wp.int32)  # Index of the receiver's sample.
     pending_light: wp.array(dtype=PendingLight)
     scatter: wp.array(dtype=Scatter)  # Only with transparent shadows.
-    shadow: wp.array(dtype=wp.int32)  # Slot of the shadow ray, or -1.
+    shadow: wp.array(dtype=wp.int32)  # Slot of the shadow ray (see Shadows), or -1.
 
 
 @wp.struct
 class Shadows:
-    """The shadow rays: arrays by slot, light * capacity + index."""
+    """The shadow rays: arrays indexed by slot = light * capacity + index."""
 
-    value: wp.array(dtype=wp.vec3)  # Radiance that the light adds if nothing is in between.
+    value: wp.array(dtype=wp.vec3)  # Radiance that the light adds if unoccluded.
     walk: wp.array(dtype=ShadowWalk)  # The ray's progress, with transparent shadows.
 
 
 @wp.struct
 class ShadowQueue:
-    """The shadow rays that are traced next: arrays by place, light * capacity + index. Without transparent shadows the place is the
-    slot."""
+    """The shadow rays that are traced next: arrays indexed by place = light * capacity + index.
+
+    Without transparent shadows, the place of a ray is its slot."""
 
     rays: RenderRays
     occluded: wp.array(dtype=wp.bool)  # Without transparent shadows.
     hits: HitArrays  # With transparent shadows.
     slot: wp.array(dtype=wp.int32)  # With transparent shadows.
-    count: wp.array(dtype=wp.int32)  # Shadow rays of each light.
+    count: wp.array(dtype=wp.int32)  # Number of queued shadow rays, by light.
 
 
 @wp.struct
 class Block:
-    """Values of a block of up to BLOCK hits or missed rays; wave_rows.py has their layout."""
+    """Intermediate values of up to BLOCK hits or missed rays, in the layout of wave_rows.py."""
 
     rows: wp.array(dtype=wp.float32)
 
 
 @wp.struct
 class Wave:
-    """The whole state. `task` and `progress` have one entry."""
+    """The whole state of a wave. The arrays `task` and `progress` have one entry."""
 
     capacity: int
     task: wp.array(dtype=Task)
@@ -147,7 +150,8 @@ def store_fields(samples: wp.array(dtype=Sample), i: int, radiance: wp.vec3, ray
 def store_sample(samples: wp.array(dtype=Sample), i: int, sample: Sample):
     """Store sample i field by field.
 
-    A copy of the struct would read 16 bytes at a time what was written 4 bytes at a time. The core cannot forward such stores."""
+    Storing the struct as a whole would read in 16-byte loads what was just written in 4-byte stores. The core would have to wait: it
+    cannot forward such stores to the load."""
     store_fields(samples, i, sample.radiance, sample.rays, sample.cut_depth, sample.cut_throughput, sample.lost)
 
 

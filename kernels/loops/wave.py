@@ -1,21 +1,21 @@
-"""Waves: pictures on a CPU, one thread a tile, many samples at a time.
+"""Waves: the CPU's render loop. One thread renders one tile, many samples at a time.
 
-This is a wavefront tracer (Laine, Karras and Aila 2013, "Megakernels Considered Harmful"). The pending rays of a wave of samples
-wait in one queue (state.py). One launch traces them all, in packets; the next shades all hits, and vectorises what has no branches.
-Each sample takes its paths and adds its light in the order of one_ray.py, so that the pictures have the same bits
-(tests/wrt/renderer/test_waves.py).
+This is a wavefront tracer (Laine, Karras and Aila 2013, "Megakernels Considered Harmful"). A wave is a group of samples. Their
+pending rays wait in one queue (state.py). One launch traces all queued rays, in packets. The next launch shades all hits, vectorised
+where the code has no branches. Each sample takes its paths and adds its light in the order of one_ray.py, so that both loops render
+the same bits (tests/wrt/renderer/test_waves.py).
 
-trace_wave is a single launch for Python. It launches:
+Python launches only the kernel trace_wave, which launches the others:
 1. For FRESH camera rays at a time, while they are in the cache: begin_wave (wave_begin.py), closest_hit, and shade_wave
    (wave_shade.py), which pushes new paths and requests shadow rays.
 2. Until no path waits: the shadow rays to each light, whose light add_direct_light adds; then closest_hit and shade_wave for the
    top path of each sample.
 3. add_to_film for the finished samples.
 
-Each kernel is one thread that loops over its queue, so it counts without atomics. Only where a structure has no batches is
-closest_hit a thread a ray (query.py). Traversal and shading are separate kernels: another scene compiles no traversal again. The
-vectorised parts are in wave_surfaces.py, wave_textures.py, wave_normals.py, wave_numbers.py and wave_lights.py. They pass their
-results in the rows of wave_rows.py."""
+Each kernel is one thread that loops over its queue, so that it counts without atomics. The exception is closest_hit for structures
+without batches, which has one thread for each ray (query.py). Traversal and shading are separate kernels, so that a new scene does not
+recompile traversal. The vectorised parts are in wave_surfaces.py, wave_textures.py, wave_normals.py, wave_numbers.py and
+wave_lights.py. They store their results in the rows of wave_rows.py."""
 
 from functools import cache
 from typing import Any
@@ -30,23 +30,23 @@ from wrt.kernels.shade.film import add_sample, load_pixel, make_write_aovs, stor
 from wrt.kernels.shade.headers import lanes_kernel
 from wrt.kernels.shade.sampling import LANES
 from wrt.kernels.shade.shading import make_shading
-from wrt.kernels.shade.shadows import Shadow, make_advance_shadow
-from wrt.kernels.shade.step import Sample, add_light, add_surface_light
+from wrt.kernels.shade.shadows import make_advance_shadow
+from wrt.kernels.shade.step import DirectLight, Sample, add_light, add_surface_light
 from wrt.kernels.structs import AovFilm, Film, Surfaces, kernel
 
-FRESH = 2048  # Camera rays that are made, traced and shaded at a time, while they are in the cache.
+FRESH = 2048  # Number of camera rays that are made, traced and shaded together, so that they stay in the cache.
 
 
 @wp.func
 def film_index(task: Task, at: int, x: int, y: int, columns: int) -> int:
-    """Return the index of the tile's pixel `at` in a film whose first pixel is x, y."""
+    """Return the film's index of the tile's pixel `at`. (x, y) is the film's first pixel in the picture, `columns` its width."""
     return (task.y + at / task.width - y) * columns + task.x + at % task.width - x
 
 
 def make_shadow_kernel(features: Features) -> Any:
-    """Return the kernel that moves each queued shadow ray of one light past the surface that the ray has just hit.
+    """Return the kernel that advances each queued shadow ray of one light past the surface that it has just hit.
 
-    A ray that is blocked, cut or at the light leaves the queue. Only transparent shadows need this kernel."""
+    Rays that are blocked, cut or at the light leave the queue. Only scenes with transparent shadows need this kernel."""
     advance_shadow = make_advance_shadow(features, make_shading(features))
 
     @kernel
@@ -67,13 +67,13 @@ def make_shadow_kernel(features: Features) -> Any:
 
 
 def make_add_direct_light(transparent_shadows: bool) -> Any:
-    """Return the function that adds the unoccluded light of all lights to the receivers' samples."""
+    """Return add_direct_light(wave, lights): add the light that reaches the receivers to their samples."""
 
     @wp.func
     def add_direct_light(wave: Wave, lights: int):
         for a in range(wave.progress[0].receivers):
-            direct = Shadow()
-            light = wp.vec3()  # A local: Warp stores and reloads a struct that changes in a loop.
+            direct = DirectLight()
+            radiance = wp.vec3()  # A local variable: Warp stores and reloads a struct that changes in a loop.
             rays = int(0)
             for i in range(lights):
                 slot = wave.receivers.shadow[i * wave.capacity + a]
@@ -82,10 +82,10 @@ def make_add_direct_light(transparent_shadows: bool) -> Any:
                     if wp.static(transparent_shadows):
                         direct = add_light(direct, value, wave.receivers.scatter[a], wave.shadows.walk[slot].shadow)
                     else:
-                        light += wp.where(wave.shadow_queue.occluded[slot], 0.0, 1.0) * value
+                        radiance += wp.where(wave.shadow_queue.occluded[slot], 0.0, 1.0) * value
                         rays += 1
             if wp.static(not transparent_shadows):
-                direct.transmittance = light
+                direct.radiance = radiance
                 direct.rays = rays
             s = wave.receivers.sample[a]
             store_sample(wave.samples.total, s, add_surface_light(wave.samples.total[s], wave.receivers.pending_light[a], direct))
@@ -98,12 +98,12 @@ def make_add_direct_light(transparent_shadows: bool) -> Any:
 
 @wp.func_native("wrt::add_sample(film, pixels.data + (long long)p, done.data + (long long)p * samples, samples);")
 def add_to_pixels(film: Film, pixels: wp.array(dtype=wp.int32), done: wp.array(dtype=Sample), p: int, samples: int) -> None:
-    """Call add_sample for LANES entries of the film, from pixels[p] on, with done[p * samples] and the following."""
+    """Add the samples from done[p * samples] on to the film's entries pixels[p] .. pixels[p + LANES - 1], by add_sample (film.h)."""
 
 
 @wp.func
 def add_to_film(wave: Wave, film: Film):
-    """Add the samples of a wave to their pixels, in their order."""
+    """Add the samples of a wave to their pixels, in the order of their indices."""
     task = wave.task[0]
     for p in range(task.pixels):
         wave.pixels.film_index[p] = film_index(task, wave.pixels.order[p], film.x, film.y, film.columns)
@@ -121,25 +121,24 @@ def add_to_film(wave: Wave, film: Film):
 
 @wp.struct
 class WaveLaunches:
-    """The launches of a wave, recorded by the host. Transparent shadows take shadow_closest_hit and advance_shadow in place of
-    shadow_any_hit."""
+    """The launches of a wave, recorded by the host."""
 
     begin: Launch
     closest_hit: Launch
     shade: Launch
-    shadow_any_hit: Launch
-    shadow_closest_hit: Launch
+    shadow_any_hit: Launch  # In scenes without transparent shadows.
+    shadow_closest_hit: Launch  # In scenes with transparent shadows, as advance_shadow.
     advance_shadow: Launch
 
 
 @cache
 def make_loop_kernel(transparent_shadows: bool) -> Any:
-    """Return the kernel that takes a wave from its camera rays to the film."""
+    """Return the kernel trace_wave, which renders a wave from its camera rays to the film."""
     add_direct_light = make_add_direct_light(transparent_shadows)
 
     @wp.func
     def trace_shadows(wave: Wave, launches: WaveLaunches, lights: int):
-        """Trace all shadow rays, and add the light that arrives."""
+        """Trace all queued shadow rays, and add the light that reaches the receivers."""
         for light in range(lights):
             first = light * wave.capacity
             if wp.static(transparent_shadows):
@@ -177,7 +176,7 @@ def make_loop_kernel(transparent_shadows: bool) -> Any:
 
 
 def make_aov_kernel(features: Features) -> Any:
-    """Return the kernel that writes what the rays of an AOV film hit."""
+    """Return the kernel that writes the AOVs of the rays that begin_aov queued, from their closest hits."""
     write_aovs = make_write_aovs(features)
 
     @kernel

@@ -1,4 +1,4 @@
-"""The beginning of a wave: its samples and their camera rays."""
+"""The kernels that begin a wave: they place its samples and queue their camera rays."""
 
 from typing import Any
 
@@ -16,8 +16,7 @@ from wrt.kernels.structs import AovFilm, Film, Limits, kernel
 
 
 def make_place_samples(features: Features) -> Any:
-    """Return place_samples(wave, film, limits, first, end): set the keys of the pixels first .. end - 1, and place their samples on
-    film (in pixels) and lens."""
+    """Return place_samples(wave, film, limits, first, end): set keys, film points and lens points of the pixels first .. end - 1."""
     draw = make_draw(features)
 
     @wp.func
@@ -57,9 +56,9 @@ def make_place_samples(features: Features) -> Any:
 
 
 def make_queue_camera_rays(features: Features, camera_kind: Any) -> Any:
-    """Return queue_camera_rays(wave, camera, film, first, end) -> int: queue the camera rays of those samples, vectorised.
+    """Return queue_camera_rays(wave, camera, film, first, end) -> int: queue the rays of the samples first .. end - 1, vectorised.
 
-    Each ray is at its sample's place. The result counts the rays without length, where the film gets no light."""
+    The ray of sample s is at place s. The result is the number of dead rays (no_ray), at film points that get no light."""
     camera_struct = camera_kind.Camera
     camera_ray = camera_kind.make_camera_ray(features)
 
@@ -94,9 +93,9 @@ def make_queue_camera_rays(features: Features, camera_kind: Any) -> Any:
 
 @wp.func
 def close_gaps(wave: Wave, first: int, end: int, queued: int) -> int:
-    """Close the gaps that camera rays without length leave in the queue; their samples are black.
+    """Remove the dead rays (no_ray) of the samples first .. end - 1 from the queue. Their samples are black.
 
-    The rays of the samples first .. end - 1 move to the places from `queued` on. Return the place behind the last one."""
+    The other rays move to the places from `queued` on. Return the place behind the last ray."""
     place = queued
     for s in range(first, end):
         ray = load_render_ray(wave.queue.rays, s)
@@ -111,13 +110,13 @@ def close_gaps(wave: Wave, first: int, end: int, queued: int) -> int:
 
 
 def make_begin_kernel(features: Features, camera_kind: Any) -> Any:
-    """Return the kernel that queues the camera rays of a wave."""
+    """Return the kernel begin_wave, which queues the camera rays of a wave."""
     camera_struct = camera_kind.Camera
     place_samples, queue_camera_rays = make_place_samples(features), make_queue_camera_rays(features, camera_kind)
 
     @lanes_kernel
     def begin_wave(wave: Wave, camera: camera_struct, limits: Limits, film: Film, first_pixel: int, end_pixel: int):
-        """Queue the samples of the pixels first_pixel .. end_pixel - 1, from the place of their first sample on."""
+        """Queue the rays of the pixels first_pixel .. end_pixel - 1, from the place of their first sample on."""
         samples = wave.task[0].samples
         queued = first_pixel * samples
         first = int(first_pixel)
@@ -135,7 +134,7 @@ def make_begin_kernel(features: Features, camera_kind: Any) -> Any:
 
 
 def make_begin_aov_kernel(camera_kind: Any) -> Any:
-    """Return the kernel for the rays through the pixels' centres. A ray has no length where the film gets no light."""
+    """Return the kernel that queues the rays through the pixels' centres; no_ray at centres that get no light."""
     camera_struct = camera_kind.Camera
     camera_ray = camera_kind.make_camera_ray()
 

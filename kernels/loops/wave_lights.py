@@ -1,4 +1,4 @@
-"""Light samples for a wave's hits: what has no branches is vectorised."""
+"""Light samples for a wave's hits. Samples of the sky and of the first mesh light are vectorised."""
 
 from typing import Any, NamedTuple
 
@@ -23,25 +23,26 @@ MESH = list(kinds.LIGHTS).index("mesh")
 
 @wp.func
 def first_is_mesh(lighting: Lighting) -> bool:
+    """Return whether light 0 is an emissive mesh."""
     if lighting.count == 0:
         return False
     return lighting.lights[0].kind == MESH
 
 
 class BlockSamples:
-    """The light samples that are computed for a whole block before they are needed."""
+    """The light samples of a scene that are computed for a whole block of hits at once."""
 
     def __init__(self, features: Features) -> None:
         kind = BACKGROUNDS[features.background]
         by_cosine = features.sky_light and kind.sample is None and kind.make_block_radiance is None
-        self.normals: Rows | None = normal_rows(features)  # None: normals are computed one by one.
-        self.mesh = "mesh" in features.lights and not features.instances  # Of the first light, if it is a mesh.
-        self.sky = by_cosine and self.normals is not None  # Of the background.
-        self.points = by_cosine and self.normals is None  # Only the points that place the sky's samples.
+        self.normals: Rows | None = normal_rows(features)  # None: shading normals are not in rows.
+        self.mesh = "mesh" in features.lights and not features.instances  # Samples of light 0, if it is a mesh.
+        self.sky = by_cosine and self.normals is not None  # Samples of the background.
+        self.points = by_cosine and self.normals is None  # Only sky_point of the background's samples.
 
 
 def make_store_spheres(features: Features, sampled: BlockSamples, shading: Shading, hit_surface: Any) -> Any:
-    """Return store_spheres(wave, surfaces, first, end): complete the rows that light samples read, for hits on spheres."""
+    """Return store_spheres(wave, surfaces, first, end): for hits on spheres, store the points and normals that light samples read."""
     store_point, store_normal = SURFACES.field("point").store(), (sampled.normals or SURFACES.field("shading")).store()
     look_up, shading_normal = shading.look_up, shading.shading_normal
 
@@ -60,8 +61,8 @@ def make_store_spheres(features: Features, sampled: BlockSamples, shading: Shadi
 
 
 def make_sample_sky(features: Features, sampled: BlockSamples) -> Any:
-    """Return sample_sky(wave, lighting, count): store samples of the sky in the rows SKY, or only their points in SKY_POINTS."""
-    sky_point, sky_sample, light_numbers = make_sky_point(features), make_sky_sample(features), make_light_points(features).numbers
+    """Return sample_sky(wave, lighting, count): store background samples in the rows SKY, or only sky_point in SKY_POINTS."""
+    sky_point, sky_sample, light_xi = make_sky_point(features), make_sky_sample(features), make_light_points(features).xi
     load_key, load_normal = KEYS.load(), (sampled.normals or SURFACES.field("shading")).load()
     store_point, store_sample = SKY_POINTS.store(), SKY.store("end", "distant", "area")
 
@@ -73,7 +74,7 @@ def make_sample_sky(features: Features, sampled: BlockSamples) -> Any:
         i = int(0)
         while i < count:
             at = load_key(rows, i)
-            point = sky_point(light_numbers(at.key, at.index, light))
+            point = sky_point(light_xi(at.key, at.index, light))
             if wp.static(sampled.sky):
                 store_sample(rows, i, sky_sample(background, load_normal(rows, i), point))
             else:
@@ -84,10 +85,10 @@ def make_sample_sky(features: Features, sampled: BlockSamples) -> Any:
 
 
 def make_sample_mesh(features: Features) -> Any:
-    """Return sample_mesh(wave, surfaces, lighting, count): store samples of the first light, a mesh, in the rows LIGHTS.
+    """Return sample_mesh(wave, surfaces, lighting, count): store samples of light 0, a mesh, in the rows LIGHTS.
 
-    Emitters are chosen and loaded one by one in between."""
-    light_numbers = make_light_points(features).numbers
+    Random numbers and samples are vectorised. Emitters are chosen and loaded one by one."""
+    light_xi = make_light_points(features).xi
     load_key, load_xi, store_xi = KEYS.load(), EMITTERS.field("xi").load(), EMITTERS.field("xi").store()
     load_emitter, store_emitter = (make("emitter.material", "emitter.instance") for make in (EMITTERS.load, EMITTERS.store))
     load_eye, store_sample = SURFACES.field("point").load(), LIGHTS.store("distant", "area")
@@ -97,7 +98,7 @@ def make_sample_mesh(features: Features) -> Any:
         i = int(0)
         while i < count:
             at = load_key(rows, i)
-            store_xi(rows, i, light_numbers(at.key, at.index, 0))
+            store_xi(rows, i, light_xi(at.key, at.index, 0))
             i = i + 1
 
     @wp.func
@@ -133,16 +134,15 @@ def make_sample_mesh(features: Features) -> Any:
 
 @wp.struct
 class Vertex:
-    """A surface that requests shadow rays, and the seed of its light samples."""
+    """A surface that requests shadow rays, and the key of its light samples."""
 
     surface: Surface
     key: Key
-    i: int  # Its place in the block.
+    i: int  # Index of its hit in the block.
 
 
-def make_light_at(features: Features, sampled: BlockSamples, choose_light: Any) -> Any:
-    """Return light_at(wave, surfaces, lighting, vertex, light) -> LightSample: load it if computed, else call choose_light (of
-    make_step)."""
+def make_light_at(features: Features, sampled: BlockSamples, sample_light: Any) -> Any:
+    """Return light_at(wave, surfaces, lighting, vertex, light) -> LightSample: load it if it is in rows, else call sample_light."""
     light_point = make_light_points(features).point
     load_light, load_sky, load_point = LIGHTS.load("distant", "area"), SKY.load("end", "distant", "area"), SKY_POINTS.load()
 
@@ -161,23 +161,23 @@ def make_light_at(features: Features, sampled: BlockSamples, choose_light: Any) 
                 return sky
         if wp.static(sampled.points):
             if light == lighting.count:
-                return choose_light(lighting, surfaces, light, vertex.surface, load_point(wave.block.rows, vertex.i))
+                return sample_light(lighting, surfaces, light, vertex.surface, load_point(wave.block.rows, vertex.i))
         point = light_point(lighting, vertex.key.key, vertex.key.index, light)
-        return choose_light(lighting, surfaces, light, vertex.surface, point)
+        return sample_light(lighting, surfaces, light, vertex.surface, point)
 
     return light_at
 
 
 class WaveLights(NamedTuple):
-    """The functions for the light samples of a block."""
+    """The device functions for the light samples of a block of at most BLOCK hits."""
 
-    sample: Any  # (wave, surfaces, lighting, first, end): for hits with surfaces, at most BLOCK.
-    at: Any  # From make_light_at.
-    needs_keys: bool  # Keys must be stored before (wave_numbers.py).
+    sample: Any  # (wave, surfaces, lighting, first, end): store the samples of the hits first .. end - 1, after their surfaces.
+    at: Any  # The result of make_light_at.
+    needs_keys: bool  # True if `sample` reads the rows KEYS (wave_numbers.py).
 
 
-def make_wave_lights(features: Features, shading: Shading, hit_surface: Any, choose_light: Any) -> WaveLights:
-    """Return the WaveLights of a scene. `hit_surface` comes from make_wave_surfaces, choose_light is `choose` of make_step."""
+def make_wave_lights(features: Features, shading: Shading, hit_surface: Any, sample_light: Any) -> WaveLights:
+    """Return the WaveLights of a scene. `hit_surface` comes from make_wave_surfaces, sample_light from make_step."""
     sampled = BlockSamples(features)
     store_spheres = make_store_spheres(features, sampled, shading, hit_surface)
     sample_sky, sample_mesh = make_sample_sky(features, sampled), make_sample_mesh(features)
@@ -192,4 +192,4 @@ def make_wave_lights(features: Features, shading: Shading, hit_surface: Any, cho
             if first_is_mesh(lighting):
                 sample_mesh(wave, surfaces, lighting, end - first)
 
-    return WaveLights(sample, make_light_at(features, sampled, choose_light), sampled.sky or sampled.points or sampled.mesh)
+    return WaveLights(sample, make_light_at(features, sampled, sample_light), sampled.sky or sampled.points or sampled.mesh)

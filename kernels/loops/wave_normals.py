@@ -1,4 +1,4 @@
-"""Shading normals at a wave's hits, on the viewer's side, vectorised."""
+"""Shading normals at a wave's hits, on the side of the ray's origin, in vectorised loops."""
 
 from typing import Any
 
@@ -16,14 +16,14 @@ from wrt.kernels.structs import Surfaces
 
 
 def normal_rows(features: Features) -> Rows | None:
-    """Return the rows that hold the normals; None if they are computed one by one."""
+    """Return the rows that hold the shading normals; None if normals are computed one by one."""
     if features.instances or (features.normal_maps and not textures_vectorised(features)):
         return None
     return NORMALS if features.smooth or features.normal_maps else SURFACES.field("shading")
 
 
 def make_compute_normals(features: Features) -> Any:
-    """Return compute_normals(rows, count): compute the normals of a block's first hits from their surfaces and texels."""
+    """Return compute_normals(rows, count): fill the rows NORMALS of `count` hits from their surfaces and texels."""
     load_hit, load_surface, load_normal = HITS.load(), SURFACES.load(), TEXELS.field("normal").load()
     store_normal = NORMALS.store()
 
@@ -43,15 +43,11 @@ def make_compute_normals(features: Features) -> Any:
 
 
 def make_wave_normals(features: Features, shading_normal: Any) -> tuple[Any, Any]:
-    """Return compute_normals, and normal_at(wave, surfaces, surface, texels, wo, i) for hit i of the block.
+    """Return compute_normals or None, and normal_at(wave, surfaces, surface, texels, wo, i) -> vec3 for hit i of the block.
 
-    normal_at loads what compute_normals computed, or calls `shading_normal` (of make_shading)."""
+    normal_at loads the result of compute_normals. Without a result, it calls `shading_normal` (from make_shading)."""
     vectorised = normal_rows(features) == NORMALS
     load_normal = NORMALS.load()
-
-    @wp.func
-    def compute_no_normals(rows: wp.array(dtype=wp.float32), count: int):
-        pass
 
     @wp.func
     def normal_at(wave: Wave, surfaces: Surfaces, s: Surface, texels: Texels, wo: wp.vec3, i: int) -> wp.vec3:
@@ -62,4 +58,4 @@ def make_wave_normals(features: Features, shading_normal: Any) -> tuple[Any, Any
                 return shading_normal(surfaces, s, texels, wo)
         return load_normal(wave.block.rows, i)
 
-    return make_compute_normals(features) if vectorised else compute_no_normals, normal_at
+    return make_compute_normals(features) if vectorised else None, normal_at

@@ -1,4 +1,4 @@
-"""Random numbers for a wave's hits, vectorised."""
+"""Keys and random numbers for a wave's hits, in vectorised loops."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ store_key = KEYS.store()
 
 @wp.func
 def key_at(wave: Wave, s: int) -> wp.uint32:
-    """Return the key of the path of sample s that has just been traced."""
+    """Return the key of the path that has just been traced for sample s."""
     if wave.progress[0].fresh != 0:
         return wave.pixels.key[s / wave.task[0].samples]
     return wave.samples.paths[wave.samples.pending[s] * wave.capacity + s].key
@@ -31,7 +31,7 @@ def store_keys(wave: Wave, first: int, end: int):
 
 
 def make_sample_facets(choose_facet: Any) -> Any:
-    """Return sample_facets(wave, count): store choose_facet of each hit of a block, from its key, in the rows FACETS."""
+    """Return sample_facets(wave, count): store the results of choose_facet for `count` hits in the rows FACETS."""
     load_key, store_facet = KEYS.load(), FACETS.store()
 
     @wp.func

@@ -1,4 +1,4 @@
-"""The layout of a block: the structs that vectorised loops load and store for BLOCK hits, each in rows of its own."""
+"""The layout of a block: each struct that vectorised loops load and store for BLOCK hits has rows of its own."""
 
 import warp as wp
 
@@ -12,13 +12,13 @@ from wrt.kernels.structs import Emitter
 
 @wp.struct
 class TriangleHit:
-    """The inputs of a surface."""
+    """A hit on a triangle, with the data for its Surface and shading normal."""
 
     triangle: Triangle
     u: float  # Barycentrics of the hit.
     v: float
-    direction: wp.vec3  # Of the ray.
-    material: int  # -1 if a sphere was hit.
+    direction: wp.vec3  # The ray's direction.
+    material: int  # Material of the triangle; -1 if the ray hit a sphere.
     is_mapped: int  # 1 if the material has a normal map.
     normal_scale: float
 
@@ -36,7 +36,7 @@ class EmitterPoint:
     """A sampled point on an emitter."""
 
     emitter: Emitter
-    emission: wp.vec3  # Of its material.
+    emission: wp.vec3  # Emission of the emitter's material.
     two_sided: int
     xi: wp.vec2  # Places the point on the emitter, in [0, 1)^2.
 
@@ -46,11 +46,11 @@ SURFACES = Rows(Surface, BLOCK, HITS.end)
 TEXELS = Rows(Texels, BLOCK, SURFACES.end)
 NORMALS = Rows(wp.vec3, BLOCK, TEXELS.end)  # Shading normals on the viewer's side.
 KEYS = Rows(Key, BLOCK, NORMALS.end)
-FACETS = Rows(wp.vec3, BLOCK, KEYS.end)  # Choose the microfacet.
+FACETS = Rows(wp.vec3, BLOCK, KEYS.end)  # Results of choose_facet.
 EMITTERS = Rows(EmitterPoint, BLOCK, FACETS.end)
-LIGHTS = Rows(LightSample, BLOCK, EMITTERS.end)  # For the first light.
-SKY = Rows(LightSample, BLOCK, LIGHTS.end)
-SKY_POINTS = Rows(wp.vec3, BLOCK, SKY.end)  # Place the samples on the sky (sky_point).
-MISS_DIRECTIONS = Rows(wp.vec3, BLOCK, SKY_POINTS.end)  # Of missed rays.
-MISS_COLORS = Rows(wp.vec3, BLOCK, MISS_DIRECTIONS.end)  # The background there.
+LIGHTS = Rows(LightSample, BLOCK, EMITTERS.end)  # Samples of light 0, if it is a mesh.
+SKY = Rows(LightSample, BLOCK, LIGHTS.end)  # Samples of the background.
+SKY_POINTS = Rows(wp.vec3, BLOCK, SKY.end)  # Results of sky_point.
+MISS_DIRECTIONS = Rows(wp.vec3, BLOCK, SKY_POINTS.end)  # Directions of missed rays.
+MISS_COLORS = Rows(wp.vec3, BLOCK, MISS_DIRECTIONS.end)  # The background's radiance in these directions.
 ROWS = MISS_COLORS.end

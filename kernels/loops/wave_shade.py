@@ -1,4 +1,4 @@
-"""The step at every hit of a wave's queue: light, new paths, and requests for shadow rays."""
+"""The kernels that shade a wave's traced rays: they add light, push new paths, and queue shadow rays."""
 
 from typing import Any, NamedTuple
 
@@ -19,8 +19,8 @@ from wrt.kernels.shade.follow_up import FOLLOWED, FollowUp, add_cuts, make_follo
 from wrt.kernels.shade.headers import lanes_kernel
 from wrt.kernels.shade.paths import make_paths
 from wrt.kernels.shade.shading import Shading, make_shading
-from wrt.kernels.shade.shadows import Shadow, begin_shadow
-from wrt.kernels.shade.step import Sample, ShadowRequest, Step, add_surface_light, make_shaded, make_step, receives_light
+from wrt.kernels.shade.shadows import begin_shadow
+from wrt.kernels.shade.step import DirectLight, Sample, ShadowRequest, Step, add_surface_light, make_shaded, make_step, receives_light
 from wrt.kernels.structs import Lighting, Limits, Surfaces, any_positive
 
 Shaded = make_shaded(False)
@@ -29,20 +29,20 @@ camera_path = make_paths(False).camera_path
 
 @wp.struct
 class WaveHit:
-    """A queued ray that has hit something."""
+    """A queued ray that has hit something, and the state of its sample."""
 
-    j: int  # Index among the hits.
-    k: int  # Place in the queue.
-    sample: int
-    pending: int  # Waiting paths of the sample.
-    traced: int  # Rays of the sample so far, this one included.
-    path: Path
-    total: Sample  # The sample's light so far.
+    j: int  # Index in Outcomes.hit_rays.
+    k: int  # Place of the ray in the queue.
+    sample: int  # Index of the sample.
+    pending: int  # Number of waiting paths of the sample.
+    traced: int  # Number of the sample's rays so far, with this ray and without shadow rays.
+    path: Path  # The path of the ray.
+    total: Sample  # The light of the sample so far.
 
 
 @wp.func
 def partition(queue: RayQueue, outcomes: Outcomes, first: int, end: int) -> int:
-    """Sort the rays first .. end - 1 into outcomes.hit_rays and outcomes.missed_rays; return the number of hits.
+    """Sort the places first .. end - 1 into outcomes.hit_rays and outcomes.missed_rays; return the number of hits.
 
     It is branch-free: hits and misses alternate unpredictably."""
     hits = int(0)
@@ -76,16 +76,16 @@ def load_wave_hit(wave: Wave, j: int) -> WaveHit:
 
 
 def make_add_background(features: Features) -> Any:
-    """Return add_background(wave, lighting, missed) -> int: add the background to the samples of the first `missed` missed rays.
+    """Return add_background(wave, lighting, missed) -> int: add the background to the samples of the `missed` missed rays.
 
-    The result is the number of outcomes.resumed_samples."""
+    It stores the samples that have waiting paths in outcomes.resumed_samples, and returns their number."""
     kind = BACKGROUNDS[features.background]
     radiance, store_direction, load_color = kind.radiance, MISS_DIRECTIONS.store(), MISS_COLORS.load()
     block_radiance = kind.make_block_radiance(MISS_DIRECTIONS, MISS_COLORS) if kind.make_block_radiance else None
 
     @wp.func
     def miss_radiance(wave: Wave, lighting: Lighting, j: int, missed: int) -> wp.vec3:
-        """Return the background's radiance for missed ray j. At the first ray of a block, all of the block are computed."""
+        """Return the background's radiance for missed ray j. The first ray of a block computes the radiance of the whole block."""
         if wp.static(block_radiance is not None):
             i = j % BLOCK
             if i == 0:
@@ -124,31 +124,34 @@ def make_add_background(features: Features) -> Any:
 
 
 class BlockFunctions(NamedTuple):
-    """The functions for a block of hits."""
+    """The device functions for a block of at most BLOCK hits."""
 
-    prepare: Any  # (wave, surfaces, lighting, first, end): compute the vectorised parts of these hits, at most BLOCK.
-    own_kernel: bool  # Whether `prepare` is a kernel of its own.
-    shade: Any  # (wave, surfaces, lighting, hit) -> Shaded, for a prepared hit.
-    light_at: Any  # From make_light_at.
+    prepare: Any  # (wave, surfaces, lighting, first, end): compute the vectorised parts of the hits first .. end - 1.
+    own_kernel: bool  # True if `prepare` is compiled as a kernel of its own.
+    shade: Any  # (wave, surfaces, lighting, hit) -> Shaded, for a hit of the prepared block.
+    light_at: Any  # The result of make_light_at.
 
 
 def make_block_functions(features: Features, shading: Shading, step: Step) -> BlockFunctions:
     """Return the BlockFunctions of a scene.
 
-    With textures, rough surfaces or block light samples, `prepare` is a kernel of its own. Two cores then compile the two kernels
-    in 0.6 of the time of one; without these, two kernels would take longer."""
+    In scenes with textures, rough surfaces or light samples by blocks, `prepare` is a kernel of its own. Two cores compile the two
+    kernels in 0.6 of the time that one kernel takes. In other scenes, two kernels would take longer."""
     compute_surfaces, hit_surface = make_wave_surfaces(features, shading.surface_at)
     sample_textures, texels_at = make_wave_textures(features, shading.look_up)
     compute_normals, normal_at = make_wave_normals(features, shading.shading_normal)
-    lights = make_wave_lights(features, shading, hit_surface, step.choose)
+    lights = make_wave_lights(features, shading, hit_surface, step.sample_light)
     sample_facets, load_facet = make_sample_facets(step.choose_facet), FACETS.load()
     needs_keys = features.rough or lights.needs_keys
 
     @wp.func
     def prepare(wave: Wave, surfaces: Surfaces, lighting: Lighting, first: int, end: int):
-        compute_surfaces(wave, surfaces, first, end, wave.progress[0].hits)
-        sample_textures(surfaces, wave.block.rows, end - first)
-        compute_normals(wave.block.rows, end - first)
+        if wp.static(compute_surfaces is not None):
+            compute_surfaces(wave, surfaces, first, end, wave.progress[0].hits)
+        if wp.static(sample_textures is not None):
+            sample_textures(surfaces, wave.block.rows, end - first)
+        if wp.static(compute_normals is not None):
+            compute_normals(wave.block.rows, end - first)
         if wp.static(needs_keys):
             store_keys(wave, first, end)
         if wp.static(features.rough):
@@ -173,7 +176,7 @@ def make_block_functions(features: Features, shading: Shading, step: Step) -> Bl
 def make_request_shadows(features: Features, step: Step, light_at: Any) -> Any:
     """Return request_shadows(wave, surfaces, lighting, shaded, hit, receiver) -> bool: queue the shadow rays of a hit.
 
-    It writes their slots as those of the receiver, and returns whether there are any."""
+    It stores their slots in the receiver's Receivers.shadow, and returns True if it queued a ray."""
 
     @wp.func
     def queue_shadow(wave: Wave, light: int, request: ShadowRequest) -> int:
@@ -210,8 +213,7 @@ def make_request_shadows(features: Features, step: Step, light_at: Any) -> Any:
 
 
 def make_push_paths(features: Features) -> Any:
-    """Return push_paths(wave, hit, shaded, next) -> int: push the new paths that are followed; return the sample's number of
-    waiting paths."""
+    """Return push_paths(wave, hit, shaded, next) -> the sample's number of waiting paths, after pushing the FOLLOWED paths."""
 
     @wp.func
     def push_paths(wave: Wave, hit: WaveHit, shaded: Shaded, next: FollowUp) -> int:
@@ -234,7 +236,7 @@ def make_push_paths(features: Features) -> Any:
 
 
 def make_shade_kernels(features: Features) -> tuple[Any, Any]:
-    """Return the kernel that shades the queue, and the kernel that prepares a block for it, or None."""
+    """Return the kernel that shades the queue, and the kernel of BlockFunctions.prepare, or None without own_kernel."""
     shading = make_shading(features)
     step, follow_up, add_background = make_step(features, shading), make_follow_up(features), make_add_background(features)
     block_functions = make_block_functions(features, shading, step)
@@ -242,7 +244,7 @@ def make_shade_kernels(features: Features) -> tuple[Any, Any]:
 
     @lanes_kernel
     def shade_wave(wave: Wave, surfaces: Surfaces, lighting: Lighting, limits: Limits, block: Launch, first: int, end: int):
-        """Shade the rays first .. end - 1. New rays are queued from place progress.queued on, which is at most `first`."""
+        """Shade the rays at the places first .. end - 1. New rays are queued from place progress.queued on, which is <= first."""
         queued = int(wave.progress[0].queued)
         receivers = int(wave.progress[0].receivers)
         hits = partition(wave.queue, wave.outcomes, first, end)
@@ -270,7 +272,7 @@ def make_shade_kernels(features: Features) -> tuple[Any, Any]:
                     wave.receivers.scatter[receivers] = shaded.scatter
                 receivers += 1
             else:
-                total = add_surface_light(total, next.pending_light, Shadow())
+                total = add_surface_light(total, next.pending_light, DirectLight())
             store_sample(wave.samples.total, hit.sample, total)
             if pending > 0:
                 wave.samples.traced_rays[hit.sample] = hit.traced

@@ -1,4 +1,4 @@
-"""The surfaces at a wave's hits: triangles are loaded one by one and computed vectorised."""
+"""The surfaces at a wave's hits. Triangles are loaded one by one; their surfaces are computed in vectorised loops."""
 
 from typing import Any
 
@@ -12,17 +12,17 @@ from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.surface import Surface, facing, make_on_sphere, make_on_triangle, make_place_of, make_triangle_at
 from wrt.kernels.structs import Surfaces
 
-FAR = 16  # Hits between the prefetch of a triangle and its load.
+FAR = 16  # Number of hits between the prefetch of a triangle's corners and their load.
 
 
 @wp.func
 def hit_triangle(wave: Wave, surfaces: Surfaces, j: int) -> int:
-    """Return the triangle of hit j; for a sphere any valid one, whose result is ignored."""
+    """Return the prim_id of hit j's triangle. For a sphere, return any valid triangle; its result is ignored."""
     return wp.min(wave.queue.hits.prim_id[wave.outcomes.hit_rays[j]], surfaces.n_triangles - 1)
 
 
 class Attributes:
-    """The attributes of surfaces that a scene has, and the fields of the rows that it leaves out."""
+    """The attributes of a scene's surfaces, and the fields of the rows HITS and SURFACES that are not stored."""
 
     def __init__(self, features: Features) -> None:
         self.smooth, self.tangents = features.smooth, features.normal_maps
@@ -34,14 +34,14 @@ class Attributes:
 
 
 def make_load_triangles(has: Attributes) -> Any:
-    """Return load_triangles(wave, surfaces, first, end, hits): store the triangles of the hits first .. end - 1 in their rows."""
+    """Return load_triangles(wave, surfaces, first, end, hits): store the triangles of the hits first .. end - 1 in the rows HITS."""
     smooth, uvs, tangents = has.smooth, has.uvs, has.tangents
     place_of, triangle_at = make_place_of(False), make_triangle_at(smooth, uvs, False)
     store_hit = HITS.store(*has.not_of_hits)
 
     @wp.func
     def prefetch_triangles(wave: Wave, surfaces: Surfaces, j: int, hits: int):
-        """Prefetch the face of a later hit, and the corners of a nearer one."""
+        """Prefetch the corners of hit j + FAR, and the face of hit j + 2 FAR."""
         prim_id = hit_triangle(wave, surfaces, wp.min(j + 2 * FAR, hits - 1))
         prefetch(surfaces.faces, prim_id)
         prefetch(surfaces.prim_material, prim_id)
@@ -74,7 +74,9 @@ def make_load_triangles(has: Attributes) -> Any:
 
 
 def make_compute_surfaces(has: Attributes) -> Any:
-    """Return compute_surfaces(wave, surfaces, first, end, hits) for the hits first .. end - 1 (at most BLOCK) of `hits`."""
+    """Return compute_surfaces(wave, surfaces, first, end, hits): fill the rows SURFACES for the hits first .. end - 1.
+
+    These are at most BLOCK of the wave's `hits` hits."""
     load_triangles = make_load_triangles(has)
     on_triangle = make_on_triangle(has.smooth, has.uvs, has.tangents)
     load_hit, store_surface = HITS.load(*has.not_of_hits), SURFACES.store(*has.not_of_surfaces)
@@ -97,7 +99,7 @@ def make_compute_surfaces(has: Attributes) -> Any:
 def make_hit_surface(has: Attributes, spheres: bool) -> Any:
     """Return hit_surface(wave, surfaces, i, k) -> Surface of hit i of the block, at place k of the queue.
 
-    Triangles are loaded from compute_surfaces' rows; spheres are computed here."""
+    Surfaces of triangles are loaded from the rows SURFACES; surfaces of spheres are computed."""
     on_sphere = make_on_sphere(has.uvs, has.tangents)
     load_surface = SURFACES.load(*has.not_of_surfaces)
 
@@ -118,17 +120,13 @@ def make_hit_surface(has: Attributes, spheres: bool) -> Any:
 
 
 def make_wave_surfaces(features: Features, surface_at: Any) -> tuple[Any, Any]:
-    """Return compute_surfaces and hit_surface. With instances, hit_surface computes each surface by `surface_at`."""
-
-    @wp.func
-    def compute_no_surfaces(wave: Wave, surfaces: Surfaces, first: int, end: int, hits: int):
-        pass
+    """Return compute_surfaces and hit_surface. In scenes with instances, these are None and a function that calls `surface_at`."""
 
     @wp.func
     def single_hit_surface(wave: Wave, surfaces: Surfaces, i: int, k: int) -> Surface:
         return surface_at(surfaces, load_render_ray(wave.queue.rays, k), load_hit(wave.queue.hits, k))
 
     if features.instances:
-        return compute_no_surfaces, single_hit_surface
+        return None, single_hit_surface
     has = Attributes(features)
     return make_compute_surfaces(has), make_hit_surface(has, features.spheres)

@@ -1,4 +1,4 @@
-"""Texels at a wave's hits, vectorised."""
+"""Texels at a wave's hits, in vectorised loops."""
 
 from typing import Any
 
@@ -13,17 +13,12 @@ from wrt.kernels.structs import Surfaces
 
 
 def textures_vectorised(features: Features) -> bool:
-    """Return whether a wave's textures are sampled many at a time."""
+    """Return whether textures are sampled for a block of hits at a time."""
     return features.textures and not features.checkerboards and not features.instances
 
 
-@wp.func
-def sample_nothing(surfaces: Surfaces, rows: wp.array(dtype=wp.float32), count: int):
-    pass
-
-
 def make_sample_texture(name: str, texture: MaterialTexture) -> Any:
-    """Return sample_texture(surfaces, rows, count): store one texture at a block's first hits, on triangles, in the rows TEXELS."""
+    """Return sample_texture(surfaces, rows, count): sample one texture at `count` hits on triangles; store it in the rows TEXELS."""
     material, u, v = (rows.first * BLOCK for rows in (HITS.field("material"), SURFACES.field("u"), SURFACES.field("v")))
     channels = sum(1 << channel for channel in texture.channels)
     to = TEXELS.field(next(iter(texture.fields))).first * BLOCK
@@ -43,7 +38,7 @@ def make_sample_texture(name: str, texture: MaterialTexture) -> Any:
 
 
 def make_link(sample: Any, sample_others: Any) -> Any:
-    """Return the function that samples one texture after the others."""
+    """Return the function that calls `sample_others` and then `sample`."""
 
     @wp.func
     def sample_all(surfaces: Surfaces, rows: wp.array(dtype=wp.float32), count: int):
@@ -54,13 +49,14 @@ def make_link(sample: Any, sample_others: Any) -> Any:
 
 
 def make_wave_textures(features: Features, look_up: Any) -> tuple[Any, Any]:
-    """Return sample(surfaces, rows, count) for the surfaces of a block, and texels_at(wave, surfaces, surface, i) -> Texels.
+    """Return sample(surfaces, rows, count) or None, and texels_at(wave, surfaces, surface, i) -> Texels of hit i of the block.
 
-    texels_at loads what `sample` computed for hit i, or calls `look_up` (of make_shading)."""
+    texels_at loads the result of `sample`. Without a result, it calls `look_up` (from make_shading)."""
     textures = textures_of(features) if textures_vectorised(features) else {}
-    sample = sample_nothing
+    sample = None
     for name, texture in textures.items():
-        sample = make_link(make_sample_texture(name, texture), sample)
+        sample_one = make_sample_texture(name, texture)
+        sample = make_link(sample_one, sample) if sample else sample_one
     load = TEXELS.load(*(field for name in TEXTURES.keys() - textures.keys() for field in TEXTURES[name].fields))
 
     @wp.func

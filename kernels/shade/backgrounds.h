@@ -1,11 +1,11 @@
-// The environment's picture: environment_at of backgrounds.py with the same bits, in loops that compilers vectorise.
+// The environment's picture: environment_at of backgrounds.py, in loops that compilers vectorise. The results have the same bits.
 #pragma once
 #include "layout.h"
 
 namespace wrt {
 
-// Look up `count` columns x and lines y of a Background's picture; store red, green and blue in x, y and z. Each must have room for
-// LANES - 1 more values, which are overwritten.
+// Look up `count` columns x and rows y of a Background's picture. Store red, green and blue in x, y and z. Each of the three arrays must
+// have room for LANES - 1 more values, which are overwritten.
 template <class Background> void environment_at(const Background& background, float* x, float* y, float* z, int count) {
     const int w = background.width, h = background.height - 1;
     const float* const pixels = (const float*)background.pixels.data;

@@ -1,5 +1,4 @@
-"""Background kinds: the radiance behind all surfaces, and its samples as a light. Each kind is a function and an entry of
-BACKGROUNDS."""
+"""Background kinds: the radiance of rays that miss, and samples of the background as a light. Each is an entry of BACKGROUNDS."""
 
 from typing import Any, NamedTuple
 
@@ -13,7 +12,7 @@ from wrt.kernels.shade.sampling import PI, TWO_PI, cosine_point, rotated_to, sea
 from wrt.kernels.structs import Background
 
 # --- the kinds --------------------------------------------------------------------------------------------------------
-# Each is (background, unit direction in world space) -> radiance.
+# Each kind is a function (background, unit direction in world space) -> radiance.
 
 
 @wp.func
@@ -23,14 +22,14 @@ def constant(b: Background, direction: wp.vec3) -> wp.vec3:
 
 @wp.func
 def gradient(b: Background, direction: wp.vec3) -> wp.vec3:
-    """Interpolate linearly in y."""
+    """Interpolate linearly in the direction's y, from `bottom` at -1 to `top` at 1."""
     return wp.lerp(b.bottom, b.top, 0.5 * (direction[1] + 1.0))
 
 
 @wp.func
 def rotation_of(angle: float) -> tuple[float, float]:
-    """Return the sine and cosine of the background's rotation."""
-    sin = angle  # Most pictures are not rotated. For 0 and -0, sin_cos has the same bits.
+    """Return the sine and cosine of the background's rotation, in radians. Most backgrounds have the angle 0, which is fast."""
+    sin = angle  # The bits of sin_cos for 0 and -0.
     cos = float(1.0)
     if angle != 0.0:
         sin, cos = sin_cos(angle)
@@ -39,7 +38,7 @@ def rotation_of(angle: float) -> tuple[float, float]:
 
 @wp.func
 def rotated(d: wp.vec3, sin: float, cos: float) -> wp.vec3:
-    """Rotate about +y, counter-clockwise seen from above, by the angle of this sine and cosine."""
+    """Rotate d about +y, counter-clockwise seen from above, by the angle with this sine and cosine."""
     return wp.vec3(cos * d[0] + sin * d[2], d[1], cos * d[2] - sin * d[0])
 
 
@@ -51,14 +50,14 @@ def rotate_y(d: wp.vec3, angle: float) -> wp.vec3:
 
 @wp.func
 def environment_pixel(b: Background, column: int, row: int) -> wp.vec3:
-    """Return a pixel of the picture: columns wrap around, lines end at the poles."""
+    """Return the radiance of a pixel of the picture: columns wrap around, rows are clamped at the poles."""
     x = wp.where(column < 0, column + b.width, wp.where(column >= b.width, column - b.width, column))
     return b.pixels[wp.clamp(row, 0, b.height - 1) * b.width + x]
 
 
 @wp.func
 def environment_column(b: Background, x: float, z: float) -> float:
-    """Return a direction's column in the equirectangular picture, with a fraction."""
+    """Return the column of a direction in the equirectangular picture, in pixels with a fraction."""
     return (0.5 + atan2(x, -z) / TWO_PI) * float(b.width) - 0.5
 
 
@@ -69,7 +68,7 @@ def environment_row(b: Background, y: float) -> float:
 
 @wp.func
 def environment_at(b: Background, x: float, y: float) -> wp.vec3:
-    """Look up column x and line y, bilinearly."""
+    """Return the bilinearly interpolated radiance at column x and row y of the picture."""
     column = int(wp.floor(x))
     row = int(wp.floor(y))
     fx = x - wp.floor(x)
@@ -91,13 +90,13 @@ def environment(b: Background, direction: wp.vec3) -> wp.vec3:
     wrt::environment_at(background, x, x + length, x + 2 * (long long)length, count);
 """)
 def environment_colors(background: Background, rows: wp.array(dtype=wp.float32), at: int, length: int, count: int) -> None:
-    """Replace `count` columns and lines, in two rows from rows[at] on, by the colours of environment_at, in three rows.
+    """Replace `count` columns x and rows y of the picture, stored from rows[at] on, by environment_at's red, green and blue.
 
-    A row has `length` entries and room for LANES - 1 more. For lanes_kernel (headers.py)."""
+    Each of the three arrays has `length` entries and room for LANES - 1 more. For lanes_kernel (headers.py)."""
 
 
 def make_environment_block(directions: Rows, colors: Rows) -> Any:
-    """Return environment_block(b, rows, count): store `environment` of `count` directions in the rows `colors`, vectorised."""
+    """Return environment_block(b, rows, count): compute `environment` of the first `count` directions, vectorised."""
     load_direction, store_place = directions.load(), colors.store()
 
     @wp.func
@@ -115,13 +114,13 @@ def make_environment_block(directions: Rows, colors: Rows) -> Any:
 
 @wp.func
 def environment_sample(b: Background, xi: wp.vec2) -> LightSample:
-    """Sample a direction by the picture's brightness."""
+    """Sample a direction with a density in proportion to the picture's brightness, uniform in angle within a pixel."""
     row = search_cdf(b.row_cdf, 0, b.height, xi[0])
     first = row * b.width
     column = search_cdf(b.column_cdf, first, b.width, xi[1])
     p_row = share_of_row(b.row_cdf, 0, row)
     p_column = share_of_row(b.column_cdf, first, column)
-    # Its place within the cell is uniform again: it places the direction within the pixel.
+    # The position of xi within its interval of the cdf is uniform again. It places the direction within the pixel.
     v = 1.0 - (b.row_cdf[row] - xi[0]) / p_row
     u = 1.0 - (b.column_cdf[first + column] - xi[1]) / p_column
     theta = PI * (float(row) + wp.clamp(v, 0.0, 1.0)) / float(b.height)
@@ -137,14 +136,14 @@ def environment_sample(b: Background, xi: wp.vec2) -> LightSample:
 
 
 class BackgroundKind(NamedTuple):
-    """The device functions of a kind."""
+    """The device functions of a kind of background."""
 
     radiance: Any  # (background, direction) -> radiance.
-    sample: Any = None  # (background, xi) -> LightSample with wi and weight. None: by the cosine.
-    make_block_radiance: Any = None  # As make_environment_block. None: it is not faster.
+    sample: Any = None  # (background, xi) -> LightSample with wi and weight. None: sample by the cosine.
+    make_block_radiance: Any = None  # Vectorised `radiance`, with the signature of make_environment_block. None: it is not faster.
 
 
-# By the names in wrt.scene.backgrounds.BACKGROUNDS.
+# The keys are the names in wrt.scene.backgrounds.BACKGROUNDS.
 BACKGROUNDS = {
     "constant": BackgroundKind(constant),
     "gradient": BackgroundKind(gradient),
@@ -152,11 +151,11 @@ BACKGROUNDS = {
 }
 
 
-# --- the scene's ------------------------------------------------------------------------------------------------------
+# --- the kind of a scene ------------------------------------------------------------------------------------------------------
 
 
 def make_sky_point(features: Features) -> Any:
-    """Return sky_point(xi): the point that sky_sample takes. It is branch-free, so that loops vectorise."""
+    """Return sky_point(xi) -> vec3: the `point` for sky_sample. It is branch-free, so that loops vectorise."""
     of_cosine = BACKGROUNDS[features.background].sample is None
 
     @wp.func
@@ -169,16 +168,14 @@ def make_sky_point(features: Features) -> Any:
 
 
 def make_sky_sample(features: Features) -> Any:
-    """Return the function that samples a direction to the background; `point` comes from sky_point."""
+    """Return sky_sample(b, n, point) -> LightSample of the background at a surface with normal n. `point` comes from sky_point."""
     kind = BACKGROUNDS[features.background]
-    radiance, by_kind = kind.radiance, kind.sample
-    of_cosine = by_kind is None
-    sample_of_kind = no_sample if of_cosine else by_kind
+    radiance, sample_of_kind = kind.radiance, kind.sample
 
     @wp.func
     def sky_sample(b: Background, n: wp.vec3, point: wp.vec3) -> LightSample:
         sample = LightSample()
-        if wp.static(of_cosine):
+        if wp.static(sample_of_kind is None):
             sample.wi = rotated_to(point, n)
             cosine = wp.max(wp.dot(sample.wi, n), 1.0e-9)
             sample.weight = radiance(b, sample.wi) * (PI / cosine)
@@ -189,8 +186,3 @@ def make_sky_sample(features: Features) -> Any:
         return sample
 
     return sky_sample
-
-
-@wp.func
-def no_sample(b: Background, xi: wp.vec2) -> LightSample:
-    return LightSample()

@@ -1,4 +1,4 @@
-"""Direct light: one sample of one light, as reflected radiance and as a shadow ray."""
+"""Direct light: the shadow ray and the reflected radiance of one sample of a light."""
 
 from typing import Any, NamedTuple
 
@@ -17,8 +17,8 @@ from wrt.kernels.structs import Lighting, Ray, Surfaces, any_positive, gamma, ma
 def shadow_ray(s: Surface, sample: LightSample) -> Ray:
     """Return the segment from a surface to a light, which ends at t = 1.
 
-    For a light with an area it ends a little earlier. The rounding of the segment's direction and of t, about 16 ulps, grows with
-    the distance and not with the light's own error bound."""
+    For a light with an area, t_max is 32 roundings below 1, so that the light does not occlude itself. The rounding of the direction
+    and of t, about 16 ulps, grows with the distance, and the error bound of the light's point does not cover it."""
     ray = make_ray(spawn_point(s.point, s.error, s.geometric, sample.wi), sample.wi)
     ray.exclude_plus_one = s.exclude_plus_one
     if sample.distant == 0:
@@ -28,14 +28,14 @@ def shadow_ray(s: Surface, sample: LightSample) -> Ray:
 
 
 def make_reflected_light(features: Features) -> Any:
-    """Return `choose`, which samples a light, and `reflected`, the unoccluded radiance that the sample sends to the eye."""
+    """Return sample_light, which samples a light, and reflected_light, the unoccluded radiance that a sample sends to the eye."""
     light_sample = make_light_sample(features)
     sky_sample = make_sky_sample(features)
     lights = bool(features.lights)
 
     @wp.func
-    def choose(lighting: Lighting, surfaces: Surfaces, i: int, s: Surface, point: wp.vec3) -> LightSample:
-        """Sample light i; the background is the light after the last one. `point` comes from light_point."""
+    def sample_light(lighting: Lighting, surfaces: Surfaces, i: int, s: Surface, point: wp.vec3) -> LightSample:
+        """Sample light i, or the background if i = lighting.count. `point` comes from LightPoints.point."""
         sample = LightSample()
         if wp.static(lights):
             if i < lighting.count:
@@ -46,37 +46,37 @@ def make_reflected_light(features: Features) -> Any:
         return sample
 
     @wp.func
-    def reflected(sample: LightSample, s: Surface, scatter: Scatter, wo: wp.vec3) -> wp.vec3:
+    def reflected_light(sample: LightSample, s: Surface, scatter: Scatter, wo: wp.vec3) -> wp.vec3:
         cosine = wp.dot(s.shading, sample.wi)
         if cosine <= 0.0 or wp.dot(s.geometric, sample.wi) <= 0.0:
             return wp.vec3(0.0, 0.0, 0.0)
         value = scatter.diffuse / PI
         if wp.static(features.highlight):
-            # A traced reflection finds lights that have an area by itself; the background is no small light.
+            # A traced reflection finds area lights by itself. The background has no highlight: it is no small light.
             if sample.area == 0 or (scatter.traced == 0 and sample.distant == 0):
                 if any_positive(scatter.highlight):
                     value = value + scatter.highlight * blinn_phong(s.shading, sample.wi, wo, scatter.exponent)
         return cosine * wp.cw_mul(value, sample.weight)
 
-    return choose, reflected
+    return sample_light, reflected_light
 
 
 class LightPoints(NamedTuple):
-    """The random points on lights."""
+    """The functions for random points on lights, in sample `index` at the hit of the path with the seed `key`."""
 
-    numbers: Any  # (key, index, i) -> vec2: place a sample on light i, at the path vertex `key`.
-    point: Any  # (lighting, key, index, i) -> vec3: sky_point of them for the background, else both and 0.
+    xi: Any  # (key, index, i) -> vec2 in [0, 1)^2, which places a sample on light i.
+    point: Any  # (lighting, key, index, i) -> vec3: sky_point(xi) for the background, else (xi[0], xi[1], 0).
 
 
 def make_light_points(features: Features) -> LightPoints:
     """Return the LightPoints of a scene."""
     sample_2d = make_sample_2d(features)
     sky_point = make_sky_point(features)
-    single = {number for number, name in enumerate(LIGHTS) if name in features.lights and name in WITHOUT_AREA}
-    is_single = wp.types.vector(len(LIGHTS), int)(*(int(number in single) for number in range(len(LIGHTS))))
+    single = {kind for kind, name in enumerate(LIGHTS) if name in features.lights and name in WITHOUT_AREA}
+    is_single = wp.types.vector(len(LIGHTS), int)(*(int(kind in single) for kind in range(len(LIGHTS))))
 
     @wp.func
-    def numbers(key: wp.uint32, index: wp.uint32, i: int) -> wp.vec2:
+    def light_xi(key: wp.uint32, index: wp.uint32, i: int) -> wp.vec2:
         return sample_2d(hash_pair(key, wp.static(wp.uint32(0x4C49))), index, i)
 
     @wp.func
@@ -85,10 +85,10 @@ def make_light_points(features: Features) -> LightPoints:
             if i < lighting.count:
                 if is_single[lighting.lights[i].kind] != 0:
                     return wp.vec3(0.0, 0.0, 0.0)
-        xi = numbers(key, index, i)
+        xi = light_xi(key, index, i)
         if wp.static(features.sky_light):
             if i == lighting.count:
                 return sky_point(xi)
         return wp.vec3(xi[0], xi[1], 0.0)
 
-    return LightPoints(numbers, light_point)
+    return LightPoints(light_xi, light_point)

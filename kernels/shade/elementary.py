@@ -1,23 +1,24 @@
 """Elementary functions with the same bits on every device.
 
-They use only operations that IEEE 754 defines to the last bit (float32 sums, products, quotients and roots) and integers. The sin
+They use only integers and operations that IEEE 754 defines to the last bit: float32 sums, products, quotients and roots. The sin
 and pow of compilers and C libraries differ between machines. The error is below 1.7 ulp for all arguments (`python -m
-tests.elementary` finds the largest); an ulp is the distance of floats at the exact result. A NaN is always the same one, so that
-its bits agree too.
+tests.elementary` measures the largest error). An ulp is the distance of neighbouring floats at the exact result. All NaNs have the
+same bits.
 
 The methods are those of Muller, "Elementary Functions" (3rd ed., 2016). The argument is reduced (chapter 11). A polynomial gives
-the function near 0 (chapter 3). A second float carries the rounding errors along. Each polynomial interpolates its function so that
-its relative error is nearly minimal (tests/elementary.py derives them). A constant in parts is their sum: the first parts have few
-bits, and exact products."""
+the function near 0 (chapter 3). A second float carries the rounding errors along. Each polynomial interpolates its function with a
+nearly minimal relative error (tests/elementary.py derives the coefficients). Some constants are stored as a sum of parts. The first
+parts have so few bits that their products are exact."""
 
 import warp as wp
 
 from wrt.kernels.structs import noinline
 
-SHIFT = wp.constant(12582912.0)  # 1.5 * 2^23: a sum with it is rounded to an integer, ties to even.
+SHIFT = wp.constant(12582912.0)  # 1.5 * 2^23: adding it rounds a float to an integer, ties to even.
 
-# Of sin and cos: pi / 2 in parts (the first two multiples of 2^-24, the third of 13 bits). The bits of 2 / pi after 32 zeros.
-REDUCED_BY_PARTS = wp.constant(3000.0)  # Up to here, fewer than 2^11 quarter turns are subtracted, exactly.
+# For sin and cos: pi / 2 = QUARTER_1 + ... + QUARTER_4. The first two are multiples of 2^-24, the third has 13 bits. TWO_OVER_PI_BITS
+# are the bits of 2 / pi, behind 32 zeros.
+REDUCED_BY_PARTS = wp.constant(3000.0)  # Up to this |x|, fewer than 2^11 quarter turns are subtracted, exactly.
 TWO_OVER_PI = wp.constant(0.6366197466850281)
 QUARTER_1 = wp.constant(1.57080078125)
 QUARTER_2 = wp.constant(-4.470348358154297e-06)
@@ -27,13 +28,14 @@ TWO_OVER_PI_BITS = wp.constant(wp.types.vector(8, wp.uint32)(
     0, 0xA2F9836E, 0x4E441529, 0xFC2757D1, 0xF534DDC0, 0xDB629599, 0x3C439041, 0xFE5163AB))
 SIN_1, SIN_2, SIN_3 = wp.constant(-0.16666655242443085), wp.constant(0.008332177065312862), wp.constant(-0.0001951719168573618)
 COS_1, COS_2, COS_3 = wp.constant(0.041666656732559204), wp.constant(-0.001388773089274764), wp.constant(2.4477101760567166e-05)
-# Of acos and atan2: pi / 2 in two parts.
+# For acos and atan2: pi / 2 in two parts.
 HALF_PI, HALF_PI_REST = wp.constant(1.5707963705062866), wp.constant(-4.371138828673793e-08)
 ASIN_1, ASIN_2, ASIN_3 = wp.constant(0.16666747629642487), wp.constant(0.07495515793561935), wp.constant(0.045443885028362274)
 ASIN_4, ASIN_5 = wp.constant(0.02430625818669796), wp.constant(0.04195747897028923)
 ATAN_1, ATAN_2, ATAN_3 = wp.constant(-0.3333323001861572), wp.constant(0.1999407857656479), wp.constant(-0.1417323350906372)
 ATAN_4, ATAN_5 = wp.constant(0.10151606798171997), wp.constant(-0.051188621670007706)
-# Of exp and power: log(2) in one part, and in two, the first of 16 bits. 2 / log(2) and a third of it, the first parts of 12 bits.
+# For exp and power: log(2) as one float, and in two parts, the first of 16 bits. LOG_0 and LOG_1 with their rests are 2 / log(2) and
+# a third of it; these first parts have 12 bits.
 LOG2_E, LOG_2 = wp.constant(1.4426950216293335), wp.constant(0.6931471824645996)
 LOG_2_FIRST, LOG_2_REST = wp.constant(0.693145751953125), wp.constant(1.428606765330187e-06)
 EXP_1, EXP_2, EXP_3 = wp.constant(0.5), wp.constant(0.16666577756404877), wp.constant(0.041666556149721146)
@@ -41,12 +43,12 @@ EXP_4, EXP_5 = wp.constant(0.008363173343241215), wp.constant(0.0013926175888627
 LOG_0, LOG_0_REST = wp.constant(2.8857421875), wp.constant(-0.0003521057078614831)
 LOG_1, LOG_1_REST = wp.constant(0.9619140625), wp.constant(-0.00011736857413779944)
 LOG_2ND, LOG_3RD, LOG_4TH = wp.constant(0.5770792961120605), wp.constant(0.4119340479373932), wp.constant(0.33594173192977905)
-ROOT_HALF_BITS = wp.constant(0x3F3504F3)  # Of the float below sqrt(1/2).
+ROOT_HALF_BITS = wp.constant(0x3F3504F3)  # The bits of the largest float below sqrt(1/2).
 
 
 @wp.func
 def nan() -> float:
-    """Return the NaN of these bits: compilers and devices make different ones."""
+    """Return the NaN with the bits 0x7FC00000. Compilers and devices make NaNs with different bits."""
     return wp.cast(0x7FC00000, wp.float32)
 
 
@@ -70,13 +72,13 @@ def power_of_two(n: int) -> float:
 
 @wp.func
 def reduced(x: float) -> wp.vec3:
-    """Return (r, less, n) for 2^10 < |x| < inf: |x| is r - less beyond a multiple of pi / 2, and n that multiple modulo 4.
+    """Return (r, less, n) with |x| = r - less + k pi / 2 and n = k modulo 4, for 2^10 < |x| < inf.
 
-    The method is Payne and Hanek's (1983). With |x| = m 2^e, only those bits of 2 / pi matter whose product with x is neither a
-    multiple of 4 nor below 2^-62."""
+    This is the method of Payne and Hanek (1983). With |x| = m 2^e, only some bits of 2 / pi matter: those whose product with x is
+    neither a multiple of 4 nor below 2^-62."""
     bits = wp.cast(wp.abs(x), wp.int32)
     m = wp.uint64((bits & 0x7FFFFF) | 0x800000)
-    start = (bits >> 23) - 120  # e + 30: the first of these bits
+    start = (bits >> 23) - 120  # e + 30: index of the first bit that matters
     i = start >> 5
     shift = wp.uint64(start & 31)
     a = (wp.uint64(TWO_OVER_PI_BITS[i]) << wp.uint64(32)) | wp.uint64(TWO_OVER_PI_BITS[i + 1])
@@ -98,7 +100,7 @@ def reduced(x: float) -> wp.vec3:
 
 @wp.func
 def sin_cos_of_parts(x: float, r: float, less: float, n: float) -> tuple[float, float]:
-    """Return sine and cosine of x = r - less + n quarter turns."""
+    """Return (sin x, cos x) for x = r - less + n pi / 2."""
     z = r * r
     s = wp.where(x == 0.0, x, r - (less - r * z * (SIN_1 + z * (SIN_2 + z * SIN_3))))  # sin(-0) = -0
     half = 0.5 * z
@@ -133,14 +135,14 @@ def sin_cos(x: float) -> tuple[float, float]:
         sin, cos = near_sin_cos(x)
     elif wp.abs(x) < wp.inf:
         sign = wp.sign(x)
-        of_size = reduced(x)
-        sin, cos = sin_cos_of_parts(x, sign * of_size[0], sign * of_size[1], sign * of_size[2])
+        parts = reduced(x)
+        sin, cos = sin_cos_of_parts(x, sign * parts[0], sign * parts[1], sign * parts[2])
     return sin, cos
 
 
 @wp.func
 def acos(x: float) -> float:
-    """Return the angle in [0, pi]; NaN beyond [-1, 1]. Near the ends, acos x = 2 asin sqrt((1 - x) / 2)."""
+    """Return the angle in [0, pi]; NaN for |x| > 1. For |x| > 1/2, acos |x| = 2 asin sqrt((1 - |x|) / 2)."""
     a = wp.abs(x)
     if not a <= 1.0:
         return nan()
@@ -154,15 +156,15 @@ def acos(x: float) -> float:
 
 @wp.func
 def atan2(y: float, x: float) -> float:
-    """Return the angle of the point (x, y), in [-pi, pi]; for zeros and infinities as IEEE 754 defines it."""
+    """Return the angle of the point (x, y) in [-pi, pi]. Zeros and infinities give the results that IEEE 754 defines."""
     low = wp.min(wp.abs(x), wp.abs(y))
     high = wp.max(wp.abs(x), wp.abs(y))
     if not wp.abs(x) + wp.abs(y) >= 0.0:
         return nan()
-    # atan(low / high), or where 2 low > high pi / 4 + atan((low - high) / (low + high)). Branch-free, to vectorise.
+    # atan(low / high); if 2 low > high, it is pi / 4 + atan((low - high) / (low + high)). Branch-free, so that loops vectorise.
     equal = low == high  # Also for zeros and infinities.
     middle = 2.0 * low > high
-    half = wp.where(high > 1.0, 0.5, 1.0)  # Against overflow.
+    half = wp.where(high > 1.0, 0.5, 1.0)  # A factor against overflow.
     over = wp.where(middle, half * low - half * high, low)
     under = wp.where(middle, half * low + half * high, high)
     t = wp.where(equal, 0.0, over / under)
@@ -179,7 +181,7 @@ def atan2(y: float, x: float) -> float:
 
 @wp.func
 def scaled_exp(r: float, n: float) -> float:
-    """Return 2^n e^r, for |r| < 0.35 and |n| < 152, in two steps, so that a result below 2^-126 is rounded once."""
+    """Return 2^n e^r for |r| < 0.35 and |n| < 152. It multiplies by 2^n in two steps: a result below 2^-126 is rounded once."""
     z = r * r
     p = 1.0 + (r + z * ((EXP_1 + r * EXP_2) + z * ((EXP_3 + r * EXP_4) + z * EXP_5)))
     first = int(n) >> 1
@@ -199,8 +201,8 @@ def exp(x: float) -> float:
 def power_of_positive(x: float, y: float) -> float:
     """Return x^y = 2^(y log2 x), for 0 < x < inf and any y but NaN.
 
-    Let x = m 2^k with m near 1, and s = (m - 1) / (m + 1). Then log2 m = (2 / log 2) atanh s = s g(s^2). The result's digits are
-    those behind the point of y log2 x, which may have 8 bits before the point. So s, g, the logarithm and y are each split into 12
+    Let x = m 2^k with m near 1, and s = (m - 1) / (m + 1). Then log2 m = (2 / log 2) atanh s = s g(s^2). The fraction of y log2 x
+    gives the result's digits, and its integer part may take 8 bits of a float. So s, g, the logarithm and y are each split into 12
     bits and a rest. The product of the first parts is exact, and the rests are so small that their rounding does no harm."""
     tiny = x < wp.static(2.0**-126)
     bits = wp.cast(wp.where(tiny, x * wp.static(2.0**24), x), wp.int32) - ROOT_HALF_BITS
@@ -230,11 +232,11 @@ def power_of_positive(x: float, y: float) -> float:
     rest = ((k - whole) + first) + (s1 * g2 + s2 * g)
     l1 = upper(whole + rest)
     l2 = (whole - l1) + rest
-    # y log2 x = e1 + e2; as |log2 x| is at least 2^-24, a larger y changes nothing.
-    held = wp.clamp(y, -wp.static(2.0**32), wp.static(2.0**32))
-    y1 = upper(held)
+    # y log2 x = e1 + e2. As |log2 x| is at least 2^-24, any |y| above 2^32 overflows or underflows like 2^32.
+    limited = wp.clamp(y, -wp.static(2.0**32), wp.static(2.0**32))
+    y1 = upper(limited)
     e1 = y1 * l1
-    e2 = y1 * l2 + (held - y1) * (l1 + l2)
+    e2 = y1 * l2 + (limited - y1) * (l1 + l2)
     if wp.abs(e1) > 151.0:
         return wp.where(e1 > 0.0, wp.inf, 0.0)
     n = nearest(e1 + e2)
@@ -243,7 +245,7 @@ def power_of_positive(x: float, y: float) -> float:
 
 @noinline  # Inlined, it would add 10 % to the compile time of a shading kernel.
 def power(x: float, y: float) -> float:
-    """Return x^y as IEEE 754's `pow`: NaN if x < 0 and y is not an integer."""
+    """Return x^y with the special cases of IEEE 754's `pow`: NaN if x < 0 and y is not an integer."""
     if y == 0.0 or x == 1.0:
         return 1.0
     a = wp.abs(x)
@@ -252,7 +254,7 @@ def power(x: float, y: float) -> float:
     sign = float(1.0)
     if wp.cast(x, wp.int32) < 0:
         whole = wp.floor(y) == y
-        if whole and wp.abs(y) < wp.static(2.0**24):  # All larger ones are even.
+        if whole and wp.abs(y) < wp.static(2.0**24):  # All larger floats are even.
             if (int(y) & 1) != 0:
                 sign = -1.0
         if not whole and a > 0.0 and a < wp.inf:

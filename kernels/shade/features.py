@@ -7,7 +7,7 @@ from dataclasses import dataclass
 class Features:
     """Everything that changes the code of a render kernel. A switch that is False leaves no trace in it."""
 
-    camera: str = "wrt.kernels.shade.cameras.perspective"  # The module of its device function.
+    camera: str = "wrt.kernels.shade.cameras.perspective"  # The module of the camera kind.
     lens: bool = False
     blades: bool = False
     filter: bool = False  # The pixel filter is not the box.
@@ -18,10 +18,10 @@ class Features:
     textures: bool = False
     checkerboards: bool = False
     normal_maps: bool = False
-    parameter_textures: bool = False  # Of roughness, metallic or transmission.
+    parameter_textures: bool = False  # Textures of roughness, metallic or transmission.
     cutout: bool = False
     blend: bool = False
-    materials: tuple[str, ...] = ()  # The kinds that the scene has.
+    materials: tuple[str, ...] = ()  # The kinds of materials that the scene has.
     thin_glass: bool = False
     absorption: bool = False
     transmission: bool = False
@@ -29,7 +29,7 @@ class Features:
     highlight: bool = False
     schlick: bool = False
     emission: bool = False
-    lights: tuple[str, ...] = ()  # The kinds that the scene has.
+    lights: tuple[str, ...] = ()  # The kinds of lights that the scene has.
     background: str = "constant"
     sky_light: bool = False  # The background is sampled as a light.
     ambient: bool = False
@@ -37,10 +37,10 @@ class Features:
     transparent_shadows: bool = False
     reflection: bool = False
     refraction: bool = False
-    stack_size: int = 1  # Room for a path's waiting rays, rounded up so that near depths share a kernel.
-    counting: bool = False  # Rays carry the label that a log keeps (wrt.kernels.study.ray_log).
+    stack_size: int = 1  # Paths of a sample that can wait, rounded up so that similar max_depths share a kernel.
+    counting: bool = False  # Rays carry a label for the ray log (wrt.kernels.study.ray_log).
 
     @property
     def direct_light(self) -> bool:
-        """Lights are sampled at a hit."""
+        """True if lights or the background are sampled at a hit."""
         return bool(self.lights) or self.sky_light

@@ -1,4 +1,4 @@
-// The film: add_sample of film.py for LANES pixels at a time, with the same bits.
+// The film: add_sample of film.py for LANES pixels at a time. The results have the same bits.
 #pragma once
 #include "layout.h"
 
@@ -53,13 +53,13 @@ struct Pixels {
     }
 };
 
-// Add `samples` samples to each of LANES pixels of a Film, in their order. `pixels` has the indices of the pixels, and `done` the
-// samples of the first pixel, then of the next. The LANES indices behind `pixels` are prefetched: they must be readable.
+// Add `samples` samples to each of the LANES pixels of a Film at the indices `pixels`, in the samples' order. `done` holds the samples
+// of the first pixel, then those of the second, and so on. The pixels at the next LANES indices are prefetched: these must be valid.
 template <class Film, class Sample> void add_sample(const Film& film, const int* pixels, const Sample* done, int samples) {
     prefetch_pixels(film, pixels + LANES);
     Pixels sum;
     sum.load(film, pixels);
-    // A table of places: the compiler vectorises multiples of `samples` only for samples = 1.
+    // A table of the lanes' first samples: without it, the compiler vectorises the loop only for samples = 1.
     long long first[LANES];
     for (int lane = 0; lane < LANES; ++lane) first[lane] = (long long)lane * samples;
     for (int j = 0; j < samples; ++j)

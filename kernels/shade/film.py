@@ -1,4 +1,4 @@
-"""The film: samples added to a pixel, and the AOVs of a hit."""
+"""The film: adds samples to pixels, and writes the AOVs (depth, normal, albedo, ids) of a pixel's hit."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from wrt.kernels.structs import AovFilm, Film, Hit, Ray, Surfaces
 
 @wp.struct
 class Pixel:
-    """A pixel of the film (structs.Film) while samples are added."""
+    """A local copy of one pixel of structs.Film, whose fields it has, while samples are added."""
 
     mean: wp.vec3
     m2: wp.vec3
@@ -52,6 +52,7 @@ def store_pixel(film: Film, i: int, pixel: Pixel):
 
 @wp.func
 def add_sample(before: Pixel, sample: Sample) -> Pixel:
+    """Update mean and sum of squared deviations (Welford 1962). A radiance that is not finite is counted, and black."""
     pixel = before
     color = sample.radiance
     if not wp.isfinite(color[0] + color[1] + color[2]):
@@ -75,12 +76,12 @@ def pixel_center(x: int, y: int, width: int, height: int) -> wp.vec2:
 
 
 def make_write_aovs(features: Features) -> Any:
-    """Return the function that writes a pixel's AOVs."""
+    """Return write_aovs(film, pixel, surfaces, ray, hit)."""
     surface_at, look_up, resolve, shading_normal, _, _ = make_shading(features)
 
     @wp.func
     def write_aovs(film: AovFilm, pixel: int, surfaces: Surfaces, ray: Ray, hit: Hit):
-        """Write the AOVs of `hit`, the closest one of `ray` or a miss."""
+        """Write the AOVs of `hit`, the closest hit of `ray` or a miss, to entry `pixel` of the film."""
         film.depth[pixel] = hit.t
         film.prim_id[pixel] = hit.prim_id
         film.material_id[pixel] = -1

@@ -1,8 +1,8 @@
-"""The follow-up of a hit, for both loops: which new paths are followed, which are cut, and how much light the cuts lose.
+"""The follow-up of a hit, for both loops: decides which new paths are followed or cut, and how much light the cuts lose.
 
-A path is cut after max_depth bounces, after MAX_TRANSPARENT surfaces in a row that it passed straight, or below min_throughput. All
-paths of a sample are cut after MAX_RAYS rays: without min_throughput, a tree of 64 levels has no end. The loops push the FOLLOWED
-paths in the order onward, reflected, refracted, and trace the last one first."""
+A path is cut after max_depth bounces, after it has passed MAX_TRANSPARENT surfaces straight in a row, or below min_throughput. All
+new paths of a sample are cut after MAX_RAYS rays: with min_throughput = 0, a tree of 64 levels would never end. The loops push the
+FOLLOWED paths in the order onward, reflected, refracted, and trace the path pushed last first."""
 
 from typing import Any
 
@@ -14,30 +14,30 @@ from wrt.kernels.shade.shadows import MAX_TRANSPARENT
 from wrt.kernels.shade.step import PendingLight, Sample, make_shaded, mean3
 from wrt.kernels.structs import Limits, Surfaces
 
-MAX_RAYS = wp.constant(1 << 16)  # Of one camera ray, without shadow rays: a full tree of 15 bounces.
+MAX_RAYS = wp.constant(1 << 16)  # Rays of one sample, without shadow rays: as many as a full binary tree of 15 bounces.
 # Verdicts on a new path.
 NONE = wp.constant(0)  # Its throughput is 0.
 FOLLOWED = wp.constant(1)
-CUT_BY_DEPTH = wp.constant(2)  # Or by MAX_TRANSPARENT or MAX_RAYS.
+CUT_BY_DEPTH = wp.constant(2)  # Cut by max_depth, MAX_TRANSPARENT or MAX_RAYS.
 CUT_BY_THROUGHPUT = wp.constant(3)
 
 
 @wp.struct
 class FollowUp:
-    """The verdicts on the new paths of a Shaded."""
+    """The verdicts on the three paths of a Shaded, and the light that the cuts lose."""
 
     onward: int
     reflected: int
     refracted: int
     cut_depth: int  # Paths that are CUT_BY_DEPTH.
     cut_throughput: int  # Paths that are CUT_BY_THROUGHPUT.
-    lost: float  # Of the path onward.
+    lost: float  # What the onward path adds to Sample.lost: 0 unless it is cut.
     pending_light: PendingLight
 
 
 @wp.func
 def add_cuts(before: Sample, next: FollowUp) -> Sample:
-    """Add the cuts of a hit to its sample."""
+    """Add the number of cut paths of a hit, and the loss of its onward path, to the sample."""
     out = before
     out.cut_depth += next.cut_depth
     out.cut_throughput += next.cut_throughput
@@ -45,28 +45,20 @@ def add_cuts(before: Sample, next: FollowUp) -> Sample:
     return out
 
 
-def make_lost(features: Features) -> Any:
-    """Return the function for the light that a cut path loses."""
-    Path = make_path(features.counting)
+def make_follow_up(features: Features) -> Any:
+    """Return follow_up(surfaces, shaded, limits, traced) -> FollowUp; `traced` is the sample's number of rays without shadow rays."""
+    Path, Shaded = make_path(features.counting), make_shaded(features.counting)
 
     @wp.func
     def lost(surfaces: Surfaces, path: Path, verdict: int) -> float:
-        """Return the radiance that a cut path would have added in a room of radiance 1; 0 for a path that is not cut."""
+        """Return the radiance that a cut path would have added in surroundings of radiance 1; 0 for a path that is not cut."""
         if verdict < CUT_BY_DEPTH:
             return 0.0
         lost = mean3(path.throughput)
         if wp.static(features.refraction):
-            if path.medium >= 0:  # Radiance is ior^2 times as high inside glass, and the throughput was divided by that.
+            if path.medium >= 0:  # Inside glass the radiance is ior^2 times as high, and `scatter` divided by ior^2.
                 lost = lost * surfaces.materials[path.medium].ior * surfaces.materials[path.medium].ior
         return lost
-
-    return lost
-
-
-def make_follow_up(features: Features) -> Any:
-    """Return follow_up(surfaces, shaded, limits, traced) -> FollowUp; `traced` counts the sample's rays without shadow rays."""
-    Path, Shaded = make_path(features.counting), make_shaded(features.counting)
-    lost = make_lost(features)
 
     @wp.func
     def verdict_of(path: Path, limits: Limits, traced: int) -> int:

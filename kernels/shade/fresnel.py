@@ -1,14 +1,13 @@
-"""Fresnel's formulas: the share of light that a boundary reflects."""
+"""Fresnel's formulas: the reflectance of a smooth boundary."""
 
 import warp as wp
 
 
 @wp.func
 def fresnel_dielectric(cos_i: float, eta: float) -> float:
-    """Return the share of unpolarised light that a smooth boundary reflects; 1 at total internal reflection.
+    """Return the reflectance of a dielectric for unpolarised light; 1 at total internal reflection (Born and Wolf, section 1.5).
 
-    Here cos_i >= 0 is the cosine of incidence, and eta the index behind the boundary over the index in front (Born and Wolf,
-    section 1.5)."""
+    cos_i >= 0 is the cosine of the angle of incidence. eta is the refractive index behind the boundary over that in front."""
     sin2_t = (1.0 - cos_i * cos_i) / (eta * eta)
     if sin2_t >= 1.0:
         return 1.0
@@ -20,7 +19,7 @@ def fresnel_dielectric(cos_i: float, eta: float) -> float:
 
 @wp.func
 def fresnel_schlick(cos_i: float, eta: float) -> float:
-    """Return Schlick 1994's approximation, with the angle on the thinner side; 1 at total internal reflection."""
+    """Return Schlick 1994's approximation, with the cosine in the medium of lower index; 1 at total internal reflection."""
     c = cos_i
     if eta < 1.0:
         sin2_t = (1.0 - cos_i * cos_i) / (eta * eta)
@@ -34,13 +33,13 @@ def fresnel_schlick(cos_i: float, eta: float) -> float:
 
 @wp.func
 def contrast(a: float, b: float) -> float:
-    """Return (a - b) / (a + b), or 1 if both are 0. That is the limit at grazing incidence, and without any metal."""
+    """Return (a - b) / (a + b), or 1 if both are 0, as in the limit of grazing incidence."""
     return wp.where(a + b > 0.0, (a - b) / (a + b), 1.0)
 
 
 @wp.func
 def fresnel_conductor(cos_i: float, eta: float, k: float) -> float:
-    """Return the share that a metal of index eta + i k reflects, unpolarised (Born and Wolf, section 14.2)."""
+    """Return the reflectance of a metal of index eta + i k for unpolarised light (Born and Wolf, section 14.2)."""
     c2 = cos_i * cos_i
     s2 = 1.0 - c2
     t0 = eta * eta - k * k - s2
@@ -57,6 +56,6 @@ def fresnel_conductor(cos_i: float, eta: float, k: float) -> float:
 
 @wp.func
 def fresnel_tint(cos_i: float, f0: wp.vec3) -> wp.vec3:
-    """Return Schlick's curve from the colour f0 at normal incidence to white at a right angle: glTF 2.0's metals."""
+    """Return Schlick's reflectance of glTF 2.0's metals, from the colour f0 at normal incidence to white at grazing incidence."""
     m = 1.0 - cos_i
     return f0 + (wp.vec3(1.0, 1.0, 1.0) - f0) * (m * m * m * m * m)

@@ -1,7 +1,7 @@
-"""The C++ of this folder, for vectorised CPU kernels.
+"""The decorator `lanes_kernel`, for CPU kernels that call the vectorised C++ functions of this folder's headers.
 
-Each header has functions of the Python file of the same name. They have the same names and return the same bits
-(tests/kernels/shade/test_twins.py)."""
+A header implements functions of the Python file of the same name. The C++ functions have the names of the Python functions and return
+the same bits (tests/kernels/shade/test_twins.py)."""
 
 from functools import partial
 from typing import TYPE_CHECKING

@@ -1,8 +1,10 @@
 """Points of hits with error bounds, normals, texture coordinates and ids, for ray queries.
 
-The point is the intersection of the given float32 ray with the plane of the triangle. Corners are as given; an instance's map is
-float64. The computation is in float64, with a running error bound (Higham 2002, section 3.3), and rounded to float32 at the end.
-Barycentric coordinates, which kernels.shade.surface starts from, carry the error of u and v, which is large on needles."""
+The point is the intersection of the float32 ray with the plane of the triangle, whose corners are float32. An instance transforms them
+in float64. The computation is in float64, with a running error bound (Higham 2002, section 3.3); the results are rounded to float32.
+kernels.shade.surface interpolates the corners by u and v instead. The error of u and v is large on needle-shaped triangles."""
+
+from typing import Any
 
 import warp as wp
 
@@ -10,20 +12,20 @@ from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.shade.surface import Place, corners_at, instance_at, sphere_uv, triangle_point, triangle_uv, world_normal
 from wrt.kernels.structs import Instance, Surfaces, kernel
 
-U32 = wp.constant(wp.float64(2.0**-24))  # Unit roundoffs.
-U64 = wp.constant(wp.float64(2.0**-53))
-SAFETY = wp.constant(wp.float64(1.0 + 2.0**-20))  # For the rounding of the bounds themselves.
-SMALLEST = wp.constant(wp.float64(2.0**-149))  # Of float32.
+U32 = wp.constant(wp.float64(2.0**-24))  # Unit roundoff of float32.
+U64 = wp.constant(wp.float64(2.0**-53))  # Unit roundoff of float64.
+SAFETY = wp.constant(wp.float64(1.0 + 2.0**-20))  # Factor on error bounds, for their own rounding.
+SMALLEST = wp.constant(wp.float64(2.0**-149))  # The smallest positive float32.
 
 
 @wp.struct
 class HitPlaces:
-    """The results, one entry a hit. An array of length 0 is not asked for. A miss is NaN, and -1 among the ids."""
+    """The results, one entry for each hit, in world space. Arrays of length 0 are not computed. A miss has NaN vectors and ids -1."""
 
-    point: wp.array(dtype=wp.vec3)  # World space, as all vectors.
-    error: wp.array(dtype=wp.vec3)  # Bound for each axis.
-    normal: wp.array(dtype=wp.vec3)
-    shading: wp.array(dtype=wp.vec3)
+    point: wp.array(dtype=wp.vec3)
+    error: wp.array(dtype=wp.vec3)  # Bound on the error of `point`, per axis.
+    normal: wp.array(dtype=wp.vec3)  # Unit normal of the flat triangle or the sphere, on the outside.
+    shading: wp.array(dtype=wp.vec3)  # Interpolated unit normal, on the outside.
     uv: wp.array(dtype=wp.vec2)
     object: wp.array(dtype=wp.int32)
     instance: wp.array(dtype=wp.int32)
@@ -32,15 +34,15 @@ class HitPlaces:
 
 @wp.struct
 class ObjectIds:
-    """The ids that users know."""
+    """The tables from primitives to the ids that users know."""
 
-    first_prim: wp.array(dtype=wp.int32)  # Of each object and each sphere, in their order.
-    instance: wp.array(dtype=wp.int32)  # The user's id of each of Surfaces.instances.
+    first_prim: wp.array(dtype=wp.int32)  # First prim_id of each object, then of each sphere.
+    instance: wp.array(dtype=wp.int32)  # The user's id of each entry of Surfaces.instances.
 
 
 @wp.struct
 class PlanePoint:
-    """A point, its error bound per axis, and the normal of its plane, of any length."""
+    """A point on a plane or a sphere, its error bound per axis, and the normal there, of any length."""
 
     point: wp.vec3d
     error: wp.vec3d
@@ -67,20 +69,20 @@ def to_world_size(i: Instance, p: wp.vec3d) -> wp.vec3d:
 
 @wp.func
 def cross_size(a: wp.vec3d, b: wp.vec3d) -> wp.vec3d:
-    """Add all terms of wp.cross; a, b >= 0."""
+    """Return wp.cross(a, b) with all terms added, for a, b >= 0."""
     return wp.vec3d(a[1] * b[2] + a[2] * b[1], a[2] * b[0] + a[0] * b[2], a[0] * b[1] + a[1] * b[0])
 
 
 @wp.func
 def on_plane(v0: wp.vec3d, v1: wp.vec3d, v2: wp.vec3d, off: wp.vec3d, origin: wp.vec3d, direction: wp.vec3d) -> PlanePoint:
-    """Intersect a line with the plane through three corners, which are known to `off` per axis.
+    """Intersect a line with the plane through three corners, whose error per axis is at most `off`.
 
-    If rounding leaves open whether they intersect, the error is infinite or NaN."""
+    If, to rounding, the line may be parallel to the plane, the result's error is infinite or NaN."""
     out = PlanePoint()
     e1 = v1 - v0
     e2 = v2 - v0
     out.normal = wp.cross(e1, e2)
-    # An edge is off by two corners and its own rounding. A component of the normal has two products and three roundings.
+    # An edge has the errors of two corners and one rounding. A component of the normal has two products and three roundings.
     slack = wp.float64(2.0) * off + U64 * wp.max(wp.abs(e1), wp.abs(e2))
     size = cross_size(wp.abs(e1), wp.abs(e2))
     normal_error = cross_size(slack, wp.abs(e1) + wp.abs(e2) + slack) + wp.float64(4.0) * U64 * size
@@ -97,26 +99,26 @@ def on_plane(v0: wp.vec3d, v1: wp.vec3d, v2: wp.vec3d, off: wp.vec3d, origin: wp
         return out
     t = height / slope
     t_error = (height_error + wp.abs(t) * slope_error) / (wp.abs(slope) - slope_error) + wp.float64(2.0) * U64 * wp.abs(t)
-    way = t * direction
-    out.point = origin + way
-    out.error = t_error * wp.abs(direction) + wp.float64(2.0) * U64 * (wp.abs(origin) + wp.abs(way))
+    offset = t * direction
+    out.point = origin + offset
+    out.error = t_error * wp.abs(direction) + wp.float64(2.0) * U64 * (wp.abs(origin) + wp.abs(offset))
     return out
 
 
 @wp.func
 def clamped_to_triangle(at: PlanePoint, v0: wp.vec3d, v1: wp.vec3d, v2: wp.vec3d) -> PlanePoint:
-    """Move a point beside the triangle onto it, and add the distance to its error.
+    """Move a point of the plane outside the triangle onto the triangle, and add the distance to the point's error.
 
-    A ray at an edge, or on an outline, may pass its triangle by a rounding error and then meet the plane far away."""
+    A ray that hits an edge may miss the triangle by a rounding error. Its point on the plane may then be far away."""
     e1 = v1 - v0
     e2 = v2 - v0
-    way = at.point - v0
+    from_v0 = at.point - v0
     square = wp.dot(at.normal, at.normal)
-    u = wp.dot(at.normal, wp.cross(way, e2)) / square
-    v = wp.dot(at.normal, wp.cross(e1, way)) / square
+    u = wp.dot(at.normal, wp.cross(from_v0, e2)) / square
+    v = wp.dot(at.normal, wp.cross(e1, from_v0)) / square
     if u >= wp.float64(0.0) and v >= wp.float64(0.0) and u + v <= wp.float64(1.0):
         return at
-    u = wp.max(wp.float64(0.0), u)  # In this order -0 becomes 0 on the CPU as on CUDA.
+    u = wp.max(wp.float64(0.0), u)  # In this order of arguments -0 becomes 0 on both the CPU and CUDA.
     v = wp.max(wp.float64(0.0), v)
     over = wp.max(u + v, wp.float64(1.0))
     out = at
@@ -127,7 +129,7 @@ def clamped_to_triangle(at: PlanePoint, v0: wp.vec3d, v1: wp.vec3d, v2: wp.vec3d
 
 @wp.func
 def on_triangle(surfaces: Surfaces, place: Place, u: float, v: float, origin: wp.vec3d, direction: wp.vec3d) -> PlanePoint:
-    """Return the point on a face; its normal points outside, also on a mirrored instance."""
+    """Return the intersection of a line with a face, with the normal on the outside, also for a mirrored instance."""
     t = corners_at(surfaces, place.face)
     v0 = wp.vec3d(t.v0)
     v1 = wp.vec3d(t.v1)
@@ -146,7 +148,7 @@ def on_triangle(surfaces: Surfaces, place: Place, u: float, v: float, origin: wp
         side = wp.float64(instance.handedness)
     at = clamped_to_triangle(on_plane(v0, v1, v2, off, origin, direction), v0, v1, v2)
     at.normal = side * at.normal
-    # To rounding, the ray runs along the plane: its point may be anywhere on the triangle.
+    # If the error exceeds the triangle, the ray runs along the plane: the point may be anywhere on the triangle.
     reach = wp.max(wp.max(wp.abs(v0 - middle), wp.abs(v1 - middle)), wp.abs(v2 - middle)) + off
     if not longest(at.error) <= longest(reach):
         at.point = middle
@@ -156,19 +158,19 @@ def on_triangle(surfaces: Surfaces, place: Place, u: float, v: float, origin: wp
 
 @wp.func
 def on_sphere(sphere: wp.vec4, t: float, origin: wp.vec3d, direction: wp.vec3d) -> PlanePoint:
-    """Return the line's point on the sphere that is on t's side of the middle."""
+    """Intersect a line with a sphere. Of the two points, return the one on the same side of the chord's middle as parameter t."""
     center = wp.vec3d(wp.float64(sphere[0]), wp.float64(sphere[1]), wp.float64(sphere[2]))
     radius = wp.float64(sphere[3])
     unit = direction / longest(direction)
     unit = unit / wp.length(unit)
-    way = origin - center
-    along = -wp.dot(way, unit)
-    foot = way + along * unit  # The line's point nearest to the centre.
-    foot_error = wp.float64(16.0) * U64 * wp.length(way)
+    from_center = origin - center
+    along = -wp.dot(from_center, unit)
+    foot = from_center + along * unit  # The line's point nearest to the centre, relative to the centre.
+    foot_error = wp.float64(16.0) * U64 * wp.length(from_center)
     square = radius * radius - wp.dot(foot, foot)
     square_error = foot_error * (wp.float64(2.0) * wp.length(foot) + foot_error) + wp.float64(8.0) * U64 * radius * radius
     half = wp.sqrt(wp.max(square, wp.float64(0.0)))
-    # Roots of two numbers d apart differ by at most sqrt(d), and by at most d over either root.
+    # The square roots of a and b differ by at most sqrt(|a - b|), and by at most |a - b| over either root.
     half_error = wp.sqrt(square_error)
     if half > half_error:
         half_error = square_error / half
@@ -184,7 +186,7 @@ def on_sphere(sphere: wp.vec4, t: float, origin: wp.vec3d, direction: wp.vec3d) 
 
 @wp.func
 def shading_normal(surfaces: Surfaces, place: Place, u: float, v: float, geometric: wp.vec3) -> wp.vec3:
-    """Return the interpolated normal, on the outside; the geometric one if the corners have none."""
+    """Return the interpolated unit normal, on the outside; `geometric` if the corners have no normals."""
     face = surfaces.faces[place.face]
     n0 = surfaces.normals[face[0]]
     n1 = surfaces.normals[face[1]]
@@ -203,7 +205,7 @@ def shading_normal(surfaces: Surfaces, place: Place, u: float, v: float, geometr
 
 @wp.func
 def last_entry(first: wp.array(dtype=wp.int32), prim_id: int) -> int:
-    """Return the last entry that does not begin behind prim_id. Entries without primitives begin where the next one does."""
+    """Return the last i with first[i] <= prim_id. An object without primitives has the same `first` as the next object."""
     low = int(0)
     high = int(first.shape[0])
     while high - low > 1:
@@ -217,8 +219,7 @@ def last_entry(first: wp.array(dtype=wp.int32), prim_id: int) -> int:
 
 @wp.func
 def place_of(surfaces: Surfaces, prim_id: int) -> Place:
-    """Return the data as kernels.shade.surface.make_place_of does, with or without instances (-1); material -1 without
-    materials."""
+    """Return the indices of a primitive's data. Without instances or materials, their index is -1."""
     place = Place()
     place.face = prim_id
     place.instance = -1
@@ -235,24 +236,23 @@ def place_of(surfaces: Surfaces, prim_id: int) -> Place:
 
 
 @wp.func
+def write(out: wp.array(dtype=Any), i: int, value: Any):
+    """Store `value` in entry i, unless the array has length 0."""
+    if out.shape[0] > 0:
+        out[i] = value
+
+
+@wp.func
 def write_miss(out: HitPlaces, i: int):
     nothing = wp.vec3(wp.nan, wp.nan, wp.nan)
-    if out.point.shape[0] > 0:
-        out.point[i] = nothing
-    if out.error.shape[0] > 0:
-        out.error[i] = nothing
-    if out.normal.shape[0] > 0:
-        out.normal[i] = nothing
-    if out.shading.shape[0] > 0:
-        out.shading[i] = nothing
-    if out.uv.shape[0] > 0:
-        out.uv[i] = wp.vec2(wp.nan, wp.nan)
-    if out.object.shape[0] > 0:
-        out.object[i] = -1
-    if out.instance.shape[0] > 0:
-        out.instance[i] = -1
-    if out.material.shape[0] > 0:
-        out.material[i] = -1
+    write(out.point, i, nothing)
+    write(out.error, i, nothing)
+    write(out.normal, i, nothing)
+    write(out.shading, i, nothing)
+    write(out.uv, i, wp.vec2(wp.nan, wp.nan))
+    write(out.object, i, -1)
+    write(out.instance, i, -1)
+    write(out.material, i, -1)
 
 
 @wp.func
@@ -261,18 +261,14 @@ def write_ids(surfaces: Surfaces, object_ids: ObjectIds, place: Place, prim_id: 
         out.object[i] = last_entry(object_ids.first_prim, prim_id)
     if out.instance.shape[0] > 0:
         out.instance[i] = object_ids.instance[place.instance]
-    if out.material.shape[0] > 0:
-        out.material[i] = place.material
+    write(out.material, i, place.material)
 
 
 @wp.func
 def write_point(at: PlanePoint, out: HitPlaces, i: int):
-    point = wp.vec3(at.point)
-    if out.point.shape[0] > 0:
-        out.point[i] = point
-    if out.error.shape[0] > 0:
-        least = wp.vec3d(SMALLEST, SMALLEST, SMALLEST)
-        out.error[i] = wp.vec3(SAFETY * (at.error + U32 * wp.abs(at.point)) + least)
+    least = wp.vec3d(SMALLEST, SMALLEST, SMALLEST)
+    write(out.point, i, wp.vec3(at.point))
+    write(out.error, i, wp.vec3(SAFETY * (at.error + U32 * wp.abs(at.point)) + least))
 
 
 @wp.func
@@ -283,17 +279,9 @@ def write_interpolated(surfaces: Surfaces, place: Place, u: float, v: float, nor
         out.uv[i] = triangle_uv(surfaces, place.face, u, v)
 
 
-@wp.func
-def write_interpolated_on_sphere(normal: wp.vec3, out: HitPlaces, i: int):
-    if out.shading.shape[0] > 0:
-        out.shading[i] = normal
-    if out.uv.shape[0] > 0:
-        out.uv[i] = sphere_uv(normal)
-
-
 @kernel
 def hit_places(surfaces: Surfaces, object_ids: ObjectIds, rays: RayArrays, hits: HitArrays, out: HitPlaces, first: int):
-    """Write the results of hits first .. first + dim - 1. A prim_id that is none of the surfaces' is a miss."""
+    """Write the results of the hits first .. first + dim - 1. A prim_id below 0 or beyond the last primitive is a miss."""
     i = first + wp.tid()
     prim_id = hits.prim_id[i]
     count = surfaces.n_triangles + surfaces.spheres.shape[0]
@@ -310,13 +298,13 @@ def hit_places(surfaces: Surfaces, object_ids: ObjectIds, rays: RayArrays, hits:
         on_ball = on_sphere(surfaces.spheres[prim_id - surfaces.n_triangles], hits.t[i], origin, direction)
         write_point(on_ball, out, i)
         normal = wp.vec3(wp.normalize(on_ball.normal))
-        if out.normal.shape[0] > 0:
-            out.normal[i] = normal
-        write_interpolated_on_sphere(normal, out, i)
+        write(out.normal, i, normal)
+        write(out.shading, i, normal)
+        if out.uv.shape[0] > 0:
+            out.uv[i] = sphere_uv(normal)
     else:
         at = on_triangle(surfaces, place, hits.u[i], hits.v[i], origin, direction)
         write_point(at, out, i)
         normal = wp.vec3(wp.normalize(at.normal / longest(at.normal)))
-        if out.normal.shape[0] > 0:
-            out.normal[i] = normal
+        write(out.normal, i, normal)
         write_interpolated(surfaces, place, hits.u[i], hits.v[i], normal, out, i)

@@ -1,4 +1,4 @@
-"""Light kinds: one sample of a light, as seen from a surface. Each kind is a function and an entry of LIGHTS.
+"""Light kinds: functions that sample a light as seen from a surface. Each kind is a function and an entry of LIGHTS.
 
 wrt/scene/lights.py has the lights' parameters. docs/extending.md, "A light", adds a kind."""
 
@@ -27,23 +27,24 @@ class LightSample:
 
     wi: wp.vec3  # Unit direction to the light.
     end: wp.vec3  # End of the shadow ray, unless `distant`.
-    distant: int  # 1: the shadow ray has no end.
-    weight: wp.vec3  # Radiance over density, or a light without area's irradiance at normal incidence.
-    area: int  # 1 if a ray could hit this light.
+    distant: int  # 1 if the light is at infinity, else 0.
+    weight: wp.vec3  # Radiance over density per steradian. For a light without area: irradiance at normal incidence.
+    area: int  # 1 if a ray can hit this light, else 0.
 
 
 # --- the kinds --------------------------------------------------------------------------------------------------------
-# Each is (lighting, surfaces, light, surface, xi) -> sample, placed by xi in [0, 1)^2. A weight of 0 is no light.
+# Each kind is a function (lighting, surfaces, light, surface, xi) -> LightSample, where xi in [0, 1)^2 places the sample. A sample of
+# weight 0 adds no light.
 
 
 @wp.func
 def point_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface, xi: wp.vec2) -> LightSample:
-    """Sample a point light, equal in all directions."""
+    """Sample a point light, which shines equally in all directions."""
     sample = LightSample()
-    way = light.position - s.point
-    distance2 = wp.dot(way, way)
+    to_light = light.position - s.point
+    distance2 = wp.dot(to_light, to_light)
     if distance2 > 0.0:
-        sample.wi = way / wp.sqrt(distance2)
+        sample.wi = to_light / wp.sqrt(distance2)
         sample.end = light.position
         sample.weight = light.color / distance2
     return sample
@@ -61,7 +62,7 @@ def directional_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: S
 
 @wp.func
 def spot_falloff(light: Light, cos_angle: float) -> float:
-    """Return 1 inside the inner cone, 0 outside the outer one, and in between the square of a linear ramp in the cosine."""
+    """Return 1 inside the inner cone, 0 outside the outer cone, and between them the square of a linear ramp in the cosine."""
     if cos_angle <= light.cos_outer:
         return 0.0
     if cos_angle >= light.cos_inner:
@@ -81,7 +82,7 @@ def spot_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface,
 
 @wp.func
 def choose_emitter(lighting: Lighting, light: Light, xi: float) -> tuple[int, float]:
-    """Choose an emitter by power. Return its index, and the place of xi within its share, in [0, 1), which is uniform again."""
+    """Choose an emitter by power. Return its index, and a random number in [0, 1) that is uniform and can be used again."""
     chosen = search_cdf(lighting.emitter_cdf, light.first, light.count, xi)
     share = share_of_row(lighting.emitter_cdf, light.first, chosen)
     left = lighting.emitter_cdf[light.first + chosen] - xi
@@ -90,6 +91,7 @@ def choose_emitter(lighting: Lighting, light: Light, xi: float) -> tuple[int, fl
 
 @wp.func
 def emitter_corners(emitter: Emitter) -> Triangle:
+    """Return the emitter as a Triangle without attributes."""
     t = Triangle()
     t.v0 = emitter.v0
     t.v1 = emitter.v1
@@ -102,21 +104,21 @@ def from_emitter(point: wp.vec3, error: wp.vec3, n: wp.vec3, emission: wp.vec3, 
                  eye: wp.vec3) -> LightSample:
     """Return the sample of an emitter's point, with normal n, as seen from `eye`. It is branch-free, so that loops vectorise."""
     sample = LightSample()
-    way = point - eye
-    distance2 = wp.dot(way, way)
-    sample.wi = way / wp.sqrt(wp.max(distance2, wp.static(2.0**-126)))
+    to_light = point - eye
+    distance2 = wp.dot(to_light, to_light)
+    sample.wi = to_light / wp.sqrt(wp.max(distance2, wp.static(2.0**-126)))
     cos_light = -wp.dot(sample.wi, n)
     cos_light = wp.where(two_sided, wp.abs(cos_light), cos_light)
     lit = cos_light > 0.0 and distance2 > 0.0
-    sample.weight = wp.where(lit, cos_light / (distance2 * pdf_area), 0.0) * emission  # The emission is finite.
-    # The shadow ray ends just before the light, whose own surface must not occlude it.
+    sample.weight = wp.where(lit, cos_light / (distance2 * pdf_area), 0.0) * emission  # 0 * emission is 0, as emissions are finite.
+    # The shadow ray ends just before the light, so that the light's own surface does not occlude it.
     sample.end = spawn_point(point, error, n, eye - point)
     sample.area = 1
     return sample
 
 
 def make_mesh_light(features: Features) -> Any:
-    """Return the function that samples a mesh: an emitter by power, then a point uniformly by area."""
+    """Return the function that samples an emissive mesh: an emitter by power, then a point uniformly by area."""
 
     @wp.func
     def mesh_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface, xi: wp.vec2) -> LightSample:
@@ -140,25 +142,24 @@ def make_mesh_light(features: Features) -> Any:
 
 
 @wp.func
-def is_within(light: Light, s: Surface, way: wp.vec3) -> bool:
-    """Return whether a surface is inside a sphere light. On the sphere, to rounding, its normal decides. `way` points to the
-    centre."""
+def is_within(light: Light, s: Surface, to_center: wp.vec3) -> bool:
+    """Return whether surface s is inside a sphere light. If s is on the sphere, to rounding, the normal of s decides."""
     rounding = wp.length(s.error) + wp.static(16.0 * 2.0**-24) * (light.radius + wp.length(light.position))
-    distance = wp.length(way)
+    distance = wp.length(to_center)
     if distance < light.radius - rounding:
         return True
-    return distance < light.radius + rounding and wp.dot(s.geometric, way) > 0.0
+    return distance < light.radius + rounding and wp.dot(s.geometric, to_center) > 0.0
 
 
 @wp.func
-def sphere_light_from_within(light: Light, s: Surface, way: wp.vec3, xi: wp.vec2) -> LightSample:
-    """Sample the normal's hemisphere by the cosine: all directions meet the inside of the sphere, if that emits."""
+def sphere_light_from_within(light: Light, s: Surface, to_center: wp.vec3, xi: wp.vec2) -> LightSample:
+    """Sample the hemisphere of the normal by the cosine, as all directions meet the sphere's inside; no light if one-sided."""
     sample = LightSample()
     if light.two_sided == 0:
         return sample
     sample.wi = cosine_hemisphere(xi, s.shading)
-    along = wp.dot(sample.wi, way)
-    across = way - along * sample.wi
+    along = wp.dot(sample.wi, to_center)
+    across = to_center - along * sample.wi
     half_chord = wp.sqrt(wp.max(0.0, light.radius * light.radius - wp.dot(across, across)))
     n = wp.normalize(s.point + (along + half_chord) * sample.wi - light.position)
     extent = wp.vec3(light.radius, light.radius, light.radius) + wp.abs(light.position)
@@ -172,24 +173,24 @@ def sphere_light_from_within(light: Light, s: Surface, way: wp.vec3, xi: wp.vec2
 def sphere_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface, xi: wp.vec2) -> LightSample:
     """Sample the cone that the sphere subtends, uniformly (PBR, section 6.2.4); from inside, the hemisphere by the cosine."""
     sample = LightSample()
-    way = light.position - s.point
-    distance2 = wp.dot(way, way)
-    if is_within(light, s, way):
-        return sphere_light_from_within(light, s, way, xi)
+    to_center = light.position - s.point
+    distance2 = wp.dot(to_center, to_center)
+    if is_within(light, s, to_center):
+        return sphere_light_from_within(light, s, to_center, xi)
     sin2_max = light.radius * light.radius / distance2
     if sin2_max >= 1.0:
         return sample
-    # 1 - cos of the cone's half angle without cancellation for a far (small) sphere.
+    # 1 - cos of the cone's half angle, without cancellation for a distant sphere.
     one_minus_cos = sin2_max / (1.0 + wp.sqrt(1.0 - sin2_max))
     h = one_minus_cos * xi[0]
     sin_theta = wp.sqrt(wp.max(0.0, h * (2.0 - h)))
-    axis = way / wp.sqrt(distance2)
+    axis = to_center / wp.sqrt(distance2)
     x = frame_x(axis)
     around = sin_theta * point_at(TWO_PI * xi[1])
     sample.wi = wp.normalize((1.0 - h) * axis + around[0] * x + around[1] * wp.cross(axis, x))
-    # The near crossing with the sphere; pulled out by more than its rounding error.
-    along = wp.dot(sample.wi, way)
-    across = way - along * sample.wi
+    # The shadow ray ends at its first crossing with the sphere, moved outwards by more than the crossing's rounding error.
+    along = wp.dot(sample.wi, to_center)
+    across = to_center - along * sample.wi
     half_chord = wp.sqrt(wp.max(0.0, light.radius * light.radius - wp.dot(across, across)))
     n = wp.normalize(s.point + (along - half_chord) * sample.wi - light.position)
     extent = wp.vec3(light.radius, light.radius, light.radius) + wp.abs(light.position)
@@ -199,8 +200,8 @@ def sphere_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surfac
     return sample
 
 
-# By the names in wrt.scene.lights.LIGHTS, and mesh and sphere for emissive surfaces: from a scene's features to the device function.
-# Light.kind is the index here.
+# Functions from a scene's features to the device function of a kind. The keys are the names in wrt.scene.lights.LIGHTS, and "mesh" and
+# "sphere" for emissive surfaces. Light.kind is the index in this table.
 LIGHTS = {
     "point": lambda features: point_light,
     "directional": lambda features: directional_light,
@@ -208,21 +209,19 @@ LIGHTS = {
     "mesh": make_mesh_light,
     "sphere": lambda features: sphere_light,
 }
-
-
-# Kinds with a single sample, which takes no random numbers. A kind of another module adds its name.
+# Kinds whose sample takes no random numbers. A module that adds such a kind adds its name here, too.
 WITHOUT_AREA = {"point", "directional", "spot"}
 
 
-# --- any of them ------------------------------------------------------------------------------------------------------
+# --- all kinds of a scene ------------------------------------------------------------------------------------------------------
 
 
 def make_light_sample(features: Features) -> Any:
-    """Return the function that samples a light of any kind of the scene: one `if` after another, as in materials.py."""
+    """Return the function that samples a light of any kind of the scene, one `if` after another (see materials.make_of_kind)."""
     light_sample = no_light
-    for number, name in reversed(list(enumerate(LIGHTS))):
+    for kind, name in reversed(list(enumerate(LIGHTS))):
         if name in features.lights:
-            light_sample = make_link(number, LIGHTS[name](features), light_sample)
+            light_sample = make_link(kind, LIGHTS[name](features), light_sample)
     return light_sample
 
 
@@ -231,12 +230,12 @@ def no_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface, x
     return LightSample()
 
 
-def make_link(number: int, function: Any, others: Any) -> Any:
-    """Return the function that takes `function` for lights of kind `number`, and `others` for the rest."""
+def make_link(kind: int, function: Any, others: Any) -> Any:
+    """Return the function that calls `function` for lights of this kind, and `others` for lights of all other kinds."""
 
     @wp.func
     def light_sample(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface, xi: wp.vec2) -> LightSample:
-        if light.kind == wp.static(number):
+        if light.kind == wp.static(kind):
             return function(lighting, surfaces, light, s, xi)
         return others(lighting, surfaces, light, s, xi)
 

@@ -1,4 +1,4 @@
-"""Material kinds: how a surface scatters light, and where rays go on. Each kind is a function and an entry of MATERIALS."""
+"""Material kinds: how a surface scatters light, and the directions of new rays. Each kind is a function and an entry of MATERIALS."""
 
 from typing import Any
 
@@ -11,27 +11,27 @@ from wrt.kernels.shade.sampling import PI, ggx_normal, ggx_visible_share
 from wrt.kernels.shade.surface import Surface
 from wrt.kernels.structs import Material
 
-SMOOTH = wp.constant(1.0e-4)  # GGX's alpha. Below, facets deviate by less than a float32 direction resolves.
+SMOOTH = wp.constant(1.0e-4)  # Largest GGX alpha of a smooth surface: its facets deviate by less than float32 directions resolve.
 
 
 @wp.struct
 class Scatter:
-    """Weights and directions of a surface's scattered light. A weight of 0 means no ray."""
+    """Weights and directions of the light that a surface scatters. A weight of 0 means no ray."""
 
-    reflected: wp.vec3  # Weight towards `reflection`, on the ray's side.
+    reflected: wp.vec3  # Weight of the ray in direction `reflection`, on the side of wo.
     reflection: wp.vec3
-    transmitted: wp.vec3  # Weight towards `refraction`, through the surface.
+    transmitted: wp.vec3  # Weight of the ray in direction `refraction`, on the other side.
     refraction: wp.vec3
-    bends: int
+    bends: int  # 1 if the transmitted ray enters another medium, else 0.
     diffuse: wp.vec3  # Albedo of Lambert's law.
-    highlight: wp.vec3  # For lights that no ray can hit.
-    exponent: float
-    traced: int  # 1 if reflected rays find the other lights, so that the highlight leaves them out.
+    highlight: wp.vec3  # Colour of the highlight of lights that no ray can hit.
+    exponent: float  # Exponent of the highlight (blinn_phong).
+    traced: int  # 1 if reflected rays find area lights, so that these have no highlight.
 
 
 @wp.func
 def blinn_phong(n: wp.vec3, wi: wp.vec3, wo: wp.vec3, exponent: float) -> float:
-    """Return Blinn's highlight, per steradian, scaled so that no more light leaves than arrives at normal incidence.
+    """Return Blinn's highlight per steradian, scaled so that at normal incidence no more light leaves than arrives.
 
     (e + 2)(e + 4) / (8 pi (2^(-e/2) + e)) cos^e (Akenine-Moeller et al. 2008, "Real-Time Rendering", 3rd ed., section 7.6)."""
     h = wp.normalize(wi + wo)
@@ -41,7 +41,7 @@ def blinn_phong(n: wp.vec3, wi: wp.vec3, wo: wp.vec3, exponent: float) -> float:
 
 @wp.func
 def with_highlight(m: Material, before: Scatter) -> Scatter:
-    """Give a rough reflection a highlight of the same width, for lights that no ray can hit (Walter et al. 2007, eq. 41)."""
+    """Add the highlight of lights that no ray can hit, as wide as the rough reflection (Walter et al. 2007, eq. 41)."""
     out = before
     alpha = m.roughness * m.roughness
     if alpha > SMOOTH:
@@ -52,8 +52,9 @@ def with_highlight(m: Material, before: Scatter) -> Scatter:
 
 
 # --- the kinds --------------------------------------------------------------------------------------------------------
-# Each is (material, surface, n, wo, out) -> out. The normal n reflects: a microfacet's, if rough. The unit vector wo points to where
-# the ray came from. `out` has only `reflection`, the mirrored direction. Reflected, transmitted and diffuse add up to at most 1.
+# Each kind is a function (material, surface, n, wo, out) -> out. n is the shading normal, or a microfacet's normal on a rough surface.
+# The unit vector wo points to the ray's origin. On entry, only out.reflection is set, to wo mirrored at n. The sum of the results
+# `reflected`, `transmitted` and `diffuse` is at most 1.
 
 
 @wp.func
@@ -68,7 +69,7 @@ def diffuse(m: Material, s: Surface, n: wp.vec3, wo: wp.vec3, out: Scatter) -> S
 
 @wp.func
 def mirror(m: Material, s: Surface, n: wp.vec3, wo: wp.vec3, out: Scatter) -> Scatter:
-    """Reflect the same share at every angle."""
+    """Reflect the share m.albedo of light at every angle."""
     result = out
     result.reflected = m.albedo
     return result
@@ -88,7 +89,7 @@ def conductor(m: Material, s: Surface, n: wp.vec3, wo: wp.vec3, out: Scatter) ->
 
 
 def make_glass(features: Features) -> Any:
-    """Return the function for reflection and refraction at a boundary to index m.ior, or at a thin pane."""
+    """Return the function that reflects and refracts at a boundary to the index m.ior, or at a thin pane."""
     fresnel = fresnel_schlick if features.schlick else fresnel_dielectric
 
     @wp.func
@@ -97,7 +98,7 @@ def make_glass(features: Features) -> Any:
         cos_o = wp.clamp(wp.dot(n, wo), 0.0, 1.0)
         if wp.static(features.thin_glass):
             if m.thin != 0:
-                # Light is reflected between the faces: R + T^2 R + T^2 R^3 + ... = 2 R / (1 + R).
+                # The sum over all reflections between the two faces: R + T^2 R + T^2 R^3 + ... = 2 R / (1 + R).
                 r = fresnel(cos_o, m.ior)
                 both = 2.0 * r / (1.0 + r)
                 out.reflected = wp.vec3(both, both, both)
@@ -119,7 +120,7 @@ def make_glass(features: Features) -> Any:
 
 
 def make_metallic_roughness(features: Features) -> Any:
-    """Return the function for glTF 2.0's material (appendix B): a metal and a coated diffuse or clear body, mixed by `metallic`."""
+    """Return the function for glTF 2.0's material (appendix B): a metal, mixed by `metallic` with a coated diffuse or clear body."""
     fresnel = fresnel_schlick if features.schlick else fresnel_dielectric
     glass = make_glass(features)
 
@@ -144,7 +145,7 @@ def make_metallic_roughness(features: Features) -> Any:
     return metallic_roughness
 
 
-# From a scene's features to the device function; Material.kind is the index.
+# Functions from a scene's features to the device function of a kind. Material.kind is the index in this table.
 MATERIALS = {
     "diffuse": lambda features: diffuse,
     "mirror": lambda features: mirror,
@@ -154,17 +155,17 @@ MATERIALS = {
 }
 
 
-# --- any of them ------------------------------------------------------------------------------------------------------
+# --- all kinds of a scene ------------------------------------------------------------------------------------------------------
 
 
 def make_of_kind(features: Features) -> Any:
-    """Return the function for all kinds of the scene, one `if` after another.
+    """Return the function that scatters at a surface of any kind of the scene, one `if` after another.
 
-    Warp keeps the old code of a table that a device function looks up, even after an edit."""
+    A kernel that looked up MATERIALS would not be recompiled after an edit of the table: Warp does not hash it."""
     of_kind = no_kind
-    for number, name in reversed(list(enumerate(MATERIALS))):
+    for kind, name in reversed(list(enumerate(MATERIALS))):
         if name in features.materials:
-            of_kind = make_link(number, MATERIALS[name](features), of_kind)
+            of_kind = make_link(kind, MATERIALS[name](features), of_kind)
     return of_kind
 
 
@@ -173,12 +174,12 @@ def no_kind(m: Material, s: Surface, n: wp.vec3, wo: wp.vec3, out: Scatter) -> S
     return out
 
 
-def make_link(number: int, function: Any, others: Any) -> Any:
-    """Return the function that takes `function` for materials of kind `number`, and `others` for the rest."""
+def make_link(kind: int, function: Any, others: Any) -> Any:
+    """Return the function that calls `function` for materials of this kind, and `others` for materials of all other kinds."""
 
     @wp.func
     def of_kind(m: Material, s: Surface, n: wp.vec3, wo: wp.vec3, out: Scatter) -> Scatter:
-        if m.kind == wp.static(number):
+        if m.kind == wp.static(kind):
             return function(m, s, n, wo, out)
         return others(m, s, n, wo, out)
 
@@ -186,12 +187,12 @@ def make_link(number: int, function: Any, others: Any) -> Any:
 
 
 def make_scatter(features: Features) -> Any:
-    """Return the function that scatters light at a surface of any kind."""
+    """Return scatter(m, surface, wo, facet) -> Scatter, for every kind of the scene."""
     of_kind = make_of_kind(features)
 
     @wp.func
     def scatter(m: Material, s: Surface, wo: wp.vec3, facet: wp.vec3) -> Scatter:
-        """Scatter the ray from direction -wo. `facet`, from cap_point, places the microfacet of a rough surface."""
+        """Scatter a ray of direction -wo. `facet`, a cap_point, places the microfacet of a rough surface."""
         out = Scatter()
         n = s.shading
         rough = bool(False)
@@ -206,10 +207,10 @@ def make_scatter(features: Features) -> Any:
             cos_s = wp.dot(s.shading, wo)
             weight_r = ggx_visible_share(cos_s, wp.dot(s.shading, out.reflection), alpha)
             weight_t = ggx_visible_share(cos_s, wp.dot(s.shading, out.refraction), alpha)
-            # A facet may send light below the surface: it would meet another facet, which single scattering leaves out.
+            # A facet may send light below the surface, to another facet. Single scattering leaves such light out.
             out.reflected = wp.where(wp.dot(out.reflection, s.shading) > 0.0, weight_r, 0.0) * out.reflected
             out.transmitted = wp.where(wp.dot(out.refraction, s.shading) < 0.0, weight_t, 0.0) * out.transmitted
-        # Interpolated normals can point a mirrored ray into the surface: the flat normal mirrors it instead.
+        # A shading normal may mirror the ray into the surface. Then the geometric normal mirrors it instead.
         if wp.dot(out.reflection, s.geometric) <= 0.0:
             out.reflection = 2.0 * wp.dot(s.geometric, wo) * s.geometric - wo
         if wp.dot(out.refraction, s.geometric) >= 0.0:

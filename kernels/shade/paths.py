@@ -1,4 +1,4 @@
-"""Paths: rays that wait to be traced, from the camera or from a surface."""
+"""Paths: rays from the camera or from a surface that wait to be traced, with their throughput."""
 
 from functools import cache
 from typing import Any, NamedTuple
@@ -9,20 +9,20 @@ from wrt.kernels.shade.sampling import hash_pair
 from wrt.kernels.shade.surface import Surface, spawn_point
 from wrt.kernels.structs import Ray, make_ray
 
-UNKNOWN = wp.constant(-2)  # The medium of a camera ray: it may start inside glass.
+UNKNOWN = wp.constant(-2)  # Path.medium of a camera ray, which may start inside glass.
 CAMERA, REFLECTED, REFRACTED, ONWARD = (wp.constant(branch) for branch in range(4))  # The branch that made a path.
 BRANCHES = wp.constant(4)
 
 
 @wp.func
 def label(branch: int, depth: int) -> int:
-    """Return the Ray.slot of a path's ray before it is logged. A shadow ray has 0: it belongs to the path's ray before it."""
+    """Return the Ray.slot with which a path's ray reaches the ray log. A shadow ray has 0: it belongs to the path ray logged before."""
     return 1 + branch + BRANCHES * depth
 
 
 @cache
 def make_path(counting: bool) -> Any:
-    """Return the struct Path. `counting` as in Features."""
+    """Return the struct Path. `counting` is Features.counting."""
 
     @wp.struct
     class Path:
@@ -30,12 +30,12 @@ def make_path(counting: bool) -> Any:
 
         origin: wp.vec3
         direction: wp.vec3
-        throughput: wp.vec3  # Weight of its radiance in the sample.
+        throughput: wp.vec3  # Weight of the ray's radiance in the sample.
         depth: int  # Bounces so far.
-        passed: int  # Surfaces in a row that it passed straight.
-        medium: int  # The solid glass around it: a material, OUTSIDE or UNKNOWN.
-        exclude_plus_one: int  # 1 + the triangle that it starts on, or 0.
-        key: wp.uint32  # Seed of its samples.
+        passed: int  # Blended surfaces that the path has passed straight since its last bounce.
+        medium: int  # Material of the solid glass around the origin, OUTSIDE or UNKNOWN.
+        exclude_plus_one: int  # 1 + prim_id of the triangle that the ray starts on and ignores; 0: none.
+        key: wp.uint32  # Seed of the random numbers at the ray's hit.
         if counting:
             branch: int  # CAMERA to ONWARD.
 
@@ -52,7 +52,7 @@ class Paths(NamedTuple):
 
 @cache
 def make_paths(counting: bool) -> Paths:
-    """Return the functions that make paths. `counting` as in Features."""
+    """Return the functions that make paths. `counting` is Features.counting."""
     Path = make_path(counting)
 
     @wp.func
@@ -75,6 +75,7 @@ def make_paths(counting: bool) -> Paths:
 
     @wp.func
     def child(path: Path, s: Surface, direction: wp.vec3, throughput: wp.vec3, branch: int) -> Path:
+        """Return the path that leaves surface s after one more bounce, in the medium of `path`."""
         out = Path()
         out.origin = spawn_point(s.point, s.error, s.geometric, direction)
         out.direction = direction

@@ -1,4 +1,4 @@
-"""The rays of a camera, outside of a render, and the ray without length."""
+"""The kernel for a camera's rays outside of a render, and the ray of a film point that gets no light."""
 
 from typing import Any
 
@@ -9,16 +9,16 @@ from wrt.kernels.structs import Ray, kernel, make_ray
 
 @wp.func
 def no_ray() -> Ray:
-    """Return the ray where the film gets no light: t_max < 0, and direction 0."""
+    """Return the ray of a film point that gets no light: t_max = -1 and direction 0."""
     ray = make_ray(wp.vec3(0.0, 0.0, 0.0), wp.vec3(0.0, 0.0, 0.0))
     ray.t_max = -1.0
     return ray
 
 
 def make_camera_rays_kernel(camera_kind: Any) -> Any:
-    """Return the kernel for the rays through the middle of the lens; the direction is 0 where there is no ray.
+    """Return the kernel that writes origin and unit direction of the ray through each film point and the middle of the lens.
 
-    `camera_kind` is a module as kernels/shade/cameras describes it."""
+    The direction is 0 at film points that get no light. kernels/shade/cameras describes the module `camera_kind`."""
     camera_struct = camera_kind.Camera
     camera_ray = camera_kind.make_camera_ray()
 

@@ -41,8 +41,8 @@ static inline unsigned sobol_second(unsigned x) {
 
 static inline float unit_float(unsigned x) { return (float)(x >> 8) * UNIT; }
 
-// Store the points first, first + 1 ... of sample_2d's sequence with this seed, hash_pair(key, dimension). There must be room for
-// LANES - 1 points more, which are computed, too.
+// Store the points first .. first + count - 1 of sample_2d's sequence in `to`. The seed is hash_pair(key, dimension). `to` must have
+// room for LANES - 1 more points, which are overwritten.
 static inline void sample_2d(unsigned seed, unsigned first, int count, float* to) {
     const unsigned seed_x = hash_u32(seed ^ SEED_X), seed_y = hash_u32(seed ^ SEED_Y);
     for (int j = 0; j < count; j += LANES) {
@@ -56,8 +56,8 @@ static inline void sample_2d(unsigned seed, unsigned first, int count, float* to
     }
 }
 
-// Replace `count` values in [0, 1) by their quantiles. `icdf`, the inverse distribution, has `size` entries. Results go to `out` first,
-// as the compiler does not know that they cannot overwrite the table.
+// Replace `count` values in [0, 1) by their quantiles. `icdf`, the inverse distribution, has `size` entries. Results go to the local
+// array `out` first: otherwise the compiler must assume that storing them changes the table.
 static inline void quantile(const float* icdf, int size, float* values, int count) {
     for (int j = 0; j < count; j += LANES) {
         const int n = count - j < LANES ? count - j : LANES;

@@ -1,7 +1,7 @@
-"""Samples: a counter-based low-discrepancy sequence, and the shapes that its points are mapped to.
+"""Samples: points of a low-discrepancy sequence in [0, 1)^2, and maps from the unit square to disks, triangles and directions.
 
-Every number depends on (pixel, sample, dimension, seed) alone, so that pictures do not depend on tiles, threads or passes. Each
-pair of dimensions is the two-dimensional Sobol sequence, its points shuffled and Owen-scrambled by hashing (Burley 2020, "Practical
+Every random number depends on (pixel, sample, dimension, seed) alone, so that pictures do not depend on tiles, threads or passes.
+Each pair of dimensions is the two-dimensional Sobol sequence, shuffled and Owen-scrambled by hashing (Burley 2020, "Practical
 Hash-based Owen Scrambling", JCGT 9(4)). The hash of the nested scramble has the constants of Vegdahl 2021 ("Building a Better LK
 Hash"). Independent random numbers serve for comparison."""
 
@@ -13,21 +13,21 @@ from wrt.kernels.shade.elementary import near_sin_cos, sin_cos
 from wrt.kernels.shade.features import Features
 from wrt.kernels.structs import unit
 
-# The constants of the hash, of the scramble, and of the seeds of a point's two numbers.
+# The multipliers of the hash, the multipliers of the scramble, and the seeds of a point's two coordinates.
 HASH_1, HASH_2 = 0x21F0AAAD, 0xD35A2D97
 LK_1, LK_2, LK_3 = 0x3D20ADEA, 0x05526C56, 0x53A22864
 SEED_X, SEED_Y = 0xA511E9B3, 0x63D83595
-# Masks of every second bit, pair, four and eight bits, and the step of a 24-bit number in [0, 1).
+# Masks of every second bit, 2-bit, 4-bit and 8-bit group, and the step between 24-bit numbers in [0, 1).
 BITS_1, BITS_2, BITS_4, BITS_8 = 0x55555555, 0x33333333, 0x0F0F0F0F, 0x00FF00FF
 UNIT = wp.constant(2.0**-24)
-LANES = 16  # Numbers that vectorised code computes at a time.
+LANES = 16  # Entries that vectorised code computes at a time.
 TWO_PI = wp.constant(6.283185307179586)
 PI = wp.constant(3.141592653589793)
 
 
 @wp.func
 def hash_u32(x: wp.uint32) -> wp.uint32:
-    """Permute the 32-bit numbers without visible pattern, by two rounds of xor-shift and multiplication (Wellons 2018)."""
+    """Permute the 32-bit integers pseudo-randomly, by two rounds of xor-shift and multiplication (Wellons 2018)."""
     x = x ^ (x >> wp.uint32(16))
     x = x * wp.static(wp.uint32(HASH_1))
     x = x ^ (x >> wp.uint32(15))
@@ -37,7 +37,7 @@ def hash_u32(x: wp.uint32) -> wp.uint32:
 
 @wp.func
 def hash_pair(a: wp.uint32, b: wp.uint32) -> wp.uint32:
-    """Hash two numbers; the order matters."""
+    """Hash two integers, whose order matters, to one."""
     return hash_u32(a + wp.static(wp.uint32(0x9E3779B9)) * hash_u32(b + wp.static(wp.uint32(0x85EBCA6B))))
 
 
@@ -53,7 +53,7 @@ def reverse_bits(x: wp.uint32) -> wp.uint32: ...
 
 @wp.func
 def laine_karras(x: wp.uint32, seed: wp.uint32) -> wp.uint32:
-    """Permute numbers so that each bit depends only on itself and lower ones: on reversed bits, a nested scramble."""
+    """Permute the integers so that each bit depends only on itself and lower bits: a nested scramble of the reversed bits."""
     x = x ^ (x * wp.static(wp.uint32(LK_1)))
     x = x + seed
     x = x * ((seed >> wp.uint32(16)) | wp.uint32(1))
@@ -65,7 +65,7 @@ def laine_karras(x: wp.uint32, seed: wp.uint32) -> wp.uint32:
 def sobol_second(index: wp.uint32) -> wp.uint32:
     """Return the bits of the second Sobol dimension, lowest bit first: the Pascal matrix modulo 2.
 
-    Entry (i, j) is odd exactly if j's bits are among i's (Lucas), so that the product is five folds."""
+    Entry (i, j) is odd exactly if the set bits of j are also set in i (Lucas), so that five xor-shifts compute the product."""
     x = index
     x = x ^ ((x >> wp.uint32(1)) & wp.static(wp.uint32(BITS_1)))
     x = x ^ ((x >> wp.uint32(2)) & wp.static(wp.uint32(BITS_2)))
@@ -76,13 +76,13 @@ def sobol_second(index: wp.uint32) -> wp.uint32:
 
 @wp.func
 def unit_float(x: wp.uint32) -> float:
-    """Map the upper 24 bits to [0, 1)."""
+    """Map the upper 24 bits of x to a float in [0, 1)."""
     return float(x >> wp.uint32(8)) * UNIT
 
 
 @wp.func
 def sample_2d(key: wp.uint32, index: wp.uint32, dimension: int) -> wp.vec2:
-    """Return point `index` of the sequence of (key, dimension). Any 2^k-aligned block of 2^k points is a (0, k, 2)-net."""
+    """Return point `index` in [0, 1)^2 of the sequence of (key, dimension). Each 2^k-aligned block of 2^k points is a (0, k, 2)-net."""
     seed = hash_pair(key, wp.uint32(dimension))
     i = reverse_bits(laine_karras(reverse_bits(index), seed))
     x = reverse_bits(laine_karras(i, hash_u32(seed ^ wp.static(wp.uint32(SEED_X)))))
@@ -103,12 +103,12 @@ def independent_2d(key: wp.uint32, index: wp.uint32, dimension: int) -> wp.vec2:
 def sample_points(seed: wp.uint32, first: int, count: int, out: wp.array(dtype=wp.vec2), at: int) -> None:
     """Store the points first, first + 1 ... of sample_2d's sequence in out[at], out[at + 1] ..., for lanes_kernel (headers.py).
 
-    `seed` is hash_pair(key, dimension). `out` must have room for LANES - 1 more."""
+    `seed` is hash_pair(key, dimension). `out` must have room for LANES - 1 more points, which are overwritten."""
 
 
 @wp.func_native("wrt::quantile(icdf.data, icdf.shape[0], (float*)(points.data + (long long)first), 2 * count);")
 def quantiles(icdf: wp.array(dtype=wp.float32), points: wp.array(dtype=wp.vec2), first: int, count: int) -> None:
-    """Replace both numbers of each point by their `quantile`. For lanes_kernel."""
+    """Replace both coordinates of points first .. first + count - 1 by their `quantile`. For lanes_kernel (headers.py)."""
 
 
 @wp.func
@@ -120,12 +120,12 @@ def quantile(icdf: wp.array(dtype=wp.float32), x: float) -> float:
 
 
 def make_draw(features: Features) -> Any:
-    """Return the function that draws many numbers of a pixel, for the CPU."""
+    """Return the function that draws many samples of one pixel, for the CPU."""
     sample = make_sample_2d(features)
 
     @wp.func
     def draw(key: wp.uint32, dimension: int, first: int, count: int, out: wp.array(dtype=wp.vec2), at: int):
-        """Store sample_2d(key, first + i, dimension) in out[at + i], for each i below `count`; needs room as sample_points does."""
+        """Store sample_2d(key, first + i, dimension) in out[at + i] for i < count. `out` needs the room that sample_points needs."""
         if wp.static(features.independent):
             for i in range(count):
                 out[at + i] = sample(key, wp.uint32(first + i), dimension)
@@ -136,20 +136,20 @@ def make_draw(features: Features) -> Any:
 
 
 def make_sample_2d(features: Features) -> Any:
-    """Return the sampler of the scene's settings."""
+    """Return independent_2d or sample_2d, as the scene's settings choose."""
     return independent_2d if features.independent else sample_2d
 
 
 @wp.func
 def point_at(angle: float) -> wp.vec2:
-    """Return the point of the unit circle at this angle."""
+    """Return the point of the unit circle at an angle in radians."""
     sin, cos = sin_cos(angle)
     return wp.vec2(cos, sin)
 
 
 @wp.func
 def disk(xi: wp.vec2) -> wp.vec2:
-    """Map to the unit disk, uniformly, by concentric squares (Shirley and Chiu 1997)."""
+    """Map [0, 1)^2 uniformly to the unit disk, concentric squares to circles (Shirley and Chiu 1997)."""
     a = 2.0 * xi[0] - 1.0
     b = 2.0 * xi[1] - 1.0
     wide = wp.abs(a) > wp.abs(b)
@@ -162,8 +162,9 @@ def disk(xi: wp.vec2) -> wp.vec2:
 
 @wp.func
 def polygon(xi: wp.vec2, sides: int, rotation: float) -> wp.vec2:
-    """Map to the regular polygon in the unit circle, uniformly: the first number chooses a sector, the rest a point of its
-    triangle."""
+    """Map [0, 1)^2 uniformly to a regular polygon in the unit circle, rotated by `rotation` radians.
+
+    The first coordinate chooses a sector. Its remainder and the second coordinate choose a point of the sector's triangle."""
     scaled = xi[0] * float(sides)
     sector = wp.min(int(scaled), sides - 1)
     r = wp.sqrt(scaled - float(sector))
@@ -174,14 +175,14 @@ def polygon(xi: wp.vec2, sides: int, rotation: float) -> wp.vec2:
 
 @wp.func
 def triangle_numbers(x: float, y: float) -> tuple[float, float]:
-    """Return `triangle` as two numbers. It is branch-free, as search_cdf: a random branch is mispredicted half the time."""
+    """Return `triangle` as two floats. Like search_cdf it is branch-free, as a random branch is mispredicted half the time."""
     half = 0.5 * wp.where(y > x, x, y)
     return wp.where(y > x, half, x - half), wp.where(y > x, y - half, half)
 
 
 @wp.func
 def triangle(xi: wp.vec2) -> wp.vec2:
-    """Map to barycentrics (of v1, v2), uniformly over a triangle, without folding or square root (Heitz 2019)."""
+    """Map [0, 1)^2 to barycentrics (of v1, v2), uniformly over a triangle, without folding or square root (Heitz 2019)."""
     u, v = triangle_numbers(xi[0], xi[1])
     return wp.vec2(u, v)
 
@@ -202,34 +203,34 @@ def frame_x(n: wp.vec3) -> wp.vec3:
 
 @wp.func
 def cosine_point(xi: wp.vec2) -> wp.vec3:
-    """Map to directions around the z axis with density cos / pi (Malley's method)."""
+    """Map [0, 1)^2 to unit directions around the z axis with density cos / pi per steradian (Malley's method)."""
     d = disk(xi)
     return wp.vec3(d[0], d[1], wp.sqrt(wp.max(0.0, 1.0 - d[0] * d[0] - d[1] * d[1])))
 
 
 @wp.func
 def rotated_to(point: wp.vec3, n: wp.vec3) -> wp.vec3:
-    """Rotate a direction around the z axis to one around n."""
+    """Rotate `point` by a rotation that takes the z axis to the unit vector n."""
     x = frame_x(n)
     return unit(point[0] * x + point[1] * wp.cross(n, x) + point[2] * n)
 
 
 @wp.func
 def cosine_hemisphere(xi: wp.vec2, n: wp.vec3) -> wp.vec3:
-    """Map to directions around n with density cos / pi."""
+    """Map [0, 1)^2 to unit directions around n with density cos / pi per steradian."""
     return rotated_to(cosine_point(xi), n)
 
 
 @wp.func
 def cap_point(xi: wp.vec2) -> wp.vec3:
-    """Map to a spherical cap: a point of the unit circle, and the depth below the pole."""
+    """Map [0, 1)^2 to a spherical cap: x and y are a point of the unit circle, z is the relative depth below the pole."""
     sin, cos = near_sin_cos(TWO_PI * xi[0])
     return wp.vec3(cos, sin, xi[1])
 
 
 @wp.func
 def ggx_normal(cap: wp.vec3, n: wp.vec3, wo: wp.vec3, alpha: float) -> wp.vec3:
-    """Return a microfacet normal of the GGX surface that wo sees (Dupuy and Benyoub 2023, spherical caps); `cap` is a cap_point."""
+    """Return a GGX microfacet normal, drawn from those visible from wo (Dupuy and Benyoub 2023); `cap` is a cap_point."""
     x = frame_x(n)
     y = wp.cross(n, x)
     w = wp.normalize(wp.vec3(alpha * wp.dot(wo, x), alpha * wp.dot(wo, y), wp.dot(wo, n)))
@@ -241,7 +242,7 @@ def ggx_normal(cap: wp.vec3, n: wp.vec3, wo: wp.vec3, alpha: float) -> wp.vec3:
 
 @wp.func
 def ggx_lambda(cos_theta: float, alpha: float) -> float:
-    """Return Smith's Lambda: hidden over visible microfacet area towards a direction at this angle (Heitz 2014, eq. 72)."""
+    """Return Smith's Lambda: hidden over visible microfacet area, seen at cosine cos_theta to the normal (Heitz 2014, eq. 72)."""
     c2 = cos_theta * cos_theta
     tan2 = wp.max(0.0, 1.0 - c2) / wp.max(c2, 1.0e-12)
     return 0.5 * (wp.sqrt(1.0 + alpha * alpha * tan2) - 1.0)
@@ -256,7 +257,7 @@ def ggx_visible_share(cos_o: float, cos_i: float, alpha: float) -> float:
 
 @wp.func
 def search_cdf(cdf: wp.array(dtype=wp.float32), first: int, count: int, x: float) -> int:
-    """Return the lowest i with x < cdf[first + i]; cdf rises to 1."""
+    """Return the lowest i with x < cdf[first + i]; the `count` entries from `first` on rise to 1."""
     low = int(0)
     high = int(count - 1)
     while low < high:

@@ -1,4 +1,4 @@
-"""Segments between pairs of points, for visibility queries."""
+"""Rays along the segments between pairs of points, for visibility queries."""
 
 import warp as wp
 
@@ -6,15 +6,14 @@ from wrt.kernels.query import RayArrays
 from wrt.kernels.shade.surface import corners_at, spawn_point, triangle_normal
 from wrt.kernels.structs import Surfaces, gamma, kernel, largest, unit
 
-END = 64.0  # In roundings, see `segments`.
+END = 64.0  # Length cut off at each end of a segment, in units of rounding; see `segments`.
 
 
 @wp.func
 def lifted(surfaces: Surfaces, prim_id: int, point: wp.vec3, towards: wp.vec3) -> wp.vec3:
-    """Move a point on a primitive off its plane, or off the sphere, by the point's rounding error.
+    """Move a point on a triangle or sphere off the surface, on the side of `towards`, by the point's rounding error.
 
-    A ray from there does not hit a neighbouring face in the same plane. A point with prim_id -1, or on a face without a plane,
-    stays."""
+    A ray from there does not hit a neighbouring face in the same plane. A point with prim_id -1 or on a degenerate face stays."""
     if prim_id < 0:
         return point
     error = wp.vec3()
@@ -36,7 +35,7 @@ def lifted(surfaces: Surfaces, prim_id: int, point: wp.vec3, towards: wp.vec3) -
 
 @wp.func
 def is_before(p: wp.vec3, q: wp.vec3) -> bool:
-    """Compare by x, then y, then z."""
+    """Return whether p comes before q in lexicographic order."""
     if p[0] != q[0]:
         return p[0] < q[0]
     if p[1] != q[1]:
@@ -50,23 +49,24 @@ class Pairs:
 
     a: wp.array(dtype=wp.vec3)
     b: wp.array(dtype=wp.vec3)
-    on_a: wp.array(dtype=wp.int32)  # -1: on none. Length 0: unknown for all.
-    on_b: wp.array(dtype=wp.int32)  # As on_a.
+    on_a: wp.array(dtype=wp.int32)  # prim_id of the primitive that a lies on, -1: none. Length 0: unknown for all points.
+    on_b: wp.array(dtype=wp.int32)  # The same for b.
 
 
 @kernel
 def segments(surfaces: Surfaces, pairs: Pairs, size: float, rays: RayArrays, first: int):
-    """Make the rays between a and b, without their ends.
+    """Make the rays between a and b, shortened at both ends. A ray does not depend on which of its two points is called a.
 
-    The ray does not depend on which of the two points is called a. `size` is that of the largest primitive. A segment that is all
-    ends, or not finite, becomes a ray that hits nothing.
+    `size` is the size of the largest primitive. A segment that is not finite, or not longer than its two cuts, becomes a ray that
+    hits nothing.
 
-    An end p is shortened by the rounding error of a surface through p. Let u = 2^-24, |p| the largest coordinate of p, and S the
-    size of the primitive there. Then p is off the surface by a few u |p|. The ray begins at the end with the smaller |p|. At its
-    origin no rounding of the direction counts, and a triangle unit is off by 7 u S. Corners relative to the origin are rounded
-    once, u S, and sheared, 6 u S. At the other end q the direction is off by u |q - p| <= 2 u |q|, and so is the unit's distance.
-    The cosine at which the ray meets the surface divides all of these. So the ray is shortened by END u max(|p|, S) at the origin,
-    at most by END u |q|, and by END u |q| at the other end. That suffices for cosines above 0.15."""
+    At an end p the ray is shortened by the rounding error of a surface through p. Let u = 2^-24, |p| the largest absolute coordinate
+    of p, and S the size of the primitive at p. Then p is off the surface by a few u |p|. The ray begins at the end with the smaller
+    |p|. There the rounding of the direction does not matter, and the error of a triangle test is 7 u S: u S from rounding the corners
+    relative to the origin, 6 u S from shearing them. At the other end q, the error of the direction is u |q - p| <= 2 u |q|, and so
+    is the error of the test's distance. All these errors are divided by the cosine between ray and normal. So the ray is shortened by
+    END u max(|p|, S) at its origin, but at most by END u |q|, and by END u |q| at the other end. That suffices for cosines above
+    0.15."""
     i = first + wp.tid()
     p = pairs.a[i]
     q = pairs.b[i]
@@ -77,10 +77,10 @@ def segments(surfaces: Surfaces, pairs: Pairs, size: float, rays: RayArrays, fir
     swapped = largest(q) < largest(p) or (largest(q) == largest(p) and is_before(q, p))
     origin = wp.where(swapped, q, p)
     target = wp.where(swapped, p, q)
-    way = target - origin
-    length = largest(way)
+    segment = target - origin
+    length = largest(segment)
     rays.origin[i] = origin
-    rays.direction[i] = way
+    rays.direction[i] = segment
     rays.t_min[i] = gamma(END) * wp.min(wp.max(largest(origin), size), largest(target)) / length
     rays.t_max[i] = 1.0 - gamma(END) * largest(target) / length
     if not rays.t_min[i] < rays.t_max[i]:
@@ -92,7 +92,7 @@ def segments(surfaces: Surfaces, pairs: Pairs, size: float, rays: RayArrays, fir
 
 @kernel
 def to_visible(a: wp.array(dtype=wp.vec3), b: wp.array(dtype=wp.vec3), occluded: wp.array(dtype=wp.bool), first: int):
-    """Turn `occluded` into visibility. Nothing is visible from or to a point that is not finite."""
+    """Replace `occluded` by visibility in place. A pair with a point that is not finite is not visible."""
     i = first + wp.tid()
     finite = largest(a[i]) < wp.inf and largest(b[i]) < wp.inf and wp.isfinite(a[i]) and wp.isfinite(b[i])
     occluded[i] = finite and not occluded[i]

@@ -1,4 +1,4 @@
-"""The data at a hit: the surface, its material with textures, its shading normal, and how it scatters light."""
+"""The data at a hit: the surface, its material with textures, its shading normal, and its scattering."""
 
 from typing import Any, NamedTuple
 
@@ -13,13 +13,12 @@ from wrt.kernels.shade.textures import make_sample_texture
 from wrt.kernels.structs import Material, Surfaces, unit
 from wrt.kernels.warp_private import fields_of
 
-MASK = 1  # Alpha modes; 0 is opaque.
-BLEND = 2
+MASK, BLEND = 1, 2  # Values of Material.alpha_mode; 0 is opaque.
 
 
 @wp.struct
 class Texels:
-    """A material's textures at a point, linear; 1 without a texture. Fields that the scene does not have are unread."""
+    """The linear values of a material's textures at a point; 1 without a texture. Fields of textures that no material has are unread."""
 
     albedo: wp.vec3
     alpha: float
@@ -31,22 +30,22 @@ class Texels:
 
 
 class MaterialTexture(NamedTuple):
-    """A texture of a material: the fields of Texels that it sets (neighbours), with their channels in the order "rgba"."""
+    """A texture of a material: the neighbouring fields of Texels that it sets, and the channels (of "rgba") that each field takes."""
 
     fields: dict[str, str]
-    feature: str = "parameter_textures"  # The switch that compiles it in; "" means any texture.
+    feature: str = "parameter_textures"  # The field of Features that compiles it in; "": compiled in with any texture.
 
     @property
     def channels(self) -> list[int]:
         return ["rgba".index(channel) for channels in self.fields.values() for channel in channels]
 
     @property
-    def numbers(self) -> list[str]:
-        """The number of Texels that each channel sets, in C++."""
-        return [number for name in self.fields for number in numbers_of(fields_of(Texels)[name], f"texels.{name}")]
+    def components(self) -> list[str]:
+        """The component of Texels that each channel sets, as a C++ expression."""
+        return [component for name in self.fields for component in numbers_of(fields_of(Texels)[name], f"texels.{name}")]
 
 
-# A material's textures, by the field of Material that has their index, for both loops.
+# A material's textures, for both loops. The keys are the fields of Material that hold the textures' indices.
 TEXTURES = {
     "albedo_texture": MaterialTexture({"albedo": "rgb", "alpha": "a"}, ""),
     "emission_texture": MaterialTexture({"emission": "rgb"}, ""),
@@ -57,14 +56,14 @@ TEXTURES = {
 
 
 def textures_of(features: Features) -> dict[str, MaterialTexture]:
-    """Return the textures that a scene has."""
+    """Return the entries of TEXTURES that a scene's kernel needs."""
     if not features.textures and not features.checkerboards:
         return {}
     return {name: texture for name, texture in TEXTURES.items() if not texture.feature or getattr(features, texture.feature)}
 
 
 def make_look_up(features: Features) -> Any:
-    """Return look_up(surfaces, surface) -> Texels of a surface's material."""
+    """Return look_up(surfaces, surface) -> Texels of the surface's material at its texture coordinates."""
     sample_texture = make_sample_texture(features.textures, features.checkerboards)
     look_up = no_texels
     for name, texture in textures_of(features).items():
@@ -78,25 +77,25 @@ def no_texels(surfaces: Surfaces, s: Surface) -> Texels:
 
 
 def make_texture_link(name: str, texture: MaterialTexture, sample_texture: Any, others: Any) -> Any:
-    """Return the look_up of one texture after the others."""
+    """Return a look_up that calls the look_up `others` and then samples one more texture."""
 
     @wp.func_native(f"return materials.data[(long long)material].{name};")
     def index_of(materials: wp.array(dtype=Material), material: int) -> int: ...
 
-    @wp.func_native("\n".join(f"{to} = color[{channel}];" for channel, to in zip(texture.channels, texture.numbers, strict=True)))
-    def put(texels: wp.ref[Texels], color: wp.vec4) -> None: ...
+    @wp.func_native("\n".join(f"{to} = color[{channel}];" for channel, to in zip(texture.channels, texture.components, strict=True)))
+    def store_color(texels: wp.ref[Texels], color: wp.vec4) -> None: ...
 
     @wp.func
     def look_up(surfaces: Surfaces, s: Surface) -> Texels:
         texels = others(surfaces, s)
-        put(texels, sample_texture(surfaces, index_of(surfaces.materials, s.material), wp.vec2(s.u, s.v)))
+        store_color(texels, sample_texture(surfaces, index_of(surfaces.materials, s.material), wp.vec2(s.u, s.v)))
         return texels
 
     return look_up
 
 
 def make_resolve(features: Features) -> Any:
-    """Return the function for the material at a point: parameters times textures."""
+    """Return resolve(surfaces, surface, texels) -> Material at a point: parameters times textures."""
 
     @wp.func
     def resolve(surfaces: Surfaces, s: Surface, texels: Texels) -> Material:
@@ -115,8 +114,9 @@ def make_resolve(features: Features) -> Any:
 
 
 def make_cutout(features: Features) -> Any:
-    """Return the function that tells traversal units to ignore hits on the clear parts of masked textures; None without
-    cut-outs."""
+    """Return accepts(surfaces, prim_id, u, v) -> bool, or None in scenes without cut-outs.
+
+    It is False for a hit whose alpha is below the cutoff. Traversal ignores such hits."""
     if not features.cutout:
         return None
     sample_texture = make_sample_texture(features.textures, features.checkerboards)
@@ -139,7 +139,7 @@ def make_cutout(features: Features) -> Any:
 
 @wp.func
 def bump(s: Surface, scale: float, color: wp.vec3) -> wp.vec3:
-    """Return the shading normal of a normal map. It is branch-free, so that loops vectorise."""
+    """Return the unit shading normal for the normal map's linear RGB `color`. It is branch-free, so that loops vectorise."""
     side = wp.where(s.front != 0, 1.0, -1.0)
     outward = side * s.shading
     t = s.tangent - wp.dot(s.tangent, outward) * outward
@@ -148,13 +148,13 @@ def bump(s: Surface, scale: float, color: wp.vec3) -> wp.vec3:
     x = (2.0 * color[0] - 1.0) * scale
     y = (2.0 * color[1] - 1.0) * scale
     z = 2.0 * color[2] - 1.0
-    # glTF: +y is up in the picture, while v runs down; the bitangent is cross(n, t) for pictures that are not mirrored.
+    # In glTF, +y points up in the picture, while v runs down. The bitangent is cross(n, t), negated if the texture is mirrored.
     n = unit(x * t + y * s.bitangent_sign * wp.cross(outward, t) + z * outward)
     return where_vec3(length == 0.0, s.shading, side * n)
 
 
 def make_is_solid(features: Features) -> Any:
-    """Return the function that recognises solid glass, which a ray enters at a front and leaves at a back."""
+    """Return is_solid(m) -> bool: True for solid glass, which a ray enters at a front face and leaves at a back face."""
 
     @wp.func
     def is_solid(m: Material) -> bool:
@@ -167,31 +167,31 @@ def make_is_solid(features: Features) -> Any:
 
 
 class Shading(NamedTuple):
-    """The functions for the data at a hit."""
+    """The device functions for the data at a hit."""
 
     surface_at: Any  # (surfaces, ray, hit) -> Surface.
     look_up: Any  # (surfaces, surface) -> Texels.
     resolve: Any  # (surfaces, surface, texels) -> Material.
-    shading_normal: Any  # (surfaces, surface, texels, wo) -> vec3.
+    shading_normal: Any  # (surfaces, surface, texels, wo) -> unit vec3 on the side of wo.
     scatter: Any  # (material, surface, wo, facet) -> Scatter.
     is_solid: Any  # (material) -> bool.
 
 
 def make_shading(features: Features) -> Any:
-    """Return the functions that a kernel's step, shadow rays and AOVs share."""
+    """Return the Shading of a scene, which the step, shadow rays and AOVs share."""
     uvs = features.textures or features.checkerboards
     surface_at = make_surface_at(features.spheres, features.smooth, uvs, features.normal_maps, features.instances)
     look_up, resolve = make_look_up(features), make_resolve(features)
 
     @wp.func
     def shading_normal(surfaces: Surfaces, s: Surface, texels: Texels, wo: wp.vec3) -> wp.vec3:
-        """Return the interpolated or mapped normal, bent just so far that it is visible from wo."""
+        """Return the interpolated or mapped normal, made visible from wo as `visible_normal` does."""
         n = s.shading
         if wp.static(features.normal_maps):
             if surfaces.materials[s.material].normal_texture >= 0:
                 n = bump(s, surfaces.materials[s.material].normal_scale, texels.normal)
         if wp.static(features.smooth or features.normal_maps):
-            if wp.dot(n, wo) < MIN_COSINE:  # Seldom true, and the rest of `visible_normal` is slow.
+            if wp.dot(n, wo) < MIN_COSINE:  # Rarely true; the rest of `visible_normal` is slow.
                 n = visible_normal(n, wo)
         return n
 

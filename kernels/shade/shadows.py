@@ -10,46 +10,46 @@ from wrt.kernels.shade.shading import BLEND, Shading
 from wrt.kernels.shade.surface import Surface, make_place_of, spawn_point
 from wrt.kernels.structs import Hit, Material, Ray, Surfaces
 
-OUTSIDE = wp.constant(-1)  # Of any glass.
-MAX_TRANSPARENT = wp.constant(256)  # Surfaces in a row that a ray passes straight.
+OUTSIDE = wp.constant(-1)  # The medium of a ray that is outside all solid glass.
+MAX_TRANSPARENT = wp.constant(256)  # A ray passes at most so many surfaces straight, in a row; then it is cut.
 
 
 @wp.struct
 class Shadow:
-    """The transmittance of a shadow ray, and the rays that it took."""
+    """The transmittance of a shadow ray, and the number of rays traced for it."""
 
     transmittance: wp.vec3
-    lost: wp.vec3  # The transmittance where the ray was cut, else 0.
+    lost: wp.vec3  # The transmittance up to the cut; 0 if the ray was not cut.
     rays: int
     cut: int  # 1 if the ray met more than MAX_TRANSPARENT surfaces.
 
 
 @wp.func
 def attenuation(surfaces: Surfaces, medium: int, distance: float) -> wp.vec3:
-    """Return Beer-Lambert's transmittance over a distance in world units."""
+    """Return Beer-Lambert's transmittance of material `medium` over a distance in world units."""
     sigma = surfaces.materials[medium].absorption
     return wp.vec3(exp(-sigma[0] * distance), exp(-sigma[1] * distance), exp(-sigma[2] * distance))
 
 
 @wp.func
 def covered(coverage: float, through: wp.vec3) -> wp.vec3:
-    """Return the transmittance of a surface that is present with share `coverage` and then lets `through` through."""
+    """Return the mean transmittance of a surface: `through` on the share `coverage` of its area, 1 on the rest."""
     return coverage * through + wp.vec3(1.0 - coverage, 1.0 - coverage, 1.0 - coverage)
 
 
 @wp.struct
 class Passage:
-    """The light of a shadow ray along its way, from the ray's origin on."""
+    """The transmittance of a shadow ray from its origin to the current point."""
 
-    transmittance: wp.vec3  # Of all surfaces behind `medium`.
-    medium: int  # The solid glass around the ray, or OUTSIDE.
+    transmittance: wp.vec3  # Of all surfaces that the ray has passed, without the glass of `medium`.
+    medium: int  # Material of the solid glass around the point, or OUTSIDE.
     coverage: float  # The glass's alpha where it was entered.
-    inside: wp.vec3  # Transmittance within the glass so far.
+    inside: wp.vec3  # Transmittance of the glass so far, with the face where the ray entered.
 
 
 @wp.func
 def leave_glass(p: Passage) -> Passage:
-    """Take the passage out of its glass, if any."""
+    """Multiply the transmittance by that of the glass around the ray, if any, and set the medium to OUTSIDE."""
     out = Passage()
     out.transmittance = p.transmittance
     out.medium = OUTSIDE
@@ -60,31 +60,31 @@ def leave_glass(p: Passage) -> Passage:
 
 @wp.func
 def is_opaque(m: Material) -> bool:
-    """Return whether no light goes straight through, for any texture and direction."""
+    """Return whether the material blocks all shadow rays, for any texture and direction."""
     return m.transmission <= 0.0 and m.alpha_mode != wp.static(BLEND)
 
 
 def make_pass_surface(features: Features, scatter: Any, is_solid: Any) -> Any:
-    """Return the function that takes light through one more surface."""
+    """Return pass_surface(surfaces, passage, m, s, wo, distance) -> Passage behind surface s with material m."""
 
     @wp.func
     def straight_transmittance(m: Material, from_outside: Surface, wo: wp.vec3) -> wp.vec3:
         """Return the share of light that goes straight through a surface of alpha 1.
 
-        An unbent ray meets both sides of solid glass at its angle outside. So from_outside.front must be 1; otherwise a ray that
-        leaves would count as totally reflected."""
+        An unbent ray meets both faces of solid glass at the angle that it has outside. So from_outside.front must be 1. With
+        front = 0, Fresnel's formula would find total reflection for a ray that leaves."""
         share = scatter(m, from_outside, wo, wp.vec3())
         if share.bends == 0:
             return share.transmitted
         if wp.static(features.tinted_shadows):
-            return m.ior * m.ior * share.transmitted  # A straight ray's solid angle does not change.
+            return m.ior * m.ior * share.transmitted  # Undoes the 1 / ior^2 of `scatter`: an unbent beam keeps its solid angle.
         return wp.vec3(0.0, 0.0, 0.0)
 
     @wp.func
     def pass_surface(surfaces: Surfaces, before: Passage, m: Material, s: Surface, wo: wp.vec3, distance: float) -> Passage:
-        """Take light through a surface, at `distance` (world units) behind the last surface or the ray's origin.
+        """Return the passage behind surface s, which is `distance` (world units) from the last surface or the ray's origin.
 
-        Blended solid glass is present as a whole, with the alpha of the point where it is entered."""
+        Solid glass that is blended has one alpha for the whole way through it: the alpha where the ray enters."""
         p = before
         inward = s.front != 0
         s.front = 1
@@ -98,14 +98,14 @@ def make_pass_surface(features: Features, scatter: Any, is_solid: Any) -> Any:
         if not is_solid(m):
             p.transmittance = wp.cw_mul(p.transmittance, covered(coverage, through))
         elif inward:
-            p = leave_glass(p)  # Glass in glass: each boundary counts as one to air.
+            p = leave_glass(p)  # Glass in glass: each boundary counts as a boundary to air.
             p.medium = s.material
             p.coverage = coverage
             p.inside = through
         elif p.medium == s.material:
             p.inside = wp.cw_mul(p.inside, through)
             p = leave_glass(p)
-        else:  # the ray began inside
+        else:  # The ray began inside this glass.
             p = leave_glass(p)
             if wp.static(features.absorption):
                 through = wp.cw_mul(through, attenuation(surfaces, s.material, distance))
@@ -117,10 +117,10 @@ def make_pass_surface(features: Features, scatter: Any, is_solid: Any) -> Any:
 
 @wp.struct
 class ShadowWalk:
-    """A shadow ray on its way through surfaces."""
+    """A shadow ray that passes one transparent surface after another."""
 
-    ray: Ray  # The rest of the way.
-    end: wp.vec3  # The segment's end.
+    ray: Ray  # The part that is not traced yet.
+    end: wp.vec3  # End of the segment, at the light.
     passage: Passage
     surfaces: int  # Surfaces passed so far.
     shadow: Shadow  # The result, once done = 1.
@@ -138,7 +138,7 @@ def begin_shadow(ray: Ray, end: wp.vec3) -> ShadowWalk:
 
 
 def make_pass_hit(features: Features, shading: Shading) -> Any:
-    """Return pass_hit(surfaces, walk, hit) -> ShadowWalk: go through the closest surface on the way, or stop there."""
+    """Return pass_hit(surfaces, walk, hit) -> ShadowWalk: pass the surface at `hit`, or end the walk there if it is opaque."""
     place_of = make_place_of(features.instances)
     pass_surface = make_pass_surface(features, shading.scatter, shading.is_solid)
 
@@ -164,7 +164,7 @@ def make_pass_hit(features: Features, shading: Shading) -> Any:
         walk.ray.exclude_plus_one = s.exclude_plus_one
         if ray.t_max <= 1.0:
             walk.ray.direction = walk.end - walk.ray.origin
-            if wp.dot(walk.ray.direction, d) <= 0.0:  # the light is within the surface's rounding error
+            if wp.dot(walk.ray.direction, d) <= 0.0:  # The light is within the rounding error of the surface's point.
                 walk.shadow.transmittance = now.transmittance
                 walk.done = 1
         return walk
@@ -173,7 +173,7 @@ def make_pass_hit(features: Features, shading: Shading) -> Any:
 
 
 def make_advance_shadow(features: Features, shading: Shading) -> Any:
-    """Return advance_shadow(surfaces, walk, hit) -> ShadowWalk. Nothing here traces a ray."""
+    """Return advance_shadow(surfaces, walk, hit) -> ShadowWalk. The caller traces walk.ray and passes its closest hit."""
     pass_hit = make_pass_hit(features, shading)
 
     @wp.func
@@ -181,7 +181,7 @@ def make_advance_shadow(features: Features, shading: Shading) -> Any:
         walk = before
         p = walk.passage
         if wp.static(features.absorption):
-            if p.medium >= 0 and walk.ray.t_max <= 1.0:  # the light is inside it
+            if p.medium >= 0 and walk.ray.t_max <= 1.0:  # The light is inside the glass.
                 p.inside = wp.cw_mul(p.inside, attenuation(surfaces, p.medium, wp.length(walk.ray.direction)))
         p = leave_glass(p)
         walk.shadow.transmittance = p.transmittance
@@ -190,7 +190,7 @@ def make_advance_shadow(features: Features, shading: Shading) -> Any:
 
     @wp.func
     def advance_shadow(surfaces: Surfaces, before: ShadowWalk, hit: Hit) -> ShadowWalk:
-        """Advance the walk past `hit`, the closest one of walk.ray, or to the light after a miss."""
+        """Advance the walk past `hit`, the closest hit of walk.ray, or to the light if it is a miss."""
         walk = before
         walk.shadow.rays += 1
         if hit.prim_id < 0:
@@ -208,9 +208,9 @@ def make_advance_shadow(features: Features, shading: Shading) -> Any:
 
 
 def make_transmittance(features: Features, shading: Shading, accel_struct: Any, closest_hit: Any, any_hit: Any) -> Any:
-    """Return the function that traces a shadow ray.
+    """Return transmittance(accel, surfaces, ray, end) -> Shadow: trace the shadow ray `ray`, whose segment ends at `end`.
 
-    It takes one any-hit query, or one closest hit after another if the scene has transparent shadows."""
+    This takes one any-hit query, or one closest-hit query after another if the scene has transparent shadows."""
     advance_shadow = make_advance_shadow(features, shading)
 
     @wp.func

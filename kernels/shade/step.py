@@ -1,8 +1,8 @@
-"""The integrator's step: what follows from a path and its hit. Nothing here traces a ray.
+"""The integrator's step: shades the hit of a path. It traces no rays; kernels/loops does.
 
 It is Whitted 1980, "An Improved Illumination Model for Shaded Display", without recursion. A hit yields emission, the ambient term,
-a shadow request for each light, and at most three new paths. They go straight on (through a partly transparent surface), are
-reflected, or are refracted. Each path carries its throughput. follow_up.py decides which are followed; kernels/loops traces."""
+a shadow request for each light, and at most three new paths: straight on through a partly transparent surface, reflected, and
+refracted. Each path carries its throughput. follow_up.py decides which paths are followed and which are cut."""
 
 from functools import cache
 from typing import Any, NamedTuple
@@ -20,21 +20,21 @@ from wrt.kernels.shade.shadows import OUTSIDE, Shadow, attenuation
 from wrt.kernels.shade.surface import Surface
 from wrt.kernels.structs import Lighting, Material, Ray, Surfaces, any_positive
 
-FACET = wp.constant(2)  # The dimension of the samples that choose a microfacet.
+FACET = wp.constant(2)  # Dimension of the samples that choose a microfacet; 0 is the film, 1 the lens.
 
 
 @cache
 def make_shaded(counting: bool) -> Any:
-    """Return the struct Shaded, the result of `shade`. `counting` as in Features."""
+    """Return the struct Shaded, the result of `shade`. `counting` is Features.counting."""
     path_struct = make_path(counting)
 
     @wp.struct
     class Shaded:
-        """The result of shading a path's hit. A path of throughput 0 is none."""
+        """The result of shading a path's hit. A path of throughput 0 means no path."""
 
         light: wp.vec3  # Emission and the ambient term.
         throughput: wp.vec3  # Weight of this surface's light in the sample.
-        surface: Surface  # Shadow rays start here.
+        surface: Surface  # The surface at the hit, where shadow rays start.
         scatter: Scatter
         wo: wp.vec3
         key: wp.uint32  # Seed of the light samples.
@@ -47,22 +47,22 @@ def make_shaded(counting: bool) -> Any:
 
 @wp.struct
 class ShadowRequest:
-    """A shadow ray, and the light that it carries if nothing is in between."""
+    """A shadow ray, and the radiance that it adds if nothing occludes the light."""
 
-    value: wp.vec3  # Radiance towards the eye, if unoccluded. 0: no ray to trace.
+    value: wp.vec3  # Radiance towards the eye, if unoccluded. 0: there is no ray to trace.
     ray: Ray  # The segment to the light.
-    end: wp.vec3  # Its end.
+    end: wp.vec3  # End of the segment, unless the light is at infinity.
 
 
 @wp.struct
 class Sample:
-    """The radiance along one camera ray, and the rays that it took."""
+    """The radiance along one camera ray, and counts of the rays traced and cut for it."""
 
     radiance: wp.vec3
     rays: int
     cut_depth: int
     cut_throughput: int
-    lost: float  # What the cut rays would have added in a room of radiance 1 (ior^2 inside glass), mean of channels.
+    lost: float  # Radiance (mean of channels) that the cut rays would have added if all surroundings had radiance 1.
 
 
 @wp.func
@@ -72,7 +72,7 @@ def mean3(v: wp.vec3) -> float:
 
 @wp.func
 def absorbed(surfaces: Surfaces, throughput: wp.vec3, medium: int, distance: float) -> wp.vec3:
-    """Return the throughput behind `distance` (world units) in a medium; a negative medium absorbs nothing."""
+    """Return the throughput after `distance` (world units) in material `medium`. A negative medium absorbs nothing."""
     if medium < 0:
         return throughput
     return wp.cw_mul(throughput, attenuation(surfaces, medium, distance))
@@ -87,25 +87,35 @@ def emitted(m: Material, s: Surface) -> wp.vec3:
 
 @wp.struct
 class PendingLight:
-    """A surface's light before its shadow rays are traced."""
+    """The light of a surface that is added to its sample after the surface's shadow rays are traced."""
 
-    light: wp.vec3  # As in Shaded.
-    throughput: wp.vec3  # As in Shaded.
-    lost_reflected: float  # Sample.lost of the reflected path, if cut.
-    lost_refracted: float  # Of the refracted path.
+    light: wp.vec3  # Shaded.light.
+    throughput: wp.vec3  # Shaded.throughput.
+    lost_reflected: float  # What the reflected path adds to Sample.lost: 0 unless it is cut.
+    lost_refracted: float  # What the refracted path adds to Sample.lost: 0 unless it is cut.
+
+
+@wp.struct
+class DirectLight:
+    """The light that arrives at a surface from all lights, as reflected radiance, and counts of its shadow rays."""
+
+    radiance: wp.vec3
+    lost: wp.vec3  # What the cut shadow rays would have added if the lights were surroundings of radiance 1.
+    rays: int
+    cut: int
 
 
 @wp.func
 def receives_light(scatter: Scatter) -> bool:
-    """Return whether direct light can be reflected."""
+    """Return whether a surface with this scattering reflects direct light."""
     return any_positive(scatter.diffuse) or any_positive(scatter.highlight)
 
 
 @wp.func
-def add_light(before: Shadow, value: wp.vec3, scatter: Scatter, shadow: Shadow) -> Shadow:
-    """Add one light of this value to the direct light. In `Shadow.transmittance` stands a radiance here."""
+def add_light(before: DirectLight, value: wp.vec3, scatter: Scatter, shadow: Shadow) -> DirectLight:
+    """Add one light, of the unoccluded radiance `value`, to the direct light."""
     out = before
-    out.transmittance += wp.cw_mul(value, shadow.transmittance)
+    out.radiance += wp.cw_mul(value, shadow.transmittance)
     out.rays += shadow.rays
     if shadow.cut > 0:
         out.cut += shadow.cut
@@ -114,10 +124,10 @@ def add_light(before: Shadow, value: wp.vec3, scatter: Scatter, shadow: Shadow) 
 
 
 @wp.func
-def add_surface_light(before: Sample, pending: PendingLight, direct: Shadow) -> Sample:
-    """Add a surface's light to its sample; `direct` is the sum of add_light."""
+def add_surface_light(before: Sample, pending: PendingLight, direct: DirectLight) -> Sample:
+    """Add a surface's pending light and its direct light to the sample."""
     out = before
-    out.radiance += wp.cw_mul(pending.throughput, pending.light + direct.transmittance)
+    out.radiance += wp.cw_mul(pending.throughput, pending.light + direct.radiance)
     out.rays += direct.rays
     out.cut_depth += direct.cut
     if direct.cut > 0:
@@ -128,14 +138,15 @@ def add_surface_light(before: Sample, pending: PendingLight, direct: Shadow) -> 
 
 
 def make_transparency(features: Features, is_solid: Any) -> Any:
-    """Return the function for the transparency of a blended surface."""
+    """Return transparency(m, surface, medium) -> share of a path that goes straight on."""
 
     @wp.func
     def transparency(m: Material, s: Surface, medium: int) -> float:
-        """Return the share of a ray that ignores the surface: 1 - alpha.
+        """Return 1 - alpha for a blended surface, else 0.
 
-        Blended solid glass is present or absent as a whole, decided where a ray enters. A ray that ignored its front ignores its
-        back, and a ray inside meets all of the back. Else a ray could enter unbent and leave with ior^2 of its light."""
+        Solid glass whose medium is known has one answer for front and back, found at the front. A path that went straight through
+        the front ignores the back (1). A path that was refracted at the front meets all of the back (0). Otherwise a path could
+        enter unbent and leave with ior^2 of its light."""
         if m.alpha_mode != wp.static(BLEND):
             return 0.0
         if wp.static(features.refraction):
@@ -146,27 +157,14 @@ def make_transparency(features: Features, is_solid: Any) -> Any:
     return transparency
 
 
-def make_choose_facet(features: Features) -> Any:
-    """Return the function that draws a microfacet, for rough materials."""
-    sample_2d = make_sample_2d(features)
-
-    @wp.func
-    def choose_facet(key: wp.uint32, index: wp.uint32) -> wp.vec3:
-        if wp.static(features.rough):
-            return cap_point(sample_2d(key, index, FACET))
-        return wp.vec3()
-
-    return choose_facet
-
-
 def make_straight_on(features: Features, is_solid: Any) -> Any:
-    """Return the function for the path that goes straight through a blended surface."""
+    """Return straight_on(surfaces, path, m, surface, share, distance) -> Path behind a blended surface."""
     Path = make_path(features.counting)
     child = make_paths(features.counting).child
 
     @wp.func
     def straight_on(surfaces: Surfaces, path: Path, m: Material, s: Surface, share: float, distance: float) -> Path:
-        """Return the part of a path that ignores the surface. It counts as no bounce."""
+        """Return the path that goes straight on with `share` of the throughput. This is no bounce: the depth stays."""
         onward = child(path, s, path.direction, share * path.throughput, ONWARD)
         onward.depth = path.depth
         onward.passed = path.passed + 1
@@ -180,30 +178,23 @@ def make_straight_on(features: Features, is_solid: Any) -> Any:
     return straight_on
 
 
-def make_medium_at(is_solid: Any) -> Any:
-    """Return the function for a ray's medium at a surface."""
+def make_shade(features: Features, shading: Shading) -> Any:
+    """Return shade(surfaces, lighting, path, surface, texels, t, facet) -> Shaded."""
+    Path, Shaded = make_path(features.counting), make_shaded(features.counting)
+    child = make_paths(features.counting).child
+    transparency, straight_on = make_transparency(features, shading.is_solid), make_straight_on(features, shading.is_solid)
 
     @wp.func
     def medium_at(m: Material, s: Surface, medium: int) -> int:
-        """Return the solid glass on the ray's side of a surface. A back face is always seen from inside."""
-        if not is_solid(m):
+        """Correct `medium` at a surface of solid glass: a ray that meets its back face must be inside it."""
+        if not shading.is_solid(m):
             return medium
         return wp.where(s.front == 0, s.material, wp.where(medium == UNKNOWN, OUTSIDE, medium))
-
-    return medium_at
-
-
-def make_shade(features: Features, shading: Shading) -> Any:
-    """Return the device function from a path and its hit to everything that follows."""
-    Path, Shaded = make_path(features.counting), make_shaded(features.counting)
-    child = make_paths(features.counting).child
-    transparency, medium_at = make_transparency(features, shading.is_solid), make_medium_at(shading.is_solid)
-    straight_on = make_straight_on(features, shading.is_solid)
 
     @wp.func
     def shade(surfaces: Surfaces, lighting: Lighting, arriving: Path, surface: Surface, texels: Texels, t: float,
               facet: wp.vec3) -> Shaded:
-        """Shade `surface` at distance t along the path; its shading normal faces the ray. `facet` comes from choose_facet."""
+        """Shade `surface`, which path `arriving` hits at distance t (world units). wo must see `surface.shading`."""
         out = Shaded()
         path = arriving
         s = surface
@@ -240,35 +231,35 @@ def make_shade(features: Features, shading: Shading) -> Any:
     return shade
 
 
-def make_shadow_request(features: Features, reflected: Any) -> Any:
-    """Return the function that requests a shadow ray; `reflected` comes from make_reflected_light."""
-    Shaded = make_shaded(features.counting)
+class Step(NamedTuple):
+    """The device functions that both loops call at a hit."""
+
+    choose_facet: Any  # (key, index) -> vec3, a cap_point: the facet for `shade`, in sample `index` at the path with this key.
+    shade: Any  # (surfaces, lighting, path, surface, texels, t, facet) -> Shaded.
+    extra_lights: int  # 1 if the background is sampled: it is light number lighting.count. Else 0.
+    sample_light: Any  # (lighting, surfaces, i, surface, point) -> LightSample of light i; `point` comes from LightPoints.
+    shadow_request: Any  # (shaded, sample) -> ShadowRequest.
+
+
+def make_step(features: Features, shading: Shading) -> Step:
+    """Return the Step of a scene."""
+    Shaded, sample_2d = make_shaded(features.counting), make_sample_2d(features)
+    sample_light, reflected_light = make_reflected_light(features)
+
+    @wp.func
+    def choose_facet(key: wp.uint32, index: wp.uint32) -> wp.vec3:
+        if wp.static(features.rough):
+            return cap_point(sample_2d(key, index, FACET))
+        return wp.vec3()
 
     @wp.func
     def shadow_request(shaded: Shaded, sample: LightSample) -> ShadowRequest:
         out = ShadowRequest()
         s = shaded.surface
-        out.value = reflected(sample, s, shaded.scatter, shaded.wo)
+        out.value = reflected_light(sample, s, shaded.scatter, shaded.wo)
         if any_positive(out.value):
             out.ray = shadow_ray(s, sample)
             out.end = sample.end
         return out
 
-    return shadow_request
-
-
-class Step(NamedTuple):
-    """The device functions of a loop."""
-
-    choose_facet: Any  # (key, index) -> vec3: place a microfacet for sample `index` of the path `key`.
-    shade: Any  # (surfaces, lighting, path, surface, texels, t, facet) -> Shaded.
-    extra_lights: int  # 1 if the background is sampled, as the light after the last.
-    choose: Any  # (lighting, surfaces, i, surface, point) -> LightSample of light i; `point` from LightPoints.
-    shadow_request: Any  # (shaded, sample) -> ShadowRequest.
-
-
-def make_step(features: Features, shading: Shading) -> Step:
-    """Return the step of a scene's kernel."""
-    choose, reflected = make_reflected_light(features)
-    return Step(make_choose_facet(features), make_shade(features, shading), 1 if features.sky_light else 0, choose,
-                make_shadow_request(features, reflected))
+    return Step(choose_facet, make_shade(features, shading), 1 if features.sky_light else 0, sample_light, shadow_request)

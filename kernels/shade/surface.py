@@ -8,7 +8,7 @@ from wrt.kernels.shade.elementary import acos, atan2
 from wrt.kernels.shade.sampling import PI, TWO_PI, frame_x, where_vec3
 from wrt.kernels.structs import Hit, Instance, Ray, Surfaces, gamma, largest, lift, unit
 
-MIN_COSINE = wp.constant(1.0e-3)  # Of a shading normal and the direction to the eye.
+MIN_COSINE = wp.constant(1.0e-3)  # Smallest cosine between a visible shading normal and the direction to the eye.
 
 
 @wp.struct
@@ -18,29 +18,29 @@ class Surface:
     point: wp.vec3
     error: wp.vec3  # Bound on the point's rounding error, per axis.
     geometric: wp.vec3  # Unit normal of the flat triangle or the sphere, on the ray's side.
-    shading: wp.vec3  # Interpolated normal, on that side too.
+    shading: wp.vec3  # Interpolated unit normal, on the ray's side.
     tangent: wp.vec3  # Unit vector along growing u, not always perpendicular to the normal.
     bitangent_sign: float  # -1 if the texture is mirrored, else 1.
-    u: float  # Texture coordinates: two numbers, as a vec2 does not vectorise.
+    u: float  # Texture coordinates: two floats, as a vec2 does not vectorise.
     v: float
     material: int
     front: int  # 1 if the ray comes from the outside, the counter-clockwise side.
-    exclude_plus_one: int  # 1 + the triangle that rays from here ignore, 0 on a sphere.
+    exclude_plus_one: int  # 1 + prim_id of the triangle, which new rays ignore; 0 on a sphere.
 
 
 @wp.func
 def next_away(x: float, direction: float) -> float:
-    """Return a float32 at least one step from x, on the side of direction's sign."""
+    """Return a float32 at least one float above x if direction > 0, below x if direction < 0, and x if direction = 0."""
     step = wp.abs(x) * wp.static(2.0**-23) + 1.0e-45
     return wp.where(direction > 0.0, x + step, wp.where(direction < 0.0, x - step, x))
 
 
 @wp.func
 def spawn_point(point: wp.vec3, error: wp.vec3, normal: wp.vec3, direction: wp.vec3) -> wp.vec3:
-    """Return the origin of a ray that leaves towards `direction`: outside the box of the point's error, on that side of the surface.
+    """Return the origin of a ray that leaves a surface point towards `direction`, moved along the normal to the direction's side.
 
-    It is the smallest such step along the normal, rounded away (Pharr, Jakob and Humphreys 2023, "Physically Based Rendering", section
-    6.8.6). It scales with the coordinates, unlike a fixed epsilon."""
+    The origin is just outside the box of the point's error (Pharr, Jakob and Humphreys 2023, "Physically Based Rendering", section
+    6.8.6). Unlike a fixed epsilon, the step scales with the coordinates."""
     distance = wp.dot(wp.abs(normal), error)
     offset = wp.where(wp.dot(direction, normal) < 0.0, -distance, distance) * normal
     p = point + offset
@@ -58,7 +58,7 @@ class Place:
 
 @wp.func
 def instance_at(surfaces: Surfaces, prim_id: int) -> int:
-    """Return the instance of a primitive: the last one that does not begin behind it."""
+    """Return the instance of a primitive: the last instance whose first_prim is at most prim_id."""
     low = int(0)
     high = int(surfaces.instances.shape[0])
     while high - low > 1:
@@ -72,12 +72,12 @@ def instance_at(surfaces: Surfaces, prim_id: int) -> int:
 
 @wp.func
 def sphere_uv(n: wp.vec3) -> wp.vec2:
-    """Return longitude and latitude of a unit normal, as coordinates of a picture that wraps around the sphere once."""
+    """Return the texture coordinates of a sphere at unit normal n, in [0, 1]: longitude and colatitude, with +y at v = 0."""
     return wp.vec2(0.5 + atan2(-n[2], n[0]) / TWO_PI, acos(wp.clamp(n[1], -1.0, 1.0)) / PI)
 
 
 def make_place_of(instances: bool) -> Any:
-    """Return the function from a prim_id to its data."""
+    """Return place_of(surfaces, prim_id) -> Place."""
 
     @wp.func
     def place_of(surfaces: Surfaces, prim_id: int) -> Place:
@@ -109,28 +109,23 @@ def world_point(i: Instance, p: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def world_direction(i: Instance, d: wp.vec3) -> wp.vec3:
-    return transformed(i.world_x, i.world_y, i.world_z, d, 0.0)
-
-
-@wp.func
 def world_normal(i: Instance, n: wp.vec3) -> wp.vec3:
-    """Transform a normal to unit length. The outside stays outside, also of a mirrored instance; zero stays zero."""
+    """Transform a normal to a unit normal in world space. It stays on the outside, also for mirrored instances; 0 stays 0."""
     return wp.normalize(n[0] * i.normal_x + n[1] * i.normal_y + n[2] * i.normal_z)
 
 
 @wp.func
 def world_error(i: Instance, p: wp.vec3, error: wp.vec3, world: wp.vec3) -> wp.vec3:
-    """Bound the error per axis of `world`, the image of p, which is off by `error`.
+    """Bound the error per axis of `world`, the image in world space of a point p with the error bound `error`.
 
-    Two more roundings in the mesh's space are for the next ray, whose origin is transformed back there and rounded."""
+    The bound includes two roundings in the mesh's space: the origin of the next ray is transformed back there and rounded."""
     e = error + gamma(2.0) * wp.abs(p)
     return transformed(wp.abs(i.world_x), wp.abs(i.world_y), wp.abs(i.world_z), e, 0.0) + gamma(2.0) * wp.abs(world)
 
 
 @wp.struct
 class Triangle:
-    """A triangle: corners in the space of its mesh; if the scene has them, normals (world space) and texture coordinates."""
+    """A triangle: corners in the space of its mesh, and, if the scene has any, normals in world space and texture coordinates."""
 
     v0: wp.vec3
     v1: wp.vec3
@@ -138,13 +133,13 @@ class Triangle:
     n0: wp.vec3
     n1: wp.vec3
     n2: wp.vec3
-    u: wp.vec3  # Of the three corners.
-    v: wp.vec3
+    u: wp.vec3  # Texture coordinates u of the three corners.
+    v: wp.vec3  # Texture coordinates v of the three corners.
 
 
 @wp.func
 def corners_at(surfaces: Surfaces, index: int) -> Triangle:
-    """Return face `index` without attributes."""
+    """Return the corners of face `index`, in the space of its mesh, as a Triangle without attributes."""
     face = surfaces.faces[index]
     triangle = Triangle()
     triangle.v0 = surfaces.vertices[face[0]]
@@ -154,7 +149,7 @@ def corners_at(surfaces: Surfaces, index: int) -> Triangle:
 
 
 def make_triangle_at(smooth: bool, uvs: bool, instances: bool) -> Any:
-    """Return the function that loads a triangle with the attributes that the scene has."""
+    """Return triangle_at(surfaces, place) -> Triangle with the attributes that the scene has."""
 
     @wp.func
     def triangle_at(surfaces: Surfaces, place: Place) -> Triangle:
@@ -164,7 +159,7 @@ def make_triangle_at(smooth: bool, uvs: bool, instances: bool) -> Any:
             triangle.n0 = surfaces.normals[face[0]]
             triangle.n1 = surfaces.normals[face[1]]
             triangle.n2 = surfaces.normals[face[2]]
-            if wp.static(instances):  # Each corner's: an interpolated normal would turn elsewhere.
+            if wp.static(instances):  # Transform before interpolating: the order changes the result.
                 instance = surfaces.instances[place.instance]
                 triangle.n0 = world_normal(instance, triangle.n0)
                 triangle.n1 = world_normal(instance, triangle.n1)
@@ -182,24 +177,24 @@ def make_triangle_at(smooth: bool, uvs: bool, instances: bool) -> Any:
 
 @wp.func
 def triangle_point(t: Triangle, u: float, v: float) -> wp.vec3:
-    """Return the point at these barycentrics, in the space of the corners."""
+    """Return the point at the barycentrics u (of v1) and v (of v2), in the space of the corners."""
     return (1.0 - u - v) * t.v0 + u * t.v1 + v * t.v2
 
 
 @wp.func
 def triangle_uv(surfaces: Surfaces, index: int, u: float, v: float) -> wp.vec2:
-    """Return the texture coordinates of face `index` at these barycentrics."""
+    """Return the texture coordinates of face `index` at the barycentrics u and v."""
     face = surfaces.faces[index]
     return (1.0 - u - v) * surfaces.uvs[face[0]] + u * surfaces.uvs[face[1]] + v * surfaces.uvs[face[2]]
 
 
 @wp.func
 def triangle_point_error(t: Triangle, u: float, v: float) -> wp.vec3:
-    """Return the distance per axis at which a ray that starts at triangle_point is clear of the triangle's plane.
+    """Return the error per axis by which spawn_point must move triangle_point, so that a new ray is clear of the triangle's plane.
 
-    It has two parts. The point itself takes seven roundings in a row (PBR, section 6.8.5). The next ray's distance to a neighbour
-    in the same plane has a rounding that grows with the triangle's size, not with its coordinates. A floor at y = 0 has only the
-    second."""
+    The error has two parts. The first covers the point's seven successive roundings (PBR, section 6.8.5). The second covers the
+    rounding of the new ray's distance to a neighbour in the same plane, and grows with the triangle's size, not with its coordinates.
+    On a floor at y = 0, the first part is 0."""
     size = gamma(8.0) * wp.max(largest(t.v1 - t.v0), largest(t.v2 - t.v0))
     point = gamma(7.0) * (wp.abs((1.0 - u - v) * t.v0) + wp.abs(u * t.v1) + wp.abs(v * t.v2))
     return point + wp.vec3(size, size, size)
@@ -209,8 +204,8 @@ def triangle_point_error(t: Triangle, u: float, v: float) -> wp.vec3:
 def triangle_normal(t: Triangle) -> wp.vec3:
     """Return the unit normal on the counter-clockwise side, in the corners' space; 0 for a degenerate triangle.
 
-    The edges are scaled to about 1 first, or a triangle of size 1e-20 would have a normal of length 0. wrt.renderer.upload has the
-    same in NumPy."""
+    Scaled edges keep the cross product of a triangle of size 1e-20 from underflowing to 0. wrt.renderer.upload computes the same
+    bits in NumPy."""
     e1 = t.v1 - t.v0
     e2 = t.v2 - t.v0
     return unit(wp.cross(e1 / largest(e1), e2 / largest(e2)))
@@ -218,7 +213,7 @@ def triangle_normal(t: Triangle) -> wp.vec3:
 
 @wp.func
 def towards_u(t: Triangle, outward: wp.vec3) -> tuple[wp.vec3, float]:
-    """Return Surface.tangent and bitangent_sign; `outward` is the normal on the outside."""
+    """Return Surface.tangent and Surface.bitangent_sign of a triangle; `outward` is its unit normal on the outside."""
     e1 = t.v1 - t.v0
     e2 = t.v2 - t.v0
     longer = wp.min(lift(e1), lift(e2))
@@ -226,25 +221,25 @@ def towards_u(t: Triangle, outward: wp.vec3) -> tuple[wp.vec3, float]:
     v1 = t.v[1] - t.v[0]
     u2 = t.u[2] - t.u[0]
     v2 = t.v[2] - t.v[0]
-    # dp/du up to a positive factor. v runs down: a picture that is not mirrored has a negative determinant.
+    # The tangent is dp/du up to a positive factor. As v runs down, the determinant is negative unless the texture is mirrored.
     sign = wp.where(u1 * v2 - v1 * u2 > 0.0, -1.0, 1.0)
     along = -sign * (v2 * (longer * e1) - v1 * (longer * e2))
     return where_vec3(wp.dot(along, along) > 0.0, unit(along), frame_x(outward)), sign
 
 
 def make_on_triangle(smooth: bool, uvs: bool, tangents: bool) -> Any:
-    """Return the function for the surface of a triangle. Like `facing`, it is branch-free, so that loops vectorise."""
+    """Return on_triangle(triangle, u, v) -> Surface. Like `facing`, it is branch-free, so that loops vectorise."""
 
     @wp.func
     def on_triangle(t: Triangle, u: float, v: float) -> Surface:
-        """Return the surface at these barycentrics, in the corners' space.
+        """Return the surface at the barycentrics u and v, in the corners' space.
 
-        Only the shading normal is in world space; 0 stands for the triangle's own."""
+        Only the shading normal is in world space. It is 0 if the corners have no normals: `facing` then takes the geometric normal."""
         s = Surface()
         s.point = triangle_point(t, u, v)
         s.error = triangle_point_error(t, u, v)
         s.geometric = triangle_normal(t)
-        if wp.static(smooth):  # Corners without a normal have 0.
+        if wp.static(smooth):  # A corner without a normal has the normal 0.
             s.shading = unit((1.0 - u - v) * t.n0 + u * t.n1 + v * t.n2)
         if wp.static(uvs):
             s.u = (1.0 - u - v) * t.u[0] + u * t.u[1] + v * t.u[2]
@@ -260,10 +255,9 @@ def make_on_triangle(smooth: bool, uvs: bool, tangents: bool) -> Any:
 
 @wp.func
 def facing(surface: Surface, direction: wp.vec3) -> Surface:
-    """Turn a surface to the side of a ray of this direction.
+    """Return the surface with `front` set and both normals on the side that a ray of this direction comes from.
 
-    The winding defines the outside. A smooth normal that disagrees with it by more than a right angle is flipped. Then both normals
-    turn together."""
+    The winding defines the outside. A shading normal more than a right angle away from the geometric normal is negated first."""
     s = surface
     n = surface.geometric
     shading = where_vec3(wp.dot(surface.shading, surface.shading) > 0.0, surface.shading, n)
@@ -278,22 +272,22 @@ def facing(surface: Surface, direction: wp.vec3) -> Surface:
 
 @wp.func
 def visible_normal(n: wp.vec3, wo: wp.vec3) -> wp.vec3:
-    """Bend a shading normal just so far that it is visible from wo."""
+    """Return the shading normal n, bent towards wo as far as needed for a cosine of about MIN_COSINE."""
     facing = wp.dot(n, wo)
     return where_vec3(facing < MIN_COSINE, unit(n + (MIN_COSINE - facing) * wo), n)
 
 
 def make_on_sphere(uvs: bool, tangents: bool) -> Any:
-    """Return the function for the surface of a sphere."""
+    """Return on_sphere(surfaces, ray, hit) -> Surface of a sphere, in world space."""
 
     @wp.func
     def on_sphere(surfaces: Surfaces, ray: Ray, hit: Hit) -> Surface:
         s = Surface()
         sphere = surfaces.spheres[hit.prim_id - surfaces.n_triangles]
         center = wp.vec3(sphere[0], sphere[1], sphere[2])
-        # The point is moved back onto the sphere, so that its error no longer grows with the ray's length.
-        way = ray.origin + hit.t * ray.direction - center
-        s.geometric = wp.normalize(lift(way) * way)
+        # The point is projected onto the sphere, so that its error does not grow with the ray's length.
+        from_center = ray.origin + hit.t * ray.direction - center
+        s.geometric = wp.normalize(lift(from_center) * from_center)
         s.shading = s.geometric
         s.point = center + sphere[3] * s.geometric
         s.error = gamma(6.0) * (wp.vec3(sphere[3], sphere[3], sphere[3]) + wp.abs(center))
@@ -312,26 +306,29 @@ def make_on_sphere(uvs: bool, tangents: bool) -> Any:
 
 
 def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, instances: bool = False) -> Any:
-    """Return the function for the surface at a hit, with the attributes that the scene has."""
+    """Return surface_at(surfaces, ray, hit) -> Surface, with the attributes that the scene has."""
     place_of = make_place_of(instances)
     triangle_at = make_triangle_at(smooth, uvs, instances)
     surface_of_triangle, on_sphere = make_on_triangle(smooth, uvs, tangents), make_on_sphere(uvs, tangents)
 
     @wp.func
-    def on_triangle(surfaces: Surfaces, hit: Hit, place: Place) -> Surface:
-        return surface_of_triangle(triangle_at(surfaces, place), hit.u, hit.v)
-
-    @wp.func
     def in_world(local: Surface, instance: Instance) -> Surface:
-        """Transform a surface from the mesh's space to the world."""
+        """Transform a surface from the mesh's space to world space."""
         s = local
         s.point = world_point(instance, local.point)
         s.error = world_error(instance, local.point, local.error, s.point)
         s.geometric = world_normal(instance, local.geometric)
         if wp.static(tangents):
             s.bitangent_sign = local.bitangent_sign * instance.handedness
-            tangent = world_direction(instance, local.tangent)
+            tangent = transformed(instance.world_x, instance.world_y, instance.world_z, local.tangent, 0.0)
             s.tangent = wp.normalize(lift(tangent) * tangent)
+        return s
+
+    @wp.func
+    def on_triangle(surfaces: Surfaces, hit: Hit, place: Place) -> Surface:
+        s = surface_of_triangle(triangle_at(surfaces, place), hit.u, hit.v)
+        if wp.static(instances):
+            s = in_world(s, surfaces.instances[place.instance])
         return s
 
     @wp.func
@@ -344,12 +341,8 @@ def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, inst
                 s = on_sphere(surfaces, ray, hit)
             else:
                 s = on_triangle(surfaces, hit, place)
-                if wp.static(instances):
-                    s = in_world(s, surfaces.instances[place.instance])
         else:
             s = on_triangle(surfaces, hit, place)
-            if wp.static(instances):
-                s = in_world(s, surfaces.instances[place.instance])
         s = facing(s, ray.direction)
         s.material = place.material
         s.exclude_plus_one = wp.where(hit.prim_id < surfaces.n_triangles, hit.prim_id + 1, 0)

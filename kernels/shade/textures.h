@@ -1,6 +1,7 @@
-// Textures: sample_texture of textures.py for pictures with the same bits, in loops that compilers vectorise.
+// Textures: sample_texture of textures.py for pictures, in loops that compilers vectorise. The results have the same bits.
 //
-// The texels' places are computed first, for all hits of a block, and prefetched. LANES hits take one pass for each of their pictures.
+// The indices of the texels are computed first, for all hits of a block, and prefetched. This takes one pass over LANES hits for each
+// picture that they use.
 #pragma once
 #include "layout.h"
 
@@ -8,7 +9,8 @@ namespace wrt {
 
 enum Kind { NONE, LINEAR, SRGB };
 
-// The look-ups of a block: the indices of the four texels around each, and the weights of the right and of the lower ones.
+// The look-ups of a block: the indices of the four texels around each point, and the weights x of the right texels and y of the lower
+// texels.
 template <int BLOCK> struct Places {
     int corner[4][BLOCK], kinds[BLOCK];
     float x[BLOCK], y[BLOCK];
@@ -21,8 +23,8 @@ static inline int wrapped(int at, int size, int wrap) {
     return j >= size ? 2 * size - 1 - j : j;
 }
 
-// Wrap LANES columns (or lines), and their right (or lower) neighbours, for the lanes in the mask `of`. Only coordinates more than
-// one picture outside need a division.
+// Wrap LANES columns (or rows), and their right (or lower) neighbours, for the lanes in the mask `of`. Only columns more than one
+// picture outside need a division.
 __attribute__((always_inline)) static inline void wrapped(const int* at, int size, int wrap, unsigned of, int* here, int* next) {
     if (wrap == WRAP_CLAMP) {
         for (int lane = 0; lane < LANES; ++lane) {
@@ -47,7 +49,7 @@ __attribute__((always_inline)) static inline void wrapped(const int* at, int siz
     }
 }
 
-// Compute the texels' places of one texture, for the lanes from i on that need it.
+// Compute `places` for the look-ups i .. i + LANES - 1 that use `texture`: those with same[lane] != 0, the bits of `mask`.
 template <int BLOCK, class Texture>
 __attribute__((always_inline)) static inline void place_picture(Places<BLOCK>& places, int i, const Texture& texture, const int* same,
                                                                 unsigned mask, const float* us, const float* vs) {
@@ -83,7 +85,7 @@ __attribute__((always_inline)) static inline void place_picture(Places<BLOCK>& p
     }
 }
 
-// Compute the texels' places of LANES look-ups, from i on.
+// Compute `places` for the look-ups i .. i + LANES - 1, and prefetch their texels.
 template <int BLOCK, class Surfaces>
 __attribute__((always_inline)) static inline void find_texels(Places<BLOCK>& places, int i, const Surfaces& surfaces, const int* wanted,
                                                               const float* us, const float* vs) {
@@ -112,7 +114,7 @@ __attribute__((always_inline)) static inline void find_texels(Places<BLOCK>& pla
     }
 }
 
-// Interpolate one channel of LANES look-ups, from i on, from the four texels around each. any_srgb: one of the pictures is sRGB.
+// Interpolate one channel of the look-ups i .. i + LANES - 1 from the four texels around each. any_srgb: one of the pictures is sRGB.
 template <int BLOCK>
 __attribute__((always_inline)) static inline void mix(const Places<BLOCK>& places, int i, unsigned (*texel)[LANES], int channel,
                                                       bool any_srgb, const float* srgb_to_linear, float* out) {
@@ -132,8 +134,8 @@ __attribute__((always_inline)) static inline void mix(const Places<BLOCK>& place
     }
 }
 
-// Sample the textures wanted[0 .. count - 1] at us, vs, for a count of at most BLOCK. -1 means no texture, and fills `wanted` up to a
-// multiple of LANES. The channels in the mask `channels` go to rows of BLOCK values, one after another.
+// Sample the textures wanted[0 .. count - 1] at (us, vs), for count <= BLOCK. The index -1 means no texture; `wanted` is filled with -1
+// up to a multiple of LANES. Each channel in the mask `channels` is stored in a row of BLOCK values, from `to` on.
 template <int BLOCK, class Surfaces>
 __attribute__((noinline)) void sample_texture(const Surfaces& surfaces, const int* wanted, const float* us, const float* vs, int count,
                                               int channels, float* to) {

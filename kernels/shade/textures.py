@@ -9,13 +9,13 @@ from wrt.kernels.structs import Surfaces, Texture
 WRAP_REPEAT = 0
 WRAP_CLAMP = 1
 WRAP_MIRROR = 2
-FARTHEST = wp.constant(2.0**30)  # Texels from a picture's first one.
+FARTHEST = wp.constant(2.0**30)  # Largest distance from a picture's first texel, in texels.
 
 
 @wp.func
 def wrapped(i: int, size: int, wrap: int) -> int:
     """Wrap column (or line) i into 0 .. size - 1."""
-    if i >= 0 and i < size:  # True for most, and a division is as slow as all the rest.
+    if i >= 0 and i < size:  # Usually true; the division below is as slow as the rest of a look-up.
         return i
     if wrap == wp.static(WRAP_CLAMP):
         return wp.clamp(i, 0, size - 1)
@@ -27,13 +27,13 @@ def wrapped(i: int, size: int, wrap: int) -> int:
 
 @wp.func
 def texel(surfaces: Surfaces, texture: Texture, column: int, row: int) -> wp.vec4:
-    """Return one texel, linear; alpha is never sRGB-encoded. Column and line must be within the picture."""
+    """Return the linear RGBA of one texel. Alpha is never sRGB-encoded. Column and row must be within the picture."""
     packed = surfaces.texels[texture.first + row * texture.width + column]
     r = int(packed & wp.uint32(255))
     g = int((packed >> wp.uint32(8)) & wp.uint32(255))
     b = int((packed >> wp.uint32(16)) & wp.uint32(255))
     a = int(packed >> wp.uint32(24))
-    # The table's second half is the linear encoding, so that both take one look-up.
+    # Entries 0 .. 255 of the table decode sRGB; entries 256 .. 511 decode linear bytes.
     base = wp.where(texture.srgb != 0, 0, 256)
     table = surfaces.srgb_to_linear
     return wp.vec4(table[base + r], table[base + g], table[base + b], table[256 + a])
@@ -41,22 +41,14 @@ def texel(surfaces: Surfaces, texture: Texture, column: int, row: int) -> wp.vec
 
 @wp.func
 def texel_place(at: float, size: int) -> float:
-    """Return a texture coordinate in texels, counted from the first texel's centre."""
-    # Beyond 2^24 float32 has no fractions, and beyond 2^31 the integer depends on the device.
+    """Convert a texture coordinate to texels, with 0 at the centre of the first texel."""
+    # The bound keeps the integer below 2^31: beyond that, its value depends on the device.
     return wp.clamp(at * float(size) - 0.5, -FARTHEST, FARTHEST)
 
 
 @wp.func
-def texture_uv(texture: Texture, uv: wp.vec2) -> wp.vec2:
-    """Transform texture coordinates by the texture's matrix."""
-    u = texture.row_u[0] * uv[0] + texture.row_u[1] * uv[1] + texture.row_u[2]
-    v = texture.row_v[0] * uv[0] + texture.row_v[1] * uv[1] + texture.row_v[2]
-    return wp.vec2(u, v)
-
-
-@wp.func
 def picture(surfaces: Surfaces, texture: Texture, u: float, v: float) -> wp.vec4:
-    """Sample a picture, bilinearly."""
+    """Return the bilinearly interpolated linear RGBA of a picture at texture coordinates (u, v)."""
     x = texel_place(u, texture.width)
     y = texel_place(v, texture.height)
     left = wrapped(int(wp.floor(x)), texture.width, texture.wrap_u)
@@ -65,7 +57,7 @@ def picture(surfaces: Surfaces, texture: Texture, u: float, v: float) -> wp.vec4
     fy = y - wp.floor(y)
     above = wp.vec4(0.0, 0.0, 0.0, 0.0)
     here = wp.vec4(0.0, 0.0, 0.0, 0.0)
-    rows = wp.where(texture.height > 0, 2, 0)  # A constant would unroll the loop at each of a surface's textures.
+    rows = wp.where(texture.height > 0, 2, 0)  # With a constant 2, the compiler would unroll the loop in each texture's code.
     for i in range(rows):
         row = wrapped(int(wp.floor(y)) + i, texture.height, texture.wrap_v)
         above = here
@@ -82,22 +74,23 @@ def checkerboard(texture: Texture, u: float, v: float) -> wp.vec4:
 
 
 def make_sample_texture(pictures: bool, checkerboards: bool) -> Any:
-    """Return the look-up for the kinds of texture that the scene has."""
+    """Return sample_texture(surfaces, index, uv) -> RGBA, with code for the kinds of texture that the scene has."""
 
     @wp.func
     def sample_texture(surfaces: Surfaces, index: int, uv: wp.vec2) -> wp.vec4:
-        """Return the linear RGBA of texture `index` at uv; white without a texture (index < 0)."""
+        """Return the linear RGBA of texture `index` at uv; white if index < 0, which means no texture."""
         if index < 0:
             return wp.vec4(1.0, 1.0, 1.0, 1.0)
         texture = surfaces.textures[index]
-        at = texture_uv(texture, uv)
+        u = texture.row_u[0] * uv[0] + texture.row_u[1] * uv[1] + texture.row_u[2]
+        v = texture.row_v[0] * uv[0] + texture.row_v[1] * uv[1] + texture.row_v[2]
         result = wp.vec4(1.0, 1.0, 1.0, 1.0)
         if wp.static(checkerboards):
             if texture.width == 0:
-                result = checkerboard(texture, at[0], at[1])
+                result = checkerboard(texture, u, v)
         if wp.static(pictures):
             if texture.width > 0:
-                result = picture(surfaces, texture, at[0], at[1])
+                result = picture(surfaces, texture, u, v)
         return result
 
     return sample_texture

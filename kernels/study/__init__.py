@@ -1,1 +1,1 @@
-"""Device code of the laboratory alone."""
+"""Kernels that only the laboratory (wrt.lab) uses: measurements, and code to compare wrt with."""

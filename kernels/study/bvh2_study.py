@@ -1,7 +1,7 @@
-"""Variants of the binary BVH's traversal, for counting: without order, without early stop, or with a short stack. The hits are the same.
-A short stack forgets its oldest entries. When it is empty, the walk starts again at the root and follows a trail. It has one bit a level,
-set if only the last child is left. (Laine 2010, "Restart Trail for Stackless BVH Traversal"; Vaidyanathan et al. 2019, "Wide BVH Traversal
-with a Short Stack")."""
+"""Variants of the binary BVH's traversal, to count their steps: without order, without early stop, or with a short stack; same hits.
+A short stack overwrites its oldest entries. When the stack is empty, the walk restarts at the root and follows a trail. The trail has one
+bit per level, which is set if only the last child of the level remains. Laine 2010, "Restart Trail for Stackless BVH Traversal";
+Vaidyanathan et al. 2019, "Wide BVH Traversal with a Short Stack"."""
 
 from typing import Any, NamedTuple
 
@@ -13,17 +13,17 @@ from wrt.kernels.traverse.common import Units, make_probe, no_hit
 from wrt.kernels.traverse.counters import Counts, make_counters
 from wrt.kernels.traverse.leaf import make_leaf
 
-LEVELS = 62  # levels of the tree that a trail has bits for
+LEVELS = 62  # largest number of levels of a tree for which a trail has bits
 TOP = wp.constant(wp.uint64(1 << 63))
 NONE = wp.constant(wp.uint64(0))
 
 
 class Study(NamedTuple):
-    """A variant, used as a structure's traversal module; a short stack needs `ordered` and `early`."""
+    """A variant, in place of a structure's traversal module. The variant with a short stack is always ordered and early."""
 
-    entries: int = STACK_SIZE  # Of the stack; STACK_SIZE: as many as needed.
+    entries: int = STACK_SIZE  # Number of stack entries; STACK_SIZE: as many as needed.
     ordered: bool = True  # Visit the nearer child first.
-    early: bool = True  # Drop boxes and entries beyond the best hit.
+    early: bool = True  # Drop boxes and stack entries behind the best hit.
 
     def make_struct(self, record: Any) -> Any:
         return make_struct(record)
@@ -37,23 +37,23 @@ class Study(NamedTuple):
 
 @wp.struct
 class Trail:
-    """The path of a walk."""
+    """The path from the root to the present node. A level is one bit; the root's is TOP, and each step down halves it."""
 
-    done: wp.uint64  # Levels that are done but for their last child.
-    level: wp.uint64  # One bit, lower for each step down.
+    done: wp.uint64  # Levels where only the last child remains.
+    level: wp.uint64  # Level of the present node.
     resumed: wp.uint64  # Level whose last child is next.
 
 
 @wp.func
 def carry(trail: Trail) -> Trail:
-    """Move on to the deepest level with a child left; TOP or above: no level has one."""
+    """Move on to the deepest level that has another child. If no level has one, trail.done becomes TOP or more."""
     trail.done = (trail.done & ((~trail.level) + wp.uint64(1))) + trail.level
     trail.resumed = trail.done & ((~trail.done) + wp.uint64(1))
     return trail
 
 
 def make_short_stack(units: Units, entries: int, any_hit: bool, accepts: Any = None) -> Any:
-    """Make the unit with so many entries (0: each pop restarts at the root), for trees of at most LEVELS levels."""
+    """Make the traversal with a stack of `entries` entries, for trees of at most LEVELS levels. With 0, each pop restarts at the root."""
     probe_of = make_probe(units)
     visit_leaf = make_leaf(units, any_hit, accepts)
     ray_aabb = units.box_test
@@ -68,7 +68,7 @@ def make_short_stack(units: Units, entries: int, any_hit: bool, accepts: Any = N
         counts = Counts()
         stack = wp.zeros(shape=wp.static(capacity), dtype=Child)
         stack_t = wp.zeros(shape=wp.static(capacity), dtype=wp.float32)
-        top = int(0)  # pushes - pops; the newest entry is at (top - 1) modulo capacity
+        top = int(0)  # number of pushes minus number of pops; the newest entry has the index (top - 1) modulo capacity
         size = int(0)
         child = Child()
         trail = Trail()
@@ -87,7 +87,7 @@ def make_short_stack(units: Units, entries: int, any_hit: bool, accepts: Any = N
                 t_1 = ray_aabb(probe.box, node.lo_1, node.hi_1, best.t)
                 if t_0 < wp.inf or t_1 < wp.inf:
                     trail.level = trail.level >> wp.uint64(1)
-                    second = t_1 < t_0  # the nearer child; a miss is at infinity
+                    second = t_1 < t_0  # visit child 1 first; for a missed child, t is inf
                     go = bool(True)
                     if t_0 < wp.inf and t_1 < wp.inf:
                         if (trail.done & trail.level) != NONE:
@@ -101,11 +101,11 @@ def make_short_stack(units: Units, entries: int, any_hit: bool, accepts: Any = N
                     elif trail.level != trail.resumed:
                         trail.done = trail.done | trail.level
                     else:
-                        go = bool(False)  # only the first child is in reach, and it is done
+                        go = bool(False)  # the walk resumes at the last child, but the ray enters only the first one, which is done
                     if go:
                         child = child_of(node, second)
                         continue
-            # Take the newest entry, of the deepest level with a child left, or restart at the root.
+            # Pop the newest entry, which belongs to the deepest level that has another child, or restart at the root.
             found = bool(False)
             while not found:
                 trail = carry(trail)

@@ -1,24 +1,24 @@
-"""Replay of fetches through set-associative LRU caches (CPU only)."""
+"""Replay of memory fetches through set-associative caches with LRU replacement (CPU only)."""
 
 import warp as wp
 
 from wrt.kernels.structs import kernel
 
-LINE = wp.constant(wp.int64(128))
+LINE = wp.constant(wp.int64(128))  # bytes of a cache line
 
 
 @wp.struct
 class Caches:
-    """One cache a thread, all alike."""
+    """One cache per thread, all of the same size."""
 
     sets: int
     ways: int
-    tags: wp.array(dtype=wp.int64)  # `sets` sets of `ways` lines, the most recently used first; -1: empty.
+    tags: wp.array(dtype=wp.int64)  # For each cache, `sets` sets of `ways` line indices, the most recently used first; -1: empty.
 
 
 @wp.func
 def access(caches: Caches, which: int, line: wp.int64) -> bool:
-    """Return whether the line is in the cache, and put it there; its set is `line modulo sets`."""
+    """Return whether a line is in cache `which`, and put it there. The line's set is `line` modulo `sets`."""
     begin = (which * caches.sets + int(line % wp.int64(caches.sets))) * caches.ways
     moved = line
     for way in range(caches.ways):
@@ -32,44 +32,44 @@ def access(caches: Caches, which: int, line: wp.int64) -> bool:
 
 @kernel
 def replay_lru(caches: Caches, lines: wp.array(dtype=wp.int64), hit: wp.array(dtype=wp.int8)):
-    """Replay lines in one thread: hit[i] = 1 if lines[i] is in the cache."""
+    """Access lines one after another, in one thread: store hit[i] = 1 if lines[i] is in the cache, else 0."""
     for i in range(lines.shape[0]):
         hit[i] = wp.where(access(caches, wp.tid(), lines[i]), wp.int8(1), wp.int8(0))
 
 
 @wp.struct
 class Trace:
-    """Rays in the order of warps, and their fetches."""
+    """The fetches of rays, which are grouped into warps of a GPU."""
 
-    sms: int  # Warps go to them by turns.
-    slots: int  # Concurrent warps of an SM.
+    sms: int  # Number of multiprocessors (SMs); SM s runs the warps s, s + sms, s + 2 sms and so on.
+    slots: int  # Number of warps that an SM runs at a time.
     warp_first: wp.array(dtype=wp.int64)  # Warp w has the rays warp_first[w] .. warp_first[w + 1] - 1, at most 32.
     first: wp.array(dtype=wp.int64)  # Ray i has the fetches first[i] .. first[i + 1] - 1.
-    address: wp.array(dtype=wp.int64)
-    size: wp.array(dtype=wp.int64)  # Bytes.
+    address: wp.array(dtype=wp.int64)  # First byte of each fetch.
+    size: wp.array(dtype=wp.int64)  # Number of bytes of each fetch.
 
 
 @wp.struct
 class Missed:
-    """Misses of each SM's L1; the misses of SM s are the entries first[s] .. first[s] + misses[s] - 1."""
+    """Misses in the L1 cache of each SM, and scratch. SM s has the misses first[s] .. first[s] + misses[s] - 1 of line, time and lanes."""
 
     first: wp.array(dtype=wp.int64)
-    line: wp.array(dtype=wp.int64)
-    time: wp.array(dtype=wp.int64)  # Round of the miss.
-    lanes: wp.array(dtype=wp.int64)  # Lanes that wait for the line.
-    wanted: wp.array(dtype=wp.int64)  # Lanes that asked for a line, each counted.
-    accesses: wp.array(dtype=wp.int64)
-    misses: wp.array(dtype=wp.int64)
+    line: wp.array(dtype=wp.int64)  # Line of each miss.
+    time: wp.array(dtype=wp.int64)  # Round of each miss.
+    lanes: wp.array(dtype=wp.int64)  # Number of lanes that wait for the line of each miss.
+    wanted: wp.array(dtype=wp.int64)  # Number of lines that the lanes of each SM request, before lanes share accesses.
+    accesses: wp.array(dtype=wp.int64)  # Number of L1 accesses of each SM.
+    misses: wp.array(dtype=wp.int64)  # Number of L1 misses of each SM.
     slot_warp: wp.array(dtype=wp.int32)  # Running warp of each of sms * slots slots; -1: none.
-    slot_round: wp.array(dtype=wp.int64)  # Its round.
-    seen: wp.array(dtype=wp.int64)  # Lines of a warp's round, seen_size for each SM.
-    seen_at: wp.array(dtype=wp.int64)  # Entry of each one's miss; -1: it hit.
+    slot_round: wp.array(dtype=wp.int64)  # Number of rounds that the running warp has finished.
+    seen: wp.array(dtype=wp.int64)  # Scratch: distinct lines of a warp's round, seen_size entries per SM.
+    seen_at: wp.array(dtype=wp.int64)  # Scratch: index of the miss of each line in `seen`; -1 for a hit.
     seen_size: int
 
 
 @wp.func
 def play_round(trace: Trace, caches: Caches, out: Missed, sm: int, warp: int, step: wp.int64, time: wp.int64) -> bool:
-    """Let each lane make its fetch `step`; lanes share a line's access. Return whether a lane has a next fetch."""
+    """Replay fetch `step` of each lane of a warp. Lanes that fetch the same line share one access. Return whether more fetches follow."""
     more = bool(False)
     begin = sm * out.seen_size
     seen = int(0)
@@ -107,7 +107,7 @@ def play_round(trace: Trace, caches: Caches, out: Missed, sm: int, warp: int, st
 
 @kernel
 def replay_warps(trace: Trace, caches: Caches, out: Missed, sm: int):
-    """Replay one SM: in each round every warp in a slot makes one fetch a lane; a finished warp frees its slot."""
+    """Replay one SM. In each round, every warp in a slot makes one fetch per lane. A finished warp frees its slot."""
     waiting = sm
     n = trace.warp_first.shape[0] - 1
     time = wp.int64(0)

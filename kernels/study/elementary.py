@@ -1,4 +1,4 @@
-"""The elementary functions over arrays, for comparison between devices and with exact values."""
+"""The elementary functions of wrt.kernels.shade on arrays, to compare devices with each other and with exact values."""
 
 import warp as wp
 
@@ -10,7 +10,7 @@ FUNCTIONS = ("sin", "cos", "acos", "exp", "atan2", "power")
 
 @kernel
 def call_functions(x: wp.array(dtype=float), y: wp.array(dtype=float), out: wp.array2d(dtype=float)):
-    """Write a row for each pair: FUNCTIONS in order, of x or of (x, y)."""
+    """Store in out[i] the values of all FUNCTIONS, in their order, of x[i] or of (x[i], y[i])."""
     i = wp.tid()
     sin, cos = sin_cos(x[i])
     out[i, 0] = sin

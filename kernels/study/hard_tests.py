@@ -1,4 +1,4 @@
-"""The arithmetic that decides the watertight test on a GPU: float32, float-float, or float64."""
+"""Classify watertight triangle tests by the arithmetic that decides them on a GPU: float32, float-float or float64."""
 
 import warp as wp
 
@@ -6,13 +6,13 @@ from wrt.kernels.query import RayArrays, load_ray
 from wrt.kernels.structs import NO_HIT, Primitive, kernel
 from wrt.kernels.units.triangle import edge_areas, outside, sure_crossing, to_ray_space, triangle_ray
 
-REFUSED, SURE, HARD = 0, 1, 2
+REFUSED, SURE, HARD = 0, 1, 2  # rejected in float32; hit computed in float-float arithmetic; decided in float64
 
 
 @kernel
 def classify(primitives: wp.array(dtype=Primitive), rays: RayArrays, ray: wp.array(dtype=wp.int32),
              primitive: wp.array(dtype=wp.int32), out: wp.array(dtype=wp.int32)):
-    """Classify the test of ray[i] against primitive[i]."""
+    """Store REFUSED, SURE or HARD for the test of ray number ray[i] against primitive number primitive[i]."""
     i = wp.tid()
     tested = load_ray(rays, ray[i])
     shear = triangle_ray(tested)

@@ -1,4 +1,4 @@
-"""Warp's own ray queries as kernels: rivals to measure."""
+"""Kernels with the ray queries of Warp (wp.mesh_query_ray), for comparison with wrt."""
 
 import warp as wp
 
@@ -6,16 +6,10 @@ from wrt.kernels.structs import kernel
 
 
 @kernel
-def warp_mesh_query(
-    mesh: wp.uint64,
-    origins: wp.array(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
-    t: wp.array(dtype=wp.float32),
-    u: wp.array(dtype=wp.float32),
-    v: wp.array(dtype=wp.float32),
-    prim_id: wp.array(dtype=wp.int32),
-):
-    """Store the closest hit of each ray, prim_id = -1 on a miss; directions must have unit length."""
+def warp_mesh_query(mesh: wp.uint64, origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3),
+                    t: wp.array(dtype=wp.float32), u: wp.array(dtype=wp.float32), v: wp.array(dtype=wp.float32),
+                    prim_id: wp.array(dtype=wp.int32)):
+    """Store the closest hit of each ray; a miss has prim_id = -1. Directions must have unit length."""
     i = wp.tid()
     query = wp.mesh_query_ray(mesh, origins[i], directions[i], 1.0e38)
     prim_id[i] = -1
@@ -28,13 +22,8 @@ def warp_mesh_query(
 
 
 @kernel
-def warp_mesh_any(
-    mesh: wp.uint64,
-    origins: wp.array(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
-    reach: wp.array(dtype=wp.float32),
-    dark: wp.array(dtype=wp.bool),
-):
-    """Store whether each ray hits anything within reach; directions must have unit length."""
+def warp_mesh_any(mesh: wp.uint64, origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3),
+                  t_max: wp.array(dtype=wp.float32), occluded: wp.array(dtype=wp.bool)):
+    """Store whether each ray hits anything at t <= t_max. Directions must have unit length."""
     i = wp.tid()
-    dark[i] = wp.mesh_query_ray_anyhit(mesh, origins[i], directions[i], reach[i])
+    occluded[i] = wp.mesh_query_ray_anyhit(mesh, origins[i], directions[i], t_max[i])

@@ -1,4 +1,4 @@
-"""The cost of bounding volumes: isolated tests, and walks counted as others publish them."""
+"""The cost of bounding volumes: kernels with tests alone, and counts of walks in the way of another library (tinybvh)."""
 
 from functools import cache
 from typing import Any
@@ -14,7 +14,7 @@ from wrt.kernels.units.box import box_ray, ray_aabb
 
 @cache
 def make_enter_kernel(volumes: Volumes) -> Any:
-    """Make the kernel that tests each ray against both children of every node of `accel`."""
+    """Make the kernel that tests each ray against the volumes of both children of every node."""
     struct, set_up, enter = volumes.struct, volumes.set_up, volumes.enter
     probe_of = make_probe(Units())
 
@@ -23,10 +23,10 @@ def make_enter_kernel(volumes: Volumes) -> Any:
         """Store the number of volumes that each ray enters."""
         i = wp.tid()
         ray = load_ray(rays, i)
-        what = set_up(accel, probe_of(ray))
+        prepared = set_up(accel, probe_of(ray))
         n = int(0)
         for k in range(accel.nodes.shape[0]):
-            entry = enter(what, accel.nodes[k], ray.t_max)
+            entry = enter(prepared, accel.nodes[k], ray.t_max)
             n = n + wp.where(entry[0] < wp.inf, 1, 0) + wp.where(entry[1] < wp.inf, 1, 0)
         entered[i] = n
 
@@ -36,8 +36,8 @@ def make_enter_kernel(volumes: Volumes) -> Any:
 @kernel
 def count_popped(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), rays: RayArrays, t: wp.array(dtype=wp.float32),
                  prim_id: wp.array(dtype=wp.int32), visits: wp.array(dtype=wp.int32), primitives: wp.array(dtype=wp.int32)):
-    """Count the walk of rays with known closest hits (t, prim_id) as tinybvh does.
-    Each popped node or leaf is a visit, even one that begins beyond the closest hit."""
+    """Count visits and primitive tests of rays with known closest hits (t, prim_id), in the way of tinybvh.
+    Each popped node or leaf counts as a visit, even if it begins behind the closest hit."""
     i = wp.tid()
     box = box_ray(load_ray(rays, i))
     best = float(wp.inf)

@@ -1,9 +1,9 @@
-"""A z-buffer: visibility by the pixels that each triangle covers.
+"""A rasterizer with a z-buffer, in float64.
 
-It answers the same question as rays through the pixels' centres, by other means and in float64, and shares no code with the ray units:
-each checks the other. Triangles are in homogeneous pixel coordinates (Olano and Greer 1997, "Triangle scan conversion using 2D homogeneous
-coordinates"), so that a triangle through the camera's plane needs no clipping. A pixel's key is (depth, prim_id), and the smallest wins in
-any order of triangles.
+It computes the same hits as rays through the pixels' centres, by another method and without code of the ray units, so that each can check
+the other. Triangles are in homogeneous pixel coordinates (Olano and Greer 1997, "Triangle scan conversion using 2D homogeneous
+coordinates"), so that a triangle through the camera's plane needs no clipping. Each pixel stores the smallest key (depth, prim_id), so the
+order of triangles does not matter.
 """
 
 import warp as wp
@@ -12,7 +12,7 @@ from wrt.kernels.structs import kernel
 
 ROUNDOFF = wp.constant(wp.float64(2.0**-53))
 SPLITTER = wp.constant(wp.float64(2.0**27 + 1.0))
-CENTRE_PAD = wp.constant(wp.float64(1e-9))  # in pixels; more than the rounding of a projected vertex
+CENTRE_PAD = wp.constant(wp.float64(1e-9))  # in pixels; exceeds the rounding error of a projected vertex
 ZERO = wp.constant(wp.float64(0.0))
 HALF = wp.constant(wp.float64(0.5))
 
@@ -22,23 +22,23 @@ class View:
     """A pinhole camera and its picture."""
 
     origin: wp.vec3d
-    from_pixels: wp.mat33d  # Maps (x, y, 1), in pixels from the top left corner, to the direction of length 1 along the axis of view.
-    to_pixels: wp.mat33d  # Its inverse: maps a point minus `origin` to homogeneous pixels (x w, y w, w).
+    from_pixels: wp.mat33d  # Maps (x, y, 1), in pixels from the top left corner, to a direction with component 1 along the view axis.
+    to_pixels: wp.mat33d  # Inverse of from_pixels: maps a point minus `origin` to homogeneous pixels (x w, y w, w).
     width: int
     height: int
 
 
 @wp.struct
 class Edge:
-    """An edge function: normal . (x, y, 1) is 0 on the edge."""
+    """An edge function normal . (x, y, 1), which is 0 on the edge."""
 
     normal: wp.vec3d
-    slack: wp.float64  # Bound on its rounding error.
+    slack: wp.float64  # Bound on the function's rounding error.
 
 
 @kernel
 def project(view: View, vertices: wp.array(dtype=wp.vec3), first: int, projected: wp.array(dtype=wp.vec3d)):
-    """Project vertices to homogeneous pixels; triangles that share a vertex share its rounding."""
+    """Project vertices to homogeneous pixels. Each vertex is rounded once, so triangles that share it use the same coordinates."""
     i = first + wp.tid()
     projected[i] = view.to_pixels @ (wp.vec3d(vertices[i]) - view.origin)
 
@@ -53,7 +53,7 @@ def has_extent(v0: wp.vec3, v1: wp.vec3, v2: wp.vec3) -> bool:
 
 @wp.func
 def centres_between(low: wp.float64, high: wp.float64, size: int) -> wp.vec2i:
-    """First and last of the pixels 0 .. size - 1 whose centre is in [low, high]; first > last if none is."""
+    """Return the first and the last of the pixels 0 .. size - 1 with a centre in [low, high]; first > last if no pixel has."""
     end = wp.float64(size)
     first = wp.ceil(wp.clamp(low, ZERO, end) - HALF - CENTRE_PAD)
     last = wp.floor(wp.clamp(high, ZERO, end) - HALF + CENTRE_PAD)
@@ -62,9 +62,9 @@ def centres_between(low: wp.float64, high: wp.float64, size: int) -> wp.vec2i:
 
 @wp.func
 def pixel_box(view: View, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> wp.vec4i:
-    """Pixels (x0, y0, x1, y1), inclusive, that a triangle may cover; x0 > x1 if none.
-    In front of the camera's plane it is the box around the projected corners. Through the plane it is the whole picture, unless the
-    triangle is outside of one of the picture's borders."""
+    """Return the box of pixels (x0, y0, x1, y1), inclusive, that a triangle may cover; x0 > x1 if it covers none.
+    For a triangle in front of the camera's plane, this is the box around its projected corners. For a triangle through the plane, it is
+    the whole picture, unless all corners are outside the same border of the picture."""
     none = wp.vec4i(0, 0, -1, -1)
     if a[2] > ZERO and b[2] > ZERO and c[2] > ZERO:
         ax = a[0] / a[2]
@@ -92,15 +92,9 @@ def pixel_box(view: View, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> wp.vec4i:
 
 
 @kernel
-def bound(
-    view: View,
-    vertices: wp.array(dtype=wp.vec3),
-    projected: wp.array(dtype=wp.vec3d),
-    faces: wp.array(dtype=wp.vec3i),
-    first: int,
-    boxes: wp.array(dtype=wp.vec4i),
-):
-    """Store the box of pixels of each triangle. Most small triangles lie between the pixels' centres and end here."""
+def bound(view: View, vertices: wp.array(dtype=wp.vec3), projected: wp.array(dtype=wp.vec3d), faces: wp.array(dtype=wp.vec3i), first: int,
+          boxes: wp.array(dtype=wp.vec4i)):
+    """Store the pixel_box of each triangle. It is empty for most small triangles, which lie between the pixels' centres."""
     i = first + wp.tid()
     f = faces[i]
     box = pixel_box(view, projected[f[0]], projected[f[1]], projected[f[2]])
@@ -112,10 +106,10 @@ def bound(
 
 @wp.func
 def edge_between(p: wp.vec3d, q: wp.vec3d, size: wp.vec2d) -> Edge:
-    """Edge function of Olano and Greer: the plane through the camera and both ends.
-    It is exactly negated if p and q change places. Its `slack` bounds the difference to `turn` at the same pixel: `turn` rounds p - (x, y)
-    p_w in each factor, this function three products. All are below (|p_x| + width |p_w|) (|q_y| + height |q_w|), or the same with p and q
-    exchanged."""
+    """Return the edge function of Olano and Greer: the plane through the camera and the edge's ends p and q. `size`: of the picture.
+    Exchanging p and q negates the function exactly. The `slack` bounds the difference from `turn` at the same pixel: `turn` rounds
+    p - (x, y) p_w in each factor, and this function rounds three products. The products are below (|p_x| + width |p_w|)
+    (|q_y| + height |q_w|), or the same with p and q exchanged."""
     edge = Edge()
     edge.normal = wp.cross(p, q)
     p_x = wp.abs(p[0]) + size[0] * wp.abs(p[2])
@@ -128,7 +122,7 @@ def edge_between(p: wp.vec3d, q: wp.vec3d, size: wp.vec2d) -> Edge:
 
 @wp.func
 def cut(span: wp.vec2d, edge: Edge, side: wp.float64, y: wp.float64) -> wp.vec2d:
-    """Clip a span of a row, from x = span[0] to span[1], to the given side (1, -1) of an edge, with its slack."""
+    """Clip a span of a row, from x = span[0] to x = span[1], to one side (1 or -1) of an edge, moved outwards by edge.slack."""
     slope = side * edge.normal[0]
     rest = side * (edge.normal[1] * y + edge.normal[2]) + edge.slack
     if slope > ZERO:
@@ -140,7 +134,7 @@ def cut(span: wp.vec2d, edge: Edge, side: wp.float64, y: wp.float64) -> wp.vec2d
 
 @wp.func
 def product_error(a: wp.float64, b: wp.float64) -> wp.float64:
-    """Exact rounding error of a * b, without over- and underflow (Dekker 1971, section 5.9)."""
+    """Return the exact rounding error of a * b, which must not over- or underflow (Dekker 1971, section 5.9)."""
     t = SPLITTER * a
     a_high = t - (t - a)
     a_low = a - a_high
@@ -152,8 +146,8 @@ def product_error(a: wp.float64, b: wp.float64) -> wp.float64:
 
 @wp.func
 def turn(p: wp.vec2d, q: wp.vec2d) -> wp.float64:
-    """Twice the signed area of (0, p, q), with the exact sign; exactly negated if p and q change places.
-    Rounding is monotone: products that round to different numbers are in the right order. For equal ones, their rounding errors decide."""
+    """Return twice the signed area of the triangle (0, p, q), with the exact sign. Exchanging p and q negates the result exactly.
+    Rounding is monotone, so two products that round to different numbers are in the right order. Else, their rounding errors decide."""
     left = p[0] * q[1]
     right = p[1] * q[0]
     if left != right:
@@ -163,10 +157,10 @@ def turn(p: wp.vec2d, q: wp.vec2d) -> wp.float64:
 
 @wp.func
 def owns(p: wp.vec2d, q: wp.vec2d, area: wp.float64) -> bool:
-    """Apply the fill rule: return whether a triangle owns a pixel whose centre, the origin here, is on its edge from p to q.
-    All centres count as moved right by a little and down by much less. So exactly one of two neighbours owns the edge, and one of a fan of
-    triangles the corner. The triangle's area may have any sign. Only for edges in front of the camera, with p and q on opposite sides of
-    the centre."""
+    """Apply the fill rule: return whether a triangle owns a pixel whose centre, the origin here, is on the triangle's edge from p to q.
+    The rule moves all centres right by an infinitesimal, and down by a smaller one. So exactly one of two neighbours owns a centre on their
+    common edge, and exactly one of a fan of triangles owns a centre on their common corner. The triangle's area may have any sign. The edge
+    must be in front of the camera, with p and q on opposite sides of the centre."""
     if p[1] != q[1]:
         return (p[1] > q[1]) == (area > ZERO)
     return (q[0] > p[0]) == (area > ZERO)
@@ -174,9 +168,9 @@ def owns(p: wp.vec2d, q: wp.vec2d, area: wp.float64) -> bool:
 
 @wp.func
 def depth_at(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, x: wp.float64, y: wp.float64) -> wp.float64:
-    """Intersection of the line through a pixel's centre with a triangle, in units of the direction (x, y, 1); -1 on a miss.
-    The corners move so that the centre is the origin: rounded, but alike for all triangles that share a corner. All further decisions are
-    exact, so that no centre falls between two triangles. Both sides of a triangle count; edge-on or behind the camera is a miss."""
+    """Return the depth at which the line through a pixel's centre meets a triangle, in units of the direction (x, y, 1); -1 on a miss.
+    The corners are moved so that the centre is the origin. This rounds, but equally for all triangles that share a corner. Later decisions
+    are exact, so no centre falls between two triangles. Both sides of a triangle count. Edge-on or behind the camera is a miss."""
     p = wp.vec2d(a[0] - x * a[2], a[1] - y * a[2])
     q = wp.vec2d(b[0] - x * b[2], b[1] - y * b[2])
     r = wp.vec2d(c[0] - x * c[2], c[1] - y * c[2])
@@ -200,7 +194,7 @@ def depth_at(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, x: wp.float64, y: wp.float64
 
 @wp.func
 def key_of(depth: wp.float32, prim_id: int) -> wp.uint64:
-    """Key that sorts by depth, then by prim_id: the bits of float32 >= 0 sort as the numbers do."""
+    """Return a key that sorts by depth, then by prim_id. For floats >= 0, the bits have the same order as the values."""
     return (wp.uint64(wp.cast(depth, wp.uint32)) << wp.uint64(32)) | wp.uint64(prim_id)
 
 
@@ -216,13 +210,13 @@ class Corners:
 
 @wp.func
 def draw_row(view: View, corners: Corners, columns: wp.vec2i, row: int, keys: wp.array(dtype=wp.uint64)):
-    """Put a triangle's key into the pixels of part of a row that it covers and is nearest in."""
+    """Update the keys of the pixels in part of a row that a triangle covers."""
     y = wp.float64(row) + HALF
     for column in range(columns[0], columns[1] + 1):
         x = wp.float64(column) + HALF
         w = depth_at(corners.a, corners.b, corners.c, x, y)
         if w >= ZERO:
-            # abs: -0 would sort behind everything
+            # The key of -0 would be greater than all others, so take the absolute value.
             depth = wp.float32(wp.abs(w) * wp.length(view.from_pixels @ wp.vec3d(x, y, wp.float64(1.0))))
             if wp.isfinite(depth):
                 wp.atomic_min(keys, row * view.width + column, key_of(depth, corners.prim_id))
@@ -231,9 +225,8 @@ def draw_row(view: View, corners: Corners, columns: wp.vec2i, row: int, keys: wp
 @kernel
 def rasterize(view: View, projected: wp.array(dtype=wp.vec3d), faces: wp.array(dtype=wp.vec3i), boxes: wp.array(dtype=wp.vec4i),
               prim_ids: wp.array(dtype=wp.int32), bands: wp.vec2i, keys: wp.array(dtype=wp.uint64)):
-    """Draw triangles in bands of rows, launched over (bands, triangles); bands: first row of the first band, rows of each.
-    Two threads may share a pixel on CUDA, where the minimum is atomic. On the CPU it is not: a band is a launch of its own in one thread.
-    """
+    """Draw triangles in bands of rows. The launch has the dimensions (bands, triangles); bands: (first row of the first, rows per band).
+    On CUDA, threads may share a pixel, because atomic_min is atomic. On the CPU it is not: each band needs a launch of its own."""
     band, i = wp.tid()
     corners = Corners()
     corners.prim_id = prim_ids[i]
@@ -253,8 +246,8 @@ def rasterize(view: View, projected: wp.array(dtype=wp.vec3d), faces: wp.array(d
     edge_a = edge_between(b, c, size)
     edge_b = edge_between(c, a, size)
     edge_c = edge_between(a, b, size)
-    # The inner side of edges in front of the camera has the determinant's sign. If rounding hides it (edge-on, or through the camera),
-    # both sides are drawn.
+    # The sign of the determinant tells the inner side of the edges of a triangle in front of the camera. If rounding makes the sign
+    # uncertain, because the triangle is edge-on or passes through the camera, both sides are drawn.
     det = wp.dot(a, edge_a.normal)
     slack = wp.float64(4.0) * (
         wp.abs(a[2]) * edge_a.slack + wp.abs(b[2]) * edge_b.slack + wp.abs(c[2]) * edge_c.slack

@@ -1,6 +1,6 @@
-"""A log of every ray of a picture: what it asks, its kind, and its number of bounces.
-A logged structure wraps the structure proper: its traversal logs the ray, gives it a row of the counters, and hands it on. Only kernels
-that profile are compiled with it."""
+"""A log of every ray of a picture: closest hit or any hit, its kind, and its number of bounces.
+A logged structure wraps an acceleration structure. Its traversal logs the ray, sets Ray.slot for the counters, and calls the wrapped
+traversal. Only the kernels of profiles are compiled with it."""
 
 from functools import cache
 from typing import Any
@@ -12,42 +12,42 @@ from wrt.kernels.structs import Hit, Ray, Surfaces
 
 @wp.struct
 class LoggedRay:
-    """A ray as in structs.Ray, with its kind and its answer."""
+    """The fields of a structs.Ray, its kind, and whether it hit."""
 
     origin: wp.vec3
     direction: wp.vec3
     t_min: float
     t_max: float
     exclude_plus_one: int
-    label: int  # By shade.paths.label.
-    any_hit: int  # 1: an any-hit query.
-    hit: int  # 1: it hit.
+    label: int  # Kind and number of bounces, packed by shade.paths.label.
+    any_hit: int  # 1 for an any-hit query, 0 for a closest hit.
+    hit: int  # 1 if the ray hit anything, else 0.
 
 
 @wp.struct
 class RayLog:
     """The log of a tile."""
 
-    used: wp.array(dtype=wp.int32)  # Rays of each pixel so far.
-    first: wp.array(dtype=wp.int64)  # First entry of each pixel in `rays`; length 0: count, do not log.
+    used: wp.array(dtype=wp.int32)  # Number of rays of each pixel so far.
+    first: wp.array(dtype=wp.int64)  # Index in `rays` of each pixel's first ray. Length 0: count rays, but do not log them.
     rays: wp.array(dtype=LoggedRay)
 
 
 @cache
 def make_struct(accel_struct: Any) -> Any:
-    """Make the logged structure."""
+    """Make the type of the logged structure."""
 
     @wp.struct
     class Logged:
         accel: accel_struct
         log: RayLog
-        row: int  # Pixel of this thread in the tile; each thread sets it in its own copy.
+        row: int  # Index in the tile of this thread's pixel; each thread sets it in its own copy.
 
     return Logged
 
 
 def make_traversal(accel_struct: Any, traverse: Any, any_hit: bool) -> Any:
-    """Make `traverse` with a log; its counters go to the ray's row, or to the pixel's if rays are only counted."""
+    """Wrap `traverse` with a log. Ray.slot, the index for counters, becomes the ray's index in the log or, without a log, the pixel's."""
     struct = make_struct(accel_struct)
 
     @wp.func

@@ -1,4 +1,4 @@
-"""Rays that start at hits of others, as the integrator's do, to test that they do not hit the surface that they leave."""
+"""Rays that start at hits of other rays, as in a render, to test that they do not hit the surface that they leave."""
 
 from typing import Any
 
@@ -11,17 +11,17 @@ from wrt.kernels.structs import Surfaces, kernel, make_ray
 
 @wp.struct
 class Respawn:
-    """Second rays and both answers."""
+    """Directions of the second rays, and the hits of first and second rays."""
 
     direction: wp.array(dtype=wp.vec3)
-    exclude: int  # 1: exclude the triangle that they start on, as the integrator does.
-    first_prim_id: wp.array(dtype=wp.int32)
-    next_prim_id: wp.array(dtype=wp.int32)
+    exclude: int  # 1: a second ray excludes the triangle that it starts on, as in a render; 0: it does not.
+    first_prim_id: wp.array(dtype=wp.int32)  # Hits of the first rays; -1 on a miss.
+    next_prim_id: wp.array(dtype=wp.int32)  # Hits of the second rays; -1 on a miss.
 
 
 def make_respawn_kernel(accel_struct: Any, traverse: Any, surface_at: Any) -> Any:
-    """Make the kernel that stores each ray's hit, and the hit of a second ray from there; -1 on a miss.
-    On a sphere the second direction is turned outwards: inwards it would hit the far wall, rightly."""
+    """Make the kernel that stores the hit of each ray, and the hit of a second ray that starts there.
+    On a sphere, the second direction is turned outwards, because an inward ray correctly hits the sphere again."""
 
     @kernel
     def respawn(accel: accel_struct, surfaces: Surfaces, rays: RayArrays, out: Respawn, first: int):

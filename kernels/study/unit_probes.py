@@ -1,32 +1,24 @@
-"""Kernels with a unit several times and little else: the difference of two kernels is the unit's machine code."""
+"""Kernels that call a box or triangle test several times, and do little else. Two kernels with different numbers of calls differ by the
+machine code of the additional tests."""
 
 from functools import cache
 from typing import Any
 
 import warp as wp
 
-from wrt.kernels.native import source
-from wrt.kernels.structs import Ray, kernel, size_of
-from wrt.kernels.units.box import RAY_AABB, BoxRay
-from wrt.kernels.units.triangle import RAY_TRIANGLE, TriangleRay
-
-
-@wp.struct
-class ProbeRay:
-    """A ray with the set-up of both units."""
-
-    ray: Ray
-    box: BoxRay
-    triangle: TriangleRay
+from wrt.kernels.structs import kernel, size_of
+from wrt.kernels.traverse.common import Probe
+from wrt.kernels.units.box import RAY_AABB
+from wrt.kernels.units.triangle import RAY_TRIANGLE
 
 
 @cache
 def make_box_probe(test: str | None, count: int) -> Any:
-    """Make the kernel of `count` box tests by RAY_AABB[test], whose results are summed; None: the planes are summed."""
+    """Make the kernel that sums the results of `count` box tests RAY_AABB[test]; if `test` is None, it sums the boxes' coordinates."""
     unit = RAY_AABB[test] if test is not None else None
 
     @kernel
-    def box_probe(rays: wp.array(dtype=ProbeRay), lo: wp.array(dtype=wp.vec3), hi: wp.array(dtype=wp.vec3),
+    def box_probe(rays: wp.array(dtype=Probe), lo: wp.array(dtype=wp.vec3), hi: wp.array(dtype=wp.vec3),
                   out: wp.array(dtype=wp.float32)):
         i = wp.tid()
         ray = rays[i]
@@ -44,17 +36,24 @@ def make_box_probe(test: str | None, count: int) -> Any:
 
 
 def numbers_of(record: Any) -> int:
-    """Return the numbers of a record that a test reads: all but prim_id."""
+    """Return how many numbers of a record a test reads: all except prim_id."""
     return size_of(record) // 4 - 1
 
 
 @cache
 def make_add_numbers(record: Any) -> Any:
-    """Make add_numbers(total, record): the sum of total and the numbers that a test reads."""
+    """Make add_numbers(total, record), which adds to total the numbers that a test reads."""
     layout = record.numpy_dtype()
     prim_id = layout["offsets"][layout["names"].index("prim_id")] // 4
 
-    @wp.func_native(source("study/add_numbers.h", PRIM_ID=prim_id))
+    @wp.func_native(f"""
+    float numbers[sizeof(record) / sizeof(float)];
+    memcpy(numbers, &record, sizeof(record));
+    for (unsigned k = 0; k < sizeof(record) / sizeof(float); ++k) {{
+        if (k != {prim_id}) total += numbers[k];
+    }}
+    return total;
+    """)
     def add_numbers(total: float, record: record) -> float: ...
 
     return add_numbers
@@ -62,13 +61,13 @@ def make_add_numbers(record: Any) -> Any:
 
 @cache
 def make_triangle_probe(test: str, count: int, adding: bool = False) -> Any:
-    """Make the kernel of `count` tests by RAY_TRIANGLE[test], whose t, u, v are summed; adding: the records' numbers are summed."""
+    """Make the kernel that sums t, u and v of `count` tests RAY_TRIANGLE[test]; with `adding`, it sums the records' numbers instead."""
     unit = RAY_TRIANGLE[test].intersect
     record = RAY_TRIANGLE[test].record
     add_numbers = make_add_numbers(record)
 
     @kernel
-    def triangle_probe(rays: wp.array(dtype=ProbeRay), primitives: wp.array(dtype=record), out: wp.array(dtype=wp.float32)):
+    def triangle_probe(rays: wp.array(dtype=Probe), primitives: wp.array(dtype=record), out: wp.array(dtype=wp.float32)):
         i = wp.tid()
         ray = rays[i]
         total = float(0.0)

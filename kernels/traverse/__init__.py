@@ -1,1 +1,1 @@
-"""The RT core's traversal units: one structure a file, and what they share."""
+"""Traversal of acceleration structures for one ray: one structure per file, and common parts."""

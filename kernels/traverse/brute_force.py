@@ -1,4 +1,4 @@
-"""The traversal unit without a structure: it tests every primitive, and is the yardstick for all others."""
+"""Traversal without a structure: test every primitive. The hits of the other structures are compared with its hits."""
 
 from functools import cache
 from typing import Any
@@ -13,7 +13,7 @@ from wrt.kernels.traverse.leaf import make_leaf
 
 @cache
 def make_struct(record: Any) -> Any:
-    """Make the structure over records of this kind: all primitives, in the order of prim_id."""
+    """Make the structure's type, for primitives stored as `record` in the order of prim_id."""
 
     @wp.struct
     class BruteForce:
@@ -24,7 +24,7 @@ def make_struct(record: Any) -> Any:
 
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """Make the unit for the closest hit, or for any hit, among all primitives."""
+    """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found."""
     probe_of = make_probe(units)
     visit_leaf = make_leaf(units, any_hit, accepts)
     _, _, _, finish = make_counters(units, 0)

@@ -1,28 +1,30 @@
-"""The traversal unit of the BSP tree: planes of any orientation, cells visited front to back.
+"""Traversal of the BSP tree: its planes have any orientation, and its cells are visited from front to back.
 
-Ize, Wald and Parker 2008, "Ray Tracing with the BSP Tree". Planes across an axis are the fast path: one subtraction and one
-multiplication, as in a k-d tree.
+Ize, Wald and Parker 2008, "Ray Tracing with the BSP Tree". A plane across an axis takes only one subtraction and one multiplication, as
+in a k-d tree.
 
-**Why no hit is lost.** u = 2^-24; lengths are measured along an axis. Let a primitive X of extent E have a hit, found by the unit at t'
-and reported as t after the clamp to X's box (`within_bounds`). Let P = origin + t' direction and D = |t'| max|direction|.
+**Why no hit is lost.** u = 2^-24; lengths are measured along an axis. Let X be a primitive of extent E with a hit. Its test computes t',
+and clamping to X's box (`within_bounds`) changes t' to t. Let P = origin + t' direction and D = |t'| max|direction|.
 
-1. P is within 8 u (D + E) of a point Q of X. The weights of t' are convex to 2^-50 (products and areas are exact in float64). They weight
-   corners that the shear moves by at most 7 u (D + E); the rounding of t' adds u D. Spheres are nearer.
-2. |t - t'| <= reach := 2^-19 D_box / min|direction_i| over the components that are not 0. D_box is the longest distance along an axis from
-   the origin to the root box, so that D <= D_box and E <= 2 D_box. P is within 24 u D_box of X's box, and the slab distances carry 3 u
-   D_box. The clamp moves t' no farther than to the plane that it is beyond, and 27 u < 2^-19 = 32 u.
-3. For a ray nearly along an axis, a second bound counts. Let m be the longest component of the direction. The slab of X's padded box
-   across m holds t' but for 24 u D_box, and t but for 3 u D_box and FAR_PAD's 14 u. So reach <= (E_padded + 2^-18 D_box) / |direction_m|.
-   The walk takes the smaller bound, with the largest E_padded of all primitives. Its segment extends `reach` beyond t_min and beyond the
-   best hit, and is cut by the root box grown by 2^-19 D_box.
-4. The builder lists each X, clipped to the cell, on every side that Q is in, or misses by at most the builder's share of node.tolerance
-   (`plane_tolerance`). There |plane(P)| differs from plane(Q) by |n|_1 8 u (D + E). The computed value differs from plane(P) by 4 u
-   (sum |n_i Q_i| + |d|) + 7 u |n|_1 D (both dot products), and by 3 u |n|_1 D (the two distances). The terms without D are in
-   node.tolerance. The others sum to 18 u |n|_1 D <= 31.2 u D; the walk takes 2^-19 D, with the largest D of the ray's part in this cell.
+1. P is within 8 u (D + E) of a point Q of X. The unit computes t' as a weighted mean of the corners' distances. Products and areas are
+   exact in float64, so the weights are convex within 2^-50. The shear moves the corners by at most 7 u (D + E), and rounding t' adds u D.
+   For spheres the distance is smaller.
+2. |t - t'| <= reach := 2^-19 D_box / min|direction_i|, over the components that are not 0. D_box is the longest distance along an axis from
+   the origin to the root box, so D <= D_box and E <= 2 D_box. P is within 24 u D_box of X's box, and the slab distances have errors of
+   3 u D_box. Clamping moves t' at most to the box's plane that P lies beyond, and 27 u < 2^-19 = 32 u.
+3. For a ray nearly along an axis, a second bound is smaller. Let m be the direction's longest component. The slab of X's padded box across
+   m contains t' within 24 u D_box, and t within 3 u D_box and FAR_PAD's 14 u. So reach <= (E_padded + 2^-18 D_box) / |direction_m|. The
+   walk uses the smaller of both bounds, with the largest E_padded of all primitives. Its segment extends by `reach` before t_min and behind
+   the best hit, and is clipped to the root box grown by 2^-19 D_box.
+4. The builder clips X to the cell. It lists X on a side of the plane if Q is on that side. It also does if Q is beyond the plane by at most
+   the builder's share of node.tolerance (`plane_tolerance`). The value plane(P) differs from plane(Q) by |n|_1 8 u (D + E). The computed
+   value differs from plane(P) by 4 u (sum |n_i Q_i| + |d|) + 7 u |n|_1 D (dot products) + 3 u |n|_1 D (distances). The terms without D
+   are in node.tolerance. The other terms sum to 18 u |n|_1 D <= 31.2 u D. The walk uses 2^-19 D, with the largest D of the ray's part in
+   this cell.
 
-So a plane is a slab of that half thickness, and the walk visits a child if the ray is on its side or in the slab. Then t' is in the
-interval of a leaf that lists X, and the leaf is visited unless it begins more than `reach` beyond the best hit. A ray along the plane
-divides by 0 or nearly so. Its distances lie outside the interval or are NaN, and one child or both are visited.
+So each plane becomes a slab of this half thickness. The walk visits a child if the ray is on the child's side or in the slab. Then t' is in
+the ray's interval of a leaf that lists X. The leaf is visited unless it begins more than `reach` behind the best hit. For a ray parallel to
+the plane, the divisor is 0 or tiny: its distances lie outside the interval or are NaN, and the walk visits one child or both.
 """
 
 from functools import cache
@@ -30,30 +32,30 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.structs import NO_HIT, Hit, Ray, size_of
+from wrt.kernels.structs import NO_HIT, Hit, Ray, largest, size_of
 from wrt.kernels.traverse.bvh2 import Child, child_of
 from wrt.kernels.traverse.common import Probe, Units, make_probe, no_hit
 from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
 from wrt.kernels.traverse.leaf import make_leaf
 from wrt.kernels.units.box import BoxRay, slab_interval
 
-# Builders keep the depth at or below this; a path from the root pushes at most one child a level.
+# Stack entries. Builders keep a tree's depth at or below STACK_SIZE, because the walk pushes at most one child per level.
 STACK_SIZE = 64
 REACH = wp.constant(2.0**-19)
-SMALLEST = wp.constant(2.0**-120)  # above what underflows in the derivation
-PLANE = 3  # BspNode.axis of a plane that is not across an axis
-INNER = -1  # count of a child that is an inner node
+SMALLEST = wp.constant(2.0**-120)  # Added to margins: larger than any error by underflow in the proof.
+PLANE = 3  # Value of BspNode.axis for a plane that is not at right angles to an axis.
+INNER = -1  # Value of `count` for a child that is an inner node.
 
 
 @wp.struct
 class BspNode:
-    """A plane normal . p + offset = 0 and its two children: 0 below the plane, 1 above it.
-    A child is the inner node `first` (count = INNER), or the primitives first .. first + count - 1, which may be none."""
+    """A plane normal . p + offset = 0 and its two children: 0 below the plane (negative values), 1 above it.
+    A child is the inner node `first` (count = INNER), or a leaf with the primitives first .. first + count - 1; count may be 0."""
 
     normal: wp.vec3
     offset: float
     tolerance: float  # Half of the plane's thickness, without the part proportional to the ray's distance.
-    axis: int  # 0, 1, 2: the plane is p[axis] + offset = 0; PLANE: any.
+    axis: int  # 0, 1, 2: the plane is p[axis] + offset = 0; PLANE: the plane has any orientation.
     first_0: int
     count_0: int
     first_1: int
@@ -62,29 +64,28 @@ class BspNode:
 
 @wp.struct
 class Reach:
-    """The part of a ray that is walked."""
+    """The part of a ray that the walk follows."""
 
-    t_0: float  # Begin.
-    t_1: float  # End.
-    beyond: float  # Distance that the walk goes on behind the best hit.
-    drift: float  # Thickness of a plane per unit of t.
+    t_0: float  # t at the begin.
+    t_1: float  # t at the end.
+    beyond: float  # Length, in t, by which the walk continues behind the best hit: `reach` of the proof.
+    drift: float  # Half thickness of a plane per unit of t.
 
 
 @wp.func
 def reach_of(box: BoxRay, ray: Ray, t_max: float, lo: wp.vec3, hi: wp.vec3, extent: float) -> Reach:
-    """Compute the part of the ray to walk (2. and 3. above); t_0 > t_1, or NaN, if the ray misses the root box."""
-    corner = wp.max(wp.abs(lo - ray.origin), wp.abs(hi - ray.origin))
-    grow = REACH * wp.max(wp.max(corner[0], corner[1]), corner[2]) + SMALLEST
+    """Compute the part of the ray to follow, by steps 2 and 3 of the proof. If the ray misses the root box, t_0 <= t_1 is False."""
+    grow = REACH * wp.max(largest(lo - ray.origin), largest(hi - ray.origin)) + SMALLEST
     margin = wp.vec3(grow, grow, grow)
     interval = slab_interval(box, lo - margin, hi + margin)
     size = wp.abs(ray.direction)
     smallest = float(wp.inf)
     for axis in range(3):
         smallest = wp.where(size[axis] > 0.0, wp.min(smallest, size[axis]), smallest)
-    largest = wp.max(wp.max(size[0], size[1]), size[2])
+    longest = largest(ray.direction)
     out = Reach()
-    out.beyond = wp.min(grow / smallest, (extent + 2.0 * grow) / largest)
-    out.drift = REACH * largest
+    out.beyond = wp.min(grow / smallest, (extent + 2.0 * grow) / longest)
+    out.drift = REACH * longest
     out.t_0 = wp.max(interval[0], ray.t_min - out.beyond)
     out.t_1 = wp.min(interval[1], t_max + out.beyond)
     return out
@@ -92,11 +93,11 @@ def reach_of(box: BoxRay, ray: Ray, t_max: float, lo: wp.vec3, hi: wp.vec3, exte
 
 @cache
 def make_struct(record: Any) -> Any:
-    """Make the structure over records of this kind; the root is the child (first, count), as in a node."""
+    """Make the structure's type, for primitives stored as `record`. `first` and `count` describe the root, as they do a node's child."""
 
     @wp.struct
     class Bsp:
-        lo: wp.vec3  # The root box: lo, hi.
+        lo: wp.vec3  # lo, hi: the root box.
         hi: wp.vec3
         extent: float  # Longest side of a primitive's padded box.
         first: int
@@ -110,20 +111,20 @@ def make_struct(record: Any) -> Any:
 
 @wp.struct
 class Sides:
-    """The children of a node in the order of a ray."""
+    """The children of a node, ordered along a ray."""
 
     near: Child
     far: Child
     meets_near: bool
     meets_far: bool
-    near_t_1: float  # Latest t at which the ray leaves the nearer one.
-    far_t_0: float  # Earliest t at which it enters the farther one.
+    near_t_1: float  # Latest t at which the ray leaves the nearer child.
+    far_t_0: float  # Earliest t at which the ray enters the farther child.
 
 
 @wp.func
 def cut_by_plane(node: BspNode, box: BoxRay, direction: wp.vec3, t_0: float, t_1: float, drift: float) -> Sides:
-    """Order and cut the part of a ray from t_0 to t_1 by a node's plane; drift: of Reach."""
-    # Distance of the origin from the plane, against the normal, and 1 / speed along the normal.
+    """Order a node's children along a ray, and cut the ray's part [t_0, t_1] at the node's plane; drift: Reach.drift."""
+    # `height` is the origin's distance below the plane, `inv` 1 / (normal . direction).
     height = float(0.0)
     inv = float(0.0)
     if node.axis < wp.static(PLANE):
@@ -149,7 +150,7 @@ def cut_by_plane(node: BspNode, box: BoxRay, direction: wp.vec3, t_0: float, t_1
 
 
 def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
-    """Make walk(accel, surfaces, probe, reach) -> best hit, counts."""
+    """Make walk(accel, surfaces, probe, reach) -> (best Hit, Counts)."""
     visit_leaf = make_leaf(units, any_hit, accepts)
     fetch_node, _, push, _ = make_counters(units, size_of(BspNode))
 
@@ -194,7 +195,7 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
                     count = sides.far.count
                     t_0 = sides.far_t_0
                     continue
-            # Pop the next child that does not begin beyond the best hit and the distance that a clamp can move it.
+            # Pop the next child that begins at most reach.beyond behind the best hit.
             found = bool(False)
             while size > 0 and not found:
                 size = size - 1
@@ -211,7 +212,7 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
 
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """Make the unit for the closest hit, or for any hit. It needs no box test: only the root has a box."""
+    """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found. units.box is not used."""
     probe_of = make_probe(units)
     walk = make_walk(units, any_hit, accepts)
     _, _, _, finish = make_counters(units, 0)

@@ -1,6 +1,7 @@
-"""The traversal unit of the binary BVH: front to back, with a stack.
-A node holds the volumes of both children: one fetch feeds two tests. The walk visits the nearer child at once and pushes the farther one;
-it drops a popped node that begins beyond the closest hit. Volumes are boxes here; `bvh2_sphere.py` and `bvh2_kdop.py` share the walk."""
+"""Traversal of the binary BVH from front to back, with a stack.
+A node holds the bounding volumes of both children, so that one fetch serves two tests. The walk visits the nearer child at once, and pushes
+the farther child. It drops a popped node that begins behind the closest hit. The volumes are boxes here, spheres in `bvh2_sphere.py`, and
+14-DOPs in `bvh2_kdop.py`."""
 
 from functools import cache
 from typing import Any, NamedTuple
@@ -14,15 +15,15 @@ from wrt.kernels.traverse.leaf import make_leaf
 from wrt.kernels.traverse.stack import key_of, make_stack, reference_of, t_of
 from wrt.kernels.units.box import BoxRay
 
-# Builders keep the depth at or below this; a path from the root pushes at most one node a level.
+# Stack entries. Builders keep a tree's depth at or below STACK_SIZE, because the walk pushes at most one node per level.
 STACK_SIZE = 64
-ENTRY = 12  # bytes
+ENTRY = 12  # size of a stack entry in bytes: a key of 8 and a count of 4
 
 
 @wp.struct
 class Bvh2Node:
-    """Two children: a box, and either a leaf's primitives first .. first + count - 1, or (count = 0) the inner node `first`. A missing
-    child is an empty box (lo = inf, hi = -inf)."""
+    """Two children. A child has a box, and is the inner node `first` (count = 0) or a leaf with the primitives first .. first + count - 1.
+    A missing child has an empty box (lo = inf, hi = -inf)."""
 
     lo_0: wp.vec3
     hi_0: wp.vec3
@@ -36,7 +37,7 @@ class Bvh2Node:
 
 @cache
 def make_struct(record: Any, node: Any = Bvh2Node) -> Any:
-    """Make the structure over these kinds of records and nodes: nodes[0] is the root, primitives are in the order of the leaves."""
+    """Make the structure's type. nodes[0] is the root; primitives are stored as `record` in the order of the leaves."""
 
     @wp.struct
     class Bvh2:
@@ -48,18 +49,18 @@ def make_struct(record: Any, node: Any = Bvh2Node) -> Any:
 
 
 class Volumes(NamedTuple):
-    """A kind of bounding volume."""
+    """A kind of bounding volume: types and functions for make_binary_traversal."""
 
-    struct: Any  # Of the structure.
-    node: Any  # Of a node, with first_0, count_0, first_1, count_1 as in Bvh2Node.
-    set_up: Any  # Function (accel, probe) -> the ray as `enter` reads it.
-    enter: Any  # Function (ray, node, t_max) -> entry distances of both children; inf on a miss, never beyond a hit inside.
-    root: Any = None  # Function (ray) -> the node where the walk begins; None: node 0.
+    struct: Any  # Type of the structure.
+    node: Any  # Type of a node, with first_0, count_0, first_1, count_1 as in Bvh2Node.
+    set_up: Any  # Function (accel, probe) -> the ray set up for `enter`.
+    enter: Any  # Function (ray, node, t_max) -> vec2, t where the ray enters each child; inf on a miss, never behind a hit inside.
+    root: Any = None  # Function (ray) -> index of the node where the walk begins; None: node 0.
 
 
 @cache
 def box_volumes(record: Any, box_test: Any) -> Volumes:
-    """Make boxes as volumes; box_test: of RAY_AABB."""
+    """Make the Volumes of boxes; box_test: an entry of RAY_AABB."""
     struct = make_struct(record)
 
     @wp.func
@@ -75,7 +76,7 @@ def box_volumes(record: Any, box_test: Any) -> Volumes:
 
 @wp.struct
 class Child:
-    """A leaf's primitives first .. first + count - 1, or (count = 0) the inner node `first`."""
+    """The inner node `first` (count = 0), or a leaf with the primitives first .. first + count - 1."""
 
     first: int
     count: int
@@ -90,19 +91,19 @@ def child_of(node: Any, second: bool) -> Child:
 
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """Make the unit for the closest hit, or for any hit."""
+    """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found."""
     volumes = box_volumes(units.triangle_test.record, units.box_test)
     return make_binary_traversal(units, volumes, make_leaf(units, any_hit, accepts), any_hit)
 
 
 def make_binary_traversal(units: Units, volumes: Volumes, visit_leaf: Any, any_hit: bool, ordered: bool = True,
                           early: bool = True) -> Any:
-    """Make a unit over a tree with these volumes and leaves (kernels.traverse.leaf). Studies switch off `ordered` (nearer child first) and
-    `early` (nodes beyond the best hit are dropped)."""
+    """Make the traversal of a tree with these volumes; visit_leaf: see kernels.traverse.leaf. The laboratory switches off `ordered` (visit
+    the nearer child first) and `early` (drop nodes that begin behind the best hit)."""
     probe_of = make_probe(units)
     struct, set_up, enter, root = volumes.struct, volumes.set_up, volumes.enter, volumes.root
     fetch_node, _, push, finish = make_counters(units, size_of(volumes.node))
-    # An entry: a key (entry distance and node or first primitive) and a count of primitives.
+    # A stack entry is a key (entry distance, and inner node or first primitive) and the child's `count`.
     new_keys, shared_keys, put_key, key_at = make_stack(units.stack, STACK_SIZE, wp.uint64, ENTRY)
     new_counts, shared_counts, put_count, count_at = make_stack(units.stack, STACK_SIZE, wp.int32, ENTRY)
 
@@ -151,7 +152,7 @@ def make_binary_traversal(units: Units, volumes: Volumes, visit_leaf: Any, any_h
                     first = near.first
                     count = near.count
                     continue
-            # Pop the next node that does not begin beyond the closest hit. Equal t stays: a tie may have a lower prim_id there.
+            # Pop the next node that begins at or before the closest hit: at the same t, it may have a hit with a lower prim_id.
             found = bool(False)
             while size > 0 and not found:
                 size = size - 1

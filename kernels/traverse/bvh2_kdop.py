@@ -1,4 +1,4 @@
-"""The traversal unit of the binary BVH over 14-DOPs: boxes with their corners cut off, 56 bytes each."""
+"""Traversal of the binary BVH of 14-DOPs: boxes with their corners cut off by diagonal planes, 56 bytes each (kernels.units.kdop)."""
 
 from functools import cache
 from typing import Any
@@ -14,7 +14,7 @@ from wrt.kernels.units.kdop import KdopRay, kdop_ray, ray_kdop
 
 @wp.struct
 class KdopNode:
-    """A Bvh2Node with the diagonal planes of both children: cut_lo <= project(x - middle) <= cut_hi."""
+    """A Bvh2Node with the diagonal slabs of both children: cut_lo <= units.kdop.project(x - middle) <= cut_hi."""
 
     lo_0: wp.vec3
     hi_0: wp.vec3
@@ -32,7 +32,7 @@ class KdopNode:
 
 @cache
 def make_struct(record: Any) -> Any:
-    """Make the structure over records of this kind; middle: the point to which the diagonal planes are relative."""
+    """Make the structure's type, for primitives stored as `record`; `middle` is the origin of the diagonal projections."""
 
     @wp.struct
     class Bvh2Kdop:
@@ -46,7 +46,7 @@ def make_struct(record: Any) -> Any:
 
 @cache
 def kdop_volumes(record: Any) -> Volumes:
-    """Make 14-DOPs as volumes."""
+    """Make the Volumes of 14-DOPs."""
     struct = make_struct(record)
 
     @wp.func
@@ -62,6 +62,6 @@ def kdop_volumes(record: Any) -> Volumes:
 
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """Make the unit for the closest hit, or for any hit; the box test of `units` serves primitives only."""
+    """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found. units.box is not used."""
     volumes = kdop_volumes(units.triangle_test.record)
     return make_binary_traversal(units, volumes, make_leaf(units, any_hit, accepts), any_hit)

@@ -1,4 +1,4 @@
-"""The traversal unit of the binary BVH over spheres: 16 bytes a volume in place of a box's 24."""
+"""Traversal of the binary BVH of bounding spheres: a sphere takes 16 bytes, a box 24."""
 
 from functools import cache
 from typing import Any
@@ -14,7 +14,7 @@ from wrt.kernels.units.bounding_sphere import SphereRay, ray_bounding_sphere, sp
 
 @wp.struct
 class SphereNode:
-    """A Bvh2Node with spheres (center, radius); a missing child has radius -1."""
+    """A Bvh2Node with spheres (center, radius) instead of boxes; a missing child has radius -1."""
 
     sphere_0: wp.vec4
     sphere_1: wp.vec4
@@ -30,7 +30,7 @@ def make_struct(record: Any) -> Any:
 
 @cache
 def sphere_volumes(record: Any) -> Volumes:
-    """Make bounding spheres as volumes."""
+    """Make the Volumes of bounding spheres."""
     struct = make_struct(record)
 
     @wp.func
@@ -45,6 +45,6 @@ def sphere_volumes(record: Any) -> Volumes:
 
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """Make the unit for the closest hit, or for any hit; the box test of `units` serves primitives only."""
+    """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found. units.box is not used."""
     volumes = sphere_volumes(units.triangle_test.record)
     return make_binary_traversal(units, volumes, make_leaf(units, any_hit, accepts), any_hit)

@@ -1,9 +1,9 @@
-"""Margins of a walk through cells that list a triangle only where the triangle itself is.
+"""Margins of a walk through the cells of a grid or octree. A cell lists only triangles that meet the cell, not all whose boxes meet it.
 
-The point at the triangle unit's t is on the triangle, but for its pad and a few roundings: it is in a cell that lists the triangle. Then t
-is clamped to the interval of the triangle's box (kernels.units.triangle.within_bounds). That moves it by up to the pad across the
-direction, which on a grazing ray is a long way along it. So a reported hit lies up to `cell_slack` before or behind the cells that list
-it. The walk begins as far before t_min, and goes on as far behind its best hit.
+Before clamping, a hit is on its triangle, except for the triangle's pad and a few roundings. So it is in a cell that lists the triangle.
+Then t is clamped to the interval of the triangle's box (kernels.units.triangle.within_bounds). This moves the hit by up to the pad at right
+angles to a face of the box, which on a grazing ray is a long way along the ray. So the final hit lies up to `cell_slack` before or behind
+the cells that list its triangle. The walk begins by cell_slack before t_min, and continues by cell_slack behind its best hit.
 """
 
 import warp as wp
@@ -13,20 +13,20 @@ from wrt.kernels.units.box import FAR_PAD, BoxRay
 
 @wp.func
 def later(t: float) -> float:
-    """Upper bound of t over the rounding of plane distances (kernels.units.box.FAR_PAD), for any sign. Monotone; NaN stays."""
+    """Return an upper bound of the exact distance whose rounded value is t (kernels.units.box.FAR_PAD), for any sign. Monotone."""
     return wp.max(t * FAR_PAD, t * wp.static(2.0 - float(FAR_PAD)))
 
 
 @wp.func
 def earlier(t: float) -> float:
-    """Lower bound of t over the same rounding."""
+    """Return a lower bound of the exact distance whose rounded value is t; see `later`."""
     return wp.min(t * FAR_PAD, t * wp.static(2.0 - float(FAR_PAD)))
 
 
 @wp.func
 def cell_slack(ray: BoxRay, pad: float, extent: float) -> float:
-    """Distance along this ray by which the clamp may move t: across the largest pad of any triangle, within the largest box of any. A
-    component of the direction whose reciprocal is infinite moves nothing."""
+    """Return a bound on the change of t by clamping. pad: largest pad of any triangle's box; extent: largest extent of any box.
+    Axes with an infinite reciprocal direction do not change t."""
     steep = float(wp.inf)
     grazing = float(0.0)
     for axis in range(3):

@@ -1,4 +1,4 @@
-"""The test of a primitive, shared by all traversal units."""
+"""The test of one primitive, and the options of a traversal: common to all structures."""
 
 from typing import Any, NamedTuple
 
@@ -11,16 +11,16 @@ from wrt.kernels.units.triangle import RAY_TRIANGLE, TriangleRay, triangle_ray
 
 
 class Units(NamedTuple):
-    """Options of a traversal unit."""
+    """Options with which a traversal is compiled."""
 
-    triangle: str = "watertight"  # Name in RAY_TRIANGLE.
-    box: str = "conservative"  # Name in RAY_AABB.
+    triangle: str = "watertight"  # Name of the triangle test in RAY_TRIANGLE.
+    box: str = "conservative"  # Name of the box test in RAY_AABB.
     spheres: bool = False  # True if primitives may be spheres.
-    counters: bool = False  # True to count.
-    instances: bool = False  # True below instances: Ray.first_prim is added to each prim_id.
-    resumes: bool = False  # True to go on behind a hit: at t_min, only prim_id >= Ray.slot counts; no spheres.
-    lists: bool = False  # True to list all hits (kernels.hit_lists) in place of the best.
-    stack: str = "local"  # Place of the stack, in kernels.traverse.stack.PLACES, for units that have the choice.
+    counters: bool = False  # True to count fetches and tests (kernels.traverse.counters).
+    instances: bool = False  # True if the structure is placed by instances: Ray.first_prim is added to each prim_id.
+    resumes: bool = False  # True to resume behind a hit: of hits at t_min, only those with prim_id >= Ray.slot count; no spheres.
+    lists: bool = False  # True to list all hits (kernels.hit_lists) instead of the best hit.
+    stack: str = "local"  # Name in kernels.traverse.stack.PLACES: where the stack is, in the structures that support the choice.
 
     @property
     def triangle_test(self) -> Any:
@@ -33,7 +33,7 @@ class Units(NamedTuple):
 
 @wp.struct
 class Probe:
-    """A ray with the set-up of both units: what the SM hands to the RT core."""
+    """A ray, set up for the box unit and the triangle unit."""
 
     ray: Ray
     box: BoxRay
@@ -42,18 +42,18 @@ class Probe:
 
 @wp.func
 def no_hit(ray: Ray) -> Hit:
-    """Best hit before a walk: a miss at the segment's end, so that a hit exactly there still counts. A ray that is not finite gets an
-    empty segment: comparisons with NaN would let it enter every box, empty ones too."""
+    """Return the best hit at the start of a walk: a miss with t = t_max, so that a hit exactly at t_max still counts.
+    A ray that is not finite gets t = -inf, an empty segment: with NaN in its comparisons, it would enter every box."""
     best = Hit()
-    zero = 0.0 * ray.origin + 0.0 * ray.direction  # 0 or NaN; the components' sum could overflow
+    zero = 0.0 * ray.origin + 0.0 * ray.direction  # components are 0 or NaN; a sum of the components themselves could overflow
     s = zero[0] + zero[1] + zero[2]
-    best.t = wp.where(s == 0.0, ray.t_max, float(-wp.inf))  # wp.isfinite would be a call
+    best.t = wp.where(s == 0.0, ray.t_max, float(-wp.inf))  # the compiler would not inline wp.isfinite
     best.prim_id = NO_HIT
     return best
 
 
 def make_probe(units: Units) -> Any:
-    """Make probe_of(ray) -> Probe, the set-up of both units."""
+    """Make probe_of(ray) -> Probe. The triangle set-up is left out if the triangle test does not use it."""
 
     @wp.func
     def probe_of(ray: Ray) -> Probe:
@@ -68,13 +68,13 @@ def make_probe(units: Units) -> Any:
 
 
 def make_better(units: Units, accepts: Any = None) -> Any:
-    """Make the unit that keeps the better of two hits.
-    accepts(surfaces, prim_id, u, v) -> bool may reject a hit (cut-outs); None accepts all. With units.lists, it is accepts(lists, ray,
-    hit, best) -> Hit: it stores the hit in `lists`, passed as `surfaces`, and returns the next `best`."""
+    """Make better(ray, surfaces, hit, prim_id, best), which returns the better of two hits.
+    accepts(surfaces, prim_id, u, v) -> bool may reject a hit, as cut-outs do; None accepts all hits. With units.lists, its form is
+    accepts(lists, ray, hit, best) -> Hit: it stores the hit in `lists`, the walk's argument `surfaces`, and returns the next `best`."""
 
     @wp.func
     def better(ray: Ray, surfaces: Any, hit: Hit, prim_id: int, best: Hit) -> Hit:
-        """Closer of `best` and a primitive's hit in [t_min, best.t]; the lower prim_id at equal t."""
+        """Return the closer of `best` and a primitive's hit, if that is in [t_min, best.t]; at equal t, the hit with the lower prim_id."""
         if hit.prim_id == NO_HIT or not (hit.t >= ray.t_min and hit.t <= best.t):
             return best
         if hit.t == best.t and prim_id > best.prim_id:
@@ -101,7 +101,7 @@ def sphere_hit(probe: Probe, surfaces: Surfaces, prim_id: int) -> Hit:
 
 
 def make_intersect(units: Units, accepts: Any = None) -> Any:
-    """Make the unit that tests one primitive and keeps the better hit; accepts: of make_better."""
+    """Make intersect(probe, surfaces, primitive, best): test one primitive, return the better hit. accepts: as in make_better."""
     record = units.triangle_test.record
     ray_triangle = units.triangle_test.intersect
     better = make_better(units, accepts)
@@ -111,7 +111,7 @@ def make_intersect(units: Units, accepts: Any = None) -> Any:
         prim_id = primitive.prim_id
         if wp.static(units.instances):
             prim_id = primitive.prim_id + probe.ray.first_prim
-        if prim_id + 1 == probe.ray.exclude_plus_one:  # before the test: a ray's own triangle, at its origin, is a hard case
+        if prim_id + 1 == probe.ray.exclude_plus_one:  # first, because the test of the triangle at the ray's origin takes long
             return best
         hit = Hit()
         if wp.static(units.spheres):

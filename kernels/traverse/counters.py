@@ -1,6 +1,6 @@
-"""The cost of a ray: counters of the RT core's units, and the addresses that they fetch.
-They are compiled in only with `Units.counters`. Without it, every function here returns its argument, and the compiler removes the call. A
-traversal unit counts into a local `Counts`, and adds it to the structure's `Recorder` at its end."""
+"""The cost of a ray: counts of fetches and tests, and a trace of the addresses that the traversal fetches.
+They are compiled in only with `Units.counters`. Otherwise, every function here returns its argument `counts`, and the compiler removes the
+call. A traversal counts in a local `Counts`, and adds it to the structure's `Recorder` at the end."""
 
 from typing import Any
 
@@ -9,50 +9,50 @@ import warp as wp
 from wrt.kernels.structs import NO_HIT, Hit, Ray, size_of
 from wrt.kernels.traverse.common import Units
 
-# Nodes and primitives have separate address spaces; an entry of the trace is address * 2^12 + size in bytes.
+# An entry of a trace is address * SIZE_RANGE + size, both in bytes. Nodes have addresses from 0 on, primitives from PRIMITIVE_SPACE on.
 PRIMITIVE_SPACE = wp.constant(wp.int64(1 << 40))
 SIZE_RANGE = wp.constant(wp.int64(1 << 12))
 
 
 @wp.struct
 class Counts:
-    """Counts of one or several rays."""
+    """Counts of one ray or of several rays."""
 
     probes: int  # Rays.
     nodes: int  # Fetches of a node, or of a grid's cell.
-    boxes: int  # Box tests.
-    box_operations: int  # Operations of the box unit: rows of boxes, or plane tests of a k-d or BSP tree.
-    primitives: int  # Tests of the triangle unit.
-    leaves: int  # Leaves entered.
+    boxes: int  # Boxes tested.
+    box_operations: int  # Operations of the box unit: tests of a node's boxes, or of a plane of a k-d or BSP tree.
+    primitives: int  # Primitives fetched and tested.
+    leaves: int  # Leaves visited.
     pushes: int
     pops: int
-    stack: int  # Most entries at a time.
-    node_bytes: int  # Bytes fetched, with repetitions.
-    primitive_bytes: int  # Bytes fetched, with repetitions.
+    stack: int  # Largest number of entries on the stack.
+    node_bytes: int  # Bytes of all fetched nodes, repeated fetches included.
+    primitive_bytes: int  # Bytes of all fetched primitives, repeated fetches included.
 
 
 @wp.struct
 class Recorder:
-    """Where counts and traces go."""
+    """Arrays to which a traversal adds its counts and its traces."""
 
-    counts: wp.array(dtype=Counts)  # By Ray.slot.
-    first: wp.array(dtype=wp.int64)  # The trace of slot i begins at fetches[first[i]]; length 0: no traces.
+    counts: wp.array(dtype=Counts)  # Indexed by Ray.slot.
+    first: wp.array(dtype=wp.int64)  # The trace of slot i begins at fetches[first[i]]. Length 0: write no traces.
     fetches: wp.array(dtype=wp.int64)
-    base: wp.int64  # Added to all addresses: where this of several structures begins.
+    base: wp.int64  # Address at which this structure begins, if there are several; added to all addresses.
 
 
 @wp.func
 def write_fetch(recorder: Recorder, slot: int, counts: Counts, address: wp.int64, size: int):
-    """Append a fetch to the ray's trace; `counts`: those before this fetch. No other ray writes to that trace."""
+    """Append a fetch to the trace of a slot, which belongs to one ray. `counts` does not yet include this fetch."""
     if recorder.first.shape[0] > 0:
-        before = recorder.counts[slot]  # fetches in structures before this one
+        before = recorder.counts[slot]  # counts of the structures that the ray has left
         place = recorder.first[slot] + wp.int64(before.nodes + before.primitives + counts.nodes + counts.primitives)
         recorder.fetches[place] = (recorder.base + address) * SIZE_RANGE + wp.int64(size)
 
 
 @wp.func
 def add_counts(recorder: Recorder, slot: int, counts: Counts):
-    """Add to the slot's counts; `stack` keeps the maximum."""
+    """Add `counts` to the recorder's entry `slot`; of `stack`, store the maximum."""
     total = recorder.counts[slot]
     total.probes += counts.probes
     total.nodes += counts.nodes
@@ -69,14 +69,14 @@ def add_counts(recorder: Recorder, slot: int, counts: Counts):
 
 
 def make_counters(units: Units, node_bytes: int) -> Any:
-    """Make fetch_node, fetch_primitive, push (each returns the next counts) and finish; node_bytes: of one node."""
+    """Make fetch_node, fetch_primitive and push, which each return the new counts, and finish. node_bytes: size of a node."""
     on = units.counters
     node_size = int(node_bytes)
     primitive_size = size_of(units.triangle_test.record)
 
     @wp.func
     def fetch_node(recorder: Recorder, ray: Ray, counts: Counts, index: int, boxes: int) -> Counts:
-        """Count the fetch of node `index`, and one operation of the box unit on `boxes` boxes."""
+        """Count the fetch of node `index`, and one operation of the box unit that tests `boxes` boxes."""
         if wp.static(on):
             size = wp.static(node_size)
             write_fetch(recorder, ray.slot, counts, wp.int64(index) * wp.int64(wp.static(node_size)), size)
@@ -88,7 +88,7 @@ def make_counters(units: Units, node_bytes: int) -> Any:
 
     @wp.func
     def fetch_primitive(recorder: Recorder, ray: Ray, counts: Counts, index: int) -> Counts:
-        """Count the fetch of primitive `index`, and its test."""
+        """Count the fetch of primitive `index`, which is then tested."""
         if wp.static(on):
             size = wp.static(primitive_size)
             write_fetch(recorder, ray.slot, counts, PRIMITIVE_SPACE + wp.int64(index) * wp.int64(wp.static(primitive_size)), size)
@@ -98,7 +98,7 @@ def make_counters(units: Units, node_bytes: int) -> Any:
 
     @wp.func
     def push(counts: Counts, size: int) -> Counts:
-        """Count a push; `size`: entries on the stack after it."""
+        """Count a push; `size`: number of stack entries after the push."""
         if wp.static(on):
             counts.pushes += 1
             counts.stack = wp.max(counts.stack, size)
@@ -106,9 +106,9 @@ def make_counters(units: Units, node_bytes: int) -> Any:
 
     @wp.func
     def finish(recorder: Recorder, ray: Ray, counts: Counts, best: Hit) -> Hit:
-        """Hand the counts to the recorder, and return the answer: a miss has t = inf and prim_id = -1."""
+        """Add the counts to the recorder, and return the traversal's result; a miss gets t = inf and prim_id = -1."""
         if wp.static(on):
-            if wp.static(not units.instances):  # with instances, the level above counts the ray
+            if wp.static(not units.instances):  # with instances, the upper level counts the ray
                 counts.probes += 1
             add_counts(recorder, ray.slot, counts)
         if best.prim_id == NO_HIT:

@@ -1,7 +1,7 @@
-"""The traversal unit of the uniform grid: from cell to cell along the ray (3D-DDA).
-Amanatides and Woo 1987, "A Fast Voxel Traversal Algorithm for Ray Tracing", changed to lose no ray. The distance to every plane is
-computed from its coordinate, so that errors do not add up. A ray that leaves a cell within rounding of an edge or corner also visits the
-other cells around it. The walk visits exactly the cells that the conservative box test would enter, each once."""
+"""Traversal of the uniform grid: a step from cell to cell along the ray (3D-DDA).
+Amanatides and Woo 1987, "A Fast Voxel Traversal Algorithm for Ray Tracing", changed to lose no ray. The distance to each plane is computed
+from the plane's coordinate, so that errors do not accumulate. A ray that leaves a cell near an edge or corner, within rounding, also visits
+the other cells at the edge or corner. The walk visits each cell that the conservative box test would enter once, and no other cell."""
 
 from functools import cache
 from typing import Any
@@ -18,7 +18,7 @@ from wrt.kernels.units.box import BoxRay, slab_interval
 
 @wp.struct
 class GridCell:
-    """The references first .. first + count - 1."""
+    """A cell. It lists the primitives references[first] .. references[first + count - 1]."""
 
     first: int
     count: int
@@ -26,7 +26,7 @@ class GridCell:
 
 @wp.struct
 class GridLayout:
-    """Cells of equal size, but for rounding, from lo to hi; n: cells along each axis."""
+    """A grid of cells from lo to hi with n cells along each axis. Cells have the edges `size`, except for rounding."""
 
     lo: wp.vec3
     hi: wp.vec3
@@ -36,20 +36,20 @@ class GridLayout:
 
 @wp.func
 def grid_plane(layout: GridLayout, axis: int, i: int) -> float:
-    """Coordinate of plane i of the n + 1 across this axis; monotone in i. Builder and traversal share this function."""
+    """Return the coordinate of plane i (0 .. n) across an axis; monotone in i. Builder and traversal share this function."""
     return wp.where(i >= layout.n[axis], layout.hi[axis], layout.lo[axis] + float(i) * layout.size[axis])
 
 
 @wp.func
 def guessed_slab(layout: GridLayout, axis: int, x: float) -> int:
-    """Approximate slab of x, a start for exact searches."""
+    """Return the approximate index of the slab that contains x, where an exact search can begin. A slab is a layer of cells."""
     guess = (x - layout.lo[axis]) / layout.size[axis]
     return int(wp.where(guess > 0.0, wp.min(guess, float(layout.n[axis] - 1)), 0.0))
 
 
 @wp.func
 def slab_of(layout: GridLayout, axis: int, x: float) -> int:
-    """Lowest slab whose upper plane is not below x; slabs are closed, so that a plane is in both."""
+    """Return the index of the lowest slab that contains x. Slabs are closed: the plane between two slabs belongs to both."""
     slab = guessed_slab(layout, axis, x)
     while slab < layout.n[axis] - 1 and grid_plane(layout, axis, slab + 1) < x:
         slab += 1
@@ -60,14 +60,14 @@ def slab_of(layout: GridLayout, axis: int, x: float) -> int:
 
 @wp.func
 def exit_distance(layout: GridLayout, ray: BoxRay, axis: int, cell: int) -> float:
-    """Distance at which the ray leaves this slab of cells; inf if it is parallel to it."""
+    """Return t where the ray leaves slab `cell` of an axis; inf if the ray is parallel to the slab."""
     plane = grid_plane(layout, axis, wp.where(ray.inv_dir[axis] < 0.0, cell, cell + 1))
     return wp.where(parallel(ray, axis), float(wp.inf), (plane - ray.origin[axis]) * ray.inv_dir[axis])
 
 
 @wp.func
 def first_slab(layout: GridLayout, ray: BoxRay, direction: wp.vec3, axis: int, t: float) -> int:
-    """First slab along the ray that it may not have left at t; for a parallel ray, the lowest that holds the origin."""
+    """Return the first slab along the ray that the ray may not have left at t. For a parallel ray: the lowest slab with the origin."""
     last = layout.n[axis] - 1
     if parallel(ray, axis):
         return slab_of(layout, axis, ray.origin[axis])
@@ -83,7 +83,7 @@ def first_slab(layout: GridLayout, ray: BoxRay, direction: wp.vec3, axis: int, t
 
 @wp.func
 def slabs_left(layout: GridLayout, ray: BoxRay, axis: int, slab: int, t_exit: float, limit: float) -> int:
-    """Count the slabs that the ray leaves for the next ones up to `limit`, from `slab` on, which it leaves at t_exit."""
+    """Count the slabs behind `slab` that the ray enters at t <= limit. t_exit: t where the ray leaves `slab`."""
     n = int(0)
     step = wp.where(ray.inv_dir[axis] < 0.0, -1, 1)
     while t_exit <= limit and slab + step >= 0 and slab + step < layout.n[axis]:
@@ -95,18 +95,18 @@ def slabs_left(layout: GridLayout, ray: BoxRay, axis: int, slab: int, t_exit: fl
 
 @cache
 def make_struct(record: Any) -> Any:
-    """Make the structure over records of this kind, in the order of prim_id."""
+    """Make the structure's type, for primitives stored as `record` in the order of prim_id."""
 
     @wp.struct
     class Grid:
-        lo: wp.vec3  # The GridLayout: lo, hi, size, n.
+        lo: wp.vec3  # lo, hi, size, n: the GridLayout.
         hi: wp.vec3
         size: wp.vec3
         n: wp.vec3i
         pad: float  # Largest pad of a triangle's box.
         extent: float  # Largest extent of a triangle's box.
-        mailbox: int  # 1: remember tested primitives.
-        cells: wp.array(dtype=GridCell)  # In the order x, then y, then z.
+        mailbox: int  # 1: use a mailbox (kernels.traverse.leaf); 0: do not.
+        cells: wp.array(dtype=GridCell)  # Cell (x, y, z) has the index x + n[0] * (y + n[1] * z).
         references: wp.array(dtype=wp.int32)  # Indices of primitives.
         primitives: wp.array(dtype=record)
         recorder: Recorder
@@ -125,7 +125,7 @@ def layout_of(accel: Any) -> GridLayout:
 
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """Make the unit for the closest hit, or for any hit; the walk has a box test of its own."""
+    """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found. units.box is not used."""
     probe_of = make_probe(units)
     visit_leaf = make_mailbox_leaf(units, any_hit, accepts)
     fetch_node, _, _, finish = make_counters(units, size_of(GridCell))
@@ -157,7 +157,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
             side = wp.where(axis == 2, 0, axis + 1)
             other = wp.where(axis == 0, 2, axis - 1)
             t_out = t_next[axis]
-            # The ray may leave slabs across the other two axes at the same place: their cells are visited with this one.
+            # If the ray may leave slabs of the other two axes at the same t, the next cells on these axes are visited with this cell.
             limit = wp.where(t_out < wp.inf, later(t_out), float(-wp.inf))
             side_slabs = slabs_left(layout, probe.box, side, slab[side], t_next[side], limit)
             other_slabs = slabs_left(layout, probe.box, other, slab[other], t_next[other], limit)

@@ -1,7 +1,7 @@
-"""The traversal unit of two levels: a binary BVH (TLAS) over placed structures (BLAS), each in a space of its own.
-Any traversal unit is the lower level. It gets the ray in its structure's space and returns its usual hit, so that a closed mesh stays
-watertight where it is placed. The direction is not normalised: t is the same in both spaces. This level must never pass by a structure
-that has a hit: see `enter`."""
+"""Traversal of two levels: a binary BVH (TLAS) over placed structures (BLAS), each in its own space.
+The lower level is any traversal of kernels.traverse or kernels.wide. It gets the ray in its structure's space, so that a closed mesh stays
+watertight when it is placed. The direction is not normalised, so t is equal in both spaces. The upper level must not miss a structure that
+contains a hit: see `enter`."""
 
 from functools import cache
 from typing import Any
@@ -12,31 +12,31 @@ from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
 from wrt.kernels.traverse.bvh2 import Bvh2Node, Volumes, make_binary_traversal
 from wrt.kernels.traverse.common import Probe, Units
 from wrt.kernels.traverse.counters import Counts, Recorder, add_counts
-from wrt.kernels.units.box import FAR_PAD, BoxRay, slab_interval
+from wrt.kernels.units.box import BoxRay, ray_aabb
 
 
 @wp.struct
 class Placement:
-    """A placed structure."""
+    """A structure placed in the scene."""
 
-    bottom: int  # Index of the structure.
-    first_prim: int  # prim_id of its first primitive in the scene.
-    local_x: wp.vec4d  # Rows of the affine map from the world to the structure's space: local_x, local_y, local_z.
+    bottom: int  # Index of the structure in Instances.bottoms.
+    first_prim: int  # prim_id, in the scene, of the structure's first primitive.
+    local_x: wp.vec4d  # local_x, local_y, local_z: rows of the affine map from world space to the structure's space.
     local_y: wp.vec4d
     local_z: wp.vec4d
 
 
 @cache
 def make_struct(bottom: Any) -> Any:
-    """Make the two levels over structures of this kind."""
+    """Make the type of the two-level structure over structures of type `bottom`."""
 
     @wp.struct
     class Instances:
-        nodes: wp.array(dtype=Bvh2Node)  # A tree for each world; leaves are ranges of placements.
+        nodes: wp.array(dtype=Bvh2Node)  # One tree per world; leaves are ranges of placements.
         placements: wp.array(dtype=Placement)
         bottoms: wp.array(dtype=bottom)
-        bases: wp.array(dtype=wp.int64)  # Where each structure begins in the traces' address space.
-        slack: float  # Factor of the boxes' widening: see `enter`.
+        bases: wp.array(dtype=wp.int64)  # Address at which each structure begins in traces (Recorder.base).
+        slack: float  # Factor by which `enter` widens boxes.
         recorder: Recorder
 
     return Instances
@@ -44,7 +44,7 @@ def make_struct(bottom: Any) -> Any:
 
 @wp.struct
 class WidenedRay:
-    """The ray as `enter` reads it."""
+    """A ray set up for `enter`."""
 
     box: BoxRay
     slack: float
@@ -52,32 +52,28 @@ class WidenedRay:
 
 @wp.func
 def enter(ray: BoxRay, lo: wp.vec3, hi: wp.vec3, slack: float, t_max: float) -> float:
-    """Distance of `ray_aabb` to the box widened by slack times the distance to its farthest corner.
+    """Return the result of `ray_aabb` for the box widened by slack times the distance to the box's farthest corner.
 
-    In the structure's space the ray is rounded to float32: its point at t is off by u (|o| + t |d|), per axis. A hit may be u 17 t |d|
-    outside of its primitive's box (3 for the slabs, 14 for FAR_PAD). Mapped back to the world, with A the map, that is at most u (2 + 17)
-    |A| |A^-1| times the distance. The part u |A| times the coordinates is in the builder's box (wrt.accel.instances). The rounding of this
-    test adds 4.
+    In the structure's space, the ray is rounded to float32: its point at t is off by u (|o| + t |d|) per axis. A hit may be 17 u t |d|
+    outside its primitive's box (3 for the slabs, 14 for FAR_PAD). In world space, with the map A from the structure to the world, that is
+    at most u (2 + 17) |A| |A^-1| times the distance. The builder's box contains the part u |A| times the coordinates
+    (wrt.accel.instances). The rounding of this test adds 4.
 
-    slack = 32 u max |A| |A^-1| (sums of rows) covers them. So this distance never exceeds a hit's t inside: no hit is passed by, in any
-    order of visits.
+    slack = 32 u max |A| |A^-1| covers these errors; |A| is the largest sum of absolute values in a row. So the returned t is never greater
+    than the t of a hit inside, and no hit is lost, in any order of visits.
     """
     if lo[0] > hi[0]:
-        return float(wp.inf)  # widened, an empty box would not be empty
+        return float(wp.inf)  # an empty box, which widening would make non-empty
     to_lo = wp.abs(lo - ray.origin)
     to_hi = wp.abs(hi - ray.origin)
     pad = slack * wp.max(wp.max(to_lo), wp.max(to_hi))
     widening = wp.vec3(pad, pad, pad)
-    interval = slab_interval(ray, lo - widening, hi + widening)
-    begin = wp.where(interval[0] > ray.t_min, interval[0], ray.t_min)
-    end = interval[1] * FAR_PAD
-    end = wp.where(end < t_max, end, t_max)
-    return wp.where(begin <= end, begin, float(wp.inf))
+    return ray_aabb(ray, lo - widening, hi + widening, t_max)
 
 
 @wp.func
 def power_of_two(longest: wp.float64) -> wp.float64:
-    """Power of two that brings a number > 0 between 2^-64 and 2^64, the range of a direction's longest component; usually 1."""
+    """Return the power of two that scales a number > 0 to between 2^-64 and 2^64, the range for a direction's longest component."""
     scale = wp.float64(1.0)
     x = longest
     steps = int(0)
@@ -94,7 +90,7 @@ def power_of_two(longest: wp.float64) -> wp.float64:
 
 @wp.func
 def local_scale(place: Placement, direction: wp.vec3) -> wp.float64:
-    """Power of two that scales the direction in the structure's space; t there times the scale is t in the world."""
+    """Return the power of two by which `local_ray` scales the direction; t in the structure's space times it is t in world space."""
     d = wp.vec4d(wp.float64(direction[0]), wp.float64(direction[1]), wp.float64(direction[2]), wp.float64(0.0))
     return power_of_two(
         wp.max(wp.max(wp.abs(wp.dot(place.local_x, d)), wp.abs(wp.dot(place.local_y, d))), wp.abs(wp.dot(place.local_z, d)))
@@ -103,7 +99,7 @@ def local_scale(place: Placement, direction: wp.vec3) -> wp.float64:
 
 @wp.func
 def local_ray(place: Placement, ray: Ray, scale: wp.float64) -> Ray:
-    """Ray in the structure's space: computed in float64, rounded once; scale: `local_scale`."""
+    """Transform a ray to the structure's space, in float64, rounded once; scale: `local_scale`."""
     o = wp.vec4d(wp.float64(ray.origin[0]), wp.float64(ray.origin[1]), wp.float64(ray.origin[2]), wp.float64(1.0))
     d = wp.vec4d(wp.float64(ray.direction[0]), wp.float64(ray.direction[1]), wp.float64(ray.direction[2]), wp.float64(0.0))
     out = Ray()
@@ -120,11 +116,11 @@ def local_ray(place: Placement, ray: Ray, scale: wp.float64) -> Ray:
 
 
 def make_placed_leaf(units: Units, any_hit: bool, bottom: Any, struct: Any) -> Any:
-    """Make the leaf of the upper level (kernels.traverse.leaf); bottom: traversal of the placed structures."""
+    """Make visit_leaf (kernels.traverse.leaf) for the upper level; bottom: the traversal of the placed structures."""
 
     @wp.func
     def visit(accel: struct, surfaces: Surfaces, ray: Ray, index: int, best: Hit) -> Hit:
-        """Better of `best` and the hit in one placed structure; the lower prim_id at equal t."""
+        """Return the closer of `best` and the hit in one placed structure; at equal t, the hit with the lower prim_id."""
         place = accel.placements[index]
         structure = accel.bottoms[place.bottom]
         if wp.static(units.counters):
@@ -141,7 +137,7 @@ def make_placed_leaf(units: Units, any_hit: bool, bottom: Any, struct: Any) -> A
 
     @wp.func
     def visit_leaf(accel: struct, surfaces: Surfaces, probe: Probe, first: int, count: int, best: Hit, counts: Counts):
-        if wp.static(units.counters):  # the lower level adds its own counts
+        if wp.static(units.counters):  # the lower level adds its own counts to the recorder, so these must be there first
             add_counts(accel.recorder, probe.ray.slot, counts)
             counts = Counts()
         for i in range(first, first + count):
@@ -155,8 +151,8 @@ def make_placed_leaf(units: Units, any_hit: bool, bottom: Any, struct: Any) -> A
 
 
 def make_traversal(units: Units, any_hit: bool, bottom: Any, bottom_struct: Any) -> Any:
-    """Make the unit for the closest hit, or for any hit, in the world whose root is ray.first_prim. bottom: the lower level's traversal,
-    made with these units."""
+    """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found. It walks the world whose root is
+    node ray.first_prim. bottom: the lower level's traversal, made with the same units."""
     struct = make_struct(bottom_struct)
 
     @wp.func
@@ -176,6 +172,6 @@ def make_traversal(units: Units, any_hit: bool, bottom: Any, bottom_struct: Any)
         return ray.first_prim
 
     volumes = Volumes(struct, Bvh2Node, set_up, enter_both, root)
-    # Only the lower walk may use shared memory: this walk goes on behind it.
+    # This walk must not use shared memory: it continues after the lower walk, which may overwrite the entries.
     visit_leaf = make_placed_leaf(units, any_hit, bottom, struct)
     return make_binary_traversal(units._replace(instances=False, stack="local"), volumes, visit_leaf, any_hit)

@@ -1,12 +1,12 @@
-"""The traversal unit of the k-d tree: cells from front to back, with a stack.
+"""Traversal of the k-d tree: cells from front to back, with a stack.
 
-Havran 2000, "Heuristic Ray Shooting Algorithms", appendix C. The splitting plane cuts the part of the ray inside a cell, [t_enter,
-t_exit]. The walk visits the nearer child at once and pushes the farther one with its part. Cells do not overlap: the first cell with a hit
-inside ends the walk.
+Havran 2000, "Heuristic Ray Shooting Algorithms", appendix C. The splitting plane cuts the ray's part inside a cell, [t_enter, t_exit]. The
+walk visits the nearer child at once, and pushes the farther child with its part. Cells do not overlap, so the first cell that contains its
+hit ends the walk.
 
-Rounding loses no hit. Both parts are widened by the error of the plane's distance and of the hit's t, which are proportional to the
-distance. Errors proportional to the triangle are in the leaves: their triangles are clipped to larger cells (kernels.build.clip). A ray in
-the splitting plane has the distance 0 * inf = NaN, and comparisons that are false for NaN send it whole to both sides.
+Rounding loses no hit. Both parts are widened by the errors of the plane's distance and of the hit's t, which are proportional to the
+distance. The builder covers errors proportional to the triangle: it clips triangles to slightly larger cells (kernels.build.clip). If the
+ray lies in the splitting plane, the plane's distance is 0 * inf = NaN, and the comparisons below send the whole part to both sides.
 """
 
 from functools import cache
@@ -14,18 +14,16 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.structs import NO_HIT, Hit, Ray, size_of
+from wrt.kernels.structs import NO_HIT, Hit, Ray, largest, size_of
 from wrt.kernels.traverse.cell_ray import earlier, later
 from wrt.kernels.traverse.common import Probe, Units, make_probe, no_hit
 from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
 from wrt.kernels.traverse.leaf import make_leaf
 from wrt.kernels.units.box import slab_interval
 
-# Builders keep the depth at or below this; a path from the root pushes at most one node a level.
+# Stack entries. Builders keep a tree's depth at or below STACK_SIZE, because the walk pushes at most one node per level.
 STACK_SIZE = 64
-
-# KdNode.word is 4 * (left child, or first primitive of a leaf) + LEAF, or + the axis of the plane.
-LEAF = wp.constant(3)
+LEAF = wp.constant(3)  # KdNode.word modulo 4 in a leaf
 
 CLAMP_RELATIVE = wp.constant(1.0 + 2.0**-19)
 CLAMP_GRAZING = wp.constant(2.0**-20)
@@ -33,8 +31,8 @@ CLAMP_GRAZING = wp.constant(2.0**-20)
 
 @wp.struct
 class KdNode:
-    """An inner node: split is the plane's coordinate, word = 4 left + axis, and the right child is left + 1. 8 bytes.
-    A leaf: split is the number of primitives, word = 4 first + LEAF."""
+    """A node of 8 bytes. In an inner node, split is the plane's coordinate and word = 4 * left + axis; the right child is node left + 1.
+    In a leaf, split is the number of primitives and word = 4 * first + LEAF, for the first primitive's index."""
 
     split: float
     word: int
@@ -42,8 +40,8 @@ class KdNode:
 
 @cache
 def make_struct(record: Any) -> Any:
-    """Make the structure over records of this kind; nodes[0] is the root, with the cell lo, hi. Primitives are in the order of the leaves,
-    once in each leaf that they reach into."""
+    """Make the structure's type; nodes[0] is the root, with the cell lo .. hi. Primitives are stored as `record`, in the order of the
+    leaves, once for each leaf whose cell they meet."""
 
     @wp.struct
     class KdTree:
@@ -59,27 +57,26 @@ def make_struct(record: Any) -> Any:
 
 @wp.func
 def clamp_slack(direction: wp.vec3, inv_dir: wp.vec3, reach: float) -> float:
-    """Distance by which the clamp to a triangle's box may move a hit along the ray.
-    A ray that misses a triangle by rounding, 16 u of its extent, may still hit, with t clamped to the triangle's box (`within_bounds`). A
-    ray that leaves the box at a shallow angle is then far from the triangle, outside the leaves around it. The distance is 16 u extent /
-    |d|, for the axis with the smallest |d| that is not 0, and at most the length of the box."""
-    longest = wp.max(wp.max(wp.abs(direction[0]), wp.abs(direction[1])), wp.abs(direction[2]))
+    """Return a bound on the change of t by clamping to a triangle's box (`within_bounds`); reach: largest extent of a clipped triangle.
+    The triangle unit may report a hit for a ray that misses the triangle by 16 u of its extent. After clamping t on a grazing ray, the hit
+    may be far from the triangle, outside the leaves that list it. The bound is 16 u extent / |d|, for the smallest component |d| that is
+    not 0. It is at most the length of the ray's part in the box."""
     steepest = float(0.0)
     for axis in range(3):
         inverse = wp.abs(inv_dir[axis])
         if inverse < wp.inf:
             steepest = wp.max(steepest, inverse)
-    return reach * wp.min(CLAMP_GRAZING * steepest, 1.01 / longest)
+    return reach * wp.min(CLAMP_GRAZING * steepest, 1.01 / largest(direction))
 
 
 @wp.func
 def limit_of(t: float, slack: float) -> float:
-    """Limit behind which no cell begins that holds a hit nearer than t."""
+    """Return the distance up to which a cell may begin that contains a hit with a smaller or equal t."""
     return t * CLAMP_RELATIVE + slack
 
 
 def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
-    """Make walk(accel, surfaces, probe, part, slack, counts) -> best hit, counts; part: of the ray, (t_enter, t_exit)."""
+    """Make walk(accel, surfaces, probe, part, slack, counts) -> (best Hit, Counts); part: (t_enter, t_exit) in the root's cell."""
     visit_leaf = make_leaf(units, any_hit, accepts)
     fetch_node, _, push, _ = make_counters(units, size_of(KdNode))
 
@@ -125,7 +122,7 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
             if wp.static(any_hit):
                 if best.prim_id != NO_HIT:
                     break
-            # Pop the next cell that does not begin beyond the closest hit. Equal t stays: a tie may have a lower prim_id there.
+            # Pop the next cell that begins at or before the closest hit: at the same t, it may have a hit with a lower prim_id.
             limit = limit_of(best.t, slack)
             found = bool(False)
             while size > 0 and not found:
@@ -141,7 +138,7 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
 
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """Make the unit for the closest hit, or for any hit."""
+    """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found."""
     probe_of = make_probe(units)
     ray_aabb = units.box_test
     walk = make_walk(units, any_hit, accepts)
@@ -153,7 +150,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
         probe = probe_of(ray)
         best = no_hit(ray)
         counts = Counts()
-        counts.boxes += 1  # the root's cell is part of the structure
+        counts.boxes += 1  # the box of the root's cell
         counts.box_operations += 1
         if ray_aabb(probe.box, accel.lo, accel.hi, best.t) < wp.inf:
             slack = clamp_slack(ray.direction, probe.box.inv_dir, accel.reach)

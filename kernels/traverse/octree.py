@@ -1,7 +1,7 @@
-"""The traversal unit of the octree: from the root down to the octants that the ray meets, front to back.
-Glassner 1984, "Space Subdivision for Fast Ray Tracing". The stack has one entry a level, with a mask of the pending octants, as in Laine
-and Karras 2010, "Efficient Sparse Voxel Octrees". The distance to every plane is computed from its coordinate, so that errors do not add
-up. The walk enters exactly the octants that the conservative box test would enter. Octants without primitives have no node."""
+"""Traversal of the octree: from the root down to the octants that the ray meets, from front to back.
+Glassner 1984, "Space Subdivision for Fast Ray Tracing". The stack has one entry per level, with a mask of the pending octants, as in Laine
+and Karras 2010, "Efficient Sparse Voxel Octrees". The distance to each plane is computed from the plane's coordinate, so that errors do not
+accumulate. The walk enters the same octants as the conservative box test. Octants without primitives have no node."""
 
 from functools import cache
 from typing import Any
@@ -15,15 +15,14 @@ from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
 from wrt.kernels.traverse.leaf import Mailbox, make_mailbox_leaf
 from wrt.kernels.units.box import BoxRay, slab_interval
 
-# Corners of cells are multiples of the finest cell, exact in float32; the stack has one entry a level.
-MAX_LEVELS = 20
+MAX_LEVELS = 20  # levels, and stack entries: corners of cells, in units of the finest cell, are integers that are exact in float32
 
 
 @wp.struct
 class OctreeNode:
-    """A leaf (count >= 0) with the references first .. first + count - 1, or an inner node; 8 bytes. In an inner node, -count is the mask
-    of the octants that have a node; these nodes stand one after another from `first` on. Bit k of the mask is octant k; in k, bits 1, 2, 4
-    select the upper half in x, y, z."""
+    """A node of 8 bytes. A leaf (count >= 0) lists the primitives references[first] .. references[first + count - 1].
+    In an inner node, -count is the mask of the octants that have a node; their nodes are consecutive from `first` on. Bit k of the mask
+    stands for octant k, where the bits of value 1, 2, 4 in k select the upper half in x, y, z."""
 
     first: int
     count: int
@@ -31,7 +30,7 @@ class OctreeNode:
 
 @wp.struct
 class OctreeLayout:
-    """The root's cell from lo to hi, and the finest cells: cubes of edge `size`, 2^levels along each axis, up to hi or beyond."""
+    """The root's cell lo .. hi, and the finest cells: cubes of edge `size`, 2^levels along each axis from lo on, cut off at hi."""
 
     lo: wp.vec3
     hi: wp.vec3
@@ -41,26 +40,26 @@ class OctreeLayout:
 
 @wp.func
 def octree_planes(layout: OctreeLayout, corner: wp.vec3i) -> wp.vec3:
-    """Coordinates of the planes with these indices, in finest cells, across x, y and z. Monotone, and never outside the root's cell, whose
-    last planes are hi. Builder and traversal share this function."""
+    """Return the coordinates of a corner that is given in finest cells. Monotone, and inside the root's cell.
+    Builder and traversal share this function."""
     return wp.min(layout.lo + layout.size * wp.vec3(float(corner[0]), float(corner[1]), float(corner[2])), layout.hi)
 
 
 @wp.func
 def octant_corner(octant: int, half: int) -> wp.vec3i:
-    """Lowest corner of an octant, relative to that of its cell; half: half the cell's edge. In finest cells."""
+    """Return an octant's lowest corner minus its cell's lowest corner; half: half the cell's edge. Both in finest cells."""
     return half * wp.vec3i(octant & 1, (octant >> 1) & 1, (octant >> 2) & 1)
 
 
 @wp.func
 def distances(layout: OctreeLayout, ray: BoxRay, corner: wp.vec3i) -> wp.vec3:
-    """Distances at which the ray meets the three planes of a corner; NaN for a plane that it lies in."""
+    """Return t where the ray meets each of the three planes through a corner; NaN for a plane that contains the ray."""
     return wp.cw_mul(octree_planes(layout, corner) - ray.origin, ray.inv_dir)
 
 
 @wp.func
 def latest(t: wp.vec3, begin: float) -> float:
-    """Largest of `begin` and the three distances, NaN ignored."""
+    """Return the largest of `begin` and three distances, ignoring NaN."""
     out = wp.where(t[0] > begin, t[0], begin)
     out = wp.where(t[1] > out, t[1], out)
     return wp.where(t[2] > out, t[2], out)
@@ -68,7 +67,7 @@ def latest(t: wp.vec3, begin: float) -> float:
 
 @wp.func
 def earliest(t: wp.vec3, end: float) -> float:
-    """Smallest of `end` and the three distances, NaN ignored."""
+    """Return the smallest of `end` and three distances, ignoring NaN."""
     out = wp.where(t[0] < end, t[0], end)
     out = wp.where(t[1] < out, t[1], out)
     return wp.where(t[2] < out, t[2], out)
@@ -85,9 +84,10 @@ def in_order(mask: int, flip: int) -> int:
 
 @wp.func
 def octants_met(occupied: int, enter: float, middle: wp.vec3, leave: float) -> int:
-    """Mask of the occupied octants that the ray meets in a cell that it meets from `enter` to `leave` (widened).
-    Octants are in the order of the ray: bits 1, 2, 4 of an index are its half in x, y, z, 0 for the nearer one. An octant is met unless it
-    begins, on one axis, after it ends on another. The box test of each octant would say the same, to the last bit."""
+    """Return the mask of the occupied octants that the ray meets in a cell, in which it is from `enter` to `leave` (widened).
+    Octants are in the order of the ray: the bits of value 1, 2, 4 in an index are 0 for the nearer half in x, y, z. Argument `middle` has
+    the distances to the planes between the halves. The ray meets an octant unless the octant's interval on one axis begins after that on
+    another axis ends. The result equals box tests of all octants."""
     met = occupied
     x = later(middle[0])
     y = later(middle[1])
@@ -108,17 +108,17 @@ def octants_met(occupied: int, enter: float, middle: wp.vec3, leave: float) -> i
 
 @cache
 def make_struct(record: Any) -> Any:
-    """Make the structure over records of this kind, in the order of prim_id; nodes[0] is the root."""
+    """Make the structure's type, for primitives stored as `record` in the order of prim_id; nodes[0] is the root."""
 
     @wp.struct
     class Octree:
-        lo: wp.vec3  # The OctreeLayout: lo, hi, size, levels.
+        lo: wp.vec3  # lo, hi, size, levels: the OctreeLayout.
         hi: wp.vec3
         size: float
         levels: int
         pad: float  # Largest pad of a triangle's box.
         extent: float  # Largest extent of a triangle's box.
-        mailbox: int  # 1: remember tested primitives.
+        mailbox: int  # 1: use a mailbox (kernels.traverse.leaf); 0: do not.
         nodes: wp.array(dtype=OctreeNode)
         references: wp.array(dtype=wp.int32)  # Indices of primitives.
         primitives: wp.array(dtype=record)
@@ -129,14 +129,14 @@ def make_struct(record: Any) -> Any:
 
 @wp.struct
 class OctreeRay:
-    """The ray as the walk reads it."""
+    """A ray set up for the walk."""
 
     layout: OctreeLayout
     box: BoxRay
-    backwards: wp.vec3i  # 1 on each axis along which the direction is negative, else 0.
-    flip: int  # The same as a mask.
-    begin: float  # Distance at which the walk begins.
-    slack: float  # Distance that the walk goes on behind the best hit.
+    backwards: wp.vec3i  # For each axis: 1 if the direction's component is negative, else 0.
+    flip: int  # `backwards` as a mask. XOR with it converts an octant's index from the order of space to the order of the ray.
+    begin: float  # t where the walk begins.
+    slack: float  # Length, in t, by which the walk continues behind the best hit.
 
 
 @wp.func
@@ -158,13 +158,14 @@ def octree_ray(accel: Any, box: BoxRay, t_min: float) -> OctreeRay:
 
 @wp.func
 def distance_to_cell(ray: OctreeRay, corner: wp.vec3i, size: int) -> float:
-    """Distance at which the ray enters the cell of `size` finest cells with this lowest corner, at least ray.begin."""
+    """Return t, at least ray.begin, where the ray enters the cell with this lowest corner and the edge `size`, in finest cells."""
     return latest(distances(ray.layout, ray.box, corner + size * ray.backwards), ray.begin)
 
 
 @wp.func
 def enter_octants(ray: OctreeRay, occupied: int, corner: wp.vec3i, size: int, enter: float, limit: float) -> int:
-    """Mask, in the order of the ray, of the occupied octants that it meets up to `limit`, in the cell that it enters at `enter`."""
+    """Return the mask, in the order of the ray, of the occupied octants that the ray meets at t <= limit in a cell.
+    The cell has the lowest corner `corner` and the edge `size`, in finest cells. The ray enters the cell at t = enter."""
     forwards = wp.vec3i(1, 1, 1) - ray.backwards
     leave = later(earliest(distances(ray.layout, ray.box, corner + size * forwards), float(wp.inf)))
     half = size >> 1
@@ -173,7 +174,7 @@ def enter_octants(ray: OctreeRay, occupied: int, corner: wp.vec3i, size: int, en
 
 
 def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
-    """Make walk(accel, surfaces, probe, set_up, enter, counts) -> best hit, counts; enter: where the root's cell begins."""
+    """Make walk(accel, surfaces, probe, set_up, enter, counts) -> (best Hit, Counts); enter: t where the ray enters the root's cell."""
     visit_leaf = make_mailbox_leaf(units, any_hit, accepts)
     fetch_node, _, push, _ = make_counters(units, size_of(OctreeNode))
 
@@ -212,7 +213,7 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
                 if wp.static(any_hit):
                     if best.prim_id != NO_HIT:
                         break
-            # Go on with the first octant of the node just met, or the next pending one that can hold a better hit.
+            # Continue with the first octant of the node just entered, or with the next pending octant that may contain a better hit.
             fresh = left != 0
             found = bool(False)
             while level > 0 and not found:
@@ -240,7 +241,7 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
 
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """Make the unit for the closest hit, or for any hit; the walk has a box test of its own."""
+    """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found. units.box is not used."""
     probe_of = make_probe(units)
     walk = make_walk(units, any_hit, accepts)
     _, _, _, finish = make_counters(units, 0)
@@ -251,7 +252,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
         probe = probe_of(ray)
         best = no_hit(ray)
         counts = Counts()
-        counts.boxes += 1  # the root's cell is part of the structure
+        counts.boxes += 1  # the box of the root's cell
         counts.box_operations += 1
         set_up = octree_ray(accel, probe.box, ray.t_min)
         interval = slab_interval(probe.box, accel.lo, accel.hi)

@@ -1,5 +1,5 @@
-"""The stack of a walk: a local vector of the thread, or on CUDA partly in shared memory.
-With the place "shared", CUDA keeps the first entries in the block's shared memory; most rays need no more (docs/acceleration.md,
+"""The stack of a traversal: in a thread's local memory or, on CUDA, partly in shared memory.
+In the place "shared", the first entries are in the shared memory of a CUDA block; most rays need no more entries (docs/acceleration.md,
 "Structure and blocks on a GPU"). Aila and Laine 2009, "Understanding the Efficiency of Ray Traversal on GPUs"; Ylitie, Karras and Laine
 2017, "Efficient Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs"."""
 
@@ -9,21 +9,21 @@ from typing import Any, NamedTuple
 import warp as wp
 
 PLACES = ("local", "shared")
-SHARED = 64  # Bytes of shared memory a thread: with more, a T4 would hold fewer warps.
+SHARED = 64  # Bytes of shared memory per thread. With more, fewer warps would fit on a multiprocessor of a T4.
 
 
 class Stack(NamedTuple):
-    """Functions of a stack. Of two nested walks in one thread, at most one may use shared memory."""
+    """Functions of a stack. If a thread nests two walks, only one of them may use shared memory."""
 
-    new: Any  # Function () -> the local entries, not initialised.
-    shared: Any  # Function () -> the address of the thread's entries in shared memory.
-    put: Any  # Function (entries, shared, i, entry).
-    get: Any  # Function (entries, shared, i) -> entry.
+    new: Any  # Function () -> entries: the thread's local memory, not initialised.
+    shared: Any  # Function () -> shared: the address of the thread's entries in shared memory.
+    put: Any  # Function (entries, shared, i, entry): write entry i.
+    get: Any  # Function (entries, shared, i) -> entry i.
 
 
 @cache
 def make_uninitialized(length: int, dtype: Any) -> Any:
-    """Make an uninitialised vector: Warp sets new ones to 0, and most rays use little of a stack's 512 bytes."""
+    """Make uninitialized(), which returns an uninitialised vector. Warp sets new vectors to 0: a waste, as most rays use few entries."""
     of = f"wp::vec_t<{length}, wp::{dtype.__name__}>"
 
     @wp.func_native(f"alignas({of}) char memory[sizeof({of})]; return *({of}*)memory;")
@@ -34,17 +34,17 @@ def make_uninitialized(length: int, dtype: Any) -> Any:
 
 @cache
 def make_stack(place: str, size: int, dtype: Any, entry_bytes: int) -> Stack:
-    """Make a stack of `size` values of a type; `entry_bytes` counts the parallel stacks of the same walk too. All stacks of one place and
-    type share one piece of shared memory."""
+    """Make a stack of `size` values of a type. entry_bytes: size of an entry, summed over the parallel stacks of a walk. All stacks of the
+    same place and type share one block of shared memory."""
     vector = wp.types.vector(size, dtype)
     short = SHARED // entry_bytes if place == "shared" else 0
     at = f"((wp::{dtype.__name__}*)shared)[i * WP_TILE_BLOCK_DIM]"
 
     def on_cuda(text: str, otherwise: str) -> str:
-        """Return C++ with that text for CUDA, if entries are shared."""
+        """Return C++ that is `text` on CUDA, and `otherwise` on the CPU or if the place is "local"."""
         return f"\n#if defined(__CUDA_ARCH__)\n    {text}\n#else\n    {otherwise}\n#endif\n" if short else otherwise
 
-    # Entries of one depth are adjacent: threads of a warp never conflict in a bank.
+    # In shared memory, the entries i of all threads are adjacent, so that the threads of a warp have no bank conflicts.
     @wp.func_native(on_cuda(f"__shared__ wp::{dtype.__name__} first[{short} * WP_TILE_BLOCK_DIM];"
                             " return (wp::uint64)(first + threadIdx.x);", "return 0;"))
     def shared() -> wp.uint64: ...
@@ -60,7 +60,7 @@ def make_stack(place: str, size: int, dtype: Any, entry_bytes: int) -> Stack:
 
 @wp.func
 def key_of(t: float, reference: int) -> wp.uint64:
-    """Pack an entry of the stack: keys are in the order of t, which is never below 0 nor -0."""
+    """Pack t and a reference into a stack entry. Keys sort by t, which must be at least 0 and not -0."""
     return (wp.uint64(wp.cast(t, wp.uint32)) << wp.uint64(32)) | wp.uint64(wp.cast(reference, wp.uint32))
 
 

@@ -1,1 +1,1 @@
-"""The RT core's test units: one ray against one box, triangle, sphere or other bounding volume."""
+"""Tests of one ray against one box, triangle, sphere or other bounding volume: the test units of an RT core."""

@@ -1,27 +1,28 @@
-"""The unit for bounding spheres: the test of a ray against a sphere around a subtree.
-It lets every hit through and finds none; exact hits on spheres are `sphere.py`'s. A sphere is a vec4 (center, radius); a negative radius
-marks an empty one."""
+"""The test of a ray against the bounding sphere of a subtree. `sphere.py` computes hits on spheres that are primitives.
+The test accepts every ray that hits something inside. A sphere is a vec4 (center, radius); a negative radius marks an empty sphere."""
 
 import warp as wp
 
 from wrt.kernels.structs import Ray
+from wrt.kernels.units.box import entry_of
 
-# Errors relative to distance + radius, in units of 2^-24: the line's distance from the center 7, the point nearest to it 8, the ends of
-# the chord 4. A hit is clamped to its primitive's padded box by distances that are rounded too (3 errors each, and FAR_PAD): 18. The sum,
-# 37, is below 64.
+# Bound on errors relative to distance + radius. In units of 2^-24, the line's distance from the center has the error 7, the line's point
+# nearest to the center 8, the ends of the chord 4. Clamping t to the primitive's padded box adds 18 (3 per slab distance, and FAR_PAD). The
+# sum, 37, is below 64.
 SPHERE_PAD = wp.constant(2.0**-18)
-# Squares overflow above LARGEST: such a sphere is always entered. They underflow below SMALLEST, which every radius grows by.
+# Squares of lengths above LARGEST may overflow: the ray always enters such a sphere. Squares of lengths below SMALLEST may underflow: so
+# the test adds SMALLEST to every radius.
 LARGEST = wp.constant(2.0**60)
 SMALLEST = wp.constant(2.0**-60)
 
 
 @wp.struct
 class SphereRay:
-    """The ray as the bounding-sphere test reads it, in the space of the spheres."""
+    """A ray set up for the bounding-sphere test, in the space of the spheres."""
 
     origin: wp.vec3
     direction: wp.vec3  # Of unit length.
-    inv_length: float  # 1 / length of the ray's own direction: t = distance * inv_length.
+    inv_length: float  # 1 / length of Ray.direction, to convert a distance to t.
     t_min: float
 
 
@@ -40,9 +41,9 @@ def sphere_ray(ray: Ray) -> SphereRay:
 
 @wp.func
 def ray_bounding_sphere(ray: SphereRay, sphere: wp.vec4, t_max: float) -> float:
-    """Distance at which the segment [t_min, t_max] enters the sphere, or inf if it misses.
-    An origin inside gives t_min; an empty sphere gives inf. Conservative: the radius grows by SPHERE_PAD (distance + radius), which bounds
-    all rounding. The domain is that of `ray_aabb`. A ray with NaN may enter."""
+    """Return t where the segment [t_min, t_max] enters the sphere: t_min for an origin inside, inf for a miss or an empty sphere.
+    Conservative: the radius grows by SPHERE_PAD (distance + radius), which bounds all rounding errors. The domain is the same as for
+    `box.ray_aabb`. A ray with NaN may enter."""
     x = ray.origin[0] - sphere[0]
     y = ray.origin[1] - sphere[1]
     z = ray.origin[2] - sphere[2]
@@ -60,8 +61,4 @@ def ray_bounding_sphere(ray: SphereRay, sphere: wp.vec4, t_max: float) -> float:
     if not square >= 0.0:
         return float(wp.inf)
     half = wp.sqrt(square)
-    enter = (middle - half) * ray.inv_length
-    leave = (middle + half) * ray.inv_length
-    enter = wp.where(enter > ray.t_min, enter, ray.t_min)
-    leave = wp.where(leave < t_max, leave, t_max)
-    return wp.where(enter <= leave, enter, float(wp.inf))
+    return entry_of((middle - half) * ray.inv_length, (middle + half) * ray.inv_length, ray.t_min, t_max)

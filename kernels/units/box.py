@@ -1,25 +1,24 @@
-"""The box unit: the test of a ray against an axis-aligned box.
+"""The box unit: the test of a ray against an axis-aligned box. RAY_AABB is the table of box tests.
 
-The reciprocal direction is computed once a ray (`BoxRay`); a box then takes three subtractions and three multiplications for each of its
-two corners. Distances are (plane - origin) * inv_dir: the cheaper plane * inv_dir - origin * inv_dir cancels, and loses rays. RAY_AABB is
-the table of tests.
+`BoxRay` holds the reciprocal direction, computed once per ray. A box then takes three subtractions and three multiplications for each of
+its two corners. Distances are (plane - origin) * inv_dir. The cheaper plane * inv_dir - origin * inv_dir suffers from cancellation, and
+loses rays.
 
-**What runs.** This file tests one box and one ray, in all structures but bvh4, bvh8 and bvh8c. Those test the children of a node together:
-`kernels/wide/nodes.py`, on a CPU `kernels/wide/box.h`. They enter every box that this file enters, at the same distance
-(tests/kernels/wide/test_lanes.py); packets have their bits
-(tests/kernels/wide/test_packets.py). The whole table: kernels/README.md.
+**What runs.** All structures except bvh4, bvh8 and bvh8c call this file, for one box and one ray. These three test all children of a node
+together, in `kernels/wide/nodes.py` and, on a CPU, `kernels/wide/box.h`. There, a ray enters every box that it enters here, at the same
+distance (tests/kernels/wide/test_lanes.py, tests/kernels/wide/test_packets.py). The table of all cases is in kernels/README.md.
 """
 
 import warp as wp
 
 from wrt.kernels.structs import Ray
 
-# The far distance carries at most 3 rounding errors, and so does the near distance of another axis. The interval is widened by twice that
-# (Ize 2013, "Robust BVH Ray Traversal", section 3). Each side grows by 4 more, because the triangle unit rounds sheared vertices in
-# proportion to the distance. `padded_lo` and `padded_hi` cover the rest.
+# Factor of far distances. Far and near distances carry at most 3 rounding errors each, so the interval grows by 2 * 3 errors (Ize 2013,
+# "Robust BVH Ray Traversal", section 3). Each end grows by 4 more errors, because the triangle unit rounds sheared vertices in proportion
+# to the distance. `padded_lo` and `padded_hi` cover errors in proportion to the box.
 FAR_PAD = wp.constant(1.0 + 2.0 * (7.0 * 2.0**-24) / (1.0 - 7.0 * 2.0**-24))
 
-# Powers of two: the host computes the same box to the last bit (wrt.accel.geometry.Geometry.bounds).
+# Factors of box_pad. They are powers of two, so that the host computes the same bits (wrt.accel.geometry.Geometry.bounds).
 PAD_EXTENT = 2.0**-21
 PAD_COORDINATE = 2.0**-22
 PAD_SMALLEST = 2.0**-148
@@ -27,10 +26,10 @@ PAD_SMALLEST = 2.0**-148
 
 @wp.struct
 class BoxRay:
-    """The ray as the box unit reads it."""
+    """A ray set up for the box unit."""
 
     origin: wp.vec3
-    inv_dir: wp.vec3  # +-inf for a component of the direction that is +-0.
+    inv_dir: wp.vec3  # 1 / direction; +-inf where the direction's component is +-0.
     t_min: float
 
 
@@ -46,13 +45,13 @@ def box_ray(ray: Ray) -> BoxRay:
 
 @wp.func
 def box_pad(lo: wp.vec3, hi: wp.vec3) -> float:
-    """Distance by which a primitive's box grows so that it contains every hit that the primitive's unit accepts.
+    """Return the distance by which to grow a primitive's box lo .. hi, so that it contains every hit that the triangle unit accepts.
 
-    The triangle unit sees vertices off by up to 3 u of the hit's distance (FAR_PAD covers that) and 5 u of the triangle's extent. The
-    extent may be far longer than the ray: a ray that starts just above a floor 1000 wide. Without the pad, a ray through the edge of two
-    triangles can go to the triangle whose box it misses, and is lost. The pad is 8 u of the extent; `padded_lo` and `padded_hi` add 4 u of
-    the coordinates for the rounding of lo and hi. PAD_SMALLEST covers underflow in the shear; it changes only the pads of triangles below
-    2^-103.
+    In the triangle unit, vertices are off by up to 3 u of the hit's distance, which FAR_PAD covers, and by 5 u of the triangle's extent
+    (u = 2^-24). The extent may be far longer than the ray, for example on a floor of width 1000 just below the ray's origin. Without the
+    pad, a ray through the common edge of two triangles may hit only the triangle whose box it misses, and would be lost. The pad is 8 u of
+    the extent. `padded_lo` and `padded_hi` add 4 u of the coordinates, for the rounding of lo and hi. PAD_SMALLEST covers underflow in the
+    shear; it matters only for triangles smaller than 2^-103.
     """
     e = hi - lo
     return wp.static(PAD_EXTENT) * wp.max(wp.max(e[0], e[1]), e[2]) + wp.static(PAD_SMALLEST)
@@ -70,10 +69,10 @@ def padded_hi(hi: wp.vec3, pad: float) -> wp.vec3:
 
 @wp.func
 def slab_interval(ray: BoxRay, lo: wp.vec3, hi: wp.vec3) -> wp.vec2:
-    """Distances at which the infinite line enters and leaves the box; entry > exit if it misses.
-    The direction's sign selects near and far planes. A line in a face gives 0 * inf = NaN for that plane, and comparisons that are false
-    for NaN ignore it. An empty box (lo = inf, hi = -inf) is never entered. Monotone to the last bit: a larger box never has a later entry
-    or an earlier exit."""
+    """Return (entry, exit): t where the infinite line enters and leaves the box; entry > exit if it misses the box.
+    The direction's signs select near and far planes. If the line lies in a face, the distance to that plane is 0 * inf = NaN, and the
+    comparisons below ignore NaN. No line enters an empty box (lo = inf, hi = -inf). Monotone to the last bit: a larger box never has a
+    later entry or an earlier exit."""
     near_x = wp.where(ray.inv_dir[0] < 0.0, hi[0], lo[0])
     near_y = wp.where(ray.inv_dir[1] < 0.0, hi[1], lo[1])
     near_z = wp.where(ray.inv_dir[2] < 0.0, hi[2], lo[2])
@@ -100,27 +99,32 @@ def slab_interval(ray: BoxRay, lo: wp.vec3, hi: wp.vec3) -> wp.vec2:
 
 
 @wp.func
-def ray_aabb(ray: BoxRay, lo: wp.vec3, hi: wp.vec3, t_max: float) -> float:
-    """Distance at which the segment [t_min, t_max] enters the box, or inf if it misses.
+def entry_of(enter: float, leave: float, t_min: float, t_max: float) -> float:
+    """Return where the segment [t_min, t_max] enters the interval [enter, leave]; inf if they do not meet."""
+    begin = wp.where(enter > t_min, enter, t_min)
+    end = wp.where(leave < t_max, leave, t_max)
+    return wp.where(begin <= end, begin, float(wp.inf))
 
-    An origin inside gives t_min; an empty box gives inf. Conservative: no ray that meets the box in exact arithmetic is missed. The
-    domain: the direction's longest component is between 2^-64 and 2^64 (`kernels.query` scales others), distances to the box are below
-    2^126, and coordinates differ by less than 2^127. A component of the direction below 2^-128 counts as 0: its planes are at infinity. A
-    ray with NaN may enter: `no_hit` keeps such rays out.
+
+@wp.func
+def ray_aabb(ray: BoxRay, lo: wp.vec3, hi: wp.vec3, t_max: float) -> float:
+    """Return t where the segment [t_min, t_max] enters the box: t_min for an origin inside, inf for a miss or an empty box.
+
+    Conservative: every ray that meets the box in exact arithmetic enters it. Domain: the direction's longest component is between 2^-64
+    and 2^64 (`kernels.query` scales other directions). Distances to the box are below 2^126, and coordinates differ by less than 2^127. A
+    component of the direction below 2^-128 counts as 0, with its planes at infinity. A ray with NaN may enter; `traverse.common.no_hit`
+    gives such a ray an empty segment.
     """
     interval = slab_interval(ray, lo, hi)
-    enter = wp.where(interval[0] > ray.t_min, interval[0], ray.t_min)
-    leave = interval[1] * FAR_PAD
-    leave = wp.where(leave < t_max, leave, t_max)
-    return wp.where(enter <= leave, enter, float(wp.inf))
+    return entry_of(interval[0], interval[1] * FAR_PAD, ray.t_min, t_max)
 
 
 @wp.func
 def ray_aabb_plain(ray: BoxRay, lo: wp.vec3, hi: wp.vec3, t_max: float) -> float:
-    """Test slab after slab, each pair of distances sorted by comparison (Kay and Kajiya 1986, "Ray Tracing Complex Scenes").
-    Returns what `ray_aabb` does, without its margin: rays at edges may be lost, and a ray in a face (0 * inf = NaN) may hit or miss."""
+    """Test one slab after another, and sort each pair of distances (Kay and Kajiya 1986, "Ray Tracing Complex Scenes").
+    The result is as in `ray_aabb`, but without margin: rays at edges may be lost, and a ray in a face (0 * inf = NaN) may hit or miss."""
     if lo[0] > hi[0]:
-        return float(wp.inf)  # sorted, the distances of an empty box would be those of all space
+        return float(wp.inf)  # an empty box: after sorting, its distances would be -inf and inf
     enter = float(ray.t_min)
     leave = float(t_max)
     for axis in range(3):
@@ -141,12 +145,10 @@ def ray_aabb_plain(ray: BoxRay, lo: wp.vec3, hi: wp.vec3, t_max: float) -> float
 
 @wp.func
 def ray_aabb_minmax(ray: BoxRay, lo: wp.vec3, hi: wp.vec3, t_max: float) -> float:
-    """Test slabs selected by sign, with comparisons that ignore NaN (Williams et al. 2005).
-    Returns what `ray_aabb` does, without its margin: about one ray in 10^7 that grazes an edge is lost."""
+    """Select near and far planes by the direction's signs, and ignore NaN (Williams et al. 2005).
+    The result is as in `ray_aabb`, but without margin: of the rays that graze an edge, about one in 10^7 is lost."""
     interval = slab_interval(ray, lo, hi)
-    enter = wp.where(interval[0] > ray.t_min, interval[0], ray.t_min)
-    leave = wp.where(interval[1] < t_max, interval[1], t_max)
-    return wp.where(enter <= leave, enter, float(wp.inf))
+    return entry_of(interval[0], interval[1], ray.t_min, t_max)
 
 
 RAY_AABB = {

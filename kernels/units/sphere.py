@@ -1,7 +1,7 @@
-"""The sphere unit: the intersection of a ray with an exact sphere.
-The discriminant comes from the distance between center and line. The root that would cancel comes from the product of both. Source:
-Haines, Guenther and Akenine-Moeller 2019, "Precision Improvements for Ray/Sphere Intersection", Ray Tracing Gems, chapter 7. All in
-float64: the distance to a ground sphere is the difference of two numbers near its radius."""
+"""The sphere unit: the intersection of a ray with a sphere that is a primitive.
+The discriminant is computed from the distance between center and line. One root would suffer from cancellation; it is computed from the
+product of both roots. Source: Haines, Guenther and Akenine-Moeller 2019, "Precision Improvements for Ray/Sphere Intersection", Ray Tracing
+Gems, chapter 7. In float64, because the distance to a large ground sphere is a small difference of two numbers near its radius."""
 
 import warp as wp
 
@@ -12,8 +12,8 @@ from wrt.kernels.units.triangle import clamped, padded_interval
 
 @wp.func
 def ray_sphere(box: BoxRay, ray: Ray, center: wp.vec3, radius: float) -> Hit:
-    """First of the two crossings with t >= ray.t_min; prim_id is 0 on a hit, else NO_HIT. u = v = 0.
-    The center is in the ray's space. t is clamped to the interval of the sphere's padded box."""
+    """Return the first of the two intersections with t >= ray.t_min; prim_id is 0 on a hit, else NO_HIT. u = v = 0.
+    Center and ray are in the same space. t is clamped to the interval of the sphere's padded box."""
     hit = Hit()
     hit.prim_id = NO_HIT
     hit.t = float(wp.inf)
@@ -33,9 +33,9 @@ def ray_sphere(box: BoxRay, ray: Ray, center: wp.vec3, radius: float) -> Hit:
         return hit  # the line touches the sphere at the ray's origin
     far = float(q / a)
     near = float((wp.dot(f, f) - r * r) / q)
-    t_0 = wp.where(near <= far, near, far)  # not wp.min, wp.max: for 0 and -0, CUDA and the CPU return different zeros
+    t_0 = wp.where(near <= far, near, far)  # wp.min and wp.max of 0 and -0 have another sign on CUDA than on the CPU
     t_1 = wp.where(near >= far, near, far)
-    # Rounding moves the corners of a small sphere's box by a good part of its radius: only the padded box surely contains it.
+    # Far from 0, rounding moves the corners of a small sphere's box by a good part of the radius: only the padded box contains the sphere.
     extent = wp.vec3(radius, radius, radius)
     interval = padded_interval(box, center - extent, center + extent)
     if not interval[0] <= interval[1] * FAR_PAD:

@@ -1,14 +1,14 @@
-"""The triangle unit: the intersection of a ray with a triangle.
+"""The triangle unit: the intersection of a ray with a triangle. RAY_TRIANGLE is the table of triangle tests.
 
 `watertight` follows Woop, Benthin and Wald 2013, "Watertight Ray/Triangle Intersection" (JCGT 2(1)). The triangle is translated and
-sheared so that the ray becomes the z axis, and three signed areas around the origin decide. Two triangles with a common edge compute the
-same area with opposite sign, so that no ray passes between them. The other tests serve comparison; RAY_TRIANGLE is the table of all. A
-test takes the ray's set-up and one record, and returns a `Hit` on the whole line.
+sheared so that the ray becomes the z axis. The signs of three areas around the origin decide. Two triangles with a common edge compute
+the same area with opposite signs, so no ray passes between them. The other tests serve for comparison. A test takes the ray's set-up and
+one record, and returns the `Hit` on the infinite line: the caller compares t with the segment.
 
-**What runs.** This file tests one triangle and one ray. On a CPU, closest_hit and any_hit of arrays through bvh8 (the default) run the
-same steps in lanes, and so do pictures: `kernels/wide/triangle.h`. Both have the same bits (tests/kernels/wide/test_packets.py). The
-one-ray walk of bvh4, bvh8 and bvh8c first rejects triangles far from the ray in lanes (`wide/lanes.py`), and tests the others here. The
-whole table: kernels/README.md.
+**What runs.** This file tests one triangle and one ray. On a CPU, pictures and the queries closest_hit and any_hit through bvh8 (the
+default) run the same steps vectorised, in `kernels/wide/triangle.h`, with the same bits (tests/kernels/wide/test_packets.py). The traversal
+of bvh4, bvh8 and bvh8c for one ray first rejects most triangles of a row with vector instructions (`wide/lanes.py`), and tests the other
+triangles here. The table of all cases is in kernels/README.md.
 """
 
 from typing import Any, NamedTuple
@@ -19,17 +19,17 @@ from wrt.kernels.structs import NO_HIT, Hit, PlanePrimitive, Primitive, Ray, noi
 from wrt.kernels.units.box import FAR_PAD, BoxRay, box_pad, padded_hi, padded_lo, slab_interval
 from wrt.kernels.units.float_float import difference_of_products, pair_quotient, pair_sum, pair_times, rounding_is_certain
 
-# Rounding alone moves t by so much when it is clamped to its box: seven errors (wrt.lab.oracle.bounds), and one step of a denormal.
+# Clamping t to the triangle's box moves t by up to seven rounding errors (wrt.lab.oracle.bounds) plus the smallest denormal.
 CLAMP_ROUNDING = wp.constant(7.0 * 2.0**-24)
 CLAMP_STEP = wp.constant(2.0**-149)
-# A ray whose progress along an axis is below this part of its length may have a shear that underflowed.
+# The shear may underflow on a ray that advances along some axis by less than this fraction of its length.
 SLOWEST = wp.constant(2.0**-120)
 U_SQUARED = 2.0**-48  # u^2, u = 2^-24
 
 
 @wp.struct
 class TriangleRay:
-    """The ray as the triangle unit reads it: the order of axes (kz: of the direction's largest component) and the shear."""
+    """A ray set up for the triangle unit: the order of axes (kz: the axis of the direction's largest component) and the shear."""
 
     kx: int
     ky: int
@@ -41,7 +41,7 @@ class TriangleRay:
 
 @wp.func
 def component(v: wp.vec3, k: int) -> float:
-    """Component v[k] by selection: an index unknown to the compiler would send v through memory."""
+    """Return v[k] by selection. With an index unknown at compile time, the compiler would store v to memory."""
     return wp.where(k == 0, v[0], wp.where(k == 1, v[1], v[2]))
 
 
@@ -58,7 +58,7 @@ def triangle_ray(ray: Ray) -> TriangleRay:
     kx = wp.where(kz == 2, 0, kz + 1)
     ky = wp.where(kx == 2, 0, kx + 1)
     d_z = component(d, kz)
-    # A ray against the axis swaps x and y, which keeps the winding.
+    # If the ray runs against axis kz, swapping x and y keeps the triangles' winding.
     out.kx = wp.where(d_z < 0.0, ky, kx)
     out.ky = wp.where(d_z < 0.0, kx, ky)
     out.kz = kz
@@ -70,26 +70,26 @@ def triangle_ray(ray: Ray) -> TriangleRay:
 
 @wp.func
 def sheared(v: wp.vec3, shear_x: float, shear_y: float) -> wp.vec3:
-    """Shear a corner, relative to the origin and in the ray's order of axes, so that the ray becomes the z axis."""
+    """Shear a corner so that the ray becomes the z axis. The corner is relative to the ray's origin, in the axis order kx, ky, kz."""
     return wp.vec3(v[0] - shear_x * v[2], v[1] - shear_y * v[2], v[2])
 
 
 @wp.func
 def to_ray_space(v: wp.vec3, shear: TriangleRay) -> wp.vec3:
-    """Bring a corner, relative to the ray's origin, into the ray's space: axes reordered, then sheared."""
+    """Transform a corner, relative to the ray's origin, to the space in which the ray is the z axis: reorder axes, then shear."""
     turned = wp.vec3(component(v, shear.kx), component(v, shear.ky), component(v, shear.kz))
     return sheared(turned, shear.shear_x, shear.shear_y)
 
 
 @wp.func
 def edge_areas(a: Any, b: Any, c: Any):
-    """Twice the signed areas that the z axis spans with the edges bc, ca, ab."""
+    """Return twice the signed areas of the triangles (0, b, c), (0, c, a), (0, a, b) in the xy plane; vec3 or vec3d."""
     return type(a)(c[0] * b[1] - c[1] * b[0], a[0] * c[1] - a[1] * c[0], b[0] * a[1] - b[1] * a[0])
 
 
 @wp.func
 def outside(areas: Any) -> bool:
-    """Test whether two of the areas have different signs: the z axis passes the triangle. NaN has no sign."""
+    """Test whether two of the areas have opposite signs, which means that the z axis misses the triangle. NaN counts as no sign."""
     zero = areas.dtype(0.0)
     return ((areas[0] < zero or areas[1] < zero or areas[2] < zero)
             and (areas[0] > zero or areas[1] > zero or areas[2] > zero))
@@ -97,9 +97,9 @@ def outside(areas: Any) -> bool:
 
 @wp.func
 def inside_edge(area: wp.float64, start: wp.vec3, end: wp.vec3, winding: wp.float64) -> bool:
-    """Test whether the z axis passes the edge from start to end on the side where the triangle lies.
-    area: of edge_areas for this edge. winding: sum of the three areas; its sign is the triangle's winding. If the axis meets the edge
-    (area 0), the axis moved in x and y by (e, e^2), for an infinitesimal e > 0, decides."""
+    """Test whether the z axis passes the edge from start to end on the triangle's side.
+    Argument `area` is the entry of edge_areas for this edge, `winding` the sum of all three, whose sign is the triangle's winding. If the
+    axis meets the edge (area 0), it is moved in x and y by (e, e^2), for an infinitesimal e > 0."""
     zero = wp.float64(0.0)
     side = wp.where(winding < zero, -area, area)
     if side == zero:
@@ -112,8 +112,8 @@ def inside_edge(area: wp.float64, start: wp.vec3, end: wp.vec3, winding: wp.floa
 
 @wp.func
 def is_crossed(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> bool:
-    """Test whether the z axis, moved by an infinitesimal, crosses the triangle of sheared corners.
-    The moved axis meets no edge and no corner. Around an edge, those triangles count that a line beside it crosses (Edelsbrunner and
+    """Test whether the z axis, moved by an infinitesimal, crosses the triangle with these sheared corners.
+    The moved axis meets no edge and no corner, so a ray through a common edge crosses exactly one of two neighbours (Edelsbrunner and
     Muecke 1990, "Simulation of Simplicity")."""
     areas = edge_areas(wp.vec3d(a), wp.vec3d(b), wp.vec3d(c))
     winding = areas[0] + areas[1] + areas[2]
@@ -123,7 +123,7 @@ def is_crossed(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> bool:
 
 @wp.func
 def no_triangle() -> Hit:
-    """Miss: t = inf, prim_id = NO_HIT."""
+    """Return a miss: t = inf, prim_id = NO_HIT."""
     hit = Hit()
     hit.t = float(wp.inf)
     hit.prim_id = NO_HIT
@@ -132,9 +132,9 @@ def no_triangle() -> Hit:
 
 @wp.func
 def crossing(a: wp.vec3, b: wp.vec3, c: wp.vec3, shear_z: float) -> Hit:
-    """Intersection of the z axis with the triangle of sheared corners, in float64; prim_id is 0 on a hit, else NO_HIT.
-    Products of float32 are exact there, and so are the signs of the areas. Nearly edge-on, where the areas cancel, t, u and v keep their
-    digits."""
+    """Intersect the z axis with the triangle with these sheared corners, in float64; prim_id is 0 on a hit, else NO_HIT.
+    Products of two float32 are exact in float64, and so are the signs of the areas. Therefore t, u and v are accurate even for triangles
+    nearly edge-on, where the areas suffer from cancellation."""
     hit = no_triangle()
     areas = edge_areas(wp.vec3d(a), wp.vec3d(b), wp.vec3d(c))
     if outside(areas):
@@ -153,19 +153,19 @@ def crossing(a: wp.vec3, b: wp.vec3, c: wp.vec3, shear_z: float) -> Hit:
 
 @noinline
 def hard_crossing(a: wp.vec3, b: wp.vec3, c: wp.vec3, shear_z: float) -> Hit:
-    """Call `crossing` as a function of its own: on a GPU it holds all float64 code of a traversal."""
+    """Call `crossing`, without inlining: so a GPU traversal has its float64 code, which takes many registers, in one function."""
     return crossing(a, b, c, shear_z)
 
 
 @wp.func
 def sure_crossing(a: wp.vec3, b: wp.vec3, c: wp.vec3, shear_z: float) -> Hit:
-    """Return what `crossing` returns, to the last bit, without float64; prim_id is NO_HIT if the bits are not certain.
+    """Compute the bits of `crossing` without float64; prim_id is NO_HIT if they are not certain, or on a miss.
 
-    Let w_i be the exact areas, A their sum, Q the sum of the sizes of their products, and Z the largest |z|. An area is off by at most 3.1
-    u^2 Q, A by 9.2 u^2 Q. The sum of w_i z_i is off by 12.2 u^2 Q Z, each quotient by 30 u^2 of itself. That is 43 u^2 Q / A for u and v,
-    and 56 u^2 (Q / A) Z |shear_z| for t. The error of float64 is below one such u^2, and `rounding_is_certain` needs one. If all numbers
-    within 64 u^2 round alike, float64 has rounded to the same bits. The ranges of Q and Z exclude under- and overflow: products of a low
-    part may lose 2^-150, but u^2 Q and u^2 Q Z are at least 2^-138.
+    Let w_i be the exact areas, A their sum, Q the sum of the absolute values of their products, and Z the largest |z|. The error of an area
+    is at most 3.1 u^2 Q, of A 9.2 u^2 Q, and of the sum of w_i z_i 12.2 u^2 Q Z. A division adds 30 u^2 of the quotient. In total, u and v
+    are off by 43 u^2 Q / A, and t by 56 u^2 (Q / A) Z |shear_z|. Arithmetic in float64 adds less than one such u^2, `rounding_is_certain`
+    needs another. If all numbers within 64 u^2 round to the same float32, `crossing` returns that float32. The ranges of Q and Z exclude
+    under- and overflow: products of a low part may lose 2^-150, but u^2 Q and u^2 Q Z are at least 2^-138.
     """
     hit = no_triangle()
     size = ((wp.abs(c[0] * b[1]) + wp.abs(c[1] * b[0])) + (wp.abs(a[0] * c[1]) + wp.abs(a[1] * c[0]))
@@ -197,17 +197,17 @@ def sure_crossing(a: wp.vec3, b: wp.vec3, c: wp.vec3, shear_z: float) -> Hit:
 
 @wp.func
 def watertight(origin: wp.vec3, shear: TriangleRay, v0: wp.vec3, v1: wp.vec3, v2: wp.vec3) -> Hit:
-    """Intersect a line with a triangle, both sides; prim_id is 0 on a hit, else NO_HIT. t may be negative.
+    """Intersect the infinite line of a ray with a triangle, from both sides; prim_id is 0 on a hit, else NO_HIT. t may be negative.
 
-    Products of two float32 are monotone: an area's sign can be wrong only if the area is 0 or under- or overflows. So float32 rejects most
-    triangles, and `crossing` decides the others in float64. On GPUs, where float64 is slow, float-float arithmetic gives the same bits if
-    it is certain of them, and float64 decides the rest.
+    Rounded products of two float32 are monotone, so a float32 area with the wrong sign is 0, or has under- or overflowed. Therefore float32
+    rejects most triangles, and `crossing` decides the others in float64. On GPUs, where float64 is slow, `sure_crossing` computes the same
+    bits in float-float arithmetic; float64 decides only where the bits are uncertain.
 
-    A triangle seen exactly edge-on is missed, and so are NaN coordinates. Triangles without area are stored as NaN, since rounding here
-    may give corners on a line an area (wrt.accel.triangle_data.corners).
+    The line misses a triangle exactly edge-on, and a triangle with a NaN coordinate. A triangle without area is stored with NaN, because
+    here the rounded shear could give it an area (wrt.accel.triangle_data.corners).
 
     Domain: coordinates differ by less than 2^127, and the direction's longest component is between 2^-64 and 2^64 (`kernels.query` scales
-    others). wrt.lab.oracle.bounds has the error bounds.
+    other directions). wrt.lab.oracle.bounds has the error bounds.
     """
     a = to_ray_space(v0 - origin, shear)
     b = to_ray_space(v1 - origin, shear)
@@ -224,36 +224,36 @@ def watertight(origin: wp.vec3, shear: TriangleRay, v0: wp.vec3, v1: wp.vec3, v2
 
 @wp.func
 def lower(a: wp.vec3, b: wp.vec3) -> wp.vec3:
-    """Componentwise minimum; wp.min's care for NaN costs more than the comparison."""
+    """Return the componentwise minimum. wp.min also handles NaN, and takes longer."""
     return wp.vec3(wp.where(b[0] < a[0], b[0], a[0]), wp.where(b[1] < a[1], b[1], a[1]), wp.where(b[2] < a[2], b[2], a[2]))
 
 
 @wp.func
 def upper(a: wp.vec3, b: wp.vec3) -> wp.vec3:
-    """Componentwise maximum, as `lower`."""
+    """Return the componentwise maximum. wp.max also handles NaN, and takes longer."""
     return wp.vec3(wp.where(b[0] > a[0], b[0], a[0]), wp.where(b[1] > a[1], b[1], a[1]), wp.where(b[2] > a[2], b[2], a[2]))
 
 
 @wp.func
 def padded_interval(ray: BoxRay, lo: wp.vec3, hi: wp.vec3) -> wp.vec2:
-    """Slab interval of a primitive's padded box, the box that structures are built from."""
+    """Return the slab interval of the padded box of a primitive with the box lo .. hi. Structures are built from padded boxes."""
     pad = box_pad(lo, hi)
     return slab_interval(ray, padded_lo(lo, pad), padded_hi(hi, pad))
 
 
 @wp.func
 def clamped(t: float, interval: wp.vec2) -> float:
-    """Clamp t to the interval; an empty interval gives its entry."""
+    """Clamp t to the interval (entry, exit); return the entry if the interval is empty."""
     inside = wp.where(t > interval[1], interval[1], t)
     return wp.where(inside < interval[0], interval[0], inside)
 
 
 @wp.func
 def underflowed(ray: BoxRay, t: float, moved: float) -> bool:
-    """Test whether the clamp to a box moved t farther than rounding explains, on a ray whose shear may have underflowed.
-    Along some axis, such a ray moves less than 2^-120 until t, or less than 2^-120 of its length. Underflow moves the sheared corners by
-    2^-150 (1 + distance). For any other ray that is at most 2^-29 of its way. Divided by so small a component of the direction, as in the
-    distance to a slab, it can be any length."""
+    """Test whether clamping moved t farther than rounding explains, on a ray whose shear may have underflowed.
+    Such a ray advances along some axis by less than 2^-120 up to t, or by less than 2^-120 of its length. Underflow moves sheared corners
+    by 2^-150 (1 + distance): at most 2^-29 of the advance of any other ray. Divided by a tiny component of the direction, as in the
+    distance to a slab, the error can have any size."""
     if not wp.abs(moved - t) > CLAMP_ROUNDING * wp.abs(t) + CLAMP_STEP:
         return False
     steep = float(wp.inf)
@@ -268,14 +268,14 @@ def underflowed(ray: BoxRay, t: float, moved: float) -> bool:
 
 @wp.func
 def within_bounds(ray: BoxRay, t: float, lo: wp.vec3, hi: wp.vec3) -> float:
-    """Clamp t to the interval of the primitive's own box; inf if the ray misses even the padded box.
+    """Clamp t to the slab interval of the triangle's box lo .. hi; return inf if the ray misses even the padded box.
 
-    Rounding can put t before the point where the ray enters the triangle's box. A traversal from front to back would then drop some nodes
-    or keep them, by the order of its visits. With t inside the box's interval, and boxes monotone (a node's box contains the padded boxes
-    of its triangles), every structure finds the same hits to the last bit.
+    Rounding can put t in front of the triangle's box. Then a traversal from front to back would drop some nodes or not, depending on the
+    order of its visits. With t inside the interval, and monotone boxes (a node's box contains the padded boxes of its triangles), every
+    structure finds the same hits to the last bit.
 
-    If the shear underflowed, the slabs belong to the exact ray, but t belongs to a neighbouring one, which may miss the box. It meets the
-    padded box: t is clamped to that interval.
+    If the shear underflowed, t belongs to a ray beside the exact one, and the exact ray may miss the box. But it meets the padded box, so t
+    is clamped to the interval of the padded box.
     """
     interval = slab_interval(ray, lo, hi)
     moved = clamped(t, interval)
@@ -289,7 +289,7 @@ def within_bounds(ray: BoxRay, t: float, lo: wp.vec3, hi: wp.vec3) -> float:
 
 @wp.func
 def ray_triangle(box: BoxRay, shear: TriangleRay, v0: wp.vec3, v1: wp.vec3, v2: wp.vec3) -> Hit:
-    """Default unit: `watertight`, with t clamped to the triangle's own box."""
+    """Intersect by `watertight`, and clamp t to the triangle's box; prim_id is 0 on a hit, else NO_HIT."""
     hit = watertight(box.origin, shear, v0, v1, v2)
     if hit.prim_id != NO_HIT:
         hit.t = within_bounds(box, hit.t, lower(lower(v0, v1), v2), upper(upper(v0, v1), v2))
@@ -300,15 +300,15 @@ def ray_triangle(box: BoxRay, shear: TriangleRay, v0: wp.vec3, v1: wp.vec3, v2: 
 
 @wp.func
 def watertight_triangle(box: BoxRay, shear: TriangleRay, ray: Ray, triangle: Primitive) -> Hit:
-    """Default unit for a record: `ray_triangle`."""
+    """Intersect a record by `ray_triangle`. This is the default test of RAY_TRIANGLE."""
     return ray_triangle(box, shear, triangle.v0, triangle.v1, triangle.v2)
 
 
 @wp.func
 def moeller_trumbore(box: BoxRay, shear: TriangleRay, ray: Ray, triangle: Primitive) -> Hit:
-    """Solve for t, u, v by Cramer's rule on two edges (v1 and v2 of the record).
-    Moeller and Trumbore 1997, "Fast, Minimum Storage Ray/Triangle Intersection". Each triangle rounds its own edges: a ray can pass
-    between two neighbours, or hit both."""
+    """Solve for t, u, v by Cramer's rule; v1 and v2 of the record are the edges from v0.
+    Moeller and Trumbore 1997, "Fast, Minimum Storage Ray/Triangle Intersection". Two neighbours round their common edge differently, so a
+    ray can pass between them or hit both."""
     p = wp.cross(ray.direction, triangle.v2)
     determinant = wp.dot(triangle.v1, p)
     if determinant == 0.0:
@@ -327,21 +327,21 @@ def moeller_trumbore(box: BoxRay, shear: TriangleRay, ray: Ray, triangle: Primit
 
 @wp.func
 def on_plane(plane: wp.vec4, point: wp.vec3) -> float:
-    """Value of the plane's equation at a point."""
+    """Return the value of the plane's equation at a point."""
     return plane[0] * point[0] + plane[1] * point[1] + plane[2] * point[2] + plane[3]
 
 
 @wp.func
 def along(plane: wp.vec4, direction: wp.vec3) -> float:
-    """Dot product of the plane's normal with a direction."""
+    """Return the dot product of the plane's normal with a direction."""
     return plane[0] * direction[0] + plane[1] * direction[1] + plane[2] * direction[2]
 
 
 @wp.func
 def plane_equation(box: BoxRay, shear: TriangleRay, ray: Ray, triangle: PlanePrimitive) -> Hit:
-    """Solve the plane equation for t, and take u and v of the point there.
-    A ray parallel to the plane (divisor 0) misses. The caller compares t with t_min and t_max. The point counts if u, v >= 0 and u + v <=
-    1. The triangle's plane is `c`; `a` and `b` give u and v of a point on it."""
+    """Solve the equation of the triangle's plane for t, then compute u and v of the point at t.
+    The record's plane `c` is the triangle's plane; `a` and `b` evaluate to u and v. The point is inside if u, v >= 0 and u + v <= 1. A ray
+    parallel to the plane (divisor 0) misses."""
     slope = along(triangle.c, ray.direction)
     if slope == 0.0:
         return no_triangle()
@@ -358,9 +358,9 @@ def plane_equation(box: BoxRay, shear: TriangleRay, ray: Ray, triangle: PlanePri
 @wp.func
 def baldwin_weber(box: BoxRay, shear: TriangleRay, ray: Ray, triangle: PlanePrimitive) -> Hit:
     """Map the ray to the space where the triangle is (0,0,0), (1,0,0), (0,1,0), and intersect the ray with the plane z = 0.
-    Baldwin and Weber 2016, "Fast Ray-Triangle Intersections by Coordinate Transformation" (JCGT 5(3)). a, b, c are the rows of the affine
-    map. The triangle does not determine which direction becomes the z axis. The paper picks a coordinate axis, so that three of the map's
-    twelve numbers are constants. Here it is the triangle's unit normal, and all twelve numbers are stored."""
+    Baldwin and Weber 2016, "Fast Ray-Triangle Intersections by Coordinate Transformation" (JCGT 5(3)). The record's a, b, c are the rows of
+    the affine map. The direction that maps to the z axis is arbitrary. The paper takes a coordinate axis, so that three of the map's twelve
+    numbers are constants. wrt takes the triangle's unit normal, and stores all twelve."""
     slope = along(triangle.c, ray.direction)
     if slope == 0.0:
         return no_triangle()
@@ -376,10 +376,10 @@ def baldwin_weber(box: BoxRay, shear: TriangleRay, ray: Ray, triangle: PlanePrim
 class TriangleTest(NamedTuple):
     """A triangle test and the record that it reads."""
 
-    intersect: Any
-    record: Any
-    layout: str  # Name in wrt.accel.triangle_data.LAYOUTS: how corners become a record.
-    uses_shear: bool = False  # True if the test reads the watertight test's set-up.
+    intersect: Any  # Function (BoxRay, TriangleRay, Ray, record) -> Hit.
+    record: Any  # Primitive or PlanePrimitive.
+    layout: str  # Name in wrt.accel.triangle_data.LAYOUTS of the function that converts corners to records.
+    uses_shear: bool = False  # True if the test reads the TriangleRay.
 
 
 RAY_TRIANGLE = {

@@ -1,1 +1,1 @@
-"""Wide BVHs on rows of lanes: nodes, the walk of one ray, packets of rays."""
+"""Wide BVHs, whose nodes have 4 or 8 children: nodes, traversal for one ray, packets of rays. Boxes and triangles are tested in rows."""

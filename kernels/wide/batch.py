@@ -1,16 +1,16 @@
-"""Many rays through a wide BVH on the CPU: packets and interleaved rays, with the same hits to the last bit.
+"""Traversal of a wide BVH for many rays on the CPU: packets and interleaved rays. The hits have the bits of the traversal for one ray.
 
-Rays with a common direction walk the tree as a packet (Wald et al. 2001, "Interactive Rendering with Coherent Ray Tracing"). First a beam
-around all rays is tested against a node. The children that the beam enters are then tested against the rays, sixteen at a time. Other rays
-are interleaved: many are under way at once, and each takes one step in its turn. The core has work while a ray waits for memory or for its
-own last result."""
+Sixteen rays with similar directions walk the tree as a packet (Wald et al. 2001, "Interactive Rendering with Coherent Ray Tracing"). At a
+node, a beam around all rays is tested first. The children that the beam enters are then tested against all sixteen rays at once. All other
+rays are interleaved: one thread has many rays in progress, and each ray takes one step in turn. So the core always has work, while single
+rays wait for memory or for their last result."""
 
 from functools import cache
 from typing import Any
 
 import warp as wp
 
-from wrt.kernels.memory import put_number
+from wrt.kernels.memory import put_int, put_number
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import NO_HIT, Hit, Surfaces
 from wrt.kernels.traverse.common import Probe, Units, make_better, sphere_hit
@@ -55,31 +55,30 @@ from wrt.kernels.wide.packets import (
     slot_at,
     spheres_of,
     store_bits,
-    store_slot,
     write_hits,
     write_occluded,
 )
 from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
 from wrt.kernels.wide.traverse import WideTraversal
 
-PRIM_ID = WIDTH * PRIM_ID_ROW  # Place of the prim_ids in a row.
-PACKETS = 4  # Packets that are set up together.
-SLOTS = 24  # Interleaved rays under way.
-FEW_RAYS = 6  # Up to so many rays are tested one by one against a leaf.
-MIN_VISITS = 6  # Rays a node, on average, from which a packet is faster than its rays interleaved.
-# After MAX_FAILED packets in a row that fell apart, the next PAUSE packets are interleaved.
+PRIM_ID = WIDTH * PRIM_ID_ROW  # Index of the first prim_id in a row of primitives.
+PACKETS = 4  # Number of packets that are set up together.
+SLOTS = 24  # Number of interleaved rays in progress.
+FEW_RAYS = 6  # If a packet has at most so many rays in a leaf, the rays are tested one by one.
+MIN_VISITS = 6  # Mean number of rays per node from which a packet is faster than interleaving its rays.
+# A packet below MIN_VISITS has failed. After MAX_FAILED failures in succession, the rays of the next PAUSE packets are interleaved.
 MAX_FAILED, PAUSE = 4, 32
 
 
 @wp.func
 def vector(packet: wp.array(dtype=wp.float32), first: int) -> wp.vec3:
-    """Return three consecutive fields of one ray."""
+    """Return three consecutive fields of one ray as a vec3; first: index in `packet` of the ray's first field."""
     return wp.vec3(number(packet, first), number(packet, first + LANES), number(packet, first + 2 * LANES))
 
 
 @wp.func
 def probe_at(packet: wp.array(dtype=wp.float32), ray: int) -> Probe:
-    """Return the sphere unit's input for the ray in one column of a packet."""
+    """Return the sphere unit's input for one ray of a packet; ray: the ray's column in `packet`."""
     probe = Probe()
     probe.ray.origin = vector(packet, ray + wp.static(FIELD["origin_x"]))
     probe.ray.direction = vector(packet, ray + wp.static(FIELD["direction_x"]))
@@ -110,7 +109,8 @@ def store_best(packet: wp.array(dtype=wp.float32), ray: int, best: Hit):
 
 
 def make_sphere_test(units: Units, any_hit: bool, accepts: Any) -> Any:
-    """Return test_spheres: test the spheres of a row in the mask against one ray; for any hit, return whether one is hit."""
+    """Return test_spheres, which tests the spheres of a row that are in the mask against one ray.
+    It returns whether the ray is finished: for any-hit rays, whether the ray hits a sphere; else False."""
     better = make_better(units, accepts)
 
     @wp.func
@@ -124,7 +124,7 @@ def make_sphere_test(units: Units, any_hit: bool, accepts: Any) -> Any:
                 best = better(probe.ray, surfaces, sphere_hit(probe, surfaces, prim_id), prim_id, best)
         found = bool(best.prim_id != NO_HIT)
         if wp.static(any_hit):
-            best.t = wp.where(found, -float(wp.inf), best.t)  # Nothing else is reached.
+            best.t = wp.where(found, -float(wp.inf), best.t)  # The ray's segment is now empty, so it enters no further box.
         store_best(scratch.packets, ray, best)
         return wp.static(any_hit) and found
 
@@ -132,11 +132,11 @@ def make_sphere_test(units: Units, any_hit: bool, accepts: Any) -> Any:
 
 
 def make_accepted(any_hit: bool, accepts: Any, ray_triangles: Any) -> Any:
-    """Return nearest_accepted: as the triangle test of make_row_test, for triangles that `accepts` may refuse."""
+    """Return nearest_accepted: the triangle test of make_row_test for triangles whose hits `accepts` may reject (cut-outs)."""
 
     @wp.func
     def nearest_accepted(accel: WideBvh, first: int, mask: int, surfaces: Surfaces, scratch: Scratch, ray: int) -> bool:
-        """Test the nearest triangle that is hit, until one is accepted."""
+        """Find the nearest hit in the mask; if `accepts` rejects it, drop the triangle from the mask and repeat."""
         before = best_at(scratch.packets, ray)
         while True:
             lane = ray_triangles(accel, first, mask, scratch, ray)
@@ -155,7 +155,8 @@ def make_accepted(any_hit: bool, accepts: Any, ray_triangles: Any) -> Any:
 
 
 def make_row_test(units: Units, any_hit: bool, accepts: Any, inlined: bool) -> Any:
-    """Return test_row: test the first `count` primitives of a row against one ray; for any hit, return whether one is hit."""
+    """Return test_row, which tests the first `count` primitives of a row against one ray.
+    It returns whether the ray is finished: for any-hit rays, whether the ray hits a primitive; else False."""
     ray_triangles = make_ray_triangles(any_hit and accepts is None, inlined)
     test_spheres, nearest_accepted = make_sphere_test(units, any_hit, accepts), make_accepted(any_hit, accepts, ray_triangles)
 
@@ -177,7 +178,7 @@ def make_row_test(units: Units, any_hit: bool, accepts: Any, inlined: bool) -> A
 
 
 def make_packet_leaf(units: Units, any_hit: bool, accepts: Any) -> Any:
-    """Return test_leaf: test a leaf against the rays of the mask, all at once if they are many, else one by one."""
+    """Return test_leaf, which tests a leaf against the packet's rays in the mask: all at once, or one by one (FEW_RAYS)."""
     test_row = make_row_test(units, any_hit, accepts, False)
     triangles = make_triangles(any_hit)
 
@@ -208,12 +209,12 @@ def make_packet_leaf(units: Units, any_hit: bool, accepts: Any) -> Any:
 
 
 def make_packet_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
-    """Return walk: take a packet with a beam through the tree."""
+    """Return walk, which takes a packet that has a beam through the tree."""
     children, test_leaf = make_children(any_hit), make_packet_leaf(units, any_hit, accepts)
 
     @wp.func
     def walk(accel: WideBvh, surfaces: Surfaces, scratch: Scratch, base: int, active: int) -> bool:
-        """Return whether the packet stayed together: at least MIN_VISITS rays a node on average."""
+        """Return whether the packet succeeded: on average, at least MIN_VISITS of its rays visited each node."""
         nodes = int(0)
         visits = int(0)
         size = int(0)
@@ -239,21 +240,21 @@ def make_packet_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
 
 
 def make_interleaved(units: Units, any_hit: bool, accepts: Any) -> Any:
-    """Return interleaved: take the rays of several packets through the tree, each by itself.
+    """Return interleaved, which takes rays of PACKETS packets through the tree, one step of each ray in turn.
 
-    `waiting` has a bit for each ray, lane after lane, packet after packet."""
-    test_row = make_row_test(units, any_hit, accepts, True)  # Inlined: 1.02 times as fast, any hit 1.05.
+    The mask `waiting` has a bit for each ray to trace: bit LANES * packet + lane."""
+    test_row = make_row_test(units, any_hit, accepts, True)  # Inlining makes closest hits 1.02 times, any hits 1.05 times as fast.
     begin, step, pop = make_steps(any_hit)
 
     @wp.func
     def start(accel: WideBvh, scratch: Scratch, slot: int, ray: int):
-        """Start a ray. rays_meeting_root found that it enters a child of the root, so there is a next node or leaf."""
+        """Put a ray into a slot. Ray is LANES * packet + lane. It enters a child of the root (rays_meeting_root), so a next node exists."""
         column = ray / LANES * PACKET_SIZE + ray % LANES
         prefetch_next(accel, begin(accel, scratch, slot, column))
 
     @wp.func
     def turn(accel: WideBvh, surfaces: Surfaces, scratch: Scratch, slot: int) -> bool:
-        """Visit a node or a leaf, and go on to the next one; return False if the ray is done."""
+        """Visit a slot's node or leaf, and choose the next one; return False if the ray is finished."""
         words = slot * SLOT_SIZE
         reference = slot_at(scratch.slots, words + wp.static(SLOT["next"]))
         if reference < 0:
@@ -301,7 +302,7 @@ def make_interleaved(units: Units, any_hit: bool, accepts: Any) -> Any:
 def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accepts: Any = None) -> Any:
     """Return the kernel that traces the rays first .. end - 1 in a single thread, PACKETS packets at a time.
 
-    It writes to `out` (HitArrays, or an array of bool for any hit) and to scratch.report. Arrays must have no gaps."""
+    The kernel writes to `out` (HitArrays or, with any_hit, an array of bool) and to scratch.report. All arrays must be contiguous."""
     walk_packet = make_packet_walk(units, any_hit, accepts)
     interleaved = make_interleaved(units, any_hit, accepts)
     set_up = make_set_up(rays_struct)
@@ -310,19 +311,19 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
 
     @packet_kernel
     def trace(accel: WideBvh, surfaces: Surfaces, rays: rays_struct, out: out_type, scratch: Scratch, first: int, end: int):
-        store_slot(scratch.report, FAILED, 0)
-        store_slot(scratch.report, PAUSED, 0)
-        store_slot(scratch.report, ANY_REFUSED, 0)
+        put_int(scratch.report, FAILED, 0)
+        put_int(scratch.report, PAUSED, 0)
+        put_int(scratch.report, ANY_REFUSED, 0)
         for block in range(first, end, wp.static(PACKETS * LANES)):
             single_rays = wp.uint64(0)
-            packets = wp.min((end - block + LANES - 1) / LANES, PACKETS)  # A constant would unroll the walk.
+            packets = wp.min((end - block + LANES - 1) / LANES, PACKETS)  # Not a constant: Warp would unroll the loop over the walk.
             for p in range(packets):
                 base = PACKET_SIZE * p
                 count = wp.min(end - block - LANES * p, LANES)
                 active = set_up(rays, block + LANES * p, count, wp.static(far_pad(units.box)), scratch, base)
                 store_bits(scratch.packets, base + ACTIVE, active)
                 if bits(scratch.packets, base + REFUSED) != 0:
-                    store_slot(scratch.report, ANY_REFUSED, 1)
+                    put_int(scratch.report, ANY_REFUSED, 1)
             for p in range(packets):
                 base = PACKET_SIZE * p
                 active = bits(scratch.packets, base + ACTIVE)
@@ -330,12 +331,12 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
                 if active >= COHERENT and paused == 0:
                     coherent = walk_packet(accel, surfaces, scratch, base, active - COHERENT)
                     failed = wp.where(coherent, 0, slot_at(scratch.report, FAILED) + 1)
-                    if failed == MAX_FAILED:  # After the pause, one more failure starts the next.
+                    if failed == MAX_FAILED:  # After this pause, a single failure starts the next pause.
                         failed = failed - 1
-                        store_slot(scratch.report, PAUSED, PAUSE)
-                    store_slot(scratch.report, FAILED, failed)
+                        put_int(scratch.report, PAUSED, PAUSE)
+                    put_int(scratch.report, FAILED, failed)
                 else:
-                    store_slot(scratch.report, PAUSED, wp.max(paused - 1, 0))
+                    put_int(scratch.report, PAUSED, wp.max(paused - 1, 0))
                     active = active & wp.static(COHERENT - 1)
                     active = rays_meeting_root(accel, scratch, base, active)
                     single_rays = single_rays | (wp.uint64(active) << wp.uint64(LANES * p))
@@ -347,16 +348,16 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
 
 
 class BatchTraversal(WideTraversal):
-    """The traversal of plain nodes of 8, with a kernel for many rays."""
+    """The traversal of plain nodes with 8 children (bvh8), which also has a kernel for many rays."""
 
     stream_block = PACKETS * LANES
-    stream_sizes = PACKETS * PACKET_SIZE, STACK_WORDS * SLOTS, SLOT_SIZE * SLOTS, REPORT_SIZE  # Lengths of Scratch's arrays.
+    stream_sizes = PACKETS * PACKET_SIZE, STACK_WORDS * SLOTS, SLOT_SIZE * SLOTS, REPORT_SIZE  # Lengths of the arrays in Scratch.
 
     def __init__(self) -> None:
         super().__init__(WIDTH)
 
     def make_stream(self, units: Units, any_hit: bool, rays_struct: Any = RayArrays, accepts: Any = None) -> Any:
-        """Return make_kernel's kernel, or None for units without a vectorised form."""
+        """Return the kernel of `make_kernel`, or None if the units have no vectorised form."""
         if units.triangle != "watertight" or units.box not in ROW_PADS or units.counters or units.instances or units.resumes:
             return None
         return make_kernel(units, any_hit, rays_struct, accepts)

@@ -1,4 +1,5 @@
-// Boxes: units/box.py vectorised, under the same names, for one ray and the boxes of a node's children, or a packet and one box.
+// Box tests: units/box.py vectorised, with the same names. Either for one ray and the boxes of a node's children, or for the rays of a
+// packet and one box.
 #pragma once
 #include "lanes.h"
 
@@ -8,8 +9,8 @@ template <class T> struct BoxRay { Vec3<T> origin, inv_dir; };
 
 template <class T> struct Interval { T enter, leave; };
 
-// Narrow an interval to the part of a line between the near and far planes of a box. A NaN (0 * inf) compares as false, so that its
-// plane changes nothing. far_inv_dir is inv_dir widened for the rounding of far distances.
+// Narrow the interval t to the part of a line between the near and far planes of a box. A distance NaN (0 * inf) changes nothing, because
+// it compares as false. far_inv_dir is inv_dir times a factor that covers the rounding of far distances.
 template <class T, class Plane, class Number>
 WRT_INLINE void narrow(Interval<T>& t, const Vec3<Plane>& near, const Vec3<Plane>& far, const Vec3<Number>& origin,
                        const Vec3<Number>& inv_dir, const Vec3<Number>& far_inv_dir) {
@@ -28,7 +29,7 @@ WRT_INLINE void narrow(Interval<T>& t, const Vec3<Plane>& near, const Vec3<Plane
     t.leave = leave_z < t.leave ? leave_z : t.leave;
 }
 
-// Return the planes of boxes that lines meet first, by the sign of their directions. With lo and hi swapped, return the far planes.
+// Return the planes of boxes that rays meet first, by the signs of the rays' directions. With lo and hi exchanged: the far planes.
 template <class T> WRT_INLINE Vec3<T> near_planes(const BoxRay<T>& ray, const Vec3<T>& lo, const Vec3<T>& hi) {
     return {{ray.inv_dir[0] < 0.0f ? hi[0] : lo[0], ray.inv_dir[1] < 0.0f ? hi[1] : lo[1], ray.inv_dir[2] < 0.0f ? hi[2] : lo[2]}};
 }
@@ -41,7 +42,8 @@ template <class T> WRT_INLINE Interval<T> slab_interval(const BoxRay<T>& ray, co
 
 // --- one ray and the children of a node --------------------------------------------------------------------------------------
 
-// The part of a LaneRay (lanes.py) that a node needs. `near` has the plane that the ray meets first on each axis.
+// The part of a LaneRay (lanes.py) that the test of a node needs. `near` has, for each axis, the index of the plane that the ray meets
+// first (layout.py: PLANES).
 struct NodeRay {
     Vec3<float> origin, inv_dir, far_inv_dir;
     int near[3];
@@ -53,14 +55,14 @@ template <class LaneRay> WRT_INLINE NodeRay node_ray(const LaneRay& ray) {
     return {{{o[0], o[1], o[2]}}, {{i[0], i[1], i[2]}}, {{f[0], f[1], f[2]}}, {ray.near_x, ray.near_y, ray.near_z}, ray.box.t_min};
 }
 
-// A node with N children. Layout has the constants of nodes.py.
+// A node with N children, in the layout that nodes.py describes. `Layout` has the constants.
 template <int N, class Layout> struct Node {
     typedef typename Lanes<N>::Floats Row;
     const float* numbers;
 
     WRT_MEMBER unsigned word() const { return load<unsigned>(numbers + Layout::WORD); }
 
-    // Return plane `k`, one of this axis, of all children.
+    // Return plane `k` of all children; `axis` is its axis.
     WRT_MEMBER Row plane(int k, int axis) const {
         if constexpr (Layout::COMPRESSED) {
             typedef unsigned char Bytes __attribute__((vector_size(N)));
@@ -89,7 +91,7 @@ template <int N, class Layout> struct Node {
         return mask_of(t.enter <= t.leave) & exist();
     }
 
-    // Return the ray's entry distances.
+    // Return the ray's entry distances of all children.
     WRT_MEMBER Row entries(const NodeRay& ray) const { return interval(ray, 0.0f).enter; }
 };
 

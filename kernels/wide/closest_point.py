@@ -1,11 +1,11 @@
-"""Closest points: a walk over a wide BVH by distance instead of along a ray.
+"""Closest points on a mesh: a walk over a wide BVH in the order of distance from a point.
 
-The record of a triangle without area has NaN in its first corner, so that no ray hits it. A point still has a distance to it, as to a
-segment or a point. So its corners are read from the mesh.
+A triangle without area has NaN in the first corner of its record, so that no ray hits it. But a point has a distance to it, as to a segment
+or a point: so the corners are read from the mesh.
 
-The distance to a triangle is computed in float64 (Ericson 2005, "Real-Time Collision Detection", section 5.1, has the problem). It is at
-least the distance to the triangle's padded box. Rounding keeps the order of distances, so no box on the way is farther than a triangle in
-it. Which triangle is nearest does not depend on the tree."""
+The distance to a triangle is computed in float64 (Ericson 2005, "Real-Time Collision Detection", section 5.1). It is clamped to at least
+the distance to the triangle's padded box. Rounding is monotone, so no box above a triangle is farther than the triangle. Therefore the
+nearest triangle does not depend on the tree."""
 
 from functools import cache
 from typing import Any
@@ -23,12 +23,12 @@ from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
 from wrt.kernels.wide.traverse import make_gather, make_struct, row_size
 
 empty_stack = make_uninitialized(STACK_SIZE, wp.uint64)
-NOTHING = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))  # Greater than any entry of a stack.
+NOTHING = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))  # No node: greater than every stack entry.
 
 
 @wp.struct
 class Nearest:
-    """A point on a triangle, and its squared distance. A prim_id of -1 means that none was found so far."""
+    """A point on a triangle, and its squared distance from the query point; prim_id = -1: no triangle found."""
 
     d2: wp.float64
     point: wp.vec3d
@@ -39,7 +39,7 @@ class Nearest:
 
 @wp.struct
 class PointArrays:
-    """Closest points. If there is no triangle: distance inf, prim_id -1, and the rest 0."""
+    """Closest points, one entry per query point. Without a triangle, distance is inf, prim_id -1, and all else 0."""
 
     distance: wp.array(dtype=wp.float32)
     point: wp.array(dtype=wp.vec3)
@@ -50,7 +50,7 @@ class PointArrays:
 
 @wp.func
 def squared_distance(p: wp.vec3, lo: wp.vec3, hi: wp.vec3) -> wp.float64:
-    """Return the squared distance from a point to a box, 0 inside."""
+    """Return the squared distance from a point to a box; 0 for a point inside."""
     out = wp.float64(0.0)
     for axis in range(3):
         x = wp.float64(p[axis])
@@ -61,7 +61,7 @@ def squared_distance(p: wp.vec3, lo: wp.vec3, hi: wp.vec3) -> wp.float64:
 
 @wp.func
 def before(a: wp.vec3d, b: wp.vec3d) -> bool:
-    """Compare points by x, then y, then z."""
+    """Test whether a precedes b in the order by x, then y, then z."""
     if a[0] != b[0]:
         return a[0] < b[0]
     if a[1] != b[1]:
@@ -71,9 +71,7 @@ def before(a: wp.vec3d, b: wp.vec3d) -> bool:
 
 @wp.func
 def along_edge(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d) -> wp.float64:
-    """Return the place of p's closest point on the edge: 0 at a, 1 at b.
-
-    If both are one point it is 1: the smaller of NaN and a number is the number."""
+    """Return the parameter of the edge's point closest to p: 0 at a, 1 at b. For a = b it is 1, because wp.min ignores NaN."""
     edge = b - a
     t = wp.dot(p - a, edge) / wp.dot(edge, edge)
     return wp.max(wp.min(t, wp.float64(1.0)), wp.float64(0.0))
@@ -81,7 +79,8 @@ def along_edge(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d) -> wp.float64:
 
 @wp.func
 def nearer_edge(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, best: Nearest, corner_a: int, corner_b: int) -> Nearest:
-    """Return the nearer of `best` and the edge between two corners, which is the same for both triangles at it."""
+    """Return the nearer of `best` and the point closest to p on the edge from a to b; these are corners corner_a and corner_b (0 .. 2).
+    Both triangles at an edge get the same bits, because the edge's ends are first sorted."""
     turned = before(b, a)
     start = wp.where(turned, b, a)
     end = wp.where(turned, a, b)
@@ -104,7 +103,7 @@ def nearer_edge(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, best: Nearest, corner_a: 
 
 @wp.func
 def on_edges(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> Nearest:
-    """Return the closest point on a triangle's three edges."""
+    """Return the point closest to p on a triangle's three edges."""
     out = Nearest()
     out.d2 = wp.float64(wp.inf)
     out = nearer_edge(p, a, b, out, 0, 1)
@@ -114,9 +113,9 @@ def on_edges(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> Nearest:
 
 @wp.func
 def on_triangle(point: wp.vec3, triangle: Primitive) -> Nearest:
-    """Return the closest point on a triangle: inside it if the point is above it, else on an edge.
+    """Return the closest point on a triangle: inside the triangle if the query point projects into it, else on an edge.
 
-    If a corner is NaN or infinite, d2 is infinite. The record of a triangle without area has such a corner."""
+    If a corner is NaN or infinite, as in the record of a triangle without area, d2 is infinite."""
     p = wp.vec3d(point)
     a = wp.vec3d(triangle.v0)
     b = wp.vec3d(triangle.v1)
@@ -128,7 +127,7 @@ def on_triangle(point: wp.vec3, triangle: Primitive) -> Nearest:
     ap = p - a
     normal = wp.cross(ab, ac)
     area = wp.dot(normal, normal)
-    if not area < wp.float64(wp.inf):  # With finite corners it is far from overflow.
+    if not area < wp.float64(wp.inf):  # True only for corners that are not finite: float32 corners cannot overflow float64 here.
         return out
     v = wp.dot(wp.cross(ab, ap), normal)
     u = wp.dot(wp.cross(ap, ac), normal)
@@ -144,7 +143,7 @@ def on_triangle(point: wp.vec3, triangle: Primitive) -> Nearest:
 
 @wp.func
 def nearer_of(p: wp.vec3, triangle: Primitive, on: Nearest, best: Nearest) -> Nearest:
-    """Return the nearer of `best` and the point `on` this triangle; of equal ones the lower prim_id."""
+    """Return the nearer of `best` and `on`, a point on this triangle; at equal distance, the point with the lower prim_id."""
     lo = lower(lower(triangle.v0, triangle.v1), triangle.v2)
     hi = upper(upper(triangle.v0, triangle.v1), triangle.v2)
     pad = box_pad(lo, hi)
@@ -158,7 +157,7 @@ def nearer_of(p: wp.vec3, triangle: Primitive, on: Nearest, best: Nearest) -> Ne
 
 @noinline
 def nearer_flat(p: wp.vec3, surfaces: Surfaces, prim_id: int, best: Nearest) -> Nearest:
-    """Return nearer_of for a triangle without area: all of it is on its edges, and its record does not hold its corners."""
+    """Return nearer_of for a triangle without area. It consists of its edges, and its corners are read from the mesh."""
     face = surfaces.faces[prim_id]
     triangle = Primitive()
     triangle.v0 = surfaces.vertices[face[0]]
@@ -172,7 +171,7 @@ def nearer_flat(p: wp.vec3, surfaces: Surfaces, prim_id: int, best: Nearest) -> 
 
 
 def make_leaf_search(layout: NodeLayout) -> Any:
-    """Return nearest_in_leaf(accel, surfaces, reference, p, best) -> Nearest."""
+    """Return nearest_in_leaf(accel, surfaces, reference, p, best) -> Nearest: the nearest point of `best` and a leaf's triangles."""
     struct, gather = make_struct(Primitive), make_gather(Primitive, layout.width)
     width, size_of_row = layout.width, row_size(Primitive, layout.width)
 
@@ -193,7 +192,7 @@ def make_leaf_search(layout: NodeLayout) -> Any:
 
 
 def make_closest_point(layout: NodeLayout) -> Any:
-    """Return closest_point(accel, surfaces, p) -> Nearest, which walks the tree."""
+    """Return closest_point(accel, surfaces, p) -> Nearest: the point of all triangles closest to p."""
     struct, nearest_in_leaf = make_struct(Primitive), make_leaf_search(layout)
     plane, exists = make_plane(layout.width, layout.compressed)
 
@@ -228,7 +227,8 @@ def make_closest_point(layout: NodeLayout) -> Any:
                             if far != NOTHING:
                                 stack[size] = far
                                 size = size + 1
-            # The nearest child is next, or pop. What is farther than the best is dropped. Equal stays: see `nearer_of`.
+            # Next is the nearest child or, without one, an entry of the stack. Entries farther than the best are dropped, but not entries
+            # at the same distance: they may have a lower prim_id.
             while near == NOTHING and size > 0:
                 size = size - 1
                 if t_of(stack[size]) <= float(best.d2):
@@ -243,7 +243,7 @@ def make_closest_point(layout: NodeLayout) -> Any:
 
 @cache
 def make_closest_point_kernel(layout: NodeLayout) -> Any:
-    """Return the kernel for points first .. first + dim - 1, in a tree whose primitives are corners."""
+    """Return the kernel for points first .. first + dim - 1; the tree's primitives have the layout "corners"."""
     struct, closest_point = make_struct(Primitive), make_closest_point(layout)
 
     @kernel

@@ -1,12 +1,12 @@
-// Steps of one interleaved ray (layout.py: LEVEL, SLOT_WORDS). Each returns the next reference, or EMPTY (0) if the ray is done.
-// `nodes` is the tree's array, `slot` the ray's slot, and `bottom` the place in `stacks` where the ray's stack begins.
+// Steps of one interleaved ray (layout.py: LEVEL, SLOT_WORDS). Each step returns the next reference, or EMPTY (0) if the ray is finished.
+// `nodes` is the tree's array, `slot` the ray's slot, and `bottom` the index in `stacks` where the ray's stack begins.
 #pragma once
 #include "packet.h"
 
 namespace wrt {
 
-// Take the next child from a ray's stack, whose last level is at `at`. For any hit it is the last child there, else the nearest that
-// begins at or before `reach`.
+// Take the next child from a ray's stack, whose last level begins at stacks[at]. For any-hit rays, it is the last child of that level.
+// Otherwise, it is the nearest child of a level, and begins at or before `reach`.
 template <bool ANY_HIT> WRT_INLINE int take(const float* nodes, float reach, unsigned* stacks, int bottom, int at, int* slot) {
     unsigned* level;
     int child;
@@ -15,13 +15,13 @@ template <bool ANY_HIT> WRT_INLINE int take(const float* nodes, float reach, uns
         level = stacks + at;
         child = 31 - __builtin_clz(level[LEVEL_LEFT]);
     } else {
-        // Keys are not sorted, since most rays enter only one child or two: the least is searched here.
+        // Keys are not sorted, because most rays enter only one child or two. So search the least.
         unsigned key;
         for (;; at -= LEVEL) {
             if (at == bottom) return 0;
             level = stacks + at;
             key = least_of(load<Lanes<WIDTH>::Keys>(level));
-            // Equal stays: a tie there may have a lower prim_id.
+            // A child that begins exactly at `reach` may have a hit with a lower prim_id.
             if (__builtin_bit_cast(float, key & ~(unsigned)KEY_MASK) <= reach) break;
         }
         child = key & (WIDTH - 1);
@@ -35,8 +35,8 @@ template <bool ANY_HIT> WRT_INLINE int take(const float* nodes, float reach, uns
     return next;
 }
 
-// Push the children of a node that a ray enters on its stack, as a new level, if there are any; then take one. Both cases share one
-// path: a third of the nodes have no entered child, and a branch would be mispredicted. Distances are not negative.
+// Push the children of a node that a ray enters onto its stack as a new level, if there are any; then take a child. Both cases share one
+// path: in a third of the nodes, the ray enters no child, and a branch would be mispredicted. Distances must not be negative.
 template <bool ANY_HIT>
 WRT_INLINE int push_and_take(const float* nodes, int first, const Interval<Lanes<WIDTH>::Floats>& t, float reach, unsigned* stacks,
                             int bottom, int* slot) {
@@ -55,7 +55,7 @@ WRT_INLINE int push_and_take(const float* nodes, int first, const Interval<Lanes
     return take<ANY_HIT>(nodes, reach, stacks, bottom, WRT_UNPREDICTABLE(left != 0) ? place + LEVEL : place, slot);
 }
 
-// Put a ray into a slot, at the root's children, by the ROOT_ENTRIES of rays_meeting_root.
+// Put a ray into a slot, and take the first of the root's children. rays_meeting_root has stored their ROOT_ENTRIES.
 template <bool ANY_HIT> WRT_INLINE int begin(const float* nodes, float* packets, int ray, unsigned* stacks, int bottom, int* slot) {
     typedef Lanes<WIDTH>::Floats Children;
     Children enter;
@@ -66,7 +66,7 @@ template <bool ANY_HIT> WRT_INLINE int begin(const float* nodes, float* packets,
     return push_and_take<ANY_HIT>(nodes, 0, {enter, all<Children>(LARGEST)}, reach, stacks, bottom, slot);
 }
 
-// Go from a node to the next child, of this node or on the stack.
+// Visit a node, and take the next child: of this node or, if the ray enters none, from the stack.
 template <bool ANY_HIT> WRT_INLINE int step(const float* nodes, float* packets, unsigned* stacks, int bottom, int* slot) {
     typedef Lanes<WIDTH>::Floats Children;
     const int first = slot[SLOT_NEXT] * NODE_SIZE;
@@ -82,13 +82,13 @@ template <bool ANY_HIT> WRT_INLINE int step(const float* nodes, float* packets, 
     return push_and_take<ANY_HIT>(nodes, first, t, reach, stacks, bottom, slot);
 }
 
-// Go from a leaf to a child on the stack that begins at or before `reach`, the ray's t.
+// After a leaf, take a child from the stack that begins at or before `reach`, the ray's t.
 template <bool ANY_HIT> WRT_INLINE int pop(const float* nodes, float reach, unsigned* stacks, int bottom, int* slot) {
     return take<ANY_HIT>(nodes, reach, stacks, bottom, slot[SLOT_PLACE], slot);
 }
 
-// Test the triangles of a row in the mask. Store the nearest hit in the ray's column, and return its lane, or -1. For any hit, store
-// only t = -inf and some prim_id, and return lane 0.
+// Test the triangles of a row that are in the mask. Store the nearest hit in the ray's column; return its lane, or -1 on a miss. For an
+// any-hit ray that hits, store only t = -inf and prim_id = 0, and return 0.
 template <bool ANY_HIT> WRT_INLINE int ray_triangles_here(const float* row, int mask, float* column) {
     const OneRay ray = {column};
     const LeafRow triangles = {{row}};
@@ -113,7 +113,7 @@ template <bool ANY_HIT> WRT_INLINE int ray_triangles_here(const float* row, int 
     return j;
 }
 
-// The same, not inlined.
+// Call ray_triangles_here, without inlining.
 template <bool ANY_HIT> WRT_CALLED int ray_triangles(const float* row, int mask, float* column) {
     return ray_triangles_here<ANY_HIT>(row, mask, column);
 }

@@ -1,13 +1,13 @@
-// Vectors of lanes, on all of which one instruction works. They are an extension of GCC and Clang, and run on every CPU without
-// naming an instruction set.
+// Vectors whose lanes one instruction processes. They are an extension of GCC and Clang: the compiler chooses the instructions, so that the
+// code runs on every CPU.
 #pragma once
 #define WRT_INLINE static inline __attribute__((always_inline))
 #define WRT_MEMBER inline __attribute__((always_inline))
-#define WRT_CALLED static __attribute__((noinline))  // Otherwise the compiler inlines it at each call.
+#define WRT_CALLED static __attribute__((noinline))  // For large functions, which the compiler would inline at each call.
 
 namespace wrt {
 
-// Integers are as long as floats. A comparison of floats returns integers, -1 or 0, which choose between floats or integers.
+// Vectors of N lanes. A comparison of Floats returns Ints, -1 or 0 in each lane, which the operator ?: accepts to select lanes.
 template <int N> struct Lanes {
     typedef float Floats __attribute__((vector_size(4 * N)));
     typedef int Ints __attribute__((vector_size(4 * N)));
@@ -26,7 +26,7 @@ template <class V> WRT_INLINE V load(const void* from) {
 
 template <class V> WRT_INLINE void store(void* to, V value) { __builtin_memcpy(to, &value, sizeof(value)); }
 
-// Return a number in all lanes, or a vector unchanged.
+// Return a vector with the number x in all lanes; if x is a vector, return x.
 template <class V, class Number> WRT_INLINE V all(Number x) { return x - V{}; }
 
 template <class V> WRT_INLINE V absolute(V x) {
@@ -48,7 +48,7 @@ template <class V> WRT_INLINE auto least_of(V x) {
 #endif
 }
 
-// Return the lanes where a comparison holds as a mask, a bit a lane.
+// Return a comparison's result as a mask: bit k is set if the comparison holds in lane k.
 template <class V> WRT_INLINE int mask_of(V holds) {
     constexpr int N = lanes_of<V>;
 #if defined(__clang__)
@@ -64,7 +64,7 @@ template <class V> WRT_INLINE int mask_of(V holds) {
 #endif
 }
 
-// Return the comparison that holds in the lanes of a mask.
+// Return a mask as a comparison's result: -1 in the lanes whose bit is set, else 0.
 template <class Ints> WRT_INLINE Ints in_mask(int mask) {
     Ints lane;
     for (int k = 0; k < lanes_of<Ints>; ++k) lane[k] = k;
@@ -73,7 +73,7 @@ template <class Ints> WRT_INLINE Ints in_mask(int mask) {
 
 WRT_INLINE int lowest(unsigned mask) { return __builtin_ctz(mask); }
 
-// For a condition that is true about half the time.
+// Tell the compiler that a condition is true about half the time, so that it avoids a branch.
 #if defined(__clang__)
 #define WRT_UNPREDICTABLE(condition) __builtin_unpredictable(condition)
 #else

@@ -1,7 +1,7 @@
-"""Rows of 4 or 8 floats that one CPU instruction works on, for the few loops that take most of a ray's time.
+"""Rows of 4 or 8 floats, which one vector instruction of a CPU processes: for the loops that take most of a ray's time.
 
-Rows lie one after another in a flat array of float32. Each function on a row has two forms, which a test holds to the same bits. One is C++
-for the CPU; the other is plain Warp, lane by lane, for CUDA."""
+Rows are consecutive in a flat array of float32. Each function on a row has two forms with the same bits (tests/kernels/wide/test_lanes.py):
+C++ for the CPU and, for CUDA, plain Warp that processes one lane after another."""
 
 from functools import cache
 from typing import Any
@@ -13,32 +13,32 @@ from wrt.kernels.units.box import FAR_PAD, BoxRay
 from wrt.kernels.units.triangle import edge_areas, outside, sheared
 from wrt.kernels.wide.layout import CACHE_LINE
 
-# Rows widen far distances by widening the reciprocals: one product instead of two. The two ways differ by at most four roundings.
-# 8 u more than FAR_PAD outweigh these, so that rows enter every box that the box unit enters.
+# Factor of far distances, as FAR_PAD. Rows multiply the reciprocal direction by it once per ray, not each distance: this differs by at
+# most four roundings. LANE_PAD exceeds FAR_PAD by 8 u, so that a ray enters every box of a row that it enters in the box unit.
 LANE_PAD = wp.constant(FAR_PAD * (1.0 + 8.0 * 2.0**-24))
 
 
 @wp.struct
 class LaneRay:
-    """A ray as the tests of rows need it."""
+    """A ray set up for the tests of rows."""
 
-    box: BoxRay  # For the box unit; t_min is never -0.
-    far_inv_dir: wp.vec3  # Reciprocals for far planes.
-    near_x: int  # The plane (nodes.PLANES) that the ray meets first on x.
+    box: BoxRay  # Set-up for the box unit; t_min is never -0.
+    far_inv_dir: wp.vec3  # inv_dir times nodes.far_pad, for distances to far planes.
+    near_x: int  # Indices near_x, near_y, near_z in layout.PLANES: for each axis, the plane that the ray meets first.
     near_y: int
     near_z: int
-    kx: int  # This and the next four: as in TriangleRay.
+    kx: int  # kx, ky, kz, shear_x, shear_y: as in TriangleRay.
     ky: int
     kz: int
     shear_x: float
     shear_y: float
-    origin: wp.vec3  # In the order kx, ky, kz.
+    origin: wp.vec3  # The ray's origin in the axis order kx, ky, kz.
 
 
 def lanes_only(body: str, otherwise: str = "0") -> str:
-    """Return the body of a native function for the CPU, where kernels of structs.kernel have the headers of wide/.
+    """Return the body of a native function that exists only with the headers of wide/, in CPU kernels of structs.kernel.
 
-    CUDA calls the plain form. A kernel that a user made by wp.kernel is refused (ray_query.fused)."""
+    Elsewhere the function returns `otherwise` and is not called: CUDA uses the plain form, and ray_query.fused rejects wp.kernel."""
     return f"\n#if defined(WRT_INLINE)\n{body}\n#else\n    return {otherwise};\n#endif\n"
 
 
@@ -50,17 +50,17 @@ def lanes_only(body: str, otherwise: str = "0") -> str:
 #endif
 """)
 def lowest(mask: int) -> int:
-    """Return the lowest lane of a mask, which must not be empty."""
+    """Return the index of the lowest bit set in a mask, which must not be 0."""
 
 
 @wp.func_native("return rows.data[(long long)i];")
 def value(rows: wp.array(dtype=wp.float32), i: int) -> float:
-    """Return rows[i], of an array without gaps."""
+    """Return rows[i] of a contiguous array."""
 
 
 @wp.func_native("int value; memcpy(&value, rows.data + (long long)i, sizeof(value)); return value;")
 def bits(rows: wp.array(dtype=wp.float32), i: int) -> int:
-    """Return rows[i] as the int32 of the same bits."""
+    """Return the bits of rows[i] as an int32."""
 
 
 @wp.func_native(f"""
@@ -69,7 +69,7 @@ def bits(rows: wp.array(dtype=wp.float32), i: int) -> int:
 #endif
 """)
 def prefetch(rows: wp.array(dtype=wp.float32), first: int, lines: int) -> None:
-    """Prefetch so many cache lines from rows[first] on."""
+    """Prefetch `lines` cache lines, from rows[first] on."""
 
 
 @cache
@@ -80,11 +80,11 @@ def row_type(width: int) -> Any:
 
 @cache
 def make_plain_cull(width: int) -> Any:
-    """Return make_cull in plain Warp, lane by lane."""
+    """Return the function of `make_cull` in plain Warp, one lane after another."""
 
     @wp.func
     def corner(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay) -> wp.vec3:
-        """Return a corner as the ray sees it. Its three rows have this lane at first, first + width and first + 2 width."""
+        """Return a corner in the space where the ray is the z axis. Its x, y, z are rows[first], [first + width], [first + 2 width]."""
         x = value(rows, first + width * ray.kx)
         y = value(rows, first + width * ray.ky)
         z = value(rows, first + width * ray.kz)
@@ -94,7 +94,7 @@ def make_plain_cull(width: int) -> Any:
     def cull(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay) -> int:
         mask = int(0)
         j = int(0)
-        while j < width:  # A `for` would be unrolled, and double a traversal's instructions.
+        while j < width:  # Warp would unroll a `for`, which doubles the number of instructions of a traversal.
             a = corner(rows, first + j, ray)
             b = corner(rows, first + j + 3 * width, ray)
             c = corner(rows, first + j + 6 * width, ray)
@@ -108,7 +108,7 @@ def make_plain_cull(width: int) -> Any:
 
 @cache
 def make_native_cull(width: int) -> Any:
-    """Return make_cull in C++, for the CPU only."""
+    """Return the function of `make_cull` in C++, for the CPU only."""
 
     @wp.func_native(lanes_only(f"return wrt::cull<{width}>(rows.data + (long long)first, ray);"))
     def cull(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay) -> int: ...
@@ -118,7 +118,7 @@ def make_native_cull(width: int) -> Any:
 
 @cache
 def make_cull(width: int) -> Any:
-    """Return cull(rows, first, ray): the mask of a row's triangles without the ones that the watertight unit refuses in float32."""
+    """Return cull(rows, first, ray), which returns the mask of a row's triangles that the watertight test does not reject in float32."""
     plain, vector = make_plain_cull(width), make_native_cull(width)
 
     @wp.func

@@ -1,4 +1,4 @@
-"""Constants of nodes, packets, stacks and slots, for Python and for C++ (`LAYOUT_H` is the text of layout.h)."""
+"""Memory layouts of nodes, packets, stacks and slots, as constants for Python and C++; LAYOUT_H is the text of layout.h."""
 
 from typing import NamedTuple
 
@@ -11,24 +11,24 @@ from wrt.kernels.wide.references import LEAF_BITS
 
 CACHE_LINE = 16  # In floats.
 
-# --- nodes (their layouts are described in wide/nodes.py) -------------------------------------------------------------
+# --- nodes (wide/nodes.py describes their layouts) --------------------------------------------------------------------
 
-# The planes' rows. The indices of an axis's low and high plane differ in the last bit.
+# Names of a node's planes, in order. The indices of the low and the high plane of an axis differ in the last bit.
 PLANES = ("lo_x", "hi_x", "lo_y", "hi_y", "lo_z", "hi_z")
 LO_X, HI_X, LO_Y, HI_Y, LO_Z, HI_Z = range(len(PLANES))
 
-# A compressed node: the places of its word and its bytes, the parts of the word, and the fraction's bits in a float32.
+# A compressed node: the index of its word and of its first bytes, in floats; the bit fields of the word; mantissa bits of a float32.
 WORD, FIRST_BYTES = 3, 4
 EXPONENT_BITS = 8
 EXIST_SHIFT = 3 * EXPONENT_BITS
 MANTISSA_BITS = 23
 
-# The builder limits the stack of a single ray's walk to so many entries (kernels.build.wide.collapse).
+# Entries of the stack in a traversal for one ray. The builder makes no tree that needs more (kernels.build.wide.collapse).
 STACK_SIZE = 64
 
 
 def first_reference(width: int, compressed: bool) -> int:
-    """Return the place of the children's references in a node."""
+    """Return the index of the first child's reference in a node, in floats."""
     return FIRST_BYTES + len(PLANES) * width // 4 if compressed else len(PLANES) * width
 
 
@@ -38,7 +38,7 @@ def node_size(width: int, compressed: bool) -> int:
 
 
 class NodeLayout(NamedTuple):
-    """Nodes of `width` children, plain or compressed."""
+    """The layout of nodes with `width` children, plain or compressed."""
 
     width: int
     compressed: bool
@@ -53,58 +53,58 @@ class NodeLayout(NamedTuple):
 
     @property
     def unit(self) -> int:
-        """Number of primitives that a leaf's reference counts in: a row, or 1 if leaves follow each other without a gap."""
+        """Unit in which a leaf's reference counts primitives: a whole row, or 1 with compressed nodes, whose leaves share rows."""
         return 1 if self.compressed else self.width
 
 
 # --- many rays at a time ----------------------------------------------------------------------------------------------
 
-WIDTH = 8  # Children of a node, and triangles of a row.
-LANES = 16  # Rays of a packet.
-PRIM_ID_ROW = size_of(Primitive) // 4 - 1  # Among the values of a row of primitives.
-ROW_SIZE = size_of(Primitive) // 4 * WIDTH  # Floats in a row of primitives.
-COHERENT = 1 << LANES  # set_up adds it to the mask of active rays if they have a beam.
-LINES = 5  # Prefetched cache lines. A row of triangles has 5, a node 4, and a branch would cost more.
+WIDTH = 8  # Number of children of a node, and of triangles in a row.
+LANES = 16  # Number of rays in a packet.
+PRIM_ID_ROW = size_of(Primitive) // 4 - 1  # Index of prim_id among the 4-byte values of a primitive.
+ROW_SIZE = size_of(Primitive) // 4 * WIDTH  # Number of floats in a row of primitives.
+COHERENT = 1 << LANES  # Bit that set_up adds to the mask of active rays if they have a beam.
+LINES = 5  # Number of cache lines to prefetch: a row of triangles has 5, a node 4. Prefetching 5 is faster than a branch.
 
-# A packet is a block of floats. It begins with a vector of sixteen lanes for each field of a ray. The field `turned` is the origin in the
-# order kx, ky, kz. The field `axes` has kx, ky, kz in AXIS_BITS each, and `near` the place of the near planes in a node.
+# A packet is a block of floats. It begins with a vector of sixteen lanes for each field of a ray. The fields `turned` are the origin in
+# the axis order kx, ky, kz. The field `axes` has kx, ky, kz, with AXIS_BITS each. The fields `near` are indices of near planes in a node.
 FIELDS = ("origin_x", "origin_y", "origin_z", "inverse_x", "inverse_y", "inverse_z", "far_x", "far_y", "far_z", "t_min", "t",
           "direction_x", "direction_y", "direction_z", "turned_x", "turned_y", "turned_z", "shear_x", "shear_y", "shear_z",
           "axes", "u", "v", "prim_id", "scale", "near_x", "near_y", "near_z", "exclude")
-FIELD = {name: LANES * i for i, name in enumerate(FIELDS)}  # Places of the fields in a packet.
+FIELD = {name: LANES * i for i, name in enumerate(FIELDS)}  # Index in a packet of each field's first lane.
 AXIS_BITS = 2
 
-# Then follows the beam: intervals that hold the origins and reciprocals of all its rays. Each word has values for x, y and z. The
-# first two are the origins closest to the near and to the far planes. The next are the reciprocals of the largest and the smallest
-# magnitude, and the same two for far planes. The next tells which plane of a node is near, as a float. The last is the lowest t_min
-# of all rays. Two words more are not the beam's. REFUSED is the mask of rays that a query refuses (wrt.accel.queries.rays).
-# ACTIVE is the result of set_up.
+# After the fields comes the beam: intervals that contain the origins and the reciprocal directions of all rays. Each entry has three
+# values, for x, y and z. Of all origins, near_origin is closest to the near planes, and far_origin to the far planes. Of all reciprocals,
+# `largest` and `smallest` have the largest and the smallest magnitude. Multiplied by the far pad, they are far_largest and far_smallest.
+# The index of the near plane in PLANES, as a float, is near_row. The lowest t_min of all rays is a single value. Two more words follow:
+# REFUSED, the mask of invalid rays, which a query rejects (wrt.accel.queries.rays); and ACTIVE, the result of set_up.
 BEAM_WORDS = ("near_origin", "far_origin", "largest", "smallest", "far_largest", "far_smallest", "near_row", "t_min")
 BEAM = {name: LANES * len(FIELDS) + 3 * i for i, name in enumerate(BEAM_WORDS)}
 REFUSED = BEAM["t_min"] + 1
 ACTIVE = REFUSED + 1
 
-# Then follows what rays_meeting_root finds: for each child of the root, a vector of the rays' entry distances, inf for a miss.
+# Then come the results of rays_meeting_root: for each child of the root, a vector of the rays' entry distances, inf for a miss.
 ROOT_ENTRIES = LANES * (ACTIVE // LANES + 1)
 PACKET_SIZE = ROOT_ENTRIES + WIDTH * LANES  # A multiple of 16, which keeps all vectors aligned to cache lines.
 
-# An entry of a packet's stack has its key (traverse.stack.key_of), of two words, then the mask of its rays (ENTRY_RAYS), and a word
-# of padding. A packet's stack needs one entry more than a ray's: it also holds the nearest child. It shares the memory of the
-# slots' stacks, which are used later.
+# An entry of a packet's stack has a key of two words (traverse.stack.key_of), the mask of the rays (ENTRY_RAYS), and a word of padding. It
+# needs one entry more than the stack of one ray, because it also holds the nearest child. Packets and interleaved rays run one after the
+# other, so their stacks share memory.
 ENTRY, ENTRY_RAYS = 4, 2
 
-# A ray's stack is a list of levels, one for each node above the ray's place that has children left. A level holds eight keys, the
-# place of the node's references (LEVEL_REFERENCES), and the mask of the children left (LEVEL_LEFT). A key is the distance with its
-# last four bits replaced by the child's index + 8; an order does not need these bits. A child that was missed or taken has a key of
-# all ones, which is a NaN. Any hit needs no order, and has no keys. The first level is empty.
+# The stack of an interleaved ray is a list of levels: one for each ancestor of the present node that has pending children. A level holds
+# eight keys, the index of the node's references (LEVEL_REFERENCES), and the mask of pending children (LEVEL_LEFT). A key is the entry
+# distance, with its last four bits replaced by the child's index + 8; the order of children does not need these bits. If a child is not
+# pending, all bits of its key are 1, which is a NaN. Any-hit rays need no order and have no keys. The first level is empty.
 LEVEL = 16
 LEVEL_REFERENCES = WIDTH
 LEVEL_LEFT = WIDTH + 1
 KEY_MASK = 2 * WIDTH - 1
-# A level is pushed for a node with two or more entered children. A single ray's walk pushes an entry there, too.
+# A level remains on the stack only for a node with two or more entered children. The traversal for one ray pushes an entry there, too.
 STACK_WORDS = LEVEL * (STACK_SIZE + 2)
 
-# A slot holds an interleaved ray: its column in `packets`, the next reference, and the place of its last level.
+# A slot describes an interleaved ray: its column in `packets`, the next reference, and the index of the last level of its stack.
 SLOT_WORDS = ("ray", "next", "place")
 SLOT = {name: i for i, name in enumerate(SLOT_WORDS)}
 SLOT_SIZE = 4

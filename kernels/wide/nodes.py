@@ -1,11 +1,11 @@
-"""Nodes of wide BVHs: the boxes of all children tested against one ray, as rows of lanes.
+"""Nodes of wide BVHs, and the test of one ray against the boxes of all children of a node.
 
-Nodes lie in a flat array of float32; layout.py has the constants.
-- A plain node has 8 rows of `width` floats, 64 for bvh8. They are the six planes (PLANES), the children's references (int32), and an unused
-  row that aligns nodes to cache lines.
-- A compressed node has 24 floats for bvh8c (Ylitie, Karras and Laine 2017, section 3.2). They are an origin (3 floats), a word of three
+Nodes are consecutive in a flat array of float32; layout.py has the constants.
+- A plain node has 8 rows of `width` floats, 64 floats for bvh8. The rows are the six planes (PLANES), the children's references (int32),
+  and an unused row that aligns nodes to cache lines.
+- A compressed node has 24 floats for bvh8c (Ylitie, Karras and Laine 2017, section 3.2). It has an origin (3 floats), a word with three
   exponents and the mask of existing children, six rows of `width` bytes, and the references. A plane is origin + byte * 2^(exponent - 127),
-  rounded once. The builder makes sure that it is never inside the box. A NaN origin leaves its axis open: it stops no ray."""
+  rounded once. The builder ensures that no plane cuts off a part of the box. With a NaN origin, an axis rejects no ray."""
 
 from functools import cache
 from typing import Any
@@ -17,19 +17,19 @@ from wrt.kernels.units.box import RAY_AABB
 from wrt.kernels.wide.lanes import LANE_PAD, LaneRay, bits, lanes_only, row_type, value
 from wrt.kernels.wide.layout import EXIST_SHIFT, EXPONENT_BITS, FIRST_BYTES, HI_X, HI_Y, HI_Z, LO_X, LO_Y, LO_Z, MANTISSA_BITS, WORD
 
-# Factor of far distances, for the box tests that have a form in rows.
+# Factor of far distances for the box tests that have a vectorised form, by their names in RAY_AABB.
 ROW_PADS = {"conservative": LANE_PAD, "minmax": 1.0}
 
 
 @cache
 def make_plane(width: int, compressed: bool) -> Any:
-    """Return plane(nodes, first, k, lane), a value of one of PLANES, and exists(nodes, first, lane) for that child."""
+    """Return plane(nodes, first, k, lane): the coordinate of plane PLANES[k] of a child; and exists(nodes, first, lane) -> bool."""
 
     @wp.func
     def plane(nodes: wp.array(dtype=wp.float32), first: int, k: int, lane: int) -> float:
         if wp.static(compressed):
             axis = k >> 1
-            at = k * width + lane  # Of the bytes, four in a word.
+            at = k * width + lane  # Index among the bytes; a word has four.
             byte = (bits(nodes, first + FIRST_BYTES + (at >> 2)) >> (8 * (at & 3))) & 255
             exponent = (bits(nodes, first + WORD) >> (EXPONENT_BITS * axis)) & wp.static((1 << EXPONENT_BITS) - 1)
             return value(nodes, first + axis) + float(byte) * wp.cast(exponent << MANTISSA_BITS, wp.float32)
@@ -45,7 +45,7 @@ def make_plane(width: int, compressed: bool) -> Any:
 
 
 def lane_by_lane(width: int, compressed: bool, enters: Any) -> Any:
-    """Return make_children's function for the test of one child, enters(nodes, first, lane, ray, t_max) -> distance or inf."""
+    """Return the function of `make_children`, which tests one child after another by enters(nodes, first, lane, ray, t_max) -> t or inf."""
     row = row_type(width)
     _, exists = make_plane(width, compressed)
 
@@ -65,7 +65,7 @@ def lane_by_lane(width: int, compressed: bool, enters: Any) -> Any:
 
 @cache
 def make_scalar(width: int, compressed: bool, box: str) -> Any:
-    """Return make_children's function by the scalar unit of RAY_AABB, for a box test that has no form in rows."""
+    """Return the function of `make_children` for a box test without a vectorised form: it calls RAY_AABB[box]."""
     plane, _ = make_plane(width, compressed)
     ray_aabb = RAY_AABB[box]
 
@@ -80,7 +80,7 @@ def make_scalar(width: int, compressed: bool, box: str) -> Any:
 
 @cache
 def make_plain(width: int, compressed: bool) -> Any:
-    """Return make_children's function in plain Warp."""
+    """Return the function of `make_children` in plain Warp."""
     plane, _ = make_plane(width, compressed)
 
     @wp.func
@@ -104,7 +104,7 @@ def make_plain(width: int, compressed: bool) -> Any:
 
 @cache
 def make_native(width: int, compressed: bool) -> Any:
-    """Return make_children's function in C++, for the CPU only."""
+    """Return the function of `make_children` in C++, for the CPU only."""
     row = row_type(width)
     numbers = {"COMPRESSED": int(compressed), "WORD": WORD, "FIRST_BYTES": FIRST_BYTES, "EXPONENT_BITS": EXPONENT_BITS,
                "EXIST_SHIFT": EXIST_SHIFT, "MANTISSA_BITS": MANTISSA_BITS}
@@ -130,10 +130,10 @@ def make_native(width: int, compressed: bool) -> Any:
 
 @cache
 def make_children(width: int, compressed: bool, box: str) -> Any:
-    """Return children(nodes, first, ray, t_max) -> (row, mask) for the node at `first` and a finite t_max.
+    """Return children(nodes, first, ray, t_max) -> (row, mask) for the node at nodes[first] and a finite t_max.
 
-    The mask has the children that the ray enters, at or before t_max and before it leaves them. The row has its entry distances, at least
-    t_min. `box` is a name in RAY_AABB; the ray's far_inv_dir is widened by far_pad(box). Each device runs its own form."""
+    The mask has the children that the ray's segment [t_min, t_max] enters. The row has the entry distances, at least t_min. The box test
+    `box` is a name in RAY_AABB; ray.far_inv_dir must include the factor far_pad(box). CUDA and the CPU run different forms."""
     if box not in ROW_PADS:
         return make_scalar(width, compressed, box)
     plain, vector = make_plain(width, compressed), make_native(width, compressed)
@@ -148,5 +148,5 @@ def make_children(width: int, compressed: bool, box: str) -> Any:
 
 
 def far_pad(box: str) -> float:
-    """Return the factor of far distances: 1 for a box test that widens them itself."""
+    """Return the factor for LaneRay.far_inv_dir; 1 for a box test without a vectorised form, which widens distances itself."""
     return ROW_PADS.get(box, 1.0)

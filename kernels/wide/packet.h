@@ -1,11 +1,11 @@
-// Steps of a packet's walk: tests of nodes and triangles, and the stack (layout.py).
+// Steps of a packet's traversal: tests of nodes and triangles, and the stack. layout.py describes the memory layouts.
 #pragma once
 #include "layout.h"
 #include "triangle.h"
 
 namespace wrt {
 
-// --- all rays of a packet, or one of them (layout.py: FIELDS) -------------------------------------------------------------------
+// --- access to the fields of all rays of a packet, or of one ray (layout.py: FIELDS) ---------------------------------------------
 
 typedef Lanes<LANES>::Floats Rays;
 typedef Lanes<LANES>::Ints RayInts;
@@ -30,7 +30,7 @@ template <class T, class Number> WRT_INLINE Vec3<T> in_lanes(const Vec3<Number>&
     return {{all<T>(v[0]), all<T>(v[1]), all<T>(v[2])}};
 }
 
-// Return three fields, for x, y and z.
+// Return a vector of three consecutive fields; `first` is the index of the x field.
 template <class T, class Ray> WRT_INLINE Vec3<T> vector(const Ray& ray, int first) {
     return {{all<T>(ray[first]), all<T>(ray[first + LANES]), all<T>(ray[first + 2 * LANES])}};
 }
@@ -59,8 +59,8 @@ struct Triangle {
     WRT_MEMBER RayInts prim_id() const { return all<RayInts>(id); }
 };
 
-// Return the hits in [t_min, t]. At t itself, the prim_id must not be higher than the best hit's. The steps are those of
-// `watertight`, `within_bounds` and `better` (traverse/common.py), in the lanes of `mask`, without a ray's own triangle (EXCLUDE).
+// Return the hits that are better than the best hit of each ray: with t in [t_min, T] and, at t = T, a prim_id that is not higher. The
+// steps are those of `watertight`, `within_bounds` and `better` (traverse/common.py), in the lanes of `mask`, without a ray's own triangle.
 template <int N, class Triangles, class Ray>
 WRT_INLINE Hits<N> ray_triangle(const Triangles& triangles, const Ray& ray, int mask) {
     typedef typename Lanes<N>::Floats Floats;
@@ -87,7 +87,7 @@ WRT_INLINE Hits<N> ray_triangle(const Triangles& triangles, const Ray& ray, int 
     return hit;
 }
 
-// Return the primitives of a row that are spheres.
+// Return the mask of the primitives of a row that are spheres.
 WRT_INLINE int spheres_of(const float* row, int n_triangles) {
     return mask_of(LeafRow{{row}}.prim_id() >= n_triangles);
 }
@@ -111,9 +111,9 @@ WRT_INLINE Interval<Rays> interval_in(const PacketRay& ray, const Vec3<Rays>& ne
 
 typedef Lanes<WIDTH>::Floats Children;
 
-// Return the distances at which the beam enters and leaves the children of a node. Distances are products of two intervals, so the
-// bounds are the extreme origin times both reciprocals. The largest reciprocal comes first: it may be infinite, and the comparison
-// then skips 0 * inf = NaN.
+// Return the distances at which the beam enters and leaves the children of a node. A distance is a product of two intervals, so its bounds
+// are products of the extreme origin with both extreme reciprocals. The largest reciprocal comes first, because it may be infinite: then
+// the comparison ignores a product 0 * inf = NaN.
 WRT_INLINE Interval<Children> beam_interval(const float* packet, const float* node, const int near[3]) {
     Interval<Children> t = {all<Children>(packet[BEAM_T_MIN]), all<Children>(LARGEST)};
     for (int k = 0; k < 3; ++k) {
@@ -134,7 +134,8 @@ WRT_INLINE void prefetch(const float* nodes, const float* primitives, int refere
     for (int k = 0; k < LINES; ++k) __builtin_prefetch(first + CACHE_LINE * k);
 }
 
-// Push an entry on a stack of `size` entries. Those from `begin` on stay sorted, the farthest deepest; for any hit, in node order.
+// Push an entry onto a stack of `size` entries, and sort the entries from `begin` on, with the farthest deepest. For any-hit rays, entries
+// stay in the order of the node's children.
 template <bool ANY_HIT> WRT_INLINE void push(unsigned* stack, int begin, int size, unsigned long long key, int rays) {
     unsigned* at = stack + ENTRY * size;
     if constexpr (!ANY_HIT)
@@ -144,7 +145,7 @@ template <bool ANY_HIT> WRT_INLINE void push(unsigned* stack, int begin, int siz
     at[ENTRY_RAYS] = rays;
 }
 
-// Push the children of a node that rays of the mask enter on a stack of `size` entries; return its new size. Needs a beam.
+// Push the children of a node that rays of the mask enter onto a stack of `size` entries; return the new size. The packet must have a beam.
 template <bool ANY_HIT>
 WRT_CALLED int children(const float* nodes, const float* primitives, float* packet, int node, int mask, unsigned* stack, int size) {
     const float* const p = nodes + (long long)node * NODE_SIZE;
@@ -162,14 +163,14 @@ WRT_CALLED int children(const float* nodes, const float* primitives, float* pack
         if (!met) continue;
         const int next = load<int>(p + REFERENCES + child);
         prefetch(nodes, primitives, next);
-        const float entry = beam.enter[child];  // A copy: clang 22 casts the bits of element 0 of `beam.enter[child]`.
+        const float entry = beam.enter[child];  // Without this copy, clang 22 casts the bits of beam.enter[0].
         const auto key = (unsigned long long)__builtin_bit_cast(unsigned, entry) << 32 | (unsigned)next;
         push<ANY_HIT>(stack, size, top++, key, met);
     }
     return top;
 }
 
-// Return the rays of the mask that enter a child of the root, and store ROOT_ENTRIES.
+// Return the mask of the rays in `mask` that enter a child of the root, and store their entry distances in ROOT_ENTRIES.
 WRT_INLINE int rays_meeting_root(const float* root, int mask, float* packet) {
     const PacketRay ray = packet_ray({packet});
     const BoxRay<Rays> box = {ray.origin, ray.inv_dir};
@@ -186,11 +187,11 @@ WRT_INLINE int rays_meeting_root(const float* root, int mask, float* packet) {
     return out & mask;
 }
 
-// Return the rays whose t is at least t_entry.
+// Return the mask of the rays whose t is at least t_entry.
 WRT_INLINE int rays_reaching(float t_entry, float* packet) { return mask_of(AllRays{packet}[T] >= t_entry); }
 
-// Test the first `count` triangles of a row, one after another, against the rays of the mask; return the rays that hit one. For any
-// hit, t becomes -inf.
+// Test the first `count` triangles of a row, one after another, against the rays of the mask; return the mask of the rays that hit a
+// triangle. In any-hit rays that hit, t becomes -inf.
 template <bool ANY_HIT> WRT_CALLED int triangles(const float* row, int count, int mask, float* numbers) {
     const AllRays packet = {numbers};
     int found = 0;
@@ -212,7 +213,7 @@ template <bool ANY_HIT> WRT_CALLED int triangles(const float* row, int count, in
     return found;
 }
 
-// Write HitArrays (query.py) from `first` on. A miss has t = inf and prim_id = -1.
+// Write the hits of `count` rays to HitArrays (query.py), from index `first` on. A miss gets t = inf and prim_id = -1.
 template <class HitArrays> WRT_INLINE void write_hits(const HitArrays& hits, int first, int count, float* numbers) {
     const AllRays packet = {numbers};
     const RayInts id = packet.bits(PRIM_ID), prim_id = id == NO_HIT ? all<RayInts>(-1) : id;

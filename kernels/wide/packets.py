@@ -1,7 +1,7 @@
-"""Packets and interleaved rays, for kernels of one CPU thread: each function is a call of C++ (packet.h, set_up.h, interleaved.h).
+"""Packets and interleaved rays, for kernels of one CPU thread: each function calls C++ (packet.h, set_up.h, interleaved.h).
 
-Tests hold them to the bits of the scalar units. A packet begins at `base` in Scratch.packets, and a ray's column there is `ray`, base +
-lane."""
+The results have the bits of the box and triangle units (tests/kernels/wide/test_packets.py). The argument `base` is the index in
+Scratch.packets where a packet begins; `ray` is the index of a ray's column, base + lane."""
 
 from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -17,15 +17,15 @@ from wrt.kernels.wide.traverse import make_struct
 WideBvh = make_struct(Primitive)
 HEADERS = with_headers("wide/set_up.h", "wide/interleaved.h", layout=LAYOUT_H)
 
-if TYPE_CHECKING:  # As in structs.
+if TYPE_CHECKING:  # type checkers skip device code (structs.py)
     from typing import no_type_check as packet_kernel
 else:
     def packet_kernel(function):
-        """Make a kernel that may call the functions of this file."""
+        """Make a kernel that can call the functions of this file."""
         return kernel(function, extra_build_options=HEADERS)
 
 
-# Counts that a launch leaves: packets in a row that fell apart, packets until one is tried again, 1 after an invalid ray.
+# Indices of Scratch.report: packets that failed in succession; packets to interleave before the next is walked; 1 if a ray was invalid.
 FAILED, PAUSED, ANY_REFUSED = (wp.constant(place) for place in range(3))
 REPORT_SIZE = 3
 
@@ -34,14 +34,14 @@ REPORT_SIZE = 3
 class Scratch:
     """The working memory of one thread."""
 
-    packets: wp.array(dtype=wp.float32)  # PACKET_SIZE each.
-    stacks: wp.array(dtype=wp.uint32)  # STACK_WORDS for each slot; before these run, one packet's stack.
-    slots: wp.array(dtype=wp.int32)  # SLOT_SIZE each.
-    report: wp.array(dtype=wp.int32)  # By FAILED, PAUSED and ANY_REFUSED.
+    packets: wp.array(dtype=wp.float32)  # PACKET_SIZE floats per packet.
+    stacks: wp.array(dtype=wp.uint32)  # STACK_WORDS words per slot; during a packet's walk, the packet's stack.
+    slots: wp.array(dtype=wp.int32)  # SLOT_SIZE words per slot.
+    report: wp.array(dtype=wp.int32)  # Entries FAILED, PAUSED and ANY_REFUSED, which remain from launch to launch.
 
 
 def flag(value: bool) -> str:
-    """Return a bool as C++ writes a template's argument."""
+    """Return a bool as a C++ template argument."""
     return "true" if value else "false"
 
 
@@ -50,7 +50,7 @@ def flag(value: bool) -> str:
 
 @cache
 def make_set_up(rays_struct: Any) -> Any:
-    """Return set_up for RayArrays, or for RenderRays, whose directions are not scaled."""
+    """Return set_up for rays_struct: RayArrays, or RenderRays, whose directions it does not scale."""
     plain = rays_struct is RayArrays
     excludes = "nullptr" if plain else "rays.exclude.data + first"
 
@@ -58,9 +58,9 @@ def make_set_up(rays_struct: Any) -> Any:
     return wrt::set_up<{flag(plain)}>(wrt::pointers_to(rays, first, {excludes}), count, pad, scratch.packets.data + base);
     """)
     def set_up(rays: rays_struct, first: int, count: int, pad: float, scratch: Scratch, base: int) -> int:
-        """Set up rays first .. first + count - 1; return the mask of rays that are not empty, plus COHERENT if they have a beam.
+        """Set up rays first .. first + count - 1. Return the mask of rays whose segments are not empty, plus COHERENT if they have a beam.
 
-        `pad` is nodes.far_pad."""
+        The factor `pad` is nodes.far_pad."""
 
     return set_up
 
@@ -72,16 +72,16 @@ def make_children(any_hit: bool) -> Any:
                                           scratch.stacks.data, size);
     """)
     def children(accel: WideBvh, scratch: Scratch, base: int, reference: int, mask: int, size: int) -> int:
-        """Push the children of a node that rays of the mask enter on a stack of `size` entries; return its new size.
+        """Push the children of a node that rays of the mask enter onto a stack of `size` entries; return the new size.
 
-        The nearest child is on top; for any hit, the last one. The packet must have a beam."""
+        The nearest child is on top or, for any-hit rays, the node's last entered child. The packet must have a beam."""
 
     return children
 
 
 @wp.func_native("return wrt::rays_meeting_root(accel.nodes.data, mask, scratch.packets.data + base);")
 def rays_meeting_root(accel: WideBvh, scratch: Scratch, base: int, mask: int) -> int:
-    """Return the rays of the mask that enter a child of the root; write ROOT_ENTRIES."""
+    """Return the mask of the rays in `mask` that enter a child of the root; write their entry distances to ROOT_ENTRIES."""
 
 
 @wp.func_native("return wrt::rays_reaching(t_entry, scratch.packets.data + base);")
@@ -95,9 +95,9 @@ def make_triangles(any_hit: bool) -> Any:
     return wrt::triangles<{flag(any_hit)}>(accel.primitives.data + first, count, mask, scratch.packets.data + base);
     """)
     def triangles(accel: WideBvh, first: int, count: int, mask: int, scratch: Scratch, base: int) -> int:
-        """Test the first `count` triangles of a row against the rays of the mask; return the rays that hit one.
+        """Test the first `count` triangles of a row against the rays of the mask; return the mask of rays that hit a triangle.
 
-        For any hit, t becomes -inf."""
+        In any-hit rays that hit, t becomes -inf."""
 
     return triangles
 
@@ -117,20 +117,20 @@ def key_at(stacks: wp.array(dtype=wp.uint32), i: int) -> wp.uint64:
 
 @wp.func_native(f"return (int)stacks.data[{ENTRY} * i + {ENTRY_RAYS}];")
 def rays_at(stacks: wp.array(dtype=wp.uint32), i: int) -> int:
-    """Return the mask of the rays of entry i."""
+    """Return the mask of the rays in entry i of a packet's stack."""
 
 
 # --- one ray of a packet, and its slot --------------------------------------------------------------------------------
 
 
 class Steps(NamedTuple):
-    """The steps of an interleaved ray. Each returns the next reference, or EMPTY if the ray is done.
+    """Functions for the steps of an interleaved ray. Each returns the next reference, or EMPTY if the ray is finished.
 
-    The next child is the nearest one, or for any hit the last one."""
+    The next child is the nearest pending child or, for any-hit rays, the last."""
 
-    begin: Any  # Put a ray into a slot, at the root's children.
-    step: Any  # From a node to the next child, of this node or on the stack.
-    pop: Any  # To a child on the stack that begins at or before `reach`, the ray's t.
+    begin: Any  # Put a ray into a slot, and choose the first child of the root.
+    step: Any  # Visit a node, and choose the next child: of this node or from the stack.
+    pop: Any  # Choose a child from the stack that begins at or before `reach`, the ray's t.
 
 
 @cache
@@ -151,7 +151,7 @@ def make_steps(any_hit: bool) -> Steps:
 
 @wp.func_native("return mask & wrt::spheres_of(accel.primitives.data + first, n_triangles);")
 def spheres_of(accel: WideBvh, first: int, mask: int, n_triangles: int) -> int:
-    """Return the mask's primitives of a row that are spheres."""
+    """Return the mask of the primitives in `mask` of a row that are spheres."""
 
 
 @cache
@@ -160,9 +160,9 @@ def make_ray_triangles(any_hit: bool, inlined: bool) -> Any:
 
     @wp.func_native(f"return wrt::{name}<{flag(any_hit)}>(accel.primitives.data + first, mask, scratch.packets.data + ray);")
     def ray_triangles(accel: WideBvh, first: int, mask: int, scratch: Scratch, ray: int) -> int:
-        """Store the nearest hit of a row's triangles in the mask in the ray's column; return its lane, or -1.
+        """Test the triangles of a row that are in the mask. Store the nearest hit in the ray's column; return its lane, or -1 on a miss.
 
-        For any hit, which triangle is open: the lane is 0, and u and v are not set."""
+        For any-hit rays, the result tells only hit (0) or miss (-1), and u and v are not set."""
 
     return ray_triangles
 
@@ -186,7 +186,3 @@ def store_bits(packet: wp.array(dtype=wp.float32), i: int, value: int) -> None: 
 
 @wp.func_native("return slots.data[(long long)i];")
 def slot_at(slots: wp.array(dtype=wp.int32), i: int) -> int: ...
-
-
-@wp.func_native("slots.data[(long long)i] = value;")
-def store_slot(slots: wp.array(dtype=wp.int32), i: int, value: int) -> None: ...

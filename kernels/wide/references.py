@@ -1,19 +1,19 @@
-"""References: the child of a wide node, in one int32.
+"""References: an int32 that describes a child of a wide node.
 
-A reference is EMPTY, the index of an inner node (above 0), or a leaf (below 0): its first primitive and their count. The functions for
-leaves are for kernels. The host calls `leaf_first.func(...)` and so on, with ints or NumPy arrays of int64."""
+A reference is EMPTY (0), the index of an inner node (positive), or a leaf (negative), as its first primitive and number of primitives.
+The functions below are device code. The host calls `leaf_first.func(...)`, for example, with ints or NumPy arrays of int64."""
 
 import warp as wp
 
-EMPTY = wp.constant(0)  # A child that does not exist: no node has the root as a child.
+EMPTY = wp.constant(0)  # A child that does not exist. (Index 0 is the root, which is no node's child.)
 LEAF_BITS = 6
-MAX_LEAF = 1 << LEAF_BITS  # Most primitives of a leaf.
-MAX_FIRST = 1 << (31 - LEAF_BITS)  # Leaves begin below this.
+MAX_LEAF = 1 << LEAF_BITS  # Largest number of primitives in a leaf.
+MAX_FIRST = 1 << (31 - LEAF_BITS)  # Upper bound, exclusive, of a leaf's `first`.
 
 
 @wp.func
 def leaf_reference(first: int, count: int) -> int:
-    """Return the reference of a leaf of `count` (1 .. MAX_LEAF) primitives; `first` (below MAX_FIRST) counts in the layout's unit."""
+    """Return the reference of a leaf with `count` (1 .. MAX_LEAF) primitives; first: index below MAX_FIRST, in units of NodeLayout.unit."""
     return -1 - (MAX_LEAF * first + count - 1)
 
 

@@ -1,17 +1,17 @@
-// Set-up of a packet: `scaled_ray` of query.py, then the rays' fields for units and nodes, and the beam.
+// Set-up of a packet: the scaling of query.py (scaled_ray), then the rays' fields for tests of boxes and triangles, and the beam.
 #pragma once
 #include "packet.h"
 
 namespace wrt {
 
-// Arrays of rays, from the first one of a packet on. `excludes` is as Ray.exclude_plus_one, or null.
+// Arrays of rays; each pointer is to the first ray of a packet. `excludes` has values of Ray.exclude_plus_one, or is null.
 struct RayPointers {
     const float *origins, *directions, *t_mins, *t_maxs;
     const int* excludes;
-    bool one_t_min, one_t_max;  // One value for all rays.
+    bool one_t_min, one_t_max;  // True if the array has one value for all rays.
 };
 
-// Return the pointers of Warp's arrays without gaps. A stride of 0 means one t_min or t_max for all rays (query.py: RayArrays).
+// Return pointers to ray `first` in contiguous Warp arrays. A stride of 0 means one t_min or t_max for all rays (query.py: RayArrays).
 template <class RayArrays> WRT_INLINE RayPointers pointers_to(const RayArrays& rays, int first, const int* excludes) {
     const bool one_t_min = rays.t_min.strides[0] == 0, one_t_max = rays.t_max.strides[0] == 0;
     return {(const float*)(rays.origin.data + first), (const float*)(rays.direction.data + first),
@@ -25,7 +25,8 @@ struct SixteenRays {
     RayInts exclude;
 };
 
-// Return component K of sixteen vectors of three. Of the three registers, the first two have 11 or 10 values, the third the rest.
+// Return component K of sixteen vectors of three, which are 48 consecutive floats: three vectors of lanes. The first two vectors have 11 or
+// 10 values of the component, the third has the others.
 template <int K> WRT_INLINE Rays component_of(const float* v) {
     const Rays two = __builtin_shufflevector(load<Rays>(v), load<Rays>(v + LANES), K, K + 3, K + 6, K + 9, K + 12, K + 15, K + 18,
                                              K + 21, K + 24, K + 27, K < 2 ? K + 30 : 0, 0, 0, 0, 0, 0);
@@ -35,7 +36,7 @@ template <int K> WRT_INLINE Rays component_of(const float* v) {
 
 WRT_INLINE Vec3<Rays> vectors_of(const float* v) { return {{component_of<0>(v), component_of<1>(v), component_of<2>(v)}}; }
 
-// Load `count` rays. Copies of the last one fill the other lanes.
+// Load `count` rays. Copies of the last ray fill the other lanes.
 WRT_INLINE SixteenRays load_rays(const RayPointers& from, int count) {
     SixteenRays out;
     if (count == LANES) {
@@ -70,14 +71,14 @@ WRT_INLINE Rays longest(const Vec3<Rays>& v) {
     return z > longer ? z : longer;
 }
 
-// Return the mask of rays that a query refuses (wrt.accel.queries.rays).
+// Return the mask of invalid rays, which a query rejects (wrt.accel.queries.rays).
 WRT_INLINE int refused(const SixteenRays& rays) {
     RayInts good = (longest(rays.direction) > 0.0f) & (rays.t_min >= 0.0f) & (rays.t_max == rays.t_max);
     for (int k = 0; k < 3; ++k) good &= (absolute(rays.origin[k]) <= FARTHEST) & (absolute(rays.direction[k]) <= LARGEST);
     return mask_of(~good);
 }
 
-// Scale directions so that reciprocals neither overflow nor underflow; return the factor. A t_min of -0 becomes 0.
+// Scale directions so that their reciprocals neither over- nor underflow, as query.py does; return the factors. A t_min of -0 becomes 0.
 template <bool SCALED> WRT_INLINE Rays scale_rays(SixteenRays& rays) {
     const Rays one = all<Rays>(1.0f), largest = all<Rays>(LARGEST), length = longest(rays.direction);
     Rays scale = one, inverse = one;
@@ -91,7 +92,7 @@ template <bool SCALED> WRT_INLINE Rays scale_rays(SixteenRays& rays) {
     return scale;
 }
 
-// Return t of the best hit before the walk (traverse/common.py). A ray that is not finite gets an empty segment.
+// Return t of the best hit before the traversal, as no_hit in traverse/common.py. A ray that is not finite gets an empty segment.
 WRT_INLINE Rays no_hit(const SixteenRays& rays) {
     const Rays zero_x = 0.0f * rays.origin[0] + 0.0f * rays.direction[0], zero_y = 0.0f * rays.origin[1] + 0.0f * rays.direction[1];
     const Rays zero_z = 0.0f * rays.origin[2] + 0.0f * rays.direction[2], largest = all<Rays>(LARGEST);
@@ -105,7 +106,7 @@ template <class Ray> WRT_INLINE void store_vector(const Ray& ray, int first, con
     for (int k = 0; k < 3; ++k) ray.put(first + LANES * k, v[k]);
 }
 
-// Store the triangle unit's set-up (triangle_ray).
+// Store the rays' set-up for the triangle unit, as triangle_ray in units/triangle.py computes it.
 WRT_INLINE void store_triangle_ray(const AllRays& packet, const Vec3<Rays>& o, const Vec3<Rays>& d) {
     const RayInts zero = {}, one = all<RayInts>(1), two = all<RayInts>(2);
     const Rays size_x = absolute(d[0]), size_y = absolute(d[1]), size_z = absolute(d[2]);
@@ -119,12 +120,13 @@ WRT_INLINE void store_triangle_ray(const AllRays& packet, const Vec3<Rays>& o, c
     store_vector(packet, SHEAR_X, {{component(d, kx) / d_z, component(d, ky) / d_z, 1.0f / d_z}});
 }
 
-// Return the place of an axis's near planes in a node.
+// Return the index of an axis's near planes in a node.
 WRT_INLINE RayInts near_row(Rays inv_dir, int lo, int hi) {
     return inv_dir < 0.0f ? all<RayInts>(WIDTH * hi) : all<RayInts>(WIDTH * lo);
 }
 
-// Return the lesser of two neighbours, a's in the lower half and b's in the upper. Four layers reduce sixteen vectors to minima.
+// Return the minimum of each two neighbouring lanes: of a in the lower half of the result, of b in the upper half. Four layers of calls
+// reduce sixteen vectors to one vector of their minima.
 WRT_INLINE Rays lesser(Rays a, Rays b) {
     const Rays even = __builtin_shufflevector(a, b, 0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
     const Rays odd = __builtin_shufflevector(a, b, 1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
@@ -133,8 +135,8 @@ WRT_INLINE Rays lesser(Rays a, Rays b) {
 
 WRT_INLINE Rays lesser(Rays a, Rays b, Rays c, Rays d) { return lesser(lesser(a, b), lesser(c, d)); }
 
-// Store the beam around all active rays of the packet (layout.py: BEAM_WORDS). Return false if their directions differ in sign
-// along an axis.
+// Store the beam around all active rays of the packet (layout.py: BEAM_WORDS). Return false if there are no active rays, or if their
+// directions differ in sign along an axis.
 WRT_INLINE bool store_beam(float* packet, const SixteenRays& rays, const Vec3<Rays>& inv_dir, int active, float far_pad) {
     int down[3];
     for (int k = 0; k < 3; ++k) {
@@ -154,8 +156,8 @@ WRT_INLINE bool store_beam(float* packet, const SixteenRays& rays, const Vec3<Ra
     // A maximum is the minimum of the negated values.
     const Rays least = lesser(lesser(lesser(o[0], o[1], o[2], -o[0]), lesser(-o[1], -o[2], i[0], i[1])),
                               lesser(lesser(i[2], -i[0], -i[1], -i[2]), lesser(begin, begin, begin, begin)));
-    // The least and greatest origins, then the least and greatest reciprocals, swapped on an axis with negative directions. So the
-    // order is: origins to near planes, to far planes, reciprocals of largest magnitude, of smallest.
+    // `ends` has the least and greatest origins, then the least and greatest reciprocals. On an axis with positive directions, `beam`
+    // exchanges least and greatest. So `beam` has the order near_origin, far_origin, largest, smallest (layout.py).
     const Rays ends = __builtin_shufflevector(least, -least, 0, 1, 2, 19, 20, 21, 6, 7, 8, 25, 26, 27, 12, 13, 14, 15);
     const Rays other_ends = __builtin_shufflevector(ends, ends, 3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8, 12, 13, 14, 15);
     const int x = down[0], y = down[1], z = down[2];
@@ -168,7 +170,7 @@ WRT_INLINE bool store_beam(float* packet, const SixteenRays& rays, const Vec3<Ra
     return true;
 }
 
-// Set up `count` rays; return the mask of rays that are not empty, plus COHERENT if they have a beam.
+// Set up `count` rays; return the mask of rays whose segments are not empty, plus COHERENT if these rays have a beam.
 template <bool SCALED> WRT_CALLED int set_up(const RayPointers& from, int count, float far_pad, float* numbers) {
     SixteenRays rays = load_rays(from, count);
     const AllRays packet = {numbers};

@@ -1,19 +1,19 @@
-"""The traversal unit of the wide BVHs: nodes of 4 or 8 children, whose boxes are tested as one row, like the triangles of a leaf.
+"""Traversal of the wide BVHs for one ray. Nodes have 4 or 8 children, whose boxes are tested as one row; so are the triangles of a leaf.
 
-The method is that of Wald, Benthin and Boulos 2008, "Getting Rid of Packets", and Afra and Ernst 2008 and 2010, for one ray. Rows of
-triangles are only culled of what the watertight unit would refuse in float32. The unit itself tests the rest, so that its answers keep
-their bits. Any other triangle test gets every primitive of a leaf.
+Wald, Benthin and Boulos 2008, "Getting Rid of Packets"; Afra and Ernst 2008 and 2010. The test of a row of triangles only rejects triangles
+that the watertight unit would reject in float32. The unit itself tests the others, so that hits have the same bits as in other structures.
+With another triangle test, the unit tests every primitive of a leaf.
 
-Children are visited from near to far. The nearest is next; the others are pushed, the farthest deepest. A popped child that begins beyond
-the closest hit is dropped. Any hit needs no order: the last child is next, and the builder puts leaves and large boxes last."""
+The walk visits the nearest child next, and pushes the others, with the nearest of them on top. It drops a popped child that begins behind
+the closest hit. Any-hit rays need no order: the last child is next, and the builder puts leaves and large boxes last."""
 
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import warp as wp
 
 from wrt.kernels.query import LARGEST
-from wrt.kernels.structs import NO_HIT, Hit, Ray
+from wrt.kernels.structs import NO_HIT, Hit, Ray, size_of
 from wrt.kernels.traverse.common import Probe, Units, make_intersect, make_probe, no_hit
 from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
 from wrt.kernels.traverse.stack import key_of, make_stack, reference_of, t_of
@@ -26,16 +26,16 @@ from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
 
 @cache
 def make_struct(record: Any) -> Any:
-    """Return the struct of a wide BVH whose leaves have this record.
+    """Return the type of a wide BVH whose primitives are stored as `record`.
 
-    A row has as many primitives as a node has children: the first float of all records, then the second, and so on. A leaf begins with a
-    row of its own, and its reference counts rows. With compressed nodes, leaves follow each other without a gap, and references count
+    A row holds as many primitives as a node has children: the first float of all records, then the second float, and so on. A leaf begins
+    with a new row, and its reference counts rows. With compressed nodes, leaves follow each other without a gap, and references count
     primitives."""
 
     @wp.struct
     class WideBvh:
-        nodes: wp.array(dtype=wp.float32)  # As in kernels.wide.nodes, the root first.
-        primitives: wp.array(dtype=wp.float32)  # The rows.
+        nodes: wp.array(dtype=wp.float32)  # Nodes as in kernels.wide.nodes, the root first.
+        primitives: wp.array(dtype=wp.float32)  # Rows of primitives.
         recorder: Recorder
 
     return WideBvh
@@ -43,15 +43,15 @@ def make_struct(record: Any) -> Any:
 
 def row_size(record: Any, width: int) -> int:
     """Return the number of floats in one row of primitives."""
-    return record.numpy_dtype()["itemsize"] // 4 * width
+    return size_of(record) // 4 * width
 
 
 @wp.func
 def lane_ray(probe: Probe, pad: float) -> LaneRay:
-    """Set up a ray, once; `pad` is nodes.far_pad."""
+    """Set up a ray for the tests of rows; pad: nodes.far_pad."""
     out = LaneRay()
     out.box = probe.box
-    out.box.t_min = probe.box.t_min + 0.0  # Not -0: entries are sorted by their bits.
+    out.box.t_min = probe.box.t_min + 0.0  # Turns -0 into 0, because stack entries are sorted by the bits of t.
     out.far_inv_dir = pad * probe.box.inv_dir
     out.near_x = wp.where(probe.box.inv_dir[0] < 0.0, HI_X, LO_X)
     out.near_y = wp.where(probe.box.inv_dir[1] < 0.0, HI_Y, LO_Y)
@@ -68,7 +68,7 @@ def lane_ray(probe: Probe, pad: float) -> LaneRay:
 
 @cache
 def make_gather(record: Any, width: int) -> Any:
-    """Return gather(rows, i): the record whose floats are rows[i], rows[i + width], and so on."""
+    """Return gather(rows, i), which loads the record whose floats are rows[i], rows[i + width], rows[i + 2 width] and so on."""
 
     @wp.func_native(f"""
     float numbers[sizeof(out) / sizeof(float)];
@@ -87,7 +87,7 @@ def make_gather(record: Any, width: int) -> Any:
 
 
 def make_row_test(units: Units, any_hit: bool, accepts: Any, width: int) -> Any:
-    """Return test_row: test the primitives of a row that are in the mask; `first` is the row's first float."""
+    """Return test_row, which tests the primitives of a row that are in the mask, and returns the best hit; first: index of the row."""
     intersect = make_intersect(units, accepts)
     gather = make_gather(units.triangle_test.record, width)
     cull = make_cull(width)
@@ -111,7 +111,7 @@ def make_row_test(units: Units, any_hit: bool, accepts: Any, width: int) -> Any:
 
 @cache
 def make_prefetch(record: Any, layout: NodeLayout) -> Any:
-    """Return prefetch_next(accel, reference): prefetch the first cache lines of the node or leaf that `reference` points to."""
+    """Return prefetch_next(accel, reference), which prefetches the first cache lines of the node or leaf that `reference` points to."""
     struct, lines = make_struct(record), 2
 
     @wp.func
@@ -126,7 +126,7 @@ def make_prefetch(record: Any, layout: NodeLayout) -> Any:
 
 
 def make_leaf_test(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout) -> Any:
-    """Return test_leaf(accel, surfaces, reference, probe, rows, best) -> the best hit; for any hit, the first one found."""
+    """Return test_leaf(accel, surfaces, reference, probe, rows, best) -> best Hit; with any_hit, it stops at the first hit."""
     record = units.triangle_test.record
     struct = make_struct(record)
     test_row = make_row_test(units, any_hit, accepts, layout.width)
@@ -153,17 +153,8 @@ def make_leaf_test(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
     return test_leaf
 
 
-class Counting(NamedTuple):
-    """The counters of a walk, if units.counters. push and finish come from traverse.counters.make_counters."""
-
-    node: Any  # (accel, ray, counts, index) -> counts.
-    leaf: Any  # (accel, ray, counts, reference) -> counts.
-    pop: Any  # (counts) -> counts.
-    push: Any
-    finish: Any
-
-
-def make_counting(units: Units, layout: NodeLayout) -> Counting:
+def make_counting(units: Units, layout: NodeLayout) -> Any:
+    """Return count_node, count_leaf and count_pop, which return the new counts; and push and finish of counters.make_counters."""
     struct = make_struct(units.triangle_test.record)
     fetch_node, fetch_primitive, push, finish = make_counters(units, 4 * layout.size)
 
@@ -192,11 +183,11 @@ def make_counting(units: Units, layout: NodeLayout) -> Counting:
             counts.pops += 1
         return counts
 
-    return Counting(count_node, count_leaf, count_pop, push, finish)
+    return count_node, count_leaf, count_pop, push, finish
 
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout) -> Any:
-    """Return traverse(accel, surfaces, ray): the closest hit, or for any hit the first one found."""
+    """Return traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found."""
     struct = make_struct(units.triangle_test.record)
     children = make_children(layout.width, layout.compressed, units.box)
     probe_of = make_probe(units)
@@ -207,7 +198,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
 
     @wp.func
     def child(accel: struct, at: int) -> int:
-        """Load the reference at `at`, and prefetch its node or leaf."""
+        """Load the reference at accel.nodes[at], and prefetch its node or leaf."""
         reference = bits(accel.nodes, at)
         prefetch_next(accel, reference)
         return reference
@@ -217,7 +208,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
         probe = probe_of(ray)
         rows = lane_ray(probe, wp.static(far_pad(units.box)))
         best = no_hit(ray)
-        best.t = wp.where(best.t < LARGEST, best.t, LARGEST)  # A box that begins at infinity is not entered.
+        best.t = wp.where(best.t < LARGEST, best.t, LARGEST)  # Finite, so that the ray enters no box that begins at infinity.
         counts = Counts()
         stack = new_stack()
         shared = shared_stack()
@@ -250,7 +241,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
                         else:
                             far = wp.max(near, key)
                             near = wp.min(near, key)
-                            # Not fully sorted: only the farthest so far stays deepest. Most nodes push two or three.
+                            # Most nodes push two or three entries, so this does not sort them fully: the nearest pushed so far is on top.
                             if size > begin:
                                 under = get(stack, shared, size - 1)
                                 put(stack, shared, size, wp.min(far, under))
@@ -261,7 +252,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
                         counts = count_push(counts, size)
                     reference = reference_of(near)
                     continue
-            # Pop, and drop what begins beyond the closest hit. Equal stays: a tie there may have a lower prim_id.
+            # Pop the next child that begins at or before the closest hit: at the same t, it may have a hit with a lower prim_id.
             found = bool(False)
             while size > 0 and not found:
                 size = size - 1
@@ -278,7 +269,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
 
 
 class WideTraversal:
-    """The traversal of one layout of nodes, as wrt.accel takes it in place of a module."""
+    """The traversal of one node layout. It has the functions make_struct and make_traversal, as the modules of kernels.traverse have."""
 
     def __init__(self, width: int, compressed: bool = False) -> None:
         self.layout = NodeLayout(width, compressed)

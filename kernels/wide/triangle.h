@@ -1,11 +1,11 @@
-// Triangles: the watertight test of units/triangle.py vectorised, under the same names, for one ray and a row of triangles, or a
-// packet and one triangle.
+// The watertight triangle test: units/triangle.py vectorised, with the same names. Either for one ray and a row of triangles, or for the
+// rays of a packet and one triangle.
 #pragma once
 #include "box.h"
 
 namespace wrt {
 
-// A row of N triangles: the first float of all their records, then the second, and so on.
+// A row of N triangles: the first float of all records, then the second float of all records, and so on.
 template <int N> struct Row {
     const float* numbers;
     typedef typename Lanes<N>::Floats Floats;
@@ -14,14 +14,14 @@ template <int N> struct Row {
     WRT_MEMBER Vec3<Floats> corner(int i) const { return {{component(i, 0), component(i, 1), component(i, 2)}}; }
 };
 
-// The set-up of a ray. `origin` is in the order kx, ky, kz.
+// A ray set up for the triangle test. `origin` is in the axis order kx, ky, kz.
 template <class Int, class Number> struct TriangleRay {
     Int kx, ky, kz;
     Number shear_x, shear_y;
     Vec3<Number> origin;
 };
 
-// Return a corner relative to the origin, sheared along the ray.
+// Return a corner in the space where the ray is the z axis.
 template <class Triangles, class Int, class Number>
 WRT_INLINE auto to_ray_space(const Triangles& triangles, int corner, const TriangleRay<Int, Number>& ray) {
     auto x = triangles.component(corner, ray.kx) - ray.origin[0];
@@ -40,7 +40,7 @@ template <class T> WRT_INLINE auto outside(const Vec3<T>& areas) {
            & ((areas[0] > zero) | (areas[1] > zero) | (areas[2] > zero));
 }
 
-// Return the mask of a row's triangles without the ones that the test refuses in float32.
+// Return the mask of a row's triangles that the test does not reject in float32.
 template <int N, class LaneRay> WRT_INLINE int cull(const float* numbers, const LaneRay& ray) {
     const Row<N> row = {numbers};
     const TriangleRay<int, float> shear = {ray.kx, ray.ky, ray.kz, ray.shear_x, ray.shear_y,
@@ -68,7 +68,7 @@ template <int N> struct Hits {
     int mask;
 };
 
-// Intersect the z axis with triangles of sheared corners, in float64, in the lanes of `mask`.
+// Intersect the z axis with triangles with these sheared corners, in float64, in the lanes of `mask`.
 template <int N, class Floats>
 WRT_INLINE Hits<N> crossing(const Vec3<Floats>& a, const Vec3<Floats>& b, const Vec3<Floats>& c, Floats shear_z, int mask) {
     typedef typename Lanes<N>::Doubles Doubles;
@@ -91,7 +91,7 @@ template <class T> WRT_INLINE Vec3<T> upper(const Vec3<T>& a, const Vec3<T>& b) 
     return {{b[0] > a[0] ? b[0] : a[0], b[1] > a[1] ? b[1] : a[1], b[2] > a[2] ? b[2] : a[2]}};
 }
 
-// Return the padding of a box. Bounds has the constants of units/box.py and units/triangle.py, under their names.
+// Return the pad of a box. `Bounds` has the constants of units/box.py and units/triangle.py.
 template <class Bounds, class T> WRT_INLINE T box_pad(const Vec3<T>& lo, const Vec3<T>& hi) {
     const T e_x = hi[0] - lo[0], e_y = hi[1] - lo[1], e_z = hi[2] - lo[2];
     const T longer = e_x > e_y ? e_x : e_y;
@@ -114,7 +114,7 @@ template <class Floats> WRT_INLINE Floats clamped(Floats t, const Interval<Float
     return inside < interval.enter ? interval.enter : inside;
 }
 
-// Return the lanes of `mask` where clamping moved t farther than rounding explains, on a ray whose shear may have underflowed.
+// Return the mask of lanes where clamping moved t farther than rounding explains, on a ray whose shear may have underflowed.
 template <class Bounds, class Floats>
 WRT_INLINE int underflowed(const BoxRay<Floats>& ray, Floats t, Floats moved, int mask) {
     mask &= mask_of(absolute(moved - t) > Bounds::CLAMP_ROUNDING * absolute(t) + Bounds::CLAMP_STEP);
@@ -130,7 +130,8 @@ WRT_INLINE int underflowed(const BoxRay<Floats>& ray, Floats t, Floats moved, in
     return mask & mask_of((steep < least) | ((absolute(t) < least) & (absolute(moved) < least)));
 }
 
-// Clamp the t of hits to the intervals of their triangles' boxes, or of the padded boxes. Drop hits that miss even these.
+// Clamp the t of hits to the slab intervals of their triangles' boxes or, if the ray misses a box, of the padded box. Remove hits whose ray
+// misses even the padded box.
 template <class Bounds, int N, class Floats>
 WRT_INLINE void within_bounds(const BoxRay<Floats>& ray, Hits<N>& hit, const Vec3<Floats>& lo, const Vec3<Floats>& hi) {
     Interval<Floats> interval = slab_interval(ray, lo, hi);

@@ -1,7 +1,7 @@
-"""A long run of the fuzzer: `python -m tests.fuzz --inputs 1000000 --workers 2 --out FOLDER`.
+"""Fuzz the readers of files: `python -m tests.fuzz --inputs 1000000 --workers 2 --out FOLDER`.
 
-Each reader gets its share of the inputs. Workers are processes of their own, so that a crash or a hang costs one input, which is
-counted and saved. The same seed gives the same inputs: `--format ply --first 1234 --inputs 1` makes that one again.
+Each format gets the same number of inputs. Workers are processes, so that a crash or a hang costs one input, which is counted and
+saved. The same seed makes the same inputs: `--format ply --first 1234 --inputs 1` repeats one input.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from typing import Any
 
 from tests.fuzz.formats import ALL_FORMATS, FORMATS, make_case
 
-HANG = 40.0  # seconds of work on a case
-STUCK = 60.0  # seconds without any
-POLL = 0.1
-START = 300.0  # seconds that a worker may take to compile before its first case
-AT_ONCE = 20_000  # inputs a process
+HANG = 40.0  # Largest processor time of an input, in seconds.
+STUCK = 60.0  # Longest wait for an input, in seconds.
+POLL = 0.1  # Seconds between two looks at a worker.
+START = 300.0  # Longest time before a worker's first input, in seconds: it compiles kernels.
+AT_ONCE = 20_000  # Inputs per process.
 
 
 @dataclass
 class Tally:
-    """What came of one format's inputs."""
+    """The outcomes of one format's inputs."""
 
     inputs: int = 0
     read: int = 0
@@ -40,31 +40,32 @@ class Tally:
     crashes: int = 0
     hangs: int = 0
     seconds: float = 0.0
-    slowest: tuple[float, int] = (0.0, -1)
-    defects: dict[str, list[int]] = field(default_factory=dict)  # by their first line
+    slowest: tuple[float, int] = (0.0, -1)  # processor time in seconds, and number of the input
+    defects: dict[str, list[int]] = field(default_factory=dict)  # numbers of inputs by the problem's first line
 
 
 class Run:
-    """Inputs first to first + count of one format."""
+    """Run the inputs of one format in worker processes, one after another."""
 
     def __init__(self, name: str, seed: int, out: Path) -> None:
         self.name, self.seed, self.out, self.tally = name, seed, out, Tally()
 
     def work(self, first: int, count: int) -> None:
+        """Run the inputs first .. first + count - 1."""
         end = first + count
         while first < end:
             first = self._process(first, min(end, first + AT_ONCE))
 
     def _process(self, first: int, end: int) -> int:
-        """One worker; returns the number of the first case that is still to do."""
+        """Run a worker until it ends; return the number of the first input that is left to do."""
         with tempfile.TemporaryDirectory(dir="/dev/shm" if os.path.isdir("/dev/shm") else None) as folder:
             command = [sys.executable, "-m", "tests.fuzz.worker", self.name, str(self.seed), str(first), str(end - first), folder]
             environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-            with open(Path(folder) / "told", "w+") as told, open(Path(folder) / "errors", "w+") as errors:
-                process = subprocess.Popen(command, stdout=told, stderr=errors, env=environment)
+            with open(Path(folder) / "reports", "w+") as reports, open(Path(folder) / "errors", "w+") as errors:
+                process = subprocess.Popen(command, stdout=reports, stderr=errors, env=environment)
                 ended = self._watch(process, Path(folder) / "beat")
-                told.seek(0)
-                lines = [json.loads(line) for line in told if line.endswith("\n")]
+                reports.seek(0)
+                lines = [json.loads(line) for line in reports if line.endswith("\n")]
                 errors.seek(0)
                 text = errors.read()
             self._count(lines)
@@ -79,9 +80,10 @@ class Run:
             return last + 1
 
     def _watch(self, process: subprocess.Popen[bytes], beat: Path) -> str:
-        """Wait for its end; kill it where a case takes longer than HANG of its own time, or waits for something.
+        """Wait until the worker ends, and return "crashes"; if an input hangs, kill the worker and return "hangs".
 
-        Waiting is counted in polls: whoever stops us both is no hang, and a machine with other work is not either.
+        An input hangs after HANG seconds of processor time, or STUCK seconds of waiting. Waiting is counted in polls, so that time in
+        which the system suspends both processes does not count.
         """
         number, polls, begin = b"", 0, 0.0
         while process.poll() is None:
@@ -111,7 +113,7 @@ class Run:
     def _defect(self, number: int, problem: str) -> None:
         numbers = self.tally.defects.setdefault(problem.split("\n")[0], [])
         numbers.append(number)
-        if len(numbers) <= 3:  # the rest are alike
+        if len(numbers) <= 3:  # save at most three inputs of each kind
             case = make_case(ALL_FORMATS[self.name], random.Random(f"{self.seed} {self.name} {number}"))
             self.out.mkdir(parents=True, exist_ok=True)
             (self.out / f"{self.name}-{number}{case.suffix}").write_bytes(case.data)
@@ -119,7 +121,7 @@ class Run:
 
 
 def _worked(pid: int) -> float:
-    """Seconds that a process has computed so far; 0 where the system does not tell, or it has ended."""
+    """Return the processor time of a process in seconds; 0 if the process has ended, or the system has no /proc."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
@@ -129,29 +131,26 @@ def _worked(pid: int) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
-    parser.add_argument("--inputs", type=int, default=80_000, help="over all formats together")
+    parser.add_argument("--inputs", type=int, default=80_000, help="number of inputs of all formats together")
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--format", action="append", choices=list(ALL_FORMATS), help="only these")
+    parser.add_argument("--format", action="append", choices=list(ALL_FORMATS), help="only this format; may be repeated")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--first", type=int, default=0, help="number of the first input of each format")
-    parser.add_argument("--out", type=Path, default=Path("fuzz-defects"), help="where inputs that show a defect are kept")
-    given = parser.parse_args()
-    names = given.format or list(FORMATS)
-    shutil.rmtree(given.out, ignore_errors=True)
-    runs = [Run(name, given.seed, given.out) for name in names]
+    parser.add_argument("--first", type=int, default=0, help="index of the first input of each format")
+    parser.add_argument("--out", type=Path, default=Path("fuzz-defects"), help="folder for the inputs with defects; is emptied first")
+    options = parser.parse_args()
+    names = options.format or list(FORMATS)
+    shutil.rmtree(options.out, ignore_errors=True)
+    runs = [Run(name, options.seed, options.out) for name in names]
     begin = time.perf_counter()
-    with ThreadPoolExecutor(given.workers) as pool:
-        for run, future in [(run, pool.submit(run.work, given.first, -(-given.inputs // len(names)))) for run in runs]:
+    with ThreadPoolExecutor(options.workers) as pool:
+        for run, future in [(run, pool.submit(run.work, options.first, -(-options.inputs // len(names)))) for run in runs]:
             future.result()
             tally = run.tally
             slowest, which = tally.slowest
-            print(
-                f"{run.name}: {tally.inputs} inputs, {tally.read} read, {tally.refused} refused,"
-                f" {tally.out_of_memory} out of memory, {tally.crashes} crashes, {tally.hangs} hangs,"
-                f" {sum(map(len, tally.defects.values()))} defects;"
-                f" slowest {slowest:.2f} s (number {which}), {1e3 * tally.seconds / max(tally.inputs, 1):.2f} ms each",
-                flush=True,
-            )
+            print(f"{run.name}: {tally.inputs} inputs, {tally.read} read, {tally.refused} refused,"
+                  f" {tally.out_of_memory} out of memory, {tally.crashes} crashes, {tally.hangs} hangs,"
+                  f" {sum(map(len, tally.defects.values()))} defects; slowest: {slowest:.2f} s (input {which}),"
+                  f" mean: {1e3 * tally.seconds / max(tally.inputs, 1):.2f} ms", flush=True)
             for problem, numbers in sorted(tally.defects.items(), key=lambda item: -len(item[1])):
                 print(f"  {len(numbers)} x {problem} ({', '.join(map(str, numbers[:3]))})", flush=True)
     total = sum(run.tally.inputs for run in runs)

@@ -1,4 +1,4 @@
-"""The readers under test: of each, sound files, ways to damage them, and what reads them."""
+"""The formats to fuzz: for each, valid files, functions that damage them, and a function that reads them."""
 
 from __future__ import annotations
 
@@ -26,17 +26,16 @@ from tests.gltf_files import pack_glb
 
 @dataclass(frozen=True)
 class Format:
-    """seeds: sound files; damaged: a file made of one of them; read: whatever it raises but InputError is a defect; names_sizes: a
-    few bytes may ask for much, up to fixed limits (pixels, triangles by formula), and so a MemoryError is an end, too."""
+    """A format of files, and how to test its reader."""
 
-    seeds: Callable[[], list[Seed]]
-    damaged: Callable[[Seed, Seed, Random], Seed]
-    read: Callable[[Path], object]
-    names_sizes: bool = False
+    seeds: Callable[[], list[Seed]]  # Returns valid files.
+    damaged: Callable[[Seed, Seed, Random], Seed]  # Returns a damaged copy of the first file, sometimes with parts of the second.
+    read: Callable[[Path], object]  # Any exception but InputError is a defect.
+    names_sizes: bool = False  # A small file may ask for much memory (image sizes, subdivisions): MemoryError is no defect.
 
 
 def make_case(form: Format, rng: Random) -> Seed:
-    """A damaged file."""
+    """Return a damaged file."""
     sound = form.seeds()
     return form.damaged(rng.choice(sound), rng.choice(sound), rng)
 
@@ -46,7 +45,7 @@ def make_case(form: Format, rng: Random) -> Seed:
 
 @cache
 def toml_words() -> list[str]:
-    """Every key and every choice of the schema."""
+    """Return every key and every choice of the schema of scene files, and file names."""
     from wrt.io.load import schema
 
     found: set[str] = set()
@@ -63,7 +62,7 @@ def toml_words() -> list[str]:
 
 
 def toml_text(value: Any) -> str:
-    """A TOML value, inline; what TOML has no words for becomes text."""
+    """Return a value as inline TOML; values without a TOML type become strings."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, dict):
@@ -97,7 +96,7 @@ GLTF_WORDS = (
 
 
 def damaged_gltf(seed: Seed, other: Seed, rng: Random) -> Seed:
-    """Its JSON, its buffer, or the bytes of the container; sizes fit after the first two."""
+    """Damage the JSON, the buffer, or any bytes of the file. After damage to JSON or buffer, the sizes of the container are right."""
     glb = seed.suffix == ".glb"
     if rng.random() < 0.2:
         return Seed(seed.suffix, mutate(seed.data, rng, BYTES if glb else TEXT + BYTES[:2], other.data))
@@ -108,7 +107,7 @@ def damaged_gltf(seed: Seed, other: Seed, rng: Random) -> Seed:
 
 
 def gltf_parts(seed: Seed) -> tuple[Any, bytes]:
-    """The JSON and the buffer of a sound file."""
+    """Return the JSON and the buffer of a valid file."""
     if seed.suffix == ".gltf":
         tree = json.loads(seed.data)
         return tree, base64.b64decode(tree["buffers"][0]["uri"].partition(",")[2])
@@ -116,9 +115,9 @@ def gltf_parts(seed: Seed) -> tuple[Any, bytes]:
     return json.loads(seed.data[20 : 20 + length]), seed.data[28 + length :]
 
 
-def gltf_of(suffix: str, tree: Any, binary: bytes, new: bool = False) -> Seed:
-    """A file of such JSON and buffer; new: which a .gltf does not hold yet."""
-    if new and suffix == ".gltf":
+def gltf_of(suffix: str, tree: Any, binary: bytes, encode: bool = False) -> Seed:
+    """Return a file with this JSON and buffer; encode: write the buffer into the JSON of a .gltf."""
+    if encode and suffix == ".gltf":
         tree["buffers"][0]["uri"] = "data:;base64," + base64.b64encode(binary).decode()
     text = json.dumps(tree).encode()
     return Seed(suffix, pack_glb(text, binary) if suffix == ".glb" else text)
@@ -156,7 +155,7 @@ def damaged_image(seed: Seed, other: Seed, rng: Random) -> Seed:
 
 
 def damaged_png(data: bytes, rng: Random) -> bytes:
-    """Chunks that are changed, moved, left out or doubled, with checksums that fit."""
+    """Change, delete or duplicate chunks; the checksums are right."""
     chunks = png_chunks(data)
     for _ in range(rng.randint(1, 3)):
         i = rng.randrange(len(chunks))
@@ -168,23 +167,8 @@ def damaged_png(data: bytes, rng: Random) -> bytes:
             fields[j] = rng.choice(INTEGERS) & (0xFFFFFFFF if j < 2 else 0xFF) if rng.random() < 0.5 else rng.randrange(20)
             body = struct.pack(">IIBBBBB", *fields)
         elif what < 3:
-            kind = rng.choice(
-                (
-                    b"IDAT",
-                    b"PLTE",
-                    b"tRNS",
-                    b"iCCP",
-                    b"zTXt",
-                    b"iTXt",
-                    b"tEXt",
-                    b"acTL",
-                    b"fcTL",
-                    b"fdAT",
-                    b"gAMA",
-                    b"eXIf",
-                    b"IEND",
-                )
-            )
+            kind = rng.choice((b"IDAT", b"PLTE", b"tRNS", b"iCCP", b"zTXt", b"iTXt", b"tEXt", b"acTL", b"fcTL", b"fdAT", b"gAMA",
+                               b"eXIf", b"IEND"))
         elif what == 3 and kind == b"IDAT":
             with contextlib.suppress(zlib.error):
                 body = zlib.compress(mutate(zlib.decompress(body), rng, BYTES))
@@ -210,12 +194,11 @@ def png_chunks(data: bytes) -> list[tuple[bytes, bytes]]:
 
 def png_of(chunks: list[tuple[bytes, bytes]]) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body)) for kind, body in chunks
-    )
+        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body)) for kind, body in chunks)
 
 
 def read_picture(path: Path) -> object:
-    """As an environment, as a texture, and what is written about it."""
+    """Read the file as an environment and as a texture; raise InputError if both refuse it, or if memory ran out."""
     from wrt.core.errors import InputError
     from wrt.picture.decode import decode_rgba8
     from wrt.picture.image import read_image
@@ -237,15 +220,14 @@ def read_picture(path: Path) -> object:
 
 
 def damaged_checked(seed: Seed, other: Seed, rng: Random) -> Seed:
-    """Header or arrays changed, most often with a checksum that fits, as somebody with bad intentions would write it."""
+    """Damage the header or the arrays, usually with a right checksum, as an attacker would write it."""
     if rng.random() < 0.05:
         return Seed(seed.suffix, mutate(seed.data, rng, BYTES, other.data))
     magic, header, body = seed.data.split(b"\n", 2)
     body = body[:-32]
     if rng.random() < 0.3:
-        tree = mutate_tree(
-            json.loads(header), rng, ("bvh2", "bvh4", "bvh8", "bvh8c", "grid", "kdtree", "octree", "brute_force", "fast", "order")
-        )
+        tree = mutate_tree(json.loads(header), rng, ("bvh2", "bvh4", "bvh8", "bvh8c", "grid", "kdtree", "octree", "brute_force",
+                                                     "fast", "order"))
         header = json.dumps(tree).encode() if rng.random() < 0.9 else mutate(header, rng, TEXT)
     else:
         body = damaged_numbers(body, rng) if rng.random() < 0.8 else mutate(body, rng, BYTES)
@@ -258,20 +240,13 @@ def signed(suffix: str, *parts: bytes) -> Seed:
 
 
 def damaged_numbers(body: bytes, rng: Random) -> bytes:
-    """Some 4-byte numbers replaced: by others from the same array, by neighbours, by extremes."""
+    """Replace some 4-byte numbers: by other numbers of the same array, by neighbours, by extremes."""
     numbers = np.frombuffer(body[: len(body) // 4 * 4], "<u4").copy()
     for _ in range(rng.choice((1, 1, 1, 2, 5, 50)) if len(numbers) else 0):
         i = rng.randrange(len(numbers))
         special = (0, 1, 0xFFFFFFFF, 0x80000000, 0x7FFFFFFF, 0x7F800000, 0xFF800000, 0x7FC00000, 0x00000001, rng.randrange(200))
-        numbers[i] = rng.choice(
-            (
-                numbers[rng.randrange(len(numbers))],
-                int(numbers[i]) + 1 & 0xFFFFFFFF,
-                int(numbers[i]) - 1 & 0xFFFFFFFF,
-                int(numbers[i]) ^ 1 << rng.randrange(32),
-                rng.choice(special),
-            )
-        )
+        numbers[i] = rng.choice((numbers[rng.randrange(len(numbers))], int(numbers[i]) + 1 & 0xFFFFFFFF,
+                                 int(numbers[i]) - 1 & 0xFFFFFFFF, int(numbers[i]) ^ 1 << rng.randrange(32), rng.choice(special)))
     return numbers.tobytes() + body[len(numbers) * 4 :]
 
 
@@ -304,7 +279,7 @@ def accel_seeds() -> list[Seed]:
 
 
 def read_accel(path: Path) -> object:
-    """Read, and walked by rays: a link that leads nowhere shows only then."""
+    """Load the structure, and trace rays: only a traversal shows a bad reference."""
     accel = load_accel_only(path)
     return accel.closest_hit(*rays())
 
@@ -356,17 +331,17 @@ def scene_seeds() -> list[Seed]:
 
 
 def damaged_scene(seed: Seed, other: Seed, rng: Random) -> Seed:
-    """Of the same kind as the first."""
+    """Damage a scene; take parts only from a scene of the same format."""
     if other.suffix != seed.suffix:
         other = seed
     return damaged_toml(seed, other, rng) if seed.suffix == ".toml" else damaged_gltf(seed, other, rng)
 
 
 def render_scene(path: Path) -> object:
-    """A picture of 8x8 pixels of whatever can be loaded; pixels that are not finite are a defect.
+    """Render 8x8 pixels of the scene; pixels that are not finite are a defect.
 
-    One kernel with nearly all features for each kind of background: one for each mixture would take its time to compile. So each
-    scene has smooth normals, be they zero.
+    All scenes with the same background share a kernel with nearly all features, to save compile time. That kernel needs normals,
+    so scenes without normals get zeros.
     """
     from dataclasses import fields
     from unittest import mock
@@ -401,7 +376,7 @@ def load_scene_with_normals(path: Path) -> Any:
     return scene
 
 
-# What is read; and what is done with it, which takes longer and is run only when asked for.
+# A run without --format takes FORMATS; SLOW_FORMATS also render.
 FORMATS: dict[str, Format] = {
     "toml": Format(seeds.scenes, damaged_toml, read_scene, names_sizes=True),
     "gltf": Format(seeds.gltf, damaged_gltf, read_scene, names_sizes=True),

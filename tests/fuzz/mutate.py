@@ -1,4 +1,4 @@
-"""Damage for files: bytes, words and lines of text, and the values of a JSON tree. All chance comes from a random.Random."""
+"""Functions that damage files: bytes, words and lines of text, and the values of a JSON tree. Choices come from a random.Random."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ JUNK: tuple[Any, ...] = (
     None, True, False, *INTEGERS, 0.5, -0.5, 1e-45, 1e-30, 1e18, 1e30, 3.5e38, 1e300, "", "x", "\0", "../x", "/", "/dev/zero",
     "é", "VEC3", "SCALAR", "MASK", "BLEND", "data:,", "#" * 300, [], [0], [[]], [0, 0, 0], [1.0] * 16, {}, {"index": 0},
 )
-MOST_BYTES = 1 << 16  # of an input: how a reader treats longer ones is a matter of its limits, which tests look at
+MOST_BYTES = 1 << 16  # of an input: other tests check the readers' limits on larger files
 
 
 def mutate(data: bytes, rng: Random, steps: Sequence[Callable[[bytearray, Random], None]], other: bytes = b"") -> bytes:
-    """A damaged copy: one to a few of the steps, often one; `other` is what a part may be taken from."""
+    """Return a damaged copy: apply one to eight random steps, and sometimes copy in a part of `other`."""
     out = bytearray(data)
     for _ in range(1 if rng.random() < 0.5 else rng.randint(2, 8)):
         if other and rng.random() < 0.03:
@@ -41,7 +41,7 @@ def mutate(data: bytes, rng: Random, steps: Sequence[Callable[[bytearray, Random
 
 
 def at(out: bytearray, rng: Random) -> int:
-    """A place; headers, where most is decided, are hit as often as all the rest."""
+    """Return a random offset: half of the time in the first 128 bytes, the header."""
     return rng.randrange(min(len(out), 128) if rng.random() < 0.5 else len(out)) if out else 0
 
 
@@ -56,7 +56,7 @@ def put_byte(out: bytearray, rng: Random) -> None:
 
 
 def put_number(out: bytearray, rng: Random) -> None:
-    """An integer or a float that readers often trip over, in one of the usual codes."""
+    """Write an extreme integer or float, in a random binary format."""
     where = at(out, rng)
     kind = rng.choice("BHIQfd")
     if kind in "fd":
@@ -74,9 +74,8 @@ def remove(out: bytearray, rng: Random) -> None:
 
 def insert(out: bytearray, rng: Random) -> None:
     where = at(out, rng)
-    out[where:where] = rng.choice(
-        (b"\0", b"\xff", b"\n", bytes(rng.randrange(256) for _ in range(rng.randint(1, 8))))
-    ) * rng.choice((1, 1, 4, 300))
+    new = rng.choice((b"\0", b"\xff", b"\n", bytes(rng.randrange(256) for _ in range(rng.randint(1, 8)))))
+    out[where:where] = new * rng.choice((1, 1, 4, 300))
 
 
 def copy_part(out: bytearray, rng: Random) -> None:
@@ -141,44 +140,20 @@ def move_lines(out: bytearray, rng: Random) -> None:
 
 
 def swap_mark(out: bytearray, rng: Random) -> None:
-    """One mark becomes another, or many of it."""
+    """Replace a punctuation mark by another, or by many of them."""
     marks = [i for i, byte in enumerate(out) if byte in b"[]{}(),.=:;\"'/#-+\\ \t"]
     if marks:
         where = rng.choice(marks)
-        out[where : where + 1] = rng.choice(
-            (
-                b"",
-                b"[",
-                b"]",
-                b"{",
-                b"}",
-                b",",
-                b"=",
-                b".",
-                b'"',
-                b"'",
-                b"'''",
-                b"/",
-                b"#",
-                b"-",
-                b"\\",
-                b"\n",
-                b"\r",
-                b"\t",
-                b"[" * 2000,
-                b"{a=" * 500,
-                b"a." * 1000,
-                b"-" * 50,
-                b"\\\n",
-            )
-        )
+        out[where : where + 1] = rng.choice((
+            b"", b"[", b"]", b"{", b"}", b",", b"=", b".", b'"', b"'", b"'''", b"/", b"#", b"-", b"\\", b"\n", b"\r", b"\t",
+            b"[" * 2000, b"{a=" * 500, b"a." * 1000, b"-" * 50, b"\\\n"))
 
 
 TEXT = (word_to_number, word_to_number, word_to_number, word_to_word, word_to_word, repeat_words, move_lines, move_lines, swap_mark)
 
 
 def places(value: Any) -> list[tuple[Any, Any]]:
-    """Every (container, key) in a tree."""
+    """Return every (container, key) of a JSON tree; list indices are keys."""
     found, stack = [], [value]
     while stack:
         value = stack.pop()
@@ -190,8 +165,9 @@ def places(value: Any) -> list[tuple[Any, Any]]:
 
 
 def mutate_tree(tree: Any, rng: Random, words: Sequence[str] = (), junk: Sequence[Any] = JUNK) -> Any:
-    """A damaged copy: values become others (junk, nearby numbers, values from elsewhere in the tree), appear twice, or go.
-    words: keys and texts that mean something in the format."""
+    """Return a damaged copy of a JSON tree: values are deleted, duplicated, or replaced by junk, near numbers or other values.
+
+    words: keys and strings that have a meaning in the format."""
     tree = copy.deepcopy(tree)
     for _ in range(1 if rng.random() < 0.4 else rng.randint(2, 6)):
         all_places = places(tree)
@@ -211,9 +187,8 @@ def mutate_tree(tree: Any, rng: Random, words: Sequence[str] = (), junk: Sequenc
         elif kind == 4 and words and isinstance(value, str):
             container[key] = rng.choice(words)
         elif kind in (5, 6) and isinstance(value, int | float) and not isinstance(value, bool):
-            container[key] = rng.choice(
-                (-value, value + 1, value - 1, value * 2, value * 1e6, value / 1e6, rng.choice(INTEGERS), rng.random())
-            )
+            near = -value, value + 1, value - 1, value * 2, value * 1e6, value / 1e6
+            container[key] = rng.choice((*near, rng.choice(INTEGERS), rng.random()))
         else:
             container[key] = copy.deepcopy(rng.choice(junk))
     return tree

@@ -1,4 +1,4 @@
-"""Sound files to begin from, all made here: small, and together with nearly everything that the readers read."""
+"""Valid files to damage: small, generated here, and together with nearly every feature that the readers support."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ SIDE_FILES = ("a.png", "sky.hdr", "sky.exr", "box.obj", "ball.ply", "part.stl", 
 
 
 class Seed(NamedTuple):
-    """A file: its suffix, and what is in it."""
+    """The suffix and the bytes of a file."""
 
     suffix: str
     data: bytes
 
 
 def side_files(folder: Path) -> None:
-    """Write what the scenes refer to."""
+    """Write the files that the scenes refer to."""
     (folder / "a.png").write_bytes(_png())
     (folder / "sky.hdr").write_bytes(_linear(".hdr"))
     (folder / "sky.exr").write_bytes(_linear(".exr"))
@@ -161,11 +161,8 @@ def scenes() -> list[Seed]:
 @cache
 def gltf() -> list[Seed]:
     with tempfile.TemporaryDirectory() as name:
-        paths = [
-            rich_file().write(Path(name), "a.glb"),
-            rich_file().write(Path(name), "a.gltf"),
-            one_triangle().write(Path(name), "b.gltf"),
-        ]
+        paths = [rich_file().write(Path(name), "a.glb"), rich_file().write(Path(name), "a.gltf"),
+                 one_triangle().write(Path(name), "b.gltf")]
         document = json.loads(paths[1].read_text())
         document["images"] = [{"uri": "a.png"}]
         outside = Seed(".gltf", json.dumps(document).encode())
@@ -181,19 +178,14 @@ def obj() -> list[Seed]:
         "vn 0 0 1\nvn 0 1 0\nusemtl red\nf 1/1/1 2/2/1 3/3/2\ns off\nusemtl blue\nf 1//1 3//1 4//2\ng a b\n"
         "f -5/-3 -4/-2 \\\n -1/-1\nf 1 2 3 5 4\nl 1 2\np 1\n# end\n"
     )
-    star = "".join(
-        f"v {np.cos(a) * r:.4f} {np.sin(a) * r:.4f} 0\n" for a, r in zip(np.arange(20) * np.pi / 10, [1, 0.4] * 10, strict=True)
-    )
-    return [
-        Seed(".obj", BOX_OBJ.encode()),
-        Seed(".obj", rich.encode()),
-        Seed(".obj", f"{star}f {' '.join(map(str, range(1, 21)))}\n".encode()),
-    ]
+    star = "".join(f"v {np.cos(a) * r:.4f} {np.sin(a) * r:.4f} 0\n"
+                   for a, r in zip(np.arange(20) * np.pi / 10, [1, 0.4] * 10, strict=True))
+    return [Seed(".obj", text.encode()) for text in (BOX_OBJ, rich, f"{star}f {' '.join(map(str, range(1, 21)))}\n")]
 
 
 @cache
 def ply() -> list[Seed]:
-    """Text, and binary in both orders; quads, uvs of vertices and of faces, other elements."""
+    """Return text files, and binary files in both byte orders; with quads, uvs of vertices and faces, and other elements."""
     corners = [(0, 0, 0, 0, 0, 1, 0, 0), (1, 0, 0, 0, 0, 1, 1, 0), (1, 1, 0, 0, 0, 1, 1, 1), (0, 1, 0, 0, 0, 1, 0, 1)]
     names = ("x", "y", "z", "nx", "ny", "nz", "s", "t")
 
@@ -207,23 +199,15 @@ def ply() -> list[Seed]:
 
     text = header("ascii", True) + "".join(" ".join(map(str, row)) + "\n" for row in corners) + "3 0 1 2\n4 0 1 2 3\n0.5 7\n"
     uv = "6 0 0 1 0 1 1\n"
-    text_uv = (
-        header("ascii", False) + "".join(" ".join(map(str, row[:6])) + "\n" for row in corners) + f"3 0 1 2 {uv}3 0 2 3 {uv}0.5 7\n"
-    )
+    text_uv = header("ascii", False) + "".join(" ".join(map(str, row[:6])) + "\n" for row in corners)
+    text_uv += f"3 0 1 2 {uv}3 0 2 3 {uv}0.5 7\n"
     binary = []
     for form, order in (("binary_little_endian", "<"), ("binary_big_endian", ">")):
         for faces in ([(0, 1, 2), (0, 2, 3)], [(0, 1, 2), (0, 1, 2, 3)]):
             body = np.array(corners, order + "f4").tobytes()
             body += b"".join(bytes([len(face)]) + np.array(face, order + "i4").tobytes() for face in faces)
-            binary.append(
-                Seed(
-                    ".ply",
-                    header(form, True).encode()
-                    + body
-                    + np.array(0.5, order + "f8").tobytes()
-                    + np.array(7, order + "u2").tobytes(),
-                )
-            )
+            edge = np.array(0.5, order + "f8").tobytes() + np.array(7, order + "u2").tobytes()
+            binary.append(Seed(".ply", header(form, True).encode() + body + edge))
     return [Seed(".ply", text.encode()), Seed(".ply", text_uv.encode()), *binary]
 
 
@@ -233,10 +217,8 @@ def stl() -> list[Seed]:
     record = np.zeros(2, [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
     record["corners"] = corners
     binary = b"made here".ljust(80) + np.uint32(2).tobytes() + record.tobytes()
-    facets = [
-        "facet normal 0 0 1\n outer loop\n" + "".join(f"  vertex {x:g} {y:g} {z:g}\n" for x, y, z in each) + " endloop\nendfacet\n"
-        for each in corners
-    ]
+    facets = ["facet normal 0 0 1\n outer loop\n" + "".join(f"  vertex {x:g} {y:g} {z:g}\n" for x, y, z in each)
+              + " endloop\nendfacet\n" for each in corners]
     text = f"solid one\n{facets[0]}endsolid one\nsolid two\n{facets[1]}{facets[0]}endsolid two\n"
     return [Seed(".stl", binary), Seed(".stl", text.encode())]
 
@@ -264,28 +246,12 @@ def images() -> list[Seed]:
     from PIL import Image
 
     rgba = np.dstack([(_picture() * 255).astype(np.uint8), np.full((5, 8), 99, np.uint8)])
-    seeds = [
-        Seed(".png", _png()),
-        Seed(".png", _png(np.uint16)),
-        Seed(".exr", _linear(".exr")),
-        Seed(".exr", _linear(".exr", bits=16)),
-        Seed(".hdr", _linear(".hdr")),
-    ]
+    seeds = [Seed(".png", _png()), Seed(".png", _png(np.uint16)), Seed(".exr", _linear(".exr")),
+             Seed(".exr", _linear(".exr", bits=16)), Seed(".hdr", _linear(".hdr"))]
     for suffix, form, mode in (
-        (".png", "PNG", "RGBA"),
-        (".png", "PNG", "P"),
-        (".png", "PNG", "1"),
-        (".png", "PNG", "I;16"),
-        (".jpg", "JPEG", "RGB"),
-        (".jpg", "JPEG", "CMYK"),
-        (".webp", "WEBP", "RGBA"),
-        (".bmp", "BMP", "RGB"),
-        (".tga", "TGA", "RGBA"),
-        (".png", "GIF", "P"),
-        (".png", "AVIF", "RGB"),
-        (".png", "TIFF", "RGB"),
-        (".png", "PPM", "RGB"),
-    ):
+            (".png", "PNG", "RGBA"), (".png", "PNG", "P"), (".png", "PNG", "1"), (".png", "PNG", "I;16"), (".jpg", "JPEG", "RGB"),
+            (".jpg", "JPEG", "CMYK"), (".webp", "WEBP", "RGBA"), (".bmp", "BMP", "RGB"), (".tga", "TGA", "RGBA"),
+            (".png", "GIF", "P"), (".png", "AVIF", "RGB"), (".png", "TIFF", "RGB"), (".png", "PPM", "RGB")):
         buffer = io.BytesIO()
         picture = Image.fromarray(rgba)
         picture = Image.fromarray(rgba[..., 0].astype(np.uint16) * 257) if mode == "I;16" else picture.convert("RGB").convert(mode)
@@ -293,10 +259,7 @@ def images() -> list[Seed]:
         seeds.append(Seed(suffix, buffer.getvalue()))
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "a.exr"
-        write_exr(
-            path,
-            {"depth.Z": _picture()[..., 0], "R": _picture()[..., 0], "G": _picture()[..., 1], "B": _picture()[..., 2]},
-            {"note": "x"},
-        )
+        red, green, blue = np.moveaxis(_picture(), 2, 0)
+        write_exr(path, {"depth.Z": red, "R": red, "G": green, "B": blue}, {"note": "x"})
         seeds.append(Seed(".exr", path.read_bytes()))
     return seeds

@@ -1,7 +1,4 @@
-"""Damaged files of every kind that is read: each is read or refused with an InputError, and nothing else happens.
-
-A few seconds of what `python -m tests.fuzz` does for as long as one likes.
-"""
+"""Readers accept damaged files of every format, or raise InputError; a few seconds of what `python -m tests.fuzz` does at length."""
 
 from __future__ import annotations
 
@@ -24,7 +21,7 @@ from wrt.core.errors import InputError
 
 def judge_of(name: str, folder: Path) -> Judge:
     form = FORMATS[name]
-    if name == "accel":  # rays through all structures would compile too much here
+    if name == "accel":  # tracing rays would compile kernels for all structures
         form = Format(form.seeds, form.damaged, load_accel_only)
     return Judge(form, folder)
 
@@ -37,14 +34,8 @@ def test_damaged_files_are_read_or_refused(name: str, tmp_path: Path) -> None:
     sound = judge.outcomes["read"]
     assert sound > 0.7 * len(judge.form.seeds())
 
-    @settings(
-        max_examples=150,
-        deadline=10_000,
-        derandomize=True,
-        database=None,
-        suppress_health_check=list(HealthCheck),
-        phases=(Phase.explicit, Phase.generate),
-    )
+    @settings(max_examples=150, deadline=10_000, derandomize=True, database=None, suppress_health_check=list(HealthCheck),
+              phases=(Phase.explicit, Phase.generate))
     @given(st.integers(0, 2**64))
     @example(0)
     def check(number: int) -> None:
@@ -68,7 +59,7 @@ def test_any_bytes_are_read_or_refused(name: str, tmp_path: Path) -> None:
 
 
 def test_a_defect_is_seen(tmp_path: Path) -> None:
-    """Of a reader that fails in each way: the judge tells which."""
+    """The judge reports each way in which a reader can fail."""
     import os
     import warnings
 
@@ -91,20 +82,15 @@ def test_a_defect_is_seen(tmp_path: Path) -> None:
     judge = Judge(Format(list, lambda seed, other, rng: seed, reader), tmp_path)
     with judge.watching_stderr():
         words = ("error", "hidden", "memory", "stderr", "warning", "refused", "fine")
-        told = {word: judge.read(0, Seed(".x", word.encode())) for word in words}
-    assert told.pop("refused") == told.pop("fine") == ""
-    assert [problem.split()[0] for problem in told.values()] == [
+        problems = {word: judge.read(0, Seed(".x", word.encode())) for word in words}
+    assert problems.pop("refused") == problems.pop("fine") == ""
+    assert [problem.split()[0] for problem in problems.values()] == [
         "UnicodeDecodeError", "InputError", "MemoryError", "stderr", "RuntimeWarning"]
     judge.form = replace(judge.form, names_sizes=True)
     assert judge.read(0, Seed(".x", b"memory")) == "" and judge.outcomes["out of memory"] == 1
 
 
 def test_the_command_runs_workers(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "tests.fuzz", "--inputs", "300", "--format", "ply", "--out", str(tmp_path / "out")],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command = [sys.executable, "-m", "tests.fuzz", "--inputs", "300", "--format", "ply", "--out", str(tmp_path / "out")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0 and "300 inputs, 0 defects" in done.stdout and not (tmp_path / "out").exists()

@@ -1,6 +1,6 @@
-"""Reads damaged files one after another in this process, and tells what went wrong: `python -m tests.fuzz.worker ARGUMENTS`.
+"""Read damaged files one after another, and print defects as JSON: tests/fuzz/__main__.py starts `python -m tests.fuzz.worker`.
 
-Whoever started it looks at the file `beat` in its folder, which holds the number of the case in work, to see that it is alive.
+The file `beat` in the worker's folder holds the number of the input in work plus 1, so that its parent sees progress.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from tests.fuzz import seeds
 from tests.fuzz.formats import ALL_FORMATS, Format, make_case
 from wrt.core.errors import InputError, SceneWarning
 
-ROOM = 1 << 30  # bytes of address space beyond what a worker has when it begins
+ROOM = 1 << 30  # bytes of address space that a worker may allocate for the inputs
 
 
 class Judge:
-    """Reads files in a folder and says what is wrong with how that went."""
+    """Read files, and describe what went wrong."""
 
     def __init__(self, form: Format, folder: Path) -> None:
         self.form, self.folder = form, folder
@@ -40,7 +40,7 @@ class Judge:
 
     @contextlib.contextmanager
     def watching_stderr(self) -> Iterator[None]:
-        """File descriptor 2 goes to a file during the block: libraries in C write to it past Python."""
+        """Redirect file descriptor 2 to a file during the block, because C libraries write to it directly."""
         before = os.dup(2)
         with open(self.folder / "stderr", "w+b") as self.stderr:
             os.dup2(self.stderr.fileno(), 2)
@@ -52,23 +52,18 @@ class Judge:
                 self.stderr = None
 
     def read(self, number: int, seed: seeds.Seed) -> str:
-        """Write the file and read it: "" where that went well, else what is wrong, its first line without details."""
+        """Write the file and read it. Return "" or the problem, whose first line has no details, so that equal problems group."""
         path = self.folder / f"case{seed.suffix}"
         path.write_bytes(seed.data)
-        begin = time.process_time()  # who stops the process for a while makes no case slow
+        begin = time.process_time()  # wall time would count pauses of the process
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             problem = self._attempt(path)
         seconds = time.process_time() - begin
         self.slowest = max(self.slowest, (seconds, number))
-        problem = problem or next(
-            (
-                f"{each.category.__name__} in {each.filename}:{each.lineno}\n{each.message}"
-                for each in caught
-                if not issubclass(each.category, SceneWarning)
-            ),
-            "",
-        )
+        others = [each for each in caught if not issubclass(each.category, SceneWarning)]
+        if others and not problem:
+            problem = f"{others[0].category.__name__} in {others[0].filename}:{others[0].lineno}\n{others[0].message}"
         if self.stderr is not None and os.fstat(self.stderr.fileno()).st_size:
             self.stderr.seek(0)
             problem = problem or f"stderr\n{self.stderr.read().decode(errors='replace')}"
@@ -96,7 +91,7 @@ class Judge:
 
 
 def _place(error: BaseException) -> str:
-    """The last line of the project that it came through."""
+    """Return the file and line of the innermost frame of the traceback that is in the project."""
     frames = [f for f in traceback.extract_tb(error.__traceback__) if "/wrt/" in f.filename or "/tests/" in f.filename]
     return f"{Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else "?"
 
@@ -107,7 +102,7 @@ def main(name: str, seed: str, first: str, count: str, folder: str) -> None:
     beat_path = Path(folder) / "beat"
     beat_path.write_bytes(b"\0" * 8)
     with open(beat_path, "r+b") as file, mmap.mmap(file.fileno(), 8) as beat, judge.watching_stderr():
-        for each in judge.form.seeds():  # imports, compiles, takes its memory
+        for each in judge.form.seeds():  # so that imports, kernels and caches are in memory before the limit is set
             judge.read(-1, each)
         judge.outcomes = dict.fromkeys(judge.outcomes, 0)
         judge.slowest = (0.0, -1)
@@ -119,11 +114,8 @@ def main(name: str, seed: str, first: str, count: str, folder: str) -> None:
             case = make_case(judge.form, random.Random(f"{seed} {name} {number}"))
             if problem := judge.read(number, case):
                 print(json.dumps({"number": number, "problem": problem, "suffix": case.suffix}), file=out, flush=True)
-        print(
-            json.dumps({"done": int(count), **judge.outcomes, "slowest": judge.slowest, "seconds": time.perf_counter() - begin}),
-            file=out,
-            flush=True,
-        )
+        summary = {"done": int(count), **judge.outcomes, "slowest": judge.slowest, "seconds": time.perf_counter() - begin}
+        print(json.dumps(summary), file=out, flush=True)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""All hits of rays, found by testing every primitive: what structures and walks are held to."""
+"""All hits of rays, found by testing every primitive: the reference for structures and walks."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hi
 
 @wp.struct
 class HitList:
-    """Up to `capacity` hits a ray, in the order of prim_id; count may be larger than capacity."""
+    """Up to `capacity` hits of each ray, in the order of prim_id. `count` has the number of all hits, also of those not stored."""
 
     capacity: int
     count: wp.array(dtype=wp.int32)
@@ -20,7 +20,7 @@ class HitList:
 
 
 def make_all_hits_kernel(units: Units) -> Any:
-    """Every primitive that each ray hits in its segment, by testing all of them: what the units say, without a structure."""
+    """Return the kernel that lists every primitive that a ray hits in its segment, by the test units and without a structure."""
     probe_of = make_probe(units)
     intersect = make_intersect(units)
     record = units.triangle_test.record

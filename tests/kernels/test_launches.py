@@ -1,4 +1,4 @@
-"""CPU kernels that launch others: as recorded, with another last argument, or for a range of rays."""
+"""CPU kernels that launch recorded kernels: with the recorded arguments, with another last argument, or for a range."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from wrt.kernels.structs import kernel
 
 @wp.struct
 class Log:
-    """Log of launches: `entries` so far, their values in `what`, and how often each index was in a range."""
+    """Log of launches: the number of `entries`, their values in `what`, and how often each index was in a range."""
 
     entries: wp.array(dtype=wp.int32)
     what: wp.array(dtype=wp.int32)
@@ -36,14 +36,14 @@ def take(log: Log, first: int, end: int):
 
 @kernel
 def take_one(log: Log, first: int, end: int):
-    i = first + wp.tid()  # a thread too many is seen behind the range
+    i = first + wp.tid()  # A thread too many leaves its mark behind the range.
     log.seen[i] = log.seen[i] + 1
 
 
 @kernel
 def loop(log: Log, note_launch: Launch):
     run(note_launch)
-    while log.entries[0] < 4:  # which `note` adds to
+    while log.entries[0] < 4:  # `note` adds an entry.
         run_with(note_launch, log.entries[0])
 
 
@@ -70,7 +70,7 @@ def test_a_kernel_launches_another_repeatedly() -> None:
     gc.collect()
     wp.launch(loop, dim=1, inputs=[it, of_note], device="cpu")
     assert it.what.numpy().tolist() == [70, 10, 20, 30, 0, 0, 0, 0]
-    wp.launch(loop, dim=1, inputs=[it, of_note], device="cpu")  # with the argument that it had last
+    wp.launch(loop, dim=1, inputs=[it, of_note], device="cpu")  # The recorded launch has the last argument that it had.
     assert it.what.numpy()[4] == 30 and it.entries.numpy()[0] == 5
 
 
@@ -90,7 +90,7 @@ def test_released_launches_free_their_memory() -> None:
     it = log()
     Launches().recorded(recorded(take, it, 0, 0))
     gc.collect()
-    gc.disable()  # objects that only the collector frees stay
+    gc.disable()  # Objects in reference cycles stay.
     try:
         before = len(gc.get_objects())
         for _ in range(50):

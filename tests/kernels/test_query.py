@@ -1,4 +1,4 @@
-"""The kernels over arrays of rays: the entries that they write, and what they write on a miss."""
+"""The kernels over arrays of rays: which entries they write, and the values of a miss."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ TRIANGLE = Mesh([[-1, -1, 0], [1, -1, 0], [0, 1, 0]], [[0, 1, 2]])
 
 
 def ray_arrays():
-    """Ten rays along +z from z = -2: even ones meet the triangle at t = 2, odd ones pass it, two have segments too short."""
+    """Ten rays along +z from z = -2. Even rays meet the triangle at t = 2, but the segments of rays 4 and 6 exclude it. Odd rays miss."""
     rays = RayArrays()
     origin = np.zeros((10, 3))
     origin[:, 2] = -2.0
@@ -67,7 +67,7 @@ def test_only_the_rows_asked_for_are_written(name):
 @settings(max_examples=40, deadline=None)
 @given(power=st.integers(-125, 125), triangle=st.sampled_from(list(RAY_TRIANGLE)))
 def test_t_scales_with_the_direction_and_nothing_else_does(power, triangle):
-    # Powers of two, components of 8 bits: the direction is exact down to 2^-133, as a denormal, and up to 2^125.
+    # Components have 8 bits and the scale is a power of two. So the direction is exact down to 2^-133, as a denormal, and up to 2^125.
     rng = np.random.default_rng(power + 200)
     direction = rng.integers(-128, 129, (200, 3)) / 128.0
     direction[:, 2] = 1.0
@@ -88,12 +88,12 @@ LARGEST = np.finfo(np.float32).max
 @pytest.mark.parametrize("name", STRUCTURES)
 @pytest.mark.parametrize("t_max", [np.inf, LARGEST, 2.0**127])
 def test_a_hit_whose_t_is_beyond_float32_is_a_miss(name, t_max):
-    # t = 2^128, beyond by half a step; the last number there is; one step less; 2^127; far within; beyond by a lot.
+    # t = 2^128, which is too large; the largest float32; the float32 below it; 2^127; 2^88; 2^140, which is far too large.
     distance = np.array([1.0, 1.0 - 2.0**-24, 1.0 - 2.0**-23, 0.5, 2.0**-40, 2.0**12]) * 2.0**-12
     expected = distance.astype(np.float64) * 2.0**140
     origin = np.stack([0.0 * distance, 0.0 * distance, -distance], axis=1)
     direction = np.tile([0.0, 0.0, 2.0**-140], (6, 1))
-    for copies in (1, 16):  # a packet takes sixteen rays alike
+    for copies in (1, 16):  # A packet has sixteen equal rays.
         accel = build(TRIANGLE, name)
         o, d = np.repeat(origin, copies, axis=0), np.repeat(direction, copies, axis=0)
         found = np.repeat(expected <= min(t_max, LARGEST), copies)
@@ -106,7 +106,7 @@ def test_a_hit_whose_t_is_beyond_float32_is_a_miss(name, t_max):
 
 @pytest.mark.parametrize("name", STRUCTURES)
 def test_any_hit_and_closest_hit_agree_on_rays_of_any_length(name):
-    # Two triangles, so that what is found first may be beyond float32 and the other not.
+    # Two triangles: the t of the hit that is found first may be beyond float32, and the t of the other hit within it.
     rng = np.random.default_rng(4)
     near = np.concatenate([TRIANGLE.vertices, TRIANGLE.vertices + [0.0, 0.0, 3.0]])
     n = 4000
@@ -139,7 +139,7 @@ def test_make_ray_goes_to_infinity_and_excludes_nothing():
 
 @pytest.mark.parametrize("name", families_first())
 def test_a_ray_excludes_no_triangle_by_default(name):
-    # A user's kernel: triangle 0 is hit, unless exclude_plus_one names it.
+    # In a user's kernel, triangle 0 is hit unless exclude_plus_one = 1 excludes it.
     structure = Structure(ACCELERATORS[name])
     struct, traverse = structure.struct, structure.traversal(any_hit=False)
 

@@ -1,4 +1,4 @@
-"""Structs in rows: what is stored is loaded again, number by number, and the text that does it."""
+"""Structs in rows: stored values are loaded again with all bits, and the generated C++ is as expected."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Thing:
 
 THINGS = Rows(Thing, 5, 2)
 
-# What Rows writes: a plain copy for each number. Place of number k of entry i: (first + k) * length + i.
+# The C++ of Rows: a copy for each number. Number k of entry i is at the place (first + k) * length + i.
 STORED = """\
     memcpy(rows.data + 10ll + i, &value.corner.point[0], 4);
     memcpy(rows.data + 15ll + i, &value.corner.point[1], 4);
@@ -62,7 +62,7 @@ def test_rows_follow_one_another() -> None:
 
 
 def copied(source: Rows, target: Rows, things: Any, without: tuple[str, ...] = ()) -> Any:
-    """Values that went to rows, from there to other rows, and back; and those rows."""
+    """Return the values after storing to rows, copying to other rows and loading, and the other rows."""
     store, load, store_again, load_again = source.store(), source.load(*without), target.store(), target.load()
 
     @kernel
@@ -84,12 +84,12 @@ def copied(source: Rows, target: Rows, things: Any, without: tuple[str, ...] = (
 def test_each_number_keeps_its_bits() -> None:
     rng = np.random.default_rng(0)
     things = records(Thing, 5)
-    things[:] = np.frombuffer(rng.bytes(things.nbytes), things.dtype)  # NaN and denormals too
+    things[:] = np.frombuffer(rng.bytes(things.nbytes), things.dtype)  # NaN and denormals, too.
     out, rows = copied(THINGS, Rows(Thing, 5, THINGS.end), things)
     assert out.tobytes() == things.tobytes()
     numbers = np.frombuffer(things.tobytes(), np.uint32).reshape(5, -1).T
     np.testing.assert_array_equal(rows[2:].view(np.uint32), np.concatenate([numbers, numbers]))
-    assert np.isnan(rows[:2]).all()  # nothing else is written
+    assert np.isnan(rows[:2]).all()  # Only the struct's rows are written.
 
 
 def test_a_field_that_is_left_out_is_zero() -> None:

@@ -1,8 +1,8 @@
-"""The native code under the sanitizers of addresses and of undefined behaviour: `python -m tests.sanitize`.
+"""Run the C++ headers of kernels/ under AddressSanitizer and UndefinedBehaviorSanitizer: `python -m tests.sanitize`.
 
-Each program of PROGRAMS is compiled by g++, and by clang++ where there is one, with headers of kernels/ and nothing of Warp. It
-reads cases that Python wrote, walks them in arrays that end where they must, and compares its answers with those of the scalar
-kernels. A further program is one more row: its source here, its own layout.h, and a function that writes its cases.
+g++ and clang++, if installed, compile each program of PROGRAMS with the headers, without Warp. The program reads cases that Python
+wrote, runs the headers' functions on arrays of exact length, and compares the results with those of the scalar kernels. A further
+program is one more row: its source in this folder, its layout.h, and a function that writes its cases.
 """
 
 from __future__ import annotations
@@ -24,14 +24,15 @@ from wrt.kernels.wide.layout import LAYOUT_H
 
 HERE = Path(__file__).parent
 COMPILERS = "g++", "clang++"
-PLAIN = "-std=c++17", "-ffp-contract=off", "-Wall", "-Wextra", "-Wno-psabi"  # psabi: vectors as arguments, within one file
+# -Wno-psabi: a program is one file, so the ABI of vector arguments does not matter.
+PLAIN = "-std=c++17", "-ffp-contract=off", "-Wall", "-Wextra", "-Wno-psabi"
 SANITIZED = "-O1", "-g1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"
 
-LIMIT = 120  # seconds: a walk may be broken so that it never ends
+LIMIT = 120  # seconds for a program: a broken traversal may never end
 
 
 class Program(NamedTuple):
-    """headers: the folder of kernels/ that it includes from; layout: the text of layout.h there."""
+    """A C++ program. headers: the folder of kernels/ with its headers; layout: the text of the generated layout.h."""
 
     source: str
     headers: str
@@ -46,7 +47,7 @@ PROGRAMS = (
 
 
 def compile_program(compiler: str, program: Program, folder: Path, *flags: str) -> Path:
-    """Compile into a folder, where layout.h is written too. Raises CalledProcessError."""
+    """Write layout.h and compile the program into a folder; return its path. Raises CalledProcessError."""
     (folder / "layout.h").write_text("#pragma once\n" + program.layout)
     out = folder / f"{program.source}-{compiler}"
     where = "-I", str(ROOT / "kernels" / program.headers), "-I", str(folder)
@@ -55,7 +56,7 @@ def compile_program(compiler: str, program: Program, folder: Path, *flags: str) 
 
 
 def usable() -> list[str]:
-    """The compilers that are there and can link the sanitizers' libraries."""
+    """Return the compilers that are installed and can link the libraries of the sanitizers."""
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "empty.cpp"
         source.write_text("int main() { return 0; }\n")
@@ -66,11 +67,11 @@ def usable() -> list[str]:
 
 def main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.sanitize", description=__doc__)
-    parser.add_argument("--if-possible", action="store_true", help="end with 0 where no compiler has the sanitizers")
+    parser.add_argument("--if-possible", action="store_true", help="exit with 0 instead of 2 if no compiler has the sanitizers")
     options = parser.parse_args(arguments)
     compilers = usable()
     if not compilers:
-        print("not run: neither g++ nor clang++ is there with the libraries of -fsanitize=address,undefined")
+        print("not run: needs g++ or clang++ with the libraries of -fsanitize=address,undefined")
         return 0 if options.if_possible else 2
     worst = 0
     with tempfile.TemporaryDirectory() as name:

@@ -1,4 +1,4 @@
-"""Trees and rays for walks.cpp, with the answers of the kernel for one ray: small trees of all counts, bad triangles, bad rays."""
+"""Cases for walks.cpp: small trees, some with bad triangles or rays, and the hits of the kernels that trace one ray at a time."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, 0.5, 1e-40, 1e-30, -3e38, np.inf, -np.
 
 
 def triangles(rng: np.random.Generator, n: int) -> np.ndarray:
-    """(n, 3, 3) corners: every fifth triangle without area, every seventh in the place of the one before."""
+    """Return corners (n, 3, 3): every fifth triangle has no area, every seventh is a copy of its predecessor."""
     corners = rng.normal(size=(n, 1, 3)) + rng.choice([1e-3, 0.3, 2.0], (n, 1, 1)) * rng.normal(size=(n, 3, 3))
     corners[4::5, 2] = corners[4::5, rng.integers(0, 2)]
     corners[6::7] = corners[5::7][: len(corners[6::7])]
@@ -30,7 +30,8 @@ def triangles(rng: np.random.Generator, n: int) -> np.ndarray:
 
 
 def rays(rng: np.random.Generator, n: int, corners: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Origins, directions, t_min, t_max: towards triangles, side by side or not; every eighth ray has numbers that none should."""
+    """Return origins, directions, t_min and t_max of n rays towards triangles, half of them coherent; every eighth ray has special
+    values: infinities, NaN, subnormal and huge numbers."""
     together = rng.random((n, 1)) < 0.5
     origin = np.where(together, 3.0 + 0.01 * rng.normal(size=(n, 3)), 3.0 * rng.normal(size=(n, 3)))
     aim = corners.reshape(-1, 3)[rng.integers(0, corners.size // 3, n)] * rng.random((n, 1))
@@ -43,9 +44,9 @@ def rays(rng: np.random.Generator, n: int, corners: np.ndarray) -> tuple[np.ndar
     return origin, direction, t_min, rng.choice(np.array([np.inf, np.inf, 3.4e38, 1.0, 0.0], np.float32), n)
 
 
-def answers(accel: Any, given: tuple[np.ndarray, ...]) -> list[np.ndarray]:
-    """t, u, v, prim_id and whether there is any hit, one ray at a time."""
-    origin, direction, t_min, t_max = given
+def answers(accel: Any, rays: tuple[np.ndarray, ...]) -> list[np.ndarray]:
+    """Return t, u, v and prim_id of the closest hits, and any_hit as int32, by the kernels that trace one ray at a time."""
+    origin, direction, t_min, t_max = rays
     n = len(origin)
     arrays, hits = RayArrays(), HitArrays()
     arrays.origin, arrays.direction = vec3s(origin), vec3s(direction)
@@ -60,7 +61,7 @@ def answers(accel: Any, given: tuple[np.ndarray, ...]) -> list[np.ndarray]:
 
 
 def cases() -> Iterator[list[np.ndarray]]:
-    """The arrays of each case, in the order in which walks.cpp reads them."""
+    """Yield the arrays of each case, in the order in which walks.cpp reads them."""
     rng = np.random.default_rng(1)
     for count in FACES:
         corners = triangles(rng, count)
@@ -74,7 +75,7 @@ def cases() -> Iterator[list[np.ndarray]]:
 
 
 def write_cases(path: Path) -> None:
-    """Each array after its length."""
+    """Write each array behind its length, an int32."""
     with path.open("wb") as file:
         for arrays in cases():
             for array in arrays:

@@ -1,5 +1,5 @@
-// Shading in lanes by the headers of kernels/shade alone, with arrays that have no number more than they need. The file of cases comes
-// from tests/sanitize/shading.py: of each, its kind, what the function is given, and what its scalar twin answers.
+// Vectorised shading with the headers of kernels/shade. Arrays have exactly the elements that the headers may access.
+// tests/sanitize/shading.py writes the file of cases: the kind, the arguments, and the results of the scalar function.
 #include "backgrounds.h"
 #include "film.h"
 #include "sampling.h"
@@ -18,7 +18,7 @@ typedef std::vector<int> Ints;
 
 const int BLOCK = 64;
 
-template <class T> struct Array {  // as Warp's
+template <class T> struct Array {  // the interface of Warp's array that the headers use
     T* data;
 };
 
@@ -95,7 +95,7 @@ bool sky(FILE* file) {
     Floats x = next<float>(file), y = next<float>(file);
     const Floats red = next<float>(file), green = next<float>(file), blue = next<float>(file);
     const size_t n = x.size();
-    x.resize(whole(n), __builtin_nanf("")), y.resize(whole(n), 3e38f);  // what stands behind is anything
+    x.resize(whole(n), __builtin_nanf("")), y.resize(whole(n), 3e38f);  // lanes without a sample may have any values
     Floats z(whole(n));
     environment_at(Background{size[0], size[1], scale[0], {pixels.data()}}, x.data(), y.data(), z.data(), (int)n);
     return same(x.data(), red.data(), 4 * n) && same(y.data(), green.data(), 4 * n) && same(z.data(), blue.data(), 4 * n);
@@ -105,12 +105,12 @@ bool texels(FILE* file) {
     std::vector<Texture> textures = next<Texture>(file);
     std::vector<unsigned> all = next<unsigned>(file);
     Floats table = next<float>(file);
-    const Ints wanted = next<int>(file), asked = next<int>(file);
-    const Floats us = next<float>(file), vs = next<float>(file), expected = next<float>(file);  // row by row of the channels asked for
-    const size_t n = asked[0], rows = expected.size() / n;
+    const Ints wanted = next<int>(file), size_and_mask = next<int>(file);
+    const Floats us = next<float>(file), vs = next<float>(file), expected = next<float>(file);  // expected: a row per channel
+    const size_t n = size_and_mask[0], rows = expected.size() / n;
     Floats out(rows * BLOCK);
     sample_texture<BLOCK>(Surfaces{{textures.data()}, {all.data()}, {table.data()}}, wanted.data(), us.data(), vs.data(), (int)n,
-                          asked[1], out.data());
+                          size_and_mask[1], out.data());
     bool right = true;
     for (size_t row = 0; row < rows; ++row)
         for (size_t i = 0; i < n; ++i) {

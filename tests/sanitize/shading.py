@@ -1,4 +1,4 @@
-"""Cases for shading.cpp, with the answers of the scalar twins: boundary counts, far and bad coordinates, and bad samples."""
+"""Cases for shading.cpp: counts around multiples of the lanes, bad coordinates and samples, with the results of the scalar kernels."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def sky_kernel(b: Background, x: wp.array(dtype=float), y: wp.array(dtype=float)
 
 
 def skies(rng: np.random.Generator) -> Iterator[list[np.ndarray]]:
-    """Columns and rows up to half a pixel beside the picture, where the seam and the poles are."""
+    """Yield lookups in environments up to half a pixel beside the image, where the seam and the poles are."""
     for height, width in ((1, 1), (1, 7), (5, 1), (5, 8)):
         image = rng.random((height, width, 3)).astype(np.float32)
         b = upload_scene(Scene(background=EnvironmentBackground(image, scale=1.5)), DEVICE).lighting.background
@@ -70,7 +70,7 @@ def skies(rng: np.random.Generator) -> Iterator[list[np.ndarray]]:
 
 
 def texels(rng: np.random.Generator) -> Iterator[list[np.ndarray]]:
-    """Pictures of one texel and more, wrapped in every way; near, far, and not finite."""
+    """Yield lookups in textures of 1x1 texels and larger, with every wrap mode; uv near, far, and not finite."""
     wraps = [(u, v) for u in ("repeat", "clamp", "mirror") for v in ("repeat", "clamp", "mirror")]
     pictures = [Texture(picture(rng, 1 + i, 1 + 2 * i), srgb=i % 2 == 0, wrap=wrap) for i, wrap in enumerate(wraps)]
     surfaces = surfaces_with(pictures)
@@ -104,7 +104,7 @@ def pixels(rng: np.random.Generator) -> Iterator[list[np.ndarray]]:
 
 
 def write_cases(path: Path) -> None:
-    """Each array after its number of bytes."""
+    """Write each array behind its number of bytes, an int32."""
     rng = np.random.default_rng(1)
     with path.open("wb") as file:
         for cases in (points(), quantiles(rng), skies(rng), texels(rng), pixels(rng)):

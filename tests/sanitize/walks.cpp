@@ -1,5 +1,5 @@
-// Walks of wide trees by the headers of kernels/wide alone, with arrays that have no number more than they need: the walks of
-// kernels/wide/batch.py in C++. The file of cases comes from tests/sanitize/cases.py.
+// The traversals of kernels/wide/batch.py in C++, with the headers of kernels/wide. Arrays have exactly the elements that the headers
+// may access. tests/sanitize/cases.py writes the file of cases.
 #include "interleaved.h"
 #include "set_up.h"
 
@@ -14,7 +14,7 @@ using namespace wrt;
 
 const int EMPTY = 0;
 
-template <class T> struct Array {  // as Warp's
+template <class T> struct Array {  // the interface of Warp's array that the headers use
     T* data;
     int strides[1];
 };
@@ -34,10 +34,10 @@ struct HitArrays {
 };
 
 struct Case {
-    std::vector<float> nodes, primitives;  // of a tree with nodes of 8 children
+    std::vector<float> nodes, primitives;  // of a BVH with 8 children per node
     std::vector<float> origins, directions, t_mins, t_maxs;
     std::vector<int> excludes;
-    std::vector<float> t, u, v;  // what the scalar walk finds
+    std::vector<float> t, u, v;  // the hits by the kernel for one ray
     std::vector<int> prim_id, occluded;
     int rays;
 };
@@ -49,7 +49,7 @@ template <bool ANY_HIT> class Walk {
 public:
     explicit Walk(Case& c) : given(c), packet(PACKET_SIZE), stack(STACK_WORDS), slot(SLOT_SIZE) {}
 
-    // Rays first .. first + count - 1, as one packet if they have a beam and `together`, else one by one.
+    // Trace the rays first .. first + count - 1: as one packet if `together` and their bounds form a beam, else one by one.
     void trace(int first, int count, bool together) {
         RayArrays rays = {{(Vector*)given.origins.data(), {12}}, {(Vector*)given.directions.data(), {12}},
                           {given.t_mins.data(), {given.t_mins.size() == 1 ? 0 : 4}}, {given.t_maxs.data(), {4}}};
@@ -91,7 +91,7 @@ private:
         const float* row = given.primitives.data() + leaf_first(reference) * ROW_SIZE;
         for (int left = leaf_count(reference); left > 0; left -= WIDTH, row += ROW_SIZE) {
             const int n = left < WIDTH ? left : WIDTH;
-            if (mask & 1) {  // by lanes of rays, or ray by ray: both occur
+            if (mask & 1) {  // cover both forms: rays in lanes, and ray by ray
                 mask &= ~(triangles<ANY_HIT>(row, n, mask, packet.data()) & (ANY_HIT ? ~0 : 0));
             } else {
                 for (int rays = mask; rays; rays &= rays - 1)
@@ -123,7 +123,7 @@ private:
     std::vector<int> slot;
 };
 
-// Whether all rays of a case are answered as expected, from `first` on in packets of at most `most`.
+// Return whether all rays of a case have the expected hits, traced in packets of at most `most` rays.
 bool agrees(Case& c, int most, bool together) {
     std::vector<float> t(c.rays), u(c.rays), v(c.rays);
     std::vector<int> prim_id(c.rays);

@@ -1,4 +1,4 @@
-"""Documented calls that type checkers accept, with the types that they find; never run."""
+"""Documented calls, with the types that type checkers must infer for their results. The file is checked, never run."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def warp_queries(accel: OneMesh, origins: WarpArray, directions: WarpArray) -> N
 
 
 class Tensor:
-    """A tensor of any library that speaks DLPack."""
+    """A tensor of any library with DLPack."""
 
     def __len__(self) -> int: ...  # type: ignore[empty-body]
     def __getitem__(self, index: Any, /) -> Tensor: ...  # type: ignore[empty-body]

@@ -1,4 +1,4 @@
-"""mypy (strict) and pyright see what users write: documented calls pass with their types, and mistakes are found."""
+"""mypy (strict) and pyright accept the calls in examples.py, with their types, and report the errors in mistakes.py."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ EXAMPLES, MISTAKES = (Path(__file__).with_name(name) for name in ("examples.py",
 
 
 def mypy(tmp_path: Path) -> set[tuple[str, int]]:
-    """Return the lines (file, line) in which mypy finds an error, with Warp's own types and not those of stubs/."""
+    """Return (file, line) of each error that mypy reports, with Warp's own types instead of stubs/."""
     pytest.importorskip("mypy")
     config = tmp_path / "mypy.ini"
     config.write_text("[mypy]\nstrict = True\nfollow_imports = silent\nignore_missing_imports = True\n")
@@ -28,10 +28,10 @@ def mypy(tmp_path: Path) -> set[tuple[str, int]]:
 
 
 def pyright(tmp_path: Path) -> set[tuple[str, int]]:
-    """Return the same of pyright."""
+    """Return (file, line) of each error that pyright reports."""
     pytest.importorskip("basedpyright")
     config = tmp_path / "pyrightconfig.json"
-    # `strict` minus what Warp and trimesh do not say of themselves.
+    # `strict` without the rules that need types which Warp and trimesh do not declare.
     rules = {"reportUnknownMemberType": "none", "reportUnknownArgumentType": "none", "reportUnknownVariableType": "none",
              "reportUnusedExpression": "none", "reportUnusedCallResult": "none"}
     config.write_text(json.dumps({"include": [str(EXAMPLES), str(MISTAKES)], "typeCheckingMode": "strict", "pythonVersion": "3.11",
@@ -44,5 +44,5 @@ def pyright(tmp_path: Path) -> set[tuple[str, int]]:
 
 @pytest.mark.parametrize("check", [mypy, pyright])
 def test_documented_calls_pass_and_mistakes_are_found(check, tmp_path: Path) -> None:
-    wrong = {(MISTAKES.name, i) for i, line in enumerate(MISTAKES.read_text().splitlines(), 1) if "  # error" in line}
+    wrong = {(MISTAKES.name, i) for i, line in enumerate(MISTAKES.read_text().splitlines(), 1) if "  # Error" in line}
     assert check(tmp_path) == wrong

@@ -1,7 +1,7 @@
-"""From the CUDA C++ that Warp writes for a module to an object file of the host, by Warp's own Clang.
+"""Compile the CUDA C++ that Warp writes for a module to an object file for the host, with Warp's Clang.
 
-No code of NVIDIA's compilers is made or read. Warp's headers are taken in their form for the CPU (the precompiled ones, with the
-CPU's flags); the module's text after them as CUDA code, with `__CUDA_ARCH__` defined.
+NVIDIA's compilers play no part. Warp's headers are compiled (and precompiled) as for the CPU, with the CPU's flags; the module's code
+behind them as CUDA code, with `__CUDA_ARCH__` defined.
 """
 
 from __future__ import annotations
@@ -14,20 +14,20 @@ from pathlib import Path
 from tests.virtual_gpu.warp_private import BLOCK_DIM, KERNEL, LAST_HEADER, compile_for_host
 
 DEVICE_H = Path(__file__).with_name("device.h").read_text()
-LEVEL = 2  # of optimisation, as for the CPU
+LEVEL = 2  # optimisation, the same as for the CPU
 SUFFIX = f".virtual{sha256(DEVICE_H.encode()).hexdigest()[:8]}.cubin"
 
 
 def entry(kernel: str) -> str:
-    """The name of the function that runs a whole grid of a kernel."""
+    """Return the name of the function that runs a whole grid of a kernel."""
     return f"virtual_gpu_{kernel}"
 
 
 def for_host(source: str, arch: int) -> str:
-    """The C++ of a module for the host."""
+    """Return the C++ for the host of a module in CUDA C++."""
     block_dim = BLOCK_DIM.search(source)
     if block_dim is None or source.count(LAST_HEADER) != 1:
-        raise NotImplementedError("Warp writes another beginning of CUDA modules than its release 1.19")
+        raise NotImplementedError("the CUDA module does not begin with the headers that Warp 1.19 writes")
     headers, text = source.split(LAST_HEADER)
     headers = BLOCK_DIM.sub("#define WP_TILE_BLOCK_DIM 1", headers)  # as precompiled for the CPU
     device = DEVICE_H.replace("MODULE_BLOCK_DIM", block_dim[1]).replace("MODULE_ARCH", f"{arch}0")
@@ -38,11 +38,11 @@ def for_host(source: str, arch: int) -> str:
 
 @cache
 def precompiled_headers() -> tempfile.TemporaryDirectory[str]:
-    """The folder for what Clang precompiles, removed at the end of the process."""
+    """Return the folder for Clang's precompiled headers, which is removed at the end of the process."""
     return tempfile.TemporaryDirectory()
 
 
 def compile_module(source: str, arch: int, path: str, *, fuse_fp: bool) -> int:
-    """Write the object file. Zero, or an error that Clang has printed on stderr."""
+    """Write the object file; return 0, or an error code of Clang, which prints the error on stderr."""
     return compile_for_host(for_host(source, arch), Path(path).with_suffix(".cpp").name, path, precompiled_headers().name,
                             fuse_fp=fuse_fp, level=LEVEL)

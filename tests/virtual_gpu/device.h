@@ -1,7 +1,7 @@
-// Between Warp's headers, compiled as for the CPU, and the text of a CUDA module: what that text asks of CUDA's compiler, and a loop
-// over the threads of a grid. A module is loaded for one device, which runs one launch at a time and one thread after another:
-// statics are enough for the built-in variables, and Warp's atomic functions for the CPU are atomic. There is nothing that threads
-// of a block could do together (__syncthreads, shuffles, votes, tiles): a module that asks for it does not compile.
+// This text is inserted between Warp's headers, which are compiled as for the CPU, and the code of a CUDA module. It defines CUDA's
+// built-in names, and a loop over the threads of a grid. A module is loaded for one device, which runs one launch at a time and one
+// thread after another: so static variables are enough for threadIdx and the like, and Warp's atomic functions for the CPU are
+// atomic. Operations of a block (__syncthreads, shuffles, votes, tiles) are missing: a module with one does not compile.
 
 #undef WP_TILE_BLOCK_DIM
 #define WP_TILE_BLOCK_DIM MODULE_BLOCK_DIM
@@ -9,7 +9,7 @@
 
 #define __global__
 #define __device__
-#define __shared__ static  // one thread runs after another: each finds what it wrote itself
+#define __shared__ static  // threads run one after another: each reads the values that it wrote
 #define __forceinline__ inline
 #define __launch_bounds__(...)
 
@@ -24,7 +24,7 @@ inline int device_block_dim() { return ::blockDim.x; }
 }
 #define block_dim device_block_dim
 
-// Of CUDA's functions, those that kernels name; `atomicMin` and the like are named through Warp's.
+// CUDA functions that kernels call. Kernels call `atomicMin` and the like through Warp's functions.
 inline int __ffs(int mask) { return __builtin_ffs(mask); }
 inline int __popc(unsigned mask) { return __builtin_popcount(mask); }
 inline unsigned __brev(unsigned x) { return __builtin_bitreverse32(x); }
@@ -33,7 +33,7 @@ inline float __int_as_float(int bits) { return __builtin_bit_cast(float, bits); 
 inline void __threadfence() {}
 inline int __float_as_int(float number) { return __builtin_bit_cast(int, number); }
 
-// CUDA's fminf and fmaxf take -0 for less than 0, and Warp's form for the CPU takes the first of two that are equal.
+// For CUDA's fminf and fmaxf, -0 is less than 0. Warp's functions for the CPU return the first of two equal arguments.
 namespace wp {
 template <class T> inline T cuda_min(T a, T b) { return min(a, b); }
 template <class T> inline T cuda_max(T a, T b) { return max(a, b); }
@@ -73,7 +73,7 @@ namespace virtual_gpu {
 
 struct Grid {
     uint3 blocks, threads;
-    const unsigned* order;  // the threads' numbers in the grid in the order in which they run; 0: as they are
+    const unsigned* order;  // the indices of the threads in the grid, in the order in which they run; null: ascending
 };
 
 template <int... I> struct Places {};

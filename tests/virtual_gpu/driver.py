@@ -1,5 +1,5 @@
-"""What stands in for the GPUs, their driver and Warp's code for them. The methods of `Gpus` are called as Warp's C functions are
-(warp/native/warp.h), without `wp_`; each has done its work when it returns. What is wrong raises VirtualGpuError at once."""
+"""Replacements of Warp's C functions for CUDA devices. The methods of `Gpus` have the names of the functions in warp/native/warp.h,
+without `wp_`. Each call is complete when it returns; errors raise VirtualGpuError at once."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from tests.virtual_gpu.graphs import Counts, Graph, Graphs, VirtualGpuError, add
 from tests.virtual_gpu.memory import Memory
 from tests.virtual_gpu.warp_private import array_t, element_size, fields_of, is_array
 
-CONTEXT = 1 << 8  # the handle of cuda:0's; cuda:1's is the next
+CONTEXT = 1 << 8  # handle of the context of cuda:0; that of cuda:1 is one more, and so on
 NAME = "virtual GPU"
 MOST_BLOCKS = 2**31 - 1  # of a grid in x
-# Functions that always answer the same.
+# Functions that return a constant.
 CONSTANT: dict[str, Any] = {
     "is_cuda_enabled": 1, "cuda_driver_is_initialized": 1, "cuda_device_get_name": NAME.encode(), "cuda_device_get_sm_count": 36,
     "cuda_device_get_max_shared_memory": 48 << 10, "cuda_device_is_uva": 1, "cuda_device_is_mempool_supported": 1,
@@ -45,7 +45,7 @@ class Triple(ctypes.Structure):
 
 
 class Grid(ctypes.Structure):
-    """As in device.h."""
+    """The struct Grid of device.h."""
 
     _fields_ = [("blocks", Triple), ("threads", Triple), ("order", ctypes.c_void_p)]
 
@@ -55,18 +55,18 @@ RUN = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.POINTER(Grid))
 
 @dataclass
 class Function:
-    """A kernel that is loaded. arguments: their names and types, where Warp knows them; dimensions: of its launches."""
+    """A loaded kernel."""
 
     name: str
-    run: Any
-    arguments: list[tuple[str, Any]] = field(default_factory=list)
-    dimensions: int = 1
+    run: Any  # The C function that runs a grid.
+    arguments: list[tuple[str, Any]] = field(default_factory=list)  # Names and types, without the launch's bounds.
+    dimensions: int = 1  # Of a launch.
 
 
 def arrays_of(name: str, kind: Any, at: int) -> Iterator[tuple[str, array_t, int]]:
-    """The arrays of a kernel's argument, and those of their records that hold arrays: name, record and bytes of an element.
-
-    An array is given before what is in it, so that who asks can look first whether it may be read."""
+    """Yield the arrays in a kernel's argument at an address, also those in structs and in arrays of structs: name, array_t of Warp,
+    and bytes of an element. An array comes before the arrays in its elements, so that the caller can check first that it is
+    readable."""
     if is_array(kind):
         array = array_t.from_address(at)
         yield name, array, element_size(kind)
@@ -78,13 +78,13 @@ def arrays_of(name: str, kind: Any, at: int) -> Iterator[tuple[str, array_t, int
 
 
 def has_arrays(kind: Any) -> bool:
-    """Whether it is a struct with arrays."""
+    """Return whether a type is a struct that contains arrays."""
     return any(is_array(each) or has_arrays(each) for _, each, _ in fields_of(kind))
 
 
 class Gpus(Graphs):
-    """devices: how many; arch: their compute capability, 75 for 7.5; seed: of the order of a grid's threads, None: as they are
-    numbered; memory: bytes of each device."""
+    """Virtual GPUs. devices: their number; arch: their compute capability, 75 for 7.5; memory: bytes of each device; seed: of the
+    random order of a grid's threads, None for ascending order."""
 
     def __init__(self, real: Any, devices: int, arch: int, seed: int | None, memory: int) -> None:
         self.real, self.devices, self.arch = real, devices, arch
@@ -123,7 +123,7 @@ class Gpus(Graphs):
 
     @property
     def current(self) -> list[int | None]:
-        """This thread's contexts, the current one last."""
+        """The stack of contexts of this thread; the last is current."""
         if not hasattr(self.local, "contexts"):
             self.local.contexts = [None]
         return self.local.contexts  # type: ignore[no-any-return]
@@ -185,14 +185,14 @@ class Gpus(Graphs):
     alloc_device_async, free_device_async = alloc_device_default, free_device_default
 
     def check(self, what: str, at: int, size: int, device: int | None) -> None:
-        """device: whose bytes they must be; None: the host's."""
+        """Raise VirtualGpuError unless `size` bytes from address `at` are on the device; None: on the host."""
         good = not self.memory.is_device(at) if device is None else self.memory.holds(at, size, device)
         if size and not good:
             place = "the host" if device is None else f"cuda:{device}"
             raise VirtualGpuError(f"{what} must be {size} bytes on {place}, and is {self.memory.describe(at)}")
 
     def copy(self, kind: str, to: Any, device: int | None, of: Any, other: int | None, size: int) -> bool:
-        """Between two devices, or the host (None)."""
+        """Copy `size` bytes from `of` on the device `other` to `to` on `device`; None is the host. kind: the key in Counts."""
         self.check(f"{kind}: the target", address(to), size, device)
         self.check(f"{kind}: the source", address(of), size, other)
         with self.lock:
@@ -218,7 +218,7 @@ class Gpus(Graphs):
         return self.copy("p2p", to, context - CONTEXT, of, other - CONTEXT, size)
 
     def write(self, what: str, context: int, at: Any, size: int, call: Callable[..., Any], *args: Any) -> Any:
-        """Let the host's function write to so many bytes of a device (0: not known)."""
+        """Call a function of the host that writes `size` bytes from address `at` of a device (0: not checked)."""
         def now() -> Any:
             self.check(f"{what}: the target", address(at), size, context - CONTEXT)
             with self.memory.opened():
@@ -248,14 +248,14 @@ class Gpus(Graphs):
     def radix_sort_pairs_uint64_device(self, keys: int, values: int, count: int, *args: Any) -> None:
         context = self.current[-1]
         if context is None:
-            raise VirtualGpuError("the sort works in the current context, and there is none (wp.Device.context_guard)")
+            raise VirtualGpuError("the sort needs a current context (wp.Device.context_guard)")
         self.check("sort: the values", values, 8 * count, context - CONTEXT)
         self.write("sort", context, keys, 16 * count, self.real.wp_radix_sort_pairs_uint64_host, keys, values, count, *args)
 
     # Modules
 
     def cuda_compile_program(self, source: bytes, *args: Any) -> int:
-        """For the host where it is for a virtual GPU; all else is NVIDIA's, which needs no GPU."""
+        """Compile for the host if the path is a virtual GPU's; else with NVIDIA's compiler, which needs no GPU."""
         arch, fuse_fp, path = args[1], args[11], os.fsdecode(args[15])
         if not path.endswith(SUFFIX):
             nvidias, declared = self.real.wp_cuda_compile_program, warp_private.library().wp_cuda_compile_program
@@ -286,14 +286,14 @@ class Gpus(Graphs):
 
     def cuda_configure_kernel_shared_memory(self, function: int, size: int) -> bool:
         if size:
-            raise VirtualGpuError(f"{self.objects[function].name} takes shared memory, and a virtual GPU has none")
+            raise VirtualGpuError(f"{self.objects[function].name} needs dynamic shared memory, which a virtual GPU does not have")
         return True
 
     # Launches
 
     def cuda_launch_kernel(self, context: int, handle: int, dim: int, max_blocks: int, block_dim: int, grid_stride: int,
                            cluster_dim: int, shared: int, arguments: Any, *args: Any) -> int:
-        """The grid is that of wp_cuda_launch_kernel (warp/native/warp.cu)."""
+        """Launch a kernel, with the grid that wp_cuda_launch_kernel chooses (warp/native/warp.cu)."""
         if dim == 0:
             return 0
         function: Function = self.objects[handle]
@@ -313,8 +313,9 @@ class Gpus(Graphs):
         return 0
 
     def run(self, function: Function, context: int, size: tuple[int, int, int, int], values: Any, held: list[Any]) -> None:
-        """A grid of x, y, z blocks of so many threads. values: addresses of the arguments, the first of which is the launch's
-        bounds; held: what they are in, if it is not the caller's."""
+        """Run a grid of `size` = blocks in x, y and z, and threads per block.
+
+        values: addresses of the arguments, the launch's bounds first; held: copies that the addresses point into, or []."""
         x, y, z, threads = size
         with self.lock:
             order = None if self.random is None else self.random.permutation(x * y * z * threads).astype(np.uint32)
@@ -326,12 +327,12 @@ class Gpus(Graphs):
             function.run(ctypes.addressof(values) if held else address(values), grid)
 
     def check_arguments(self, kernel: str, arguments: Iterable[tuple[str, Any, int]], device: int | None) -> None:
-        """Raise VirtualGpuError that names the array that the device, or the host (None), cannot reach. arguments: of each name,
-        type and address."""
+        """Raise VirtualGpuError with the name of an array that is not on the device (None: the host). arguments: name, type and
+        address of each argument."""
         for label, kind, at in arguments:
             for name, array, size in arrays_of(label, kind, at):
                 shape, strides = array.shape[:array.ndim], array.strides[:array.ndim]
-                if not array.data or 0 in shape:  # nothing is there to be read
+                if not array.data or 0 in shape:  # an empty array
                     continue
                 reach = [(n - 1) * step for n, step in zip(shape, strides, strict=True)]
                 first = array.data + sum(min(step, 0) for step in reach)
@@ -339,7 +340,7 @@ class Gpus(Graphs):
 
 
 class Core:
-    """Warp's C library with functions of Gpus in place of those that need a GPU; the rest of these raise when they are called."""
+    """Warp's C library, with the methods of Gpus for functions that need a GPU. Functions for GPUs that Gpus lacks raise an error."""
 
     def __init__(self, real: Any, gpus: Gpus) -> None:
         self.real, self.gpus = real, gpus

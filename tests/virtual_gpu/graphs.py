@@ -1,4 +1,4 @@
-"""CUDA graphs of virtual GPUs: what a capture records and a launch does again, and what must not be asked meanwhile."""
+"""CUDA graphs of virtual GPUs: a capture records calls, a launch repeats them; calls that cannot be captured are refused."""
 
 from __future__ import annotations
 
@@ -16,25 +16,23 @@ Call = Callable[[], Any]
 
 @dataclass
 class Graph:
-    """calls: what is to be done, in order; kept: memory that was taken while it was captured, and whether the host has freed it,
-    which is done when the graph goes."""
+    """A captured graph, or a graph during its capture."""
 
     context: int
-    calls: list[Call] = field(default_factory=list)
+    calls: list[Call] = field(default_factory=list)  # The recorded calls, in order.
+    # Addresses of memory allocated during the capture, and whether the host has freed them: they live as long as the graph.
     kept: dict[int, bool] = field(default_factory=dict)
 
 
 @dataclass
 class Counts:
-    """What has been asked of all devices. launches: by the kernel's name and the device's number; copies: "h2d", "d2h", "d2d" and
-    "p2p" (to another device), and their bytes; synchronisations: waits of the host for a device; graphs: launches of graphs,
-    whose own launches and copies count too."""
+    """The work of all devices so far. The launches and copies within a graph count each time that the graph is launched."""
 
-    launches: Counter[tuple[str, int]] = field(default_factory=Counter)
-    copies: Counter[str] = field(default_factory=Counter)
-    bytes: Counter[str] = field(default_factory=Counter)
-    synchronisations: int = 0
-    graphs: int = 0
+    launches: Counter[tuple[str, int]] = field(default_factory=Counter)  # By the kernel's name and the device's number.
+    copies: Counter[str] = field(default_factory=Counter)  # By direction: "h2d", "d2h", "d2d", or "p2p" (to another device).
+    bytes: Counter[str] = field(default_factory=Counter)  # Bytes of copies, by direction.
+    synchronisations: int = 0  # Waits of the host for a device.
+    graphs: int = 0  # Launches of graphs.
 
     def __str__(self) -> str:
         copies = ", ".join(f"{n} {kind}" for kind, n in sorted(self.copies.items())) or "none"
@@ -43,11 +41,11 @@ class Counts:
 
 
 class VirtualGpuError(RuntimeError):
-    """What a GPU would answer with an error, later or never."""
+    """An error of the program that a real GPU would report later or never."""
 
 
 def address(pointer: Any) -> int:
-    """Of what Warp gives for a pointer: a number, ctypes' pointer, or a structure itself."""
+    """Return the address of a pointer as Warp passes it: a number, a pointer of ctypes, or the structure itself."""
     if pointer is None or isinstance(pointer, int):
         return pointer or 0
     if hasattr(pointer, "_obj"):  # of ctypes.byref
@@ -58,7 +56,7 @@ def address(pointer: Any) -> int:
 
 
 class Graphs:
-    """The part of Gpus that captures and launches graphs. active: those that are captured, by context, one a device at most."""
+    """The part of Gpus that captures and launches graphs. active: the graphs during their capture, by context."""
 
     handles: Iterator[int]
     objects: dict[int, Any]
@@ -69,12 +67,12 @@ class Graphs:
     lock: Any
 
     def refuse(self, what: str) -> None:
-        """Raise VirtualGpuError for what cannot be captured, while a graph is."""
+        """Raise VirtualGpuError if a graph is being captured: `what` cannot be captured."""
         if self.active:
-            raise VirtualGpuError(f"{what} while a graph is captured: CUDA refuses that, or does not do it again with the graph")
+            raise VirtualGpuError(f"{what} while a graph is captured: CUDA refuses the call, or the graph would not repeat it")
 
     def do(self, context: int, call: Call) -> Any:
-        """At once, or where a graph is captured, when that is launched."""
+        """Call now, or, while a graph is captured, record the call."""
         graph = self.active.get(context)
         if graph is None:
             return call()
@@ -118,8 +116,9 @@ class Graphs:
 
 
 def copied(values: Any, dimensions: int, kinds: Iterable[Any]) -> tuple[Any, list[Any]]:
-    """The arguments of a launch as they are now: CUDA copies them when it captures. The first is the launch's bounds, of so many
-    dimensions; kinds: the types of the others. Also what holds the copies."""
+    """Copy the arguments of a launch, because a capture keeps their present values; return addresses, and the buffers.
+
+    The first argument is the launch's bounds; kinds: the types of the others."""
     sizes = [bounds_size(dimensions), *map(argument_size, kinds)]
     held = [ctypes.create_string_buffer(ctypes.string_at(values[i], size), size) for i, size in enumerate(sizes)]
     return (ctypes.c_void_p * len(held))(*map(ctypes.addressof, held)), held

@@ -1,8 +1,8 @@
-"""The memory of virtual GPUs: addresses that no host code may touch, and that are never given out twice.
+"""The memory of virtual GPUs: host code cannot access it, and no address is used twice.
 
-Every allocation has pages of its own, and ends (but for alignment) where its last page ends. The page behind it, and the pages of
-what was freed, stay closed for good; all others are open only while the device is at work (`opened`). So host code that reads the
-device's memory, and a kernel that follows an old address or leaves an array, end in a segmentation fault.
+Every allocation has its own pages, and ends (up to alignment) at the end of its last page. The page behind it and freed pages are
+never accessible; the others only while the device works (`opened`). So host code that reads device memory ends in a segmentation
+fault, and so does a kernel that reads freed memory or beyond an array.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 SPACE = 1 << 42  # bytes of address space; pages cost nothing until they are used
-ALIGNMENT = 256  # as of cudaMalloc
-UNWRITTEN = 0xA5  # what memory holds before anybody writes to it
+ALIGNMENT = 256  # bytes, as of cudaMalloc
+UNWRITTEN = 0xA5  # value of the bytes of new memory
 FIXED = 0x10  # MAP_FIXED, on Linux and macOS
 CLOSED, OPEN = 0, mmap.PROT_READ | mmap.PROT_WRITE
 
@@ -27,32 +27,32 @@ libc.mprotect.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int]
 
 
 def whole(size: int, unit: int) -> int:
-    """The next multiple."""
+    """Return `size` rounded up to a multiple of `unit`."""
     return -(-size // unit) * unit
 
 
 def reserve(place: int | None, size: int, more: int) -> int:
-    """Address space without pages. Freed memory is reserved anew: only so do its pages melt into those beside them, of which the
-    system lets a process have some ten thousand groups."""
+    """Reserve address space without access. Freed memory is reserved again, so that the system merges its pages with their
+    neighbours: the number of separate mappings of a process is limited, to some 65,000 on Linux."""
     flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | getattr(mmap, "MAP_NORESERVE", 0) | more
     found = libc.mmap(place, size, CLOSED, flags, -1, 0)
     if found in (None, ctypes.c_void_p(-1).value):
-        raise MemoryError(f"a virtual GPU takes {SPACE >> 40} TiB of address space (ulimit -v)")
+        raise MemoryError(f"a virtual GPU needs {SPACE >> 40} TiB of address space: raise the limit (ulimit -v)")
     return int(found)
 
 
 class Memory:
-    """Of all devices together. limit: bytes that may be in use on each."""
+    """The memory of all devices. limit: bytes of each device."""
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
         self.begin = self.next = reserve(None, SPACE, 0)
-        self.starts: list[int] = []  # ascending, as addresses only grow
-        self.known: dict[int, tuple[int, int]] = {}  # by start: size, and the device's number
+        self.starts: list[int] = []  # of live allocations, ascending because addresses only grow
+        self.known: dict[int, tuple[int, int]] = {}  # by start: bytes, and the device's number
         self.working, self.lock = 0, threading.RLock()
 
     def allocate(self, size: int, device: int) -> int:
-        """The address of so many new bytes; 0 where the device has no more."""
+        """Return the address of `size` new bytes, 0 if the device has too little memory."""
         size = max(size, 1)
         room = whole(size, mmap.PAGESIZE)
         with self.lock:
@@ -77,15 +77,15 @@ class Memory:
             reserve(first, whole(start + size - first, mmap.PAGESIZE), FIXED)
 
     def used(self, device: int) -> int:
-        """Bytes of a device that are not free."""
+        """Return the number of allocated bytes of a device."""
         return sum(size for size, owner in self.known.values() if owner == device)
 
     def is_device(self, address: int) -> bool:
-        """Whether it is, or was, on a device."""
+        """Return whether the address is, or was, on a device."""
         return self.begin <= address < self.begin + SPACE
 
     def holds(self, address: int, size: int, device: int) -> bool:
-        """Whether these bytes are in one live allocation of that device."""
+        """Return whether the bytes are within one live allocation of the device."""
         with self.lock:
             i = bisect_right(self.starts, address) - 1
             if i < 0:
@@ -95,7 +95,7 @@ class Memory:
             return address + size <= start + room and owner == device
 
     def describe(self, address: int) -> str:
-        """What an address is."""
+        """Return words for error messages on where an address is."""
         if not self.is_device(address):
             return "memory of the host" if address else "no address"
         with self.lock:
@@ -107,7 +107,7 @@ class Memory:
 
     @contextmanager
     def opened(self) -> Iterator[None]:
-        """While the device is at work."""
+        """Make all live allocations accessible during the block."""
         self._change(1)
         try:
             yield

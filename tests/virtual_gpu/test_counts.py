@@ -1,4 +1,4 @@
-"""What a picture and a query ask of a GPU: launches, copies and waits, and how many bytes go between host and device."""
+"""The numbers of launches, copies and waits for a picture and a query on a GPU, and the bytes between host and device."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ FILM = 52 * PIXELS  # bytes
 
 
 @contextmanager
-def asked() -> Iterator[SimpleNamespace]:
-    """What the block asks of the devices."""
+def counted() -> Iterator[SimpleNamespace]:
+    """Count launches, waits, copies and their bytes in the block; the numbers are set at its end."""
     counts = gpus().counts
     launches, copies, size, waits = counts.launches.copy(), counts.copies.copy(), counts.bytes.copy(), counts.synchronisations
     out = SimpleNamespace()
@@ -43,38 +43,38 @@ def some_rays(n: int = N) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize(("threads", "launches"), [
-    (0, 3),  # a pixel is a thread's
-    (2048, 5),  # where there are several, a sample is, and all are added up then
-    (PIXELS // 36 + 1, 9),  # of each of 36 multiprocessors: at most four samples in a launch
+    (0, 3),  # A thread traces all samples of a pixel.
+    (2048, 5),  # A thread traces one sample; after passes of several samples, a second launch adds them up.
+    (PIXELS // 36 + 1, 9),  # As before, with at most four samples in a launch: 36 multiprocessors with few threads.
 ])
 def test_a_picture_is_a_launch_a_pass_and_comes_back_once(threads: int, launches: int, monkeypatch: pytest.MonkeyPatch) -> None:
     renderer = Renderer(wrt.load_scene(ROOT / "scenes/spot.toml"), Options(device="cuda:0"))
     renderer.aim(renderer.prepared.plan.camera, size=(48, 27), spp=16)
     monkeypatch.setattr(pixels, "THREADS_OF_SM", threads)
-    with asked() as picture:
+    with counted() as picture:
         film = renderer.run()
-    assert (picture.launches, picture.waits) == (launches, 3)  # passes of 1, 3 and 12 samples; not one a tile
-    assert picture.copies == {"h2d": 1, "d2h": 8}  # the filter's table; each array of the film, once
+    assert (picture.launches, picture.waits) == (launches, 3)  # passes of 1, 3 and 12 samples of the whole picture, without tiles
+    assert picture.copies == {"h2d": 1, "d2h": 8}  # the table of the filter; each of the film's arrays, once
     assert picture.bytes["d2h"] == FILM
     here = wrt.render(ROOT / "scenes/spot.toml", device="cpu", size=(48, 27), spp=16)
     assert film.pixels.tobytes() == here.pixels.tobytes() and film.stats["rays"] == here.stats["rays"]
 
 
-def test_rays_of_numpy_go_there_and_hits_come_back() -> None:
+def test_rays_of_numpy_are_copied_to_the_gpu_and_hits_back() -> None:
     accel = wrt.build(shapes.icosphere(2), "bvh8", device="cuda:0")
-    with asked() as query:
+    with counted() as query:
         accel.closest_hit(*some_rays())
     assert (query.launches, query.waits, query.copies) == (1, 0, {"h2d": 2, "d2h": 4})
-    assert query.bytes == {"h2d": 24 * N, "d2h": 16 * N}  # of t_min and t_max nothing
-    with asked() as query:
+    assert query.bytes == {"h2d": 24 * N, "d2h": 16 * N}  # no arrays for t_min and t_max, which are numbers
+    with counted() as query:
         accel.any_hit(*some_rays(), t_max=np.full(N, 0.5, np.float32))
     assert query.bytes == {"h2d": 28 * N, "d2h": N} and query.launches == 1
 
 
-def test_rays_of_warp_stay_there() -> None:
+def test_rays_of_warp_stay_on_the_gpu() -> None:
     accel = wrt.build(shapes.icosphere(2), "bvh8", device="cuda:0")
     rays = [wp.array(array, dtype=wp.vec3, device="cuda:0") for array in some_rays()]
-    with asked() as query:
+    with counted() as query:
         hits = accel.closest_hit(*rays, 0.25, 7.0)
     assert (query.launches, query.waits, query.copies) == (1, 0, {})
     expected = accel.closest_hit(*some_rays(), 0.25, 7.0)
@@ -87,7 +87,7 @@ def test_many_rays_of_numpy_are_traced_in_parts(monkeypatch: pytest.MonkeyPatch)
     whole = accel.closest_hit(*some_rays(), 0.0, ends)
     monkeypatch.setattr(batches, "MOST_ON_GPU", 1000)
     monkeypatch.setattr(batches, "FEWEST", 100)
-    with asked() as query:
+    with counted() as query:
         parts = accel.closest_hit(*some_rays(), 0.0, ends)
     assert query.launches == 3
     for name in ("t", "u", "v", "prim_id"):

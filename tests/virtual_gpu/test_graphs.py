@@ -1,4 +1,4 @@
-"""CUDA graphs on a virtual GPU: a launch does the work that was captured, and work that cannot be captured is refused."""
+"""CUDA graphs on a virtual GPU: a launch repeats the captured calls; calls that cannot be captured are refused."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def add(x: wp.array(dtype=float), step: float):
     x[wp.tid()] += step
 
 
-def test_a_launch_is_recorded_with_its_arguments_and_done_with_the_graph() -> None:
+def test_a_launch_is_recorded_with_its_arguments_and_repeated_by_the_graph() -> None:
     x, y = (wp.zeros(3, dtype=float, device="cuda:0") for _ in range(2))
     wp.launch(add, 3, [x, 1.0], device="cuda:0")
     before = gpus().counts.launches.total()
@@ -35,7 +35,7 @@ def test_a_launch_is_recorded_with_its_arguments_and_done_with_the_graph() -> No
         for step in (2.0, 3.0):
             wp.launch(add, 3, [x, step], device="cuda:0")
         wp.copy(y, x)
-        room = wp.full(3, 7.0, dtype=float, device="cuda:0")  # of the graph's own memory
+        room = wp.full(3, 7.0, dtype=float, device="cuda:0")  # in memory that belongs to the graph
         wp.launch(add, 3, [room, 1.0], device="cuda:0")
     assert x.numpy().tolist() == [1.0] * 3 and gpus().counts.launches.total() == before
     for expected in (6.0, 11.0):
@@ -49,7 +49,7 @@ def test_a_launch_is_recorded_with_its_arguments_and_done_with_the_graph() -> No
     (lambda x: x.assign(np.ones(3, np.float32)), "memory of the host is copied to a device"),
     (lambda x: wp.synchronize_stream(wp.get_device("cuda:0").stream), "Cannot synchronize stream while graph capture is active"),
 ])
-def test_what_cannot_be_captured(what, message: str) -> None:
+def test_copies_and_waits_of_the_host_cannot_be_captured(what, message: str) -> None:
     x = wp.zeros(3, dtype=float, device="cuda:0")
     with pytest.raises(RuntimeError, match=message), wp.ScopedCapture("cuda:0"):
         what(x)
@@ -57,7 +57,7 @@ def test_what_cannot_be_captured(what, message: str) -> None:
     assert x.numpy().tolist() == [1.0] * 3
 
 
-def test_a_graph_that_outlives_its_arrays_is_told() -> None:
+def test_a_launch_of_a_graph_after_its_arrays_are_freed_is_an_error() -> None:
     x = wp.zeros(3, dtype=float, device="cuda:0")
     with wp.ScopedCapture("cuda:0") as capture:
         wp.launch(add, 3, [x, 1.0], device="cuda:0")
@@ -104,7 +104,7 @@ def test_the_example_in_the_documentation() -> None:
     assert names["hits"].t.numpy().tobytes() == expected.t.tobytes() and (expected.prim_id >= 0).any()
 
 
-def test_what_a_capture_of_ours_needs_first() -> None:
+def test_calls_of_wrt_that_cannot_be_captured() -> None:
     accel, points, _, _ = moving()
     with pytest.raises(InputError, match="a graph cannot capture the first refit in place"), wp.ScopedCapture("cuda:0"):
         accel.refit(points, in_place=True)
@@ -114,7 +114,7 @@ def test_what_a_capture_of_ours_needs_first() -> None:
         accel.closest_hit(*np.ones((2, 5, 3), np.float32))
 
 
-def test_a_build_on_the_device_sends_nothing_back_but_what_the_tree_costs() -> None:
+def test_a_build_on_the_device_copies_back_only_the_costs_of_the_tree() -> None:
     geometry = wrt.DeviceGeometry(wp.array(BALL.vertices, dtype=wp.vec3, device="cuda:0"),
                                   wp.array(BALL.faces.reshape(-1), dtype=wp.int32, device="cuda:0"))
     wrt.build(geometry, "bvh2", builder="lbvh", device="cuda:0")

@@ -1,4 +1,4 @@
-"""The virtual GPU by itself: `python -m pytest --device cuda:0 tests/virtual_gpu`."""
+"""The virtual GPU without wrt: `python -m pytest --device cuda:0 tests/virtual_gpu`."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def test_every_thread_runs_once_in_another_order_each_time() -> None:
         first, count, branch, at = noted()
         last.add(int(first[0]))
         assert count.tolist() == [900, 299]
-        assert set(branch) == {750 + 1 + 4}  # the CUDA branch, with the grid's own numbers
+        assert set(branch) == {750 + 1 + 4}  # __CUDA_ARCH__ + (block of 256) + __ffs(8)
         assert (at == 10 * np.arange(300)[:, None] + np.arange(3)).all()
     assert len(last) > 3
 
@@ -149,7 +149,7 @@ WRONG: dict[str, tuple[Callable[[], wp.array], str]] = {
 
 @pytest.mark.parametrize("wrong", WRONG)
 @pytest.mark.parametrize("place", ["x", "given.row.values", r"given.rows\[0\].values"])
-def test_an_array_that_the_device_cannot_reach_is_told_by_its_name(place: str, wrong: str) -> None:
+def test_the_error_names_an_array_that_is_not_on_the_device(place: str, wrong: str) -> None:
     bad, (good, out) = WRONG[wrong][0](), (wp.ones(8, dtype=float, device="cuda:0") for _ in range(2))
     given, one = Rows(), Row()
     given.row.values, one.values = (bad if place.endswith(each) else good for each in ("row.values", "].values"))
@@ -196,7 +196,7 @@ def test_freed_memory_leaves_nothing_behind() -> None:
         memory.free(memory.begin + 256)
 
 
-def test_what_is_asked_of_devices_is_counted() -> None:
+def test_launches_copies_and_waits_are_counted() -> None:
     before = {"launches": gpus().counts.launches.total(), **gpus().counts.copies, "waits": gpus().counts.synchronisations}
     array = wp.array(np.arange(8.0), dtype=float, device="cuda:0")
     wp.launch(wave, 8, [array, wp.clone(array)], device="cuda:0")
@@ -207,7 +207,7 @@ def test_what_is_asked_of_devices_is_counted() -> None:
         "launches": 1, "h2d": 1, "d2h": 1, "d2d": 1, "p2p": 1, "waits": 1}
 
 
-def test_records_come_back_as_they_went() -> None:
+def test_structs_are_copied_there_and_back() -> None:
     rows = np.zeros(3, record_dtype(Rows))
     rows["scale"] = [1.0, 2.0, 3.0]
     assert (wp.array(rows, dtype=Rows, device="cuda:0").numpy()["scale"] == rows["scale"]).all()
@@ -229,7 +229,7 @@ def test_host_code_that_reads_device_memory_ends() -> None:
     assert 'File "<string>", line 9' in ended.stderr
 
 
-def test_what_a_gpu_alone_could_do_is_refused() -> None:
+def test_a_function_that_the_virtual_gpu_lacks_is_an_error() -> None:
     points, indices = (wp.zeros(3, dtype=kind, device="cuda:0") for kind in (wp.vec3, wp.int32))
     with pytest.raises(NotImplementedError, match="a virtual GPU has no wp_mesh_create_device"):
         wp.Mesh(points, indices)
@@ -246,8 +246,8 @@ def test_threads_of_a_block_have_shared_memory() -> None:
     assert (out.numpy() == np.arange(200)).all()
 
 
-def test_of_two_zeros_the_less_is_the_negative_one() -> None:
-    """As CUDA's fminf and fmaxf have it, and not Warp's form for the CPU."""
+def test_negative_zero_is_less_than_zero() -> None:
+    """CUDA's fminf and fmaxf order the zeros; Warp's functions for the CPU do not."""
     values = np.array([[0.0, -0.0], [-0.0, 0.0], [2.0, 3.0], [np.nan, 1.0], [1.0, np.nan]], np.float32)
     x, y = (wp.array(np.ascontiguousarray(values[:, i]), dtype=float, device="cuda:0") for i in (0, 1))
     out = wp.zeros((5, 7), dtype=float, device="cuda:0")

@@ -1,5 +1,5 @@
-"""wrt on virtual GPUs: `python -m pytest --device cuda:0 tests/virtual_gpu`. Here is what shows most for the least time; all other
-tests run on `--device` too."""
+"""wrt on virtual GPUs: `python -m pytest --device cuda:0 tests/virtual_gpu`. These tests find most defects in little time; all other
+tests accept `--device`, too."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ import warp as wp
 import wrt
 from tests import bits, device
 from tests.data import ROOT
+from tests.refused import refused
 from tests.structures import STRUCTURES as ALL
 from tests.virtual_gpu import gpus
 from wrt.accel.scenes.build import build
 from wrt.core.arrays import to_numpy
-from wrt.core.errors import InputError
 from wrt.scene import shapes
 
 pytestmark = pytest.mark.skipif(not device.IS_VIRTUAL, reason="run with --device cuda:0")
@@ -61,29 +61,29 @@ def test_two_devices_share_a_picture() -> None:
 def test_rays_on_other_devices_are_copied_and_answers_there_are_refused() -> None:
     origins, directions = bits.primary_rays(16, 9)
     mesh, ends = shapes.icosphere(1), np.linspace(1.0, 9.0, len(origins), dtype=np.float32)
-    given = (origins, wp.vec3), (directions, wp.vec3), (ends, float)
+    arrays = (origins, wp.vec3), (directions, wp.vec3), (ends, float)
     expected = build(mesh, "bvh8", device="cpu").closest_hit(origins, directions, 0.0, ends)
     assert (expected.prim_id >= 0).any()
     for mine, other in (("cpu", "cuda:0"), ("cuda:0", "cpu"), ("cuda:0", "cuda:1")):
         accel = build(mesh, "bvh8", device=mine)
-        there = [wp.array(array, dtype=kind, device=other) for array, kind in given]
+        there = [wp.array(array, dtype=kind, device=other) for array, kind in arrays]
         for rays in (there, [there[0].to(mine), there[1], there[2]], [origins, directions, there[2]]):
             hits = accel.closest_hit(*rays[:2], 0.0, rays[2])
             assert hits.t.device == wp.get_device(mine) if isinstance(hits.t, wp.array) else rays[0] is origins
             for name in ("t", "u", "v", "prim_id"):
                 assert to_numpy(getattr(hits, name)).tobytes() == getattr(expected, name).tobytes()
-        with pytest.raises(InputError, match=rf"out must be a Warp array \({len(origins)},\) of bool, on {mine}"):
+        with refused("out"):
             accel.any_hit(*there[:2], out=wp.zeros(len(origins), dtype=wp.bool, device=other))
-        with pytest.raises(InputError, match="t_max must not be NaN") if "cpu" in (mine, other) else nullcontext():
+        with refused("t_max") if "cpu" in (mine, other) else nullcontext():
             accel.closest_hit(*there[:2], 0.0, wp.full(len(origins), np.nan, dtype=float, device=other))
 
 
-# Of a branch for CUDA alone: one bit of the mask of triangles that a ray may hit is cleared.
-CHANGED, WAS, IS = "kernels/wide/lanes.py", "return plain(rows, first, ray)", "return plain(rows, first, ray) & ~1"
+# A defect in a branch for CUDA only: it clears one bit of the mask of triangles that a ray may hit.
+CHANGED, RIGHT, WRONG = "kernels/wide/lanes.py", "return plain(rows, first, ray)", "return plain(rows, first, ray) & ~1"
 
 
 def checked(folder: Path, *more: str) -> tuple[int, dict[str, Any]]:
-    """`devices --check` of the project in a folder: exit code, and what it says."""
+    """Run `devices --check` of the project in a folder; return the exit code and its JSON."""
     words = ["-m", "tests.virtual_gpu", "devices", "--check", "--rays", "400", "--json", "-q", *more]
     ended = subprocess.run([sys.executable, *words], cwd=folder, env={**os.environ, "PYTHONPATH": str(folder)}, capture_output=True,
                            text=True, check=False, timeout=1200)
@@ -95,17 +95,17 @@ def test_one_bit_in_a_branch_for_cuda_fails_the_check(tmp_path: Path) -> None:
     for name in ("wrt", "kernels", "tests/virtual_gpu", "scenes"):
         shutil.copytree(ROOT / name, tmp_path / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
     text = (tmp_path / CHANGED).read_text()
-    assert text.count(WAS) == 1
-    (tmp_path / CHANGED).write_text(text.replace(WAS, IS))
-    code, told = checked(tmp_path, "--scene", "scenes/spot.toml")
-    assert code == 1, told
-    differ = {row["what"]: row["differ"] for row in told["rows"]}
+    assert text.count(RIGHT) == 1
+    (tmp_path / CHANGED).write_text(text.replace(RIGHT, WRONG))
+    code, report = checked(tmp_path, "--scene", "scenes/spot.toml")
+    assert code == 1, report
+    differ = {row["what"]: row["differ"] for row in report["rows"]}
     assert differ["bvh8"] > 100 and differ["spot"] > 100 and differ["bvh2"] == differ["brute_force"] == 0
 
 
 @pytest.mark.slow
 def test_a_check_of_everything() -> None:
-    code, told = checked(ROOT)
-    assert code == 0 and told["differ"] == 0 and told["speed"] == []
-    assert "Warp, sah: a virtual GPU has no wp_mesh_create_device" in told["speed_skipped"]
-    assert {row["what"] for row in told["rows"]} >= {*STRUCTURES, "brute_force", *(scene.stem for scene in bits.SCENES)}
+    code, report = checked(ROOT)
+    assert code == 0 and report["differ"] == 0 and report["speed"] == []
+    assert "Warp, sah: a virtual GPU has no wp_mesh_create_device" in report["speed_skipped"]
+    assert {row["what"] for row in report["rows"]} >= {*STRUCTURES, "brute_force", *(scene.stem for scene in bits.SCENES)}

@@ -1,7 +1,7 @@
-"""The only file of the virtual GPU that names private names of Warp's Python (1.19), and texts of the sources that it writes.
+"""The only file of the virtual GPU with private names of Warp's Python (1.19), and with strings of the C++ that Warp writes.
 
-Warp's C functions, which it replaces, are the methods of driver.Gpus and graphs.Graphs, by their names without `wp_`, with their
-arguments; docs/warp.md, "When Warp changes", tells the order of repair."""
+The methods of driver.Gpus and graphs.Graphs replace Warp's C functions: same names without `wp_`, same arguments. docs/warp.md, "When
+Warp changes", says what to adapt first."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from warp._src.types import array_t, launch_bounds_t, matches_array_class, type_
 __all__ = ["array_t"]
 
 VERSION = "1.19."
-LAST_HEADER = '#include "deterministic.h"\n'  # of a CUDA module
+LAST_HEADER = '#include "deterministic.h"\n'  # the last header of a CUDA module
 BLOCK_DIM = re.compile(r"^#define WP_TILE_BLOCK_DIM (\d+)$", re.MULTILINE)
 KERNEL = re.compile(r"\b__global__ void (?:\w+\(\d+\) )?(\w+)\(")
-FORWARD = "_cuda_kernel_forward"  # behind a kernel's name
+FORWARD = "_cuda_kernel_forward"  # suffix of a kernel's name
 
 
 def has_started() -> bool:
@@ -30,12 +30,12 @@ def has_started() -> bool:
 
 
 def library() -> Any:
-    """Warp's C library, or what stands in for it (driver.Core)."""
+    """Return Warp's C library, or its replacement (driver.Core)."""
     return context.runtime.core
 
 
 def compiler() -> Any:
-    """Warp's C library that has Clang in it."""
+    """Return Warp's C library with Clang."""
     return context.runtime.llvm
 
 
@@ -47,31 +47,31 @@ def is_array(kind: Any) -> bool:
 
 
 def fields_of(kind: Any) -> Iterator[tuple[str, Any, int]]:
-    """Of each field of a struct its name, its type and its offset; nothing of another type."""
+    """Yield the name, type and offset in bytes of each field of a struct; nothing for other types."""
     if isinstance(kind, Struct):
         for name, variable in kind.vars.items():
             yield name, variable.type, getattr(kind.ctype, name).offset
 
 
 def element_size(kind: Any) -> int:
-    """Bytes of an element of an array of that type."""
+    """Return the bytes of an element of an array type."""
     return int(type_size_in_bytes(kind.dtype))
 
 
 def argument_size(kind: Any) -> int:
-    """Bytes of an argument of a kernel."""
+    """Return the bytes of a kernel's argument of this type."""
     if is_array(kind):
         return ctypes.sizeof(array_t)
     return ctypes.sizeof(kind.ctype) if isinstance(kind, Struct) else int(type_size_in_bytes(kind))
 
 
 def bounds_size(dimensions: int) -> int:
-    """Bytes of the first argument, the size of the launch."""
+    """Return the bytes of a kernel's first argument, the bounds of a launch with so many dimensions."""
     return ctypes.sizeof(launch_bounds_t((1,) * dimensions))
 
 
 def arguments_of(kernel: Any) -> list[tuple[str, Any]]:
-    """The names and types of a kernel's arguments behind the first."""
+    """Return the names and types of a kernel's arguments, without the first."""
     return [(each.label, each.type) for each in kernel.adj.args]
 
 
@@ -80,9 +80,12 @@ def arguments_of(kernel: Any) -> list[tuple[str, Any]]:
 
 def replace(library_of: Callable[[Any, str], Any], name_of: Callable[[str, Any], str], loaded: Callable[[int, Any, int], None],
             on_host: Callable[[str, list[tuple[str, Any, int]]], None]) -> None:
-    """Before Warp starts. library_of: what stands in for the C library that was loaded from a path; name_of: the file for a device
-    in place of Warp's; loaded: is told the handle of a kernel on a GPU, the names and types of its arguments, and the dimensions of
-    its launches; on_host: is told of each launch on the CPU the kernel's name, and name, type and address of its arguments."""
+    """Replace functions of Warp; call before Warp starts.
+
+    - library_of(library, path) returns a replacement of the C library that Warp loaded from the path.
+    - name_of(name, device) returns the file name of a compiled module for the device, instead of Warp's name.
+    - loaded(handle, arguments, dimensions) is called for each kernel that is loaded on a GPU, with names and types of arguments.
+    - on_host(kernel, arguments) is called for each launch on the CPU, with name, type and address of each struct or array."""
     load_dll, output_name = context.Runtime.load_dll, context.Module._get_compile_output_name
     get_hooks, invoke = context.ModuleExec.get_kernel_hooks, context.invoke
 
@@ -111,8 +114,8 @@ def replace(library_of: Callable[[Any, str], Any], name_of: Callable[[str, Any],
 
 
 def compile_for_host(source: str, name: str, path: str, headers: str, *, fuse_fp: bool, level: int) -> int:
-    """Compile C++ to an object file with the CPU's flags, and Warp's headers precompiled in a folder. Zero, or an error, which
-    Clang has told on stderr."""
+    """Compile C++ to an object file with the CPU's flags; headers: folder for precompiled headers. Return 0, or an error code of
+    Clang, which prints the error on stderr."""
     flags = context._resolve_cpu_compiler_flags(None, wp.config.cpu_compiler_flags).split()
     native, given = os.path.join(build.warp_home, "native"), (ctypes.c_char_p * (len(flags) + 1))(*map(str.encode, flags), None)
     return int(compiler().wp_compile_cpp(source.encode(), os.fsencode(name), os.fsencode(native), os.fsencode(path), False, False,

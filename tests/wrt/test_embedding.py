@@ -1,4 +1,4 @@
-"""wrt inside programs that set what holds for the whole process, call it from threads of their own, or while Python ends."""
+"""wrt in programs that change process-wide settings, call it from their own threads, or call it while Python exits."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from wrt.scene.shapes import icosphere
 
 SCENE = ROOT / "scenes" / "whitted.toml"
 BALL = icosphere(3)
-# Prints the sums of a query's distances and of a picture: those of the CPU are the same everywhere, to the last bit.
+# Prints the sum of a query's distances and the sum of a picture, which have the same bits on every CPU.
 WORK = f"""
 import threading, numpy as np, wrt
 from wrt.scene.shapes import icosphere
@@ -35,7 +35,7 @@ def work(threads=2):
 
 
 def printed(code: str, name: str = "bvh") -> list[str]:
-    """What a process of its own prints that runs the code. It must end well and say nothing on stderr."""
+    """Run the code in a new process and return the lines that it prints. It must succeed and print nothing on stderr."""
     done = subprocess.run([sys.executable, "-c", f"NAME = {name!r}\n{WORK}\n{code}"], capture_output=True, text=True, timeout=600,
                           check=False, cwd=ROOT)
     assert (done.returncode, done.stderr) == (0, "")
@@ -48,7 +48,7 @@ def expected() -> str:
 
 
 def test_debug_mode_is_not_for_kernels_of_wrt(expected: str) -> None:
-    """Warp 1.19 crashes where several threads launch a kernel of that mode."""
+    """Warp 1.19 crashes if several threads launch a kernel that was compiled in debug mode."""
     assert printed("import warp as wp; wp.config.mode = 'debug'; work(4)") == [expected]
 
 

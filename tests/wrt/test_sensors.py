@@ -1,4 +1,4 @@
-"""Sensors against closed forms: pixels through K, angles of rings, moments of noise."""
+"""Sensors agree with closed forms: pixels from K, angles of LiDAR rings, moments of noise."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_it_is_the_camera_of_pictures() -> None:
 
 
 def test_misses_are_infinitely_far() -> None:
-    sensor = pinhole(np.diag([10.0, 10.0, 1.0]), (2, 2), np.diag([1.0, -1.0, -1.0, 1.0]))  # looks along -z, at the first pixel
+    sensor = pinhole(np.diag([10.0, 10.0, 1.0]), (2, 2), np.diag([1.0, -1.0, -1.0, 1.0]))  # along -z; the first pixel hits
     quad = shapes.quad((-0.1, -0.1, -2.0), (0.2, 0.0, 0.0), (0.0, 0.2, 0.0))
     hits = wrt.build(quad).closest_hit(sensor.origins, sensor.directions)
     assert np.array_equal(sensor.depth(hits), np.float32([[2.0, np.inf], [np.inf, np.inf]]))
@@ -101,7 +101,7 @@ def test_noise_has_the_deviation_that_is_asked_for() -> None:
         noisy = with_range_noise(np.full(n, r, np.float32), 7, constant, proportional)
         sigma = np.hypot(constant, proportional * r)
         assert noisy.dtype == np.float32
-        # Five standard errors of a mean, and of a deviation.
+        # Within five standard errors of a mean and of a standard deviation.
         assert abs(noisy.mean(dtype=np.float64) - r) < 5.0 * sigma / np.sqrt(n)
         assert abs(noisy.std(dtype=np.float64) / sigma - 1.0) < 5.0 / np.sqrt(2.0 * n)
     lost = np.isinf(with_range_noise(np.ones(n), 1, dropout=0.1)).mean()
@@ -142,10 +142,10 @@ def test_noise_repeats_and_is_each_elements_own() -> None:
     (lambda: with_range_noise([1.0], 0, -1.0), ("constant",)),
     (lambda: with_range_noise([1.0], 0, dropout=1.5), ("dropout", "0 to 1")),
     (lambda: with_range_noise([1.0], -1), ("seed", "0")),
-    (lambda: pinhole(np.diag([1e-40, 1.0, 1.0]), (4, 4)), (None, "beyond float32")),
-    (lambda: pinhole(K, (4, 4), [[1, 0, 0, 1e39], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), (None, "beyond float32")),
-    (lambda: pinhole(K, (4, 4)).depth(np.zeros(16)), ("hits", "those of closest_hit")),
-    (lambda: pinhole(K, (4, 4)).picture(np.zeros(3)), ("values", "one a ray, (16")),
+    (lambda: pinhole(np.diag([1e-40, 1.0, 1.0]), (4, 4)), (None, "range of float32")),
+    (lambda: pinhole(K, (4, 4), [[1, 0, 0, 1e39], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), (None, "range of float32")),
+    (lambda: pinhole(K, (4, 4)).depth(np.zeros(16)), ("hits", "closest_hit returned")),
+    (lambda: pinhole(K, (4, 4)).picture(np.zeros(3)), ("values", "one row per ray, (16")),
 ])
 def test_what_is_refused(call: Any, said: Refusal) -> None:
     with refused(*said):

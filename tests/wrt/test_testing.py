@@ -41,7 +41,7 @@ def test_the_plugin_runs_a_test_once_a_case(tmp_path: Path) -> None:
     (tmp_path / "test_use.py").write_text(USE)
     said = pytest_run(tmp_path, "--hard-case-rays", "7", "--hard-case-seed", "3", "-k", "D_published or E_grid or nothing_else")
     assert "1 failed, 2 passed" in said and f"{len(wrt.testing.CASES) - 2} deselected" in said
-    assert "E_grid: of 7 rays 7 lost, 0 invented, 0 of a wrong triangle" in said
+    assert "E_grid: of 7 rays 7 lost, 0 invented, 0 with a wrong triangle" in said
 
 
 def test_nobody_gets_the_plugin_unasked(tmp_path: Path) -> None:

@@ -17,9 +17,10 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.ray_query import kernel_argument
 from wrt.accel.queries.rays import vectors
+from wrt.accel.snapshot import Snapshot
 from wrt.accel.store import check_order, save
 from wrt.accel.structure import Structure, options_of
-from wrt.core.arrays import check_no_gradients, taken
+from wrt.core.arrays import check_no_gradients, from_tensor
 from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.core.seconds import build_clock
@@ -29,48 +30,48 @@ from wrt.kernels.warp_private import fields_of
 
 
 class OneMesh(Accelerator, ABC):
-    """A structure over a mesh, on a device. Subclasses set `name`, `kernels` and `options`, and implement `_build`.
+    """An acceleration structure over one mesh. Subclasses set `name`, `kernels` and `options`, and implement `_build`.
 
     options: frozen dataclass, which raises InputError for values out of range. kernels: module with make_struct(record) and
-    make_traversal(units, any_hit, accepts). stream: module of a kernel for many rays at a time on the CPU (wrt.accel.queries.batches),
-    with make_stream(units, any_hit) or None, stream_block and stream_sizes. can_refit: whether `_refit` follows vertices.
+    make_traversal(units, any_hit, accepts). can_refit: `_refit` is implemented. stream: module of a CPU kernel that traces many rays
+    at a time, with make_stream(units, any_hit) -> kernel or None, stream_block and stream_sizes (wrt.accel.queries.batches).
     """
 
     name: ClassVar[str]
     kernels: KernelModule
     stream: ClassVar[KernelModule | None] = None
-    options: ClassVar[type[Any]]  # a dataclass of each structure's own
+    options: ClassVar[type[Any]]  # a dataclass
     can_refit: ClassVar[bool] = False
 
     def __init__(self, geometry: Geometry, attributes: FlatScene | None = None, /, device: str = "cpu", threads: int | None = None, *,
                  triangle: str = "watertight", box: str = "conservative", **options: object) -> None:
-        super().__init__(Structure(type(self), Units(triangle, box)), geometry.kept(), attributes, device, threads)
+        super().__init__(Structure(type(self), Units(triangle, box)), geometry.unshared(), attributes, device, threads)
         self.built_with = options_of(self.name, self.options, options)
         begin = build_clock()
         built = self._build(self.built_with)
-        self._take(built, begin, built.sah_cost)
+        self._install(built, begin, built.sah_cost)
 
     @classmethod
     def restore(cls, built: Built, geometry: Geometry, attributes: FlatScene | None = None, /, device: str = "cpu",
                 threads: int | None = None, *, units: Units | None = None, built_with: object = None) -> Self:
-        """Restore a structure from its arrays and options (None: the defaults). Raises InputError if they do not fit the geometry."""
+        """Make a structure from saved arrays and options (None: defaults). Raises InputError if arrays do not fit the geometry."""
         self = cls.__new__(cls)
-        Accelerator.__init__(self, Structure(cls, units or Units()), geometry.kept(), attributes, device, threads)
+        Accelerator.__init__(self, Structure(cls, units or Units()), geometry.unshared(), attributes, device, threads)
         self.built_with = cls.options() if built_with is None else built_with
         begin = build_clock()
         check_order(built.order, len(geometry), cls.name)
         self._check(built)
-        self._take(built, begin, built.sah_cost)
+        self._install(built, begin, built.sah_cost)
         return self
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Pickle the arrays and the geometry. In the copy, a refit measures growth from the present shape."""
+        """Pickle the arrays and the geometry. In the unpickled structure, Refit.growth is relative to the present SAH cost."""
         named = {"device": str(self.device), "threads": self.threads, "units": self.structure.units, "built_with": self.built_with}
         return partial(type(self).restore, **named), (self.built, self.geometry, self._snapshot.attributes)
 
     @property
     def geometry(self) -> Geometry:
-        """Geometry of the mesh as it is now."""
+        """Geometry of the mesh, as of the last refit."""
         return self._snapshot.mesh
 
     @property
@@ -80,19 +81,19 @@ class OneMesh(Accelerator, ABC):
 
     @property
     def world(self) -> WarpStruct:
-        """The structure as it is now, as an argument of kernels (`wrt.ray_query`)."""
+        """The structure, as of the last refit, as an argument of the user's kernels (`wrt.ray_query`)."""
         return kernel_argument(self._snapshot)
 
     def _over(self, geometry: Geometry, built: Built | None = None, built_cost: float = np.nan) -> Self:
-        """Return a copy over another geometry, with arrays if they are built; queries of `self` go on with the old shape."""
-        other = copy(self)
-        other._snapshot = self._snapshot.over(geometry)
+        """Return a copy over another geometry, with the arrays of `built`. Queries of `self` still use the old geometry."""
+        other, old = copy(self), self._snapshot
+        other._snapshot = Snapshot(old.structure, old.device, old.surfaces, old.attributes, geometry)
         if built is not None:
-            other._take(built, build_clock(), built_cost)
+            other._install(built, build_clock(), built_cost)
         return other
 
-    def _take(self, built: Built, begin: float, built_cost: float) -> None:
-        """Upload the arrays and set the snapshot. begin: clock at the start of the build; built_cost: as in Snapshot."""
+    def _install(self, built: Built, begin: float, built_cost: float) -> None:
+        """Upload the arrays and set the snapshot. begin: build_clock() at the start of the build; built_cost: as in Snapshot."""
         data = self._upload(built)
         stats = AccelStats(build_clock() - begin, built.nodes, built.leaves, built.depth, built.references,
                            array_bytes(data), built.sah_cost)
@@ -100,42 +101,42 @@ class OneMesh(Accelerator, ABC):
 
     @abstractmethod
     def _build(self, options: Any) -> Built:
-        """Build over self.geometry, on the host; options: an instance of the class's `options`."""
+        """Build over self.geometry. options: an instance of the class's `options`."""
 
     def _check(self, built: Built) -> None:
-        """Raise InputError if arrays of a file would lead a ray out of bounds or into a cycle."""
+        """Raise InputError if arrays from a file would lead a ray out of bounds or into a cycle."""
         raise InputError(f"a {self.name} cannot be read from a file")
 
     def _refit(self, built: Built) -> Built:
-        """Fit the tree to self.geometry, whose vertices have moved. Called only if can_refit."""
+        """Fit the tree to the moved vertices of self.geometry. Called only if can_refit."""
         raise NotImplementedError
 
     def _moved(self, vertices: ArrayLike) -> Geometry:
-        """Return the geometry with other vertices. Raises InputError for other shapes and values that are not finite."""
+        """Return the geometry with new vertices. Raises InputError for another shape and for values that are not finite."""
         moved = vectors(vertices, "vertices").copy()
         if moved.shape != (self.geometry.n_vertices, 3):
             raise InputError(f"must be {(self.geometry.n_vertices, 3)}, got {moved.shape}", argument="vertices")
         return Geometry(moved, self.geometry.faces, self.geometry.spheres)
 
     def _refit_in_place(self, points: ArrayLike) -> None:
-        raise InputError(f"a {self.name} cannot be refitted in place", hint="take bvh2")
+        raise InputError(f"a {self.name} cannot be refitted in place", hint="use bvh2")
 
     def refit(self, vertices: ArrayLike, rebuild_at: float = np.inf, *, in_place: bool = False) -> Refit:
-        """Fit the boxes of the tree to vertices that have moved; the tree itself stays.
+        """Fit the boxes of the tree to moved vertices. The topology of the tree does not change.
 
-        Hits are exact, but queries get slower as the motion mixes primitives. Queries of other threads that begin before the refit
-        ends see the old shape.
+        Hits have the bits of a new structure, but queries become slower if neighbouring primitives move apart. Queries in other
+        threads that begin before the refit ends see the old vertices.
 
         Parameters
         ----------
         vertices : (V, 3) array_like, or Warp array (V,) of vec3
-            As many as before, finite (not checked in a Warp array on a GPU); bvh2 reads a Warp array in place. Later hits have
-            gradients in a Warp array that requires them while a `wp.Tape` records.
+            New vertices, as many as before, finite (not checked in a Warp array on a GPU). bvh2 does not copy a Warp array to the
+            host. While a `wp.Tape` records, gradients of later hits flow to a Warp array that requires gradients.
         rebuild_at : float
             Build a new tree if the SAH cost exceeds this multiple of its value at the last build.
         in_place : bool
-            Write a Warp array on the structure's device into the existing arrays, as a CUDA graph can capture. After a first call
-            this allocates nothing and waits for nothing; no other thread may query meanwhile. Only bvh2.
+            Only bvh2: write to the existing arrays, so that a CUDA graph can capture the refit. `vertices` must be a Warp array on the
+            structure's device. After the first call, nothing is allocated. No other thread may query at the same time.
 
         Returns
         -------
@@ -145,11 +146,11 @@ class OneMesh(Accelerator, ABC):
         Raises
         ------
         InputError
-            For other shapes and values, and for structures that cannot be refitted.
+            If `vertices` has another shape or is not finite, or the structure cannot be refitted.
         """
         if not self.can_refit:
-            raise InputError(f"a {self.name} cannot follow vertices that move", hint="build it again, or take bvh2")
-        vertices = taken(vertices, "vertices")
+            raise InputError(f"a {self.name} cannot be refitted", hint="build it again, or use bvh2")
+        vertices = from_tensor(vertices, "vertices")
         with self._refitting:
             begin, before = build_clock(), self._snapshot
             if in_place:
@@ -162,29 +163,29 @@ class OneMesh(Accelerator, ABC):
             if rebuilt := growth > rebuild_at:
                 built = beside._build(self.built_with)
                 built_cost = built.sah_cost
-            beside._take(built, begin, built_cost)
+            beside._install(built, begin, built_cost)
             followed = vertices if isinstance(vertices, wp.array) and vertices.requires_grad else None
             self._snapshot = replace(beside._snapshot, followed=followed)
             return Refit(beside.stats.build_seconds, growth, rebuilt)
 
     def _children(self, built: Built) -> WarpStruct:
-        """Return a hierarchy of boxes as kernels.build.end_point_overlap.Children."""
-        raise InputError(f"a {self.name} has no end-point overlap: it is no hierarchy of boxes")
+        """Convert a hierarchy of boxes to kernels.build.end_point_overlap.Children."""
+        raise InputError(f"a {self.name} has no end-point overlap, because it is not a hierarchy of boxes")
 
     def epo(self) -> float:
         """Compute the end-point overlap of a BVH: expected number of nodes and primitives visited in vain at a surface point.
 
-        It predicts the cost of rays that end on surfaces, as `stats.sah_cost` predicts that of lines (`wrt.accel.epo`).
+        It predicts the cost of rays that end on surfaces; `stats.sah_cost` predicts the cost of unbounded lines (`wrt.accel.epo`).
 
         Returns
         -------
         float
-            Overlap with both costs 1.
+            Overlap, at cost 1 per node and 1 per primitive.
 
         Raises
         ------
         InputError
-            For structures that are no BVH.
+            If the structure is not a BVH.
         """
         from wrt.accel.epo import end_point_overlap
 
@@ -192,7 +193,7 @@ class OneMesh(Accelerator, ABC):
         return end_point_overlap(self._children(built.on_host()), geometry, self.threads)
 
     def _upload(self, built: Built) -> WarpStruct:
-        def there(array: np.ndarray | WarpArray, dtype: WarpType) -> WarpArray:
+        def on_device(array: np.ndarray | WarpArray, dtype: WarpType) -> WarpArray:
             return array if isinstance(array, wp.array) else upload(array, dtype, self.device)
 
         data = self.structure.struct()
@@ -200,12 +201,12 @@ class OneMesh(Accelerator, ABC):
         for name, array in built.arrays.items():
             kind = types[name]
             is_array = isinstance(kind, wp.array)
-            setattr(data, name, there(array, kind.dtype) if is_array else kind(*np.ravel(array)))
-        data.primitives = there(self._primitives(built), types["primitives"].dtype)
+            setattr(data, name, on_device(array, kind.dtype) if is_array else kind(*np.ravel(array)))
+        data.primitives = on_device(self._primitives(built), types["primitives"].dtype)
         return data
 
     def _primitives(self, built: Built) -> np.ndarray | WarpArray:
-        """Return the records of the triangle test in the order of the leaves."""
+        """Return the records that the triangle test reads, in the order of the leaves."""
         return self.geometry.primitives(self.structure.units, built.order, self.threads)
 
     def save(self, path: PathLike) -> None:
@@ -219,7 +220,7 @@ class OneMesh(Accelerator, ABC):
         Raises
         ------
         InputError
-            For another suffix, and if the file cannot be written.
+            If the suffix is not .accel, or the file cannot be written.
         """
         save(self._snapshot, path)
 
@@ -230,6 +231,6 @@ class OneMesh(Accelerator, ABC):
 
 
 def array_bytes(data: WarpStruct) -> int:
-    """Return the bytes of all arrays of a Warp struct."""
+    """Return the size of all arrays in a Warp struct, in bytes."""
     arrays = (getattr(data, name) for name in fields_of(data))
     return sum(array.capacity for array in arrays if isinstance(array, wp.array))

@@ -25,7 +25,7 @@ class BruteForce(OneMesh):
 
     def _check(self, built: Built) -> None:
         if not np.array_equal(built.order, np.arange(len(self.geometry))):
-            raise InputError("is damaged: not every primitive stands once, in order")
+            raise InputError("is damaged: its primitives are not all there once, in order")
 
     def _refit(self, built: Built) -> Built:
         return built

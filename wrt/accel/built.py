@@ -1,4 +1,4 @@
-"""Arrays that a builder makes, and figures of a structure: sizes, costs, refits."""
+"""Result of a builder, and statistics of structures and refits."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from wrt.core.types import WarpArray
 
 @dataclass(frozen=True, eq=False)
 class Built:
-    """Result of a builder, in NumPy arrays, or in Warp's if it was built on a device (`parents`: of each node there).
+    """Result of a builder, in NumPy arrays, or in Warp arrays if it was built on the device.
 
-    arrays: one for each field of the structure's struct but `primitives` and `recorder`: records, or rows of numbers. order: (R,)
-    int32, prim_id of each record of `primitives`; one may occur several times. Where cells share records, an array `references` has
-    their indices. nodes, leaves, depth, sah_cost: as in AccelStats.
+    arrays: one array for each field of the structure's struct except `primitives` and `recorder`. order: (R,) int32, prim_id of
+    each record in `primitives`; a prim_id may occur several times. If cells share records, arrays["references"] holds their
+    indices. nodes, leaves, depth, sah_cost: as in AccelStats. parents: parent of each node, on the device only.
     """
 
     arrays: dict[str, Any]
@@ -29,7 +29,7 @@ class Built:
     parents: WarpArray | None = None
 
     def on_host(self) -> Built:
-        """Return the same with NumPy arrays."""
+        """Convert the arrays to NumPy arrays."""
         if not isinstance(self.order, wp.array):
             return self
         return replace(self, arrays={name: on_host(array) for name, array in self.arrays.items()}, order=on_host(self.order),
@@ -42,18 +42,18 @@ class Built:
 
 @dataclass(frozen=True)
 class AccelStats:
-    """Figures of a structure.
+    """Statistics of a structure.
 
     Attributes
     ----------
     build_seconds : float
-        Wall clock, without the compilation of kernels.
+        Wall-clock time of the build, without the compilation of kernels.
     nodes, leaves, depth : int
         Size of the tree; 0 without a tree.
     references : int
-        Primitives in all leaves together; structures that split space hold some of them several times.
+        Number of primitives in all leaves together. A structure that splits space counts some primitives several times.
     bytes : int
-        Memory on the device, triangles included.
+        Memory on the device, including the triangles.
     sah_cost : float
         Expected cost of a random line through the root box, at 1 per node visited and 1 per primitive tested; NaN if unknown.
     """
@@ -74,11 +74,11 @@ class Refit:
     Attributes
     ----------
     seconds : float
-        Wall clock.
+        Wall-clock time.
     growth : float
-        SAH cost of the refitted tree divided by its cost when it was built.
+        SAH cost of the refitted tree divided by the SAH cost at the last build.
     rebuilt : bool
-        Whether that was above `rebuild_at`, so that a new tree was built.
+        Whether `growth` exceeded `rebuild_at`, so that a new tree was built.
     """
 
     seconds: float

@@ -1,4 +1,4 @@
-"""Triangles in Warp arrays, over which a structure is built without a copy to the host."""
+"""Triangles in Warp arrays, over which bvh2 is built and refitted without a copy to the host."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from wrt.kernels.build.shape import Shape, count_outside
 
 
 class DeviceGeometry(Geometry):
-    """A mesh in Warp arrays, which `wrt.build` takes in place of a `Mesh`. `vertices` and `faces` copy it to the host.
+    """A mesh in Warp arrays, an argument of `wrt.build` in place of a `Mesh`. `vertices` and `faces` are copies on the host.
 
-    A structure over it copies the points, so that they may be changed for a `refit`. Points are not checked: no ray hits a triangle
+    A structure copies the points, so that the caller may modify them for a `refit`. Points are not checked: no ray hits a triangle
     with a point that is not finite.
 
     Parameters
@@ -26,7 +26,7 @@ class DeviceGeometry(Geometry):
     points : Warp array (V,) of vec3
         Vertices on any device.
     indices : Warp array (3 F,) of int32 or (F,) of vec3i
-        Faces, as `wp.Mesh` has them, on the device of the points.
+        Vertex indices of the faces, as in `wp.Mesh`, on the device of the points.
 
     Raises
     ------
@@ -38,7 +38,7 @@ class DeviceGeometry(Geometry):
     indices: WarpArray
 
     def __init__(self, points: WarpArray, indices: WarpArray) -> None:
-        points = self.points_of(points, "points")
+        points = self.checked_points(points, "points")
         flat = isinstance(indices, wp.array) and indices.dtype == wp.int32 and indices.ndim == 1 and len(indices) % 3 == 0
         if not (flat or (isinstance(indices, wp.array) and indices.dtype == wp.vec3i and indices.ndim == 1)):
             raise InputError(f"must be a Warp array (3 F,) of int32 or (F,) of vec3i, got {shown(indices)}", argument="indices")
@@ -51,30 +51,30 @@ class DeviceGeometry(Geometry):
         outside = wp.zeros(1, dtype=wp.int32, device=points.device)
         launch_on(points.device, count_outside, len(self), self.indices, len(points), outside, None)
         if n := int(outside.numpy()[0]):
-            raise InputError(f"must be 0 to {len(points) - 1}; {n} triangles have others", argument="indices")
+            raise InputError(f"must be 0 to {len(points) - 1}; {n} triangles have other indices", argument="indices")
 
     def _set(self, points: WarpArray, indices: WarpArray, spheres: np.ndarray) -> DeviceGeometry:
         self.__dict__.update(points=points, indices=indices, spheres=spheres)
         return self
 
     @staticmethod
-    def points_of(array: ArrayLike, name: str) -> WarpArray:
-        """Return a Warp array of points without gaps. Raises InputError for anything else."""
+    def checked_points(array: ArrayLike, name: str) -> WarpArray:
+        """Return a Warp array (V,) of vec3 as a contiguous array. Raises InputError, which names the argument, for anything else."""
         if not (isinstance(array, wp.array) and array.dtype == wp.vec3 and array.ndim == 1):
             raise InputError(f"must be a Warp array (V,) of vec3, got {shown(array)}", argument=name)
         return array if array.is_contiguous else array.contiguous()
 
     @staticmethod
-    def moved(points: WarpArray, indices: WarpArray, spheres: np.ndarray) -> DeviceGeometry:
-        """Make a geometry with spheres from arrays that were checked before; indices: (F,) of vec3i."""
+    def unchecked(points: WarpArray, indices: WarpArray, spheres: np.ndarray) -> DeviceGeometry:
+        """Make a geometry with spheres from valid arrays. indices: (F,) of vec3i."""
         return DeviceGeometry.__new__(DeviceGeometry)._set(points, indices, spheres)
 
-    def kept(self) -> DeviceGeometry:
+    def unshared(self) -> DeviceGeometry:
         """Return the geometry with a copy of the points."""
-        return DeviceGeometry.moved(wp.clone(self.points), self.indices, self.spheres)
+        return DeviceGeometry.unchecked(wp.clone(self.points), self.indices, self.spheres)
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Pickle and deep-copy it as a Geometry on the host, because Warp's arrays allow neither."""
+        """Pickle and deep-copy as a Geometry on the host, because Warp arrays support neither."""
         return Geometry, (self.vertices, self.faces, self.spheres)
 
     def __len__(self) -> int:
@@ -101,7 +101,7 @@ class DeviceGeometry(Geometry):
         return np.asarray(self.indices.numpy())
 
     def on(self, device: Device, faces: WarpArray | None = None) -> WarpStruct:
-        """Return kernels.build.shape.Shape; arrays of another device are copied."""
+        """Convert to kernels.build.shape.Shape on `device`; arrays of another device are copied."""
         shape = Shape()
         shape.vertices, shape.faces = self.points.to(device), self.indices.to(device) if faces is None else faces
         shape.spheres = wp.array(self.spheres, dtype=wp.vec4, device=device)

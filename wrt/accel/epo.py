@@ -1,4 +1,4 @@
-"""End-point overlap: the part of the surface that lies in boxes of a hierarchy without being below them."""
+"""End-point overlap of a BVH: the part of the surface that lies in a node's box but not in the node's subtree."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ TRIANGLES_PER_LAUNCH = 16384
 
 
 def end_point_overlap(tree: WarpStruct, geometry: Geometry, threads: int) -> float:
-    """Compute the EPO of a hierarchy (kernels.build.end_point_overlap.Children on the CPU) with both costs 1; 0 without any area.
+    """Compute the end-point overlap of a BVH, at cost 1 per node and 1 per primitive; 0 without any area.
 
-    Aila, Karras and Laine 2013, "On Quality Metrics of Bounding Volume Hierarchies", equation 2: sum over all nodes of the node's
-    cost times the part of the whole surface that is in its box and not below it. Only finite triangles have surface; spheres count
-    as tests. A triangle with several references is below each node that has one of them.
+    tree: kernels.build.end_point_overlap.Children on the CPU. Aila, Karras and Laine 2013, "On Quality Metrics of Bounding Volume
+    Hierarchies", equation 2: the sum over all nodes of the node's cost times the fraction of the surface that is in the node's box
+    but not in its subtree. Only finite triangles have surface. A triangle with several references is in several subtrees.
     """
     cpu = start("cpu")
     n = len(geometry.faces)
@@ -35,7 +35,7 @@ def end_point_overlap(tree: WarpStruct, geometry: Geometry, threads: int) -> flo
 
 
 def children(lo: np.ndarray, hi: np.ndarray, first: np.ndarray, count: np.ndarray, order: np.ndarray) -> WarpStruct:
-    """Make Children for end_point_overlap. lo, hi: (N, width, 3); first, count: (N, width); order: of the primitives."""
+    """Make Children for end_point_overlap. lo, hi: (N, width, 3); first, count: (N, width); order: (R,) prim_ids of the leaves."""
     cpu = start("cpu")
     tree = kernels.Children()
     tree.width = first.shape[1]

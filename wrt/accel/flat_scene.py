@@ -12,10 +12,10 @@ from wrt.accel.instanced_geometry import InstancedGeometry
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """Runs of primitives of one mesh in one place, in the order of prim_id; the last run may be all spheres.
+    """Runs of consecutive prim_ids: an instance, a series of joined objects, or, as the last run, all spheres.
 
-    (I,) int64 each: first_prim, first_face (into FlatScene.faces), first_material (into FlatScene.prim_material), material_step (1, or 0
-    where all are of one material); to_world: (I, 3, 4) float64.
+    (I,) int64 each: first_prim; first_face, an index into FlatScene.faces; first_material, an index into FlatScene.prim_material;
+    material_step, 1, or 0 if the run has one material. to_world: (I, 3, 4) float64.
     """
 
     first_prim: np.ndarray
@@ -27,12 +27,11 @@ class Placed:
 
 @dataclass(frozen=True, eq=False)
 class FlatScene:
-    """All shapes of a scene, or one mesh, as arrays. prim_id counts the faces of all objects in their order, then the spheres.
+    """All shapes of a scene, or one mesh, as arrays. prim_ids number the faces of all objects in order, then the spheres.
 
-    vertices: (V, 3); faces: (F, 3); normals: (V, 3) or None; uvs: (V, 2). Normals and uvs are zero for objects without them; uvs are
-    (0, 2) for one mesh without them. prim_material: index into the scene's materials. Without `placed`, everything is in world space
-    and in the order of prim_id; with it, instanced meshes are there once, in their own space. objects: first prim_id of each object
-    and then of each sphere; None without a scene.
+    vertices: (V, 3); faces: (F, 3); normals: (V, 3) or None; uvs: (V, 2). Objects without normals or uvs have zeros; a mesh without
+    uvs has (0, 2). prim_material: index into the scene's materials. Without `placed`, arrays are in world space and in the order of
+    prim_id. With it, instanced meshes are stored once, in their own spaces. objects: first prim_id of each object, then sphere.
     """
 
     geometry: Geometry | InstancedGeometry
@@ -45,21 +44,21 @@ class FlatScene:
     objects: np.ndarray | None = None
 
     def places(self, prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the row of each triangle in `faces` and in `placed` (0 without `placed`), (N,) each."""
+        """Return the row of each triangle in `faces`, and its run in `placed` (0 without `placed`), (N,) each."""
         if self.placed is None:
             return prim_id, np.zeros(len(prim_id), np.int32)
         run, local = self._run(prim_id)
         return self.placed.first_face[run] + local, run
 
     def materials(self, prim_id: np.ndarray) -> np.ndarray:
-        """Return the material of each primitive, (N,) int32."""
+        """Return the index of the material of each primitive, (N,) int32."""
         if self.placed is None:
             return self.prim_material[prim_id]
         run, local = self._run(prim_id)
         return self.prim_material[self.placed.first_material[run] + self.placed.material_step[run] * local]
 
     def corners(self, prim_id: np.ndarray) -> np.ndarray:
-        """Return the corners of triangles in world space, (N, 3, 3) float64."""
+        """Return the corners of triangles in world space, (N, 3, 3) float64: N triangles, 3 corners, 3 coordinates."""
         face, run = self.places(prim_id)
         corners = self.vertices[self.faces[face]].astype(np.float64)
         if self.placed is None:
@@ -74,7 +73,7 @@ class FlatScene:
 
 
 def flat_scene_of(geometry: Geometry | InstancedGeometry, normals: np.ndarray | None = None, uvs: np.ndarray | None = None) -> FlatScene:
-    """Return the flat scene of a mesh with its normals and uvs, or of instances of meshes without these."""
+    """Make a flat scene of a mesh with its normals and uvs, or of instances without normals and uvs."""
     material = np.zeros(0, np.int32)
     uvs = np.zeros((0, 2), np.float32) if uvs is None else uvs
     if isinstance(geometry, Geometry):
@@ -88,7 +87,7 @@ def flat_scene_of(geometry: Geometry | InstancedGeometry, normals: np.ndarray | 
 
 
 def placed_now(scene: FlatScene, geometry: Geometry | InstancedGeometry) -> Placed | None:
-    """Return scene.placed with the present matrices of the geometry."""
+    """Return scene.placed with the matrices of `geometry`, whose instances may have moved."""
     if scene.placed is None or not isinstance(geometry, InstancedGeometry):
         return None
     to_world = scene.placed.to_world.copy()
@@ -97,5 +96,5 @@ def placed_now(scene: FlatScene, geometry: Geometry | InstancedGeometry) -> Plac
 
 
 def run_of(placed: Placed, geometry: InstancedGeometry) -> np.ndarray:
-    """Return the run of each instance with a transform of its own. An instance without primitives shares another's run."""
+    """Return the index of the run of each instance with its own transform. An instance without primitives gets another one's run."""
     return np.searchsorted(placed.first_prim, geometry.first_prim[geometry.is_placed], side="right") - 1

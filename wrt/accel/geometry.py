@@ -23,9 +23,9 @@ RECORDS_PER_JOB = 32768
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """Shapes in world space: vertices (V, 3) float32, faces (F, 3) int32, spheres (S, 4) float32 (center, radius).
+    """Triangles and spheres: vertices (V, 3) float32, faces (F, 3) int32, spheres (S, 4) float32 (center, radius).
 
-    prim_id counts the faces first, then the spheres.
+    prim_ids number the faces first, then the spheres.
     """
 
     vertices: np.ndarray
@@ -58,22 +58,22 @@ class Geometry:
         return out.hexdigest()
 
     def on(self, device: Device, faces: WarpArray | None = None) -> WarpStruct:
-        """Upload to a device, as kernels.build.shape.Shape. faces: arrays that are on the device already."""
+        """Upload to a device, as kernels.build.shape.Shape. faces: the faces, if they are on the device already."""
         shape = Shape()
         shape.vertices = upload(self.vertices, wp.vec3, device)
         shape.faces = upload(self.faces, wp.vec3i, device) if faces is None else faces
         shape.spheres = upload(self.spheres, wp.vec4, device)
         return shape
 
-    def kept(self) -> Geometry:
-        """Return the geometry without arrays that others may write to."""
+    def unshared(self) -> Geometry:
+        """Return the geometry with a copy of each array that the caller may modify."""
         return self
 
     def bounds(self, threads: int = 1, out: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Compute the padded box of every primitive: low and high, (N, 3) float32, into `out` if given.
 
-        The boxes have the bits of those in the units (kernels.units.triangle.within_bounds), so that no hit is outside its box.
-        Around a triangle with a corner that is not finite the box is all of space, as in kernels.build.shape.
+        The boxes have the same bits as in the intersection tests (kernels.units.triangle.within_bounds), so that no hit is outside
+        its box. The box of a triangle with a corner that is not finite is all of space, as in kernels.build.shape.
         """
         lo, hi = out or (np.empty((len(self), 3), np.float32) for _ in range(2))
 
@@ -83,7 +83,7 @@ class Geometry:
             spheres = self.spheres[max(first - n, 0) : max(first + RECORDS_PER_JOB - n, 0)]
             low, high = (np.concatenate([end(end(corners[0], corners[1]), corners[2]), spheres[:, :3] + sign * spheres[:, 3:]])
                          for end, sign in ((np.minimum, np.float32(-1.0)), (np.maximum, np.float32(1.0))))
-            with np.errstate(over="ignore", invalid="ignore"):  # near the end of float32 the padded box is all of space
+            with np.errstate(over="ignore", invalid="ignore"):  # if coordinates overflow, the padded box is all of space
                 x, y, z = (high - low).T
                 pad = np.float32(PAD_EXTENT) * np.maximum(np.maximum(x, y), z)[:, None] + np.float32(PAD_SMALLEST)
                 lo[some] = low - (pad + np.float32(PAD_COORDINATE) * np.abs(low))
@@ -96,7 +96,7 @@ class Geometry:
         return lo, hi
 
     def primitives(self, units: Units, order: np.ndarray | None = None, threads: int = 1) -> np.ndarray:
-        """Return the records of the triangle test of `units`, in the given order of prim_id or in their own."""
+        """Return the records that the triangle test of `units` reads: one for each prim_id in `order`, or one for each primitive."""
         if order is not None and len(order) > len(self):  # make each record once
             return self.primitives(units, None, threads)[order]
         prim_id = np.arange(len(self), dtype=np.int32) if order is None else order

@@ -1,4 +1,4 @@
-"""Instances: each mesh once in its own space, with a transform to world space for each instance."""
+"""Instances: each mesh is stored once in its own space, and each instance has a transform to world space."""
 
 from __future__ import annotations
 
@@ -9,32 +9,33 @@ import numpy as np
 from wrt.accel.geometry import Geometry
 from wrt.kernels.traverse.common import Units
 
-# Largest row sum of |A| |A^-1|, at most 3 for rotation and scaling. Above, rounding in the mesh's space is large in world space.
+# Largest row sum of |A| |A^-1|, the growth of rounding errors from a mesh's own space to world space by the matrix A. Rotation and
+# scaling have at most 3.
 MAX_SPREAD = 1e4
 
 
 @dataclass(frozen=True, eq=False)
 class NumberedGeometry(Geometry):
-    """A geometry whose primitives have prim_ids of their own in the scene: numbers (N,) int32, ascending."""
+    """A geometry whose primitives have other prim_ids in the scene: prim_ids (N,) int32, ascending."""
 
-    numbers: np.ndarray
+    prim_ids: np.ndarray
 
     def primitives(self, units: Units, order: np.ndarray | None = None, threads: int = 1) -> np.ndarray:
         if order is not None and len(order) > len(self):
             return self.primitives(units, None, threads)[order]
         out = super().primitives(units, order, threads)
-        out["prim_id"] = self.numbers[out["prim_id"]]
+        out["prim_id"] = self.prim_ids[out["prim_id"]]
         return out
 
 
 @dataclass(frozen=True, eq=False)
 class InstancedGeometry:
-    """Geometries placed in world space.
+    """Instances of geometries in world space.
 
-    parts: geometries in their own spaces, whose prim_ids begin at 0; an instance adds its first_prim. part: (I,) int, the part of
-    each instance. to_world: (I, 3, 4) float64, affine and invertible. first_prim: (I,) int. n_triangles: of all instances; spheres
-    come after them and are those of part 0. worlds: (W + 1,) int, world w having the instances [worlds[w], worlds[w + 1]); None:
-    there is one world.
+    parts: geometries in their own spaces, whose prim_ids begin at 0. part: (I,) int, index of each instance's part. to_world:
+    (I, 3, 4) float64, affine and invertible. first_prim: (I,) int, which an instance adds to the prim_ids of its part. n_triangles:
+    number of triangles of all instances. Spheres belong to part 0, and their prim_ids come after the triangles. worlds: (W + 1,) int:
+    world w has the instances [worlds[w], worlds[w + 1]); None: there is one world.
     """
 
     parts: tuple[Geometry, ...]
@@ -51,24 +52,24 @@ class InstancedGeometry:
 
     @property
     def n_worlds(self) -> int:
-        """Number of worlds; 1 where instances are not in worlds."""
+        """Number of worlds; 1 if the structure was not built from a list of worlds."""
         return 1 if self.worlds is None else len(self.worlds) - 1
 
     @property
     def world_first_prim(self) -> np.ndarray:
-        """First primitive of each world among those of all worlds, (W,) int64."""
+        """Index of each world's first primitive among the primitives of all worlds, (W,) int64."""
         if self.worlds is None:
             return np.zeros(1, np.int64)
         return np.append(self.first_prim, self.n_triangles)[self.worlds[:-1]]
 
     @property
-    def numbers(self) -> np.ndarray:
+    def first_prim_in_world(self) -> np.ndarray:
         """First prim_id of each instance in its world, (I,) int64."""
         return self.first_prim - np.repeat(self.world_first_prim, np.diff(self.first_instance))
 
     @property
     def spheres(self) -> np.ndarray:
-        """Spheres (S, 4) float32, as in Geometry; none of them is an instance."""
+        """Spheres (S, 4) float32, as in Geometry. Spheres have no transforms."""
         return self.parts[0].spheres
 
     def __len__(self) -> int:
@@ -76,7 +77,7 @@ class InstancedGeometry:
 
     @property
     def is_placed(self) -> np.ndarray:
-        """Whether each instance has a transform of its own, (I,) bool; joined objects have none."""
+        """Whether each instance is of one object, with its own transform, (I,) bool; False for joined objects."""
         return np.array([not isinstance(self.parts[part], NumberedGeometry) for part in self.part], bool)
 
 

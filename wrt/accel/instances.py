@@ -1,4 +1,4 @@
-"""Two levels: each mesh is stored once, and a tree over its instances leads to it."""
+"""Structures of two levels: each mesh is stored once, below a tree over all instances."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ ALIGNMENT = 64  # bytes, between the addresses of structures
 
 
 class Instances(Accelerator):
-    """A binary BVH over instances of structures of one class, each built once. `wrt.build` makes it, with the options of the class.
+    """A binary BVH over instances of structures. These are of one class and built once each, by `wrt.build`.
 
-    The closest hit is the closest that the structures find for the ray in their own spaces, whatever the tree.
+    The closest hit does not depend on the tree: it is the closest of the hits that the structures find in their own spaces.
     """
 
     name = "instances"
@@ -42,35 +42,35 @@ class Instances(Accelerator):
         super().__init__(Structure(kind, Units(triangle, box, instances=True)), geometry, attributes, device, threads)
         self.bottoms = [kind(part, device=device, threads=threads, triangle=triangle, box=box, **options)
                         for part in geometry.parts]
-        # Snapshots keep the arrays: the Warp array of structs holds only their addresses.
-        self._placed = [bottom.snapshot for bottom in self.bottoms]
-        self._bottoms = wp.array([each.data for each in self._placed], dtype=self.structure.bottom, device=self.device)
+        # The snapshots keep the arrays alive: the Warp array of structs holds only their addresses.
+        self._bottom_snapshots = [bottom.snapshot for bottom in self.bottoms]
+        self._bottoms = wp.array([each.data for each in self._bottom_snapshots], dtype=self.structure.bottom, device=self.device)
         self._top = build_top(geometry, *world_boxes(geometry, np.arange(len(geometry.part)), self._boxes(geometry, BOXES)))
         self._roots = upload(self._top.roots, wp.int32, self.device)
-        self._take_top(geometry, begin, self._top.cost)
+        self._install_top(geometry, begin, self._top.cost)
 
     def _boxes(self, geometry: InstancedGeometry, most: int) -> list[Boxes]:
         return part_boxes(geometry, [bottom.built.order for bottom in self.bottoms], most)
 
-    def _take_top(self, geometry: InstancedGeometry, begin: float, built_cost: float) -> None:
-        """Upload the upper level and set the snapshot."""
+    def _install_top(self, geometry: InstancedGeometry, begin: float, built_cost: float) -> None:
+        """Upload the upper level and set the snapshot. begin, built_cost: see OneMesh._install."""
         top, data = self._top, self.structure.struct()
-        sizes = np.array([top.nodes.nbytes, *(each.stats.bytes for each in self._placed)], np.int64)
+        sizes = np.array([top.nodes.nbytes, *(each.stats.bytes for each in self._bottom_snapshots)], np.int64)
         data.nodes = upload(top.nodes, fields_of(data)["nodes"].dtype, self.device)
         data.placements = upload(top.placements, Placement, self.device)
         data.bottoms, data.slack = self._bottoms, top.slack
         data.bases = upload(np.cumsum((sizes + ALIGNMENT - 1) // ALIGNMENT * ALIGNMENT)[:-1], wp.int64, self.device)
-        stats = [each.stats for each in self._placed]
+        stats = [each.stats for each in self._bottom_snapshots]
         total = AccelStats(
-            build_clock() - begin, len(top.nodes) + sum(s.nodes for s in stats), top.leaves + sum(s.leaves for s in stats),
+            build_clock() - begin, len(top.nodes) + sum(s.nodes for s in stats), len(top.order) + sum(s.leaves for s in stats),
             top.depth + max((s.depth for s in stats), default=0), sum(s.references for s in stats),
             array_bytes(data) + sum(s.bytes for s in stats), float("nan"))
         self._snapshot = replace(self._snapshot, geometry=geometry, data=data, stats=total, built_cost=built_cost, roots=self._roots)
 
     def move(self, instance: ArrayLike, matrix: ArrayLike, rebuild_at: float = np.inf) -> Refit:
-        """Move instances: fit the boxes of the upper level to new matrices. Hits have the bits of a new structure.
+        """Move instances to new matrices and fit the boxes of the upper level. Hits have the bits of a new structure.
 
-        Other threads may go on with queries, as during `OneMesh.refit`.
+        Other threads may query at the same time, as during `OneMesh.refit`.
 
         Parameters
         ----------
@@ -96,13 +96,13 @@ class Instances(Accelerator):
             begin, before = build_clock(), self._snapshot
             geometry = before.geometry
             assert isinstance(geometry, InstancedGeometry)
-            rows, matrices = moves(rows_of(geometry, before.attributes), instance, matrix)
+            rows, matrices = checked_moves(rows_of(geometry, before.attributes), instance, matrix)
             to_world = geometry.to_world.copy()
             to_world[rows] = matrices
             geometry = replace(geometry, to_world=to_world)
-            if "boxes" not in self._kept:
-                self._kept["boxes"] = self._boxes(geometry, MOVED_BOXES)
-            low, high = world_boxes(geometry, rows, self._kept["boxes"])
+            if "boxes" not in self._cache:
+                self._cache["boxes"] = self._boxes(geometry, MOVED_BOXES)
+            low, high = world_boxes(geometry, rows, self._cache["boxes"])
             if not (np.maximum(np.abs(low), np.abs(high))[low[:, 0] <= high[:, 0]] <= MAX_REACH).all():
                 raise InputError(f"puts an instance farther than {MAX_REACH:g} from the origin", argument="matrix")
             top, cost = refit_top(self._top, geometry, rows, low, high), before.built_cost
@@ -111,7 +111,7 @@ class Instances(Accelerator):
                 top = build_top(geometry, top.low, top.high)
                 cost = top.cost
             self._top = top
-            self._take_top(geometry, begin, cost)
+            self._install_top(geometry, begin, cost)
             return Refit(self.stats.build_seconds, growth, rebuilt)
 
     def __reduce__(self) -> tuple[object, ...]:
@@ -125,17 +125,17 @@ class Instances(Accelerator):
 
 
 def rows_of(geometry: InstancedGeometry, scene: FlatScene | None) -> np.ndarray:
-    """Return the row of geometry.to_world for each value of hits.instance; -1 for objects without a place of their own."""
+    """Return the row of geometry.to_world for each value of hits.instance; -1 for objects that are not instances."""
     placed = np.flatnonzero(geometry.is_placed)
     if scene is None or scene.objects is None:
-        rows, numbers = np.full(len(geometry.part), -1), placed
+        rows, ids = np.full(len(geometry.part), -1), placed
     else:
-        rows, numbers = np.full(len(scene.objects), -1), np.searchsorted(scene.objects, geometry.first_prim[placed], "right") - 1
-    rows[numbers] = placed
+        rows, ids = np.full(len(scene.objects), -1), np.searchsorted(scene.objects, geometry.first_prim[placed], "right") - 1
+    rows[ids] = placed
     return rows
 
 
-def moves(row_of: np.ndarray, instance: ArrayLike, matrix: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+def checked_moves(row_of: np.ndarray, instance: ArrayLike, matrix: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Check the arguments of Instances.move and return (R,) rows and (R, 3, 4) float64; row_of: see `rows_of`.
 
     Raises InputError that names the argument.
@@ -147,21 +147,21 @@ def moves(row_of: np.ndarray, instance: ArrayLike, matrix: ArrayLike) -> tuple[n
     if matrices.shape not in ((*rows.shape, 4, 4), (*rows.shape, 3, 4)):
         raise InputError(f"must be {(*rows.shape, 4, 4)}, got {matrices.shape}", argument="matrix")
     if matrices.shape[-2] == 4 and (matrices[..., 3, :] != [0.0, 0.0, 0.0, 1.0]).any():
-        raise InputError("must be affine: its last row 0, 0, 0, 1", argument="matrix")
-    numbers, matrices = rows.reshape(-1).astype(np.int64), matrices[..., :3, :].reshape(-1, 3, 4)
-    if len(numbers) and not (numbers.min() >= 0 and numbers.max() < len(row_of)):
+        raise InputError("must be affine: its last row must be 0, 0, 0, 1", argument="matrix")
+    ids, matrices = rows.reshape(-1).astype(np.int64), matrices[..., :3, :].reshape(-1, 3, 4)
+    if len(ids) and not (ids.min() >= 0 and ids.max() < len(row_of)):
         raise InputError(f"must be 0 to {len(row_of) - 1}", argument="instance")
-    if len(np.unique(numbers)) < len(numbers):
-        raise InputError("has a number twice", argument="instance")
-    rows = row_of[numbers]
+    if len(np.unique(ids)) < len(ids):
+        raise InputError("must not have the same index twice", argument="instance")
+    rows = row_of[ids]
     if (rows < 0).any():
-        raise InputError(f"instance {numbers[np.argmin(rows)]} has no place of its own: it was joined with others, or is a sphere",
+        raise InputError(f"instance {ids[np.argmin(rows)]} cannot move: it is a sphere, or was joined with other objects",
                          argument="instance")
     with np.errstate(all="ignore"):
         linear = matrices[:, :, :3]
         good = np.isfinite(matrices).all(axis=(1, 2)) & (np.abs(np.linalg.det(linear)) > 0.0)
         good[good] = spread_of(matrices[good], inverse_of(matrices[good])) <= MAX_SPREAD
     if not good.all():
-        raise InputError(f"must be finite and flatten nothing; that of instance {numbers[np.argmin(good)]} is or does not",
-                         argument="matrix")
+        raise InputError("must be finite and must not flatten or shear too much, which the matrix of instance"
+                         f" {ids[np.argmin(good)]} violates", argument="matrix")
     return rows, matrices

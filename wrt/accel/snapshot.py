@@ -20,12 +20,12 @@ UNBUILT = AccelStats()
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """State of a structure. A refit replaces it as a whole; only a refit in place writes to its arrays.
+    """State of a structure. A refit makes a new one; only a refit in place modifies its arrays.
 
-    surfaces: kernels.structs.Surfaces with the number of triangles and the spheres alone. attributes: normals, materials and the
-    like, where wrt.build knows them. built: None over instances. built_cost: SAH cost that growth is measured against. roots: root
-    of each world (W,), over instances. followed: vertices of the last refit, if they require gradients. changes: refits in place
-    write to it.
+    surfaces: kernels.structs.Surfaces, of which only n_triangles and spheres are set. attributes: normals, materials and the like,
+    if the structure was not built from a geometry. built: None for instances. built_cost: SAH cost at the last build. roots: for
+    instances, the root of each world (W,). followed: vertices of the last refit, if they require gradients. changes: refits in
+    place modify the arrays.
     """
 
     structure: Structure
@@ -49,27 +49,23 @@ class Snapshot:
 
     @property
     def arrays(self) -> Built:
-        """Arrays of a structure over one mesh."""
+        """Result of the builder, or of the last refit, of a structure over one mesh."""
         assert self.built is not None
         return self.built
 
-    def over(self, geometry: Geometry | InstancedGeometry) -> Snapshot:
-        """Return a snapshot over another geometry, with nothing built yet."""
-        return Snapshot(self.structure, self.device, self.surfaces, self.attributes, geometry)
-
     def counting(self, data: WarpStruct) -> Snapshot:
-        """Return the snapshot for kernels that count, with `data` in place of its own."""
+        """Return the snapshot with `data` in place of its own data, for kernels that count."""
         units = self.structure.units._replace(counters=True)
         return replace(self, structure=self.structure._replace(units=units), data=data)
 
 
 def once(make: Callable[[Snapshot], T]) -> Callable[[Snapshot], T]:
-    """Cache a function of a snapshot, except for snapshots that refits in place change."""
-    kept: WeakKeyDictionary[Snapshot, T] = WeakKeyDictionary()
+    """Cache the results of a function of a snapshot, except for snapshots that refits in place modify."""
+    cache: WeakKeyDictionary[Snapshot, T] = WeakKeyDictionary()
 
-    def made(snapshot: Snapshot) -> T:
-        if snapshot in kept:
-            return kept[snapshot]
-        return make(snapshot) if snapshot.changes else kept.setdefault(snapshot, make(snapshot))
+    def cached(snapshot: Snapshot) -> T:
+        if snapshot in cache:
+            return cache[snapshot]
+        return make(snapshot) if snapshot.changes else cache.setdefault(snapshot, make(snapshot))
 
-    return made
+    return cached

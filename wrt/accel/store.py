@@ -1,7 +1,7 @@
 """Files of structures, which `wrt build` writes and `wrt.load_accel` reads.
 
-They are checked files (wrt.core.checked_file) whose header has the structure, the arrays and a hash of the geometry. Types come from
-the structure's class, and indices are checked before a ray follows them.
+A file has a checksum (wrt.core.checked_file). Its header describes the structure and the arrays, and has a hash of the geometry. The
+types of the arrays come from the structure's class. Indices are checked before a ray follows them.
 """
 
 from __future__ import annotations
@@ -32,21 +32,21 @@ STATS = ("nodes", "leaves", "depth", "sah_cost")
 
 
 def array_types(accel: type[Any], triangle: str = "watertight") -> dict[str, np.dtype]:
-    """Return the types of the rows of Built.arrays, by the fields of the structure's struct."""
+    """Return the NumPy type of one row of each array in Built.arrays, by the name of the array."""
     kinds = fields_of(Structure(accel, Units(triangle)).struct())
     return {name: row_type(kind.dtype if isinstance(kind, wp.array) else kind) for name, kind in kinds.items()
             if name not in ("primitives", "recorder")}
 
 
 def check_target(path: PathLike) -> None:
-    """Raise InputError if `path` is no file for a structure, before any work is done."""
+    """Raise InputError if a structure cannot be written to `path`."""
     if Path(path).suffix.lower() != ".accel":
-        raise InputError("a structure is written to a .accel file", path=path)
+        raise InputError("the file of a structure must have the suffix .accel", path=path)
     check_writable(path)
 
 
 def save(snapshot: Snapshot, path: PathLike) -> None:
-    """Write a structure wholly or not at all. Raises InputError if the file cannot be written."""
+    """Write a structure to a file atomically. Raises InputError if the file cannot be written."""
     check_target(path)
     structure, built = snapshot.structure, snapshot.arrays.on_host()
     units = structure.units
@@ -63,24 +63,24 @@ def save(snapshot: Snapshot, path: PathLike) -> None:
 
 def read(path: PathLike, geometry: Geometry, attributes: FlatScene | None = None, device: str = "cpu",
          threads: int | None = None) -> Any:
-    """Read a structure over the same geometry.
+    """Read a structure over `geometry`.
 
-    Raises InputError for a file that is missing, foreign, damaged, of another version or over another mesh.
+    Raises InputError if the file is missing, damaged, not a structure, of another version, or over another mesh.
     """
     header, body = read_checked(path, MAGIC, "acceleration structure")
     try:
         cls = ACCELERATORS.get(header["accel"])
         if cls is None:
-            raise InputError(f"holds a structure {header['accel']!r} that this version does not know")
+            raise InputError(f"holds a structure {header['accel']!r}, which this version of wrt does not have")
         if header["geometry"] != geometry.digest():
             raise InputError("was built over another mesh")
         built = read_arrays(cls, header, body)
-        with np.errstate(over="ignore", invalid="ignore"):  # of values near the end of float32
+        with np.errstate(over="ignore", invalid="ignore"):  # for values near the largest float32
             return cls.restore(built, geometry, attributes, device, threads, units=Units(header["triangle"], header["box"]))
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         if isinstance(error, InputError):
             raise error.at(path) from error
-        raise InputError(f"is no structure of this version ({type(error).__name__}: {error})", path=path) from error
+        raise InputError(f"is not a structure of this version of wrt ({type(error).__name__}: {error})", path=path) from error
 
 
 def read_arrays(cls: type[Any], header: JsonObject, body: memoryview) -> Built:
@@ -100,26 +100,26 @@ def read_arrays(cls: type[Any], header: JsonObject, body: memoryview) -> Built:
 
 
 def check_order(order: np.ndarray, count: int, name: str) -> None:
-    """Raise InputError unless `order` has all primitives 0 .. count - 1 and no others."""
+    """Raise InputError unless `order` contains exactly the prim_ids 0 .. count - 1, each at least once."""
     within = order.min(initial=0) >= 0 and order.max(initial=-1) < count
     if not (within and np.bincount(order, minlength=count).all()):
-        raise InputError(f"is no {name} over this geometry: its primitives are not in it, or not all of them")
+        raise InputError(f"is not a {name} over this geometry: its prim_ids are not those of the geometry")
 
 
 def check_binary(nodes: np.ndarray, n_primitives: int, max_depth: int) -> None:
-    """Raise InputError unless Bvh2Node records are a tree with root 0 over n primitives, no deeper than `max_depth`."""
+    """Raise InputError unless Bvh2Node records are a tree with root 0 over `n_primitives`, no deeper than `max_depth`."""
     check_links(nodes, [(nodes["lo_" + side] == np.inf).all(axis=1) & (nodes["hi_" + side] == -np.inf).all(axis=1)
                         for side in ("0", "1")], n_primitives, max_depth)
 
 
 def check_links(nodes: np.ndarray, empties: list[np.ndarray], n_primitives: int, max_depth: int) -> None:
-    """Check the links of a binary tree, as check_binary. empties: which of the two children do not exist, (N,) bool each."""
+    """Check the links of a binary tree, as check_binary. empties: for each side, mask (N,) of the nodes without that child."""
     inner_of = []
     for side, empty in zip(("0", "1"), empties, strict=True):
         first, count = nodes["first_" + side].astype(np.int64), nodes["count_" + side].astype(np.int64)
         leaf = count > 0
         if (empty & ((first != 0) | leaf)).any():  # kernels read `first` and `count`, not the box
-            raise InputError("is damaged: a child that does not exist leads somewhere")
+            raise InputError("is damaged: a child that does not exist has a link")
         if (count < 0).any() or (leaf & ((first < 0) | (first + count > n_primitives))).any():
             raise InputError("is damaged: a node leads out of the tree")
         inner_of.append(np.flatnonzero(~leaf & ~empty))
@@ -128,9 +128,9 @@ def check_links(nodes: np.ndarray, empties: list[np.ndarray], n_primitives: int,
 
 
 def check_tree(n: int, parent: np.ndarray, child: np.ndarray, max_depth: int) -> None:
-    """Raise InputError unless n nodes are a tree with root 0 and at most max_depth levels below it.
+    """Raise InputError unless n nodes form a tree with root 0 and at most max_depth levels below the root.
 
-    Each child must come after its parent, so that there are no cycles.
+    parent, child: the two nodes of each link. A child must come after its parent, so that there are no cycles.
     """
     sound = n > 0 and bool((child > parent).all()) and np.array_equal(np.sort(child), np.arange(1, n))
     if sound:
@@ -141,4 +141,4 @@ def check_tree(n: int, parent: np.ndarray, child: np.ndarray, max_depth: int) ->
             at = at[at > 0]
         sound = not len(at)
     if not sound:
-        raise InputError(f"is damaged: its nodes are no tree of at most {max_depth} levels below the root")
+        raise InputError(f"is damaged: its nodes do not form a tree with at most {max_depth} levels below the root")

@@ -1,4 +1,4 @@
-"""A class of structures with its intersection tests: the key of a kernel."""
+"""Class of a structure with its intersection tests: the key by which kernels are cached."""
 
 from __future__ import annotations
 
@@ -37,31 +37,31 @@ def _types_of(options: type[Any]) -> dict[str, Any]:
     return get_type_hints(options)
 
 
-def options_of(name: str, options: type[T], given: dict[str, object]) -> T:
-    """Make the options of a structure. Raises InputError for unknown options, other types and values out of range."""
+def options_of(name: str, options: type[T], values: dict[str, object]) -> T:
+    """Make the options of a structure. Raises InputError for unknown options, wrong types and values out of range."""
     known, types = {field.name: field for field in fields(options)}, _types_of(options)  # type: ignore[arg-type]
-    for option, value in given.items():
+    for option, value in values.items():
         if option not in known:
             names = [*known, "triangle", "box"]
             raise InputError(f"is no option of {name}",
                              argument=option, hint=f"{did_you_mean(option, names)}there is {', '.join(names)}")
         if not accepts(types[option], value):
             raise InputError(f"must be {known[option].type}, got {value!r}", argument=option)
-    return options(**given)
+    return options(**values)
 
 
 def default_options(name: str) -> dict[str, object]:
-    """Return the options of the structure of that name with their defaults."""
+    """Return the default value of each option of the structure called `name`."""
     return {field.name: field.default for field in fields(ACCELERATORS[name].options)}
 
 
 class Structure(NamedTuple):
-    """A class of structures and its units, from which kernels are made. Hashable.
+    """Class and intersection tests (units) of a structure, from which kernels are made. Hashable.
 
-    With Units.instances it is a tree over structures of this class (wrt.accel.instances).
+    With Units.instances, the structure is a tree over structures of this class (wrt.accel.instances).
     """
 
-    accel: type[Any]  # a subclass of wrt.accel.base.OneMesh, which stands above
+    accel: type[Any]  # a subclass of wrt.accel.base.OneMesh, a module that imports this one
     units: Units = Units()
 
     @property
@@ -71,16 +71,16 @@ class Structure(NamedTuple):
 
     @property
     def bottom(self) -> WarpType:
-        """Warp struct of one structure, also below instances."""
+        """Warp struct of a structure over one mesh; with instances, of the lower level."""
         return struct_of(self._replace(units=self.units._replace(instances=False)))
 
     def require_one_mesh(self, message: str) -> None:
-        """Raise InputError with that message if there are instances or spheres."""
+        """Raise InputError with `message` if the structure has instances or spheres."""
         if self.units.instances or self.units.spheres:
             raise InputError(message, argument="accel")
 
     def traversal(self, *, any_hit: bool, accepts: DeviceFunction | None = None) -> DeviceFunction:
-        """Make the traversal, a Warp function (accel, surfaces, ray) -> Hit."""
+        """Make the traversal, a Warp function (accel, surfaces, ray) -> Hit. accepts: Warp function that can reject hits."""
         traverse = self.accel.kernels.make_traversal(self.units, any_hit, accepts)
         if self.units.instances:
             return traverse_instances.make_traversal(self.units, any_hit, traverse, self.bottom)

@@ -12,7 +12,7 @@ FIELDS = ("name", "kernels", "options")  # class fields without a default in wrt
 
 
 class Structures(Registry[type[Any]]):
-    """Name -> class of structures over one mesh. Raises InputError that names a class field which is missing."""
+    """Registry of structures over one mesh: name -> class. Raises InputError if a class lacks a field of FIELDS."""
 
     def __getitem__(self, name: str) -> type[Any]:
         kind = super().__getitem__(name)
@@ -39,5 +39,5 @@ ACCELERATORS = Structures("structure", {
 
 
 def stack_on(device: str) -> str:
-    """Return the place of the stacks of kernels for a device, from kernels.traverse.stack.PLACES."""
-    return "local" if device == "cpu" else cuda.stack  # a CPU's threads have no other
+    """Return where kernels on a device have their traversal stacks: a name in kernels.traverse.stack.PLACES."""
+    return "local" if device == "cpu" else cuda.stack  # a CPU has no other place

@@ -37,17 +37,17 @@ class HitTensors(NamedTuple, Generic[ArrayT]):
 
 
 def hits_of(accel: OneMesh, vertices: ArrayLike | None, rays: tuple[Any, ...], rebuild_at: float) -> Hits[Any]:
-    """Refit the structure if the vertices are new, and ask closest_hit(*rays). Raises InputError that names the argument."""
+    """Refit the structure if `vertices` differ from its own; return closest_hit(*rays). Raises InputError that names the argument."""
     snapshot_of(accel)
     if vertices is not None:
-        now, followed = to_numpy(vertices), accel.geometry.vertices
-        if np.may_share_memory(now, followed) or not np.array_equal(float32(now), followed):  # shared: perhaps written to
+        new, old = to_numpy(vertices), accel.geometry.vertices
+        if np.may_share_memory(new, old) or not np.array_equal(float32(new), old):  # the caller may have modified shared memory
             accel.refit(vertices, rebuild_at)
     return accel.closest_hit(*rays)
 
 
 def library(name: str, module: str = "") -> ModuleType:
-    """Import an optional library. Raises InputError that says how to install it."""
+    """Import an optional library. If it is missing, raise InputError that says how to install it."""
     try:
         return importlib.import_module(module or name)
     except ImportError as error:

@@ -21,9 +21,9 @@ from wrt.kernels.units.box import PAD_COORDINATE
 
 ROUNDOFF = 2.0**-24
 SLACK = 32.0 * ROUNDOFF  # see kernels.traverse.instances.enter
-BOXES = 1 << 22  # box transforms for the boxes of all instances
-MOVED_BOXES = 1 << 18  # for moved instances, which get slightly larger boxes in less time
-MATRICES = 1 << 17  # box transforms at a time
+BOXES = 1 << 22  # primitives' boxes to transform in a build, summed over all instances
+MOVED_BOXES = 1 << 18  # the same in a move, where fewer boxes give slightly larger boxes of instances in less time
+MATRICES = 1 << 17  # boxes to transform at a time
 
 Boxes = tuple[np.ndarray, np.ndarray]  # centers and halves, (G, 3) float64 each
 
@@ -32,9 +32,9 @@ Boxes = tuple[np.ndarray, np.ndarray]  # centers and halves, (G, 3) float64 each
 class TopLevel:
     """Trees over instances.
 
-    nodes: (N,) Bvh2Node records, each world's tree with its root first. roots: (W,) their rows. parents: (N,) int32, -1 for a root.
-    order: (I,) int32, instance of each leaf. depth: of the deepest tree. low, high: (I, 3) float32, boxes of the instances. spread:
-    (I,), see `spread_of`. placements: (I,) records in the order of the leaves.
+    nodes: (N,) Bvh2Node records, one tree per world, each with its root first. roots: (W,) rows of the roots. parents: (N,) int32,
+    -1 for a root. order: (I,) int32, instance of each leaf. depth: depth of the deepest tree. low, high: (I, 3) float32, boxes of
+    the instances. spread: (I,), see `spread_of`. placements: (I,) records in the order of the leaves.
     """
 
     nodes: np.ndarray
@@ -48,17 +48,13 @@ class TopLevel:
     placements: np.ndarray
 
     @property
-    def leaves(self) -> int:
-        return len(self.order)
-
-    @property
     def slack(self) -> float:
-        """Fraction of the distance by which boxes are widened (kernels.traverse.instances.enter)."""
+        """Widening of boxes, as a fraction of the ray's distance (kernels.traverse.instances.enter)."""
         return float(np.float32(SLACK * self.spread.max(initial=1.0)))
 
     @property
     def cost(self) -> float:
-        """Sum of the surfaces of all boxes, each divided by that of its tree's root."""
+        """Sum of the surface areas of all boxes, each divided by the area of its tree's root."""
         areas = np.stack([half_areas(self.nodes["lo_" + side], self.nodes["hi_" + side]) for side in "01"])
         of_root = [end(self.nodes[name + "_0"], self.nodes[name + "_1"])[self.roots]
                    for name, end in (("lo", np.minimum), ("hi", np.maximum))]
@@ -77,9 +73,9 @@ def build_top(geometry: InstancedGeometry, low: np.ndarray, high: np.ndarray) ->
 
 
 def split_worlds(low: np.ndarray, high: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-    """Build a tree by binned SAH over the boxes [first[w], first[w + 1]) of each world: nodes, order, roots, depth."""
+    """Build a tree by binned SAH over the boxes [first[w], first[w + 1]) of each world; return nodes, order, roots, depth."""
     cpu, count, n = start("cpu"), np.diff(first), len(low)
-    # A tree takes as many slots as it has boxes, at least one.
+    # A tree has as many slots for nodes as it has boxes, at least one.
     slot = np.cumsum([0, *np.maximum(count, 1)])
     nodes = records(Bvh2Node, int(slot[-1]))
     used = np.zeros(len(nodes), np.uint8)
@@ -101,14 +97,14 @@ def split_worlds(low: np.ndarray, high: np.ndarray, first: np.ndarray) -> tuple[
 
 
 def write_placements(top: TopLevel, geometry: InstancedGeometry, rows: np.ndarray) -> TopLevel:
-    """Return the trees with new placements and spreads of some instances."""
+    """Return the trees with placements and spreads of the instances `rows` computed from `geometry`."""
     place = np.empty(len(top.order), np.int64)
     place[top.order] = np.arange(len(top.order))
     placements, spread = top.placements.copy(), top.spread.copy()
     to_local = inverse_of(geometry.to_world[rows])
     spread[rows] = spread_of(geometry.to_world[rows], to_local)
     out = placements[place[rows]]
-    out["bottom"], out["first_prim"] = geometry.part[rows], geometry.numbers[rows]
+    out["bottom"], out["first_prim"] = geometry.part[rows], geometry.first_prim_in_world[rows]
     out["local_x"], out["local_y"], out["local_z"] = to_local[:, 0], to_local[:, 1], to_local[:, 2]
     placements[place[rows]] = out
     return replace(top, placements=placements, spread=spread)
@@ -136,9 +132,9 @@ def refit_top(top: TopLevel, geometry: InstancedGeometry, rows: np.ndarray, low:
 
 
 def world_boxes(geometry: InstancedGeometry, rows: np.ndarray, boxes: list[Boxes]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the box of each instance around the transformed boxes of its primitives: low and high (R, 3) float32.
+    """Return a box of each instance in `rows` around the transformed boxes of its primitives: low and high (R, 3) float32.
 
-    A box around the transformed mesh is not enough: a hit has a t in the box of its primitive, which may stick out of the mesh.
+    A box around the transformed mesh is not enough: t of a hit lies in the padded box of its primitive, which extends beyond the mesh.
     """
     lo, hi = np.full((len(rows), 3), np.inf, np.float32), np.full((len(rows), 3), -np.inf, np.float32)
     for index, (center, half) in enumerate(boxes):
@@ -152,9 +148,9 @@ def world_boxes(geometry: InstancedGeometry, rows: np.ndarray, boxes: list[Boxes
 
 
 def part_boxes(geometry: InstancedGeometry, orders: list[np.ndarray], most: int) -> list[Boxes]:
-    """Return boxes around groups of each part's primitives: about `most` for all instances together, at least 8 each.
+    """Return boxes around groups of each part's primitives: about `most` boxes over all instances, at least 8 per part.
 
-    orders: order of each part's primitives in which neighbours are near.
+    orders: prim_ids of each part, in an order that puts near primitives next to each other.
     """
     groups = max(most // max(len(geometry.part), 1), 8)
     corners = [grouped_boxes(part, order, groups) for part, order in zip(geometry.parts, orders, strict=True)]
@@ -162,7 +158,7 @@ def part_boxes(geometry: InstancedGeometry, orders: list[np.ndarray], most: int)
 
 
 def grouped_boxes(geometry: Geometry, order: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return about `groups` boxes that hold all primitives' boxes: low and high (G, 3) float64. order: see `part_boxes`."""
+    """Return about `groups` boxes that contain the boxes of all primitives: low and high (G, 3) float64. order: see `part_boxes`."""
     low, high = (corner.astype(np.float64) for corner in geometry.bounds())
     if len(low) <= groups:
         return low, high

@@ -1,4 +1,4 @@
-"""Records of triangle tests from corners: LAYOUTS, by the names in kernels.units.triangle.RAY_TRIANGLE."""
+"""Records of triangle tests, computed from corners. LAYOUTS has a function for each layout in kernels.units.triangle.RAY_TRIANGLE."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from wrt.scene.clean import corners_have_area
 def corners(record: np.ndarray, v0: np.ndarray, v1: np.ndarray, v2: np.ndarray) -> None:
     """Write the corners. A triangle without area gets NaN for v0, so that no ray hits it.
 
-    Collinearity is decided exactly here, once for every ray; float64 could not decide it in a query.
+    Collinearity is decided here in exact arithmetic, because a query in float64 could not decide it.
     """
     record["v0"], record["v1"], record["v2"] = v0, v1, v2
     record["v0"][~corners_have_area(v0, v1, v2)] = np.nan
@@ -40,8 +40,5 @@ def transform(record: np.ndarray, v0: np.ndarray, v1: np.ndarray, v2: np.ndarray
             record[name] = np.where(np.isfinite(row).all(axis=1, keepdims=True), row, np.float32(0.0))
 
 
-LAYOUTS: dict[str, Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], None]] = {
-    "corners": corners,
-    "edges": edges,
-    "transform": transform,
-}
+Layout = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], None]
+LAYOUTS: dict[str, Layout] = {"corners": corners, "edges": edges, "transform": transform}

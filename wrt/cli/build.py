@@ -1,4 +1,4 @@
-"""The command `build`, which saves a structure."""
+"""The command `build`, which saves an acceleration structure."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from pathlib import Path
 
 import click
 
-from wrt.cli.common import Given, Setting, now_and_then, say, say_json, shared, values_of, warnings_reported
+from wrt.cli.common import Assignments, Setting, progress_writer, say, say_json, shared, values_of, warnings_reported
 from wrt.core.errors import InputError
 from wrt.io.meshes import SUFFIXES
 
 
-@click.command(help=f"Build a structure over MESH ({SUFFIXES}) once, and write it to a file for wrt.load_accel.")
+@click.command(help=f"Build an acceleration structure over MESH ({SUFFIXES}) and save it to a file, which wrt.load_accel reads.")
 @click.argument("mesh", type=click.Path(path_type=Path))
-@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="File to write: .accel")
-@click.option("--set", "given", type=Setting(), multiple=True, help="An option of the structure, such as max_leaf=8; repeatable")
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="File to write, with the suffix .accel")
+@click.option("--set", "assignments", type=Setting(), multiple=True, help="An option of the structure, such as max_leaf=8; repeatable")
 @shared("accel", "threads", "quiet", "as_json")
-def build(mesh: Path, output: Path, accel: str, given: Given, threads: int | None, quiet: bool,
+def build(mesh: Path, output: Path, accel: str, assignments: Assignments, threads: int | None, quiet: bool,
           as_json: bool) -> None:
     from dataclasses import asdict
 
@@ -26,10 +26,10 @@ def build(mesh: Path, output: Path, accel: str, given: Given, threads: int | Non
     from wrt.accel.store import check_target
 
     check_target(output)
-    options = values_of(given, mesh="MESH", accel="--accel", device="the CPU", threads="--threads", progress="-q")
+    options = values_of(assignments, mesh="MESH", accel="--accel", device="the CPU", threads="--threads", progress="-q")
     if reports_progress(accel):
-        tell = now_and_then(quiet)
-        options["progress"] = lambda done: tell(f"{accel}: {100.0 * done:.0f} % built")
+        write = progress_writer(quiet)
+        options["progress"] = lambda done: write(f"{accel}: {100.0 * done:.0f} % built")
     with warnings_reported(quiet):
         structure = wrt.build(mesh, accel, threads=threads, **options)
     if isinstance(structure, Instances):

@@ -1,4 +1,4 @@
-"""The table of commands with the place of each, which is imported when it is called or listed by --help."""
+"""The table of commands: name, and "module:function", which is imported when the command runs or --help lists it."""
 
 from __future__ import annotations
 

@@ -30,13 +30,13 @@ if TYPE_CHECKING:
 
 Decorator: TypeAlias = Callable[[Callable[..., None]], Callable[..., None]]
 Parsed: TypeAlias = Any  # The value of an option, which click has converted to the option's type.
-Given: TypeAlias = tuple[tuple[str, bool | int | float | str], ...]  # The values of --set by name.
-DIGITS = "[0-9]{1,9}"  # More are no pixel, and Python refuses to read thousands.
-VISIBLE = 0.003  # Share of the pixels: a patch of 26x26 in a picture of 640x360. Fewer look like noise.
+Assignments: TypeAlias = tuple[tuple[str, bool | int | float | str], ...]  # The names and values of all --set options.
+DIGITS = "[0-9]{1,9}"  # A pixel coordinate. Longer numbers are an error, as Python refuses thousands of digits.
+HINT_SHARE = 0.003  # Smallest share of dark pixels for a hint: 26x26 pixels of 640x360. Fewer look like noise.
 
 
-class Written(click.ParamType):
-    """A value that a pattern describes. form: the form in words; value: makes the value of the pattern's groups."""
+class PatternType(click.ParamType):
+    """Text that matches a pattern. form: the pattern in words, for errors; value: converts the pattern's groups to the value."""
 
     def __init__(self, name: str, pattern: str, form: str, value: Callable[..., object]) -> None:
         self.name, self.pattern, self.form, self.value = name, pattern, form, value
@@ -48,11 +48,11 @@ class Written(click.ParamType):
         return self.value(*match.groups())
 
 
-SIZE = Written("WxH", f"({DIGITS})[xX]({DIGITS})", "a size; write 640x360", lambda *sides: tuple(map(int, sides)))
-CROP = Written("X0,Y0,X1,Y1", ",".join([rf"\s*({DIGITS})\s*"] * 4),
-               "a rectangle; write X0,Y0,X1,Y1 in pixels from the top left", lambda *ends: tuple(map(int, ends)))
-DURATION = Written("TIME", r"([0-9]+(?:\.[0-9]*)?)\s*([smh]?)", "a time; write 30s, 5m or 1h",
-                   lambda number, unit: float(number) * {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0}[unit])
+SIZE = PatternType("WxH", f"({DIGITS})[xX]({DIGITS})", "a size; write 640x360", lambda *sides: tuple(map(int, sides)))
+CROP = PatternType("X0,Y0,X1,Y1", ",".join([rf"\s*({DIGITS})\s*"] * 4),
+                   "a rectangle; write X0,Y0,X1,Y1 in pixels from the top left", lambda *ends: tuple(map(int, ends)))
+DURATION = PatternType("TIME", r"([0-9]+(?:\.[0-9]*)?)\s*([smh]?)", "a time; write 30s, 5m or 1h",
+                       lambda number, unit: float(number) * {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0}[unit])
 
 
 class Names(click.ParamType):
@@ -67,7 +67,7 @@ class Names(click.ParamType):
 
 
 class Commands(click.Group):
-    """A group that suggests a similar option, compared without dashes. click compares the dashes too, which are always alike."""
+    """A group of commands that suggests a similar option for an unknown one. The dashes, common to all, are not compared."""
 
     def invoke(self, ctx: click.Context) -> object:
         try:
@@ -82,9 +82,9 @@ class Commands(click.Group):
 
 
 class OneOf(click.ParamType):
-    """A name of a table, given as "module:TABLE". This type only lists the names for --help and completion.
+    """A name in a table. place: the table as "module:TABLE". This type only lists the names, for --help and completion.
 
-    The function that gets the option checks it against the table and suggests a similar name."""
+    The function that receives the name checks it, and suggests a similar name."""
 
     name = "NAME"
 
@@ -92,7 +92,7 @@ class OneOf(click.ParamType):
         self.place = place
 
     def names(self) -> list[str]:
-        """Return the names of the table, whose module is imported now."""
+        """Import the table's module and return the table's names."""
         module, table = self.place.split(":")
         return list(getattr(importlib.import_module(module), table))
 
@@ -109,7 +109,7 @@ ACCEL = OneOf("wrt.accel.structures:ACCELERATORS")
 
 
 class Setting(click.ParamType):
-    """NAME=VALUE; the value is a number, True, False or a word."""
+    """NAME=VALUE, where VALUE is a number, True, False or text."""
 
     name = "NAME=VALUE"
 
@@ -121,35 +121,32 @@ class Setting(click.ParamType):
             parsed = ast.literal_eval(text)
         except (ValueError, SyntaxError, MemoryError, RecursionError):
             parsed = text
-        return name, parsed if isinstance(parsed, bool | int | float | str) and name != "size" else text  # 0x360 is no number
+        return name, parsed if isinstance(parsed, bool | int | float | str) and name != "size" else text  # "0x360" is a size
 
 
-SET = click.option(
-    "--set", "given", type=Setting(), multiple=True,
-    help="A setting of the scene, such as glass_shadows=tinted; repeatable. There is size, spp, max_depth, min_throughput, filter,"
-         " fresnel, glass_shadows, sampler, exposure and tonemap (docs/scene_format.md)")
-
-
-# Options and arguments of several commands, by the names of the functions' parameters.
+# Options and arguments that several commands share, by the name of the command function's parameter.
 SHARED = {
     "scene": click.argument("scene", type=click.Path(path_type=Path)),
-    "spp": click.option("--spp", type=int, help="Samples a pixel  [default: the scene's]"),
-    "size": click.option("--size", type=SIZE, help="Pixels  [default: the scene's, 640x360]"),
-    "max_depth": click.option("--max-depth", type=int, help="Bounces after the first hit  [default: the scene's; 8, glass 64]"),
+    "spp": click.option("--spp", type=int, help="Samples per pixel  [default: the scene's]"),
+    "size": click.option("--size", type=SIZE, help="Width and height in pixels  [default: the scene's, or 640x360]"),
+    "max_depth": click.option("--max-depth", type=int, help="Bounces after the first hit  [default: the scene's, or 8; 64 with glass]"),
     "crop": click.option("--crop", type=CROP, help="Render only this rectangle, in pixels from the top left"),
-    "camera": click.option("--camera", help="A camera's name or number  [default: the first]"),
-    "given": SET,
-    "seed": click.option("--seed", type=int, default=0, show_default=True, help="Another seed, another noise"),
-    "device": click.option("--device", default="cpu", show_default=True, help="cpu, cuda:0, ... (see `devices`)"),
+    "camera": click.option("--camera", help="Name or index of a camera in the scene  [default: the first]"),
+    "assignments": click.option(
+        "--set", "assignments", type=Setting(), multiple=True,
+        help="Change a setting of the scene, such as glass_shadows=tinted; repeatable. The settings are size, spp, max_depth,"
+             " min_throughput, filter, fresnel, glass_shadows, sampler, exposure and tonemap (docs/scene_format.md)"),
+    "seed": click.option("--seed", type=int, default=0, show_default=True, help="Seed of the samples: another seed gives other noise"),
+    "device": click.option("--device", default="cpu", show_default=True, help="cpu, cuda:0 ... (`devices` lists them)"),
     "threads": click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]"),
     "accel": click.option("--accel", type=ACCEL, default="bvh", show_default=True, help="Acceleration structure"),
-    "quiet": click.option("-q", "--quiet", is_flag=True, help="No progress, no warnings"),
-    "as_json": click.option("--json", "as_json", is_flag=True, help="Print as JSON"),
+    "quiet": click.option("-q", "--quiet", is_flag=True, help="Print no progress and no warnings"),
+    "as_json": click.option("--json", "as_json", is_flag=True, help="Print the result as JSON"),
 }
 
 
 def shared(*names: str) -> Decorator:
-    """Give a command these options of SHARED."""
+    """Return a decorator that adds entries of SHARED to a command."""
     return lambda command: functools.reduce(lambda wrapped, name: SHARED[name](wrapped), reversed(names), command)
 
 
@@ -158,18 +155,18 @@ def names_of(kind: type) -> list[str]:
     return [each.name for each in dataclasses.fields(kind)]
 
 
-def gathering(name: str, make: Callable[..., object], names: Sequence[str], options: Sequence[Decorator]) -> Decorator:
-    """Give a command these options, whose values it gets as one argument `name`, made by `make`.
+def option_group(name: str, make: Callable[..., object], names: Sequence[str], options: Sequence[Decorator]) -> Decorator:
+    """Return a decorator that adds `options` to a command, and passes `make(**values)` to it as the argument `name`.
 
-    names: the parameters for `make`; names without an option are left out."""
+    names: the parameters of `make`; a parameter without an option keeps its default."""
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(command)
-        def gathered(**given: Parsed) -> None:
-            own = {each: given.pop(each) for each in names if each in given}
-            command(**given, **{name: make(**own)})
+        def with_group(**values: Parsed) -> None:
+            group = {each: values.pop(each) for each in names if each in values}
+            command(**values, **{name: make(**group)})
 
-        wrapped: Callable[..., None] = gathered
+        wrapped: Callable[..., None] = with_group
         for option in options:
             wrapped = option(wrapped)
         return wrapped
@@ -177,62 +174,61 @@ def gathering(name: str, make: Callable[..., object], names: Sequence[str], opti
     return decorate
 
 
-def values_of(given: Given, **elsewhere: str) -> dict[str, Parsed]:
-    """Return the values of --set by name. Raises InputError for a name that is given twice with different values.
+def values_of(assignments: Assignments, **reserved: str) -> dict[str, Parsed]:
+    """Return the values of --set by name. Raises InputError for a name with two different values.
 
-    elsewhere: names that this command does not take from --set, each with the option that decides on it; InputError for them."""
+    reserved: names that this command refuses in --set, each with the option that decides on the value instead."""
     values: dict[str, Parsed] = {}
-    for name, value in given:
-        if name in elsewhere:
-            raise InputError(f"{elsewhere[name]} decides on that here", argument=f"--set {name}")
+    for name, value in assignments:
+        if name in reserved:
+            raise InputError("cannot be used with this command", argument=f"--set {name}", hint=f"{reserved[name]} decides on the value")
         if name in values and values[name] != value:
-            raise InputError(f"given twice, {values[name]!r} and {value!r}", argument=f"--set {name}")
+            raise InputError(f"has two values, {values[name]!r} and {value!r}", argument=f"--set {name}", hint="give one")
         values[name] = value
     return values
 
 
-def settings_of(given: Given, flags: Mapping[str, Parsed] | None = None, **elsewhere: str) -> SettingChanges:
-    """Return the scene's settings of --set, checked like those of a file, and of `flags`, the options of their own (None: not given).
+def settings_of(assignments: Assignments, flags: Mapping[str, Parsed] | None = None, **reserved: str) -> SettingChanges:
+    """Return the scene's settings from --set, and from `flags`: options such as --spp, by the setting's name (None: absent).
 
-    elsewhere: see values_of. Raises InputError for invalid settings, and for one that --set and a flag give differently."""
+    reserved: see values_of. Raises InputError for an invalid setting, and if --set and a flag differ."""
     from wrt.core.checks import as_size
     from wrt.io.toml.report import check_settings
 
     flags = {name: value for name, value in (flags or {}).items() if value is not None}
-    values = values_of(given, **elsewhere)
+    values = values_of(assignments, **reserved)
     if "size" in values:
         values["size"] = list(as_size(values["size"], "--set size"))
     settings = check_settings(values, "--set") if values else {}
     for name, value in flags.items():
         if name in settings and (tuple(settings[name]) if name == "size" else settings[name]) != value:
-            raise InputError(f"--{name.replace('_', '-')} is given too, and says otherwise: leave one of them out",
-                             argument=f"--set {name}")
+            raise InputError(f"and --{name.replace('_', '-')} have different values", argument=f"--set {name}", hint="give one of them")
     return cast("SettingChanges", {**flags, **settings})
 
 
 def depth_hint(visibly_cut: float, max_depth: int, option: str = "--max-depth") -> str | None:
-    """Return advice on max_depth, or None if too few pixels are visibly too dark. visibly_cut: their share, of Film.stats."""
+    """Return advice on max_depth, or None if few pixels are visibly too dark. visibly_cut: share of such pixels (Film.stats)."""
     from wrt.scene.settings import MAX_DEPTH
 
-    if visibly_cut < VISIBLE:
+    if visibly_cut < HINT_SHARE:
         return None
-    advice = f"raise {option}" if max_depth < MAX_DEPTH else f"{MAX_DEPTH} is the most there is"
+    advice = f"raise {option}" if max_depth < MAX_DEPTH else f"{MAX_DEPTH} is the maximum"
     return f"max_depth {max_depth} leaves {100.0 * visibly_cut:.2g}% of the pixels visibly too dark: {advice}"
 
 
-def spread_options(cluster: str | None, device: str) -> dict[str, Parsed]:
-    """Return the options of `wrt.render` for --cluster and --device. A cluster's connection is open until the command ends."""
+def device_options(cluster: str | None, device: str) -> dict[str, Parsed]:
+    """Return the options of `wrt.render` for --cluster and --device."""
     names = [name.strip() for name in device.split(",")]
     if cluster is None:
         return {"device": device} if len(names) == 1 else {"devices": names}
     if len(names) > 1:
-        raise InputError("with --cluster it is that of each worker, and one; start a worker for each device",
-                         argument="--device")
+        raise InputError("must be one device with --cluster, the device of each worker", argument="--device",
+                         hint="start a worker for each device")
     return {"device": device, "executor": client_of(cluster)}
 
 
 def client_of(cluster: str | None) -> Client | None:
-    """Return a Dask client that is open until the command ends; None for None."""
+    """Return a Dask client, which stays connected until the command ends; None without a cluster."""
     if cluster is None:
         return None
     from wrt.renderer.distributed.dask import connected
@@ -241,11 +237,11 @@ def client_of(cluster: str | None) -> Client | None:
 
 
 CLUSTER = click.option("--cluster", metavar="ADDRESS",
-                       help="Spread over the workers of a Dask scheduler, tcp://host:8786 (docs/cluster.md)")
+                       help="Share the work among the workers of a Dask scheduler, tcp://host:8786 (docs/cluster.md)")
 
 
 def load(path: Path, quiet: bool) -> Scene:
-    """Read a scene, with the loader's warnings on stderr."""
+    """Read a scene, and write the loader's warnings to stderr."""
     from wrt.io.load import load_scene
 
     with warnings_reported(quiet):
@@ -254,7 +250,7 @@ def load(path: Path, quiet: bool) -> Scene:
 
 @contextlib.contextmanager
 def warnings_reported(quiet: bool) -> Iterator[None]:
-    """Write the block's warnings to stderr at its end, a line each; none if it fails, since one message is enough."""
+    """Write the block's warnings to stderr when it ends, one per line; no warnings if it fails, since its error is enough."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", SceneWarning)
         yield
@@ -265,7 +261,7 @@ def warnings_reported(quiet: bool) -> Iterator[None]:
 
 @contextlib.contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Add the scene's file to errors that are found after it was read, unless they name a file."""
+    """Add the scene's path to an InputError of the block that has no path, since it was raised after reading."""
     try:
         yield
     except InputError as error:
@@ -275,7 +271,7 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def json_text(value: object) -> str:
-    """Return a value as JSON. NaN and infinity become null, and values without a form in JSON become text."""
+    """Return a value as JSON. NaN and infinity become null; values that JSON cannot express become text."""
 
     def plain(value: object) -> object:
         if isinstance(value, dict):
@@ -293,18 +289,20 @@ def say_json(value: object) -> None:
 
 
 def say(text: object, err: bool = True) -> None:
-    """Write a line to stderr, without an error if the terminal is gone, or to stdout. Control characters, of files, are escaped."""
+    """Write a line to stderr (err=False: stdout), with control characters escaped. A closed stderr is no error."""
     text = re.sub(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]", lambda control: f"\\x{ord(control[0]):02x}", str(text))
     with contextlib.suppress(OSError) if err else contextlib.nullcontext():
         click.echo(text, err=err)
 
 
-def now_and_then(quiet: bool, every: float = 10.0) -> Callable[[str], None]:
-    """Return a function that writes lines of progress: on a terminal over the last one, else once in `every` seconds."""
+def progress_writer(quiet: bool, every: float = 10.0) -> Callable[[str], None]:
+    """Return a function that writes a line of progress to stderr.
+
+    On a terminal, each line replaces the last one; elsewhere, at most one line is written in `every` seconds."""
     terminal = sys.stderr is not None and sys.stderr.isatty()
     due = time.monotonic()
 
-    def tell(line: str) -> None:
+    def write(line: str) -> None:
         nonlocal due
         if terminal:
             with contextlib.suppress(OSError):
@@ -313,4 +311,4 @@ def now_and_then(quiet: bool, every: float = 10.0) -> Callable[[str], None]:
             due = time.monotonic() + every
             say(line)
 
-    return (lambda line: None) if quiet else tell
+    return (lambda line: None) if quiet else write

@@ -1,4 +1,4 @@
-"""The command `devices`, which lists devices, checks one against the CPU, or finds its fastest structure."""
+"""The command `devices`, which lists devices, compares a device with the CPU, or finds its fastest structure."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from wrt.core.errors import InputError
 
 @click.command()
 @click.option("--check", is_flag=True, help="Compare a device with the CPU, bit for bit, and measure its speed; exit code 1 if"
-                                            " a bit differs. Takes minutes, to compile all kernels")
-@click.option("--tune", "tunes", is_flag=True, help="Measure which structure is fastest on a device, and print what to write")
-@click.option("--device", help="To check or to tune: cuda:0, ...  [default: cuda:0]")
+                                            " a bit differs. Compiling all kernels takes minutes")
+@click.option("--tune", "tunes", is_flag=True, help="Find the fastest structure on a device, and print the options that select it")
+@click.option("--device", help="Device for --check or --tune: cuda:0 ...  [default: cuda:0]")
 @click.option("--scene", "scenes", type=click.Path(path_type=Path), multiple=True,
-              help="For --check, repeatable  [default: the scenes of wrt]")
-@click.option("--rays", type=int, help="For --check, of each kind for each mesh and structure  [default: 20000]")
+              help="Scene file for --check; repeatable  [default: the scenes of wrt]")
+@click.option("--rays", type=int, help="Number of rays for --check, per kind of ray, mesh and structure  [default: 20000]")
 @shared("quiet", "as_json")
 def devices(check: bool, tunes: bool, device: str | None, scenes: tuple[Path, ...], rays: int | None, quiet: bool,
             as_json: bool) -> None:
-    """List the devices that Warp can compute on, check one, or find its fastest structure."""
+    """List the devices that Warp can compute on, compare one with the CPU, or find its fastest structure."""
     from wrt.core.device import describe_devices
 
     if check and tunes:
-        raise InputError("and --tune are two commands", argument="--check", hint="give one")
+        raise InputError("and --tune exclude each other", argument="--check", hint="give one")
     if not check:
         if scenes or rays is not None or (device is not None and not tunes):
-            raise InputError("belong to --check, and --device to --tune", argument="--device, --scene and --rays")
+            raise InputError("need --check", argument="--device, --scene and --rays", hint="--device also works with --tune")
     if tunes:
         from wrt.lab.tune import measured
 

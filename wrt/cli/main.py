@@ -1,8 +1,8 @@
-"""The command line, which parses, calls and prints, and knows nothing of rendering.
+"""The command line: it parses arguments, calls wrt and prints results.
 
-stdout is for data, stderr for messages. Exit code 1 means that `compare` or `devices --check` found more difference than allowed, and 2 a
-user's mistake, with one message. After an interrupt it is 128 plus the signal's number: 130 for Ctrl-C, 143 for SIGTERM, 129 for SIGHUP.
-Slow imports are in the commands that need them.
+stdout is for data, stderr for messages. Exit code 1 means that `compare` or `devices --check` found more difference than allowed. 2 means
+a user's mistake, which one message describes. After an interrupt the exit code is 128 plus the signal's number: 130 for Ctrl-C, 143 for
+SIGTERM, 129 for SIGHUP. Each command function imports slow modules itself, so that --help is fast.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from wrt.cli.common import Commands, say
 from wrt.core.errors import InputError
 from wrt.core.interrupts import Interrupted, exit_code, raise_on_termination
 
-GARBAGE_AT = 500_000  # New objects until Python collects garbage; a start makes 300,000 that stay.
-# Texts of errors that mean lack of memory: no thread, no array of Warp, no room for a library.
+GC_THRESHOLD = 500_000  # New objects between two garbage collections. Starting wrt makes 300,000 objects, which stay.
+# Parts of error messages that mean lack of memory: for a thread, for an array of Warp, for a shared library.
 OUT_OF_MEMORY = ("can't start new thread", "Failed to allocate", "failed to map segment")
 
 
@@ -35,10 +35,10 @@ def cli() -> None:
 
 
 def main() -> None:
-    """Run the command line: one message for a user's mistake, and no traceback for Ctrl-C."""
-    gc.set_threshold(GARBAGE_AT)
+    """Run the command line. A user's mistake causes one message; Ctrl-C causes no traceback."""
+    gc.set_threshold(GC_THRESHOLD)
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")  # so that a name that stdout cannot encode is no error
+        sys.stdout.reconfigure(errors="backslashreplace")  # a name that stdout cannot encode is no error
     raise_on_termination()
     try:
         code = cli(standalone_mode=False)
@@ -48,10 +48,10 @@ def main() -> None:
     except click.ClickException as error:
         error.show()
         code = error.exit_code
-    except OSError as error:  # outside of wrt: a path too long for the system, stdout on a full disk
+    except OSError as error:  # for example a path too long for the system, or stdout on a full disk
         say(f"error: {error}")
         code = 2
-    except (click.Abort, KeyboardInterrupt) as error:  # click turns the second into the first
+    except (click.Abort, KeyboardInterrupt) as error:  # click raises Abort from KeyboardInterrupt
         cause = error.__cause__ if isinstance(error, click.Abort) else error
         code = exit_code(cause.number if isinstance(cause, Interrupted) else None)
         say("interrupted")
@@ -64,12 +64,12 @@ def main() -> None:
     except SystemExit as error:
         code = error.code
     if sys.getprofile() or sys.gettrace():
-        sys.exit(code)  # profilers write their result at the exit
+        sys.exit(code)  # a profiler writes its result at exit
     _leave(code if isinstance(code, int) else 1 if code else 0)
 
 
 def _leave(code: int) -> NoReturn:
-    """Exit without waiting for a thread that compiles, and without freeing objects one by one. Files are complete or do not exist."""
+    """Exit at once, without waiting for threads that compile and without freeing objects. No file is left half written."""
     if not code:
         atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from wrt.cli.common import SIZE, Commands, Given, Names, Parsed, client_of, load, naming, say, settings_of, shared, warnings_reported
+from wrt.cli.common import SIZE, Assignments, Commands, Names, Parsed, client_of, load, naming, say, settings_of, shared, warnings_reported
 from wrt.cli.reporting import Reporting, measured, planned, reporting
 from wrt.core.registry import Registry
 from wrt.lab import plans
@@ -19,11 +19,11 @@ BENCHES: Registry[click.Command] = Registry("bench", {}, "wrt.benches")
 
 
 @click.group(cls=Commands, commands=BENCHES, invoke_without_command=True, no_args_is_help=True)
-@click.option("--quick", is_flag=True, help="With a command: its own --quick. Without one: all commands that need no file, one after"
-                                            " another, in a minute on two cores")
+@click.option("--quick", is_flag=True, help="With a command: pass --quick to it. Without a command: run every command that needs no"
+                                            " file with --quick, in a minute on two cores")
 @click.pass_context
 def bench(context: click.Context, quick: bool) -> None:
-    """Measure: speed against error, and one method against another."""
+    """Measure the speed and the error of renders, and compare methods."""
     if not quick:
         return
     if context.invoked_subcommand is not None:
@@ -31,7 +31,7 @@ def bench(context: click.Context, quick: bool) -> None:
         return
     short = [name for name, command in bench.commands.items()
              if any(each.name == "quick" for each in command.params) and not any(each.required for each in command.params)]
-    say(f"left out: {', '.join(name for name in bench.commands if name not in short)}")
+    say(f"skipped, without --quick or in need of a file: {', '.join(name for name in bench.commands if name not in short)}")
     for name in short:
         command = bench.commands[name]
         with command.make_context(name, ["--quick"], parent=context) as each:
@@ -45,11 +45,11 @@ whatif = measured(plans.WhatIf)
 
 
 @bench.command()
-@click.option("--structures", type=Names(), default=("bvh", "bvh2"), show_default=True, help="Traversals to look at, by name")
+@click.option("--structures", type=Names(), default=("bvh", "bvh2"), show_default=True, help="Names of structures")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
 def instructions(structures: tuple[str, ...], as_json: bool) -> None:
-    """Show the units in machine code for Turing: instructions of each box and triangle test, and registers, stack and code of
-    traversals, also for Hopper."""
+    """Count the machine instructions of each box and triangle test on Turing GPUs, and show registers, stack and code size of
+    traversals on Turing and Hopper GPUs."""
     from wrt.accel.structures import ACCELERATORS
     from wrt.lab.bench.report import markdown
     from wrt.lab.rtcore import instructions as study
@@ -68,12 +68,12 @@ def instructions(structures: tuple[str, ...], as_json: bool) -> None:
 
 @click.command()
 @shared("scene", "size")
-@click.option("--spp", type=int, default=1, show_default=True, help="Samples a pixel")
-@shared("max_depth", "given", "crop", "camera", "accel", "seed", "threads")
-@click.option("--gpu", default="rtx2080ti", show_default=True, help="What the model reckons for: rtx2080ti or rtx2060")
+@click.option("--spp", type=int, default=1, show_default=True, help="Samples per pixel")
+@shared("max_depth", "assignments", "crop", "camera", "accel", "seed", "threads")
+@click.option("--gpu", default="rtx2080ti", show_default=True, help=plans.MODELLED)
 @reporting("Folder for heat maps, EXR layers, histograms and a report")
-def profile(how: Reporting, scene: Path, given: Given, gpu: str, **options: Parsed) -> None:
-    """Count the work of every ray of SCENE, by pixel, kind and depth, and model the RT core."""
+def profile(how: Reporting, scene: Path, assignments: Assignments, gpu: str, **options: Parsed) -> None:
+    """Count the work of every ray of SCENE by pixel, kind of ray and depth, and estimate its time on an RT core."""
     from wrt.core.checks import require_known
     from wrt.lab.rtcore import profile_report as report
     from wrt.lab.rtcore.parameters import GPUS
@@ -83,7 +83,7 @@ def profile(how: Reporting, scene: Path, given: Given, gpu: str, **options: Pars
     require_known(gpu, GPUS, "GPU", "gpu")
     if how.output is not None:
         report.check_folder(how.output)
-    settings = settings_of(given, {name: options.pop(name) for name in ("size", "max_depth")}, spp="--spp")
+    settings = settings_of(assignments, {name: options.pop(name) for name in ("size", "max_depth")}, spp="--spp")
     loaded = load(scene, how.quiet).with_settings(**settings)
     with warnings_reported(how.quiet), progress_reporter(how.quiet) as progress, naming(scene):
         found = measure(loaded, progress=progress, **options)
@@ -96,7 +96,7 @@ def profile(how: Reporting, scene: Path, given: Given, gpu: str, **options: Pars
 
 @click.command(help=Stability.__doc__)
 @planned(Stability)
-@reporting(cluster=True, quiet="No progress")
+@reporting(cluster=True, quiet="Print no progress")
 def stability(how: Reporting, plan: Stability) -> None:
     from wrt.lab.bench.report import cells
     from wrt.lab.hard_cases import report
@@ -110,7 +110,7 @@ def stability(how: Reporting, plan: Stability) -> None:
     client = client_of(how.cluster)
     if not how.as_json:
         say("  ".join(study.COLUMNS), err=False)
-    result = study.run(plan, row_done, how.now_and_then, client)
+    result = study.run(plan, row_done, how.progress_writer, client)
     how.write(report.text(result, plan))
     data = {"machine": report.machine(plan), **result.as_dict(), "output": how.output}
     how.end(f"\n{report.summary(result)}", data, interrupted=result.interrupted)
@@ -119,18 +119,18 @@ def stability(how: Reporting, plan: Stability) -> None:
 @bench.command()
 @shared("scene")
 @planned(Error)
-@click.option("--size", type=SIZE, default="128x72", show_default=True, help="Pixels")
-@shared("camera", "given", "seed", "device", "threads")
+@click.option("--size", type=SIZE, default="128x72", show_default=True, help="Width and height in pixels")
+@shared("camera", "assignments", "seed", "device", "threads")
 @reporting()
-def error(how: Reporting, plan: Error, scene: Path, given: Given, size: tuple[int, int],
+def error(how: Reporting, plan: Error, scene: Path, assignments: Assignments, size: tuple[int, int],
           **options: Parsed) -> None:
-    """Speed against error of SCENE over the knobs that a render has: each picture against a converged reference."""
+    """Render SCENE with various values of each option, and compare time and error of the pictures with a converged reference."""
     from wrt.lab.bench import error as study
     from wrt.lab.bench import error_report as report
     from wrt.renderer.options import Options
 
     rendering = Options(**options)
-    settings = settings_of(given, size="--size", spp="--max-spp")
+    settings = settings_of(assignments, size="--size", spp="--max-spp")
     how.check_markdown()
     loaded = load(scene, how.quiet).with_settings(**settings).with_settings(size=size)
     with warnings_reported(how.quiet), naming(scene):
@@ -143,30 +143,29 @@ def error(how: Reporting, plan: Error, scene: Path, given: Given, size: tuple[in
 @bench.command()
 @shared("scene")
 @planned(Mitsuba)
-@click.option("--size", type=SIZE, default="320x180", show_default=True, help="Pixels")
-@click.option("--matte", is_flag=True, help="Make every surface diffuse, for the integrator direct, which draws the same light")
-@shared("camera", "given")
+@click.option("--size", type=SIZE, default="320x180", show_default=True, help="Width and height in pixels")
+@click.option("--matte", is_flag=True, help="Make every surface diffuse, so that Mitsuba's integrator direct computes the same light")
+@shared("camera", "assignments")
 @reporting()
-def mitsuba(how: Reporting, plan: Mitsuba, scene: Path, given: Given, size: tuple[int, int], matte: bool,
+def mitsuba(how: Reporting, plan: Mitsuba, scene: Path, assignments: Assignments, size: tuple[int, int], matte: bool,
             camera: str | None) -> None:
-    """SCENE by wrt and by Mitsuba 3 (scalar_rgb and llvm_ad_rgb), on all threads: time to equal error, process start included and
-    excluded.
+    """Render SCENE with wrt and with Mitsuba 3 (scalar_rgb and llvm_ad_rgb) on all threads, and compare the times to equal error,
+    with and without the start of the process.
 
-    llvm_ad_rgb needs an LLVM library (19 works), named in the environment variable DRJIT_LIBLLVM_PATH.
-    """
+    llvm_ad_rgb needs an LLVM library (19 works), named in the environment variable DRJIT_LIBLLVM_PATH."""
     from wrt.lab.mitsuba import equal_error
     from wrt.renderer.options import Options
 
     if matte and plan.integrator == "auto":
         plan = replace(plan, integrator="direct")
     how.check_markdown()
-    settings = settings_of(given, size="--size", spp="--spp")
+    settings = settings_of(assignments, size="--size", spp="--spp")
     loaded = load(scene, how.quiet).with_settings(**settings).with_settings(size=size)
     with tempfile.TemporaryDirectory() as folder, warnings_reported(how.quiet), naming(scene):
         command = ["render", str(scene), "--spp", "1", "--size", f"{size[0]}x{size[1]}", "-q", "-o", f"{folder}/start.png"]
         command += [f"--set={name}={value}" for name, value in settings.items()]
         result = equal_error.run(equal_error.matte(loaded) if matte else loaded, plan, Options(camera=camera), command,
-                                 how.now_and_then)
+                                 how.progress_writer)
     text = equal_error.text(result)
     how.write(text)
     how.end(text, {**result.as_dict(), "output": how.output})

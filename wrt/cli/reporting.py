@@ -1,4 +1,4 @@
-"""Parts that the measuring commands share: options, progress, the report's file, and the final text or JSON."""
+"""Parts that the measuring commands share: options, progress, and the report as text, JSON and Markdown file."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from wrt.cli.common import (
     OneOf,
     Parsed,
     client_of,
-    gathering,
     names_of,
-    now_and_then,
+    option_group,
+    progress_writer,
     say,
     say_json,
     warnings_reported,
@@ -33,15 +33,15 @@ from wrt.core.interrupts import exit_code
 from wrt.core.write_file import check_writable, write_bytes
 from wrt.lab.plans import STRUCTURES, Plan
 
-# Types of options by the annotations of a plan's fields; all others are paths.
+# The type of an option, by the annotation of the plan's field. Any other annotation means a path.
 TYPES: dict[str, Any] = {"int": int, "int | None": int, "bool": bool, "str": str, "Sequence[str]": Names(), "float": DURATION}
 
 
 @dataclass(frozen=True)
 class Reporting:
-    """The options of a report."""
+    """Options of a report, and the functions that write it."""
 
-    output: Path | None = None  # file or folder of the report
+    output: Path | None = None  # file or folder to write, as the command defines
     cluster: str | None = None  # address of a Dask scheduler
     quiet: bool = False
     as_json: bool = False
@@ -51,15 +51,15 @@ class Reporting:
             say(line)
 
     @property
-    def now_and_then(self) -> Callable[[str], None]:
-        return now_and_then(self.quiet)
+    def progress_writer(self) -> Callable[[str], None]:
+        return progress_writer(self.quiet)
 
     def check_markdown(self) -> None:
-        """Raise InputError if the report, a Markdown file, cannot be written."""
+        """Raise InputError unless `output` is None or a Markdown file that can be written."""
         if self.output is None:
             return
         if self.output.suffix.lower() != ".md":
-            raise InputError("the report is a .md file", path=self.output)
+            raise InputError("must be a .md file, the report", path=self.output)
         check_writable(self.output)
 
     def write(self, text: str) -> None:
@@ -67,47 +67,49 @@ class Reporting:
             write_bytes(self.output, (text.rstrip("\n") + "\n").encode())
 
     def end(self, text: str, data: Mapping[str, object], paths: Sequence[Path] = (), interrupted: int | None = None) -> None:
-        """Write the result and the written files (`paths`, or the output) to stdout. interrupted: exit with this signal's code."""
+        """Print the result as JSON, or as text with the names of the written files (`paths`; if empty, `output`).
+
+        interrupted: number of the signal that ended the work, which sets the exit code."""
         if self.as_json:
             say_json(data)
         else:
             for line in (text, *(paths or filter(None, [self.output]))):
                 say(line, err=False)
         if interrupted is not None:
-            say("interrupted: what was done is kept")
+            say("interrupted: the results so far are kept")
             raise SystemExit(exit_code(interrupted))
 
 
 def reporting(report: str = "Write the tables as Markdown (.md)", *, cluster: bool = False,
-              quiet: str = "No progress, no warnings") -> Decorator:
-    """Give a command the options of Reporting, which it gets as the argument `how`. report, quiet: help of -o and -q."""
+              quiet: str = "Print no progress and no warnings") -> Decorator:
+    """Return a decorator that adds the options of a Reporting, which the command receives as `how`. report, quiet: help of -o and -q."""
     options = [SHARED["as_json"],
                click.option("-q", "--quiet", is_flag=True, help=quiet),
                click.option("-o", "--output", type=click.Path(path_type=Path), help=report)]
-    return gathering("how", Reporting, names_of(Reporting), [*options, CLUSTER] if cluster else options)
+    return option_group("how", Reporting, names_of(Reporting), [*options, CLUSTER] if cluster else options)
 
 
 def planned(plan: type[Plan]) -> Decorator:
-    """Give a command a plan's options, which it gets as the argument `plan`.
+    """Return a decorator that adds a plan's options, which the command receives as `plan`.
 
-    --quick replaces the options that are not given by the plan's QUICK, and reports them in one line."""
+    --quick takes the values of the plan's QUICK for options that the command line leaves out, and lists them on stderr."""
 
-    def make(quick: bool, **given: Parsed) -> Plan:
+    def make(quick: bool, **values: Parsed) -> Plan:
         if quick:
             context = click.get_current_context()
-            less = {name: value for name, value in plan.QUICK.items()
-                    if context.get_parameter_source(name) is not ParameterSource.COMMANDLINE}
-            replaced = [f"{name.replace('_', '-')} {value} instead of {given[name]}" for name, value in less.items()]
-            say(f"{context.info_name} --quick: {', '.join(replaced) or 'all is given, nothing is left out'}")
-            given |= less
-        return plan(**given)
+            smaller = {name: value for name, value in plan.QUICK.items()
+                       if context.get_parameter_source(name) is not ParameterSource.COMMANDLINE}
+            replaced = [f"{name.replace('_', '-')} {value} instead of {values[name]}" for name, value in smaller.items()]
+            say(f"{context.info_name} --quick: {', '.join(replaced) or 'no effect, since the command line sets every option'}")
+            values |= smaller
+        return plan(**values)
 
-    flag = click.option("--quick", is_flag=True, help="Rough figures soon: less of all that is not given here, as it says")
-    return gathering("plan", make, ["quick", *names_of(plan)], [*map(parameter, dataclasses.fields(plan)[::-1]), flag])
+    flag = click.option("--quick", is_flag=True, help="Get rough figures soon: use smaller defaults, and list them on stderr")
+    return option_group("plan", make, ["quick", *names_of(plan)], [*map(parameter, dataclasses.fields(plan)[::-1]), flag])
 
 
 def parameter(each: dataclasses.Field[object]) -> Decorator:
-    """Return a field of a plan as an argument or an option of a command."""
+    """Return a decorator that adds a field of a plan to a command, as an argument or an option."""
     known, needed = each.metadata, each.default is MISSING
     kind = TYPES.get(str(each.type), click.Path(path_type=Path))
     if not known["text"]:
@@ -124,7 +126,7 @@ def parameter(each: dataclasses.Field[object]) -> Decorator:
 
 
 def measured(plan: type[Plan]) -> click.Command:
-    """Return the command that runs a plan's study (wrt.lab.bench.report.study_of); a cluster runs each mesh on one worker."""
+    """Return the command that runs a plan's study (wrt.lab.bench.report.study_of). With --cluster, a worker measures a whole mesh."""
 
     @click.command(plan.COMMAND.split()[-1], help=plan.__doc__)
     @planned(plan)

@@ -1,4 +1,4 @@
-"""Keeping the work of a long render: its checkpoint, and another folder for a picture that cannot be written."""
+"""Files of a long render: its checkpoint, and another folder for a picture that cannot be written."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from wrt.picture.film import Film
 
 EVERY = 60.0  # seconds between two checkpoints
-SUFFIX = ".checkpoint"  # after the picture's name
+SUFFIX = ".checkpoint"  # appended to the picture's name
 
 
 def checkpoint_options(output: Path, every: float | None, file: Path | None, resume: bool) -> dict[str, object]:
-    """Return the options of `wrt.render` for --checkpoint, --checkpoint-file and --resume; without any, there is no checkpoint."""
+    """Return the options of `wrt.render` for --checkpoint, --checkpoint-file and --resume; empty if all three are absent."""
     if every is None and file is None and not resume:
         return {}
     file = file or output.with_name(output.name + SUFFIX)
@@ -31,30 +31,29 @@ def checkpoint_options(output: Path, every: float | None, file: Path | None, res
 
 
 def save_film(film: Film, output: Path, bits: int | None, layers: Sequence[str] | None) -> tuple[list[Path], list[int], InputError | None]:
-    """Write the picture, on failure into a new folder wrt-* in the folder for temporary files (TMPDIR).
+    """Write the picture to `output`, or if that fails into a new folder wrt-* in the folder for temporary files (TMPDIR).
 
-    Returns the paths written, the numbers of the signals that arrived meanwhile, and the error if the picture is not at `output`. Raises
-    InputError if neither folder takes it.
-    """
-    with held_interrupts() as late:
+    Returns the paths written, the numbers of the signals that arrived meanwhile, and the error if writing to `output` failed. Raises
+    InputError if both folders fail."""
+    with held_interrupts() as signals:
         try:
-            return film.save(output, bits=bits, aov=layers), late, None
+            return film.save(output, bits=bits, aov=layers), signals, None
         except InputError as error:
             with contextlib.suppress(OSError, InputError):
-                place = Path(tempfile.mkdtemp(prefix="wrt-"))
+                folder = Path(tempfile.mkdtemp(prefix="wrt-"))
                 try:
-                    return film.save(place / output.name, bits=bits, aov=layers), late, error
+                    return film.save(folder / output.name, bits=bits, aov=layers), signals, error
                 except InputError:
-                    shutil.rmtree(place, ignore_errors=True)
+                    shutil.rmtree(folder, ignore_errors=True)
             raise
 
 
 def remove_checkpoint(path: Path) -> None:
     """Remove the checkpoint of a finished picture. Raises InputError if the system refuses."""
-    if path.is_dir():  # not wrt's; the render has warned that it cannot hold a checkpoint
+    if path.is_dir():  # not written by wrt; the render has warned that the checkpoint is not saved
         return
     try:
         path.unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"cannot be removed: {error.strerror}",
-                         path=path, hint="the picture is done, so it is of no use any more") from error
+                         path=path, hint="remove this checkpoint by hand; the picture is finished") from error

@@ -8,17 +8,17 @@ from typing import cast
 
 import click
 
-from wrt.cli.common import Given, load, naming, say, say_json, settings_of, shared
+from wrt.cli.common import Assignments, load, naming, say, say_json, settings_of, shared
 from wrt.core.errors import InputError
 
 
 @click.command()
-@shared("scene", "camera", "given", "as_json")
-def info(scene: Path, camera: str | None, given: Given, as_json: bool) -> None:
-    """Describe SCENE, and list the features that its kernel is compiled with."""
+@shared("scene", "camera", "assignments", "as_json")
+def info(scene: Path, camera: str | None, assignments: Assignments, as_json: bool) -> None:
+    """Describe SCENE, and list the features that its render kernels are compiled with."""
     from wrt.renderer.features import describe
 
-    settings = settings_of(given)
+    settings = settings_of(assignments)
     loaded = load(scene, quiet=False).with_settings(**settings)
     with naming(scene):
         facts = describe(loaded, camera)
@@ -27,7 +27,7 @@ def info(scene: Path, camera: str | None, given: Given, as_json: bool) -> None:
         return
     features = cast("dict[str, bool]", facts.pop("features"))
     for name, value in facts.items():
-        between = "; " if isinstance(value, list) and value and isinstance(value[0], str) else ", "  # names may have commas
+        between = "; " if isinstance(value, list) and value and isinstance(value[0], str) else ", "  # names may contain commas
         shown = "none" if value in (None, []) else between.join(map(str, value)) if isinstance(value, list) else value
         say(f"{name}: {shown}", err=False)
     for state in (True, False):
@@ -36,7 +36,7 @@ def info(scene: Path, camera: str | None, given: Given, as_json: bool) -> None:
 
 
 @click.command()
-@click.option("--markdown", is_flag=True, help="As a page to read, docs/scene_format.md")
+@click.option("--markdown", is_flag=True, help="Print the reference page docs/scene_format.md instead")
 def schema(markdown: bool) -> None:
     """Print the JSON Schema of scene files."""
     if markdown:
@@ -52,14 +52,13 @@ def schema(markdown: bool) -> None:
 @click.command()
 @click.argument("scenes", nargs=-1, required=True, type=click.Path(path_type=Path))
 def validate(scenes: tuple[Path, ...]) -> None:
-    """Check SCENES without rendering; exit code 2 if one cannot be used."""
-    bad = 0
+    """Check SCENES without rendering; exit code 2 if any of them is invalid."""
+    code = 0
     for scene in scenes:
         try:
             load(scene, quiet=False)
             say(f"{scene}: ok", err=False)
         except InputError as error:
-            bad += 1
+            code = 2
             say(f"error: {error}")
-    if bad:
-        raise SystemExit(2)
+    raise SystemExit(code)

@@ -12,66 +12,66 @@ from pathlib import Path
 
 import click
 
-from wrt.cli.common import Given, Parsed, gathering, load, names_of, naming, say, settings_of, shared
+from wrt.cli.common import Assignments, Parsed, load, names_of, naming, option_group, say, settings_of, shared
 from wrt.viewer.access import Place
 
-PLACE = (
+PLACE_OPTIONS = (
     click.option("--allow-origin", "allow_origins", multiple=True, metavar="ORIGIN",
-                 help="Another address of the viewer in browsers, such as https://example.org of a proxy; repeatable"),
+                 help="Another origin under which browsers reach the viewer, such as a proxy's https://example.org; repeatable"),
     click.option("--host", default="127.0.0.1", show_default=True,
-                 help="127.0.0.1: this machine only; 0.0.0.0: every machine that reaches it, with the printed address"),
+                 help="Address to listen on. 127.0.0.1: this machine only; 0.0.0.0: all machines that can reach this machine"),
     click.option("--port", type=click.IntRange(0, 65535), default=8080, show_default=True,
-                 help="To listen on; 0 is any free one"),
+                 help="Port to listen on; 0 chooses a free port"),
 )
 
 
 @click.command()
 @shared("scene")
-@gathering("place", Place, names_of(Place), PLACE)
-@click.option("--open/--no-open", "open_browser", default=True, help="Open a browser  [default: where there is a desktop]")
-@click.option("--spp", type=click.IntRange(1, 1 << 24), default=1024, show_default=True, help="Samples a pixel to refine until")
-@shared("device", "threads", "camera", "accel", "given", "quiet")
-def view(scene: Path, place: Place, open_browser: bool, spp: int, given: Given, quiet: bool,
+@option_group("place", Place, names_of(Place), PLACE_OPTIONS)
+@click.option("--open/--no-open", "open_browser", default=True, help="Open a browser  [default: on a desktop]")
+@click.option("--spp", type=click.IntRange(1, 1 << 24), default=1024, show_default=True, help="Samples per pixel of the finished picture")
+@shared("device", "threads", "camera", "accel", "assignments", "quiet")
+def view(scene: Path, place: Place, open_browser: bool, spp: int, assignments: Assignments, quiet: bool,
          **options: Parsed) -> None:
     """Show SCENE in a browser with an orbit camera; the picture gets finer while the camera rests.
 
-    The printed address holds a token: everybody with it may look and steer. Needs the extra `viewer`. Ctrl-C ends it.
-    """
+    The printed address contains a secret token: everybody with the address can watch, and move the camera. Ctrl-C ends the viewer.
+    The viewer needs viser: pip install "wrt[viewer]"."""
     from wrt.viewer.page import Page
     from wrt.viewer.server import import_viser, listen
 
     import_viser()
-    listen(place).close()  # raises before the scene is read
+    listen(place).close()  # raises InputError before the scene is read
     from wrt.lab.costs import CostCounter
     from wrt.renderer.options import Options
 
     rendering = Options(**options)
-    settings = settings_of(given, size="the browser's window", spp="--spp")
+    settings = settings_of(assignments, size="the browser's window", spp="--spp")
     loaded = load(scene, quiet).with_settings(**settings)
     with naming(scene):
-        loaded.camera(options["camera"])  # raises with the file's name
+        loaded.camera(options["camera"])  # raises InputError with the file's name
     page = Page(loaded, rendering, place, spp, counter_of=CostCounter.beside, warn=(lambda text: None) if quiet else say)
     say(page.url, err=False)
     if not quiet:
-        say("Ctrl-C ends it")
+        say("Ctrl-C ends the viewer")
     try:
         with in_browser(page.url) if open_browser and has_desktop() else contextlib.nullcontext():
             page.wait()
     except KeyboardInterrupt:
-        pass  # the normal end
+        pass  # the user ends the viewer
     finally:
         page.close()
-    raise SystemExit(0)  # at once, even if a kernel is being compiled
+    raise SystemExit(0)  # main() then exits at once, even while a kernel is being compiled
 
 
 @contextlib.contextmanager
 def in_browser(url: str) -> Iterator[None]:
-    """Open a browser through a file in a private folder, because all users of the machine can read a browser's command line.
+    """Open a browser at a private file that forwards to `url`.
 
-    The address holds the token."""
+    The browser's command line, which all users of the machine can read, then does not contain the token of `url`."""
     import webbrowser
 
-    with tempfile.TemporaryDirectory(prefix="wrt-view-") as folder:  # no other user may read it
+    with tempfile.TemporaryDirectory(prefix="wrt-view-") as folder:  # readable by this user only
         path = Path(folder) / "view.html"
         address = html.escape(url)
         path.write_text('<!doctype html><meta charset="utf-8"><meta name="referrer" content="no-referrer"><title>wrt</title>'
@@ -81,5 +81,5 @@ def in_browser(url: str) -> Iterator[None]:
 
 
 def has_desktop() -> bool:
-    """Return whether a browser would open in a window and not in the terminal."""
+    """Return True if a browser opens in a window, and not in the terminal."""
     return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -1,4 +1,4 @@
-"""Ray classes of other libraries with wrt's queries: change one import, keep the program. Nothing of wrt imports this."""
+"""Ray classes of other libraries, implemented with wrt's queries: a program changes only its import. wrt does not use them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Open3D's ray casting scene with wrt's queries.
+"""The RaycastingScene of Open3D, implemented with wrt's queries.
 
 >>> from wrt.compat.open3d import RaycastingScene          # in place of open3d.t.geometry.RaycastingScene
 """
@@ -37,10 +37,10 @@ SPLIT_RAYS = RawKernel(split_rays, SplitRays())
 
 
 class Array(np.ndarray):
-    """A NumPy array with the methods that convert Open3D's tensors to NumPy."""
+    """A NumPy array with the methods by which programs convert Open3D tensors to NumPy."""
 
     def numpy(self) -> np.ndarray:
-        """Return the same memory as a plain array."""
+        """Return a plain array that shares the memory."""
         return self.view(np.ndarray)
 
     def cpu(self) -> Array:
@@ -48,27 +48,27 @@ class Array(np.ndarray):
         return self
 
 
-Answer: TypeAlias = Any  # an Array, or Open3D's tensor
+Answer: TypeAlias = Any  # an Array, or an Open3D tensor
 MeshOrArray: TypeAlias = Any  # (V, 3) positions, or a mesh of any library
 
 
 class RaycastingScene:
-    """A scene like open3d.t.geometry.RaycastingScene; docs/compat.md has the differences.
+    """A scene like open3d.t.geometry.RaycastingScene. docs/compat.md lists the differences.
 
-    Answers are Open3D's tensors if the program has imported open3d, and NumPy arrays otherwise. A ray or a point that is not finite
-    hits nothing; neither does a direction of 0. All methods raise InputError, a ValueError, that names the argument, also for
-    points and origins with a finite coordinate beyond 1e37.
+    Results are Open3D tensors if the program has imported open3d, and NumPy arrays otherwise. A ray or a point that is not finite
+    hits nothing, and neither does a ray with direction 0. All methods raise InputError, a ValueError, for invalid arguments, and
+    for points and origins with a finite coordinate beyond 1e37.
 
     Parameters
     ----------
     nthreads : int
-        Threads that build, and in a method those of the query; 0: one per core.
+        Number of threads: in the constructor for the build, in methods for the query. 0: one per core.
     device
-        "cpu", "cuda:0", or Open3D's names of these.
+        "cpu", "cuda:0", or Open3D's names for these.
     rays : (..., 6) array_like
-        In methods: origins and directions of any length, taken as float32.
+        In methods: origins and directions of any length, converted to float32.
     query_points : (..., 3) array_like
-        In methods: points, taken as float32.
+        In methods: points, converted to float32.
     """
 
     INVALID_ID: ClassVar[int] = 0xFFFFFFFF
@@ -86,9 +86,9 @@ class RaycastingScene:
         Parameters
         ----------
         vertex_positions, triangle_indices
-            (V, 3) real numbers and (F, 3) indices; or a mesh alone.
+            (V, 3) real numbers and (F, 3) indices; or a mesh as the only argument.
         mesh
-            Instead: a TriangleMesh of Open3D, a `wrt.Mesh` or a `trimesh.Trimesh`.
+            Mesh in place of the two arrays: a TriangleMesh of Open3D, a `wrt.Mesh` or a `trimesh.Trimesh`.
         """
         if mesh is None and triangle_indices is None:
             mesh = vertex_positions
@@ -110,7 +110,7 @@ class RaycastingScene:
         return len(self._meshes) - 1
 
     def cast_rays(self, rays: ArrayLike, nthreads: int = 0) -> dict[str, Answer]:
-        """Find the first hit of each ray; of several at the same distance, that of the lowest IDs.
+        """Find the first hit of each ray. At equal distance, the lowest geometry ID wins, then the lowest primitive ID.
 
         Returns
         -------
@@ -119,12 +119,12 @@ class RaycastingScene:
             and primitive_normals (..., 3), 0 on a miss.
         """
         accel, _, normals = self._scene()
-        shape, good, origins, directions = _asked_rays(rays, nthreads)
+        shape, valid, origins, directions = _valid_rays(rays, nthreads)
         hits = accel.closest_hit(origins, directions, threads=_threads(nthreads))
         geometry_ids, primitive_ids = self._ids(hits.prim_id)
         found = {"t_hit": hits.t, "geometry_ids": geometry_ids, "primitive_ids": primitive_ids,
                  "primitive_uvs": np.stack([hits.u, hits.v], axis=1), "primitive_normals": normals[hits.prim_id]}
-        return _answers(found, good, shape)
+        return _answers(found, valid, shape)
 
     def test_occlusions(self, rays: ArrayLike, tnear: float = 0.0, tfar: float = math.inf, nthreads: int = 0) -> Answer:
         """Test whether each ray hits anything: (...) bool.
@@ -132,31 +132,31 @@ class RaycastingScene:
         Parameters
         ----------
         tnear, tfar
-            Segment in units of the direction's length.
+            Ends of the segment in units of the direction's length.
         """
         accel = self._scene()[0]
-        shape, good, origins, directions = _asked_rays(rays, nthreads)
+        shape, valid, origins, directions = _valid_rays(rays, nthreads)
         found = accel.any_hit(origins, directions, tnear, tfar, threads=_threads(nthreads))
-        return _answer(_spread(found, good, False), shape)
+        return _answer(_scatter(found, valid, False), shape)
 
     def count_intersections(self, rays: ArrayLike, nthreads: int = 0) -> Answer:
-        """Count the surfaces that each ray crosses; one that it meets at an edge or a corner counts once. (...) int32."""
-        shape, good, origins, directions = _asked_rays(rays, nthreads)
+        """Count the intersections of each ray with surfaces, (...) int32. An intersection at an edge or a corner counts once."""
+        shape, valid, origins, directions = _valid_rays(rays, nthreads)
         ray, *_ = every_hit(self._scene()[0], origins, directions, _threads(nthreads))
-        return _answer(_spread(np.bincount(ray, minlength=len(origins)).astype(np.int32), good, 0), shape)
+        return _answer(_scatter(np.bincount(ray, minlength=len(origins)).astype(np.int32), valid, 0), shape)
 
     def list_intersections(self, rays: ArrayLike, nthreads: int = 0) -> dict[str, Answer]:
-        """List the M intersections that `count_intersections` counts, those of a ray in order of distance.
+        """List the M intersections that `count_intersections` counts, ray by ray in order of distance.
 
         Returns
         -------
         dict
-            ray_splits (N + 1,): ray i has the rows ray_splits[i] to ray_splits[i + 1]; ray_ids, geometry_ids, primitive_ids (M,),
+            ray_splits (N + 1,): rows ray_splits[i] .. ray_splits[i + 1] - 1 are of ray i; ray_ids, geometry_ids, primitive_ids (M,),
             all uint32; t_hit (M,); primitive_uvs (M, 2).
         """
-        shape, good, origins, directions = _asked_rays(rays, nthreads)
+        shape, valid, origins, directions = _valid_rays(rays, nthreads)
         ray, face, t, u, v = every_hit(self._scene()[0], origins, directions, _threads(nthreads))
-        rows = ray if good is None else np.flatnonzero(good)[ray]
+        rows = ray if valid is None else np.flatnonzero(valid)[ray]
         splits = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=math.prod(shape)))])
         geometry_ids, primitive_ids = self._ids(face)
         found = {"ray_splits": splits.astype(np.uint32), "ray_ids": rows.astype(np.uint32), "t_hit": t,
@@ -164,7 +164,7 @@ class RaycastingScene:
         return {name: _answer(array, array.shape[:1]) for name, array in found.items()}
 
     def compute_closest_points(self, query_points: ArrayLike, nthreads: int = 0) -> dict[str, Answer]:
-        """Find the closest point of the meshes (wrt.closest_points).
+        """Find the point on the meshes that is closest to each query point (wrt.closest_points).
 
         Returns
         -------
@@ -172,54 +172,54 @@ class RaycastingScene:
             points (..., 3), geometry_ids and primitive_ids (...) uint32, primitive_uvs (..., 2), primitive_normals (..., 3);
             INVALID_ID and 0 without a mesh.
         """
-        shape, good, points = _asked_points(query_points)
+        shape, valid, points = _valid_points(query_points)
         accel, _, normals = self._scene()
         found = closest_points(accel, points, _threads(nthreads))
         geometry_ids, primitive_ids = self._ids(found.prim_id)
         answers = {"points": found.point, "geometry_ids": geometry_ids, "primitive_ids": primitive_ids,
                    "primitive_uvs": np.stack([found.u, found.v], axis=1), "primitive_normals": normals[found.prim_id]}
-        return _answers(answers, good, shape)
+        return _answers(answers, valid, shape)
 
     def compute_distance(self, query_points: ArrayLike, nthreads: int = 0) -> Answer:
         """Compute the distance of each point to the meshes, (...) float32: inf without a mesh, NaN for points that are not finite."""
-        shape, good, points = _asked_points(query_points)
-        return _answer(_spread(closest_points(self._scene()[0], points, _threads(nthreads)).distance, good, np.nan), shape)
+        shape, valid, points = _valid_points(query_points)
+        return _answer(_scatter(closest_points(self._scene()[0], points, _threads(nthreads)).distance, valid, np.nan), shape)
 
     def compute_signed_distance(self, query_points: ArrayLike, nthreads: int = 0, nsamples: int = 1) -> Answer:
-        """Compute distances to the meshes, negative where `compute_occupancy` with `nsamples` is 1: (...) float32."""
-        shape, good, points = _asked_points(query_points)
+        """Compute distances to the meshes, (...) float32; negative for points where `compute_occupancy` with `nsamples` is 1."""
+        shape, valid, points = _valid_points(query_points)
         inside = self._inside(points, nthreads, nsamples)
         distance = closest_points(self._scene()[0], points, _threads(nthreads)).distance
-        return _answer(_spread(np.where(inside, -distance, distance), good, np.nan), shape)
+        return _answer(_scatter(np.where(inside, -distance, distance), valid, np.nan), shape)
 
     def compute_occupancy(self, query_points: ArrayLike, nthreads: int = 0, nsamples: int = 1) -> Answer:
-        """Compute 1.0 for points inside and 0.0 for others, (...) float32: inside, a ray crosses surfaces an odd number of times.
+        """Return 1.0 for points inside and 0.0 for others, (...) float32. A ray from inside crosses surfaces an odd number of times.
 
         Parameters
         ----------
         nsamples
             Odd number of rays; the majority decides. For closed surfaces one ray is exact (wrt.contains).
         """
-        shape, good, points = _asked_points(query_points)
-        return _answer(_spread(self._inside(points, nthreads, nsamples).astype(np.float32), good, 0.0), shape)
+        shape, valid, points = _valid_points(query_points)
+        return _answer(_scatter(self._inside(points, nthreads, nsamples).astype(np.float32), valid, 0.0), shape)
 
     @staticmethod
     def create_rays_pinhole(*given: Any, **named: Any) -> Answer:
-        """Make rays through the pixels' centers, row by row along the camera's y axis: (height_px, width_px, 6) float32.
+        """Make a ray through each pixel's center, (height_px, width_px, 6) float32. Rows go along the camera's y axis.
 
         Parameters
         ----------
         *given, **named
-            (intrinsic_matrix, extrinsic_matrix, width_px, height_px): (3, 3), and (4, 4) from world to camera. Or (fov_deg, center,
-            eye, up, width_px, height_px): field of view along x in degrees, point to look at, and camera position; y is then up, as
-            in Open3D, so that the first row is the lowest.
+            Either (intrinsic_matrix, extrinsic_matrix, width_px, height_px): (3, 3), and (4, 4) from world to camera. Or (fov_deg,
+            center, eye, up, width_px, height_px): horizontal field of view in degrees, point to look at, and camera position. In
+            this case y is up, as in Open3D, so that the first row is the lowest.
         """
         make = _rays_looking_at if len(given) + len(named) == 6 else _rays_of_matrices
         rays = make(*given, **named)
         return _answer(rays.reshape(-1, 6), rays.shape[:2])
 
     def _scene(self) -> tuple[Accelerator, np.ndarray, np.ndarray]:
-        """Return the structure, the first prim_id of each mesh, and the unit normals of all faces with a 0 at the end for -1."""
+        """Return the structure, the first prim_id of each mesh, and the unit normals of all faces, then a zero for index -1."""
         if self._built is None:
             vertices, faces = [np.zeros((1, 3), np.float32)], [np.zeros((0, 3), np.int64)]
             for positions, indices in self._meshes:
@@ -242,10 +242,10 @@ class RaycastingScene:
     def _inside(self, points: np.ndarray, nthreads: int, nsamples: int) -> np.ndarray:
         if as_integer(nsamples, "nsamples", 1, MOST_SAMPLES) % 2 == 0:
             raise InputError(f"must be odd, got {nsamples}", argument="nsamples")
-        asked = ListQuery(self._scene()[0], _threads(nthreads), crossings=True)
+        query = ListQuery(self._scene()[0], _threads(nthreads), crossings=True)
         votes = np.zeros(len(points), np.int32)
         for seed in range(nsamples):
-            votes += odd_crossings(asked, points, seed)
+            votes += odd_crossings(query, points, seed)
         return np.asarray(2 * votes > nsamples)
 
 
@@ -254,10 +254,10 @@ def _threads(nthreads: int) -> int | None:
 
 
 def _numbers(value: Any, name: str, shape: str) -> np.ndarray:
-    """Convert arrays and tensors to real numbers."""
+    """Convert an array or tensor to a NumPy array of real numbers. Raises InputError that names the argument and its `shape`."""
     try:
         value = value.cpu().numpy() if hasattr(value, "cpu") else value
-    except (RuntimeError, TypeError) as error:  # torch's, if it requires gradients, or NumPy does not have its type
+    except (RuntimeError, TypeError) as error:  # torch raises them for tensors with gradients and for types that NumPy lacks
         raise InputError(str(error), argument=name) from error
     return real_numbers(value, name, shape)
 
@@ -265,7 +265,7 @@ def _numbers(value: Any, name: str, shape: str) -> np.ndarray:
 def _arrays_of(mesh: Any) -> tuple[Any, Any]:
     """Return positions and indices of a mesh of another library."""
     if hasattr(mesh, "vertex"):
-        with suppress(KeyError):  # Open3D's, for an empty mesh
+        with suppress(KeyError):  # Open3D raises it for an empty mesh
             return mesh.vertex.positions, mesh.triangle.indices
     for name in ("faces", "triangles"):
         if hasattr(mesh, "vertices") and hasattr(mesh, name):
@@ -282,17 +282,17 @@ def _rows(value: Any, name: str, width: int) -> tuple[tuple[int, ...], np.ndarra
 
 
 def _normals(mesh: Geometry) -> np.ndarray:
-    """Return the normals of RaycastingScene._scene."""
+    """Compute the normals for RaycastingScene._scene."""
     a, b, c = (mesh.vertices[mesh.faces[:, i]].astype(np.float64) for i in range(3))
-    with np.errstate(invalid="ignore"):  # of corners that are not finite
+    with np.errstate(invalid="ignore"):  # for corners that are not finite
         normal = np.cross(b - a, c - a)
         length = np.linalg.norm(normal, axis=1, keepdims=True)
         unit = np.divide(normal, length, out=np.zeros_like(normal), where=length > 0.0)
     return np.concatenate([unit, np.zeros((1, 3))]).astype(np.float32)
 
 
-def _asked_rays(value: Any, nthreads: int) -> tuple[tuple[int, ...], np.ndarray | None, np.ndarray, np.ndarray]:
-    """Return the leading shape, the mask of rays that can hit something (None: all), and their origins and directions."""
+def _valid_rays(value: Any, nthreads: int) -> tuple[tuple[int, ...], np.ndarray | None, np.ndarray, np.ndarray]:
+    """Return the leading shape, the mask of finite rays with a direction (None: all), and these rays' origins and directions."""
     shape, rays = _rows(value, "rays", 6)
     origins, directions = np.empty((2, len(rays), 3), np.float32)
     kind = np.empty(len(rays), np.int8)
@@ -301,53 +301,53 @@ def _asked_rays(value: Any, nthreads: int) -> tuple[tuple[int, ...], np.ndarray 
         _finite(rays, "rays")
     if kind.min(initial=1) == SPLIT_VALID:
         return shape, None, origins, directions
-    good = kind == SPLIT_VALID
-    return shape, good, origins[good], directions[good]
+    valid = kind == SPLIT_VALID
+    return shape, valid, origins[valid], directions[valid]
 
 
-def _asked_points(value: Any) -> tuple[tuple[int, ...], np.ndarray | None, np.ndarray]:
-    """Return the leading shape, the mask of finite points (None: all), and these points."""
+def _valid_points(value: Any) -> tuple[tuple[int, ...], np.ndarray | None, np.ndarray]:
+    """Return the leading shape, the mask of finite points (None: all), and the finite points."""
     shape, points = _rows(value, "query_points", 3)
-    good = _finite(points, "query_points")
-    return (shape, None, points) if good.all() else (shape, good, points[good])
+    valid = _finite(points, "query_points")
+    return (shape, None, points) if valid.all() else (shape, valid, points[valid])
 
 
 def _finite(array: np.ndarray, name: str) -> np.ndarray:
-    """Return which rows are finite. Raises InputError for finite points beyond the range of wrt's queries."""
+    """Return the mask of finite rows. Raises InputError for finite points beyond the range of wrt's queries."""
     finite = np.isfinite(array)
-    good = np.ones(len(array), bool) if finite.all() else finite.all(axis=1)
-    vectors(array[:, :3] if good.all() else np.where(good[:, None], array[:, :3], 0.0), name, FARTHEST)
-    return good
+    valid = np.ones(len(array), bool) if finite.all() else finite.all(axis=1)
+    vectors(array[:, :3] if valid.all() else np.where(valid[:, None], array[:, :3], 0.0), name, FARTHEST)
+    return valid
 
 
-def _spread(array: np.ndarray, good: np.ndarray | None, missing: float) -> np.ndarray:
-    """Insert rows of `missing` for the questions that were left out."""
-    if good is None:
+def _scatter(array: np.ndarray, valid: np.ndarray | None, missing: float) -> np.ndarray:
+    """Return an array with the rows of `array` where `valid`, and with `missing` elsewhere. valid None: all rows."""
+    if valid is None:
         return array
-    out = np.full((len(good), *array.shape[1:]), missing, array.dtype)
-    out[good] = array
+    out = np.full((len(valid), *array.shape[1:]), missing, array.dtype)
+    out[valid] = array
     return out
 
 
-def _answers(found: dict[str, np.ndarray], good: np.ndarray | None, shape: tuple[int, ...]) -> dict[str, Any]:
-    """Return the results of all rays or points of the caller as arrays or tensors.
+def _answers(found: dict[str, np.ndarray], valid: np.ndarray | None, shape: tuple[int, ...]) -> dict[str, Any]:
+    """Return results for all rays or points of the caller, as arrays or tensors.
 
-    found: results by name, one row for each ray or point that was queried. good: mask of the queried ones; None: all. The others get
-    the values of a miss. shape: leading shape of the caller's rays or points.
+    found: results by name, one row for each valid ray or point. All other rays or points get the values of a miss. shape: leading
+    shape of the caller's rays or points.
     """
     missed = {"t_hit": np.inf, "geometry_ids": RaycastingScene.INVALID_ID, "primitive_ids": RaycastingScene.INVALID_ID}
-    return {name: _answer(_spread(array, good, missed.get(name, 0.0)), shape) for name, array in found.items()}
+    return {name: _answer(_scatter(array, valid, missed.get(name, 0.0)), shape) for name, array in found.items()}
 
 
 def _answer(array: np.ndarray, shape: tuple[int, ...]) -> Answer:
-    """Return an answer with the leading shape of the question."""
+    """Convert a result to an array or tensor with the leading shape of the caller's rays or points."""
     array = np.ascontiguousarray(array).reshape((*shape, *array.shape[1:]))
     open3d = sys.modules.get("open3d")
     return array.view(Array) if open3d is None else open3d.core.Tensor.from_numpy(array)
 
 
 def _rays_of_matrices(intrinsic_matrix: Any, extrinsic_matrix: Any, width_px: int, height_px: int) -> np.ndarray:
-    """Make the rays of RaycastingScene.create_rays_pinhole."""
+    """Make the rays of create_rays_pinhole from matrices."""
     width_px, height_px = (as_integer(size, name, 0, WIDEST) for size, name in ((width_px, "width_px"), (height_px, "height_px")))
     try:
         inverse = np.linalg.inv(_matrix(intrinsic_matrix, "intrinsic_matrix", (3, 3)))
@@ -363,7 +363,7 @@ def _rays_of_matrices(intrinsic_matrix: Any, extrinsic_matrix: Any, width_px: in
 
 
 def _rays_looking_at(fov_deg: float, center: Any, eye: Any, up: Any, width_px: int, height_px: int) -> np.ndarray:
-    """Make the rays of RaycastingScene.create_rays_pinhole."""
+    """Make the rays of create_rays_pinhole from a point to look at."""
     center, eye, up = (_matrix(value, name, (3,)) for value, name in ((center, "center"), (eye, "eye"), (up, "up")))
     if not 0.0 < as_number(fov_deg, "fov_deg") < 180.0:
         raise InputError(f"must be between 0 and 180, got {fov_deg:g}", argument="fov_deg")
@@ -371,7 +371,7 @@ def _rays_looking_at(fov_deg: float, center: Any, eye: Any, up: Any, width_px: i
     z = center - eye
     x = np.cross(up, z)
     if not x.any():
-        raise InputError("must not be eye, nor in the direction of up from it", argument="center")
+        raise InputError("must differ from eye, and center - eye must not be parallel to up", argument="center")
     z, x = z / np.linalg.norm(z), x / np.linalg.norm(x)
     to_camera = np.eye(4)
     to_camera[:3, :3] = x, np.cross(z, x), z

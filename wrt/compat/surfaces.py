@@ -1,4 +1,4 @@
-"""All hits of rays as other libraries count them: an edge or a corner of a surface is one hit."""
+"""All hits of rays, counted as in other libraries: a ray through an edge or a corner of a surface hits the surface once."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from wrt.accel.queries.contains import open_edges_of
 
 def every_hit(accel: Accelerator, origins: np.ndarray, directions: np.ndarray, threads: int | None,
               limit: int = ALL) -> tuple[np.ndarray, ...]:
-    """Return ray, face, t, u and v of each hit, ray by ray in order of distance, at most `limit` of a ray.
+    """Return ray, face, t, u and v of each hit, ray by ray in order of distance, at most `limit` per ray.
 
-    A ray hits the faces that it crosses (`all_hits` with crossings). A ray that only touches faces hits the first of them. If the
-    mesh is closed, it hits the first two, where it enters and leaves, or one if it begins there.
+    A ray hits the faces that it crosses (`all_hits` with crossings). A ray that only touches faces hits the first touched face. If
+    the mesh is closed, it hits the first two, as entry and exit, or one if it begins there.
     """
     crossed = ListQuery(accel, threads, crossings=True).of(origins, directions).all(limit)
     found = [crossed.ray_id, crossed.prim_id, crossed.t, crossed.u, crossed.v]

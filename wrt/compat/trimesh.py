@@ -1,4 +1,4 @@
-"""trimesh's ray class with wrt's queries.
+"""The ray class of trimesh, implemented with wrt's queries.
 
 >>> from wrt.compat.trimesh import RayMeshIntersector
 >>> mesh.ray = RayMeshIntersector(mesh)                 # mesh.contains and the rest of trimesh use it from now on
@@ -29,22 +29,22 @@ from wrt.scene.mesh import Mesh
 if TYPE_CHECKING:
     import trimesh
 
-AWAY = 4.0  # radii of a mesh; origins farther away are moved near it before they are rounded to float32
+FAR = 4.0  # in radii of a mesh: an origin farther from the mesh is moved near it before it is rounded to float32
 PLACE_RAYS, LOCATE_HITS = RawKernel(place_rays, Placement(), PlacedRays()), RawKernel(locate_hits, HitPoints64())
 
 
 class RayMeshIntersector:
-    """A ray class like trimesh.ray.ray_pyembree's, with the keywords of ray_triangle's; docs/compat.md has the differences.
+    """A ray class like that of trimesh.ray.ray_pyembree, with the keywords of ray_triangle. docs/compat.md lists the differences.
 
-    Hits are decided watertight in float32, relative to the mesh, and located in float64. A ray that is not finite or has no
-    direction hits nothing. All methods raise InputError, a ValueError, for other shapes.
+    The watertight test finds faces in float32, in coordinates relative to the mesh; points are computed in float64. A ray that is
+    not finite, or has direction 0, hits nothing. All methods raise InputError, a ValueError, for arrays of other shapes.
 
     Parameters
     ----------
     geometry : trimesh.Trimesh
-        Mesh. When it changes, the next query builds anew.
+        Mesh. After the mesh changes, the next query builds a new structure.
     scale_to_box : bool
-        Scale meshes whose coordinates or areas are beyond float32.
+        Scale meshes whose coordinates or areas exceed the range of float32.
     device, threads
         See `wrt.build`.
     ray_origins, ray_directions : (N, 3) array_like
@@ -60,15 +60,15 @@ class RayMeshIntersector:
         self._cache = Cache(id_function=self.mesh.__hash__)
 
     @cache_decorator
-    def _placed(self) -> _Placed:
+    def _scaled(self) -> _ScaledStructure:
         """Structure over the present mesh."""
-        return _Placed(self.mesh.vertices, self.mesh.faces, **self._options)
+        return _ScaledStructure(self.mesh.vertices, self.mesh.faces, **self._options)
 
     def intersects_id(self, ray_origins: ArrayLike, ray_directions: ArrayLike, multiple_hits: bool = True, max_hits: int = 100,
                       return_locations: bool = False) -> tuple[np.ndarray, ...]:
-        """Find the faces that rays hit: all first hits in the order of the rays, then all second ones, and so on.
+        """Find the faces that rays hit: first hits in the order of the rays, then second hits, and so on.
 
-        An edge or a corner of a surface is one hit (docs/compat.md).
+        A ray through an edge or a corner of a surface hits the surface once (docs/compat.md).
 
         Parameters
         ----------
@@ -81,12 +81,12 @@ class RayMeshIntersector:
             Face and ray of each hit, (M,) int64; with return_locations also the point, (M, 3) float64.
         """
         origins, directions = _rays(ray_origins, ray_directions)
-        placed, most = self._placed, max_hits if multiple_hits else min(max_hits, 1)
-        ray, face, u, v = placed.every_hit(origins, directions, most) if most > 1 else placed.first_hit(origins, directions)
+        scaled, most = self._scaled, max_hits if multiple_hits else min(max_hits, 1)
+        ray, face, u, v = scaled.every_hit(origins, directions, most) if most > 1 else scaled.first_hit(origins, directions)
         if most != 1:
-            order = _in_rounds(ray) if most > 1 else np.zeros(0, np.int64)
+            order = _first_hits_first(ray) if most > 1 else np.zeros(0, np.int64)
             ray, face, u, v = (array[order] for array in (ray, face, u, v))
-        return (face, ray, placed.located(origins, directions, ray, face, u, v)) if return_locations else (face, ray)
+        return (face, ray, scaled.located(origins, directions, ray, face, u, v)) if return_locations else (face, ray)
 
     def intersects_location(self, ray_origins: ArrayLike, ray_directions: ArrayLike, multiple_hits: bool = True,
                             max_hits: int = 100) -> tuple[np.ndarray, ...]:
@@ -101,25 +101,25 @@ class RayMeshIntersector:
         return where, ray, face
 
     def intersects_first(self, ray_origins: ArrayLike, ray_directions: ArrayLike) -> np.ndarray:
-        """Find the face that each ray hits first; of several at the same distance, the lowest. (N,) int32, -1 on a miss."""
+        """Find the face that each ray hits first, (N,) int32, -1 on a miss. At equal distance, the lowest index wins."""
         origins, directions = _rays(ray_origins, ray_directions)
-        return self._placed.first_face(origins, directions)
+        return self._scaled.first_face(origins, directions)
 
     def intersects_any(self, ray_origins: ArrayLike, ray_directions: ArrayLike) -> np.ndarray:
         """Test whether each ray hits anything: (N,) bool."""
-        return self._placed.any_hit(*_rays(ray_origins, ray_directions))
+        return self._scaled.any_hit(*_rays(ray_origins, ray_directions))
 
     def contains_points(self, points: Any) -> np.ndarray:
         """Test whether points (N, 3) are inside, by wrt.contains: (N,) bool.
 
-        For a mesh that is not closed, trimesh's own rule applies to the hits of this class: both directions of a line agree.
+        For an open mesh, trimesh's rule decides from the hits of this class: rays in two opposite directions must agree.
         """
         points = np.asarray(points, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 3:
             raise InputError(f"must be (N, 3), got {points.shape}", argument="points")
-        if not self._placed.closed and len(self.mesh.faces):
+        if not self._scaled.closed and len(self.mesh.faces):
             return contains_points(self, points)
-        return self._placed.contains(points)
+        return self._scaled.contains(points)
 
     def __getstate__(self) -> dict[str, Any]:
         return {"mesh": self.mesh, "_options": self._options}
@@ -135,8 +135,8 @@ class RayMeshIntersector:
         return self.__copy__()
 
 
-class _Placed:
-    """A structure over a mesh that is moved near 0, if it is far away, and scaled near 1 by a power of two, for float32.
+class _ScaledStructure:
+    """A structure over a mesh that is shifted to the origin, if it is far from it, and scaled to size 1 by a power of two.
 
     Faces with a corner that is not finite keep their indices and become faces without area, which no ray hits.
     """
@@ -149,28 +149,28 @@ class _Placed:
         used = vertices[~unused] if not unused.all() else np.zeros((1, 3))
         self.low, self.high = used.min(axis=0), used.max(axis=0)
         half = (self.high / 2 - self.low / 2).max()
-        self.shift = np.where(np.abs(used).max() > AWAY * half, self.low / 2 + self.high / 2, 0.0)
+        self.shift = np.where(np.abs(used).max() > FAR * half, self.low / 2 + self.high / 2, 0.0)
         self.exponent = -int(np.frexp(half)[1]) if scale_to_box else 0
         vertices[unused] = self.low
-        self.accel = build(Mesh(self.moved(vertices), faces), device=device, threads=threads)
+        self.accel = build(Mesh(self.to_local(vertices), faces), device=device, threads=threads)
         self.threads, self.vertices, self.faces = threads, vertices, faces
-        box = self.moved(np.stack([self.low, self.high]))
+        box = self.to_local(np.stack([self.low, self.high]))
         center, radius = box.mean(axis=0), float(np.linalg.norm(box[1] - box[0])) / 2
         self.placement: WarpStruct = Placement()
         self.placement.shift, self.placement.center = wp.vec3d(*self.shift), wp.vec3d(*center)
         half_way = self.exponent // 2
         self.placement.scale, self.placement.scale_again = 2.0**half_way, 2.0**(self.exponent - half_way)
-        self.placement.radius, self.placement.near = radius, AWAY * radius
+        self.placement.radius, self.placement.near = radius, FAR * radius
 
     @property
     def closed(self) -> bool:
         return open_edges_of(self.accel.snapshot) == 0
 
-    def moved(self, points: np.ndarray) -> np.ndarray:
+    def to_local(self, points: np.ndarray) -> np.ndarray:
         return np.ldexp(points - self.shift, self.exponent)
 
-    def asked(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray | None, np.ndarray, np.ndarray]:
-        """Return the rows of the rays that can hit something (None: all), and these rays for the structure."""
+    def local_rays(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray | None, np.ndarray, np.ndarray]:
+        """Return the rows of the valid rays (None: all rays), and these rays in the structure's coordinates, float32."""
         placed_origins, placed_directions = np.empty((2, *origins.shape), np.float32)
         valid = np.empty(len(origins), bool)
         arrays = origins, directions, placed_origins, placed_directions, valid
@@ -181,8 +181,8 @@ class _Placed:
         return rows, placed_origins[rows], placed_directions[rows]
 
     def first_hit(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return ray, face, u and v of each hit."""
-        rows, origins, directions = self.asked(origins, directions)
+        """Return ray, face, u and v of each ray's first hit."""
+        rows, origins, directions = self.local_rays(origins, directions)
         hits: Hits = self.accel.closest_hit(origins, directions, threads=self.threads)
         hit = np.flatnonzero(hits.prim_id >= 0)
         return _of(rows, hit), hits.prim_id[hit].astype(np.int64), hits.u[hit], hits.v[hit]
@@ -190,19 +190,19 @@ class _Placed:
     def first_face(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Return the face of each ray's first hit, (N,) int32; -1 on a miss."""
         n = len(origins)
-        rows, origins, directions = self.asked(origins, directions)
-        return _spread(rows, self.accel.closest_hit(origins, directions, threads=self.threads).prim_id, n, -1)
+        rows, origins, directions = self.local_rays(origins, directions)
+        return _scatter(rows, self.accel.closest_hit(origins, directions, threads=self.threads).prim_id, n, -1)
 
     def every_hit(self, origins: np.ndarray, directions: np.ndarray, limit: int) -> tuple[np.ndarray, ...]:
-        """Return the same for all hits, at most `limit` of a ray, ray by ray in order of distance."""
-        rows, origins, directions = self.asked(origins, directions)
+        """Return ray, face, u and v of all hits, at most `limit` per ray, ray by ray in order of distance."""
+        rows, origins, directions = self.local_rays(origins, directions)
         ray, face, _, u, v = every_hit(self.accel, origins, directions, self.threads, limit)
         return _of(rows, ray), face.astype(np.int64), u, v
 
     def any_hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         n = len(origins)
-        rows, origins, directions = self.asked(origins, directions)
-        return _spread(rows, self.accel.any_hit(origins, directions, threads=self.threads), n, False)
+        rows, origins, directions = self.local_rays(origins, directions)
+        return _scatter(rows, self.accel.any_hit(origins, directions, threads=self.threads), n, False)
 
     def located(self, origins: np.ndarray, directions: np.ndarray, *hits: np.ndarray) -> np.ndarray:
         """Return the points (M, 3) float64 of hits: ray and face (M,) int64, u and v (M,) float32."""
@@ -213,7 +213,7 @@ class _Placed:
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         out = ((points >= self.low) & (points <= self.high)).all(axis=1)
-        out[out] = contains(self.accel, self.moved(points[out]), threads=self.threads)
+        out[out] = contains(self.accel, self.to_local(points[out]), threads=self.threads)
         return out
 
 
@@ -222,23 +222,23 @@ def _rays(origins: ArrayLike, directions: ArrayLike) -> tuple[np.ndarray, np.nda
     out = [np.asarray(real_numbers(rays, name, "(N, 3)"), np.float64) for name, rays in named.items()]
     origins, directions = (np.ascontiguousarray(rays.reshape(0, 3) if rays.shape == (0,) else rays) for rays in out)
     if origins.ndim != 2 or origins.shape[1] != 3 or origins.shape != directions.shape:
-        raise InputError(f"and ray_directions must be (N, 3) both, got {origins.shape} and {directions.shape}",
+        raise InputError(f"and ray_directions must both be (N, 3), got {origins.shape} and {directions.shape}",
                          argument="ray_origins")
     return origins, directions
 
 
-def _in_rounds(ray: np.ndarray) -> np.ndarray:
-    """Return the order of hits, given ray by ray, that has all first hits of the rays, then all second ones, and so on."""
+def _first_hits_first(ray: np.ndarray) -> np.ndarray:
+    """Return the order of hits that has the first hit of every ray, then all second hits, and so on. ray: of each hit, in order."""
     begins = np.flatnonzero(np.diff(ray, prepend=-1))
     counts = np.diff(begins, append=len(ray))
-    number = np.arange(len(ray)) - np.repeat(begins, counts)  # of a hit among those of its ray
+    rank = np.arange(len(ray)) - np.repeat(begins, counts)  # 0 for the first hit of each ray
     if counts.max(initial=0) <= 1 << 16:
-        number = number.astype(np.uint16)  # NumPy sorts short integers in linear time
-    return np.argsort(number, kind="stable")
+        rank = rank.astype(np.uint16)  # NumPy sorts short integers in linear time
+    return np.argsort(rank, kind="stable")
 
 
-def _spread(rows: np.ndarray | None, found: np.ndarray, n: int, missing: object) -> np.ndarray:
-    """Return the answers of n rays: those of `rows` (None: of all), and `missing` for the others."""
+def _scatter(rows: np.ndarray | None, found: np.ndarray, n: int, missing: object) -> np.ndarray:
+    """Return an array of n rows: `found` in the given rows, `missing` elsewhere. rows None: all rows."""
     if rows is None:
         return found
     out = np.full(n, missing, found.dtype)

@@ -1,1 +1,1 @@
-"""What all of wrt stands on: errors, checks of arguments, files, memory, interrupts, the device, arrays to and from others."""
+"""Foundations of wrt: errors, checks of arguments, files, threads, interrupts, devices, arrays shared with other libraries."""

@@ -1,4 +1,4 @@
-"""Arrays shared with other libraries without a copy: NumPy, Warp, and all that have DLPack or `__array__`."""
+"""Arrays shared with other libraries without a copy: with NumPy, Warp, and all libraries that have DLPack or `__array__`."""
 
 from __future__ import annotations
 
@@ -21,17 +21,16 @@ REAL = "iufO"  # NumPy's kinds of real numbers, and objects such as fractions: n
 
 def to_numpy(array: ArrayLike) -> np.ndarray:
     """Return a NumPy array of the same memory, or a copy of an array on a GPU."""
-    array = taken(array, "an array", None)
+    array = from_tensor(array, "an array", None)
     return array.numpy() if isinstance(array, wp.array) else np.asarray(array)
 
 
 def to_warp(array: ArrayLike, dtype: WarpType = None) -> WarpArray:
     """Return a Warp array of the same memory, or a copy of a read-only array. NumPy arrays stay on the CPU.
 
-    dtype: a Warp type, such as vec3 for arrays of three columns; None is the array's own.
-    """
+    dtype: a Warp type, such as vec3 for arrays of three columns; None keeps the array's type."""
     if not isinstance(array, np.ndarray):
-        array = taken(array, "an array", dtype)
+        array = from_tensor(array, "an array", dtype)
     if isinstance(array, wp.array):
         return array
     array = np.ascontiguousarray(array)
@@ -39,12 +38,12 @@ def to_warp(array: ArrayLike, dtype: WarpType = None) -> WarpArray:
 
 
 def real_numbers(value: object, name: str, shape: str) -> np.ndarray:
-    """Return an argument as an array of real numbers: integers and floats keep their type, objects become float32.
+    """Return an argument as a NumPy array of real numbers: integers and floats keep their type, objects become float32.
 
-    An array on a GPU is copied. Raises InputError that names the argument and the expected shape."""
+    name, shape: the argument's name and expected shape, for the message of InputError. An array on a GPU is copied."""
     if "numpy.ma" in sys.modules and isinstance(value, np.ma.MaskedArray):  # np.ma takes long to import
-        raise InputError("must not be a masked array: its mask would be ignored; leave masked rows out, or fill them", argument=name)
-    value = taken(value, name, None)
+        raise InputError("must not be a masked array", hint="leave masked rows out, or fill them", argument=name)
+    value = from_tensor(value, name, None)
     try:
         array = value.numpy() if isinstance(value, wp.array) else np.asarray(value)
         if array.dtype.kind in REAL:
@@ -55,34 +54,34 @@ def real_numbers(value: object, name: str, shape: str) -> np.ndarray:
 
 
 def float32(array: np.ndarray) -> np.ndarray:
-    """Return a contiguous and aligned array of float32, the same one if possible. Larger values become infinite."""
+    """Return a contiguous and aligned float32 array, without a copy if possible. Values beyond float32 become infinite."""
     with np.errstate(over="ignore"):
         return np.require(array, np.float32, ["C", "A"])
 
 
 def check_no_gradients(what: str = "this", **arrays: object) -> None:
-    """Raise InputError for a Warp array that requires gradients while a tape records, because `what` has none."""
+    """Raise InputError for a Warp array that requires gradients while a tape records, because the query `what` has no gradients."""
     for name, array in arrays.items() if recording_tape() is not None else ():
         if isinstance(array, wp.array) and array.requires_grad:
             raise InputError(f"requires gradients and a wp.Tape is recording, but {what} has none (t, u, v and point of"
-                             f" closest_hit have, in origins, directions and vertices): ask outside of the tape, or give"
-                             f" wp.clone({name}, requires_grad=False)", argument=name)
+                             f" closest_hit have gradients, in origins, directions and vertices)", argument=name,
+                             hint=f"query outside of the tape, or pass wp.clone({name}, requires_grad=False)")
 
 
 def is_tensor(value: object) -> TypeGuard[Tensor]:
-    """Return whether a value is another library's array, which shares its memory by DLPack."""
+    """Return True for an array of another library than NumPy and Warp that shares its memory by DLPack."""
     return not isinstance(value, np.ndarray | wp.array) and hasattr(value, "__dlpack__")
 
 
 def on_cpu(tensor: Tensor) -> bool:
-    """Return whether a tensor's memory is the host's."""
+    """Return True if a tensor is in the memory of the host."""
     return bool(tensor.__dlpack_device__()[0] == DLPACK_CPU)
 
 
-def taken(value: object, name: str, dtype: WarpType = wp.vec3) -> Any:
-    """Return a tensor as an array of the same memory: NumPy's on the CPU, Warp's on a GPU. Return any other value unchanged.
+def from_tensor(value: object, name: str, dtype: WarpType = wp.vec3) -> Any:
+    """Return a tensor as an array of the same memory: a NumPy array on the CPU, a Warp array on a GPU. Other values stay unchanged.
 
-    dtype: the Warp array's type; None is the tensor's own. Raises InputError that names the argument if the memory cannot be shared."""
+    dtype: type of the Warp array; None keeps the tensor's type. Raises InputError for the argument `name` if memory cannot be shared."""
     if not is_tensor(value):
         return value
     try:
@@ -90,22 +89,22 @@ def taken(value: object, name: str, dtype: WarpType = wp.vec3) -> Any:
             return np.from_dlpack(value)
         return wp.from_dlpack(value, dtype=dtype)
     except (BufferError, TypeError, RuntimeError, ValueError, AttributeError) as error:  # the last: JAX's, under jit
-        raise InputError(f"{shown(value)} does not share its memory: {error} (closest_hit of wrt.torch and of"
-                         f" wrt.jax has gradients)", argument=name) from error
+        raise InputError(f"{shown(value)} does not share its memory: {error}", argument=name,
+                         hint="closest_hit of wrt.torch and of wrt.jax has gradients") from error
 
 
-def returned(*given: object) -> Callable[[Array], Tensor] | None:
-    """Return a function that turns an array into a tensor of the library of the first tensor in `given`, without a copy.
+def to_tensor_like(*arguments: object) -> Callable[[Array], Tensor] | None:
+    """Return a function that turns an array into a tensor of the same library as the first tensor in `arguments`, without a copy.
 
     An array on a GPU is copied if that tensor is on the CPU. None without a tensor, or if its library has no `from_dlpack`."""
-    for value in given:
+    for value in arguments:
         if is_tensor(value):
             namespace = getattr(value, "__array_namespace__", None)  # the array API's; torch has none
-            home: Any = namespace() if namespace else sys.modules.get(type(value).__module__.partition(".")[0])
-            return partial(_given_to, home.from_dlpack, on_cpu(value)) if hasattr(home, "from_dlpack") else None
+            library: Any = namespace() if namespace else sys.modules.get(type(value).__module__.partition(".")[0])
+            return partial(_to_tensor, library.from_dlpack, on_cpu(value)) if hasattr(library, "from_dlpack") else None
     return None
 
 
-def _given_to(from_dlpack: Callable[[Array], Tensor], to_cpu: bool, array: Array) -> Tensor:
-    """Pass NumPy arrays on the CPU, because NumPy has all versions of the protocol."""
+def _to_tensor(from_dlpack: Callable[[Array], Tensor], to_cpu: bool, array: Array) -> Tensor:
+    """Convert an array by `from_dlpack`. On the CPU a NumPy array is passed, because NumPy has all versions of the protocol."""
     return from_dlpack(to_numpy(array) if to_cpu or not isinstance(array, wp.array) or array.device.is_cpu else array)

@@ -1,6 +1,6 @@
-"""Files of arrays with a checksum: a line with the kind of file, a line of JSON, the arrays' bytes, and the SHA-256 of all that.
+"""Checked files of arrays: a line with the kind of file, a line of JSON, the bytes of the arrays, and the SHA-256 of all these bytes.
 
-Nothing in them is evaluated or unpickled."""
+Nothing in such a file is evaluated or unpickled."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MAX_HEADER = 1 << 16
 
 
 def write_checked(file: BinaryIO, magic: bytes, header: JsonObject, parts: Iterable[bytes | np.ndarray]) -> None:
-    """Write such a file to an open file. magic: the first line, with its end; header: at most MAX_HEADER bytes of JSON."""
+    """Write a checked file. magic: the first line with its line end; header: at most MAX_HEADER bytes as JSON."""
     digest = sha256()
     for part in (magic, json.dumps(header).encode() + b"\n", *parts):
         view = part if isinstance(part, bytes) else np.ascontiguousarray(part).reshape(-1).view(np.uint8).data
@@ -31,7 +31,7 @@ def write_checked(file: BinaryIO, magic: bytes, header: JsonObject, parts: Itera
 
 
 def read_checked(path: str | os.PathLike[str], magic: bytes, what: str) -> tuple[JsonObject, memoryview]:
-    """Return the header and the bytes of the arrays. Raises InputError if the file is missing, damaged, or no `what`."""
+    """Return the header and the bytes of the arrays. Raises InputError if the file is missing, damaged, or not of the kind `what`."""
     try:
         with open_regular(path) as file:
             if file.read(len(magic)) != magic:
@@ -44,7 +44,7 @@ def read_checked(path: str | os.PathLike[str], magic: bytes, what: str) -> tuple
         raise error.at(path) from error
     end = bytes(data[: len(magic) + MAX_HEADER]).find(b"\n", len(magic))
     if end < 0 or sha256(data[:-DIGEST_BYTES]).digest() != data[-DIGEST_BYTES:]:
-        raise InputError("is damaged: its checksum does not fit", path=path)
+        raise InputError("is damaged: its checksum does not match its content", path=path)
     try:
         header = json.loads(bytes(data[len(magic):end]))
     except (ValueError, RecursionError):

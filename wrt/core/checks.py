@@ -1,4 +1,4 @@
-"""Checks of arguments, which bring them to one form. An InputError names the argument and what was expected."""
+"""Checks of arguments, which also convert them. `what` is the argument's name, after its place: "camera 'main': fov_y" (`wrong`)."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ import numpy.typing as npt
 from wrt.core.errors import InputError, wrong
 
 T = TypeVar("T")
-LARGEST = 1e30  # absolute value of a number in a scene; larger ones become infinite on the device
+LARGEST = 1e30  # largest absolute value of a number in a scene; float32 ends at 3.4e38
 
 
 def as_integer(value: object, what: str, low: int, high: int) -> int:
-    """Return an integer in [low, high], Python's or NumPy's. A float is no integer, even if whole."""
+    """Return a Python or NumPy integer in [low, high] as int. Raises InputError for others, and for any float, even 1.0."""
     try:
         number = operator.index(value)  # type: ignore[arg-type]
     except TypeError:
@@ -46,7 +46,7 @@ def as_size(value: object, what: str = "size", high: int = 32768) -> tuple[int, 
 
 
 def as_array(value: object, dtype: npt.DTypeLike, what: str) -> np.ndarray:
-    """Return a contiguous array. Values beyond the type's range become infinite."""
+    """Return a contiguous NumPy array of a type. Values beyond the range of a float type become infinite."""
     try:
         with np.errstate(over="ignore"):
             return np.ascontiguousarray(value, dtype=dtype)
@@ -62,7 +62,7 @@ def as_path(value: object, what: str) -> Path:
 
 
 def as_one(value: object, kind: type[T] | tuple[type[T], ...], what: str) -> T:
-    """Return the value if it is of that type, or of one of those types."""
+    """Return the value. Raises InputError unless it is an instance of `kind`."""
     kinds = kind if isinstance(kind, tuple) else (kind,)
     if not isinstance(value, kinds):
         raise wrong(what, f"must be {' or '.join(_a(each.__name__) for each in kinds)}, got {shown(value)}")
@@ -70,7 +70,7 @@ def as_one(value: object, kind: type[T] | tuple[type[T], ...], what: str) -> T:
 
 
 def as_tuple(value: object, kind: type[T] | tuple[type[T], ...], what: str) -> tuple[T, ...]:
-    """Return a tuple of values of that type from an iterable, or from a single one."""
+    """Return a tuple of instances of `kind`, from an iterable of instances or from a single instance."""
     if isinstance(value, kind):
         return (value,)
     if isinstance(value, str) or not hasattr(value, "__iter__"):
@@ -80,58 +80,58 @@ def as_tuple(value: object, kind: type[T] | tuple[type[T], ...], what: str) -> t
 
 
 def as_names(value: object, what: str) -> tuple[str, ...]:
-    """Return a tuple of names from an iterable, or from a single one."""
+    """Return a tuple of names, from an iterable of names or from a single name."""
     if not isinstance(value, Iterable):
-        raise wrong(what, f"must be a name or several, got {shown(value)}")
+        raise wrong(what, f"must be one or more names, got {shown(value)}")
     return as_tuple(value, str, what)
 
 
 def as_choice(value: str, choices: Collection[str], what: str) -> str:
-    """Return the value if it is one of the choices."""
+    """Return the value. Raises InputError unless it is one of the choices."""
     if value not in choices:
         raise wrong(what, f"must be one of {', '.join(choices)}; got {shown(value)}", did_you_mean(value, choices).rstrip() or None)
     return value
 
 
 def require_known(name: str, known: Collection[str], what: str, argument: str | None = None) -> None:
-    """Raise InputError if the name is not known."""
+    """Raise InputError if `name` is not in `known`. what: the kind of thing that the name stands for."""
     if name not in known:
         raise InputError(f"no {what} {shown(name)}", argument=argument,
                          hint=f"{did_you_mean(name, known)}there is {', '.join(known) or 'none'}")
 
 
 def unknown(name: str, what: str, known: Iterable[str], *, argument: str | None = None, place: str | None = None) -> InputError:
-    """Return the error of an unknown name, with the most similar known one, and all of them; long names and lists are cut."""
+    """Return the error about an unknown name. Its hint is the most similar known name, and a list of the known names, cut at 100."""
     names = [str(each) for each in known]
     hint = f"{did_you_mean(name, names)}known are {listed(names, 100)}" if names else "there are none"
     return InputError(f"unknown {what} {short(name)}", argument=argument, place=place, hint=hint)
 
 
 def listed(names: Collection[str], most: int = 5) -> str:
-    """Return the first names, each cut to 60 characters, and the number of the others."""
+    """Return the first `most` names, each cut to 60 characters, and the number of further names."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(map(short, islice(names, most))) + more
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """Return a question with the most similar known name, for the middle of a message; "" if none is similar."""
+    """Return "did you mean ...? " with the most similar known name; "" if none is similar."""
     near = most_similar(name, known) if isinstance(name, str) else ""
     return f"did you mean {near!r}? " if near else ""
 
 
 def most_similar(name: str, known: Iterable[str]) -> str:
-    """Return the known name that is most similar, "" if none is."""
+    """Return the known name that is most similar to `name`; "" if none is similar."""
     names = [each for each in islice(known, 1000) if len(each) <= 100]
     return next(iter(difflib.get_close_matches(name[:100], names, n=1)), "")
 
 
 def at_thing(kind: str, name: str) -> str:
-    """Return the beginning of a message about a thing with a name, or without one ("")."""
+    """Return the beginning of a message about an object of a scene, such as "camera 'main': "; without the name if that is ""."""
     return f"{kind} {name!r}: " if name else f"{kind}: "
 
 
 def shown(value: object) -> str:
-    """Return a value in the form of a message: short, and as a type where the value itself would say nothing."""
+    """Return a value for a message: numbers, text and lists as they are, but short; arrays by shape and type, others by type."""
     if isinstance(value, str | int | float | tuple | list) or value is None:
         return short(value)
     if isinstance(value, np.ndarray):
@@ -140,7 +140,7 @@ def shown(value: object) -> str:
 
 
 def short(value: object, most: int = 60) -> str:
-    """Return repr(value), cut to `most` characters, or the type of a value that cannot be written."""
+    """Return repr(value), cut to `most` characters; the type if repr fails."""
     try:
         text = repr(value)
     except (ValueError, RecursionError):  # an integer of thousands of digits, tables nested thousands deep
@@ -153,9 +153,9 @@ def _a(name: str) -> str:
 
 
 def accepts(kind: object, value: object) -> bool:
-    """Return whether a value fits an annotation: a class or a union of classes. Other annotations accept anything.
+    """Return True if a value fits an annotation: a class, or a union of classes. Other annotations accept any value.
 
-    An int is a float too, and a bool is no number."""
+    An int also fits float; a bool fits neither int nor float."""
     if get_origin(kind) in (Union, UnionType):
         return any(accepts(each, value) for each in get_args(kind))
     if not isinstance(kind, type):

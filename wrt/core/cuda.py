@@ -1,4 +1,4 @@
-"""Settings of launches on CUDA. They change speed alone: hits and pixels keep their bits. `wrt.tune` measures the alternatives."""
+"""Settings of CUDA launches. They change only the speed; hits and pixels keep their bits. `wrt.tune` measures the alternatives."""
 
 BLOCK_DIMS = (64, 32, 128, 256)
 STACKS = ("shared", "local")  # kernels.traverse.stack.PLACES

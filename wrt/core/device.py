@@ -1,4 +1,4 @@
-"""Devices: starting Warp, loading and launching kernels, and copying arrays to and from a device."""
+"""Start of Warp, loading and launching of kernels, and copies of arrays to and from a device."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from wrt.core.types import Device, Kernel, WarpArray, WarpType
 
 MOST_ROWS = (1 << 31) - 1
 ROOM_TO_COMPILE = 16 << 20  # bytes of disk for the sources and the object of a kernel, with a large margin
-FILES_TO_COMPILE = 64  # files and folders, likewise
+FILES_TO_COMPILE = 64  # files and folders of a kernel, with a large margin
 
 if wp.config.log_level == wp.LOG_INFO:  # Warp's default; another level is the user's
     wp.config.log_level = wp.LOG_WARNING
@@ -43,10 +43,9 @@ _making = threading.RLock()
 
 
 def made_once(make: Callable[P, T]) -> Callable[P, T]:
-    """Cache a function's results; of several threads that call it first, one calls `make` and the others wait.
+    """Cache a function's results. If several threads need a result at once, one calls `make` and the others wait.
 
-    Two kernels of the same code would be compiled twice, and two structs of the same fields are different types to Warp.
-    """
+    Without a cache, two kernels of the same code would be compiled twice, and two structs of the same fields be different types to Warp."""
     known: dict[tuple[object, ...], T] = {}
 
     @wraps(make)
@@ -65,27 +64,27 @@ def made_once(make: Callable[P, T]) -> Callable[P, T]:
 
 @contextmanager
 def _stderr_without(text: bytes) -> Iterator[None]:
-    """Hold back stderr during the block, then write it without the lines that contain `text`: Warp's C++ writes past Python."""
+    """Remove lines that contain `text` from what the block writes to file descriptor 2: Warp's C++ code bypasses sys.stderr."""
     try:
-        held = tempfile.TemporaryFile()
+        buffer = tempfile.TemporaryFile()
     except OSError:
-        held = None
-    if held is None or sys.stderr is None:  # no temporary file, or the caller closed stderr
+        buffer = None
+    if buffer is None or sys.stderr is None:  # no temporary file, or the caller closed stderr
         yield
         return
     sys.stderr.flush()
-    with held:
+    with buffer:
         stderr = os.dup(2)
-        os.dup2(held.fileno(), 2)
+        os.dup2(buffer.fileno(), 2)
         try:
             yield
         finally:
             os.dup2(stderr, 2)
             os.close(stderr)
-            held.seek(0)
-            if kept := b"".join(line for line in held.read().splitlines(keepends=True) if text not in line):
+            buffer.seek(0)
+            if lines := b"".join(line for line in buffer.read().splitlines(keepends=True) if text not in line):
                 with contextlib.suppress(OSError):  # a full disk
-                    os.write(2, kept)
+                    os.write(2, lines)
 
 
 @made_once
@@ -99,9 +98,9 @@ def _start_warp() -> None:
 
 @made_once
 def start(device: str) -> Device:
-    """Start Warp and return its device of that name ("cpu", "cuda:0").
+    """Start Warp and return its device of a name, such as "cpu" or "cuda:0".
 
-    Raises InputError for an unknown name, with those known, and if the kernel cache cannot be made."""
+    Raises InputError for an unknown name, with the known names, and if the folder of the kernel cache cannot be made."""
     _start_warp()
     try:
         with _stderr_without(warp_private.CUDA_ERROR):  # the InputError below reports it
@@ -112,7 +111,7 @@ def start(device: str) -> Device:
 
 
 def describe_devices() -> list[str]:
-    """Return a line for each device: its name for `--device`, its hardware and its size."""
+    """Return a line for each device: its name for `--device`, its hardware, and its threads or its memory."""
     start("cpu")
     lines = [f"cpu: {wp.get_device('cpu').name or 'CPU'}, {thread_count(None)} threads"]
     for device in wp.get_cuda_devices():
@@ -121,7 +120,7 @@ def describe_devices() -> list[str]:
 
 
 def block_dim(device: Device) -> int:
-    """Return the threads of a launch's block; 1 on the CPU, where Warp's default would be compiled for nothing."""
+    """Return the number of threads in a block; 1 on the CPU, where kernels for other sizes would be compiled in vain."""
     return 1 if device.is_cpu else cuda.block_dim
 
 
@@ -136,7 +135,7 @@ def memory_of(device: Device) -> float:
 
 
 class _Loaded:
-    """The devices (names) and block sizes for which a kernel is loaded. Warp would read files again at each call."""
+    """Names of devices, and block sizes, for which a kernel is loaded. Without this record Warp would read files at each call."""
 
     def __init__(self) -> None:
         self.devices: set[tuple[str, int]] = set()
@@ -149,8 +148,7 @@ _loaded: WeakKeyDictionary[Kernel, _Loaded] = WeakKeyDictionary()
 def load_kernel(kernel: Kernel, device: Device) -> None:
     """Compile a kernel, or read it from the cache, before threads launch it. One thread compiles it; the others wait.
 
-    Raises InputError if the cache's folder is full or cannot be written to.
-    """
+    Raises InputError if the cache's folder is full or cannot be written to."""
     loaded, place = _loaded.get(kernel) or _loaded.setdefault(kernel, _Loaded()), (device.alias, block_dim(device))
     if place not in loaded.devices:
         with loading(), loaded.lock:
@@ -161,9 +159,9 @@ def load_kernel(kernel: Kernel, device: Device) -> None:
 
 @contextmanager
 def preloading(*kernels: Kernel) -> Iterator[None]:
-    """Load kernels for the CPU in parallel while the block runs, which raises their errors when it needs them.
+    """Load kernels for the CPU on other threads while the block runs. Errors of a kernel are raised when it is launched.
 
-    At the end of the block all of them are loaded, so that the process may be forked."""
+    At the end of the block all kernels are loaded, so that the process may be forked."""
     missing = [kernel for kernel in kernels if kernel not in _loaded]
     if not missing:
         yield
@@ -176,9 +174,9 @@ def preloading(*kernels: Kernel) -> Iterator[None]:
 
 
 def preload_headers(kernel: Kernel) -> None:
-    """Start to precompile Warp's headers, by compiling this small kernel in the background, if the cache is empty.
+    """If the cache is empty, compile this small kernel in the background, which precompiles Warp's headers.
 
-    Only for processes of wrt: a process that is forked meanwhile would wait for ever. The next kernel raises errors."""
+    Only for processes of wrt: a process that is forked meanwhile would wait for ever. Errors are raised by the next kernel."""
     cpu = start("cpu")
     if not any(Path(wp.config.kernel_cache_dir).glob(warp_private.IN_CACHE)):
         submit(partial(load_kernel, kernel, cpu))
@@ -194,7 +192,7 @@ def _load(kernel: Kernel, device: Device, block_dim: int) -> None:
             if all(is_intact(path, sealed) for path in files):
                 warp_private.load(kernel, device, block_dim)
                 return
-        for path in before:  # but keep what another process has compiled since
+        for path in before:  # files that another process has compiled since stay
             remove(path)
         folder.parent.mkdir(parents=True, exist_ok=True)
         _require_room_to_compile(folder.parent)
@@ -203,19 +201,19 @@ def _load(kernel: Kernel, device: Device, block_dim: int) -> None:
 
 @contextmanager
 def _cache_errors() -> Iterator[None]:
-    """Turn the errors of the system and of Warp about the kernel cache into an InputError that names another way."""
+    """Turn errors of the system and of Warp about the kernel cache into an InputError with a hint."""
     try:
         yield
     except Exception as error:
         if not isinstance(error, OSError | UnicodeError) and not warp_private.is_warps_error(error):
             raise
         reason = "its name is not UTF-8" if isinstance(error, UnicodeError) else getattr(error, "strerror", None) or error
-        raise InputError(f"kernels cannot be compiled: {reason}", hint="WARP_CACHE_PATH names another folder",
+        raise InputError(f"kernels cannot be compiled: {reason}", hint="set WARP_CACHE_PATH to another folder",
                          path=wp.config.kernel_cache_dir or getattr(error, "filename", None)) from error
 
 
 def _require_room_to_compile(cache: Path) -> None:
-    """Raise OSError if there is no room for a kernel: LLVM ends the process on a full disk."""
+    """Raise OSError if the disk has no room to compile a kernel: LLVM ends the process on a full disk."""
     room = float(shutil.disk_usage(cache).free)
     with contextlib.suppress(ImportError):
         import resource
@@ -223,13 +221,13 @@ def _require_room_to_compile(cache: Path) -> None:
         most = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
         room = min(room, float("inf") if most == resource.RLIM_INFINITY else most)
     if room < ROOM_TO_COMPILE:
-        raise OSError(errno.ENOSPC, f"room for {room / 2**20:.1f} MiB, and {ROOM_TO_COMPILE >> 20} are needed")
+        raise OSError(errno.ENOSPC, f"there is room for {room / 2**20:.1f} MiB, but {ROOM_TO_COMPILE >> 20} MiB are needed")
     if hasattr(os, "statvfs") and (disk := os.statvfs(cache)).f_files and disk.f_favail < FILES_TO_COMPILE:
-        raise OSError(errno.ENOSPC, f"room for {disk.f_favail} files, and {FILES_TO_COMPILE} are needed")
+        raise OSError(errno.ENOSPC, f"there is room for {disk.f_favail} files, but {FILES_TO_COMPILE} are needed")
 
 
 def upload(array: np.ndarray, dtype: WarpType, device: Device) -> WarpArray:
-    """Return a Warp array of `dtype` with the rows of a NumPy array; on the CPU without a copy if the memory fits.
+    """Return a Warp array of `dtype` with the rows of a NumPy array; on the CPU without a copy if type and layout allow it.
 
     Raises InputError for more rows than the int32 indices of kernels can reach."""
     if len(array) > MOST_ROWS:
@@ -276,11 +274,9 @@ def empty_aligned(shape: int | tuple[int, ...], dtype: npt.DTypeLike) -> np.ndar
 
 @made_once
 def record_dtype(struct: WarpType) -> np.dtype:
-    """Return the memory layout of a Warp struct.
+    """Return the memory layout of a Warp struct as a NumPy type.
 
-    NumPy parses it with `ast`, and CPython 3.11 raises SystemError if two threads do so at once. Warp would parse it for each array;
-    `upload` and `on_host` do not.
-    """
+    It is cached, because NumPy parses the layout with `ast`: CPython 3.11 raises SystemError if two threads do so at once."""
     return np.dtype(struct.numpy_dtype())
 
 
@@ -303,8 +299,8 @@ def launch(kernel: Kernel, n: int, *inputs: object, threads: int = 1, step: int 
 def launch_on(device: Device, kernel: Kernel, n: int, *inputs: object, threads: int = 1, step: int = 0) -> None:
     """Launch a kernel over n elements.
 
-    With a step, the CPU launches it over ranges of `step` elements on `threads` threads, and the input None is each range's first
-    index. A GPU has one launch over all of n, in blocks of wrt.core.cuda.block_dim threads."""
+    With a step, the CPU launches it once for each range of `step` elements, on `threads` threads; an input of None is replaced by the
+    first index of the range. On a GPU there is one launch, in blocks of wrt.core.cuda.block_dim threads."""
     if n == 0:
         return
     load_kernel(kernel, device)

@@ -1,4 +1,4 @@
-"""The one error a user's mistake turns into: the command line prints its message and exits with 2."""
+"""InputError, for every mistake of a user: the command line prints its message and exits with code 2. SceneWarning, for scene files."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from contextlib import contextmanager
 from typing import Any, Self
 
 _PACKAGE = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
-LONGEST, END = 5000, 1000  # characters of a line of a message, which may quote what stands in a file; those kept of its end
+# Longest line of a message, in characters, because messages quote files; and how many of them come from the end of a longer line.
+LONGEST, END = 5000, 1000
 PREDICATE = re.compile(r"(must|is|are|has|have|holds?|needs?|requires?|shares|cannot|does|do|takes|puts|spans?|belongs?|and|or)\b")
 
 
@@ -21,14 +22,14 @@ class InputError(ValueError):
 
     Parameters
     ----------
-    what : what is wrong: a predicate of the argument ("must be 1 or more, got 0"), or a sentence of its own
+    what : what is wrong: a predicate of the argument ("must be 1 or more, got 0"), or a complete sentence
     argument : name of the argument, option or field that is wrong
     path : the file that is wrong
-    place : where in the file, or of which object: "nodes[3].scale", "line 7", "camera 'main'"
+    place : where in the file, or in which object: "nodes[3].scale", "line 7", "camera 'main'"
     hint : what would be right, or what to do
 
-    The parameters are attributes of the error. `str` gives the message: where, what is wrong, what would be right. Where one file
-    led to another, `path` is the second, and `outside` says where the first names it: "scene.toml: include[0]".
+    The parameters are attributes of the error. `str` gives the message: where, what is wrong, what would be right. If one file
+    includes another, `path` is the included file, and `outside` says where the first file names it: "scene.toml: include[0]".
     """
 
     def __init__(self, what: str, *, argument: str | None = None, path: str | os.PathLike[str] | None = None,
@@ -41,7 +42,7 @@ class InputError(ValueError):
         what, name = self.what, self.argument or ""
         if name and PREDICATE.match(what):
             what = f"{name} {what}"
-        elif name and not re.search(rf"\b{re.escape(name)}\b", what, re.IGNORECASE):  # else the sentence names it
+        elif name and not re.search(rf"\b{re.escape(name)}\b", what, re.IGNORECASE):  # the sentence does not name the argument
             what = f"{name}: {what}"
         lines = _joined(self.outside, self.path, self.place, f"{what}; {self.hint}" if self.hint else what).split("\n")
         return "\n".join(line if len(line) <= LONGEST else f"{line[:LONGEST - END - 3]}...{line[-END:]}" for line in lines)
@@ -50,7 +51,7 @@ class InputError(ValueError):
         return _restore, (type(self), self.args, self.__dict__)
 
     def at(self, path: str | os.PathLike[str] | None = None, place: str | None = None, hint: str | None = None) -> Self:
-        """Copy the error, found at that place of that file; if it has a file already, they are what led to that file."""
+        """Return a copy of the error with a file and a place. If the error has a file, the new ones say what includes that file."""
         error = copy.copy(self)
         if self.path is None:
             vars(error).update(path=path, place=_joined(place, self.place) or None)
@@ -61,7 +62,7 @@ class InputError(ValueError):
 
 
 class InputErrors(InputError):
-    """Several at once, each in `errors`, and a line of the message."""
+    """Several errors at once, in `errors`; the message has a line for each."""
 
     def __init__(self, what: str, errors: Sequence[InputError], *, path: str | os.PathLike[str] | None = None) -> None:
         super().__init__(what, path=path)
@@ -69,7 +70,7 @@ class InputErrors(InputError):
 
 
 def wrong(name: str, what: str, hint: str | None = None) -> InputError:
-    """Return the error of an argument, whose name may follow its place: "camera 'main': fov_y"."""
+    """Return the error of an argument. Its place may precede its name: "camera 'main': fov_y"."""
     place, _, argument = name.rpartition(": ")
     return InputError(what, argument=argument, place=place or None, hint=hint)
 
@@ -86,7 +87,7 @@ def _joined(*parts: str | os.PathLike[str] | None) -> str:
 
 @contextmanager
 def at(place: str | None = None, path: str | os.PathLike[str] | None = None) -> Iterator[None]:
-    """Put a file, or a place such as "nodes[3].scale", in front of any InputError raised inside."""
+    """Add a file or a place, such as "nodes[3].scale", to any InputError that the block raises."""
     try:
         yield
     except InputError as error:
@@ -94,11 +95,11 @@ def at(place: str | None = None, path: str | os.PathLike[str] | None = None) -> 
 
 
 class SceneWarning(UserWarning):
-    """Something in a scene file that wrt leaves out or replaces; the picture may differ from the author's."""
+    """A scene file holds something that wrt leaves out or replaces; the picture may differ from the author's."""
 
 
 def warn(message: str) -> None:
-    """Give a SceneWarning, shown at the line outside of wrt that led to it."""
+    """Issue a SceneWarning that points to the line of the caller outside of wrt."""
     frame, level = sys._getframe(1), 2  # of warnings.warn: 1 is this function
     while frame.f_back is not None and frame.f_code.co_filename.startswith(_PACKAGE):  # skip_file_prefixes is of Python 3.12
         frame, level = frame.f_back, level + 1

@@ -1,4 +1,4 @@
-"""Reading of files that come from other people."""
+"""Reading of untrusted files."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ from wrt.core.errors import InputError
 def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
     """Open a regular file for reading.
 
-    Raises InputError, without the path, for a folder, a pipe or a device, which may never end; and OSError.
-    """
+    Raises InputError, without the path, for a folder, and for a pipe or a device, which may never end. Raises OSError like `open`."""
     try:
         # Without O_NONBLOCK, opening a pipe waits until something writes to it.
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
@@ -29,7 +28,7 @@ def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
 
 
 def require_file(path: Path, what: str = "") -> None:
-    """Raise InputError if no file is at the path, with `what` at the end of the message, or if the system cannot look."""
+    """Raise InputError if there is no file at the path, or if the system cannot tell. what: end of the message."""
     try:
         there = path.exists()
     except OSError as error:  # a name too long, a folder that may not be looked into

@@ -7,25 +7,21 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import TypeVar
 
 T = TypeVar("T")
-SHOWN_ROWS = 200  # of one table; more make a notebook slow
+SHOWN_ROWS = 200  # of one table; more rows make a notebook slow
 
 
 def html_table(title: str, head: Sequence[object], rows: Iterable[Sequence[object]], most: int | None = SHOWN_ROWS) -> str:
-    """Return an HTML table of the first `most` rows, and a line with the number of the others. title: "" is none."""
+    """Return an HTML table of the first `most` rows, and a line with the number of further rows. title: "" for no title."""
     rows = list(rows)
     out = [f"<b>{html.escape(title)}</b>"] if title else []
-    out.append("<table>")
-    if head:
-        out.append(_row(head, "th"))
-    out += [_row(row, "td") for row in rows[:most]]
-    out.append("</table>")
+    out += ["<table>", *([_row(head, "th")] if head else []), *(_row(row, "td") for row in rows[:most]), "</table>"]
     if most is not None and len(rows) > most:
         out.append(f"<p>and {len(rows) - most} more</p>")
     return "".join(out)
 
 
 class Rows(list[T]):
-    """A list of a report's rows, which a notebook shows as the HTML that `page` makes of them."""
+    """A list of a report's rows. A notebook shows it as the HTML that `page` returns for the rows."""
 
     def __init__(self, rows: Iterable[T], page: Callable[[Sequence[T]], str]) -> None:
         super().__init__(rows)

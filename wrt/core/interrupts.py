@@ -1,6 +1,6 @@
-"""Ctrl-C that a render checks between its tiles, in place of an exception in the middle of one.
+"""Ctrl-C between the tiles of a render, in place of an exception in the middle of a tile.
 
-On the command line SIGTERM and SIGHUP count as Ctrl-C, so that the picture so far survives the end of a batch job or a terminal."""
+On the command line SIGTERM and SIGHUP act like Ctrl-C, so that the picture so far survives the end of a batch job or a terminal."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import NoReturn
 
 
 class Interrupted(KeyboardInterrupt):
-    """A KeyboardInterrupt with its signal's number."""
+    """A KeyboardInterrupt with the number of its signal."""
 
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)
@@ -23,7 +23,7 @@ def _raise(number: int, frame: object) -> NoReturn:
     raise Interrupted(number)
 
 
-# The signals that end a render early, each with the handler that raises a KeyboardInterrupt. A user's handler stays.
+# The signals that end a render early, each with the handler that raises a KeyboardInterrupt. wrt replaces no handler of a user.
 HANDLERS: dict[int, Callable[..., object]] = {signal.SIGINT: signal.default_int_handler} | {
     getattr(signal, name): _raise for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)}
 
@@ -36,17 +36,16 @@ def raise_on_termination() -> None:
 
 
 def exit_code(number: int | None) -> int:
-    """Return a shell's exit code for a process that this signal ended: 128 plus its number. None: Ctrl-C."""
+    """Return the exit code that a shell reports for a process ended by a signal: 128 plus its number. None: Ctrl-C."""
     return 128 + int(signal.SIGINT if number is None else number)
 
 
 @contextmanager
 def held_interrupts() -> Iterator[list[int]]:
-    """Hold Ctrl-C back during the block; yield a list that collects the numbers of the signals that arrive.
+    """Defer Ctrl-C during the block; yield a list that collects the numbers of the signals that arrive.
 
-    SIGTERM and SIGHUP are held too after raise_on_termination. A signal that raises no KeyboardInterrupt in this thread is not held:
-    outside the main thread, or where the user handles or ignores it.
-    """
+    After raise_on_termination, SIGTERM and SIGHUP are deferred, too. Signals that raise no KeyboardInterrupt in this thread are not
+    deferred: outside the main thread, or if the user handles or ignores them."""
     arrived: list[int] = []
     held = []
     if threading.current_thread() is threading.main_thread():

@@ -21,11 +21,10 @@ _checked: set[Path] = set()  # folders of headers that this process has checked
 
 
 def shared_headers(key: str, precompile: Callable[[Path], None], leftover: re.Pattern[str]) -> Path:
-    """Return the folder of the precompiled headers named `key`; `precompile` writes them if needed. Raises OSError if it cannot.
+    """Return the folder of the precompiled headers `key`; `precompile` writes them if necessary. Raises OSError if it cannot.
 
-    All threads and processes of a user share the folder, because Warp's headers take 1.3 s of processor time. Folders of the cache
-    that match `leftover` and were not used for a day are removed.
-    """
+    All threads and processes of a user share the folder, because precompiling Warp's headers takes 1.3 s of processor time. Folders of
+    the cache that match `leftover` and were not used for a day are removed."""
     folder = Path(wp.config.kernel_cache_dir) / f"precompiled-{key}"
     with _lock:
         if folder not in _checked or not folder.is_dir():  # the first call, or the cache was emptied
@@ -43,7 +42,7 @@ def shared_headers(key: str, precompile: Callable[[Path], None], leftover: re.Pa
 def _make_headers(folder: Path, precompile: Callable[[Path], None]) -> None:
     """Make the folder under another name, and rename it when it is complete.
 
-    Threads wait for the first one. Each of several processes makes its own; the first one's stays, because it is in use."""
+    Threads of a process wait for one of them. If several processes make the folder, the first stays, because it is in use."""
     aside = Path(mkdtemp(prefix=f"{folder.name}-", dir=folder.parent))
     try:
         precompile(aside)
@@ -79,12 +78,12 @@ def remove(path: Path) -> None:
 
 
 def seal(path: Path) -> None:
-    """Append the SHA-256 of an object file to it. Linkers ignore what follows the object."""
+    """Append its SHA-256 to an object file. Linkers ignore bytes after the object."""
     with path.open("r+b") as file:
         file.write(sha256(file.read()).digest())
 
 
 def is_intact(path: Path, sealed: bool) -> bool:
-    """Return whether a file exists and is not empty and, for a sealed object, whether its digest fits."""
+    """Return True if a file exists and is not empty, and if the SHA-256 of a sealed object file matches its content."""
     data = path.read_bytes() if path.is_file() else b""
     return len(data) > 0 and not (sealed and path.suffix == ".o" and sha256(data[:-32]).digest() != data[-32:])

@@ -1,4 +1,4 @@
-"""Optional packages: imported when they are needed, with a message that says how to install a missing one."""
+"""Optional packages: imported when they are needed. The message about a missing package says how to install it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 from wrt.core.errors import InputError
 
-# The names of packages whose modules are named otherwise.
+# Names of packages that differ from the names of their modules.
 INSTALLED_AS = {"OpenImageIO": "openimageio", "PIL": "pillow", "elftools": "pyelftools"}
 
 

@@ -1,4 +1,4 @@
-"""A table of names whose entries are imported on first use, so that a program pays only for what it uses."""
+"""Table of names whose entries are imported on first use, so that a program imports only the modules that it uses."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ T = TypeVar("T")
 class Registry(UserDict[str, T]):
     """Map a name to an entry, or to "module:attribute", which the first lookup imports.
 
-    kind: the word for an entry in messages. group: the entry points of installed packages that add entries ("": none). They are read
-    when a name is unknown or all names are needed, and replace no entry of the table.
-    """
+    kind: word for an entry in messages. group: group of entry points by which installed packages add entries ("": none). Entry points
+    are read when a name is unknown or all names are needed, and replace no entry of the table."""
 
     def __init__(self, kind: str, places: Mapping[str, T | str], group: str = "") -> None:
         super().__init__(places)  # type: ignore[arg-type]
@@ -45,7 +44,7 @@ class Registry(UserDict[str, T]):
 
     def check(self, name: str, argument: str | None = None) -> None:
         """Raise InputError if the table has no such name."""
-        from wrt.core.checks import require_known  # imports NumPy, for which the help of commands does not wait
+        from wrt.core.checks import require_known  # imports NumPy, which would delay the help of commands
 
         require_known(name, self, self.kind, argument)
 

@@ -16,14 +16,14 @@ from wrt.core.checks import shown
 from wrt.core.errors import InputError
 
 MOST_THREADS = 1 << 10
-# Bytes of a stack. Queries crash with 256 KiB, since kernels have arrays on it; renders with 512; the compiler with 768 (Linux, x86-64).
+# Bytes of a stack. Kernels have arrays on it: queries crash with 256 KiB, renders with 512, the compiler with 768 (Linux, x86-64).
 STACK = 2 << 20
 P = ParamSpec("P")
 T = TypeVar("T")
 
 
 def thread_count(threads: int | None) -> int:
-    """Return the number of threads to use; None is one for each core that this process may run on. Raises InputError for no count."""
+    """Return a checked number of threads. None: the number of cores that this process may run on."""
     if threads is not None:
         if isinstance(threads, bool) or not hasattr(threads, "__index__"):
             raise InputError(f"must be a whole number, got {shown(threads)}", argument="threads")
@@ -38,7 +38,7 @@ def thread_count(threads: int | None) -> int:
 
 @cache
 def _stack_limit() -> float:
-    """Return the bytes of the main thread's stack, and of a new thread's if threading.stack_size() is 0; infinite if unknown."""
+    """Return the bytes of the main thread's stack, or infinity if unknown. New threads have as many if threading.stack_size() is 0."""
     with contextlib.suppress(ImportError):
         import resource
 
@@ -49,15 +49,15 @@ def _stack_limit() -> float:
 
 @cache
 def _stack_size_lock(process: int) -> threading.Lock:
-    """Return the lock of a process; a forked one needs its own, which no thread holds."""
+    """Return the lock of a process. A forked process needs its own, because no thread of it would release an inherited lock."""
     return threading.Lock()
 
 
 @contextlib.contextmanager
 def _large_stacks() -> Iterator[bool]:
-    """Give threads that start in the block stacks of STACK bytes or more; yield whether they would have them anyway.
+    """Start threads in the block with stacks of STACK bytes or more; yield True if the default stack is that large.
 
-    If not, threads that the user starts meanwhile have them too: threading.stack_size() cannot be read without setting it."""
+    If it is not, threads that the user starts meanwhile get large stacks, too: threading.stack_size() holds for the whole process."""
     with _stack_size_lock(os.getpid()):
         before = threading.stack_size(STACK)
         large = (before or _stack_limit()) >= STACK
@@ -74,7 +74,7 @@ _here = threading.local()  # large: this thread's stack has STACK bytes
 
 
 def _has_stack() -> bool:
-    """Return whether this thread's stack has STACK bytes. A user's thread counts as having the size of threads that start now."""
+    """Return True if this thread's stack has STACK bytes. A thread of the user counts as having the size of threads that start now."""
     if not hasattr(_here, "large"):
         if threading.current_thread() is threading.main_thread():
             _here.large = _stack_limit() >= STACK
@@ -85,9 +85,9 @@ def _has_stack() -> bool:
 
 
 def with_stack(task: Callable[[], T]) -> T:
-    """Run a task that runs or compiles kernels, on a thread with a large stack if this one's is small.
+    """Run a task that runs or compiles kernels; on another thread if the stack of this thread is small.
 
-    On a small stack they end the process with a segmentation fault."""
+    On a small stack, kernels and the compiler end the process with a segmentation fault."""
     return task() if _has_stack() else submit(task).result()
 
 
@@ -95,11 +95,10 @@ def with_stack(task: Callable[[], T]) -> T:
 
 
 class Pool(ThreadPoolExecutor):
-    """Threads with large stacks, which start when they are needed and stay.
+    """Pool of threads with large stacks, which start when they are needed and stay.
 
-    The standard pool takes no tasks after the end of Python's main thread. Then a task runs at once in the thread that submits it;
-    InputError if that thread's stack is small.
-    """
+    The standard pool refuses tasks after the end of Python's main thread. This pool then runs a task at once in the thread that submits
+    it, or raises InputError if the stack of that thread is small."""
 
     def __init__(self, threads: int, name: str = "wrt") -> None:
         super().__init__(threads, name, initializer=partial(setattr, _here, "large", True))
@@ -109,7 +108,7 @@ class Pool(ThreadPoolExecutor):
             with _large_stacks():
                 return super().submit(task, *arguments, **named)
         if not _has_stack():
-            raise InputError("Python's main thread has ended, and the stack of this one is too small for kernels")
+            raise InputError("Python's main thread has ended, and the stack of this thread is too small for kernels")
         future = Future[T]()
         try:
             future.set_result(task(*arguments, **named))
@@ -130,7 +129,7 @@ def submit(task: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> Futur
 
 
 def run_all(tasks: Iterable[Callable[[], None]], threads: int) -> None:
-    """Run all tasks on `threads` threads, this one included. After an error no task starts; it is raised when the others have ended."""
+    """Run all tasks on `threads` threads, including this one. After an error no task starts; it is raised when running tasks have ended."""
     with_stack(partial(_run_all, list(tasks), threads))
 
 
@@ -161,7 +160,7 @@ def _run_all(jobs: list[Callable[[], None]], threads: int) -> None:
         work()
     finally:
         left.clear()
-        wait([helper for helper in helpers if not helper.cancel()])  # not for one that has not begun
+        wait([helper for helper in helpers if not helper.cancel()])  # cancels helpers that have not begun
     if errors:
         raise errors.pop(min(errors))
 
@@ -176,9 +175,8 @@ def _run_in_turn(begin: Callable[[T], tuple[Callable[[], object], Callable[[], I
 def run_growing(begin: Callable[[T], tuple[Callable[[], object], Callable[[], Iterable[T]]]], tasks: Iterable[T], threads: int) -> None:
     """Run all tasks, and the further tasks that they produce, on `threads` threads.
 
-    begin(task) returns the job for a thread, and a function to call after it, which returns more tasks. Both calls run on this
-    thread; so does the job if there is one thread. The first error is raised when all running jobs have ended.
-    """
+    begin(task) returns a job, and a function to call after the job, which returns more tasks. Jobs run on other threads, the two
+    functions on this thread; with one thread, jobs run on it, too. The first error is raised when all running jobs have ended."""
     if threads == 1:
         with_stack(partial(_run_in_turn, begin, deque(tasks)))
         return

@@ -1,6 +1,6 @@
-"""Types that many signatures share. They are for annotations: at run time each is `Any`, so that none of them imports Warp.
+"""Types that many signatures share, for annotations alone: at run time each is `Any`, so that this module does not import Warp.
 
-Write `object` for a value that is only checked, shown or passed on, and a type of one's own module for all else.
+Annotate a value that is only checked, shown or passed on as `object`, and other values with a type of their own module.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ if TYPE_CHECKING:
     Array: TypeAlias = npt.NDArray[Any] | WarpArray
     ArrayT = TypeVar("ArrayT", bound=Tensor, default=npt.NDArray[Any])  # of answers: NumPy's, Warp's or another library's
     TensorT = TypeVar("TensorT", bound=Tensor)
-    NumpyLike: TypeAlias = npt.NDArray[Any] | Sequence[Any]  # what gets answers of NumPy
-    ArrayLike: TypeAlias = npt.ArrayLike | WarpArray | Tensor  # what callers give: lists and numbers, too
-    Device: TypeAlias = wp.Device  # wp.get_device("cpu"); callers give its name
+    NumpyLike: TypeAlias = npt.NDArray[Any] | Sequence[Any]  # arguments of queries that answer in NumPy arrays
+    ArrayLike: TypeAlias = npt.ArrayLike | WarpArray | Tensor  # arguments of public functions, also lists and numbers
+    Device: TypeAlias = wp.Device  # wp.get_device("cpu"); public functions take its name
     Kernel: TypeAlias = wp.Kernel
     DeviceFunction: TypeAlias = wp.Function
-    # Warp and readers make these while the program runs, so that no checker knows their fields:
+    # Types whose fields are known only at run time:
     WarpStruct: TypeAlias = Any  # an instance of a wp.struct
     WarpType: TypeAlias = Any  # wp.float32, wp.vec3, a wp.struct
     KernelModule: TypeAlias = Any  # a module of kernels/ that a structure or a material chooses

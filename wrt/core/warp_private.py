@@ -1,7 +1,7 @@
-"""Warp's insides: private names, layouts of arguments, texts, file names, its compiler. No other file of the host names them.
+"""Private parts of Warp: names, layouts of arguments, texts, file names, the compiler. No other module of the host uses them.
 
-Device code has its own such file, kernels/warp_private.py. Everything here was read in Warp 1.19 (WORKS_WITH): `prepare` and the
-self-test in wrt.accel.queries.raw_launches refuse other insides. docs/warp.md lists each assumption and its test."""
+Device code uses private parts only in kernels/warp_private.py. All assumptions are about Warp 1.19 (WORKS_WITH): `prepare` and the
+self-test in wrt.accel.queries.raw_launches refuse a Warp that differs. docs/warp.md lists each assumption and its test."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from wrt.core.kernel_cache import seal, shared_headers
 from wrt.core.types import Device, Kernel, WarpArray, WarpStruct, WarpType
 
 WORKS_WITH = "warp-lang>=1.19,<1.20"  # as in pyproject.toml
-Record: TypeAlias = ctypes.Structure  # an argument as a kernel gets it
+Record: TypeAlias = ctypes.Structure  # a kernel argument in the memory layout of the kernel
 
 
 def refusal(what: str) -> InputError:
-    """Return the error for a Warp whose insides differ in `what`."""
+    """Return the error for a Warp whose private part `what` differs from Warp 1.19."""
     return InputError(f"Warp {wp.config.version} is not supported, its insides differ ({what})", hint=f"install '{WORKS_WITH}'")
 
 
@@ -38,19 +38,19 @@ try:
 except ImportError as error:
     raise refusal(str(error)) from error
 
-# --- structs and arrays, as kernels get them --------------------------------------------------------------------------
+# --- structs and arrays as kernel arguments ---------------------------------------------------------------------------
 
 
 def record_of(value: WarpStruct | WarpArray) -> Record:
-    """Return a struct instance or an array in the form of a kernel argument. Each call for the same struct returns the same record."""
+    """Return a struct instance or an array as a kernel argument. Each call for the same struct returns the same record."""
     record: Record = value.__ctype__()
     return record
 
 
 def array_record(array: np.ndarray) -> Record:
-    """Return a one-dimensional array in the form of a kernel argument, without a copy. The caller keeps the memory alive.
+    """Return a one-dimensional array as a kernel argument, without a copy. The caller keeps the memory alive.
 
-    Making a Warp array of the same memory takes ten times as long."""
+    A Warp array of the same memory takes ten times as long to make."""
     return array_t(array.ctypes.data, ndim=1, shape=array.shape, strides=array.strides)
 
 
@@ -68,7 +68,7 @@ def struct_record(struct: WarpType, fields: Iterable[object]) -> Record:
 
 
 def keep(array: WarpArray, memory: object) -> None:
-    """Let a Warp array that was made from an address keep the owner of its memory alive."""
+    """Make a Warp array, made from an address, keep the owner of the memory alive."""
     array._ref = memory
 
 
@@ -89,10 +89,10 @@ class Recorded(NamedTuple):
     """Addresses of a launch on the CPU. The machine code at `entry` is a C function of the two addresses `bounds` and `args`."""
 
     entry: int
-    bounds: int  # the size of the launch
-    args: int  # a C struct of all arguments
-    last: int  # the last argument in it
-    owners: object  # of the memory at these addresses
+    bounds: int  # address of the launch's size
+    args: int  # address of a C struct of all arguments
+    last: int  # address of the last argument in the struct
+    owners: object  # objects that own the memory at these addresses
 
 
 def recorded(command: wp.Launch) -> Recorded:
@@ -114,22 +114,22 @@ def _args_of(*types: type) -> type:
 
 
 def recording_tape() -> wp.Tape | None:
-    """Return the tape that records, or None. Warp must have started."""
+    """Return the wp.Tape that is recording, or None. Warp must have started."""
     return context.runtime.tape
 
 
 # --- kernels and their files ------------------------------------------------------------------------------------------
 
 IN_CACHE = "wp_*"  # folders of modules in the kernel cache
-# What killed processes leave there: folders of compilations; precompiled headers, of wrt or of older versions of Warp.
+# Folders that killed processes leave in the cache: unfinished compilations; precompiled headers of wrt or of older versions of Warp.
 LEFTOVER = re.compile(r"wp_\w+_p\d+_t\d+|precompiled-.+")
-# Texts in lines that Warp's C++ side writes to stderr, past Python.
+# Texts in lines that Warp's C++ code writes to file descriptor 2.
 NO_DRIVER, CUDA_ERROR = b"NVIDIA CUDA driver", b"Warp CUDA error"
 
 
 def is_own(kernel: Kernel) -> bool:
-    """Return whether a kernel is part of wrt and not a user's."""
-    return str(kernel.func.__module__).startswith("wrt.")  # the module is None for code that was made by exec
+    """Return True if a kernel is part of wrt and not of the user's program."""
+    return str(kernel.func.__module__).startswith("wrt.")  # the module of code made by exec is None
 
 
 def short_name(kernel: Kernel) -> str:
@@ -138,7 +138,7 @@ def short_name(kernel: Kernel) -> str:
 
 
 def module_hash(kernel: Kernel, block_dim: int | None) -> bytes:
-    """Return the hash of a kernel's code and options. block_dim: None is the module's own."""
+    """Return the hash of a kernel's code and options. block_dim: None stands for the block size of the kernel's module."""
     return bytes(kernel.module.get_module_hash(block_dim))
 
 
@@ -150,21 +150,21 @@ def cache_files(kernel: Kernel, device: Device, block_dim: int) -> list[Path]:
 
 
 def load(kernel: Kernel, device: Device, block_dim: int) -> None:
-    """Compile a kernel, or take it from the cache. Raises Warp's errors (is_warps_error) and the system's."""
+    """Compile a kernel, or load it from the cache. Raises errors of Warp (is_warps_error) and of the system."""
     kernel.module.load(device, block_dim=block_dim)
 
 
 def is_warps_error(error: BaseException) -> bool:
-    """Return whether Warp raised the error because it cannot compile or load a kernel: a plain Exception."""
+    """Return True for a plain Exception, which Warp raises if it cannot compile or load a kernel."""
     return type(error) is Exception
 
 
 # --- the compiler -----------------------------------------------------------------------------------------------------
 
-# These changes make Warp's compiler faster, and change no kernel's results. They hold only while a module of wrt is compiled. Each
-# names the processor time that it saves of a first render of scenes/whitted.toml with an empty kernel cache (docs/warp.md).
+# The changes below make Warp's compiler faster, and change no result of a kernel. They act only while a module of wrt is compiled. Each
+# names the processor time that it saves in a first render of scenes/whitted.toml with an empty kernel cache (docs/warp.md).
 
-_REPLACED = {  # the functions to replace, with their parameters in Warp 1.19
+_REPLACED = {  # replaced functions, with their parameters in Warp 1.19
     ("Module", "_compile"): ("self", "device", "output_dir", "output_name", "output_arch", "use_ptx", "options"),
     ("codegen", "codegen_struct"): ("struct", "device", "indent_size", "include_tile_helpers"),
     ("build", "build_cpu"): (
@@ -173,13 +173,13 @@ _REPLACED = {  # the functions to replace, with their parameters in Warp 1.19
     ("runtime", "get_clang_pch_dir"): (),
 }
 FLAGS = "-fpch-instantiate-templates", "-discard-value-names"
-_here = threading.local()  # own: this thread compiles a module of wrt
+_here = threading.local()  # own: True while this thread compiles a module of wrt
 
 
 def prepare() -> None:
-    """Change Warp's compiler for the modules of wrt. Called after wp.init() and before the first kernel is compiled.
+    """Change Warp's compiler for the modules of wrt. Call it after wp.init() and before the first kernel is compiled.
 
-    Raises InputError if Warp's insides are not those of 1.19."""
+    Raises InputError if the replaced functions differ from those of Warp 1.19."""
     owners = {"Module": context.Module, "codegen": codegen, "build": build, "runtime": context.runtime}
     for (owner, name), parameters in _REPLACED.items():
         found = getattr(owners[owner], name, None)
@@ -197,7 +197,7 @@ def _own() -> bool:
 
 
 def _mark_own_modules() -> None:
-    """Tell the other changes whose module a thread compiles."""
+    """Make `_own` return True while a thread compiles a module of wrt."""
     compile_module = context.Module._compile
 
     @wraps(compile_module)
@@ -227,9 +227,9 @@ def _drop_unused_helpers() -> None:
 def _compile_well() -> None:
     """Share precompiled headers between all threads and processes (saves 6.4 s), and seal each object.
 
-    Warp 1.19 precompiles its headers in every thread that compiles. FLAGS compile the headers' templates once, not with each kernel,
-    and give values no names (0.4 s of it). The headers leave out bfloat16 where the kernel's source says that it needs none (0.4 s).
-    LLVM crashes on a damaged object, or runs it; the seal shows the damage."""
+    Warp 1.19 precompiles its headers in every thread that compiles. With FLAGS, the templates of the headers are compiled once, not with
+    each kernel, and values have no names (0.4 of the 6.4 s). A kernel whose source begins with `#define WP_NO_BFLOAT16` gets headers
+    without bfloat16 (0.4 s). LLVM crashes on a damaged object, or runs it; the seal reveals the damage."""
     compile_object, own_headers = build.build_cpu, context.runtime.get_clang_pch_dir
 
     @wraps(compile_object)
@@ -248,7 +248,7 @@ def _compile_well() -> None:
 
             try:
                 options["pch_dir"] = str(shared_headers(_headers_key(options), precompile, LEFTOVER))
-            except OSError:  # the cache is read-only, and the kernel is compiled elsewhere
+            except OSError:  # the cache is read-only, and the kernel is compiled in another folder
                 options["pch_dir"] = own_headers()
         compile_object(obj_path, cpp_path, **options)
         seal(Path(obj_path))
@@ -260,7 +260,7 @@ def _compile_well() -> None:
 def _headers_key(options: dict[str, Any]) -> str:
     """Return a name for headers precompiled with these options.
 
-    It depends on the processor and on the headers' paths and times, because Clang refuses precompiled headers of any others."""
+    The name depends on the processor and on paths and times of the headers: Clang refuses precompiled headers made for others."""
     llvm, user = context.runtime.llvm, os.getuid() if hasattr(os, "getuid") else ""
     processor = llvm.wp_get_host_cpu_name(), llvm.wp_get_host_cpu_features()
     key = _native_headers(), processor, user, sorted({**options, "pch_dir": None}.items())

@@ -1,4 +1,4 @@
-"""Writing of files through a temporary file, synced to the disk and then renamed, so that a path always holds a complete file.
+"""Writing of files by a temporary file that is synced to the disk and then renamed, so that a path always holds a complete file.
 
 A link at the path is replaced and never followed: in a shared folder, another user's link could lead to any file of this user. A
 killed process leaves its temporary file, `.wrt-*` (docs/long_renders.md).
@@ -16,11 +16,11 @@ from typing import BinaryIO
 
 from wrt.core.errors import InputError
 
-_UNABLE = (errno.EINVAL, errno.ENOTSUP, errno.ENOSYS)  # of file systems that cannot sync folders
+_UNABLE = (errno.EINVAL, errno.ENOTSUP, errno.ENOSYS)  # errors of file systems that cannot sync folders
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
-    """Raise the InputError that `replacing` this path would raise, before the work on its content."""
+    """Raise the InputError that `replacing(path)` would raise, so that it comes before the work on the file's content."""
     with _reported(path):
         file = _temporary(_target(path))
         file.close()
@@ -28,7 +28,7 @@ def check_writable(path: str | os.PathLike[str]) -> None:
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
-    """Write `data` as `replacing` does."""
+    """Write `data` to a file by `replacing`."""
     with replacing(path) as file:
         file.write(data)
 
@@ -37,8 +37,7 @@ def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
 def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """Open a new file in the folder of `path` for reading and writing; after the block, sync it and rename it to `path`.
 
-    After any failure the new file is removed and an existing `path` is unchanged. Raises InputError with `path` if the system refuses.
-    """
+    After any failure the new file is removed, and an existing file at `path` is unchanged. Raises InputError if the system refuses."""
     with _reported(path):
         target = _target(path)
         file = _temporary(target)
@@ -64,7 +63,7 @@ def _reported(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def _target(path: str | os.PathLike[str]) -> Path:
-    """Return the absolute path. Raises InputError if a file cannot be put there."""
+    """Return the absolute path. Raises InputError if a file cannot be written to it."""
     target = Path(path).absolute()  # the current folder may change
     try:
         os.access(target, os.F_OK)
@@ -82,14 +81,14 @@ def _target(path: str | os.PathLike[str]) -> Path:
 
 
 def _temporary(target: Path) -> BinaryIO:
-    """Create a file beside `target` with its suffix, from which OpenImageIO knows the format.
+    """Create a file beside `target` with its suffix, by which OpenImageIO chooses the format.
 
-    Mode x follows no link, and gives the usual permissions; tempfile's are for the user alone."""
+    Mode x follows no link, and gives the usual permissions; files of tempfile are readable by the user alone."""
     return open(target.with_name(f".wrt-{uuid.uuid4().hex}{target.suffix}"), "x+b")
 
 
 def _sync_folder(folder: Path) -> None:
-    """Sync a folder's names, since a power cut can undo a rename before that. Windows has no call for it."""
+    """Sync the names in a folder to the disk: until then, a power cut can undo a rename. Windows has no call for it."""
     if os.name == "nt":
         return
     try:

@@ -1,1 +1,1 @@
-"""Files to meshes and scenes."""
+"""Readers of mesh files and scene files."""

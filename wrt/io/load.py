@@ -14,6 +14,7 @@ from wrt.core.checks import as_path, shown
 from wrt.core.errors import InputError, at, warn
 from wrt.core.files import read_file, require_file, utf8
 from wrt.core.packages import needed_by
+from wrt.core.registry import Registry
 from wrt.core.types import JsonObject, PathLike
 from wrt.io.mesh_file import MESH_FORMATS, load_mesh
 from wrt.scene.defaults import stage
@@ -30,12 +31,12 @@ def load_scene(path: PathLike) -> Scene:
     Parameters
     ----------
     path
-        The file. Its suffix tells the format: .toml, .gltf, .glb or one of wrt.MESH_FORMATS.
+        The file. Its suffix gives the format: .toml, .gltf, .glb or one of wrt.MESH_FORMATS.
 
     Raises
     ------
     InputError
-        With the file and the place in it. For TOML it lists all mistakes, each with its key, value and what was expected.
+        If the file cannot be used; it names the file and the place. For TOML it lists all mistakes, each with key, value and expectation.
     """
     path = as_path(path, "path")
     known = ", ".join([*LOADERS, *MESH_FORMATS])
@@ -44,13 +45,13 @@ def load_scene(path: PathLike) -> Scene:
         raise InputError(f"is a directory, not a scene file ({known})", path=path)
     load = LOADERS.get(path.suffix.lower(), _load_bare_mesh if path.suffix.lower() in MESH_FORMATS else None)
     if load is None:
-        raise InputError(f"is no scene file: known are {known}", path=path)
+        raise InputError(f"is no scene file: its suffix must be one of {known}", path=path)
     with np.errstate(over="ignore", invalid="ignore"):  # the scene refuses infinite values
         return load(path)
 
 
 def as_scene(value: Scene | Mesh | PathLike) -> Scene:
-    """Return a scene unchanged, or the scene of a path or a Mesh with the warnings of `load_scene`. Raises InputError for others."""
+    """Return a Scene unchanged; else the scene of a Mesh or of a file, with the warnings of `load_scene`. Raises InputError otherwise."""
     if isinstance(value, Scene):
         return value
     if isinstance(value, Mesh):
@@ -74,14 +75,7 @@ def _load_toml(path: Path) -> Scene:
         from wrt.io.toml.build import build
         from wrt.io.toml.report import check
 
-    data = _parse(path)
-    return _staged(build(check(data, path), path), path)
-
-
-def _load_gltf(path: Path) -> Scene:
-    from wrt.io.gltf.reader import load_gltf
-
-    return load_gltf(path)
+    return _staged(build(check(_parse(path), path), path), path)
 
 
 def _load_bare_mesh(path: Path) -> Scene:
@@ -89,7 +83,7 @@ def _load_bare_mesh(path: Path) -> Scene:
 
 
 def _bare(mesh: Mesh, name: str, path: PathLike) -> Scene:
-    """Return the scene of a mesh alone, in light grey."""
+    """Return a scene of one mesh in light grey."""
     grey = Material(name="light grey", albedo=(0.75, 0.75, 0.75))
     unread = " (.mtl files are not read)" if os.fspath(path).lower().endswith(".obj") else ""
     parts = f"its {len(mesh.groups)} parts are all light grey{unread}: a TOML scene can give each a material"
@@ -97,13 +91,14 @@ def _bare(mesh: Mesh, name: str, path: PathLike) -> Scene:
     return _staged(Scene(objects=(Object(mesh, (grey,), name=name),), name=name), path, notes)
 
 
-LOADERS: dict[str, Callable[[Path], Scene]] = {".toml": _load_toml, ".gltf": _load_gltf, ".glb": _load_gltf}
+LOADERS: Registry[Callable[[Path], Scene]] = Registry("scene format", {
+    ".toml": _load_toml, ".gltf": "wrt.io.gltf.reader:load_gltf", ".glb": "wrt.io.gltf.reader:load_gltf"})
 
 
 def _parse(path: Path) -> JsonObject:
     try:
         data = tomllib.loads(utf8(read_file(path)).decode())
-        _require_sound(data)
+        _require_64_bits(data)
         return data
     except InputError as error:
         raise error.at(path) from error
@@ -120,10 +115,10 @@ def _parse(path: Path) -> JsonObject:
         raise InputError("holds a number of thousands of digits", path=path) from error
 
 
-def _require_sound(value: object) -> None:
+def _require_64_bits(value: object) -> None:
     """Raise InputError for an integer of more than 64 bits, which TOML forbids."""
     for each in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
-        _require_sound(each)
+        _require_64_bits(each)
     if isinstance(value, int) and not -(1 << 63) <= value < 1 << 63:
         raise InputError("holds an integer of more than 64 bits")
 

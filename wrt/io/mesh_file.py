@@ -1,4 +1,4 @@
-"""Reading of mesh files as a `Mesh`, with a reader for each suffix in MESH_FORMATS."""
+"""Reading of mesh files. MESH_FORMATS has a reader for each suffix."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from wrt.scene.mesh import Mesh, unit_rows
 
 @dataclass(frozen=True, eq=False)
 class RawMesh:
-    """A file's arrays as in `Mesh`, triangulated and with every index in range, but not yet cleaned."""
+    """Arrays of a mesh file, with the meaning of `Mesh`'s fields: triangulated, every index in range, but not yet cleaned."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -29,8 +29,8 @@ class RawMesh:
     uvs: np.ndarray | None = None
     groups: tuple[str, ...] = ()
     face_group: np.ndarray | None = None
-    incomplete: int = 0  # faces with fewer than three corners
-    positions: int = 0  # in the file
+    incomplete: int = 0  # number of faces with fewer than three corners
+    positions: int = 0  # number of positions in the file
 
 
 Reader = Callable[[Path], RawMesh]
@@ -38,14 +38,15 @@ MESH_FORMATS: Registry[Reader] = Registry("mesh format", PLACES)
 
 
 def register_mesh_format(suffix: str, read: Reader) -> None:
-    """Make files with a suffix readable wherever a mesh can be named.
+    """Register the reader of a mesh format, so that wrt reads its files wherever it takes the path of a mesh.
 
     Parameters
     ----------
     suffix
-        Such as ".off", in small letters.
+        Suffix of the files, in small letters, such as ".off".
     read
-        Returns a file's RawMesh, which is then checked and cleaned. Raises InputError, without the path, for a file it cannot read.
+        Function that returns the RawMesh of a path, which wrt then checks and cleans. It raises InputError, without the path, for a
+        file that it cannot read.
     """
     if not suffix.startswith(".") or suffix != suffix.lower():
         raise InputError(f"must begin with a dot and be in small letters, got {shown(suffix)}", argument="suffix")
@@ -56,36 +57,36 @@ def load_mesh(path: PathLike, parts: Sequence[tuple[int, int]] = ()) -> Mesh:
     """Read a mesh file, with faces and vertices in the order of the file.
 
     Polygons become triangles. Faces without area and vertices without a face are dropped (`Mesh.dropped` counts the faces); nothing is
-    merged. Normals are made unit length, and v is flipped so that (0, 0) is the top left of a picture. Normals and uvs that are not
-    finite become zero, with one SceneWarning.
+    merged. Normals are scaled to unit length, and v is flipped so that (0, 0) is the top left of an image. Normals and uvs that are
+    not finite become zero, with one SceneWarning.
 
     Parameters
     ----------
     path
         A file with a suffix of wrt.MESH_FORMATS.
     parts
-        Ranges (first, count) of the file's triangles before any is dropped. They become the groups "0", "1" ... in place of the
-        file's groups; the triangles outside of them become the last group, "rest".
+        Ranges (first, count) of the file's triangles, counted before any is dropped. They become the groups "0", "1" ... in place of the
+        file's groups; triangles outside of all ranges become the last group, "rest".
 
     Raises
     ------
     InputError
-        With the file and the place: a file that is missing, truncated or without triangles, an index out of range, a position that
-        is not finite.
+        If the file is missing, truncated or without triangles, if an index is out of range or a position not finite. It names the file
+        and the place.
     """
     path = as_path(path, "path")
     if path.suffix.lower() not in MESH_FORMATS:
-        scene = "; wrt.load_scene and wrt.build take scenes" if path.suffix.lower() in (".toml", ".gltf", ".glb") else ""
-        raise InputError(f"is no mesh file: known are {', '.join(MESH_FORMATS)}{scene}", path=path)
+        hint = "wrt.load_scene and wrt.build read scene files" if path.suffix.lower() in (".toml", ".gltf", ".glb") else None
+        raise InputError(f"is no mesh file: its suffix must be one of {', '.join(MESH_FORMATS)}", path=path, hint=hint)
     require_file(path)
     with at(path=path):
         raw = MESH_FORMATS[path.suffix.lower()](path)
         if len(raw.faces) == 0:
-            raise InputError(f"holds no triangles ({raw.positions} positions, {raw.incomplete} faces of fewer than 3 corners)")
+            raise InputError(f"has no triangles ({raw.positions} positions, {raw.incomplete} faces with fewer than 3 corners)")
         groups, face_group = _part_groups(parts, len(raw.faces)) if parts else (raw.groups, raw.face_group)
     cleaned = clean(raw.vertices, raw.faces, raw.normals, raw.uvs, face_group)
     if len(cleaned.faces) == 0:
-        raise InputError(f"none of its {len(raw.faces)} triangles has any area", path=path)
+        raise InputError(f"none of its {len(raw.faces)} triangles has an area", path=path)
     normals = _finite(cleaned.normals, "normals", path)
     return Mesh(
         vertices=cleaned.vertices,
@@ -100,32 +101,32 @@ def load_mesh(path: PathLike, parts: Sequence[tuple[int, int]] = ()) -> Mesh:
 
 
 def mesh_of(value: Mesh | PathLike) -> Mesh:
-    """Return a Mesh unchanged, or the mesh of a file by its path. Raises InputError for others."""
+    """Return a Mesh unchanged, or read the mesh file of a path. Raises InputError for any other value."""
     if not isinstance(value, Mesh | str | os.PathLike):
         raise InputError(f"must be a Mesh or the path of a mesh file, got {shown(value)}", argument="mesh")
     return value if isinstance(value, Mesh) else load_mesh(value)
 
 
 def as_mesh(value: Mesh | PathLike) -> Mesh:
-    """Return mesh_of(value). Raises InputError for a mesh without triangles, too."""
+    """Return `mesh_of(value)`. Also raises InputError if the mesh has no triangles."""
     mesh = mesh_of(value)
     if not len(mesh.faces):
-        raise InputError("there are no triangles to hit", path=None if isinstance(value, Mesh) else value)
+        raise InputError("the mesh has no triangles", path=None if isinstance(value, Mesh) else value)
     return mesh
 
 
 def _part_groups(parts: Sequence[tuple[int, int]], faces: int) -> tuple[tuple[str, ...], np.ndarray]:
     group = np.full(faces, len(parts), dtype=np.int32)
-    for number, (first, count) in enumerate(parts):
+    for index, (first, count) in enumerate(parts):
         if first < 0 or count < 0 or first + count > faces:
             last = short(first + count - 1)
-            raise InputError(f"triangles {short(first)} to {last}, but the file has {faces}", place=f"part {number}")
-        group[first:first + count] = number
-    return (*(str(number) for number in range(len(parts))), "rest"), group
+            raise InputError(f"has triangles {short(first)} to {last}, but the file has {faces} (the first is 0)", place=f"part {index}")
+        group[first:first + count] = index
+    return (*(str(index) for index in range(len(parts))), "rest"), group
 
 
 def _finite(array: np.ndarray | None, attribute: str, path: Path) -> np.ndarray | None:
-    """Convert to float32 and set rows that are not finite to zero, so that a bad normal does not cost the whole mesh."""
+    """Convert to float32 and set rows that are not finite to zero, with a warning, so that a bad normal does not spoil the mesh."""
     if array is None:
         return None
     with np.errstate(over="ignore"):
@@ -133,6 +134,6 @@ def _finite(array: np.ndarray | None, attribute: str, path: Path) -> np.ndarray 
     finite = np.isfinite(array)
     if not finite.all():
         bad = ~finite.all(axis=1)
-        warn(f"{path}: {int(bad.sum())} {attribute} are not finite and taken as zero")
+        warn(f"{path}: {int(bad.sum())} {attribute} are not finite and are read as zero")
         array = np.where(bad[:, None], np.float32(0.0), array)
     return array

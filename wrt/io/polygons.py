@@ -10,12 +10,11 @@ from wrt.core.packages import needed_by
 def triangulate(corners: np.ndarray, counts: np.ndarray, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Cut polygons into triangles, in the order of the polygons and with their winding.
 
-    corners: (C,) integers, the vertex indices of all polygons in sequence; counts: (P,) corners of each polygon; vertices: (V, 3).
-    Returns (T, 3) integers, indices into `corners`, and (T,), the polygon of each triangle. A polygon of n corners gives n - 2
-    triangles, or none for n < 3. Convex polygons become the fan about their first corner. A polygon is concave if a triangle of that
-    fan faces against the polygon's area vector; it is projected along that vector and cut by ear clipping (mapbox-earcut).
-    Self-intersecting polygons have no right answer, and get triangles all the same.
-    """
+    corners: (C,) integers, the vertex indices of all polygons in sequence; counts: (P,), the number of corners of each polygon;
+    vertices: (V, 3). Returns (T, 3) integers, indices into `corners`, and (T,), the index of each triangle's polygon. A polygon of n
+    corners gives n - 2 triangles, or none for n < 3. Convex polygons become the fan about their first corner. A polygon is concave if
+    a triangle of its fan faces against its area vector; it is projected along that vector and cut by ear clipping (mapbox-earcut).
+    Self-intersecting polygons have no right answer; they also give n - 2 triangles."""
     counts, corners = np.asarray(counts, dtype=np.int64), np.asarray(corners)
     fan = np.maximum(counts - 2, 0)
     small = np.int32 if max(len(corners), len(counts)) < 1 << 31 else np.int64
@@ -37,15 +36,15 @@ def triangulate(corners: np.ndarray, counts: np.ndarray, vertices: np.ndarray) -
 
 
 def strip(indices: np.ndarray) -> np.ndarray:
-    """Return the triangles (N - 2, 3) of a strip: each vertex with the two before it."""
+    """Return the triangles (N - 2, 3) of a triangle strip of N vertex indices: each vertex with the two before it."""
     i = np.arange(max(len(indices) - 2, 0), dtype=indices.dtype)
-    odd = i & 1  # every second triangle swaps two corners, so that all face one way
+    odd = i & 1  # every second triangle swaps two corners, so that all triangles face the same side
     return indices[np.stack([i, i + 1 + odd, i + 2 - odd], axis=1)]
 
 
 def _areas(corners: np.ndarray, counts: np.ndarray, vertices: np.ndarray, triangles: np.ndarray,
            polygon: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the area vectors (P, 3) of polygons with over three corners, of twice the area's length, and the indices of concave ones."""
+    """Return area vectors (P, 3) of twice the area's length (0 for up to three corners), and the indices of the concave polygons."""
     area, against = np.zeros((len(counts), 3)), np.zeros(len(counts), dtype=bool)
     large = counts > 3  # triangles are convex
     size, several = counts[large] - 2, large[polygon]
@@ -58,9 +57,9 @@ def _areas(corners: np.ndarray, counts: np.ndarray, vertices: np.ndarray, triang
 
 
 def _ears(outline: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Return triangles (n - 2, 3) of one polygon's outline (n, 3), seen along `normal`; a fan if it has fewer ears.
+    """Return triangles (n - 2, 3) of one polygon's outline (n, 3), projected along `normal`.
 
-    Self-intersecting polygons have fewer."""
+    Self-intersecting polygons can have fewer than n - 2 ears; they become a fan."""
     with needed_by("a concave polygon"):
         from mapbox_earcut import triangulate_float64
 

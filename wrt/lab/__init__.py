@@ -1,1 +1,1 @@
-"""The laboratory: oracle, hard cases, the model of the RT core, benchmarks, Mitsuba beside wrt. The product never imports it."""
+"""The laboratory: oracle, hard cases, model of the RT core, benchmarks, comparison with Mitsuba. Rendering never imports it."""

@@ -1,4 +1,4 @@
-"""Cost of every pixel: the render kernel over a structure that counts, with a log of the rays in front of it."""
+"""Cost of every pixel: run the render kernel over a structure that counts its steps and logs its rays."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ COUNTERS = tuple(fields_of(Counts))
 
 
 class LoggedStructure(NamedTuple):
-    """A structure with a log of the rays in front of it; hashable, as Structure."""
+    """A structure that logs each ray before it traverses; hashable, like Structure."""
 
     inner: Structure
 
@@ -47,7 +47,7 @@ class LoggedStructure(NamedTuple):
 
 
 class CostCounter:
-    """A render that counts. built: the same scene prepared for pictures, whose structure and arrays the counter shares."""
+    """A render that counts traversal steps. built: the same scene prepared for pictures; the counter shares its structure and arrays."""
 
     def __init__(self, plan: Plan, device: Device, built: Prepared | None = None) -> None:
         counting = plan.structure._replace(units=plan.structure.units._replace(counters=True))
@@ -56,11 +56,11 @@ class CostCounter:
 
     @classmethod
     def beside(cls, built: Prepared) -> CostCounter:
-        """Return the counter of a scene that is prepared for pictures."""
+        """Return a counter that shares the structure and arrays of a scene prepared for pictures."""
         return cls(built.plan, built.device, built)
 
     def aim(self, camera: CameraKind, angles_of: tuple[int, int] | None = None, **settings: Any) -> None:
-        """Change camera and settings, as Prepared.aimed."""
+        """Change camera and settings; arguments as for Prepared.aimed."""
         self.prepared = self.prepared.aimed(camera, angles_of, **settings)
 
     def film(self) -> DeviceFilm:
@@ -72,8 +72,8 @@ class CostCounter:
         run_all([partial(work, item) for item in items], 1 if self.prepared.device.is_cuda else self.prepared.threads)
 
     def trace(self, rectangle: Rectangle, film: DeviceFilm, recorder: Recorder, log: ray_log.RayLog) -> None:
-        """Trace all samples of a tile into the film; write counters to a Recorder and rays to a RayLog."""
-        data = copied(self.prepared.accel.data)  # since every tile has a recorder of its own
+        """Trace all samples of a tile into the film; write counters to `recorder` and rays to `log`."""
+        data = copied(self.prepared.accel.data)  # each tile has its own recorder
         data.recorder = recorder
         accel = self.prepared.plan.structure.struct()
         accel.accel, accel.log = data, log
@@ -91,10 +91,8 @@ class CostCounter:
         return log.used.numpy(), on_host(recorder.counts)
 
     def costs(self, go_on: Callable[[int], bool] = lambda done: True) -> dict[str, np.ndarray] | None:
-        """Return a map of each of COUNTERS, (H, W) int32: sums over a pixel's rays (stack: the largest).
-        After each tile, `go_on` is called with the number of finished pixels, from several threads. After False no more tiles are traced,
-        and
-        the result is None."""
+        """Return a map (H, W) int32 for each of COUNTERS: the sum over a pixel's rays (stack: the largest).
+        After each tile, a thread calls `go_on` with the number of finished pixels. If it returns False, stop and return None."""
         film = self.film()
         x0, y0, x1, y1 = self.prepared.plan.crop
         out = {name: np.zeros((y1 - y0, x1 - x0), np.int32) for name in COUNTERS}

@@ -1,6 +1,6 @@
-"""`python -m wrt devices --check`: compare a device's answers with the CPU's, bit for bit, and measure its speed.
+"""`python -m wrt devices --check`: compare a device's results with the CPU's, bit for bit, and measure its speed.
 
-The CPU's answers are those of the default structure: all structures have the same."""
+The CPU computes hits with the default structure, since all structures find the same hits."""
 
 from __future__ import annotations
 
@@ -42,28 +42,29 @@ from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene, Sphere
 
-FOLDER = Path(__file__).parents[2] / "scenes"  # of a checkout; an installed package has none
+FOLDER = Path(__file__).parents[2] / "scenes"  # exists in a checkout, not in an installed package
 PICTURE: dict[str, Any] = {"size": (64, 36), "spp": 4, "seed": 3}
 MESHES: dict[str, Callable[[], Mesh]] = {
     "ball": partial(shapes.icosphere, 3), "torus": partial(shapes.torus, 1.0, 0.4, 64, 32), "terrain": partial(terrain, 48),
     "teapot": partial(shapes.teapot, 32), "teapot in a ring": lambda: shapes.merged([shapes.torus(500.0), shapes.teapot(16)], "")}
-CONSTRUCTORS = ("sah", "median", "lbvh", "cubql")  # of Warp's BVH
-FAST, SLOW, RUNS = 1 << 20, 1 << 15, 7  # timed rays on CUDA and on the CPU
-TIMED_CELLS = 192  # of a side of the terrain that is timed
-COLUMNS: Columns = {"part": "{part}", "what": "{what}", "compared": "{count}", "differ": "{differ}",
-                    "where": lambda row: ", ".join(row.where[:4]) + (", ..." if len(row.where) > 4 else "")}
-SPEED: Columns = {"who": "{who}", "rays": "{kind}", "Mray/s": lambda row: spread(row.mrays), "wrt / it": "{first_over_it:.2f}"}
+CONSTRUCTORS = ("sah", "median", "lbvh", "cubql")  # builders of Warp's BVH
+FAST, SLOW, RUNS = 1 << 20, 1 << 15, 7  # number of timed rays on CUDA and on the CPU, and of timed runs
+TIMED_CELLS = 192  # cells a side of the timed terrain
+COLUMNS: Columns = {"results": "{part}", "of": "{what}", "compared": "{count}", "differ": "{differ}",
+                    "places": lambda row: ", ".join(row.where[:4]) + (", ..." if len(row.where) > 4 else "")}
+SPEED: Columns = {"structure": "{who}", "rays": "{kind}", "Mray/s": lambda row: spread(row.mrays),
+                  "default / structure": "{first_over_it:.2f}"}
 LEGEND = """\
-compared: number of answers; differ: answers with other bits than the CPU's, and where. Each difference is a fault: please report it with
-this table."""
+compared: number of results. differ: results whose bits are not the CPU's. places: meshes and rays of these results. Each difference is a
+fault: please report it with this table."""
 TIMED = """\
-Rays and answers are on the device; median of the runs in turn, quartiles in brackets. wrt / it: how many times as fast wrt's default
-structure is."""
+Rays and hits are in device memory. Mray/s: median of alternating runs, quartiles in brackets. default / structure: speed of wrt's default
+structure over that of the row's structure."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """What to check: scenes (files; none: the shipped ones), rays of each kind for each mesh, rays of each hard case (`cases`)."""
+    """Options of the check. scenes: files, by default wrt's own; rays, cases: number for each mesh and kind, and for each hard case."""
 
     device: str
     scenes: Sequence[Path] = ()
@@ -81,7 +82,7 @@ class Check:
 
 
 def built_in() -> Scene:
-    """Return a scene with most kinds of light transport, for packages without scene files."""
+    """Return a scene with most kinds of light transport, for an installed package, which has no scene files."""
     glass, mirror = (Material(kind=kind, albedo=(0.9, 0.9, 0.9), name=kind) for kind in ("glass", "mirror"))
     return Scene(objects=(Object(shapes.quad((-4.0, 0.0, 4.0), (8.0, 0.0, 0.0), (0.0, 0.0, -8.0)), (Material(),)),
                           Object(shapes.teapot(16), (mirror,))),
@@ -94,19 +95,19 @@ def structures() -> list[str]:
     return list(dict.fromkeys(kind.name for kind in ACCELERATORS.values()))
 
 
-def rows(plan: Check, tell: Callable[[str], None]) -> Iterator[Row]:
-    """Yield the row of each comparison as it is done; `tell` gets the name of the next one."""
-    tell("compiling")
+def rows(plan: Check, report: Callable[[str], None]) -> Iterator[Row]:
+    """Yield a row after each comparison; `report` receives the name of the next comparison."""
+    report("compiling")
     compile_all(plan)
     yield from function_rows(plan)
-    tell("hits")
+    report("hits")
     yield from hit_rows(plan)
-    tell("hard cases")
+    report("hard cases")
     yield hard_row(plan)
     for name, scene in plan.pictures.items():
-        tell(f"picture of {name}")
-        here, there = (render(scene, device=device, **PICTURE).pixels.reshape(-1, 3) for device in ("cpu", plan.device))
-        yield row("pixels", name, {"": different(here, there)})
+        report(f"picture of {name}")
+        on_cpu, on_device = (render(scene, device=device, **PICTURE).pixels.reshape(-1, 3) for device in ("cpu", plan.device))
+        yield row("pixels", name, {"": different(on_cpu, on_device)})
 
 
 def compile_all(plan: Check) -> None:
@@ -119,16 +120,16 @@ def compile_all(plan: Check) -> None:
 
 
 def function_rows(plan: Check) -> Iterator[Row]:
-    """Compare elementary functions on numbers that are usual in shading, and on any bits."""
+    """Yield a row for each elementary function, compared for numbers that are usual in shading and for random bits."""
     rng = np.random.default_rng(0)
     common = rng.normal(0.0, 4.0, size=(2, 50_000)).astype(np.float32)
     x, y = np.concatenate([common, rng.integers(0, 2**32, size=common.shape, dtype=np.uint32).view(np.float32)], axis=1)
-    here, there = (called(x, y, device) for device in ("cpu", plan.device))
+    on_cpu, on_device = (function_values(x, y, device) for device in ("cpu", plan.device))
     for i, name in enumerate(FUNCTIONS):
-        yield row("functions", name, {"": different(here[:, i], there[:, i])})
+        yield row("functions", name, {"": different(on_cpu[:, i], on_device[:, i])})
 
 
-def called(x: np.ndarray, y: np.ndarray, name: str) -> np.ndarray:
+def function_values(x: np.ndarray, y: np.ndarray, name: str) -> np.ndarray:
     device = start(name)
     out = wp.empty((len(x), len(FUNCTIONS)), dtype=wp.float32, device=device)
     load_kernel(call_functions, device)
@@ -137,7 +138,7 @@ def called(x: np.ndarray, y: np.ndarray, name: str) -> np.ndarray:
 
 
 def hit_rows(plan: Check) -> Iterator[Row]:
-    """Yield a row for each structure."""
+    """Yield a row for each structure, with the hits of all meshes and kinds of rays."""
     geometries = {name: Geometry.of(make()) for name, make in MESHES.items()}
     on_cpu = {name: build(geometry, device="cpu") for name, geometry in geometries.items()}
     rays = {name: ray_sets(accel, plan.rays) for name, accel in on_cpu.items()}
@@ -146,13 +147,13 @@ def hit_rows(plan: Check) -> Iterator[Row]:
         for mesh, geometry in geometries.items():
             accel = build(geometry, structure, device=plan.device)
             n = BRUTE_FORCE_TESTS // (20 * len(geometry)) if structure == "brute_force" else plan.rays
-            for kind, some in rays[mesh].items():
-                differ[f"{mesh}, {kind}"] = compare(accel, on_cpu[mesh], some.part(slice(0, n)))
+            for kind, of_kind in rays[mesh].items():
+                differ[f"{mesh}, {kind}"] = compare(accel, on_cpu[mesh], of_kind.part(slice(0, n)))
         yield row("hits", structure, differ)
 
 
 def compare(accel: Accelerator, truth: Accelerator, rays: RaySet) -> np.ndarray:
-    """Return which rays have another answer."""
+    """Return flags of the rays whose hits differ in a bit, (N,)."""
     found, expected = (answer(each, rays, None) for each in (accel, truth))
     if not (isinstance(found, Hits) and isinstance(expected, Hits)):
         return different(np.asarray(found), np.asarray(expected))
@@ -160,13 +161,13 @@ def compare(accel: Accelerator, truth: Accelerator, rays: RaySet) -> np.ndarray:
 
 
 def different(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return which rows have other bits."""
+    """Return flags of the rows whose bits differ, (N,)."""
     a, b = (np.ascontiguousarray(each).reshape(len(each), -1).view(np.uint8) for each in (a, b))
     return (a != b).any(axis=1)
 
 
 def hard_row(plan: Check) -> Row:
-    """Compare the default structure in all hard cases whose rays the host accepts."""
+    """Return the row of the default structure's hits in all hard cases whose rays and meshes wrt accepts."""
     differ = dict[str, np.ndarray]()
     for name in HARD_CASES:
         case = generate(name, plan.cases)
@@ -177,31 +178,32 @@ def hard_row(plan: Check) -> Row:
 
 
 def row(part: str, what: str, differ: dict[str, np.ndarray]) -> Row:
-    """Count the answers that differ. differ: a flag for each answer, by place."""
+    """Return the row that counts the differences. differ: place -> a flag for each result."""
     return Row(part=part, what=what, count=sum(map(len, differ.values())), differ=sum(int(each.sum()) for each in differ.values()),
                where=[place for place, each in differ.items() if each.any() and place])
 
 
 def speed_rows(plan: Check) -> tuple[list[Row], str]:
-    """Measure wrt's structures beside Warp's query with each constructor; return no rows if the device has none, and what was skipped."""
+    """Measure wrt's structures and Warp's mesh query with each constructor. Return the rows and the reasons of skipped constructors.
+    If the device runs none of Warp's queries, return no rows."""
     geometry, device = Geometry.of(terrain(TIMED_CELLS)), start(plan.device)
-    everybody: dict[str, Any] = {f"wrt {name}": Own(structure=name, device=plan.device) for name in structures() if name != "brute_force"}
+    algorithms: dict[str, Any] = {f"wrt {name}": Own(structure=name, device=plan.device) for name in structures() if name != "brute_force"}
     skipped, warps, out = [], dict[str, Any](), list[Row]()
     for constructor in CONSTRUCTORS:
         warp = WarpMesh(plan.device, constructor)
         try:
             warp.prepare(geometry)
             warps[f"Warp, {constructor}"] = warp
-        except RuntimeError as error:  # also what is not implemented
+        except RuntimeError as error:  # includes NotImplementedError
             skipped.append(f"Warp, {constructor}: {error}")
-    for own in everybody.values() if warps else ():
+    for own in algorithms.values() if warps else ():
         own.prepare(geometry)
-    everybody |= warps
+    algorithms |= warps
     kinds = ray_sets(build(geometry, device="cpu"), FAST if device.is_cuda else SLOW) if warps else {}
     for kind, rays in kinds.items():
-        jobs = {name: partial(finished, each.search(rays, thread_count(None)), device) for name, each in everybody.items()}
+        jobs = {name: partial(finished, each.search(rays, thread_count(None)), device) for name, each in algorithms.items()}
         seconds = alternate(jobs, RUNS)
-        first = seconds[next(iter(everybody))]
+        first = seconds[next(iter(algorithms))]
         out += [Row(who=name, kind=kind, rays=len(rays), mrays=(len(rays) / taken / 1e6).tolist(),
                     first_over_it=float(np.median(taken / first))) for name, taken in seconds.items()]
     return out, "; ".join(skipped)
@@ -214,7 +216,7 @@ def finished(search: Callable[[], object], device: Device) -> None:
 
 @dataclass(frozen=True)
 class Result:
-    """What was compared and where (`machine`), the comparisons (`rows`), and the results of `speed_rows`."""
+    """Result of `run`. machine: description of the device; rows: comparisons; speed, skipped: results of `speed_rows`."""
 
     machine: str
     rows: list[Row]
@@ -226,7 +228,7 @@ class Result:
         return sum(each.differ for each in self.rows)
 
     def text(self) -> str:
-        verdict = "Every bit is the CPU's." if self.differ == 0 else f"{self.differ} answers differ from the CPU's."
+        verdict = "Every bit equals the CPU's." if self.differ == 0 else f"{self.differ} results differ from the CPU's."
         parts = [tabled(COLUMNS, self.rows, "Bits", f"Machine: {self.machine}\n\n{verdict}\n\n{LEGEND}"),
                  tabled(SPEED, self.speed, "Speed", "\n\n".join(filter(None, [
                      TIMED if self.speed else "", f"Skipped: {self.skipped}" if self.skipped else ""])))]
@@ -237,14 +239,14 @@ class Result:
                 "speed": [each.as_dict() for each in self.speed], "speed_skipped": self.skipped or None}
 
 
-def run(plan: Check, tell: Callable[[str], None] = lambda line: None) -> Result:
-    """Compare and measure; `tell` gets lines of progress."""
+def run(plan: Check, report: Callable[[str], None] = lambda line: None) -> Result:
+    """Compare and measure; `report` receives lines of progress."""
     machine = machine_line(f"{thread_count(None)} threads for the CPU", f"Warp {wp.__version__}", device=plan.device)
     compared = []
-    for each in rows(plan, tell):
+    for each in rows(plan, report):
         compared.append(each)
         if each.differ:
-            tell(f"{each.part} of {each.what}: {each.differ} of {each.count} differ")
-    tell("speed")
+            report(f"{each.part} of {each.what}: {each.differ} of {each.count} differ")
+    report("speed")
     speed, skipped = speed_rows(plan)
     return Result(machine, compared, speed, skipped)

@@ -1,6 +1,6 @@
-"""Plans of the measurements: each option is declared once, for Python and for the command line.
+"""Plans of the measurements. A field of a Plan is an argument in Python and an option on the command line.
 
-A field of a Plan is an option of its command. Nothing heavy is imported here: the command line reads all plans for its help."""
+This module imports nothing heavy, because the command line reads all plans for its help."""
 
 from __future__ import annotations
 
@@ -9,19 +9,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from typing import Any, ClassVar
 
+# Names that an option accepts: their kind, as messages call it, and their table.
 STRUCTURES = ("structure", "wrt.accel.structures:ACCELERATORS")
 KINDS = ("kind of ray", "wrt.lab.bench.rays:RAY_KINDS")
 GPUS = ("GPU", "wrt.lab.rtcore.parameters:GPUS")
-SOME_THREADS = ("one", "all", "both")
-THREADS = "Threads on the CPU  [default: all cores]"
-INSIDE = "The camera stands in the middle of the mesh's box, as in a room"
-MODELLED = "The GPU to model: rtx2080ti or rtx2060"
+THREAD_CHOICES = ("one", "all", "both")
+THREADS = "Number of CPU threads  [default: all cores]"
+RAY_SEED = "Seed of the random rays"
+INSIDE = "Put the camera at the centre of the mesh's bounding box, as in a room"
+MODELLED = "GPU to model: rtx2080ti or rtx2060"
 
 
 def option(default: Any, text: str = "", between: tuple[int, int] | None = None, of: tuple[str, str] | None = None) -> Any:
     """Return a field of a Plan.
-    - text: for --help, "" for an argument; between: lowest and highest value (None is always allowed).
-    - of: what the value names, and the table of names as "module:TABLE"."""
+    - text: help of the option; "" makes the field an argument. between: lowest and highest value (None is always allowed).
+    - of: kind and table of the names that the field accepts; the table as "module:TABLE"."""
     return field(default=default, metadata={"text": text, "between": between, "of": of})
 
 
@@ -30,14 +32,14 @@ def the_meshes(default: object = ()) -> Sequence[object]:
 
 
 def the_kinds(*default: str) -> Sequence[str]:
-    return option(default or ("primary", "shadow", "diffuse", "random"), "Of rays: primary, shadow, diffuse, random", of=KINDS)
+    return option(default or ("primary", "shadow", "diffuse", "random"), "Kinds of rays: primary, shadow, diffuse, random", of=KINDS)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Options of a measurement. Raises InputError for a number out of its range and for an unknown name.
+    """Options of a measurement. Raise InputError for a number out of its range and for an unknown name.
 
-    COMMAND: its command; STUDY: the module that measures it; QUICK: values that replace defaults with --quick."""
+    COMMAND: name of the command; STUDY: module that measures; QUICK: values that replace the defaults under --quick."""
 
     COMMAND: ClassVar[str] = ""
     STUDY: ClassVar[str] = ""
@@ -71,53 +73,55 @@ class Plan:
 
 @dataclass(frozen=True)
 class Visibility(Plan):
-    """Rasterising against ray casting, as triangles and pixels grow: the cost of both, and where they differ.
+    """Compare rasterising with ray casting as triangles and pixels grow: the time of both, and the pixels where they differ.
 
-    MESHES: mesh files; without any, a sphere and a terrain."""
+    MESHES: mesh files; default: a sphere and a terrain."""
 
     COMMAND, STUDY = "bench visibility", "wrt.lab.bench.visibility"
     QUICK = {"size": 128, "max_size": 512, "max_triangles": 50_000, "runs": 5}
     meshes: Sequence[Any] = the_meshes()
-    size: int = option(512, "Pixels a side as triangles grow", (1, 16384))
-    max_size: int = option(1024, "Pixels a side at the end of the sweep from 64 on", (64, 16384))
-    max_triangles: int = option(1_500_000, "Meshes are cut finer up to this many", (1, 2**30))
-    runs: int = option(7, "Runs of each kind, alternating", (1, 1000))
+    size: int = option(512, "Side of the square picture, in pixels, while the number of triangles grows", (1, 16384))
+    max_size: int = option(1024, "Largest side, in pixels, of the sweep over picture sizes, which starts at 64", (64, 16384))
+    max_triangles: int = option(1_500_000, "Subdivide meshes up to this number of triangles", (1, 2**30))
+    runs: int = option(7, "Timed runs of each method, alternating", (1, 1000))
     accel: str = option("bvh", "Acceleration structure", of=STRUCTURES)
-    device: str = option("cpu", "cpu, cuda:0, ... (see `devices`)")
+    device: str = option("cpu", "Device to measure on: cpu, cuda:0, ... (`wrt devices` lists them)")
     threads: int | None = option(None, THREADS)
 
 
 @dataclass(frozen=True)
 class Units(Plan):
-    """The default triangle and box tests beside the others: ratios of their times with their spread, on one thread.
+    """Compare the default triangle and box tests with the other tests: ratios of times, with their spread, on one thread.
 
-    MESHES: mesh files; without any, a sphere, a terrain and a teapot."""
+    MESHES: mesh files; default: a sphere, a terrain and a teapot."""
 
     COMMAND, STUDY, QUICK = "bench units", "wrt.lab.bench.units", {"rays": 1 << 14, "runs": 5}
     meshes: Sequence[Any] = the_meshes()
-    rays: int = option(2**17, "Rays of each kind", (1, 2**28))
-    runs: int = option(9, "Runs of each unit, in turn", (1, 1000))
+    rays: int = option(2**17, "Number of rays of each kind", (1, 2**28))
+    runs: int = option(9, "Timed runs of each test, alternating", (1, 1000))
     accel: str = option("bvh", "Acceleration structure", of=STRUCTURES)
-    seed: int = option(0, "Other rays")
+    seed: int = option(0, RAY_SEED)
 
 
 @dataclass(frozen=True)
 class Peers(Plan):
-    """wrt beside Embree (robust, fast, in packets) and Warp's mesh_query_ray: the same rays in turn, on one thread and on all.
-    With ratios, and answers that differ.
+    """Compare wrt with Embree (robust, fast, in packets) and Warp's mesh_query_ray on the same rays: speeds, their ratios, and
+    the number of answers that differ.
 
-    MESHES: mesh files; without any, a sphere."""
+    MESHES: mesh files; default: a sphere."""
 
     COMMAND, STUDY, QUICK = "bench peers", "wrt.lab.bench.peers", {"rays": 20_000, "runs": 5}
     meshes: Sequence[Any] = the_meshes()
-    structures: Sequence[str] = option(("bvh",), "Of wrt, by name; ratios are of the first", of=STRUCTURES)
-    rivals: Sequence[str] = option((), "embree, embree_fast, embree16, embree16_incoherent, warp, open3d  [default: all installed]",
+    structures: Sequence[str] = option(("bvh",), "Structures of wrt to measure; ratios relate to the first one", of=STRUCTURES)
+    rivals: Sequence[str] = option((), "Libraries to compare with: embree, embree_fast, embree16, embree16_incoherent, warp, open3d"
+                                           "  [default: all installed]",
                                    of=("rival", "wrt.lab.hard_cases.contestants:PEERS"))
     kinds: Sequence[str] = the_kinds()
-    rays: int = option(100_000, "Rays of each kind", (1, 2**28))
-    runs: int = option(7, "Runs of each, in turn", (1, 1000))
-    seed: int = option(0, "Other rays")
-    threads: str = option("both", "one (by its CPU time), all (by the clock) or both", of=("number of threads", f"{__name__}:SOME_THREADS"))
+    rays: int = option(100_000, "Number of rays of each kind", (1, 2**28))
+    runs: int = option(7, "Timed runs of each library, alternating", (1, 1000))
+    seed: int = option(0, RAY_SEED)
+    threads: str = option("both", "CPU threads: one (measures CPU time), all (measures wall-clock time) or both",
+                          of=("number of threads", f"{__name__}:THREAD_CHOICES"))
 
     def __post_init__(self) -> None:
         from wrt.core.errors import InputError
@@ -131,133 +135,133 @@ class Peers(Plan):
 
 @dataclass(frozen=True)
 class HardCases(Plan):
-    """The hard cases against wrt and other ray libraries: rays lost, invented and given to a wrong triangle, and errors of t.
+    """Run the hard cases on wrt and other ray libraries: count rays lost, hits invented and wrong triangles, and measure the error of t.
 
-    CASES: names such as E_grid, or the letters of groups; without any, all."""
+    CASES: names such as E_grid, or letters of groups such as E; default: all."""
 
     COMMAND, STUDY, QUICK = "bench hard-cases", "wrt.lab.hard_cases.comparison", {"rays": 100}
     cases: Sequence[str] = option(())
-    libraries: Sequence[str] = option((), "Which: wrt, embree ... (a wrong name lists them)  [default: all that are installed]",
+    libraries: Sequence[str] = option((), "Libraries to test: wrt, embree, ... (an unknown name lists them)  [default: all installed]",
                                       of=("library", "wrt.lab.hard_cases.libraries:LIBRARIES"))
-    rays: int = option(1000, "Rays of each case", (1, 2**40))
-    seed: int = option(0, "Other rays")
+    rays: int = option(1000, "Number of rays of each case", (1, 2**40))
+    seed: int = option(0, RAY_SEED)
 
 
 @dataclass(frozen=True)
 class Closed(Plan):
-    """Closed meshes: points inside, and rays through corners and edges, which must cross an even number of times.
-    Also by Open3D and trimesh, if installed.
+    """Test closed meshes: which points are inside, and rays through corners and edges, which must cross an even number of times.
+    Open3D and trimesh answer too, if installed.
 
-    MESHES: closed mesh files, beside seven made meshes."""
+    MESHES: closed mesh files, in addition to seven built-in meshes."""
 
     COMMAND, STUDY, QUICK = "bench closed", "wrt.lab.bench.closed", {"points": 1000, "rays": 1000, "others": 1000}
     meshes: Sequence[Any] = the_meshes()
-    points: int = option(10_000, "Points of each mesh", (1, 2**28))
-    rays: int = option(10_000, "Rays of each mesh", (1, 2**28))
-    others: int = option(10_000, "How many the others get at most (trimesh without Embree: a hundredth); 0: none", (0, 2**28))
-    seed: int = option(0, "Other points and rays")
+    points: int = option(10_000, "Number of points for each mesh", (1, 2**28))
+    rays: int = option(10_000, "Number of rays for each mesh", (1, 2**28))
+    others: int = option(10_000, "Most points and rays for another library (trimesh without Embree: a hundredth); 0: none", (0, 2**28))
+    seed: int = option(0, "Seed of the random points and rays")
 
 
 @dataclass(frozen=True)
 class Accel(Plan):
-    """All structures: time to build, memory, steps and time to search, and answers that differ (none may).
+    """Compare all structures: build time, memory, traversal steps and time, and the number of answers that differ (must be 0).
 
-    MESHES: mesh files; without any, a terrain that grows from a thousand triangles on."""
+    MESHES: mesh files; default: a terrain that grows from a thousand triangles on."""
 
     COMMAND, STUDY, QUICK = "bench accel", "wrt.lab.bench.accel", {"rays": 20_000, "runs": 3, "max_triangles": 20_000}
     meshes: Sequence[Any] = the_meshes()
-    structures: Sequence[str] = option((), "Which, by name  [default: all but brute_force]", of=STRUCTURES)
+    structures: Sequence[str] = option((), "Structures to measure  [default: all but brute_force]", of=STRUCTURES)
     kinds: Sequence[str] = the_kinds()
-    rays: int = option(100_000, "Rays of each kind", (1, 2**28))
-    runs: int = option(5, "Runs of each structure, alternating", (1, 1000))
-    builds: int = option(1, "Builds of each structure", (1, 100))
-    max_triangles: int = option(1_000_000, "Without meshes, the terrain grows to this", (1000, 2**28))
-    threads: int = option(1, "Threads to search with (builds use all cores)")
-    seed: int = option(0, "Other rays")
-    stadium: bool = option(False, "Each mesh in a stadium a thousand times its size, with the rays it has alone")
+    rays: int = option(100_000, "Number of rays of each kind", (1, 2**28))
+    runs: int = option(5, "Timed runs of each structure, alternating", (1, 1000))
+    builds: int = option(1, "Timed builds of each structure", (1, 100))
+    max_triangles: int = option(1_000_000, "Largest number of triangles of the terrain, if no MESHES are given", (1000, 2**28))
+    threads: int = option(1, "Number of CPU threads that trace (builds use all cores)")
+    seed: int = option(0, RAY_SEED)
+    stadium: bool = option(False, "Put each mesh into a stadium a thousand times its size, and trace the same rays")
 
 
 @dataclass(frozen=True)
 class Bvh(Plan):
-    """Builders of binary BVHs over MESHES: quality, time and memory; and boxes, spheres and 14-DOPs around the same tree."""
+    """Compare builders of binary BVHs over MESHES by quality, time and memory; compare boxes, spheres and 14-DOPs on one tree."""
 
     COMMAND, STUDY, QUICK = "bench bvh", "wrt.lab.bench.bvh", {"rays": 1 << 14, "builds": 1, "runs": 3}
     meshes: Sequence[Any] = the_meshes(MISSING)
-    builders: Sequence[str] = option((), "Which, by name  [default: all]", of=("builder", "wrt.accel.bvh.builders:BVH_BUILDERS"))
-    rays: int = option(2**18, "Rays into each mesh", (1, 2**26))
-    builds: int = option(3, "Builds of each builder, after the first", (1, 100))
-    runs: int = option(7, "Runs of each volume, alternating", (1, 1000))
-    threads: int | None = option(None, "Threads to build with  [default: all cores]")
-    seed: int = option(0, "Other rays")
+    builders: Sequence[str] = option((), "Builders to measure  [default: all]", of=("builder", "wrt.accel.bvh.builders:BVH_BUILDERS"))
+    rays: int = option(2**18, "Number of rays into each mesh", (1, 2**26))
+    builds: int = option(3, "Timed builds of each builder, after a first one that is not timed", (1, 100))
+    runs: int = option(7, "Timed runs of each bounding volume, alternating", (1, 1000))
+    threads: int | None = option(None, "Number of CPU threads that build  [default: all cores]")
+    seed: int = option(0, RAY_SEED)
 
 
 @dataclass(frozen=True)
 class RtCore(Plan):
-    """The model of the RT core on MESHES: what limits it, rays a second as ranges, and which assumption moves them most."""
+    """Model the RT core on MESHES: what limits it, a range of rays a second, and which assumption changes that range most."""
 
     COMMAND, STUDY, QUICK = "bench rtcore", "wrt.lab.rtcore.meshes", {"rays": 1 << 12}
     meshes: Sequence[Any] = the_meshes(MISSING)
-    structures: Sequence[str] = option((), "Which, by name  [default: every BVH]", of=STRUCTURES)
+    structures: Sequence[str] = option((), "Structures to model  [default: every BVH]", of=STRUCTURES)
     kinds: Sequence[str] = the_kinds("primary", "diffuse")
-    rays: int = option(2**16, "Rays of each kind", (1, 2**22))
+    rays: int = option(2**16, "Number of rays of each kind", (1, 2**22))
     gpu: str = option("rtx2080ti", MODELLED, of=GPUS)
-    seed: int = option(0, "Other rays")
+    seed: int = option(0, RAY_SEED)
     inside: bool = option(False, INSIDE)
 
 
 @dataclass(frozen=True)
 class Float64(Plan):
-    """How many triangle tests, and of how many rays, need float64 if a GPU runs the watertight test on MESHES."""
+    """Count the triangle tests that need float64 if a GPU runs the watertight test on MESHES, and the rays that have such a test."""
 
     COMMAND, STUDY, QUICK = "bench float64", "wrt.lab.rtcore.hard_tests", {"rays": 1 << 12}
     meshes: Sequence[Any] = the_meshes(MISSING)
     kinds: Sequence[str] = the_kinds("primary", "diffuse")
-    rays: int = option(2**16, "Rays of each kind", (1, 2**22))
-    seed: int = option(0, "Other rays")
+    rays: int = option(2**16, "Number of rays of each kind", (1, 2**22))
+    seed: int = option(0, RAY_SEED)
     inside: bool = option(False, INSIDE)
 
 
 @dataclass(frozen=True)
 class Pictures(Plan):
-    """SCENES by waves of samples, as the CPU renders, beside one ray at a time: nanoseconds a sample on one thread, in turn.
-    Also the pixels that differ (none may)."""
+    """Render SCENES by waves of samples, as the CPU does, and one ray at a time. Compare nanoseconds a sample on one thread, and
+    count the pixels that differ (must be 0)."""
 
     COMMAND, STUDY, QUICK = "bench pictures", "wrt.lab.bench.pictures", {"size": "160x90", "spp": 4, "runs": 3}
     scenes: Sequence[Any] = option(MISSING)
-    size: str = option("640x360", "Pixels of each picture")
-    spp: int = option(16, "Samples a pixel", (1, 1 << 16))
-    runs: int = option(5, "Runs of each, in turn", (1, 1000))
+    size: str = option("640x360", "Width x height of each picture, in pixels")
+    spp: int = option(16, "Samples per pixel", (1, 1 << 16))
+    runs: int = option(5, "Timed runs of each way to render, alternating", (1, 1000))
     accel: str = option("bvh", "Acceleration structure", of=STRUCTURES)
 
 
 @dataclass(frozen=True)
 class WhatIf(Plan):
-    """Change one thing of the RT core's design, and count the same rays through MESH again.
+    """Change one part of the RT core's design, trace the same rays through MESH, and compare their cost.
 
-    STUDY: width (of nodes, their format and volume), stack (entries, with restarts), planes (bits of a box plane), order (nearer child
-    first, early stop), sorting (of rays), rates (boxes a clock against triangles a clock)."""
+    STUDY names the part. "width": children, format and bounding volume of a node. "stack": entries of a short stack with restarts.
+    "planes": bits of a box plane. "order": nearer child first, early stop. "sorting": order of the rays. "rates": tests a clock."""
 
     COMMAND, STUDY = "whatif", "wrt.lab.rtcore.whatif"
     study: str = option(MISSING, of=("study", "wrt.lab.rtcore.whatif:STUDIES"))
     mesh: Any = option(MISSING)  # noqa: RUF009
     kinds: Sequence[str] = the_kinds("primary", "diffuse")
-    rays: int = option(2**15, "Rays of each kind", (1, 2**22))
+    rays: int = option(2**15, "Number of rays of each kind", (1, 2**22))
     gpu: str = option("rtx2080ti", MODELLED, of=GPUS)
-    seed: int = option(0, "Other rays")
+    seed: int = option(0, RAY_SEED)
     inside: bool = option(False, INSIDE)
 
 
 @dataclass(frozen=True)
 class Error(Plan):
-    """Knobs of a scene to turn, and how often it is rendered."""
+    """Settings to vary in a study of error, and how often each picture is rendered."""
 
     QUICK = {"max_spp": 4, "repeats": 3}
-    knobs: Sequence[str] = option((), "Which to turn: sampler, max_depth, triangle ... (a wrong name lists them)  [default: all]",
+    knobs: Sequence[str] = option((), "Settings to vary: sampler, max_depth, triangle, ... (an unknown name lists them)  [default: all]",
                                   of=("knob", "wrt.lab.bench.error:KNOBS"))
-    max_spp: int = option(64, "Samples a pixel: 1, 2, 4 ... up to this", (1, 1 << 16))
-    repeats: int = option(8, "Seeds of each picture, for the intervals", (3, 1000))  # 2 seeds have no spread
-    reference_spp: int | None = option(None, "Samples of each of the reference's seeds  [default: 8 times --max-spp]", (1, 1 << 24))
-    row_limit: float = option(120.0, "Leave out what would take longer than this, with all its seeds  [default: 120s]")
+    max_spp: int = option(64, "Largest number of samples per pixel, after 1, 2, 4, ...", (1, 1 << 16))
+    repeats: int = option(8, "Seeds for each picture; their spread gives the confidence intervals", (3, 1000))  # 2 seeds have no spread
+    reference_spp: int | None = option(None, "Samples per pixel of 8 reference pictures each  [default: 8 times --max-spp]", (1, 1 << 24))
+    row_limit: float = option(120.0, "Leave out a picture whose seeds together would take longer than this time  [default: 120s]")
 
     @property
     def levels(self) -> list[int]:
@@ -266,33 +270,33 @@ class Error(Plan):
 
 @dataclass(frozen=True)
 class Mitsuba(Plan):
-    """Samples and pictures of each renderer."""
+    """Options of a comparison with Mitsuba 3 at equal error."""
 
     QUICK = {"spp": 8, "repeats": 3, "rival_limit": 5.0, "starts": 1}
-    spp: int = option(64, "wrt's samples a pixel; its error is what Mitsuba must reach", (1, 1 << 16))
-    repeats: int = option(7, "Pictures of each, alternating, each with its own seed", (3, 1000))
-    reference_spp: int | None = option(None, "Samples of each of the reference's 8 seeds  [default: 8 times --spp]")
-    rival_limit: float = option(60.0, "No picture of Mitsuba's takes longer  [default: 60s]")
-    integrator: str = option("auto", "Mitsuba's: path, volpath, direct or whitted (in Python, scalar_rgb only)",
+    spp: int = option(64, "Samples per pixel of wrt; Mitsuba takes as many as it needs for the same error", (1, 1 << 16))
+    repeats: int = option(7, "Pictures of each renderer, alternating, each with its own seed", (3, 1000))
+    reference_spp: int | None = option(None, "Samples per pixel of 8 reference pictures each  [default: 8 times --spp]")
+    rival_limit: float = option(60.0, "Longest time for a picture by Mitsuba  [default: 60s]")
+    integrator: str = option("auto", "Integrator of Mitsuba: auto, path, volpath, direct or whitted (in Python, scalar_rgb only)",
                              of=("integrator", "wrt.lab.mitsuba.translate:INTEGRATORS"))
-    variants: Sequence[str] = option(("scalar_rgb", "llvm_ad_rgb"), "Mitsuba's; llvm_ad_rgb needs an LLVM library",
+    variants: Sequence[str] = option(("scalar_rgb", "llvm_ad_rgb"), "Variants of Mitsuba; llvm_ad_rgb needs an LLVM library",
                                      of=("variant of Mitsuba", "wrt.lab.mitsuba.process:VARIANTS"))
-    starts: int = option(3, "How often to time whole processes; 0: not at all")
-    seed: int = option(0, "Decides on all seeds")
+    starts: int = option(3, "Number of timed runs of whole processes; 0 skips them")
+    seed: int = option(0, "Seed from which the seeds of all pictures follow")
 
 
 @dataclass(frozen=True)
 class Stability(Plan):
-    """The hard cases against the intersection tests: rays lost and errors, with the speed beside them.
+    """Run the hard cases on the intersection tests: rays lost, errors and speed.
 
-    CASES: names such as E_grid, or the letters of groups; without any, all."""
+    CASES: names such as E_grid, or letters of groups such as E; default: all."""
 
     COMMAND = "stability"
     QUICK = {"rays": 300, "sample": 300, "runs": 3}
     cases: Sequence[str] = option(())
-    rays: int = option(10_000, "Rays of each case, for the default", (1, 2**40))
-    sample: int = option(10_000, "How many of them the oracle judges, and the other tests and peers get", (1, 2**40))
-    peers: bool = option(False, "Also Embree (robust, fast, in packets), Warp's mesh_query_ray and Open3D, where installed")
-    seed: int = option(0, "Other rays")
-    threads: int | None = option(None, "Threads for the rays beyond the sample  [default: all cores]")
-    runs: int = option(7, "Runs of each for the speed, in turn", (1, 1000))
+    rays: int = option(10_000, "Number of rays of each case for the default tests", (1, 2**40))
+    sample: int = option(10_000, "Number of these rays that the oracle judges, and that the other tests and libraries trace", (1, 2**40))
+    peers: bool = option(False, "Also test Embree (robust, fast, in packets), Warp's mesh_query_ray and Open3D, if installed")
+    seed: int = option(0, RAY_SEED)
+    threads: int | None = option(None, "Number of CPU threads for the rays beyond the sample  [default: all cores]")
+    runs: int = option(7, "Timed runs of each test and library, alternating", (1, 1000))

@@ -1,4 +1,4 @@
-"""`wrt.tune`: find the fastest structure on a device, and on CUDA its best block size and place for the stack."""
+"""`wrt.tune`: find the fastest structure on a device; on CUDA also its best block size and memory for the traversal stack."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ from wrt.lab.bench.timing import alternate, spread
 from wrt.lab.bench.visibility import terrain
 from wrt.lab.hard_cases.contestants import Own
 
-STRUCTURES = ("bvh8", "bvh2", "bvh4", "bvh8c")  # The default first.
-CELLS = 320  # Of a side of the terrain: 204,800 triangles, far more than a GPU's L1 holds.
-KINDS = ("primary", "shadow", "diffuse")  # Of a picture.
-FAST, SLOW = 1 << 20, 1 << 15  # Rays on CUDA, and on the CPU.
-FEWEST, MOST = 3, 100  # runs
-MARGIN = 1.03  # times as fast as the default: less may be noise
+STRUCTURES = ("bvh8", "bvh2", "bvh4", "bvh8c")  # The first one is the default.
+CELLS = 320  # Cells a side of the terrain: 204,800 triangles, far more than a GPU's L1 holds.
+KINDS = ("primary", "shadow", "diffuse")  # Kinds of rays in a picture.
+FAST, SLOW = 1 << 20, 1 << 15  # Number of rays on CUDA and on the CPU.
+FEWEST, MOST = 3, 100  # Timed runs.
+MARGIN = 1.03  # Least speed over the default's that counts as faster; less may be noise.
 COLUMNS: Columns = {"structure": "{accel}", "block": "{block}", "stack": "{stack}", "rays": "{kind}",
-                    "Mray/s": lambda row: spread(row.mrays), "times as fast as the default": "{speed:.2f}"}
+                    "Mray/s": lambda row: spread(row.mrays), "speed / default": "{speed:.2f}"}
 LEGEND = """\
-Rays and answers are on the device; median of the runs in turn, quartiles in brackets. The last column is the geometric mean over the
-kinds of rays. Block and stack are settings of wrt.core.cuda."""
+Rays and hits are in device memory. Mray/s: median of alternating runs, quartiles in brackets. speed / default: geometric mean over the
+kinds of rays. block (threads a block) and stack (memory of the traversal stack) are settings of wrt.core.cuda."""
 
 
 class Choice(NamedTuple):
-    """A name in ACCELERATORS, and settings of wrt.core.cuda."""
+    """A structure, by its name in ACCELERATORS, with settings of wrt.core.cuda."""
 
     accel: str = STRUCTURES[0]
     block_dim: int = cuda.BLOCK_DIMS[0]
@@ -51,7 +51,7 @@ DEFAULT = Choice()
 
 @dataclass(frozen=True)
 class Tuning:
-    """The fastest choice (`best`), the speed of each measured choice over the default's, and the rows of measurements."""
+    """Result of `measured`. best: the fastest choice; speeds: choice -> its speed over the default's; rows: all measurements."""
 
     device: str
     best: Choice
@@ -101,18 +101,18 @@ def tune(device: str, seconds: float = 1.0) -> dict[str, str]:
 
 
 def measured(device: str, seconds: float = 1.0, clock: Callable[[], float] = time.perf_counter) -> Tuning:
-    """Tune as `tune` and return all measurements; on CUDA also those of the fastest structure with each block size and stack."""
-    there = start(as_one(device, str, "device"))
+    """Measure all structures as `tune` does; on CUDA also measure the fastest one with each block size and stack."""
+    target = start(as_one(device, str, "device"))
     if not as_one(seconds, (int, float), "seconds") > 0.0:
         raise InputError(f"must be more than 0, got {seconds}", argument="seconds")
     geometry = Geometry.of(terrain(CELLS))
-    rays = ray_sets(build(geometry, DEFAULT.accel, device), FAST if there.is_cuda else SLOW)
-    phases = 2 if there.is_cuda else 1
-    rows, speeds = measure([Choice(accel) for accel in STRUCTURES], geometry, rays, there, seconds / phases, clock)
+    rays = ray_sets(build(geometry, DEFAULT.accel, device), FAST if target.is_cuda else SLOW)
+    phases = 2 if target.is_cuda else 1
+    rows, speeds = measure([Choice(accel) for accel in STRUCTURES], geometry, rays, target, seconds / phases, clock)
     best = fastest(speeds)
-    if there.is_cuda:
+    if target.is_cuda:
         others = [DEFAULT, *(Choice(best.accel, block, stack) for block in cuda.BLOCK_DIMS for stack in cuda.STACKS)]
-        more = measure(list(dict.fromkeys(others)), geometry, rays, there, seconds / phases, clock)
+        more = measure(list(dict.fromkeys(others)), geometry, rays, target, seconds / phases, clock)
         rows, speeds = rows + more[0], speeds | more[1]
         best = fastest(more[1])
     return Tuning(device, best, machine_line(f"Warp {wp.__version__}", device=device), speeds, rows)
@@ -120,32 +120,32 @@ def measured(device: str, seconds: float = 1.0, clock: Callable[[], float] = tim
 
 def measure(choices: list[Choice], geometry: Geometry, rays: Mapping[str, RaySet], device: Device, seconds: float,
             clock: Callable[[], float]) -> tuple[list[Row], dict[Choice, float]]:
-    """Measure all choices, the default first; return the rows and each choice's speed over the default's."""
+    """Measure all choices; return the rows and each choice's speed over the first one's, the default."""
     jobs: dict[tuple[Choice, str], Callable[[], None]] = {}
     for accel in dict.fromkeys(choice.accel for choice in choices):
         own = Own(structure=accel, device=device.alias)
         own.prepare(geometry)
         for kind in KINDS:
             search = own.search(rays[kind], thread_count(None))
-            jobs |= {(choice, kind): partial(ask, choice, search, device) for choice in choices if choice.accel == accel}
-    once = sum(float(taken.sum()) for taken in alternate(jobs, 1, clock).values())
-    taken = alternate(jobs, min(max(int(seconds / once), FEWEST), MOST), clock)
-    middle = {key: float(np.median(each)) for key, each in taken.items()}
-    speeds = {choice: float(np.exp(np.mean([np.log(middle[choices[0], kind] / middle[choice, kind]) for kind in KINDS])))
+            jobs |= {(choice, kind): partial(search_with, choice, search, device) for choice in choices if choice.accel == accel}
+    round_seconds = sum(float(run.sum()) for run in alternate(jobs, 1, clock).values())
+    runs = alternate(jobs, min(max(int(seconds / round_seconds), FEWEST), MOST), clock)
+    median = {key: float(np.median(each)) for key, each in runs.items()}
+    speeds = {choice: float(np.exp(np.mean([np.log(median[choices[0], kind] / median[choice, kind]) for kind in KINDS])))
               for choice in choices}
     rows = [Row(accel=choice.accel, block=choice.block_dim if device.is_cuda else "",
                 stack=choice.stack if device.is_cuda else "", kind=kind, rays=len(rays[kind]),
-                mrays=(len(rays[kind]) / each / 1e6).tolist(), speed=speeds[choice]) for (choice, kind), each in taken.items()]
+                mrays=(len(rays[kind]) / each / 1e6).tolist(), speed=speeds[choice]) for (choice, kind), each in runs.items()]
     return rows, speeds
 
 
 def fastest(speeds: Mapping[Choice, float]) -> Choice:
-    """Return the fastest choice, or the default if no other is faster by MARGIN. speeds: over the default's."""
+    """Return the fastest choice, or DEFAULT if no choice is faster by MARGIN. speeds: speed over the default's."""
     best = max(speeds, key=lambda choice: speeds[choice])
     return best if speeds[best] >= MARGIN else DEFAULT
 
 
-def ask(choice: Choice, search: Callable[[], object], device: Device) -> None:
+def search_with(choice: Choice, search: Callable[[], object], device: Device) -> None:
     before = cuda.block_dim, cuda.stack
     cuda.block_dim, cuda.stack = choice.block_dim, choice.stack
     try:

@@ -1,1 +1,1 @@
-"""Films and images: files, tone mapping, metrics, heat maps."""
+"""Films and images: files, tone mapping, error metrics, heat maps."""

@@ -1,4 +1,4 @@
-"""Decode PNG, JPEG and the like with Pillow. The bytes are untrusted: few formats are allowed, and the size is checked first."""
+"""Decode untrusted PNG, JPEG and similar pictures with Pillow: few formats are allowed, and the size is checked before the pixels."""
 
 from __future__ import annotations
 
@@ -13,24 +13,23 @@ import numpy as np
 from wrt.core.errors import InputError
 from wrt.core.packages import needed_by
 
-# Pillow has further formats, such as EPS, which run programs.
+# Other formats of Pillow, such as EPS, run programs.
 FORMATS = ("PNG", "JPEG", "WEBP", "AVIF", "BMP", "GIF")
 MAX_SIDE = 32768  # pixels
 MAX_PIXELS = 1 << 27  # 16384x8192
 
 
 def check_size(width: int, height: int, most: int = MAX_PIXELS) -> None:
-    """Raise InputError if a picture is too large to be read."""
+    """Raise InputError if a picture has more than MAX_SIDE pixels on a side or more than `most` pixels."""
     if max(width, height) > MAX_SIDE or width * height > most:
-        limits = f"at most {MAX_SIDE} a side and {most} pixels are read"
-        raise InputError(f"cannot be read as an image: it is {width}x{height}; {limits}")
+        raise InputError(f"cannot be read as an image: it is {width}x{height}",
+                         hint=f"at most {MAX_SIDE} pixels a side and {most} in all are read")
 
 
 def decode_rgba8(data: bytes, formats: tuple[str, ...] = FORMATS) -> np.ndarray:
-    """Decode a picture to (H, W, 4) uint8 codes, row 0 on top; without alpha it is 255.
+    """Decode a picture to (H, W, 4) uint8 codes, row 0 on top. Alpha is 255 in a picture without alpha.
 
-    16-bit channels keep their high byte; colour profiles are ignored. Raises InputError for a broken, truncated or too large picture.
-    """
+    16-bit channels keep their high byte; colour profiles are ignored. Raises InputError for a broken, truncated or too large picture."""
     with _opened(data, formats) as picture:
         if picture.mode.startswith("I"):  # 16-bit grey, which Pillow would clip to 255
             grey = (np.asarray(picture).astype(np.uint32) >> 8).astype(np.uint8)
@@ -42,8 +41,7 @@ def decode_png16(data: bytes) -> np.ndarray:
     """Decode a PNG with 16 bits a channel to (H, W, 3) uint16 codes without alpha. Raises InputError as decode_rgba8 does.
 
     Pillow keeps one byte of each channel of a colour picture: the high one, or the low one if the byte order is declared as swapped.
-    Grey with alpha has four bytes a pixel, read here as RGBA. (OpenImageIO keeps all bytes, but its libpng writes errors to stderr.)
-    """
+    Grey with alpha has four bytes a pixel, read here as RGBA. (OpenImageIO keeps all bytes, but its libpng writes errors to stderr.)"""
     with _opened(data, ("PNG",)) as picture:
         order = picture.tile[0][3] if picture.tile else ""
         if picture.mode.startswith("I"):
@@ -64,14 +62,14 @@ def decode_png16(data: bytes) -> np.ndarray:
 
 @contextmanager
 def _opened(data: bytes, formats: tuple[str, ...]) -> Iterator[Any]:
-    """Yield an image of Pillow, which decodes its pixels when they are read."""
+    """Yield a Pillow image, which decodes its pixels on first use."""
     with needed_by("a picture in a file"):
         from PIL import Image, UnidentifiedImageError
 
     Image.init()
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about sizes above half of Pillow's own limit, and about metadata
+            warnings.simplefilter("ignore")  # Pillow warns of sizes above half its own limit, and of metadata
             with Image.open(io.BytesIO(data), formats=[name for name in formats if name in Image.OPEN]) as picture:
                 check_size(*picture.size)
                 yield picture

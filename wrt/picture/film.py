@@ -1,4 +1,4 @@
-"""Film, the result of a render: pixels, variance and AOVs, with what displays and saves them."""
+"""Film, the result of a render: pixels, variance and AOVs; their display and their files."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from wrt.core.checks import as_names
+from wrt.core.checks import as_names, require_known
 from wrt.core.errors import InputError
 from wrt.core.types import PathLike, WarpArray
 from wrt.picture.image import as_half, check_writable, color_channels, encode_png, output_format, write_codes, write_exr, write_image
@@ -23,19 +23,19 @@ LETTERS = {"variance": "RGB", "depth": "Z", "normal": "XYZ", "albedo": "RGB"}
 class Film:
     """The result of `render`.
 
-    `np.asarray(film)`, `from_dlpack(film)` of any library, `numpy()` and `warp()` share the memory of the pixels.
+    The results of `np.asarray(film)`, of any library's `from_dlpack(film)`, of `numpy()` and of `warp()` share the memory of the pixels.
 
     Parameters
     ----------
     pixels
         (H, W, 3) float32, linear Rec. 709 radiance, the mean of the samples; row 0 is on top.
     variance
-        (H, W, 3) float32, estimated variance of that mean: its square root is the standard error. inf for fewer than two samples.
+        (H, W, 3) float32, estimated variance of `pixels`: its square root is the standard error. inf for fewer than two samples.
     samples
         (H, W) int32, number of samples of each pixel.
     aov
-        Layers by name, of the first hit of one ray through the centre of the pixel and of the lens: without filter, without a mean
-        over samples. Blended surfaces count, cut-out parts do not. (H, W) or (H, W, 3) each:
+        Layers by name, (H, W) or (H, W, 3) each. A value is that of the first hit of one ray through the centre of the pixel and of the
+        lens: it is neither filtered nor averaged over samples. Rays hit surfaces of alpha mode "blend", but not what "mask" cuts out.
 
         - "depth", float32: distance from the camera along the ray, in scene units (not along the camera's axis); inf on a miss.
         - "normal", float32: unit shading normal in world space, on the side of the camera; 0 on a miss.
@@ -43,9 +43,9 @@ class Film:
         - "prim_id", int32: index of the triangle, all objects in order, then of the sphere; -1 on a miss.
         - "material_id", int32: index into `scene.materials`; -1 on a miss.
     stats
-        Counts, and `stats["seconds"]` of wall-clock time by stage: "compile", which runs beside "upload" and "build", then "aov" and
-        "trace", with the seconds before a resume. "lost_throughput_per_sample" is the radiance that cut rays would have added in
-        surroundings of radiance 1. "visibly_cut" is the share of pixels that lack 5 % or more of it because of max_depth.
+        Counts and times. `stats["seconds"]` has the wall-clock seconds of each stage, including those before a resume: "compile" (runs
+        beside "upload" and "build"), "aov" and "trace". "lost_throughput_per_sample" is the radiance that cut rays would have added in
+        surroundings of radiance 1. "visibly_cut" is the share of pixels that lose 5 % or more of their radiance by `max_depth`.
     metadata
         Entries that `save` writes into files: scene, spp, seed, seconds, version ...
     exposure, tonemap
@@ -69,7 +69,7 @@ class Film:
     def __post_init__(self) -> None:
         size = self.pixels.shape[:2]
         if self.pixels.shape != (*size, 3) or self.variance.shape != (*size, 3) or self.samples.shape != size:
-            raise InputError(f"and variance must be (H, W, 3) and samples (H, W), got {self.pixels.shape},"
+            raise InputError(f"pixels and variance must be (H, W, 3) and samples (H, W), got {self.pixels.shape},"
                              f" {self.variance.shape} and {self.samples.shape}", argument="pixels", place="film")
         for name, array in self.aov.items():
             if array.shape[:2] != size:
@@ -85,7 +85,7 @@ class Film:
 
     @property
     def layers(self) -> dict[str, np.ndarray]:
-        """All layers beside the pixels, by name: the AOVs, "variance" and "samples"."""
+        """All layers except the pixels, by name: the AOVs, "variance" and "samples"."""
         return {**self.aov, "variance": self.variance, "samples": self.samples}
 
     def to_srgb8(self) -> np.ndarray:
@@ -117,17 +117,17 @@ class Film:
         return encode_png(self.to_srgb8(), self.metadata)
 
     def save(self, path: PathLike, *, bits: int | None = None, aov: str | Iterable[str] | None = None) -> list[Path]:
-        """Write the picture, and layers with it. Each file is written whole or not at all.
+        """Write the picture and layers to files. Each file is written completely or not at all.
 
         Parameters
         ----------
         path
-            The suffix decides: .png is exposed and tone-mapped, .exr and .hdr stay linear.
+            Path of the picture. A .png file is exposed and tone-mapped; .exr and .hdr files are linear.
         bits
             Bits of a channel: 8 or 16 for PNG (default 8), 32 or 16 for EXR (default 32).
         aov
-            Names of `layers`. EXR has all by default, with their values, as channels (depth.Z ... prim_id). For PNG and HDR the
-            default is none, and each layer becomes a PNG to look at: `name.depth.png` beside `name.png`.
+            Names of `layers`. An EXR file has all layers by default, as channels with their values (depth.Z ... prim_id). Beside a PNG
+            or HDR file, each named layer becomes a PNG file to look at, such as `name.depth.png`; the default is none.
 
         Returns
         -------
@@ -137,7 +137,7 @@ class Film:
         Raises
         ------
         InputError
-            If a path or a name is wrong, before anything is written, or the system refuses.
+            If a path or a name is wrong (nothing is written then), or if the system refuses to write.
         """
         suffix, bits = output_format(path, bits)
         names = self._layer_names(aov, suffix)
@@ -160,9 +160,8 @@ class Film:
         if aov is None:
             return list(self.layers) if suffix == ".exr" else []
         names = list(dict.fromkeys(as_names(aov, "aov")))
-        unknown = [name for name in names if name not in self.layers]
-        if unknown:
-            raise InputError(f"no AOV {unknown[0]!r}", argument="aov", hint=f"there are {', '.join(self.layers)}")
+        for name in names:
+            require_known(name, self.layers, "AOV", "aov")
         return names
 
 
@@ -172,7 +171,7 @@ def aov_path(path: PathLike, name: str) -> Path:
 
 
 def layer_channels(name: str, array: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the EXR channels of a layer by name: depth.Z, normal.X ..., or `name` alone without LETTERS."""
+    """Return the EXR channels of a layer by name: depth.Z, normal.X ...; a layer that is not in LETTERS has one channel, `name`."""
     if array.ndim == 3:
         return color_channels(name, array, LETTERS.get(name, "RGB"))
     return {f"{name}.{LETTERS[name]}" if name in LETTERS else name: array}
@@ -190,13 +189,13 @@ def _view_depth(depth: np.ndarray) -> np.ndarray:
 
 
 def _view_normal(normal: np.ndarray) -> np.ndarray:
-    """Return -1 to 1 as codes 0 to 255, without sRGB encoding; a miss is black."""
+    """Return a colour for each normal: components from -1 to 1 become codes 0 to 255, without sRGB encoding; a miss is black."""
     hit = np.abs(normal).sum(axis=-1, keepdims=True) > 0.0
     return np.rint(np.where(hit, np.clip(0.5 + 0.5 * normal, 0.0, 1.0), 0.0) * 255.0).astype(np.uint8)
 
 
 def _view_id(ids: np.ndarray) -> np.ndarray:
-    """Return a colour from a hash of each id, the same in every picture; a miss is black."""
+    """Return a colour for each id, from a hash: an id has the same colour in every picture; a miss is black."""
     value = (ids.astype(np.int64) + 1).astype(np.uint32)  # then the finaliser of MurmurHash3, modulo 2^32
     for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35), (16, 1)):
         value = (value ^ (value >> np.uint32(shift))) * np.uint32(factor)
@@ -214,15 +213,14 @@ AOV_VIEWS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "albedo": to_codes,
     "prim_id": _view_id,
     "material_id": _view_id,
-    # The standard error on the scale of the picture, without exposure and tone mapping; inf is white.
+    # The standard error in the scale of the picture, without exposure and tone mapping; inf is white.
     "variance": lambda variance: to_codes(np.sqrt(np.maximum(variance, 0.0))),
-    # From 0, black, to the largest number, white.
+    # From 0 (black) to the largest count (white).
     "samples": lambda samples: _grey(255.0 * samples / max(int(samples.max(initial=0)), 1)),
 }
 
 
 def aov_to_srgb8(name: str, array: np.ndarray) -> np.ndarray:
     """Return a layer as a picture to look at, (H, W, 3) uint8. Raises InputError if AOV_VIEWS has no view of that name."""
-    if name not in AOV_VIEWS:
-        raise InputError(f"AOV {name!r} has no view", argument="aov", hint=f"there are {', '.join(AOV_VIEWS)}")
+    require_known(name, AOV_VIEWS, "view of the AOV", "aov")
     return AOV_VIEWS[name](array)

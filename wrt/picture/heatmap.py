@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 
 INK, PALE = (30, 30, 30), (110, 110, 110)
 BAR, MARGIN, TITLE = 18, 14, 30  # pixels: width of the scale, margin, height of the title
-LEAST = 480  # narrower pictures are enlarged by a whole factor
-BRIGHTEST = 99.0  # percentile of the values that gets the last colour
+LEAST = 480  # pixels: narrower pictures are enlarged by a whole factor
+BRIGHTEST = 99.0  # percentile of the values at which the last colour begins
 
 
 @cache
 def colors() -> np.ndarray:
-    """Return (256, 3) uint8 from black over blue, red and yellow to near white, evenly in OKLCh lightness."""
+    """Return the colour scale (256, 3) uint8: black, blue, red, yellow, near white, in even steps of OKLCh lightness."""
     t = np.linspace(0.0, 1.0, 256)
     lightness = 0.10 + 0.87 * t
     hue = np.radians(270.0 + 195.0 * t)
@@ -36,7 +36,7 @@ def colors() -> np.ndarray:
 
 
 def top_of(values: np.ndarray) -> float:
-    """Return the value of the last colour: a round number at or above nearly all values; 1 if all are 0."""
+    """Return the end of the colour scale: a round number that 99 % of the values do not exceed; 1 if all values are 0."""
     most = float(np.percentile(values, BRIGHTEST) or values.max()) if values.size else 0.0
     if most <= 0.0:
         return 1.0
@@ -45,7 +45,7 @@ def top_of(values: np.ndarray) -> float:
 
 
 def step_of(top: float) -> float:
-    """Return the distance of 4 to 10 marks from 0 to `top`: 1, 2 or 5 times a power of ten."""
+    """Return the distance of the marks of a scale from 0 to `top`, for 4 to 10 marks: 1, 2 or 5 times a power of ten."""
     power = 10.0 ** math.floor(math.log10(top / 4.0))
     return next(power * factor for factor in (5.0, 2.0, 1.0) if top / (power * factor) >= 4.0 - 1e-9)
 
@@ -58,8 +58,7 @@ def colored(values: np.ndarray, top: float) -> np.ndarray:
 def heatmap(values: np.ndarray, title: str, top: float | None = None) -> np.ndarray:
     """Draw values (h, w) >= 0, row 0 on top, as (H, W, 3) uint8 with a title and a colour scale.
 
-    top: end of the scale, which larger values share; None: `top_of`. The title gives the mean and the largest value.
-    """
+    top: end of the scale, whose colour larger values have, too; None: `top_of(values)`. The mean and the largest value follow the title."""
     with needed_by("a heat map"):
         from PIL import Image, ImageDraw
 
@@ -86,7 +85,7 @@ def heatmap(values: np.ndarray, title: str, top: float | None = None) -> np.ndar
 
 
 def short(value: float) -> str:
-    """Format a value with three digits, thousands as k, millions as M."""
+    """Format a value with three digits; from ten thousand on in k (thousands), from ten million on in M (millions)."""
     for factor, letter in ((1e6, "M"), (1e3, "k")):
         if value >= 10.0 * factor:
             return f"{value / factor:.3g}{letter}"

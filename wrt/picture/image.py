@@ -1,4 +1,4 @@
-"""Image files: PNG (8 and 16 bit), OpenEXR and Radiance HDR, each written whole or not at all.
+"""Image files: PNG (8 and 16 bit), OpenEXR and Radiance HDR. Each file is written completely or not at all.
 
 Row 0 is on top. Colours in memory are linear Rec. 709; a PNG or JPEG file holds sRGB codes. OpenImageIO reads and writes EXR and HDR,
 Pillow reads the rest (wrt.picture.decode). PNG is encoded here: Pillow writes no 16-bit RGB, and OpenImageIO's PNG writer damages text
@@ -29,16 +29,16 @@ from wrt.picture.tonemap import decode_srgb, to_codes
 
 Metadata = Mapping[str, object]
 
-# Bits per channel of the formats that are written; the first is the default.
+# Bits per channel in which a format is written; the first is the default.
 FORMATS: dict[str, tuple[int, ...]] = {".png": (8, 16), ".exr": (32, 16), ".hdr": (32,)}
 DISPLAY_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tga")  # read as sRGB codes
 LINEAR_SUFFIXES = (".exr", ".hdr")
-METADATA_PREFIX = "wrt:"  # of the names of text entries
+METADATA_PREFIX = "wrt:"  # begins the names of text entries
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _MAGIC = {".exr": (b"\x76\x2f\x31\x01",), ".hdr": (b"#?RADIANCE", b"#?RGBE")}
 MAX_LINEAR_PIXELS = 1 << 28  # an environment of 24576x10922, or 16384x16384
 HALF_MAX = 65504.0
-EXACT_IN_FLOAT = 1 << 24  # largest integer up to which float32 holds all
+EXACT_IN_FLOAT = 1 << 24  # float32 represents all integers up to this one
 
 
 # --- before and around writing ----------------------------------------------------------------------------------------
@@ -68,12 +68,11 @@ def write_image(path: PathLike, pixels: np.ndarray, *, bits: int | None = None, 
     """Write one picture in the format of the suffix.
 
     - pixels: (H, W, 3) linear. bits: per channel, of FORMATS (default 8 for PNG, 32 for EXR and HDR; 16 in EXR is half).
-    - exposure, tonemap: apply to PNG alone; metadata: text entries `wrt:key`.
+    - exposure, tonemap: for PNG alone; metadata: text entries, written as `wrt:key`.
 
     EXR keeps NaN and infinite values. In PNG, NaN and -inf are black, +inf is white. HDR has 0 for NaN and negative values, and its
     largest value for +inf. A SceneWarning counts replaced pixels. Raises InputError if the file cannot be written; an existing file
-    then stays unchanged.
-    """
+    then stays unchanged."""
     pixels = np.asarray(pixels, dtype=np.float32)
     if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.size == 0:
         raise InputError(f"must be (H, W, 3), got {pixels.shape}", argument="pixels", path=path)
@@ -95,10 +94,9 @@ def write_codes(path: PathLike, codes: np.ndarray, metadata: Metadata | None = N
 def write_exr(path: PathLike, channels: Mapping[str, np.ndarray], metadata: Metadata | None = None) -> None:
     """Write named channels to one OpenEXR part, ZIP-compressed.
 
-    channels: (H, W) each, all of one size; float16 is stored as half, all else as float. Integers are exact up to 2^24; a SceneWarning
-    reports larger ones. (OpenEXR has integer channels, but OpenImageIO's Python binding rounds them beside float channels.)
-    Raises InputError as write_image does.
-    """
+    channels: (H, W) each, all of one size; float16 is stored as half, other types as float. Integers are exact up to 2^24; a SceneWarning
+    reports larger integers. (OpenEXR has integer channels, but OpenImageIO's Python binding rounds them beside float channels.)
+    Raises InputError as write_image does."""
     oiio = _oiio()
     arrays = list(channels.values())
     height, width = arrays[0].shape
@@ -124,10 +122,10 @@ def _oiio() -> Any:
 
 
 def _write_oiio(path: PathLike, spec: Any, pixels: np.ndarray, header: bytes = b"") -> None:
-    """Write (H, W, C) float32; `header` is inserted behind the first line of the file."""
+    """Write (H, W, C) float32 by OpenImageIO, and insert `header` after the first line of the file."""
     oiio = _oiio()
     with replacing(path) as file:
-        # By descriptor if it has a name: another user of the folder could replace the file by a link.
+        # By the name of the descriptor, if possible: another user of the folder could replace the file by a link.
         name = f"/dev/fd/{file.fileno()}" if os.path.isdir("/dev/fd") else file.name
         out = oiio.ImageOutput.create(os.path.basename(file.name))  # OpenImageIO rejects folders that are not UTF-8
         if out is None:
@@ -136,7 +134,7 @@ def _write_oiio(path: PathLike, spec: Any, pixels: np.ndarray, header: bytes = b
             good = out.open(name, spec) and out.write_image(pixels)
         finally:
             closed = out.close()
-        # Some failures, such as a full disk, appear in the text only.
+        # OpenImageIO reports some failures, such as a full disk, by geterror alone.
         error = " ".join(out.geterror().split()).replace(name, os.fspath(path))
         if error or not (good and closed):
             raise InputError(f"cannot be written: {error or 'unknown error'}", path=path)
@@ -150,10 +148,10 @@ def _write_oiio(path: PathLike, spec: Any, pixels: np.ndarray, header: bytes = b
 def _write_hdr(path: PathLike, pixels: np.ndarray, metadata: Metadata) -> None:
     oiio = _oiio()
     _warn_replaced(path, ~(np.isfinite(pixels) & (pixels >= 0.0)), "negative, NaN or infinite, which .hdr cannot hold")
-    held = np.clip(np.nan_to_num(pixels, nan=0.0, posinf=1e38, neginf=0.0), 0.0, 1e38)
+    clipped = np.clip(np.nan_to_num(pixels, nan=0.0, posinf=1e38, neginf=0.0), 0.0, 1e38)
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, "float")
     header = "".join(f"# {METADATA_PREFIX}{key}={' '.join(str(value).split())}\n" for key, value in metadata.items())
-    _write_oiio(path, spec, held, _utf8(header))
+    _write_oiio(path, spec, clipped, _utf8(header))
 
 
 def color_channels(layer: str, pixels: np.ndarray, names: str = "RGB") -> dict[str, np.ndarray]:
@@ -162,14 +160,14 @@ def color_channels(layer: str, pixels: np.ndarray, names: str = "RGB") -> dict[s
 
 
 def as_half(path: PathLike, pixels: np.ndarray) -> np.ndarray:
-    """Convert to float16. Finite values beyond +-65504 are clipped and counted in one SceneWarning that names `path`."""
+    """Convert to float16. Finite values beyond +-65504 are clipped, and a SceneWarning with `path` counts the pixels."""
     beyond = np.isfinite(pixels) & (np.abs(pixels) > HALF_MAX)
     _warn_replaced(path, beyond, f"beyond {HALF_MAX:g}, the largest half, and clipped to it")
     return np.where(beyond, np.copysign(np.float32(HALF_MAX), pixels), pixels).astype(np.float16)
 
 
 def _utf8(value: object) -> bytes:
-    """Encode as UTF-8; lone surrogates (of file names that are not UTF-8) become "?"."""
+    """Encode a value as UTF-8 text; lone surrogates (from file names that are not UTF-8) become "?"."""
     return str(value).encode("utf-8", "replace")
 
 
@@ -182,8 +180,7 @@ def _warn_replaced(path: PathLike, where: np.ndarray, what: str) -> None:
 def encode_png(codes: np.ndarray, metadata: Metadata | None = None) -> bytes:
     """Encode (H, W, 3) uint8 or uint16 sRGB codes as a PNG file, with metadata in iTXt (UTF-8) entries named `wrt:key`.
 
-    Source: W3C, Portable Network Graphics Specification (third edition); every row has the filter "up".
-    """
+    Source: W3C, Portable Network Graphics Specification (third edition); every row has the filter "up"."""
     if codes.ndim != 3 or codes.shape[2] != 3 or codes.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"codes must be (H, W, 3) uint8 or uint16, got {codes.shape} {codes.dtype}")
     height, width = codes.shape[:2]
@@ -209,18 +206,17 @@ def encode_png(codes: np.ndarray, metadata: Metadata | None = None) -> bytes:
 def read_image(path: PathLike) -> np.ndarray:
     """Read the colours of an image file: (H, W, 3) float32, linear.
 
-    EXR needs channels R, G, B, or one grey channel. PNG, JPEG and the like are decoded from sRGB, 16-bit PNG at full precision. Alpha is
-    ignored. Raises InputError for a missing, truncated or too large file, and for one that is no picture.
-    """
+    EXR needs channels R, G, B, or one grey channel. PNG, JPEG and similar files are decoded from sRGB, 16-bit PNG at full precision. Alpha
+    is ignored. Raises InputError for a missing, truncated or too large file, and for a file that is no picture."""
     suffix = Path(path).suffix.lower()
     if suffix in LINEAR_SUFFIXES:
         return _pick_colors(read_channels(path), path)
     with at(path=path):
         data = read_file(path)
         if suffix not in DISPLAY_SUFFIXES:
-            raise InputError(f"not an image format that wrt reads ({', '.join(LINEAR_SUFFIXES + DISPLAY_SUFFIXES)})")
+            raise InputError(f"is no image file: its suffix must be one of {', '.join(LINEAR_SUFFIXES + DISPLAY_SUFFIXES)}")
         deep = data[:8] == PNG_MAGIC and data[24:25] == b"\x10"
-        formats = ("TGA",) if suffix == ".tga" else FORMATS_READ  # by its name alone, since TGA has no magic number
+        formats = ("TGA",) if suffix == ".tga" else FORMATS_READ  # TGA files have no magic number: the suffix decides
         codes = decode_png16(data) if deep else decode_rgba8(data, formats)[..., :3]
     levels = np.iinfo(codes.dtype).max
     return decode_srgb(np.arange(levels + 1) / levels).astype(np.float32)[codes]
@@ -229,14 +225,13 @@ def read_image(path: PathLike) -> np.ndarray:
 def read_channels(path: PathLike) -> dict[str, np.ndarray]:
     """Read all channels of the first part of an EXR or HDR file, by name: (H, W) float32.
 
-    Raises InputError for a missing, truncated or too large file, and for one that is no such picture.
-    """
+    Raises InputError for a missing, truncated or too large file, and for a file that is no such picture."""
     with _opened(path) as source:
         spec = source.spec()
         with at(path=path):
             check_size(spec.width, spec.height, MAX_LINEAR_PIXELS)
         if spec.depth > 1 or spec.deep:
-            raise InputError("cannot be read as an image: it has no flat pixels", path=path)
+            raise InputError("cannot be read as an image: it must be flat, but has depth samples or slices", path=path)
         pixels = source.read_image("float")
         if pixels is None:
             raise InputError(f"cannot be read as an image: {_reason(source.geterror)}", path=path)
@@ -245,7 +240,7 @@ def read_channels(path: PathLike) -> dict[str, np.ndarray]:
 
 @contextlib.contextmanager
 def _opened(path: PathLike) -> Iterator[Any]:
-    """Open an EXR or HDR file in OpenImageIO, after a check of its first bytes: OpenImageIO would try every format."""
+    """Open an EXR or HDR file in OpenImageIO. The first bytes are checked before, because OpenImageIO would try every format."""
     try:
         with at(path=path), open_regular(path) as file:
             first = file.read(16)
@@ -268,11 +263,11 @@ def _opened(path: PathLike) -> Iterator[Any]:
 
 
 def _reason(geterror: Callable[[], str]) -> str:
-    """Return OpenImageIO's message on one line."""
+    """Return the error message of OpenImageIO on one line."""
     try:
         return " ".join(geterror().split()) or "unknown error"
     except UnicodeDecodeError:  # it quotes names from the file
-        return "its names are no text"
+        return "its names are not UTF-8"
 
 
 def _pick_colors(channels: Mapping[str, np.ndarray], path: PathLike) -> np.ndarray:
@@ -281,5 +276,5 @@ def _pick_colors(channels: Mapping[str, np.ndarray], path: PathLike) -> np.ndarr
         return np.stack([upper["R"], upper["G"], upper["B"]], axis=-1)
     single = [array for name, array in upper.items() if name != "A"]
     if len(single) != 1:
-        raise InputError(f"has no channels R, G, B; it has {', '.join(channels)}", path=path)
+        raise InputError(f"must have channels R, G, B, or one grey channel; it has {', '.join(channels)}", path=path)
     return np.repeat(single[0][..., None], 3, axis=-1)

@@ -31,10 +31,10 @@ def compare(a: np.ndarray, b: np.ndarray, *, exposure: float = 0.0, tonemap: str
     Returns
     -------
     dict of str to float
-        Of linear values over all pixels and channels: "mse"; "relmse", the mean of (a - b)^2 / (b^2 + 0.01) [1]_; "max_abs";
-        "mean_ratio", mean(a) / mean(b). Of displayed values: "psnr" in dB of sRGB codes with peak 1 (inf if equal); "flip", the mean
-        of `flip_map`. All are NaN if no pixel is finite. Counts: "pixels", "nonfinite_a", "nonfinite_b", and "nonfinite_differ",
-        nonfinite pixels at which a and b differ.
+        From linear values of all pixels and channels: "mse"; "relmse", the mean of (a - b)^2 / (b^2 + 0.01) [1]_; "max_abs", the
+        largest difference; "mean_ratio", mean(a) / mean(b). From displayed values: "psnr" of sRGB codes with peak 1, in dB (inf if
+        equal); "flip", the mean of `flip_map`. These are NaN if no pixel is finite. Counts: "pixels"; "nonfinite_a" and "nonfinite_b",
+        pixels with NaN or infinity; "nonfinite_differ", such pixels at which a and b differ.
 
     Raises
     ------
@@ -69,7 +69,7 @@ def compare(a: np.ndarray, b: np.ndarray, *, exposure: float = 0.0, tonemap: str
 
 def _shown_errors(a: np.ndarray, b: np.ndarray, finite: np.ndarray, exposure: float, tonemap: str) -> tuple[float, float]:
     """Return the mean squared error of sRGB codes and the mean of FLIP, both over finite pixels."""
-    # Pixels that are left out are black in both, since FLIP filters over neighbours.
+    # Other pixels are black in both pictures, because FLIP filters over neighbours.
     a, b = (tone_map(np.where(finite[..., None], image, np.float32(0.0)), exposure, tonemap) for image in (a, b))
     flip = float(np.mean(flip_map(a, b)[finite], dtype=np.float64))
     a, b = (encode_srgb(image[finite].astype(np.float64)) for image in (a, b))
@@ -82,10 +82,10 @@ def failures(result: Mapping[str, float], limits: Mapping[str, float | None]) ->
     Parameters
     ----------
     result
-        As `compare` returns it.
+        Result of `compare`.
     limits
-        By name: a lower limit of psnr, upper limits of all others; None is no limit. With any limit, a measure that is NaN and pixels
-        that are not finite and differ are failures too.
+        Limits by name: a lower limit for psnr, upper limits for other measures; None for no limit. NaN violates every limit. With any
+        limit, pixels that are not finite and differ are a failure, too.
     """
     active = {name: limit for name, limit in limits.items() if limit is not None}
     sentences = []
@@ -128,7 +128,7 @@ def flip_map(a: np.ndarray, b: np.ndarray, pixels_per_degree: float = PIXELS_PER
     a, b
         (H, W, 3) display-linear in [0, 1] (`tone_map`, or a decoded PNG), finite, in any order.
     pixels_per_degree
-        Pixels in one degree of the visual angle.
+        Pixels per degree of the visual angle.
 
     Returns
     -------
@@ -152,7 +152,7 @@ def flip_map(a: np.ndarray, b: np.ndarray, pixels_per_degree: float = PIXELS_PER
 
 # --- difference image -------------------------------------------------------------------------------------------------
 
-# a brighter: black, red, yellow, white; a darker: black, blue, cyan, white
+# Colours for differences from 0 to the limit.
 BRIGHTER = np.array([[0, 0, 0], [220, 40, 20], [255, 210, 60], [255, 255, 255]], dtype=np.float64)
 DARKER = np.array([[0, 0, 0], [30, 70, 230], [70, 220, 255], [255, 255, 255]], dtype=np.float64)
 NONFINITE_COLOR = (0, 200, 0)
@@ -160,11 +160,11 @@ BAR_HEIGHT = 24
 
 
 def difference_image(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Draw the signed difference a - b, with the colour scale below.
+    """Draw the signed difference a - b, with a colour scale below the picture.
 
-    Each pixel shows the linear difference of the channel that differs most. Black is equal; red, yellow and white are increasing if a is
-    brighter; blue, cyan and white if it is darker. Green: a and b differ and are not both finite. White is the 99.9th percentile of
-    |a - b| and more.
+    Each pixel shows the linear difference of the channel that differs most. Black: a and b are equal. Red, yellow, white: a is brighter,
+    by more and more. Blue, cyan, white: a is darker. White begins at the 99.9th percentile of |a - b|. Green: a and b differ and are not
+    both finite.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ def difference_image(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _heat(share: np.ndarray) -> np.ndarray:
-    """Return colours, (..., 3) uint8, of shares in [-1, 1]; others are clipped."""
+    """Return colours, (..., 3) uint8, of shares of the limit, clipped to [-1, 1]."""
     steps = np.linspace(0.0, 1.0, len(BRIGHTER))
     size = np.clip(np.abs(share), 0.0, 1.0)
     colors = [np.where(share >= 0.0, np.interp(size, steps, BRIGHTER[:, i]), np.interp(size, steps, DARKER[:, i])) for i in range(3)]
@@ -202,8 +202,8 @@ def _heat(share: np.ndarray) -> np.ndarray:
 
 
 def _bar(width: int, limit: float) -> np.ndarray:
-    """Return the colour scale from -limit to limit, (BAR_HEIGHT, width, 3) uint8, over its numbers if they fit."""
-    with needed_by("a scale"):
+    """Return the colour scale from -limit to limit, (BAR_HEIGHT, width, 3) uint8, with numbers below it if they fit."""
+    with needed_by("a difference image"):
         from PIL import Image, ImageDraw
 
     colors = np.zeros((BAR_HEIGHT, width, 3), np.uint8)

@@ -9,23 +9,22 @@ from collections.abc import Callable
 
 import numpy as np
 
-from wrt.core.errors import InputError
+from wrt.core.checks import as_choice
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)  # weights of linear Rec. 709
-
-# White for every curve, and small enough that its square fits in a float32.
+# Radiance that every curve shows as white; its square fits in a float32.
 BRIGHTEST = 1e9
 
 
 def encode_srgb(linear: np.ndarray) -> np.ndarray:
-    """Apply the sRGB transfer function (IEC 61966-2-1): [0, 1] to [0, 1], any shape, NaN stays NaN."""
+    """Apply the sRGB transfer function (IEC 61966-2-1), [0, 1] to [0, 1], to an array of any shape; NaN stays NaN."""
     linear = np.asarray(linear)
     low = linear <= 0.0031308
     return np.where(low, linear * 12.92, 1.055 * np.power(np.where(low, 1.0, linear), 1.0 / 2.4) - 0.055)
 
 
 def decode_srgb(encoded: np.ndarray) -> np.ndarray:
-    """Invert `encode_srgb`: [0, 1] to [0, 1], any shape, NaN stays NaN."""
+    """Invert `encode_srgb`, [0, 1] to [0, 1], for an array of any shape; NaN stays NaN."""
     encoded = np.asarray(encoded)
     low = encoded <= 0.04045
     return np.where(low, encoded / 12.92, np.power((np.where(low, 1.0, encoded) + 0.055) / 1.055, 2.4))
@@ -36,8 +35,7 @@ def luminance(linear: np.ndarray) -> np.ndarray:
     return linear @ LUMINANCE.astype(linear.dtype)
 
 
-# --- curves: (..., 3) linear, finite and >= 0, to display-linear; `tone_map` clips to [0, 1] ---------------------------
-
+# --- curves: from linear radiance (..., 3), finite and >= 0, to display-linear; `tone_map` clips the result to [0, 1] -
 
 REINHARD_WHITE = 4.0  # two stops above 1
 
@@ -45,14 +43,13 @@ REINHARD_WHITE = 4.0  # two stops above 1
 def reinhard(linear: np.ndarray) -> np.ndarray:
     """Apply Reinhard's extended operator to luminance: L (1 + L / W^2) / (1 + L); W = 4 is the lowest luminance that is white.
 
-    Chromaticity is kept, so that a channel of a bright saturated colour can still clip.
-    Source: Reinhard, Stark, Shirley, Ferwerda, "Photographic Tone Reproduction for Digital Images" (2002), equation 4.
-    """
+    Chromaticity stays the same, so that a channel of a bright saturated colour can still clip.
+    Source: Reinhard, Stark, Shirley, Ferwerda, "Photographic Tone Reproduction for Digital Images" (2002), equation 4."""
     bright = luminance(linear)[..., None]
     return linear * ((1.0 + bright / REINHARD_WHITE**2) / (1.0 + bright))
 
 
-# Rows act on a column of RGB. In: Rec. 709 to AP1 with the RRT's desaturation; out: the ODT's and back.
+# Matrices that act on columns of RGB. In: Rec. 709 to AP1 with the desaturation of the RRT; out: AP1 to Rec. 709 with that of the ODT.
 ACES_IN = np.array([[0.59719, 0.35458, 0.04823], [0.07600, 0.90834, 0.01566], [0.02840, 0.13383, 0.83777]])
 ACES_OUT = np.array([[1.60475, -0.53108, -0.07367], [-0.10208, 1.10813, -0.00605], [-0.00327, -0.07276, 1.07602]])
 
@@ -60,14 +57,13 @@ ACES_OUT = np.array([[1.60475, -0.53108, -0.07367], [-0.10208, 1.10813, -0.00605
 def aces(linear: np.ndarray) -> np.ndarray:
     """Apply Stephen Hill's fit of the ACES reference rendering and sRGB output transforms, without extra exposure.
 
-    Source: S. Hill, ACES.hlsl in "Baking Lab" (M. Pettineo and D. Neubelt, 2016).
-    """
+    Source: S. Hill, ACES.hlsl in "Baking Lab" (M. Pettineo and D. Neubelt, 2016)."""
     v = linear @ ACES_IN.T.astype(linear.dtype)
     fitted = (v * (v + 0.0245786) - 0.000090537) / (v * (0.983729 * v + 0.4329510) + 0.238081)
     return fitted @ ACES_OUT.T.astype(linear.dtype)
 
 
-# The inset of the primaries. The published rows sum to 1 only within 2e-4; scaled to 1, a grey stays exactly grey.
+# Inset of the primaries. The published rows sum to 1 only within 2e-4; they are scaled to a sum of 1, so that grey stays exactly grey.
 AGX_INSET = np.array([
     [0.842479062253094, 0.0784335999999992, 0.0792237451477643],
     [0.0423282422610123, 0.878468636469772, 0.0791661274605434],
@@ -81,7 +77,7 @@ AGX_SLOPE, AGX_TOE_POWER, AGX_SHOULDER_POWER = 2.0, 3.0, 3.25
 
 
 def _agx_half(reach: np.ndarray, x_span: float, y_span: float, power: float) -> np.ndarray:
-    """Evaluate one half of the sigmoid, from the pivot (0, 0) with slope AGX_SLOPE to its end (x_span, y_span)."""
+    """Evaluate one half of the sigmoid at `reach` from the pivot: from (0, 0) with slope AGX_SLOPE to the end (x_span, y_span)."""
     scale = (((AGX_SLOPE * x_span / y_span) ** power - 1.0) * (AGX_SLOPE * x_span) ** -power) ** (-1.0 / power)
     term = AGX_SLOPE * reach / scale
     return scale * term / (1.0 + term**power) ** (1.0 / power)
@@ -90,8 +86,7 @@ def _agx_half(reach: np.ndarray, x_span: float, y_span: float, power: float) -> 
 def agx_contrast(x: np.ndarray) -> np.ndarray:
     """Apply AgX's default contrast: [0, 1] (log2 of exposure) to [0, 1] (display code); mid-grey is exactly 0.5.
 
-    This is the sigmoid itself; the polynomials that are often fitted to it are off by up to 0.006 and miss 0 and 1.
-    """
+    This is the sigmoid itself; the polynomials that are often fitted to it are off by up to 0.006 and miss 0 and 1."""
     x_pivot, y_pivot = AGX_PIVOT
     toe = y_pivot - _agx_half(np.maximum(x_pivot - x, 0.0), x_pivot, y_pivot, AGX_TOE_POWER)
     shoulder = y_pivot + _agx_half(np.maximum(x - x_pivot, 0.0), 1.0 - x_pivot, 1.0 - y_pivot, AGX_SHOULDER_POWER)
@@ -103,8 +98,7 @@ def agx(linear: np.ndarray) -> np.ndarray:
 
     Sources: T. Sobotka, AgX-S2O3 (inset matrix, range, sigmoid), with the slope and powers of the NumPy version in the
     AgX repository; B. Wrensch, "Minimal AgX Implementation" (2023), for undoing the inset after the curve and for the
-    2.2 power that the codes are meant for.
-    """
+    2.2 power that the codes are meant for."""
     inset = linear @ AGX_INSET.T.astype(linear.dtype)
     stops = np.log2(np.maximum(inset / 0.18, 2.0**AGX_MIN_EV))
     x = np.clip((stops - AGX_MIN_EV) / (AGX_MAX_EV - AGX_MIN_EV), 0.0, 1.0)
@@ -123,11 +117,9 @@ TONEMAPS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 def tone_map(pixels: np.ndarray, exposure: float = 0.0, tonemap: str = "none") -> np.ndarray:
     """Map linear radiance to display-linear light, (..., 3) float32 in [0, 1].
 
-    pixels: (..., 3) linear; exposure: stops; tonemap: a name in TONEMAPS. Negative values, -inf and NaN become black, +inf the
-    brightest value of the curve. Raises InputError for an unknown name.
-    """
-    if tonemap not in TONEMAPS:
-        raise InputError(f"must be one of {', '.join(TONEMAPS)}; got {tonemap!r}", argument="tonemap")
+    pixels: (..., 3) linear; exposure: stops; tonemap: a name in TONEMAPS. Negative values, -inf and NaN become black; +inf becomes the
+    brightest value of the curve. Raises InputError for an unknown name."""
+    as_choice(tonemap, TONEMAPS, "tonemap")
     with np.errstate(over="ignore", invalid="ignore"):  # overflow gives +inf, inf * 0 gives NaN: both are replaced below
         exposed = np.asarray(pixels, dtype=np.float32) * np.float32(2.0**exposure)
     linear = np.clip(np.nan_to_num(exposed, nan=0.0, posinf=BRIGHTEST, neginf=0.0), 0.0, BRIGHTEST)
@@ -135,7 +127,7 @@ def tone_map(pixels: np.ndarray, exposure: float = 0.0, tonemap: str = "none") -
 
 
 def to_codes(pixels: np.ndarray, exposure: float = 0.0, tonemap: str = "none", bits: int = 8) -> np.ndarray:
-    """Return `tone_map`, sRGB-encoded and rounded to the nearest code: (..., 3) uint8, or uint16 for bits=16."""
+    """Return the result of `tone_map`, sRGB-encoded and rounded to codes: (..., 3) uint8, or uint16 for bits=16."""
     scale = 2.0**bits - 1.0
     encoded = encode_srgb(tone_map(pixels, exposure, tonemap).astype(np.float64))
     return np.rint(encoded * scale).astype(np.uint8 if bits == 8 else np.uint16)

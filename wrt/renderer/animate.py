@@ -21,7 +21,7 @@ from wrt.scene.cameras import CameraKind
 from wrt.scene.model import Scene, moves, scene_at
 from wrt.scene.values import as_number
 
-REBUILD_AT = 1.5  # growth of the SAH cost by refits (docs/moving.md, "Meshes that change shape")
+REBUILD_AT = 1.5  # factor by which refits may raise the SAH cost (docs/moving.md, "Meshes that change shape")
 MOVIES = {".gif": "GIF", ".png": "PNG", ".apng": "PNG"}
 
 
@@ -29,9 +29,9 @@ MOVIES = {".gif": "GIF", ".png": "PNG", ".apng": "PNG"}
 class Animation:
     """Parameters of an animation. Raises InputError for values out of range.
 
-    - frames: their number, at the times 0, 1 / frames, 2 / frames ... of the period; the first follows the last seamlessly.
-    - degrees: orbit of the camera in the period (None: 360, or 0 if an object moves).
-    - rebuild_at: growth of the SAH cost from which the structure is rebuilt in place of a refit.
+    - frames: number of frames, at the times 0, 1 / frames, 2 / frames ... of one period; the animation loops seamlessly.
+    - degrees: orbit of the camera in one period (None: 360, or 0 if an object moves).
+    - rebuild_at: factor by which the SAH cost grows until the structure is rebuilt instead of refitted.
     """
 
     frames: int = 36
@@ -47,14 +47,13 @@ class Animation:
 
 
 def animate(scene: Scene, animation: Animation, options: Options) -> Iterator[Film]:
-    """Yield the frames one by one; an interrupted frame is the last.
+    """Yield the frames one by one. After Ctrl-C, the interrupted frame is the last.
 
-    stats["frame"] of each has its time, the action on the structure ("built", "kept", "refitted" or "rebuilt"), its seconds, and the
-    growth of the SAH cost. Moving meshes are not instanced. Raises InputError if nothing would move.
-    """
+    Each film has stats["frame"]: number, time in the period, "structure" ("built", "kept", "refitted" or "rebuilt"), seconds for the
+    structure, and growth of its SAH cost. Moving meshes are not instanced. Raises InputError if nothing moves."""
     degrees = animation.degrees if animation.degrees is not None else (0.0 if moves(scene) else 360.0)
     if animation.frames > 1 and degrees == 0.0 and not moves(scene):
-        raise InputError("nothing moves: no object has a motion, and the camera goes round by 0 degrees")
+        raise InputError("nothing moves: no object has a motion, and the camera orbits by 0 degrees")
     if moves(scene):
         options = replace(options, instancing="never")
     renderer = Renderer(scene_at(scene, 0.0), options)
@@ -63,7 +62,7 @@ def animate(scene: Scene, animation: Animation, options: Options) -> Iterator[Fi
     for frame in range(animation.frames):
         time = frame / animation.frames
         if frame and moves(scene):
-            done = renderer.follow(scene_at(scene, time), animation.rebuild_at)
+            done = renderer.move_objects(scene_at(scene, time), animation.rebuild_at)
         elif frame:
             done = {"structure": "kept", "seconds": 0.0, "growth": 1.0}
         renderer.aim(orbited(start, middle, degrees * time))
@@ -90,7 +89,7 @@ def orbited(camera: CameraKind, middle: np.ndarray, degrees: float) -> CameraKin
 
 
 def check_output(path: str | os.PathLike[str]) -> Path:
-    """Return the path of a file of MOVIES, or of a folder, which is made. Raises InputError if frames cannot be written there."""
+    """Return a movie's path, with a suffix of MOVIES, or a folder's path, after creating it. Raises InputError if that fails."""
     path = Path(path)
     if path.suffix.lower() in MOVIES:
         check_writable(path)
@@ -100,7 +99,7 @@ def check_output(path: str | os.PathLike[str]) -> Path:
     try:
         path.mkdir(exist_ok=True)
     except OSError as error:
-        raise InputError(f"cannot be made: {error.strerror}", path=path) from error
+        raise InputError(f"the folder cannot be created: {error.strerror}", path=path) from error
     check_writable(frame_path(path, 0, 1))
     return path
 
@@ -111,10 +110,9 @@ def frame_path(folder: Path, number: int, frames: int) -> Path:
 
 
 def save_movie(path: str | os.PathLike[str], frames: Sequence[np.ndarray], fps: float) -> None:
-    """Write pictures, (H, W, 3) uint8 each, as one looping file, whole or not at all. Raises InputError if the system refuses.
+    """Write pictures, (H, W, 3) uint8 each, as one looping animation. Raises InputError, and leaves no file, if the system refuses.
 
-    .gif has 256 dithered colours a frame and times in hundredths of a second; .png and .apng keep all colours.
-    """
+    A .gif has 256 dithered colours per frame, and frame times in hundredths of a second. .png and .apng keep all colours."""
     with needed_by("a movie"):
         from PIL import Image
 

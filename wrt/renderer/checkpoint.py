@@ -1,8 +1,8 @@
 """Checkpoints of long renders: the film in a file that is complete at any moment (wrt.core.write_file).
 
-A checkpoint is a checked file (wrt.core.checked_file). It has the identity of its render (all that can change a pixel), its progress, and
-the arrays of the film with the number of samples of each pixel. A render resumes from any state between two tiles. If two renders
-write one checkpoint, it holds the last complete state of either.
+A checkpoint is a file with checksums (wrt.core.checked_file). It contains the identity of its render (everything that can change a
+pixel), the progress, and the film's arrays with the number of samples of each pixel. A render can resume from any state between two
+tiles. If two renders write the same checkpoint, it has the last complete state of one of them.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from wrt.core.write_file import check_writable, replacing
 from wrt.renderer.film_arrays import DeviceFilm
 from wrt.renderer.options import OPTIONS
 from wrt.renderer.plan import Plan
-from wrt.scene.digest import camera_digest, scene_digest
+from wrt.scene.digest import digest
 from wrt.scene.settings import SETTINGS
 
 MAGIC = b"wrt checkpoint 1\n"
-# Options that may change on resume; and the camera and the device, which are compared by digest and by kind.
+# Options and settings that may change on resume; and `camera` and `device`, since the digest and the kind are compared instead.
 NO_PIXEL = ("spp", "exposure", "tonemap", "threads", "aov", "time_limit", "target_error", "tile_size", "pass_size", "progress",
             "checkpoint", "checkpoint_every", "resume", "camera", "device", "devices", "executor")
-# Messages for values that differ; for all others, both values are shown.
-OTHER = {"scene": "the scene is another", "camera": "the camera is another", "kernels": "the kernels are another version"}
+# Messages for differing hashes. For other parts of the identity, the message shows both values.
+DIFFERENT = {"scene": "the scene differs", "camera": "the camera differs", "kernels": "the kernels have another version"}
 
 
 @dataclass(frozen=True)
 class Saved:
-    """Contents of a checkpoint. samples: the smallest and the largest number of a pixel, in each group; seconds: of tracing."""
+    """Contents of a checkpoint. samples: smallest and largest number of samples of a pixel per group; seconds: time of tracing."""
 
     samples: tuple[int, int]
     seconds: float
@@ -46,7 +46,7 @@ class Saved:
 
 
 def read(path: str | os.PathLike[str]) -> Saved:
-    """Read a checkpoint. Raises InputError for a missing, foreign or damaged file, and for one of another version."""
+    """Read a checkpoint. Raises InputError if the file is missing, damaged, of another version, or no checkpoint."""
     header, body = read_checked(path, MAGIC, "checkpoint")
     try:
         low, high = map(int, header["samples"])
@@ -61,11 +61,10 @@ def read(path: str | os.PathLike[str]) -> Saved:
 
 
 class Checkpoint:
-    """The file of one render. identity: JSON values that must be equal on resume; groups: number of groups of samples.
+    """The checkpoint of one render. identity: JSON values that must be equal on resume; groups: number of groups of samples.
 
-    With `resume`, an existing file is read, and refused if its identity differs; without, any existing file is refused. These errors, and
-    those of writing, are raised before the work.
-    """
+    With `resume`, the constructor reads an existing file and refuses it if its identity differs. Without `resume`, it refuses any
+    existing file. It also checks that the file can be written."""
 
     def __init__(self, path: Path, every: float, identity: dict[str, Any], *, groups: int, resume: bool) -> None:
         self.path, self.every, self.groups = path.absolute(), every, groups
@@ -75,7 +74,7 @@ class Checkpoint:
         check_writable(path)
         if os.path.lexists(self.path):
             if not resume:
-                raise InputError("is there already", path=path, hint="resume it (--resume, resume=True), or remove it first")
+                raise InputError("exists already", path=path, hint="resume it (--resume, resume=True), or remove it first")
             self.saved = self._checked(read(self.path))
         self._last = 0.0
 
@@ -83,13 +82,13 @@ class Checkpoint:
         differ = [name for name in {**self.identity, **saved.identity} if self.identity.get(name) != saved.identity.get(name)]
         if differ != ["kernels"]:
             differ = [name for name in differ if name != "kernels"]  # other settings may compile other kernels
-        reported = [OTHER.get(name, f"{name} was {saved.identity.get(name)}, is {self.identity.get(name)}") for name in differ]
+        reported = [DIFFERENT.get(name, f"{name} was {saved.identity.get(name)}, is {self.identity.get(name)}") for name in differ]
         if reported:
             raise InputError(f"is a checkpoint of another render: {'; '.join(reported)}", path=self.path)
         return saved
 
     def facts(self) -> dict[str, object]:
-        """Return the entries of a film's stats."""
+        """Return the checkpoint's entries of Film.stats."""
         resumed = None if self.saved is None else {"samples": self.saved.samples[0] * self.groups, "seconds": self.saved.seconds}
         return {"checkpoint": None if self.problem else str(self.path), "resumed": resumed}
 
@@ -98,7 +97,7 @@ class Checkpoint:
     def begin(self) -> None:
         """Start the clock. Raises InputError if another render has written the file since the constructor looked for it."""
         if self.saved is None and os.path.lexists(self.path):
-            raise InputError("is there already: another render wrote it meanwhile", path=self.path)
+            raise InputError("exists: another render wrote it meanwhile", path=self.path)
         self._last = time.monotonic()
 
     def due(self) -> bool:
@@ -106,7 +105,7 @@ class Checkpoint:
         return time.monotonic() - self._last >= self.every
 
     def save(self, film: DeviceFilm, seconds: float) -> None:
-        """Write the film. If the system refuses, the old file stays, `problem` has the reason, and the render continues."""
+        """Write the film. If the system refuses, keep the old file and store the reason in `problem`, so that the render can continue."""
         samples = film.view(film.groups[0].samples)
         header = {"samples": [int(samples.min()), int(samples.max())], "seconds": seconds, "identity": self.identity}
         try:
@@ -120,38 +119,38 @@ class Checkpoint:
     # --- reading ------------------------------------------------------------------------------------------------------
 
     def restore(self, film: DeviceFilm) -> None:
-        """Copy the arrays of the file into an empty film."""
+        """Copy the arrays of the file into an empty film. Raises InputError if they are invalid."""
         assert self.saved is not None
         if len(self.saved.body) != sum(film.view(array).nbytes for _, array in film.arrays()):
-            raise InputError("is damaged: its arrays do not fit", path=self.path)
-        at = 0
+            raise InputError("is damaged: its arrays have the wrong size", path=self.path)
+        begin = 0
         for name, array in film.arrays():
-            there = film.view(array)
-            values = np.frombuffer(self.saved.body[at:at + there.nbytes], there.dtype).reshape(there.shape)
-            if name.startswith("mean") and not np.isfinite(values).all():  # the kernel stores such samples as black
-                raise InputError("is damaged: its film is not finite", path=self.path)
+            old = film.view(array)
+            values = np.frombuffer(self.saved.body[begin:begin + old.nbytes], old.dtype).reshape(old.shape)
+            if name.startswith("mean") and not np.isfinite(values).all():  # a kernel never stores such values
+                raise InputError("is damaged: its pixels are not finite", path=self.path)
             film.put(array, values)
-            at += there.nbytes
+            begin += old.nbytes
         samples = [film.view(group.samples) for group in film.groups]
         if any((each != samples[0]).any() for each in samples) or (samples[0].min(), samples[0].max()) != self.saved.samples:
-            raise InputError("is damaged: its samples do not fit", path=self.path)
-        self.saved = replace(self.saved, body=memoryview(b""))  # the memory of the file may go now
+            raise InputError("is damaged: its numbers of samples disagree", path=self.path)
+        self.saved = replace(self.saved, body=memoryview(b""))  # free the memory of the file's contents
 
 
 def checkpoint_of(plan: Plan, kind: str) -> Checkpoint | None:
-    """Return the checkpoint of the plan's options, or None. kind: of the device (wrt.renderer.prepare.kind_of).
+    """Return the checkpoint that the plan's options name, or None. kind: kind of the device (wrt.renderer.prepare.kind_of).
 
-    Raises InputError if it cannot be written or resumed.
-    """
+    Raises InputError if the checkpoint cannot be written or resumed."""
     options, settings = plan.options, plan.scene.settings
     if options.checkpoint is None:
         return None
     identity = {name: getattr(settings, name) for name in SETTINGS if name not in NO_PIXEL}
     identity |= {name: getattr(options, name) for name in OPTIONS if name not in NO_PIXEL}
-    identity |= {"crop": plan.crop, "groups of samples": plan.groups, "scene": scene_digest(plan.scene),
-                 "camera": camera_digest(plan.camera), "device": kind, "version": VERSION, "kernels": plan.kernels_hash()}
+    identity |= {"crop": plan.crop, "groups of samples": plan.groups, "scene": digest(plan.scene),
+                 "camera": digest(plan.camera), "device": kind, "version": VERSION, "kernels": plan.kernels_hash()}
     file = Checkpoint(Path(options.checkpoint), options.checkpoint_every, identity, groups=plan.groups, resume=options.resume)
-    taken = 0 if file.saved is None else file.saved.samples[1]
-    if taken > max(1, settings.spp // plan.groups):
-        raise InputError(f"holds {taken * plan.groups} samples a pixel already; spp is {settings.spp}", argument="spp", path=file.path)
+    samples = 0 if file.saved is None else file.saved.samples[1]
+    if samples > max(1, settings.spp // plan.groups):
+        raise InputError(f"must be {samples * plan.groups} or more, the samples per pixel in this checkpoint; got {settings.spp}",
+                         argument="spp", path=file.path)
     return file

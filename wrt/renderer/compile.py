@@ -18,7 +18,7 @@ from wrt.scene.shapes import icosphere
 
 
 def compile_queries(accel: str, device: str = "cpu") -> list[str]:
-    """Compile the kernels that build and query a structure of that name; return their names. Raises InputError."""
+    """Compile the kernels that build and query an acceleration structure; return their names. Raises InputError for an unknown name."""
     structure = build(icosphere(2), accel, device)
     rays = np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32)
     structure.closest_hit(*rays)
@@ -27,7 +27,7 @@ def compile_queries(accel: str, device: str = "cpu") -> list[str]:
 
 
 def compile_picture(scene: Scene, accel: str, device: str = "cpu", threads: int = 1) -> list[str]:
-    """Compile the kernels that render a scene with all AOVs, on several threads; return their names. Raises InputError."""
+    """Compile the kernels that render a scene with all AOVs; return their names. Raises InputError if the scene cannot be rendered."""
     target = start(device)
     kernels = plan_of(scene, Options(accel=accel, device=device, aov=tuple(OF_AOVS))).kernels
     run_all([partial(load_kernel, kernel, target) for kernel in kernels], threads)

@@ -1,4 +1,4 @@
-"""Features of the render kernels that a scene needs."""
+"""Features that the render kernels of a scene are compiled with."""
 
 from __future__ import annotations
 
@@ -16,25 +16,21 @@ from wrt.scene.lights import EMISSIVE, LIGHTS
 from wrt.scene.materials import MATERIALS, SLOTS, Checkerboard, Texture
 from wrt.scene.model import Scene
 
-STACK_STEP = 16
-# Textures with a feature of their own; all others share one (wrt.kernels.shade.shading.TEXTURES).
+STACK_STEP = 16  # Stack sizes are multiples of this, so that scenes share kernels.
+# Textures that do not need the feature `parameter_textures`.
 COMMON = {"albedo_texture", "emission_texture", "normal_texture"}
 
 
 def switches(features: Features) -> dict[str, bool]:
-    """Return each on/off feature that a scene can need, by name; every kind of light, material and background is one."""
+    """Return each on/off feature by name. Each kind of light, material and background counts as a feature, too."""
     on_off = {name: value for name, value in vars(features).items() if isinstance(value, bool) and name != "counting"}
     return on_off | {f"{name}_lights": name in features.lights for name in (*LIGHTS, *EMISSIVE)} | {
         name: name in features.materials for name in MATERIALS} | {
         name: name == features.background for name in BACKGROUNDS if name != Features.background}
 
 
-def mesh_lights(scene: Scene) -> bool:
-    return any(m.lights_others for thing in scene.objects for m in thing.materials)
-
-
 def features_of(scene: Scene, camera: CameraKind, meshes: frozenset[int] = frozenset()) -> Features:
-    """Return the features that a scene needs with this camera. meshes: id()s of the instanced meshes (wrt.accel.scenes.instancing)."""
+    """Return the features for a scene and a camera. meshes: id()s of the instanced meshes (wrt.accel.scenes.instancing)."""
     settings, materials = scene.settings, scene.materials
     textures = [texture for material in materials for texture in material.textures]
     kinds = {material.kind for material in materials}
@@ -43,7 +39,7 @@ def features_of(scene: Scene, camera: CameraKind, meshes: frozenset[int] = froze
     highlight = rough or any(max(m.specular) > 0.0 for m in materials)
     lit = diffuse or highlight
     lights = {light.kind for light in scene.lights}
-    lights |= {"mesh"} if mesh_lights(scene) else set()
+    lights |= {"mesh"} if any(m.lights_others for thing in scene.objects for m in thing.materials) else set()
     lights |= {"sphere"} if any(s.material.lights_others for s in scene.spheres) else set()
     clear = [m for m in materials if m.is_clear]
     blend = any(m.alpha_mode == "blend" for m in materials)
@@ -51,8 +47,8 @@ def features_of(scene: Scene, camera: CameraKind, meshes: frozenset[int] = froze
     reflection = any(MATERIALS[kind].reflects for kind in kinds)
     refraction = bool(clear)
     children = int(reflection) + int(refraction) + int(blend)
-    # A ray is popped before its children are pushed: each level adds one ray less than it has children. The ray straight through a
-    # blended surface takes no level: it waits below its siblings until they are done.
+    # A ray is popped before its children are pushed, so that each level adds children - 1 rays to the stack. The ray straight through a
+    # blended surface does not increase the depth: it waits on the stack below its siblings until they are done.
     pending = (children - 1) * (settings.max_depth + 1) + 1
     return Features(
         camera=camera.device,
@@ -90,11 +86,10 @@ def features_of(scene: Scene, camera: CameraKind, meshes: frozenset[int] = froze
 
 @cache
 def filter_icdf(name: str, size: int = 4097) -> np.ndarray:
-    """Return the inverse distribution of a pixel filter along x or y, (size,) float32, in pixels from the centre.
+    """Return the inverse cumulative distribution of a pixel filter along x or y, (size,) float32, in pixels from the centre.
 
-    gaussian: standard deviation 0.5, cut at 1.5 pixels; blackman-harris: the four-term window over 3 pixels (Harris 1978). The device
-    interpolates linearly, which widens the tails: with 4097 entries the standard deviation is off by 2e-4, with 257 by 8e-3.
-    """
+    gaussian: standard deviation 0.5, cut at 1.5 pixels; blackman-harris: the four-term window, 3 pixels wide (Harris 1978). Kernels
+    interpolate linearly, which widens the tails: with 4097 entries the standard deviation is off by 2e-4, with 257 by 8e-3."""
     x = np.linspace(-1.5, 1.5, 20001)
     if name == "gaussian":
         density = np.exp(-2.0 * x * x) - np.exp(-2.0 * 1.5 * 1.5)
@@ -109,13 +104,14 @@ def filter_icdf(name: str, size: int = 4097) -> np.ndarray:
 
 def describe(scene: Scene, camera: str | int | None = None) -> JsonObject:
     """Return counts, names, bounds (None without shapes) and features of a scene, as `python -m wrt info` prints them."""
+    meshes = {id(o.mesh): o.mesh for o in scene.objects}.values()
     has_shapes = scene.spheres or any(len(thing.mesh.faces) for thing in scene.objects)
     low, high = (corner.tolist() for corner in scene.bounds()) if has_shapes else (None, None)
     return {
         "name": scene.name,
         "triangles": sum(len(thing.mesh.faces) for thing in scene.objects),
-        "unique_triangles": sum(len(mesh.faces) for mesh in {id(o.mesh): o.mesh for o in scene.objects}.values()),
-        "zero_area_triangles_left_out": sum(mesh.dropped for mesh in {id(o.mesh): o.mesh for o in scene.objects}.values()),
+        "unique_triangles": sum(len(mesh.faces) for mesh in meshes),
+        "zero_area_triangles_left_out": sum(mesh.dropped for mesh in meshes),
         "objects": len(scene.objects),
         "spheres": len(scene.spheres),
         "materials": [f"{m.name or i} ({m.kind})" for i, m in enumerate(scene.materials)],

@@ -1,4 +1,4 @@
-"""The film on the device: the samples of a pixel form one sequence, or several independent ones that estimate the error."""
+"""The film on the device. With a target error, a pixel's samples form several groups, which estimate the error."""
 
 from __future__ import annotations
 
@@ -14,14 +14,13 @@ from wrt.kernels import structs
 from wrt.renderer.features import filter_icdf
 from wrt.scene.settings import Settings
 
-# Independent sequences of a pixel, for an estimate of the error. Over a picture, four estimate it as well as eight. Longer sequences
-# converge faster: eight have up to 1.4 times the error of four.
+# Number of groups with a target error; each is an independent sequence. Eight groups estimate a picture's error no better than four. They
+# have up to 1.4 times the error of four, because longer sequences converge faster.
 GROUPS = 4
-# Bytes of a pixel: of a film with one group, and of the picture written from it; of each further group; of AOVs.
+# Bytes per pixel: a film with one group and the picture written from it; each further group; AOVs.
 BYTES_OF_FILM, BYTES_OF_GROUP, BYTES_OF_AOVS = 132, 20, 36
 OF_A_GROUP = {"mean": wp.vec3, "samples": wp.int32, "lost": wp.float32}
-# Share of the surrounding brightness: the smallest difference that people see in a detail of some pixels.
-VISIBLE = 0.05
+VISIBLE = 0.05  # Smallest difference, as a share of the surrounding brightness, that people see in a detail of a few pixels.
 SHARED = {"m2": wp.vec3, "rays": wp.int64, "cut_depth": wp.int32, "cut_throughput": wp.int32, "not_finite": wp.int32}
 OF_AOVS = {"depth": wp.float32, "normal": wp.vec3, "albedo": wp.vec3, "prim_id": wp.int32, "material_id": wp.int32}
 
@@ -29,10 +28,9 @@ OF_AOVS = {"depth": wp.float32, "normal": wp.vec3, "albedo": wp.vec3, "prim_id":
 class DeviceFilm:
     """Arrays with one entry for each pixel of the crop, for the render kernel: a struct and a seed for each group of samples.
 
-    The samples of a group form one scrambled sequence. Its points are evenly spread, so that their variance overestimates the error of
-    their mean. Several groups with scrambles of their own have independent means. The variance of these means, over their number, is an
-    unbiased estimate of the variance of the mean (Owen 1997, "Monte Carlo Variance of Scrambled Net Quadrature", section 1).
-    """
+    The samples of a group form one scrambled sequence. Its points are evenly spread, so that the variance of the samples overestimates
+    the error of their mean. Groups with different scrambles have independent means. The variance of these means, divided by the number
+    of groups, estimates the variance of the pixel without bias (Owen 1997, "Monte Carlo Variance of Scrambled Net Quadrature")."""
 
     def __init__(self, settings: Settings, crop: tuple[int, int, int, int], device: Device, seed: int, groups: int = 1) -> None:
         self.crop, self.seed = crop, seed
@@ -51,10 +49,10 @@ class DeviceFilm:
             for name, array in {**shared, **own}.items():
                 setattr(film, name, array)
             self.groups.append(film)
-        self._read: dict[int, np.ndarray] | None = None  # arrays that a snapshot has copied, by address
+        self._read: dict[int, np.ndarray] | None = None  # in a snapshot: host copies of arrays, by device address
 
     def snapshot(self) -> DeviceFilm:
-        """Return the film for reading: each array of a GPU is copied once, at its first use."""
+        """Return a copy of this object for reading. It copies each array from a GPU only once, at the first use."""
         out = copy(self)
         out._read = {}
         return out
@@ -68,13 +66,8 @@ class DeviceFilm:
         """Write values, (H, W) or (H, W, 3), to a device array."""
         array.assign(values.reshape(array.shape[0], *values.shape[2:]))
 
-    @property
-    def rays(self) -> int:
-        """Number of rays so far."""
-        return int(self.groups[0].rays.numpy().sum())
-
     def view(self, array: WarpArray) -> np.ndarray:
-        """Return a device array with one entry for each pixel as (H, W) or (H, W, 3), on the CPU without a copy."""
+        """Return a device array with one entry for each pixel as (H, W) or (H, W, 3). On the CPU, this makes no copy."""
         pixels = None if self._read is None else self._read.get(array.ptr)
         if pixels is None:
             pixels = array.numpy()
@@ -87,56 +80,48 @@ class DeviceFilm:
         return self.view(array).copy()
 
     def count(self, name: str) -> int:
-        """Return the sum of a shared count over the pixels."""
-        return int(self.picture(getattr(self.groups[0], name)).sum(dtype=np.int64))
+        """Return the sum over all pixels of an array of counts in SHARED, such as "rays"."""
+        return int(self.view(getattr(self.groups[0], name)).sum(dtype=np.int64))
 
-    def lost(self) -> float:
+    def lost_throughput(self) -> float:
         """Return the throughput of all rays that were cut, summed over all samples."""
         return sum(float(self.picture(film.lost).sum(dtype=np.float64)) for film in self.groups)
 
     def visibly_cut(self, most_by_throughput: float) -> float:
-        """Return the share of pixels that are visibly too dark because of max_depth, a lower bound.
+        """Return a lower bound of the share of pixels that are visibly too dark because of max_depth.
 
-        In surroundings of radiance 1, which the eye adapts to, the rays cut by depth would have added VISIBLE or more to such a pixel.
+        Visibly too dark: the rays cut by max_depth would have added VISIBLE or more to the pixel, in surroundings of radiance 1.
 
-        most_by_throughput: upper bound of the throughput of one ray cut by min_throughput, which `lost` contains too.
-        """
+        most_by_throughput: upper bound of the throughput of a ray cut by min_throughput. The array `lost` contains these rays too."""
         film = self.groups[0]
         lost = sum((self.view(group.lost) for group in self.groups[1:]), self.view(film.lost))
         by_depth = np.where(self.view(film.cut_depth) > 0, lost - most_by_throughput * self.view(film.cut_throughput), 0.0)
         return float((by_depth > VISIBLE * self.samples()).mean())
 
     def samples(self) -> np.ndarray:
-        """Return the number of samples of each pixel, summed over the groups, (H, W) int32.
-
-        All groups have the same number of samples in a pixel.
-        """
+        """Return the number of samples of each pixel, summed over the groups, (H, W) int32."""
         return sum((self.picture(film.samples) for film in self.groups[1:]), self.picture(self.groups[0].samples))
 
     def pixels_and_variance(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the mean of the samples and the estimated variance of that mean, (H, W, 3) float32 each.
 
-        The variance is inf for fewer than two samples, and with groups for none.
-        """
+        The variance is inf in a pixel with fewer than two samples; with several groups, in a pixel without samples."""
         if len(self.groups) == 1:
             film = self.groups[0]
             n = self.picture(film.samples)[..., None].astype(np.float32)
             m2 = np.where(n < 2.0, np.float32(np.inf), self.picture(film.m2))
-            with np.errstate(invalid="ignore"):  # m2 of an untrusted checkpoint can be anything
+            with np.errstate(invalid="ignore"):  # m2 of a manipulated checkpoint can have any value
                 return self.picture(film.mean), m2 / np.maximum(n * (n - 1.0), 1.0)
         mean, variance = self._over_groups()
         with np.errstate(over="ignore"):
             return mean.astype(np.float32), variance.astype(np.float32)
 
     def error(self) -> float:
-        """Return the estimated root mean square error over pixels and channels, from two or more groups; inf if a pixel has no samples."""
+        """Return the estimated root mean square error over pixels and channels. Needs several groups; inf if a pixel has no samples."""
         return math.sqrt(float(self.snapshot()._over_groups()[1].mean()))
 
     def _over_groups(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the mean of the groups' means and its estimated variance, (H, W, 3) float64; inf without samples.
-
-        Only one group is in memory at a time.
-        """
+        """Return the mean of the groups' means and its estimated variance (inf without samples), (H, W, 3) float64 each."""
         n = len(self.groups)
         with np.errstate(over="ignore", invalid="ignore"):
             mean = sum(self.picture(film.mean) / np.float64(n) for film in self.groups)
@@ -157,7 +142,7 @@ class AovFilm:
             setattr(self.struct, name, wp.zeros(self.shape[0] * self.shape[1], dtype=dtype, device=device))
 
     def view(self, name: str) -> np.ndarray:
-        """Return one AOV, (H, W) or (H, W, 3), on the CPU without a copy."""
+        """Return one AOV, (H, W) or (H, W, 3). On the CPU, this makes no copy."""
         array = getattr(self.struct, name).numpy()
         return array.reshape(*self.shape, *array.shape[1:])
 

@@ -30,20 +30,20 @@ AOVS = ("depth", "normal", "albedo", "prim_id", "material_id")
 
 @dataclass(frozen=True)
 class Progress:
-    """Progress of a render, as its callback receives it. A resumed render counts what was done before in all four figures.
+    """Progress of a render, which its callback receives. All numbers of a resumed render include the work before the resume.
 
     Parameters
     ----------
     done, total
-        Samples done and to do, summed over the pixels; in the stages before "trace", done of total steps.
+        Number of samples done, and of all samples, summed over the pixels. In the stages before "trace": percent done, and 100.
     rays, seconds
-        Rays traced so far, and seconds of tracing.
+        Number of rays traced so far, and seconds of tracing; before "trace", seconds since preparing began.
     stage
-        "trace"; before it, if that takes longer than a second, "compile" (reported once) and "build".
+        "trace"; before it, if preparing takes longer than a second, "compile" (reported once) and "build".
     note
-        Trouble that does not end the render; "" without.
+        A problem that does not end the render, or "".
     picture
-        Makes a Film of the samples so far (pixels, variance, samples) while the render runs. Tiles under way are half done in it.
+        Function that makes a Film (pixels, variance, samples) of the samples so far. Running tiles may be incomplete in it.
     """
 
     done: int
@@ -56,18 +56,18 @@ class Progress:
 
     @property
     def rays_per_second(self) -> float:
-        """Mean rate so far; 0 before anything is traced."""
+        """Mean number of rays per second so far; 0 before tracing."""
         return self.rays / self.seconds if self.seconds > 0.0 else 0.0
 
     @property
     def seconds_left(self) -> float:
-        """Seconds to go at the mean speed so far; inf before anything is done."""
+        """Estimated seconds left, at the mean speed so far; inf before the first sample."""
         return self.seconds * (self.total - self.done) / self.done if self.done else float("inf")
 
 
 @dataclass
 class Options:
-    """The options of `render`, which defines each, as one object, without the scene's settings.
+    """The options of `render` as one object, without the scene's settings. The docstring of `render` defines each.
 
     Raises
     ------
@@ -119,14 +119,14 @@ class Options:
             raise InputError(f"must be more than 0 seconds, got {self.checkpoint_every}", argument="checkpoint_every")
         self.checkpoint = None if self.checkpoint is None else as_path(self.checkpoint, "checkpoint")
         if as_one(self.resume, bool, "resume") and self.checkpoint is None:
-            raise InputError("needs a checkpoint to go on with", argument="resume")
+            raise InputError("needs a checkpoint", argument="resume", hint="name its file with `checkpoint`")
         self.tile_size = None if self.tile_size is None else as_integer(self.tile_size, "tile_size", 1, 1 << 15)
         self.pass_size = None if self.pass_size is None else as_integer(self.pass_size, "pass_size", 1, 1 << 24)
         self.seed = as_integer(self.seed, "seed", 0, 2**32 - 1)
         if self.crop is not None and len(as_tuple(self.crop, (int, np.integer), "crop")) != 4:
             raise InputError(f"must be x0, y0, x1, y1 in pixels, got {self.crop!r}", argument="crop")
         if not (self.progress is None or callable(self.progress)):
-            raise InputError(f"must be a function of a Progress, got {shown(self.progress)}", argument="progress")
+            raise InputError(f"must be a function that takes a Progress, got {shown(self.progress)}", argument="progress")
         as_one(self.camera, (str, int, np.integer, CameraKind, type(None)), "camera")
         as_one(self.accel_options, dict, "accel_options")
         as_one(self.threads, (int, np.integer, type(None)), "threads")
@@ -135,18 +135,17 @@ class Options:
             self._check_devices()
         elif self.executor is None:
             start(self.device)
-        elif not (isinstance(self.executor, Executor) or hasattr(self.executor, "get_executor")):  # as Dask's Client has
+        elif not (isinstance(self.executor, Executor) or hasattr(self.executor, "get_executor")):  # an attribute of Dask's Client
             raise InputError("must be a concurrent.futures.Executor or a dask.distributed.Client,"
                              f" got {shown(self.executor)}", argument="executor")
 
     def _check_devices(self) -> None:
         self.devices = as_tuple(self.devices, str, "devices")
         if self.executor is not None:
-            raise InputError("are of this machine; an executor's workers have one `device` each",
-                             argument="devices", hint="give one or the other")
+            raise InputError("and executor exclude each other", argument="devices", hint="each worker of an executor uses `device`")
         kinds = {str(device.arch) if device.is_cuda else "cpu" for device in map(start, self.devices)}
         if len(kinds) != 1:
-            raise InputError(f"must be one or more of the same kind, whose pixels are the same, got {shown(self.devices)}",
+            raise InputError(f"must be one or more devices of one kind, since others round differently, got {shown(self.devices)}",
                              argument="devices")
         self.device = self.devices[0]
 

@@ -17,7 +17,7 @@ camera_rays_kernel = made_once(make_camera_rays_kernel)
 
 
 def camera_rays(camera: CameraKind, size: tuple[int, int] | str) -> tuple[np.ndarray, np.ndarray]:
-    """Make one ray for each pixel, through the centre of the lens and of the pixel, as the AOVs of a Film have it.
+    """Make one ray for each pixel, through the centres of the lens and of the pixel. The AOVs of a Film use the same rays.
 
     Parameters
     ----------
@@ -29,8 +29,8 @@ def camera_rays(camera: CameraKind, size: tuple[int, int] | str) -> tuple[np.nda
     Returns
     -------
     origins, directions
-        (width * height, 3) float32 each, in world space, row by row from the top left. Directions have unit length, so that t of a
-        hit is the AOV "depth"; they are 0 beyond the image circle of a fisheye.
+        (width * height, 3) float32 each, in world space, row by row from the top left. Directions have unit length, so that a hit's
+        t is the AOV "depth". Beyond the image circle of a fisheye, directions are 0.
 
     Raises
     ------

@@ -1,6 +1,6 @@
-"""Pictures by one ray at a time (wrt.kernels.loops.one_ray): on CUDA, and for counters.
+"""Rendering with threads that trace one ray at a time (wrt.kernels.loops.one_ray): on CUDA, and for counters.
 
-A thread takes a pixel, or a sample if the pixels alone would leave multiprocessors of a GPU idle.
+A thread renders a pixel. If there are too few pixels to occupy all multiprocessors of a GPU, a thread renders one sample.
 """
 
 from __future__ import annotations
@@ -18,23 +18,22 @@ from wrt.renderer.tiles import Work
 from wrt.renderer.waves import SceneRecords
 
 THREADS_OF_SM = 2048  # resident threads of NVIDIA's largest multiprocessors
-ROUNDS = 4  # samples of a launch for each resident thread
+ROUNDS = 4  # threads in one launch for each resident thread
 
 
 def film_launch(device: Device, kernel: Kernel, scene: SceneRecords, limits: list[WarpStruct], film: DeviceFilm,
-                alone: bool) -> Callable[[Work], int]:
-    """Return a function that adds samples to the film and returns their number.
+                always_by_pixels: bool) -> Callable[[Work], int]:
+    """Return a function that adds samples to the film and returns the number of samples, summed over pixels.
 
-    limits: for each group of the film; alone: one thread for each pixel, always.
-    """
-    room = 0 if alone else device.sm_count * THREADS_OF_SM * ROUNDS
+    limits: one struct for each group of the film; always_by_pixels: a thread renders a pixel, never one sample."""
+    most_threads = 0 if always_by_pixels else device.sm_count * THREADS_OF_SM * ROUNDS
     samples = wp.empty(0, dtype=Sample, device=device)
 
     def trace(work: Work) -> int:
         nonlocal samples
         pixels, end = work.rectangle[2] * work.rectangle[3], work.first + work.n
-        by_samples = work.n > 1 and pixels * ROUNDS <= room
-        step = min(room // pixels, work.n) if by_samples else work.n
+        by_samples = work.n > 1 and pixels * ROUNDS <= most_threads
+        step = min(most_threads // pixels, work.n) if by_samples else work.n
         if by_samples and len(samples) < pixels * step:
             samples = wp.empty(pixels * step, dtype=Sample, device=device)
         for first in range(work.first, end, step):
@@ -51,7 +50,7 @@ def film_launch(device: Device, kernel: Kernel, scene: SceneRecords, limits: lis
 
 
 def aov_launch(device: Device, kernel: Kernel, scene: SceneRecords, film: AovFilm) -> Callable[[Work], int]:
-    """Return a function that writes AOVs to the film and returns the number of its pixels."""
+    """Return a function that writes the AOVs of a rectangle to the film and returns the number of pixels."""
 
     def trace(work: Work) -> int:
         launch_on(device, kernel, work.rectangle[2] * work.rectangle[3], scene.accel, scene.surfaces, scene.camera, film.struct,

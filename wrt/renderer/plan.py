@@ -1,4 +1,4 @@
-"""What is to be rendered and how, settled before any work: camera, features, crop, and which kernels that takes."""
+"""The plan of a render, made before any work: camera, features, crop, and kernels."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from wrt.scene.cameras import CameraKind
 from wrt.scene.model import Scene
 from wrt.scene.settings import SettingChanges, Settings
 
-AIMED = ("size", "spp", "max_depth", "min_throughput", "exposure", "tonemap")  # settings that do not change the kernels
+AIMED = ("size", "spp", "max_depth", "min_throughput", "exposure", "tonemap")  # settings that the kernels do not depend on
 
 
 @made_once
@@ -41,10 +41,11 @@ def aov_kernel(features: Features, structure: Structure) -> Kernel:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A scene and the options of its render, resolved.
+    """A scene and the options of its render, with defaults resolved.
 
-    - accel: the structure's own name ("bvh" is an alias); meshes: id()s of the instanced meshes (wrt.accel.scenes.instancing).
-    - structure: a Structure, or a class with its members; crop: x0, y0, x1, y1 in pixels; deepest: bounces that the kernels' stacks hold.
+    - accel: the structure's real name ("bvh" is an alias); meshes: id()s of the instanced meshes (wrt.accel.scenes.instancing).
+    - structure: a Structure, or a class with its members; crop: x0, y0, x1, y1 in pixels.
+    - deepest: largest max_depth for which the kernels' stacks suffice.
     """
 
     scene: Scene
@@ -59,7 +60,7 @@ class Plan:
 
     @property
     def groups(self) -> int:
-        """Number of independent sequences of samples of a pixel (wrt.renderer.film_arrays)."""
+        """Number of groups of samples, each an independent sequence (wrt.renderer.film_arrays)."""
         return 1 if self.options.target_error is None else GROUPS
 
     @property
@@ -69,16 +70,16 @@ class Plan:
         return (x1 - x0) * (y1 - y0)
 
     def require_memory(self, device: Device) -> None:
-        """Raise InputError if the film, with the picture written from it, is larger than the memory of the device."""
+        """Raise InputError if the film and the picture written from it exceed the memory of the device."""
         x0, y0, x1, y1 = self.crop
         pixel = BYTES_OF_FILM + BYTES_OF_GROUP * (self.groups - 1) + (BYTES_OF_AOVS if self.options.aov else 0)
-        if self.area * pixel > (there := memory_of(device)):
+        if self.area * pixel > (memory := memory_of(device)):
             raise InputError(f"a picture of {x1 - x0}x{y1 - y0} takes {self.area * pixel / 2**30:.1f} GiB of memory; {device} has"
-                             f" {there / 2**30:.1f}")
+                             f" {memory / 2**30:.1f} GiB")
 
     @property
     def by_waves(self) -> bool:
-        """True on the CPU, except with counters: waves of many samples. Otherwise a thread traces one sample at a time."""
+        """True if many samples are traced in a wave: on the CPU, without counters. Otherwise a thread traces one ray at a time."""
         return self.options.device == "cpu" and not self.structure.units.counters
 
     @property
@@ -87,7 +88,7 @@ class Plan:
 
     @property
     def kernels(self) -> list[Kernel]:
-        """All kernels to compile. Without waves, the render kernel is first; the AOV kernel follows if the options name AOVs."""
+        """All kernels to compile. Without waves: the render kernel; for AOVs, the AOV kernel; on GPUs, add_samples."""
         if self.by_waves:
             return self.wave_kernels.all()
         makes = [render_kernel, aov_kernel] if self.options.aov else [render_kernel]
@@ -95,7 +96,7 @@ class Plan:
         return [make(self.features, self.structure) for make in makes] + folds
 
     def kernels_hash(self) -> str:
-        """Return a hash of all code that makes pixels, equal in every process."""
+        """Return a hash of the code of all kernels except the AOV kernels, equal in every process."""
         block_dim = 1 if self.options.device == "cpu" else None
         kernels = replace(self, options=replace(self.options, aov=())).kernels
         hashes = [module_hash(kernel, block_dim) for kernel in kernels]
@@ -110,8 +111,7 @@ class Plan:
     def aimed(self, camera: CameraKind, **settings: Unpack[SettingChanges]) -> Plan:
         """Return the plan for another camera and other settings (of AIMED), with the same kernels.
 
-        Raises InputError for what they were not made for: another kind of camera, a lens in place of a pinhole, more bounces.
-        """
+        Raises InputError if the kernels lack a feature: for another kind of camera, a lens in place of a pinhole, more bounces."""
         scene = self.scene.with_settings(**settings)
         lacks = [name for name, needed, has in (
             (f"a camera of the kind {camera.kind}", camera.device != self.features.camera, False),
@@ -123,7 +123,7 @@ class Plan:
         return replace(self, scene=scene, camera=camera, crop=_crop(scene.settings, self.options))
 
     def moved(self, scene: Scene) -> Plan:
-        """Return the plan for the same objects, moved."""
+        """Return the plan for a scene with the same objects, which have moved."""
         return replace(self, scene=scene, meshes=instanced_meshes(scene, self.options.instancing))
 
 

@@ -27,18 +27,18 @@ from wrt.renderer.waves import CAPACITY, SceneRecords, Waves
 from wrt.scene.cameras import CameraKind
 from wrt.scene.settings import SettingChanges
 
-TILE_SIZE = 32  # smallest side on the CPU
-TILES_EACH = 8  # smallest number of tiles for each thread
-PREPARING = "wrt prepares"  # name of the threads that compile and build
-PREPARING_REPORTED = 1.0  # seconds of compiling and building until `progress` is called
+TILE_SIZE = 32  # Smallest side of a tile on the CPU, in pixels.
+TILES_EACH = 8  # Tiles of a pass for each thread, or more.
+PREPARING = "wrt prepares"  # Name of the threads that compile and build.
+PREPARING_REPORTED = 1.0  # Seconds of compiling and building after which `progress` is called.
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
     """A prepared scene.
 
-    - kernels: Plan.kernels, compiled; arrays: the scene on the device; camera: its device struct; waves: for Plan.by_waves.
-    - seconds: of "upload" and "build", and of "compile", which runs beside them, until the last kernel was loaded.
+    - kernels: Plan.kernels, compiled; arrays: the scene on the device; camera: device struct; waves: None unless Plan.by_waves.
+    - seconds: time of the stages "upload" and "build", and of "compile", which runs in parallel until the last kernel is loaded.
     """
 
     plan: Plan
@@ -54,23 +54,21 @@ class Prepared:
     def aimed(self, camera: CameraKind, angles_of: tuple[int, int] | None = None, **settings: Unpack[SettingChanges]) -> Prepared:
         """Return this scene with another camera and other settings, as Plan.aimed allows.
 
-        angles_of: size of the aspect ratio to use if the picture's own size is rounded, which would change the angle of view.
-        """
+        angles_of: width and height for the camera's aspect ratio; None: the picture's size, which may be rounded."""
         plan = self.plan.aimed(camera, **settings)
         plan.require_memory(self.device)
         return replace(self, plan=plan, camera=camera_struct(camera, angles_of or plan.scene.settings.size))
 
     def facts(self) -> dict[str, object]:
-        """Return counts of the scene and its structure."""
+        """Return the counts of the scene and its structure for Film.stats."""
         return {"triangles": self.accel.geometry.n_triangles, "stored_triangles": len(self.arrays.world.faces),
                 "spheres": len(self.accel.geometry.spheres),
                 "accel": {"name": self.plan.accel, **asdict(self.accel.stats)}}
 
     def tiles(self, samples: int) -> Iterator[Rectangle]:
-        """Yield the tiles of a pass with `samples` of each pixel.
+        """Yield the tiles of a pass with `samples` samples per pixel.
 
-        On CUDA, one tile is the whole crop. On the CPU, a tile has one or two waves, but each thread gets TILES_EACH tiles.
-        """
+        On CUDA, one tile is the whole crop. On the CPU, a tile fills about two waves, or less if a thread would get too few tiles."""
         x0, y0, x1, y1 = self.plan.crop
         side = TILE_SIZE
         if self.device.is_cuda:
@@ -81,10 +79,9 @@ class Prepared:
         return tiles(self.plan.crop, side if self.device.is_cuda else self.plan.options.tile_size or side)
 
     def launch(self, film: DeviceFilm | AovFilm, accel: WarpStruct | None = None) -> Callable[[Work], int]:
-        """Return a function that traces some work into the film and returns its number of samples.
+        """Return a function that traces some work, adds it to the film, and returns the number of samples.
 
-        accel: device record in place of the structure's.
-        """
+        accel: device struct that replaces the acceleration structure's."""
         accel = self.accel.data if accel is None else accel
         scene = SceneRecords(accel, self.arrays.surfaces, self.arrays.lighting, self.camera)
         limits = [] if isinstance(film, AovFilm) else [self.plan.limits(seed) for seed in film.seeds]
@@ -92,19 +89,18 @@ class Prepared:
             return self.waves.launch(scene, limits, film)
         if isinstance(film, AovFilm):
             return aov_launch(self.device, self.kernels[1], scene, film)
-        alone = self.device.is_cpu or self.plan.structure.units.counters
-        return film_launch(self.device, self.kernels[0], scene, limits, film, alone)
+        by_pixels = self.device.is_cpu or self.plan.structure.units.counters
+        return film_launch(self.device, self.kernels[0], scene, limits, film, by_pixels)
 
-    # --- calls of workers (wrt.renderer.distributed) ---
+    # --- called by workers (wrt.renderer.distributed) ---
 
     def ready(self) -> dict[str, object]:
         return {"facts": self.facts(), "seconds": self.seconds}
 
     def trace_tile(self, work: Work, seed: int, state: list[np.ndarray] | None) -> list[np.ndarray]:
-        """Return the arrays of a film of the rectangle (DeviceFilm.arrays), with the samples of `work` added to `state` (None: zeros).
+        """Return the arrays (DeviceFilm.arrays) of a film of the rectangle: `state` (None: zeros) with the samples of `work` added.
 
-        It has no side effects, so that several threads can call it, and a failed call can be repeated.
-        """
+        This method has no side effects, so that several threads can call it, and a failed call can be repeated."""
         film = DeviceFilm(self.plan.scene.settings, corners(work.rectangle), self.device, seed, self.plan.groups)
         for (_, array), values in zip(film.arrays(), state or (), strict=False):
             film.put(array, values)
@@ -112,22 +108,21 @@ class Prepared:
         return [film.picture(array) for _, array in film.arrays()]
 
     def aov_tile(self, work: Work) -> list[np.ndarray]:
-        """Return the AOVs of the options, in their order, for a rectangle."""
+        """Return the AOVs of a rectangle, in the order of the options."""
         film = AovFilm(self.plan.scene.settings, corners(work.rectangle), self.device)
         self.launch(film)(work)
         return [film.picture(name) for name in self.plan.options.aov]
 
 
 def kind_of(device: Device) -> str:
-    """Name the kind of a device; pictures of two devices of one kind have the same bits."""
+    """Return the kind of a device. Devices of one kind render the same bits."""
     return f"cuda, sm_{device.arch}" if device.is_cuda else "cpu"
 
 
 def prepare(plan: Plan, device: Device, built: Prepared | None = None) -> Prepared:
-    """Compile and build. built: source of the arrays and the structure, to compile other kernels alone.
+    """Compile kernels, upload arrays, and build the structure. Raises InputError if the scene cannot be rendered.
 
-    Raises InputError if the scene cannot be rendered.
-    """
+    built: prepared scene whose arrays and structure are reused, so that only kernels are compiled."""
     work = _Preparation(plan, device)
     work.run(([work.build] if built is None else []) + [partial(work.compile, kernel) for kernel in work.kernels])
     arrays, accel = (work.arrays, work.accel) if built is None else (built.arrays, built.accel)
@@ -138,7 +133,7 @@ def prepare(plan: Plan, device: Device, built: Prepared | None = None) -> Prepar
 
 
 class _Preparation:
-    """Own threads: some compile, which takes longest, while one uploads and builds."""
+    """Threads that prepare a scene: one uploads and builds, while the others compile."""
 
     arrays: DeviceScene
     accel: Accelerator
@@ -150,7 +145,7 @@ class _Preparation:
         self.compiled, self.fraction_built, self.reported = list[Kernel](), 0.0, ("", 0)
 
     def run(self, jobs: list[Callable[[], None]]) -> None:
-        """Run the jobs. Neither Ctrl-C nor an error waits for the compiler; waits are short, since Python handles Ctrl-C between them."""
+        """Run the jobs. After Ctrl-C or an error, return without waiting for the compiler. Python handles Ctrl-C between short waits."""
         pool = Pool(1 + min(self.threads, len(self.kernels)), PREPARING)
         pending = {pool.submit(job) for job in jobs}
         try:

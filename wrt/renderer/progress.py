@@ -19,24 +19,24 @@ LINE_EVERY = 10.0  # seconds between lines, if stderr is no terminal
 
 
 def describe(progress: Progress) -> str:
-    """Return rays per second, the time left, and the note."""
+    """Return rays per second, the time left, and the note as text."""
     note = f"; {progress.note}" if progress.note else ""
     return f"{progress.rays_per_second / 1e6:.1f} Mray/s, {time_left(progress.seconds_left)}{note}"
 
 
 def time_left(seconds: float) -> str:
-    """Return minutes and seconds; "?" if unknown."""
+    """Return a time as text in minutes and seconds; "?" if it is unknown (inf)."""
     return f"{int(seconds // 60)}:{int(seconds % 60):02d} left" if seconds < 1e6 else "?"
 
 
 class TimeLeft:
-    """Estimate of the time left, at the mean speed so far, for work of known size."""
+    """Estimate of the time left, at the mean speed so far. total: size of the work; done: set by the caller, in the same unit."""
 
     def __init__(self, total: float) -> None:
         self.total, self.done, self.begin = total, 0.0, time.perf_counter()
 
     def __str__(self) -> str:
-        """Return a suffix such as ", about 1:30 left"; empty before anything is done."""
+        """Return a suffix for a line, such as ", about 1:30 left"; empty while `done` is 0."""
         if self.done <= 0.0:
             return ""
         seconds = (time.perf_counter() - self.begin) * max(self.total - self.done, 0.0) / self.done
@@ -51,11 +51,11 @@ def progress_reporter(quiet: bool) -> Iterator[Callable[[Progress], None] | None
         return
     with _bar() if sys.stderr.isatty() else nullcontext(_lines()) as report:
 
-        def careful(progress: Progress) -> None:
+        def report_safely(progress: Progress) -> None:
             with suppress(OSError):  # a closed terminal (SIGHUP) must not end the render
                 report(progress)
 
-        yield careful
+        yield report_safely
 
 
 @contextmanager
@@ -93,7 +93,7 @@ def _lines() -> Callable[[Progress], None]:
             print(COMPILING, file=sys.stderr, flush=True)
         elif progress.seconds >= due[progress.stage]:
             due[progress.stage] = progress.seconds + LINE_EVERY
-            what = BUILDING if progress.stage == "build" else describe(progress)
-            print(f"{100.0 * progress.done / progress.total:.0f} %, {what}", file=sys.stderr, flush=True)
+            text = BUILDING if progress.stage == "build" else describe(progress)
+            print(f"{100.0 * progress.done / progress.total:.0f} %, {text}", file=sys.stderr, flush=True)
 
     return report

@@ -1,4 +1,4 @@
-"""Render a scene to a film in one call, on this device or by workers."""
+"""`wrt.render`: render a scene to a film in one call, on one device or with several workers."""
 
 from __future__ import annotations
 
@@ -27,41 +27,41 @@ def render(scene: Scene | Mesh | str | os.PathLike[str], **options: Unpack[Rende
     Parameters
     ----------
     scene
-        A Scene. A Mesh, or the path of a scene or mesh file, is loaded as `load_scene` does.
+        A Scene, a Mesh, or the path of a scene or mesh file. `load_scene` says how a Mesh or a path becomes a scene.
     size, spp, max_depth, min_throughput, filter, fresnel, glass_shadows, sampler, exposure, tonemap
-        Replace the scene's own setting of that name; see Settings. None keeps it. `size` may also be text such as "640x360".
+        Replace the scene's setting of the same name; see Settings. None keeps it. A `size` may also be text such as "640x360".
     seed
         Seed of the samples.
     device, threads
-        A device of Warp, "cpu" or "cuda:0"; the number of CPU threads (None: one for each core).
+        Name of a Warp device such as "cpu" or "cuda:0"; number of CPU threads (None: one for each core).
     accel, accel_options, triangle, box
-        Name of the acceleration structure in ACCELERATORS, its options as `build` takes them, and its triangle and box test.
+        Name of the acceleration structure in ACCELERATORS, its options (see `build`), and its triangle and box test.
     instancing
-        Which meshes that several objects share are stored once: "auto", "always" or "never".
+        Which of the meshes that several objects share are stored once: "auto" (large meshes), "always" or "never".
     camera
         Name or index of one of the scene's cameras, or a camera of any kind. None: the first.
     crop
-        x0, y0, x1, y1 in pixels: the part of the picture to render.
+        x0, y0, x1, y1 in pixels from the top left: the rectangle to render.
     aov
         Layers to return beside the pixels: "depth", "normal", "albedo", "prim_id", "material_id". Film defines them.
     time_limit
-        Seconds of tracing. The first sample of each pixel is always taken.
+        Seconds of tracing after which the render stops. Each pixel gets at least one sample.
     target_error
-        Stop once the estimated error is no larger: the root mean square, over pixels and channels, of the standard error in
-        linear radiance. It is noise alone, without what max_depth and min_throughput cut. Each pixel's samples form four
-        independent sequences. The estimate is made when each has 1, 2, 4, 8 ... samples. The keyword `spp` is then the upper
-        limit, rounded down to a multiple of four; without it the limit is 65,536, whatever the scene says.
+        Stop once the estimated error is at most this: the root mean square, over pixels and channels, of the standard error in
+        linear radiance. The estimate covers noise, but not the radiance that max_depth and min_throughput cut. Each pixel's samples
+        form four independent sequences. The error is estimated when each sequence has 1, 2, 4, 8 ... samples. The keyword `spp` is
+        then the upper limit, rounded down to a multiple of four. Without the keyword, the limit is 65,536; the scene's spp is ignored.
     tile_size, pass_size
-        Side of a tile in pixels, and samples of a pixel in one pass. None: chosen by wrt.
+        Side of a tile in pixels, and samples per pixel in one pass. None: wrt chooses.
     progress
-        Called with a Progress about ten times a second.
+        Function that is called with a Progress about ten times per second.
     checkpoint, checkpoint_every, resume
-        File that holds the work so far, written every `checkpoint_every` seconds of tracing and at the end; it stays. An existing
-        file is refused, unless `resume` is True: the picture then has the bits of an uninterrupted render.
+        File for the samples so far, written every `checkpoint_every` seconds of tracing and at the end. If the file exists, `resume`
+        must be True. The render then continues from the file, and the picture has the bits of an uninterrupted render.
     devices
-        Several devices of this machine, of one kind, that share the tiles, in place of `device`.
+        Several devices of one kind on this machine, which share the tiles. They replace `device`.
     executor
-        A concurrent.futures.Executor or a dask.distributed.Client, whose workers trace the tiles on their `device`.
+        A concurrent.futures.Executor or a dask.distributed.Client. Its workers trace the tiles, each on its `device`.
 
     Returns
     -------
@@ -76,28 +76,28 @@ def render(scene: Scene | Mesh | str | os.PathLike[str], **options: Unpack[Rende
     Warns
     -----
     SceneWarning
-        If part of the scene is left out, or the picture is all black although the scene has lights.
+        If wrt leaves out a part of the scene, or the picture is all black although the scene has lights.
 
     Examples
     --------
     >>> film = wrt.render("scenes/whitted.toml", spp=16, size=(320, 180), aov=["depth"])
     >>> film.save("whitted.png")
     """
-    given: dict[str, Any] = {**options}
-    changes = {name: given.pop(name) for name in SETTINGS if name in given}
-    if given.get("target_error") is not None and changes.get("spp") is None:
+    keywords: dict[str, Any] = {**options}
+    changes = {name: keywords.pop(name) for name in SETTINGS if name in keywords}
+    if keywords.get("target_error") is not None and changes.get("spp") is None:
         changes["spp"] = MAX_SPP
-    for name in given:
+    for name in keywords:
         if name not in OPTIONS:
             raise unknown(name, "argument of render", (*SETTINGS, *OPTIONS), argument=name)
-    how = Options(**given)
+    resolved = Options(**keywords)
     scene = as_scene(scene).with_settings(**changes)
-    if how.executor is None and how.devices is None:
-        film = Renderer(scene, how, once=True).run()
+    if resolved.executor is None and resolved.devices is None:
+        film = Renderer(scene, resolved, once=True).run()
     else:
         from wrt.renderer.distributed.renderer import DistributedRenderer
 
-        film = DistributedRenderer(scene, how).run()
+        film = DistributedRenderer(scene, resolved).run()
     if scene.lights and film.samples.all() and not film.pixels.any():
-        warn("the picture is all black: no light reaches what the camera sees (it may be enclosed, with all lights outside)")
+        warn("the picture is all black: no light reaches the visible surfaces (a surface may enclose them, with all lights outside)")
     return film

@@ -29,20 +29,22 @@ from wrt.scene.cameras import CameraKind
 from wrt.scene.model import Scene
 from wrt.scene.settings import SettingChanges
 
-REFINED_FROM = 8  # camera samples per triangle: with fewer, refining the tree costs more time than it saves
+REFINED_FROM = 8  # smallest number of camera samples per triangle for which refining the tree saves time
 
 
 class Renderer:
-    """A prepared scene, which `run` renders. once: for a single picture. Raises InputError if the scene cannot be rendered."""
+    """A prepared scene, which `run` renders any number of times. Raises InputError if the scene cannot be rendered.
+
+    once: the caller needs one picture only; wrt then builds the structure faster if the picture has few samples."""
 
     def __init__(self, scene: Scene, options: Options, *, once: bool = False) -> None:
         if options.executor is not None or options.devices is not None:
-            raise InputError("an executor or several devices are for wrt.render; this runs on one device")
+            raise InputError("a Renderer runs on one device", hint="use wrt.render for `devices` or `executor`")
         device = start(options.device)
         plan = plan_of(scene, options)
         plan.require_memory(device)
         self.checkpoint = checkpoint_of(plan, kind_of(device))
-        if once and (builder := builder_for(plan)):  # not in the checkpoint: a resumed render may use another tree
+        if once and (builder := builder_for(plan)):  # the checkpoint does not contain it: a resumed render may use another tree
             plan = replace(plan, options=replace(options, accel_options=builder | options.accel_options))
         self.prepared = prepare(plan, device)
 
@@ -53,19 +55,18 @@ class Renderer:
     def aim(self, camera: CameraKind, angles_of: tuple[int, int] | None = None, **settings: Unpack[SettingChanges]) -> None:
         """Set the camera and settings of the next `run`, with the same kernels and structure, as Prepared.aimed allows."""
         if self.checkpoint is not None:
-            raise InputError("this renderer was not made for a checkpoint")
+            raise InputError("a renderer with a checkpoint cannot change its camera or settings")
         self.prepared = self.prepared.aimed(camera, angles_of, **settings)
 
-    def follow(self, scene: Scene, rebuild_at: float) -> dict[str, object]:
-        """Replace the scene by one with the same objects, moved: upload its surfaces, and refit the structure.
+    def move_objects(self, scene: Scene, rebuild_at: float) -> dict[str, object]:
+        """Replace the scene by a scene with the same objects, which have moved: upload the surfaces, and refit the structure.
 
-        The structure is rebuilt if it cannot be refitted, or if its SAH cost would grow by `rebuild_at` or more. Returns "structure"
-        ("refitted" or "rebuilt"), "seconds", and "growth" of the SAH cost (NaN: unknown).
-        """
+        The structure is rebuilt if it cannot be refitted, or if its SAH cost would grow by the factor `rebuild_at` or more. Returns
+        "structure" ("refitted" or "rebuilt"), "seconds", and "growth" of the SAH cost (a factor; NaN: unknown)."""
         old = self.prepared
         plan = old.plan.moved(scene)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", SceneWarning)  # reported by the constructor
+            warnings.simplefilter("ignore", SceneWarning)  # the constructor has reported the warnings
             arrays = upload_scene(scene, old.device, plan.meshes)
         geometry: Any = arrays.world.geometry
         self.prepared = replace(old, plan=plan, arrays=arrays)
@@ -79,19 +80,19 @@ class Renderer:
         return {"structure": "rebuilt", "seconds": accel.stats.build_seconds, "growth": float("nan")}
 
     def run(self, *, seed: int | None = None, spp: int | None = None) -> Film:
-        """Render until samples, time limit or target error end it. seed, spp: replace those of options and scene, without a checkpoint."""
+        """Render until the samples, the time limit or the target error are reached. seed, spp: replace the options' and the scene's."""
         if self.checkpoint is not None and (seed is not None or spp is not None):
-            raise InputError("a render with a checkpoint has the seed and spp that it was made with")
+            raise InputError("a renderer with a checkpoint cannot change its seed or spp")
         return Run(LocalTracer(self.prepared), self.checkpoint, seed, spp).film()
 
 
 def builder_for(plan: Plan) -> dict[str, str]:
-    """Return the structure's option `builder` for a single picture; empty if its default pays off for the number of samples."""
+    """Return the option `builder` for a single picture: "binned" if the default builder would take longer than it saves, else nothing."""
     triangles = sum(len(mesh.faces) for mesh in stored_meshes(plan.scene, plan.meshes))
     few = triangles > SMALL and plan.area * plan.scene.settings.spp < REFINED_FROM * triangles
     return {"builder": "binned"} if few and default_options(plan.accel).get("builder") == "refined" else {}
 
 
 def same_faces(before: Geometry, now: Geometry | InstancedGeometry) -> bool:
-    """Return True if only vertices differ. Rounding may have made a face collinear, which changes the faces."""
+    """Return True if only vertices differ. The faces differ if rounding made a face collinear, which is then left out."""
     return (isinstance(now, Geometry) and np.array_equal(before.faces, now.faces) and before.vertices.shape == now.vertices.shape)

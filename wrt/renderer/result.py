@@ -11,23 +11,24 @@ from wrt.core.version import VERSION
 from wrt.picture.film import Film
 from wrt.renderer.film_arrays import DeviceFilm
 from wrt.renderer.plan import Plan
-from wrt.scene.model import Scene
 
 Facts = dict[str, Any]  # entries of a film's stats
 
 
 def film_of(plan: Plan, arrays: DeviceFilm, seed: int, aov: dict[str, np.ndarray], seconds: dict[str, float], facts: Facts) -> Film:
-    """Return the film with its statistics. facts: entries about the scene, its structure and the end of the run."""
+    """Return the film with its statistics. facts: entries of the stats about the scene, its structure and the end of the run."""
     arrays = arrays.snapshot()
     options, settings, samples = plan.options, plan.scene.settings, arrays.samples()
     total = max(int(samples.sum()), 1)
     rays = arrays.count("rays")
+    ior = max((m.ior for m in plan.scene.materials if m.kind == "glass" or m.transmission > 0.0), default=1.0)
+    most_by_throughput = settings.min_throughput * ior**2  # inside glass, radiance is larger by ior^2
     stats: dict[str, Any] = {
         "seconds": seconds, "rays": rays, "rays_per_sample": rays / total,
         "rays_per_second": rays / seconds["trace"] if seconds["trace"] > 0.0 else 0.0,
         "cut_by_depth": arrays.count("cut_depth"), "cut_by_throughput": arrays.count("cut_throughput"),
-        "lost_throughput_per_sample": arrays.lost() / total,
-        "visibly_cut": arrays.visibly_cut(_most_cut_by_throughput(plan.scene)) if plan.features.reflection else 0.0,
+        "lost_throughput_per_sample": arrays.lost_throughput() / total,
+        "visibly_cut": arrays.visibly_cut(most_by_throughput) if plan.features.reflection else 0.0,
         "not_finite": arrays.count("not_finite"), "samples": int(samples.sum()), **facts,
     }
     if options.target_error is not None:
@@ -39,25 +40,15 @@ def film_of(plan: Plan, arrays: DeviceFilm, seed: int, aov: dict[str, np.ndarray
         "seconds": round(seconds["trace"], 3), "version": VERSION, "max_depth": settings.max_depth, "filter": settings.filter,
         "accel": options.accel, "device": ",".join(options.devices or [options.device]),
     }
-    return replace(_pixels(plan, arrays), aov=aov, stats=stats, metadata=metadata)
+    return replace(bare_film(plan, arrays), aov=aov, stats=stats, metadata=metadata)
 
 
-def film_so_far(plan: Plan, arrays: DeviceFilm) -> Film:
-    """Return a film with pixels, variance and samples alone."""
-    return _pixels(plan, arrays.snapshot())
-
-
-def _pixels(plan: Plan, arrays: DeviceFilm) -> Film:
+def bare_film(plan: Plan, arrays: DeviceFilm) -> Film:
+    """Return a film with pixels, variance and samples only. arrays: a snapshot."""
     settings = plan.scene.settings
     return Film(*arrays.pixels_and_variance(), arrays.samples(), exposure=settings.exposure, tonemap=settings.tonemap)
 
 
 def plain_text(name: str) -> str:
-    """Return a name that UTF-8 can encode: lone surrogates, of glTF files and file names, become "?"."""
+    """Return a name that UTF-8 can encode: lone surrogates, which glTF files and file names may contain, become "?"."""
     return name.encode("utf-8", "replace").decode()
-
-
-def _most_cut_by_throughput(scene: Scene) -> float:
-    """Return the largest throughput of a ray that min_throughput cuts; inside glass, radiance is larger by ior^2."""
-    glass = [m.ior for m in scene.materials if m.kind == "glass" or m.transmission > 0.0]
-    return scene.settings.min_throughput * max(glass, default=1.0) ** 2

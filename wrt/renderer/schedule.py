@@ -1,4 +1,4 @@
-"""Schedule of a run: passes and their tiles, until samples, time, target error or Ctrl-C end it."""
+"""Schedule of a render: passes of tiles, until the samples, the time limit, the target error or Ctrl-C end it."""
 
 from __future__ import annotations
 
@@ -25,32 +25,31 @@ from wrt.renderer.film_arrays import AovFilm, DeviceFilm
 from wrt.renderer.options import Options, Progress
 from wrt.renderer.plan import Plan
 from wrt.renderer.prepare import Prepared
-from wrt.renderer.result import Facts, film_of, film_so_far
+from wrt.renderer.result import Facts, bare_film, film_of
 from wrt.renderer.tiles import Rectangle, Work, work_left
 
-MAX_PASS = 64  # samples of a pixel: Ctrl-C waits for the end of a pass on a GPU
-# Factor from pass to pass. Larger factors are faster on the CPU (16 spp: 4 is up to 1.15 times as fast as 2),
-# but leave a picture that ends early less even.
+MAX_PASS = 64  # Largest number of samples per pixel in a pass. On a GPU, Ctrl-C waits for the end of the pass.
+# Factor by which the samples per pixel grow from pass to pass. A larger factor is faster on the CPU (with 16 spp, 4 is up to 1.15 times
+# as fast as 2). If the render ends early, however, the samples are spread less evenly over the picture.
 GROWTH = 4
-STEP_SECONDS = 0.1
-OVERTIME = 5.0  # seconds without an answer after the time limit until a pass is abandoned; SILENT in the first pass
-SILENT = 20.0  # seconds without an answer until a report
+STEP_SECONDS = 0.1  # Time between two steps of a tracer.
+OVERTIME = 5.0  # Seconds after the time limit without a finished tile, until the pass is abandoned. In the first pass: SILENT.
+SILENT = 20.0  # Seconds without a finished tile until the progress notes it.
 
-# Samples done, summed over pixels, and True while no tile runs: then no pixel is half done.
+# A step: samples done, summed over pixels; and True if no tile is running, so that all pixels have whole samples.
 Steps = Generator[tuple[int, bool], None, None]
 
 
 class OutOfTime(Exception):
-    """A pass is abandoned, because its tracer does not answer."""
+    """The time limit has passed, and the tracer finishes no more tiles."""
 
 
 class Tracer(Protocol):
-    """Traces the tiles of a run: threads of this process, or workers (wrt.renderer.distributed).
+    """Traces the tiles of a run, with threads of this process or with workers (wrt.renderer.distributed).
 
-    device: of the film; seconds: of each stage of the preparation; facts: entries of stats. `trace` yields a step about
-    every tenth of a second, and one at the end. If `due()` is true, it yields a step without running tiles. When it is closed early, tiles
-    that run come to their end, and no others begin.
-    """
+    - device: the film's device; seconds: time of each stage of the preparation; facts: entries of Film.stats.
+    - trace: yields a step about every tenth of a second, and one at the end. If `due()` is true, it waits for the running tiles before
+      the next step. If the caller closes the generator early, running tiles are finished, and no others begin."""
 
     plan: Plan
     device: Device
@@ -64,7 +63,7 @@ class Tracer(Protocol):
 
 
 class LocalTracer:
-    """Traces on the device of a prepared scene: on all threads, or in one launch on CUDA."""
+    """Traces on the device of a prepared scene: on the CPU with all threads, on CUDA tile by tile."""
 
     def __init__(self, prepared: Prepared) -> None:
         self.prepared, self.plan, self.device, self.seconds = prepared, prepared.plan, prepared.device, prepared.seconds
@@ -77,7 +76,7 @@ class LocalTracer:
             wp.synchronize_device(self.device)
             yield done, True
             return
-        if min(self.prepared.threads, len(work)) == 1:  # the calling one
+        if min(self.prepared.threads, len(work)) == 1:  # the calling thread
             yield from self._trace_here(trace, work, due)
             return
         left, samples = deque(work), list[int]()  # a future for each job would add 10 % to a short picture
@@ -119,12 +118,11 @@ class LocalTracer:
 
 
 class Passes:
-    """Iterator over passes: first sample and number of samples, in each group, 1, 3, 12, 48, 64 ..., so that a first picture comes soon.
+    """Iterator over passes: the first sample and the number of samples, in each group. A pass has 1, 3, 12, 48, 64, 64 ... samples.
 
-    A time limit counts from the first pass on. A pass takes no more samples than are likely to be done in the time left, or in `every`
-    seconds. The first sample of each pixel is always taken. `samples`: the smallest and the largest number that pixels have already.
-    A render that was saved within a pass begins with the pixels that are behind.
-    """
+    The time limit counts from the first pass on. A pass has only as many samples as will probably be done in the time left, and in
+    `every` seconds. Each pixel gets at least one sample. samples: smallest and largest number of samples that the pixels have already.
+    If they differ, because the checkpoint was written within a pass, the first passes bring all pixels to the largest number."""
 
     def __init__(self, film: DeviceFilm, options: Options, spp: int, samples: tuple[int, int], every: float) -> None:
         self.film, self.options, self.every = film, options, every
@@ -135,7 +133,7 @@ class Passes:
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
         limit = self.options.time_limit or math.inf
-        first = known = self.fewest  # the speed is measured over the samples since `known`, at the time `since`
+        first = timed_from = self.fewest  # the speed is measured from the sample `timed_from` on, which began at the time `since`
         begin = since = time.perf_counter()
         self.deadline = begin + limit
         count = self._size(first)
@@ -149,32 +147,32 @@ class Passes:
                 if left <= 0.0:
                     self.timed_out = True
                     return
-                likely = min(left, self.every) / (now - since) * (first - known) if first > known else 1.0
+                likely = min(left, self.every) / (now - since) * (first - timed_from) if first > timed_from else 1.0
                 count = max(1, min(count, int(min(likely, self.spp))))
             yield first, count
             first += count
             if first == self.most:
-                known, since = first, time.perf_counter()
+                timed_from, since = first, time.perf_counter()
             count = self._size(first)
 
     def _size(self, first: int) -> int:
-        """Return the size of a pass without limits of time and error."""
+        """Return the number of samples of a pass that begins at sample `first`, before the limits of time and error."""
         return self.options.pass_size or min(max((GROWTH - 1) * first, 1), self.largest)
 
-    def _precise_enough(self, taken: int) -> bool:
-        """Return True if the target error is reached after `taken` samples in each group; checked at powers of 2."""
+    def _precise_enough(self, samples: int) -> bool:
+        """Return True if the target error is reached. samples: number in each group; the error is estimated at powers of 2 only."""
         target = self.options.target_error
-        if target is None or taken == 0 or taken & (taken - 1):
+        if target is None or samples == 0 or samples & (samples - 1):
             return False
         error = self.film.error()
-        if error > target:  # at worst the variance falls as 1 / n
+        if error > target:  # the variance falls as 1 / samples or faster
             steps = math.ceil(min(2.0 * math.log2(error / target), 24.0))
-            self.expected_spp = min(self.spp, taken << steps)
+            self.expected_spp = min(self.spp, samples << steps)
         return error <= target
 
 
 class Run:
-    """One picture of a prepared scene. seed, spp: replace the options' and the scene's, unless None."""
+    """The render of one picture. seed, spp: replace the options' seed and the scene's spp, unless None."""
 
     def __init__(self, tracer: Tracer, checkpoint: Checkpoint | None, seed: int | None = None, spp: int | None = None) -> None:
         plan = tracer.plan
@@ -188,12 +186,12 @@ class Run:
         if checkpoint is not None and checkpoint.saved is not None:
             checkpoint.restore(self.arrays)
             samples, self.seconds_before = checkpoint.saved.samples, checkpoint.saved.seconds
-        if checkpoint is not None and tracer.device.is_cuda:  # a launch takes the whole picture
+        if checkpoint is not None and tracer.device.is_cuda:  # the film cannot be saved during a launch, which traces the whole picture
             every = checkpoint.every
         self.passes = Passes(self.arrays, plan.options, spp or plan.scene.settings.spp, samples, every)
 
     def film(self) -> Film:
-        """Take the samples and return the film."""
+        """Render and return the film."""
         begin = self.begin = time.perf_counter()
         interrupted = out_of_time = False
         with held_interrupts() as self.interrupts:
@@ -201,17 +199,17 @@ class Run:
                 self.checkpoint.begin()
             try:
                 if self.plan.options.aov:
-                    self._take_aovs()
+                    self._trace_aovs()
                     self.seconds["aov"] = time.perf_counter() - begin
                 self.begin = time.perf_counter()
                 for first, count in self.passes:
-                    self._take(first, count)
-            except KeyboardInterrupt:  # from _follow, or from a progress callback
+                    self._trace_pass(first, count)
+            except KeyboardInterrupt:  # raised by _trace, or by a progress callback
                 interrupted = True
             except OutOfTime:
                 out_of_time = True
             except Exception as error:
-                self._keep(error)
+                self._save_before(error)
                 raise
             self.seconds["trace"] = self._elapsed()
             if self.checkpoint is not None:
@@ -222,18 +220,18 @@ class Run:
             return film_of(self.plan, self.arrays, self.seed, self.aov, self.seconds, facts)
 
     def _facts(self, interrupted: bool, out_of_time: bool) -> Facts:
-        """Return facts of the scene and of the end of the run."""
+        """Return entries of Film.stats about the scene, the end of the run and the checkpoint."""
         end = {"interrupted": interrupted, "signal": int(self.interrupts[0]) if self.interrupts else None,
                "timed_out": (out_of_time or self.passes.timed_out) and not interrupted}
         return self.tracer.facts() | end | ({} if self.checkpoint is None else self.checkpoint.facts())
 
-    def _keep(self, error: Exception) -> None:
-        """Save a checkpoint before an error ends the run, unless the device is CUDA: its film may be unreadable."""
+    def _save_before(self, error: Exception) -> None:
+        """Save a checkpoint before an error ends the run. After an error on CUDA, the film may be unreadable and is not saved."""
         if self.checkpoint is None or self.tracer.device.is_cuda:
             return
         self.checkpoint.save(self.arrays, self._elapsed())
         if isinstance(error, InputError) and not self.checkpoint.problem:
-            raise error.at(hint=f"{self.checkpoint.path} has what was done") from error
+            raise error.at(hint=f"{self.checkpoint.path} has the samples so far") from error
 
     def _elapsed(self) -> float:
         """Return the seconds of tracing, including those before a resume."""
@@ -242,25 +240,24 @@ class Run:
     def _due(self) -> bool:
         return self.checkpoint is not None and self.checkpoint.due()
 
-    def _take(self, first: int, count: int) -> None:
-        """Bring every pixel with fewer samples to `first + count` in each group."""
+    def _trace_pass(self, first: int, count: int) -> None:
+        """Trace until every pixel has at least `first + count` samples in each group."""
         work, before = [Work(tile, first, count) for tile in self.tracer.tiles(count)], first * self.plan.area
         if first < self.passes.most:  # after a resume
             samples = self.arrays.view(self.arrays.groups[0].samples)
             work, before = work_left(work, samples, self.plan.crop), int(samples.sum(dtype=np.int64))
-        self._follow(self.arrays, work, lambda done, silent: self._report(before + done, silent), OVERTIME if first else SILENT)
+        self._trace(self.arrays, work, lambda done, silent: self._report(before + done, silent), OVERTIME if first else SILENT)
 
-    def _take_aovs(self) -> None:
+    def _trace_aovs(self) -> None:
         arrays = AovFilm(self.plan.scene.settings, self.plan.crop, self.tracer.device)
         work = [Work(tile, 0, 1) for tile in self.tracer.tiles(1)]
-        self._follow(arrays, work, lambda done, silent: None, SILENT)
+        self._trace(arrays, work, lambda done, silent: None, SILENT)
         self.aov = {name: arrays.picture(name) for name in self.plan.options.aov}
 
-    def _follow(self, film: DeviceFilm | AovFilm, work: list[Work], report: Callable[[int, float], None], overtime: float) -> None:
-        """Trace, save and report. Raises KeyboardInterrupt after Ctrl-C, once no tile runs, so that no pixel is half done.
+    def _trace(self, film: DeviceFilm | AovFilm, work: list[Work], report: Callable[[int, float], None], overtime: float) -> None:
+        """Trace, save checkpoints and report. Raises KeyboardInterrupt after Ctrl-C; running tiles are finished first.
 
-        Raises OutOfTime if there was no answer for `overtime` seconds after the time limit.
-        """
+        Raises OutOfTime if no tile was finished for `overtime` seconds after the time limit."""
         total = sum(job.total for job in work)
         if self.interrupts:
             raise KeyboardInterrupt
@@ -279,7 +276,7 @@ class Run:
                     raise OutOfTime
 
     def _report(self, done: int, silent: float) -> None:
-        """Call `progress`. done: samples of a group, summed over the pixels; silent: seconds without an answer."""
+        """Call `progress`. done: samples of one group, summed over the pixels; silent: seconds without a finished tile."""
         plan = self.plan
         if plan.options.progress is None:
             return
@@ -287,5 +284,5 @@ class Run:
         note = "" if self.checkpoint is None else self.checkpoint.problem
         if silent > SILENT and not note:
             note = f"a worker has not answered for {silent:.0f} s"
-        plan.options.progress(Progress(done * plan.groups, total, self.arrays.rays, self._elapsed(), note=note,
-                                       picture=lambda: film_so_far(plan, self.arrays)))
+        plan.options.progress(Progress(done * plan.groups, total, self.arrays.count("rays"), self._elapsed(), note=note,
+                                       picture=lambda: bare_film(plan, self.arrays.snapshot())))

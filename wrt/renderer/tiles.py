@@ -1,4 +1,4 @@
-"""Tiles of a picture, and the samples that each still needs."""
+"""Tiles of a picture, and the samples that each tile still needs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Rectangle = tuple[int, int, int, int]  # x, y, width, height
 
 
 class Work(NamedTuple):
-    """Samples `first` to `first + n` of each pixel of a rectangle."""
+    """Samples `first` to `first + n - 1` of each pixel of a rectangle."""
 
     rectangle: Rectangle
     first: int
@@ -38,16 +38,15 @@ def corners(rectangle: Rectangle) -> tuple[int, int, int, int]:
 
 
 def work_left(work: list[Work], samples: np.ndarray, crop: tuple[int, int, int, int]) -> list[Work]:
-    """Return the work that is left. samples: (H, W) of the crop, `first` or more.
+    """Return the part of the work that is not done yet. samples: number of samples of each pixel of the crop, (H, W) int32.
 
-    A rectangle is halved until all pixels of a part have equally many samples; they differ by whole tiles of an earlier run.
-    """
+    Rectangles are halved until all pixels of a part have equally many samples. An earlier run left whole tiles with equal numbers."""
     out = []
     stack = work[::-1]
     while stack:
         (x, y, width, height), first, n = stack.pop()
-        there = samples[y - crop[1] : y - crop[1] + height, x - crop[0] : x - crop[0] + width]
-        low, high = int(there.min()), int(there.max())
+        of_part = samples[y - crop[1] : y - crop[1] + height, x - crop[0] : x - crop[0] + width]
+        low, high = int(of_part.min()), int(of_part.max())
         goal = first + n
         if low == high:
             if low < goal:

@@ -1,4 +1,4 @@
-"""Upload of a scene: geometry, and tables of materials, textures and lights."""
+"""Upload of a scene to a device: geometry, and tables of materials, textures and lights."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from wrt.scene.model import Scene
 from wrt.scene.size import require_size
 from wrt.scene.values import LUMINANCE
 
-# More area lights than this are sampled as one, by power: a shadow ray to each would cost more than it gains.
+# If a scene has more emissive objects, they are sampled as one light, by power, since a shadow ray to each would cost too much.
 MAX_MESH_LIGHTS = 16
 WRAPS = {"repeat": textures.WRAP_REPEAT, "clamp": textures.WRAP_CLAMP, "mirror": textures.WRAP_MIRROR}
 
 
 class TextureTable:
-    """Texels of all images in sequence; an image used twice is stored once."""
+    """Table of the textures, and the texels of all images one after another. An image that several textures use is stored once."""
 
     def __init__(self) -> None:
         self.rows: list[Texture | Checkerboard] = []
@@ -44,6 +44,7 @@ class TextureTable:
         self.size = 0
 
     def index(self, texture: Texture | Checkerboard | None) -> int:
+        """Return the index of a texture in the table, after adding it if it is new; -1 for None."""
         if texture is None:
             return -1
         for i, row in enumerate(self.rows):
@@ -76,23 +77,23 @@ class TextureTable:
 
 @cache
 def srgb_table() -> np.ndarray:
-    """Return (512,) float32: linear values of the 256 sRGB codes (IEC 61966-2-1), then i / 255."""
+    """Return the linear values of the 256 sRGB codes (IEC 61966-2-1), then i / 255 for the codes i of linear images; (512,) float32."""
     code = np.arange(256) / 255.0
     return np.concatenate([decode_srgb(code), code]).astype(np.float32)
 
 
-def index_of(kind: str, table: Collection[str], what: str) -> int:
-    """Return the index of a kind in a table of device functions. Raises InputError if it has none."""
+def index_of(kind: str, table: Collection[str], group: str) -> int:
+    """Return the index of a kind in a table of device functions. Raises InputError if the table lacks it. group: name for the error."""
     if kind not in table:
-        raise InputError(f"{what} {kind!r} has no device function: wrt.kernels.shade has no row for it")
+        raise InputError(f"{group} {kind!r} has no device function in the tables of wrt.kernels.shade")
     return list(table).index(kind)
 
 
-def material_records(used: tuple[Material, ...], table: TextureTable) -> np.ndarray:
-    """Return the device's materials. Fields that a kind does not use are 0 and without texture; `transmission` of clear kinds is 1."""
-    out = records(structs.Material, max(len(used), 1))
+def material_records(scene_materials: tuple[Material, ...], table: TextureTable) -> np.ndarray:
+    """Return the device's materials. A field that the kind does not use is 0, or -1 for a texture; `transmission` of clear kinds is 1."""
+    out = records(structs.Material, max(len(scene_materials), 1))
     some_use = kinds_that_use()
-    for row, material in zip(out, used, strict=False):
+    for row, material in zip(out, scene_materials, strict=False):
         for name in out.dtype.names or ():
             unused = name in some_use and not material.uses(name)
             if name.endswith("_texture"):
@@ -109,10 +110,9 @@ def material_records(used: tuple[Material, ...], table: TextureTable) -> np.ndar
 
 
 def light_records(scene: Scene, world: FlatScene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return lights, emitters and the cdf of the emitters (float32).
+    """Return the device's lights, the emitters (emissive triangles), and the cdf of each mesh light's emitters (float32).
 
-    Each object with emissive faces is one light; more than MAX_MESH_LIGHTS together are one.
-    """
+    Each object with emissive faces is one light. More than MAX_MESH_LIGHTS such objects form one light together."""
     rows: list[dict[str, Any]] = []
     for light in scene.lights:
         rows.append({"kind": index_of(light.kind, lights.LIGHTS, "light kind"), **light.record()})
@@ -141,7 +141,7 @@ def light_records(scene: Scene, world: FlatScene) -> tuple[np.ndarray, np.ndarra
 
 
 def _emissive_groups(scene: Scene, world: FlatScene) -> list[np.ndarray]:
-    """Return the prim_ids of the emissive faces of each object that has some."""
+    """Return, for each object with emissive faces, the prim_ids of these faces."""
     lit = np.array([m.lights_others for m in scene.materials], bool)
     groups = []
     first = 0
@@ -157,14 +157,14 @@ def _emissive_groups(scene: Scene, world: FlatScene) -> list[np.ndarray]:
 
 
 def _emitters(scene: Scene, world: FlatScene, prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the emitters of one light and their cdf; both are empty if the power is 0."""
+    """Return the emitters of one light and their cdf by power; both are empty if the total power is 0."""
     corner = world.corners(prim_id)
     area = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
     power = np.array([LUMINANCE @ np.array(m.emission) for m in scene.materials])[world.materials(prim_id)] * area
     total = power.sum()
     if not total > 0.0:
         return records(structs.Emitter, 1)[:0], np.zeros(0, np.float32)
-    # The density follows the rounded cdf, which samples the emitters.
+    # The density is computed from the rounded cdf, because the kernels sample the emitters with it.
     cdf = (np.cumsum(power) / total).astype(np.float32)
     cdf[np.nonzero(power)[0][-1] :] = 1.0
     share = np.diff(cdf.astype(np.float64), prepend=0.0)
@@ -203,7 +203,7 @@ def background_struct(background: Background, device: Device) -> WarpStruct:
 
 @dataclass(frozen=True, eq=False)
 class DeviceScene:
-    """Surfaces and lighting for the kernels, and the flat scene with the geometry for the acceleration structure."""
+    """A scene on a device: surfaces and lighting for the kernels, and on the host the flat scene with the structure's geometry."""
 
     world: FlatScene
     surfaces: WarpStruct
@@ -211,23 +211,23 @@ class DeviceScene:
 
 
 def warn_left_out(scene: Scene) -> None:
-    """Give a SceneWarning for parts that a picture leaves out. Raises InputError if the scene cannot be rendered."""
+    """Issue a SceneWarning for each part that a picture leaves out. Raises InputError if the scene cannot be rendered."""
     require_size(scene)
     for sphere in scene.spheres:
         if sphere.material.alpha_mode == "mask" and sphere.material.albedo_texture is not None:
             raise InputError(f"a cut-out texture needs a mesh; material {sphere.material.name!r}", place=f"sphere {sphere.name!r}")
-    bare = [thing.name or str(i) for i, thing in enumerate(scene.objects)
+    without_uvs = [thing.name or str(i) for i, thing in enumerate(scene.objects)
             if thing.mesh.uvs is None and any(m.textures for m in thing.materials)]
-    if bare:
-        warn(f"no texture coordinates, so that a texture's first texel is everywhere: objects {listed(bare)}")
-    unreached = [m.name or str(i) for i, m in enumerate(scene.materials) if m.is_emissive and m.emits_light and not m.lights_others]
-    if unreached:
-        warn("emission that is seen but lights nothing, since a texture or alpha says where it is: materials"
-             f" {listed(unreached)} (emits_light = false says that it is meant)")
+    if without_uvs:
+        warn(f"no texture coordinates, so that a texture shows its first texel everywhere: objects {listed(without_uvs)}")
+    unlit = [m.name or str(i) for i, m in enumerate(scene.materials) if m.is_emissive and m.emits_light and not m.lights_others]
+    if unlit:
+        warn("emission that is seen but lights nothing, because it varies with a texture or alpha: materials"
+             f" {listed(unlit)} (emits_light = false turns this warning off)")
 
 
 def upload_scene(scene: Scene, device: Device, meshes: frozenset[int] = frozenset()) -> DeviceScene:
-    """Upload a scene. meshes: id()s of the instanced meshes (wrt.accel.scenes.instancing). Raises InputError as `warn_left_out` does."""
+    """Upload a scene. meshes: id()s of the instanced meshes (wrt.accel.scenes.instancing). Raises and warns as `warn_left_out` does."""
     warn_left_out(scene)
     world = flatten(scene, meshes)
     table = TextureTable()
@@ -259,7 +259,7 @@ def upload_scene(scene: Scene, device: Device, meshes: frozenset[int] = frozense
 
 
 def camera_struct(camera: CameraKind, size: tuple[int, int]) -> WarpStruct:
-    """Return the device's camera for a picture of `size` pixels."""
+    """Return the device's camera. size: width and height of the picture, whose aspect ratio the camera takes."""
     c = import_module(camera.device).Camera()
     pose = camera.camera_to_world
     c.origin = wp.vec3(*pose[:3, 3])

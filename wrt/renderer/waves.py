@@ -1,4 +1,4 @@
-"""Pictures on the CPU by waves of samples (wrt.kernels.loops.wave): their kernels, working memory and launches."""
+"""Rendering on the CPU in waves of samples (wrt.kernels.loops.wave): kernels, working memory and launches."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ from wrt.kernels.wide.batch import BatchTraversal
 from wrt.renderer.film_arrays import AovFilm, DeviceFilm
 from wrt.renderer.tiles import Work
 
-# Most samples of a wave; 4,096 to 32,768 are 0.92 to 1.06 times as fast, depending on the scene. Fewer if a sample has many paths or
-# lights: MAX_SLOTS is the limit of all samples' together.
-CAPACITY, MAX_SLOTS = 16384, 1 << 18
-ALL = 1 << 30  # Rays of a kernel whose only thread takes them all.
-OF_CAMERA = ("camera", "lens", "blades", "filter", "independent")
-OF_CUTOUT = ("instances", "textures", "checkerboards", "cutout")
+# Largest number of samples in a wave. With 4,096 to 32,768, renders are 0.92 to 1.06 times as fast as with 16,384, depending on the scene.
+CAPACITY = 16384
+MAX_SLOTS = 1 << 18  # Largest number of stack entries, and of shadow rays, of all samples of a wave together.
+ALL = 1 << 30  # Block size of a kernel whose only thread traces all rays.
+CAMERA_FEATURES = ("camera", "lens", "blades", "filter", "independent")
+CUTOUT_FEATURES = ("instances", "textures", "checkerboards", "cutout")
 
 
 class SceneRecords(NamedTuple):
-    """The device's records of a scene."""
+    """The device structs of a scene: acceleration structure, surfaces, lighting, and camera."""
 
     accel: WarpStruct
     surfaces: WarpStruct
@@ -61,9 +61,9 @@ begin_aov_kernel = made_once(wave_begin.make_begin_aov_kernel)
 
 @made_once
 def queue_kernel(structure: Structure, features: Features, any_hit: bool) -> tuple[Kernel, int]:
-    """Return the kernel for a queue of rays, and the rays that one of its threads takes: ALL, or 1 without a kernel for many.
+    """Return the kernel that traces a queue of rays, and the number of rays per thread: ALL if the structure has a stream kernel, else 1.
 
-    It always handles spheres, so that scenes with and without them share it."""
+    The kernel always handles spheres, so that scenes with and without spheres share it."""
     structure = structure._replace(units=structure.units._replace(spheres=True))
     accepts = make_cutout(features)
     stream = structure.accel.stream
@@ -75,7 +75,7 @@ def queue_kernel(structure: Structure, features: Features, any_hit: bool) -> tup
 
 @dataclass(frozen=True)
 class WaveKernels:
-    """The kernels of a picture; None: not needed."""
+    """The kernels of a picture; None: the picture does not need the kernel."""
 
     shade: Kernel
     prepare: Kernel | None
@@ -86,7 +86,7 @@ class WaveKernels:
     loop: Kernel
     begin_aov: Kernel | None
     aov: Kernel | None
-    block: int  # As queue_kernel returns it.
+    block: int  # Rays per thread of the traversals: ALL or 1.
 
     def all(self) -> list[Kernel]:
         """Return the kernels, the slowest to compile first."""
@@ -94,10 +94,10 @@ class WaveKernels:
 
 
 def wave_kernels(features: Features, structure: Structure, aov: bool) -> WaveKernels:
-    """Return the kernels of a picture, with those of AOVs on request."""
+    """Return the kernels of a picture. aov: include the AOV kernels."""
     default = Features()
     surfaces = replace(features, camera=default.camera, lens=False, blades=False, filter=False, stack_size=default.stack_size)
-    cutout, camera = keep_only(features, OF_CUTOUT), import_module(features.camera)
+    cutout, camera = keep_only(features, CUTOUT_FEATURES), import_module(features.camera)
     transparent = features.transparent_shadows
     closest_hit, block = queue_kernel(structure, cutout, False)
     shade, prepare = shade_kernels(surfaces)
@@ -107,7 +107,7 @@ def wave_kernels(features: Features, structure: Structure, aov: bool) -> WaveKer
         closest_hit=closest_hit,
         any_hit=queue_kernel(structure, cutout, True)[0] if features.direct_light and not transparent else None,
         shadow=shadow_kernel(surfaces) if transparent else None,
-        begin=begin_kernel(keep_only(features, OF_CAMERA), camera),
+        begin=begin_kernel(keep_only(features, CAMERA_FEATURES), camera),
         loop=wave.make_loop_kernel(transparent),
         begin_aov=begin_aov_kernel(camera) if aov else None,
         aov=aov_kernel(surfaces) if aov else None,
@@ -117,17 +117,17 @@ def wave_kernels(features: Features, structure: Structure, aov: bool) -> WaveKer
 
 @dataclass(frozen=True)
 class Waves:
-    """The kernels of a scene, and the working memory of their threads."""
+    """The kernels of a scene, and the working memory of the threads."""
 
     kernels: WaveKernels
-    features: Features  # For the size of the buffers.
-    lights: int  # A sampled background is one of them.
+    features: Features  # They determine the size of the buffers.
+    lights: int  # Number of lights; a sampled background counts as a light.
     free: list[Buffers] = field(default_factory=list)  # Buffers that no thread uses.
 
     def launch(self, scene: SceneRecords, limits: list[WarpStruct], film: DeviceFilm | AovFilm) -> Callable[[Work], int]:
-        """Return a function that renders some work into the film and returns its number of samples.
+        """Return a function that renders some work, adds it to the film, and returns the number of samples.
 
-        Several threads may call it. `limits` are those of each group of the film."""
+        Several threads may call this function at once. limits: one struct for each group of the film."""
         recorded: dict[int, Picture | Aovs] = {}
 
         def trace(work: Work) -> int:
@@ -138,15 +138,15 @@ class Waves:
             if id(buffers) not in recorded:
                 recorded[id(buffers)] = (Aovs(self, buffers, scene, film) if isinstance(film, AovFilm)
                                          else Picture(self, buffers, scene, limits, film))
-            recorded[id(buffers)].take(work)
-            self.free.append(buffers)  # Not after an error.
+            recorded[id(buffers)].trace(work)
+            self.free.append(buffers)  # After an error, the buffers are not reused.
             return work.total
 
         return trace
 
 
 def capacity(features: Features, lights: int) -> int:
-    """Return the number of samples in a wave."""
+    """Return the number of samples in a wave. lights: number of shadow rays per hit."""
     return max(min(CAPACITY, MAX_SLOTS // max(lights, features.stack_size)), 64)
 
 
@@ -155,7 +155,7 @@ class Buffers:
 
     def __init__(self, features: Features, lights: int) -> None:
         self.capacity = n = capacity(features, lights)
-        self.task, self.order = records(state.Task, 1), np.zeros(n, np.int32)  # The wave's arrays view them.
+        self.task, self.order = records(state.Task, 1), np.zeros(n, np.int32)  # The wave's arrays share this memory.
         w, cpu = state.Wave(), start("cpu")
         self.wave = w
         w.capacity = n
@@ -172,7 +172,7 @@ class Buffers:
         self.scratch = new_scratch(BatchTraversal.stream_sizes)
 
     def allocate_shadows(self, transparent: bool, lights: int) -> None:
-        """Allocate the receivers and their shadow rays."""
+        """Allocate the receivers (hits that wait for direct light) and their shadow rays."""
         w, n, slots = self.wave, self.capacity, self.capacity * lights
         w.receivers.sample, w.receivers.pending_light = empty(n, wp.int32), empty(n, PendingLight)
         w.receivers.shadow = empty(slots, wp.int32)
@@ -184,8 +184,8 @@ class Buffers:
         else:
             w.shadow_queue.occluded = empty(slots, wp.bool)
 
-    def take(self, work: Work, each: Callable[[], None]) -> None:
-        """Call `each` for every wave of some work, after setting its task."""
+    def for_each_wave(self, work: Work, launch: Callable[[], None]) -> None:
+        """Split some work into waves; for each wave, set the task and call `launch`."""
         task, (x, y, width, height) = self.task[0], work.rectangle
         task["x"], task["y"], task["width"] = x, y, width
         order, most = block_order(width, height), min(work.n, self.capacity)
@@ -196,11 +196,11 @@ class Buffers:
             for begin in range(0, len(order), count):
                 pixels = order[begin : begin + count]
                 self.order[: len(pixels)], task["pixels"] = pixels, len(pixels)
-                each()
+                launch()
 
 
 class Picture:
-    """The launches of a picture in some buffers, packed once: only the buffers change from wave to wave."""
+    """The launches of a picture with one thread's buffers. They are recorded once, since only the buffers' contents change."""
 
     def __init__(self, waves: Waves, buffers: Buffers, scene: SceneRecords, limits: list[WarpStruct], film: DeviceFilm) -> None:
         kernels, w = waves.kernels, buffers.wave
@@ -227,14 +227,14 @@ class Picture:
                 setattr(of_group, name, launch)
             self.groups.append(command(kernels.loop, w, of_group, waves.lights, group))
 
-    def take(self, work: Work) -> None:
+    def trace(self, work: Work) -> None:
         """Trace all samples of some work."""
         for group in self.groups:
-            self.buffers.take(work, group.launch)
+            self.buffers.for_each_wave(work, group.launch)
 
 
 class Aovs:
-    """The launches of AOVs in some buffers."""
+    """The launches of AOVs with one thread's buffers."""
 
     def __init__(self, waves: Waves, buffers: Buffers, scene: SceneRecords, film: AovFilm) -> None:
         kernels, w = waves.kernels, buffers.wave
@@ -243,10 +243,11 @@ class Aovs:
         self.aov = command(kernels.aov, w, scene.surfaces, film.struct)
         self.closest_hit = traversal(kernels, kernels.closest_hit, buffers, scene.accel, scene.surfaces, w.queue.rays, w.queue.hits)
 
-    def take(self, work: Work) -> None:
-        self.buffers.take(work, self.trace)
+    def trace(self, work: Work) -> None:
+        """Trace the AOVs of the rectangle of some work."""
+        self.buffers.for_each_wave(work, self._trace_wave)
 
-    def trace(self) -> None:
+    def _trace_wave(self) -> None:
         pixels = int(self.buffers.task[0]["pixels"])
         self.begin.launch()
         self.closest_hit.set_dim(-(-pixels // self.block))
@@ -256,12 +257,12 @@ class Aovs:
 
 
 def command(kernel: Kernel | None, *inputs: object) -> wp.Launch:
-    """Record a launch of one thread."""
+    """Record the launch of a kernel with one thread, without running it."""
     return wp.launch(kernel, dim=1, inputs=inputs, device="cpu", record_cmd=True, record_tape=False)
 
 
 def traversal(kernels: WaveKernels, kernel: Kernel, buffers: Buffers, *inputs: object) -> wp.Launch:
-    """Record a launch whose last two arguments are the range of a queue's rays: first, end."""
+    """Record the launch of a traversal of a queue. Its last two arguments, first and end, are the range of rays, set before each run."""
     return command(kernel, *inputs, *([buffers.scratch] if kernels.block > 1 else []), 0, 0)
 
 
@@ -284,7 +285,7 @@ def empty_hits(n: int) -> WarpStruct:
 
 @lru_cache(maxsize=64)
 def block_order(width: int, height: int) -> np.ndarray:
-    """Return the pixels of a rectangle, y * width + x, in squares of 4x4 and 2x2, so that neighbours go the same way; int32."""
+    """Return the pixels of a rectangle, y * width + x (int32), in squares of 4x4 and 2x2, so that neighbours are traced together."""
     y, x = np.mgrid[:height, :width]
     within = (x & 1) | (y & 1) << 1 | (x & 2) << 1 | (y & 2) << 2
     return np.lexsort((within.ravel(), x.ravel() // 4, y.ravel() // 4)).astype(np.int32)

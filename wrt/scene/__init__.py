@@ -1,1 +1,1 @@
-"""What a scene is: meshes, cameras, lights, materials, shapes and motion, as frozen NumPy data that was checked."""
+"""Scenes as frozen, checked NumPy data: meshes, cameras, lights, materials, shapes and motion."""

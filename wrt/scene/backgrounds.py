@@ -11,17 +11,14 @@ from wrt.scene.values import BLACK, LUMINANCE, WHITE, Color
 
 
 class Background(Kind):
-    """Base class of backgrounds; kernels/shade/backgrounds.py has the device functions under the same kind.
-
-    Arrays in `record` are uploaded to the device.
-    """
+    """Base class of backgrounds. kernels/shade/backgrounds.py has the device functions of each `kind`; arrays in `record` are uploaded."""
 
     what = "background"
     name = ""
 
     @property
     def is_black(self) -> bool:
-        """True if the background has colours and all are black; then it is not sampled."""
+        """True if the background has colours and all of them are black. Renders do not sample a black background."""
         colors = [getattr(self, name) for name, each in forms(type(self)).items() if each.metadata["form"] == "color"]
         return bool(colors) and not np.any(colors)
 
@@ -56,9 +53,9 @@ class EnvironmentBackground(Background):
     Parameters
     ----------
     image
-        (H, W, 3) linear radiance, 0 or more. Row 0 is the upper edge; columns run to the right of a view along -z, towards +x.
+        (H, W, 3) linear radiance, 0 or more. Row 0 is the upper edge. Seen along -z, columns run from left to right, towards +x.
     scale, rotation
-        Factor of the image; angle about +y in radians, counter-clockwise seen from above.
+        Factor on the radiance; rotation about +y in radians, counter-clockwise seen from above.
     """
 
     kind = "environment"
@@ -69,8 +66,8 @@ class EnvironmentBackground(Background):
     name: str = ""
 
     def record(self) -> Record:
-        """Return the image, and the distributions that sample a pixel by its brightness times its solid angle."""
-        # Bilinear lookup spreads a pixel into its neighbours, so that their probability must not be 0. A small share of the mean
+        """Return the image, and cumulative distributions that sample a pixel in proportion to its brightness times its solid angle."""
+        # Bilinear lookup spreads a pixel into its neighbours, whose probability must therefore not be 0. A small share of the mean
         # keeps dark pixels above 0 despite rounding.
         height, width = self.image.shape[:2]
         brightness = self.image.astype(np.float64) @ LUMINANCE

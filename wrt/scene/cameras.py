@@ -19,12 +19,11 @@ from wrt.scene.values import SMALLEST, as_number, as_transform, as_vector
 class CameraKind:
     """Base class of cameras: a pose and a name.
 
-    camera_to_world: (4, 4), rotation and translation; a camera looks along its own -z, +y is up. A subclass adds its parameters as
-    fields that are each `field(metadata=given(...))`.
-    """
+    camera_to_world: (4, 4) rotation and translation; a camera looks along its own -z, +y is up. A subclass adds its parameters as
+    fields, each with `field(metadata=given(...))`."""
 
     kind: ClassVar[str]  # name in scene files
-    device: ClassVar[str]  # module of its device functions, as wrt.kernels.shade.cameras describes
+    device: ClassVar[str]  # module of the device functions, which wrt.kernels.shade.cameras describes
 
     camera_to_world: np.ndarray = field(default_factory=lambda: np.eye(4))
     name: str = field(default="", kw_only=True)
@@ -36,7 +35,7 @@ class CameraKind:
         z = matrix[:3, 2]
         x = np.cross(matrix[:3, 1], z)
         if not np.linalg.norm(x) > 0.0:
-            raise wrong(at + "camera_to_world", "is singular")
+            raise wrong(at + "camera_to_world", "must be invertible")
         z = z / np.linalg.norm(z)
         x = x / np.linalg.norm(x)
         matrix[:3, 0], matrix[:3, 1], matrix[:3, 2] = x, np.cross(z, x), z
@@ -71,26 +70,26 @@ class CameraKind:
         origin, aim, upward = (np.array(as_vector(v, n)) for v, n in ((position, "position"), (target, "target"), (up, "up")))
         z = origin - aim
         if not np.linalg.norm(z) > 0.0:
-            raise InputError("is the same point as position", argument="target", place="camera")
+            raise InputError("must differ from position, but is the same point", argument="target", place="camera")
         z /= np.linalg.norm(z)
         x = np.cross(upward, z)
         if np.linalg.norm(x) < 1e-9 * max(float(np.linalg.norm(upward)), 1e-300):
-            raise InputError("is parallel to the direction of view", argument="up", place="camera")
+            raise InputError("must not be zero or parallel to the viewing direction", argument="up", place="camera")
         x /= np.linalg.norm(x)
         matrix = np.eye(4)
         matrix[:3, 0], matrix[:3, 1], matrix[:3, 2], matrix[:3, 3] = x, np.cross(z, x), z, origin
         return cls(camera_to_world=matrix, **fields)
 
     def record(self, size: tuple[int, int]) -> Record:
-        """Return the fields of the device struct beside the pose, for a picture of `size` pixels."""
+        """Return the fields of the camera's device struct, except the pose. size: width and height of the picture in pixels."""
         return {}
 
     def switches(self) -> dict[str, bool]:
-        """Return the Features of the kernels that this camera decides: `lens` if rays need a sample of a lens."""
+        """Return the kernel features that this camera sets, by name, such as `lens`: rays start at sampled points of a lens."""
         return {}
 
     def opened(self) -> Self:
-        """Return this camera with every switch on, so that a viewer can set all parameters without new kernels."""
+        """Return a copy that has a lens if the kind can have one: a viewer then opens and closes the aperture without compiling."""
         return self
 
 
@@ -118,7 +117,7 @@ class Camera(CameraKind):
     fov_y: float = field(default=math.pi / 4.0, metadata=given("angle", "full vertical angle of view", ge=0.0005, le=179.94))
     aperture_radius: float = field(default=0.0, metadata=given("number", "0: a pinhole", "length", ge=0.0))
     focus_distance: float = field(default=1.0, metadata=given(
-        "number", "along the axis to the plane in focus (default: the target's distance, if there is one)", "length", ge=SMALLEST))
+        "number", "distance along the axis to the plane in focus (default: the target's distance, else 1)", "length", ge=SMALLEST))
     blades: int = field(default=0, metadata=given("whole", "sides of the aperture, 3 or more; 0: round", ge=0, le=64))
     blade_rotation: float = field(default=0.0, metadata=given("angle", "rotation of the aperture"))
 
@@ -146,15 +145,14 @@ class Camera(CameraKind):
 
         The sensor is at the image distance s' = f s / (s - f), so that focusing near narrows the view, as in a real camera. The
         aperture's radius is f / (2 f_number). Raises InputError unless focus_distance exceeds focal_length and exactly one of
-        f_number and aperture_radius is given.
-        """
+        f_number and aperture_radius is given."""
         f = as_number(focal_length, "focal_length", low=SMALLEST)
         s = as_number(focus_distance, "focus_distance", low=SMALLEST)
         h = as_number(sensor_height, "sensor_height", low=SMALLEST)
         if s <= f:
             raise InputError(f"must be longer than focal_length ({f:g}), got {s:g}", argument="focus_distance")
         if (f_number is None) == (aperture_radius is None):
-            raise InputError("or aperture_radius must be given, and not both", argument="f_number")
+            raise InputError("give exactly one of f_number and aperture_radius", argument="f_number")
         radius = aperture_radius if f_number is None else f / (2.0 * as_number(f_number, "f_number", low=1e-3))
         image_distance = f * s / (s - f)
         return {"fov_y": 2.0 * math.atan(0.5 * h / image_distance), "focus_distance": s,
@@ -165,8 +163,7 @@ class Camera(CameraKind):
 class OrthographicCamera(CameraKind):
     """Parallel rays that start at the plane through the camera.
 
-    height: extent of the view from the lower to the upper edge of the picture, in scene units; the width follows from the aspect ratio.
-    """
+    height: extent of the view from the lower to the upper edge of the picture, in scene units; the width follows from the aspect ratio."""
 
     kind = "orthographic"
     device = "wrt.kernels.shade.cameras.orthographic"
@@ -182,8 +179,7 @@ class OrthographicCamera(CameraKind):
 class FisheyeCamera(CameraKind):
     """An equidistant fisheye; black beyond the image circle, whose diameter is the shorter side of the picture.
 
-    The angle to the axis is proportional to the distance from the centre. fov: full angle across the circle in radians.
-    """
+    The angle to the axis is proportional to the distance from the centre. fov: full angle across the circle in radians."""
 
     kind = "fisheye"
     device = "wrt.kernels.shade.cameras.fisheye"
@@ -200,8 +196,7 @@ class FisheyeCamera(CameraKind):
 class PanoramaCamera(CameraKind):
     """All directions around a point, equirectangular, with the camera's axis in the middle.
 
-    A picture of aspect ratio 2:1 can serve as the image of an EnvironmentBackground.
-    """
+    A picture of aspect ratio 2:1 can serve as the image of an EnvironmentBackground."""
 
     kind = "panorama"
     device = "wrt.kernels.shade.cameras.panorama"

@@ -1,4 +1,4 @@
-"""Clean a mesh for tracing: faces without area and unused vertices go."""
+"""Clean a mesh for tracing: remove faces without area and vertices without a face."""
 
 from __future__ import annotations
 
@@ -29,16 +29,11 @@ def clean(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None = 
     """Flip collinear faces (`flip_collinear`), drop faces whose area is exactly zero, then drop unused vertices.
 
     vertices: (V, 3), converted to float32; faces: (F, 3) integers; normals (V, 3), uvs (V, 2) and face_group (F,) or None.
-    The order of the rest is kept. Faces with a NaN or infinite corner stay for `Mesh` to report. Raises InputError that names the
-    first face with an index outside [0, V).
-    """
+    Remaining faces and vertices keep their order. Faces with a NaN or infinite corner stay, and `Mesh` refuses them. Raises InputError
+    that names the first face with an index outside [0, V)."""
     vertices = np.asarray(vertices, dtype=np.float32).reshape(-1, 3)
     faces = np.asarray(faces).reshape(-1, 3)
-    if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
-        face = int(np.argmax(((faces < 0) | (faces >= len(vertices))).any(axis=1)))
-        corners = faces[face].tolist()
-        raise InputError(f"face {face} is {corners}, but there are {len(vertices)} vertices", argument="faces")
-
+    require_indices(faces, len(vertices))
     faces, source, without = _flipped(vertices, faces)
     dropped = int(np.count_nonzero(without))
     if dropped:
@@ -56,11 +51,15 @@ def clean(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None = 
     return Cleaned(vertices, faces.astype(np.int32, copy=False), normals, uvs, face_group, dropped)
 
 
-def has_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return (F,) bool, exact: True if the corners of a face are not collinear, or one is not finite.
+def require_indices(faces: np.ndarray, count: int, place: str | None = None) -> None:
+    """Raise InputError, which names the first wrong face, unless faces (F, 3) hold indices of `count` vertices."""
+    if len(faces) and (faces.min() < 0 or faces.max() >= count):
+        face = int(np.argmax(((faces < 0) | (faces >= count)).any(axis=1)))
+        raise InputError(f"face {face} is {faces[face].tolist()}, but there are {count} vertices", argument="faces", place=place)
 
-    vertices: (V, 3) float32; faces: (F, 3).
-    """
+
+def has_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return (F,) bool, exact: True if the corners of a face (vertices (V, 3) float32) are not collinear, or not all finite."""
     out = np.ones(len(faces), dtype=bool)
     for first in range(0, len(faces), AT_ONCE):
         part = faces[first:first + AT_ONCE]
@@ -71,8 +70,7 @@ def has_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def corners_have_area(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
     """Return `has_area` of triangles with corners p, q, r, (N, 3) float32 each; fastest if 24 N float64 fit in the cache.
 
-    The cross product of two edges is computed in float64, and again in integers if no component exceeds its rounding error.
-    """
+    The cross product of two edges is computed in float64, and again in integers if no component exceeds its rounding error."""
     a, b, c = (np.array(corner.T, np.float64, order="C") for corner in (p, q, r))
     out = np.ones(len(p), dtype=bool)
     unknown: np.ndarray | slice = slice(None)
@@ -104,19 +102,18 @@ def _has_area_exactly(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray
 def flip_collinear(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Replace faces with collinear corners by flips of their longest edge; the surface stays the same.
 
-    A collinear face (a, b, c), b between a and c, has no area, but it splits the edge from a to c in two. Without it, the neighbour
-    (a, c, d) and the faces beyond b would share no edge, and rays could pass between them by rounding. The flip turns the pair into
-    (a, b, d) and (b, c, d): as many faces, and the same area.
+    A collinear face (a, b, c), b between a and c, has no area, but it splits the edge from a to c in two. Without this face, its
+    neighbour (a, c, d) and the faces beyond b would share no edge, and rays could pass between them by rounding. The flip replaces the
+    face and its neighbour by (a, b, d) and (b, c, d): as many faces, and the same area.
 
-    vertices: (V, 3) float32; faces: (F, 3). Returns faces (F, 3) of the same dtype, and source (F,): the index of the face that each is
-    now a part of, with its material and group. Faces with two equal corners stay, and faces whose longest edge does not have exactly
-    one other face.
-    """
+    vertices: (V, 3) float32; faces: (F, 3). Returns faces (F, 3) of the same dtype, and source (F,). A returned face lies in the input
+    face with the index `source`, and takes its material and group. Faces with two equal corners stay as they are, and so do faces whose
+    longest edge does not belong to exactly two faces."""
     return _flipped(vertices, faces)[:2]
 
 
 def _flipped(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return faces and source of `flip_collinear`, and (F,) bool: the face still has no area."""
+    """Return faces and source of `flip_collinear`, and (F,) bool: True for faces that still have no area."""
     faces, source = faces.copy(), np.arange(len(faces))
     suspects, without = source.copy(), ~has_area(vertices, faces)
     for _ in range(ROUNDS):
@@ -130,7 +127,7 @@ def _flipped(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nd
         other = place[neighbour]
         ready = (neighbour >= 0) & ((other < 0) | (np.sort(ends) == np.sort(ends[other])).all(axis=1))
         flat, ends, middle, neighbour = (x[ready] for x in (flat, ends, middle, neighbour))
-        # A face takes part in one flip a round: the one of the lowest flat face.
+        # A face takes part in one flip a round: that of the flat face with the lowest index.
         first = np.full(len(faces), len(faces))
         for side in (flat, neighbour):
             np.minimum.at(first, side, flat)
@@ -149,7 +146,7 @@ def _flipped(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _longest_edges(vertices: np.ndarray, faces: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the flat faces with three distinct corners, the ends (N, 2) of their longest edge, and their third corner (N,)."""
+    """Return the flat faces (N,) with three distinct corners, the ends (N, 2) of their longest edges, and their third corners (N,)."""
     corners = vertices[faces[flat]].astype(np.float64)
     edges = np.stack([corners[:, (i + 2) % 3] - corners[:, (i + 1) % 3] for i in range(3)], axis=1)  # edge opposite corner i
     apart = (edges != 0.0).any(axis=2).all(axis=1)
@@ -160,7 +157,7 @@ def _longest_edges(vertices: np.ndarray, faces: np.ndarray, flat: np.ndarray) ->
 
 
 def _across(faces: np.ndarray, flat: np.ndarray, ends: np.ndarray, n_vertices: int) -> np.ndarray:
-    """Return (N,) the other face of each edge `ends`, or -1 unless there is exactly one."""
+    """Return the face (N,) on the other side of the edge `ends` (N, 2) of each face in `flat` (N,); -1 unless there is exactly one."""
 
     def key(p: np.ndarray, q: np.ndarray) -> np.ndarray:
         return np.minimum(p, q).astype(np.int64) * n_vertices + np.maximum(p, q)

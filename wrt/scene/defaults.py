@@ -1,4 +1,4 @@
-"""Default camera and lights, so that any file of shapes makes a picture."""
+"""Default camera and lights, so that a file that holds only shapes can be rendered."""
 
 from __future__ import annotations
 
@@ -18,19 +18,18 @@ from wrt.scene.values import BLACK, LUMINANCE, SMALLEST
 
 FOV_Y = math.radians(40.0)
 _THREE_QUARTER = np.array([0.62, 0.42, 1.0])  # direction from the scene to the camera; the front of glTF is +z, up is +y
-_MARGIN = 1.05  # factor of the bounding sphere's radius
+_MARGIN = 1.05  # radius of the sphere in view, in radii of the scene's bounding sphere
 
-# Key light and sky together give a white surface that faces both a radiance near 1.
+# A white surface that faces the key light and the sky has a radiance near 1.
 _KEY_IRRADIANCE = 1.7
-DARK = 0.01  # radiance that counts as unlit: 25 of 255 on a display
+DARK = 0.01  # a lower radiance counts as unlit; a display shows it as code 25 of 255
 _SKY = GradientBackground(bottom=(0.22, 0.21, 0.20), top=(0.50, 0.60, 0.75))
 
 
 def bounding_sphere(scene: Scene) -> tuple[np.ndarray, float]:
     """Return the centre (3,) of the scene's box, and the radius of the smallest sphere around it that holds all shapes.
 
-    Raises InputError if the scene has no shapes.
-    """
+    Raises InputError if the scene has no shapes."""
     low, high = scene.bounds()
     center = 0.5 * low + 0.5 * high
     radius = max((math.dist(sphere.center, center) + sphere.radius for sphere in scene.spheres), default=0.0)
@@ -44,8 +43,7 @@ def frame_camera(scene: Scene, aspect: float = 16.0 / 9.0) -> Camera:
     """Return a pinhole camera in three-quarter view that sees the whole bounding sphere of the scene.
 
     aspect: width / height of the picture. The vertical angle of view is 40 degrees; the narrower of the two angles determines the
-    distance. Raises InputError if the scene has no shapes.
-    """
+    distance. Raises InputError if the scene has no shapes."""
     center, radius = bounding_sphere(scene)
     half_angle = math.atan(math.tan(0.5 * FOV_Y) * min(aspect, 1.0))
     radius = max(radius, 1e-9 * float(np.abs(center).max()), SMALLEST)  # a single point has none
@@ -55,7 +53,9 @@ def frame_camera(scene: Scene, aspect: float = 16.0 / 9.0) -> Camera:
 
 
 def is_lit(scene: Scene) -> bool:
-    """Return True for a light, a background, ambient, or emission that gives a white sphere around the scene a radiance >= DARK."""
+    """Return True if the scene has a light, a background, an ambient term or enough emission.
+
+    Emission is enough if it would give a white sphere around the scene a radiance of DARK or more."""
     if scene.lights or scene.background != ConstantBackground(BLACK) or scene.ambient != BLACK:
         return True
     power = _emitted_power(scene)
@@ -63,7 +63,7 @@ def is_lit(scene: Scene) -> bool:
 
 
 def _emitted_power(scene: Scene) -> float:
-    """Return luminance times area, summed over all emissive surfaces that light others."""
+    """Return emitted luminance times area, summed over the surfaces whose emission lights others."""
 
     def radiance(material: Material) -> float:
         return float(LUMINANCE @ material.emission) * (1 + material.two_sided) * material.lights_others
@@ -79,7 +79,7 @@ def _emitted_power(scene: Scene) -> float:
 
 
 def emission_named(scene: Scene) -> str:
-    """Name the materials that light others, for a message; "" if there are none."""
+    """Return "the emission of ..." with the names of the materials whose emission lights others; "" if there are none."""
     names = [material.name for material in scene.materials if material.lights_others]
     return f"the emission of {listed(names)}" if names else ""
 
@@ -87,14 +87,13 @@ def emission_named(scene: Scene) -> str:
 def stage(scene: Scene) -> tuple[Scene, list[str]]:
     """Return the scene with a camera and lights, and a sentence on each addition.
 
-    A missing camera is one that frames the scene. If `is_lit` is False, a key light from above the first camera's right shoulder and a
-    pale sky are added. Raises InputError for a scene without a camera and without shapes, and for one too small to be rendered.
-    """
+    A scene without a camera gets one that frames it. A scene that is not lit (`is_lit`) gets a key light from above the first camera's
+    right shoulder and a pale sky. Raises InputError for a scene without cameras and shapes, and for a scene that is too small."""
     require_size(scene)
     added = []
     if not scene.cameras:
         scene = replace(scene, cameras=(frame_camera(scene),))
-        added.append("it has no camera: one that frames the scene was added")
+        added.append("it has no camera: a camera that frames the scene was added")
     if not is_lit(scene):
         right, up, back = scene.cameras[0].camera_to_world[:3, :3].T
         direction = -(back + 0.6 * up + 0.4 * right)

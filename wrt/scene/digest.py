@@ -1,4 +1,4 @@
-"""Digests of scenes and cameras: equal for equal pictures, whatever the names of files and parts."""
+"""SHA-256 digests of scenes and cameras: equal digests mean equal pictures. Names of files and parts do not enter a digest."""
 
 from __future__ import annotations
 
@@ -11,22 +11,14 @@ from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene
 from wrt.scene.pack import pack
 
-# Fields that change no pixel.
-NO_PIXEL: dict[type, tuple[str, ...]] = {
+# Fields that do not enter the digest: they change no pixel, or are a scene's cameras and settings. object: fields of every class.
+LEFT_OUT: dict[type, tuple[str, ...]] = {
     object: ("name",), Scene: ("cameras", "settings"), Mesh: ("groups", "face_group", "dropped"), Object: ("motion",)}
 
 
-def scene_digest(scene: Scene) -> str:
-    """Return the SHA-256 of all that can change a pixel, except cameras and settings."""
-    return _digest(scene)
-
-
-def camera_digest(camera: CameraKind) -> str:
-    return _digest(camera)
-
-
-def _digest(thing: Scene | CameraKind) -> str:
-    text, arrays = pack(thing, NO_PIXEL)
+def digest(thing: Scene | CameraKind) -> str:
+    """Return the SHA-256, in hexadecimal, of all fields of a scene or a camera but LEFT_OUT."""
+    text, arrays = pack(thing, LEFT_OUT)
     out = sha256(text.encode())
     for array in arrays:
         out.update(f"{array.shape}{array.dtype.str}".encode() + np.ascontiguousarray(array).tobytes())

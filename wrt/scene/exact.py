@@ -1,8 +1,8 @@
 """Exact crossings of lines with triangles and spheres.
 
-Inputs are float32 values in float64: integers times powers of two. A sign is computed in float64 and accepted if it exceeds a bound on
-its error (a static filter: Shewchuk 1997, "Adaptive Precision Floating-Point Arithmetic and Fast Robust Geometric Predicates"). The few
-others are recomputed in Python's integers, without rounding. A product of three float32 neither over- nor underflows in float64.
+Inputs are float32 values in float64: integers times powers of two. The sign of a float64 result is accepted if the result exceeds a
+bound on its error. This is a static filter (Shewchuk 1997, "Adaptive Precision Floating-Point Arithmetic and Fast Robust Geometric
+Predicates"). Other signs, a few, are recomputed in Python's integers. A product of three float32 neither over- nor underflows in float64.
 
 Let `a, b, c = v0 - o, v1 - o, v2 - o` and `N = (v1 - v0) x (v2 - v0)`. The line `o + t d` meets the plane at `t = a.N / d.N`, and the
 barycentric of v0 is `w0 = d.(b x c) / d.N`. The scalar triple products add up to `d.N`.
@@ -20,15 +20,14 @@ import numpy as np
 UNIT = 2.0**-53  # unit roundoff of float64
 ACCURATE = 1e-14  # larger errors, relative in t and absolute in u and v, are recomputed in integers
 
-# A triple product of differences has 8 roundings in sequence, and so has the sum of magnitudes that it is compared with.
+# Error bound of a triple product of differences, relative to the sum of its terms' magnitudes; either has 8 roundings in sequence.
 TRIPLE = 10.0 * UNIT
 
 
 class Place(IntEnum):
     """Location of the intersection of a line with the plane of a triangle; INSIDE, EDGE and VERTEX are hits.
 
-    COPLANAR: the line lies in the plane; a parallel line is OUTSIDE. DEGENERATE: the triangle has no area.
-    """
+    COPLANAR: the line lies in the plane; a line parallel to the plane is OUTSIDE. DEGENERATE: the triangle has no area."""
 
     OUTSIDE = 0
     INSIDE = 1
@@ -40,11 +39,9 @@ class Place(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Crossings:
-    """Results for N pairs of line and primitive, (N,) each.
+    """Intersections of N lines with the planes of N triangles, (N,) each.
 
-    place: int8, of Place; t, u, v: float64, inf or NaN if the line is parallel or misses the sphere. `t_error`: bound on
-    |t - exact t|; `slope`: d.N, float64 (1 for spheres).
-    """
+    place: int8, of Place; t, u, v: float64, inf or NaN for a line parallel to the plane; t_error: bound on |t - exact t|; slope: d.N."""
 
     place: np.ndarray
     t: np.ndarray
@@ -59,7 +56,7 @@ class Crossings:
 
 
 def _triple(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a . (b x c) of (3, N) arrays whose entries have at most one rounding, and a bound on its error."""
+    """Return a . (b x c) of (3, N) arrays whose entries have at most one rounding, and a bound on the error of the result."""
     value = np.zeros(a.shape[1])
     size = np.zeros(a.shape[1])
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
@@ -74,7 +71,7 @@ def _triple_exact(a: list[Any], b: list[Any], c: list[Any]) -> Any:
 
 
 def whole_numbers(*arrays: np.ndarray) -> tuple[list[list[Any]], int]:
-    """Return the rows of (3, N) float32 values as object arrays of Python ints, and one k for all: value = int * 2^k."""
+    """Return the rows of (3, N) float32 values as object arrays of Python ints, and the exponent k of all: value = int * 2^k."""
     parts = [np.frexp(array) for array in arrays]
     used = [exponent[mantissa != 0.0] for mantissa, exponent in parts]
     k = min((int(e.min()) for e in used if e.size), default=0) - 24
@@ -104,7 +101,7 @@ def _sign(x: Any) -> np.ndarray:
 
 
 def _resolve(rows: np.ndarray, o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, ...], out: Crossings) -> None:
-    """Overwrite entries of `out` with results in integer arithmetic; t, u, v are then correctly rounded."""
+    """Overwrite the entries `rows` of `out` with results of integer arithmetic, whose t, u and v are correctly rounded."""
     weights, (numerator, slope, slope_power), normal, power = exact_plane(o[:, rows], d[:, rows], tuple(corner[:, rows] for corner in v))
     w_sign = np.stack([_sign(w) for w in weights])
     slope_sign = _sign(slope)
@@ -128,9 +125,9 @@ def _resolve(rows: np.ndarray, o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray
 def triangle_crossings(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, np.ndarray, np.ndarray], *, all_rows: bool = False) -> Crossings:
     """Intersect line i with triangle i. o, d and the corners in v: (3, N) float64 that hold finite float32 values.
 
-    `place` is exact. For hits the relative error of t is at most ACCURATE (bound: t_error). The error of u and v is at most ACCURATE, too.
-    With `all_rows`, misses have the same accuracy, and COPLANAR and DEGENERATE; otherwise both are OUTSIDE.
-    """
+    `place` is exact. For hits the relative error of t (bound: t_error) and the errors of u and v are at most ACCURATE.
+
+    all_rows: compute misses as accurately as hits, and distinguish COPLANAR and DEGENERATE from OUTSIDE."""
     a, b, c = (corner - o for corner in v)
     weights = np.empty((3, o.shape[1]))
     bounds = np.empty_like(weights)
@@ -166,7 +163,9 @@ def triangle_crossings(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, np.nda
 
 @dataclass(frozen=True, eq=False)
 class SphereCrossings:
-    """Entry t[0] and exit t[1] of N lines, float64 (2, N), NaN on a miss, equal if the line touches; t_error: bounds on both."""
+    """Intersections of N lines with spheres: entry t[0] and exit t[1], float64 (2, N), and bounds on their errors.
+
+    t is NaN on a miss. A line that touches its sphere has equal t[0] and t[1]."""
 
     hit: np.ndarray
     touching: np.ndarray
@@ -177,8 +176,7 @@ class SphereCrossings:
 def sphere_crossings(o: np.ndarray, d: np.ndarray, center: np.ndarray, radius: np.ndarray) -> SphereCrossings:
     """Intersect line i with sphere i. o, d, center: (3, N), radius: (N,) > 0, float64 that hold float32 values.
 
-    The sign of the discriminant is exact: a line that touches the sphere hits it. The relative error of t is at most ACCURATE.
-    """
+    The sign of the discriminant is exact: a line that touches the sphere hits it. The relative error of t is at most ACCURATE."""
     f = o - center
     a, b, ff, rr = (d * d).sum(axis=0), (d * f).sum(axis=0), (f * f).sum(axis=0), radius * radius
     cross = np.stack([d[j] * f[k] - d[k] * f[j] for j, k in ((1, 2), (2, 0), (0, 1))])
@@ -208,7 +206,7 @@ def sphere_crossings(o: np.ndarray, d: np.ndarray, center: np.ndarray, radius: n
 
 
 def _sphere_exact(o: np.ndarray, d: np.ndarray, center: np.ndarray, radius: float) -> tuple[int, np.ndarray]:
-    """Return the sign of the discriminant, and both roots in float64."""
+    """Return the exact sign of the discriminant of one line and sphere, and both roots in float64."""
     columns = [np.array(x, dtype=np.float64).reshape(-1, 1) for x in (o, center, [radius, 0.0, 0.0])]
     (origin, middle, extent), k = whole_numbers(*columns)
     (direction,), k_d = whole_numbers(d.reshape(3, 1))

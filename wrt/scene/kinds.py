@@ -1,4 +1,4 @@
-"""Fields that describe themselves, for scenes in Python, for scene files and for their reference; the base of lights and backgrounds."""
+"""Dataclass fields with a description, which scenes in Python, scene files and their reference page share; base of lights, backgrounds."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from wrt.core.errors import wrong
 from wrt.scene.values import Color, _unit, as_number, as_vector
 
 K = TypeVar("K", bound="Kind")
-Limits = dict[str, Any]  # of a field, by the names that `given` takes
+Limits = dict[str, Any]  # limits of a field: the keywords of `given`
 Record = dict[str, Any]  # values by the field names of a device struct: scalars, tuples, arrays
 
 
@@ -33,7 +33,7 @@ def _image(value: Any, what: str, limits: Limits) -> np.ndarray:
     return image
 
 
-# The forms of a field, and the function that checks and converts a value of each.
+# Forms of a field. The function of a form checks and converts a value, from the value, its name in messages and the limits.
 FORMS: dict[str, Callable[[Any, str, Limits], Any]] = {
     "point": lambda value, what, limits: as_vector(value, what),  # in world space; a transform moves it
     "direction": lambda value, what, limits: _unit(as_vector(value, what), what),  # of any length, stored at 1; a transform turns it
@@ -50,21 +50,20 @@ FORMS: dict[str, Callable[[Any, str, Limits], Any]] = {
 
 
 def given(form: str, about: str, unit: str = "", **limits: Any) -> dict[str, Any]:
-    """Return a field's `metadata`.
+    """Return the `metadata` that describes a dataclass field.
 
-    - form: a key of FORMS; about: entry in the reference of scene files; unit: unless the form implies it.
-    - limits: ge, gt, le, lt of numbers, angles and colours, or the allowed values (among).
-    """
+    - form: a key of FORMS; about: text in the reference of scene files; unit: "" if the form implies it, or without a unit.
+    - limits: ge, gt, le, lt of numbers, angles (in degrees) and colours, or the allowed values (among)."""
     return {"form": form, "about": about, "unit": unit, "limits": limits}
 
 
 def forms(kind: type[object]) -> dict[str, Field[Any]]:
-    """Return the fields that `given` describes, by name."""
+    """Return the fields of a dataclass that `given` describes, by name."""
     return {each.name: each for each in fields(kind) if "form" in each.metadata}  # type: ignore[arg-type]
 
 
 def check_fields(thing: object, at: str) -> None:
-    """Convert each described field to its form; a default of None stays. Raises InputError, which begins with `at`."""
+    """Convert each described field of a dataclass instance to its form; a default of None stays. Messages of InputError begin with `at`."""
     for name, each in forms(type(thing)).items():
         value = getattr(thing, name)
         if value is not None or each.default is not None:
@@ -72,10 +71,9 @@ def check_fields(thing: object, at: str) -> None:
 
 
 class Kind:
-    """Base of frozen dataclasses whose fields are each `field(metadata=given(...))`, and `name: str = ""`.
+    """Base of frozen dataclasses whose fields are described by `field(metadata=given(...))`, except `name: str = ""`.
 
-    kind: its name in scene files, in the table of kinds and in the table of device functions; what: its name in messages.
-    """
+    kind: name of the class in scene files, in the table of kinds and in the table of device functions; what: name in messages."""
 
     kind: ClassVar[str]
     what: ClassVar[str]
@@ -85,11 +83,11 @@ class Kind:
         check_fields(self, at_thing(self.what, self.name))
 
     def record(self) -> Record:
-        """Return the values that the device function reads, by their names in the struct of kernels/structs.py."""
+        """Return the values that the device function reads, by the names of the fields in the struct of kernels/structs.py."""
         raise NotImplementedError
 
     def moved(self: K, matrix: np.ndarray) -> K:
-        """Return a copy under a (4, 4) transform: points move, directions turn, intensities stay, as in glTF."""
+        """Return a copy with points and directions transformed by a (4, 4) matrix. Intensities stay the same, as in glTF."""
         changes: dict[str, Any] = {}
         for name, each in forms(type(self)).items():
             if each.metadata["form"] == "point":
@@ -99,5 +97,5 @@ class Kind:
         return replace(self, **changes)  # type: ignore[type-var]
 
     def places(self) -> list[Color]:
-        """Return its points in world space; empty if it is infinitely far away."""
+        """Return the points of a light in world space; [] for a light at infinity."""
         return [getattr(self, name) for name, each in forms(type(self)).items() if each.metadata["form"] == "point"]

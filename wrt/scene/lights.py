@@ -14,7 +14,7 @@ from wrt.scene.values import Color, as_number
 
 
 class Light(Kind):
-    """Base class of lights; kernels/shade/lights.py has the device functions under the same kind."""
+    """Base class of lights. kernels/shade/lights.py has the device functions of each `kind`."""
 
     what = "light"
 
@@ -25,7 +25,7 @@ class PointLight(Light):
 
     kind = "point"
     position: Color = field(metadata=given("point", "position"))
-    intensity: Color = field(metadata=given("color", "equal in all directions; irradiance = intensity / distance^2", "radiant intensity"))
+    intensity: Color = field(metadata=given("color", "in every direction; irradiance = intensity / distance^2", "radiant intensity"))
     name: str = ""
 
     def record(self) -> Record:
@@ -49,9 +49,8 @@ class DirectionalLight(Light):
 class SpotLight(Light):
     """A point light limited to a cone.
 
-    Within the half angle `inner` of the axis `intensity` is full, beyond `outer` it is 0. Between them it is scaled by the square of a
-    linear ramp in the cosine, as KHR_lights_punctual recommends. Angles are in radians.
-    """
+    The light has its full intensity up to the angle `inner` from the axis, and none beyond `outer`. Between these half angles (radians)
+    a factor falls from 1 to 0: the square of a linear ramp in the cosine, as KHR_lights_punctual recommends."""
 
     kind = "spot"
     position: Color = field(metadata=given("point", "position"))
@@ -67,7 +66,7 @@ class SpotLight(Light):
         as_number(self.outer, at + "outer", low=1e-4)
         if self.inner > self.outer:
             inner, outer = math.degrees(self.inner), math.degrees(self.outer)
-            raise wrong(at + "inner", f"must not be larger than outer ({outer:.6g} degrees), got {inner:.6g}")
+            raise wrong(at + "inner", f"must be at most outer ({outer:.6g} degrees), got {inner:.6g} degrees")
 
     def record(self) -> Record:
         return {"position": self.position, "color": self.intensity, "direction": self.direction,

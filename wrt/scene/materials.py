@@ -26,9 +26,9 @@ class Texture:
     image
         (H, W, 4) uint8, row 0 on top.
     srgb
-        RGB is sRGB-encoded; alpha never is.
+        True if RGB is sRGB-encoded. Alpha is always linear.
     wrap
-        Lookup beyond the image in u and in v: "repeat", "clamp" or "mirror".
+        Lookup outside the image, in u and in v: "repeat", "clamp" or "mirror".
     uv_transform
         (2, 3), maps (u, v, 1) of the mesh to the (u, v) of the image.
     """
@@ -54,7 +54,7 @@ class Texture:
 
 @dataclass(frozen=True)
 class Checkerboard:
-    """Squares of two colours in turn, `scale` squares for each unit of u and of v."""
+    """Squares of two alternating colours, `scale` squares for each unit of u and of v."""
 
     color_a: Color = field(default=(0.8, 0.8, 0.8), metadata=given("color", "colour of the square at (u, v) = (0, 0)"))
     color_b: Color = field(default=(0.2, 0.2, 0.2), metadata=given("color", "colour of the adjacent squares"))
@@ -65,12 +65,12 @@ class Checkerboard:
 
 
 class MaterialKind(NamedTuple):
-    """Properties of a kind of material; kernels/shade/materials.py has its device function under the same name.
+    """Properties of a kind of material. kernels/shade/materials.py has the device function of the same name.
 
-    - about: entry in the reference of scene files.
-    - uses: fields that this kind reads and not every kind does. For other kinds they are 0 on the device, and no keys of a scene file.
-    - scatters: `albedo` is diffuse, at least in part; reflects: spawns reflected rays; clear: transmits light without `transmission`.
-    """
+    - about: text in the reference of scene files.
+    - uses: fields that this kind reads and some other kind does not. A kind that does not use a field has 0 in its place on the device,
+      and refuses the field in a scene file.
+    - scatters: `albedo` is diffuse, at least in part; reflects: spawns reflected rays; clear: transmits light without `transmission`."""
 
     about: str
     uses: tuple[str, ...] = ()
@@ -110,25 +110,25 @@ class Material:
         - "mirror": reflectance `albedo` at every angle.
         - "conductor": exact Fresnel reflection with the index of refraction `eta` + i `k` (presets in CONDUCTORS); `roughness`.
         - "glass": dielectric of index `ior` that reflects and refracts; `albedo` tints transmission; `absorption`, `thin`, `roughness`.
-        - "metallic_roughness": glTF 2.0's, from `albedo` (base colour), `metallic`, `roughness`, `ior`, `transmission`.
+        - "metallic_roughness": as in glTF 2.0, from `albedo` (base colour), `metallic`, `roughness`, `ior`, `transmission`.
     albedo
-        Reflectance, or for glass the transmittance of each surface.
+        Reflectance; for glass the transmittance of each surface.
     absorption
-        Per scene unit inside (Beer-Lambert): exp(-absorption d) is left after a distance d.
+        Coefficient per scene unit inside glass (Beer-Lambert): the share exp(-absorption d) of the light is left after a distance d.
     thin
-        An infinitely thin pane: no bending, and the reflections of both faces are summed.
+        True for an infinitely thin pane: light is not bent, and the reflections of both faces are summed.
     roughness
         Perceptual roughness of glTF in [0, 1]; the GGX alpha is its square. 0 is a perfect mirror.
     emission, two_sided
-        Emitted radiance, linear, of the front side (counter-clockwise), or of both sides.
+        Emitted radiance, linear; True if both sides emit, and not only the front (corners counter-clockwise).
     emits_light
-        The emission lights other surfaces, unless a texture or alpha limits it (`lights_others`). False: it is only seen.
+        True: the emission lights other surfaces, unless the material has an emission texture or alpha. False: it is only visible.
     alpha, alpha_mode, alpha_cutoff
-        Opacity. "opaque" ignores it; "mask" ignores hits with alpha < alpha_cutoff; "blend" lets 1 - alpha of a ray pass.
+        Opacity. "opaque" ignores it; "mask" ignores hits with alpha < alpha_cutoff; "blend" lets the share 1 - alpha of the light pass.
     albedo_texture, emission_texture, normal_texture
-        Factor of albedo (its alpha of `alpha`); factor of emission; tangent-space normal map, scaled by `normal_scale`.
+        Factor on `albedo`, with a factor on `alpha` in its alpha; factor on `emission`; tangent-space normal map, scaled by `normal_scale`.
     metallic_roughness_texture, transmission_texture
-        Factors: green of roughness and blue of metallic; red of transmission.
+        Factors on `roughness` (green) and `metallic` (blue); factor on `transmission` (red).
 
     Raises
     ------
@@ -143,18 +143,18 @@ class Material:
     specular: Color = field(default=BLACK, metadata=given("color", "colour of the highlight (diffuse)", le=1.0))
     exponent: float = field(default=50.0, metadata=given("number", "exponent of the highlight (diffuse)", ge=0.0, le=1e6))
     eta: Color = field(default=CONDUCTORS["silver"][0], metadata=given("color", "real part of the index of refraction (conductor)", le=1e3))
-    k: Color = field(default=CONDUCTORS["silver"][1], metadata=given("color", "imaginary part (conductor)", le=1e3))
+    k: Color = field(default=CONDUCTORS["silver"][1], metadata=given("color", "imaginary part of that index (conductor)", le=1e3))
     ior: float = field(default=1.5, metadata=given("number", "index of refraction (glass, metallic_roughness)", ge=1.0, le=10.0))
     absorption: Color = field(default=BLACK, metadata=given(
-        "color", "exp(-absorption d) is left after a distance d inside (glass, metallic_roughness)", "1 / length"))
+        "color", "exp(-absorption d) of the light is left after a distance d inside (glass, metallic_roughness)", "1 / length"))
     thin: bool = field(default=False, metadata=given("flag", "an infinitely thin pane, without bending (glass, metallic_roughness)"))
     metallic: float = field(default=0.0, metadata=given("number", "0: dielectric, 1: metal (metallic_roughness)", ge=0.0, le=1.0))
     roughness: float = field(default=0.0, metadata=given(
-        "number", "square root of the GGX alpha; 0: perfect mirror (conductor, glass, metallic_roughness)", ge=0.0, le=1.0))
+        "number", "square root of the GGX alpha; 0: a perfect mirror (conductor, glass, metallic_roughness)", ge=0.0, le=1.0))
     transmission: float = field(default=0.0, metadata=given("number", "transmitted share (metallic_roughness)", ge=0.0, le=1.0))
     emission: Color = field(default=BLACK, metadata=given("color", "emitted by the front side", "radiance"))
     two_sided: bool = field(default=False, metadata=given("flag", "both sides emit"))
-    emits_light: bool = field(default=True, metadata=given("flag", "the emission lights other surfaces; false: it is only seen"))
+    emits_light: bool = field(default=True, metadata=given("flag", "the emission lights other surfaces; false: it is only visible"))
     alpha: float = field(default=1.0, metadata=given("number", "opacity", ge=0.0, le=1.0))
     alpha_mode: str = field(default="opaque", metadata=given("choice", "opaque: alpha is ignored; mask: no surface if alpha <"
                                                              " alpha_cutoff; blend: 1 - alpha of the light passes", among=ALPHA_MODES))
@@ -175,47 +175,46 @@ class Material:
         check_fields(self, at)
 
     def uses(self, field: str) -> bool:
-        """Return True if this kind reads `field` and some other kind does not. `reads` also accepts the fields of every kind."""
+        """Return True if this kind reads `field` and some other kind does not."""
         return field in MATERIALS[self.kind].uses
 
     def reads(self, field: str) -> bool:
-        """Return True if this kind reads `field`."""
+        """Return True if this kind reads `field`, also if every kind does."""
         return self.uses(field) or field not in kinds_that_use()
 
     @property
     def is_clear(self) -> bool:
-        """True if light passes through it, apart from alpha."""
+        """True if the surface transmits light. Alpha does not count."""
         return MATERIALS[self.kind].clear or (self.uses("transmission") and self.transmission > 0.0)
 
     @property
     def is_rough(self) -> bool:
-        """True if its reflection is spread. Below a roughness of 0.01 the spread is below the resolution of float32 directions."""
+        """True if reflections are blurred. Up to a roughness of 0.01 the blur is below the resolution of float32 directions."""
         return self.uses("roughness") and self.roughness > 0.01
 
     @property
     def is_emissive(self) -> bool:
-        """True if it emits, apart from textures."""
+        """True if `emission` is not black. A texture may still be."""
         return max(self.emission) > 0.0
 
     @property
     def lights_others(self) -> bool:
-        """True if its emission is sampled as a light. A texture or alpha rules that out: lights are sampled by power, not by texel."""
-        plain = self.emission_texture is None and self.alpha_mode == "opaque"
-        return self.is_emissive and self.emits_light and plain
+        """True if surfaces of this material are sampled as lights: their power must not vary by an emission texture or alpha."""
+        return self.is_emissive and self.emits_light and self.emission_texture is None and self.alpha_mode == "opaque"
 
     @property
     def textures(self) -> tuple[Texture | Checkerboard, ...]:
-        """Its textures, in no particular order."""
+        """Textures that the material has, in the order of SLOTS."""
         slots = (getattr(self, name) for name in SLOTS)
         return tuple(texture for texture in slots if texture is not None)
 
 
-# The fields that are textures; True for a colour, which may also be a checkerboard.
+# Fields that hold textures. True: the texture is a colour, and a checkerboard is allowed.
 SLOTS = {name: Checkerboard in each.metadata["limits"]["among"] for name, each in forms(Material).items()
          if each.metadata["form"] == "texture"}
 
 
 def kinds_that_use() -> dict[str, tuple[str, ...]]:
-    """Return the kinds that read each field, of the fields that not every kind reads."""
+    """Return the kinds that read a field, by field, for the fields that some kind does not read."""
     used = dict.fromkeys(name for kind in MATERIALS.values() for name in kind.uses)
     return {name: tuple(kind for kind, row in MATERIALS.items() if name in row.uses) for name in used}

@@ -11,6 +11,7 @@ import numpy as np
 from wrt.core.checks import LARGEST, as_array, shown
 from wrt.core.errors import InputError
 from wrt.core.packages import needed_by
+from wrt.scene.clean import require_indices
 
 if TYPE_CHECKING:
     import trimesh
@@ -23,22 +24,22 @@ class Mesh:
     Parameters
     ----------
     vertices
-        (V, 3), stored as float32; finite, at most 1e30.
+        (V, 3), stored as float32; finite, at most 1e30 in absolute value.
     faces
-        (F, 3) integers, stored as int32; counter-clockwise seen from outside.
+        (F, 3) indices of vertices, stored as int32; counter-clockwise seen from outside.
     normals
-        (V, 3) unit vectors for smooth shading, or None for flat. A zero normal is flat at that vertex.
+        (V, 3) unit vectors for smooth shading, or None for flat shading. A zero normal means flat shading at its vertex.
     uvs
         (V, 2) texture coordinates, or None; (0, 0) is the top left of an image.
     groups, face_group
-        Names of parts, and an index into them for each face, (F,), or None.
+        Names of the parts of the mesh; and the index of each face's part (F,), or None.
     dropped
         Number of faces that the loader left out because their area is exactly zero.
 
     Raises
     ------
     InputError
-        If an array has the wrong shape, type or a value out of range; it names the first wrong element.
+        If an array has a wrong shape, a wrong type or a value out of range; the message names the first wrong row.
     """
 
     vertices: np.ndarray
@@ -54,24 +55,21 @@ class Mesh:
         vertices = self._array("vertices", np.float32, 3)
         faces = self._array("faces", np.int32, 3)
         _require_finite(vertices, self.name, "vertices")
+        place = self.name or None
         if self.reach > np.float32(LARGEST):
             row = int(np.argmax(np.abs(vertices).max(axis=1)))
-            raise InputError(f"vertex {row} is {vertices[row].tolist()}; at most {LARGEST:g} can be traced", argument="vertices",
-                             place=self.name or None)
-        if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
-            face = int(np.argmax(((faces < 0) | (faces >= len(vertices))).any(axis=1)))
-            raise InputError(f"face {face} is {faces[face].tolist()}, but there are {len(vertices)} vertices",
-                             argument="faces", place=self.name or None)
+            raise InputError(f"must be at most {LARGEST:g}, but row {row} is {vertices[row].tolist()}", argument="vertices", place=place)
+        require_indices(faces, len(vertices), place)
         for attribute, width in (("normals", 3), ("uvs", 2)):
             if getattr(self, attribute) is not None:
                 array = self._array(attribute, np.float32, width)
                 if len(array) != len(vertices):
-                    raise InputError(f"{len(array)} {attribute} for {len(vertices)} vertices", argument=attribute, place=self.name or None)
+                    raise InputError(f"must have {len(vertices)} rows like the vertices, got {len(array)}", argument=attribute, place=place)
                 _require_finite(array, self.name, attribute)
         if self.face_group is not None:
             group = as_array(self.face_group, np.int32, "face_group")
             if group.shape != (len(faces),):
-                raise InputError(f"must be ({len(faces)},), got {group.shape}", argument="face_group", place=self.name or None)
+                raise InputError(f"must be ({len(faces)},), got {group.shape}", argument="face_group", place=place)
             object.__setattr__(self, "face_group", group)
 
     def _array(self, attribute: str, dtype: type, width: int) -> np.ndarray:
@@ -91,9 +89,8 @@ class Mesh:
     def from_trimesh(cls, mesh: trimesh.Trimesh | trimesh.Scene, smooth: bool = False) -> Mesh:
         """Return the triangles of a trimesh mesh, or of a whole trimesh scene in world space.
 
-        Texture coordinates are kept if there are any, vertex normals if `smooth`. Faces without area stay, and are never hit. Raises
-        InputError for any other object, and as Mesh does.
-        """
+        The result has the texture coordinates of the mesh, if there are any, and its vertex normals if `smooth`. Faces without area
+        stay, but rays never hit them. Raises InputError for any other object, and for arrays that `Mesh` refuses."""
         with needed_by("a mesh of trimesh"):
             import trimesh
 
@@ -139,12 +136,12 @@ def _require_finite(array: np.ndarray, name: str, attribute: str) -> None:
     if not finite.all():
         bad = ~finite.all(axis=1)
         row = int(np.argmax(bad))
-        raise InputError(f"{attribute} {row} is {array[row].tolist()} ({int(bad.sum())} not finite in all)",
+        raise InputError(f"must be finite, but row {row} is {array[row].tolist()} ({int(bad.sum())} such rows)",
                          argument=attribute, place=name or None)
 
 
 def unit_rows(vectors: np.ndarray) -> np.ndarray:
-    """Return (N, 3) vectors at unit length, float32; zero vectors stay."""
+    """Return (N, 3) float32 vectors scaled to unit length; zero vectors stay zero."""
     wide = vectors.astype(np.float64)
     length = np.linalg.norm(wide, axis=1, keepdims=True)
     return np.divide(wide, length, out=np.zeros_like(wide), where=length > 0.0).astype(np.float32)

@@ -26,7 +26,7 @@ from wrt.scene.motion import Motion
 from wrt.scene.settings import DEPTH, GLASS_DEPTH, SETTINGS, SettingChanges, Settings
 from wrt.scene.values import BLACK, MAX_REACH, SMALLEST, Color, as_number, as_transform, as_vector, require_count
 
-MANY_VERTICES = 1 << 26  # of all objects together; with more, `outlines` uses boxes of repeated meshes
+MANY_VERTICES = 1 << 26  # of all objects together; with more, `outlines` replaces repeated meshes by their boxes
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,18 +36,18 @@ class Object:
     Parameters
     ----------
     mesh, materials
-        The geometry, which objects can share, and one or more materials.
+        The geometry, which objects can share; one or more materials.
     transform
         (4, 4), object to world, acting on column vectors. If it mirrors, the outside of the mesh stays outside.
     face_material
-        (F,) index into `materials` for each face. None: the first material for all.
+        (F,) index into `materials` for each face. None: all faces have the first material.
     motion
         Movement in `wrt animate`; a single picture ignores it.
 
     Raises
     ------
     InputError
-        If a field has the wrong type, shape or range, or the object reaches beyond 1e18.
+        If a field has the wrong type, shape or range, or if a world coordinate exceeds 1e18.
     """
 
     mesh: Mesh
@@ -62,18 +62,18 @@ class Object:
         as_one(self.mesh, Mesh, at + "mesh")
         object.__setattr__(self, "materials", as_tuple(self.materials, Material, at + "materials"))
         if not self.materials:
-            raise wrong(at + "materials", "must be one or more")
+            raise wrong(at + "materials", "must hold at least one material")
         object.__setattr__(self, "transform", as_transform(self.transform, at + "transform"))
         with np.errstate(over="ignore"):
             reach = (np.abs(self.transform[:3, :3]).sum(axis=1) * self.mesh.reach + np.abs(self.transform[:3, 3])).max()
         if not reach <= MAX_REACH:
-            raise InputError(f"reaches {reach:.3g} units from the origin; at most {MAX_REACH:g} can be rendered", place=at[:-2])
+            raise InputError(f"reaches {reach:.3g} units from the origin; at most {MAX_REACH:g} are possible", place=at[:-2])
         if self.face_material is not None:
             index = as_array(self.face_material, np.int32, at + "face_material")
             if index.shape != (len(self.mesh.faces),):
                 raise wrong(at + "face_material", f"must be ({len(self.mesh.faces)},), got {index.shape}")
             if index.size and (index.min() < 0 or index.max() >= len(self.materials)):
-                raise wrong(at + "face_material", f"must index {len(self.materials)} materials")
+                raise wrong(at + "face_material", f"must be 0 to {len(self.materials) - 1}, got {index.min()} to {index.max()}")
             object.__setattr__(self, "face_material", index)
         if self.motion is not None:
             as_one(self.motion, Motion, at + "motion").check(self.mesh)
@@ -97,20 +97,20 @@ class Sphere:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """All that a picture is made from. A frozen dataclass: `dataclasses.replace` makes changed copies.
+    """Everything that a render needs. A frozen dataclass: `dataclasses.replace` makes changed copies.
 
     Parameters
     ----------
     objects, spheres, lights
-        Placed meshes, exact spheres, and lights without a surface.
+        Placed meshes; exact spheres; lights without a surface.
     cameras
-        The first is the default of `render`.
+        Cameras; `render` uses the first by default.
     background
         Radiance of rays that hit nothing; black by default.
     ambient
         Radiance that every diffuse surface receives from all directions, unshadowed (Whitted's ambient term).
     settings
-        Size, samples and the like; keywords of `render` override them.
+        Size, samples and other defaults of `render`, whose keywords override them.
 
     Raises
     ------
@@ -157,7 +157,7 @@ class Scene:
 
     @property
     def materials(self) -> tuple[Material, ...]:
-        """Every material in use, each once, in the order of first use. `material_id` of a film is an index into it."""
+        """Materials in use, each once, in the order of first use. A film's "material_id" is an index into this tuple."""
         used: dict[int, Material] = {}
         for thing in self.objects:
             for material in thing.materials:
@@ -167,7 +167,7 @@ class Scene:
         return tuple(used.values())
 
     def camera(self, name: str | int | None = None) -> CameraKind:
-        """Return the camera of that name or index (None: the first). Raises InputError for an unknown one."""
+        """Return the camera of a name or index, or the first camera for None. Raises InputError if there is no such camera."""
         if not self.cameras:
             raise InputError("the scene has no camera")
         if name is None:
@@ -178,14 +178,13 @@ class Scene:
         for index, camera in enumerate(self.cameras):
             if str(index) == str(name):
                 return camera
-        known = ", ".join(f"{camera.name!r} (number {i})" for i, camera in enumerate(self.cameras))
-        raise InputError(f"no camera {name!r}", argument="camera", hint=f"the scene's cameras are {known}")
+        known = ", ".join(f"{camera.name!r} (index {i})" for i, camera in enumerate(self.cameras))
+        raise InputError(f"the scene has no camera {name!r}", argument="camera", hint=f"its cameras are {known}")
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lowest and the highest corner, (3,) float64 each, of all shapes in world space.
+        """Return the lowest and the highest corner, (3,) float64 each, of the box around all shapes in world space.
 
-        The box is conservative for more than 2^26 vertices, which instances reach. Raises InputError if the scene has no shapes.
-        """
+        The box may be too large if the objects have more than 2^26 vertices together. Raises InputError if the scene has no shapes."""
         corners: list[np.ndarray] = []
         for points, transform in self.outlines():
             points = points @ transform[:3, :3].T + transform[:3, 3]
@@ -198,11 +197,10 @@ class Scene:
         return np.min(corners, axis=0), np.max(corners, axis=0)
 
     def outlines(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Yield points, (N, 3) float64, whose convex hull holds an object, and its transform, for each object with faces.
+        """Yield for each object with faces its transform, after points (N, 3) float64 in object space whose convex hull holds its mesh.
 
-        The points are the vertices of its mesh. Shared meshes are replaced by the corners of their boxes if all objects together have
-        more than MANY_VERTICES: a file of many nodes with one large mesh would take hours.
-        """
+        The points are the vertices of the mesh. For a shared mesh they are the corners of its box if all objects together have more
+        than MANY_VERTICES. Otherwise a file with one large mesh at many nodes would take hours."""
         shown = [thing for thing in self.objects if len(thing.mesh.faces)]
         times = Counter(id(thing.mesh) for thing in shown)
         many = sum(len(thing.mesh.vertices) for thing in shown) > MANY_VERTICES
@@ -217,10 +215,9 @@ class Scene:
                 yield vertices.astype(np.float64), thing.transform
 
     def with_settings(self, **changes: Unpack[SettingChanges]) -> Scene:
-        """Return a copy of the scene with the given settings changed. A setting given as None keeps the scene's value.
+        """Return a copy of the scene with changed settings. A setting of None keeps the scene's value.
 
-        Raises InputError for an unknown setting and for a wrong value.
-        """
+        Raises InputError for an unknown setting and for a wrong value."""
         for name in changes:
             if name not in SETTINGS:
                 raise unknown(name, "setting", SETTINGS, argument=name)
@@ -233,7 +230,7 @@ def moves(scene: Scene) -> bool:
 
 
 def scene_at(scene: Scene, time: float) -> Scene:
-    """Return the scene at `time`, 0 to 1, of its period: the same objects, faces and materials, moved."""
+    """Return the scene at `time` in [0, 1] of its period: its objects are moved, and have no motion themselves."""
     return replace(scene, objects=tuple(
         replace(thing, mesh=thing.motion.mesh(thing.mesh, time), transform=thing.transform @ thing.motion.transform(time),
                 motion=None) if thing.motion else thing for thing in scene.objects))

@@ -15,16 +15,16 @@ from wrt.scene.mesh import Mesh
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Movement of an object in a period, from time 0 to 1.
+    """Movement of an object within one period, from time 0 to 1.
 
     Parameters
     ----------
     keys
         (K, 3, 3), K >= 2: translation, rotation (degrees about x, then y, then z) and scale at K times evenly spread from 0 to 1,
-        interpolated linearly. They act before the object's transform. None: the object stays.
+        interpolated linearly. They act before the object's transform. None: the object is not moved.
     target
-        A mesh with the same faces, or None. Vertices move along lines to those of the target and back, with the weight
-        (1 - cos 2 pi t) / 2.
+        A mesh with the same faces, or None. Each vertex moves on a line to its position in the target and back: the target has the
+        weight (1 - cos 2 pi t) / 2.
 
     Raises
     ------
@@ -43,7 +43,7 @@ class Motion:
         if keys.ndim != 3 or keys.shape[1:] != (3, 3) or len(keys) < 2 or not np.isfinite(keys).all():
             raise InputError(f"must be (K, 3, 3), finite, with two keys or more, got {keys.shape}", argument="keys", place="motion")
         if (keys[:, 2] == 0.0).any() or (np.sign(keys[:, 2]) != np.sign(keys[0, 2])).any():
-            raise InputError("a scale must not be zero, also not between two keys", argument="keys", place="motion")
+            raise InputError("must not pass through a scale of zero, at a key or between two keys", argument="keys", place="motion")
         object.__setattr__(self, "keys", keys)
 
     def check(self, mesh: Mesh) -> None:
@@ -51,8 +51,8 @@ class Motion:
         if self.target is None:
             return
         if len(self.target.vertices) != len(mesh.vertices) or not np.array_equal(self.target.faces, mesh.faces):
-            raise InputError(f"must have the same faces; it has {len(self.target.vertices)} vertices and "
-                             f"{len(self.target.faces)} faces, the mesh {len(mesh.vertices)} and {len(mesh.faces)}",
+            raise InputError(f"must have the same faces as the mesh; it has {len(self.target.vertices)} vertices and "
+                             f"{len(self.target.faces)} faces, the mesh has {len(mesh.vertices)} and {len(mesh.faces)}",
                              argument="target", place="motion")
 
     def transform(self, time: float) -> np.ndarray:
@@ -82,5 +82,5 @@ class Motion:
             length = np.linalg.norm(mixed, axis=1, keepdims=True)
             normals = np.divide(mixed, length, out=np.zeros_like(mixed), where=length > 1e-6).astype(np.float32)
         elif mesh.normals is not None:
-            normals = np.zeros_like(mesh.vertices)  # flat, in a kernel for smooth meshes
+            normals = np.zeros_like(mesh.vertices)  # flat shading by zero normals: the mesh's kernels read normals
         return replace(mesh, vertices=vertices, normals=normals)

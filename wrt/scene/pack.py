@@ -26,24 +26,22 @@ def kinds() -> dict[str, type[object]]:
         *LIGHTS.values(), *BACKGROUNDS.values())}
 
 
-LEFT_OUT: dict[type, tuple[str, ...]] = {Object: ("motion",)}  # a picture shows the object without
+LEFT_OUT: dict[type, tuple[str, ...]] = {Object: ("motion",)}  # a single picture ignores it
 
 
 def pack(scene: object, left_out: dict[type, tuple[str, ...]] = LEFT_OUT) -> tuple[str, list[np.ndarray]]:
-    """Return the text, and the arrays that it refers to. Shared meshes, materials and textures are stored once.
+    """Return the JSON text of a scene, and the arrays to which the text refers. Shared meshes, materials and textures are stored once.
 
-    left_out: fields to store as None, by their class (object: of every class).
-    """
+    left_out: fields to store as None, by their class (object: of every class)."""
     packer = _Packer(left_out)
     packer.plain(scene)
     return json.dumps(packer.things), packer.arrays
 
 
 def unpack(text: str, arrays: list[np.ndarray]) -> Scene:
-    """Return the scene, bit for bit, with the same sharing; it uses `arrays` without a copy. Raises InputError for a foreign text.
+    """Return the packed scene, bit for bit and with the same sharing; it uses `arrays` without a copy. Raises InputError for other texts.
 
-    Constructors are bypassed: they would round the pose of a camera once more.
-    """
+    Constructors are bypassed, because they would round the pose of a camera once more."""
     things: list[Any] = []
     known = kinds()
 
@@ -69,7 +67,7 @@ def unpack(text: str, arrays: list[np.ndarray]) -> Scene:
 
 
 class _Packer:
-    """Collects `things`, [class name, {field: value}], each after the things that it refers to, and `arrays`."""
+    """Collector of `things`, [class name, {field: value}] each, and of `arrays`. A thing follows the things that it refers to."""
 
     def __init__(self, left_out: dict[type, tuple[str, ...]]) -> None:
         self.left_out = left_out
@@ -78,7 +76,7 @@ class _Packer:
         self.known: dict[int, dict[str, int]] = {}
 
     def plain(self, value: object) -> Any:
-        """Return a value as JSON has it, with a reference in place of each thing and array."""
+        """Return a value for JSON; a thing or an array is replaced by a reference, such as {"array": index}."""
         if isinstance(value, tuple):
             return {"tuple": [self.plain(each) for each in value]}
         if isinstance(value, np.generic):

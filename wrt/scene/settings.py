@@ -11,14 +11,14 @@ FILTERS = ("box", "gaussian", "blackman-harris")
 SAMPLERS = ("sobol", "independent")
 TONEMAPS = ("none", "reinhard", "aces", "agx")
 MAX_DEPTH = 64  # bounces
-DEPTH, GLASS_DEPTH = 8, 64  # bounces where nobody gives a depth: eight leave a black band in the rim of a glass vase
+DEPTH, GLASS_DEPTH = 8, 64  # default bounces without and with glass: 8 leave a black band in the rim of a glass vase
 FRESNELS = ("exact", "schlick")
 GLASS_SHADOWS = ("opaque", "tinted")
 
 
 @dataclass(frozen=True)
 class Settings:
-    """The settings that a scene asks for; keywords of `render` override them.
+    """Render settings of a scene. Keywords of `render` override them.
 
     Parameters
     ----------
@@ -27,18 +27,18 @@ class Settings:
     max_depth
         Bounces after the first hit; 0 is direct light alone. None: 64 if light passes through a material of the scene, else 8.
     min_throughput
-        A ray whose throughput (largest channel) would be smaller ends.
+        A ray ends if the largest channel of its throughput would fall below this value.
     filter
         Pixel filter: "box", "gaussian" or "blackman-harris".
     fresnel
         Fresnel term of dielectrics: "exact", or "schlick", which is cheaper and approximate.
     glass_shadows
-        "opaque": solid glass blocks shadow rays, which is right but for caustics. "tinted": shadow rays pass straight through it
-        and take its colour (the default of scenes from glTF files with solid glass).
+        "opaque": solid glass blocks shadow rays, which is right except for caustics. "tinted": shadow rays pass straight through
+        solid glass and take its colour (the default of scenes from glTF files with solid glass).
     sampler
         "sobol" (Owen-scrambled, evenly spread), or "independent" random numbers, whose noise falls more slowly.
     exposure, tonemap
-        Stops (factors of 2) of the displayed values; curve from linear to display: "none", "reinhard", "aces" or "agx".
+        Exposure in stops, factors of 2 on the displayed values; curve from linear to display: "none", "reinhard", "aces" or "agx".
 
     Raises
     ------
@@ -49,9 +49,9 @@ class Settings:
     size: tuple[int, int] = field(default=(640, 360), metadata=given("size", "width and height", "pixels"))
     spp: int = field(default=64, metadata=given("whole", "samples per pixel", ge=1, le=1 << 24))
     max_depth: int = field(default=None, metadata=given(  # type: ignore[assignment]  # a Scene's is a number
-        "whole", f"bounces after the first hit (default: {GLASS_DEPTH} where light goes through a material, else {DEPTH})", ge=0,
+        "whole", f"bounces after the first hit (default: {GLASS_DEPTH} if light passes through a material, else {DEPTH})", ge=0,
         le=MAX_DEPTH))
-    min_throughput: float = field(default=1e-3, metadata=given("number", "a ray of smaller throughput ends", ge=0.0, le=1.0))
+    min_throughput: float = field(default=1e-3, metadata=given("number", "a ray ends below this throughput", ge=0.0, le=1.0))
     filter: str = field(default="blackman-harris", metadata=given("choice", "pixel filter", among=FILTERS))
     fresnel: str = field(default="exact", metadata=given("choice", "Fresnel term of dielectrics", among=FRESNELS))
     glass_shadows: str = field(default="opaque", metadata=given(
@@ -59,7 +59,7 @@ class Settings:
         " has solid glass)", among=GLASS_SHADOWS))
     sampler: str = field(default="sobol", metadata=given(
         "choice", "samples of a pixel: evenly spread, or independent random numbers", among=SAMPLERS))
-    exposure: float = field(default=0.0, metadata=given("number", "each doubles what is displayed", "stops", ge=-100.0, le=100.0))
+    exposure: float = field(default=0.0, metadata=given("number", "each stop doubles the displayed values", "stops", ge=-100.0, le=100.0))
     tonemap: str = field(default="none", metadata=given("choice", "curve from linear to display", among=TONEMAPS))
 
     def __post_init__(self) -> None:

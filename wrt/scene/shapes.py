@@ -16,32 +16,31 @@ from wrt.scene.mesh import Mesh
 from wrt.scene.values import as_number, as_vector
 
 Point = Sequence[float] | np.ndarray
-MAX_FACES = 1 << 23  # of one shape: a short scene file must not take all memory, or minutes
+MAX_FACES = 1 << 23  # triangles of one shape: a short scene file must not fill the memory or take minutes
 
 
 def quad(corner: Point = (-0.5, -0.5, 0.0), edge_u: Point = (1.0, 0.0, 0.0), edge_v: Point = (0.0, 1.0, 0.0)) -> Mesh:
     """Return a parallelogram of two triangles whose front is towards cross(edge_u, edge_v).
 
-    uv is (0, 1) at `corner` and (0, 0) at the end of edge_v: an image is upright on the front with edge_u to the right and edge_v up.
-    """
+    On the front, with edge_u to the right and edge_v up, an image is upright: uv is (0, 1) at `corner` and (0, 0) at the end of edge_v."""
     origin, u, v = (np.array(as_vector(value, "quad: " + name))
                     for value, name in ((corner, "corner"), (edge_u, "edge_u"), (edge_v, "edge_v")))
     if not np.linalg.norm(np.cross(u, v)) > 0.0:
-        raise InputError(f"{u.tolist()} and edge_v {v.tolist()} span no area", argument="edge_u", place="quad")
+        raise InputError(f"edge_u and edge_v must span an area, got {u.tolist()} and {v.tolist()}", argument="edge_u", place="quad")
     return Mesh(np.array([origin, origin + u, origin + u + v, origin + v]), np.array([[0, 1, 2], [0, 2, 3]]),
                 uvs=np.array([[0, 1], [1, 1], [1, 0], [0, 0]]), name="quad")
 
 
 def box(low: Point = (-0.5, -0.5, -0.5), high: Point = (0.5, 0.5, 0.5)) -> Mesh:
-    """Return a closed box with its corners at `low` and `high`, flat; each side has uvs from 0 to 1."""
+    """Return a closed box with opposite corners `low` and `high`, flat-shaded; each side has uvs from 0 to 1."""
     bottom, top = np.array(as_vector(low, "box: low")), np.array(as_vector(high, "box: high"))
     if not (top > bottom).all():
-        raise InputError(f"must be above low {bottom.tolist()} in every axis, got {top.tolist()}", argument="high", place="box")
+        raise InputError(f"must be above low ({bottom.tolist()}) in every axis, got {top.tolist()}", argument="high", place="box")
     return Mesh(np.where(_BOX_TOP, top, bottom), _BOX_FACES, uvs=_BOX_UVS, name="box")
 
 
-# True for each of the 24 corners and each axis at `high`. First are the low and the high side across x, with four corners in the order of
-# a quad (reversed on the low side, so that it faces out). The sides across y and z follow.
+# True where a corner (24 rows) is at `high` in an axis (3 columns). The low and the high side across x come first, then those across y
+# and z. Each has four corners in the order of a quad, reversed on the low side so that it faces out.
 _BOX_SIDES = np.array([[[0, 1, 0], [0, 0, 0], [0, 0, 1], [0, 1, 1]], [[1, 0, 0], [1, 1, 0], [1, 1, 1], [1, 0, 1]]], dtype=bool)
 _BOX_TOP = np.concatenate([np.roll(_BOX_SIDES, axis, axis=2) for axis in range(3)]).reshape(24, 3)
 _BOX_FACES = (np.array([[0, 1, 2], [0, 2, 3]]) + 4 * np.arange(6)[:, None, None]).reshape(12, 3).astype(np.int32)
@@ -91,10 +90,10 @@ def torus(radius: float = 1.0, tube_radius: float = 0.35, segments: int = 64, tu
 def lathe(profile: Sequence[Point], segments: int = 64) -> Mesh:
     """Return a surface of revolution of a profile around the y axis.
 
-    profile: two or more points (radius, height); from the bottom up, the surface faces outwards. It is closed if both ends are on the
-    axis. A point given twice makes a sharp edge; all others are smooth. u runs around the axis, v from the end of the profile to its start.
+    profile: two or more points (radius, height). From the bottom up, the surface faces outwards; it is closed if both ends are on the
+    axis. A repeated point makes a sharp edge; other points are smooth. u runs around the axis, v from the end of the profile to its start.
     """
-    # In float32, as the vertices are: points that coincide there count as given twice.
+    # In float32 like the vertices: points that are equal in float32 count as repeated.
     line = np.asarray(profile, dtype=np.float32).astype(np.float64)
     well_formed = line.ndim == 2 and line.shape[1:] == (2,) and len(line) >= 2
     if not well_formed or not np.isfinite(line).all() or (line[:, 0] < 0.0).any():
@@ -103,8 +102,8 @@ def lathe(profile: Sequence[Point], segments: int = 64) -> Mesh:
     step = np.diff(line, axis=0)
     length = np.linalg.norm(step, axis=1)
     if not length.any():
-        raise InputError("has only points that are the same", argument="profile", place="lathe")
-    # The normal of a step is its direction turned right; a point has the mean of its two steps, unless it is given twice.
+        raise InputError("must hold two different points", argument="profile", place="lathe")
+    # The normal of a step is its direction turned right; a point has the mean of its two steps, unless it is repeated.
     side = np.stack([step[:, 1], -step[:, 0]], axis=1) / np.where(length > 0.0, length, 1.0)[:, None]
     normal = np.concatenate([side, side[-1:]]) + np.concatenate([side[:1], side])
     # On the axis, the normal of a smooth surface is parallel to the axis.
@@ -123,7 +122,7 @@ def lathe(profile: Sequence[Point], segments: int = 64) -> Mesh:
 
 
 def prism(sides: int = 3, radius: float = 1.0, length: float = 2.0) -> Mesh:
-    """Return a closed, flat prism along z, without uvs. Its base is a regular polygon with a corner at +y on a circle of `radius`."""
+    """Return a closed, flat-shaded prism along z, without uvs. Its base is a regular polygon in a circle of `radius`, a corner at +y."""
     sides = as_integer(sides, "prism: sides", 3, 4096)
     radius, length = as_number(radius, "prism: radius", low=1e-30), as_number(length, "prism: length", low=1e-30)
     angle = np.pi / 2.0 + np.arange(sides) * (2.0 * np.pi / sides)
@@ -140,11 +139,10 @@ def prism(sides: int = 3, radius: float = 1.0, length: float = 2.0) -> Mesh:
 def tube(points: Sequence[Point] | np.ndarray, radius: float | Point = 0.1, segments: int = 24) -> Mesh:
     """Return a round tube along a polyline, with flat ends; `radius` is one number, or one for each point.
 
-    Its rings turn as little as possible from point to point (parallel transport). u runs around, v along.
-    """
+    Its rings turn as little as possible from point to point (parallel transport). u runs around the tube, v along it."""
     line = np.asarray(points, dtype=np.float64)
     if line.ndim != 2 or line.shape[1:] != (3,) or len(line) < 2 or not np.isfinite(line).all():
-        raise InputError("must be two or more triples", argument="points", place="tube")
+        raise InputError("must be two or more finite points (x, y, z)", argument="points", place="tube")
     _require_segments("tube", segments, rows=len(line) - 1)
     try:
         radii = np.broadcast_to(np.asarray(radius, dtype=np.float64), (len(line),))
@@ -155,7 +153,7 @@ def tube(points: Sequence[Point] | np.ndarray, radius: float | Point = 0.1, segm
     step = np.diff(line, axis=0)
     length = np.linalg.norm(step, axis=1, keepdims=True)
     if not (length > 0.0).all():
-        raise InputError("has two points in a row that are the same", argument="points", place="tube")
+        raise InputError("must not hold the same point twice in a row", argument="points", place="tube")
     step /= length
     tangent = np.concatenate([step[:1], step[1:] + step[:-1], step[-1:]])
     tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-300)
@@ -181,10 +179,9 @@ def tube(points: Sequence[Point] | np.ndarray, radius: float | Point = 0.1, segm
 
 
 def teapot(segments: int = 64) -> Mesh:
-    """Return a pot with lid, spout and handle, about 2 wide and 1 high, on y = 0. Its closed parts overlap.
+    """Return a pot with lid, spout and handle, about 2 units wide and 1 high, on y = 0. Its parts are closed meshes that overlap.
 
-    The outlines are this project's own: body and lid are lathes, spout and handle are tubes.
-    """
+    The outlines are this project's own: body and lid are lathes, spout and handle are tubes."""
     _require_segments("teapot", segments)
     rows = max(segments // 2, 8)
     t = np.linspace(0.0, 1.0, rows)
@@ -203,7 +200,7 @@ def teapot(segments: int = 64) -> Mesh:
 
 
 def merged(parts: Sequence[Mesh], name: str) -> Mesh:
-    """Return one mesh of several; it has normals if all parts do, and uvs if all parts do."""
+    """Return the parts as one mesh. It has normals if all parts have normals, and uvs if all parts have uvs."""
     start = np.cumsum([0, *(len(part.vertices) for part in parts)])
     normals = [part.normals for part in parts if part.normals is not None]
     uvs = [part.uvs for part in parts if part.uvs is not None]
@@ -217,7 +214,7 @@ def merged(parts: Sequence[Mesh], name: str) -> Mesh:
 
 
 def _grid(points: np.ndarray, normals: np.ndarray, name: str) -> Mesh:
-    """Return a sheet of (M, N, 3) points without degenerate triangles. u runs along the first axis, v against the second."""
+    """Return the mesh of a grid of points (M, N, 3), without triangles of no area. u grows along the first axis, v against the second."""
     m, n = points.shape[:2]
     u, v = np.meshgrid(np.linspace(0.0, 1.0, m), np.linspace(1.0, 0.0, n), indexing="ij")
     i, j = np.meshgrid(np.arange(m - 1), np.arange(n - 1), indexing="ij")
@@ -228,12 +225,11 @@ def _grid(points: np.ndarray, normals: np.ndarray, name: str) -> Mesh:
 
 
 def _require_segments(shape: str, *segments: int, rows: int = 1) -> None:
-    """Raise InputError unless each number of segments, and the number of triangles with `rows` of quads, is in range."""
+    """Raise InputError unless each number of segments is in range, and the triangles of a grid of `rows` times all segments, too."""
     for count in segments:
         as_integer(count, f"{shape}: segments", 3, 4096)
-    faces = 2 * rows * math.prod(segments)
-    if faces > MAX_FACES:
-        raise InputError(f"{faces} triangles; at most {MAX_FACES} are made", argument="segments", place=shape)
+    if (faces := 2 * rows * math.prod(segments)) > MAX_FACES:
+        raise InputError(f"must make at most {MAX_FACES} triangles, got {faces}", argument="segments", place=shape)
 
 
 SHAPES: dict[str, Callable[..., Mesh]] = {

@@ -11,24 +11,24 @@ from wrt.core.errors import InputError
 from wrt.scene.model import Scene
 from wrt.scene.values import SMALLEST
 
-# The square of the distance to a light is a normal float32 from a distance of 2^-63 (1.1e-19) on: in the smallest scene, a ten-thousandth
-# of its size.
+# Smallest size with a light at a finite distance. The squared distance to the light is a normal float32 down to a distance of 2^-63
+# (1.1e-19), a ten-thousandth of this size.
 SMALLEST_LIT = 1e-15
 FACES_AT_ONCE = 1 << 12
 
 
 def require_size(scene: Scene) -> None:
     """Raise InputError if a scene is too small to be rendered."""
-    light = _light_with_a_place(scene)
+    light = _finite_light(scene)
     needed = SMALLEST_LIT if light else SMALLEST
     size = _size(scene, needed)
     if 0.0 < size < needed:  # a single point cannot be hit
-        within = f" with a light that has a place in it ({light})" if light else ""
-        raise InputError(f"the scene is {size:.3g} units across; at least {needed:g} can be rendered{within}: make it larger")
+        within = f" with a light at a finite distance ({light})" if light else ""
+        raise InputError(f"the scene is {size:.3g} units across; at least {needed:g} can be rendered{within}", hint="make it larger")
 
 
-def _light_with_a_place(scene: Scene) -> str:
-    """Return the name of the first light at a finite distance, or of the first emissive shape; "" without any."""
+def _finite_light(scene: Scene) -> str:
+    """Return the name of the first light at a finite distance, or of the first emissive shape; "" without both."""
     for light in scene.lights:
         if light.places():
             return at_thing("light", light.name)[:-2]
@@ -42,7 +42,7 @@ def _light_with_a_place(scene: Scene) -> str:
 
 
 def _size(scene: Scene, enough: float) -> float:
-    """Return the longest side of the box around all shapes and lights at finite distances, or a lower bound of `enough` or more."""
+    """Return the longest side of the box around all shapes and finite lights, or any lower bound of it that is at least `enough`."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     size = 0.0
     for points in _points(scene):

@@ -14,8 +14,8 @@ BLACK: Color = (0.0, 0.0, 0.0)
 WHITE: Color = (1.0, 1.0, 1.0)
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 SMALLEST = 1e-30  # smallest length
-MAX_OBJECTS = 1 << 20  # of objects, of spheres and of lights
-MAX_REACH = 1e18  # largest coordinate in world space: squares of distances must be float32
+MAX_OBJECTS = 1 << 20  # largest number of objects, of spheres and of lights
+MAX_REACH = 1e18  # largest coordinate in world space: squared distances must not overflow float32
 
 
 def as_vector(value: object, what: str, *, low: float = -math.inf, high: float = math.inf) -> Color:
@@ -49,8 +49,7 @@ def as_number(value: object, what: str, *, low: float = -math.inf, high: float =
 def as_transform(value: object, what: str) -> np.ndarray:
     """Return a (4, 4) float64 affine matrix that acts on column vectors.
 
-    Raises InputError unless it is finite, (4, 4) and affine. It may be singular: glTF files hide nodes by a scale of 0.
-    """
+    Raises InputError unless the matrix is finite, (4, 4) and affine. It may be singular: glTF files hide nodes by a scale of 0."""
     matrix = as_array(value, np.float64, what)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise wrong(what, f"must be a finite 4x4 matrix, got shape {matrix.shape}")

@@ -12,10 +12,9 @@ from wrt.scene.mesh import Mesh
 def smooth(mesh: Mesh) -> Mesh:
     """Return the mesh with smooth normals: the sum of the unit normals of adjacent faces, weighted by their angle at the vertex.
 
-    Vertices at exactly the same position get the same normal, so that seams of the texture do not show. With these weights the normal
-    does not depend on the triangulation (Thuermer and Wuethrich, "Computing vertex normals from polygonal facets", 1998). If the sum
-    cancels out, the normal is zero (flat). A mesh that has normals is returned unchanged.
-    """
+    Vertices at exactly the same position get the same normal, so that texture seams do not show. With these weights the normal
+    does not depend on the triangulation (Thuermer and Wuethrich, "Computing vertex normals from polygonal facets", 1998). A sum that
+    cancels out gives a zero normal (flat shading). A mesh with normals is returned unchanged."""
     if mesh.normals is not None:
         return mesh
     points = mesh.vertices.astype(np.float64)[mesh.faces]

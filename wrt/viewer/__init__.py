@@ -1,1 +1,1 @@
-"""A look around in a scene: in a browser and in notebooks."""
+"""Interactive views of a scene in a browser, and pictures in notebooks."""

@@ -1,7 +1,7 @@
-"""Access to the viewer: every request must carry the token and this viewer's values of Host and Origin.
+"""Access to the viewer: every request must carry the token, and a Host and an Origin of this viewer.
 
-The token is part of the printed address and then of the page's path (`/TOKEN/`), from which viser's page makes the address of its
-WebSocket. It is no cookie: a browser sends cookies to every port of a host, also to a server of another user of the machine.
+The printed address contains the token. It redirects to the page's path `/TOKEN/`, from which viser's page derives the address of its
+WebSocket. The token is no cookie, because a browser sends cookies to every port of a host, also to another user's server.
 """
 
 from __future__ import annotations
@@ -18,39 +18,39 @@ from wrt.core.errors import InputError
 
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 ORIGIN = re.compile(r"(https?)://([a-z0-9._-]+|\[[0-9a-f:.]+\])(?::([1-9][0-9]{0,4}))?/?")
-PORTS = {"http": 80, "https": 443}  # left out of an origin by browsers
+PORTS = {"http": 80, "https": 443}  # default ports, which browsers leave out of an origin
 
 
 class Refused(Exception):
-    """A request that is not answered. `about` is its kind; the message is for the user who started the viewer."""
+    """A refused request or message. kind: kind of refusal, which is reported once; message: for the user who started the viewer."""
 
-    def __init__(self, about: str, message: str) -> None:
+    def __init__(self, kind: str, message: str) -> None:
         super().__init__(message)
-        self.about = about
+        self.kind = kind
 
 
 @dataclass(frozen=True)
 class Access:
     """The token and the addresses that requests must carry."""
 
-    origins: frozenset[str]  # such as "http://127.0.0.1:8080"; Host must be that of one of them
+    origins: frozenset[str]  # allowed values of Origin, such as "http://127.0.0.1:8080"; their hosts are the allowed values of Host
     port: int  # of the server
     token: str = field(default_factory=lambda: secrets.token_urlsafe(32), repr=False)
 
     def check(self, hosts: Sequence[str], origins: Sequence[str], address: str) -> None:
-        """Raise Refused unless the values of the headers Host and Origin are this viewer's.
+        """Raise Refused unless the headers Host (one value) and Origin (at most one value) name this viewer.
 
-        address: the connection's local IP address. It is allowed too, since no attacker can point a name at a number."""
+        address: the connection's local IP address, which is allowed too: DNS rebinding, which this check prevents, needs a name."""
         own = self.origins | {origin_of("http", as_host(address), self.port)}
         if len(hosts) != 1 or hosts[0] not in {origin.partition("//")[2] for origin in own}:
-            raise Refused("host", f"a request for {shown(hosts)}, which is not this viewer; --allow-origin would let it in")
+            raise Refused("host", f"a request for the host {shown(hosts)}, which is not this viewer; --allow-origin can allow it")
         if origins and (len(origins) != 1 or origins[0] not in own):
-            raise Refused("origin", f"a request by a page of {shown(origins)}; --allow-origin would let it in")
+            raise Refused("origin", f"a request by a page of the origin {shown(origins)}; --allow-origin can allow it")
 
-    def inside(self, target: str) -> tuple[str, str]:
-        """Return the path of a request's target without the token, and the relative address to redirect to, or "".
+    def strip_token(self, target: str) -> tuple[str, str]:
+        """Return the path of a request's target without the token, and the relative address to redirect to ("": none).
 
-        Raises Refused unless the target carries the token as the first part of its path or as `?token=`."""
+        Raises Refused unless the token is the first part of the path, or the value of `?token=`."""
         path, _, query = target.partition("?")
         first, slash, rest = path[1:].partition("/")
         if path.startswith("/") and self._is_token(first):
@@ -63,7 +63,7 @@ class Access:
         raise Refused("token", "a request without the token of the printed address")
 
     def _page(self, query: str) -> str:
-        """Return the page's address relative to the root, which a proxy may have moved."""
+        """Return the page's address relative to the viewer's root, which a proxy may put under a sub-path."""
         return f"{self.token}/" + (f"?{query}" if query else "")
 
     def _is_token(self, text: str) -> bool:
@@ -74,9 +74,9 @@ class Access:
 class Place:
     """The address that the viewer listens on. Raises InputError for an invalid origin."""
 
-    host: str = "127.0.0.1"  # this machine only; 0.0.0.0: every machine that reaches this one
-    port: int = 8080  # 0: any free one
-    allow_origins: Iterable[str] = ()  # further addresses of the viewer in browsers, such as a proxy's "https://example.org"
+    host: str = "127.0.0.1"  # this machine only; 0.0.0.0: all machines that can reach this machine
+    port: int = 8080  # 0: a free port
+    allow_origins: Iterable[str] = ()  # further origins under which browsers reach the viewer, such as "https://example.org"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "allow_origins", tuple(as_origin(text) for text in self.allow_origins))
@@ -86,13 +86,13 @@ HERE = Place()
 
 
 def access_for(place: Place, address: str, port: int) -> tuple[Access, str]:
-    """Return the Access of a server that listens at `address` and `port`, and the address to print."""
-    where = ip_address(address.partition("%")[0])
+    """Return the Access of a server that listens at `address` and `port`, and the viewer's URL with the token."""
+    ip = ip_address(address.partition("%")[0])
     names = {as_host(address), as_host(place.host.lower())}
     home = as_host(address)
-    if where.is_unspecified:  # every address of this machine
-        names, home = set(LOOPBACK), LOOPBACK[0] if where.version == 4 else LOOPBACK[2]
-    elif where.is_loopback:
+    if ip.is_unspecified:  # the server listens at every address of this machine
+        names, home = set(LOOPBACK), LOOPBACK[0] if ip.version == 4 else LOOPBACK[2]
+    elif ip.is_loopback:
         names |= set(LOOPBACK)
     origins = {origin_of("http", name, port) for name in names} | set(place.allow_origins)
     access = Access(frozenset(origins), port)
@@ -100,17 +100,17 @@ def access_for(place: Place, address: str, port: int) -> tuple[Access, str]:
 
 
 def as_host(address: str) -> str:
-    """Return an IP address or name in the form of a URL."""
+    """Return an IP address or a name as URLs write it: IPv6 in brackets."""
     return f"[{address}]" if ":" in address else address
 
 
 def origin_of(scheme: str, host: str, port: int) -> str:
-    """Return an origin in the form of browsers."""
+    """Return an origin as browsers write it: without the scheme's default port."""
     return f"{scheme}://{host}" + ("" if port == PORTS[scheme] else f":{port}")
 
 
 def as_origin(text: str) -> str:
-    """Return a user's origin in the form of browsers. Raises InputError if it is invalid."""
+    """Return a user's origin as browsers write it. Raises InputError for text that is no origin."""
     match = ORIGIN.fullmatch(text.lower())
     port = 0 if match is None else int(match[3] or PORTS[match[1]])
     if match is None or port > 65535:
@@ -119,7 +119,7 @@ def as_origin(text: str) -> str:
 
 
 def shown(values: object) -> str:
-    """Return what a client sent in a short form for a message."""
+    """Return a value from a client as at most 60 characters, for a message."""
     text = ", ".join(map(repr, values)) if isinstance(values, list) else repr(values)
     text = text or "no name"
     return text if len(text) <= 60 else text[:57] + "..."

@@ -1,4 +1,4 @@
-"""Messages that a browser may send to the viewer: a camera, a click into the picture, a control's value. All others are dropped."""
+"""Checks of a browser's messages. It may send a camera, a click into the picture, and a control's value; nothing else."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ if TYPE_CHECKING:
     Control: TypeAlias = viser.GuiInputHandle[Any]
 
 LARGEST_VIEWPORT = 16384  # pixels a side
-FARTHEST = 1e9  # absolute value of a coordinate, in units of the viewport
+FARTHEST = 1e9  # largest absolute value of a coordinate, in units of the viewport
 NARROWEST, WIDEST = 1e-5, math.pi - 1e-3  # angle of view, radians
-CAMERA = {"wxyz": 4, "position": 3, "look_at": 3, "up_direction": 3}  # lengths of its vectors
+CAMERA = {"wxyz": 4, "position": 3, "look_at": 3, "up_direction": 3}  # vectors of a camera message, and their lengths
 LENS = ("fov", "near", "far")
 PIXELS = ("image_width", "image_height")
 
 
 def check_message(message: object, control_of: Callable[[str], Control | None]) -> None:
-    """Raise Refused unless a decoded message is allowed. control_of: returns viser's handle of the control with a uuid, or None."""
+    """Raise Refused unless a decoded message is allowed. control_of: returns viser's control for a uuid, or None."""
     table: dict[str, Any] = message if isinstance(message, dict) else {}
     kind = table.get("type")
     if kind == "ViewerCameraMessage":
@@ -38,7 +38,7 @@ def check_message(message: object, control_of: Callable[[str], Control | None]) 
 
 
 def _check_camera(message: dict[str, Any]) -> None:
-    fine = (
+    valid = (
         message.keys() == {"type", *CAMERA, *LENS, *PIXELS}
         and all(_is_vector(message[name], length) for name, length in CAMERA.items())
         and abs(math.hypot(*message["wxyz"]) - 1.0) < 0.01
@@ -46,45 +46,45 @@ def _check_camera(message: dict[str, Any]) -> None:
         and NARROWEST <= message["fov"] <= WIDEST
         and all(type(message[name]) is int and 0 <= message[name] <= LARGEST_VIEWPORT for name in PIXELS)
     )
-    if not fine:
-        raise Refused("camera", "a camera that is none")
+    if not valid:
+        raise Refused("camera", "an invalid camera")
 
 
 def _check_click(message: dict[str, Any]) -> None:
     place = message.get("screen_pos")
-    fine = (
+    valid = (
         message.keys() == {"type", "event_type", "ray_origin", "ray_direction", "screen_pos", "modifier"}
         and message["event_type"] == "click"
         and _is_vector(message["ray_origin"], 3) and _is_vector(message["ray_direction"], 3)
         and isinstance(place, list) and len(place) == 1 and _is_vector(place[0], 2, 0.0, 1.0)
         and (message["modifier"] is None or isinstance(message["modifier"], str))
     )
-    if not fine:
-        raise Refused("click", "a click that is none")
+    if not valid:
+        raise Refused("click", "an invalid click")
 
 
 def _check_update(message: dict[str, Any], control_of: Callable[[str], Control | None]) -> None:
     updates = message.get("updates")
     if message.keys() != {"type", "uuid", "updates"} or not isinstance(message["uuid"], str) or not isinstance(updates, dict):
-        raise Refused("control", "a change of a control that is none")
+        raise Refused("control", "an invalid change of a control")
     control = control_of(message["uuid"])
     if control is None:
-        raise Refused("no control", "a change of a control that there is not")
+        raise Refused("no control", "a change of an unknown control")
     if updates.keys() != {"value"}:
-        raise Refused(f"control {control.label}", f"{control.label}: a change of something else than its value")
-    if not can_have(control, updates["value"]):
-        raise Refused(f"control {control.label}", f"{control.label}: it cannot have the value {shown(updates['value'])}")
+        raise Refused(f"control {control.label}", f"{control.label}: a change of another property than the value")
+    if not accepts(control, updates["value"]):
+        raise Refused(f"control {control.label}", f"{control.label}: the value {shown(updates['value'])} is not allowed")
 
 
-def can_have(control: Control, value: object) -> bool:
-    """Return whether a browser may set a control to the value."""
+def accepts(control: Control, value: object) -> bool:
+    """Return True if a browser may set a control to a value."""
     import viser
 
     if control.disabled or not control.visible:
         return False
     if isinstance(control, viser.GuiSliderHandle | viser.GuiNumberHandle):
         low, high = (sign * math.inf if end is None else end for end, sign in ((control.min, -1.0), (control.max, 1.0)))
-        # The page rounds to seven decimals, also at the ends.
+        # The page rounds values to seven decimals, so that they may lie just outside the limits.
         return (_is_number(value, low - 1e-6 * abs(low), high + 1e-6 * abs(high))
                 and (not isinstance(control.value, int) or value == int(value)))
     if isinstance(control, viser.GuiDropdownHandle):

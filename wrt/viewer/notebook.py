@@ -20,18 +20,18 @@ if TYPE_CHECKING:
     from IPython.display import DisplayHandle
     from PIL import Image
 
-SHARE = 0.1  # largest share of the time that showing takes
+SHARE = 0.1  # largest share of the time that may go into showing pictures
 
 
 class LiveView:
     """A callback that shows a render's picture and progress in the output of a notebook's cell.
 
-    Interrupting the kernel ends the render, which returns the picture so far.
+    Interrupting the notebook's kernel ends the render, which returns the picture so far.
 
     Parameters
     ----------
     every
-        Seconds between two pictures; more if showing one takes over a tenth of the time.
+        Seconds between two pictures; more if showing pictures would take over a tenth of the time.
 
     Raises
     ------
@@ -77,7 +77,7 @@ class LiveView:
             self._handle.update(self._html(page))
 
 
-TITLE, GAP = 22, 8  # pixels above a picture, and between two
+TITLE, GAP = 22, 8  # pixels: height of a title above a picture, and space between pictures
 
 
 def side_by_side(pictures: Mapping[str, Film | np.ndarray], columns: int = 2, scale: int = 1) -> Image.Image:
@@ -86,7 +86,7 @@ def side_by_side(pictures: Mapping[str, Film | np.ndarray], columns: int = 2, sc
     Parameters
     ----------
     pictures
-        Films or display codes (H, W, 3) uint8, by name ("" is none).
+        Films or display codes (H, W, 3) uint8, by title ("": no title).
     columns
         Pictures in a row.
     scale
@@ -100,7 +100,7 @@ def side_by_side(pictures: Mapping[str, Film | np.ndarray], columns: int = 2, sc
     Raises
     ------
     InputError
-        For no pictures, and for an array of another shape or type.
+        If there is no picture, or an array has another shape or dtype.
     """
     with needed_by("a notebook's picture"):
         from PIL import Image, ImageDraw
@@ -108,7 +108,7 @@ def side_by_side(pictures: Mapping[str, Film | np.ndarray], columns: int = 2, sc
     from wrt.picture.heatmap import INK, font
 
     if not pictures or columns < 1 or scale < 1:
-        raise InputError("side_by_side needs a picture or more, columns and scale of 1 or more")
+        raise InputError("side_by_side needs at least one picture, and columns and scale of 1 or more")
     codes = [each.to_srgb8() if isinstance(each, Film) else np.asarray(each) for each in pictures.values()]
     for name, array in zip(pictures, codes, strict=True):
         if array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] != 3:

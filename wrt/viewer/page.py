@@ -1,6 +1,6 @@
-"""The viewer in a browser: viser's orbit controls and panel, and the pictures of a wrt.viewer.refine.Viewer as the background.
+"""The viewer in a browser: viser's orbit controls and panel over the pictures of a wrt.viewer.refine.Viewer.
 
-Several browsers share the panel. The picture follows the camera that moved last and appears in its browser.
+Several browsers share the panel. The Viewer renders the camera that moved last, and only that camera's browser gets the picture.
 """
 
 from __future__ import annotations
@@ -28,47 +28,46 @@ from wrt.viewer.access import HERE, Place, access_for
 from wrt.viewer.camera import camera_toml, from_viewport, orbited_point, unit_of, up_of
 from wrt.viewer.refine import Viewer
 from wrt.viewer.renderers import CounterOf, Shown
-from wrt.viewer.server import Door, import_viser, listen, to_stderr
+from wrt.viewer.server import Guard, import_viser, listen, to_stderr
 
 if TYPE_CHECKING:
     import viser
 
 Event = TypeVar("Event")
 
-MOST_PIXELS = 1 << 21  # of a picture; a larger viewport gets a coarser picture
+MOST_PIXELS = 1 << 21  # largest number of pixels of a picture; a larger viewport shows the picture enlarged
 RESOLUTIONS = {"full": 1, "1/2": 2, "1/4": 4}
 PICTURE = "picture"
-QUALITY = {True: 92, False: 80}  # of JPEG at full resolution, and of a coarse picture
-LEGEND_SIZE = (12, 256)
+QUALITY = {True: 92, False: 80}  # JPEG quality of a picture at full resolution, and of a coarse picture
+LEGEND_HEIGHT = 12  # pixels
 FARTHEST_FOCUS = 1e9  # in units of the viewport
 
 
 def full_size(size: tuple[int, int], before: tuple[int, int]) -> tuple[int, int]:
-    """Return the size of the viewport of a canvas, which viser gives fewer pixels of the same shape if a browser draws slowly."""
+    """Return a viewport's size from the size of its canvas, which viser shrinks if the browser is slow. before: last viewport size."""
     smaller = size[0] <= before[0] and abs(size[0] * before[1] - size[1] * before[0]) <= max(before)
     return before if smaller else size
 
 
 def status(shown: Shown, viewer: Viewer, full: tuple[int, int], browsers: int) -> str:
-    """Return the panel's text about a picture, as Markdown. full: the viewport's size in pixels; browsers: their number."""
+    """Return the panel's text about a picture, as Markdown. full: viewport's size in pixels; browsers: number of connected browsers."""
     height, width = shown.codes.shape[:2]
-    rays = f"{shown.speed / 1e6:.2f} Mray/s, {shown.rays_per_sample:.1f} rays a sample"
+    rays = f"{shown.speed / 1e6:.2f} Mray/s, {shown.rays_per_sample:.1f} rays per sample"
     if shown.view.cost:
-        what = f"**{shown.view.cost}** a pixel: mean {short(shown.mean)}, largest {short(shown.largest)}"
+        content = f"**{shown.view.cost}** per pixel: mean {short(shown.mean)}, largest {short(shown.largest)}"
     else:
-        what = f"**{shown.spp} of {viewer.spp} spp**"
-    whole = "" if (width, height) == full else f" of {full[0]}x{full[1]}"
-    size = f"{width}x{height}{whole}{', coarse' if shown.scale > 1 else ''}"
-    others = f"  \n{browsers} browsers look: the picture follows the camera that moved last" if browsers > 1 else ""
-    return f"{what}, {size}  \n{rays}  \n{viewer.renderers.describe(shown.view.accel)}{others}"
+        content = f"**{shown.spp} of {viewer.spp} spp**"
+    viewport = "" if (width, height) == full else f" of {full[0]}x{full[1]}"
+    size = f"{width}x{height}{viewport}{', coarse' if shown.scale > 1 else ''}"
+    others = f"  \n{browsers} browsers are connected: the picture follows the camera that moved last" if browsers > 1 else ""
+    return f"{content}, {size}  \n{rays}  \n{viewer.renderers.describe(shown.view.accel)}{others}"
 
 
 class Page:
-    """A server with the panel and one Viewer, until `close`. `url` is its address with the token.
+    """A server with the panel and one Viewer, which runs until `close`. `url` is the page's address with the token.
 
-    spp, counter_of: see Viewer. warn: called once for each kind of refused request or message. Raises InputError if it cannot listen
-    at the place.
-    """
+    spp, counter_of: see Viewer. warn: called once for each kind of refused request or message. Raises InputError if the server cannot
+    listen at `place`."""
 
     def __init__(self, scene: Scene, options: Options, place: Place = HERE, spp: int = 1024, *,
                  counter_of: CounterOf | None = None, warn: Callable[[str], None] = to_stderr) -> None:
@@ -81,8 +80,8 @@ class Page:
         try:
             address, port = listening.getsockname()[:2]
             access, self.url = access_for(place, address, port)
-            self.door = Door(access, warn)
-            self.server = self.door.open(listening, "wrt")
+            self.guard = Guard(access, warn)
+            self.server = self.guard.open(listening, "wrt")
         except BaseException:
             listening.close()
             raise
@@ -90,7 +89,7 @@ class Page:
         self.server.gui.configure_theme(show_share_button=False, show_logo=False, dark_mode=True)
         self._panel(start)
         self.server.on_client_connect(self._connected)
-        self.server.on_client_disconnect(self._gone)
+        self.server.on_client_disconnect(self._disconnected)
         self.thread = threading.Thread(target=self._run, name="wrt viewer", daemon=True)
         self.failure: BaseException | None = None
         self.thread.start()
@@ -102,7 +101,7 @@ class Page:
             self.failure = error
 
     def wait(self) -> None:
-        """Wait until `close`, or raise the renderer's error."""
+        """Wait until `close`. Raises the error that ends the Viewer's thread."""
         while self.thread.is_alive():
             self.thread.join(0.5)
         if self.failure is not None:
@@ -110,14 +109,14 @@ class Page:
 
     def close(self) -> None:
         self.viewer.stop()
-        self.door.close()
+        self.guard.close()
 
     # --- the viewport -------------------------------------------------------------------------------------------------
 
     async def _connected(self, client: viser.ClientHandle) -> None:
         client.camera.on_update(self._moved)
 
-    async def _gone(self, client: viser.ClientHandle) -> None:
+    async def _disconnected(self, client: viser.ClientHandle) -> None:
         if client.client_id != self.watching:
             return
         others = self.server.get_clients()
@@ -127,7 +126,7 @@ class Page:
             self.viewer.pause()
 
     async def _moved(self, viewport: viser.CameraHandle) -> None:
-        """Follow a browser's camera. A coroutine and no thread, because cameras must come in order."""
+        """Render a browser's new camera. viser runs coroutines in order, but functions in threads."""
         width, height = viewport.image_width, viewport.image_height
         if width < 1 or height < 1:
             return
@@ -138,8 +137,8 @@ class Page:
         size = max(1, round(width / coarser)), max(1, round(height / coarser))
         try:
             changed = self.viewer.change(camera=lambda camera: from_viewport(camera, viewport, self.unit), size=size)
-        except InputError as error:  # its values are too large in the scene's units
-            self.door.report("camera", f"dropped a camera: {error}")
+        except InputError as error:  # the position overflows in scene units
+            self.guard.report("camera", f"dropped a camera: {error}")
             return
         if newcomer and not changed:
             self.viewer.again()
@@ -151,49 +150,48 @@ class Page:
         form = {"format": "png"} if shown.done else {"format": "jpeg", "jpeg_quality": QUALITY[shown.scale == 1]}
         client.scene.set_background_image(shown.codes, **form)
         self.status.content = status(shown, self.viewer, self.full, len(self.server.get_clients()))
-        self.legend.visible = self.marks.visible = bool(shown.view.cost)
+        self.legend.visible = self.legend_text.visible = bool(shown.view.cost)
         self.exr.disabled = bool(shown.view.cost)
         if shown.view.cost:
-            self.marks.content = f"0 (dark) to {short(shown.top)} (light)"
+            self.legend_text.content = f"0 (dark) to {short(shown.top)} (light)"
 
     def _report(self, text: str) -> None:
-        self.doing.content, self.doing.visible = text, bool(text)
+        self.activity.content, self.activity.visible = text, bool(text)
 
     # --- the panel ----------------------------------------------------------------------------------------------------
 
     def _panel(self, camera: CameraKind) -> None:
         gui = self.server.gui
         self.status = gui.add_markdown("waiting for the first picture")
-        self.doing = gui.add_markdown("", visible=False)
+        self.activity = gui.add_markdown("", visible=False)
         if isinstance(camera, Camera):
             self._lens_folder(camera)
         with gui.add_folder("Light"):
-            depth = gui.add_slider("bounces", 0, self.viewer.deepest, 1, self.viewer.view.max_depth, hint="After the first hit")
+            depth = gui.add_slider("bounces", 0, self.viewer.deepest, 1, self.viewer.view.max_depth, hint="Number after the first hit")
             accel = gui.add_dropdown("structure", tuple(ACCELERATORS), initial_value=self.viewer.view.accel,
-                                     hint="Built once each; the picture is the same, its speed and cost are not")
+                                     hint="Acceleration structure, built at its first use. It changes speed and cost, not the picture")
         depth.on_update(self._safe(lambda event: self.viewer.change(max_depth=int(depth.value))))
         accel.on_update(self._safe(lambda event: self.viewer.change(accel=accel.value)))
         self._picture_folder()
         with gui.add_folder("Save"):
-            png = gui.add_button("picture as PNG", hint="As it is shown")
-            self.exr = gui.add_button("picture as EXR", hint="Linear, with variance and samples")
-            toml = gui.add_button("camera as TOML", hint="A table for a scene file")
+            png = gui.add_button("picture as PNG", hint="The picture as shown")
+            self.exr = gui.add_button("picture as EXR", hint="Linear radiance, variance and number of samples")
+            toml = gui.add_button("camera as TOML", hint="The camera as a table for a scene file")
         png.on_click(self._safe(lambda event: self._save(event.client, ".png")))
         self.exr.on_click(self._safe(lambda event: self._save(event.client, ".exr")))
-        toml.on_click(self._safe(lambda event: give_camera(event.client, self.viewer.view.camera)))
+        toml.on_click(self._safe(lambda event: show_camera(event.client, self.viewer.view.camera)))
 
     def _lens_folder(self, camera: Camera) -> None:
         gui, unit = self.server.gui, self.unit
-        widest = nice(max(4.0 * camera.aperture_radius, 0.05 * unit))
+        widest = round_up(max(4.0 * camera.aperture_radius, 0.05 * unit))
         with gui.add_folder("Lens"):
             angle = gui.add_slider("angle of view", 5.0, 120.0, 0.5, min(max(round(math.degrees(camera.fov_y), 2), 5.0), 120.0),
-                                   hint="Vertical, degrees")
+                                   hint="Vertical angle in degrees")
             aperture = gui.add_slider("aperture", 0.0, widest, widest / 200.0, camera.aperture_radius,
-                                      hint="Its radius in scene units; 0 is a pinhole")
+                                      hint="Radius of the lens in scene units; 0 is a pinhole")
             self.focus = gui.add_number("focus", camera.focus_distance, min=1e-6 * unit, max=FARTHEST_FOCUS * unit,
-                                        step=nice(0.01 * unit),
-                                        hint="Distance along the axis to what is sharp, in scene units")
-            self.by_click = gui.add_checkbox("click to focus", False, hint="A click into the picture focuses on what is there")
+                                        step=round_up(0.01 * unit), hint="Distance of the plane in focus, in scene units")
+            self.by_click = gui.add_checkbox("click to focus", False, hint="A click into the picture focuses on the surface there")
         angle.on_update(self._safe(lambda event: self._set_angle(math.radians(angle.value))))
         aperture.on_update(self._safe(lambda event: self._set_lens(aperture_radius=float(aperture.value))))
         self.focus.on_update(self._safe(lambda event: self._set_lens(focus_distance=float(self.focus.value))))
@@ -203,14 +201,14 @@ class Page:
         gui, viewer = self.server.gui, self.viewer
         with gui.add_folder("Picture"):
             cost = gui.add_dropdown("show", (PICTURE, *viewer.costs), initial_value=PICTURE,
-                                    hint="The picture, or a heat map of what each pixel costs: a counter summed over its rays")
-            self.legend = gui.add_image(np.repeat(colors()[None], LEGEND_SIZE[0], axis=0), visible=False)
-            self.marks = gui.add_markdown("", visible=False)
+                                    hint="The picture, or a heat map of a cost: a counter summed over the rays of each pixel")
+            self.legend = gui.add_image(np.repeat(colors()[None], LEGEND_HEIGHT, axis=0), visible=False)
+            self.legend_text = gui.add_markdown("", visible=False)
             exposure = gui.add_slider("exposure", min(-8.0, viewer.exposure), max(8.0, viewer.exposure), 0.1, viewer.exposure,
-                                      hint="Stops")
+                                      hint="In stops")
             tonemap = gui.add_dropdown("tone mapping", TONEMAPS, initial_value=viewer.tonemap)
             self.resolution = gui.add_dropdown("resolution", tuple(RESOLUTIONS), initial_value="full",
-                                               hint="Of the viewport's pixels")
+                                               hint="Pixels of the picture per pixel of the viewport, along each side")
         cost.on_update(self._safe(lambda event: viewer.change(cost="" if cost.value == PICTURE else cost.value)))
         for control in (exposure, tonemap):
             control.on_update(self._safe(lambda event: viewer.tone(float(exposure.value), tonemap.value)))
@@ -222,19 +220,19 @@ class Page:
                 await self._moved(client.camera)
 
     def _safe(self, action: Callable[[Event], object]) -> Callable[[Event], None]:
-        """Return the action for a browser's event with its errors reported in one line."""
+        """Return an action for a browser's event that reports its errors in one line, in place of raising them."""
 
         def act(event: Event) -> None:
             try:
                 action(event)
             except (InputError, OSError) as error:
-                self.door.report("action", f"error: {error}")
+                self.guard.report("action", f"error: {error}")
 
         return act
 
     def _set_angle(self, fov_y: float) -> None:
         for client in self.server.get_clients().values():
-            client.camera.fov = fov_y  # then the client reports a new camera
+            client.camera.fov = fov_y  # the browser then reports a new camera
 
     def _set_lens(self, **fields: float) -> None:
         self.viewer.change(camera=lambda camera: replace(camera, **fields))
@@ -252,7 +250,7 @@ class Page:
 
 
 def place_camera(server: viser.ViserServer, camera: CameraKind, target: np.ndarray, unit: float) -> None:
-    """Start browsers at the camera, turning about `target`. unit: the length of the viewport's unit."""
+    """Set the first camera of every browser, which orbits `target` (3,). unit: viewport's unit in scene units."""
     server.scene.set_up_direction(tuple(up_of(camera)))
     start = server.initial_camera
     start.position = tuple(camera.camera_to_world[:3, 3] / unit)
@@ -260,8 +258,8 @@ def place_camera(server: viser.ViserServer, camera: CameraKind, target: np.ndarr
     start.fov = (camera if isinstance(camera, Camera) else Camera()).fov_y
 
 
-def give_camera(client: viser.ClientHandle | None, camera: CameraKind) -> None:
-    """Show a camera in a browser as a table of a scene file."""
+def show_camera(client: viser.ClientHandle | None, camera: CameraKind) -> None:
+    """Show a camera in a browser as a table of a scene file, with a button to save the table."""
     if client is None:
         return
     text = camera_toml(camera)
@@ -274,7 +272,7 @@ def give_camera(client: viser.ClientHandle | None, camera: CameraKind) -> None:
 
 
 def encoded(picture: Film | np.ndarray, suffix: str) -> bytes:
-    """Return the content of a file with a picture, or with the codes (h, w, 3) of a heat map."""
+    """Return the bytes of a picture's file. picture: a Film, or the codes (h, w, 3) uint8 of a heat map, which becomes a PNG."""
     if isinstance(picture, np.ndarray):
         return encode_png(picture)
     with tempfile.TemporaryDirectory() as folder:
@@ -283,7 +281,7 @@ def encoded(picture: Film | np.ndarray, suffix: str) -> bytes:
         return path.read_bytes()
 
 
-def nice(value: float) -> float:
-    """Round up to a power of ten times 1, 2 or 5."""
+def round_up(value: float) -> float:
+    """Round up to 1, 2 or 5 times a power of ten."""
     power = 10.0 ** math.floor(math.log10(value))
     return next(power * factor for factor in (1.0, 2.0, 5.0, 10.0) if power * factor >= value * (1.0 - 1e-9))

@@ -1,6 +1,6 @@
-"""A picture that follows a changing view: coarse at once after a change, then finer until the next change.
+"""Progressive rendering of a changing view: a coarse picture soon after each change, then finer pictures until the next change.
 
-It knows nothing of browsers; wrt.viewer.page connects it to one.
+This module is independent of browsers; wrt.viewer.page connects it to them.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from wrt.scene.cameras import CameraKind
 from wrt.scene.model import Scene
 from wrt.viewer.renderers import CounterOf, Renderers, Shown, View
 
-COARSE = 0.08  # Target seconds of the first picture after a change.
-PATIENCE = 0.5  # Seconds after which it is abandoned for the next change.
-EVERY = 0.25  # Seconds between two pictures of a view that is refined.
-SCALES = (1, 2, 4, 8, 16, 32)  # Pixels a side of the view to one of a coarse picture.
-REST = 0.4  # Seconds after a change of exposure or tone mapping until the picture is shown as done again.
-DEEPEST = 12  # Bounces that a user can choose, or more if the scene has more.
+COARSE = 0.08  # Target time of the first picture after a change, in seconds.
+PATIENCE = 0.5  # Seconds after which the next change interrupts even the first picture.
+EVERY = 0.25  # Seconds between two pictures while a view is refined.
+SCALES = (1, 2, 4, 8, 16, 32)  # Pixels of the view, along each side, for one pixel of a coarse picture.
+REST = 0.4  # Seconds from the last change of exposure or tone mapping until the picture counts as done again.
+DEEPEST = 12  # Largest max_depth that the user can choose, unless the scene's is larger.
 COSTS = ("nodes", "primitives", "probes", "boxes", "stack", "node_bytes")  # Counters for heat maps.
 
 
@@ -39,20 +39,20 @@ class _Work:
     """A view that is being rendered."""
 
     view: View
-    request: int  # the change that asked for it
+    request: int  # value of Viewer._requested at the start
     scale: int = 1
-    last_shown: float = -np.inf  # time of its last picture
+    last_shown: float = -np.inf  # time of the last picture shown
 
 
 class Pace(dict[tuple[str, bool], float]):
-    """Seconds of a sample, by structure and by kind: picture (False) or heat map (True)."""
+    """Measured seconds per sample. Key: the structure's name, and False for a picture or True for a heat map."""
 
     def note(self, view: View, samples: int, seconds: float) -> None:
         if samples:
             self[view.accel, bool(view.cost)] = seconds / samples
 
     def scales(self, view: View) -> list[int]:
-        """Return the scales to render: the first that should take at most COARSE (8 without a measurement), then finer ones to 1."""
+        """Return the scales to render, down to 1. The first should take COARSE seconds at most; it is 8 without a measurement."""
         pace = self.get((view.accel, bool(view.cost)))
         seconds = COARSE * 8**2 if pace is None else pace * view.size[0] * view.size[1]
         first = next((scale for scale in SCALES if seconds / scale**2 <= COARSE), SCALES[-1])
@@ -60,13 +60,14 @@ class Pace(dict[tuple[str, bool], float]):
 
 
 class Viewer:
-    """A renderer of the view that `change` asked for last. A thread of its own calls `run`, which returns after `stop`.
+    """Renders the view that `change` requested last. The caller runs `run` in a thread of its own, until `stop`.
 
     All other methods may be called from any thread and never wait for a picture. `change` and `pause` increase `_requested`. The
-    thread renders while that differs from `_completed` and somebody watches.
+    thread renders while `_requested` differs from `_completed` and the viewer is watched, which is from `change` until `pause`.
 
-    `scene` and `options` are those of a Renderer, with the first view as options.camera. `run` calls `show` with each picture, and
-    `report` with a text on its work or "". Refining ends at `spp` samples a pixel. `counter_of` is that of Renderers.
+    - scene, options: as for Renderer; options.camera has the first view. counter_of: as for Renderers.
+    - show: called with each picture. report: called with a text about compiling, building and errors ("": nothing to report).
+    - spp: samples per pixel of the finished picture.
     """
 
     def __init__(self, scene: Scene, options: Options, show: Callable[[Shown], None],
@@ -82,19 +83,18 @@ class Viewer:
         self.renderers = Renderers(scene.with_settings(max_depth=self.deepest), options, self._on_progress, counter_of)
         self._pace = Pace()
         self._condition = threading.Condition()
-        self._requested = self._completed = 0  # counts of changes
+        self._requested = self._completed = 0  # number of requests, and the last request that was rendered or abandoned
         self._watched = self._redraw = self._stopped = False
-        self._toning = False  # exposure or tone mapping change, so that the last picture was not shown as done
+        self._toning = False  # True while exposure or tone mapping change; the picture then does not count as done
         self._work: _Work | None = None
         self._film: Film | None = None  # of `shown`, unless that is a heat map
 
     # --- from any thread ----------------------------------------------------------------------------------------------
 
     def change(self, **changes: Any) -> bool:
-        """Ask for another view by fields of View; return whether it differs. camera: also a function of the present one.
+        """Request a view with some fields of View changed; return True if it differs. camera: a camera, or a function of the current one.
 
-        Raises InputError for an unknown structure or counter.
-        """
+        Raises InputError for an unknown structure or counter."""
         if "accel" in changes:
             ACCELERATORS.check(changes["accel"], "accel")
         if changes.get("cost"):
@@ -118,26 +118,26 @@ class Viewer:
         self.again()
 
     def again(self) -> None:
-        """Show the last picture once more, to another viewer."""
+        """Show the last picture once more, for a browser that has not received it."""
         with self._condition:
             self._redraw = True
             self._condition.notify_all()
 
     def pause(self) -> None:
-        """Stop tracing until the next change, because nobody watches."""
+        """Stop tracing until the next `change`, because no browser is connected."""
         with self._condition:
             self._requested += 1
             self._watched = False
 
     def stop(self) -> None:
-        """Make `run` return after the tiles that are being traced."""
+        """Make `run` return once the running tiles end."""
         with self._condition:
             self._stopped = True
             self._requested += 1
             self._condition.notify_all()
 
     def picture(self) -> Film | np.ndarray | None:
-        """Return the last picture for a file: a Film with exposure and tone mapping, or the codes (h, w, 3) of a heat map."""
+        """Return the last picture for a file: a Film, or the codes (h, w, 3) uint8 of a heat map; None before the first picture."""
         with self._condition:
             film, shown = self._film, self.shown
         if film is None:
@@ -147,7 +147,7 @@ class Viewer:
     # --- the thread that renders --------------------------------------------------------------------------------------
 
     def run(self) -> None:
-        """Compile and build, then render every view that is asked for until `stop`."""
+        """Compile and build, then render each requested view, until `stop`."""
         self._prepare(self.view)
         while True:
             with self._condition:
@@ -161,9 +161,9 @@ class Viewer:
         return self._watched and self._requested != self._completed
 
     def step(self) -> None:
-        """Refine the last request until it is done or there is another one; or show the picture with another tone mapping.
+        """Refine the last request until it is done or the next request comes; without a request, show the last picture again.
 
-        While exposure or tone mapping change the picture is not shown as done, so that it is sent faster."""
+        While exposure or tone mapping change, the picture does not count as done, so that the page sends it as a smaller JPEG."""
         with self._condition:
             redraw, self._redraw = self._redraw, False
             work = _Work(self.view, self._requested) if self._pending else None
@@ -189,7 +189,7 @@ class Viewer:
             self.report(f"error: {error}")
 
     def _prepare(self, view: View) -> bool:
-        """Make the renderer that the view needs, if it is missing; return whether that succeeded."""
+        """Make the renderer that the view needs, if it is missing; return False if that fails, after reporting the error."""
         try:
             self.renderers.prepare(view)
         except InputError as error:
@@ -198,7 +198,7 @@ class Viewer:
         return True
 
     def _abandoned(self, work: _Work, seconds: float) -> bool:
-        """Return whether there is another request, and this view was shown or has had its time."""
+        """Return True if there is a newer request, and this view was shown at least once or took over PATIENCE seconds."""
         return self._requested != work.request and (work.last_shown > -np.inf or seconds > PATIENCE)
 
     def _trace(self, work: _Work) -> bool:
@@ -210,7 +210,7 @@ class Viewer:
         return True
 
     def _on_progress(self, progress: Progress) -> None:
-        """Report a renderer's progress. Raises KeyboardInterrupt to end the render."""
+        """Report a renderer's progress, and show pictures while it refines. Raises KeyboardInterrupt to end an abandoned render."""
         if progress.stage != "trace" or self._work is None:
             done = f" {progress.done / progress.total:.0%}" if progress.stage == "build" else ""
             self.report("building the structure ..." + done if progress.stage == "build" else COMPILING)

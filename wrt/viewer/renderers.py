@@ -1,4 +1,4 @@
-"""The viewer's renderers: one for each structure, made when a view first needs it."""
+"""The viewer's renderers: one for each acceleration structure, made when a view first needs it."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from wrt.renderer.pixel_rays import film_rays
 from wrt.renderer.prepare import Prepared
 from wrt.renderer.renderer import Renderer
 from wrt.scene.cameras import CameraKind
-from wrt.scene.digest import camera_digest
+from wrt.scene.digest import digest
 from wrt.scene.model import Scene
 
-TILE_SIZE = 16  # pixels; small, because the next view waits for the tiles that run
+TILE_SIZE = 16  # pixels a side; small, because the next view waits until all running tiles end
 
 
 class Counter(Protocol):
-    """A counter of every pixel's work, for heat maps."""
+    """Counts the work of each pixel, for heat maps."""
 
     def aim(self, camera: CameraKind, angles_of: tuple[int, int] | None = None, **settings: Any) -> None:
-        """Turn to another view, as Prepared.aimed does."""
+        """Set another camera and other settings, as Prepared.aimed does."""
 
     def costs(self, go_on: Callable[[int], bool]) -> dict[str, np.ndarray] | None:
-        """Return the counters by name, (H, W) int32 each, or None if go_on(pixels done) returned False."""
+        """Return the counts by counter, (H, W) int32 each, or None once go_on(number of pixels so far) returns False."""
 
 
 CounterOf = Callable[[Prepared], Counter]
 
 
 class Renderers:
-    """The renderers of a scene by structure, and their counters. Methods that make one raise InputError if it cannot be made.
+    """The renderers of a scene and their counters, by name of the structure.
 
-    progress: called by all of them. counter_of: makes the counter of a prepared structure; None: no heat maps."""
+    progress: callback of all renderers. counter_of: makes the counter of a prepared scene; None: no heat maps."""
 
     def __init__(self, scene: Scene, options: Options, progress: Callable[[Progress], None], counter_of: CounterOf | None) -> None:
         self.scene, self.options, self.progress, self.counter_of = scene, options, progress, counter_of
@@ -44,7 +44,7 @@ class Renderers:
         self.counters: dict[str, Counter] = {}
 
     def prepare(self, view: View) -> None:
-        """Make the renderer and the counter that the view needs, if they are missing."""
+        """Make the renderer and the counter that the view needs, if they are missing. Raises InputError if that fails."""
         if view.accel not in self.by_accel:
             options = replace(self.options, accel=view.accel, camera=view.camera.opened(), tile_size=TILE_SIZE,
                               progress=self.progress)
@@ -53,21 +53,21 @@ class Renderers:
             self.counters[view.accel] = self.counter_of(self.by_accel[view.accel].prepared)
 
     def picture(self, view: View, scale: int, spp: int) -> Film:
-        """Render the view with one pixel for `scale` x `scale` of its pixels."""
+        """Render the view with one pixel for each block of `scale` x `scale` pixels."""
         renderer = self.by_accel[view.accel]
         renderer.aim(view.camera, view.size, **_settings(view, scale, spp))
         return renderer.run()
 
     def costs(self, view: View, scale: int, go_on: Callable[[int], bool]) -> dict[str, np.ndarray] | None:
-        """Return the counters of the view's pixels, see Counter.costs."""
+        """Return the counts of the view, with one pixel for each block of `scale` x `scale` pixels; see Counter.costs."""
         counter = self.counters[view.accel]
         counter.aim(view.camera, view.size, **_settings(view, scale, 1))
         return counter.costs(go_on)
 
     def focus_at(self, view: View, x: float, y: float) -> float | None:
-        """Return the distance along the axis of the surface at a point of the picture, or None where nothing is hit or built.
+        """Return the distance along the axis, in scene units, to the surface at a point of the picture.
 
-        x, y: 0 to 1 from the top left corner."""
+        x, y: 0 to 1 from the top left corner. None: the ray hits nothing, or the structure is not built yet."""
         if view.accel not in self.by_accel:
             return None
         origins, directions = film_rays(view.camera, view.size, np.array([[x, y]]))
@@ -76,7 +76,7 @@ class Renderers:
         return float(hits.t[0]) * along if hits.prim_id[0] >= 0 else None
 
     def describe(self, accel: str) -> str:
-        """Return the size and the build time of a structure as text."""
+        """Return a structure's name, size and build time as text; before it is built, the name."""
         if accel not in self.by_accel:
             return accel
         stats = self.by_accel[accel].accel.stats
@@ -90,32 +90,32 @@ def _settings(view: View, scale: int, spp: int) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A view that the viewer was asked for."""
+    """A picture or heat map that the user requests."""
 
     camera: CameraKind
     size: tuple[int, int]  # width, height in pixels at full resolution
     max_depth: int
     accel: str  # a name in ACCELERATORS
-    cost: str = ""  # the counter of a heat map, one of wrt.viewer.refine.COSTS; "" is the picture
+    cost: str = ""  # the counter of a heat map, one of wrt.viewer.refine.COSTS; "": the picture
 
     def same(self, other: View) -> bool:
-        """Return whether the picture would be the same."""
-        mine, others = ((v.size, v.max_depth, v.accel, v.cost, camera_digest(v.camera)) for v in (self, other))
-        return mine == others
+        """Return True if both views have the same pixels."""
+        fields, others = ((v.size, v.max_depth, v.accel, v.cost, digest(v.camera)) for v in (self, other))
+        return fields == others
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """A picture to show."""
+    """A picture or heat map to show."""
 
     codes: np.ndarray  # (h, w, 3) uint8, display values
     view: View
-    scale: int  # pixels a side of the view to one of the picture
-    spp: int  # least number of samples of a pixel
-    speed: float = 0.0  # rays a second
+    scale: int  # one pixel stands for scale x scale pixels of the view
+    spp: int  # smallest number of samples of a pixel
+    speed: float = 0.0  # rays per second
     rays_per_sample: float = 0.0
-    done: bool = False  # it gets no finer
-    # Of a heat map: the value with the last colour, the mean and the largest value.
+    done: bool = False  # True: the picture gets no finer
+    # For a heat map, counts per pixel: `top` has the last colour; mean and largest value.
     top: float = 0.0
     mean: float = 0.0
     largest: float = 0.0

@@ -1,8 +1,8 @@
-"""viser's server behind a guard: it answers no request without the token, and gets only the messages of wrt.viewer.messages.
+"""viser's server behind a guard, which refuses requests without the token and messages that wrt.viewer.messages does not allow.
 
-viser serves its page and its WebSocket by one call of `websockets.asyncio.server.serve`, without a hook for checks. That call gets
-wrt's checks and a socket that wrt has bound, so that no other port is opened. It works with the versions of viser in VERSIONS; with
-another one, or if viser does not make the call, nothing is served.
+viser serves its page and its WebSocket with one call of `websockets.asyncio.server.serve`, without a hook for checks. During that
+call, wrt replaces `serve`, to add its checks and a socket that wrt has bound. viser opens no other port. VERSIONS has the supported
+versions of viser. With another version, or if viser does not call `serve`, the viewer does not start.
 """
 
 from __future__ import annotations
@@ -36,21 +36,21 @@ if TYPE_CHECKING:
     Handler: TypeAlias = Callable[[ServerConnection], Awaitable[None]]  # of a WebSocket
     Files: TypeAlias = Callable[[ServerConnection, Request], Response | None]  # viser's answer to requests for its files
 
-VERSIONS = (1, 1, 1), (1, 2)  # the first that works, the first that may not
-LARGEST_MESSAGE = 1 << 16  # bytes; a browser sends a few hundred
-MOST_CONNECTIONS = 64  # open at a time, also without a token so far
-LONGEST_PATH = 200
-LONGEST_LINE = 300  # characters of a report
-CONNECTING = 0  # websockets.protocol.State of a connection before its WebSocket
-CLOSING = 1.0  # seconds for a browser to close its WebSocket
-QUIET = logging.getLogger("wrt.viewer.refine.connections")  # errors of single connections are not shown
+VERSIONS = (1, 1, 1), (1, 2)  # Supported versions of viser: from the first, below the second.
+LARGEST_MESSAGE = 1 << 16  # Bytes; a browser's messages have a few hundred.
+MOST_CONNECTIONS = 64  # Open at a time, with or without a token.
+LONGEST_PATH = 200  # Characters.
+LONGEST_LINE = 300  # Characters of a report.
+CONNECTING = 0  # The websockets.protocol.State of a connection before the handshake.
+CLOSING = 1.0  # Seconds that a browser has to close its WebSocket.
+QUIET = logging.getLogger("wrt.viewer.refine.connections")  # Drops the errors of single connections.
 QUIET.propagate = False
 QUIET.addHandler(logging.NullHandler())
-_ALONE = threading.RLock()  # held while stdout and websockets' `serve` are replaced in the whole process
+_PATCHING = threading.RLock()  # held while stdout or websockets' `serve` is replaced in the whole process
 
 
 def import_viser() -> ModuleType:
-    """Return the module viser. Raises InputError that says how to install it."""
+    """Return the module viser. Raises InputError if it is missing or has an unsupported version."""
     try:
         import viser
     except ImportError as error:
@@ -58,12 +58,12 @@ def import_viser() -> ModuleType:
     numbers = tuple(map(int, re.findall(r"[0-9]+", viser.__version__)[:3]))
     if not VERSIONS[0] <= numbers < VERSIONS[1]:
         raise InputError(f"the viewer cannot guard viser {viser.__version__}",
-                         hint='pip install "wrt[viewer]" installs one that it can')
+                         hint='pip install "wrt[viewer]" installs a version that it can guard')
     return viser
 
 
 def listen(place: Place) -> socket.socket:
-    """Return a socket that listens at the place. Raises InputError if it cannot."""
+    """Return a socket that listens at `place`. Raises InputError if the system refuses."""
     host, port = place.host, place.port
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
@@ -72,7 +72,7 @@ def listen(place: Place) -> socket.socket:
         number = getattr(error, "errno", None) or 0
         reason = os.strerror(number) if number > 0 else getattr(error, "strerror", None) or str(error)
         raise InputError(f"cannot listen on port {port} of {host} ({reason})",
-                         argument="port", hint="--port and --host choose another") from error
+                         argument="port", hint="choose another with --port or --host") from error
 
 
 def to_stderr(text: str) -> None:
@@ -83,16 +83,16 @@ def to_stderr(text: str) -> None:
 
 
 @contextlib.contextmanager
-def quiet() -> Iterator[None]:
-    """Drop what viser writes to stdout, which is for data."""
-    with _ALONE, contextlib.redirect_stdout(io.StringIO()):
+def without_stdout() -> Iterator[None]:
+    """Drop viser's output to stdout, because wrt's stdout is for data."""
+    with _PATCHING, contextlib.redirect_stdout(io.StringIO()):
         yield
 
 
-class Door:
-    """Guard of a viser server, which `open` starts: it checks every request and every message.
+class Guard:
+    """Guard of a viser server: it checks every request and every message. `open` starts the server.
 
-    warn: called once for each kind of refusal."""
+    warn: called with one line, once for each kind of refusal."""
 
     def __init__(self, access: Access, warn: Callable[[str], None] = to_stderr) -> None:
         self.access, self.warn = access, warn
@@ -100,44 +100,44 @@ class Door:
         self.connections: WeakSet[ServerConnection] = WeakSet()
         self._thread = 0  # viser's thread
         self._loop: Any = None  # its event loop
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         self._lock = threading.Lock()
 
     def open(self, listening: socket.socket, label: str) -> viser.ViserServer:
-        """Start a viser server behind this guard. Raises InputError if viser does not use it."""
+        """Start a viser server behind this guard. Raises InputError if viser does not call `serve` as expected."""
         viser = import_viser()
         websockets: Any = importlib.import_module("websockets.asyncio.server")
-        warnings.filterwarnings("ignore", r"Queued a \w+ on a closed connection", UserWarning)  # after a browser has left
+        warnings.filterwarnings("ignore", r"Queued a \w+ on a closed connection", UserWarning)  # from viser, after a browser disconnects
         host, port = listening.getsockname()[:2]
 
         def guarded(handler: Handler, *address: object, **settings: Any) -> object:
             self._thread = self._thread or threading.get_ident()
             if self._thread != threading.get_ident():
-                return serve(handler, *address, **settings)  # another server of this process that starts at the same time
+                return serve(handler, *address, **settings)  # the call of another server, which starts at the same time
             settings = {key: value for key, value in settings.items() if key not in ("host", "port", "sock")}
             self._loop = asyncio.get_running_loop()
-            self._loop.set_exception_handler(self._failed)
-            return serve(self._greeting(handler), sock=listening, **settings | self._settings(settings.get("process_request")))
+            self._loop.set_exception_handler(self._report_failure)
+            return serve(self._checking_version(handler), sock=listening, **settings | self._settings(settings.get("process_request")))
 
-        with quiet():
+        with without_stdout():
             serve, websockets.serve = websockets.serve, guarded
             try:
                 server = viser.ViserServer(host, port, label=label, verbose=False)
             finally:
                 websockets.serve = serve
         if not self._thread or server.get_port() != port:
-            with quiet():
+            with without_stdout():
                 server.stop()
             listening.close()
-            raise InputError(f"viser {viser.__version__} does not let itself be guarded; the viewer knows 1.1.1")
+            raise InputError(f"viser {viser.__version__} cannot be guarded", hint="the viewer is tested with viser 1.1.1")
         self.viser = server
         return server
 
     def close(self) -> None:
-        """Stop viser's server, which would wait for connections that have not sent a request yet."""
-        with contextlib.suppress(RuntimeError):  # it has stopped
+        """Abort connections that have sent no request, for which viser would wait; then stop viser's server."""
+        with contextlib.suppress(RuntimeError):  # the server has stopped already
             self._loop.call_soon_threadsafe(self._abort_half_open)
-        with quiet():
+        with without_stdout():
             self.viser.stop()
 
     def _abort_half_open(self) -> None:
@@ -145,36 +145,36 @@ class Door:
             if connection.protocol.state == CONNECTING:
                 connection.transport.abort()
 
-    def report(self, about: str, text: str) -> None:
-        """Report a text in one line, once for each kind `about`."""
+    def report(self, kind: str, text: str) -> None:
+        """Pass a text to `warn` as one line, once for each kind."""
         with self._lock:
-            if about in self._told:
+            if kind in self._reported:
                 return
-            self._told.add(about)
-        self.warn(f"viewer: {' '.join(text.split())[:LONGEST_LINE]} (told once)")
+            self._reported.add(kind)
+        self.warn(f"viewer: {' '.join(text.split())[:LONGEST_LINE]} (reported once)")
 
     # --- requests -----------------------------------------------------------------------------------------------------
 
     def _settings(self, page: Files | None) -> dict[str, Any]:
-        """Return settings of websockets' `serve` that replace viser's."""
+        """Return the arguments of websockets' `serve` that replace viser's. page: viser's answers to requests for files."""
         return {"process_request": lambda connection, request: self._answer(connection, request, page), "server_header": None,
                 "max_size": LARGEST_MESSAGE, "close_timeout": CLOSING, "logger": QUIET, "create_connection": _checked_connection(self)}
 
     def _answer(self, connection: ServerConnection, request: Request, page: Files | None) -> Response | None:
-        """Return the answer to a request; None opens a WebSocket."""
+        """Return the response to a request; None: the request opens a WebSocket."""
         from websockets.http11 import Request
 
         headers = request.headers
         try:
             self.access.check(headers.get_all("Host"), headers.get_all("Origin"), connection.local_address[0].partition("%")[0])
-            path, moved = self.access.inside(request.path)
+            path, location = self.access.strip_token(request.path)
         except Refused as refused:
-            self.report(refused.about, f"refused {refused}")
+            self.report(refused.kind, f"refused {refused}")
             return _response(HTTPStatus.FORBIDDEN)
         if [value.lower() for value in headers.get_all("Upgrade")] == ["websocket"]:
             return None
-        if moved:
-            return _response(HTTPStatus.SEE_OTHER, Location=moved)
+        if location:
+            return _response(HTTPStatus.SEE_OTHER, Location=location)
         if page is None or len(path) > LONGEST_PATH or "\0" in path or "%00" in path:
             return _response(HTTPStatus.NOT_FOUND)
         encodings = {"Accept-Encoding": "gzip"} if any("gzip" in value for value in headers.get_all("Accept-Encoding")) else {}
@@ -184,27 +184,27 @@ class Door:
         answer.headers.update(COMMON)
         return answer
 
-    def _greeting(self, handler: Handler) -> Handler:
-        """Return viser's handler for browsers with its protocol. It would report others on stdout."""
+    def _checking_version(self, handler: Handler) -> Handler:
+        """Return viser's handler for browsers with this version of viser; viser would report other versions on stdout."""
         import viser
 
-        async def greet(connection: ServerConnection) -> None:
+        async def check(connection: ServerConnection) -> None:
             if connection.subprotocol == f"viser-v{viser.__version__}":
                 await handler(connection)
             else:
                 self.report("version", f"closed a WebSocket of the protocol {shown(connection.subprotocol)}; load the page again")
                 await connection.close(1002, f"Version mismatch: the server is viser {viser.__version__}")
 
-        return greet
+        return check
 
     # --- messages -----------------------------------------------------------------------------------------------------
 
-    def lets_in(self, data: str | bytes) -> bool:
-        """Return whether viser may get a message; report a refused one."""
+    def allows(self, data: str | bytes) -> bool:
+        """Return True if viser may receive a message; report a refused message."""
         try:
             check_message(_decoded(data), self._control)
         except Refused as refused:
-            self.report(refused.about, f"dropped {refused}")
+            self.report(refused.kind, f"dropped {refused}")
             return False
         return True
 
@@ -215,29 +215,29 @@ class Door:
         handles = (panel._gui_input_handle_from_uuid.get(uuid) for panel in panels)
         return next((handle for handle in handles if handle is not None), None)
 
-    def _failed(self, loop: object, context: dict[str, Any]) -> None:
-        """Report an error in one line in place of asyncio's traceback."""
+    def _report_failure(self, loop: object, context: dict[str, Any]) -> None:
+        """Report an error in one line, in place of asyncio's traceback."""
         error = context.get("exception")
-        what = context.get("message") if error is None else f"{type(error).__name__}: {error}"
-        self.report(f"failure {type(error).__name__}", f"error: {what}")
+        text = context.get("message") if error is None else f"{type(error).__name__}: {error}"
+        self.report(f"failure {type(error).__name__}", f"error: {text}")
 
 
-def _checked_connection(door: Door) -> type[ServerConnection]:
+def _checked_connection(guard: Guard) -> type[ServerConnection]:
     """Return a class of connections whose messages the guard checks."""
     from websockets.asyncio.server import ServerConnection
 
     class Checked(ServerConnection):
         def connection_made(self, transport: asyncio.BaseTransport) -> None:
             super().connection_made(transport)
-            door.connections.add(self)
+            guard.connections.add(self)
             if len(self.server.handlers) > MOST_CONNECTIONS:
-                door.report("connections", f"closed a connection; there are {MOST_CONNECTIONS} already")
+                guard.report("connections", f"closed a connection, because {MOST_CONNECTIONS} are open already")
                 self.transport.abort()
 
         async def recv(self, decode: bool | None = None) -> str | bytes:  # type: ignore[override]
             while True:
                 data: str | bytes = await super().recv(decode)
-                if door.lets_in(data):
+                if guard.allows(data):
                     return data
 
     return Checked
@@ -247,7 +247,7 @@ COMMON = {"Cache-Control": "no-store", "Referrer-Policy": "no-referrer", "X-Cont
 
 
 def _response(status: HTTPStatus, **headers: str) -> Response:
-    """Return an answer without content."""
+    """Return a response without content."""
     from websockets.datastructures import Headers
     from websockets.http11 import Response
 
@@ -262,4 +262,4 @@ def _decoded(data: str | bytes) -> object:
             return msgspec.msgpack.decode(data)
     except (msgspec.MsgspecError, ValueError, TypeError, RecursionError, OverflowError):
         pass
-    raise Refused("frame", "a message that is no MessagePack")
+    raise Refused("frame", "a message that is not MessagePack")

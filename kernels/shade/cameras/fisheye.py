@@ -12,14 +12,14 @@ from wrt.kernels.structs import Ray, make_ray
 
 @wp.struct
 class Camera:
-    """A fisheye; lengths on the film are in radii of the image circle."""
+    """A fisheye camera. The unit of length on the film is the radius of the image circle."""
 
     origin: wp.vec3
     right: wp.vec3
     up: wp.vec3
     forward: wp.vec3
-    half_angle: float  # Between the axis and the rays at the edge of the image circle.
-    half_width: float  # Of the picture.
+    half_angle: float  # Angle between the axis and the rays at the edge of the image circle, in radians.
+    half_width: float  # Half the width of the picture, in radii of the image circle.
     half_height: float
 
 

@@ -1,4 +1,4 @@
-"""Parallel rays: things look equally large at any distance."""
+"""Orthographic projection: all rays are parallel to `forward`."""
 
 from typing import Any
 
@@ -22,7 +22,7 @@ class Camera:
 
 @wp.func
 def camera_ray(camera: Camera, film: wp.vec2, xi: wp.vec2) -> Ray:
-    """Return a ray along `forward` from the plane through `origin`. Things behind that plane are invisible."""
+    """Return a ray along `forward` from the plane through `origin`. Objects behind that plane are invisible."""
     x = (2.0 * film[0] - 1.0) * camera.half_width
     y = (1.0 - 2.0 * film[1]) * camera.half_height
     return make_ray(camera.origin + x * camera.right + y * camera.up, camera.forward)

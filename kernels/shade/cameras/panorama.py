@@ -1,4 +1,4 @@
-"""All directions around one point, equirectangular: columns are longitudes, lines are latitudes."""
+"""Equirectangular panorama of all directions around one point: columns are longitudes, lines are latitudes."""
 
 from typing import Any
 
@@ -21,7 +21,7 @@ class Camera:
 def camera_ray(camera: Camera, film: wp.vec2, xi: wp.vec2) -> Ray:
     """Return a ray: the middle column looks along `forward`, the right half to the right, the upper edge to `up`.
 
-    An environment background of the same picture appears in the same directions."""
+    For a camera that looks along -z, with +y up, this is the layout of an environment background."""
     longitude = wp.TAU * (film[0] - 0.5)
     colatitude = wp.PI * film[1]
     sin, cos = sin_cos(longitude)

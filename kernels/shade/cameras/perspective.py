@@ -1,4 +1,4 @@
-"""A pinhole, or a thin lens with a round or polygonal aperture."""
+"""Perspective projection through a pinhole, or through a thin lens with a round or polygonal aperture."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from wrt.kernels.structs import Ray, lift, make_ray, unit
 
 @wp.struct
 class Camera:
-    """The picture spans forward +- tan_x right +- tan_y up."""
+    """The rays through the picture's edges have the directions forward +- tan_x right +- tan_y up."""
 
     origin: wp.vec3
     right: wp.vec3
@@ -27,7 +27,7 @@ class Camera:
 
 @wp.func
 def chief_ray(camera: Camera, film: wp.vec2) -> wp.vec3:
-    """Return the direction through the lens' centre, which no lens bends; its `forward` component is 1."""
+    """Return the direction of the ray through the lens' centre; its `forward` component is 1."""
     x = (2.0 * film[0] - 1.0) * camera.tan_x
     y = (1.0 - 2.0 * film[1]) * camera.tan_y
     return camera.forward + x * camera.right + y * camera.up
@@ -41,9 +41,8 @@ def make_camera_ray(features: Features | None = None) -> Any:
     def camera_ray(camera: Camera, film: wp.vec2, xi: wp.vec2) -> Ray:
         """Return the ray through the film point and the lens sample.
 
-        All rays of one film point cross at a point S of the plane in focus. Two rays that meet at S are easy to construct: the
-        chief ray, and the ray that arrives parallel to the axis and leaves through the focal point. By the lens equation 1/s + 1/s'
-        = 1/f, S is on the chief ray at distance s = focus_distance along the axis. The ray goes from the lens sample L to S."""
+        All rays of one film point cross at a point S of the plane in focus. The lens does not bend the chief ray, so that S is on
+        it, at the distance focus_distance along the axis. The ray goes from the lens sample to S."""
         chief = chief_ray(camera, film)
         ray = make_ray(camera.origin, unit(chief))
         if wp.static(lens):
@@ -52,8 +51,8 @@ def make_camera_ray(features: Features | None = None) -> Any:
                 sample = polygon(xi, camera.blades, camera.blade_rotation)
             offset = camera.aperture_radius * (sample[0] * camera.right + sample[1] * camera.up)
             ray.origin = camera.origin + offset
-            way = camera.focus_distance * chief - offset
-            ray.direction = unit(lift(way) * way)
+            to_focus = camera.focus_distance * chief - offset
+            ray.direction = unit(lift(to_focus) * to_focus)
         return ray
 
     return camera_ray

@@ -1,4 +1,4 @@
-"""The BSP builder's geometry: cells cut by planes, and triangles clipped to cells, against convex hulls and areas."""
+"""The BSP builder's geometry against convex hulls and known areas: cells cut by planes, and triangles clipped to cells."""
 
 from itertools import pairwise
 
@@ -19,7 +19,7 @@ from wrt.kernels.structs import kernel
 @kernel
 def cut_cell(cells: Cells, lo: wp.vec3d, hi: wp.vec3d, normal: wp.array(dtype=wp.vec3d), offset: wp.array(dtype=wp.float64),
              eps: wp.float64, areas: wp.array(dtype=wp.vec3d)):
-    """Cut the box in slot 0 by one plane after another, and keep the part above; areas: predicted (below, above), then clipped."""
+    """Cut the box in slot 0 by one plane after another, and keep the part above. areas: predicted (below, above), then clipped."""
     box_cell(cells, 0, lo, hi)
     for i in range(normal.shape[0]):
         n = normal[i]
@@ -34,7 +34,7 @@ def cut_cell(cells: Cells, lo: wp.vec3d, hi: wp.vec3d, normal: wp.array(dtype=wp
 
 
 def cut(lo, hi, normals, offsets, eps=1e-12):
-    """Predicted and clipped areas, (N, 2) each, and the cells: the rest in slot 0, below and above the last plane in 1 and 2."""
+    """Return predicted and clipped areas, (N, 2) each, and the cells: the rest in slot 0, the last cut's parts in slots 1 and 2."""
     n, cells = len(normals), cells_of(3)
     areas = wp.zeros(2 * n, dtype=wp.vec3d, device=DEVICE)
     launch(cut_cell, 1, cells, wp.vec3d(*lo), wp.vec3d(*hi), wp.array(normals, dtype=wp.vec3d, device=DEVICE),
@@ -50,7 +50,7 @@ def faces_of(cells, slot):
 
 
 def test_a_cube_by_planes_whose_cuts_are_known():
-    # Across an axis; corner to corner, where the cut is a hexagon of side sqrt(1/2); and a corner cut off.
+    # A plane across an axis; a plane across the diagonal, whose cut is a hexagon of side sqrt(1/2); a plane that cuts a corner off.
     normals = np.array([[1.0, 0.0, 0.0], unit(np.ones(3)), unit(np.ones(3))])
     offsets = [-0.25, -1.5 / np.sqrt(3.0), -0.5 / np.sqrt(3.0)]
     hexagon, triangle = 0.75 * np.sqrt(3.0), np.sqrt(3.0) / 8.0
@@ -66,7 +66,7 @@ def test_many_cuts_leave_a_convex_cell(seed):
     rng = np.random.default_rng(seed)
     lo, hi = -rng.uniform(0.5, 2.0, 3), rng.uniform(0.5, 2.0, 3)
     normals = unit(rng.normal(size=(20, 3)))
-    offsets = rng.uniform(0.05, 0.8, 20)  # the origin stays above
+    offsets = rng.uniform(0.05, 0.8, 20)  # The origin stays above every plane.
     predicted, clipped, cells = cut(lo, hi, normals, offsets)
     np.testing.assert_allclose(predicted[:, 1], clipped[:, 1], rtol=1e-9)
     real = clipped[:, 0] > 0.0
@@ -75,7 +75,7 @@ def test_many_cuts_leave_a_convex_cell(seed):
     faces = faces_of(cells, 0)
     hull = ConvexHull(np.concatenate(faces))
     assert np.isclose(clipped[-1, 1], hull.area, rtol=1e-9)
-    # Closed and counterclockwise from outside: the cones from the origin to the faces fill the hull.
+    # The faces are closed and counterclockwise from outside: the cones from the origin to the faces fill the hull.
     volume = sum(np.dot(face[0], np.cross(face[k], face[k + 1])) for face in faces for k in range(1, len(face) - 1)) / 6.0
     assert np.isclose(volume, hull.volume, rtol=1e-9)
     assert all((face @ normals.T + offsets > -1e-12).all() for face in faces)
@@ -83,7 +83,7 @@ def test_many_cuts_leave_a_convex_cell(seed):
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_plane_in_a_face_leaves_a_part_without_volume(sign):
-    # A box of 1 x 2 x 3 and the plane of its high x face, also when it is off by rounding.
+    # A box of 1 x 2 x 3 and the plane of its high x face, exact or off by a rounding error.
     for noise in (0.0, 1e-15, -1e-15):
         predicted, clipped, _ = cut(np.zeros(3), np.array([1.0, 2.0, 3.0]), [[sign, 0.0, 0.0]], [-sign * (1.0 + noise)])
         whole, flat = 22.0, 12.0
@@ -93,7 +93,7 @@ def test_a_plane_in_a_face_leaves_a_part_without_volume(sign):
 
 
 def test_a_cell_without_volume_is_cut():
-    # A flat square, by its own plane (both parts are all of it), and by one across it.
+    # A flat square is cut by its own plane, where both parts are the whole square, and by a plane across it.
     predicted, _, _ = cut(np.zeros(3), np.array([1.0, 1.0, 0.0]), [[0.0, 0.0, 1.0]], [0.0])
     np.testing.assert_allclose(predicted[0], [2.0, 2.0])
     predicted, clipped, _ = cut(np.zeros(3), np.array([1.0, 1.0, 0.0]), [[1.0, 0.0, 0.0]], [-0.25])
@@ -108,7 +108,7 @@ def test_a_cell_smaller_than_the_margin_gains_nothing():
 
 @kernel
 def clip(pieces: Pieces, normal: wp.array(dtype=wp.vec3d), point: wp.array(dtype=wp.vec3d), out: wp.array(dtype=wp.int32)):
-    """Piece 3 i is cut into 3 i + 1 (below) and 3 i + 2 (above)."""
+    """Cut piece 3 i into the pieces 3 i + 1 (below the plane) and 3 i + 2 (above)."""
     i = wp.tid()
     split = plane_through(normal[i], point[i])
     size = clip_piece(pieces, 3 * i, 3 * i + 1, 100 * i + 20, split, 0)

@@ -23,7 +23,7 @@ from wrt.scene.shapes import icosphere, torus
 
 
 def geometry_of(lo, hi):
-    """A triangle in each box: its corners are two opposite corners of the box and a third one."""
+    """Return a triangle in each box, between two opposite corners and a third corner of the box."""
     lo, hi = np.asarray(lo, np.float32).reshape(-1, 3), np.asarray(hi, np.float32).reshape(-1, 3)
     third = np.where([True, False, True], lo, hi)
     vertices = np.stack([lo, third, hi], axis=1).reshape(-1, 3)
@@ -85,12 +85,12 @@ def points(values):
 
 
 def progression(rng):
-    """Ratio 16 and up: bins can only split off the largest box."""
+    """Return boxes in geometric progression, of ratio 16 and up: bins can only split off the largest box."""
     return points(16.0 ** np.arange(-29, 15)[:, None] * np.array([1.0, 0.0, 0.0]))
 
 
 def crowded_progression(rng):
-    """The same with a crowd at each step, in three axes: without the depth limit, deeper than the stack."""
+    """Return a progression along three axes with many boxes at each step. Without the depth limit, its tree overflows the stack."""
     steps = [np.eye(3)[axis] * 4.0**k for axis in range(3) for k in range(-60, 31) for _ in range(3)]
     return points(np.concatenate([steps, np.zeros((500, 3))]))
 
@@ -119,7 +119,7 @@ def test_every_primitive_in_one_leaf_and_boxes_nested(builder, case, max_leaf):
     lo, hi = CASES[case](np.random.default_rng(1))
     tree = make(lo, hi, builder, max_leaf=max_leaf)
     leaves = check_tree(lo, hi, tree, max_leaf)
-    assert leaves == tree.leaves == len(tree.nodes) + 1  # a binary tree
+    assert leaves == tree.leaves == len(tree.nodes) + 1  # True for every binary tree.
     assert leaves >= len(lo) / max_leaf
 
 
@@ -156,8 +156,8 @@ def test_one_and_two_threads_build_the_same_tree(builder):
 
 
 def test_no_subtree_is_forgotten_however_many_are_deferred():
-    # Crowds of more than a thread's share, each inside shells that are split off one after another. Hundreds of small ranges are deferred
-    # at the top; an ordinary scene defers some dozens.
+    # Clusters larger than one thread's share, each inside shells that are split off one after another. The top defers hundreds of
+    # small ranges; for an ordinary scene it defers some dozens.
     parts = []
     for crowd in range(32):
         base = np.full(3, (crowd + 1.0) * 2**19)
@@ -182,7 +182,7 @@ def test_every_builder_gives_the_same_bits_as_brute_force(builder, kind):
 
 
 def test_splits_follow_the_surface_area():
-    # Two far clusters: the root must separate them. The expected cost is far below the cost of a median split.
+    # The root must separate two distant clusters. Then the expected cost is far below the cost of a median split.
     rng = np.random.default_rng(4)
     center = np.where(np.arange(1000)[:, None] < 100, [-50.0, 0.0, 0.0], [50.0, 0.0, 0.0]) + rng.random((1000, 3))
     tree = make(center, center + 0.01)
@@ -201,13 +201,13 @@ def test_quality_and_statistics(mesh):
     assert stats.nodes == len(nodes) and stats.leaves == stats.nodes + 1
     assert stats.bytes == nodes.nbytes + structure.data.primitives.numpy().nbytes
     assert np.log2(stats.leaves) <= stats.depth <= STACK_SIZE
-    # A random line through a closed convex surface of n triangles must meet two of them and some log2(n) nodes.
+    # A random line through a closed convex surface of n triangles meets two triangles and about log2(n) nodes.
     assert 2.0 < stats.sah_cost < 4.0 * np.log2(len(mesh.faces))
     assert build(mesh, "bvh2", max_leaf=64, cost_traversal=1e9).stats.sah_cost > stats.sah_cost
 
 
 def test_builders_rank_as_the_literature_says():
-    # Two shells through each other, triangles of very different sizes and a long sliver: splits matter.
+    # Two intersecting shells, triangles of very different sizes and a long sliver make spatial splits useful.
     ball, ring = icosphere(3), torus()
     slivers = np.random.default_rng(6).uniform(-2.0, 2.0, (300, 3, 3)) * [1.0, 1.0, 0.02]
     vertices = np.concatenate([ball.vertices, 1.5 * ring.vertices, slivers.reshape(-1, 3)])
@@ -222,18 +222,18 @@ def test_builders_rank_as_the_literature_says():
 
 def test_spatial_splits_stay_within_their_budget():
     rng = np.random.default_rng(7)
-    ends = rng.uniform(-1.0, 1.0, (400, 2, 3))  # needles: their boxes are nearly empty
+    ends = rng.uniform(-1.0, 1.0, (400, 2, 3))  # Needles, whose boxes are almost empty.
     corners = np.concatenate([ends, ends[:, :1] + 0.01 * rng.normal(size=(400, 1, 3))], axis=1)
     geometry = Geometry.of(Mesh(corners.reshape(-1, 3), np.arange(1200).reshape(-1, 3)))
     references = [build(geometry, "bvh2", builder="sbvh", split_budget=b).stats.references for b in (0.0, 0.3, 2.0)]
     assert references[0] == 400 < references[1] <= 520 and references[1] < references[2] <= 1200
-    assert build(geometry, "bvh2", builder="sbvh", split_alpha=1.0).stats.references == 400  # no overlap is as large
+    assert build(geometry, "bvh2", builder="sbvh", split_alpha=1.0).stats.references == 400  # No overlap is as large as the root.
     with refused("split_budget", "at most 8"):
         build(geometry, "bvh2", builder="sbvh", split_budget=9.0)
 
 
 def test_sah_cost_by_hand():
-    # Two unit cubes side by side, one primitive each: 1 node + each cube's share (6 of the root's 10) of one test.
+    # Two unit cubes side by side with one primitive each. The cost is 1 node and 2 * 6/10 tests: the areas are 6 and 10.
     nodes = make([[0, 0, 0], [1, 0, 0]], [[1, 1, 1], [2, 1, 1]]).nodes
     assert sah_cost(nodes) == pytest.approx(1.0 + 2.0 * 6.0 / 10.0, rel=1e-5)
 
@@ -288,7 +288,7 @@ def test_levels_end_for_every_number():
 @pytest.mark.parametrize("builder", BVH_BUILDERS)
 @pytest.mark.parametrize("power", [-80, 66])
 def test_a_tree_does_not_depend_on_the_scale(builder, power):
-    # 2^-80 is about 1e-24, 2^66 about 1e20: areas are beyond float32, and the padding scales too.
+    # 2^-80 is about 1e-24, 2^66 about 1e20: areas are beyond the range of float32. The padding scales with the boxes.
     mesh = torus(segments=24, tube_segments=12)
     lo, hi = (corner.astype(np.float64) for corner in Geometry.of(mesh).bounds())
     reference, scaled = (make(lo * scale, hi * scale, builder) for scale in (1.0, 2.0**power))

@@ -1,4 +1,4 @@
-"""Clipping for builders: the clipped box never misses a part of the triangle in the cell, and is hardly larger."""
+"""Clipping for builders: the clipped box contains the part of the triangle in the cell, and is hardly larger."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ U = 2.0**-24
 
 
 def clip(corners, cell_lo, cell_hi, spheres=(), exact=True):
-    """The box of each triangle, or sphere, in a cell."""
+    """Return the box of the part of each triangle, or sphere, in its cell."""
     corners = np.asarray(corners, np.float32).reshape(-1, 3, 3)
     faces = np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3)
     geometry = Geometry(corners.reshape(-1, 3), faces, np.asarray(spheres, np.float32).reshape(-1, 4))
@@ -26,7 +26,7 @@ def clip(corners, cell_lo, cell_hi, spheres=(), exact=True):
 
 
 def polygon_in(triangle, lo, hi):
-    """Corners of the part of a triangle in a box, cut by one half-space after another in float64."""
+    """Return the corners of the part of a triangle in a box, clipped by one half-space after another in float64."""
     polygon = triangle.astype(np.float64)
     for axis in range(3):
         for sign, bound in ((1.0, lo[axis]), (-1.0, hi[axis])):
@@ -45,8 +45,8 @@ def polygon_in(triangle, lo, hi):
 def test_the_box_holds_what_is_in_the_cell_and_little_more(scale, move):
     rng = np.random.default_rng(1)
     triangles = rounded(scale * (rng.uniform(-1.0, 1.0, (400, 1, 3)) + rng.normal(size=(400, 3, 3))) + move)
-    triangles[::9, :, 1] = triangles[::9, :1, 1]  # in planes across an axis
-    triangles[::11, 2] = triangles[::11, 1]  # without area
+    triangles[::9, :, 1] = triangles[::9, :1, 1]  # In planes perpendicular to an axis.
+    triangles[::11, 2] = triangles[::11, 1]  # Without area.
     cut = 0
     for _ in range(6):
         ends = np.sort(rounded(scale * rng.uniform(-1.5, 1.5, (2, 3)) + move), axis=0)
@@ -68,7 +68,7 @@ def test_the_box_holds_what_is_in_the_cell_and_little_more(scale, move):
 
 
 def test_a_triangle_in_the_wall_between_two_cells_is_in_both():
-    # It would be missed by rays that rounding takes to the other side.
+    # If only one cell listed it, rays that rounding moves to the other cell would miss it.
     wall = [[0.0, -1.0, -1.0], [0.0, 1.0, -1.0], [0.0, 0.0, 1.0]]
     for cell_lo, cell_hi in (([-1, -2, -2], [0, 2, 2]), ([0, -2, -2], [1, 2, 2])):
         lo, hi = clip(wall, cell_lo, cell_hi)

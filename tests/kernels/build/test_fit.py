@@ -1,4 +1,4 @@
-"""Fitting boxes from the leaves up, a thread a node; the machine code shows the order of memory that a GPU needs."""
+"""Fitting boxes from the leaves up, with a thread for each node. The machine code has the memory order that a GPU needs."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_boxes_bound_their_subtrees_and_a_refit_can_be_repeated() -> None:
     there = upload(nodes, Bvh2Node, DEVICE)
     fitting = Fitting(DEVICE, len(geometry), len(nodes))
     linked = tree_of(fitting, there, parents_of(there), upload(tree.order, wp.int32, DEVICE))
-    for _ in range(2):  # the second time as the first
+    for _ in range(2):  # A repeated refit gives the same boxes.
         fitting.refit(linked, geometry.on(DEVICE))
         assert there.numpy().tobytes() == tree.nodes.tobytes()
         assert not fitting.arrived.numpy().any()
@@ -42,8 +42,8 @@ def test_on_a_gpu_fences_order_the_writes_and_reads_bypass_the_l1_cache(tmp_path
     (ptx,) = wp.compile_aot_module(fit.fit.module, arch=75, module_dir=tmp_path, use_ptx=True)
     text = Path(ptx).read_text()
     assert len(re.findall(r"\batom\.global\.add", text)) == 1
-    assert len(re.findall(r"\bmembar\.gl|\bfence\.\w+\.gpu", text)) == 2  # after the writes, and before the reads
-    assert len(re.findall(r"\bld\.volatile", text)) >= 2 * 11  # both children's summaries
+    assert len(re.findall(r"\bmembar\.gl|\bfence\.\w+\.gpu", text)) == 2  # After the writes, and before the reads.
+    assert len(re.findall(r"\bld\.volatile", text)) >= 2 * 11  # The summaries of both children.
 
 
 def test_they_compile_for_hopper(tmp_path: Path) -> None:

@@ -1,11 +1,10 @@
-"""The grid's builder: every cell lists its primitives, over any input."""
+"""The grid's builder: every cell lists the primitives in it, for any input."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.cell_cases import CASES, points_of, random_lines, segments, triangles
+from tests.cell_cases import CASES, assert_damage_is_refused, points_of, random_lines, segments, triangles
 from tests.refused import refused
 from wrt.accel.cells import grid as module
 from wrt.accel.scenes.build import build
@@ -13,7 +12,7 @@ from wrt.scene.shapes import icosphere
 
 
 def lists(grid):
-    """Cell of each reference, in x, y, z, and the primitive."""
+    """Return the cell (x, y, z) and the primitive of each reference."""
     cells = grid.data.cells.numpy()
     where = np.repeat(np.arange(len(cells)), cells["count"])
     assert np.array_equal(cells["first"], np.cumsum(cells["count"]) - cells["count"])
@@ -22,7 +21,7 @@ def lists(grid):
 
 
 def planes(layout, axis):
-    """The planes across an axis, rounded as the device rounds them."""
+    """Return the planes between cells along an axis, rounded as the device rounds them."""
     lo, size, n = np.float32(layout.lo[axis]), np.float32(layout.size[axis]), layout.n[axis]
     return np.append(lo + np.arange(n, dtype=np.float32) * size, np.float32(layout.hi[axis]))
 
@@ -34,7 +33,7 @@ def test_points_of_a_primitive_are_in_cells_that_list_it(case):
     grid = build(geometry, "grid", density=20.0)
     where, reference = lists(grid)
     listed = set(zip(*where.T.tolist(), reference.tolist(), strict=True))
-    assert len(listed) == len(reference) == grid.stats.references  # none is there twice in a cell
+    assert len(listed) == len(reference) == grid.stats.references  # No cell lists a primitive twice.
     layout = grid.data
     for _ in range(20):
         point = points_of(geometry, rng)
@@ -53,23 +52,23 @@ def test_primitives_of_a_cell_are_in_ascending_order_on_any_number_of_threads():
 
 
 def test_cells_that_only_the_box_of_a_triangle_meets_do_not_list_it():
-    # One triangle across a cube: of n^3 cells it meets about as many as a plane does, not all.
+    # A triangle across a cube of n^3 cells meets about as many cells as a plane does, not all cells.
     corners = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     grid = build(triangles(np.repeat(corners[None], 20, axis=0)), "grid", density=50.0)
     n = np.array(grid.data.n)
     assert (n == 10).all()
     where, _ = lists(grid)
-    # In units of cells the triangle is x + y + z = n: a cell meets it if its lowest corner is below and its highest above.
+    # In units of cells, the triangle is on x + y + z = n. A cell meets it if its lowest corner is below and its highest above.
     lowest = where.sum(axis=1)
     assert (lowest <= 10).all() and (lowest + 3 >= 10).all()
     x, y, z = np.indices((10, 10, 10))
-    expected = ((x + y + z <= 10) & (x + y + z + 3 >= 10)).sum()  # closed cells, and pads: cells that touch at a corner count too
+    expected = ((x + y + z <= 10) & (x + y + z + 3 >= 10)).sum()  # Cells are closed and padded: cells that touch at a corner count.
     assert len(where) == 20 * expected
 
 
 @pytest.mark.parametrize("density", [0.1, 1.0, 8.0])
 def test_as_many_cells_as_the_density_asks_for(density):
-    # Boxes of many shapes, some without height: the number of cells is as asked, and cells are nearly cubes.
+    # Boxes have many shapes, some without height. The number of cells is as requested, and cells are almost cubes.
     rng = np.random.default_rng(3)
     for shape in ([1, 1, 1], [1, 2, 3], [30, 1, 1], [1, 0, 1], [20, 5, 0]):
         geometry = triangles((rng.uniform(-1.0, 1.0, (5000, 1, 3)) + 0.02 * rng.normal(size=(5000, 3, 3))) * shape)
@@ -109,13 +108,6 @@ def test_random_lines_cost_what_the_statistics_expect():
     assert abs(cost.mean() - grid.stats.sah_cost) < 3.0 * cost.std() / np.sqrt(n)
 
 
-def spoilt(name, change):
-    grid = build(icosphere(2), "grid")
-    arrays = {key: np.array(value) for key, value in grid.built.arrays.items()}
-    change(arrays[name])
-    return grid, replace(grid.built, arrays=arrays)
-
-
 @pytest.mark.parametrize(("name", "change"), [
     ("cells", lambda a: a["first"].__setitem__(5, -1)), ("cells", lambda a: a["count"].__setitem__(5, 1 << 30)),
     ("cells", lambda a: a["count"].__setitem__(5, -1)), ("references", lambda a: a.__setitem__(3, 320)),
@@ -125,7 +117,4 @@ def spoilt(name, change):
     ("pad", lambda a: a.__setitem__((), np.nan)), ("mailbox", lambda a: a.__setitem__((), 2)),
 ])
 def test_arrays_from_a_file_are_checked(name, change):
-    grid, built = spoilt(name, change)
-    type(grid).restore(grid.built, grid.geometry)
-    with refused(what="damaged"):
-        type(grid).restore(built, grid.geometry)
+    assert_damage_is_refused(build(icosphere(2), "grid"), name, change)

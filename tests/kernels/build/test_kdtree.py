@@ -1,4 +1,4 @@
-"""The k-d tree's builder: invariants of every tree over any input, and that its splits are the cheapest."""
+"""The k-d tree's builder: its trees keep their invariants for any input, and its splits are the cheapest."""
 
 from types import SimpleNamespace
 
@@ -24,7 +24,7 @@ def make(geometry, threads=1, **options):
 
 
 def cells(tree):
-    """(lo, hi, depth, word & 3, members or None) of all nodes, the root first; each node once."""
+    """Yield (lo, hi, depth, word & 3, members or None) of each node once, the root first."""
     met = np.zeros(len(tree.nodes), int)
     todo = [(0, tree.lo.astype(np.float64), tree.hi.astype(np.float64), 1)]
     while todo:
@@ -44,7 +44,7 @@ def cells(tree):
 
 
 def check_tree(geometry, tree, max_depth, growth):
-    """Check that leaves hold each primitive that reaches into them once, and no primitive whose padded box does not."""
+    """Check that a leaf holds each primitive that reaches into it once, and no primitive whose padded box is outside."""
     box_lo, box_hi = geometry.bounds()
     box_hi = np.where(box_lo < box_hi, box_hi, np.nextafter(box_hi, np.float32(np.inf)))
     size = np.maximum(np.abs(box_lo), np.abs(box_hi)).max(axis=1, keepdims=True).astype(np.float64)
@@ -101,7 +101,7 @@ def test_the_cost_is_the_sum_over_the_cells(kind):
 
 
 def expected_cost(tree, options, plane, geometry):
-    """Cost of a split of the root by the primitives' boxes, by definition, without a sweep."""
+    """Return the cost of a split of the root by the primitives' boxes, by definition, without a sweep."""
     lo, hi = geometry.bounds()
     axis, position = plane
     left, right = np.count_nonzero(lo[:, axis] < position), np.count_nonzero(hi[:, axis] > position)
@@ -127,7 +127,7 @@ def test_the_split_is_the_cheapest_of_all_faces(seed):
     chosen = int(tree.nodes["word"][0]) & 3, float(tree.nodes["split"][0])
     assert expected_cost(tree, options, chosen, geometry) == pytest.approx(cheapest, rel=1e-12)
 
-    # Between 64 bins a side there are other planes; the best of them is hardly worse.
+    # With 64 bins for each axis the candidate planes are others. The best of them is hardly worse.
     root = BuilderCell(tree.lo, tree.hi, np.arange(60, dtype=np.int32), lo, hi, 0, 1000, 0)
     found = binned_split(root, options)
     low, high = tree.lo.astype(np.float64), tree.hi.astype(np.float64)
@@ -138,7 +138,7 @@ def test_the_split_is_the_cheapest_of_all_faces(seed):
 
 
 def test_empty_space_is_cut_off():
-    # Eight clusters in the corners of a cell.
+    # Eight clusters are in the corners of a cell.
     rng = np.random.default_rng(3)
     center = rng.random((400, 3)) + 10.0 * rng.integers(0, 2, (400, 3))
     tree = make(geometry_of(rounded(center - 0.01), rounded(center + 0.01)))
@@ -153,7 +153,7 @@ def test_clipping_leaves_fewer_references():
 
 
 def test_one_and_two_threads_build_the_same_tree():
-    geometry = Geometry.of(torus(segments=48, tube_segments=24))  # above perfect_below: the top is binned, and leaves tasks
+    geometry = Geometry.of(torus(segments=48, tube_segments=24))  # More than perfect_below: the top is binned and defers tasks.
     one, two = (make(geometry, threads, perfect_below=1024) for threads in (1, 2))
     assert np.array_equal(one.nodes, two.nodes) and np.array_equal(one.order, two.order) and one.cost == two.cost
     check_tree(geometry, one, KdOptions().depth(len(geometry)), 16.0)

@@ -1,4 +1,4 @@
-"""Boxes and corners made on a device have the bits of the host's."""
+"""Boxes and corners that a device computes have the bits of the host's boxes and corners."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from wrt.scene.clean import corners_have_area
 
 
 def geometry_of(corners: np.ndarray) -> Geometry:
-    """corners: (N, 3, 3)."""
+    """Return the triangles with these corners, (N, 3, 3), as a Geometry."""
     vertices = np.ascontiguousarray(corners, np.float32).reshape(-1, 3)
     spheres = np.array([[0.1, -2.0, 3.3, 0.7], [1e30, 0.0, -1e-40, 1e-3]], np.float32)
     return Geometry(vertices, np.arange(len(vertices), dtype=np.int32).reshape(-1, 3), spheres)
 
 
 def hard_corners(n: int = 4000) -> np.ndarray:
-    """Of all sizes, most of them on a line or nearly so."""
+    """Return corners of triangles of all sizes; the corners of most triangles are almost collinear."""
     rng = np.random.default_rng(3)
     a, b = (rng.integers(-(1 << 20), 1 << 20, size=(n, 3)).astype(np.float32) for _ in range(2))
-    c = (a + rng.integers(-4, 5, size=(n, 1)).astype(np.float32) * (b - a)).astype(np.float32)  # exact
+    c = (a + rng.integers(-4, 5, size=(n, 1)).astype(np.float32) * (b - a)).astype(np.float32)  # Exactly collinear.
     near = rng.random(n) < 0.3
     c[near, 0] = np.nextafter(c[near, 0], np.float32(np.inf))
     grid = rng.integers(-3, 4, size=(n, 3, 3)).astype(np.float32) * np.float32(0.25)
     far = grid.copy()
-    far[:, 1] *= np.float32(2.0**60)  # differences that float64 cannot hold
+    far[:, 1] *= np.float32(2.0**60)  # Their differences are not exact in float64.
     far[:, 2] = far[:, 1] * np.float32(2.0)
     scale = np.float32(2.0) ** rng.integers(-148, 120, size=(n, 1, 1)).astype(np.float32)
     return np.concatenate([np.stack([a, b, c], axis=1), grid, grid * scale, far])

@@ -1,4 +1,4 @@
-"""The test of a triangle against a cell, compared with clipping the triangle to the cell in float64."""
+"""The overlap test of triangle and cell, compared with clipping the triangle to the cell in float64."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def meets(corners: wp.array(dtype=wp.vec3), lo: wp.array(dtype=wp.vec3), hi: wp.
 
 
 def clipped(polygon, lo, hi):
-    """Part of a polygon in a closed box (Sutherland and Hodgman)."""
+    """Return the part of a polygon in a closed box (Sutherland and Hodgman)."""
     for axis in range(3):
         for sign, bound in ((1.0, hi[axis]), (-1.0, -lo[axis])):
             out = []
@@ -52,7 +52,7 @@ def test_meets_exactly_the_cells_that_clipping_leaves_something_in(case):
     corners = CASES[case](rng, n).astype(np.float32)
     geometry = Geometry(corners.reshape(-1, 3), np.arange(3 * n, dtype=np.int32).reshape(-1, 3), np.zeros((0, 4), np.float32))
     lo, hi = geometry.bounds()
-    # Cells in and at the triangle's box, many of them with a face in common with it.
+    # Cells in and beside the triangle's box; many share a face with it.
     extent = (hi - lo).astype(np.float64)
     size = extent * rng.uniform(0.02, 0.6, (n, 3))
     cell_lo = (lo + rng.choice([0.0, 0.25, 0.5, 0.75], (n, 3)) * extent).astype(np.float32)
@@ -64,7 +64,7 @@ def test_meets_exactly_the_cells_that_clipping_leaves_something_in(case):
     pad = np.maximum(corners.min(axis=1) - lo.astype(np.float64), hi.astype(np.float64) - corners.max(axis=1))
     triangle = [list(c) for c in corners.astype(np.float64)]
     inside = np.array([len(clipped(triangle[i], cell_lo[i], cell_hi[i])) > 0 for i in range(n)])
-    # The grown triangle is at most its pad away: a cell larger by that on all sides holds a part of it.
+    # The test pads the triangle. So a cell that is larger by the padding on all sides contains a part of the triangle.
     reach = 1.000001 * pad
     near = np.array([len(clipped(triangle[i], cell_lo[i] - reach[i], cell_hi[i] + reach[i])) > 0 for i in range(n)])
     assert found[inside].all()

@@ -1,4 +1,4 @@
-"""The collapse of binary trees into wide ones: invariants of every tree, and that no collapse is cheaper."""
+"""The collapse of binary trees into wide trees: the trees keep their invariants, and no other collapse is cheaper."""
 
 from functools import cache
 
@@ -15,7 +15,7 @@ from wrt.scene.shapes import icosphere
 
 
 def leaf(reference):
-    """First row and number of primitives."""
+    """Return the first row and the number of primitives of a leaf reference."""
     return (-1 - reference) // 64, (-1 - reference) % 64 + 1
 
 
@@ -87,7 +87,7 @@ def least_cost(nodes, order_size, width, max_leaf, c_node, c_row):
         return int(nodes[f"count_{code[1]}"][code[0]]) if is_leaf(code) else sum(size(c) for c in below(code))
 
     def forests(roots):
-        """Every set of at most `width` roots that opening some of these leads to."""
+        """Yield every set of at most `width` roots that results from opening some of `roots`."""
         found = {roots}
         todo = [roots]
         while todo:
@@ -101,7 +101,7 @@ def least_cost(nodes, order_size, width, max_leaf, c_node, c_row):
 
     @cache
     def one(code):
-        """Cost of this subtree as one root."""
+        """Return the cost of this subtree as one root."""
         a = area(nodes[f"lo_{code[1]}"][code[0]], nodes[f"hi_{code[1]}"][code[0]])
         whole = c_row * a * -(-size(code) // width) if size(code) <= max_leaf else np.inf
         if is_leaf(code):
@@ -131,7 +131,7 @@ def test_no_collapse_is_cheaper(seed, c_node, c_row, max_leaf):
 
 
 def test_a_deep_binary_tree_still_fits_on_the_stack():
-    # Boxes in geometric progression, by a builder that peels them off one by one: wide nodes would keep up to 7 entries a level.
+    # The builder splits boxes in geometric progression off one by one. Wide nodes would then push up to 7 entries at each level.
     lo = np.repeat(2.0 ** np.arange(-60.0, 60.0)[:, None], 3, axis=1)
     geometry = geometry_of(lo, 1.01 * lo)
     for builder in BVH_BUILDERS:
@@ -143,7 +143,7 @@ def test_a_deep_binary_tree_still_fits_on_the_stack():
 @pytest.mark.parametrize("width", [4, 8])
 @pytest.mark.parametrize("builder", ["binned", "sweep", "reinsertion"])
 def test_a_binary_tree_down_to_single_primitives_is_not_cheaper(builder, width):
-    # The wide builder stops where two leaves of up to a row have no less area than one: the collapse would join them again.
+    # The wide builder does not split a row if this saves no area: the collapse would join the two leaves again.
     rng = np.random.default_rng(7)
     for kind in ("mixed", "soup"):
         geometry = GEOMETRIES[kind](rng)
@@ -172,7 +172,8 @@ def test_any_binary_builder_gives_the_same_answers(builder):
 
 
 def test_the_expected_cost_is_what_random_lines_find():
-    # Lines through two random points of a sphere around the mesh are uniform. Count nodes and primitives of the lines that meet the root.
+    # Lines through two random points of a sphere around the mesh are uniform. The test counts nodes and primitives of lines that meet
+    # the root.
     rng = np.random.default_rng(5)
     structure = build(icosphere(2), "bvh8")
     tree = structure._tree(structure.built)

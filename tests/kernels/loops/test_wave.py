@@ -1,4 +1,4 @@
-"""The parts of waves."""
+"""The branch-free functions of vectorised loops: unit vectors, and the choice of one of two vectors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Camera rays against closed forms in float64. A lens is held to the construction by chief ray, parallel ray and their point S."""
+"""Camera rays against closed forms in float64. For a lens, chief ray and parallel ray give the point S on every ray."""
 
 from functools import cache
 from importlib import import_module
@@ -69,7 +69,7 @@ def test_default_camera_looks_along_minus_z_with_y_up():
 
 
 def meeting_point(point_a, direction_a, point_b, direction_b):
-    """Return where two lines in one plane cross, by least squares in float64, and their distance there."""
+    """Return the point where two lines in one plane cross, by least squares in float64, and their distance there."""
     a = np.stack([direction_a, -direction_b], axis=1)
     (s, t), *_ = np.linalg.lstsq(a, point_b - point_a, rcond=None)
     p, q = point_a + s * direction_a, point_b + t * direction_b
@@ -88,12 +88,12 @@ def test_all_rays_of_a_film_point_cross_at_the_lectures_point(focus, blades, f_n
     sensor_distance = 1.0 / (1.0 / f - 1.0 / focus)
     rng = np.random.default_rng(1)
     for film in [(0.0, 0.0), (0.9, 0.2), (0.5, 0.49), *rng.random((4, 2))]:
-        # The sensor's picture is upside down: the film point (top left first) lies at (-x, -y) behind the lens.
+        # The picture on the sensor is upside down: a film point towards (x, y) lies at (-x, -y) behind the lens.
         x = (film[0] - 0.5) * sensor * size[0] / size[1]
         y = (0.5 - film[1]) * sensor
         on_sensor = np.array([-x, -y, -sensor_distance])
-        chief = -on_sensor  # through the lens' center, not deflected
-        hits_lens = np.array([-x, -y, 0.0])  # comes parallel to the axis, leaves through the focal point
+        chief = -on_sensor  # Through the lens' center, which does not deflect it.
+        hits_lens = np.array([-x, -y, 0.0])  # This ray arrives parallel to the axis and leaves through the focal point.
         point, gap = meeting_point(np.zeros(3), chief, hits_lens, np.array([0.0, 0.0, f]) - hits_lens)
         assert gap < 1e-9 * focus and point[2] == pytest.approx(focus, rel=1e-9)
         s = eye + point[0] * right + point[1] * up + point[2] * forward
@@ -103,7 +103,7 @@ def test_all_rays_of_a_film_point_cross_at_the_lectures_point(focus, blades, f_n
         along = ((s - origin) * direction).sum(axis=1)
         miss = np.linalg.norm(origin + along[:, None] * direction - s, axis=1)
         assert miss.max() < 2e-6 * (focus + np.abs(eye).max())
-        # The rays start all over the lens: in its plane, within its radius, and not all from one place.
+        # The rays start in the lens' plane, within its radius, and from different points.
         local = (origin - eye) @ np.stack([right, up, forward], axis=1)
         assert np.abs(local[:, 2]).max() < 1e-6
         radius = np.linalg.norm(local[:, :2], axis=1)
@@ -129,8 +129,8 @@ def test_blades_bound_the_aperture(blades, rotation):
     angle = rotation + np.pi / blades * (2.0 * np.arange(blades) + 1.0)
     across = origin[:, :2] @ np.array([np.cos(angle), np.sin(angle)])
     inner = 2.0 * np.cos(np.pi / blades)
-    assert across.max() <= inner + 1e-5  # inside every blade, and so inside the circle
-    assert (across.max(axis=0) > 0.98 * inner).all()  # and up to each of them
+    assert across.max() <= inner + 1e-5  # Inside every blade, and so inside the circle.
+    assert (across.max(axis=0) > 0.98 * inner).all()  # The points reach every blade.
     corner = rotation + 2.0 * np.pi / blades * np.arange(blades)
     assert ((origin[:, :2] @ np.array([np.cos(corner), np.sin(corner)])).max(axis=0) > 1.9).all()
 
@@ -165,7 +165,7 @@ def test_a_fisheyes_angles_are_proportional_to_the_radius(size, fov):
     inside = radius < 1.0 - 1e-6
     origin, direction = rays(camera, size, FILM[inside])
     angle = np.arccos(np.clip(direction @ forward, -1.0, 1.0))
-    assert np.allclose(angle, 0.5 * fov * radius[inside], atol=2e-3)  # arccos doubles the digits that are lost beside the axis
+    assert np.allclose(angle, 0.5 * fov * radius[inside], atol=2e-3)  # Near the axis, arccos loses half of the digits.
     assert np.allclose(np.sin(0.5 * fov * radius[inside])[:, None] * np.stack([x, y], axis=1)[inside] / radius[inside, None],
                        np.stack([direction @ right, direction @ up], axis=1), atol=2e-6)
     assert np.allclose(origin, eye, atol=1e-6)

@@ -1,4 +1,4 @@
-"""The elementary functions against the C library in float64, and where they are worst, against 60 decimal digits."""
+"""The elementary functions against the C library in float64; the largest errors against 60 decimal digits."""
 
 from decimal import Decimal, getcontext, localcontext
 from fractions import Fraction
@@ -16,12 +16,12 @@ from wrt.kernels.shade import elementary as functions
 from wrt.kernels.study.elementary import FUNCTIONS, call_functions
 
 BOUND = {"sin": 1.0, "cos": 1.0, "acos": 1.3, "exp": 1.1, "atan2": 1.7, "power": 1.3}  # ulp
-PRIME = 4099  # a stride through all bits
+PRIME = 4099  # A stride through all bit patterns of float32.
 QUIET_NAN = 0x7FC00000
 
 
 def called(x: object, y: object = 1.0) -> dict[str, np.ndarray]:
-    """Every function of these numbers, from a launch."""
+    """Return the results of every function for x and y, by name."""
     x, y = np.broadcast_arrays(np.asarray(x, np.float32), np.asarray(y, np.float32))
     out = wp.zeros((x.size, len(FUNCTIONS)), dtype=wp.float32, device=elementary.DEVICE)
     launch(call_functions, x.size, floats(x.ravel()), floats(y.ravel()), out)
@@ -32,7 +32,7 @@ def called(x: object, y: object = 1.0) -> dict[str, np.ndarray]:
 
 
 def arctangent(x: Decimal) -> Decimal:
-    """By halving the angle until its series is short."""
+    """Compute the arctangent by halving the angle until its series is short."""
     halvings = 0
     while abs(x) > Decimal("0.01"):
         x, halvings = x / (1 + (1 + x * x).sqrt()), halvings + 1
@@ -40,7 +40,7 @@ def arctangent(x: Decimal) -> Decimal:
 
 
 def sine(x: Decimal) -> Decimal:
-    """x at most 4."""
+    """Compute the sine for |x| <= 4."""
     term, total, i = x, x, 1
     while abs(term) > Decimal("1e-80"):
         term = -term * x * x / ((i + 1) * (i + 2))
@@ -49,7 +49,7 @@ def sine(x: Decimal) -> Decimal:
 
 
 def exactly(name: str, x: float, y: float = 0.0) -> Decimal:
-    getcontext().prec = 120  # of the largest float, 39 digits stand before the point
+    getcontext().prec = 120  # The largest float has 39 digits before the point.
     a, b = Decimal(x), Decimal(y)
     pi = 4 * arctangent(Decimal(1))
     if name in ("sin", "cos"):
@@ -69,7 +69,7 @@ def error_in_ulp(found: float, exact: Decimal) -> float:
     return float(abs(Fraction(found) - Fraction(exact)) / place)
 
 
-# --- all numbers -----------------------------------------------------------------------------------------------------
+# --- all floats -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ONE)
@@ -85,7 +85,7 @@ def test_zeros_keep_their_sign() -> None:
     assert np.signbit(found["sin"]).tolist() == [False, True] and found["cos"].tolist() == found["exp"].tolist() == [1.0, 1.0]
 
 
-@pytest.mark.slow  # minutes
+@pytest.mark.slow  # Takes minutes.
 @pytest.mark.parametrize("name", ONE)
 def test_all_floats_of_one_argument(name: str) -> None:
     assert elementary.worst_of_one(name)[0] < BOUND[name]
@@ -102,7 +102,7 @@ def test_pairs(name: str) -> None:
 
 
 def test_a_wrong_result_is_an_error() -> None:
-    """The measure sees what it is there for: one unit, a sign of zero, an infinity too early, a number for NaN."""
+    """The error measure detects an error of one ulp, a wrong sign of zero, an early infinity, and a number in place of NaN."""
 
     @elementary.kernel
     def measured(found: wp.array(dtype=float), exact: wp.array(dtype=wp.float64), out: wp.array(dtype=float)):

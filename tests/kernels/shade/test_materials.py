@@ -5,6 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from tests.fresnel import fresnel
 from tests.refused import refused
 
 from tests.kernel_tools import DEVICE, floats, launch, rounded, sobol_like, unit, vec2s, vec3s, zeros  # isort: skip
@@ -39,22 +40,12 @@ def highlight_kernel(wi: wp.array(dtype=wp.vec3), wo: wp.vec3, exponent: float, 
     out[i] = blinn_phong(wp.vec3(0.0, 0.0, 1.0), wi[i], wo, exponent)
 
 
-def fresnel(cosine, eta, k=0.0, f0=(0.0, 0.0, 0.0)):
-    """exact, Schlick, conductor, tint (N, 3), as float64."""
+def reflectances(cosine, eta, k=0.0, f0=(0.0, 0.0, 0.0)):
+    """Return the reflectances: exact, Schlick, conductor, each (N,), and tint (N, 3), in float64."""
     cosine = np.atleast_1d(cosine)
     outs = [zeros(len(cosine)) for _ in range(3)] + [zeros(len(cosine), wp.vec3)]
     launch(fresnel_kernel, len(cosine), floats(cosine), float(eta), float(k), wp.vec3(*f0), *outs)
     return [out.numpy().astype(np.float64) for out in outs]
-
-
-def complex_fresnel(cosine, n):
-    """Unpolarised reflectance of a boundary to the complex index n (numpy's arithmetic, from Snell's law)."""
-    cosine = np.asarray(cosine, np.complex128)
-    sine = np.sqrt(1.0 - cosine**2)
-    inner = np.sqrt(1.0 - (sine / n) ** 2)
-    s = (cosine - n * inner) / (cosine + n * inner)
-    p = (n * cosine - inner) / (n * cosine + inner)
-    return 0.5 * (np.abs(s) ** 2 + np.abs(p) ** 2)
 
 
 ANGLES = np.radians(np.concatenate([np.linspace(0.0, 89.0, 200), [89.5, 89.9, 89.99]]))
@@ -62,25 +53,25 @@ ANGLES = np.radians(np.concatenate([np.linspace(0.0, 89.0, 200), [89.5, 89.9, 89
 
 @pytest.mark.parametrize(("degrees", "value"), [(0.0, 0.04), (45.0, 0.05024), (60.0, 0.08919), (80.0, 0.38770)])
 def test_dielectric_at_known_angles(degrees, value):
-    assert fresnel(np.cos(np.radians(degrees)), 1.5)[0][0] == pytest.approx(value, abs=1e-5)
+    assert reflectances(np.cos(np.radians(degrees)), 1.5)[0][0] == pytest.approx(value, abs=1e-5)
 
 
 def test_brewsters_angle():
-    # tan(theta) = n: the parallel part is 0, and half of the perpendicular part is left.
+    # At tan(theta) = n the parallel reflectance is 0, so that the mean is half of the perpendicular reflectance.
     cosine = np.cos(np.arctan(1.5))
     assert np.degrees(np.arctan(1.5)) == pytest.approx(56.310, abs=1e-3)
     inner = np.sqrt(1.0 - (1.0 - cosine**2) / 2.25)
     perpendicular = ((cosine - 1.5 * inner) / (cosine + 1.5 * inner)) ** 2
-    assert fresnel(cosine, 1.5)[0][0] == pytest.approx(0.5 * perpendicular, abs=1e-6)
+    assert reflectances(cosine, 1.5)[0][0] == pytest.approx(0.5 * perpendicular, abs=1e-6)
 
 
 @pytest.mark.parametrize("eta", [1.0, 1.0003, 1.33, 1.5, 2.42, 10.0, 1.0 / 1.33, 1.0 / 1.5, 0.1])
 def test_dielectric_against_complex_arithmetic(eta):
     cosine = rounded(np.cos(ANGLES))
-    found = fresnel(cosine, eta)[0]
+    found = reflectances(cosine, eta)[0]
     sine = np.sqrt(1.0 - cosine**2)
     reflected = sine / eta >= 1.0 - 1e-6
-    expected = complex_fresnel(cosine, eta)
+    expected = fresnel(cosine, eta)
     assert np.abs(found - expected)[~reflected].max() < 5e-5
     assert (found[sine / eta > 1.0 + 1e-6] == 1.0).all()
     assert ((found >= 0.0) & (found <= 1.0)).all()
@@ -89,34 +80,34 @@ def test_dielectric_against_complex_arithmetic(eta):
 def test_total_internal_reflection_begins_at_its_angle():
     critical = np.degrees(np.arcsin(1.0 / 1.5))
     assert critical == pytest.approx(41.810, abs=1e-3)
-    below, above = (fresnel(np.cos(np.radians(critical + d)), 1.0 / 1.5)[0][0] for d in (-0.01, 0.01))
+    below, above = (reflectances(np.cos(np.radians(critical + d)), 1.0 / 1.5)[0][0] for d in (-0.01, 0.01))
     assert below < 0.96 and above == 1.0
-    assert fresnel(np.cos(np.radians(critical + 0.01)), 1.0 / 1.5)[1][0] == 1.0
+    assert reflectances(np.cos(np.radians(critical + 0.01)), 1.0 / 1.5)[1][0] == 1.0
 
 
 def test_a_boundary_reflects_the_same_from_both_sides():
     outside = np.cos(np.radians(np.linspace(0.0, 85.0, 100)))
     inside = np.sqrt(1.0 - (1.0 - outside**2) / 1.5**2)
-    assert np.abs(fresnel(outside, 1.5)[0] - fresnel(inside, 1.0 / 1.5)[0]).max() < 1e-5
-    assert np.abs(fresnel(outside, 1.5)[1] - fresnel(inside, 1.0 / 1.5)[1]).max() < 1e-5
+    assert np.abs(reflectances(outside, 1.5)[0] - reflectances(inside, 1.0 / 1.5)[0]).max() < 1e-5
+    assert np.abs(reflectances(outside, 1.5)[1] - reflectances(inside, 1.0 / 1.5)[1]).max() < 1e-5
 
 
 @pytest.mark.parametrize(("eta", "bound"), [(1.33, 0.06), (1.5, 0.036), (1.8, 0.05)])
 def test_schlick_stays_near_the_exact_curve(eta, bound):
     cosine = np.cos(np.radians(np.linspace(0.0, 89.9, 400)))
-    exact, schlick, _, _ = fresnel(cosine, eta)
+    exact, schlick, _, _ = reflectances(cosine, eta)
     r = ((eta - 1.0) / (eta + 1.0)) ** 2
     assert np.abs(schlick - (r + (1.0 - r) * (1.0 - cosine) ** 5)).max() < 1e-6
     assert exact[0] == pytest.approx(schlick[0], abs=1e-6)
-    assert 0.02 < np.abs(exact - schlick).max() < bound  # the largest error is near 85 degrees
+    assert 0.02 < np.abs(exact - schlick).max() < bound  # The largest error is near 85 degrees.
 
 
 @pytest.mark.parametrize("metal", CONDUCTORS)
 def test_metals_against_complex_arithmetic(metal):
     cosine = rounded(np.cos(ANGLES))
     for eta, k in zip(*CONDUCTORS[metal], strict=True):
-        found = fresnel(cosine, eta, k)[2]
-        assert np.abs(found - complex_fresnel(cosine, complex(eta, k))).max() < 2e-6
+        found = reflectances(cosine, eta, k)[2]
+        assert np.abs(found - fresnel(cosine, complex(eta, k))).max() < 2e-6
         assert found[0] == pytest.approx(((eta - 1) ** 2 + k * k) / ((eta + 1) ** 2 + k * k), abs=1e-6)
 
 
@@ -124,25 +115,25 @@ def test_metals_against_complex_arithmetic(metal):
                                         (0.0, 1000.0), (1e-3, 5.0), (0.2, 0.0)])
 def test_metals_of_any_index_that_a_scene_may_have(eta, k):
     cosine = rounded(np.concatenate([np.cos(ANGLES), [0.0, 1.0, 1e-4, 0.5]]))
-    found = fresnel(cosine, eta, k)[2]
+    found = reflectances(cosine, eta, k)[2]
     assert np.isfinite(found).all()
     assert (found >= -1e-6).all() and (found <= 1.0 + 1e-5).all()
     if (eta, k) not in ((0.0, 0.0), (1.0, 0.0)):
-        inside = np.abs(np.sqrt(1.0 - cosine**2) - eta) > 1e-3  # away from the critical angle, where the curve is vertical
-        assert np.abs(found - complex_fresnel(cosine, complex(eta, k)))[inside].max() < 5e-4
+        inside = np.abs(np.sqrt(1.0 - cosine**2) - eta) > 1e-3  # Away from the critical angle, where the curve is vertical.
+        assert np.abs(found - fresnel(cosine, complex(eta, k)))[inside].max() < 5e-4
 
 
 def test_tint_runs_from_f0_to_white():
     f0 = np.array([0.9, 0.5, 0.1])
-    tint = fresnel([1.0, 0.5, 0.0], 1.5, f0=f0)[3]
+    tint = reflectances([1.0, 0.5, 0.0], 1.5, f0=f0)[3]
     assert np.allclose(tint[0], f0) and np.allclose(tint[2], 1.0)
     assert np.allclose(tint[1], f0 + (1.0 - f0) / 32.0, atol=1e-6)
 
 
 @pytest.mark.parametrize("exponent", [0.0, 1.0, 10.0, 100.0, 1e4, 1e5])
 def test_highlight_is_normalised(exponent):
-    # Quadrature over the half vector's angle h: hemispherical reflectance at normal incidence is exactly 1, and so never more.
-    # The direction wi is at 2 h. Its solid angle is 4 cos(h) times the half vector's, while it is above the surface.
+    # Quadrature over the half vector's angle h: the hemispherical reflectance at normal incidence must be 1.
+    # The direction wi is at the angle 2 h. Its solid angle is 4 cos(h) times that of the half vector.
     x, w = np.polynomial.legendre.leggauss(300)
     reach = min(np.pi / 4.0, 12.0 / np.sqrt(exponent + 1.0))
     h, w = 0.5 * reach * (x + 1.0), 0.5 * reach * w
@@ -152,7 +143,7 @@ def test_highlight_is_normalised(exponent):
     solid_angle = 2.0 * np.pi * np.sin(h) * 4.0 * np.cos(h)
     reflectance = (value.numpy() * np.cos(2.0 * h) * solid_angle * w).sum()
     assert reflectance == pytest.approx(1.0, abs=2e-3)
-    assert reflectance <= 1.0 + (1e-5 if exponent < 1e3 else 2e-3)  # pow of float32 is all that may exceed it
+    assert reflectance <= 1.0 + (1e-5 if exponent < 1e3 else 2e-3)  # Only the rounding of power may exceed 1.
 
 
 # --- scatter ----------------------------------------------------------------------------------------------------------
@@ -213,7 +204,7 @@ def test_conductor_reflects_by_channel():
     eta, k = CONDUCTORS["gold"]
     out = scatter(Material("conductor", eta=eta, k=k), slanted([0.0, 30.0, 80.0]))
     for i, degrees in enumerate([0.0, 30.0, 80.0]):
-        expected = [complex_fresnel(np.cos(np.radians(degrees)), complex(a, b)) for a, b in zip(eta, k, strict=True)]
+        expected = [fresnel(np.cos(np.radians(degrees)), complex(a, b)) for a, b in zip(eta, k, strict=True)]
         assert np.allclose(out["reflected"][i], expected, atol=1e-5)
 
 
@@ -225,14 +216,14 @@ def test_glass_obeys_snell_and_keeps_energy(front):
     eta = 1.5 if front else 1.0 / 1.5
     share = out["reflected"][:, 0].astype(np.float64)
     goes_on = np.sin(np.radians(degrees)) < eta * (1.0 - 1e-6)
-    assert np.abs(share - np.where(goes_on, complex_fresnel(np.cos(np.radians(degrees)), eta), 1.0)).max() < 3e-4
+    assert np.abs(share - np.where(goes_on, fresnel(np.cos(np.radians(degrees)), eta), 1.0)).max() < 3e-4
     assert np.allclose(out["reflection"], wo * [-1, -1, 1], atol=1e-6)
     refraction = out["refraction"][goes_on].astype(np.float64)
-    assert np.abs(refraction[:, 0] + wo[goes_on, 0] / eta).max() < 1e-6  # sin_t = sin_i / eta, on the other side
+    assert np.abs(refraction[:, 0] + wo[goes_on, 0] / eta).max() < 1e-6  # sin_t = sin_i / eta, on the other side of the normal.
     assert (refraction[:, 2] < 0.0).all() and np.abs(refraction[:, 1]).max() < 1e-7
     assert np.abs(np.linalg.norm(refraction, axis=1) - 1.0).max() < 1e-6
     assert not out["transmitted"][~goes_on].any() and (share[~goes_on] == 1.0).all()
-    # Flux: radiance behind the boundary counts eta^2 fold (PBR, section 9.5.2).
+    # The flux is conserved: behind the boundary it is eta^2 times the radiance (PBR, section 9.5.2).
     assert np.allclose(share + out["transmitted"][:, 0] * eta**2, 1.0, atol=1e-5)
     assert np.allclose(out["transmitted"][:, 1], 0.5 * out["transmitted"][:, 0])
     assert (out["bends"] == goes_on).all()
@@ -241,7 +232,7 @@ def test_glass_obeys_snell_and_keeps_energy(front):
 def test_thin_glass_sums_the_reflections_of_both_faces():
     degrees = np.linspace(0.0, 85.0, 30)
     out = scatter(Material("glass", albedo=(1.0, 1.0, 0.25), ior=1.5, thin=True), slanted(degrees))
-    r = complex_fresnel(np.cos(np.radians(degrees)), 1.5)
+    r = fresnel(np.cos(np.radians(degrees)), 1.5)
     series = r + sum((1.0 - r) ** 2 * r ** (2 * k + 1) for k in range(60))
     assert np.abs(out["reflected"][:, 0] - series).max() < 1e-5
     assert np.allclose(out["transmitted"][:, 0], 1.0 - series, atol=1e-5)
@@ -251,7 +242,7 @@ def test_thin_glass_sums_the_reflections_of_both_faces():
 
 
 def some_materials():
-    """Return a material of each kind, and the corners of metallic-roughness, with albedo 1: none may absorb light."""
+    """Yield materials of each kind and extremes of metallic_roughness, all with albedo 1. Smooth ones must not absorb light."""
     rest = {"albedo": (1.0, 1.0, 1.0)}
     yield from (Material("mirror", **rest), Material("glass", ior=1.5, **rest), Material("glass", thin=True, **rest))
     yield Material("conductor", roughness=0.5)
@@ -281,7 +272,7 @@ def test_no_kind_creates_energy(material, front):
             assert np.abs(np.linalg.norm(direction, axis=1) - 1.0).max(initial=0.0) < 1e-5
             assert (direction[:, 2] * side > 0.0).all()
         if material.roughness == 0.0 and material.kind != "conductor":
-            assert (total > 1.0 - 1e-4).all()  # what is smooth and white keeps all of it
+            assert (total > 1.0 - 1e-4).all()  # A smooth white surface absorbs nothing.
 
 
 @pytest.mark.parametrize("kind", ["conductor", "glass", "metallic_roughness"])

@@ -1,4 +1,4 @@
-"""The sample sequence's net property, and the shapes against their closed forms."""
+"""The net property of the sample sequence, and the moments of sampled shapes and directions against closed forms."""
 
 import numpy as np
 import pytest
@@ -99,7 +99,7 @@ def shapes(xi, sides=5, rotation=0.3, n=(0.0, 0.0, 1.0)):
 
 
 def assert_net(points, k):
-    """Exactly one point in each elementary interval 2^-a x 2^-(k-a)."""
+    """Check that each elementary interval 2^-a x 2^-(k-a) has exactly one point."""
     for a in range(k + 1):
         cell = np.floor(points * [2.0**a, 2.0 ** (k - a)]).astype(int)
         number = cell[:, 0] * 2 ** (k - a) + cell[:, 1]
@@ -120,8 +120,8 @@ def test_samples_lie_in_the_half_open_square():
 
 
 def test_keys_and_dimensions_are_independent():
-    # The same net for two pixels or two dimensions would show as structure. Their points must be uncorrelated, and pairs of one
-    # coordinate of each must fill the square evenly.
+    # The same net for two pixels or two dimensions would be visible as a pattern. The points of two keys or dimensions must be
+    # uncorrelated, and pairs of a coordinate of each must fill the square evenly.
     rng = np.random.default_rng(1)
     n = 4096
     sets = [samples(key, np.arange(n), dimension) for key, dimension in
@@ -132,16 +132,16 @@ def test_keys_and_dimensions_are_independent():
                 for y in range(2):
                     assert abs(np.corrcoef(a[:, x], b[:, y])[0, 1]) < 5.0 / np.sqrt(n)
                     counts = np.histogram2d(a[:, x], b[:, y], bins=8, range=[[0, 1], [0, 1]])[0]
-                    assert counts.min() > 20 and counts.max() < 120  # 64 expected
+                    assert counts.min() > 20 and counts.max() < 120  # The expectation is 64.
 
 
 def test_first_sample_over_neighbouring_keys_is_uniform():
-    # One sample a pixel: over pixels it must be white noise, not a pattern.
+    # With one sample for each pixel, the samples of neighbouring pixels must be white noise.
     keys = np.arange(1 << 14, dtype=np.uint32)
     out = zeros(len(keys), wp.vec2)
     launch(sample_kernel, len(keys), uints(keys), uints(np.zeros(len(keys))), 0, out)
     counts = np.histogram2d(*out.numpy().T, bins=16, range=[[0, 1], [0, 1]])[0]
-    chi2 = ((counts - 64.0) ** 2 / 64.0).sum()  # 255 degrees of freedom: standard deviation 22.6
+    chi2 = ((counts - 64.0) ** 2 / 64.0).sum()  # 255 degrees of freedom: the standard deviation is 22.6.
     assert 255.0 - 6.0 * 22.6 < chi2 < 255.0 + 6.0 * 22.6
     assert abs(np.corrcoef(out.numpy()[:-1, 0], out.numpy()[1:, 0])[0, 1]) < 0.04
 
@@ -152,13 +152,13 @@ def test_different_seeds_give_different_orders():
 
 
 def test_owen_scrambling_beats_random_samples():
-    # The mean of a smooth function over 1024 points is off by far less than 1/sqrt(n) (Owen 1997: n^-1.5 up to logarithms).
+    # The error of the mean of a smooth function over 1024 points is far below 1/sqrt(n) (Owen 1997: n^-1.5 up to logarithms).
     errors = []
     for key in range(40):
         x, y = samples(key, np.arange(1024)).T.astype(np.float64)
         errors.append((np.exp(x) * np.sin(3.0 * y)).mean() - (np.e - 1.0) * (1.0 - np.cos(3.0)) / 3.0)
     assert np.sqrt(np.mean(np.square(errors))) < 0.01 / np.sqrt(1024)
-    assert abs(np.mean(errors)) < 4.0 * np.std(errors) / np.sqrt(40)  # and it is unbiased
+    assert abs(np.mean(errors)) < 4.0 * np.std(errors) / np.sqrt(40)  # The mean is unbiased.
 
 
 def run_bits(x):
@@ -172,7 +172,7 @@ def test_bit_tricks():
     x = np.concatenate([np.arange(4096), np.random.default_rng(2).integers(0, 2**32, 4096)]).astype(np.uint32)
     hashed, reverse, second, number = run_bits(x)
     assert np.array_equal(reverse, [int(f"{int(v):032b}"[::-1], 2) for v in x])
-    # The second Sobol dimension, from its definition: direction numbers of the primitive polynomial x + 1 (all m odd).
+    # The second Sobol dimension by definition, from the direction numbers of the primitive polynomial x + 1.
     v = [1 << 31]
     for _ in range(31):
         v.append(v[-1] ^ (v[-1] >> 1))
@@ -190,7 +190,7 @@ def test_bit_tricks():
     for bit in range(32):
         other = run_bits(x ^ np.uint32(1 << bit))[0]
         flips.append(np.unpackbits((hashed ^ other).view(np.uint8)).mean())
-    assert 0.45 < min(flips) and max(flips) < 0.55  # each input bit turns half of the output
+    assert 0.45 < min(flips) and max(flips) < 0.55  # Each input bit flips half of the output bits.
 
 
 # --- shapes -----------------------------------------------------------------------------------------------------------
@@ -223,9 +223,9 @@ def test_polygon_moments(sides, rotation):
     half = np.pi / sides
     normals = rotation + half + 2.0 * half * np.arange(sides)
     across = p @ np.array([np.cos(normals), np.sin(normals)])
-    assert across.max() <= np.cos(half) + 1e-6  # within every side, and so within the circle
+    assert across.max() <= np.cos(half) + 1e-6  # Inside every side, and so inside the circle.
     assert np.linalg.norm(p, axis=1).max() <= 1.0 + 1e-6
-    # Second moment of a regular n-gon of circumradius 1 about its center: (2 + cos(2 pi / n)) / 6.
+    # The second moment of a regular n-gon of circumradius 1 about its center is (2 + cos(2 pi / n)) / 6.
     assert abs((p**2).sum(axis=1).mean() - (2.0 + np.cos(2.0 * half)) / 6.0) < 2e-3
     assert np.abs(p.mean(axis=0)).max() < 2e-3
     for scale in (0.3, 0.7):
@@ -258,7 +258,7 @@ def test_cosine_hemisphere_moments(n):
     assert abs(cosine.mean() - 2.0 / 3.0) < 1e-3 and abs((cosine**2).mean() - 0.5) < 1e-3
     across = d - cosine[:, None] * n
     assert np.abs(across.mean(axis=0)).max() < 2e-3
-    second = across.T @ across / len(d)  # (I - n n^T) / 4: no direction in the plane is preferred
+    second = across.T @ across / len(d)  # Must be (I - n n^T) / 4: isotropic in the plane.
     assert np.abs(second - 0.25 * (np.eye(3) - np.outer(n, n))).max() < 2e-3
     for c in (0.2, 0.7):
         assert abs((cosine >= c).mean() - (1.0 - c * c)) < 2e-3
@@ -295,7 +295,7 @@ def ggx_d(c, alpha):
 
 
 def hemisphere_grid(n=400):
-    """Directions over the upper hemisphere with their solid angles: Gauss in the cosine, trapezoid around."""
+    """Return directions of the upper hemisphere and their solid angles: Gauss nodes in the cosine, equal steps in azimuth."""
     x, w = np.polynomial.legendre.leggauss(n)
     c, w = 0.5 * (x + 1.0), 0.5 * w
     phi = 2.0 * np.pi * (np.arange(n) + 0.5) / n
@@ -307,12 +307,12 @@ def hemisphere_grid(n=400):
 @pytest.mark.parametrize("alpha", [0.05, 0.3, 1.0])
 @pytest.mark.parametrize("cos_o", [1.0, 0.7, 0.2])
 def test_ggx_normals_are_those_that_are_seen(cos_o, alpha):
-    # Density of visible normals: D(m) max(0, wo.m) / (cos_o (1 + Lambda)); the moments of m by quadrature.
+    # The density of visible normals is D(m) max(0, wo.m) / (cos_o (1 + Lambda)). Quadrature gives the moments of m.
     wo = np.array([np.sqrt(1.0 - cos_o**2), 0.0, cos_o])
     h, _ = run_ggx(sobol_like(1 << 16, np.random.default_rng(9)), (0.0, 0.0, 1.0), wo, alpha)
     assert np.abs(np.linalg.norm(h, axis=1) - 1.0).max() < 1e-5
     assert (h @ wo).min() > -1e-6 and h[:, 2].min() > 0.0
-    # In slopes the peak is as wide for every alpha: theta = atan(alpha tan(q)).
+    # With theta = atan(alpha tan(q)), the peak in q has the same width for every alpha.
     x, w = np.polynomial.legendre.leggauss(600)
     q, w = 0.25 * np.pi * (x + 1.0), 0.25 * np.pi * w
     theta = np.arctan(alpha * np.tan(q))
@@ -332,7 +332,7 @@ def test_ggx_normals_are_those_that_are_seen(cos_o, alpha):
 @pytest.mark.parametrize("alpha", [0.1, 0.4, 1.0])
 @pytest.mark.parametrize("cos_o", [1.0, 0.6, 0.25])
 def test_white_rough_mirror_against_quadrature(cos_o, alpha):
-    # Reflectance of single scattering, F = 1: integral of D G2 / (4 cos_o) over the hemisphere of wi; never above 1.
+    # The reflectance of single scattering with F = 1 is the integral of D G2 / (4 cos_o) over the hemisphere of wi. It is at most 1.
     wo = np.array([np.sqrt(1.0 - cos_o**2), 0.0, cos_o])
     _, share = run_ggx(sobol_like(1 << 16, np.random.default_rng(10)), (0.0, 0.0, 1.0), wo, alpha)
     wi, weight = hemisphere_grid(500)
@@ -343,7 +343,7 @@ def test_white_rough_mirror_against_quadrature(cos_o, alpha):
     assert share.mean() == pytest.approx(expected, abs=3e-3)
     assert 0.3 < expected < 1.0
     if (cos_o, alpha) == (1.0, 1.0):
-        assert expected == pytest.approx(1.0 - np.log(2.0), abs=1e-4)  # in closed form
+        assert expected == pytest.approx(1.0 - np.log(2.0), abs=1e-4)  # The closed form.
 
 
 def test_ggx_in_any_frame_is_the_same_distribution():
@@ -379,4 +379,4 @@ def test_search_cdf(weights, before):
     launch(search_kernel, len(x), floats(padded), before, len(cdf), floats(x), out)
     expected = np.searchsorted(cdf, x, side="right")
     assert np.array_equal(out.numpy(), expected)
-    assert all(weights[i] > 0 for i in out.numpy())  # what has no weight is never chosen
+    assert all(weights[i] > 0 for i in out.numpy())  # An entry of weight 0 is never chosen.

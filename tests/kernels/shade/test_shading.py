@@ -1,4 +1,4 @@
-"""The table of a material's textures: both loops, the host's material and its switches have the same ones."""
+"""The table of a material's textures: both loops, the host's materials and the features have the same textures."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ def test_host_and_device_have_the_same_textures() -> None:
 
 
 def test_channels_go_to_numbers_of_texels_that_follow_one_another() -> None:
-    """The wave loop stores one channel after another, so a block's rows must follow one another, too."""
+    """The wave loop stores the channels of a texture in adjacent rows, so that its fields must be neighbours in Texels."""
     rows, seen = Rows(Texels, 64), []
     for texture in TEXTURES.values():
         fields = [rows.field(name) for name in texture.fields]
         assert [each.end for each in fields[:-1]] == [each.first for each in fields[1:]]
-        assert fields[-1].end - fields[0].first == len(texture.channels) == len(texture.numbers)
+        assert fields[-1].end - fields[0].first == len(texture.channels) == len(texture.components)
         assert texture.channels == sorted(texture.channels)
         seen += texture.fields
     assert sorted(seen) == sorted(fields_of(Texels))
     metallic_roughness, albedo = TEXTURES["metallic_roughness_texture"], TEXTURES["albedo_texture"]
-    assert metallic_roughness.channels == [1, 2] and metallic_roughness.numbers == ["texels.roughness", "texels.metallic"]
-    assert albedo.channels == [0, 1, 2, 3] and albedo.numbers[1:] == ["texels.albedo[1]", "texels.albedo[2]", "texels.alpha"]
+    assert metallic_roughness.channels == [1, 2] and metallic_roughness.components == ["texels.roughness", "texels.metallic"]
+    assert albedo.channels == [0, 1, 2, 3] and albedo.components[1:] == ["texels.albedo[1]", "texels.albedo[2]", "texels.alpha"]
 
 
 @pytest.mark.parametrize("name", SLOTS)

@@ -59,7 +59,7 @@ def away_kernel(x: wp.array(dtype=wp.float32), side: wp.array(dtype=wp.float32),
 
 
 def surfaces_at(scene, origin, direction, hits, onward=None):
-    """Surface records of hits, and where rays in the `onward` directions start."""
+    """Return the surfaces of hits, and the origins of new rays in the `onward` directions."""
     n = len(origin)
     out, start = zeros(n, Surface), zeros(n, wp.vec3)
     onward = direction if onward is None else onward
@@ -75,7 +75,7 @@ def scene_of(mesh=None, spheres=()):
 
 
 def hit_rays(scene, rng, n, target, scale=1.0):
-    """Rays at `target`s that hit, with their hits."""
+    """Return rays that are aimed at the points `target` and hit, and their hits."""
     direction = rounded(rng.normal(size=(n, 3)))
     origin = rounded(target - direction * scale * 10.0 ** rng.uniform(-0.5, 2, (n, 1)))
     structure = build(flatten_joined(scene).geometry, "bvh")
@@ -118,7 +118,7 @@ def test_flat_normals_and_points_at_any_scale(scale):
     assert (np.abs(found["point"].astype(np.float64) / scale - point) <= found["error"].astype(np.float64) / scale).all()
     away = np.abs(((found["point"].astype(np.float64) / scale - corner[:, 0]) * normal).sum(axis=1))
     assert (away <= (np.abs(normal) * found["error"] / scale).sum(axis=1) * 1.01)[sound].all()
-    assert (found["error"] <= 40.0 * 2.0**-24 * np.abs(corner).max(axis=(1, 2))[:, None] * scale).all()  # and no looser
+    assert (found["error"] <= 40.0 * 2.0**-24 * np.abs(corner).max(axis=(1, 2))[:, None] * scale).all()  # The bound is tight.
 
 
 def test_smooth_normals_are_interpolated_and_turned_together():
@@ -161,7 +161,7 @@ def test_corners_without_a_normal_are_flat():
 
 
 def uv_of(found):
-    """Texture coordinates, (N, 2)."""
+    """Return the texture coordinates, (N, 2)."""
     return np.stack([found["u"], found["v"]], axis=1)
 
 
@@ -180,14 +180,14 @@ def test_uv_and_tangent():
     w = np.stack([1.0 - hits.u.astype(np.float64) - hits.v, hits.u, hits.v], axis=1)
     uv = mesh.uvs[face].astype(np.float64)
     assert np.abs(uv_of(found) - np.einsum("ni,nij->nj", w, uv)).max() < 1e-5
-    # dp/du and dp/dv solve: edge_k = du_k dp/du + dv_k dp/dv.
+    # dp/du and dp/dv solve the equations edge_k = du_k dp/du + dv_k dp/dv.
     edges = (mesh.vertices[face[:, 1:]] - mesh.vertices[face[:, :1]]).astype(np.float64)
     changes = uv[:, 1:] - uv[:, :1]
     determinant = np.linalg.det(changes)
     sound = np.abs(determinant) > 0.05
     solved = np.linalg.solve(np.where(sound[:, None, None], changes, np.eye(2)), edges)
     assert np.abs(found["tangent"] - unit(solved[:, 0]))[sound].max() < 1e-3
-    # glTF: bitangent = cross(normal, tangent) * sign is the picture's up, against growing v (v runs down).
+    # In glTF, bitangent = cross(normal, tangent) * sign points up in the picture, towards decreasing v.
     normal = unit(np.cross(edges[:, 0], edges[:, 1]))
     bitangent = np.cross(normal, found["tangent"]) * found["bitangent_sign"][:, None]
     assert ((bitangent * solved[:, 1]).sum(axis=1) < 0.0)[sound].all()
@@ -231,13 +231,13 @@ def test_spheres(ball):
 
 
 def test_sphere_coordinates():
-    # u runs around +y from -x, v from the top down, as wrt.scene.model.Sphere says.
+    # u runs around +y from -x, and v from the top down, as documented in wrt.scene.model.Sphere.
     scene = scene_of(spheres=[[0.0, 0.0, 0.0, 2.0]])
     where = np.array([[1, 0, 0], [0, 0, 1], [0, 0, -1], [0.6, 0.8, 0.0], [0.6, -0.8, 0.0], [-0.6, 0.0, 0.8], [0, 1, 0]], float)
     hits = build(upload_scene(scene, DEVICE).world.geometry, "bvh").closest_hit(4.0 * where, -where)
     found, _ = surfaces_at(scene, 4.0 * where, -where, hits)
     assert np.allclose(uv_of(found)[:, 1], np.arccos(where[:, 1]) / np.pi, atol=1e-5)
-    # From -x (the seam) over +z, +x and -z, which is to the right for who looks at it from outside with +y up.
+    # u grows from the seam at -x over +z, +x and -z: to the right, seen from outside with +y up.
     assert np.allclose(uv_of(found)[[1, 0, 2], 0], [0.25, 0.5, 0.75], atol=1e-6)
     around = np.mod(np.arctan2(where[:, 2], -where[:, 0]) / (2.0 * np.pi), 1.0)
     assert np.allclose(uv_of(found)[:6, 0], around[:6], atol=1e-6)
@@ -246,7 +246,7 @@ def test_sphere_coordinates():
     moved = unit(where[:6] + step * tangent[:6])
     hits = build(upload_scene(scene, DEVICE).world.geometry, "bvh").closest_hit(4.0 * moved, -moved)
     further, _ = surfaces_at(scene, 4.0 * moved, -moved, hits)
-    assert (uv_of(further)[:6, 0] > uv_of(found)[:6, 0]).all()  # the tangent points along growing u
+    assert (uv_of(further)[:6, 0] > uv_of(found)[:6, 0]).all()  # The tangent points along growing u.
     assert np.allclose(uv_of(further)[:3, 1], uv_of(found)[:3, 1], atol=1e-5)
 
 
@@ -269,7 +269,7 @@ def test_next_away_moves_every_float():
 
 
 def onward_directions(rng, normal, grazing):
-    """Directions to either side of a surface, down to a given slope."""
+    """Return directions to both sides of a surface, with slopes down to `grazing`."""
     d = directions(rng, len(normal))
     d = d - (d * normal).sum(axis=1, keepdims=True) * normal * (1.0 if grazing else 0.0)
     d = unit(d) + (grazing * normal if grazing else 0.0)
@@ -280,7 +280,7 @@ def onward_directions(rng, normal, grazing):
 @pytest.mark.parametrize("grazing", [None, 1e-2, 1e-4])
 @pytest.mark.parametrize(("scale", "offset"), [(1.0, 0.0), (1e-6, 0.0), (1e6, 0.0), (1.0, 1000.0), (1e-3, 100.0), (1e-15, 0.0)])
 def test_a_new_ray_does_not_meet_its_own_triangle(scale, offset, grazing):
-    # pbrt-v4, shapes_test, Reintersect: no triangle is excluded here, the offset alone must do.
+    # As in pbrt-v4, shapes_test, Reintersect: no triangle is excluded, so that only the offset prevents the hit.
     rng = np.random.default_rng(9)
     mesh = random_triangles(rng, 100, scale, offset)
     scene = scene_of(mesh)
@@ -298,7 +298,7 @@ def test_a_new_ray_does_not_meet_its_own_triangle(scale, offset, grazing):
 @pytest.mark.parametrize("tilt", [(0.0, 0.0), (1.0, 2.0), (0.25, -0.5)])
 @pytest.mark.parametrize(("scale", "offset"), [(1.0, 0.0), (128.0, 0.0), (2.0**-10, 0.0), (1.0, 1024.0)])
 def test_a_new_ray_does_not_meet_its_neighbours_in_a_plane(scale, offset, tilt):
-    # Coordinates with few digits: all triangles lie in one plane exactly, so that any second hit is an artefact.
+    # Coordinates have few digits, so that all triangles are exactly in one plane. Any second hit is an artefact.
     i, j = np.meshgrid(np.arange(-4.0, 5.0), np.arange(-4.0, 5.0), indexing="ij")
     vertices = np.stack([i, j, tilt[0] * i + tilt[1] * j], axis=-1).reshape(-1, 3) * scale + offset
     first = (np.arange(8)[:, None] * 9 + np.arange(8)).reshape(-1, 1)
@@ -314,7 +314,7 @@ def test_a_new_ray_does_not_meet_its_neighbours_in_a_plane(scale, offset, tilt):
         _, start = surfaces_at(scene, origin, direction, hits, onward)
         assert not structure.any_hit(start, onward).any()
         step = np.linalg.norm(start - origin - hits.t[:, None].astype(np.float64) * direction, axis=1)
-        assert step.max() < 1e-4 * (scale + offset)  # and the offset is small
+        assert step.max() < 1e-4 * (scale + offset)  # The offset is small.
 
 
 @pytest.mark.parametrize("ball", BALLS)
@@ -330,21 +330,21 @@ def test_a_new_ray_does_not_meet_its_own_sphere(ball):
     near = 1e-5 * radius if ball == "ground" else radius
     structure, origin, direction, hits = hit_rays(scene, rng, n, center + 0.999999 * radius * on, near)
     found, _ = surfaces_at(scene, origin, direction, hits)
-    # Which side a direction goes to is a matter of the normal: at 1e-6 the point itself is rounded by 3 % of the radius.
+    # The normal tells to which side a direction goes: for a radius of 1e-6, the rounding of the point is 3 % of the radius.
     outward = unit(np.where(found["front"][:, None] != 0, 1.0, -1.0) * found["geometric"])
     for grazing in (None, 1e-2):
         onward = onward_directions(rng, outward, grazing)
         _, start = surfaces_at(scene, origin, direction, hits, onward)
         leaves = (onward * outward).sum(axis=1) > 0.0
         assert not structure.any_hit(start[leaves], onward[leaves]).any()
-        # The way through: the far side, at the length of the chord, and not the near side again.
+        # A ray through the sphere hits the far side, at the length of the chord, not the near side again.
         through = structure.closest_hit(start[~leaves], onward[~leaves])
         assert (through.prim_id == 0).all()
         f, d = (start[~leaves].astype(np.longdouble) - center), onward[~leaves].astype(np.longdouble)
         a, b = (d * d).sum(axis=1), (f * d).sum(axis=1)
         nearest = f - (b / a)[:, None] * d
         half = np.sqrt((np.longdouble(radius) ** 2 - (nearest * nearest).sum(axis=1)) / a)
-        # t is held to the box, whose corners are rounded like all coordinates.
+        # t is clamped to the sphere's box, whose corners are rounded like all coordinates.
         slack = 8.0 * 2.0**-24 * np.abs(center).max()
         assert np.allclose(through.t, (half - b / a).astype(np.float64), rtol=1e-6, atol=slack)
         assert (half > 0.0).all()

@@ -1,4 +1,4 @@
-"""Texture look-ups against a slow float64 oracle."""
+"""Texture look-ups against a reference in float64."""
 
 from functools import cache
 
@@ -68,7 +68,7 @@ def place(i, size, wrap):
 
 
 def bilinear(texture, u, v):
-    """The definition: texel centers at (i + 0.5) / size, weights by distance."""
+    """Look up a texture by the definition: texel centers are at (i + 0.5) / size, and weights are linear in the distance."""
     image = linear(texture.image.astype(np.float64), texture.srgb)
     u, v = texture.uv_transform @ [u, v, 1.0]
     height, width = image.shape[:2]
@@ -101,14 +101,14 @@ def test_texel_centers_and_halfway_points():
     assert np.array_equal(look_up([texture], 0, uv).astype(np.float32), expected)
     between = look_up([texture], 0, [[1.0 / 8.0, 0.5 / 4.0]])[0]
     assert np.allclose(between, 0.5 * (image[0, 0] / 255.0 + image[0, 1] / 255.0), atol=1e-6)
-    seam = look_up([texture], 0, [[0.0, 0.5 / 4.0]])[0]  # repeat: between the last column and the first
+    seam = look_up([texture], 0, [[0.0, 0.5 / 4.0]])[0]  # With WRAP_REPEAT, between the last and the first column.
     assert np.allclose(seam, 0.5 * (image[0, 0] / 255.0 + image[0, 7] / 255.0), atol=1e-6)
 
 
 def test_decoding_comes_before_filtering_and_spares_alpha():
     image = np.array([[[0, 0, 0, 0], [255, 255, 255, 255]]], np.uint8)
     middle = look_up([Texture(image, srgb=True, wrap=("clamp", "clamp"))], 0, [[0.5, 0.5]])[0]
-    assert np.allclose(middle, 0.5)  # halfway between decoded black and white, not the decoded middle grey
+    assert np.allclose(middle, 0.5)  # The mean of decoded black and white, not the decoded middle grey.
     grey = np.full((1, 1, 4), 128, np.uint8)
     assert look_up([Texture(grey, srgb=True)], 0, [[0.2, 0.9]])[0] == pytest.approx(
         [0.215861, 0.215861, 0.215861, 128 / 255.0], abs=1e-6)
@@ -129,7 +129,7 @@ def test_uv_transform_and_several_textures():
     table = TextureTable()
     for texture in textures:
         table.index(texture)
-    assert table.size == first.image[..., 0].size + turned.image[..., 0].size  # a picture used twice is stored once
+    assert table.size == first.image[..., 0].size + turned.image[..., 0].size  # A picture that is used twice is stored once.
 
 
 def test_no_texture_is_white():
@@ -148,7 +148,7 @@ def test_checkerboard():
 
 @pytest.mark.parametrize("wrap", ["repeat", "clamp", "mirror"])
 def test_coordinates_far_out_stay_within_the_picture(wrap):
-    # The index must stay inside the picture, whatever the coordinate: texels of other pictures lie right beside it.
+    # The index must stay inside the picture for any coordinate: texels of other pictures are adjacent.
     inside = np.full((64, 4096, 4), 200, np.uint8)
     guard = np.zeros((1, 4096, 4), np.uint8)
     textures = [Texture(guard, srgb=False), Texture(inside, srgb=False, wrap=(wrap, wrap)), Texture(guard.copy(), srgb=False)]
@@ -158,7 +158,7 @@ def test_coordinates_far_out_stay_within_the_picture(wrap):
 
 
 def test_coordinates_beyond_all_integers_keep_their_side():
-    # 1e6 times 4096 is no int32: devices make the largest or the smallest one of it, and the CPU took the left edge.
+    # 1e6 times 4096 exceeds int32. The conversion would give the largest or the smallest int32, depending on the device.
     wide = np.zeros((2, 4096, 4), np.uint8)
     wide[:, -1] = 255
     uv = [[1e6, 0.5], [-1e6, 0.5], [3e38, 0.5], [-3e38, 0.5]]
@@ -175,5 +175,5 @@ def test_one_texel_picture():
 
 
 def test_the_table_of_plain_numbers_is_a_division():
-    """textures.h divides."""
+    """textures.h divides by 255 in place of a look-up in the table."""
     np.testing.assert_array_equal(srgb_table()[256:], np.arange(256, dtype=np.float32) / np.float32(255.0))

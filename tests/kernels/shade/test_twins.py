@@ -1,6 +1,6 @@
-"""Native functions that compute in lanes, and their scalar twins: the same bits.
+"""Vectorised C++ functions have the bits of their twins: scalar functions in Python.
 
-Each is a Warp function of one call, of the function of its twin's name in the header beside the twin's file.
+A native Warp function only calls the C++ function. The C++ function has its twin's name, and its header the name of the twin's file.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def points_kernel(key: wp.uint32, first: int, n: int, lanes: wp.array(dtype=wp.v
 
 
 def check_points() -> None:
-    """Compare for several first indices and counts."""
+    """Compare sample_points with sample_2d for several first indices and counts."""
     for key, first in ((0, 0), (0xFFFFFFFF, 5), (0x12345678, (1 << 20) - 7), (77, 0x7FFFFFFF - 37)):
         for n in (1, 7, 8, 9, 12, 16, 37):
             room = AT + LANES * -(-n // LANES)
@@ -80,7 +80,7 @@ def check_quantiles() -> None:
         points, single = wp.array(values, dtype=wp.vec2, device="cpu"), zeros(values.shape)
         launch(quantiles_kernel, 1, icdf, points, n)
         launch(quantile_kernel, values.shape, icdf, wp.array(values, device="cpu"), single)
-        expected = np.concatenate([values[:AT], single.numpy()[AT : AT + n], values[AT + n :]])  # the others stay as they are
+        expected = np.concatenate([values[:AT], single.numpy()[AT : AT + n], values[AT + n :]])  # The other values stay unchanged.
         np.testing.assert_array_equal(points.numpy().view(np.int32), expected.view(np.int32))
 
 
@@ -95,7 +95,7 @@ def seen_kernel(b: Background, rows: wp.array(dtype=float), count: int):
 
 
 def check_environment() -> None:
-    """Compare also at the seam and the poles. Values behind the last direction are arbitrary."""
+    """Compare directions, also at the seam and the poles. Values behind the last direction are arbitrary."""
     for rotation in (0.0, 0.7):
         rng = np.random.default_rng(1)
         axes = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [-0.0, 1, -0.0], [0.5**0.5, 0, 0.5**0.5]])
@@ -128,7 +128,7 @@ def textures_kernel(surfaces: Surfaces, wanted: wp.array(dtype=wp.int32), uv: wp
 
 
 def in_lanes(surfaces: Any, index: Any, uv: np.ndarray, channels: int = 15) -> np.ndarray:
-    """Return the channels asked for, then NaN, (N, 4). Values behind the last are arbitrary, as in a block that is not full."""
+    """Return the requested channels, then NaN, (N, 4). Values behind the last index are arbitrary, as in a block that is not full."""
     wanted, coordinates = np.full(BLOCK, -1), np.full((2, BLOCK), np.nan, np.float32)
     wanted[: len(uv)], coordinates[:, : len(uv)] = index, uv.T
     out = floats(np.full(4 * BLOCK, np.nan))
@@ -137,13 +137,13 @@ def in_lanes(surfaces: Any, index: Any, uv: np.ndarray, channels: int = 15) -> n
 
 
 def check_textures() -> None:
-    """Compare several pictures, wrapped in every way, near and far away, and no picture."""
+    """Compare look-ups in several pictures, with every wrap mode, near and far coordinates, and without a picture."""
     for count in (1, 17, 64):
         rng = np.random.default_rng(count)
         wraps = [(u, v) for u in ("repeat", "clamp", "mirror") for v in ("repeat", "clamp", "mirror")]
         turned = np.array([[1.5, 0.25, -3.0], [0.125, -2.0, 0.5]])
         pictures = [Texture(picture(rng, 1 + i, 1 + 2 * i), srgb=i % 2 == 0, wrap=wrap) for i, wrap in enumerate(wraps)]
-        pictures += [replace(each, uv_transform=turned, srgb=not each.srgb) for each in pictures]  # with the same texels
+        pictures += [replace(each, uv_transform=turned, srgb=not each.srgb) for each in pictures]  # They share the texels.
         surfaces = surfaces_with(pictures)
         for scale in (0.5, 1.5, 4.0, 1e3, 1e12):
             for _ in range(20):
@@ -193,7 +193,7 @@ def check_film() -> None:
         done["radiance"] = rng.lognormal(size=(len(done), 3)) * rng.choice([0.0, 1e-30, 1.0, 1e20], (len(done), 1))
         done["radiance"][rng.random(len(done)) < 0.1, 1] = np.nan
         done["radiance"][rng.random(len(done)) < 0.1, 0] = np.inf
-        done["radiance"][rng.random(len(done)) < 0.1] = np.float32(3e38)  # finite, but their sum is not
+        done["radiance"][rng.random(len(done)) < 0.1] = np.float32(3e38)  # The channels are finite, but their sum is not.
         for name in ("rays", "cut_depth", "cut_throughput"):
             done[name] = rng.integers(0, 1 << 30 if name == "rays" else 9, len(done))
         done["lost"] = rng.random(len(done))
@@ -215,7 +215,7 @@ def check_film() -> None:
 
 
 class Twin(NamedTuple):
-    """A native function, and its scalar twin of this name in `file`. `check` asserts that both have the same bits."""
+    """A native function and the name of its scalar twin in `file`. `check` asserts that both have the same bits."""
 
     native: Any
     file: Any

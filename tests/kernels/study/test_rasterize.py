@@ -1,4 +1,4 @@
-"""The z-buffer: coverage against exact arithmetic, the fill rule, triangles through the camera, and no order."""
+"""The z-buffer: coverage against exact arithmetic, the fill rule, triangles through the camera, and independence of order."""
 
 import math
 from fractions import Fraction
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.kernel_tools import DEVICE, launch, zeros  # before warp: it silences Warp's banner
+from tests.kernel_tools import DEVICE, launch, zeros  # Before warp: it silences Warp's banner.
 from tests.refused import refused
 from wrt.accel.geometry import Geometry
 from wrt.kernels.structs import kernel
@@ -19,19 +19,19 @@ from wrt.scene.shapes import box, icosphere
 
 import warp as wp  # isort: skip
 
-# tan(fov / 2) = 1, so that a power of two of pixels makes all of the camera's numbers exact.
+# tan(fov / 2) = 1: if width and height are powers of two, all of the camera's numbers are exact.
 STRAIGHT = Camera(fov_y=math.pi / 2)
 TURNED = Camera.look_at((0.3, -0.2, 0.7), (1.1, 0.4, -2.0), up=(0.1, 1.0, 0.2), fov_y=1.1)
 
 
 def geometry(triangles) -> Geometry:
-    """Triangles (N, 3 corners, 3) that share no vertex."""
+    """Return triangles (N, 3 corners, 3) as a Geometry without shared vertices."""
     vertices = np.asarray(triangles, np.float32).reshape(-1, 3)
     return Geometry(vertices, np.arange(len(vertices), dtype=np.int32).reshape(-1, 3), np.zeros((0, 4), np.float32))
 
 
 def origin_of(camera: Camera) -> np.ndarray:
-    """The float32 position that the device gets, (3,) float64."""
+    """Return the float32 position that the device gets, as (3,) float64."""
     return np.array(list(camera_struct(camera, (1, 1)).origin), np.float64)
 
 
@@ -42,7 +42,7 @@ def draw(what: Geometry, camera: Camera, size, threads=1) -> tuple[np.ndarray, n
 
 
 def counts(what: Geometry, camera: Camera, size) -> np.ndarray:
-    """How many triangles cover each pixel, each drawn by itself."""
+    """Return how many triangles cover each pixel, by drawing each triangle alone."""
     total = np.zeros((size[1], size[0]), int)
     for face in what.faces:
         total += draw(Geometry(what.vertices, face[None].copy(), what.spheres), camera, size)[1] == 0
@@ -50,13 +50,13 @@ def counts(what: Geometry, camera: Camera, size) -> np.ndarray:
 
 
 def at_pixels(camera: Camera, size, places, distance) -> np.ndarray:
-    """World points (N, 3) float32 that are seen at `places` (N, 2) in pixels, at a distance along the axis."""
+    """Return the world points (N, 3), float32, at the picture points `places` (N, 2) in pixels and a distance along the axis."""
     d = np.column_stack([places, np.ones(len(places))]) @ directions_from_pixels(camera, size).T
     return (origin_of(camera) + d * np.reshape(distance, (-1, 1))).astype(np.float32)
 
 
 def exact_answer(triangle, camera: Camera, size, column: int, row: int):
-    """Whether a pixel's centre is inside (1), outside (-1) or on an edge or too near to tell (0), and the depth along d."""
+    """Return 1 if a pixel's centre is inside, -1 outside, 0 on or too near an edge; and the depth along d."""
     matrix = directions_from_pixels(camera, size)
     point = (Fraction(2 * column + 1, 2), Fraction(2 * row + 1, 2), Fraction(1))
     d = [sum(Fraction(float(m)) * x for m, x in zip(line, point, strict=True)) for line in matrix]
@@ -79,7 +79,7 @@ def exact_answer(triangle, camera: Camera, size, column: int, row: int):
 def random_triangles(kind: str, rng: np.random.Generator, n: int) -> np.ndarray:
     if kind == "ahead":
         return rng.uniform(-2.0, 2.0, (n, 3, 3)) + [0.0, 0.0, -3.0]
-    if kind == "around":  # many pass through the plane of the camera
+    if kind == "around":  # Many triangles cross the plane of the camera.
         return rng.uniform(-3.0, 3.0, (n, 3, 3))
     if kind == "huge":
         return rng.uniform(-1.0, 1.0, (n, 3, 3)) * 10.0 ** rng.uniform(0.0, 30.0, (n, 1, 1))
@@ -108,14 +108,14 @@ def test_coverage_and_depth_are_those_of_exact_arithmetic(kind: str, camera: Cam
 
 
 def test_the_fill_rule_counts_a_right_triangle_as_top_left() -> None:
-    """With the diagonal through the centres, a triangle above or left of it owns them: n (n + 1) / 2; else n (n - 1) / 2."""
+    """The diagonal passes through n centres. A triangle above or left of it owns them: n (n + 1) / 2 pixels, else n (n - 1) / 2."""
     n = 8
     corner = np.array([[0.0, 0.0], [n, 0.0], [0.0, n], [n, n]])
     for triangle, area in (((0, 1, 2), n * (n - 1) // 2), ((3, 1, 2), n * (n + 1) // 2)):
         points = at_pixels(STRAIGHT, (16, 16), corner[list(triangle)] + 4.0, 1.0)
         prim_id = draw(geometry([points]), STRAIGHT, (16, 16))[1]
         assert (prim_id == 0).sum() == area
-    # The diagonal from top left to bottom right: the triangle to its right has it as its left edge.
+    # The diagonal from top left to bottom right is the left edge of the triangle on its right.
     for triangle, area in (((0, 1, 3), n * (n + 1) // 2), ((0, 3, 2), n * (n - 1) // 2)):
         points = at_pixels(STRAIGHT, (16, 16), corner[list(triangle)] + 4.0, 1.0)
         assert (draw(geometry([points]), STRAIGHT, (16, 16))[1] == 0).sum() == area
@@ -133,7 +133,7 @@ def test_a_quad_from_centre_to_centre_has_its_top_and_left_sides() -> None:
 @pytest.mark.parametrize("flip", [False, True], ids=["front", "back"])
 @pytest.mark.parametrize("camera", [STRAIGHT, TURNED], ids=["exact", "rounded"])
 def test_each_centre_on_shared_edges_and_corners_is_covered_once(camera: Camera, flip: bool) -> None:
-    """A sheet whose corners are at the centres of pixels, at many distances; in the turned camera they are off by rounding."""
+    """The corners of a sheet are at pixel centres, at many distances. In the turned camera, rounding moves them off the centres."""
     n, size = 7, (16, 16)
     rng = np.random.default_rng(2)
     x, y = np.meshgrid(np.arange(n + 1), np.arange(n + 1))
@@ -141,14 +141,14 @@ def test_each_centre_on_shared_edges_and_corners_is_covered_once(camera: Camera,
     points = at_pixels(camera, size, places, 2.0 ** rng.integers(-2, 3, len(places)))
     corner = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
     a, b, c, d = corner, corner + 1, corner + n + 2, corner + n + 1
-    other = rng.random(len(a)) < 0.5  # which diagonal
+    other = rng.random(len(a)) < 0.5  # Chooses the diagonal of each square.
     faces = np.concatenate([np.where(other[:, None], np.column_stack(p), np.column_stack(q))
                             for p, q in (((a, b, c), (a, b, d)), ((a, c, d), (b, c, d)))])
     sheet = Geometry(points, (faces[:, ::-1] if flip else faces).astype(np.int32).copy(), np.zeros((0, 4), np.float32))
     total = counts(sheet, camera, size)
-    assert (total[1:14, 1:14] == 1).all()  # inside of the outline
+    assert (total[1:14, 1:14] == 1).all()  # Inside the outline.
     assert total.max() == 1
-    if camera is STRAIGHT:  # exact corners: the outline has its top and left sides
+    if camera is STRAIGHT:  # The corners are exact: only top and left sides of the outline are covered.
         expected = np.zeros(total.shape, int)
         expected[0:14, 0:14] = 1
         np.testing.assert_array_equal(total, expected)
@@ -160,7 +160,7 @@ def test_one_triangle_of_a_fan_owns_its_middle(camera: Camera) -> None:
     for n in range(3, 24):
         angle = np.sort(rng.random(n)) * 2.0 * np.pi
         if np.ptp(np.append(angle, angle[0] + 2.0 * np.pi)) > 0.0 and np.diff(np.append(angle, angle[0] + 2.0 * np.pi)).max() > 3.1:
-            continue  # the middle is outside
+            continue  # The middle is outside the picture.
         ring = 4.5 + 4.0 * np.column_stack([np.cos(angle), np.sin(angle)])
         points = at_pixels(camera, (8, 8), np.concatenate([[[4.5, 4.5]], ring]), rng.uniform(0.5, 4.0, n + 1))
         i = np.arange(n)
@@ -169,7 +169,7 @@ def test_one_triangle_of_a_fan_owns_its_middle(camera: Camera) -> None:
 
 
 def test_no_pixel_is_lost_inside_a_closed_mesh_with_corners_at_the_centres() -> None:
-    """A ball around the camera, seen through 256 pixels; every corner that is seen is moved onto a centre."""
+    """A ball surrounds the camera, whose picture has 256 pixels. Every visible corner is moved onto a pixel's centre."""
     size = (16, 16)
     for camera in (STRAIGHT, TURNED):
         ball = icosphere(4)
@@ -185,7 +185,7 @@ def test_no_pixel_is_lost_inside_a_closed_mesh_with_corners_at_the_centres() -> 
 
 
 def test_a_plane_through_the_camera_ends_at_the_horizon() -> None:
-    """One triangle far larger than the view, at y = -1, on all sides of the camera: depth 1 / -d_y below the horizon."""
+    """A triangle at y = -1 extends far beyond the view on all sides of the camera. Its depth below the horizon is 1 / -d_y."""
     size = (64, 64)
     floor = geometry([[[-1e4, -1.0, 2e4], [2e4, -1.0, 0.0], [-1e4, -1.0, -2e4]]])
     depth, prim_id = draw(floor, STRAIGHT, size)
@@ -197,7 +197,7 @@ def test_a_plane_through_the_camera_ends_at_the_horizon() -> None:
 
 
 def test_a_box_around_the_camera_fills_the_picture() -> None:
-    """Depth of a cube's inside from its centre: the largest part of the direction reaches the wall first."""
+    """The camera is at the cube's centre: the largest component of the direction determines the depth."""
     camera = Camera.look_at((0.0, 0.0, 0.0), (1.0, 0.7, -0.4), fov_y=2.5)
     size = (40, 24)
     depth, prim_id = draw(Geometry.of(box((-2.0,) * 3, (2.0,) * 3)), camera, size)
@@ -224,7 +224,7 @@ def test_what_is_never_seen(name: str, triangle) -> None:
 
 
 def test_triangles_without_area_are_not_seen_though_rounding_gives_them_some() -> None:
-    """Corners on the picture's diagonal, which goes through centres; projected, they are off the line by a last digit."""
+    """The corners are on the picture's diagonal, which goes through centres. Projection moves them off the line by a last digit."""
     rng = np.random.default_rng(6)
     along = rng.uniform(-1.0, 1.0, (500, 3, 1))
     what = geometry(along * [1.0, 1.0, 0.0] - [0.0, 0.0, 1.0])
@@ -250,7 +250,7 @@ def test_scaling_by_a_power_of_two_scales_the_depth_alone(exponent: int) -> None
 
 
 def test_tiny_triangles_are_found_by_the_centre_they_are_around() -> None:
-    """A triangle of 1e-3 pixels around a centre covers that pixel alone; moved by half a pixel it covers none."""
+    """A triangle of 1e-3 pixels around a centre covers only that pixel. Moved by half a pixel, it covers none."""
     size = (32, 32)
     for camera in (STRAIGHT, TURNED):
         place = np.array([[13.5, 20.5]]) + 1e-3 * np.array([[-1.0, -0.7], [1.2, -0.8], [0.1, 1.0]])
@@ -272,7 +272,7 @@ def test_the_order_of_triangles_does_not_matter() -> None:
     order = np.random.default_rng(1).permutation(len(what.faces))
     other_depth, other_id = draw(Geometry(what.vertices, what.faces[order].copy(), what.spheres), TURNED, size)
     np.testing.assert_array_equal(depth, other_depth)
-    np.testing.assert_array_equal(prim_id, np.where(other_id >= 0, order[other_id], -1))  # no two are at one depth
+    np.testing.assert_array_equal(prim_id, np.where(other_id >= 0, order[other_id], -1))  # No two triangles have the same depth.
 
 
 def test_at_equal_depth_the_lowest_prim_id_wins() -> None:
@@ -291,7 +291,7 @@ def test_threads_do_not_change_a_pixel(threads: int) -> None:
 
 
 def test_the_launch_for_cuda_gives_the_same_picture() -> None:
-    """All bands in one launch, every triangle in each: done here on the CPU, in one thread."""
+    """One launch has all bands, with every triangle in each band. The test runs it on the CPU, in one thread."""
     what, size = soup(500), (70, 50)
     rasterizer = Rasterizer(what)
     rasterizer.draw(TURNED, size)
@@ -308,12 +308,12 @@ def turns(p: wp.array(dtype=wp.vec2d), q: wp.array(dtype=wp.vec2d), out: wp.arra
 
 
 def test_turn_has_the_exact_sign() -> None:
-    """Also where both products round to the same number: q is p times a number, but for the last digits."""
+    """In many cases both products round to the same number: q is a multiple of p except for the last digits."""
     rng = np.random.default_rng(4)
     p = rng.normal(size=(4000, 2)) * 10.0 ** rng.uniform(-20.0, 20.0, (4000, 1))
     q = p * rng.normal(size=(4000, 1))
-    q[::4] = p[::4] * 3.0 * 2.0 ** rng.integers(-30, 30, (1000, 1))  # mostly a little off
-    q[1::4] = p[1::4] * 0.5  # exactly collinear
+    q[::4] = p[::4] * 3.0 * 2.0 ** rng.integers(-30, 30, (1000, 1))  # Almost collinear.
+    q[1::4] = p[1::4] * 0.5  # Exactly collinear.
     q[2::4] *= 1.0 + 2.0**-52 * rng.integers(-1, 2, (1000, 2))
     out = zeros(4000, wp.float64)
     launch(turns, 4000, *(wp.array(rows, dtype=wp.vec2d, device=DEVICE) for rows in (p, q)), out)
@@ -324,7 +324,7 @@ def test_turn_has_the_exact_sign() -> None:
                       for (a, b), (c, d) in zip(p.tolist(), q.tolist(), strict=True)])
     np.testing.assert_array_equal(np.sign(out.numpy()), exact)
     rounded = np.sign(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0])
-    assert (rounded != exact).sum() > 100 and (exact == 0).sum() >= 1000  # the cases are hard
+    assert (rounded != exact).sum() > 100 and (exact == 0).sum() >= 1000  # The cases are hard.
 
 
 def test_kernels_compile_for_turing_and_hopper(tmp_path: Path) -> None:

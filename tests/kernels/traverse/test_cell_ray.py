@@ -1,4 +1,4 @@
-"""Margins of walks in cells that list a triangle only where it is: no ray is lost, from far away or grazing."""
+"""Margins of walks through cells that list only the triangles that touch them: no far or grazing ray is lost."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ FINE = {"grid": {"density": 100.0}, "octree": {"max_leaf": 1, "by_cost": False, 
 @pytest.mark.parametrize("name", FINE)
 @pytest.mark.parametrize("distance", [1e2, 1e4, 1e6, 1e8])
 def test_far_origins(distance, name):
-    # From 1e6 on, rounding is as wide as the cells: the walk widens, up to all of them.
+    # From a distance of 1e6 on, rounding is as wide as a cell. The walk then visits more cells, up to all cells.
     rng = np.random.default_rng(2)
     geometry = soup(rng, size=0.3)
     cells, brute = build(geometry, name), build(geometry, "brute_force")

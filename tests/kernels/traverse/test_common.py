@@ -1,4 +1,4 @@
-"""The traversal units: every structure in the registry finds, to the last bit, what testing all primitives finds."""
+"""Traversal: every structure in the registry finds the same hits, to the last bit, as brute force."""
 
 from functools import cache
 
@@ -29,7 +29,7 @@ NO_SPHERES = np.zeros((0, 4), np.float32)
 
 
 def soup(rng, n, size=0.2):
-    """n random triangles as a Geometry, none of them connected."""
+    """Return n random triangles without shared vertices as a Geometry."""
     corners = rng.uniform(-1.0, 1.0, (n, 1, 3)) + size * rng.normal(size=(n, 3, 3))
     return triangles(corners)
 
@@ -40,13 +40,13 @@ def triangles(corners, spheres=NO_SPHERES):
 
 
 def coincident(rng):
-    """60 triangles, each five times, in a shuffled order."""
+    """Return 60 triangles, each five times, in a shuffled order."""
     corners = rng.uniform(-1.0, 1.0, (60, 1, 3)) + 0.4 * rng.normal(size=(60, 3, 3))
     return triangles(np.repeat(corners, 5, axis=0)[rng.permutation(300)])
 
 
 def flat(rng):
-    """Triangles that all lie in the plane y = 0.25, on a grid, and many overlap."""
+    """Return triangles with corners on a grid in the plane y = 0.25; many overlap."""
     corners = rng.integers(-8, 9, (400, 3, 3)) / 8.0
     corners[:, :, 1] = 0.25
     return triangles(corners)
@@ -57,20 +57,20 @@ def all_equal(_rng):
 
 
 def progression(rng):
-    """Each triangle 3 times as large and as far away as the one before: no split by space is balanced."""
+    """Return triangles in geometric progression of ratio 3, in size and distance: no split by space is balanced."""
     scale = 3.0 ** np.arange(-30, 30)[:, None, None]
     return triangles(scale * (np.array([1.0, 0.3, 0.1]) + 0.2 * rng.normal(size=(60, 3, 3))))
 
 
 def tiny_and_huge(rng):
-    """A dense cluster of a thousandth in a room of a thousand."""
+    """Return a dense cluster of size 1e-3 in a room of size 1e3."""
     room = 1000.0 * rng.uniform(-1.0, 1.0, (30, 3, 3))
     cluster = 0.5 + 1e-3 * (rng.uniform(-1.0, 1.0, (500, 1, 3)) + 0.1 * rng.normal(size=(500, 3, 3)))
     return triangles(np.concatenate([room, cluster]))
 
 
 def mixed(rng):
-    """Triangles and spheres, some of the spheres inside each other, two of them the same."""
+    """Return triangles and spheres; some spheres are inside each other, and two are equal."""
     spheres = np.concatenate([rng.uniform(-1.0, 1.0, (60, 3)), rng.uniform(0.02, 0.4, (60, 1))], axis=1)
     spheres[7] = spheres[3]
     spheres[9, :3], spheres[9, 3] = spheres[4, :3], 0.5 * spheres[4, 3]
@@ -92,7 +92,7 @@ GEOMETRIES = {
 
 
 def rays_for(geometry, rng, n=6000):
-    """Rays from in and around the geometry: at corners, at points on edges, anywhere, and along the axes."""
+    """Return rays from in and around the geometry, aimed at corners, at points on edges, at random points, and along the axes."""
     points = geometry.vertices.astype(np.float64)
     if len(geometry.spheres):
         points = np.concatenate([points, geometry.spheres[:, :3] + 0.9 * geometry.spheres[:, 3:]])
@@ -153,13 +153,13 @@ def test_leaf_size_does_not_matter(name, max_leaf):
     assert_same_hits(build(geometry, name, max_leaf=max_leaf).closest_hit(origin, direction), expected)
 
 
-# Kernels with and without spheres are two: those with are compiled for the default box test, and for all in one structure.
+# Geometries with spheres have kernels of their own. To save compile time, only bvh2 tries every box test with spheres.
 @pytest.mark.parametrize("kind, box, name", [
     pytest.param(kind, box, name, marks=[] if box == Units().box or name in FAMILIES else pytest.mark.slow)
     for kind in ("none", "one", "two", "one_sphere", "mixed") for box in RAY_AABB for name in TREES
     if box == Units().box or name == "bvh2" or kind in ("none", "one", "two")])
 def test_any_box_test_ends_and_hardly_loses_a_ray(kind, box, name):
-    # A small tree has empty boxes, which no test may enter; the looser tests may lose a ray in an edge, and no more.
+    # A small tree has empty boxes, which no test may enter. Looser tests may only lose rays at edges.
     rng = np.random.default_rng(12)
     geometry = GEOMETRIES[kind](rng)
     origin, direction = rays_for(geometry, rng)
@@ -207,7 +207,7 @@ def test_the_segment_is_closed(name):
 @pytest.mark.parametrize("name", STRUCTURES)
 @pytest.mark.parametrize("kind", ["none", "one", "two", "one_sphere", "soup"])
 def test_rays_that_are_not_finite_miss_and_end(kind, name):
-    # NaN compares false with everything: such a ray must not enter an empty box and loop for ever.
+    # Comparisons with NaN are false: a ray with a NaN must not enter an empty box and loop for ever.
     structure = build(GEOMETRIES[kind](np.random.default_rng(5)), name)
     rows = []
     for bad in (np.nan, np.inf, -np.inf):
@@ -225,7 +225,7 @@ def test_rays_that_are_not_finite_miss_and_end(kind, name):
 
 
 def edge_points(mesh, rng, per_edge):
-    """Points on the edges of a mesh, in float64."""
+    """Return random points on the edges of a mesh, in float64."""
     ends = np.unique(np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
     a, b = (np.repeat(mesh.vertices[ends[:, i]].astype(np.float64), per_edge, axis=0) for i in range(2))
     return a + rng.random((len(a), 1)) * (b - a)
@@ -246,7 +246,7 @@ def test_a_closed_mesh_is_watertight(placed, name):
     hits = structure.closest_hit(origin, targets - origin)
     assert (hits.prim_id >= 0).all(), f"{(hits.prim_id < 0).sum()} of {len(targets)} rays left the ball"
     assert structure.any_hit(origin, targets - origin).all()
-    # From the center, whose float32 directions point at the corners exactly.
+    # From the center, the float32 directions point exactly at the corners.
     center = rounded(np.broadcast_to(np.zeros(3) * scale + move, (2562, 3)))
     hits = structure.closest_hit(center, mesh.vertices - center)
     assert (hits.prim_id >= 0).all() and np.allclose(hits.t, 1.0, rtol=2e-5 if placed == "far" else 2e-6)
@@ -254,7 +254,7 @@ def test_a_closed_mesh_is_watertight(placed, name):
 
 @pytest.mark.parametrize("name", STRUCTURES)
 def test_a_floor_of_long_triangles_is_watertight(name):
-    # The rounding of far corners moves the seams by more than the relative margin of a box test near the origin.
+    # Rounding moves the seams between far corners by more than the relative margin of a box test near the origin.
     rng = np.random.default_rng(7)
     x = np.linspace(-4.0, 4.0, 9)
     vertices = np.array([[a, 0.0, z] for a in x for z in (-1000.0, 1000.0)])
@@ -266,11 +266,11 @@ def test_a_floor_of_long_triangles_is_watertight(name):
     direction = np.stack([rng.uniform(-0.3, 0.3, n), -(10.0 ** rng.uniform(-4, -0.5, n)), rng.choice([-1.0, 1.0], n)], axis=1)
     origin = rounded(target - direction * 10.0 ** rng.uniform(-2, 1, (n, 1)))
     direction = rounded(target - origin)
-    for turn in range(3):  # the floor, and two walls
+    for turn in range(3):  # The floor, and two walls.
         mesh = Mesh(np.roll(vertices, turn, axis=1), faces)
         hits = build(mesh, name).closest_hit(np.roll(origin, turn, axis=1), np.roll(direction, turn, axis=1))
         assert (hits.prim_id >= 0).all(), f"{(hits.prim_id < 0).sum()} of {n} rays fell through"
-        # The seams are off by a few u of the strips' length, and so is the place where the ray is said to meet them.
+        # The seams are off by a few u of the strips' length, and so are the points of the hits.
         assert (np.abs(hits.t - 1.0) * np.linalg.norm(direction, axis=1)).max() < 4.0 * 2.0**-24 * 1000.0
 
 
@@ -295,7 +295,7 @@ def test_rays_along_the_faces_of_a_grid(name):
                 assert (hits.prim_id >= 0).all() and (hits.t == 5.0).all()
 
 
-# --- what a ray may refuse --------------------------------------------------------------------------------------------
+# --- excluded and refused hits ----------------------------------------------------------------------------------------
 
 
 @wp.func
@@ -305,7 +305,7 @@ def accepts_even_near_edge(surfaces: Surfaces, prim_id: int, u: float, v: float)
 
 @cache
 def refusing_kernels(name):
-    """Kernels over rays with an `exclude` each, and over traversals that refuse hits."""
+    """Return a kernel over rays that each exclude a triangle, and a kernel over a traversal that refuses some hits."""
     structure = Structure(next(cls for cls in ACCELERATORS.values() if cls.name == name))
     struct = structure.struct
     closest = structure.traversal(any_hit=False)
@@ -370,7 +370,7 @@ def test_refused_hits_let_the_ray_on(name):
     origin, direction = rays_for(geometry, rng, 4000)
     dark = zeros(4000, wp.int32)
     hits = run_refusing(1, name, geometry, origin, direction, dark)
-    # Brute force by hand: each even triangle by itself, hits with u >= 0.75 left out, the closest of the rest.
+    # The reference: the closest hit of the even triangles, without hits with u >= 0.75.
     best_t = np.full(4000, np.inf, np.float32)
     best_id = np.full(4000, -1)
     for prim_id in range(0, 40, 2):
@@ -396,7 +396,7 @@ def test_scaling_the_direction_scales_t():
 
 
 def test_far_rays_find_a_small_ball():
-    # From 100,000 radii away: rays aimed inside the silhouette hit, rays aimed well outside miss.
+    # From 100,000 radii away, rays aimed inside the silhouette hit, and rays aimed clearly outside miss.
     rng = np.random.default_rng(11)
     structure = build(icosphere(3), "bvh")
     away = directions(rng, 2000)

@@ -1,4 +1,4 @@
-"""The counters: equal to a walk in plain Python, or within the laws of every walk, and absent from the code when off."""
+"""The counters equal those of a walk in plain Python, or obey the laws of every walk, and leave no code when they are off."""
 
 import inspect
 import sys
@@ -30,7 +30,7 @@ NAMES = ("nodes", "boxes", "box_operations", "primitives", "leaves", "pushes", "
 
 
 def aimed(geometry, n, seed):
-    """Half of the rays start inside the box of the geometry, half outside; all go towards a point of the box."""
+    """Return rays towards points in the geometry's box; half start inside the box, half outside."""
     rng = np.random.default_rng(seed)
     lo, hi = geometry.vertices.min(axis=0), geometry.vertices.max(axis=0)
     center, half = 0.5 * (lo + hi), 0.5 * (hi - lo)
@@ -40,7 +40,7 @@ def aimed(geometry, n, seed):
 
 
 def check(geometry, name, n, seed, **options):
-    """Every counter and every fetch of n rays equals the walk's."""
+    """Check that every counter and every fetch of n rays equals that of the walk in Python."""
     structure = build(geometry, name, **options)
     origins, directions = aimed(geometry, n, seed)
     hits = structure.closest_hit(origins, directions, trace=True)
@@ -73,7 +73,7 @@ def test_counters_equal_a_walk_in_python(name):
 
 @pytest.mark.parametrize("name", STRUCTURES)
 def test_counters_are_those_of_some_walk(name):
-    """As many fetches as nodes and primitives, the nearest hit among them, nothing taken from an empty stack."""
+    """A ray has as many fetches as nodes and primitives, its closest hit is among them, and it never pops an empty stack."""
     structure = build(soup(), name)
     hits = structure.closest_hit(*aimed(structure.geometry, 500, 6), trace=True)
     counters = hits.counters
@@ -119,7 +119,7 @@ def test_no_rays_cost_nothing(name):
 
 @pytest.mark.parametrize("name", families_first())
 def test_counting_off_leaves_nothing_in_the_machine_code(name, monkeypatch, tmp_path):
-    """The code for Turing equals that of a source whose counters do nothing, to the last byte."""
+    """The code for Turing has the same bytes as code compiled from a source whose counters do nothing."""
 
     @wp.func
     def fetch_node(recorder: Recorder, ray: Ray, counts: Counts, index: int, boxes: int) -> Counts:
@@ -151,7 +151,7 @@ def test_counting_off_leaves_nothing_in_the_machine_code(name, monkeypatch, tmp_
         if i == 0:
             unit = structure.accel.kernels
             module = unit if inspect.ismodule(unit) else sys.modules[type(unit).__module__]
-            walk = module if hasattr(module, "make_counters") else traverse_bvh2  # shared by trees with other volumes
+            walk = module if hasattr(module, "make_counters") else traverse_bvh2  # Trees with other bounding volumes share this module.
             monkeypatch.setattr(walk, "make_counters", lambda *_: (fetch_node, fetch_primitive, push, finish))
         else:
             monkeypatch.undo()

@@ -1,20 +1,19 @@
-"""The grid's walk where it is hard: rays in the planes and through the corners of cells, from far away, and grazing ones."""
+"""Hard cases of the grid's walk: rays in the planes and through the corners of cells, far rays, and grazing rays."""
 
-from itertools import product
 
 import numpy as np
 import pytest
 
 from tests.kernel_tools import rounded, unit  # isort: skip (starts Warp)
 
-from tests.cell_cases import assert_same, soup
+from tests.cell_cases import assert_rays_at_corners_agree, assert_same, soup
 from wrt.accel.scenes.build import build
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 
 
 def corner_planes(grid):
-    """Coordinates of the cells' planes, one array an axis."""
+    """Return the coordinates of the planes between cells, one array for each axis."""
     layout = grid.data
     return [np.append(np.float32(layout.lo[a]) + np.arange(layout.n[a], dtype=np.float32) * np.float32(layout.size[a]),
                       np.float32(layout.hi[a])) for a in range(3)]
@@ -24,21 +23,13 @@ def corner_planes(grid):
 def test_rays_in_faces_and_through_edges_and_corners_of_cells(mailbox):
     rng = np.random.default_rng(1)
     geometry = soup(rng)
-    grid, brute = build(geometry, "grid", mailbox=mailbox), build(geometry, "brute_force")
-    planes = corner_planes(grid)
-    n = 20_000
-    corner = np.stack([rng.choice(p, n) for p in planes], axis=1)
-    size = np.array(grid.data.size)
-    steps = np.array([d for d in product([-1.0, -0.0, 0.0, 1.0], repeat=3) if np.any(d)])
-    direction = (steps[rng.integers(len(steps), size=n)] * size).astype(np.float32)  # diagonals of the cells: corner to corner
-    origin = (corner - 8 * direction).astype(np.float32)
-    origin[: n // 2] = corner[: n // 2]
-    assert_same(grid.closest_hit(origin, direction), brute.closest_hit(origin, direction))
-    assert np.array_equal(grid.any_hit(origin, direction, 0.1, 3.0), brute.any_hit(origin, direction, 0.1, 3.0))
+    grid = build(geometry, "grid", mailbox=mailbox)
+    corner = np.stack([rng.choice(plane, 20_000) for plane in corner_planes(grid)], axis=1)
+    assert_rays_at_corners_agree(grid, geometry, corner, np.array(grid.data.size), rng)
 
 
 def test_a_hit_in_a_later_cell_does_not_end_the_walk():
-    # A long triangle begins in the first cell and is hit in the last; a short one in between is nearer.
+    # A long triangle begins in the first cell and is hit in the last cell. A short triangle between them is nearer.
     long = [[-1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [9.0, 0.0, 9.0]]
     short = [[6.0, -1.0, 5.0], [6.0, 1.0, 5.0], [6.0, 0.0, 9.0]]
     rest = [[[x, 20.0, z], [x + 1.0, 20.0, z], [x, 20.0, z + 1.0]] for x in range(9) for z in range(9)]

@@ -1,4 +1,4 @@
-"""Two levels: the closest of all structures' hits, for every structure, and no ray lost."""
+"""Instances: every two-level structure finds the closest of all instances' hits, and loses no ray."""
 
 from functools import cache
 
@@ -20,7 +20,7 @@ NODE_BYTES = Bvh2Node.numpy_dtype()["itemsize"]
 
 
 def matrix(rng, scale=2.0, far=20.0, shear=True):
-    """A random affine map: rotations, scales up to 10^scale along rotated axes, mirrors and a translation."""
+    """Return a random affine map: rotations, scales up to 10^scale along rotated axes, mirroring and a translation."""
     out = np.eye(4)
     turn = Rotation.random(2, random_state=int(rng.integers(1 << 30))).as_matrix()
     out[:3, :3] = turn[0] @ np.diag(10.0 ** rng.uniform(-scale, scale, 3) * rng.choice([-1.0, 1.0], 3))
@@ -32,7 +32,7 @@ def matrix(rng, scale=2.0, far=20.0, shear=True):
 
 @cache
 def crowd():
-    """Overlapping instances of two balls, two in the same place, and a part in the world with spheres."""
+    """Return overlapping instances of a ball and a torus, three with the same matrix, and a part in world space with spheres."""
     rng = np.random.default_rng(1)
     ball, ring = Geometry.of(icosphere(2)), Geometry.of(torus(segments=12, tube_segments=8))
     matrices = [matrix(rng, 0.7, 4.0) for _ in range(24)]
@@ -41,7 +41,7 @@ def crowd():
     corners = rounded(rng.uniform(-6.0, 6.0, (60, 1, 3)) + rng.normal(size=(60, 3, 3))).astype(np.float32).reshape(-1, 3)
     spheres = np.concatenate([rng.uniform(-5.0, 5.0, (20, 3)), rng.uniform(0.1, 1.0, (20, 1))], axis=1).astype(np.float32)
     n = placed.n_triangles
-    # Half of the part's triangles come before the instances, half behind them.
+    # Half of the part's triangles have prim_ids below those of the instances, half above.
     first = placed.first_prim + 30
     numbers = np.concatenate([np.arange(30), np.arange(n + 30, n + 80)]).astype(np.int32)
     world = NumberedGeometry(corners, np.arange(180, dtype=np.int32).reshape(-1, 3), spheres, numbers)
@@ -59,13 +59,13 @@ def rays(n, seed, reach=12.0):
 
 
 def rows_times(rows, v, w):
-    """Row after row in float64, in the order of the sum that the device takes, rounded once."""
+    """Return the rows times (v, w) in float64, summed in the device's order and rounded once."""
     v = v.astype(np.float64)
     return np.stack([r[0] * v[:, 0] + r[1] * v[:, 1] + r[2] * v[:, 2] + r[3] * w for r in rows], axis=1).astype(np.float32)
 
 
 def expected(geometry, origins, directions, t_min, t_max):
-    """t, prim_id, u, v by brute force over every instance; at equal t the lowest prim_id."""
+    """Return t, prim_id, u, v by brute force over every instance. At equal t, the lowest prim_id is hit."""
     n = len(origins)
     best = {"t": np.full(n, np.inf, np.float32), "prim_id": np.full(n, -1)} | {k: np.zeros(n, np.float32) for k in "uv"}
     for part, rows, first in zip(geometry.part, inverse_of(geometry.to_world), geometry.first_prim, strict=True):
@@ -108,7 +108,7 @@ def test_hits_are_the_closest_of_all_instances_to_the_last_bit(name):
 
 @cache
 def ball_tree():
-    """One structure for all tests of closed balls; it is placed anew for each."""
+    """Return one structure for all tests of closed balls. Each test sets its transformation."""
     return Geometry.of(icosphere(3))
 
 
@@ -124,7 +124,7 @@ PLACES = {
 
 @pytest.mark.parametrize("kind", PLACES)
 def test_no_ray_leaves_a_closed_mesh_that_was_transformed(kind):
-    """From within, at every vertex, along every edge's middle and at random, from several places inside, over many maps."""
+    """Rays start at several points inside. They are aimed at every vertex, every edge's middle and random points, for many maps."""
     ball, rng = ball_tree(), np.random.default_rng(5)
     v = ball.vertices.astype(np.float64)
     edges = np.unique(np.sort(ball.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
@@ -135,17 +135,17 @@ def test_no_ray_leaves_a_closed_mesh_that_was_transformed(kind):
         accel = build(place((ball, m)), "bvh2")
         origin = (0.5 * unit(rng.normal(size=(len(goals), 3))) * rng.random((len(goals), 1))) @ m[:3, :3].T + m[:3, 3]
         origin = rounded(origin)
-        inside = np.linalg.norm((origin - m[:3, 3]) @ np.linalg.inv(m[:3, :3]).T, axis=1) < 0.9  # rounding may move it out
+        inside = np.linalg.norm((origin - m[:3, 3]) @ np.linalg.inv(m[:3, :3]).T, axis=1) < 0.9  # Rounding may move an origin out.
         directions = (goals @ m[:3, :3].T + m[:3, 3] - origin)[inside].astype(np.float32)
         hits = accel.closest_hit(origin[inside], directions)
         assert (hits.prim_id < 0).sum() == 0
-        assert np.abs(hits.t - 1.0).max() < 0.05  # most of it from the rounding of the origin, where it is squeezed
+        assert np.abs(hits.t - 1.0).max() < 0.05  # Mostly the rounding of the origin, where the map squeezes.
         tested += len(directions)
     assert tested > 15_000
 
 
 def fine_cube(n):
-    """The cube from -0.5 to 0.5, each face of n by n squares: its triangles' boxes are small, however it is turned."""
+    """Return the cube from -0.5 to 0.5 with n by n squares on each face. Its triangles' boxes are small for any rotation."""
     steps = np.linspace(-0.5, 0.5, n + 1)
     a, b = (x.ravel() for x in np.meshgrid(steps, steps))
     corner = np.arange(n * (n + 1)).reshape(n, n + 1)[:, :n].ravel()
@@ -159,9 +159,9 @@ def fine_cube(n):
 
 
 def test_a_far_mesh_is_hit_exactly_where_its_own_structure_is():
-    """Rays past the edges of a cube, nearly along the world's axes, from 1e4 to 1e6 sizes away. The cube fills its world box, but is
-    aslant in its own space, where the ray's rounding exceeds the boxes' pads by far. Without the widening of `enter` many hits would be
-    passed by."""
+    """Rays pass the edges of a cube, nearly along the world's axes, from 1e4 to 1e6 sizes away. The cube fills its world box, but is
+    rotated in its own space. There the rounding of the ray is far larger than the boxes' padding. Without the margin that `enter` adds,
+    many hits would be lost."""
     (vertices, faces), rng = fine_cube(24), np.random.default_rng(6)
     for power in (4, 5, 6):
         m = np.eye(4)
@@ -179,7 +179,7 @@ def test_a_far_mesh_is_hit_exactly_where_its_own_structure_is():
 
 
 def test_rays_that_graze_the_instances_boxes_are_not_lost():
-    """Flat instances, whose boxes are as thin as the mesh: rays in the planes of the boxes' faces, and at their edges."""
+    """The instances are flat, with boxes as thin as the mesh. Rays run in the planes of the boxes' faces, and at their edges."""
     corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
     square = Geometry(corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32), NO_SPHERES)
     rng = np.random.default_rng(7)
@@ -187,7 +187,7 @@ def test_rays_that_graze_the_instances_boxes_are_not_lost():
     placed = place(*((square, np.block([[t, 50.0 * rng.normal(size=(3, 1))], [np.zeros((1, 3)), 1.0]])) for t in turns))
     which = rng.integers(0, 300, 20_000)
     u, v = rng.random((2, 20_000))
-    # Half of the goals on the diagonal that the two triangles share, half anywhere.
+    # Half of the targets lie on the diagonal that the two triangles share, half anywhere.
     v = np.where(np.arange(20_000) % 2, u, v)[:, None]
     goal = np.stack([u, v[:, 0], np.zeros(20_000), np.ones(20_000)], axis=1)
     world = np.einsum("nij,nj->ni", placed.to_world[which], goal)
@@ -195,13 +195,13 @@ def test_rays_that_graze_the_instances_boxes_are_not_lost():
     directions = rounded(world - origins)
     hits = build(placed, "bvh2").closest_hit(origins, directions)
     truth = expected_of_one(placed, which, origins, directions)
-    inside = truth < np.inf  # rounding takes some that are near the square's border past it
+    inside = truth < np.inf  # Rounding moves some targets near the square's border outside.
     assert inside.mean() > 0.98
     assert (hits.t[inside] <= truth[inside]).all()
 
 
 def expected_of_one(geometry, which, origins, directions):
-    """t in the one instance that each ray is aimed at."""
+    """Return t of the hit in the instance that each ray is aimed at."""
     out = np.full(len(which), np.inf, np.float32)
     alone = build(geometry.parts[0], "bvh2")
     for i, rows in enumerate(inverse_of(geometry.to_world)):
@@ -219,7 +219,7 @@ def test_counters_are_those_of_both_levels():
     both, one = (a.closest_hit(origins, directions, trace=True).counters for a in (accel, alone))
     entered = one.nodes > 0
     assert entered.all() and (both.probes == 1).all()
-    # The upper level has one node, whose leaves are the two instances; no ray meets the far one but along x.
+    # The upper level has one node, whose leaves are the two instances. Only rays along x meet the far instance.
     visits = both.leaves - one.leaves
     once = (visits == 1) & (np.abs(directions[:, 0]) < 0.9 * np.abs(directions).max(axis=1))
     assert once.sum() > 20

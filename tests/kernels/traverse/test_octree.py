@@ -1,13 +1,12 @@
-"""The octree's walk where it is hard: rays in the planes and through the corners of cells, and how much it visits."""
+"""Hard cases of the octree's walk: rays in the planes and through the corners of cells. It visits few nodes."""
 
-from itertools import product
 
 import numpy as np
 import pytest
 
 from tests.kernel_tools import rounded, unit  # isort: skip (starts Warp)
 
-from tests.cell_cases import assert_same, soup
+from tests.cell_cases import assert_rays_at_corners_agree, assert_same, soup
 from tests.rewalk import PRIMITIVES
 from wrt.accel.scenes.build import build
 from wrt.scene.shapes import icosphere
@@ -17,17 +16,11 @@ from wrt.scene.shapes import icosphere
 def test_rays_in_faces_and_through_edges_and_corners_of_cells(mailbox):
     rng = np.random.default_rng(1)
     geometry = soup(rng)
-    octree, brute = build(geometry, "octree", mailbox=mailbox), build(geometry, "brute_force")
+    octree = build(geometry, "octree", mailbox=mailbox)
     lo, hi = np.array(octree.data.lo, np.float32), np.array(octree.data.hi, np.float32)
     size = np.float32(octree.data.size) * np.float32(1 << int(octree.data.levels) - 4)
-    n = 20_000
-    corner = np.minimum(lo + rng.integers(0, 17, (n, 3)).astype(np.float32) * size, hi)
-    steps = np.array([d for d in product([-1.0, -0.0, 0.0, 1.0], repeat=3) if np.any(d)])
-    direction = (steps[rng.integers(len(steps), size=n)] * size).astype(np.float32)  # diagonals of the cells: corner to corner
-    origin = (corner - 8 * direction).astype(np.float32)
-    origin[: n // 2] = corner[: n // 2]
-    assert_same(octree.closest_hit(origin, direction), brute.closest_hit(origin, direction))
-    assert np.array_equal(octree.any_hit(origin, direction, 0.1, 3.0), brute.any_hit(origin, direction, 0.1, 3.0))
+    corner = np.minimum(lo + rng.integers(0, 17, (20_000, 3)).astype(np.float32) * size, hi)
+    assert_rays_at_corners_agree(octree, geometry, corner, size, rng)
 
 
 def test_rays_in_planes_visit_the_cells_that_the_box_test_enters():
@@ -45,7 +38,7 @@ def test_rays_in_planes_visit_the_cells_that_the_box_test_enters():
     for i in range(len(origin)):
         fetched = slice(counters.first[i], counters.first[i + 1])
         node = counters.address[fetched][counters.address[fetched] < PRIMITIVES] // octree.data.nodes.numpy().itemsize
-        assert len(set(node)) == len(node)  # none twice
+        assert len(set(node)) == len(node)  # No node is visited twice.
         with np.errstate(divide="ignore", invalid="ignore"):
             ends = [(plane[node] - origin[i]) / direction[i] for plane in (low - 1e-5, high + 1e-5)]
         enter, leave = np.fmax.reduce(np.minimum(*ends), axis=1), np.fmin.reduce(np.maximum(*ends), axis=1)
@@ -53,10 +46,10 @@ def test_rays_in_planes_visit_the_cells_that_the_box_test_enters():
 
 
 def cells(octree):
-    """The corners of every node's cell, (N, 3) float64 each."""
+    """Return the lowest and the highest corner of every node's cell, (N, 3) float64 each."""
     nodes, n = octree.data.nodes.numpy(), 1 << int(octree.data.levels)
     low, size = np.zeros((len(nodes), 3)), np.full(len(nodes), float(n))
-    for i, (first, count) in enumerate(zip(nodes["first"], nodes["count"], strict=True)):  # a node stands before its children
+    for i, (first, count) in enumerate(zip(nodes["first"], nodes["count"], strict=True)):  # A node precedes its children.
         octants = [k for k in range(8) if count < 0 and -count >> k & 1]
         for child, k in enumerate(octants, first):
             size[child] = size[i] / 2

@@ -1,4 +1,4 @@
-"""What the traversals are made of on a GPU, read in the PTX for Turing: float64 in the function for hard cases alone."""
+"""The PTX of the traversals, compiled for Turing: only the function for hard cases has float64 instructions."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ import warp as wp
 
 from wrt.accel.structures import ACCELERATORS
 
-HARD = "hard_crossing"  # kernels.units.triangle
+HARD = "hard_crossing"  # A function of kernels.units.triangle.
 HEAD = re.compile(r"\.(entry|func)\s+(?:\([^)]*\)\s*)?([\w$]+)")
 
 
 @dataclass
 class Function:
-    """entry: whether it is a kernel; double: its statements with float64; called: the functions that it calls."""
+    """A function in PTX. entry: True for a kernel; double: its statements with float64; called: names of the functions it calls."""
 
     entry: bool
     double: list[str] = field(default_factory=list)
@@ -30,14 +30,14 @@ class Function:
 
 
 def functions(ptx: str) -> dict[str, Function]:
-    """Every function of a module that has a body, by its name."""
+    """Return the functions of a module that have a body, by name."""
     text = re.sub(r"//[^\n]*|/\*.*?\*/", "", ptx, flags=re.DOTALL)
     text = re.sub(r'"[^"\n]*"', '""', text)
     out: dict[str, Function] = {}
     for head in HEAD.finditer(text):
         begin, end = text.find("{", head.end()), text.find(";", head.end())
         if begin < 0 or -1 < end < begin:
-            continue  # declared, not defined
+            continue  # A declaration without a body.
         depth, at = 1, begin + 1
         while depth:
             depth += {"{": 1, "}": -1}.get(text[at], 0)
@@ -79,7 +79,7 @@ $L__BB0_2:
 
 
 def test_statements_with_float64_are_found() -> None:
-    """In a module by hand: by the instruction, by a register that holds one, behind a label and a predicate."""
+    """The module is written by hand. It has float64 instructions and registers, also behind a label and a predicate."""
     found = functions(MODULE)
     assert set(found) == {"hard", "kernel"} and found["hard"].double == ["cvt.f64.f32 %fd1, %f1"]
     assert found["kernel"].entry and not found["hard"].entry and "hard" in found["kernel"].called
@@ -95,5 +95,5 @@ def test_float64_is_in_the_function_for_hard_cases_alone(name: str, make: Any, t
     found = functions(Path(file).read_text())
     (entry,) = (each for each in found.values() if each.entry)
     (hard,) = (key for key in found if HARD in key)
-    assert hard in entry.called and len(found[hard].double) > 20  # it is there, and its float64 is found
+    assert hard in entry.called and len(found[hard].double) > 20  # The function exists, and its float64 is found.
     assert {key: each.double for key, each in found.items() if each.double} == {hard: found[hard].double}

@@ -1,4 +1,4 @@
-"""The stack of a walk in either place: it returns what was put, each thread has its own, and walks find the same hits."""
+"""The stack of a walk, in shared or local memory: it returns stored values, threads do not share it, and hits are the same."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_get_returns_what_put_stored_and_threads_do_not_share(where: str, monkey
     expected[:, 3] = 7
     assert (out.numpy() == expected).all()
     # A virtual GPU runs threads one after another, which hides writes to another thread's entries. So the test reads the addresses: the
-    # first entries of all threads of a block are adjacent, and the next ones follow them.
+    # first entries of all threads of a block must be adjacent.
     first = places.numpy().reshape(-1, BLOCK).astype(np.int64)
     if DEVICE.is_cuda and where == "shared":
         assert (first - first[:, :1] == 8 * np.arange(BLOCK)).all() and (first > 0).all()

@@ -1,4 +1,4 @@
-"""The bounding sphere's unit: it lets every hit inside through at any scale, and rejects clear misses."""
+"""The test of a ray against a bounding sphere: it enters every sphere that the exact line meets, and rejects clear misses."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def entries(origin, direction, center, radius, t_min=0.0, t_max=np.inf):
 
 
 def test_by_hand():
-    # Towards the unit sphere from 5 away; from inside; away from it; past it; in segments that end before or begin behind it.
+    # Rays towards the unit sphere from 5 away, from inside, away from it, and past it; then segments that end before it or begin behind.
     origin = [[-5, 0, 0], [0.5, 0, 0], [5, 0, 0], [-5, 2, 0], [-5, 0, 0], [-5, 0, 0], [-5, 0, 0]]
     found = entries(origin, [2.0, 0.0, 0.0], np.zeros(3), 1.0, [0, 0.1, 0, 0, 0, 3.5, 2.5], [np.inf] * 4 + [1.9, np.inf, np.inf])
     np.testing.assert_allclose(found, [2.0, 0.1, np.inf, np.inf, np.inf, np.inf, 2.5], rtol=1e-4)
@@ -45,7 +45,7 @@ def test_an_empty_sphere_is_never_entered_and_an_endless_one_always():
 
 
 def cases(seed, n=20_000):
-    """Rays at points on and in spheres, from near and far, many of them along the surface; sizes from 1e-25 to 1e25."""
+    """Rays aimed at points on and in spheres of radius 1e-25 to 1e25, from near and far; many rays run along the surface."""
     rng = np.random.default_rng(seed)
     radius = rounded(10.0 ** rng.uniform(-25, 25, n))
     center = rounded(radius[:, None] * directions(rng, n) * 10.0 ** rng.uniform(-2, 3, (n, 1)))
@@ -58,7 +58,7 @@ def cases(seed, n=20_000):
 
 
 def exact(origin, direction, center, radius):
-    """Distance of the line from the center over the radius, and where it enters and leaves, in extended precision."""
+    """Distance of the line from the center in radii, and t where it enters and leaves, in extended precision."""
     o, d, c, r = (np.asarray(a, np.longdouble) for a in (origin, direction, center, radius))
     f = o - c
     dd = (d * d).sum(axis=1)
@@ -77,7 +77,7 @@ def test_every_line_that_meets_it_enters_in_time(seed):
     assert 0.3 < meets.mean()
     found = entries(origin, direction, center, radius)
     assert (found[meets] <= np.maximum(enter[meets], 0.0)).all()
-    # A segment that ends where the exact line enters, rounded up, is let in too.
+    # A segment that ends at the exact entry, rounded up, enters too.
     end = np.nextafter(np.maximum(enter, 0.0).astype(np.float32), np.float32(np.inf))
     assert np.isfinite(entries(origin, direction, center, radius, 0.0, end)[meets]).all()
 
@@ -85,9 +85,9 @@ def test_every_line_that_meets_it_enters_in_time(seed):
 def test_clear_misses_are_rejected():
     origin, direction, center, radius = cases(3)
     near, enter, _ = exact(origin, direction, center, radius)
-    size = np.linalg.norm(origin - center, axis=1) / radius  # 64 u of distance and radius are let in, coordinates added up
+    size = np.linalg.norm(origin - center, axis=1) / radius  # The test's margin is 64 u of distance and radius, as sums of coordinates.
     found = entries(origin, direction, center, 0.98 * radius)
-    large = (radius > 1e-12) & (radius < 1e14)  # below 2^-60 all is taken as that, beyond 2^60 all is entered
+    large = (radius > 1e-12) & (radius < 1e14)  # The test takes smaller radii as 2^-60, and enters every larger sphere.
     outside = large & (near > 0.98 + 2.0**-17 * (size + 1.0)) & (size < 1e3)
     assert outside.sum() > 1000 and (found[outside] == np.inf).all()
     inside = large & (near < 0.9) & (size < 1e3) & (enter > 0.0)

@@ -1,4 +1,4 @@
-"""The box unit against exact rational slabs, and the properties that the traversal rests on."""
+"""The box tests against exact rational slabs, and the properties that traversal relies on."""
 
 from fractions import Fraction
 from functools import cache
@@ -53,7 +53,7 @@ def pad_kernel(
 
 
 def run(origin, direction, lo, hi, t_min=0.0, t_max=np.inf):
-    """entry (N,) and interval (N, 2), float32; arguments of one row are repeated."""
+    """Return `entry` (N,) and `interval` (N, 2), float32. Arguments of one row are repeated."""
     rows = [np.asarray(a, dtype=np.float32).reshape(-1, 3) for a in (origin, direction, lo, hi)]
     n = max(len(a) for a in rows)
     origin, direction, lo, hi = (vec3s(np.broadcast_to(a, (n, 3))) for a in rows)
@@ -64,7 +64,7 @@ def run(origin, direction, lo, hi, t_min=0.0, t_max=np.inf):
 
 
 def exact_interval(origin, direction, lo, hi):
-    """Entry and exit of the line in rational arithmetic, or None where it misses; entry may be below 0."""
+    """Return t at the line's entry and exit in rational arithmetic, or None if it misses. The entry may be below 0."""
     enter, leave = None, None
     for axis in range(3):
         o, d = Fraction(float(origin[axis])), Fraction(float(direction[axis]))
@@ -84,7 +84,7 @@ AXES = [(axis, sign) for axis in range(3) for sign in (-1.0, 1.0)]
 
 @pytest.mark.parametrize(("axis", "sign"), AXES)
 def test_rays_in_faces_edges_and_along_them_hit(axis, sign):
-    # 0 * inf is NaN where the line lies in a face's plane: 9 lines a direction, 8 of them in a face or an edge.
+    # If the line lies in a face's plane, 0 * inf is NaN. Each direction has 9 lines; 8 of them lie in a face or an edge.
     lo, hi = np.array([-1.0, 0.25, 3.0]), np.array([2.0, 0.5, 7.0])
     others = [a for a in range(3) if a != axis]
     origins = []
@@ -131,7 +131,7 @@ def test_origin_inside_is_a_hit_at_t_min():
 
 def test_a_box_of_no_size_is_hit_by_rays_through_it():
     rng = np.random.default_rng(2)
-    point = rng.integers(-512, 512, (1000, 3)) / 64.0  # few digits, so that the origin below is exact
+    point = rng.integers(-512, 512, (1000, 3)) / 64.0  # So few digits that the origin below is exact.
     direction = rng.choice([-1.0, 1.0], (1000, 3)) * 2.0 ** rng.integers(-3, 3, (1000, 3))
     origin = point - 4.0 * direction
     assert (rounded(origin) == origin).all()
@@ -154,7 +154,7 @@ def test_signed_zeros_of_the_direction_agree():
     direction[~direction.any(axis=1), 2] = 1.0
     corners = rng.integers(-3, 4, (2, 5000, 3)).astype(float)
     lo, hi = corners.min(axis=0), corners.max(axis=0)
-    origin = rng.integers(-3, 4, (5000, 3)).astype(float)  # often in the plane of a face
+    origin = rng.integers(-3, 4, (5000, 3)).astype(float)  # Often in the plane of a face.
     plus = run(origin, np.where(direction == 0.0, 0.0, direction), lo, hi)[0]
     minus = run(origin, np.where(direction == 0.0, -0.0, direction), lo, hi)[0]
     assert np.array_equal(plus, minus)
@@ -164,7 +164,7 @@ def test_signed_zeros_of_the_direction_agree():
 @settings(max_examples=100, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), test=st.sampled_from(list(RAY_AABB)))
 def test_properties_of_every_box_test(seed, test):
-    # Coordinates are small whole numbers: origins in faces, edges and corners, and directions with zeros, are common.
+    # Coordinates are small integers. So origins in faces, edges and corners are common, and so are directions with zeros.
     rng = np.random.default_rng(seed)
     n = 400
     corners = rng.integers(-3, 4, (2, n, 3)).astype(float)
@@ -179,18 +179,18 @@ def test_properties_of_every_box_test(seed, test):
     zero = direction == 0.0
     plus, minus = (entries(origin, np.where(zero, z, direction), lo, hi) for z in (0.0, -0.0))
     in_face = (zero & ((origin == lo) | (origin == hi))).any(axis=1)
-    agree = ~in_face if test == "plain" else np.ones(n, bool)  # plain: a NaN goes where the comparisons send it
+    agree = ~in_face if test == "plain" else np.ones(n, bool)  # For a NaN, the result of "plain" depends on the order of its comparisons.
     assert np.array_equal(plus[agree], minus[agree])
     within = ((origin >= lo) & (origin <= hi)).all(axis=1)
     assert (plus[within & agree] == 0.0).all()
-    # Empty on one axis or on all of them: never entered.
+    # A box that is empty on one axis or on all axes is never entered.
     empty = lo.copy(), hi.copy()
     axis, row = rng.integers(3, size=n), np.arange(n)
     empty[0][row, axis], empty[1][row, axis] = np.inf, -np.inf
     assert (entries(origin, direction, np.full((n, 3), np.inf), np.full((n, 3), -np.inf)) == INF).all()
-    if test != "plain":  # which looks for an empty box on x alone, as builders' empty boxes are so on every axis
+    if test != "plain":  # "plain" checks only x: the empty boxes of builders are empty on every axis.
         assert (entries(origin, direction, *empty) == INF).all()
-    # Turned by a quarter, mirrored, scaled and moved by powers of two: nothing is rounded, so nothing changes.
+    # Quarter turns, mirroring, and scaling and moving by powers of two round nothing. So the results stay the same.
     turn, sign, scale = rng.permutation(3), rng.choice([-1.0, 1.0], 3), 2.0 ** rng.integers(-8, 9)
     a, b = (sign * corner[:, turn] * scale + 16.0 * scale for corner in (lo, hi))
     moved = entries(sign * origin[:, turn] * scale + 16.0 * scale, sign * direction[:, turn] * scale,
@@ -228,7 +228,7 @@ def test_conservative_against_exact_slabs():
     size = np.maximum(np.abs(enter), np.abs(leave))
     clear_hit = ~parallel_outside & (leave - np.maximum(enter, 0.0) > 1e-12 * size)
     assert np.isfinite(entry[clear_hit]).all()
-    # What passes by with a margin that rounding cannot explain is missed: always answering yes is no box test.
+    # A ray must miss if it passes the box at a distance larger than rounding: a test that is always true would fail here.
     clear_miss = parallel_outside | (np.maximum(enter, 0.0) - leave > 4e-6 * size)
     assert (entry[clear_miss] == INF).all()
     assert clear_hit.sum() > 10_000 and clear_miss.sum() > 10_000
@@ -287,8 +287,8 @@ def test_segment_ends():
     assert run(origin, direction, lo, hi, t_min=three)[0][0] == 3.0
     beyond = np.float32(3.0 * FAR_PAD * (1.0 + 3e-7))
     assert run(origin, direction, lo, hi, t_min=beyond)[0][0] == INF
-    assert run(origin, direction, lo, hi, t_min=2.5, t_max=2.75)[0][0] == 2.5  # the segment lies inside
-    assert run(origin, -direction, lo, hi)[0][0] == INF  # behind
+    assert run(origin, direction, lo, hi, t_min=2.5, t_max=2.75)[0][0] == 2.5  # The segment lies inside the box.
+    assert run(origin, -direction, lo, hi)[0][0] == INF  # The box is behind the ray.
 
 
 def test_padded_box_contains_the_box_and_its_rounding():
@@ -348,14 +348,14 @@ def test_looser_tests_enter_where_the_conservative_one_does(test):
     hit = np.isfinite(entry)
     assert 0.1 < hit.mean() < 0.9
     assert np.array_equal(entry[hit], conservative[hit])
-    # And what it misses beyond the conservative one, it misses by rounding, or because the ray lies in a face's plane.
+    # If only the looser test misses, the cause is rounding, or a ray in a face's plane.
     in_face = ((direction == 0.0) & ((origin == lo) | (origin == hi))).any(axis=1)
     lost = ~hit & np.isfinite(conservative) & ~in_face
     assert not lost.any() if test == "conservative" else lost.mean() < 0.2
 
 
 def test_looser_tests_keep_what_they_promise():
-    # minmax passes over the NaN of a ray in a face, like the default; plain does not promise that.
+    # Like the default, minmax ignores the NaN of a ray in a face. plain does not promise that.
     lo, hi = np.array([-1.0, -1.0, -1.0]), np.array([1.0, 1.0, 1.0])
     for axis, sign in AXES:
         direction = np.zeros(3)

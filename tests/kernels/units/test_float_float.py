@@ -1,4 +1,4 @@
-"""Float-float arithmetic against exact fractions: what is without error, and how far the rest may be off."""
+"""Float-float arithmetic against exact fractions: exact operations have no error, other operations keep their error bounds."""
 
 from fractions import Fraction
 
@@ -43,7 +43,7 @@ def round_kernel(x: wp.array(dtype=wp.vec2), error: wp.array(dtype=wp.float32), 
 
 
 def pairs(rng, n):
-    """Pairs of any sign, the low part up to half a step of the high one, often next to nothing or nothing."""
+    """Float-float numbers of any sign, (n, 2) float32. The low part is up to half an ulp of the high part, and often tiny or 0."""
     high = rng.uniform(1.0, 2.0, n).astype(np.float32) * np.exp2(rng.integers(-12, 12, n)).astype(np.float32)
     high *= rng.choice(np.float32([-1.0, 1.0]), n)
     low = (np.spacing(np.abs(high)) * rng.uniform(-0.5, 0.5, n)).astype(np.float32)
@@ -58,7 +58,7 @@ def fractions(rows):
 def test_sums_are_exact_and_the_rest_is_within_its_bounds():
     rng = np.random.default_rng(0)
     x, y = pairs(rng, N), pairs(rng, N)
-    y[: N // 4] = -x[: N // 4]  # sums and differences that cancel, all or nearly all
+    y[: N // 4] = -x[: N // 4]  # Sums that cancel completely or almost completely.
     y[: N // 8, 1] = 0.0
     out = [zeros(N, wp.vec2) for _ in range(6)]
     launch(all_of_them, N, vec2s(x), vec2s(y), *out)
@@ -79,7 +79,7 @@ def test_sums_are_exact_and_the_rest_is_within_its_bounds():
 
 
 def test_rounding_is_certain_if_no_midpoint_is_within_the_error():
-    """Around 1 + j 2^-25 steps of float32 are 2^-23 wide: midpoints are half a step from the high part."""
+    """At the high part 1.5 the step of float32 is 2^-23, so that midpoints are 2^-24 from the high part."""
     low = np.float32([0.0, 2.0**-25, 2.0**-24 - 2.0**-40, -(2.0**-25), 2.0**-24 - 2.0**-40, np.nan, 0.0, 0.0])
     error = np.float32([2.0**-26, 2.0**-26, 2.0**-41, 2.0**-26, 2.0**-39, 2.0**-26, np.inf, np.nan])
     out = zeros(len(low), wp.int32)

@@ -1,4 +1,4 @@
-"""The 14-DOP's unit: it lets every hit of the triangle unit through, grazing rays too, and rejects its cut corners."""
+"""The 14-DOP test: it enters for every hit of the triangle test, also for grazing rays, and rejects the box's cut corners."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ class Around:
 def kdop_kernel(origin: wp.array(dtype=wp.vec3), direction: wp.array(dtype=wp.vec3), t_max: wp.array(dtype=wp.float32),
                 around: Around, t_hit: wp.array(dtype=wp.float32), entry: wp.array(dtype=wp.float32),
                 box_entry: wp.array(dtype=wp.float32)):
-    """t_hit: the triangle unit's; entry, box_entry: of the 14-DOP and of its box, in a segment that ends at t_max and t_hit."""
+    """Store t of the triangle's hit, and t at the entry into the 14-DOP and its box for a segment that ends at min(t_max, t_hit)."""
     i = wp.tid()
     ray = Ray()
     ray.origin = origin[i]
@@ -75,7 +75,7 @@ def test_host_and_device_project_alike():
 
 @pytest.mark.parametrize("kind", ["any", "edge", "grazing", "sliver", "far", "axis"])
 def test_every_hit_of_the_triangle_is_let_through(kind):
-    # The rays are aimed at points on the triangles; `middle` is near, or as far off as the triangles are large, times 1000.
+    # The rays are aimed at points on the triangles. The 14-DOPs' common centre `middle` is near the triangles or far from them.
     rng = np.random.default_rng(3)
     n = 40_000
     scale = 10.0 ** rng.uniform(-6, 6, (n, 1))
@@ -83,7 +83,7 @@ def test_every_hit_of_the_triangle_is_let_through(kind):
     place = 10.0 * rng.random((n, 1, 1)) * rng.normal(size=(n, 1, 3))
     corners = rounded(scale[:, None] * (shape * rng.normal(size=(n, 3, 3)) + place))
     if kind == "axis":
-        corners[:, :, 1] = corners[:, :1, 1]  # in planes across an axis
+        corners[:, :, 1] = corners[:, :1, 1]  # In planes perpendicular to an axis.
     weight = rng.dirichlet([0.5, 0.5, 0.5], n)
     if kind == "edge":
         weight[:, 2] = 0.0
@@ -105,7 +105,7 @@ def test_every_hit_of_the_triangle_is_let_through(kind):
 
 
 def test_the_corners_of_the_box_are_cut_off():
-    # A triangle across the unit cube's diagonal: rays that pass through the cube's corners beside it meet its box alone.
+    # A triangle perpendicular to the unit cube's diagonal: rays through the cube's other corners meet its box but not its 14-DOP.
     corners = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     origin = np.array([[0.9, 0.9, 9.0], [0.1, 0.1, 9.0], [0.9, 0.9, 9.0]])
     direction = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, -1.0], [1e-9, -0.0, -1.0]])

@@ -1,4 +1,4 @@
-"""The sphere unit against float64 and rational arithmetic."""
+"""The sphere test against float64 and rational arithmetic."""
 
 import numpy as np
 import pytest
@@ -46,7 +46,7 @@ def run(origin, direction, center, radius, t_min=0.0):
 
 
 def exact(origin, direction, center, radius):
-    """Both crossings (N, 2) and the discriminant relative to the radius (N,), in extended precision."""
+    """Return t of both crossings (N, 2) and the discriminant relative to the radius (N,), in extended precision."""
     f = np.asarray(origin, np.longdouble) - center
     d = np.asarray(direction, np.longdouble)
     a, b = (d * d).sum(-1), (f * d).sum(-1)
@@ -83,7 +83,7 @@ def test_first_crossing_against_extended_precision(distance):
 
 @pytest.mark.parametrize("radius", [1e2, 1e4, 1e6])
 def test_a_sphere_as_the_ground(radius):
-    # In float32 the height above it would be the difference of two numbers of the size of the radius.
+    # In float32, the height above the sphere is the difference of two numbers as large as the radius.
     rng = np.random.default_rng(6)
     n = 10_000
     origin = rounded(np.stack([rng.uniform(-5, 5, n), rng.uniform(0.01, 2.0, n), rng.uniform(-5, 5, n)], axis=1))
@@ -97,7 +97,7 @@ def test_a_sphere_as_the_ground(radius):
 
 
 def test_a_small_sphere_far_from_the_origin_is_whole():
-    # The corners of its box are rounded by some percent of the radius: that must not cut a slice off.
+    # The box's corners are rounded by some percent of the radius. This must not cut a slice off the sphere.
     rng = np.random.default_rng(7)
     n = 20_000
     center = rounded(1000.0 * rng.normal(size=(n, 3)))
@@ -114,7 +114,7 @@ def test_a_small_sphere_far_from_the_origin_is_whole():
 
 
 def test_seen_from_very_far():
-    # 1e6 radii away, straight at the center and exactly representable: the near side, not a lost digit.
+    # A ray from 1e6 radii away, straight at the center, with exact coordinates: t of the near side must be exact.
     for scale in (1.0, 1e-6, 1e6):
         t = run([0.0, 0.0, -1e6 * scale], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0], scale)
         assert t[0] == pytest.approx((1e6 - 1.0) * scale, rel=1e-7)
@@ -134,7 +134,7 @@ def test_origin_inside_finds_the_way_out():
 
 
 def test_on_the_surface():
-    # An origin exactly on the sphere: outwards t = 0 is the last contact, inwards it is the first (closed segment).
+    # The origin is exactly on the sphere and segments are closed: t = 0 is the last crossing outwards, and the first one inwards.
     center, radius = np.zeros(3), 2.0
     origin = np.array([0.0, 0.0, 2.0])
     assert run(origin, [0.0, 0.0, 1.0], center, radius)[0] == 0.0
@@ -187,7 +187,7 @@ def test_nothing_depends_on_the_scale(power):
 @given(seed=st.integers(0, 2**32 - 1), power=st.integers(-90, 90), turn=st.permutations(range(3)),
        sign=st.tuples(*[st.sampled_from([-1.0, 1.0])] * 3))
 def test_turned_mirrored_scaled_and_moved_by_powers_of_two(seed, power, turn, sign):
-    # Whole numbers up to 2^10, moved by such: no float32 is rounded. Turning takes float64 sums in another order.
+    # Integers up to 2^10, moved by such integers, are exact in float32. A turned scene changes the order of float64 sums.
     rng = np.random.default_rng(seed)
     n = 500
     center, direction = rng.integers(-512, 513, (n, 3)), rng.integers(-64, 65, (n, 3))
@@ -198,7 +198,7 @@ def test_turned_mirrored_scaled_and_moved_by_powers_of_two(seed, power, turn, si
     moved = run((origin + 1024.0) * scale, direction * scale, (center + 1024.0) * scale, radius * scale)
     turned = run(sign * origin[:, turn], sign * direction[:, turn], sign * center[:, turn], radius)
     _, inside = exact(origin, direction, center, radius)
-    clear = np.abs(inside) > 1e-9  # a grazing line is decided by the last digit of float64
+    clear = np.abs(inside) > 1e-9  # The last digit of float64 decides whether a grazing line hits.
     assert np.isfinite(reference).sum() > 10
     for other in (moved, turned):
         assert np.array_equal(np.isinf(other)[clear], np.isinf(reference)[clear])
@@ -216,6 +216,6 @@ def test_nan_misses():
 
 
 def test_the_sign_of_zero_is_the_same_on_every_device() -> None:
-    """Inside a tiny sphere both crossings are rounded to 0, the one behind to -0."""
+    """Inside a tiny sphere both crossings are rounded to 0, the crossing behind the origin to -0."""
     t = run((5e-39, 0.0, 0.0), (2.0**64, 0.0, 0.0), (0.0, 0.0, 0.0), 1e-38)
     assert t[0] == 0.0 and not np.signbit(t[0])

@@ -1,4 +1,4 @@
-"""The triangle unit against float64, and the properties that keep a mesh closed."""
+"""The triangle test against float64, and the properties that keep rays from leaking through a mesh."""
 
 from fractions import Fraction
 
@@ -17,7 +17,7 @@ from wrt.kernels.structs import NO_HIT, Hit, Primitive, Ray, kernel
 from wrt.kernels.units.box import box_ray
 from wrt.kernels.units.triangle import RAY_TRIANGLE, crossing, ray_triangle, sure_crossing, to_ray_space, triangle_ray, watertight
 
-# pbrt-v4, shapes_test, Triangle.BadCases: three collinear points and a ray that must miss them (published numbers).
+# Published numbers of pbrt-v4, shapes_test, Triangle.BadCases: three collinear points, and a ray that must miss.
 BAD_TRIANGLE = [[-1113.45459, -79.049614, -56.2431908], [-1113.45459, -87.0922699, -56.2431908],
                 [-1113.45459, -79.2090149, -56.2431908]]
 BAD_ORIGIN, BAD_DIRECTION = [-1081.47925, 99.9999542, 87.7701111], [-32.1072998, -183.355865, -144.607635]
@@ -33,7 +33,7 @@ def triangle_kernel(
     line: wp.array(dtype=Hit),
     unit: wp.array(dtype=Hit),
 ):
-    """The watertight test alone, and the unit, which clamps t to the triangle's box."""
+    """Store the hits of the watertight test, and of the unit, which also clamps t to the triangle's box."""
     i = wp.tid()
     ray = Ray()
     ray.origin = origin[i]
@@ -44,7 +44,7 @@ def triangle_kernel(
 
 
 def run(origin, direction, triangle, which="unit"):
-    """Hits as a structured array of t, u, v, prim_id; triangle: (N, 3, 3) or (3, 3), given to the unit as its records are."""
+    """Return the hits as a structured array of t, u, v, prim_id. `triangle` is (N, 3, 3) or (3, 3)."""
     origin, direction = (np.asarray(a, np.float32).reshape(-1, 3) for a in (origin, direction))
     triangle = np.asarray(triangle, np.float32).reshape(-1, 3, 3)
     n = max(len(origin), len(direction), len(triangle))
@@ -61,7 +61,7 @@ def is_hit(hits):
 
 
 def exact(origin, direction, triangle):
-    """t, u, v (N,) in float64 by Cramer's rule (Moeller and Trumbore 1997), wherever the plane is met."""
+    """Return t, u, v (N,) of the line and the triangle's plane in float64, by Cramer's rule (Moeller and Trumbore 1997)."""
     v0, v1, v2 = (np.asarray(triangle)[:, i] for i in range(3))
     e1, e2, s = v1 - v0, v2 - v0, np.asarray(origin) - v0
     p, q = np.cross(direction, e2), np.cross(s, e1)
@@ -71,7 +71,7 @@ def exact(origin, direction, triangle):
 
 
 def exact_fraction(origin, direction, triangle):
-    """The same in rational arithmetic for one ray; None where the ray is parallel to the plane."""
+    """Return t, u, v of one ray in rational arithmetic, or None if the ray is parallel to the plane."""
     o, d = ([Fraction(float(x)) for x in row] for row in (origin, direction))
     v0, v1, v2 = ([Fraction(float(x)) for x in row] for row in triangle)
 
@@ -91,7 +91,7 @@ def exact_fraction(origin, direction, triangle):
 
 
 def aimed_rays(rng, n, spread=0.4):
-    """Rays at points in and around triangles of size about 1, at least 0.2 off their planes."""
+    """Return rays aimed at points in and around triangles of size about 1, from at least 0.2 off the triangles' planes."""
     triangle = rounded(rng.normal(size=(n, 3, 3)) + 3.0 * rng.normal(size=(n, 1, 3)))
     w = rng.normal(1.0 / 3.0, spread, (n, 2))
     target = triangle[:, 0] + w[:, :1] * (triangle[:, 1] - triangle[:, 0]) + w[:, 1:] * (triangle[:, 2] - triangle[:, 0])
@@ -113,7 +113,7 @@ def test_t_and_barycentrics_against_float64():
     assert not is_hit(hits)[margin < -1e-4].any()
     assert (margin > 1e-4).sum() > 2000 and (margin < -1e-4).sum() > 2000
     on = is_hit(hits)
-    # Coordinates are some tens at most and slopes above 0.2: rounding of the ray's line, seen on the plane.
+    # Coordinates are at most some tens and slopes above 0.2. They bound the effect of the rounding of the ray on its point.
     bound = 2.0**-24 * 40.0 * (1.0 + np.abs(origin).max(axis=1) + np.abs(triangle).max(axis=(1, 2)))[on]
     assert (np.abs(hits["t"] - t)[on] * np.linalg.norm(direction, axis=1)[on] <= bound).all()
     assert (np.abs(hits["u"] - u)[on] <= bound * 5.0).all() and (np.abs(hits["v"] - v)[on] <= bound * 5.0).all()
@@ -127,7 +127,7 @@ def test_both_sides_and_every_order_of_the_corners_agree():
     n = 40_000
     triangle = rounded(rng.normal(size=(n, 3, 3)) * 10.0 ** rng.uniform(-3, 3, (n, 1, 3)))
     w = rng.dirichlet([0.4, 0.4, 0.4], n)
-    w = np.where(rng.random((n, 3)) < 0.25, 0.0, w)  # many on edges and at corners
+    w = np.where(rng.random((n, 3)) < 0.25, 0.0, w)  # Many points are on edges and at corners.
     w = np.where(w.sum(axis=1, keepdims=True) > 0.0, w, [1.0, 0.0, 0.0])
     target = np.einsum("ni,nij->nj", w / w.sum(axis=1, keepdims=True), triangle)
     direction = directions(rng, n)
@@ -153,7 +153,7 @@ def test_no_ray_between_two_triangles_with_a_common_edge():
     along = rng.uniform(0.05, 0.95, (n, 1))
     target = edge[:, 0] + along * (edge[:, 1] - edge[:, 0])
     origin = rounded(target - direction * 10.0 ** rng.uniform(-3, 2, (n, 1)))
-    # The two other corners stand on opposite sides of the plane through ray and edge, far enough to cover the ray.
+    # The other two corners are on opposite sides of the plane through ray and edge, so far away that the triangles cover the ray.
     side = np.cross(edge[:, 1] - edge[:, 0], direction)
     length = np.linalg.norm(side, axis=1, keepdims=True)
     extent = np.linalg.norm(edge[:, 1] - edge[:, 0], axis=1, keepdims=True)
@@ -170,7 +170,7 @@ def test_no_ray_between_two_triangles_with_a_common_edge():
 
 
 def adversarial_hits(rng, n):
-    """Triangles of wild proportions, flat in some axes, and rays at their edges from very near to far."""
+    """Return triangles of extreme proportions, flat in some axes, and rays aimed at their edges from very near and far."""
     scale = 10.0 ** rng.uniform(-4, 4, (n, 1, 3)) * np.where(rng.random((n, 1, 3)) < 0.3, 0.0, 1.0)
     triangle = rng.uniform(-1.0, 1.0, (n, 3, 3)) * scale
     same = rng.random((n, 1, 3)) < 0.3
@@ -191,7 +191,7 @@ def adversarial_hits(rng, n):
 
 
 def test_a_hit_is_never_outside_the_triangles_padded_box():
-    # Else a traversal that trusts boxes loses a ray that the triangle test had promised to this triangle alone.
+    # Otherwise traversal may cull the box of the only triangle that a ray near an edge hits, and the ray leaks.
     for seed in range(4):
         rays = adversarial_hits(np.random.default_rng(seed), 200_000)
         line, unit = run(*rays, which="line"), run(*rays)
@@ -202,7 +202,7 @@ def test_a_hit_is_never_outside_the_triangles_padded_box():
 
 
 def test_t_when_seen_nearly_edge_on():
-    # A floor 2000 wide at a height of 1e-6: the areas cancel to a millionth, and t must keep its digits all the same.
+    # A floor 2000 wide, seen from a height of 1e-6: the areas cancel to a millionth, but t must stay accurate.
     rng = np.random.default_rng(4)
     n = 20_000
     floor = np.array([[-1000.0, 0.0, -1000.0], [1000.0, 0.0, -1000.0], [0.0, 0.0, 1000.0]])
@@ -243,7 +243,7 @@ def test_nothing_depends_on_the_scale(power, seed):
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), order=st.permutations(range(3)))
 def test_any_order_of_the_corners_gives_the_same_decision_and_point(seed, order):
-    # To the last bit: the areas change places and all change sign together; only the sums of t are taken in another order.
+    # Decisions agree to the last bit: a new order permutes the areas and may negate all of them. Only the sum of t has another order.
     origin, direction, triangle = adversarial_hits(np.random.default_rng(seed), 2000)
     reference, turned = run(origin, direction, triangle, which="line"), run(origin, direction, triangle[:, order], which="line")
     hit = is_hit(reference)
@@ -260,7 +260,7 @@ def test_any_order_of_the_corners_gives_the_same_decision_and_point(seed, order)
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), power=st.integers(-8, 8), step=st.tuples(*[st.integers(-64, 64)] * 3))
 def test_moving_everything_by_powers_of_two_changes_no_bit(seed, power, step):
-    # Corners and origins are whole numbers up to 2^12 and are moved by such: no sum is rounded, so nothing may change.
+    # Corners, origins and displacements are integers up to 2^12. No sum is rounded, so that no bit may change.
     rng = np.random.default_rng(seed)
     triangle, target = rng.integers(-2048, 2049, (500, 3, 3)), rng.integers(-2048, 2049, (500, 3))
     direction = rng.integers(-512, 513, (500, 3))
@@ -269,7 +269,7 @@ def test_moving_everything_by_powers_of_two_changes_no_bit(seed, power, step):
     scale, moved = 2.0**power, np.array(step) * 64.0
     reference = run(origin * scale, direction, triangle * scale)
     shifted = run((origin + moved) * scale, direction, (triangle + moved) * scale)
-    # t is held to the box, which is the only number that depends on where the box is: by its padding, and only on an edge.
+    # Only t may change, as it is clamped to the padded box, whose padding depends on the position: this happens only at edges.
     line, other = (run(o * scale, direction, v * scale, which="line")
                    for o, v in ((origin, triangle), (origin + moved, triangle + moved)))
     assert np.array_equal(line, other) and np.array_equal(is_hit(shifted), is_hit(reference))
@@ -279,8 +279,8 @@ def test_moving_everything_by_powers_of_two_changes_no_bit(seed, power, step):
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_neighbours_see_their_edge_from_both_sides(seed):
-    # Two triangles fold over an edge, and rays come from anywhere. Their order may not decide which one is hit. A ray that passes the edge
-    # within the width of both hits one: the areas at the edge are negatives.
+    # Two triangles share an edge. The areas of a ray at the edge are exact negatives in the two triangles. So the order of the
+    # triangles does not decide which triangle is hit, and a ray at the edge, within the width of both, hits one.
     rng = np.random.default_rng(seed)
     n = 2000
     edge = rounded(rng.normal(size=(n, 2, 3)) * 10.0 ** rng.uniform(-3, 3, (n, 1, 1)) + rng.normal(size=(n, 1, 3)))
@@ -316,11 +316,11 @@ def test_triangles_without_area_are_missed():
     direction = rng.normal(size=(n, 3))
     point = np.stack([a, a, a], axis=1)
     assert not is_hit(run(a - direction, direction, point)).any()
-    for order in ([0, 0, 1], [0, 1, 0], [1, 0, 0]):  # two corners the same
+    for order in ([0, 0, 1], [0, 1, 0], [1, 0, 0]):  # Two corners are equal.
         needle = np.stack([a, b], axis=1)[:, order]
         middle = 0.5 * (a + b)
         assert not is_hit(run(middle - direction, direction, needle)).any()
-    for axis in range(3):  # three points on a line along an axis
+    for axis in range(3):  # Three points on a line along an axis.
         line = np.repeat(a[:, None], 3, axis=1)
         line[:, :, axis] = rng.normal(size=(n, 3))
         target = line[:, 0] + rng.random((n, 1)) * (line[:, 1] - line[:, 0])
@@ -328,8 +328,8 @@ def test_triangles_without_area_are_missed():
 
 
 @pytest.mark.parametrize(("origin", "direction", "triangle", "t"), [
-    # Across x the ray moves by less than float32 resolves, from a face of the triangle's box. The sheared corners miss that, while the
-    # slab of x ends where the ray starts.
+    # The ray starts in a face of the triangle's box, and its x changes by less than float32 resolves. The sheared corners do not show
+    # this change, while the slab of x ends at the ray's origin.
     ((0.0, 3.6090652682815795e-20, 3.338891601232995e-20), (-2.652004651570872e-37, 0.0, 0.29204800724983215),
      ((-2e-20, 1e-20, -3e-20), (0.0, 4e-20, -3e-20), (0.0, 3e-20, 4e-20)), -1.23e-19),
     ((0.0, 3.6090652682815795e-20, -2.5e-20), (2.652004651570872e-37, 0.0, 0.29204800724983215),
@@ -341,7 +341,7 @@ def test_triangles_without_area_are_missed():
     ((0.0, 0.0, 3.5), (-1e-38, 0.0, 1e18), ((-1.0, -1.0, 2.0), (0.0, -1.0, 4.0), (0.0, 1.0, 1.0)), -1e-18),
 ])
 def test_t_where_the_shear_underflows(origin, direction, triangle, t):
-    for axes in ([0, 1, 2], [1, 2, 0], [2, 0, 1]):  # the same along every axis
+    for axes in ([0, 1, 2], [1, 2, 0], [2, 0, 1]):  # The same case along every axis.
         hit = run(np.array(origin)[axes], np.array(direction)[axes], np.array(triangle)[:, axes])
         assert is_hit(hit).all() and np.allclose(hit["t"], t, rtol=5e-3, atol=0.0)
 
@@ -372,7 +372,7 @@ def test_coordinates_that_are_not_finite_miss(bad):
 
 
 def test_decisions_on_exact_coordinates_are_exact():
-    # Small integers and a direction along z: nothing is rounded, so even rays at edges and corners are decided exactly.
+    # With small integers and a direction along z nothing is rounded: even rays at edges and corners are decided exactly.
     rng = np.random.default_rng(8)
     n = 4000
     triangle = rng.integers(-4, 5, (n, 3, 3)).astype(float)
@@ -399,12 +399,12 @@ def products_kernel(m: wp.array(dtype=wp.vec4), forth: wp.array(dtype=wp.float32
 
 
 def test_kernels_are_compiled_without_fused_multiply_add():
-    # Each product must be rounded by itself: two triangles see a common edge from opposite sides, and their areas must be
-    # exact negatives. Products that are nearly equal show it.
+    # Each product must be rounded by itself: the areas that two triangles compute at their common edge must be exact negatives.
+    # The difference of two nearly equal products shows a fused multiply-add.
     rng = np.random.default_rng(9)
     m = rng.normal(size=(20_000, 4)).astype(np.float32)
     m[:, 3] = m[:, 0] * m[:, 1] / m[:, 2]
-    assert products_kernel.module.options["fuse_fp"] is False  # on a CPU without such an instruction this alone tells
+    assert products_kernel.module.options["fuse_fp"] is False  # On a CPU without the instruction, only the option shows it.
     forth, back = zeros(len(m)), zeros(len(m))
     launch(products_kernel, len(m), wp.array(m, dtype=wp.vec4, device=DEVICE), forth, back)
     assert np.array_equal(forth.numpy(), -back.numpy())
@@ -436,7 +436,7 @@ def crossings_kernel(
 
 
 def without_float64(origin, direction, triangle):
-    """Mask (N,) of the hits that float-float arithmetic is certain of, and all hits; the certain ones have float64's bits."""
+    """Return the mask (N,) of hits that float-float arithmetic is certain of, and all hits. Certain hits have float64's bits."""
     n = len(origin)
     sure, exact = zeros(n, Hit), zeros(n, Hit)
     triangle = np.asarray(triangle, np.float32)
@@ -454,7 +454,7 @@ def test_float_float_arithmetic_is_certain_but_for_hard_cases():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_certain_float_float_hits_have_the_bits_of_float64(seed):
-    """Wild triangles, at rays of all lengths and all scales, where much under- and overflows."""
+    """The triangles have extreme proportions. Rays have all lengths and scales, so that many values underflow or overflow."""
     origin, direction, triangle = adversarial_hits(np.random.default_rng(seed), 200_000)
     told, hit = without_float64(origin, direction, triangle)
     assert 20_000 < told.sum() < hit.sum() - 10_000
@@ -478,7 +478,7 @@ def test_rays_through_an_edge_or_from_the_plane_are_hard_cases():
 
 
 def closest(test, origin, direction, triangle):
-    """The closest hit of each ray among the triangles, by one test of the table."""
+    """Return the closest hit of each ray among the triangles, by the test with the name `test`."""
     n = len(triangle)
     geometry = Geometry(np.asarray(triangle, np.float32).reshape(-1, 3), np.arange(3 * n, dtype=np.int32).reshape(-1, 3),
                         np.zeros((0, 4), np.float32))
@@ -513,7 +513,7 @@ def test_every_test_misses_triangles_without_area_and_behind(test):
     rng = np.random.default_rng(11)
     a, b = rounded(rng.normal(size=(2, 3)))
     direction = rounded(rng.normal(size=(500, 3)))
-    # Moeller and Trumbore's determinant of a needle is rounding noise, not 0: that test is known to hit some.
+    # The determinant of a needle is rounding noise, not 0, in Moeller and Trumbore's test. So that test hits some needles.
     needles = ([a, a, b], [a, b, a], [b, a, a]) if test != "moeller_trumbore" else ()
     for triangle in ([a, a, a], *needles):
         for target in (a, 0.5 * (a + b)):
@@ -535,7 +535,7 @@ def test_every_test_answers_the_same_from_every_structure(test):
     direction = rounded(rng.uniform(-1.0, 1.0, (20_000, 3)) - origin)
     brute, tree = (build(geometry, name, triangle=test).closest_hit(origin, direction) for name in ("brute_force", "bvh"))
     differ = brute.prim_id != tree.prim_id
-    # Only the default promises the same bits: the others' t may lie before the box that leads to their triangle.
+    # Only the default test promises the same bits from every structure: the t of other tests may lie before the triangle's box.
     assert differ.mean() <= (0.0 if test == "watertight" else 1e-3)
     same = ~differ & (brute.prim_id >= 0)
     assert same.sum() > 5000 and np.array_equal(brute.t[same], tree.t[same])

@@ -1,4 +1,4 @@
-"""Many rays at a time: the answers have the bits of the kernel for one ray, however rays are mixed."""
+"""Batches of rays: the hits have the bits of the kernel for one ray, for any mixture of rays."""
 
 import numpy as np
 import pytest
@@ -87,7 +87,7 @@ def test_more_rays_than_a_launch(sphere, threads):
     o, d, _, _ = mixed_rays(150_001)
     for _ in range(3):
         assert_same(sphere, o, d, threads=threads)
-    assert 1 <= len(free) <= threads  # Working memory is used again.
+    assert 1 <= len(free) <= threads  # Working memory is reused.
     assert all(array.ptr % 64 == 0 for worker in free for array in (worker.scratch.packets, worker.scratch.stacks))
 
 
@@ -126,7 +126,7 @@ def test_the_rays_of_the_benchmarks(sphere, kind):
 
 
 def soup(corners):
-    """Triangles without common vertices, corner after corner."""
+    """Return triangles without shared vertices from their corners."""
     return Mesh(corners.reshape(-1, 3).astype(np.float32), np.arange(corners.size // 3, dtype=np.int32).reshape(-1, 3))
 
 
@@ -214,7 +214,7 @@ def test_packets_are_given_up_where_they_fall_apart():
     accel = build(Geometry.of(icosphere(6)), "bvh8")
     rays = ray_sets(accel, 6_000)["primary"]
     assert_same(accel, rays.origins, rays.directions)
-    # And they are given up: rays that are parallel, but far from each other, and not those beside each other.
+    # Packets of parallel rays that are far from each other fall apart. Packets of neighbouring rays do not.
     n = PACKETS * LANES
     apart = np.random.default_rng(7).uniform(-1.0, 1.0, (n, 2)).astype(np.float32)
     for xy, failed in ((apart, MAX_FAILED - 1), (0.3 + 0.001 * apart, 0)):
@@ -246,7 +246,7 @@ def test_a_million_rays(name):
 
 
 def assert_picture_rays_as_one_ray(accel, o, d, t_max, exclude, accepts=None):
-    """Trace RenderRays by the kernel for many rays and the one for one ray; return the closest hits' prim_id."""
+    """Trace RenderRays by the kernel for many rays and by the kernel for one ray; return the closest hits' prim_id."""
     rays = RenderRays()
     rays.origin, rays.direction = vec3s(o), vec3s(d)
     rays.t_min, rays.t_max = zeros(len(o)), wp.array(t_max.astype(np.float32), dtype=wp.float32, device=DEVICE)
@@ -268,7 +268,7 @@ def assert_picture_rays_as_one_ray(accel, o, d, t_max, exclude, accepts=None):
 
 @cpu_only
 def test_rays_of_a_picture_leave_out_what_they_start_on():
-    """A mesh with spheres in its leaves."""
+    """The scene is a mesh with spheres in its leaves."""
     mesh = icosphere(3)
     spheres = np.array([[1.0, 0.2, 0.0, 0.3], [0.0, -1.0, 0.1, 0.25], [0.4, 0.4, 0.9, 0.01]], np.float32)
     accel = build(Geometry(mesh.vertices, mesh.faces, spheres), "bvh8")
@@ -286,7 +286,7 @@ def one_in_three(surfaces: Surfaces, prim_id: int, u: float, v: float) -> bool:
 
 @cpu_only
 def test_hits_that_are_not_accepted_are_passed():
-    """As with cut-outs: many triangles of a row are hit, and the nearest is often refused."""
+    """Many triangles of a row are hit, and `accepts` often refuses the nearest, as it does for cut-outs."""
     mesh, spheres = crowd(), np.array([[0.5, 0.5, 0.5, 0.2]], np.float32)
     accel = build(Geometry(mesh.vertices, mesh.faces, spheres), "bvh8")
     o, d, _, t_max = mixed_rays(4000, 4)

@@ -1,4 +1,4 @@
-"""Rows of lanes: the C++ for the CPU returns the bits of the plain Warp for CUDA."""
+"""Tests of a row of boxes or triangles: the C++ code for the CPU returns the bits of the Warp code for CUDA."""
 
 from functools import cache
 
@@ -25,7 +25,7 @@ pytestmark = cpu_only
 
 @cache
 def both_kernel(width, compressed):
-    """Return the native and the plain result for node i, block i of `rows` and ray i."""
+    """Return the kernel for the results of C++ and Warp code, for node i, row i of triangles and ray i."""
     row = row_type(width)
     probe_of = make_probe(Units())
 
@@ -71,7 +71,7 @@ def results(width, compressed, nodes, rows, rays):
 
 
 def plain_nodes(lo, hi):
-    """(n, W, 3) boxes as nodes."""
+    """Return boxes, (n, W, 3), as nodes."""
     n, width, _ = lo.shape
     nodes = np.zeros((n, 8, width), np.float32)
     nodes[:, 0:6:2], nodes[:, 1:6:2] = lo.transpose(0, 2, 1), hi.transpose(0, 2, 1)
@@ -79,7 +79,7 @@ def plain_nodes(lo, hi):
 
 
 def compressed_nodes(rng, n, width, origins):
-    """Nodes of random bytes, of all exponents where a step is between 2^-20 and 2^20, and some of their ends."""
+    """Return nodes of random bytes, with all exponents of steps from 2^-20 to 2^20, and some of their ends."""
     nodes = np.zeros((n, node_size(width, True)), np.float32)
     nodes[:, :3] = origins
     exponents = np.where(rng.random((n, 3)) < 0.1, rng.choice([1, 2, 253, 254], (n, 3)), rng.integers(107, 147, (n, 3)))
@@ -118,7 +118,7 @@ def test_both_forms_agree_on_random_rows(width, compressed):
 @pytest.mark.parametrize("compressed", [False, True])
 @pytest.mark.parametrize("width", WIDTHS)
 def test_both_forms_agree_where_numbers_are_special(width, compressed):
-    # Planes through the origin, directions with +-0, empty boxes, denormals, overflow, infinities and NaN.
+    # Special values: planes through the origin, directions with +-0, empty boxes, denormals, overflow, infinities and NaN.
     rng = np.random.default_rng(10 + width)
     n = 40_000
     special = np.array([0.0, -0.0, 1.0, -1.0, 0.5, 1e-40, -1e-40, 3e38, -3e38, np.inf, -np.inf, np.nan], np.float32)
@@ -159,7 +159,7 @@ def scalar_boxes(rows: wp.array(dtype=wp.float32), origin: wp.array(dtype=wp.vec
 
 
 def test_rows_of_boxes_leave_out_none_that_the_box_unit_enters():
-    # Flat and thin boxes that lines graze: the last bits decide, and the rows must err to the same side, by no more than LANE_PAD.
+    # Lines graze flat and thin boxes, so that the last bits decide. The rows must err towards entering, by no more than LANE_PAD.
     rng = np.random.default_rng(3)
     n, t_max = 50_000, np.float32(3.0)
     assert LANE_PAD >= FAR_PAD * (1.0 + 7.0 * 2.0**-24)

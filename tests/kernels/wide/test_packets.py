@@ -22,14 +22,14 @@ from wrt.kernels.wide.traverse import lane_ray
 
 EXCLUDE = LANES * FIELDS.index("exclude")
 NOTHING = wp.constant(99)
-CHILDREN = np.array([-3, -2, -1, 1, 2, 3, 4, 5], np.int32)  # references of a node: leaves and nodes, none EMPTY
+CHILDREN = np.array([-3, -2, -1, 1, 2, 3, 4, 5], np.int32)  # References of a node to leaves and nodes; none is EMPTY.
 PRIM_IDS = np.array([3, 1, 4, 0, 5, 9, 2, 6], np.int32)
 SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, 0.5, 1e-40, -1e-40, 3e38, -3e38, np.inf, -np.inf, np.nan], np.float32)
 
 
 @wp.struct
 class Lanes:
-    """The results of the lanes: by packet, then by ray."""
+    """The results of the packet functions, by packet and then by ray."""
 
     state: wp.array(dtype=wp.int32)
     meets: wp.array(dtype=wp.int32)
@@ -47,12 +47,12 @@ class Lanes:
 set_up = packets.make_set_up(RayArrays)
 children, children_any = packets.make_children(False), packets.make_children(True)
 triangles, triangles_any = packets.make_triangles(False), packets.make_triangles(True)
-BELOW = wp.constant(2)  # entries that are on a stack before
+BELOW = wp.constant(2)  # Number of entries on the stack before a test.
 
 
 @wp.func
 def lead_to(scratch: Scratch, slot: int, node: int):
-    """With an empty stack."""
+    """Go on to `node` with an empty stack."""
     scratch.slots[slot * SLOT_SIZE + 1] = node
     scratch.slots[slot * SLOT_SIZE + 2] = slot * STACK_WORDS
 
@@ -63,8 +63,8 @@ def make_walk(any_hit):
     @wp.func
     def walk(accel: WideBvh, scratch: Scratch, node: int, empty: int, column: int, reach: float, ray: int,
              begun: wp.array(dtype=wp.int32), missed: wp.array(dtype=wp.int32), out: wp.array2d(dtype=wp.int32)):
-        """What is next, or NOTHING: at the root; after a step into `node` and one into `empty`; and after a step into `node` and
-        one pop after another."""
+        """Store the next reference, or NOTHING: at the root; after steps into `node` and `empty`; and after a step into `node` and
+        each of the following pops."""
         next = begin(accel, scratch, ray, column)
         begun[ray] = wp.where(next == EMPTY, NOTHING, next)
         lead_to(scratch, ray, node)
@@ -99,7 +99,7 @@ def with_stack(scratch: Scratch, stack: wp.array(dtype=wp.uint32)):
 @packet_kernel
 def by_packets(rays: RayArrays, count: int, reach: float, empty: int, accel: WideBvh, nodes: wp.array2d(dtype=wp.float32),
                scratch: Scratch, out: Lanes):
-    """Packet i with node i, and a slot for each ray; rays beyond `count` of each packet are left out. nodes: those of accel."""
+    """Test packet i with node i of accel (`nodes`), and a slot for each ray. Only the first `count` rays of a packet are active."""
     i = wp.tid()
     base = PACKET_SIZE * i
     active = set_up(rays, LANES * i, count, LANE_PAD, scratch, base)
@@ -137,7 +137,7 @@ ray_triangles, ray_triangles_any = packets.make_ray_triangles(False, True), pack
 @packet_kernel
 def triangles_ray_by_ray(accel: WideBvh, state: wp.array(dtype=wp.int32), in_row: int, any_hit: bool, scratch: Scratch,
                          found: wp.array(dtype=wp.int32)):
-    """found: a lane, or -1."""
+    """Store in `found` the lane of the hit triangle, or -1."""
     i = wp.tid()
     for j in range(LANES):
         column = PACKET_SIZE * i + j
@@ -210,7 +210,7 @@ def scalar_kernel():
 
 
 class Both:
-    """Rays (16 n, 3), a node and a row of triangles for each packet, tested by lanes and by scalar units."""
+    """Results of packet functions and of scalar units for rays (16 n, 3), with a node and a row of triangles for each packet."""
 
     def __init__(self, rays, nodes, corners, count=LANES, any_hit=False, reach=LARGEST, in_row=WIDTH, exclude=None):
         self.rays = RayArrays()
@@ -260,18 +260,18 @@ class Both:
         self.scalar = out
 
     def lane_rows(self, of, names):
-        """(16 n, names) from the packets."""
+        """Return the values of the fields `names` by ray, (16 n, len(names)), from the packets."""
         table = of[:, : LANES * len(FIELDS)].reshape(self.n, len(FIELDS), LANES)
         return np.stack([table[:, FIELDS.index(name)].reshape(-1) for name in names], axis=1)
 
     @property
     def active(self):
-        """(n, 16) bool."""
+        """Return the mask of active rays, (n, 16) bool."""
         return (self.state[:, None] >> np.arange(LANES) & 1).astype(bool)
 
 
 def same(a, b):
-    """Equal bits, or both NaN."""
+    """Check that the bits are equal, or both values are NaN."""
     np.testing.assert_array_equal(np.where(np.isnan(a), np.float32(np.nan), a).view(np.int32),
                                   np.where(np.isnan(b), np.float32(np.nan), b).view(np.int32))
 
@@ -285,7 +285,7 @@ def plain_nodes(lo, hi):
 
 
 def random_case(rng, n, coherent):
-    """Rays around one per packet (or any), boxes and triangles about their way."""
+    """Return rays around one ray for each packet (random rays unless `coherent`), and boxes and triangles near their paths."""
     spread = np.where(rng.random((n, 1, 1)) < 0.5, 0.02, 0.3) if coherent else 1.0
     origin = rng.normal(size=(n, 1, 3)) + spread * rng.normal(size=(n, LANES, 3)) * (rng.random((n, 1, 1)) < 0.7)
     towards = rng.normal(size=(n, 1, 3)) if coherent else 0.0
@@ -301,10 +301,10 @@ def random_case(rng, n, coherent):
 
 
 def special_case(rng, n):
-    """Zeros of both signs, denormals, overflow, infinities and NaN everywhere."""
+    """Return rays, boxes and triangles with zeros of both signs, denormals, overflow, infinities and NaN."""
     direction = rng.choice(SPECIAL[:7], (n * LANES, 3))
     direction[~direction.any(axis=1)] = 1.0
-    alike = rng.random(n * LANES) < 0.5  # Otherwise hardly a packet has a beam.
+    alike = rng.random(n * LANES) < 0.5  # Otherwise almost no packet has a beam.
     direction[alike] = np.abs(direction[alike])
     ends = np.array([0.0, -0.0, 0.5, 1.0, 1e30, 3.4e38, -np.inf, np.inf], np.float32)
     rays = rng.choice(SPECIAL, (n * LANES, 3), p=[0.17, 0.1] + [0.08] * 9 + [0.01]), direction, rng.choice(ends[:4], n * LANES), \
@@ -313,7 +313,7 @@ def special_case(rng, n):
 
 
 def underflow_case(rng, n):
-    """Rays that start in faces of the triangles' boxes, and leave them so slowly that the shear underflows."""
+    """Return rays that start in faces of the triangles' boxes. A direction component is so small that the shear underflows."""
     size = 10.0 ** rng.uniform(-20.0, 0.0, (n, 1, 1))
     origin = rng.integers(-2, 3, (n, LANES, 3)) * size
     slow = 10.0 ** rng.uniform(-45.0, -15.0, (n, LANES, 2)) * rng.choice([-1.0, 1.0], (n, 1, 2))
@@ -358,7 +358,7 @@ def test_packets_with_a_beam_go_the_same_way(name):
 
 @pytest.mark.parametrize("name", CASES)
 def test_a_beam_enters_what_one_of_its_rays_enters(name):
-    # The children's masks are the box unit's, ray by ray. So is the result of rays_meeting_root for all children together.
+    # For each ray, the masks of entered children equal the box unit's results. So does rays_meeting_root for all children together.
     both = case(name)
     entered = both.scalar.entered.numpy().reshape(-1, LANES, 1) >> np.arange(WIDTH) & 1
     entered = entered.astype(bool) & both.active[..., None]
@@ -368,7 +368,7 @@ def test_a_beam_enters_what_one_of_its_rays_enters(name):
     first = np.where(entered, both.scalar.entries.numpy().reshape(-1, LANES, WIDTH), np.inf).min(axis=1)
     for i in np.flatnonzero(coherent):
         for stack, any_hit in zip(both.stacks, (False, True), strict=True):
-            size = stack[i, 0, 3]  # The result of `children`, stored where no entry is.
+            size = stack[i, 0, 3]  # The result of `children`, stored in an unused entry.
             assert (stack[i, BELOW:size, ENTRY_RAYS] > 0).all()
             assert not stack[i, :BELOW, :3].any() and not stack[i, size:].any()
             references, begins = stack[i, BELOW:size, 0].view(np.int32), stack[i, BELOW:size, 1].view(np.float32)
@@ -410,7 +410,7 @@ def walked(both, reach=np.inf):
     keys = np.where(entered, (entries.view(np.int32) & ~15 | np.arange(WIDTH) + 8).astype(np.int64), 2**40)
     order = np.argsort(keys, axis=1)
     begins = (np.take_along_axis(keys, order, axis=1).clip(0, 2**31 - 1) & ~15).astype(np.int32).view(np.float32)
-    within = np.take_along_axis(entered, order, axis=1) & ((begins <= reach) | (np.arange(WIDTH) == 0))  # The first is not popped.
+    within = np.take_along_axis(entered, order, axis=1) & ((begins <= reach) | (np.arange(WIDTH) == 0))  # The first child is not popped.
     return np.concatenate([np.where(within, CHILDREN[order], NOTHING), np.full((len(order), 1), NOTHING)], axis=1), entered
 
 
@@ -420,9 +420,9 @@ def test_a_step_and_pops_lead_from_the_near_to_the_far(name):
     expected, entered = walked(both)
     np.testing.assert_array_equal(np.where(entered.any(axis=1, keepdims=True), both.walk, NOTHING), expected)
     assert (both.walk[~entered.any(axis=1), 0] == NOTHING).all()
-    np.testing.assert_array_equal(both.missed, both.walk[:, 1])  # A node without an entered child is as good as a pop.
+    np.testing.assert_array_equal(both.missed, both.walk[:, 1])  # A node without an entered child leads to a pop.
 
-    # A key is never farther than the entry, and hardly nearer. So no child that begins before the hit is dropped.
+    # A key is at most t of the entry, and hardly less. So no child that begins before the hit is dropped.
     entries = both.scalar.entries.numpy()[entered]
     begins = (entries.view(np.int32) & ~15).view(np.float32).astype(np.float64)
     assert (begins <= entries).all() and (begins >= entries * (1.0 - 2.0**-19) - 2.0**-144).all()
@@ -457,7 +457,7 @@ def test_rays_begin_with_the_nearest_child_of_the_root(name):
 
 
 def assert_rows_as_the_unit(both, any_hit):
-    """Triangles by packets and ray by ray against the scalar unit's hits."""
+    """Check the hits of triangles, found by packets and ray by ray, against the scalar unit's hits."""
     hits, active = both.scalar.hits.numpy(), both.active.reshape(-1)
     found = (hits["prim_id"] != NO_HIT) & active
     np.testing.assert_array_equal((both.found[:, None] >> np.arange(LANES) & 1).reshape(-1), found)
@@ -515,5 +515,5 @@ def test_lanes_beyond_the_last_ray_are_not_active(count):
 
 
 def test_constants_fit_each_other():
-    assert ENTRY * (STACK_SIZE + 1) <= STACK_WORDS  # Both a packet's stack and a ray's.
-    assert SLOTS <= 31 and PACKETS * LANES == 64 and COHERENT == 1 << LANES  # Masks of slots, of waiting rays and of lanes.
+    assert ENTRY * (STACK_SIZE + 1) <= STACK_WORDS  # The size of a packet's stack and of a ray's stack.
+    assert SLOTS <= 31 and PACKETS * LANES == 64 and COHERENT == 1 << LANES  # Widths of the masks of slots, of waiting rays and of lanes.

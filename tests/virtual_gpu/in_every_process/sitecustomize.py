@@ -1,6 +1,6 @@
-"""Python runs this first in every process that has this folder in PYTHONPATH: those that tests on a virtual GPU start have it too.
+"""Install virtual GPUs in the processes that tests start: Python runs this file at start, as its folder is in PYTHONPATH.
 
-It waits for Warp: some of them hold that nothing imports it.
+It waits until the process imports Warp, because some tests check that a process does not import Warp.
 """
 
 import sys
@@ -11,7 +11,7 @@ from typing import Any
 
 
 class BeforeWarp(MetaPathFinder):
-    """Is asked for every module that is imported."""
+    """An import hook that installs virtual GPUs after the import of Warp."""
 
     def find_spec(self, name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
         if name != "warp":

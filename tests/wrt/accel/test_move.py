@@ -1,4 +1,4 @@
-"""Instances that move: the answers of a structure that is built anew, to the last bit."""
+"""Moved instances: hits have the bits of hits in a new structure."""
 
 from __future__ import annotations
 
@@ -16,14 +16,13 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry, NumberedGeometry
 from wrt.accel.instances import Instances
 from wrt.accel.scenes.build import build
-from wrt.core.errors import InputError
 from wrt.scene.materials import Material
 from wrt.scene.model import Object, Scene, Sphere
 from wrt.scene.shapes import icosphere, torus
 
 
 def matrices(n: int, seed: int) -> np.ndarray:
-    """(n, 4, 4): turned, stretched, some mirrored, moved."""
+    """Return matrices (n, 4, 4) that rotate, stretch and translate; some also mirror."""
     rng = np.random.default_rng(seed)
     out = np.tile(np.eye(4), (n, 1, 1))
     out[:, :3, :3] = Rotation.random(n, random_state=seed).as_matrix() * (10.0 ** rng.uniform(-0.4, 0.2, (n, 1, 3)))
@@ -70,7 +69,7 @@ def test_hits_are_those_of_a_new_structure(kind: str) -> None:
         assert np.array_equal(accel.geometry.to_world[rows], places[some][..., :3, :])  # type: ignore[attr-defined]
         seen.add(answers(accel))
         assert answers(accel) == answers(anew(accel, kind))
-    accel.move([4, 5], places[[8, 8]])  # three in one place: the lowest prim_id is hit
+    accel.move([4, 5], places[[8, 8]])  # three instances coincide: the hit has the lowest prim_id
     assert answers(accel) == answers(anew(accel, kind)) not in seen and len(seen) == 5
 
 
@@ -130,9 +129,9 @@ def with_a_part_in_the_world() -> Instances:
     ([[1], [1, 2]], np.eye(4), ("instance", "whole number")),
     (3, "no", ("matrix", "(4, 4)")),
     (4, np.eye(4), ("instance", "0 to 3")), (-1, np.eye(4), ("instance", "0 to 3")),
-    (0.5, np.eye(4), ("instance", "whole number")), ([2, 2], np.tile(np.eye(4), (2, 1, 1)), ("instance", "number twice")),
-    (0, np.eye(4), ("instance", "0 has no place")),
-    (1, np.diag([1.0, 1.0, 0.0, 1.0]), ("matrix", "flatten nothing")),
+    (0.5, np.eye(4), ("instance", "whole number")), ([2, 2], np.tile(np.eye(4), (2, 1, 1)), ("instance", "index twice")),
+    (0, np.eye(4), ("instance", "0 cannot move")),
+    (1, np.diag([1.0, 1.0, 0.0, 1.0]), ("matrix", "not flatten")),
     (1, np.full((3, 4), np.nan), ("matrix", "finite")), (1, 2.0 * np.eye(4), ("matrix", "affine")),
     (1, np.diag([1e25, 1e25, 1e25, 1.0]), ("matrix", "farther than 1e")),
 ])
@@ -145,7 +144,7 @@ def test_what_is_refused_changes_nothing(instance: Any, matrix: Any, told: Refus
 
 
 def test_moved_by_turns_while_others_ask() -> None:
-    """Every answer is of one place or the other."""
+    """Each result is that of one of the two places."""
     accel, places = structure(), [matrices(24, seed) for seed in (2, 3)]
     known: list[tuple[bytes, ...]] = []
     for place_of in places:
@@ -171,7 +170,7 @@ def test_moved_by_turns_while_others_ask() -> None:
 
 
 def test_over_a_scene_an_instance_is_an_object() -> None:
-    """Two objects, the first and one between, are joined in the world, so that rows of geometry.to_world are numbered otherwise."""
+    """The first object and a middle object are joined, so that rows of geometry.to_world differ from indices of objects."""
     grey, ball, large = (Material(),), icosphere(1), icosphere(5)
     alone = {0: icosphere(2), 4: ball}
     scene = Scene(tuple(Object(alone.get(k, large), grey, shifted(10.0 * k)) for k in range(20)),
@@ -183,14 +182,14 @@ def test_over_a_scene_an_instance_is_an_object() -> None:
     assert before.object.tolist() == before.instance.tolist() == list(range(21))
     for k in range(20):
         if k in alone:
-            with pytest.raises(InputError, match=f"instance {k} has no place of its own"):
+            with refused("instance", f"instance {k}"):
                 accel.move(k, shifted(1000.0))
             continue
         accel.move(k, shifted(1000.0))
         assert np.flatnonzero(np.isinf(accel.closest_hit(origins, down).t)).tolist() == [k]
         accel.move(int(before.instance[k]), shifted(10.0 * k))
         assert np.array_equal(accel.closest_hit(origins, down).t, before.t)
-    with refused("instance", "20 has no place"):
+    with refused("instance", "20 cannot move"):
         accel.move(20, shifted(1000.0))
     with refused("instance", "0 to 20"):
         accel.move(21, shifted(1000.0))

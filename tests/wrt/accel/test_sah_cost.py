@@ -1,11 +1,11 @@
-"""The SAH cost is what it says: the steps of a random line that nothing stops, counted by the very traversal that is measured.
+"""The SAH cost equals the mean number of steps of random lines, as counted by the traversal itself.
 
-Lines that meet a convex region uniformly meet a convex part of it with the ratio of the surface areas (Crofton; MacDonald and
-Booth 1990, "Heuristics for ray tracing using space subdivision"). So inner nodes and primitives of the leaves on a line are, in
-the mean, `stats.sah_cost`, if traversal and builder agree on every region.
+A uniformly random line through a convex region meets a convex part of it with a probability equal to the ratio of surface areas.
+(Crofton; MacDonald and Booth 1990, "Heuristics for ray tracing using space subdivision".) So the mean number of inner nodes and leaf
+primitives on a line is `stats.sah_cost`, if traversal and builder agree on every region.
 
-The lines are a scrambled Sobol sequence. sigma is what as many independent ones would have, so that 2 sigma is never left by
-chance however many structures there are; what is found is far closer.
+The lines are a scrambled Sobol sequence, and sigma is the standard error of as many independent lines. The error of the sequence is
+much smaller, so that it does not exceed 2 sigma by chance.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ BATCH = 1 << 16
 
 
 def lines_through_box(accel: Accelerator, n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Uniform lines that meet the box of the geometry: a point of its surface, a cosine-distributed direction inwards, and the
-    origin moved back along it to where the whole line is ahead. n: a power of 2."""
+    """Return n uniformly random lines through the box of the geometry, as rays that begin before the box. n: a power of 2. A line has
+    a random point on the box's surface and a cosine-distributed direction inwards."""
     from scipy.stats import qmc
 
     lo, hi = accel.geometry.bounds()
@@ -58,9 +58,9 @@ def lines_through_box(accel: Accelerator, n: int, seed: int) -> tuple[np.ndarray
 
 @dataclass(frozen=True)
 class Case:
-    """What a structure is asked for: options; inner: the inner nodes among what it counted; lines: those that meet its root
-    region, if that is not the box of the geometry; exact: whether each node's region lies in its parent's. If not, the cost is
-    only a bound: a line that meets a node and not its parent never comes there."""
+    """How to test a structure. options: its options. inner: function from counters to the number of inner nodes. lines: function that
+    makes lines through the root's region, if that is not the box of the geometry. exact: each node's region lies in its parent's
+    region. If not, the SAH cost is only a bound, because a line may meet a node but not its parent."""
 
     options: dict[str, Any] = field(default_factory=dict)
     inner: Callable[[Counters], np.ndarray] = lambda counters: counters.nodes
@@ -68,15 +68,15 @@ class Case:
     exact: bool = True
 
 
-# Structures that are not here are asked for as they are by default.
+# Structures that are not listed are tested with their default options.
 CASES: dict[str, list[Case]] = {
-    "brute_force": [Case(lines=lambda accel, n, seed: lines_through_box(accel, 64, seed))],  # each line takes as many steps
+    "brute_force": [Case(lines=lambda accel, n, seed: lines_through_box(accel, 64, seed))],  # each line has the same number of steps
     "bvh2_sphere": [Case(exact=False)],
     "bvh2": [Case({"builder": builder}) for builder in BVH_BUILDERS],
-    # The SAH knows of no primitive that is not tested again.
+    # Without mailbox, because the SAH cost counts a primitive in every cell.
     "grid": [Case({"mailbox": False})],
     "octree": [Case({"mailbox": False})],
-    "kdtree": [Case(options, inner=lambda counters: counters.nodes - counters.leaves)  # a leaf is fetched as a node
+    "kdtree": [Case(options, inner=lambda counters: counters.nodes - counters.leaves)  # leaves count as nodes, too
                for options in ({}, {"clip": False, "empty_bonus": 0.8}, {"max_leaf": 8, "perfect_below": 1024})],
 }
 ALL = [pytest.param(name, case, id="-".join([name, *map(str, case.options.values())]))
@@ -84,7 +84,7 @@ ALL = [pytest.param(name, case, id="-".join([name, *map(str, case.options.values
 
 
 def let_through(accel: Accelerator) -> None:
-    """Make all primitives ones that no ray hits: the structure stays, and every ray goes to its end."""
+    """Replace all primitives by primitives that no ray hits, so that every ray traverses the structure to its end."""
     records = accel.data.primitives.numpy()
     if records.dtype.names is None:
         records[...] = np.nan
@@ -95,7 +95,7 @@ def let_through(accel: Accelerator) -> None:
 
 
 def check(geometry: Geometry, name: str, case: Case, n: int, most: float) -> None:
-    """The mean of n lines is the SAH cost within 2 sigma, and sigma is at most this share of it."""
+    """Check that the mean of n lines is the SAH cost within 2 sigma, and that sigma is at most the share `most` of the cost."""
     try:
         accel = build(geometry, name, **case.options)
     except InputError as error:
@@ -119,7 +119,7 @@ def check(geometry: Geometry, name: str, case: Case, n: int, most: float) -> Non
 
 
 def soup() -> Geometry:
-    """Triangles of all sizes and shapes, flat ones along the axes among them."""
+    """Return triangles of all sizes and shapes, some of them axis-aligned."""
     rng = np.random.default_rng(3)
     corners = rng.uniform(-1.0, 1.0, (500, 1, 3)) + 10.0 ** rng.uniform(-3.0, -0.3, (500, 1, 1)) * rng.normal(size=(500, 3, 3))
     corners[::7, :, 0] = corners[::7, :1, 0]

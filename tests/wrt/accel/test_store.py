@@ -1,4 +1,4 @@
-"""Structures in files: the same answers after a round trip, and one clear message for every file that is not one."""
+"""Files of structures: the same hits after a round trip, and a clear message for every other file."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ def same(a, b) -> None:
 
 
 def signed(data: bytes) -> bytes:
-    """With a checksum that fits, as somebody with bad intentions would write it."""
+    """Return the data with a valid checksum, as an attacker would write it."""
     return data + sha256(data).digest()
 
 
 @pytest.mark.parametrize("name", STRUCTURES)
 def test_a_structure_goes_through_pickle(name: str) -> None:
-    """Also copied deeply; with the options that it was built with, and after a refit."""
+    """Pickled and deep copies have the same options and hits, also after a refit."""
     ball = Mesh(BALL.vertices, BALL.faces, normals=BALL.vertices)
     before = build(ball, name, **({"triangle": "moeller_trumbore", "max_leaf": 2} if name == "bvh2" else {}))
     for after in (pickle.loads(pickle.dumps(before)), deepcopy(before)):
@@ -68,7 +68,7 @@ def test_a_structure_goes_through_pickle(name: str) -> None:
 
 
 def test_a_structure_over_arrays_of_a_device_goes_through_pickle(saved: Path) -> None:
-    """It is over a Geometry then, also where load_accel was given the arrays."""
+    """The copy is over a Geometry, also if load_accel got Warp arrays."""
     over = DeviceGeometry(wp.array(BALL.vertices, dtype=wp.vec3, device="cpu"), wp.array(BALL.faces, dtype=wp.vec3i, device="cpu"))
     for before in (build(over, "bvh2"), load_accel(saved, over)):
         for after in (pickle.loads(pickle.dumps(before)), deepcopy(before)):
@@ -126,28 +126,27 @@ def test_another_mesh_is_refused(saved: Path) -> None:
     (lambda data: b"PK\3\4" + data, (None, "no acceleration structure")),
     (lambda data: data[:5000] + bytes([data[5000] ^ 1]) + data[5001:], (None, "damaged")),
     (lambda data: signed(MAGIC + b"[]\n"), (None, "no acceleration structure")),
-    (lambda data: signed(MAGIC + b"{}\n"), (None, "no structure")),
+    (lambda data: signed(MAGIC + b"{}\n"), (None, "not a structure")),
     (lambda data: signed(MAGIC + b"{" * 100000), (None, "damaged")),
     (lambda data: signed(MAGIC + b"[" * 60000 + b"\n"), (None, "no acceleration")),
 ])
 def test_a_damaged_or_foreign_file_is_refused(saved: Path, spoil, message: Refusal) -> None:
     saved.write_bytes(spoil(saved.read_bytes()))
-    with refused(*message) as error:
+    with refused(*message, path=saved):
         load_accel(saved, BALL)
-    assert "ball.accel" in str(error.value)
 
 
 def test_missing_files_and_wrong_suffixes(tmp_path: Path) -> None:
     with refused(path="nothing.accel"):
         load_accel(tmp_path / "nothing.accel", BALL)
-    with refused(what=".accel file"):
+    with refused(what="suffix .accel"):
         build(BALL).save(tmp_path / "x.npz")
     with refused(what="does not exist"):
         build(BALL).save(tmp_path / "no" / "x.accel")
 
 
 def edited(path: Path, change) -> None:
-    """The file with its nodes and order changed, and a checksum that fits."""
+    """Change the nodes and the order in a file, and make its checksum valid."""
     data = path.read_bytes()[:-DIGEST_BYTES]
     end = data.index(b"\n", len(MAGIC)) + 1
     header = json.loads(data[len(MAGIC):end])
@@ -181,7 +180,7 @@ def test_indices_are_checked_before_a_ray_follows_them(saved: Path, change) -> N
 
 
 def test_a_child_that_does_not_exist_leads_nowhere() -> None:
-    """A refit on a device looks at `first` and `count`, not at the box."""
+    """A refit on a device reads `first` and `count`, not the box."""
     nodes = build(wrt.Mesh(np.eye(3), np.array([[0, 1, 2]])), "bvh2").built.arrays["nodes"].copy()
     check_binary(nodes, 1, 64)
     nodes["first_1"][0] = 10**8
@@ -206,7 +205,7 @@ def test_boxes_of_any_size_are_looked_at_without_a_word(name: str, tmp_path: Pat
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(at=st.integers(0, 10**6), value=st.integers(0, 255))
 def test_any_byte_may_be_changed(saved: Path, at: int, value: int) -> None:
-    """Changed before the checksum is taken: what is accepted then answers without leaving its arrays."""
+    """A byte changes before the checksum is computed. If the file is accepted, queries stay within its arrays."""
     data = bytearray(saved.read_bytes()[:-DIGEST_BYTES])
     data[at % len(data)] = value
     path = saved.with_name("changed.accel")
@@ -214,7 +213,7 @@ def test_any_byte_may_be_changed(saved: Path, at: int, value: int) -> None:
     try:
         load_accel(path, BALL).closest_hit(*rays(50))
     except InputError as error:
-        assert "changed.accel" in str(error)
+        assert error.path == path
 
 
 def test_the_command(tmp_path: Path, monkeypatch) -> None:
@@ -225,10 +224,10 @@ def test_the_command(tmp_path: Path, monkeypatch) -> None:
     assert out.code == 0 and json.loads(out.out)["accel"] == "bvh2"
     assert wrt.load_accel("box.accel", "box.obj").stats.references == 12
     for arguments, message in (
-            (("box.obj", "-o", "box.npz"), ".accel file"), (("none.obj", "-o", "a.accel"), "none.obj"),
+            (("box.obj", "-o", "box.npz"), "suffix .accel"), (("none.obj", "-o", "a.accel"), "none.obj"),
             (("box.obj", "-o", "a.accel", "--accel", "x"), "no structure 'x'"),
             (("box.obj", "-o", "a.accel", "--set", "leaf=2"), "leaf is no option"),
-            (("box.obj", "-o", "a.accel", "--set", "max_leaf=2", "--set", "max_leaf=3"), "given twice"),
+            (("box.obj", "-o", "a.accel", "--set", "max_leaf=2", "--set", "max_leaf=3"), "has two values"),
             (("box.obj", "-o", "a.accel", "--set", "max_leaf=many"), "max_leaf"),
             (("box.obj", "-o", "a.accel", "--set", "max_leaf"), "NAME=VALUE")):
         out = command("build", *arguments)

@@ -11,7 +11,7 @@ from tests.device import NAME
 from wrt.cli.compile import compile_kernels
 
 
-def test_it_tells_what_it_compiled() -> None:
+def test_the_command_reports_the_compiled_kernels() -> None:
     scene = str(ROOT / "scenes" / "fisheye.toml")
     result = CliRunner().invoke(compile_kernels, [scene, "--json"])
     done = json.loads(result.stdout)["compiled"]

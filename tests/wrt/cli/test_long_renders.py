@@ -1,4 +1,4 @@
-"""Renders that are killed, and the command line around them: nothing is lost that could be kept."""
+"""Long renders on the command line: kills, checkpoints, time limits, and pictures that cannot be written."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SMALL = ("--size", "32x18", "--spp", 4)
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Each test works in a folder of its own, with a box in it, and so do those who look for a place for temporary files."""
+    """Run each test in a new folder that contains box.obj; temporary files go into its folder tmp."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "tmp").mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "tmp"))
@@ -47,7 +47,7 @@ def channels(name: str) -> dict[str, bytes]:
 # --- kill -9 ----------------------------------------------------------------------------------------------------------
 
 RENDER = ("render", "box.obj", "--size", "160x90", "--spp", 600, "-o", "a.exr", "--aov", "depth", "--device", NAME)
-# Tells of each look at the tiles, a tenth of a second apart: seconds of tracing so far.
+# Runs the command line, and prints the stage and the seconds of tracing at each call of `progress`.
 TELLING = """
 import sys, wrt.renderer.progress
 from contextlib import contextmanager
@@ -67,8 +67,7 @@ def started(*arguments: object) -> subprocess.Popen[str]:
 
 
 def killed_when(traced: float, later: float, *arguments: object) -> list[str]:
-    """Run the command, end it by kill -9 when it says that it has traced for so many seconds, `later` seconds after that, and
-    return its lines on stderr."""
+    """Run the command, kill it (-9) `later` seconds after it reports `traced` seconds of tracing, and return its lines on stderr."""
     running = started(*arguments)
     assert running.stderr is not None
     lines = []
@@ -82,7 +81,7 @@ def killed_when(traced: float, later: float, *arguments: object) -> list[str]:
 
 
 def killed_after(seconds: float, *arguments: object) -> list[str]:
-    """Run the command, end it by kill -9 after so many seconds (or let it end before), and return its lines on stderr."""
+    """Run the command, kill it (-9) after `seconds` unless it ends before, and return its lines on stderr."""
     running = started(*arguments)
     try:
         _, err = running.communicate(timeout=seconds)
@@ -94,16 +93,16 @@ def killed_after(seconds: float, *arguments: object) -> list[str]:
 
 
 def lost_seconds(lines: list[str]) -> float:
-    """Seconds of tracing that are neither in the picture nor in the checkpoint; reading that fails where it is not whole."""
-    told = [float(line.split()[1]) for line in lines if line.startswith("trace ")]
-    if not told or Path("a.exr").exists():
+    """Return the seconds of tracing that neither the picture nor the checkpoint contains. Fails if the checkpoint is damaged."""
+    reported = [float(line.split()[1]) for line in lines if line.startswith("trace ")]
+    if not reported or Path("a.exr").exists():
         return 0.0
     saved = read("a.exr.checkpoint").seconds if Path("a.exr.checkpoint").exists() else 0.0
-    return max(told[-1] - saved, 0.0)
+    return max(reported[-1] - saved, 0.0)
 
 
 def whole_render() -> tuple[dict[str, bytes], float, float]:
-    """The picture of one go, seconds until tracing begins, and seconds of tracing, both in a process of its own."""
+    """Return the picture of an uninterrupted render in a process of its own, seconds until tracing begins, and seconds of tracing."""
     assert run(*RENDER).code == 0  # the kernel is compiled
     begin = time.monotonic()
     lines = killed_after(600.0, *RENDER)
@@ -121,13 +120,13 @@ def test_kills_lose_little_and_change_nothing() -> None:
     rng = random.Random(7)
     options = (*RENDER, "--checkpoint", "0.2s", "--resume")
     for i in range(3):
-        killed_when(0.2 * i + 0.2 * rng.random(), 0.1 * rng.random(), *options)  # of a second or two
+        killed_when(0.2 * i + 0.2 * rng.random(), 0.1 * rng.random(), *options)  # the render takes a second or two
         if Path("a.exr.checkpoint").exists():
-            assert read("a.exr.checkpoint").seconds > 0.0  # whole; how much is lost, the slow test measures
-        if Path("a.exr").exists():  # a fast machine was done before the kill
+            assert read("a.exr.checkpoint").seconds > 0.0  # the file is complete; the slow test measures the loss
+        if Path("a.exr").exists():  # a fast machine finished before the kill
             assert channels("a.exr") == expected
             Path("a.exr").unlink()
-        for left in Path().glob(".wrt-*"):  # of a kill while a checkpoint was written
+        for left in Path().glob(".wrt-*"):  # left by a kill during the writing of a checkpoint
             left.unlink()
         assert new_files() <= {"a.exr.checkpoint"}
     assert run(*options).code == 0
@@ -145,18 +144,18 @@ def test_twenty_kills_at_random_moments(extra: tuple[Any, ...], every: float, mo
     options = (*RENDER, "--checkpoint", f"{every}s", "--resume")
     losses, files, left, resumed, early = [], 0, 0, 0, 0
     for i in range(20):
-        if i % 5 == 0:  # before tracing, as likely as not
+        if i % 5 == 0:  # often before tracing begins
             lines = killed_after(rng.uniform(0.0, start), *options)
         else:
             lines = killed_when(rng.uniform(0.0, 0.9 * traced), rng.uniform(0.0, 0.2), *options)
         losses.append(lost_seconds(lines))
-        for temporary in Path().glob(".wrt-*"):  # of a kill while a file was written
+        for temporary in Path().glob(".wrt-*"):  # left by a kill during the writing of a file
             temporary.unlink()
             left += 1
         files += len(new_files())
         early += not any(line.startswith("trace ") for line in lines)
         if Path("a.exr").exists():
-            assert channels("a.exr") == expected, i  # done before the kill
+            assert channels("a.exr") == expected, i  # finished before the kill
         result = run(*options, "--checkpoint", "60s", "--json")
         assert result.code == 0 and channels("a.exr") == expected and new_files() == {"a.exr"}, i
         resumed += json.loads(result.out)["resumed"] is not None
@@ -182,11 +181,11 @@ def test_a_finished_render_leaves_no_checkpoint() -> None:
 def test_time_limits_and_resumes(folder: Path) -> None:
     options = ("render", "box.obj", "--size", "64x36", "--time-limit", "0.2s", "-o", "a.exr", "--checkpoint-file", "b")
     first = run(*options, "--spp", 1 << 20)
-    assert first.code == 0 and f"{folder.resolve() / 'b'}: go on from it with --resume" in first.err
+    assert first.code == 0 and f"{folder.resolve() / 'b'}: --resume continues from this checkpoint" in first.err
     assert new_files() == {"a.exr", "b"}
     before = int(read_channels("a.exr")["samples"].max())
     again = run(*options, "--spp", 1 << 20, "--resume")
-    assert again.code == 0 and f"{before} of them from the checkpoint" in again.err
+    assert again.code == 0 and f"{before} spp from the checkpoint" in again.err
     after = read_channels("a.exr")["samples"]
     assert before < after.min() == after.max()
     whole = run("render", "box.obj", "--size", "64x36", "--spp", int(after.max()), "-o", "c.exr")
@@ -203,14 +202,14 @@ def test_resume_without_a_checkpoint_says_that_it_begins() -> None:
     (["--checkpoint", "soon"], "write 30s, 5m or 1h"), (["--checkpoint", "0s"], "checkpoint_every must be more than 0"),
     (["--checkpoint-file", "./a.png"], "a.png: is the picture; a checkpoint needs a file of its own"),
     (["--checkpoint-file", "nowhere/c"], "nowhere/c: its folder does not exist"),
-    (["--checkpoint-file", "box.obj"], "box.obj: is there already; resume it (--resume"),
+    (["--checkpoint-file", "box.obj"], "box.obj: exists already; resume it (--resume"),
     (["--checkpoint-file", "box.obj", "--resume"], "box.obj: is no checkpoint of this version"),
 ])
-def test_what_is_refused_before_the_work(arguments: list[str], message: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_checkpoint_options_are_refused_early(arguments: list[str], message: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("wrt.renderer.renderer.prepare", lambda *_: pytest.fail("the work began"))
     result = run("render", "box.obj", *SMALL, "-o", "a.png", *arguments)
     assert result.code == 2 and message in result.err and result.out == "" and new_files() == set()
-    assert "error: box.obj: /" not in result.err  # the scene has no part in it
+    assert "error: box.obj: /" not in result.err  # the error does not name the scene
     assert Path("box.obj").read_text() == BOX_OBJ
 
 
@@ -219,7 +218,7 @@ def test_what_is_refused_before_the_work(arguments: list[str], message: str, mon
 
 @pytest.fixture
 def full(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures can be written below tmp/ only: the disk fills up while a render runs."""
+    """Let writing of pictures fail outside tmp/, as if the disk filled up during the render."""
     save = film.Film.save
 
     def failing(self: film.Film, path: Any, **options: Any) -> list[Path]:
@@ -231,7 +230,7 @@ def full(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("full")
-def test_a_picture_that_cannot_be_written_is_kept_elsewhere() -> None:
+def test_a_picture_that_cannot_be_written_goes_to_another_folder() -> None:
     result = run("render", "box.obj", *SMALL, "-o", "a.exr", "--aov", "depth", "--checkpoint", "60s")
     place = Path(result.out.strip())
     assert result.code == 2 and place.parent.parent == Path("tmp").resolve() and place.name == "a.exr"
@@ -242,7 +241,7 @@ def test_a_picture_that_cannot_be_written_is_kept_elsewhere() -> None:
 
 
 @pytest.mark.parametrize("place", ["nowhere", "tmp"])
-def test_where_no_place_takes_it_the_first_error_is_reported(place: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_if_both_folders_fail_the_first_error_is_reported(place: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(self: film.Film, path: Any, **options: Any) -> list[Path]:
         raise InputError("cannot be written: No space left on device", path=path)
 
@@ -253,7 +252,7 @@ def test_where_no_place_takes_it_the_first_error_is_reported(place: str, monkeyp
     assert new_files() == set() and not list(Path("tmp").iterdir())
 
 
-def test_a_folder_in_the_place_of_the_checkpoint_costs_only_the_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_at_the_checkpoints_path_prevents_only_the_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
     save = Checkpoint.save
 
     def taken(self: Checkpoint, *arguments: Any) -> None:

@@ -1,4 +1,4 @@
-"""The command line: what it writes where, what it answers to mistakes, and what Ctrl-C leaves behind."""
+"""The command line: its files, stdout and stderr, its messages for mistakes, and its state after Ctrl-C."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ irradiance = 1
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Each test works in a folder of its own, with a box in it."""
+    """Run each test in a new folder that contains box.obj."""
     monkeypatch.chdir(tmp_path)
     Path("box.obj").write_text(BOX_OBJ)
     return tmp_path
@@ -66,7 +66,7 @@ def new_files() -> set[str]:
 
 
 def refused(result: Result, *parts: str) -> None:
-    """Exit code 2, nothing on stdout, one message that has all the parts, and nothing but it and warnings on stderr."""
+    """Expect exit code 2, an empty stdout, and on stderr one message that contains all parts, beside warnings."""
     assert result.code == 2 and result.out == "" and len(result.errors) == 1, result
     assert all(part in result.errors[0] for part in parts), result.err
     rest = [line for line in result.err.splitlines() if line and line != result.errors[0]]
@@ -165,8 +165,8 @@ def test_cameras_by_name_and_number() -> None:
         assert read_metadata("a.png")["camera"] == expected
     for name in ("top", "2", "-1", ""):
         for command in (("render", *SMALL), ("info",)):
-            refused(run(*command, "scene.toml", "--camera", name), f"scene.toml: no camera {name!r}",
-                    "cameras are 'front' (number 0), 'side' (number 1)")
+            refused(run(*command, "scene.toml", "--camera", name), f"scene.toml: the scene has no camera {name!r}",
+                    "its cameras are 'front' (index 0), 'side' (index 1)")
 
 
 def test_a_time_limit_leaves_a_picture_of_whole_samples() -> None:
@@ -189,7 +189,7 @@ def test_names_that_cannot_be_encoded_are_no_reason_to_fail() -> None:
 
 # --- mistakes ---------------------------------------------------------------------------------------------------------
 
-HUGE = "9" * 5000  # more digits than Python converts
+HUGE = "9" * 5000  # more digits than Python converts to an integer
 WRONG = [
     (["--size", "0x0"], "size must be 1x1 to 32768x32768"), (["--size", "100000x100000"], "size must be"),
     (["--size", "640"], "write 640x360"), (["--size", "-1x3"], "write 640x360"), (["--size", HUGE + "x1"], "write 640x360"),
@@ -211,10 +211,14 @@ WRONG = [
 ]
 
 
+@pytest.fixture
+def unreadable() -> None:
+    """Replace box.obj by an empty file: a command that reads it ends with another error."""
+    Path("box.obj").write_text("")
+
+
 @pytest.mark.parametrize(("arguments", "message"), WRONG, ids=lambda value: str(value)[:40])
-def test_a_wrong_option_is_told_before_the_scene_is_read(arguments: list[str], message: str,
-                                                         monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wrt.io.load.load_scene", lambda path: pytest.fail("the scene was read"))
+def test_a_wrong_option_is_reported_before_the_scene_is_read(arguments: list[str], message: str, unreadable: None) -> None:
     Path("box.png").write_bytes(b"old")
     result = run("render", "box.obj", *arguments)
     refused(result, message)
@@ -233,8 +237,7 @@ def test_a_crop_outside_the_picture(crop: str) -> None:
     ("", "cannot write a file without a suffix"), ("box.obj/a.png", "its folder does not exist"),
     ("a" * 300 + ".png", "too long"),
 ])
-def test_a_wrong_output_is_told_before_any_work(output: str, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wrt.io.load.load_scene", lambda path: pytest.fail("the scene was read"))
+def test_a_wrong_output_is_reported_before_the_scene_is_read(output: str, message: str, unreadable: None) -> None:
     Path("folder.png").mkdir()
     refused(run("render", "box.obj", "-o", output), message)
     assert new_files() == {"folder.png"}
@@ -242,7 +245,7 @@ def test_a_wrong_output_is_told_before_any_work(output: str, message: str, monke
 
 @contextmanager
 def unwritable_folder() -> Iterator[Path]:
-    """A folder that the system lets nobody write to: root may write into any, but not into /proc."""
+    """Yield a folder without write permission: for root, /proc."""
     if os.geteuid() != 0:
         Path("closed").mkdir(mode=0o555)
         yield Path("closed")
@@ -252,14 +255,12 @@ def unwritable_folder() -> Iterator[Path]:
         pytest.skip("root may write everywhere")
 
 
-def test_an_output_folder_that_cannot_be_written_to(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wrt.io.load.load_scene", lambda path: pytest.fail("the scene was read"))
+def test_an_output_folder_that_cannot_be_written_to(unreadable: None) -> None:
     with unwritable_folder() as closed:
         refused(run("render", "box.obj", "-o", closed / "a.png"), f"error: {closed / 'a.png'}: cannot be written: ")
 
 
-def test_a_layer_that_cannot_be_written_is_told_before_any_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wrt.io.load.load_scene", lambda path: pytest.fail("the scene was read"))
+def test_a_layer_that_cannot_be_written_is_reported_before_the_scene_is_read(unreadable: None) -> None:
     Path("a.normal.png").mkdir()
     refused(run("render", "box.obj", "-o", "a.png", "--aov", "depth,normal"), "a.normal.png: is a folder")
     assert new_files() == {"a.normal.png"}
@@ -269,7 +270,7 @@ def test_a_layer_that_cannot_be_written_is_told_before_any_work(monkeypatch: pyt
     ("nothing.obj", "nothing.obj: no such file"), ("nothing.xyz", "nothing.xyz: no such file"),
     (".", ".: is a directory"), ("/", "/: is a directory"), ("..", "..: is a directory"), ("", ".: is a directory"),
     ("box.txt", "box.txt: is no scene file"), ("empty.toml", "empty.toml: the scene has no shapes"),
-    ("a" * 300 + ".obj", "too long"), ("empty.obj", "empty.obj: holds no triangles"),
+    ("a" * 300 + ".obj", "too long"), ("empty.obj", "empty.obj: has no triangles"),
 ])
 @pytest.mark.parametrize("command", ["render", "info", "validate"])
 def test_a_wrong_scene(command: str, scene: str, message: str) -> None:
@@ -299,7 +300,7 @@ def test_no_memory_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("name", ["a.png", "a.exr", "a.hdr"])
 def test_a_full_disk(name: str) -> None:
     size = ("--size", "128x128", "--spp", 1)
-    assert run("render", "box.obj", *size, "-o", name).code == 0  # nothing is compiled under the limit
+    assert run("render", "box.obj", *size, "-o", name).code == 0  # compile before the file size is limited
     whole = Path(name).read_bytes()
     with largest_file(min(4096, len(whole) // 2)):
         refused(run("render", "box.obj", *size, "-o", name, "--seed", 1), f"error: {name}: cannot be written: ")
@@ -311,7 +312,7 @@ def test_layers_of_a_picture_do_not_take_it_with_them_where_the_disk_is_full() -
     options = ("--size", "64x64", "--spp", 1, "--aov", "normal", "-o", "a.png")
     assert run("render", "box.obj", *options, "--tonemap", "none", "--exposure", -100).code == 0
     sizes = {name: Path(name).stat().st_size for name in new_files()}
-    assert sizes["a.png"] < sizes["a.normal.png"]  # a black picture takes little
+    assert sizes["a.png"] < sizes["a.normal.png"]  # a black picture is small
     for name in sizes:
         Path(name).unlink()
     with largest_file(sizes["a.png"] + 16):
@@ -349,7 +350,7 @@ def test_control_characters_of_names_are_escaped_on_stdout(command: tuple[Any, .
 
 
 def report_with(action: Callable[[Progress], None]) -> Callable[[bool], Any]:
-    """A progress_reporter that does that at every report."""
+    """Return a progress_reporter that calls `action` at every report."""
 
     @contextmanager
     def reporter(quiet: bool) -> Iterator[Callable[[Progress], None]]:
@@ -360,7 +361,7 @@ def report_with(action: Callable[[Progress], None]) -> Callable[[bool], Any]:
 
 def interrupt(progress: Progress) -> None:
     if progress.done:
-        for _ in range(3):  # a nervous hand
+        for _ in range(3):  # an impatient user
             signal.raise_signal(signal.SIGINT)
 
 
@@ -390,7 +391,7 @@ def test_ctrl_c_while_saving_waits_for_the_file(name: str, monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("where", ["wrt.io.load.load_scene", "wrt.renderer.prepare.upload_scene",
-                                   "wrt.renderer.schedule.Run._take_aovs"])
+                                   "wrt.renderer.schedule.Run._trace_aovs"])
 def test_ctrl_c_before_the_first_sample_leaves_everything_as_it_was(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
     Path("box.png").write_bytes(b"old")
     monkeypatch.setattr(where, lambda *arguments: signal.raise_signal(signal.SIGINT) or {})
@@ -456,7 +457,7 @@ def test_compare_measures_and_fails_past_its_limits() -> None:
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
-    (["a.exr", "nothing.png"], "nothing.png: cannot be read"), (["box.obj", "a.exr"], "box.obj: not an image format"),
+    (["a.exr", "nothing.png"], "nothing.png: cannot be read"), (["box.obj", "a.exr"], "box.obj: is no image file"),
     (["a.exr", "small.exr"], "different sizes, 30x20 and 8x4"), (["broken.png", "a.exr"], "broken.png: cannot be read"),
     (["a.exr", "a.exr", "-o", "d.exr"], "d.exr: must be a .png: a picture of the difference"),
     (["a.exr", "a.exr", "-o", "nowhere/d.png"], "its folder does not exist"),
@@ -485,20 +486,20 @@ def test_help_and_version() -> None:
     assert run("render", "-h").out == run("render", "--help").out
     assert run().code == 2 and "Commands:" in run().err + run().out
     refused(run("rendr"), "No such command 'rendr'")
-    assert run("--version") == Result(0, f"wrt {__version__}\n", "")  # of this code, installed or not
+    assert run("--version") == Result(0, f"wrt {__version__}\n", "")  # the version of this code, whether wrt is installed or not
 
 
 # --- real processes ---------------------------------------------------------------------------------------------------
 
 
 def default_signals() -> None:
-    """Of a process whose parent may ignore some: under nohup, or in the background."""
+    """Reset the signals that the parent process may ignore, as under nohup or in the background."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
 
 
 def process(*arguments: object, code: str = "", **options: Any) -> subprocess.Popen[str]:
-    """`python -m wrt arguments`, or with some code run before."""
+    """Start `python -m wrt` with arguments. code: Python code to run first."""
     start = ["-c", f"{code}\nfrom wrt.cli.main import main; main()"] if code else ["-m", "wrt"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), **options.pop("environment", {})}
     return subprocess.Popen([sys.executable, *start, *map(str, arguments)], text=True, env=environment,
@@ -509,14 +510,14 @@ def finish(running: subprocess.Popen[str]) -> Result:
     try:
         out, err = running.communicate(timeout=120)
     finally:
-        running.kill()  # where it has not ended
+        running.kill()  # if it has not ended
     return Result(running.returncode, out, without_compiling(err))
 
 
 def test_a_process_renders() -> None:
     result = finish(process("render", "box.obj", *SMALL))
     assert (result.code, result.out) == (0, "box.png\n") and read_image("box.png").shape == (18, 32, 3)
-    assert [line.split()[0] for line in result.err.splitlines()] == ["warning:", "2", "seconds:"]  # and no word of Warp's
+    assert [line.split()[0] for line in result.err.splitlines()] == ["warning:", "2", "seconds:"]  # and no message of Warp
 
 
 def test_a_process_refuses() -> None:
@@ -538,7 +539,7 @@ def test_closed_and_full_streams(redirection: str, code: int, out: str, err: str
     assert read_image("box.png").shape == (18, 32, 3)
 
 
-# The real reporter tells of its first look at the tiles at once: then the process is tracing.
+# Let the real reporter print its first line at once, so that the test knows when the process traces.
 AT_ONCE = "import wrt.renderer.progress; wrt.renderer.progress.LINE_EVERY = 0.0"
 
 
@@ -588,7 +589,7 @@ wrt.io.load.load_scene = slow
 COMPILING = """
 import os, wrt.renderer.prepare
 def reported(kernel, device, load=wrt.renderer.prepare.load_kernel):
-    os.write(2, b"now\\n")  # in one piece: several threads compile, while another is interrupted
+    os.write(2, b"now\\n")  # one write call, because several threads compile while the main thread is interrupted
     load(kernel, device)
 wrt.renderer.prepare.load_kernel = reported
 """
@@ -597,7 +598,7 @@ wrt.renderer.prepare.load_kernel = reported
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize("code", [LOADING, COMPILING], ids=["loading", "compiling"])
 def test_a_process_that_is_interrupted_early_leaves_nothing(code: str, number: int, folder: Path) -> None:
-    cold = {"WARP_CACHE_PATH": str(folder / "cache")}  # so that there is something to compile
+    cold = {"WARP_CACHE_PATH": str(folder / "cache")}  # an empty cache, so that kernels are compiled
     running = process("render", "box.obj", "-o", "a.png", "--spp", 1 << 24, code=code, environment=cold)
     assert running.stderr is not None
     assert any(line == "now\n" for line in running.stderr)

@@ -1,4 +1,4 @@
-"""--quick: less of what is not given, said in one line."""
+"""--quick: smaller defaults, which one line on stderr lists."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ WITHOUT_FILES = (plans.Visibility, plans.Units, plans.Peers, plans.HardCases, pl
 
 @pytest.fixture
 def measured(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """The plans that `bench` would carry out, in their order; nothing is measured."""
+    """Collect the plans that `bench` runs, in their order, without measuring."""
     plans: list[Any] = []
 
-    def noted(plan: Any, told: Any = None) -> list[Any]:
+    def noted(plan: Any, reported: Any = None) -> list[Any]:
         plans.append(plan)
         return []
 
@@ -35,7 +35,7 @@ def test_quick_is_less_than_the_default(plan: Any) -> None:
     assert any(plan.QUICK[name] != default for name, default in defaults.items())
 
 
-def test_stability_is_short_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stability_quick_lists_its_smaller_defaults(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stability, "SPEED_RAYS", 2000)
     done = command_line.wrt("stability", "E_grid", "--quick", "--rays", "20", "--sample", "20", "-q")
     assert done.code == 0 and " 20 " in done.out
@@ -43,23 +43,23 @@ def test_stability_is_short_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 @pytest.mark.parametrize("words", [("units", "--quick"), ("--quick", "units")])
-def test_a_bench_takes_what_is_given_and_of_all_else_less(measured: list[Any], words: tuple[str, ...]) -> None:
+def test_a_bench_keeps_stated_options_and_uses_smaller_defaults(measured: list[Any], words: tuple[str, ...]) -> None:
     done = command_line.wrt("bench", *words, "--runs", "4", "-q")
     assert done.code == 0, done.err
     assert measured == [plans.Units(**plans.Units.QUICK | {"runs": 4})]
     rays = plans.Units.QUICK["rays"]
     assert done.err == f"units --quick: rays {rays} instead of {plans.Units.rays}\n"
-    assert f"--rays {rays} --runs 4" in done.out  # what repeats it
+    assert f"--rays {rays} --runs 4" in done.out  # the command that repeats the measurement
 
 
-def test_without_a_name_all_run_that_need_no_file(measured: list[Any]) -> None:
+def test_without_a_name_all_benches_run_that_need_no_file(measured: list[Any]) -> None:
     done = command_line.wrt("bench", "--quick")
     assert done.code == 0, done.err
     assert measured == [plan(**plan.QUICK) for plan in WITHOUT_FILES]
     first, *others = done.err.splitlines()
     assert len(others) == len(measured)
     ran = {plan.COMMAND.removeprefix("bench ") for plan in WITHOUT_FILES}
-    assert set(first.removeprefix("left out: ").split(", ")) == set(bench.commands) - ran
+    assert set(first.removeprefix("skipped, without --quick or in need of a file: ").split(", ")) == set(bench.commands) - ran
 
 
 def test_without_quick_a_bench_needs_a_name(measured: list[Any]) -> None:

@@ -1,4 +1,4 @@
-"""Open3D's ray casting scene: its interface, the same answers as its own, and right ones where those are not."""
+"""wrt.compat.open3d has the interface and results of Open3D's RaycastingScene, and correct results where Open3D errs."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def scene_of(*meshes: Any) -> RaycastingScene:
 
 
 def down(xy: Any, z: float = 9.0) -> np.ndarray:
-    """Rays (..., 6) straight down."""
+    """Return rays (..., 6) straight down."""
     xy = np.asarray(xy, np.float32)
     return np.concatenate([xy, np.broadcast_to(np.float32([z, 0, 0, -1]), (*xy.shape[:-1], 4))], axis=-1)
 
@@ -35,7 +35,7 @@ def numpy(answer: dict[str, Any]) -> SimpleNamespace:
 
 
 def lattice() -> np.ndarray:
-    """Within a box seen from above, also on the diagonals of its faces."""
+    """Return points (x, y) inside a box seen from above, also on the diagonals of its faces."""
     return np.stack(np.meshgrid(*[np.linspace(-0.4375, 0.4375, 15)] * 2), axis=-1)
 
 
@@ -186,7 +186,7 @@ def test_faces_that_cannot_be_hit_keep_their_numbers() -> None:
 
 
 def test_distances_to_faces_without_area_and_with_nan() -> None:
-    """The segment from x = 5 to 6 counts; the face with a NaN is nowhere, and its finite corners at x = 8 are not either."""
+    """The face that is a segment from x = 5 to 6 counts. The face with a NaN does not, nor do its finite corners at x = 8."""
     scene = RaycastingScene()
     scene.add_triangles(np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 0, 0], [6, 0, 0], [8, 0, 0], [8, 1, np.nan]]),
                         [[0, 1, 2], [3, 4, 4], [5, 5, 6]])
@@ -216,7 +216,7 @@ def test_rays_of_a_pinhole() -> None:
 
 
 class Refuses:
-    """A tensor that NumPy cannot have."""
+    """A tensor that cannot be converted to NumPy."""
 
     def cpu(self) -> Any:
         raise RuntimeError("it requires grad")
@@ -280,7 +280,7 @@ def test_open3d_says_the_same() -> None:
     for got, expected in pairs:
         assert set(got) == set(expected)
         order = [np.lexsort([each["t_hit"].numpy(), each["ray_ids"].numpy()]) if "ray_ids" in each else slice(None)
-                 for each in (got, expected)]  # Open3D's are not in the order of t
+                 for each in (got, expected)]  # Open3D does not sort by t
         for name in got:
             a, b = got[name], expected[name]
             assert type(a) is type(b) and a.dtype == b.dtype and a.shape == b.shape

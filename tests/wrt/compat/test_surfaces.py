@@ -1,4 +1,4 @@
-"""How often the adapters count a surface: exact arithmetic in whole numbers decides."""
+"""The adapters count surface crossings as exact integer arithmetic does."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from wrt.compat.trimesh import RayMeshIntersector
 from wrt.scene import shapes
 
 PLACES = [(1.0, 0.0), (0.01, 0.0), (300.0, 0.0), (1.0, 1.0), (1.0, -5.0), (1.0, 100.0), (7.0, -1e3), (1.0, 1e3), (1e-4, 0.01),
-          (1e5, 1e7)]  # size of a mesh, and how far it is from 0
+          (1e5, 1e7)]  # size of a mesh, and its distance from the origin
 MESHES = [shapes.box(), shapes.icosphere(1), shapes.torus(1.0, 0.4, 8, 6),
           shapes.merged([shapes.icosphere(1), shapes.box((0.4, -0.3, -0.3), (1.6, 0.3, 0.3))], "overlapping")]
-ROUNDING = 1e-5  # of the size: what passes an edge or lies on a plane by less is not sure
+ROUNDING = 1e-5  # relative to the size: closer to an edge or plane than this, float32 cannot decide
 
 
 def shuffled(mesh: wrt.Mesh, size: float, away: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces there. Each face begins at any corner and has either winding; half of the meshes have corners of their own
-    for each face."""
+    """Return vertices and faces of a scaled and shifted mesh. Each face begins at a random corner and has a random winding. Half of
+    the meshes have separate corners for each face."""
     vertices = np.float32(size * np.float64(mesh.vertices) + away * rng.normal(size=3))
     faces = np.array([np.roll(face, rng.integers(3))[::rng.choice([-1, 1])] for face in rng.permutation(mesh.faces)])
     if rng.random() < 0.5:
@@ -32,7 +32,7 @@ def shuffled(mesh: wrt.Mesh, size: float, away: float, rng: np.random.Generator)
 
 
 def rays_at(vertices: np.ndarray, faces: np.ndarray, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """float32 rays from inside and outside at faces, corners and edges, and along the axes through corners."""
+    """Return float32 rays from inside and outside towards faces, corners and edges, and along the axes through corners."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     middle, size = (low + high) / 2.0, (high - low).max()
     a, b, c = vertices[faces[rng.integers(len(faces), size=n)]].astype(np.float64).transpose(1, 0, 2)
@@ -53,8 +53,8 @@ def cross(a: Any, b: Any) -> Any:
 
 
 def seen(origins: Any, directions: Any, corners: Any) -> tuple[Any, Any]:
-    """Of N rays and F triangles: six times the volume of the direction with each edge, as seen from the origin, (N, F, 3), and that
-    of the origin with the triangle, (N, F)."""
+    """Return, for N rays and F triangles, six times the volume of two tetrahedra: of the ray's direction and each edge, (N, F, 3), and
+    of the ray's origin and the triangle, (N, F)."""
     a, b, c = (corners[None, :, i] - origins[:, None] for i in range(3))
     d = directions[:, None]
     return np.stack([dot(d, cross(b, c)), dot(d, cross(c, a)), dot(d, cross(a, b))], axis=-1), dot(a, cross(b, c))
@@ -64,14 +64,14 @@ whole = np.frompyfunc(lambda x: int(math.ldexp(x, 149)), 1, 1)  # a float32 time
 
 
 def exact_counts(origins: np.ndarray, directions: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """How many triangles each ray goes through, those at whose edges it passes not counted."""
+    """Count the triangles whose interior each ray crosses."""
     sides, volume = seen(*(whole(array.astype(np.float64)) for array in (origins, directions, corners)))
     through = (sides > 0).all(axis=-1) | (sides < 0).all(axis=-1)
     return (through & (volume * sides.sum(axis=-1) > 0)).sum(axis=1)
 
 
 def sure(origins: np.ndarray, directions: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which rays pass all edges, and which origins lie off all planes, by more than rounding."""
+    """Return the masks of rays that pass all edges, and of origins that lie off all planes, by more than ROUNDING."""
     origins, directions, corners = (array.astype(np.float64) for array in (origins, directions, corners))
     sides, volume = seen(origins, directions, corners)
     size = np.abs(corners[None] - origins[:, None, None]).max(axis=(1, 2, 3))
@@ -81,7 +81,7 @@ def sure(origins: np.ndarray, directions: np.ndarray, corners: np.ndarray) -> tu
 
 
 def adapters(vertices: Any, faces: Any, origins: Any, directions: Any) -> list[tuple[np.ndarray, np.ndarray]]:
-    """All numbers as float32. Of each adapter: how often it counts each ray, and whether that hits anything."""
+    """Return, for each adapter, the number of hits of each ray, and whether the ray hits anything. All arrays are float32."""
     vertices, faces, origins = np.float32(vertices), np.asarray(faces), np.float32(origins)
     directions = np.broadcast_to(np.float32(directions), origins.shape)
     scene, ray = RaycastingScene(), RayMeshIntersector(trimesh.Trimesh(vertices, faces, process=False))
@@ -112,7 +112,7 @@ def test_counts_of_closed_meshes_are_exact(mesh: wrt.Mesh) -> None:
             assert np.array_equal(counts > 0, hit)
             assert np.array_equal(counts[off] % 2 == 1, inside[off]), (size, away)
             assert np.array_equal(counts[past & off], exact[past & off]), (size, away)
-            if mesh is MESHES[0]:  # convex, wherever its corners are rounded to
+            if mesh is MESHES[0]:  # convex, however its corners are rounded
                 assert (counts[off] <= np.where(inside[off], 1, 2)).all()
         seen_inside += inside[off].tolist()
         seen_sure += past[off].tolist()
@@ -169,12 +169,12 @@ def test_where_a_closed_mesh_is_only_touched_it_is_entered_and_left() -> None:
     rng = np.random.default_rng(1)
     along = rng.uniform(-0.4, 0.4, (500, 1)) * [0.0, 0.0, 1.0]
     touched = np.array([0.5, 0.5, 0.0]) + along  # points of an edge
-    direction = np.array([1.0, -1.0, 0.25])  # beside the box but for them
+    direction = np.array([1.0, -1.0, 0.25])  # the rest of the ray is outside of the box
     for counts, hit in adapters(box.vertices, box.faces, touched - 4.0 * direction, direction):
         assert np.array_equal(counts, 2 * hit) and hit.mean() > 0.5
     vertices = np.concatenate([box.vertices, [[3.0, 0.0, 0.0], [4.0, 0.0, 0.0], [3.0, 1.0, 0.0]]])
     for counts, hit in adapters(vertices, np.concatenate([box.faces, [[8, 9, 10]]]), touched - 4.0 * direction, direction):
-        assert np.array_equal(counts > 0, hit) and set(counts[hit]) <= {1, 2}  # one face is not closed: a touch is one hit
+        assert np.array_equal(counts > 0, hit) and set(counts[hit]) <= {1, 2}  # a single face is open, so that a touch is one hit
 
 
 def test_corners_that_differ_in_the_last_bit_are_one() -> None:

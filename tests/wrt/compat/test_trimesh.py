@@ -1,4 +1,4 @@
-"""trimesh's ray class: the same answers as trimesh's own, and right ones where those are not."""
+"""wrt.compat.trimesh has the results of trimesh's ray class, and correct results where trimesh errs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def random_rays(n: int, reach: float = 1.2) -> tuple[np.ndarray, np.ndarray]:
 
 
 def lattice() -> tuple[np.ndarray, np.ndarray]:
-    """Straight down on a box: on its edges, its corners and its faces' diagonals, too."""
+    """Return rays straight down on a box, also on its edges, corners and the diagonals of its faces."""
     x, y = (each.ravel() for each in np.meshgrid(np.linspace(-0.5, 0.5, 17), np.linspace(-0.5, 0.5, 17)))
     return np.stack([x, y, np.full(len(x), 100.0)], axis=1), np.repeat(DOWN, len(x), axis=0)
 
@@ -62,21 +62,21 @@ def test_trimesh_says_the_same(call: Callable[..., tuple[np.ndarray, ...]]) -> N
 @pytest.mark.parametrize("merged", [True, False])
 def test_a_ray_through_an_edge_or_a_corner_meets_each_surface_once(merged: bool) -> None:
     box = trimesh.creation.box()
-    if not merged:  # each face has corners of its own, as in files of glTF and STL
+    if not merged:  # each face has separate corners, as in glTF and STL files
         box = trimesh.Trimesh(box.vertices[box.faces].reshape(-1, 3), np.arange(36).reshape(-1, 3), process=False)
     ray = RayMeshIntersector(box)
     origins, directions = lattice()
     inside = (np.abs(origins[:, :2]) < 0.5).all(axis=1)
     assert (counts(ray, origins, directions)[inside] == 2).all()
     corners = trimesh.creation.box().vertices
-    assert (counts(ray, 0.0 * corners, corners) == 1).all()  # out of the middle
+    assert (counts(ray, 0.0 * corners, corners) == 1).all()  # from the centre outwards
     assert (counts(ray, 2.0 * corners, -corners) == 2).all()
     assert ray.intersects_any(origins, directions).all() and (ray.intersects_first(origins, directions) >= 0).all()
 
 
 def test_surfaces_in_the_same_place_are_all_there() -> None:
     low, high = trimesh.creation.box(), trimesh.creation.box()
-    high.apply_translation([0.0, 0.0, 1.0])  # stands on the other
+    high.apply_translation([0.0, 0.0, 1.0])  # touches the other box from above
     origins, directions = lattice()
     inside = (np.abs(origins[:, :2]) < 0.5).all(axis=1)
     for pair in ((low, high), (low, low.copy()), (low, trimesh.Trimesh(low.vertices, low.faces[:, ::-1]))):
@@ -109,7 +109,7 @@ def test_locations_have_the_digits_of_float64() -> None:
     exact = o + ((a - o) * normal).sum(axis=1, keepdims=True) / (d * normal).sum(axis=1, keepdims=True) * d
     square_on = np.abs((d * normal).sum(axis=1)) > 0.2 * np.sqrt((d * d).sum(axis=1) * (normal * normal).sum(axis=1))
     assert square_on.sum() > 1000 and np.abs(where - exact)[square_on].max() < 2e-14
-    corner = mesh.triangles[face[0]][0]  # a ray that float64 may see pass is located on the triangle, too
+    corner = mesh.triangles[face[0]][0]  # the point is on the triangle even if the ray misses in float64
     there = RayMeshIntersector(mesh).intersects_location([3.0 * corner], [-corner], multiple_hits=False)[0]
     assert np.abs(there - corner).max() < 1e-6
 
@@ -223,5 +223,5 @@ def test_copies_and_pickles_answer_the_same() -> None:
     for other in (copy.copy(ray), copy.deepcopy(ray), pickle.loads(pickle.dumps(ray))):
         assert type(other) is RayMeshIntersector and np.array_equal(other.intersects_first(*rays), expected)
     mesh = trimesh.creation.icosphere(2)
-    wrt_hits = wrt.build(wrt.Mesh.from_trimesh(mesh)).closest_hit(*rays)  # a mesh around 0 is not moved: the bits are those of wrt
+    wrt_hits = wrt.build(wrt.Mesh.from_trimesh(mesh)).closest_hit(*rays)  # such a mesh is not shifted: hits have the bits of wrt.build
     assert np.array_equal(wrt_hits.prim_id, expected)

@@ -1,4 +1,4 @@
-"""Arrays to and from others: the same memory, by its address."""
+"""Arrays from and to other libraries share memory, by its address."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ DIRECTIONS = np.array([(0, 0, -1), (0, 0, 1), (0, 1, 0), (0.05, 0, -1), (0, 0.05
 
 
 class Tensor:
-    """What another library's array looks like: DLPack and nothing else."""
+    """An array of another library, with DLPack alone."""
 
     def __init__(self, array: np.ndarray) -> None:
         self.array = array
@@ -36,7 +36,7 @@ class Tensor:
 
 
 class Library:
-    """What the array API asks of a library, so far as wrt asks it: its tensors say where from_dlpack is."""
+    """A library with the part of the array API that wrt uses: tensors return the namespace that has from_dlpack."""
 
     class Tensor(Tensor):
         def __array_namespace__(self, **options: Any) -> Any:
@@ -116,7 +116,7 @@ def test_rays_are_not_copied() -> None:
         assert (address(rays.origin), address(rays.direction)) == (address(ORIGINS), address(DIRECTIONS))
 
 
-def test_what_comes_in_as_tensors_goes_out_as_such() -> None:
+def test_tensors_are_answered_by_tensors() -> None:
     accel, near = wrt.build(box()), np.float32([[0.1, 0.2, 0.3]] * 5)
     o, d, p = (Library.Tensor(array) for array in (ORIGINS, DIRECTIONS, near))
     hits, of_numpy = accel.closest_hit(o, d), accel.closest_hit(ORIGINS, DIRECTIONS)
@@ -185,7 +185,7 @@ def test_tensors_on_a_device_stay_there() -> None:
     np.testing.assert_array_equal(hits.prim_id.array.numpy() >= 0, [False, True, False, False, False])
 
 
-def test_a_tensor_that_is_not_shared_is_told() -> None:
+def test_a_tensor_that_is_not_shared_is_reported() -> None:
     class Attached(Tensor):
         def __dlpack__(self, **options: Any) -> Any:
             raise BufferError("requires gradient")
@@ -196,7 +196,7 @@ def test_a_tensor_that_is_not_shared_is_told() -> None:
         wrt.build(box()).closest_hit(ORIGINS, Tensor(DIRECTIONS.ravel()))
 
 
-def test_what_cannot_be_written_to_is_copied() -> None:
+def test_read_only_arrays_are_copied() -> None:
     fixed = np.arange(6, dtype=np.float32)
     fixed.flags.writeable = False
     there = to_warp(fixed)

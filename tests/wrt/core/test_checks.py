@@ -1,4 +1,4 @@
-"""What the classes of a scene say of values of the wrong type, and how they show themselves."""
+"""Messages of scene classes about values of a wrong type, and their representations."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ GREY = Material(name="grey")
     (lambda: Settings(spp=2.0), ("spp", "whole number")),
     (lambda: Settings(size="640"), ("size", "two whole numbers")),
 ], ids=lambda value: value if isinstance(value, str) else "")
-def test_the_wrong_type_is_told_by_name(make: Callable[[], Any], message: Refusal) -> None:
+def test_a_wrong_type_is_named(make: Callable[[], Any], message: Refusal) -> None:
     with refused(*message):
         make()
 
@@ -84,7 +84,7 @@ def test_meshes_end_at_1e30() -> None:
     vertices = np.float32([[0, 0, 0], [1e29, 0, 0], [0, 1e30, 0]])
     hits = build(Mesh(vertices, [[0, 1, 2]])).closest_hit([[1e28, 1e29, 1e29]], [[0, 0, -1]])
     assert hits.prim_id.tolist() == [0] and hits.t.tolist() == [np.float32(1e29)]
-    with refused("vertices", "vertex 2"):
+    with refused("vertices", "row 2"):
         Mesh(vertices * 3, [[0, 1, 2]])
 
 
@@ -106,7 +106,7 @@ def test_lenses_may_be_tiny() -> None:
     assert tiny["aperture_radius"] == pytest.approx(1e-20 * unit["aperture_radius"])
 
 
-def test_one_thing_stands_for_a_tuple_of_it() -> None:
+def test_a_single_object_stands_for_a_tuple() -> None:
     scene = Scene(Object(box(), GREY), Sphere((0, 0, 0), 1, GREY), PointLight((0, 5, 0), 1), Camera())
     assert [len(each) for each in (scene.objects, scene.spheres, scene.lights, scene.cameras)] == [1] * 4
     assert Settings(size=" 32x18 ").size == (32, 18) and Settings(size=np.array([3, 4])).size == (3, 4)

@@ -22,7 +22,7 @@ import warp as wp  # isort: skip (after wrt.core.device, which silences Warp's b
 def test_an_unknown_device_is_refused_with_those_there_are(name: str, capfd: pytest.CaptureFixture[str]) -> None:
     with refused("device", "no device", hint="cpu"):
         start(name)
-    assert capfd.readouterr().err == ""  # and Warp's C++ side keeps quiet about it
+    assert capfd.readouterr().err == ""  # and Warp's C++ code writes nothing
 
 
 def test_the_cpu_is_there() -> None:
@@ -97,8 +97,8 @@ except wrt.InputError as error:
 
 
 def test_a_full_disk_under_the_kernel_cache_is_one_message(tmp_path: Path) -> None:
-    """LLVM would end the process. What is compiled already needs no room; what another kind of processor has compiled does."""
-    full = "cannot be compiled: room for 1.0 MiB, and 16 are needed; WARP_CACHE_PATH"
+    """LLVM would end the process. A compiled kernel needs no room, unless another kind of processor compiled it."""
+    full = "cannot be compiled: there is room for 1.0 MiB, but 16 MiB are needed; set WARP_CACHE_PATH"
     for limit, told in (("1000000", full), ("1000000000", "[0.333"), ("1000000", "[0.333"), ("1000000", full)):
         if told == full:
             for compiled in tmp_path.rglob("*.o"):
@@ -114,7 +114,7 @@ def test_a_kernel_cache_that_cannot_be_made_is_one_message(environment: dict[str
     done = subprocess.run([sys.executable, "-m", "wrt", "devices"], cwd=ROOT, capture_output=True, text=True,
                           env={**without, "PYTHONPATH": str(ROOT), **environment})
     assert done.returncode == 2 and done.stdout == "" and done.stderr.count("\n") == 1, done
-    assert done.stderr.startswith("error: /dev/null/") and done.stderr.endswith("; WARP_CACHE_PATH names another folder\n")
+    assert done.stderr.startswith("error: /dev/null/") and done.stderr.endswith("; set WARP_CACHE_PATH to another folder\n")
 
 
 READ_ONLY_CACHE = """
@@ -139,7 +139,7 @@ def test_a_read_only_kernel_cache_without_the_kernel_is_one_message(call: str, t
     done = subprocess.run([sys.executable, "-c", READ_ONLY_CACHE.replace("CALL", call)], cwd=ROOT, capture_output=True, text=True,
                           env=os.environ | {"WARP_CACHE_PATH": str(tmp_path), "PYTHONPATH": str(ROOT)})
     (cache,) = tmp_path.iterdir()
-    assert done.stdout == f"{cache}: kernels cannot be compiled: Permission denied; WARP_CACHE_PATH names another folder\n", done
+    assert done.stdout == f"{cache}: kernels cannot be compiled: Permission denied; set WARP_CACHE_PATH to another folder\n", done
     assert not list(cache.iterdir()) and done.stderr == ""
 
 

@@ -37,7 +37,7 @@ a = wp.array([1.0, 2.0], dtype=float, device="cpu")
 wp.launch(own.double_it, dim=2, inputs=[a], device="cpu")
 print(a.numpy().tolist())
 """
-TOLD = QUERY.replace("print(", "try:\n    print(") + "except wrt.InputError as error:\n    print(error)"
+WITH_MESSAGE = QUERY.replace("print(", "try:\n    print(") + "except wrt.InputError as error:\n    print(error)"
 LEFTOVER = re.compile(r"wp_\w+_p\d+_t\d+|precompiled-\w+-.*")
 RENDER = ["-m", "wrt", "render", "--spp", "1", "--size", "24x16", "-q"]
 
@@ -57,7 +57,7 @@ def leftovers(cache: Path) -> list[Path]:
 
 
 def test_two_copies_of_warp_share_a_cache_without_a_word(tmp_path: Path, cache: Path):
-    """Clang's precompiled headers of one are wrong for the other."""
+    """Clang's precompiled headers of one copy do not work for the other."""
     home = Path(warp.__file__).parent
     copy = tmp_path / "second" / "warp"
     shutil.copytree(home, copy, ignore=shutil.ignore_patterns("bin", "tests", "examples", "__pycache__"))
@@ -94,7 +94,7 @@ def test_eight_processes_that_start_cold_at_once(tmp_path: Path, cache: Path):
 
 
 def on_disk(cache: Path, options: str, *commands: str) -> subprocess.CompletedProcess[str]:
-    """Run shell commands where the cache is a new file system in memory."""
+    """Run shell commands with the cache on a new file system in memory."""
     cache.mkdir(exist_ok=True)
     mount = f"mount -t tmpfs -o {options} none {shlex.quote(str(cache))}"
     if subprocess.run(["unshare", "-m", "sh", "-c", mount], capture_output=True).returncode:
@@ -102,13 +102,13 @@ def on_disk(cache: Path, options: str, *commands: str) -> subprocess.CompletedPr
     return subprocess.run(["unshare", "-m", "sh", "-c", "\n".join([mount, *commands])], cwd=ROOT, capture_output=True, text=True)
 
 
-MESSAGE = "(WARP_CACHE_PATH names another folder)\n"
+MESSAGE = "; set WARP_CACHE_PATH to another folder\n"
 
 
 @pytest.mark.parametrize("options", [*(f"size={size}m" for size in (1, 8, 14, 18, 20, 22, 30)),
                                      *(f"nr_inodes={count}" for count in (2, 3, 4, 6, 8, 12, 30, 100))])
 def test_a_small_disk_is_one_message_or_room_enough(options: str, cache: Path):
-    query = shlex.join(command("-c", TOLD, "bvh"))
+    query = shlex.join(command("-c", WITH_MESSAGE, "bvh"))
     done = on_disk(cache, options, query, query, f"ls {cache}/*")
     first, second, *left = done.stdout.splitlines()
     assert done.stderr == "" and first == second
@@ -123,8 +123,8 @@ def test_a_read_only_disk(cache: Path):
                    f"{other} 2>&1 | tail -1")
     first, second, code, last = done.stdout.splitlines()
     assert f"{first}\n" == f"{second}\n" == ANSWER and code == "2"
-    assert done.stderr.count("\n") == 1 and done.stderr.endswith(f"Read-only file system {MESSAGE}")
-    assert last.endswith(f"Read-only file system {MESSAGE}".strip())
+    assert done.stderr.count("\n") == 1 and done.stderr.endswith(f"Read-only file system{MESSAGE}")
+    assert last.endswith(f"Read-only file system{MESSAGE}".strip())
 
 
 def test_the_object_of_another_processor_does_not_count_on_a_full_disk(cache: Path):
@@ -132,4 +132,4 @@ def test_the_object_of_another_processor_does_not_count_on_a_full_disk(cache: Pa
     done = on_disk(cache, "size=30m", query, f"for o in {cache}/*/*/*.o; do mv $o ${{o%.cpu*}}.cpu12345678.o; done",
                    f"head -c $(( $(df --output=avail -B1 {cache} | tail -1) - 600000 )) /dev/zero > {cache}/fill",
                    f"{query} 2>&1 | tail -1")
-    assert done.stdout.startswith(ANSWER) and done.stdout.endswith(MESSAGE) and "room for 0.6 MiB, and 16 are needed" in done.stdout
+    assert done.stdout.startswith(ANSWER) and done.stdout.endswith(MESSAGE) and "room for 0.6 MiB, but 16 MiB are needed" in done.stdout

@@ -1,4 +1,4 @@
-"""InputError: its fields, and the message that is made of them."""
+"""InputError: its fields, and the message made from its fields."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ def test_places_and_files_are_put_in_front() -> None:
     outer = error.at(place="include[0]").at("scene.toml", hint="see its line 7")
     assert (outer.path, outer.place, outer.outside) == ("a.gltf", "nodes[3]: matrix", "scene.toml: include[0]")
     assert str(outer) == "scene.toml: include[0]: a.gltf: nodes[3]: matrix: scale must be finite; see its line 7"
-    assert str(error) == "a.gltf: nodes[3]: matrix: scale must be finite"  # the first is as it was
+    assert str(error) == "a.gltf: nodes[3]: matrix: scale must be finite"  # the first error is unchanged
 
 
-def test_what_is_raised_inside_is_the_cause() -> None:
+def test_the_error_of_the_block_is_the_cause() -> None:
     with pytest.raises(InputError) as caught, at("quads[0]", "a.toml"):
         raise Special(3) from KeyError("x")
     assert type(caught.value) is Special and (caught.value.path, caught.value.place) == ("a.toml", "quads[0]")

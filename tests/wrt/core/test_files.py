@@ -1,4 +1,4 @@
-"""Only regular files are read; all others are refused at once, as pipes and devices may have no end."""
+"""Only regular files are read. Others are refused at once, because pipes and devices may have no end."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ def test_bytes_come_whole(tmp_path: Path) -> None:
     ("nowhere", "No such file"), ("x" * 5000, "name too long"), ("/proc/self/mem/x", "Not a directory"),
 ])
 def test_what_is_no_file(path: str, message: str) -> None:
-    with pytest.raises(InputError, match=f"cannot be read: .*{message}"):
+    with refused(None, message):
         read_file(path)
 
 
 @pytest.mark.parametrize("suffix", [".toml", ".obj", ".ply"])
 def test_a_name_too_long_for_the_system(suffix: str, tmp_path: Path) -> None:
     (tmp_path / "a.toml").write_text(f"materials.m = {{}}\n[[meshes]]\nmaterial = 'm'\nfile = '{'box.obj' * 1000}{suffix}'")
-    with pytest.raises(InputError, match="name too long") if suffix != ".toml" else pytest.raises(InputError, match="no mesh file"):
+    with refused(None, "no mesh file" if suffix == ".toml" else "name too long"):
         load_scene(tmp_path / "a.toml")
     with refused(what="name too long"):
         load_scene(tmp_path / f"{'x' * 5000}{suffix}")
@@ -55,7 +55,7 @@ def test_no_reader_waits_for_a_pipe(suffix: str, pipe: Path) -> None:
     path = pipe.rename(pipe.with_suffix(suffix))
     readers = {".accel": lambda path: load_accel(path, icosphere(0)), ".checkpoint": read}
     readers |= dict.fromkeys((".exr", ".hdr", ".png"), read_image)
-    with pytest.raises(InputError, match=rf"pipe\{suffix}: .*no regular file"):
+    with refused(None, "no regular file", path=path):
         readers.get(suffix, load_scene)(path)
 
 
@@ -75,5 +75,6 @@ def test_nor_does_a_scene_that_names_one(old: str, name: str, pipe: Path, tmp_pa
 def test_nor_does_a_gltf_file(uri: str, pipe: Path, tmp_path: Path) -> None:
     file = one_triangle()
     file.json["buffers"] = [{"byteLength": len(file.binary), "uri": uri}]
-    with pytest.raises(InputError, match=r"buffers\[0\]\.uri: "):
+    with refused(path="a.gltf") as caught:
         load_scene(file.write(tmp_path, "a.gltf"))
+    assert caught.value.place.endswith("buffers[0].uri")

@@ -1,4 +1,4 @@
-"""The kernel cache: whatever becomes of what it holds, a kernel gives the right answer, or one message tells what is wrong."""
+"""The kernel cache: after any damage, a kernel gives the right answer, or one message says what is wrong."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ COUNT_UP = kernel(count_up)
 
 
 def answer() -> list[float]:
-    """What the kernel writes; loaded from the cache as if the process began now."""
+    """Return what the kernel writes, after loading it from the cache as in a new process."""
     COUNT_UP.module.unload()
     device._loaded.clear()
     numbers = zeros(3)
@@ -49,7 +49,7 @@ RIGHT = [0.25, 1.25, 2.25]
 
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A kernel cache of its own, where nothing is yet."""
+    """An empty kernel cache for one test."""
     start("cpu")
     folder = tmp_path / "new" / "cache"
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(folder))
@@ -118,7 +118,7 @@ OF_FOLDERS = ("removed", "a link to nothing", "a link to itself", "a file", "a p
 @pytest.mark.skipif(os.name == "nt", reason="makes links and pipes as POSIX does")
 @pytest.mark.parametrize(("what", "damage"), [(what, damage) for what in ("*.o", "*.meta", "*.cpp") for damage in DAMAGE]
                          + [(".", damage) for damage in OF_FOLDERS])
-def test_whatever_is_damaged_is_compiled_anew_once(what: str, damage: str, filled: Path, cache: Path,
+def test_a_damaged_file_is_compiled_again_once(what: str, damage: str, filled: Path, cache: Path,
                                                    capfd: pytest.CaptureFixture[str]):
     shutil.copytree(filled, cache)
     assert answer() == RIGHT
@@ -134,13 +134,13 @@ def test_whatever_is_damaged_is_compiled_anew_once(what: str, damage: str, fille
     assert capfd.readouterr() == ("", "")
 
 
-def test_what_cannot_be_loaded_is_one_message_after_a_second_try(cache: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_kernel_that_cannot_be_loaded_is_one_message_after_a_second_try(cache: Path, monkeypatch: pytest.MonkeyPatch):
     assert answer() == RIGHT
     tried = []
     monkeypatch.setattr(type(COUNT_UP.module), "load", lambda *args, **options: tried.append(1) or _raise())
     with pytest.raises(InputError) as told:
         answer()
-    assert told.value.path == str(cache) and "kernels cannot be compiled: Failed to load CPU module; WARP" in str(told.value)
+    assert told.value.path == str(cache) and "kernels cannot be compiled: Failed to load CPU module; set WARP" in str(told.value)
     assert len(tried) == 2
 
 
@@ -154,7 +154,7 @@ def test_a_removed_cache_is_made_again(cache: Path):
     assert answer() == RIGHT
 
 
-def test_what_killed_processes_have_left_goes_after_a_day(cache: Path, monkeypatch: pytest.MonkeyPatch):
+def test_leftovers_of_killed_processes_are_removed_after_a_day(cache: Path, monkeypatch: pytest.MonkeyPatch):
     names = ("precompiled-1.19.0-Linux-x86_64-9e3c5285", "precompiled-abc", "wp_x_0123abc_p12_t345", "wp_x_p1_t2_0123abc", "lto")
     for day in ("old", "new"):
         for name in names:
@@ -214,7 +214,7 @@ def test_a_name_that_is_not_utf8_is_one_message(tmp_path: Path):
     done = run("-m", "wrt", "render", "a.obj", "--spp", "1", "--size", "8x8", cwd=tmp_path,
                env={"WARP_CACHE_PATH": os.fsdecode(bytes(tmp_path) + b"/c\xff")})
     assert (done.returncode, done.stdout, done.stderr.count("error: ")) == (2, "", 1)
-    assert done.stderr.endswith(": kernels cannot be compiled: its name is not UTF-8; WARP_CACHE_PATH names another folder\n")
+    assert done.stderr.endswith(": kernels cannot be compiled: its name is not UTF-8; set WARP_CACHE_PATH to another folder\n")
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="has no /dev/full")

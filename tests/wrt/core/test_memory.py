@@ -1,4 +1,4 @@
-"""Where the memory does not suffice, a command ends with one message, and Python gets a MemoryError."""
+"""If memory does not suffice, a command ends with one message, and Python gets a MemoryError."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ def png(path: Path, n: int) -> None:
     (png, ".png", 80_000_000, ("compare", "FILE", "FILE")),
 ], ids=["render", "build", "stl", "png"])
 def test_a_command_ends_with_one_message(write, suffix: str, n: int, command: tuple[str, ...], tmp_path: Path) -> None:
-    """Each lacks room for a large array. TOML's parts are small: Python 3.11 may lack the 32 bytes that it takes to leave a
-    function, and then it tries for ever."""
+    """Each file needs a large array. TOML files are left out, because their parts are small: Python 3.11 may lack the 32 bytes
+    that it takes to leave a function, and then it tries for ever."""
     write(tmp_path / f"small{suffix}", 20)
     write(tmp_path / f"large{suffix}", n)
     done = subprocess.run([sys.executable, "-c", LIMITED, f"small{suffix}", f"large{suffix}", *command], cwd=tmp_path,
@@ -79,7 +79,7 @@ def test_python_gets_a_memory_error(monkeypatch: pytest.MonkeyPatch, tmp_path: P
 
 
 def test_lists_of_one_length_are_counted_once(tmp_path: Path) -> None:
-    """Rows of one byte: their lengths take no eight bytes each."""
+    """The lengths of rows of one byte must not take eight bytes each."""
     import tracemalloc
 
     header = ("ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"

@@ -42,7 +42,7 @@ def test_queries_need_warp_and_numpy_alone(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_what_is_not_there_is_told_with_the_line_that_installs_it(tmp_path: Path) -> None:
+def test_a_missing_package_is_reported_with_the_line_that_installs_it(tmp_path: Path) -> None:
     (tmp_path / "box.obj").write_text(BOX_OBJ)
     code = WITHOUT + f"""
 import wrt

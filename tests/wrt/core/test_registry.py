@@ -1,4 +1,4 @@
-"""A registry imports what is asked for, and nothing else."""
+"""A registry imports the entries that are used, and no others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Seconds of stages, in every report of a render, and of building without kernels."""
+"""Seconds of the stages of a render, and of a build without its kernels."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Clock:
         return self.now
 
 
-def test_what_a_thread_loads_is_not_what_it_builds(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_seconds_of_loading_do_not_count_as_building(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock()
     monkeypatch.setattr(time, "perf_counter", clock)
 
@@ -47,11 +47,11 @@ def test_what_a_thread_loads_is_not_what_it_builds(monkeypatch: pytest.MonkeyPat
     other = threading.Thread(target=load, args=(4.0,))
     other.start()
     other.join()
-    assert seconds.build_clock() - begin == 0.5 + 4.0  # another's load is no excuse
+    assert seconds.build_clock() - begin == 0.5 + 4.0  # loads of other threads do not count
     with pytest.raises(OSError), seconds.loading():
         clock.now += 1.0
         raise OSError
-    assert seconds.build_clock() - begin == 0.5 + 4.0  # in vain, but spent
+    assert seconds.build_clock() - begin == 0.5 + 4.0  # a failed load counts, too
 
 
 @pytest.mark.parametrize("aov", [(), "depth"])
@@ -93,7 +93,7 @@ def test_a_worker_that_was_ready_already_took_no_more_than_was_waited_for_it() -
     assert film.stats["seconds"].keys() >= {"compile", "upload", "build", "trace"}
 
 
-def test_of_several_workers_the_one_that_took_longest_is_told() -> None:
+def test_the_worker_that_took_longest_is_reported() -> None:
     replies = [("a", "cpu", {"seconds": {"compile": 1.0, "build": 0.5}}), ("b", "cpu", {"seconds": {"compile": 6.0, "build": 2.0}})]
     assert _waited_for(replies, 9.0) == {"compile": 6.0, "build": 2.0}
     assert _waited_for(replies, 1.0) == {"compile": 1.0, "build": 1.0}

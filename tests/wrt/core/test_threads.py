@@ -86,7 +86,7 @@ def test_run_all_has_threads_of_its_own_after_a_fork() -> None:
 
 
 def test_threads_are_kept() -> None:
-    """On a busy machine a helper may not be idle again when the next call begins, which then starts another."""
+    """On a busy machine, the next call may begin before a helper is idle again; it then starts another thread."""
     both = threading.Barrier(2)
     seen: set[threading.Thread] = set()
 
@@ -100,8 +100,8 @@ def test_threads_are_kept() -> None:
 
 
 @pytest.mark.parametrize("start", [True, False])
-def test_without_the_main_thread_all_is_run(start: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The standard pool takes nothing then, and Python 3.12 starts no threads in atexit."""
+def test_tasks_run_without_the_main_thread(start: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The standard pool takes no tasks then, and Python 3.12 starts no threads in atexit."""
     ended = threading.Thread()
     ended.start()
     ended.join()

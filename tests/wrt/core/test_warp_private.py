@@ -1,5 +1,5 @@
-"""What wrt knows of Warp's insides: another Warp is refused, the changes of its compiler hold for wrt's modules alone and change no
-kernel, and headers are precompiled once."""
+"""Private parts of Warp: another Warp is refused; the changes of its compiler act on wrt's modules alone and change no kernel; headers
+are precompiled once."""
 
 import os
 import shutil
@@ -56,8 +56,8 @@ def test_the_versions_that_work_are_those_that_pip_installs() -> None:
 @pytest.mark.parametrize(("owner", "name", "change"), [
     *((*replaced, change) for replaced in warp_private._REPLACED for change in ("gone", "other parameters")),
     ("runtime", "tape", "gone")])
-def test_a_warp_with_other_insides_is_refused(owner: str, name: str, change: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Before anything of it is replaced."""
+def test_a_warp_that_differs_is_refused(owner: str, name: str, change: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The error comes before any function is replaced."""
     parts = {"Module": SimpleNamespace(), "codegen": SimpleNamespace(), "build": SimpleNamespace(),
              "runtime": SimpleNamespace(tape=None)}
     for (each, function), parameters in warp_private._REPLACED.items():
@@ -169,7 +169,7 @@ wp.launch(count, dim=1, inputs=[n], device="cpu")
 """
 
 
-def test_kernels_of_a_user_are_those_that_warp_makes_without_wrt(tmp_path: Path):
+def test_kernels_of_a_user_are_compiled_as_without_wrt(tmp_path: Path):
     files = []
     for argument in ("with wrt", "without"):
         (tmp_path / "mine.py").write_text(MINE)
@@ -181,7 +181,7 @@ def test_kernels_of_a_user_are_those_that_warp_makes_without_wrt(tmp_path: Path)
 
 
 def test_headers_are_precompiled_once_for_all_threads_and_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Warp's compiler precompiles what it does not find in its folder."""
+    """Warp's compiler precompiles headers that it does not find in its folder."""
     cache = tmp_path / "cache"
     cache.mkdir()
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(cache))
@@ -244,7 +244,7 @@ def a_compiler(build_cpu: Callable, processor: bytes, monkeypatch: pytest.Monkey
 
 @pytest.mark.parametrize("there", ["nothing", "a file", "a damaged folder", "a link"])
 def test_headers_of_another_process_that_was_faster_are_not_moved(there: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """It uses them: Clang tells when a file is gone that it is about to read."""
+    """The other process uses them: Clang fails if a file is gone that it is about to read."""
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "cache"))
     (tmp_path / "cache").mkdir()
     given: list[Path] = []
@@ -287,8 +287,8 @@ def add_two(numbers: wp.array(dtype=float)):
     numbers[0] += 2.0
 
 
-def test_what_is_preloaded_is_loaded_at_the_end_of_the_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """A process that is forked after it has no lock that a thread of its parent holds."""
+def test_preloaded_kernels_are_loaded_at_the_end_of_the_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A process that is forked after the block has no lock that a thread of its parent holds."""
     start("cpu")
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
     numbers = zeros(1)
@@ -296,7 +296,7 @@ def test_what_is_preloaded_is_loaded_at_the_end_of_the_block(tmp_path: Path, mon
         launch(add_one, 1, numbers)
         raise KeyError
     assert list(compiled("add_two").glob("*.o"))
-    shutil.rmtree(tmp_path)  # what is loaded is not looked for
+    shutil.rmtree(tmp_path)  # loaded kernels are not loaded again
     with preloading(add_one, add_two):
         launch(add_two, 1, numbers)
     assert numbers.numpy().tolist() == [3.0] and not tmp_path.exists()

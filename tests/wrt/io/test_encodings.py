@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.gltf_files import one_triangle
-from wrt.core.errors import InputError
+from tests.refused import refused
 from wrt.io.load import load_scene
 
 PLY = """ply
@@ -43,7 +43,7 @@ def texts(folder: Path) -> dict[str, str]:
 def test_a_byte_order_mark_tells_the_encoding(suffix: str, encoding: str, tmp_path: Path) -> None:
     text, path = texts(tmp_path)[suffix], tmp_path / f"b{suffix}"
     path.write_bytes(MARKS[encoding] + text.encode(encoding))
-    with pytest.raises(InputError, match=rf"b\{suffix}: is UTF-16 or UTF-32 text; save it as UTF-8$"):
+    with refused(None, "UTF-16", path=f"b{suffix}", hint="UTF-8"):
         load_scene(path)
 
 

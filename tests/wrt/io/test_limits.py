@@ -1,4 +1,4 @@
-"""Files of a few bytes that ask for everything: each is refused, with the number and the limit."""
+"""Small files that would take all memory: each is refused, with the number that it demands and the limit."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from tests.command_line import wrt as command
 from tests.gltf_files import GltfFile, one_triangle
 from tests.refused import Refusal, refused
-from wrt.core.errors import InputError, SceneWarning
+from wrt.core.errors import SceneWarning
 from wrt.io.gltf.reader import load_gltf
 from wrt.io.load import load_scene
 from wrt.scene.materials import Texture
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::wrt.core.errors.SceneWarning")
 
 
 def instanced(count: int, times: int = 1, nodes: int = 1) -> GltfFile:
-    """A triangle at `count` places that no buffer describes."""
+    """A triangle with `count` instances, whose transforms have no buffer."""
     file = GltfFile()
     one = file.view(np.zeros(3, np.float32).tobytes())
     index = {"bufferView": file.view(b"\0\0\0\0"), "componentType": 5125}
@@ -35,12 +35,12 @@ def instanced(count: int, times: int = 1, nodes: int = 1) -> GltfFile:
     return file
 
 
-@pytest.mark.parametrize(("count", "message"), [
-    (10**9, r"accessors\[0\]\.count: must be 1 to 4194304, got 1000000000"),
-    (MAX_OBJECTS + 1, rf"{MAX_OBJECTS + 1} instances; a scene holds at most {MAX_OBJECTS}"),
+@pytest.mark.parametrize(("count", "what", "hint"), [
+    (10**9, "must be 1 to 4194304", ""),
+    (MAX_OBJECTS + 1, f"{MAX_OBJECTS + 1} instances", f"at most {MAX_OBJECTS}"),
 ])
-def test_instances_without_bytes_behind_them(count: int, message: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=message):
+def test_instances_without_bytes_behind_them(count: int, what: str, hint: str, tmp_path: Path) -> None:
+    with refused(what=what, hint=hint):
         load_gltf(instanced(count).write(tmp_path))
 
 
@@ -48,9 +48,9 @@ def test_nodes_times_instances_are_counted(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr("wrt.scene.values.MAX_OBJECTS", 100)
     assert len(load_gltf(instanced(50, 2).write(tmp_path)).objects) == 100
     for file in (instanced(50, 3), instanced(40, 1, 3)):
-        with pytest.raises(InputError, match=r"nodes\[\d\].*: 1\d\d (objects|instances); a scene holds at most 100"):
+        with refused(hint="at most 100"):
             load_gltf(file.write(tmp_path))
-    hidden = instanced(40, 1, 3)  # they show nothing, but are made all the same
+    hidden = instanced(40, 1, 3)  # instances without triangles count, too
     for node in hidden.json["nodes"]:
         node["scale"] = [0, 1, 1]
     with refused(what="120 instances", place="nodes[2].extensions.EXT_mesh_gpu_instancing.attributes"):
@@ -82,9 +82,9 @@ def test_accessors_beyond_their_buffer(change: dict[str, int], message: Refusal,
     (tube, {"points": [(0.0, 0.0, float(i)) for i in range(2000)], "segments": 4096}),
 ])
 def test_shapes_of_too_many_triangles(shape, arguments: dict) -> None:
-    with pytest.raises(InputError, match=rf": \d+ triangles; at most {MAX_FACES} are made"):
+    with refused("segments", f"at most {MAX_FACES}"):
         shape(**arguments)
-    assert 20 * 4**9 <= MAX_FACES and len(icosphere(0).faces) == 20  # its own limit is within
+    assert 20 * 4**9 <= MAX_FACES and len(icosphere(0).faces) == 20  # within the limit of this argument
 
 
 @pytest.mark.parametrize("text", [
@@ -132,8 +132,9 @@ def test_nothing_outside_of_the_folder_is_read(uri: str, tmp_path: Path, monkeyp
             file.json["materials"] = [{"emissiveTexture": {"index": 0}, "emissiveFactor": [1, 1, 1]}]
             file.json["meshes"][0]["primitives"][0]["material"] = 0
         file_path = file.write(tmp_path, "a.gltf")
-        with pytest.raises(InputError, match=rf"{array}\[0\]\.uri: .*(is an address|is an absolute path|leaves the folder)"):
+        with refused(path=file_path) as caught:
             load_gltf(file_path)
+        assert caught.value.place.endswith(f"{array}[0].uri")
 
 
 def test_warnings_do_not_grow_with_the_file(tmp_path: Path) -> None:

@@ -35,7 +35,7 @@ def load(folder: Path, text: str) -> Scene:
 
 
 def errors(folder: Path, text: str) -> list[str]:
-    """The lines of the one InputError that the text gives, without the file and the count."""
+    """Return the lines of the InputError for the text, without the file and the number of errors."""
     with pytest.raises(InputError) as caught:
         load(folder, text)
     message = str(caught.value)
@@ -225,7 +225,7 @@ def test_numbers_of_thousands_of_digits(tmp_path: Path) -> None:
 @pytest.mark.parametrize("value", [2**63, -(10**30), 10**400, int("9" * 4300)])
 @pytest.mark.parametrize("field", ["[settings]\nspp", "[settings]\nexposure", "ambient", "[[spheres]]\ncenter = [0, 0, 0]\nradius",
                                    "[[meshes]]\nmaterial = 'm'\nfile = 'b.obj'\nparts = [{material = 'm', count = 9, first"])
-def test_integers_of_any_size_are_told_in_short(field: str, value: int, tmp_path: Path) -> None:
+def test_integers_of_any_size_are_reported_in_short(field: str, value: int, tmp_path: Path) -> None:
     (tmp_path / "b.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     end = "}]" if "parts" in field else ""
     top, rest = (f"{field} = {value}\n", "") if field == "ambient" else ("", f"{field} = {value}{end}\n")
@@ -233,10 +233,10 @@ def test_integers_of_any_size_are_told_in_short(field: str, value: int, tmp_path
     path.write_text(f"{top}[materials.m]\n{rest}" if "settings" not in field else rest)
     with pytest.raises(InputError) as error:
         load_scene(path)
-    assert len(str(error.value)) < 400 and "a.toml" in str(error.value)
+    assert len(str(error.value)) < 400 and error.value.path == path
 
 
-def test_no_more_than_twenty_mistakes_are_told(tmp_path: Path) -> None:
+def test_no_more_than_twenty_mistakes_are_listed(tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         load(tmp_path, CAMERA + "[[spheres]]\n" * 10 + "".join(f"wrong_{i} = 1\n" for i in range(5)))
     head, *lines = str(caught.value).split("\n  ")
@@ -250,9 +250,9 @@ def test_instances_of_a_mesh_are_placed_before_its_transform(tmp_path: Path) -> 
     assert len({id(thing.mesh) for thing in scene.objects}) == 1
     images = [thing.transform @ [1, 0, 0, 1] for thing in scene.objects]
     np.testing.assert_allclose(images, [[0, 0, -2, 1], [0, 0, -2, 1], [0, 0, -1, 1]], atol=1e-12)
-    with refused(what="transform's matrix is singular", place="meshes[0]: instances[1]"):
+    with refused(what="matrix must be invertible", place="meshes[0]: instances[1]"):
         load(tmp_path, CAMERA + SUN + table + "instances = [{}, { matrix = [1,0,0,0, 0,1,0,0, 0,0,0,0, 0,0,0,1] }]\n")
-    with pytest.raises(InputError, match="instances"):
+    with refused(None, "got []", "meshes[0].instances"):
         load(tmp_path, CAMERA + SUN + table + "instances = []\n")
 
 
@@ -300,14 +300,14 @@ def test_an_included_file_may_be_mirrored(tmp_path: Path) -> None:
     ("[[include]]\ntransform = {}", "include[0].file: is missing"),
     ("[[include]]\nfile = 'a.glb'\nplace = 1", "include[0].place: unknown key 'place'; known are 'file', 'transform'"),
     ("[[include]]\nfile = 'a.glb'\ntransform = {scale = 0}", "include[0].transform: scale must not be zero in any axis"),
-    ("[[include]]\nfile = 'a.obj'", "include[0]: 'a.obj' is no .gltf or .glb file; a mesh file belongs into [[meshes]]"),
+    ("[[include]]\nfile = 'a.obj'", "include[0]: 'a.obj' is no .gltf or .glb file; mesh files belong into [[meshes]]"),
     ("include = 'a.glb'", "include: got 'a.glb', expected an array"),
 ], ids=str)
 def test_wrong_includes(tmp_path: Path, text: str, message: str) -> None:
     assert errors(tmp_path, text + "\n") == [message]
 
 
-def test_unread_materials_of_an_obj_file_are_told_once(tmp_path: Path) -> None:
+def test_unread_materials_of_an_obj_file_are_reported_once(tmp_path: Path) -> None:
     path = tmp_path / "two.obj"
     path.write_text("mtllib x.mtl\n" + TRIANGLES + "usemtl a\nf 1 2 3\nusemtl b\nf 1 2 4\nmtllib y.mtl\nusemtl a\nf 1 3 4\n")
     with pytest.warns(SceneWarning) as caught:
@@ -470,12 +470,12 @@ position = [0, 0, 0]
     ('[materials.m]\n[[meshes]]\nfile = "m.obj"\nmaterial = "m"\ntransform = { scale = [1, 0, 1] }',
      "meshes[0].transform", "must not be zero"),
     ('[materials.m]\n[[meshes]]\nfile = "m.obj"\nmaterial = "m"\ntransform = { axis = [1, 0, 0] }',
-     "meshes[0].transform", "belong together"),
+     "meshes[0].transform", "both axis and angle"),
     (f'[materials.m]\n[[meshes]]\nfile = "m.obj"\nmaterial = "m"\ntransform = {{ matrix = {[0] * 15 + [1]} }}',
-     "meshes[0]", "singular"),
+     "meshes[0]", "invertible"),
     ('[materials.m]\n[[boxes]]\nlow = [0, 0, 0]\nhigh = [0, 1, 1]\nmaterial = "m"', "boxes[0]", "must be above low"),
     ('[[lights]]\ntype = "spot"\nposition = [0, 0, 0]\ndirection = [0, 1, 0]\nintensity = 1\ninner = 50', "lights[0]",
-     "must not be larger than outer"),
+     "must be at most outer"),
     ('[[lights]]\ntype = "directional"\ndirection = [0, 0, 0]\nirradiance = 1', "lights[0]", "must not be zero"),
 ])
 def test_errors_name_place_and_reason(tmp_path: Path, text: str, place: str, says: str) -> None:
@@ -484,27 +484,25 @@ def test_errors_name_place_and_reason(tmp_path: Path, text: str, place: str, say
     assert line.startswith(f"{place}: ") and says in line
 
 
-@pytest.mark.parametrize(("data", "says"), [
-    (b"a = 1\nb = [1,\n c]\n", "line 3, column 2: "), (b'a = """x', "end of document: "),
-    (b"a = \n", "line 1, column "),
-    (b'a = "\xff"', "byte 5 is not UTF-8"), (b"a = " + b"[" * 5000 + b"]" * 5000, "is nested too deeply"),
-    (b"a = 1\na = 2\n", "line 2, column "),
+@pytest.mark.parametrize(("data", "place"), [
+    (b"a = 1\nb = [1,\n c]\n", "line 3, column 2"), (b'a = """x', "end of document"),
+    (b"a = \n", "line 1, column 5"),
+    (b'a = "\xff"', None), (b"a = " + b"[" * 5000 + b"]" * 5000, None),
+    (b"a = 1\na = 2\n", "line 2, column 6"),
 ])
-def test_files_that_are_not_toml(tmp_path: Path, data: bytes, says: str) -> None:
+def test_files_that_are_not_toml(tmp_path: Path, data: bytes, place: str | None) -> None:
     path = tmp_path / "scene.toml"
     path.write_bytes(data)
-    with pytest.raises(InputError) as caught:
+    with refused(place=place, path=path):
         load_scene(path)
-    assert str(caught.value).startswith(f"{path}: {says}")
 
 
 def test_paths_that_are_no_scene(tmp_path: Path) -> None:
     (tmp_path / "folder.toml").mkdir()
     (tmp_path / "a.blend").write_text("")
     for name in ("none.toml", "folder.toml", "a.blend", "none"):
-        with pytest.raises(InputError) as caught:
+        with refused(None, ".toml, .gltf, .glb, .obj, .ply, .stl", path=name):
             load_scene(tmp_path / name)
-        assert name in str(caught.value) and ".toml, .gltf, .glb, .obj, .ply, .stl" in str(caught.value)
 
 
 # --- what is added ----------------------------------------------------------------------------------------------------

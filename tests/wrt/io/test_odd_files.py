@@ -1,4 +1,4 @@
-"""Every file of the data set's folder of odd ones makes a picture, or is refused with one message."""
+"""Every file of the data set's folder odd/ gives a picture, or is refused with one message."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ REFUSED = {
     "empty.ply": "no vertices", "ply_empty_header.ply": "no vertices",
     "PEER_CASES.md": "no scene file", "MeshPrimitiveModes/buffer.bin": "no scene file",
 }
-# Triangles in the world and those that were dropped, where others agree (the sum of both, where they only count faces).
+# Numbers of triangles in the scene and of dropped triangles, if other programs agree (their sum, if those count faces).
 TRIANGLES = {
     "capsule.obj": (10000, 200), "SimpleInstancing.glb": (1500, 0), "MeshPrimitiveModes/MeshPrimitiveModes.gltf": (16, 0),
     "NegativeScaleTest.glb": (7724, 0), "mode5.gltf": (2786, 0), "nested.glb": (36, 0), "busted.STL": (3878, 0),
@@ -68,8 +68,8 @@ def test_no_triangle_is_lost_on_the_way(name: str) -> None:
 
 
 def test_the_wall_with_a_hole_keeps_its_area() -> None:
-    """Cut fan-wise, its polygons give 66 triangles, 11 of them without area; another cut may make fewer empty ones. Some
-    of its polygons are concave, so that their area is that of the vector sum over the fan, not of the fan's triangles."""
+    """The fans of its polygons have 66 triangles, 11 without area; other triangulations may have fewer without area. Some
+    polygons are concave: their area is the length of the vector sum over the fan, not the sum of the triangles' areas."""
     path = odd("wallhole.obj")
     mesh = load_mesh(path)
     assert len(mesh.faces) + mesh.dropped == 66 and mesh.dropped <= 11

@@ -72,7 +72,7 @@ def test_broken_polygons_end() -> None:
 
 
 def test_a_polygon_of_many_corners() -> None:
-    """A convex one is a fan, whatever its size; a concave one is covered once."""
+    """A convex polygon becomes a fan, whatever its size; a concave polygon is covered once."""
     angle = np.linspace(0.0, 2.0 * np.pi, 1_000_000, endpoint=False)
     circle = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
     assert len(triangulate(np.arange(len(circle)), np.array([len(circle)]), circle)[0]) == len(circle) - 2

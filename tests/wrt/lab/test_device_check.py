@@ -1,4 +1,4 @@
-"""`devices --check`, here of the CPU against itself; of virtual GPUs in tests/virtual_gpu."""
+"""`devices --check` of the CPU against itself; tests/virtual_gpu checks virtual GPUs."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ WORDS = "devices", "--check", "--device", "cpu", "--rays", "300", "-q", "--scene
 
 @pytest.fixture
 def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A small one; and little to compare."""
+    """Return the path of a small scene; reduce the meshes, rays and structures that are compared."""
     (tmp_path / "floor.toml").write_text(SCENE, encoding="utf-8")
     for name, value in {"MESHES": {"ball": device_check.MESHES["ball"]}, "TIMED_CELLS": 8, "SLOW": 400, "RUNS": 1,
                         "HARD_CASES": {name: device_check.HARD_CASES[name] for name in ("C_spheres", "I_rays_not_finite")}}.items():
@@ -53,35 +53,35 @@ def strict(text: str) -> dict[str, Any]:
     return json.loads(text, parse_constant=refuse)
 
 
-def test_a_device_that_does_as_it_should(scene: Path) -> None:
+def test_the_cpu_agrees_with_itself(scene: Path) -> None:
     result = run(*WORDS, str(scene), "--json")
     assert result.code == 0, result.err
-    told = strict(result.out)
-    assert told["differ"] == 0 and told["machine"].startswith("cpu: ")
-    compared = {(row["part"], row["what"]): row["count"] for row in told["rows"]}
+    data = strict(result.out)
+    assert data["differ"] == 0 and data["machine"].startswith("cpu: ")
+    compared = {(row["part"], row["what"]): row["count"] for row in data["rows"]}
     assert compared == {**{("functions", name): 100_000 for name in ("sin", "cos", "acos", "exp", "atan2", "power")},
                         ("hits", "bvh8"): 4 * 17**2, ("hits", "brute_force"): 4 * 17**2, ("hits", "bvh8, 1 hard cases"): 2000,
                         ("pixels", "floor"): 64 * 36}
-    assert {row["who"] for row in told["speed"]} >= {"wrt bvh8", "Warp, sah"}
-    assert all(rate > 0.0 for row in told["speed"] for rate in row["mrays"])
+    assert {row["who"] for row in data["speed"]} >= {"wrt bvh8", "Warp, sah"}
+    assert all(rate > 0.0 for row in data["speed"] for rate in row["mrays"])
 
 
-def test_one_bit_of_one_answer_is_told(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    answer, asked = device_check.answer, []
+def test_one_wrong_bit_is_reported(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    answer, kinds = device_check.answer, []
 
     def wrong(accel: Any, rays: Any, threads: Any) -> Any:
         hits = answer(accel, rays, threads)
-        asked.append(rays.kind)
-        if isinstance(hits, Hits) and len(asked) == 1:
+        kinds.append(rays.kind)
+        if isinstance(hits, Hits) and len(kinds) == 1:
             hits.v.view(np.int32)[7] ^= 1
         return hits
 
     monkeypatch.setattr(device_check, "answer", wrong)
     result = run(*WORDS, str(scene))
     assert result.code == 1
-    assert "1 answers differ from the CPU's" in result.out
+    assert "1 results differ from the CPU's" in result.out
     line = next(line for line in result.out.splitlines() if line.startswith("| hits") and " bvh8 " in line)
-    assert [cell.strip() for cell in line.split("|")][3:6] == [str(4 * 17**2), "1", f"ball, {asked[0]}"]
+    assert [cell.strip() for cell in line.split("|")][3:6] == [str(4 * 17**2), "1", f"ball, {kinds[0]}"]
 
 
 def test_bits_are_compared_and_not_numbers() -> None:
@@ -92,7 +92,7 @@ def test_bits_are_compared_and_not_numbers() -> None:
     assert different(a, b).tolist() == [True, False, True]
 
 
-def test_without_a_folder_of_scenes_there_is_one_built_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_scene_files_a_built_in_scene_is_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shipped = Check("cpu").pictures
     assert {"whitted", "lens"} <= shipped.keys()
     monkeypatch.setattr(device_check, "FOLDER", tmp_path)
@@ -108,16 +108,16 @@ def test_the_built_in_scene_has_light_and_glass() -> None:
 
 @pytest.mark.parametrize(("words", "message"), [
     (("--device", "cuda:7", "--check"), "no device 'cuda:7'; there is cpu"),
-    (("--device", "cpu"), "--device, --scene and --rays belong to --check, and --device to --tune"),
+    (("--device", "cpu"), "--device, --scene and --rays need --check; --device also works with --tune"),
     (("--check", "--device", "cpu", "--rays", "0"), "rays must be"),
     (("--check", "--device", "cpu", "--scene", "none.toml"), "none.toml"),
 ])
-def test_mistakes_are_told(words: tuple[str, ...], message: str) -> None:
+def test_wrong_options_are_refused(words: tuple[str, ...], message: str) -> None:
     result = run("devices", *words)
     assert result.code == 2 and message in result.err
 
 
-def test_devices_are_listed_as_json_too() -> None:
+def test_devices_are_listed_as_json() -> None:
     assert strict(run("devices", "--json").out)["devices"][0].startswith("cpu: ")
 
 

@@ -1,4 +1,4 @@
-"""`wrt.tune` by a clock of the tests' own: the caller gets the best choice, and can pass it on."""
+"""`wrt.tune` with a simulated clock: it returns the fastest choice as arguments for other functions."""
 
 from __future__ import annotations
 
@@ -23,30 +23,30 @@ from wrt.scene.cameras import Camera
 from wrt.scene.materials import Material
 from wrt.scene.model import Object, Scene
 
-Costs = dict[Choice, float]  # seconds of a query; 1 where nothing is said
+Costs = dict[Choice, float]  # simulated seconds of a query; 1 for a missing choice
 
 
 @pytest.fixture
 def measured_by(monkeypatch: pytest.MonkeyPatch) -> Callable[[Costs], tuning.Tuning]:
-    """Measures the device by a clock that says so, over little and between few."""
+    """Return a function that tunes with simulated times, on a small mesh and two structures."""
     for name, value in {"CELLS": 4, "KINDS": ("diffuse",), "FAST": 64, "SLOW": 64, "STRUCTURES": ("bvh8", "bvh2")}.items():
         monkeypatch.setattr(tuning, name, value)
     monkeypatch.setattr(cuda, "BLOCK_DIMS", (64, 32))
 
     def by(costs: Costs) -> tuning.Tuning:
-        ask, now = tuning.ask, [0.0]
+        search_with, now = tuning.search_with, [0.0]
 
-        def slow(choice: Choice, search: Any, there: Any) -> None:
-            ask(choice, search, there)
+        def slow(choice: Choice, search: Any, target: Any) -> None:
+            search_with(choice, search, target)
             now[0] += costs.get(choice, 1.0)
 
-        monkeypatch.setattr(tuning, "ask", slow)
+        monkeypatch.setattr(tuning, "search_with", slow)
         return measured(device.NAME, clock=lambda: now[0])
 
     return by
 
 
-def test_the_fastest_can_be_passed_on(measured_by: Callable[[Costs], tuning.Tuning]) -> None:
+def test_the_fastest_choice_is_returned_as_arguments(measured_by: Callable[[Costs], tuning.Tuning]) -> None:
     there, before = start(device.NAME), (cuda.block_dim, cuda.stack)
     found = measured_by({Choice("bvh2"): 0.5, Choice("bvh2", 32): 0.4, Choice("bvh2", 32, "local"): 0.25})
     best = Choice("bvh2", 32, "local") if there.is_cuda else Choice("bvh2")
@@ -60,36 +60,36 @@ def test_the_fastest_can_be_passed_on(measured_by: Callable[[Costs], tuning.Tuni
     assert f'accel="bvh2", device="{device.NAME}"; for commands --accel bvh2 --device {device.NAME}.' in found.text()
 
 
-def test_what_is_not_clearly_faster_is_not_taken(measured_by: Callable[[Costs], tuning.Tuning]) -> None:
+def test_the_default_stays_unless_another_choice_is_clearly_faster(measured_by: Callable[[Costs], tuning.Tuning]) -> None:
     assert measured_by({Choice("bvh2"): 0.98, Choice("bvh2", 32): 0.98, Choice("bvh8", 32): 0.98}).best == DEFAULT
 
 
-def test_the_defaults_are_those_of_launches() -> None:
+def test_the_default_choice_has_the_default_settings_of_launches() -> None:
     assert DEFAULT == ("bvh8", cuda.block_dim, cuda.stack) and set(cuda.STACKS) == set(PLACES)
     assert wrt.ACCELERATORS["bvh"] is wrt.ACCELERATORS["bvh8"] and set(tuning.STRUCTURES) <= wrt.ACCELERATORS.keys()
 
 
-def test_the_command_and_the_function_say_the_same(measured_by: Callable[[Costs], tuning.Tuning]) -> None:
+def test_the_command_and_the_function_return_the_same_arguments(measured_by: Callable[[Costs], tuning.Tuning]) -> None:
     result = run("devices", "--tune", "--device", device.NAME, "--json")
     assert result.code == 0, result.err
-    told = json.loads(result.out)
-    assert told["arguments"]["device"] == device.NAME and told["best"]["accel"] == told["arguments"]["accel"]
-    assert {row["accel"] for row in told["rows"]} == {"bvh8", "bvh2"} and all(min(row["mrays"]) > 0.0 for row in told["rows"])
-    assert told["machine"].startswith(f"{device.NAME}: ")
+    data = json.loads(result.out)
+    assert data["arguments"]["device"] == device.NAME and data["best"]["accel"] == data["arguments"]["accel"]
+    assert {row["accel"] for row in data["rows"]} == {"bvh8", "bvh2"} and all(min(row["mrays"]) > 0.0 for row in data["rows"])
+    assert data["machine"].startswith(f"{device.NAME}: ")
     text = run("devices", "--tune", "--device", device.NAME)
     assert text.code == 0 and "Fastest: bvh" in text.out
-    assert tune(device.NAME).keys() == told["arguments"].keys()
+    assert tune(device.NAME).keys() == data["arguments"].keys()
 
 
 @pytest.mark.parametrize(("words", "message"), [
-    (("--tune", "--check"), "give one"), (("--tune", "--rays", "9"), "--device, --scene and --rays belong to --check"),
+    (("--tune", "--check"), "give one"), (("--tune", "--rays", "9"), "--device, --scene and --rays need --check"),
     (("--tune", "--device", "cuda:7"), "no device 'cuda:7'")])
-def test_mistakes_of_the_command(words: tuple[str, ...], message: str) -> None:
+def test_wrong_options_are_refused(words: tuple[str, ...], message: str) -> None:
     result = run("devices", *words)
     assert result.code == 2 and message in result.err
 
 
-def test_no_time_to_measure_is_refused() -> None:
+def test_zero_seconds_are_refused() -> None:
     with refused("seconds", "more than 0"):
         tune(device.NAME, seconds=0.0)
 

@@ -95,7 +95,7 @@ def test_wrong_names_write_nothing(film: Film, tmp_path: Path) -> None:
 
 def test_one_name_stands_for_a_list_of_it(film: Film, tmp_path: Path) -> None:
     assert film.save(tmp_path / "a.png", aov="depth") == [tmp_path / "a.png", tmp_path / "a.depth.png"]
-    with refused("aov", "name or several"):
+    with refused("aov", "one or more names"):
         film.save(tmp_path / "b.png", aov=5)  # type: ignore[arg-type]
     assert not (tmp_path / "b.png").exists()
 

@@ -110,7 +110,7 @@ def test_exr_is_exact_and_mitsuba_agrees(pixels: np.ndarray, tmp_path: Path) -> 
 
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs a file system that takes any name")
 @pytest.mark.parametrize("suffix", [".exr", ".hdr"])
-def test_a_name_that_openimageio_cannot_open_is_told(suffix: str, pixels: np.ndarray, tmp_path: Path) -> None:
+def test_a_name_that_openimageio_cannot_open_is_reported(suffix: str, pixels: np.ndarray, tmp_path: Path) -> None:
     path = tmp_path / os.fsdecode(b"b\xff" + suffix.encode())
     write_image(path, pixels)
     with refused(what="needs a path"):
@@ -201,7 +201,7 @@ def test_a_full_disk_leaves_the_old_file_and_nothing_else(suffix: str, tmp_path:
     path = tmp_path / f"a{suffix}"
     path.write_bytes(b"old")
     noise = np.random.default_rng(0).random((H, 4 * W, 3)).astype(np.float32)
-    with largest_file(10_000), pytest.raises(InputError, match=rf"a{suffix}: cannot be written: ") as caught:
+    with largest_file(10_000), refused(None, "cannot be written", path=path) as caught:
         write_image(path, noise)
     assert not re.search("[0-9a-f]{32}", str(caught.value))  # the temporary name is nobody's business
     assert path.read_bytes() == b"old"
@@ -273,7 +273,7 @@ def test_a_folder_that_cannot_be_written_to_is_refused(tmp_path: Path, monkeypat
         raise PermissionError(errno.EACCES, "Permission denied")
 
     monkeypatch.setattr("builtins.open", refuse)  # permissions do not bind the superuser, as which tests may run
-    with pytest.raises(InputError, match=r"a\.png: cannot be written: Permission denied"):
+    with refused(None, "Permission denied", path="a.png"):
         check_writable(tmp_path / "a.png")
 
 
@@ -355,7 +355,7 @@ def test_truncated_files_are_refused(
         write_image(path, pixels, bits=16 if kind == "a16.png" else None)
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * share)])
-    with pytest.raises(InputError, match=rf"{kind}: cannot be read as an image: \S") as caught:
+    with refused(None, "cannot be read as an image", path=path) as caught:
         read_image(path)
     assert "\n" not in str(caught.value)
     assert capfd.readouterr().err == ""  # no library talks beside the one message
@@ -363,20 +363,20 @@ def test_truncated_files_are_refused(
 
 @pytest.mark.parametrize("name", ["a.png", "a.exr", "a.hdr", "a.jpg"])
 def test_what_is_no_picture_is_refused(name: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=rf"{name}: cannot be read: No such file"):
+    with refused(None, "No such file", path=name):
         read_image(tmp_path / name)
     (tmp_path / name).write_text("hello " * 50)
-    with pytest.raises(InputError, match=f"{name}: cannot be read as an image"):
+    with refused(None, "as an image", path=name):
         read_image(tmp_path / name)
     (tmp_path / name).unlink()
     (tmp_path / name).mkdir()
-    with pytest.raises(InputError, match=f"{name}: cannot be read"):
+    with refused(path=name):
         read_image(tmp_path / name)
 
 
 def test_unknown_suffixes_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text("hello")
-    with refused(what="not an image format", path="a.txt"):
+    with refused(what="is no image file", path="a.txt"):
         read_image(tmp_path / "a.txt")
 
 

@@ -34,7 +34,7 @@ def test_each_group_has_its_material(scene: Scene, film: Film) -> None:
     names = [scene.materials[i].name for i in film.aov["material_id"][24, [2, 24, 45]]]
     assert names == ["red", "white", "green"]
     lamp = film.aov["material_id"] == [m.name for m in scene.materials].index("lamp")
-    assert lamp.any() and 8.5 < film.pixels[lamp][:, 0].max() <= 17.0 * (1.0 + 1e-5)  # seen flat, it fills no pixel
+    assert lamp.any() and 8.5 < film.pixels[lamp][:, 0].max() <= 17.0 * (1.0 + 1e-5)  # seen at a grazing angle, the lamp fills no pixel
 
 
 def test_light_agrees_with_mitsuba(scene: Scene, film: Film) -> None:
@@ -42,7 +42,7 @@ def test_light_agrees_with_mitsuba(scene: Scene, film: Film) -> None:
     from tests.mitsuba_oracle import render_mitsuba
 
     theirs = render_mitsuba(scene, size=SIZE, spp=256, integrator="direct")
-    lit = np.maximum(film.pixels, theirs.pixels).max(axis=-1) < 1.0  # the lamp's own pixels are mostly noise of its edges
+    lit = np.maximum(film.pixels, theirs.pixels).max(axis=-1) < 1.0  # without the lamp's pixels, which are mostly noise of its edges
     assert lit.mean() > 0.97
     np.testing.assert_allclose(film.pixels[lit].mean(0), theirs.pixels[lit].mean(0), rtol=5e-3)
     variance = theirs.variance + film.variance

@@ -1,4 +1,4 @@
-"""Which switches a scene turns on, and the tables that go with them."""
+"""Features that a scene turns on, and the tables of pixel filters."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ def scene_of(*materials: Material, mesh: Any = None, spheres: tuple[Material, ..
 
 
 def on(scene: Scene, camera: Camera | None = None) -> set[str]:
-    """But for "diffuse", which nearly every scene here has."""
+    """Return the features that a scene turns on, without "diffuse", which nearly every scene here has."""
     on_off = switches(features_of(scene, camera or Camera()))
     return {name for name, value in on_off.items() if value and name != "diffuse"}
 
 
 def test_a_black_opaque_scene_needs_nothing() -> None:
     assert on(scene_of(BLACK)) == set() and on(scene_of()) == set()
-    assert on(scene_of(BLACK, lights=(POINT,), background=SKY)) == set()  # nothing that light could show on
+    assert on(scene_of(BLACK, lights=(POINT,), background=SKY)) == set()  # a black surface reflects no light
     assert features_of(scene_of(BLACK), Camera()) == Features(materials=("diffuse",))
     assert features_of(scene_of(), Camera()) == Features()
 
@@ -84,7 +84,7 @@ def test_a_black_opaque_scene_needs_nothing() -> None:
     (scene_of(Material(albedo_texture=Checkerboard())), {"checkerboards"}),
     (scene_of(Material("metallic_roughness", albedo=(0, 0, 0), metallic_roughness_texture=PICTURE)),
      {"metallic_roughness", "reflection", "textures", "parameter_textures"}),
-    (scene_of(Material(metallic_roughness_texture=PICTURE)), {"textures"}),  # which its kind does not use
+    (scene_of(Material(metallic_roughness_texture=PICTURE)), {"textures"}),  # its kind of material does not use this texture
     (scene_of(Material(normal_texture=PICTURE)), {"textures", "normal_maps"}),
     (scene_of(BLACK, settings=Settings(filter="gaussian")), {"filter"}),
     (scene_of(BLACK, settings=Settings(filter="box", sampler="independent")), {"independent"}),
@@ -119,8 +119,8 @@ KINDS = [GREY, Material("mirror"), Material("glass"), Material(alpha_mode="blend
 def test_pending_rays_always_fit_on_the_stack(chosen: set[int], max_depth: int) -> None:
     features = features_of(scene_of(*(KINDS[i] for i in chosen), settings=Settings(max_depth=max_depth)), Camera())
     children = features.reflection + features.refraction + features.blend
-    # The integrator's loop where every ray has all its children: the last one pushed is popped first, and goes deepest. What
-    # goes straight on is pushed first and takes no depth (a few in a row here).
+    # The integrator's loop if every ray has all its children: the last child pushed is popped first, and goes deepest. The ray that
+    # goes straight on is pushed first and does not increase the depth (a few in a row here).
     stack, most = [(0, 0)], 1
     visited = 0
     while stack and visited < 3000:
@@ -142,7 +142,7 @@ def test_filters_by_their_inverse_distribution(name: str) -> None:
         return
     assert (np.diff(table) > 0.0).all() and np.allclose(table, -table[::-1], atol=1e-6)
     assert table[0] == -1.5 and table[-1] == 1.5
-    # Samples drawn through the table have the filter's own variance, integrated independently.
+    # Samples drawn with the table have the filter's variance, which the test integrates independently.
     x = np.linspace(-1.5, 1.5, 200_001)
     if name == "gaussian":
         density = np.exp(-(x**2) / (2.0 * 0.5**2)) - np.exp(-(1.5**2) / (2.0 * 0.5**2))
@@ -171,7 +171,7 @@ def test_describe_counts_and_names() -> None:
 
 
 def test_emission_by_texture_or_alpha_is_seen_but_does_not_light() -> None:
-    # A lamp whose picture is black lit the floor at full strength: what is sampled must be what is seen.
+    # Light sampling must not use more emission than the camera sees: here the texture of the lamp is black.
     black = Texture(np.zeros((1, 1, 4), np.uint8))
     lamp = Material(emission=(3, 3, 3))
     assert lamp.lights_others

@@ -1,4 +1,4 @@
-"""Rays of a camera as arrays: they see what the picture's own rays see."""
+"""camera_rays: they hit the same surfaces as the rays of a render."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from wrt.scene.cameras import CAMERAS, CameraKind
 from wrt.scene.shapes import box
 
 
-def test_they_hit_what_the_picture_shows() -> None:
+def test_camera_rays_hit_what_the_picture_shows() -> None:
     mesh = box()
-    camera = wrt.Camera.look_at((1.5, 2.0, 2.5), (0.1, 0.0, 0.0), aperture_radius=0.2)  # a lens: its middle
+    camera = wrt.Camera.look_at((1.5, 2.0, 2.5), (0.1, 0.0, 0.0), aperture_radius=0.2)  # a lens; the rays go through its centre
     scene = wrt.Scene(objects=(wrt.Object(mesh, (wrt.Material(),)),), cameras=(camera,))
     film = wrt.render(scene, size=(48, 27), spp=1, aov=("depth", "prim_id"))
     origins, directions = wrt.camera_rays(camera, "48x27")
@@ -44,7 +44,7 @@ def test_pictures_and_aovs_of_a_sphere_are_those_of_the_rays(kind: type[CameraKi
     assert np.array_equal(film.aov["prim_id"] >= 0, film.aov["material_id"] >= 0)
     np.testing.assert_allclose(film.aov["depth"][hit & sure], (along - np.sqrt(np.abs(across)))[hit & sure], rtol=1e-5)
     assert np.isinf(film.aov["depth"][~hit & sure]).all()
-    # A pixel shows what its centre sees, where its neighbours see the same. The sky is linear in the direction's y.
+    # A pixel's value is that of its centre if all neighbours hit the same surface. The sky is linear in the direction's y.
     value = np.where(hit, 1.0, np.where(lit, 0.2 * 0.5 * (1.0 + directions[..., 1]), 0.0))
     padded = np.pad(np.where(lit, value, -1.0), 1, constant_values=-1.0)
     near = np.stack([padded[i : i + 30, j : j + 48] for i in range(3) for j in range(3)])
@@ -61,7 +61,7 @@ def test_the_corners_are_where_the_angle_of_view_ends() -> None:
     np.testing.assert_allclose(directions, expected, atol=1e-7)
 
 
-@pytest.mark.parametrize(("camera", "size", "told"), [(None, (4, 4), ("camera", "amera")), (SCENE.cameras[0], (0, 4), ("size",))])
-def test_mistakes_are_named(camera: wrt.Camera, size: tuple[int, int], told: Refusal) -> None:
-    with refused(*told):
+@pytest.mark.parametrize(("camera", "size", "reported"), [(None, (4, 4), ("camera", "amera")), (SCENE.cameras[0], (0, 4), ("size",))])
+def test_mistakes_are_named(camera: wrt.Camera, size: tuple[int, int], reported: Refusal) -> None:
+    with refused(*reported):
         wrt.camera_rays(camera, size)

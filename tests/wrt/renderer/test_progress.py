@@ -1,4 +1,4 @@
-"""What a render tells of itself while it runs."""
+"""Progress of a render on stderr."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_the_time_left_of_work_of_known_size(monkeypatch: pytest.MonkeyPatch) ->
     assert str(left) == ""
     now, left.done = 130.0, 2.0
     assert str(left) == ", about 1:30 left"
-    left.done = 9.0  # more than was thought
+    left.done = 9.0  # more than the expected total
     assert str(left) == ", about 0:00 left"
 
 
@@ -47,28 +47,28 @@ def test_quiet_is_silent() -> None:
         assert report is None
 
 
-def test_without_a_terminal_there_is_a_line_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_terminal_there_is_a_line_every_ten_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
     stderr = io.StringIO()
     monkeypatch.setattr(sys, "stderr", stderr)
     with progress_reporter(False) as report:
         assert report is not None
-        told = []
+        reported = []
         for second in range(35):
             report(at(float(second)))
-            told.append(stderr.getvalue().count("\n"))
-    assert told == [int(second // LINE_EVERY) for second in range(35)]
+            reported.append(stderr.getvalue().count("\n"))
+    assert reported == [int(second // LINE_EVERY) for second in range(35)]
     assert set(stderr.getvalue().splitlines()[0]) & set("\x1b\r") == set()
     assert stderr.getvalue().startswith("25 %, 4.0 Mray/s, 0:30 left\n")
 
 
-def test_a_process_without_stderr_is_told_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """`print` takes stdout, where data goes, for a stderr that is closed."""
+def test_a_process_without_stderr_prints_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """If stderr is closed, `print` would write to stdout, which is for data."""
     monkeypatch.setattr(sys, "stderr", None)
     with progress_reporter(False) as report:
         assert report is None
 
 
-def test_compiling_is_told_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compiling_is_reported_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
     stderr = io.StringIO()
     monkeypatch.setattr(sys, "stderr", stderr)
     with progress_reporter(False) as report:
@@ -77,7 +77,7 @@ def test_compiling_is_told_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
     assert stderr.getvalue() == f"{COMPILING}\n"
 
 
-def test_building_is_told_in_lines_with_a_clock_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_building_is_reported_every_ten_seconds_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     stderr = io.StringIO()
     monkeypatch.setattr(sys, "stderr", stderr)
     with progress_reporter(False) as report:
@@ -89,7 +89,7 @@ def test_building_is_told_in_lines_with_a_clock_of_its_own(monkeypatch: pytest.M
     assert stderr.getvalue().splitlines() == [f"20 %, {BUILDING}", "25 %, 4.0 Mray/s, 0:30 left"]
 
 
-def test_a_terminal_that_is_gone_is_no_reason_to_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_closed_terminal_does_not_end_a_render(monkeypatch: pytest.MonkeyPatch) -> None:
     def gone(text: str) -> int:
         raise OSError("Input/output error")
 
@@ -111,7 +111,7 @@ def test_on_a_terminal_there_is_a_bar_that_goes_away(monkeypatch: pytest.MonkeyP
         try:
             while data := os.read(main, 65536):
                 seen.append(data)
-        except OSError:  # how Linux tells that the other side is closed
+        except OSError:  # Linux raises OSError when the other side is closed
             pass
 
     reader = threading.Thread(target=read)
@@ -121,7 +121,7 @@ def test_on_a_terminal_there_is_a_bar_that_goes_away(monkeypatch: pytest.MonkeyP
         with progress_reporter(False) as report:
             assert report is not None
             report(Progress(0, 200, 0, 0.0, stage="compile"))
-            time.sleep(0.3)  # it draws itself ten times a second
+            time.sleep(0.3)  # the bar is drawn ten times per second
             report(at(10.0))
     reader.join()
     os.close(main)

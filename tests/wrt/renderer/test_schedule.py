@@ -1,4 +1,4 @@
-"""What is traced when."""
+"""LocalTracer: order of tiles, pauses between tiles, errors, and early ends."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from wrt.renderer.schedule import LocalTracer
 
 
 class Jobs:
-    """Stands for what a scene was prepared to: `trace` counts what runs."""
+    """Stand-in for a Prepared scene: `trace` counts the running tiles."""
 
     def __init__(self, threads: int, fails_at: int | None = None) -> None:
         self.fails_at, self.lock = fails_at, threading.Lock()
@@ -37,7 +37,7 @@ class Jobs:
 
 @pytest.mark.parametrize("threads", [1, 3])
 @pytest.mark.parametrize("every", [1, 2, 1000])
-def test_tiles_rest_where_that_is_due_and_each_is_traced_once(threads: int, every: int) -> None:
+def test_tiles_pause_when_due_and_each_is_traced_once(threads: int, every: int) -> None:
     jobs, asked, steps = Jobs(threads), [0], list[tuple[int, bool]]()
 
     def due() -> bool:
@@ -62,7 +62,7 @@ def test_a_tile_that_fails_ends_the_others() -> None:
     assert jobs.running == 0 and len(jobs.done) < 1000
 
 
-def test_who_does_not_go_on_waits_for_the_tiles_that_run() -> None:
+def test_closing_early_waits_for_the_running_tiles() -> None:
     jobs = Jobs(2)
     work: Any = list(range(10_000))
     steps = LocalTracer(jobs.prepared).trace(None, work, lambda: False)  # type: ignore[arg-type]

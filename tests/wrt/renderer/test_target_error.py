@@ -1,4 +1,4 @@
-"""`render(target_error=...)`: it stops where it should, and what it says of its error is true."""
+"""`render(target_error=...)`: the render stops at the right number of samples, and its estimate of the error is correct."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ SCENE = Scene(objects=(FLOOR, LAMP), spheres=BALLS, cameras=(Camera.look_at((0.0
 
 
 def rmse(a: np.ndarray, b: np.ndarray, known: float = 0.0) -> float:
-    """Root mean square difference; `known`: mean variance of b, taken out."""
+    """Return the root mean square difference of a and b. known: mean variance of b, which is subtracted."""
     return math.sqrt(max(float(np.mean((a.astype(np.float64) - b) ** 2)) - known, 0.0))
 
 
 def reference(renderer: Renderer, spp: int, seeds: int = 8) -> tuple[np.ndarray, float]:
-    """The mean of independent renders, in float64, and the mean of its variance."""
+    """Return the mean of independent renders, in float64, and the mean of its variance."""
     pictures = np.stack([renderer.run(seed=10_000 + seed, spp=spp).pixels for seed in range(seeds)]).astype(np.float64)
     return pictures.mean(axis=0), float(pictures.var(axis=0, ddof=1).mean()) / seeds
 
@@ -47,7 +47,7 @@ def reference(renderer: Renderer, spp: int, seeds: int = 8) -> tuple[np.ndarray,
 
 
 @pytest.mark.parametrize("target", [0.05, 0.01, 0.003])
-def test_it_stops_at_the_first_power_of_two_that_is_good_enough(target: float) -> None:
+def test_the_render_stops_at_the_first_power_of_two_below_the_target(target: float) -> None:
     film = render(SCENE, target_error=target)
     taken = film.metadata["spp"]
     assert (film.samples == taken).all() and taken % GROUPS == 0 and math.log2(taken // GROUPS).is_integer()
@@ -91,7 +91,7 @@ def test_same_pixels_for_any_tiles_threads_and_passes(how: dict[str, Any]) -> No
 
 
 def test_a_crop_counts_its_own_error_only() -> None:
-    dark = render(SCENE, target_error=1e-9, spp=16, crop=(0, 0, 3, 2))  # nothing but black above the floor
+    dark = render(SCENE, target_error=1e-9, spp=16, crop=(0, 0, 3, 2))  # only black background above the floor
     assert dark.stats["estimated_error"] == 0.0 and dark.stats["target_reached"]
     whole, crop = (render(SCENE, target_error=1e-9, spp=16, crop=crop) for crop in (None, (4, 6, 20, 14)))
     assert np.array_equal(crop.pixels, whole.pixels[6:14, 4:20])
@@ -104,12 +104,12 @@ def test_a_black_picture_has_no_error_at_all() -> None:
     assert film.metadata["spp"] == GROUPS and film.stats["estimated_error"] == 0.0
 
 
-def test_what_is_not_known_is_not_called_small(tmp_path: Any) -> None:
+def test_the_error_is_infinite_until_every_pixel_has_samples(tmp_path: Any) -> None:
     def at_once(progress: Any) -> None:
         if progress.stage == "trace":
             raise KeyboardInterrupt
 
-    film = render(SCENE, target_error=0.5, progress=at_once, size=(1920, 1080), threads=1, device="cpu")  # by tiles, for seconds
+    film = render(SCENE, target_error=0.5, progress=at_once, size=(1920, 1080), threads=1, device="cpu")  # long enough to be interrupted
     none = film.samples == 0
     assert none.any() and np.isposinf(film.variance[none]).all() and np.isfinite(film.variance[~none]).all()
     assert film.stats["estimated_error"] == math.inf and not film.stats["target_reached"]
@@ -120,7 +120,7 @@ def test_what_is_not_known_is_not_called_small(tmp_path: Any) -> None:
     assert (aov_to_srgb8("variance", one.variance) == 255).all()
 
 
-def test_time_limit_and_interrupt_end_it_as_well() -> None:
+def test_time_limit_and_interrupt_end_a_render_with_a_target() -> None:
     film = render(SCENE, target_error=1e-9, time_limit=0.2)
     assert film.stats["timed_out"] and not film.stats["target_reached"] and film.metadata["spp"] >= GROUPS
 
@@ -153,7 +153,7 @@ def test_the_command_line(tmp_path: Any) -> None:
 
 
 def compared(scene: Scene, spp: int, seeds: int, truth: np.ndarray, known: float) -> tuple[float, float]:
-    """Estimated and true root mean square error, each over `seeds` renders with a fixed number of samples."""
+    """Return the estimated and the true root mean square error, each over `seeds` renders with a fixed number of samples."""
     films = [renderer_of(scene, 1e-12).run(seed=seed, spp=spp) for seed in range(seeds)]
     estimated = math.sqrt(np.mean([film.stats["estimated_error"] ** 2 for film in films]))
     return estimated, math.sqrt(np.mean([rmse(film.pixels, truth, known) ** 2 for film in films]))
@@ -186,7 +186,7 @@ def test_the_estimate_is_the_true_error(name: str) -> None:
     for spp in (16, 128):
         estimated, true = compared(scene, spp, 8, truth, known)
         assert estimated == pytest.approx(true, rel=0.2), spp
-        assert known < 0.1 * true**2  # the reference is good enough to tell
+        assert known < 0.1 * true**2  # the reference is precise enough
 
 
 FIVE_SCENES = ["whitted", "cornell_box", "lens", "frosted", "environment"]
@@ -204,8 +204,8 @@ def test_the_estimate_is_the_true_error_in_five_scenes(name: str) -> None:
         assert estimated == pytest.approx(true, rel=0.2), spp
 
 
-def test_stopping_does_not_flatter() -> None:
-    # A render that stops by its own estimate could stop where the estimate is too low by chance: over many seeds, it does not.
+def test_stopping_by_the_estimate_does_not_bias_the_error() -> None:
+    # A render could stop when its estimate is too low by chance. Over many seeds, this does not bias the error.
     target, truth = 0.01, truth_of_scene()
     films = [renderer_of(sampled("sobol"), target).run(seed=seed, spp=MAX_SPP) for seed in range(24)]
     true = math.sqrt(np.mean([rmse(film.pixels, *truth) ** 2 for film in films]))
@@ -214,8 +214,8 @@ def test_stopping_does_not_flatter() -> None:
     assert true < target and estimated == pytest.approx(true, rel=0.2)
 
 
-def test_the_spread_of_one_sequences_samples_is_no_honest_estimate() -> None:
-    # What this is for: evenly spread samples are far better than their variance lets on; random numbers are not.
+def test_the_variance_of_one_sequence_overestimates_the_error() -> None:
+    # Evenly spread samples have a much smaller error than their variance suggests; random samples do not.
     ratio = {}
     for sampler in ("sobol", "independent"):
         one = renderer_of(sampled(sampler), None)
@@ -227,6 +227,6 @@ def test_the_spread_of_one_sequences_samples_is_no_honest_estimate() -> None:
     assert ratio["independent"] == pytest.approx(1.0, rel=0.2)
 
 
-def test_it_is_honest_for_independent_samples_too() -> None:
+def test_the_estimate_is_the_true_error_for_independent_samples() -> None:
     estimated, true = compared(sampled("independent"), 64, 8, *truth_of_scene())
     assert estimated == pytest.approx(true, rel=0.2)

@@ -1,4 +1,4 @@
-"""Dividing a picture: every pixel once, and what is left of it after any interruption."""
+"""Tiles cover every pixel once, and work_left has the missing samples after any interruption."""
 
 from __future__ import annotations
 
@@ -28,6 +28,6 @@ def test_work_left_brings_every_pixel_to_the_goal_in_its_own_order(old: int, new
     expected = np.maximum(samples, 2 + n)
     for (x, y, w, h), first, count in work_left([Work(tile, 2, n) for tile in tiles(crop, new)], samples, crop):
         part = samples[y - 5 : y - 5 + h, x - 3 : x - 3 + w]
-        assert (part == first).all() and count > 0  # the next sample of each pixel is the one that it lacks
+        assert (part == first).all() and count > 0  # each pixel continues with its first missing sample
         part += count
     assert np.array_equal(samples, expected)

@@ -1,4 +1,4 @@
-"""Files of shapes that cannot say how they are lit: their pictures with no option, and the warnings that name what was added."""
+"""Files that cannot describe lights: their pictures without options, and the warnings that name the added lights."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from wrt.scene.shapes import box
 
 
 def gltf_box(folder: Path, low: float, high: float, emission: float = 0.0, strength: float = 1.0, **camera: Any) -> Path:
-    """A white box and a small one that emits; a camera that looks along -z, where fields of its node are given."""
+    """Write a glTF file: a white box, a small emissive box, and if `camera` has fields of its node, a camera along -z."""
     file = GltfFile()
     for (lowest, highest), glow in (((low, high), 0.0), ((-3.2, -3.0), emission)):
         mesh = box((lowest,) * 3, (highest,) * 3)
@@ -32,7 +32,7 @@ def rendered(path: Path) -> tuple[np.ndarray, list[str]]:
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always", wrt.SceneWarning)
         pixels = wrt.render(path, size="32x24", spp=4).pixels
-    assert {each.filename for each in told} == {__file__}  # the caller's line, not one of wrt's
+    assert {each.filename for each in told} == {__file__}  # the warning names the caller's file, not a file of wrt
     return pixels, [str(each.message) for each in told]
 
 
@@ -46,7 +46,7 @@ def test_weak_emission_does_not_switch_off_the_light_that_is_added(tmp_path: Pat
 def test_a_lamp_that_lights_the_scene_is_its_only_light_and_that_is_told(tmp_path: Path) -> None:
     pixels, told = rendered(gltf_box(tmp_path, -4, 4, emission=1.0, strength=2000.0, translation=[0, 0, 0]))
     assert 0.0 < np.median(pixels) and len(told) == 1
-    assert told[0].endswith("it has no lights but the emission of 'lamp': what that does not reach is black")
+    assert told[0].endswith("it has no lights but the emission of 'lamp': surfaces that it does not reach are black")
 
 
 def test_a_camera_in_a_closed_box_sees_nothing_and_that_is_told(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""From a scene to the device's tables: nothing is lost, turned inside out or counted twice on the way."""
+"""Upload of a scene to the device's tables: no value is lost, no surface turned inside out, no light counted twice."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def transform(matrix: list[list[float]], move: tuple[float, float, float] = (0.0
 
 
 def outward_share(mesh: Mesh) -> np.ndarray:
-    """For each face of a mesh around its center: the cosine between its counter-clockwise normal and the way out."""
+    """Return, for each face, the cosine between its counter-clockwise normal and the direction from the mesh's centre."""
     corner = mesh.vertices[mesh.faces].astype(np.float64)
     normal = unit(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]))
     return (normal * unit(corner.mean(axis=1) - mesh.vertices.mean(axis=0))).sum(axis=1)
@@ -68,10 +68,10 @@ def test_outside_stays_outside_and_normals_stay_normal(name: str) -> None:
     ball, matrix = icosphere(2), TRANSFORMS[name]
     world = flatten_joined(Scene(objects=(Object(ball, (GREY,), matrix),)))
     exact = ball.vertices.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-    assert np.array_equal(world.geometry.vertices, exact.astype(np.float32))  # rounded once
+    assert np.array_equal(world.geometry.vertices, exact.astype(np.float32))  # rounded to float32 once
     placed = Mesh(world.geometry.vertices, world.geometry.faces)
     assert (outward_share(placed) > 0.0).all()
-    # A sphere's normals go by the inverse transpose; they stay at right angles to the surface and point outwards.
+    # The inverse transpose maps a sphere's normals; they stay perpendicular to the surface and point outwards.
     expected = unit(ball.vertices.astype(np.float64) @ np.linalg.inv(matrix[:3, :3]))
     assert np.abs(world.normals - expected).max() < 1e-5
     assert (np.sort(placed.faces, axis=1) == np.sort(ball.faces, axis=1)).all()
@@ -129,10 +129,10 @@ def test_material_records_keep_every_value() -> None:
                      "transmission", "emission", "two_sided", "alpha", "alpha_cutoff", "normal_scale"):
             unused = name in kinds_that_use() and not material.uses(name)
             assert np.allclose(row[name], 0.0 if unused else getattr(material, name)) or name == "transmission", name
-    assert np.allclose(out["transmission"], [1.0, 0.2])  # glass lets through all that it does not reflect
+    assert np.allclose(out["transmission"], [1.0, 0.2])  # glass transmits all light that it does not reflect
     assert out["albedo_texture"].tolist() == [0, -1] and out["normal_texture"].tolist() == [0, -1]
     assert out["emission_texture"][0] == 1 and out["metallic_roughness_texture"].tolist() == [-1, 2]
-    assert len(table.rows) == 3 and table.size == 6  # the picture that two textures share is stored once
+    assert len(table.rows) == 3 and table.size == 6  # the image that two textures share is stored once
     first = table.records()["first"]
     assert first[0] == first[2] == 0 and table.records()["width"].tolist() == [3, 0, 3]
 
@@ -155,7 +155,7 @@ def test_lights_without_area() -> None:
 
 
 def lamps(count: int, **rest: float) -> Scene:
-    """`count` glowing quads of growing size in their own materials, and one dark thing."""
+    """Return a scene with `count` emissive quads of growing size, each with its own material, and one dark object."""
     objects = [Object(quad((3.0 * i, 0, 0), (1 + i, 0, 0), (0, 1, 0)), (Material(emission=(1.0 + i, 2.0, 0.5), **rest),))
                for i in range(count)]
     return Scene(objects=(Object(box(), (GREY,)), *objects))
@@ -176,7 +176,7 @@ def test_each_glowing_object_is_a_light() -> None:
     assert len(light_records(dark, flatten_joined(dark))[0]) == 0
 
 
-def test_beyond_some_number_all_are_one_light_by_power() -> None:
+def test_many_emissive_objects_are_one_light_sampled_by_power() -> None:
     count = MAX_MESH_LIGHTS + 4
     scene = lamps(count)
     rows, emitters, cdf = light_records(scene, flatten_joined(scene))
@@ -185,13 +185,13 @@ def test_beyond_some_number_all_are_one_light_by_power() -> None:
     power = area * np.repeat([LUMINANCE @ [1.0 + i, 2.0, 0.5] for i in range(count)], 2)
     assert np.allclose(np.diff(cdf, prepend=0.0), power / power.sum(), atol=1e-6)
     assert cdf[-1] == 1.0
-    # Density over all: chance of the triangle, uniform over its area; in all it is 1.
+    # Density over all triangles: probability of a triangle, divided by its area; its integral is 1.
     assert np.allclose(emitters["pdf_area"], power / power.sum() / area, rtol=1e-5)
     assert (emitters["pdf_area"] * area).sum() == pytest.approx(1.0, rel=1e-5)
 
 
 def test_the_density_of_emitters_is_that_of_the_rounded_table_by_which_they_are_chosen() -> None:
-    # A million triangles: each has a share of about 16 steps of float32 near 1, and some a sixteenth more than others.
+    # Each of a million triangles has a share of about 16 steps of float32 near 1, so that rounding changes shares by a sixteenth.
     rng = np.random.default_rng(0)
     count = 1_000_000
     corner = rng.random((count, 1, 3)).astype(np.float32)
@@ -205,7 +205,7 @@ def test_the_density_of_emitters_is_that_of_the_rounded_table_by_which_they_are_
     area = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
     chance = np.diff(cdf.astype(np.float64), prepend=0.0)
     assert np.allclose(emitters["pdf_area"] * area, chance, rtol=1e-6)
-    assert np.abs(chance * count - 1.0).max() > 0.01  # what rounding makes of equal shares
+    assert np.abs(chance * count - 1.0).max() > 0.01  # rounding makes equal shares differ
 
 
 @kernel
@@ -224,7 +224,7 @@ def test_normals_of_emitters_are_those_of_the_device_to_the_last_bit() -> None:
     n = 200_000
     corners = (rng.normal(size=(3, n, 3)) + rng.normal(size=(1, n, 3))) * 10.0 ** rng.uniform(-22, 18, (1, n, 1))
     corners = corners.astype(np.float32)
-    corners[1, :1000] = corners[0, :1000]  # no edge, edges on a line, and edges that are nearly on one
+    corners[1, :1000] = corners[0, :1000]  # edges of length 0, collinear edges, and nearly collinear edges
     corners[2, 1000:2000] = 2.0 * corners[1, 1000:2000] - corners[0, 1000:2000]
     corners[2, 2000:3000] = corners[1, 2000:3000] * np.float32(1.0 + 1e-6)
     corners[:, 3000:4000] *= np.float32(1e-38)
@@ -236,17 +236,17 @@ def test_normals_of_emitters_are_those_of_the_device_to_the_last_bit() -> None:
     assert (expected[:1000] == 0.0).all() and (np.linalg.norm(expected, axis=1) > 0.99).mean() > 0.9
 
 
-def test_emission_that_light_samples_cannot_reach_is_told_once() -> None:
+def test_emission_that_lights_nothing_is_reported_once() -> None:
     picture = Texture(np.zeros((2, 3, 4), np.uint8))
     glowing = [Material(name="sign", emission=(1, 1, 1), emission_texture=picture),
                Material(name="veil", emission=(1, 1, 1), alpha_mode="blend"), Material(emission=(1, 1, 1), alpha_mode="mask"),
                Material(name="meant", emission=(1, 1, 1), emission_texture=picture, emits_light=False),
                Material(name="lamp", emission=(1, 1, 1)), Material(name="dark", alpha_mode="blend")]
     objects = tuple(Object(quad(), (material,)) for material in glowing)
-    with pytest.warns(SceneWarning) as told:
+    with pytest.warns(SceneWarning) as reported:
         upload_scene(Scene(objects=objects), DEVICE)
-    assert len(told) == 1
-    assert "seen but lights nothing" in str(told[0].message) and "materials 'sign', 'veil', '2' (" in str(told[0].message)
+    assert len(reported) == 1
+    assert "seen but lights nothing" in str(reported[0].message) and "materials 'sign', 'veil', '2' (" in str(reported[0].message)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         upload_scene(Scene(objects=objects[3:]), DEVICE)
@@ -300,7 +300,7 @@ def test_camera_struct(size: tuple[int, int]) -> None:
     assert np.allclose(c.origin, [1, 2, 3]) and np.allclose(c.forward, [0.6, 0.8, 0.0], atol=1e-6)
     frame = np.array([c.right, c.up, c.forward])
     assert np.allclose(frame @ frame.T, np.eye(3), atol=1e-6)
-    assert np.linalg.det(frame) == pytest.approx(-1.0, abs=1e-6)  # right, up and backwards are right-handed
+    assert np.linalg.det(frame) == pytest.approx(-1.0, abs=1e-6)  # right, up and -forward are right-handed
     assert c.tan_y == pytest.approx(np.tan(0.4)) and c.tan_x == pytest.approx(np.tan(0.4) * size[0] / size[1])
     assert (c.blades, c.focus_distance) == (5, 7.0) and c.aperture_radius == pytest.approx(0.2)
 

@@ -1,4 +1,4 @@
-"""Waves of samples: the same film as one ray at a time makes, and kernels that scenes share."""
+"""Waves of samples: they give the same film as tracing one ray at a time, and scenes share their kernels."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ TILE = (3, 2, 37, 22)
 
 
 def made() -> Scene:
-    """Everything that textures can say, of triangles and of spheres, in rough, clear and blended materials; and two lights whose
-    shadows pass what is clear."""
+    """Return a scene with every kind of texture, on triangles and spheres, in rough, clear and blended materials; and with two lights
+    whose shadow rays pass through clear surfaces."""
     rng = np.random.default_rng(7)
 
     def picture(height: int, width: int, **rest: Any) -> Texture:
@@ -81,7 +81,7 @@ def assert_same(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> Non
         np.testing.assert_array_equal(values.view(np.uint8), other[name].view(np.uint8), err_msg=name)
 
 
-# What there is beside plain surfaces: shadow rays through glass and panes, cut-outs, instances, an image circle, a picture of the
+# Features beside plain surfaces: shadow rays through glass and panes, cut-outs, instances, an image circle, a picture of the
 # sky. Each slow one compiles the loop for its scene; tests/test_bits.py holds all their pixels.
 @pytest.mark.parametrize(("name", "settings"), [
     ("tinted_shadows", {"max_depth": 3}),
@@ -99,7 +99,7 @@ def test_the_film_is_that_of_one_ray_at_a_time(name: str, settings: dict[str, An
     ready = prepared(name, **settings)
     expected = film_of(one_ray_at_a_time(ready), (0, 5))
     assert expected["rays"].min() > 0 or name == "fisheye"
-    if settings:  # something was cut
+    if settings:  # some rays were cut
         assert expected["cut_depth"].sum() + expected["cut_throughput"].sum() > 0 and expected["lost of group 0"].sum() > 0.0
     assert_same(film_of(ready, (0, 5)), expected)
     assert_same(film_of(ready, (0, 1), (1, 4)), expected)
@@ -121,7 +121,7 @@ def test_more_samples_a_pixel_than_camera_rays_are_made_at_a_time() -> None:
 
 
 def filled_with(byte: int) -> Callable[[int, Any], Any]:
-    """Return an array like waves.empty's whose bytes are all this one."""
+    """Return a stand-in for waves.empty, which fills each array with one byte value."""
 
     def filled(n: int, dtype: Any) -> Any:
         array = wp.empty(n, dtype=dtype, device="cpu")
@@ -133,7 +133,7 @@ def filled_with(byte: int) -> Callable[[int, Any], Any]:
 
 @pytest.mark.parametrize("name", ["fisheye", "tinted_shadows", "glass_sky", "made"])
 def test_nothing_is_read_before_it_is_written(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Buffers are not cleared, and hold what the wave before left."""
+    """Buffers are not cleared between waves, so that they contain values of the last wave."""
     ready = prepared(name)
     films = [film_of(ready, (0, 3))]
     for byte in (0xCD, 0xFF, 0x01):
@@ -161,7 +161,7 @@ def test_aovs_are_those_of_one_ray_at_a_time(name: str) -> None:
 
 
 def test_scenes_share_what_they_have_in_common() -> None:
-    """A traversal is compiled once for a structure, and no kernel for another depth."""
+    """Scenes share the traversal of a structure, and a different max_depth needs no new kernel."""
     of = {name: plan_of(load_scene(SCENES / f"{name}.toml"), Options(device="cpu")).wave_kernels
           for name in ("whitted", "glass_slab", "lens")}
     for name in ("closest_hit", "any_hit", "loop"):

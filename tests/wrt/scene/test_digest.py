@@ -1,4 +1,4 @@
-"""One number for a scene: what changes a pixel changes it, and nothing else does."""
+"""Digest of a scene: everything that changes a pixel changes it, and nothing else does."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.data import ROOT
 from wrt.io.load import load_scene
 from wrt.scene.backgrounds import EnvironmentBackground
 from wrt.scene.cameras import Camera
-from wrt.scene.digest import camera_digest, scene_digest
+from wrt.scene.digest import digest
 from wrt.scene.lights import PointLight, SpotLight
 from wrt.scene.materials import Checkerboard, Material, Texture
 from wrt.scene.model import Object, Scene, Sphere
@@ -28,20 +28,20 @@ def scene(**changes: Any) -> Scene:
                          lights=(PointLight((0, 1, 0), (1, 1, 1)),), cameras=(Camera(),), name="scene"), **changes)
 
 
-def test_it_is_the_same_for_the_same_scene_made_or_read_twice() -> None:
-    assert scene_digest(scene()) == scene_digest(scene())
+def test_a_scene_that_is_made_or_read_twice_has_one_digest() -> None:
+    assert digest(scene()) == digest(scene())
     path = ROOT / "scenes" / "textures.toml"
-    assert scene_digest(load_scene(path)) == scene_digest(load_scene(path)) != scene_digest(scene())
+    assert digest(load_scene(path)) == digest(load_scene(path)) != digest(scene())
 
 
-def test_names_cameras_and_settings_are_not_in_it() -> None:
+def test_names_cameras_and_settings_do_not_change_it() -> None:
     same = scene(name="other", cameras=(), settings=Settings(spp=3), lights=(PointLight((0, 1, 0), (1, 1, 1), name="lamp"),))
-    assert scene_digest(same) == scene_digest(scene())
-    assert camera_digest(Camera(name="a")) == camera_digest(Camera()) != camera_digest(Camera(fov_y=1.0))
+    assert digest(same) == digest(scene())
+    assert digest(Camera(name="a")) == digest(Camera()) != digest(Camera(fov_y=1.0))
 
 
 def other(value: Any) -> Any:
-    """A value of the same type and shape that is not this one."""
+    """Return a different value of the same type and shape."""
     if isinstance(value, np.ndarray):
         return value + value.dtype.type(1)
     return not value if isinstance(value, bool) else tuple(0.5 * each + 0.25 for each in value)
@@ -66,15 +66,15 @@ def painted(**changes: Any) -> Scene:
     painted(albedo_texture=Texture(other(IMAGE))), painted(albedo_texture=Texture(IMAGE, srgb=False)),
     painted(albedo_texture=None, emission_texture=Texture(IMAGE)),
 ], ids=range(15))
-def test_whatever_changes_a_pixel_is_in_it(changed: Scene) -> None:
-    assert scene_digest(changed) != scene_digest(scene())
+def test_whatever_changes_a_pixel_changes_it(changed: Scene) -> None:
+    assert digest(changed) != digest(scene())
 
 
-def test_every_field_of_a_material_is_in_it_but_its_name() -> None:
+def test_every_field_of_a_material_but_its_name_changes_it() -> None:
     numbers = {"kind": "glass", "alpha_mode": "blend", "ior": 1.6, "exponent": 51.0}
     for each in fields(Material):
         value = getattr(Material(), each.name)
         if each.name == "name" or value is None:
             continue
         changed = numbers.get(each.name, other(value) if isinstance(value, bool | tuple) else 0.75)
-        assert scene_digest(painted(**{each.name: changed})) != scene_digest(scene()), each.name
+        assert digest(painted(**{each.name: changed})) != digest(scene()), each.name

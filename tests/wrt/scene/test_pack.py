@@ -1,4 +1,4 @@
-"""A scene as text and arrays: it comes back bit for bit, and what was shared is shared again."""
+"""Packed scenes: unpacking restores every bit, and shared objects stay shared."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.refused import refused
 from wrt.io.load import load_scene
 from wrt.scene.backgrounds import EnvironmentBackground
 from wrt.scene.cameras import Camera
-from wrt.scene.digest import camera_digest, scene_digest
+from wrt.scene.digest import digest
 from wrt.scene.lights import SpotLight
 from wrt.scene.materials import Material, Texture
 from wrt.scene.model import Object, Scene, Sphere
@@ -26,7 +26,7 @@ SHIPPED = sorted((ROOT / "scenes").glob("*.toml"))
 
 
 def sent(scene: Scene) -> Scene:
-    """As another process would have it."""
+    """Return the scene that another process unpacks."""
     text, arrays = pack(scene)
     return unpack(text, pickle.loads(pickle.dumps(arrays)))
 
@@ -36,8 +36,8 @@ def sent(scene: Scene) -> Scene:
 def test_shipped_scenes_come_back(path: Any) -> None:
     scene = load_scene(path)
     back = sent(scene)
-    assert scene_digest(back) == scene_digest(scene)
-    assert [camera_digest(camera) for camera in back.cameras] == [camera_digest(camera) for camera in scene.cameras]
+    assert digest(back) == digest(scene)
+    assert [digest(camera) for camera in back.cameras] == [digest(camera) for camera in scene.cameras]
     assert back.settings == scene.settings and back.name == scene.name
     assert [material.name for material in back.materials] == [material.name for material in scene.materials]
 

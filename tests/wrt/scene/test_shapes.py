@@ -47,7 +47,7 @@ def corners(mesh: Mesh) -> np.ndarray:
 
 
 def open_edges(mesh: Mesh) -> int:
-    """Directed edges, by position, that no neighbour runs along the other way."""
+    """Return the directed edges, by position, that have no opposite edge."""
     _, place = np.unique(mesh.vertices + np.float32(0.0), axis=0, return_inverse=True)
     faces = place.reshape(-1)[mesh.faces]
     edges = {(a, b) for face in faces.tolist() for a, b in zip(face, face[1:] + face[:1], strict=True)}

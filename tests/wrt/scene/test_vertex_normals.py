@@ -18,7 +18,7 @@ def test_close_to_the_normals_of_the_surface() -> None:
 
 
 def test_corner_of_a_box_is_the_diagonal_however_it_is_cut() -> None:
-    # The two triangles of a side meet some corners twice: weights by angle must not care.
+    # At some corners both triangles of a side meet: weights by angle must not depend on that.
     mesh = box((-1, -1, -1), (1, 1, 1))
     normals = smooth(mesh).normals
     np.testing.assert_allclose(normals, mesh.vertices / np.sqrt(3.0), atol=1e-6)

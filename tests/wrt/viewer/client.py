@@ -1,4 +1,4 @@
-"""Someone who speaks to the viewer without a browser: requests byte by byte, and a WebSocket with viser's messages."""
+"""A client of the viewer without a browser: requests byte by byte, and a WebSocket with viser's messages."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from collections.abc import Callable, Iterator
 from typing import Any
 from urllib.parse import urlsplit
 
-PATIENCE = 300.0  # seconds; on a busy machine kernels may have to be compiled
+PATIENCE = 300.0  # seconds; a busy machine may have to compile kernels
 
 
 def answer(port: int, target: str, headers: list[str], host: str = "127.0.0.1") -> bytes:
-    """All that comes back for a GET; "" where the connection is just closed. A WebSocket that opens is left at once."""
+    """Send a GET and return the whole response (empty: the connection was closed). A WebSocket is closed as soon as it opens."""
     request = "\r\n".join([f"GET {target} HTTP/1.1", *headers, "", ""])
     return raw_answer(port, request.encode("latin-1", "surrogateescape"), host)
 
@@ -32,20 +32,20 @@ def raw_answer(port: int, request: bytes, host: str = "127.0.0.1") -> bytes:
 
 
 def upgrade(subprotocol: str = "viser-v1.1.1") -> list[str]:
-    """The headers of a WebSocket's handshake."""
+    """Return the headers of a WebSocket's handshake."""
     key = base64.b64encode(b"sixteen bytes...").decode()
     return ["Upgrade: websocket", "Connection: Upgrade", f"Sec-WebSocket-Key: {key}", "Sec-WebSocket-Version: 13",
             f"Sec-WebSocket-Protocol: {subprotocol}"]
 
 
 class Client:
-    """A WebSocket at a page's address, as the page in a browser has one. Keeps what the server says."""
+    """A WebSocket to a page's address, like that of the page in a browser. It stores all messages of the server."""
 
     def __init__(self, url: str, **settings: Any) -> None:
         import viser
         from websockets.sync.client import connect
 
-        # Without a limit on what was not read yet, it answers the server's pings also while nobody reads.
+        # With an unlimited queue of unread messages, the socket answers the server's pings even if the test reads nothing.
         parts = urlsplit(url)
         settings = {"subprotocols": [f"viser-v{viser.__version__}"], "origin": f"http://{parts.netloc}", **settings}
         self.socket = connect(f"ws://{parts.netloc}{parts.path}?{parts.query}", compression=None, max_size=None,
@@ -67,7 +67,7 @@ class Client:
         self.send(type="GuiUpdateMessage", uuid=uuid, updates={"value": value})
 
     def listen(self, seconds: float) -> list[dict[str, Any]]:
-        """What the server says next, if anything within that time."""
+        """Return the server's next messages; empty if none arrive in `seconds`."""
         import msgspec
         import zstandard
 
@@ -81,16 +81,16 @@ class Client:
         return messages
 
     def until(self, condition: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
-        """The first message from now on that fulfils a condition."""
+        """Wait for the next message that fulfils a condition, and return it."""
         deadline = time.monotonic() + PATIENCE
         while True:
-            assert time.monotonic() < deadline, "it never came"
+            assert time.monotonic() < deadline, "no such message arrived"
             for message in self.listen(1.0):
                 if condition(message):
                     return message
 
     def picture(self) -> bytes:
-        """The next picture's file that was not seen before."""
+        """Wait for a new picture, and return its file."""
         seen = set(self.pictures)
         self.until(lambda message: is_picture(message) and message["rgb_data"] not in seen)
         return self.pictures[-1]
@@ -100,7 +100,7 @@ class Client:
         return [message["rgb_data"] for message in self.messages if is_picture(message)]
 
     def controls(self) -> dict[str, str]:
-        """The uuid of each control, by its label."""
+        """Return the uuid of each control by its label, once the panel has arrived."""
         while not any(message.get("props", {}).get("label") == "camera as TOML" for message in self.messages):
             assert self.listen(PATIENCE), "the panel never came"
         return {message["props"]["label"]: message["uuid"] for message in self.messages
@@ -108,14 +108,14 @@ class Client:
 
 
 def is_picture(message: dict[str, Any]) -> bool:
-    return message["type"] == "BackgroundImageMessage" and message["rgb_data"] is not None  # None: viser begins without one
+    return message["type"] == "BackgroundImageMessage" and message["rgb_data"] is not None  # None: viser starts without a picture
 
 
 def wait(condition: Callable[[], Any], listening: Client | None = None) -> None:
-    """Until it holds; `listening` takes what the server sends meanwhile."""
+    """Wait until the condition holds. listening: client that receives the server's messages meanwhile."""
     deadline = time.monotonic() + PATIENCE
     while not condition():
-        assert time.monotonic() < deadline, "it never came"
+        assert time.monotonic() < deadline, "the condition never held"
         if listening is None:
             time.sleep(0.01)
         else:

@@ -1,4 +1,4 @@
-"""Who gets into the viewer, and what they can say there. Nothing here needs a browser; tests/wrt/viewer/test_page.py has one."""
+"""Access to the viewer: requests and messages that it accepts or refuses. tests/wrt/viewer/test_page.py uses a browser."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_the_names_of_an_address(host: str, address: str, printed: str, names: t
     access, url = access_for(Place(host, 8080, ["https://Example.org", "http://proxy:9000/"]), address, 8080)
     assert url.startswith(f"http://{printed}:8080/?token=")
     assert access.origins == {f"http://{name}:8080" for name in names} | {"https://example.org", "http://proxy:9000"}
-    access.check(["192.168.1.7:8080"], ["http://192.168.1.7:8080"], "192.168.1.7")  # a number that the connection came to
+    access.check(["192.168.1.7:8080"], ["http://192.168.1.7:8080"], "192.168.1.7")  # the connection's own IP address
     access.check(["example.org"], ["https://example.org"], address)
     for name in ("evil.example:8080", "192.168.1.8:8080", "0.0.0.0:8080"):
         with pytest.raises(Refused):
@@ -62,27 +62,27 @@ def test_the_names_of_an_address(host: str, address: str, printed: str, names: t
 
 @pytest.mark.parametrize("text", ["*", "null", "example.org", "https://", "ftp://example.org", "https://example.org/path", "",
                                   "http://user@example.org", "http://a:0", "http://a:65536", "https://example.org?x", "http://a b"])
-def test_what_is_no_origin(text: str) -> None:
+def test_text_that_is_no_origin_is_refused(text: str) -> None:
     with refused(what="origin"):
         as_origin(text)
 
 
 def test_where_the_token_may_stand() -> None:
     access = Access(frozenset(), 80, "secret")
-    assert access.inside("/secret/") == ("/", "") and access.inside("/secret?a=b") == ("/", "secret/?a=b")
-    assert access.inside("/?a=b&token=secret&c=%20") == ("/", "secret/?a=b&c=+")
-    assert access.inside("/x?token=secret") == ("/x", "") and access.inside("/secret/x/y?z") == ("/x/y", "")
+    assert access.strip_token("/secret/") == ("/", "") and access.strip_token("/secret?a=b") == ("/", "secret/?a=b")
+    assert access.strip_token("/?a=b&token=secret&c=%20") == ("/", "secret/?a=b&c=+")
+    assert access.strip_token("/x?token=secret") == ("/x", "") and access.strip_token("/secret/x/y?z") == ("/x/y", "")
     for target in ("/", "/?token=", "/?token=Secret", "/?token=secret&token=secret", "/secretx/", "//secret/", "secret/", "*", "",
                    "/x/secret/", "http://h/secret/", "/?Token=secret", "/\udcff/", "/?token=%ff", "/%73ecret/"):
         with pytest.raises(Refused):
-            access.inside(target)
+            access.strip_token(target)
 
 
 # --- requests ---------------------------------------------------------------------------------------------------------
 
 
 class Served:
-    """A page, what it warned of, and its port."""
+    """A page, its warnings, and its port."""
 
     def __init__(self, **place: Any) -> None:
         from wrt.viewer.page import Page
@@ -90,7 +90,7 @@ class Served:
         self.warnings: list[str] = []
         self.page = Page(SCENE, Options(threads=1), Place(port=0, **place), spp=1, counter_of=CostCounter.beside,
                          warn=self.warnings.append)
-        self.port, self.token = self.page.server.get_port(), self.page.door.access.token
+        self.port, self.token = self.page.server.get_port(), self.page.guard.access.token
 
 
 @pytest.fixture
@@ -104,7 +104,7 @@ def rendering() -> Iterator[Served]:
 
 @pytest.fixture
 def served(monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
-    """Makes no pictures, and so compiles nothing."""
+    """Start a page that renders no pictures, so that no kernel is compiled."""
     pytest.importorskip("viser")
     monkeypatch.setattr("wrt.viewer.refine.Viewer._prepare", lambda self, view: False)
     served = Served()
@@ -115,7 +115,7 @@ def served(monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
 
 def test_a_connection_without_a_request_does_not_hold_up_the_end(served: Served) -> None:
     with socket.create_connection(("127.0.0.1", served.port), timeout=PATIENCE) as silent:
-        assert answer(served.port, "/", [])  # so that it has been accepted
+        assert answer(served.port, "/", [])  # by then the silent connection is accepted
         served.page.close()
         assert not served.page.server._websock_server._server_thread.is_alive()
         with contextlib.suppress(ConnectionResetError):
@@ -123,7 +123,7 @@ def test_a_connection_without_a_request_does_not_hold_up_the_end(served: Served)
 
 
 def attempts(port: int, token: str) -> list[tuple[str, list[str]]]:
-    """Requests of strangers: target and headers."""
+    """Return requests without access: target and headers."""
     me, way = f"127.0.0.1:{port}", f"/?token={token}"
     hosts = [[], [f"Host: {me}", f"Host: {me}"], ["Host:"], *([f"Host: {value}"] for value in (
         f"evil.example:{port}", "evil.example", f"EVIL.EXAMPLE:{port}", f"LOCALHOST:{port}", f"localhost.:{port}", "127.0.0.1",
@@ -142,7 +142,7 @@ def attempts(port: int, token: str) -> list[tuple[str, list[str]]]:
             + [(target, [f"Host: {me}"]) for target in targets] + [("/", [f"Host: {me}", *headers]) for headers in carried])
 
 
-def test_strangers_get_nothing(served: Served, capfd: pytest.CaptureFixture[str]) -> None:
+def test_requests_without_access_get_nothing(served: Served, capfd: pytest.CaptureFixture[str]) -> None:
     tries = attempts(served.port, served.token)
     assert len(tries) >= 50
     for target, headers in tries:
@@ -191,8 +191,8 @@ def test_other_origins_can_be_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
         Served(allow_origins=["*"])
 
 
-def test_what_is_no_request_is_no_news(served: Served, capfd: pytest.CaptureFixture[str]) -> None:
-    """Not on stdout, and no traceback on stderr."""
+def test_malformed_requests_print_nothing(served: Served, capfd: pytest.CaptureFixture[str]) -> None:
+    """Malformed requests print nothing on stdout, and no traceback on stderr."""
     port, token = served.port, served.token
     host = [f"Host: 127.0.0.1:{port}"]
     for request in (b"", b"\r\n\r\n", b"GET\r\n\r\n", b"\x16\x03\x01\x02\x00\x01\x00\x01", b"GET / HTTP/2\r\n\r\n",
@@ -231,7 +231,7 @@ def test_what_is_no_request_is_no_news(served: Served, capfd: pytest.CaptureFixt
 
 
 def test_only_one_port_is_open(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where viser would serve past the door, there is no viewer."""
+    """If viser would bypass the guard, the viewer does not start."""
     import viser
     import websockets.asyncio.server as websockets
     from websockets.asyncio.server import serve
@@ -258,7 +258,7 @@ def test_only_one_port_is_open(served: Served, monkeypatch: pytest.MonkeyPatch) 
         stops = 0
 
     monkeypatch.setattr(viser, "ViserServer", Other)
-    with refused(what="does not let"):
+    with refused(what="cannot be guarded"):
         Page(SCENE, Options(threads=1), Place(port=0))
     assert Other.stops == 1 and websockets.serve is serve
 
@@ -266,7 +266,7 @@ def test_only_one_port_is_open(served: Served, monkeypatch: pytest.MonkeyPatch) 
 # --- messages ---------------------------------------------------------------------------------------------------------
 
 
-def test_what_a_browser_says_is_heard() -> None:
+def test_a_browsers_messages_are_allowed() -> None:
     check_message(CAMERA, lambda uuid: None)
     check_message(CLICK, lambda uuid: None)
 
@@ -283,16 +283,16 @@ def test_what_a_browser_says_is_heard() -> None:
     {**CAMERA, "image_width": 16385}, {**CAMERA, "image_width": 64.0}, {**CAMERA, "image_height": -1},
     {**CAMERA, "position": [1e10, 0, 0]},
 ], ids=lambda message: None)
-def test_what_is_not_heard(message: Any) -> None:
+def test_other_messages_are_refused(message: Any) -> None:
     with pytest.raises(Refused):
         check_message(message, lambda uuid: None)
 
 
 @pytest.mark.parametrize("field", CAMERA)
-def test_what_is_no_part_of_a_camera(field: str) -> None:
+def test_invalid_fields_of_a_camera_are_refused(field: str) -> None:
     for value in NONSENSE:
         if field in ("near", "far") and type(value) in (int, float) and math.isfinite(value):
-            continue  # they are not used
+            continue  # the viewer does not use them
         with pytest.raises(Refused):
             check_message({**CAMERA, field: value}, lambda uuid: None)
 
@@ -307,16 +307,16 @@ def test_the_share_request_opens_nothing(rendering: Served, monkeypatch: pytest.
             somebody.send(type="ShareUrlRequest")
             somebody.send(type="ShareUrlDisconnect")
         somebody.picture()
-        somebody.look(1.0)  # is answered after all that
+        somebody.look(1.0)  # the answer comes after those to the requests above
         somebody.picture()
         assert not any("Share" in message["type"] for message in somebody.messages)
     assert asked == [] and served.page.server._share_tunnel is None
     shared = [line for line in served.warnings if "share" in line]
-    assert shared == ["viewer: dropped a request to share the viewer on the internet (told once)"]
+    assert shared == ["viewer: dropped a request to share the viewer on the internet (reported once)"]
 
 
 def moves(who: Client, begin: float) -> int:
-    """How many of 20 moves of the camera bring new pictures."""
+    """Move the camera 20 times, and return the number of different pictures that arrive."""
     new = set()
     for move in range(20):
         who.look(begin + 0.02 * move)
@@ -324,7 +324,7 @@ def moves(who: Client, begin: float) -> int:
     return len(new)
 
 
-def test_bad_values_stop_nobodys_pictures(rendering: Served, capfd: pytest.CaptureFixture[str]) -> None:
+def test_invalid_values_do_not_stop_pictures(rendering: Served, capfd: pytest.CaptureFixture[str]) -> None:
     served, page = rendering, rendering.page
     with client(page.url) as bad, client(page.url) as good:
         for who in (bad, good):
@@ -399,7 +399,7 @@ def test_a_large_message_ends_the_connection_and_too_many_are_closed(served: Ser
 
 
 def test_pages_can_begin_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each behind its own door."""
+    """Each page has a guard of its own."""
     pytest.importorskip("viser")
     monkeypatch.setattr("wrt.viewer.refine.Viewer._prepare", lambda self, view: False)
     import websockets.asyncio.server as websockets
@@ -422,8 +422,8 @@ def test_pages_can_begin_together(monkeypatch: pytest.MonkeyPatch) -> None:
             served.page.close()
 
 
-def test_viser_says_nothing_of_those_who_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A picture may be on its way to a browser that is closed meanwhile."""
+def test_viser_does_not_warn_of_disconnected_browsers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The page may send a picture to a browser that is being closed."""
     pytest.importorskip("viser")
     monkeypatch.setattr("wrt.viewer.refine.Viewer._prepare", lambda self, view: False)
     with warnings.catch_warnings(record=True) as caught:

@@ -1,4 +1,4 @@
-"""Cameras between the scene and the viewport: nothing is mirrored, tilted or scaled on the way."""
+"""Conversion of cameras between scene and viewport: no camera is mirrored, tilted or scaled."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def random_camera(seed: int, scale: float = 1.0) -> Camera:
 
 @pytest.mark.parametrize("seed", range(8))
 def test_a_viewport_has_its_camera(seed: int) -> None:
-    """viser: x to the right, y down, z forward; so says SciPy's quaternion of those axes."""
+    """viser's axes are x to the right, y down, z forward; SciPy computes their quaternion."""
     camera, unit = random_camera(seed), 0.25 * (seed + 1)
     right, up, back = camera.camera_to_world[:3, :3].T
     x, y, z, w = Rotation.from_matrix(np.stack([right, -up, -back], axis=1)).as_quat()
@@ -69,7 +69,7 @@ def test_other_kinds_turn_and_are_written_too(tmp_path: Path, camera: CameraKind
     np.testing.assert_allclose(found.camera_to_world, turned.camera_to_world, atol=1e-11)
 
 
-def test_what_is_up() -> None:
+def test_the_up_axis_of_the_viewport() -> None:
     upright = Camera.look_at((3, 2, 1), (0, 0, 0))
     assert up_of(upright).tolist() == [0.0, 1.0, 0.0]
     for camera in (Camera.look_at((0, 5, 0), (0, 0, 0), up=(0, 0, -1)), Camera.look_at((3, 2, 1), (0, 0, 0), up=(0, 0, 1)),
@@ -77,10 +77,10 @@ def test_what_is_up() -> None:
         np.testing.assert_array_equal(up_of(camera), camera.camera_to_world[:3, 1])
 
 
-def test_what_is_orbited() -> None:
-    np.testing.assert_allclose(orbited_point(SCENE, CAMERA), CAMERA.camera_to_world[:3] @ (0, 0, -4.0, 1))  # what is in focus
+def test_the_orbited_point() -> None:
+    np.testing.assert_allclose(orbited_point(SCENE, CAMERA), CAMERA.camera_to_world[:3] @ (0, 0, -4.0, 1))  # the point in focus
     assert unit_of(SCENE, CAMERA) == pytest.approx(4.0)
-    plain = Camera.look_at((3, 2, 50), (0, 0, 0))  # nobody focused it
+    plain = Camera.look_at((3, 2, 50), (0, 0, 0))  # the camera has no focus
     middle = np.mean(SCENE.bounds(), axis=0)
     point = orbited_point(SCENE, plain)
     assert (middle - point) @ plain.camera_to_world[:3, 2] == pytest.approx(0.0, abs=1e-9)

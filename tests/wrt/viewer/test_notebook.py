@@ -1,4 +1,4 @@
-"""What a notebook shows: pictures in place while they are rendered, and tables of what things are."""
+"""Output in notebooks: a picture that is updated during the render, pictures side by side, and tables."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from wrt.viewer.notebook import LiveView
 
 @pytest.fixture
 def shown(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[tuple[str, str]]]:
-    """All that was displayed: how ("new" or "update"), and the page. Stands in for IPython, installed or not."""
+    """Record the displayed pages, each with "new" or "update". The fixture replaces IPython, whether installed or not."""
     pages: list[tuple[str, str]] = []
 
     class Handle:
@@ -62,13 +62,13 @@ def test_a_render_is_shown_in_place_and_finished_in_the_end(shown: list[tuple[st
     assert np.array_equal(picture_of(shown[-1][1]), film.to_srgb8()) and "100%" in shown[-1][1]
 
 
-def test_an_interrupt_keeps_what_there_is(shown: list[tuple[str, str]]) -> None:
+def test_an_interrupt_keeps_the_picture_so_far(shown: list[tuple[str, str]]) -> None:
     view = LiveView(every=0.0)
 
     def progress(p: Progress) -> None:
         view(p)
         if p.done > 0:
-            signal.raise_signal(signal.SIGINT)  # what a notebook's stop button sends
+            signal.raise_signal(signal.SIGINT)  # a notebook's stop button sends SIGINT
 
     film = wrt.render(SCENE, spp=1 << 20, progress=progress)
     assert film.stats["interrupted"] and 0 < film.samples.max() < 1 << 20
@@ -81,7 +81,7 @@ def test_showing_leaves_time_for_rendering(shown: list[tuple[str, str]], monkeyp
     def show(self: LiveView, progress: Progress) -> None:
         nonlocal now
         shown.append(("", ""))
-        now += 2.0  # a large picture
+        now += 2.0  # showing takes 2 s, as with a large picture
 
     monkeypatch.setattr("wrt.viewer.notebook.time.monotonic", lambda: now)
     monkeypatch.setattr(LiveView, "_show", show)
@@ -113,7 +113,7 @@ def test_the_picture_in_progress_is_that_of_the_samples_so_far() -> None:
     taken = []
 
     def progress(p: Progress) -> None:
-        if p.picture is None:  # kernels compile
+        if p.picture is None:  # kernels are being compiled
             return
         film = p.picture()
         if int(film.samples.min()) == int(film.samples.max()) == p.done / film.samples.size:  # no tile is running
@@ -133,7 +133,7 @@ def test_pictures_side_by_side_keep_their_pixels() -> None:
     x = 2 * width + 8
     np.testing.assert_array_equal(sheet[23:30:2, x:x + 10:2], codes)
     y = 22 + 2 * height + 8
-    assert (sheet[y:y + 22] == 255).all() and (sheet[:22] < 128).any()  # no name, and two names
+    assert (sheet[y:y + 22] == 255).all() and (sheet[:22] < 128).any()  # white where a name is empty, dark text in the other titles
     np.testing.assert_array_equal(wrt.side_by_side({"": codes}), codes)
     for wrong in ({}, {"x": codes[..., 0]}, {"x": film.pixels}):
         with pytest.raises(InputError, match=r"side_by_side|x must be a Film"):
@@ -144,7 +144,7 @@ def test_pictures_side_by_side_keep_their_pixels() -> None:
 
 
 class Tables(HTMLParser):
-    """The text of all cells, row by row; fails on a tag that no table of ours has."""
+    """Collects the text of all cells, row by row; fails on a tag that wrt's tables do not use."""
 
     def __init__(self, page: str) -> None:
         super().__init__()

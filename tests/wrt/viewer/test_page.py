@@ -49,7 +49,7 @@ def test_without_viser_there_is_one_message(monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.parametrize(("host", "port", "part"), [
     ("127.0.0.1", None, "(Address already in use);"), ("no.such.host.invalid", 0, "no.such.host.invalid")])
-def test_where_nobody_can_listen(host: str, port: int | None, part: str) -> None:
+def test_an_address_that_cannot_be_listened_on(host: str, port: int | None, part: str) -> None:
     pytest.importorskip("viser")
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
@@ -69,7 +69,7 @@ def test_the_command_serves_until_ctrl_c(monkeypatch: pytest.MonkeyPatch) -> Non
     def wait(self: Page) -> None:
         seen.append(self)
         port = self.server.get_port()
-        came = answer(port, f"/{self.door.access.token}/", [f"Host: localhost:{port}"])
+        came = answer(port, f"/{self.guard.access.token}/", [f"Host: localhost:{port}"])
         assert came.startswith(b"HTTP/1.1 200") and answer(port, "/", [f"Host: localhost:{port}"]).startswith(b"HTTP/1.1 403")
         raise KeyboardInterrupt
 
@@ -77,8 +77,8 @@ def test_the_command_serves_until_ctrl_c(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr("wrt.viewer.refine.Viewer._prepare", lambda self, view: True)  # this test compiles nothing
     result = run("view", WHITTED, "--port", 0, "--no-open")
     assert result.code == 0 and result.out == f"{seen[0].url}\n" and seen[0].url.startswith("http://127.0.0.1:")
-    refused = "viewer: refused a request without the token of the printed address (told once)"
-    assert result.err.splitlines() == ["Ctrl-C ends it", refused]
+    refused = "viewer: refused a request without the token of the printed address (reported once)"
+    assert result.err.splitlines() == ["Ctrl-C ends the viewer", refused]
     seen[0].thread.join(10.0)
     assert not seen[0].thread.is_alive()
     assert "no camera 'nobody'" in run("view", WHITTED, "--camera", "nobody", "--port", 0).err
@@ -91,7 +91,7 @@ def test_quiet_and_other_origins(monkeypatch: pytest.MonkeyPatch) -> None:
     def wait(self: Page) -> None:
         port = self.server.get_port()
         answer(port, "/", [f"Host: localhost:{port}"])
-        assert {"https://example.org", "http://localhost:9000"} <= self.door.access.origins
+        assert {"https://example.org", "http://localhost:9000"} <= self.guard.access.origins
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Page, "wait", wait)
@@ -104,7 +104,7 @@ def test_quiet_and_other_origins(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_browsers_command_line_does_not_hold_the_token(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Everybody on the machine can read it."""
+    """All users of the machine can read the command line."""
     pytest.importorskip("viser")
     from wrt.cli import view as cli_view
     from wrt.viewer.page import Page
@@ -150,7 +150,7 @@ def page() -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def browser_page(page: Any) -> Iterator[Any]:
-    """The page in Chromium; its console's errors are the fixture's `mistakes`."""
+    """Open the page in Chromium; `mistakes` collects the errors of its console."""
     api = pytest.importorskip("playwright.sync_api")
     chromium = next((path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None)
     if chromium is None:
@@ -163,23 +163,23 @@ def browser_page(page: Any) -> Iterator[Any]:
         view.mistakes = []
         view.on("console", lambda message: view.mistakes.append(message.text) if message.type == "error" else None)
         view.on("pageerror", lambda error: view.mistakes.append(str(error)))
-        view.goto(f"{page.url}&fixedDpr=1")  # else viser draws coarser where the machine is slow
+        view.goto(f"{page.url}&fixedDpr=1")  # otherwise viser shrinks the canvas on a slow machine
         settle(page, view)
         yield view
         browser.close()
 
 
 def until(condition: Callable[[], Any], browser_page: Any) -> Any:
-    """What the condition gives when it is true at last; the browser's events go on meanwhile."""
+    """Wait until the condition is true, while the browser handles events; return the condition's value."""
     deadline = time.monotonic() + PATIENCE
     while not (value := condition()):
-        assert time.monotonic() < deadline, "it never came about"
+        assert time.monotonic() < deadline, "the condition never held"
         browser_page.wait_for_timeout(50)
     return value
 
 
 def settle(page: Any, browser_page: Any) -> None:
-    """Wait until it looks from the scene's camera, and goes on to: a slow browser begins with viser's own."""
+    """Wait until the view stays at the scene's camera, because a slow browser starts with viser's default camera."""
     for _ in range(2):
         until(lambda: page.watching >= 0 and np.allclose(page.viewer.view.camera.camera_to_world, CAMERA.camera_to_world),
               browser_page)
@@ -187,7 +187,7 @@ def settle(page: Any, browser_page: Any) -> None:
 
 
 def finished(page: Any, browser_page: Any, **view: Any) -> Any:
-    """The picture when it is as fine as it gets, and of the view that is wanted."""
+    """Wait for the finished picture of the view with these fields, and return it."""
 
     def done() -> Any:
         shown = page.viewer.shown
@@ -198,7 +198,7 @@ def finished(page: Any, browser_page: Any, **view: Any) -> Any:
 
 
 def seen(browser_page: Any, shown: Any) -> np.ndarray:
-    """What the browser shows left of the panel, in pixels of the picture, when it has come to rest."""
+    """Return the screen left of the panel, in pixels of the picture, once the screen no longer changes."""
     last, same, deadline = None, 0, time.monotonic() + PATIENCE
     while same < 2:
         assert time.monotonic() < deadline, "the screen never rests"
@@ -208,7 +208,7 @@ def seen(browser_page: Any, shown: Any) -> np.ndarray:
     height, width = shown.codes.shape[:2]
     with Image.open(io.BytesIO(data)) as image:
         pixels = np.asarray(image.convert("RGB").resize((width, height), Image.Resampling.BILINEAR)).astype(float)
-    return pixels[height // 3 :, : width * 7 // 16]  # without viser's message about software rendering
+    return pixels[height // 3 :, : width * 7 // 16]  # below viser's message about software rendering
 
 
 def expected(shown: Any, shift: tuple[int, int] = (0, 0)) -> np.ndarray:
@@ -245,7 +245,7 @@ def test_a_drag_orbits_and_stays_level(page: Any, browser_page: Any) -> None:
     browser_page.mouse.up()
     until(lambda: page.viewer.view.camera is not before.view.camera, browser_page)
     still, deadline = 0, time.monotonic() + PATIENCE
-    while still < 10:  # it swings out
+    while still < 10:  # viser moves the camera on after the drag
         assert time.monotonic() < deadline, "the camera never rests"
         camera = page.viewer.view.camera
         browser_page.wait_for_timeout(100)
@@ -280,7 +280,7 @@ def test_controls_change_the_picture(page: Any, browser_page: Any) -> None:
     assert flat.codes.mean() < bright.codes.mean() - 20.0 and difference(browser_page, flat) < ROUGHLY
     choose(browser_page, "show", "nodes")
     heat = finished(page, browser_page, cost="nodes")
-    until(lambda: "nodes a pixel" in browser_page.inner_text("body"), browser_page)
+    until(lambda: "nodes per pixel" in browser_page.inner_text("body"), browser_page)
     assert heat.mean > 1.0 and difference(browser_page, heat) < ROUGHLY
     choose(browser_page, "show", "picture")
     choose(browser_page, "structure", "bvh8")
@@ -300,22 +300,22 @@ def test_a_click_focuses(page: Any, browser_page: Any) -> None:
     browser_page.mouse.click(150, 440)
     browser_page.locator("xpath=//label[text()='click to focus']/ancestor::*[.//input][1]").locator("input").check()
     until(lambda: page.by_click.value, browser_page)
-    assert page.viewer.view.camera.focus_distance == shown.view.camera.focus_distance  # the first click was none
+    assert page.viewer.view.camera.focus_distance == shown.view.camera.focus_distance  # the first click did not focus
     browser_page.mouse.click(150, 440)
     wanted = page.viewer.renderers.focus_at(page.viewer.view, 150.5 / SIZE["width"], 440.5 / SIZE["height"])
     until(lambda: page.viewer.view.camera.focus_distance == pytest.approx(wanted, rel=0.01), browser_page)
     assert page.focus.value == page.viewer.view.camera.focus_distance != shown.view.camera.focus_distance
 
 
-def test_a_browser_that_comes_again_gets_the_picture(page: Any, browser_page: Any) -> None:
+def test_a_reloaded_page_gets_the_picture(page: Any, browser_page: Any) -> None:
     finished(page, browser_page)
-    page.viewer.spp = 1 << 20  # it leaves in the middle of a refinement
+    page.viewer.spp = 1 << 20  # the browser is reloaded during a refinement
     try:
         set_number(browser_page, "bounces", "2")
         until(lambda: page.viewer.shown.view.max_depth == 2, browser_page)
     finally:
         page.viewer.spp = 4
-    browser_page.reload()  # viser may report a camera of its own before it has heard where to begin
+    browser_page.reload()  # viser may report its default camera before it receives the first camera
     until(lambda: page.viewer.shown.done and np.allclose(page.viewer.shown.view.camera.camera_to_world, CAMERA.camera_to_world,
                                                          rtol=0.0, atol=1e-9), browser_page)
     again = finished(page, browser_page, max_depth=2)
@@ -330,16 +330,16 @@ def test_a_second_browser_gets_the_picture_and_leaves_it_to_the_first(page: Any,
     other.goto(browser_page.url)
     until(lambda: page.watching != first, other)
     settle(page, other)
-    assert other.get_by_text("2 browsers look").is_visible()
+    assert other.get_by_text("2 browsers are connected").is_visible()
     assert difference(other, finished(page, other, size=shown.view.size)) < ROUGHLY
     other.close()
     until(lambda: page.watching == first, browser_page)
-    until(lambda: not browser_page.get_by_text("browsers look").is_visible(), browser_page)
+    until(lambda: not browser_page.get_by_text("browsers are connected").is_visible(), browser_page)
     set_number(browser_page, "bounces", "1")
     assert difference(browser_page, finished(page, browser_page, max_depth=1)) < ROUGHLY
 
 
-def test_what_is_saved(page: Any, browser_page: Any, tmp_path: Path) -> None:
+def test_saved_files(page: Any, browser_page: Any, tmp_path: Path) -> None:
     shown = finished(page, browser_page)
     for name, suffix in (("picture as PNG", ".png"), ("picture as EXR", ".exr")):
         with browser_page.expect_download() as download:
@@ -364,7 +364,7 @@ def test_what_is_saved(page: Any, browser_page: Any, tmp_path: Path) -> None:
     assert browser_page.mistakes == []
 
 
-def test_the_file_that_a_browser_is_given_leads_to_the_page(page: Any, browser_page: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_private_file_forwards_to_the_page(page: Any, browser_page: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     from wrt.cli import view as cli_view
 
     shown = finished(page, browser_page)
@@ -373,7 +373,7 @@ def test_the_file_that_a_browser_is_given_leads_to_the_page(page: Any, browser_p
     with cli_view.in_browser(f"{page.url}&fixedDpr=1"):
         until(lambda: page.watching != first, other)
     settle(page, other)
-    assert other.url.startswith(f"{page.url.partition('?')[0]}{page.door.access.token}/")
+    assert other.url.startswith(f"{page.url.partition('?')[0]}{page.guard.access.token}/")
     assert difference(other, finished(page, other, size=shown.view.size)) < ROUGHLY
     other.reload()
     second = page.watching
@@ -382,9 +382,9 @@ def test_the_file_that_a_browser_is_given_leads_to_the_page(page: Any, browser_p
     until(lambda: page.watching == first, browser_page)
 
 
-def test_a_page_of_another_origin_neither_sees_nor_steers(page: Any, browser_page: Any) -> None:
-    """In a real browser, even with the token: a server of somebody else on another port, and one by another name."""
-    port, token = page.server.get_port(), page.door.access.token
+def test_a_page_of_another_origin_has_no_access(page: Any, browser_page: Any) -> None:
+    """In a real browser, even with the token: a page from another port or another host name has no access."""
+    port, token = page.server.get_port(), page.guard.access.token
     before = page.server.get_clients().keys()
 
     class Stranger(http.server.BaseHTTPRequestHandler):

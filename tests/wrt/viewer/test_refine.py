@@ -1,4 +1,4 @@
-"""The viewer without a browser: what it shows when, what it gives up, and what it does not do twice."""
+"""wrt.viewer.refine without a browser: order of pictures, abandoned views, and work that is not repeated."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from wrt.viewer import renderers
 from wrt.viewer.refine import COARSE, DEEPEST, SCALES, Viewer
 from wrt.viewer.renderers import Shown
 
-# A box on a mirror, through an open lens: as the viewer compiles every scene. One kernel serves all tests here.
+# A box on a mirror, seen through an open lens, because the viewer always compiles a lens. All tests here share one kernel.
 CAMERA = Camera.look_at((2, 2, 4), (0, 0, 0), aperture_radius=0.05, focus_distance=4.0)
 SCENE = Scene(
     objects=(Object(box(), (Material(albedo=(0.7, 0.6, 0.5)),)),
@@ -57,7 +57,7 @@ class Eye:
         self.react(shown)
 
     def see(self, **changes: Any) -> Shown:
-        """The last picture after a change."""
+        """Change the view, and return the last picture."""
         self.viewer.change(**changes)
         self.viewer.step()
         return self.pictures[-1]
@@ -68,7 +68,7 @@ def turned(degrees: float) -> Camera:
     return Camera.look_at((2 * np.cos(angle), 2, 4 + np.sin(angle)), (0, 0, 0), aperture_radius=0.05, focus_distance=4.0)
 
 
-def test_it_is_coarse_first_and_in_the_end_the_picture_itself() -> None:
+def test_pictures_get_finer_and_end_with_that_of_render() -> None:
     eye = Eye()
     last = eye.see(size=(61, 34))
     scales = [shown.scale for shown in eye.pictures]
@@ -83,7 +83,7 @@ def test_it_is_coarse_first_and_in_the_end_the_picture_itself() -> None:
 
 
 def test_a_coarse_picture_covers_the_same_view() -> None:
-    """61 and 34 are no multiples of 8: the picture of 8x5 pixels has their angles all the same."""
+    """61 and 34 are no multiples of 8, but the picture of 8x5 pixels has the same angles of view."""
     eye = Eye(spp=64)
     fine = eye.see(size=(61, 34))
     coarse = next(shown for shown in eye.pictures if shown.scale == 8)
@@ -119,11 +119,11 @@ def test_a_camera_that_never_rests_is_followed() -> None:
     eye.react = lambda shown: eye.viewer.change(camera=turned(len(eye.pictures)))
     for _ in range(6):
         eye.see(size=(61, 34))
-    assert len(eye.pictures) == 6  # one of each view: what is asked for meanwhile ends it, and not before it was seen
+    assert len(eye.pictures) == 6  # one for each view: a new request ends a view after its first picture
     assert len({shown.view for shown in eye.pictures}) == 6
 
 
-def test_what_takes_too_long_is_given_up_unseen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_first_picture_is_abandoned(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "PATIENCE", -1.0)
     eye = Eye()
     eye.see(size=(61, 34))
@@ -162,7 +162,7 @@ def test_a_structure_is_built_once(monkeypatch: pytest.MonkeyPatch) -> None:
                     {"cost": "nodes"}, {"cost": ""}):
         assert eye.see(**changes).done
     assert made == ["bvh8"]
-    eye.see(accel="bvh8")  # the same structure by another name, with a renderer of its own
+    eye.see(accel="bvh8")  # "bvh" is an alias of "bvh8", but each name has its own renderer
     eye.see(accel="bvh")
     assert made == ["bvh8", "bvh8"] and eye.words[-1] == ""
 
@@ -175,7 +175,7 @@ def test_nothing_is_rendered_twice() -> None:
     assert not eye.viewer.change(camera=same, size=(61, 34), cost="")
     eye.viewer.step()
     assert len(eye.pictures) == pictures
-    eye.viewer.pause()  # nobody looks; then the same view is asked for
+    eye.viewer.pause()  # no browser is connected; then the same view is requested
     eye.viewer.step()
     assert len(eye.pictures) == pictures and eye.viewer.change(camera=same)
 
@@ -189,7 +189,7 @@ def test_another_tone_traces_no_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     eye.viewer.step()
     assert isinstance(film, Film)
     expected = replace(film, exposure=-1.5, tonemap="aces")
-    eye.viewer.step()  # nothing has changed since
+    eye.viewer.step()  # without a further change
     changing, rests = eye.pictures[-2:]
     assert not changing.done and rests.done and eye.viewer.shown is not None and eye.viewer.shown.done
     np.testing.assert_array_equal(changing.codes, expected.to_srgb8())
@@ -200,7 +200,7 @@ def test_another_tone_traces_no_ray(monkeypatch: pytest.MonkeyPatch) -> None:
         eye.viewer.tone(0.0, "sepia")
 
 
-def test_who_comes_later_sees_it_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_again_shows_the_last_picture_once_more(monkeypatch: pytest.MonkeyPatch) -> None:
     eye = Eye()
     for changes in ({"size": (61, 34)}, {"cost": "nodes"}):
         last = eye.see(**changes)
@@ -218,35 +218,35 @@ def test_a_heat_map_is_the_profile_of_the_picture() -> None:
     assert shown.done and shown.mean == pytest.approx(values.mean()) and shown.largest == values.max()
     codes = eye.viewer.picture()
     assert isinstance(codes, np.ndarray) and codes.shape == (34, 61, 3)
-    brightness = codes.astype(int).sum(axis=2)  # the colours of a heat map get lighter
+    brightness = codes.astype(int).sum(axis=2)  # the colours of a heat map get lighter with the count
     below = values < shown.top
     order = np.argsort(values[below], kind="stable")
     assert (np.diff(brightness[below][order]) >= -2).all() and brightness[~below].min() >= brightness[below].max()
     eye.react = lambda shown: eye.viewer.change(cost="")
     eye.viewer._pace["bvh", True] = 1.0
-    assert eye.see(cost="primitives").scale == SCALES[-1]  # the rest was given up
+    assert eye.see(cost="primitives").scale == SCALES[-1]  # finer scales were abandoned
     eye.viewer.step()
     assert isinstance(eye.viewer.picture(), Film)
 
 
-def test_what_a_click_focuses_on() -> None:
+def test_the_focus_at_a_clicked_point() -> None:
     eye = Eye()
     assert eye.viewer.renderers.focus_at(eye.viewer.view, 0.5, 0.5) is None  # nothing is built yet
     eye.see(size=(61, 34))
     corner = CAMERA.camera_to_world[:3, :3].T @ (SCENE.objects[0].mesh.vertices.max(axis=0) - CAMERA.camera_to_world[:3, 3])
     tangent = np.tan(0.5 * CAMERA.fov_y)
     x, y = 0.5 + 0.5 * corner[0] / -corner[2] / tangent * 34 / 61, 0.5 - 0.5 * corner[1] / -corner[2] / tangent
-    distance = eye.viewer.renderers.focus_at(eye.viewer.view, x, y + 1e-4)  # just below the box's nearest corner
+    distance = eye.viewer.renderers.focus_at(eye.viewer.view, x, y + 1e-4)  # just below the nearest corner of the box
     assert distance is not None and distance == pytest.approx(-corner[2], rel=1e-3)
     assert eye.viewer.renderers.focus_at(eye.viewer.view, 0.5, 0.0) is None  # sky
 
 
-def test_what_there_is_not_is_refused_and_what_cannot_be_built_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unknown_names_are_refused_and_build_errors_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     eye = Eye()
     for changes, message in (({"accel": "bhv"}, ("accel", "no structure 'bhv'")), ({"cost": "fees"}, ("cost", "no counter 'fees'"))):
         with refused(*message):
             eye.viewer.change(**changes)
-    without = Viewer(SCENE, Options(), lambda shown: None)  # nothing that counts: no heat maps
+    without = Viewer(SCENE, Options(), lambda shown: None)  # without a counter, there are no heat maps
     with refused("cost", "no counter 'nodes'"):
         without.change(cost="nodes")
     eye.see(size=(61, 34))
@@ -271,12 +271,12 @@ def test_a_thread_follows_until_it_is_stopped() -> None:
     assert fine.wait(240.0)
     eye.viewer.pause()
     pictures = -1
-    for _ in range(60):  # then nothing comes any more
+    for _ in range(60):  # after a pause, no more pictures arrive
         if pictures == (pictures := len(eye.pictures)):
             break
         time.sleep(3 * module.EVERY)
     else:
-        pytest.fail("it goes on")
+        pytest.fail("pictures still arrive")
     fine.clear()
     eye.viewer.change(max_depth=1)
     assert fine.wait(240.0)
@@ -285,7 +285,7 @@ def test_a_thread_follows_until_it_is_stopped() -> None:
     assert not thread.is_alive()
 
 
-def test_a_renderer_aims_elsewhere_with_what_it_has() -> None:
+def test_a_renderer_takes_another_camera_that_its_kernels_support() -> None:
     renderer = Renderer(PINHOLE, Options())
     other = Camera.look_at((-3, 1, 4), (0, 0, 0))
     renderer.aim(other, size=(20, 31), spp=2, max_depth=1)

@@ -1,1 +1,1 @@
-"""Bounding volume hierarchies: binary and wide, their builders, refit and measures."""
+"""Bounding volume hierarchies, binary and wide: builders, refits and costs."""

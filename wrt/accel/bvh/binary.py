@@ -1,4 +1,4 @@
-"""Binary BVH, as its builder makes it."""
+"""Binary BVH with boxes, and the base class of binary BVHs with other bounding volumes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ RECORDS_PER_JOB = 32768
 
 
 class InPlace(NamedTuple):
-    """Arrays of refits in place: kernels.build.fit.Tree, and the Shape that they copy the points into."""
+    """Arrays for refits in place. tree: kernels.build.fit.Tree; shape: the Shape into which a refit copies the points."""
 
     fitting: Fitting
     tree: WarpStruct
@@ -53,7 +53,7 @@ class BinaryBvh(OneMesh):
 
     @abstractmethod
     def _around(self, nodes: np.ndarray, order: np.ndarray, leaves: int, depth: int) -> Built:
-        """Make the structure from Bvh2Node records."""
+        """Make the structure from Bvh2Node records of a binary tree; arguments as in Built."""
 
     def _check(self, built: Built) -> None:
         check_binary(built.arrays["nodes"], len(built.order), kernels.STACK_SIZE)
@@ -75,13 +75,13 @@ class Bvh2(BinaryBvh):
         return Built({"nodes": nodes}, order, len(nodes), leaves, depth, sah_cost(nodes))
 
     def _shape(self) -> WarpStruct:
-        """Upload the geometry. Its faces stay on the device for the next time."""
-        shape = self.geometry.on(self.device, self._kept.get("faces"))
-        self._kept["faces"] = shape.faces
+        """Upload the geometry. Its faces are cached on the device."""
+        shape = self.geometry.on(self.device, self._cache.get("faces"))
+        self._cache["faces"] = shape.faces
         return shape
 
     def _on_device(self, built: Built) -> Built:
-        """Return the arrays on the device, with the parents."""
+        """Copy the arrays to the device, and compute the parents."""
         nodes, order = built.arrays["nodes"], built.order
         if not isinstance(order, wp.array):
             nodes, order = upload(nodes.copy(), kernels.Bvh2Node, self.device), upload(order.copy(), wp.int32, self.device)
@@ -92,10 +92,10 @@ class Bvh2(BinaryBvh):
         if not isinstance(vertices, wp.array):
             return super()._moved(vertices)
         points = wp.clone(self._points(vertices), device=self.device)
-        return DeviceGeometry.moved(points, self._shape().faces, self.geometry.spheres)
+        return DeviceGeometry.unchecked(points, self._shape().faces, self.geometry.spheres)
 
     def _points(self, vertices: ArrayLike) -> WarpArray:
-        points = DeviceGeometry.points_of(vertices, "vertices")
+        points = DeviceGeometry.checked_points(vertices, "vertices")
         if len(points) != self.geometry.n_vertices:
             raise InputError(f"must be ({self.geometry.n_vertices},), got ({len(points)},)", argument="vertices")
         if points.device.is_cpu:
@@ -103,7 +103,7 @@ class Bvh2(BinaryBvh):
         return points
 
     def _refit(self, built: Built) -> Built:
-        """Refit on the device; only the cost of the tree is copied to the host."""
+        """Refit on the device. Only the summary of the root, with the SAH cost, is copied to the host."""
         built = self._on_device(built)
         nodes = wp.clone(built.arrays["nodes"])
         fitting = Fitting(self.device, len(self.geometry), len(nodes))
@@ -113,20 +113,20 @@ class Bvh2(BinaryBvh):
     def _refit_in_place(self, points: ArrayLike) -> None:
         points = self._points(points)
         if points.device != self.device or self.structure.units.triangle_test.layout != "corners":
-            raise InputError(f"a refit in place is from a Warp array on {self.device}, for the watertight triangle test",
+            raise InputError(f"a refit in place needs a Warp array on {self.device}, and the watertight triangle test",
                              argument="vertices")
-        kept: InPlace | None = self._kept.get("in place")
-        if kept is None or kept.tree.nodes is not self.data.nodes:
+        cached: InPlace | None = self._cache.get("in place")
+        if cached is None or cached.tree.nodes is not self.data.nodes:
             if self.device.is_capturing:
-                raise InputError("a graph cannot capture the first refit in place",
-                                 hint="refit in place once before: then what it works with is there")
-            kept = self._kept["in place"] = self._begin_in_place(points)
-        wp.copy(kept.shape.vertices, points)
-        kept.fitting.refit(kept.tree, kept.shape, self.threads)
-        self._write_corners(kept.shape, kept.tree.order, self.data.primitives)
+                raise InputError("a graph cannot capture the first refit in place, which allocates memory",
+                                 hint="refit in place once before the capture")
+            cached = self._cache["in place"] = self._begin_in_place(points)
+        wp.copy(cached.shape.vertices, points)
+        cached.fitting.refit(cached.tree, cached.shape, self.threads)
+        self._write_corners(cached.shape, cached.tree.order, self.data.primitives)
 
     def save(self, path: PathLike) -> None:
-        """Save as OneMesh.save, with the cost of a tree that was refitted in place."""
+        """Save as OneMesh.save. After a refit in place, first compute the SAH cost."""
         snapshot = self._snapshot
         built = snapshot.arrays
         if math.isnan(built.sah_cost):
@@ -134,17 +134,17 @@ class Bvh2(BinaryBvh):
         save(snapshot, path)
 
     def _begin_in_place(self, points: WarpArray) -> InPlace:
-        """Give the structure its own arrays; return the arrays that refits in place need."""
+        """Give the structure arrays that no snapshot shares; return the arrays that refits in place need."""
         built, spheres = self._on_device(self._snapshot.arrays), self.geometry.spheres
         built = replace(built, arrays={"nodes": wp.clone(built.arrays["nodes"])}, sah_cost=float("nan"))
-        moved = DeviceGeometry.moved(wp.clone(points), self._shape().faces, spheres)
+        moved = DeviceGeometry.unchecked(wp.clone(points), self._shape().faces, spheres)
         beside = self._over(moved, built, self._snapshot.built_cost)
         fitting, shape = Fitting(self.device, len(self.geometry), built.nodes), beside._shape()
         self._snapshot = replace(beside.snapshot, changes=True)
         return InPlace(fitting, tree_of(fitting, self.data.nodes, built.parents, built.order), shape)
 
     def _primitives(self, built: Built) -> np.ndarray | WarpArray:
-        """Write the records on the device if the order is there and they are plain corners; else on the host."""
+        """Write the records on the device if `order` is there and the records are three corners; else on the host."""
         if (not isinstance(built.order, wp.array) or self.structure.units.triangle_test.layout != "corners"
                 or isinstance(self.geometry, NumberedGeometry)):
             return super()._primitives(built.on_host())

@@ -1,4 +1,4 @@
-"""Boxes of wide nodes in 8 bits a plane, in the layout of kernels/wide/nodes.py.
+"""Boxes of wide nodes, compressed to 8 bits per plane, in the layout of kernels/wide/nodes.py.
 
 Ylitie, Karras and Laine 2017, "Efficient Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs", section 3.2.
 """
@@ -11,21 +11,21 @@ from wrt.kernels.wide.layout import EXIST_SHIFT, EXPONENT_BITS, FIRST_BYTES, MAN
 
 EXPONENT_BIAS, LARGEST_EXPONENT = 127, 255  # of float32
 LARGEST_BYTE = 255
-EXPONENT_SHIFTS = EXPONENT_BITS * np.arange(3, dtype=np.uint32)  # of the exponents of x, y and z in the word
+EXPONENT_SHIFTS = EXPONENT_BITS * np.arange(3, dtype=np.uint32)  # bit positions of the exponents of x, y, z in a node's word
 
 
 def decoded(origin: np.ndarray, step: np.ndarray, byte: np.ndarray) -> np.ndarray:
-    """Decode planes as kernels do, with one rounding, that of the sum. origin, step: (..., 1) float32; byte: (..., W)."""
+    """Decode planes with the bits of the kernels: only the sum rounds. origin, step: (..., 1) float32; byte: (..., W)."""
     with np.errstate(invalid="ignore", over="ignore"):
         return origin + byte.astype(np.float32) * step
 
 
 def steps(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return the biased exponent of the least power of two whose 255-fold leads from low to high; LARGEST_EXPONENT if none does."""
+    """Return the biased exponent of the least power of two p with low + 255 p >= high, or LARGEST_EXPONENT."""
     with np.errstate(invalid="ignore", over="ignore"):
         _, exponent = np.frexp((high.astype(np.float64) - low) / LARGEST_BYTE)
         biased = np.clip(np.where(high > low, exponent, -EXPONENT_BIAS) - 1 + EXPONENT_BIAS, 1, LARGEST_EXPONENT)
-        for _ in range(3):  # a power of two itself, and the roundings of the sum
+        for _ in range(3):  # frexp is one too small for a power of two, and the sum may round down
             short = ~(decoded(low, powers(biased), np.full_like(low, LARGEST_BYTE)) >= high)
             biased = np.minimum(biased + short, LARGEST_EXPONENT)
     return biased
@@ -36,9 +36,9 @@ def powers(biased: np.ndarray) -> np.ndarray:
 
 
 def compress(lo: np.ndarray, hi: np.ndarray, exists: np.ndarray) -> np.ndarray:
-    """Compress boxes to the numbers of a node before its references. lo, hi: (N, W, 3) float32; exists: (N, W) bool.
+    """Compress boxes to the floats of a node that precede its references. lo, hi: (N, W, 3) float32; exists: (N, W) bool.
 
-    Every compressed box contains the original. An axis for which 8 bits are not enough stops no ray.
+    Every compressed box contains the original box. Along an axis whose extent 8 bits cannot cover, the box is infinite.
     """
     n, width = exists.shape
     low = np.where(exists[..., None], lo, np.float32(np.inf)).min(axis=1)
@@ -62,11 +62,11 @@ def compress(lo: np.ndarray, hi: np.ndarray, exists: np.ndarray) -> np.ndarray:
 
 
 def nearest(origin: np.ndarray, step: np.ndarray, planes: np.ndarray, upward: bool) -> np.ndarray:
-    """Return the byte of the last plane not above each given plane, or of the first not below it (upward)."""
+    """Return the byte whose decoded plane is nearest to each of `planes` on its lower side, or on its upper side (upward)."""
     with np.errstate(over="ignore", invalid="ignore"):
         t = (planes.astype(np.float64) - origin) / step.astype(np.float64)
     byte = np.clip(np.where(np.isfinite(t), np.ceil(t) if upward else np.floor(t), 0.0), 0.0, LARGEST_BYTE)
-    for _ in range(2):  # the sum may round to the other side
+    for _ in range(2):  # the decoded plane may round to the wrong side
         plane = decoded(origin, step, byte)
         byte += np.where(plane < planes, 1.0, 0.0) if upward else np.where(plane > planes, -1.0, 0.0)
         byte = np.clip(byte, 0.0, LARGEST_BYTE)
@@ -74,13 +74,13 @@ def nearest(origin: np.ndarray, step: np.ndarray, planes: np.ndarray, upward: bo
 
 
 def existing_children(nodes: np.ndarray, width: int) -> np.ndarray:
-    """Return which children exist, (N, W) bool, from the words of the nodes."""
+    """Return the mask of existing children, (N, W) bool, from the words of the nodes."""
     word = np.ascontiguousarray(nodes[:, WORD]).view(np.uint32)
     return (word[:, None] >> np.arange(EXIST_SHIFT, EXIST_SHIFT + width, dtype=np.uint32) & 1).astype(bool)
 
 
 def decompress(nodes: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the boxes as kernels decode them, lo and hi (N, W, 3): empty without a child, infinite on axes that stop no ray."""
+    """Return the boxes with the bits of the kernels, lo and hi (N, W, 3); empty boxes for missing children."""
     n = len(nodes)
     word = np.ascontiguousarray(nodes[:, WORD]).view(np.uint32)
     step = powers(word[:, None] >> EXPONENT_SHIFTS & LARGEST_EXPONENT)

@@ -9,7 +9,7 @@ Bounds = tuple[np.ndarray, np.ndarray]
 
 
 def kdop_areas(nodes: np.ndarray, middle: np.ndarray) -> np.ndarray:
-    """Return the surface of both children of KdopNode records, (2, N) float64: 0 without a child, inf if it is not finite."""
+    """Return the surface area of both children of KdopNode records, (2, N) float64: 0 for a missing child, inf if not finite."""
     out = np.empty((2, len(nodes)))
     for i, side in enumerate("01"):
         lo, hi = (nodes[f"{end}_{side}"].astype(np.float64) - middle for end in ("lo", "hi"))
@@ -21,9 +21,9 @@ def kdop_areas(nodes: np.ndarray, middle: np.ndarray) -> np.ndarray:
 
 
 def kdop_area(lo: np.ndarray, hi: np.ndarray, cut_lo: np.ndarray, cut_hi: np.ndarray) -> np.ndarray:
-    """Return the surface (N,) of boxes lo, hi, (N, 3), between planes cut_lo, cut_hi, (N, 4), along the diagonals of `project`."""
+    """Return the surface area (N,) of boxes lo, hi, (N, 3), cut by planes cut_lo, cut_hi, (N, 4), across DIAGONALS."""
     axes = [(lo[:, i], hi[:, i]) for i in range(3)]
-    # A plane that cuts nothing off is moved to the box: far away, it would cost all digits.
+    # A plane outside of the box is moved to the box, because its distance would cancel all digits of an area.
     cuts = [(np.maximum(cut_lo[:, k], np.minimum(sign * lo, sign * hi).sum(axis=1)),
              np.minimum(cut_hi[:, k], np.maximum(sign * lo, sign * hi).sum(axis=1))) for k, sign in enumerate(DIAGONALS)]
     total = np.zeros(len(lo))
@@ -32,7 +32,7 @@ def kdop_area(lo: np.ndarray, hi: np.ndarray, cut_lo: np.ndarray, cut_hi: np.nda
         for x in axes[a]:
             total += box_face(x, axes[b], axes[c], cuts[0], cuts[a + 1], cuts[b + 1], cuts[c + 1])
     total += askew_faces(axes, cuts)
-    for a in range(3):  # mirrored in one axis, another diagonal is the first
+    for a in range(3):  # mirroring axis a makes diagonal a + 1 the first diagonal
         b, c = (a + 1) % 3, (a + 2) % 3
         mirrored, turned = list(axes), list(cuts)
         mirrored[a] = negated(axes[a])
@@ -46,14 +46,14 @@ def negated(bounds: Bounds) -> Bounds:
     return -bounds[1], -bounds[0]
 
 
-def quarter(t: np.ndarray) -> np.ndarray:
-    """Return the area below the diagonal z = t - y of the quarter y, z >= 0."""
+def wedge(t: np.ndarray) -> np.ndarray:
+    """Return the area of the triangle y, z >= 0, y + z <= t."""
     t = np.maximum(t, 0.0)
     return 0.5 * t * t
 
 
 def box_face(x: np.ndarray, y: Bounds, z: Bounds, sum_all: Bounds, minus_x: Bounds, minus_y: Bounds, minus_z: Bounds) -> np.ndarray:
-    """Return the area of the rectangle y, z at x within the slabs of all four diagonals."""
+    """Return the area of the box's face at x, a rectangle y, z, inside the slabs of all four diagonals."""
     up = np.maximum(sum_all[0] - x, minus_x[0] + x), np.minimum(sum_all[1] - x, minus_x[1] + x)  # y + z
     across = np.maximum(minus_y[0] - x, x - minus_z[1]), np.minimum(minus_y[1] - x, x - minus_z[0])  # z - y
     area = (below(y, z, up[1], across[1]) - below(y, z, up[0], across[1])
@@ -62,22 +62,22 @@ def box_face(x: np.ndarray, y: Bounds, z: Bounds, sum_all: Bounds, minus_x: Boun
 
 
 def below(y: Bounds, z: Bounds, q: np.ndarray, s: np.ndarray) -> np.ndarray:
-    """Return the area of the rectangle y, z where y + z <= q and z - y <= s: a tent over y with its ridge at (q - s) / 2."""
+    """Return the area of the rectangle y, z where y + z <= q and z - y <= s: a roof over y whose ridge is at (q - s) / 2."""
     ridge = np.clip(0.5 * (q - s), y[0], y[1])
     height = z[1] - z[0]
 
-    def climbed(t: np.ndarray) -> np.ndarray:  # the integral of clip(t, 0, height)
-        return np.where(t > height, (t - 0.5 * height) * height, quarter(t))
+    def integral(t: np.ndarray) -> np.ndarray:  # of clip(t, 0, height)
+        return np.where(t > height, (t - 0.5 * height) * height, wedge(t))
 
-    rising = climbed(s + ridge - z[0]) - climbed(s + y[0] - z[0])
-    falling = climbed(q - ridge - z[0]) - climbed(q - y[1] - z[0])
+    rising = integral(s + ridge - z[0]) - integral(s + y[0] - z[0])
+    falling = integral(q - ridge - z[0]) - integral(q - y[1] - z[0])
     return rising + falling
 
 
 def askew_faces(axes: list[Bounds], cuts: list[Bounds]) -> np.ndarray:
     """Return the area of both faces across the first diagonal.
 
-    They are hexagons, seen along x as a rectangle in y and z between two lines y + z = const.
+    A face is a hexagon. Its projection along x is a rectangle in y and z, cut by two lines y + z = const.
     """
     (x0, x1), total = axes[0], np.zeros(len(axes[0][0]))
     for end in (0, 1):
@@ -85,7 +85,7 @@ def askew_faces(axes: list[Bounds], cuts: list[Bounds]) -> np.ndarray:
         y0, y1 = np.maximum(axes[1][0], 0.5 * (b - cuts[2][1])), np.minimum(axes[1][1], 0.5 * (b - cuts[2][0]))
         z0, z1 = np.maximum(axes[2][0], 0.5 * (b - cuts[3][1])), np.minimum(axes[2][1], 0.5 * (b - cuts[3][0]))
         p, q = np.maximum(b - x1, 0.5 * (cuts[1][0] + b)), np.minimum(b - x0, 0.5 * (cuts[1][1] + b))
-        area = sum(sign * (quarter(end - y0 - z0) - quarter(end - y1 - z0) - quarter(end - y0 - z1) + quarter(end - y1 - z1))
+        area = sum(sign * (wedge(end - y0 - z0) - wedge(end - y1 - z0) - wedge(end - y0 - z1) + wedge(end - y1 - z1))
                    for sign, end in ((1.0, q), (-1.0, p)))
         total += np.where((y0 < y1) & (z0 < z1) & (p < q), np.sqrt(3.0) * np.maximum(area, 0.0), 0.0)
     return total

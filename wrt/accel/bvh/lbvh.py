@@ -1,4 +1,4 @@
-"""Builder along a Morton curve, for any device (kernels: kernels/build/lbvh.py)."""
+"""LBVH builder, along a Morton curve, for the CPU and CUDA (kernels: kernels/build/lbvh.py)."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from wrt.core.types import Device, WarpArray, WarpStruct
 from wrt.kernels.build import lbvh as kernels
 from wrt.kernels.traverse.bvh2 import Bvh2Node
 
-MOST = 1 << 30  # the sort needs two entries for each primitive
+MOST = 1 << 30  # primitives: the sort needs two entries for each
 
 
 def build_lbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
-    """Build with the least work; the tree is better than the median's only."""
+    """Build in the least time of all builders. Only the median builder makes worse trees."""
     if len(geometry) <= 1:
         return small_tree(*geometry.bounds())
     cpu = start("cpu")
@@ -28,23 +28,23 @@ def build_lbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryT
 
 def build_on(device: Device, shape: WarpStruct, options: BvhOptions,
              threads: int = 1) -> tuple[WarpArray, WarpArray, WarpArray, Root]:
-    """Build over a Shape of two primitives or more: Bvh2Node records, their parents, prim_ids of the leaves, and a Root.
+    """Build over a Shape of at least two primitives; return Bvh2Node records, their parents, prim_ids of the leaves, and a Root.
 
     The arrays stay on the device.
     """
     n = len(shape.faces) + len(shape.spheres)
     if n >= MOST:
-        raise InputError(f"lbvh takes fewer than {MOST} primitives, got {n}", argument="builder")
-    number_bits, bits = kernels.bits_of(n)
+        raise InputError(f"must not be lbvh for {MOST} primitives or more, got {n}", argument="builder")
+    index_bits, bits = kernels.bits_of(n)
     fitting = Fitting(device, n, n - 1)
     fitting.find_bounds(shape, threads)
     ends = wp.full(2, wp.vec3(wp.inf), dtype=wp.vec3, device=device)
     ends[1:].fill_(wp.vec3(-wp.inf))
     launch_on(device, kernels.measure, min(kernels.PARTS, n), fitting.low, fitting.high, ends)
     keys, order = wp.empty(2 * n, dtype=wp.uint64, device=device), wp.empty(2 * n, dtype=wp.int32, device=device)
-    launch_on(device, kernels.write_keys, n, fitting.low, fitting.high, ends, wp.vec2i(number_bits, bits), keys, order, None)
-    with device.context_guard:  # the sort takes the current one
-        wp.utils.radix_sort_pairs(keys, order, n, number_bits, number_bits + 3 * bits)
+    launch_on(device, kernels.write_keys, n, fitting.low, fitting.high, ends, wp.vec2i(index_bits, bits), keys, order, None)
+    with device.context_guard:  # radix_sort_pairs uses the current CUDA context
+        wp.utils.radix_sort_pairs(keys, order, n, index_bits, index_bits + 3 * bits)
     nodes, parents = (wp.empty(n - 1, dtype=kind, device=device) for kind in (Bvh2Node, wp.int32))
     launch_on(device, kernels.link, n - 1, keys, nodes, parents, None)
     order = wp.clone(order[:n])

@@ -1,8 +1,7 @@
-"""Refits of binary trees on any device (kernels: kernels/build/fit.py)."""
+"""Refits of binary trees on the CPU and CUDA (kernels: kernels/build/fit.py)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import warp as wp
@@ -18,51 +17,47 @@ PRIMITIVES_PER_JOB = 32768
 
 
 class Root(NamedTuple):
-    """Figures of a whole tree. height: inner nodes on the longest path; sah_cost: as in AccelStats."""
+    """Statistics of a whole tree. height: inner nodes on the longest path from the root; sah_cost: as in AccelStats."""
 
     inner_nodes: int
     height: int
     sah_cost: float
 
 
-@dataclass(eq=False)
 class Fitting:
-    """Arrays on a device to fit a tree around its primitives, used again for every refit."""
+    """Scratch arrays on a device for fitting the boxes of a tree to its primitives. primitives, nodes: their numbers."""
 
-    device: Device
-    primitives: int
-    nodes: int
-
-    def __post_init__(self) -> None:
-        self.low, self.high = (wp.empty(self.primitives, dtype=wp.vec3, device=self.device) for _ in range(2))
-        self.arrived = wp.zeros(self.nodes, dtype=wp.int32, device=self.device)
-        self.summaries = wp.empty(self.nodes, dtype=kernels.SubtreeSummary, device=self.device)
+    def __init__(self, device: Device, primitives: int, nodes: int) -> None:
+        self.device, self.primitives, self.nodes = device, primitives, nodes
+        self.low, self.high = (wp.empty(primitives, dtype=wp.vec3, device=device) for _ in range(2))
+        self.arrived = wp.zeros(nodes, dtype=wp.int32, device=device)
+        self.summaries = wp.empty(nodes, dtype=kernels.SubtreeSummary, device=device)
 
     def find_bounds(self, shape: WarpStruct, threads: int = 1) -> None:
         """Compute the box of each primitive of a kernels.build.shape.Shape."""
         launch_on(self.device, bounds, self.primitives, shape, self.low, self.high, None, threads=threads, step=PRIMITIVES_PER_JOB)
 
     def fit(self, tree: WarpStruct, options: WarpStruct | None = None) -> None:
-        """Fit the boxes of the tree; with options, subtrees become leaves where that costs less."""
+        """Fit the boxes of the tree to the primitives' boxes. With options, subtrees become leaves where that costs no more."""
         if options is None:
             options = BuildOptions()
             options.row = 1
         launch_on(self.device, kernels.fit, self.nodes, tree, options)
 
     def refit(self, tree: WarpStruct, shape: WarpStruct, threads: int = 1) -> None:
-        """Fit the boxes to the shape; those of spatial splits become the boxes of whole triangles. A graph can capture it."""
+        """Fit the boxes to the shape. A CUDA graph can capture this call. Boxes that spatial splits clipped become whole again."""
         self.find_bounds(shape, threads)
         self.fit(tree)
 
     def root(self) -> Root:
-        """Return the figures of the tree that was fitted last."""
+        """Return the statistics of the tree that was fitted last."""
         root = on_host(self.summaries[:1])[0]
         area, unit_cost = float(half_areas(root["lo"], root["hi"])), float(root["unit_cost"])
         return Root(int(root["inner_nodes"]), int(root["height"]), unit_cost / area if area > 0.0 else float(root["size"]))
 
 
 def tree_of(fitting: Fitting, nodes: WarpArray, parents: WarpArray | None, order: WarpArray) -> WarpStruct:
-    """Make a kernels.build.fit.Tree."""
+    """Make a kernels.build.fit.Tree that uses the arrays of `fitting`."""
     tree = kernels.Tree()
     tree.nodes, tree.parents, tree.order = nodes, parents, order
     for name in ("low", "high", "arrived", "summaries"):
@@ -71,7 +66,7 @@ def tree_of(fitting: Fitting, nodes: WarpArray, parents: WarpArray | None, order
 
 
 def parents_of(nodes: WarpArray) -> WarpArray:
-    """Return the parent of each Bvh2Node record on the device; kernels.build.fit.NO_PARENT for a root."""
+    """Return the index of the parent of each Bvh2Node record, on the nodes' device; kernels.build.fit.NO_PARENT for a root."""
     parents = wp.full(len(nodes), kernels.NO_PARENT, dtype=wp.int32, device=nodes.device)
     launch_on(nodes.device, kernels.find_parents, len(nodes), nodes, parents)
     return parents

@@ -1,4 +1,4 @@
-"""Optimisation of finished trees by reinsertion (kernels: kernels/build/reinsertion.py)."""
+"""Optimisation of built trees by reinsertion of subtrees (kernels: kernels/build/reinsertion.py)."""
 
 from __future__ import annotations
 
@@ -18,15 +18,14 @@ from wrt.kernels.build.shape import half_area
 from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node
 
 NODES_PER_LAUNCH = 256
-# With LARGEST_NODES, subtrees of so many primitives move as a whole; the collapse fills wide rows afterwards.
-SMALL_LEAF = 4
+SMALL_LEAF = 4  # primitives per leaf at most while build_refined moves subtrees; wide BVHs merge leaves afterwards
 
 
 class Effort(NamedTuple):
     """Extent of the optimisation.
 
-    share: fraction of the nodes, the largest ones, that a round tries to move. rounds: at most. least_gain: a round that reduces the
-    sum of areas by a smaller fraction is the last.
+    share: a round tries to move this fraction of the nodes, the largest ones. rounds: maximum number of rounds. least_gain: a round
+    that reduces the sum of areas by a smaller fraction is the last.
     """
 
     share: float
@@ -48,7 +47,7 @@ def build_reinsertion(geometry: Geometry, options: BvhOptions, threads: int) -> 
 
 
 def build_refined(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
-    """Build by binned SAH and reinsert the largest boxes: most of the gain of full reinsertion in a tenth of its time.
+    """Build by binned SAH and reinsert the largest nodes: most of the gain of full reinsertion in a tenth of its time.
 
     Bittner, Hapala and Havran 2013, "Fast Insertion-Based Optimization of Bounding Volume Hierarchies".
     """
@@ -62,7 +61,7 @@ def build_refined(geometry: Geometry, options: BvhOptions, threads: int) -> Bina
 
 
 def leaf_begins(tree: BinaryTree) -> np.ndarray:
-    """Return whether a leaf begins at each record, (R,) bool."""
+    """Return the mask of the records at which a leaf begins, (R,) bool."""
     begins = np.zeros(len(tree.order), bool)
     for side in ("0", "1"):
         begins[tree.nodes["first_" + side][tree.nodes["count_" + side] > 0]] = True
@@ -70,19 +69,19 @@ def leaf_begins(tree: BinaryTree) -> np.ndarray:
 
 
 def links_of(tree: BinaryTree) -> np.ndarray:
-    """Convert a tree to links: inner nodes first, then the leaves in the order of their records."""
+    """Convert a tree to Link records: inner nodes first, then the leaves in the order of their primitives."""
     nodes, n_inner = tree.nodes, len(tree.nodes)
-    links, number = records(kernels.Link, 2 * n_inner + 1), np.cumsum(leaf_begins(tree), dtype=np.int32) - 1
+    links, leaf_index = records(kernels.Link, 2 * n_inner + 1), np.cumsum(leaf_begins(tree), dtype=np.int32) - 1
     links["left"], links["right"] = -1, -1
-    place = np.empty(len(links), np.int32)  # 2 * parent + side of each link but the root
+    place = np.empty(len(links), np.int32)  # 2 * parent + side of each link except the root
     for side, child in enumerate(("left", "right")):
         first, leaf = nodes[f"first_{side}"], nodes[f"count_{side}"] > 0
-        index = links[child][:n_inner] = np.where(leaf, n_inner + number[np.where(leaf, first, 0)], first)
+        index = links[child][:n_inner] = np.where(leaf, n_inner + leaf_index[np.where(leaf, first, 0)], first)
         place[index] = np.arange(side, 2 * n_inner, 2, dtype=np.int32)
     place[0] = 0
     links["parent"] = place >> 1
     boxes = np.stack([nodes[f"{end}_{side}"] for side in (0, 1) for end in ("lo", "hi")], axis=1).reshape(-1, 6)
-    boxes = boxes.take(place, axis=0)  # much faster than from or to the fields of records
+    boxes = boxes.take(place, axis=0)  # much faster than indexing the fields of records
     links["lo"], links["hi"] = boxes[:, :3], boxes[:, 3:]
     links["parent"][0] = -1
     links["lo"][0] = np.minimum(nodes["lo_0"][0], nodes["lo_1"][0])
@@ -103,9 +102,9 @@ def scale_of(links: np.ndarray) -> np.float32:
 
 
 def optimized(tree: BinaryTree, effort: Effort, threads: int) -> tuple[WarpArray, WarpStruct, float]:
-    """Return the optimised links, the walk down to them, and the fraction of the areas that is gone.
+    """Return the optimised links, their kernels.build.reinsertion.Walk, and the fraction by which the sum of areas fell.
 
-    If the tree becomes deeper than the stack, the optimisation begins again with half as many rounds.
+    If the tree becomes deeper than the traversal stack, the optimisation begins again with half as many rounds.
     """
     before, rounds = links_of(tree), effort.rounds
     while True:
@@ -118,9 +117,9 @@ def optimized(tree: BinaryTree, effort: Effort, threads: int) -> tuple[WarpArray
 
 
 def move(links: WarpArray, effort: Effort, rounds: int, threads: int) -> float:
-    """In each round, search the best place of each large node, and make the moves, the best first.
+    """In each round, search the best place of each large node, and then make the moves in the order of their gains.
 
-    Return the fraction of the areas that is gone.
+    Return the fraction by which the sum of areas fell.
     """
     cpu = start("cpu")
     view = on_host(links)
@@ -145,7 +144,7 @@ def move(links: WarpArray, effort: Effort, rounds: int, threads: int) -> float:
 
 
 def largest(links: np.ndarray, areas: np.ndarray, share: float) -> np.ndarray:
-    """Return the largest nodes that can be moved, (K,) int32: not the root and its children."""
+    """Return the indices of the largest nodes that can move, (K,) int32. The root and its children cannot move."""
     movable = links["parent"] > 0
     most = int(share * len(links))
     if share < 1.0 and 0 < most < len(links):
@@ -165,7 +164,7 @@ def order_nodes(links: WarpArray) -> WarpStruct:
 
 
 def with_leaves(tree: BinaryTree, links: np.ndarray, walk: WarpStruct) -> BinaryTree:
-    """Convert links to a tree with the leaves of the original tree. Records of a subtree are adjacent."""
+    """Convert links to a tree with the leaves of the original tree. The primitives of a subtree become adjacent."""
     n_inner, order = len(tree.nodes), walk.order.numpy()
     before, begins, counts = np.zeros((3, len(links)), np.int32)
     before[n_inner:] = np.flatnonzero(leaf_begins(tree))
@@ -177,7 +176,7 @@ def with_leaves(tree: BinaryTree, links: np.ndarray, walk: WarpStruct) -> Binary
 
 
 def nodes_of(links: np.ndarray, inner: np.ndarray, begins: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Make Bvh2Node records of inner links, parents first. begins, counts: first record and number of records of each leaf."""
+    """Make Bvh2Node records of the links `inner`, parents first. begins, counts: first primitive and number of primitives of leaves."""
     nodes, boxes = records(Bvh2Node, len(inner)), np.concatenate([links["lo"], links["hi"]], axis=1)
     begins[inner], counts[inner] = np.arange(len(inner)), 0
     for side, name in (("0", "left"), ("1", "right")):
@@ -189,7 +188,7 @@ def nodes_of(links: np.ndarray, inner: np.ndarray, begins: np.ndarray, counts: n
 
 
 def collapse(tree: BinaryTree, links: WarpArray, walk: WarpStruct, options: BvhOptions) -> BinaryTree:
-    """Collapse subtrees of a tree with one record a leaf into leaves wherever that costs no more."""
+    """Collapse subtrees of a tree with one primitive per leaf into larger leaves wherever that costs no more."""
     launch(kernels.choose_leaves, 1, links, walk, build_options(options), scale_of(on_host(links)))
     rows, order, counts = on_host(links), walk.order.numpy(), walk.count.numpy().copy()
     # The 2 count - 2 links below a link come next in the walk: those below a leaf are inside it.

@@ -1,4 +1,4 @@
-"""Wide trees over few primitives in Python: loading the builders' kernels takes as long, and compiling them much longer."""
+"""Wide trees over few primitives, built in Python, because loading or compiling the builders' kernels would take longer."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ SMALL = 128  # primitives
 
 
 class _Choice(NamedTuple):
-    """Best way to make a subtree at most some number of children of a node.
+    """Cheapest way to represent a subtree by at most some number of children of a wide node.
 
-    cost: of these children. children: their number. first: how many of them come from the first part; 0: the subtree is one child.
+    cost: SAH cost of these children. children: their number. first: number of children from the subtree's first part; 0: the
+    subtree itself is the only child.
     """
 
     cost: float
@@ -25,9 +26,9 @@ class _Choice(NamedTuple):
 
 
 class _Subtree:
-    """Subtree of a binary tree: items (n,), their boxes lo, hi (n, 3), and half the surface of the box around them.
+    """Subtree of a binary tree: primitives `items` (n,), their boxes lo, hi (n, 3), and half the area of the box around them.
 
-    parts: its two children once it is split. choices: for at most 1, 2, .. children. opened: the best choice of two or more.
+    parts: the two children, after `split`. choices: best choice of at most 1, 2, .. children. opened: best choice of two or more.
     """
 
     parts: list[_Subtree]
@@ -36,12 +37,12 @@ class _Subtree:
 
     def __init__(self, items: np.ndarray, lo: np.ndarray, hi: np.ndarray, area: float, options: BvhOptions) -> None:
         self.items, self.lo, self.hi, self.area, self.options = items, lo, hi, area, options
-        # Single rays test a row's primitives at once, packets one after another: a leaf costs half its rows and half its items.
+        # Mean of two costs: a single ray tests a row of primitives at once; a packet of rays tests primitives one by one.
         rows = 0.5 * -(-len(items) // options.row) + 0.5 * len(items) / options.row
         self.leaf_cost = options.cost_intersection * rows * area if len(items) <= options.max_leaf else np.inf
 
     def split(self) -> None:
-        """Split where a sweep along the axes finds the least cost; of equal costs, where the parts are most equal."""
+        """Split at the least SAH cost of a sweep along all axes. At equal cost, prefer parts of equal size."""
         n, self.parts = len(self.items), []
         if n == 1:
             return
@@ -49,7 +50,7 @@ class _Subtree:
             centers = 0.5 * self.lo + 0.5 * self.hi
         order = centers.argsort(axis=0, kind="stable")  # (n, axis)
         lo, hi = self.lo[order], self.hi[order]  # (n, axis, 3)
-        # Of the first 1, 2, .. and of the last 1, 2, .. items along each axis.
+        # Areas around the first 1, 2, .. and around the last 1, 2, .. items along each axis.
         below, above = half_areas(
             np.minimum.accumulate(np.stack([lo, lo[::-1]]), axis=1), np.maximum.accumulate(np.stack([hi, hi[::-1]]), axis=1))
         below, above = below[:-1], above[-2::-1]
@@ -60,7 +61,7 @@ class _Subtree:
                       for part, area in ((order[: k + 1, axis], below), (order[k + 1 :, axis], above))]
 
     def choose(self) -> None:
-        """Find the least cost for every number of children, as kernels.build.wide does, after the parts have."""
+        """Find the least cost for every number of children, as kernels.build.wide. The parts must have chosen before."""
         self.choices = [_Choice(self.leaf_cost, 1, 0)]
         self.opened = _Choice(np.inf, 0, 0)
         if self.parts:
@@ -90,29 +91,29 @@ class _Subtree:
         return first.roots(first.choices[choice.first - 1]) + second.roots(second.choices[choice.children - choice.first - 1])
 
     def children(self) -> list[_Subtree]:
-        """Return the children of the node over this subtree in reverse order of an any-hit ray: inner nodes, leaves; small, large."""
+        """Return the children of the node over this subtree in the reverse of an any-hit ray's order: inner nodes first, by area."""
         if self._is_leaf_beside(self.opened.cost):
             return [self]
         return sorted(self.roots(self.opened), key=lambda child: (child.is_leaf, child.area))
 
 
 def small_tree(lo: np.ndarray, hi: np.ndarray, options: BvhOptions) -> WideTree:
-    """Build the wide tree over boxes lo, hi (n, 3) float32, with options.row children a node.
+    """Build the wide tree over boxes lo, hi (n, 3) float32, with options.row children per node.
 
-    A binary tree by the surface area heuristic (MacDonald and Booth 1990) down to single boxes is collapsed at least cost.
+    A binary tree down to single boxes, by the surface area heuristic (MacDonald and Booth 1990), is collapsed at the least cost.
     """
     width = options.row
     subtrees = []
     if len(lo):
         area = float(half_areas(lo.min(axis=0), hi.max(axis=0)))
         subtrees = [_Subtree(np.arange(len(lo), dtype=np.int32), lo, hi, area, options)]
-    for subtree in subtrees:  # grows
+    for subtree in subtrees:  # the loop appends to the list
         subtree.split()
         subtrees += subtree.parts
     for subtree in reversed(subtrees):
         subtree.choose()
     nodes, children_of = subtrees[:1], []
-    for node in nodes:  # grows
+    for node in nodes:  # the loop appends to the list
         children_of.append(node.children())
         nodes += [child for child in children_of[-1] if not child.is_leaf]
     shape = (max(len(nodes), 1), width)

@@ -18,7 +18,7 @@ MAX_BUDGET = 8.0
 
 
 def build_sbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
-    """Build with spatial splits where the sides of an object split overlap (Stich et al. 2009).
+    """Build by binned SAH, with spatial splits where the sides of an object split overlap (Stich et al. 2009).
 
     A primitive may be in several leaves. Raises InputError for a split_budget above MAX_BUDGET.
     """
@@ -28,25 +28,24 @@ def build_sbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryT
     n = len(lo)
     if n <= 1:
         return small_tree(lo, hi)
-    room = n + int(options.split_budget * n)
-    build = records(build_records.BuildRecord, room)
+    capacity = n + int(options.split_budget * n)
+    build = records(build_records.BuildRecord, capacity)
     build[:n] = in_order(lo, hi)
-    data = build_data(records=build, boxes=records(build_records.BuildRecord, room), nodes=records(Bvh2Node, room - 1),
-                      used=np.zeros(room - 1, np.uint8), left=np.zeros(room, np.uint8),
+    data = build_data(records=build, boxes=records(build_records.BuildRecord, capacity), nodes=records(Bvh2Node, capacity - 1),
+                      used=np.zeros(capacity - 1, np.uint8), left=np.zeros(capacity, np.uint8),
                       corners=geometry.vertices[geometry.faces].reshape(-1, 3))
     with np.errstate(over="ignore", invalid="ignore"):
         half = 0.5 * (hi.max(axis=0).astype(np.float64) - lo.min(axis=0))
         data.scale = 1.0 / max(half.max(), 2.0**-126)
         x, y, z = half * data.scale
         area = options.split_alpha * (x * y + y * z + z * x)
-    # An infinite scene gets no spatial splits.
-    data.min_overlap = min(area, 3e38) if np.isfinite(area) else 3e38
-    depth = run_tasks(make_build_ranges(split_references, share_space), data, build_options(options), n, threads, room)
+    data.min_overlap = min(area, 3e38) if np.isfinite(area) else 3e38  # no spatial splits in an infinite scene
+    depth = run_tasks(make_build_ranges(split_references, share_space), data, build_options(options), n, threads, capacity)
     return compact(data, depth)
 
 
 def compact(data: build_records.BuildData, depth: int) -> BinaryTree:
-    """Return the tree without the gaps between its leaves."""
+    """Return the tree with its leaves' primitives one after another, without gaps."""
     used = data.left.numpy() != 0
     nodes = squeeze(on_host(data.nodes), data.used.numpy() != 0)
     index = np.cumsum(used, dtype=np.int32) - 1

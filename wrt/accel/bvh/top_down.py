@@ -20,7 +20,7 @@ from wrt.kernels.warp_private import fields_of
 
 
 def build_binned(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
-    """Build by binned SAH (Wald 2007): fast, and within a few per cent of the full sweep."""
+    """Build by binned SAH (Wald 2007): fast, with an SAH cost within a few per cent of the full sweep."""
     return split_ranges("binned", primitive_records(geometry, threads), options, threads)
 
 
@@ -30,7 +30,7 @@ def build_median(geometry: Geometry, options: BvhOptions, threads: int) -> Binar
 
 
 def build_sweep(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryTree:
-    """Build by full-sweep SAH: every split of a range by centroid, along all three axes."""
+    """Build by full-sweep SAH: try every split of a range by centroid, along all three axes."""
     lo, hi = geometry.bounds(threads)
     center = 0.5 * lo + 0.5 * hi
     n = len(lo)
@@ -64,7 +64,7 @@ def build_data(**arrays: np.ndarray) -> WarpStruct:
 
 
 def split_ranges(builder: str, build: np.ndarray, options: BvhOptions, threads: int, **arrays: np.ndarray) -> BinaryTree:
-    """Run a builder of kernels.build.bvh2 over BuildRecords; arrays: the other fields of BuildData that it reads."""
+    """Run a builder of kernels.build.bvh2 over BuildRecords `build`. arrays: the other fields of BuildData that the builder reads."""
     n = len(build)
     if n <= 1:
         return small_tree(build["lo"], build["hi"])
@@ -74,18 +74,18 @@ def split_ranges(builder: str, build: np.ndarray, options: BvhOptions, threads: 
 
 
 def build_options(options: BvhOptions) -> WarpStruct:
-    """Convert the options for kernels."""
+    """Convert the options to kernels.build.records.BuildOptions."""
     out = build_records.BuildOptions()
     out.max_leaf, out.row = options.max_leaf, options.row
     out.cost_traversal, out.cost_intersection = options.cost_traversal, options.cost_intersection
     return out
 
 
-def run_tasks(kernel: Kernel, data: WarpStruct, settings: WarpStruct, n: int, threads: int, room: int = 0) -> int:
-    """Build the tree over n records on all threads, and return its depth. The tree does not depend on threads.
+def run_tasks(kernel: Kernel, data: WarpStruct, options: WarpStruct, n: int, threads: int, capacity: int = 0) -> int:
+    """Build the tree over n records on all threads, and return its depth. The tree does not depend on `threads`.
 
-    room: number of records that fit, for builders that duplicate references. A large range is split into halves or less, which
-    are tasks of their own.
+    A task splits a large range until the parts have at most half its size; these are new tasks. capacity: number of records that the
+    arrays can hold, for builders that duplicate references.
     """
     cpu = start("cpu")
     load_kernel(kernel, cpu)
@@ -95,11 +95,11 @@ def run_tasks(kernel: Kernel, data: WarpStruct, settings: WarpStruct, n: int, th
     def begin(task: np.ndarray) -> tuple[Any, Any]:
         size = int(task["end"][0] - task["begin"][0])
         stop = max(size // 2, least) if threads > 1 and size > least else 0
-        # Disjoint ranges of two or more records: there cannot be more of them.
+        # New tasks are disjoint ranges of at least two records, which bounds their number.
         most = (max(int(task["limit"][0]), int(task["end"][0])) - int(task["begin"][0])) // 2 if stop else 1
         deferred = wp.empty(most, dtype=build_records.BuildTask, device=cpu)
         count, depth = (wp.zeros(1, dtype=wp.int32, device=cpu) for _ in range(2))
-        inputs = [data, upload(task, build_records.BuildTask, cpu), settings, stop, deferred, count, depth]
+        inputs = [data, upload(task, build_records.BuildTask, cpu), options, stop, deferred, count, depth]
 
         def parts() -> list[np.ndarray]:
             depths.append(int(depth.numpy()[0]))
@@ -108,6 +108,6 @@ def run_tasks(kernel: Kernel, data: WarpStruct, settings: WarpStruct, n: int, th
         return partial(wp.launch, kernel, dim=1, device=cpu, inputs=inputs), parts
 
     root = records(build_records.BuildTask, 1)
-    root["end"], root["parent"], root["limit"] = n, -1, room
+    root["end"], root["parent"], root["limit"] = n, -1, capacity
     run_growing(begin, [root], threads if n > least else 1)
     return max(depths) + 1

@@ -1,4 +1,4 @@
-"""Options and trees of binary BVH builders, and the surface area heuristic."""
+"""Options and results of the builders of binary BVHs, and the surface area heuristic."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ MAX_LEAF = 64
 class BinaryOptions:
     """Options of binary structures.
 
-    builder: a name in BVH_BUILDERS. max_leaf: 1 to 64 primitives. cost_traversal, cost_intersection: SAH cost of a node visited and
-    of a primitive tested. For builder "sbvh", as fractions: split_alpha is the overlap of an object split over the root's area from
-    which spatial splits are tried (Stich et al. 2009). split_budget is the number of additional references over primitives.
+    builder: a name in BVH_BUILDERS. max_leaf: largest number of primitives in a leaf, 1 to 64. cost_traversal, cost_intersection: SAH
+    cost of visiting a node and of testing a primitive. Builder "sbvh" tries a spatial split if the overlap area of the best object
+    split, divided by the root's area, exceeds split_alpha (Stich et al. 2009). It adds up to split_budget references per primitive.
     """
 
     builder: str = "binned"
@@ -33,7 +33,7 @@ class BinaryOptions:
 
 @dataclass(frozen=True)
 class BvhOptions(BinaryOptions):
-    """Options of builders, with the number of primitives that are tested at once (`row`): a leaf costs as many tests as it has rows.
+    """Options of builders. row: number of primitives that one test handles, so that the cost of a leaf depends on its rows.
 
     Raises InputError for values out of range.
     """
@@ -53,8 +53,8 @@ class BvhOptions(BinaryOptions):
 class BinaryTree:
     """A binary tree.
 
-    nodes: (N,) Bvh2Node records, each parent before its children. order: (R,) int32, prim_id of each record of the leaves, where one
-    may occur several times. depth: inner nodes on the longest path from the root.
+    nodes: (N,) Bvh2Node records, each parent before its children. order: (R,) int32, prim_ids of the leaves one after another; a
+    prim_id may occur several times. depth: inner nodes on the longest path from the root.
     """
 
     nodes: np.ndarray
@@ -67,7 +67,7 @@ class BinaryTree:
 
 
 def small_tree(lo: np.ndarray, hi: np.ndarray) -> BinaryTree:
-    """Return the tree over no box or one. lo, hi: (0 or 1, 3) float32."""
+    """Return the tree over zero boxes or one box. lo, hi: (0 or 1, 3) float32."""
     nodes = records(Bvh2Node, 1)
     nodes["lo_0"], nodes["hi_0"], nodes["lo_1"], nodes["hi_1"] = np.inf, -np.inf, np.inf, -np.inf
     if len(lo):
@@ -86,20 +86,20 @@ def squeeze(nodes: np.ndarray, used: np.ndarray) -> np.ndarray:
 
 
 def half_areas(lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
-    """Return half the surface of each box lo, hi (..., 3), in float64; 0 for empty boxes."""
+    """Return half the surface area of each box lo, hi (..., 3), in float64; 0 for empty boxes."""
     e = np.clip(hi.astype(np.float64) - lo.astype(np.float64), 0.0, 1e39)
     return np.asarray(half_area.func(np.moveaxis(e, -1, 0)))
 
 
 def root_area(nodes: np.ndarray) -> float:
-    """Return half the surface of the box around the whole tree."""
+    """Return half the surface area of the box around the whole tree."""
     return float(half_areas(np.minimum(nodes["lo_0"][0], nodes["lo_1"][0]), np.maximum(nodes["hi_0"][0], nodes["hi_1"][0])))
 
 
 def expected_cost(root: float, areas: np.ndarray, counts: np.ndarray) -> float:
-    """Return the expected number of nodes visited and primitives tested by a random line through a root box of area `root`.
+    """Return the expected number of nodes visited, root included, and primitives tested by a random line through the root's box.
 
-    areas, counts: of all children; count 0: an inner node. The visit of the root counts.
+    root: area of the root's box. areas, counts: area and number of primitives of every child; 0 primitives mark an inner node.
     """
     return 1.0 + float((areas * np.maximum(counts, 1)).sum() / root) if root > 0.0 else float(counts.sum())
 

@@ -1,4 +1,4 @@
-"""Binary BVHs with other bounding volumes: the trees of bvh2 with spheres or 14-DOPs."""
+"""Binary BVHs with other bounding volumes: the trees of bvh2, with spheres or 14-DOPs in place of boxes."""
 
 from __future__ import annotations
 
@@ -20,13 +20,12 @@ from wrt.kernels.traverse import bvh2_sphere as traverse_bvh2_sphere
 from wrt.kernels.traverse.bvh2 import Bvh2Node
 from wrt.kernels.units.kdop import KDOP_PAD
 
-LINKS = ("first_0", "count_0", "first_1", "count_1")
 NODES_PER_LAUNCH = 512
 SQRT_3 = np.float32(1.7320510)  # rounded up
 
 
 class Bvh2Sphere(BinaryBvh):
-    """Bounding spheres around the primitives' padded boxes. Options: those of bvh2."""
+    """A binary BVH of bounding spheres around the primitives' padded boxes. Options: BinaryOptions."""
 
     name = "bvh2_sphere"
     kernels = traverse_bvh2_sphere
@@ -47,10 +46,10 @@ class Bvh2Sphere(BinaryBvh):
 
 
 class Bvh2Kdop(BinaryBvh):
-    """14-DOPs: the boxes of bvh2, cut by eight diagonal planes. Options: those of bvh2.
+    """A binary BVH of 14-DOPs: the boxes of bvh2, cut by eight diagonal planes. Options: BinaryOptions.
 
-    Their planes are the same everywhere, unlike those of oriented boxes. They are fitted from the leaves up without a search, and a
-    ray is prepared once for all of them. Three slabs are the box, whose distances a traversal must keep to.
+    All 14-DOPs have the same plane normals, unlike oriented boxes. So they are fitted from the leaves up without a search, and a ray
+    is prepared once for all nodes. Three of the seven slabs are the box itself.
     """
 
     name = "bvh2_kdop"
@@ -67,24 +66,24 @@ class Bvh2Kdop(BinaryBvh):
 
 
 def boxes_around(built: Built, geometry: Geometry) -> np.ndarray:
-    """Return Bvh2Node records with the links of other nodes and boxes that fit the geometry, empty without a child."""
+    """Return Bvh2Node records with the links of built.arrays["nodes"] and boxes around the geometry; a missing child is empty."""
     cpu = start("cpu")
-    nodes = upload(with_links(Bvh2Node, built.arrays["nodes"], LINKS), Bvh2Node, cpu)
+    nodes = upload(with_common_fields(Bvh2Node, built.arrays["nodes"]), Bvh2Node, cpu)
     fitting = Fitting(cpu, len(geometry), len(nodes))
     fitting.refit(tree_of(fitting, nodes, parents_of(nodes), upload(built.order.copy(), wp.int32, cpu)), geometry.on(cpu))
     return on_host(nodes).copy()
 
 
 def cost_of(nodes: np.ndarray, areas: np.ndarray) -> float:
-    """Return the SAH cost of volumes with these surfaces, (2, N), for lines through the root's box.
+    """Return the SAH cost of volumes with these surface areas, (2, N), for lines through the root's box.
 
-    Parts of volumes outside the root's box count, too.
+    Parts of volumes outside of the root's box count, too.
     """
     return expected_cost(2.0 * root_area(nodes), areas, np.stack([nodes["count_0"], nodes["count_1"]]))
 
 
 def spans_of(nodes: np.ndarray) -> list[np.ndarray]:
-    """Return begin and end of the adjacent records below each child of Bvh2Node records; node i has children 2 i and 2 i + 1."""
+    """Return begin and end of the range of primitives below each child of Bvh2Node records; node i has children 2 i and 2 i + 1."""
     first, count = (np.stack([nodes[f"{what}_0"], nodes[f"{what}_1"]], axis=1).reshape(-1) for what in ("first", "count"))
     ends = []
     for side in range(2):
@@ -95,19 +94,19 @@ def spans_of(nodes: np.ndarray) -> list[np.ndarray]:
     return [ends[0], ends[1]]
 
 
-def with_links(struct: WarpType, nodes: np.ndarray, names: tuple[str, ...] | None = None) -> np.ndarray:
-    """Make records of another kind of node with the fields in common, or with those of these names."""
+def with_common_fields(struct: WarpType, nodes: np.ndarray) -> np.ndarray:
+    """Make records of `struct`, with the values of all fields that `nodes` have, too."""
     out = records(struct, len(nodes))
-    for name in names or set(out.dtype.names or ()) & set(nodes.dtype.names or ()):
+    for name in set(out.dtype.names or ()) & set(nodes.dtype.names or ()):
         out[name] = nodes[name]
     return out
 
 
 def fit_spheres(nodes: np.ndarray, order: np.ndarray, geometry: Geometry, threads: int) -> np.ndarray:
-    """Make SphereNode records around the padded boxes of the geometry below each Bvh2Node record."""
+    """Make a SphereNode record for each Bvh2Node record, with spheres around the padded boxes of the primitives below."""
     cpu = start("cpu")
     lo, hi = geometry.bounds()
-    out = upload(with_links(traverse_bvh2_sphere.SphereNode, nodes), traverse_bvh2_sphere.SphereNode, cpu)
+    out = upload(with_common_fields(traverse_bvh2_sphere.SphereNode, nodes), traverse_bvh2_sphere.SphereNode, cpu)
     spans = upload(np.stack(spans_of(nodes), axis=1), wp.vec2i, cpu)
     launch(fits.fit_spheres, len(nodes), upload(nodes, Bvh2Node, cpu), spans, upload(order.copy(), wp.int32, cpu),
            upload(lo, wp.vec3, cpu), upload(hi, wp.vec3, cpu), out, None, threads=threads, step=NODES_PER_LAUNCH)
@@ -141,15 +140,15 @@ def cuts(geometry: Geometry, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def project(v: np.ndarray) -> np.ndarray:
-    """Project (N, 3) float32 to the four diagonals, (N, 4), as kernels.units.kdop.project."""
+    """Project points (N, 3) float32 to the four diagonals, (N, 4), with the bits of kernels.units.kdop.project."""
     x, y, z = v[:, 0], v[:, 1], v[:, 2]
     return np.stack([x + y + z, y - x + z, x - y + z, x + y - z], axis=1)
 
 
 def fit_kdops(nodes: np.ndarray, order: np.ndarray, geometry: Geometry, middle: np.ndarray) -> np.ndarray:
-    """Make KdopNode records around the geometry below each Bvh2Node record."""
+    """Make a KdopNode record for each Bvh2Node record, with 14-DOPs around the primitives below."""
     cpu = start("cpu")
     cut_lo, cut_hi = cuts(geometry, middle)
-    out = upload(with_links(traverse_bvh2_kdop.KdopNode, nodes), traverse_bvh2_kdop.KdopNode, cpu)
+    out = upload(with_common_fields(traverse_bvh2_kdop.KdopNode, nodes), traverse_bvh2_kdop.KdopNode, cpu)
     launch(fits.fit_kdops, 1, upload(order.copy(), wp.int32, cpu), upload(cut_lo, wp.vec4, cpu), upload(cut_hi, wp.vec4, cpu), out)
     return on_host(out)

@@ -26,18 +26,11 @@ from wrt.kernels.wide.traverse import WideTraversal
 ROWS_PER_JOB = 4096
 
 
-def aligned(array: np.ndarray) -> np.ndarray:
-    """Copy an array into memory that begins at a cache line."""
-    out = empty_aligned(array.shape, array.dtype)
-    out[...] = array
-    return out
-
-
 @dataclass(frozen=True)
 class Bvh4Options(BinaryOptions):
-    """Options of wide structures: BinaryOptions, where cost_intersection is that of one row of primitives.
+    """Options of wide structures: BinaryOptions, with cost_intersection for a row of primitives that one instruction tests.
 
-    max_leaf is by default the number of lanes in a row.
+    max_leaf is by default the number of primitives in a row.
     """
 
     builder: str = "refined"
@@ -68,7 +61,7 @@ class WideBvh(OneMesh):
 
     def _collapsed(self, options: BvhOptions) -> WideTree:
         """Build a binary tree and collapse it."""
-        # Two leaves are better than one if they have less area: the cost of their places in a node is not known yet.
+        # Two leaves count as cheaper than one if they have less area, because the cost of inner nodes depends on the collapse.
         of_binary = replace(options, max_leaf=min(options.max_leaf, self.width), cost_traversal=0.0, cost_intersection=1.0)
         with preloading(*(COLLAPSE if len(self.geometry) > 1 else ())):
             binary = build_binary(self.geometry, of_binary, self.threads)
@@ -77,7 +70,7 @@ class WideBvh(OneMesh):
             tree = collapse(binary, self.width, options.max_leaf, options.cost_traversal, options.cost_intersection)
         if self.compressed and len(binary.order) > MAX_FIRST:
             raise InputError(f"a {self.name} holds at most {MAX_FIRST} primitives, and there are {len(binary.order)}",
-                             hint="take bvh8")
+                             hint="use bvh8")
         return tree
 
     def _nodes(self, built: Built) -> np.ndarray:
@@ -89,7 +82,7 @@ class WideBvh(OneMesh):
         return np.ascontiguousarray(self._nodes(built)[:, first : first + self.width]).view(np.int32)
 
     def _arrays(self, tree: WideTree) -> dict[str, np.ndarray]:
-        """Return the node rows of kernels.wide.nodes."""
+        """Return the nodes in the layout of kernels.wide.nodes, as one array of floats."""
         n, size, first = len(tree.children), node_size(self.width, self.compressed), first_reference(self.width, self.compressed)
         nodes = np.zeros((n, size), np.float32)
         nodes[:, first : first + self.width] = tree.children.view(np.float32)
@@ -102,7 +95,7 @@ class WideBvh(OneMesh):
         return {"nodes": nodes.reshape(-1)}
 
     def _tree(self, built: Built) -> WideTree:
-        """Return the tree that _arrays laid out, with compressed boxes as rays meet them."""
+        """Return the tree that `_arrays` converted, with the decoded boxes if they are compressed."""
         head = self._nodes(built)[:, : first_reference(self.width, self.compressed)]
         if self.compressed:
             lo, hi = decompress(head, self.width)
@@ -113,33 +106,35 @@ class WideBvh(OneMesh):
         return WideTree(lo, hi, children, lanes_of(children, built.order, self.width), built.leaves, built.depth, 0)
 
     def _primitives(self, built: Built) -> np.ndarray:
-        """Return the records of the triangle test in rows of lanes; an unused lane repeats the primitive before it."""
+        """Return the records of the triangle test in rows of `width` lanes; an unused lane repeats the primitive before it."""
         order = (built.order if self.compressed
                  else lanes_of(self._references(built), built.order, self.width).reshape(-1))
         units, width = self.structure.units, self.width
         order = np.append(order, np.full(-len(order) % width, -1, np.int32))
-        numbers = record_dtype(units.triangle_test.record).itemsize // 4
-        rows = empty_aligned((len(order) // width, numbers, width), np.float32)
+        floats = record_dtype(units.triangle_test.record).itemsize // 4
+        rows = empty_aligned((len(order) // width, floats, width), np.float32)
 
         def fill(first: int) -> None:
             lanes = order[first * width : (first + ROWS_PER_JOB) * width]
-            records = self.geometry.primitives(units, lanes[lanes >= 0]).view(np.float32).reshape(-1, numbers)
+            records = self.geometry.primitives(units, lanes[lanes >= 0]).view(np.float32).reshape(-1, floats)
             index = np.cumsum(lanes >= 0) - 1
-            rows[first : first + ROWS_PER_JOB] = records.take(index, axis=0).reshape(-1, width, numbers).transpose(0, 2, 1)
+            rows[first : first + ROWS_PER_JOB] = records.take(index, axis=0).reshape(-1, width, floats).transpose(0, 2, 1)
 
         run_all([partial(fill, first) for first in range(0, len(rows), ROWS_PER_JOB)], self.threads)
         return rows.reshape(-1)
 
     def _upload(self, built: Built) -> WarpStruct:
-        return super()._upload(replace(built, arrays={name: aligned(array) for name, array in built.arrays.items()}))
+        nodes = empty_aligned(built.arrays["nodes"].shape, np.float32)
+        nodes[...] = built.arrays["nodes"]
+        return super()._upload(replace(built, arrays={"nodes": nodes}))
 
     def _check(self, built: Built) -> None:
         if len(built.arrays["nodes"]) % node_size(self.width, self.compressed):
-            raise InputError("is damaged: its nodes are no whole ones")
+            raise InputError("is damaged: its last node is incomplete")
         references = self._references(built)
         check_wide(references, len(built.order), 1 if self.compressed else self.width)
         if self.compressed and (existing_children(self._nodes(built), self.width) != (references != EMPTY)).any():
-            raise InputError("is damaged: a node tells of children that it does not have")
+            raise InputError("is damaged: a node's mask of children differs from its references")
         if not self.compressed:
             planes = self._nodes(built)[:, : first_reference(self.width, False)].reshape(-1, 3, 2, self.width)
             empty = ((planes[:, :, 0] == np.inf) & (planes[:, :, 1] == -np.inf)).all(axis=1)
@@ -180,7 +175,7 @@ class Bvh8(WideBvh):
 
 
 class Bvh8c(WideBvh):
-    """bvh8 in less memory: boxes in 8 bits a plane, rounded outwards, and leaves without gaps (Ylitie, Karras and Laine 2017)."""
+    """bvh8 in less memory: 8 bits per plane, rounded outwards, and leaves without gaps (Ylitie, Karras and Laine 2017)."""
 
     name = "bvh8c"
     options = Bvh8Options

@@ -25,7 +25,7 @@ class WideTree:
 
     lo, hi: (N, W, 3) float32, boxes of the children; empty boxes come first. children: (N, W) int32, see kernels.wide.references.
     order: (rows, W) int32, prim_id in each lane of the leaves' rows, or -1. depth: nodes on the longest path from the root. stack:
-    largest number of entries on the stack of a walk.
+    largest number of entries on a traversal stack.
     """
 
     lo: np.ndarray
@@ -38,16 +38,16 @@ class WideTree:
 
     @property
     def areas(self) -> np.ndarray:
-        """Half the surface of each child's box, (N, W) float64; 0 for empty boxes."""
+        """Half the surface area of each child's box, (N, W) float64; 0 for empty boxes."""
         return half_areas(self.lo, self.hi)
 
     @property
     def root_area(self) -> float:
-        """Half the surface of the root's box."""
+        """Half the surface area of the root's box."""
         return float(half_areas(self.lo[0].min(axis=0), self.hi[0].max(axis=0)))
 
     def sah_cost(self, root: float) -> float:
-        """Return the SAH cost for a root box with half the surface `root`."""
+        """Return the SAH cost. root: half the surface area of the root's box."""
         return expected_cost(root, self.areas, np.where(self.children < 0, leaf_count.func(self.children), 0))
 
 
@@ -74,14 +74,14 @@ def collapse(tree: BinaryTree, width: int, max_leaf: int, cost_traversal: float,
     n_nodes, rows, leaves, depth, stack = out.count.numpy().tolist()
     if rows > MAX_FIRST:
         raise InputError(f"a wide BVH holds at most {MAX_FIRST} rows of primitives, and these need {rows}",
-                         hint="take accel='bvh2'")
+                         hint="use accel='bvh2'")
     children, lo, hi = (array.numpy()[: n_nodes * width].reshape(-1, width, *array.numpy().shape[1:]).copy()
                         for array in (out.children, out.lo, out.hi))
     return WideTree(lo, hi, children, out.order.numpy()[: rows * width].reshape(-1, width).copy(), leaves, depth, stack)
 
 
 def refit(tree: WideTree, geometry: Geometry) -> WideTree:
-    """Fit the boxes to the geometry. Boxes of spatial splits become those of the whole triangles."""
+    """Fit the boxes to the geometry. Boxes that spatial splits clipped become the boxes of whole triangles."""
     cpu = start("cpu")
     width = tree.children.shape[1]
     low, high = (upload(np.append(box, [[end] * 3], axis=0), wp.vec3, cpu)  # lane -1: an empty box
@@ -93,7 +93,7 @@ def refit(tree: WideTree, geometry: Geometry) -> WideTree:
 
 
 def packed(children: np.ndarray, unit: int) -> np.ndarray:
-    """Renumber the leaves in references one after another, counted in `unit` primitives: 1, or a row."""
+    """Renumber the leaves in references without gaps, in units of `unit` primitives: 1, or the width of a row."""
     leaf = children < 0
     references = children[leaf].astype(np.int64)
     count = leaf_count.func(references)
@@ -107,9 +107,9 @@ def packed(children: np.ndarray, unit: int) -> np.ndarray:
 
 
 def lanes_of(children: np.ndarray, order: np.ndarray, width: int) -> np.ndarray:
-    """Return the primitive in each lane of the leaves' rows, (rows, width), or -1.
+    """Return the prim_id in each lane of the leaves' rows, (rows, width), or -1.
 
-    children: references that count rows. order: (R,) prim_id of every record, leaf after leaf.
+    children: references in units of rows. order: (R,) prim_ids of the leaves, one leaf after another.
     """
     leaves = children[children < 0]
     row, count = leaf_first.func(leaves), leaf_count.func(leaves)
@@ -123,27 +123,27 @@ def lanes_of(children: np.ndarray, order: np.ndarray, width: int) -> np.ndarray:
 
 
 def check_wide(children: np.ndarray, n_primitives: int, unit: int) -> None:
-    """Raise InputError unless references (N, width) are a tree with root 0 whose walks fit on the stack.
+    """Raise InputError unless references (N, width) form a tree with root 0 that the traversal stack suffices for.
 
-    Its leaves must hold n primitives one after another, counted in `unit` primitives.
+    The leaves must hold `n_primitives` without gaps, in units of `unit` primitives.
     """
     n = len(children)
     inner = children > 0
     if n == 0 or (children[inner] >= n).any() or (children <= np.arange(n)[:, None])[inner].any():
         raise InputError("is damaged: a node leads out of the tree")
     if (np.bincount(children[inner], minlength=n) != (np.arange(n) > 0)).any():
-        raise InputError("is damaged: its nodes are no tree")
-    leaves = -np.sort(-children[children < 0].astype(np.int64))  # references fall where places rise
+        raise InputError("is damaged: its nodes do not form a tree")
+    leaves = -np.sort(-children[children < 0].astype(np.int64))  # a later leaf has a smaller reference
     count = leaf_count.func(leaves)
     units = -(-count // unit)
     if (leaf_first.func(leaves) != np.cumsum(units) - units).any() or count.sum() != n_primitives:
         raise InputError("is damaged: a leaf leads to other primitives")
     if stack_need(children) > STACK_SIZE:
-        raise InputError(f"is damaged: a walk needs more than {STACK_SIZE} entries")
+        raise InputError(f"is damaged: a traversal needs more than {STACK_SIZE} entries on its stack")
 
 
 def stack_need(children: np.ndarray) -> int:
-    """Return the largest number of entries on the stack of a walk."""
+    """Return the largest number of entries on the stack of a traversal."""
     level, used, most = np.zeros(1, np.int64), np.zeros(1, np.int64), 0
     while len(level):
         below = used + np.maximum((children[level] != EMPTY).sum(axis=1) - 1, 0)

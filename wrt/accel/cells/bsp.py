@@ -1,4 +1,4 @@
-"""BSP tree: cells cut by planes of any orientation (kernels: kernels/build/bsp*.py)."""
+"""BSP tree: cells are split by planes of any orientation (kernels: kernels/build/bsp*.py)."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from wrt.kernels.build.bsp_cell import MAX_FACES, MAX_POINTS, Cells
 from wrt.kernels.build.bsp_split import BspTools, Pieces
 from wrt.kernels.traverse import bsp as kernels
 
-MAX_DEPTH = 60  # below the traversal unit's stack
-ROOM = 8  # pieces, nodes and references for each primitive; doubled if that is not enough
+MAX_DEPTH = 60  # less than the size of the traversal stack
+ROOM = 8  # memory for pieces, nodes and references, per primitive; doubled until it suffices
 SPARE = 1024
-MAX_ROOM = (2**31 - 1) // 6 - SPARE  # points of pieces are counted in int32, six for each
-LEFT_OVERS = 1024  # subtrees at most that are built on their own
+MAX_ROOM = (2**31 - 1) // 6 - SPARE  # pieces: their points, six for each, are indexed in int32
+MAX_SUBTREES = 1024  # that are built in launches of their own
 PIECE = {"prim_id": (wp.int32, ()), "first": (wp.int32, ()), "count": (wp.int32, ()), "lo": (wp.vec3d, (3,)),
          "hi": (wp.vec3d, (3,)), "ball": (wp.vec4d, (4,)), "extent": (wp.float64, ())}
 
@@ -39,10 +39,10 @@ PIECE = {"prim_id": (wp.int32, ()), "first": (wp.int32, ()), "count": (wp.int32,
 class BspOptions:
     """Options of the BSP tree. Raises InputError for values out of range.
 
-    cost_intersection, cost_axis, cost_plane: of a primitive, of a node across an axis, of another node; defaults of the Manta renderer.
-    samples: number of triangles of a cell, evenly spread over its list, that offer four planes each; 0: a k-d tree. max_depth: 1 to
-    60; 0: 16 + 2 log2 of the number of primitives. max_growth: limit of references per primitive, 1 to 1000, divided among cells by
-    their primitives. max_triangles: more primitives are refused. progress: called with the finished fraction, from several threads.
+    cost_intersection, cost_axis, cost_plane: SAH cost of a primitive, of a node with an axis-aligned plane, and of any other node, with
+    the defaults of the Manta renderer. samples: number of triangles per cell, evenly spread over its list, that propose four planes
+    each; 0: a k-d tree. max_depth: 1 to 60; 0: 16 + 2 log2 of the number of primitives. max_growth: limit of references per primitive,
+    1 to 1000. max_triangles: largest number of primitives. progress: called from several threads with the finished fraction.
     """
 
     cost_intersection: float = 75.0
@@ -64,11 +64,11 @@ class BspOptions:
             raise InputError(f"must be a function of one number, got {self.progress!r}", argument="progress")
 
     def __getstate__(self) -> dict[str, Any]:
-        """Pickle without `progress`, which belongs to this process."""
+        """Pickle without `progress`, which is a function of this process."""
         return {**self.__dict__, "progress": None}
 
     def on_device(self, lo: np.ndarray, hi: np.ndarray, n: int) -> WarpStruct:
-        """Convert the options for kernels, for n primitives with these boxes."""
+        """Convert the options for kernels. n: number of primitives; lo, hi: their boxes, (n, 3)."""
         out = bsp_split.BspOptions()
         out.cost_intersection, out.cost_axis, out.cost_plane = self.cost_intersection, self.cost_axis, self.cost_plane
         out.samples, out.max_depth = self.samples, self.max_depth or min(MAX_DEPTH, 16 + 2 * math.ceil(math.log2(n)))
@@ -79,7 +79,7 @@ class BspOptions:
 class Bsp(OneMesh):
     """A BSP tree, which is slow to build. Options: BspOptions.
 
-    Ize, Wald and Parker 2008, "Ray Tracing with the BSP Tree"; a subset of all triangles' planes is tried.
+    Ize, Wald and Parker 2008, "Ray Tracing with the BSP Tree". Only the planes of some triangles of a cell are tried.
     """
 
     name = "bsp"
@@ -89,8 +89,8 @@ class Bsp(OneMesh):
     def _build(self, options: BspOptions) -> Built:
         n = len(self.geometry)
         if n > options.max_triangles:
-            raise InputError(f"bsp is slow to build, and takes up to max_triangles={options.max_triangles} primitives; there are {n}",
-                             argument="max_triangles", hint="take another structure (kdtree, bvh), or raise max_triangles")
+            raise InputError(f"bsp is slow to build, so that max_triangles={options.max_triangles} is the limit; there are {n}",
+                             argument="max_triangles", hint="use another structure (kdtree, bvh), or raise max_triangles")
         if n == 0:
             return Built({"nodes": records(kernels.BspNode, 0), "lo": np.full(3, np.inf), "hi": np.full(3, -np.inf),
                           "extent": np.zeros(1, np.float32), "first": np.zeros(1, np.int32), "count": np.zeros(1, np.int32)},
@@ -102,7 +102,7 @@ class Bsp(OneMesh):
 
     def _check(self, built: Built) -> None:
         if any(built.arrays[name].size != size for name, size in (("lo", 3), ("hi", 3), ("extent", 1), ("first", 1), ("count", 1))):
-            raise InputError("is damaged: a tree has one root")
+            raise InputError("is damaged: it does not have exactly one root")
         nodes, root_first, root_count = (built.arrays[name] for name in ("nodes", "first", "count"))
         n = len(nodes)
         parent = np.repeat(np.arange(-1, n), [1, *[2] * n])
@@ -113,13 +113,13 @@ class Bsp(OneMesh):
                 (count > 0) & ((first < 0) | (first + count > len(built.order)))).any():
             raise InputError("is damaged: a node leads out of the tree")
         if ((nodes["axis"] < 0) | (nodes["axis"] > kernels.PLANE)).any():
-            raise InputError("is damaged: its nodes are no tree")
-        # The link to the root is node 0, before the others.
+            raise InputError("is damaged: a node's axis is out of range")
+        # For check_tree, the link to the root becomes node 0, before all other nodes.
         check_tree(n + 1, parent[inner] + 1, first[inner] + 1, kernels.STACK_SIZE)
 
 
 class Launch:
-    """One launch of the kernel, with memory for `room` pieces, and its results."""
+    """One launch of build_cells with memory for `room` pieces, and its results."""
 
     def __init__(self, corners: WarpArray, options: WarpStruct, room: int, n_deferred: int) -> None:
         self.cpu = start("cpu")
@@ -138,7 +138,7 @@ class Launch:
         self.output.cost = wp.zeros(1, dtype=wp.float64, device=self.cpu)
 
     def run(self, source: WarpStruct, tasks: WarpArray, cells: WarpStruct, which: int) -> bool:
-        """Launch; return False if the memory was not enough."""
+        """Launch, and return whether the memory sufficed. which: index of the task in `tasks`."""
         launch(build_bsp.build_cells, 1, source, tasks, cells, which, self.tools, self.stack, self.output)
         self.results = self.output.results.numpy().copy()
         self.nodes = on_host(self.output.nodes)[: self.results[build_bsp.N_NODES]].copy()
@@ -148,14 +148,14 @@ class Launch:
 
 
 class Subtree:
-    """Results of a launch that built one subtree."""
+    """Results of a launch, without its memory."""
 
     def __init__(self, launch: Launch) -> None:
         self.results, self.nodes, self.order, self.cost = launch.results, launch.nodes, launch.order, launch.cost
 
 
 class Builder:
-    """Build of the top of the tree in one launch, then of the remaining cells, largest first, on all threads."""
+    """Builds the top of the tree in one launch, and then the subtrees below on all threads, the largest first."""
 
     def __init__(self, geometry: Geometry, options: WarpStruct, threads: int, budget: int, progress: Callable[[float], None]) -> None:
         self.options, self.threads, self.budget, self.progress = options, threads, budget, progress
@@ -168,13 +168,13 @@ class Builder:
         self.done = 0
 
     def launch(self, source: WarpStruct, tasks: WarpArray, cells: WarpStruct, which: int, n: int, keep: int) -> Launch:
-        """Launch with more and more memory until it is enough."""
+        """Launch with twice the memory until it suffices. keep: cells of at most so many pieces are deferred to tasks; 0: none."""
         room = ROOM * n + SPARE
         self.options.keep = keep
         while True:
             if room > MAX_ROOM:
-                raise InputError(f"a BSP tree of {n} primitives is too large", hint="lower max_growth, or take another structure")
-            launch = Launch(self.corners, self.options, room, LEFT_OVERS if keep else 0)
+                raise InputError(f"a BSP tree of {n} primitives is too large", hint="lower max_growth, or use another structure")
+            launch = Launch(self.corners, self.options, room, MAX_SUBTREES if keep else 0)
             if launch.run(source, tasks, cells, which):
                 return launch
             room *= 2
@@ -200,7 +200,7 @@ class Builder:
         return self.join(top, [subtree for subtree in subtrees if subtree is not None])
 
     def join(self, top: Launch, subtrees: list[Subtree]) -> Built:
-        """Join the nodes, the top first, and the primitives."""
+        """Join the nodes and primitives of the top and the subtrees. The nodes of the top come first."""
         parts = [Subtree(top), *subtrees]
         first_node = np.cumsum([0] + [len(part.nodes) for part in parts])
         first_primitive = np.cumsum([0] + [len(part.order) for part in parts])
@@ -225,7 +225,7 @@ class Builder:
 
 
 def pieces_of(n: int, points: int) -> WarpStruct:
-    """Allocate n pieces with `points` points together."""
+    """Allocate n pieces, with `points` points in all pieces together."""
     pieces = Pieces()
     for name, (dtype, _) in PIECE.items():
         setattr(pieces, name, wp.empty(n, dtype=dtype, device=start("cpu")))
@@ -243,7 +243,7 @@ def cells_of(slots: int) -> WarpStruct:
 
 
 def start_pieces(geometry: Geometry) -> tuple[WarpStruct, np.ndarray]:
-    """Return a piece for every primitive, and the corners of the triangles, (3 F, 3) float64."""
+    """Make a piece of every primitive; return the pieces, and the corners of the triangles, (3 F, 3) float64."""
     n, triangles = len(geometry), len(geometry.faces)
     corners = geometry.vertices[geometry.faces].astype(np.float64)
     spheres = geometry.spheres.astype(np.float64)

@@ -1,4 +1,4 @@
-"""Shared parts of structures with cells: the builders' input, and checks of files."""
+"""Shared code of the grid, octree, k-d tree and BSP tree: input of the builders, and checks of files."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ def one_row(accel: Accelerator, built: Built) -> dict[str, np.ndarray]:
 def check_numbers(arrays: dict[str, np.ndarray]) -> None:
     """Raise InputError unless pad and extent are valid for kernels.traverse.cell_ray.cell_slack, and mailbox is 0 or 1."""
     if not (arrays["pad"] >= 0.0 and arrays["extent"] >= 0.0 and arrays["mailbox"] in (0, 1)):
-        raise InputError("is damaged: its numbers are out of range")
+        raise InputError("is damaged: pad, extent or mailbox is out of range")
 
 
 def check_references(cells: np.ndarray, references: np.ndarray, n_primitives: int) -> None:
-    """Raise InputError unless records (first, count) stay within the references, and these within the primitives."""
+    """Raise InputError unless the records (first, count) of cells address references, and all references address primitives."""
     first, count = cells["first"].astype(np.int64), cells["count"].astype(np.int64)
     if ((first < 0) | (count < 0) | (first + count > len(references))).any():
         raise InputError("is damaged: a cell leads out of the references")
@@ -51,14 +51,14 @@ def check_references(cells: np.ndarray, references: np.ndarray, n_primitives: in
 
 
 def require_between(**options: tuple[float, float, float]) -> None:
-    """Raise InputError for an option (value, low, high) outside of its limits."""
+    """Raise InputError for an option whose value is out of range. options: name=(value, low, high)."""
     for name, (value, low, high) in options.items():
         if not low <= value <= high:
             raise InputError(f"must be {low:.10g} to {high:.10g}, got {value}", argument=name)
 
 
 def triangle_reach(geometry: Geometry, lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest pad and extent of all triangles' padded boxes, for kernels.traverse.cell_ray.cell_slack."""
+    """Return the largest padding and extent of the triangles' padded boxes, for kernels.traverse.cell_ray.cell_slack."""
     n = len(geometry.faces)
     if not n:
         return np.zeros((), np.float32), np.zeros((), np.float32)

@@ -1,4 +1,4 @@
-"""Uniform grid: cells of one size, each with a list of the primitives that meet it."""
+"""Uniform grid: cells of one size, each with a list of the primitives that overlap it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PRIMITIVES_PER_LAUNCH = 16384
 class GridOptions:
     """Options of the grid. Raises InputError for values out of range.
 
-    density: cells per primitive, 1e-3 to 1e3. mailbox: avoid repeated tests of a primitive in several cells.
+    density: cells per primitive, 1e-3 to 1e3. mailbox: do not test a primitive of several cells again for the same ray.
     """
 
     density: float = 2.0
@@ -43,8 +43,8 @@ class GridOptions:
 class Grid(OneMesh):
     """A uniform grid. Options: GridOptions.
 
-    Cells are enlarged, with a RuntimeWarning, beyond MAX_CELLS cells or an estimate of MAX_REFERENCES references. Spheres are listed
-    in every cell of their box. The `box` test is not used.
+    If there were more than MAX_CELLS cells, or an estimate of more than MAX_REFERENCES references, cells are enlarged and a
+    RuntimeWarning is issued. Spheres are listed in every cell of their box. The `box` test is not used.
     """
 
     name = "grid"
@@ -72,19 +72,19 @@ class Grid(OneMesh):
         if not ((n >= 1) & (n <= MAX_AXIS) & (size >= 0.0) & ((last <= hi) | empty)).all():
             raise InputError("is damaged: its planes are not in order")
         if len(arrays["cells"]) != np.prod(n.astype(np.int64)):
-            raise InputError("is damaged: its cells are not those of its layout")
+            raise InputError("is damaged: the number of cells differs from its layout")
         check_references(arrays["cells"], arrays["references"], len(built.order))
 
 
 def resolution(lo: np.ndarray, hi: np.ndarray, density: float) -> WarpStruct:
-    """Return the layout: nearly cubic cells, about `density` per primitive (Cleary and Wyvill 1988)."""
+    """Choose the layout: nearly cubic cells, about `density` per primitive (Cleary and Wyvill 1988)."""
     layout = kernels.GridLayout()
     low, high = lo.min(axis=0, initial=np.inf), hi.max(axis=0, initial=-np.inf)
     extent = high.astype(np.float64) - low.astype(np.float64)
     wanted = density * len(lo)
     n = np.ones(3, np.int64)
     if len(lo) and np.isfinite(extent).all():
-        # Cells are so large that the rounding of their planes does not matter.
+        # `finest` keeps cells so large that the rounding of their planes does not matter.
         finest = np.maximum(np.abs(low), np.abs(high)).astype(np.float64) * PAD_EXTENT
         with np.errstate(divide="ignore", invalid="ignore"):
             most = np.clip(np.where(extent > 0.0, extent / finest, 1.0), 1, MAX_AXIS)
@@ -93,8 +93,8 @@ def resolution(lo: np.ndarray, hi: np.ndarray, density: float) -> WarpStruct:
         while fits.max() > 1 and references_bound(lo, hi, extent / fits) > MAX_REFERENCES:
             fits = np.maximum(fits * 3 // 4, 1)
         if wanted > MAX_CELLS or not np.array_equal(n, fits):
-            warnings.warn(f"grid: {' x '.join(map(str, fits))} cells, not about {wanted:.3g}: at most {MAX_CELLS} cells and an "
-                          f"estimated {MAX_REFERENCES} references fit", RuntimeWarning, stacklevel=2)
+            warnings.warn(f"the grid has {' x '.join(map(str, fits))} cells in place of about {wanted:.3g}, because it is limited to "
+                          f"{MAX_CELLS} cells and an estimate of {MAX_REFERENCES} references", RuntimeWarning, stacklevel=2)
         n = fits
     layout.lo, layout.hi, layout.n = wp.vec3(*low), wp.vec3(*high), wp.vec3i(*n.tolist())
     size = np.zeros(3, np.float32)
@@ -104,7 +104,7 @@ def resolution(lo: np.ndarray, hi: np.ndarray, density: float) -> WarpStruct:
 
 
 def cells_along(extent: np.ndarray, most: np.ndarray, wanted: float) -> np.ndarray:
-    """Return numbers of cells (3,) in proportion to the extent, each 1 to `most`, whose product is about `wanted`."""
+    """Return the number of cells along each axis, (3,), in proportion to the extent and 1 to `most`; the product is about `wanted`."""
     def along(log_scale: float) -> np.ndarray:
         return np.clip(extent * 2.0**log_scale, 1.0, most)
 
@@ -120,14 +120,14 @@ def cells_along(extent: np.ndarray, most: np.ndarray, wanted: float) -> np.ndarr
 
 
 def references_bound(lo: np.ndarray, hi: np.ndarray, size: np.ndarray) -> float:
-    """Estimate the references: a triangle that spans a x b x c cells meets up to ab + bc + ca of them."""
+    """Estimate the number of references: a triangle whose box spans a x b x c cells overlaps up to ab + bc + ca cells."""
     a, b, c = (((hi.astype(np.float64) - lo) / np.maximum(size, 1e-300)) + 1.0).T
     return float((a * b + b * c + c * a).sum()) / 3.0
 
 
 def list_references(geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray], layout: WarpStruct,
                     threads: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return cell records, and the primitives of all cells one after another, (R,) int32."""
+    """Return GridCell records, and the prim_ids of all cells one after another, (R,) int32."""
     cpu = start("cpu")
     source = cell_source(geometry, bounds)
     n = len(geometry)
@@ -141,7 +141,8 @@ def list_references(geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray], l
     np.cumsum(count.numpy(), out=begin[1:])
     total = int(begin[-1])
     if total >= 1 << 31:
-        raise InputError(f"{total} references to primitives are too many", argument="density", hint="choose a lower one")
+        raise InputError(f"density leads to {total} references to primitives, more than 2^31 - 1", argument="density",
+                         hint="choose a lower density")
     device_begin = upload(begin, wp.int64, cpu)
     cell_of = wp.zeros(total, dtype=wp.int32, device=cpu)
     if total:
@@ -153,7 +154,7 @@ def list_references(geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray], l
 
 
 def sah_cost(layout: WarpStruct, visits: int) -> float:
-    """Return the expected cells and primitives of a random line through the box; visits: number of cells and references."""
+    """Return the expected number of cells and primitives on a random line through the box. visits: number of cells and references."""
     extent = np.array(layout.hi, np.float64) - np.array(layout.lo, np.float64)
     whole, cell = (float(half_areas(np.zeros(3), e)) for e in (extent, extent / np.array(layout.n, np.float64)))
     return visits * cell / whole if whole > 0.0 else float(visits)

@@ -1,4 +1,4 @@
-"""The k-d tree: axis-aligned planes split space, and a primitive is in every leaf that it reaches into."""
+"""The k-d tree: axis-aligned planes split space, and every leaf lists the primitives that overlap it."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ class KdTree(OneMesh):
     def _check(self, built: Built) -> None:
         nodes = built.arrays["nodes"]
         if any(built.arrays[name].size != size for name, size in (("lo", 3), ("hi", 3), ("reach", 1))):
-            raise InputError("is damaged: a tree has one cell")
+            raise InputError("is damaged: lo, hi or reach has a wrong size")
         leaf, first = (nodes["word"] & 3) == kernels.LEAF, (nodes["word"] >> 2).astype(np.int64)
         check_tree(len(nodes), np.tile(np.flatnonzero(~leaf), 2), np.concatenate([first[~leaf], first[~leaf] + 1]),
                    kernels.STACK_SIZE)
         first, count = first[leaf], nodes["split"][leaf].astype(np.float64)
         if not ((first >= 0) & (count >= 0.0) & (first + count <= len(built.order))).all():
-            raise InputError("is damaged: a leaf has primitives that are not there")
+            raise InputError("is damaged: a leaf leads out of the primitives")

@@ -1,4 +1,4 @@
-"""Builder of k-d trees: binned SAH in NumPy for large cells, and a kernel with perfect splits for each subtree below."""
+"""Builder of k-d trees: binned SAH in NumPy for large cells, and a kernel that tries all planes for the subtrees below."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from wrt.kernels.build.shape import half_area
 from wrt.kernels.traverse.kdtree import LEAF, STACK_SIZE, KdNode
 
 BINS = 64
-# Triangles of other sizes are put into cells by their boxes, because the margin of clipping would underflow or be infinite.
+# Triangles outside of these sizes are not clipped, because the error margin of clipping would underflow or be infinite.
 CLIP_SIZES = (1e-30, 1e30)
-MAX_IN_LEAF = 1 << 24  # the node holds the number as a float32
-MAX_INDEX = 1 << 29  # a node's word has 29 bits for it
+MAX_IN_LEAF = 1 << 24  # primitives, because a node stores their number as a float32
+MAX_INDEX = 1 << 29  # of a node or reference, because a node's word has 29 bits for it
 Part = tuple[np.ndarray, np.ndarray, Any]  # nodes, order and totals of a subtree
 
 
@@ -34,10 +34,10 @@ Part = tuple[np.ndarray, np.ndarray, Any]  # nodes, order and totals of a subtre
 class KdOptions:
     """Options of the k-d tree. Raises InputError for values out of range.
 
-    max_leaf: cells with so many primitives are not split. max_depth: None for 8 + 1.3 log2 n. by_cost: stop where no split costs less
-    than a leaf. cost_traversal, cost_intersection: of the SAH. empty_bonus: discount, 0 to 1, for splits that cut off empty space.
-    perfect_below: number of primitives above which cells are split between 64 bins instead of at the best of all planes. clip: put
-    triangles into cells exactly instead of by their boxes. max_growth: limit of references and empty leaves per primitive.
+    max_leaf: cells with at most so many primitives are not split. max_depth: levels below the root; None: 8 + 1.3 log2 n. by_cost: do
+    not split if that costs more than a leaf. cost_traversal, cost_intersection: SAH cost of a node and of a primitive. empty_bonus:
+    discount, 0 to 1, for splits that cut off empty space. perfect_below: cells with more primitives are split between 64 bins, other
+    cells at the best of all planes. clip: use exact overlap, not boxes. max_growth: limit of references and empty leaves per primitive.
     """
 
     max_leaf: int = 1
@@ -66,7 +66,7 @@ class KdOptions:
 
 
 class Cell(NamedTuple):
-    """A cell to build, and its references: prim_id (n,) and their boxes lo, hi in it (n, 3)."""
+    """A cell to build a subtree in. prim_id: (n,), primitives that overlap it. lo, hi: (n, 3), boxes of the overlapping parts."""
 
     cell_lo: np.ndarray
     cell_hi: np.ndarray
@@ -79,7 +79,7 @@ class Cell(NamedTuple):
 
 
 def build_tree(geometry: Geometry, options: KdOptions, threads: int) -> Built:
-    """Build the tree over a geometry. It does not depend on threads. Its cost is that with both costs 1."""
+    """Build the tree over a geometry. It does not depend on `threads`. Built.sah_cost is at cost 1 per node and per primitive."""
     lo, hi = geometry.bounds()
     n = len(lo)
     if n == 0:
@@ -87,7 +87,7 @@ def build_tree(geometry: Geometry, options: KdOptions, threads: int) -> Built:
         nodes["word"] = LEAF
         nowhere = np.full(3, np.inf, np.float32)
         return Built({"nodes": nodes, "lo": nowhere, "hi": -nowhere, "reach": np.float32(0.0)}, np.zeros(0, np.int32), 0, 1, 1, 0.0)
-    hi = np.where(lo < hi, hi, np.nextafter(hi, np.float32(np.inf)))  # a box has an inside
+    hi = np.where(lo < hi, hi, np.nextafter(hi, np.float32(np.inf)))  # no box is flat
     shapes, reach = clippable(geometry, lo, hi, options.clip)
     budget = int(min(options.max_growth * n + 64, MAX_INDEX / 2))
     root = Cell(lo.min(axis=0), hi.max(axis=0), np.arange(n, dtype=np.int32), lo, hi, 0, budget, 0)
@@ -97,7 +97,7 @@ def build_tree(geometry: Geometry, options: KdOptions, threads: int) -> Built:
 
 
 def clippable(geometry: Geometry, lo: np.ndarray, hi: np.ndarray, clip: bool) -> tuple[WarpStruct, float]:
-    """Upload the primitives for kernels.build.clip; return them with the largest extent of the clipped ones."""
+    """Upload the primitives as kernels.build.clip.Clippable; return them, and the largest extent of all clipped triangles."""
     cpu = start("cpu")
     with np.errstate(over="ignore"):
         extent = (hi - lo).max(axis=1)
@@ -111,7 +111,7 @@ def clippable(geometry: Geometry, lo: np.ndarray, hi: np.ndarray, clip: bool) ->
 
 
 def split_top(root: Cell, shapes: WarpStruct, options: KdOptions) -> tuple[list[tuple[float, int]], list[Cell], float]:
-    """Split large cells: return nodes (split, word), the remaining cells, and the sum of the nodes' half areas."""
+    """Split large cells; return nodes (split, word), the cells to build subtrees in, and the sum of the nodes' half areas."""
     max_depth = options.depth(len(root.prim_id))
     nodes, tasks, area = [(0.0, 0)], [], 0.0
     todo = [root]
@@ -132,9 +132,9 @@ def split_top(root: Cell, shapes: WarpStruct, options: KdOptions) -> tuple[list[
 
 
 def binned_split(cell: Cell, options: KdOptions) -> tuple[int, np.float32] | None:
-    """Return the cheapest plane (axis, position) between bins within the budget, with by_cost only if cheaper than a leaf.
+    """Return the cheapest plane (axis, position) between bins within the budget; None if a leaf is cheaper, with by_cost.
 
-    Boxes are counted in the bins where they begin and in those where they end (Shevtsov, Soupikov and Kapustin 2007, "Highly
+    Boxes are counted in the bins where they begin and in the bins where they end (Shevtsov, Soupikov and Kapustin 2007, "Highly
     Parallel Fast KD-tree Construction").
     """
     n = len(cell.prim_id)
@@ -146,7 +146,7 @@ def binned_split(cell: Cell, options: KdOptions) -> tuple[int, np.float32] | Non
         planes = (low + width / BINS * np.arange(1, BINS)).astype(np.float32)
         if not np.isfinite(width) or not (np.diff(planes) > 0.0).all():
             continue
-        # A box that begins in a plane lies on its right only, one that ends there on its left only.
+        # A box that begins in a plane is only on the right of the plane. A box that ends in a plane is only on the left of it.
         left = np.cumsum(np.bincount(np.searchsorted(planes, cell.lo[:, axis], side="right"), minlength=BINS))[:-1]
         right = n - np.cumsum(np.bincount(np.searchsorted(planes, cell.hi[:, axis], side="left"), minlength=BINS))[:-1]
         share = planes.astype(np.float64) - low
@@ -163,7 +163,7 @@ def binned_split(cell: Cell, options: KdOptions) -> tuple[int, np.float32] | Non
 
 
 def divide(cell: Cell, plane: tuple[int, np.float32], shapes: WarpStruct, slot: int) -> list[Cell]:
-    """Return the cells on both sides of the plane, for the slots `slot` and slot + 1; straddling primitives are clipped."""
+    """Return the cells on both sides of the plane, whose nodes are `slot` and slot + 1. Straddling primitives are clipped."""
     axis, position = plane
     goes = [cell.lo[:, axis] < position, cell.hi[:, axis] > position]
     straddles = goes[0] & goes[1]
@@ -186,7 +186,7 @@ def divide(cell: Cell, plane: tuple[int, np.float32], shapes: WarpStruct, slot: 
 
 
 def clipped(shapes: WarpStruct, prim_id: np.ndarray, cell_lo: np.ndarray, cell_hi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the box of the part of each primitive that is in a cell."""
+    """Return the boxes lo, hi (n, 3) of the parts of primitives inside a cell."""
     cpu = start("cpu")
     lo, hi = (wp.zeros(len(prim_id), dtype=wp.vec3, device=cpu) for _ in range(2))
     launch(clip_references, len(prim_id), shapes, upload(prim_id, wp.int32, cpu), wp.vec3(*cell_lo), wp.vec3(*cell_hi), lo, hi)
@@ -194,7 +194,7 @@ def clipped(shapes: WarpStruct, prim_id: np.ndarray, cell_lo: np.ndarray, cell_h
 
 
 def build_subtrees(tasks: list[Cell], shapes: WarpStruct, options: KdOptions, threads: int) -> list[Part]:
-    """Build a subtree for each task on all threads."""
+    """Build a subtree in each cell, on all threads."""
     chosen = kernels.KdOptions()
     chosen.max_leaf, chosen.by_cost, chosen.empty_bonus = options.max_leaf, options.by_cost, options.empty_bonus
     chosen.cost_traversal, chosen.cost_intersection = options.cost_traversal, options.cost_intersection
@@ -205,13 +205,13 @@ def build_subtrees(tasks: list[Cell], shapes: WarpStruct, options: KdOptions, th
     def job(i: int) -> None:
         parts[i] = build_subtree(tasks[i], shapes, chosen)
 
-    # Largest first, so that all threads end together.
+    # The largest cells come first, so that all threads end at about the same time.
     run_all([partial(job, i) for i in sorted(range(len(tasks)), key=lambda i: -len(tasks[i].prim_id))], threads)
     return parts
 
 
 def build_subtree(cell: Cell, shapes: WarpStruct, options: WarpStruct) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Build a subtree in one launch. Most of the allocated memory is never touched."""
+    """Build a subtree in one launch. The allocated memory is an upper bound; most of it is never touched."""
     cpu = start("cpu")
     n = len(cell.prim_id)
     work = kernels.KdWork()
@@ -235,7 +235,7 @@ def build_subtree(cell: Cell, shapes: WarpStruct, options: WarpStruct) -> tuple[
 
 def joined(top: list[tuple[float, int]], tasks: list[Cell], parts: list[Part], root: Cell, area: float,
            reach: float) -> Built:
-    """Join the top and the subtrees: each root goes to its slot, its other nodes and its references to the end."""
+    """Join the top and the subtrees. The root of a subtree goes to its slot; its other nodes and its references are appended."""
     n_nodes = len(top) + sum(len(nodes) - 1 for nodes, _, _ in parts)
     n_references = sum(len(references) for _, references, _ in parts)
     if max(n_nodes, n_references) >= MAX_INDEX:

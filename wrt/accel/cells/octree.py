@@ -1,4 +1,4 @@
-"""Octree: a cell with many primitives is cut into eight, and an empty octant takes no memory."""
+"""Octree: a cell with many primitives is split into eight octants. An empty octant takes no memory."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Octree(OneMesh):
         if not 0 <= levels <= kernels.MAX_LEVELS or (levels and not (lo + np.float32(1 << levels) * arrays["size"] >= hi).all()):
             raise InputError("is damaged: its cells are not in order")
         if (arrays["nodes"]["count"] < -0xFF).any():
-            raise InputError("is damaged: its numbers are out of range")
+            raise InputError("is damaged: the count of a node is out of range")
         nodes = arrays["nodes"]
         inner = np.flatnonzero(nodes["count"] < 0)
         octants = np.bitwise_count(-nodes["count"][inner].astype(np.int64)).astype(np.int64)

@@ -20,16 +20,16 @@ from wrt.kernels.units.box import PAD_EXTENT
 REFERENCES_PER_LAUNCH = 16384
 CELLS_PER_LAUNCH = 4096
 MAX_REFERENCES = 1 << 27
-OCTANTS = np.arange(8)[:, None] >> np.arange(3) & 1  # (8, 3): which half, in x, y, z
+OCTANTS = np.arange(8)[:, None] >> np.arange(3) & 1  # (8, 3): 0 for the lower and 1 for the upper half in x, y, z
 
 
 @dataclass(frozen=True)
 class OctreeOptions:
     """Options of the octree. Raises InputError for values out of range.
 
-    max_leaf: cells with so many primitives are not split. max_depth: levels below the root, 0 to MAX_LEVELS. by_cost: stop also where
-    octants cost a ray as much as the cell. max_growth: limit of references per primitive in every part of the tree. mailbox: avoid
-    repeated tests of a primitive in several cells.
+    max_leaf: cells with at most so many primitives are not split. max_depth: levels below the root, 0 to MAX_LEVELS. by_cost: do not
+    split a cell whose octants cost a ray as much as the cell. max_growth: limit of references per primitive in every part of the
+    tree. mailbox: do not test a primitive of several cells again for the same ray.
     """
 
     max_leaf: int = 8
@@ -45,10 +45,10 @@ class OctreeOptions:
 
 @dataclass
 class Cells:
-    """The cells of one level.
+    """The M cells of one level.
 
-    corner: (M, 3) int32, lowest corners in units of finest cells. references: those of cell i are [begin[i], begin[i + 1]). growth:
-    (M,) factor by which the leaves below may have more references.
+    corner: (M, 3) int32, lowest corners in units of finest cells. references: prim_ids of cell i in [begin[i], begin[i + 1]).
+    growth: (M,) factor by which the number of references may grow in the leaves below a cell.
     """
 
     corner: np.ndarray
@@ -69,14 +69,14 @@ class Cells:
 
 
 def root_cell(lo: np.ndarray, hi: np.ndarray, max_depth: int) -> WarpStruct:
-    """Return the layout around these boxes: a cube from the lowest corner, cut off at the highest one."""
+    """Choose the layout around boxes lo, hi (N, 3): a cube from their lowest corner, clipped at their highest corner."""
     layout = OctreeLayout()
     low, high = lo.min(axis=0, initial=np.inf), hi.max(axis=0, initial=-np.inf)
     layout.lo, layout.hi, layout.size, layout.levels = wp.vec3(*low), wp.vec3(*high), 0.0, 0
     edge = float((high.astype(np.float64) - low).max())
     if not 0.0 < edge < 1e37:
         return layout
-    # Cells are so large that the rounding of their planes does not matter, and that float32 can represent them.
+    # `finest` keeps cells so large that the rounding of their planes does not matter, and that float32 can represent them.
     finest = max(float(np.abs([low, high]).max()) * PAD_EXTENT, 1e-37)
     layout.levels = min(max_depth, max(int(np.log2(edge / finest)), 0))
     size = np.float32(edge / (1 << layout.levels))
@@ -87,18 +87,18 @@ def root_cell(lo: np.ndarray, hi: np.ndarray, max_depth: int) -> WarpStruct:
 
 
 def planes(layout: WarpStruct, corner: np.ndarray) -> np.ndarray:
-    """Return coordinates (..., 3) of planes from their indices, in float64; the kernels' differ by rounding."""
+    """Convert indices of planes (..., 3) to coordinates in float64. Kernels round them to float32."""
     lo, hi = np.array(layout.lo, np.float64), np.array(layout.hi, np.float64)
     return np.minimum(lo + corner * float(layout.size), hi)
 
 
 def areas(layout: WarpStruct, corner: np.ndarray, size: int) -> np.ndarray:
-    """Return half the surface of the cells (..., 3) of this size."""
+    """Return half the surface area of cells. corner: (..., 3); size: edge in finest cells."""
     return half_areas(planes(layout, corner), planes(layout, corner + size))
 
 
 def build_tree(geometry: Geometry, options: OctreeOptions, threads: int) -> Built:
-    """Split cells with more than max_leaf primitives where that pays. Nodes are in breadth-first order; the root is a level."""
+    """Build the octree, level by level. Nodes are in breadth-first order. Built.depth counts the root as a level."""
     bounds = geometry.bounds()
     layout, n = root_cell(*bounds, options.max_depth), len(geometry)
     split = _Splitter(geometry, bounds, layout, threads)
@@ -133,16 +133,16 @@ def build_tree(geometry: Geometry, options: OctreeOptions, threads: int) -> Buil
 
 
 def choose(cells: Cells, split: _Splitter, half: int, options: OctreeOptions) -> tuple[np.ndarray, np.ndarray, Cells]:
-    """Choose the cells to split, (M,) bool; return them, the counts of their octants (K, 8), and the cells of the next level."""
+    """Choose K cells to split; return their mask (M,), their octants' numbers of references (K, 8), and the next level's cells."""
     chosen = cells.count > options.max_leaf if half else np.zeros(len(cells.corner), bool)
     large = cells.part(chosen)
     count = split.count(large, half)
-    # Each cell has its own budget, in proportion to its primitives, so that large objects leave some for small ones.
+    # Each cell has a budget of references in proportion to its primitives, so that large objects do not use up all of it.
     growth = large.growth * large.count / np.maximum(count.sum(axis=1), 1)
     keep = growth >= 1.0
     corner = large.corner[:, None] + half * OCTANTS
     if options.by_cost:
-        # Expected cost of a ray through the cell, in cells fetched and primitives tested, as one cell and as octants.
+        # Expected cost of a ray through the cell, in cells fetched and primitives tested: with octants, and as a leaf.
         area, whole = areas(split.layout, corner, half), areas(split.layout, large.corner, 2 * half)
         keep &= (area * (count + (count > 0))).sum(axis=1) < whole * large.count
     chosen[chosen] = keep
@@ -150,7 +150,7 @@ def choose(cells: Cells, split: _Splitter, half: int, options: OctreeOptions) ->
 
 
 class _Splitter:
-    """Kernels of kernels.build.octree over one geometry."""
+    """Launches of kernels.build.octree over one geometry."""
 
     def __init__(self, geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray], layout: WarpStruct, threads: int) -> None:
         self.cpu, self.layout, self.threads = start("cpu"), layout, threads
@@ -160,7 +160,7 @@ class _Splitter:
         return upload(np.ascontiguousarray(array, np.int32), wp.int32, self.cpu)
 
     def count(self, cells: Cells, half: int) -> np.ndarray:
-        """Count the references of each octant of each cell, (M, 8)."""
+        """Count the references of each octant of each cell, (M, 8). half: edge of an octant in finest cells."""
         m, n = len(cells.corner), len(cells.references)
         self.begin, self.references = self._int32(cells.begin), self._int32(cells.references)
         self.masks = wp.zeros(n, dtype=wp.int32, device=self.cpu)
@@ -182,10 +182,10 @@ class _Splitter:
         (M,), the growth that a cell's octants inherit.
         """
         begin = np.concatenate([[0], np.cumsum(count.ravel())])
-        room = np.where(count.any(axis=1, keepdims=True), begin[:-1].reshape(-1, 8), -1)
+        first = np.where(count.any(axis=1, keepdims=True), begin[:-1].reshape(-1, 8), -1)
         out = wp.zeros(int(begin[-1]), dtype=wp.int32, device=self.cpu)
         launch(build_octree.fill_octants, len(cells.corner), None, self.begin, self.masks, self.references,
-               upload(np.ascontiguousarray(room, np.int32).reshape(-1, 8), wp.int32, self.cpu), out,
+               upload(np.ascontiguousarray(first, np.int32).reshape(-1, 8), wp.int32, self.cpu), out,
                threads=self.threads, step=CELLS_PER_LAUNCH)
         has = count > 0
         return Cells(corner[has].astype(np.int32), np.concatenate([begin[:-1][has.ravel()], begin[-1:]]).astype(np.int32),

@@ -21,7 +21,7 @@ from wrt.accel.queries.rays import rays_of
 from wrt.accel.queries.world_ids import check_world
 from wrt.accel.snapshot import Snapshot
 from wrt.accel.structure import Structure, check_units
-from wrt.core.arrays import returned
+from wrt.core.arrays import to_tensor_like
 from wrt.core.checks import shown
 from wrt.core.device import start, upload
 from wrt.core.errors import InputError
@@ -32,9 +32,9 @@ from wrt.kernels.structs import Surfaces
 
 
 class Accelerator:
-    """A structure over one mesh (`OneMesh`) or over instances (`Instances`), and its queries.
+    """An acceleration structure over one mesh (`OneMesh`) or over instances (`Instances`), with its queries.
 
-    Several threads may ask one structure, while one of them refits it (docs/moving.md, "Several threads").
+    Several threads may query one structure while another thread refits it (docs/moving.md, "Several threads").
 
     Attributes
     ----------
@@ -43,44 +43,44 @@ class Accelerator:
     device : wp.Device
         Device of its arrays.
     threads : int
-        Threads that build and refit it.
+        Number of CPU threads that build and refit it.
     """
 
-    _snapshot: Snapshot  # replaced as a whole
+    _snapshot: Snapshot  # a refit assigns a new object
 
     def __init__(self, structure: Structure, geometry: Geometry | InstancedGeometry, attributes: FlatScene | None, device: str,
                  threads: int | None) -> None:
-        """Keep what every structure has; subclasses build over it and replace the snapshot. Arguments as in `Snapshot`."""
+        """Set the fields that all structures share. Subclasses then build and replace the snapshot. Arguments: see `Snapshot`."""
         check_units(structure.units.triangle, structure.units.box)
         self.device = start(device)
         self.threads = thread_count(threads)
         self.structure = structure._replace(units=structure.units._replace(spheres=len(geometry.spheres) > 0))
         surfaces = Surfaces()
         surfaces.n_triangles = geometry.n_triangles
-        surfaces.spheres = upload(geometry.spheres.copy(), wp.vec4, self.device)  # copied: the caller may write to its array later
+        surfaces.spheres = upload(geometry.spheres.copy(), wp.vec4, self.device)  # a copy, because the caller may write to its array
         self._snapshot = Snapshot(self.structure, self.device, surfaces, attributes, geometry)
         self._refitting = threading.Lock()
-        self._kept: dict[str, Any] = {}  # arrays that later refits use again
+        self._cache: dict[str, Any] = {}  # arrays that later refits reuse
 
     def __copy__(self) -> Self:
-        """Return the same structure; a refit of one of the two does not change the other."""
+        """Return a copy that shares all arrays. A refit of either does not change the other."""
         other = object.__new__(type(self))
         other.__dict__.update(self.__dict__)
         return other
 
     @property
     def snapshot(self) -> Snapshot:
-        """Consistent view of the structure as it is now, which later refits leave as it is."""
+        """Present state of the structure. A later refit does not change it, unless it is a refit in place."""
         return self._snapshot
 
     @property
     def geometry(self) -> Geometry | InstancedGeometry:
-        """Shapes that the structure is over, as they are now."""
+        """Triangles and spheres in the structure, as of the last refit."""
         return self._snapshot.geometry
 
     @property
     def data(self) -> WarpStruct:
-        """Warp struct that kernels get. A refit makes another one; a refit in place writes to the arrays of this one."""
+        """Warp struct of the structure's arrays, an argument of kernels. A refit makes a new one; a refit in place modifies it."""
         return self._snapshot.data
 
     @property
@@ -103,27 +103,28 @@ class Accelerator:
     def closest_hit(self, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
                     threads: int | None = None, *, counters: bool = False, trace: bool = False, out: Hits[Any] | None = None,
                     world: ArrayLike | None = None) -> Hits[Any]:
-        """Find the closest hit of each ray in the closed segment [t_min, t_max]; at equal t, that of the lowest prim_id.
+        """Find the closest hit of each ray in the closed segment [t_min, t_max]; at equal t, the hit with the lowest prim_id.
 
-        A surface through the origin is hit at t_min = 0; a t_min above 0 leaves it out. While a `wp.Tape` records, t, u, v and
-        `hits.point` have gradients at fixed prim_id in Warp arrays that require them: origins, directions, and the vertices of the
-        last refit (docs/gradients.md).
+        With t_min = 0 a ray hits a surface through its origin; a t_min above 0 excludes that surface. While a `wp.Tape` records,
+        t, u, v and `hits.point` have gradients at fixed prim_id. These flow to Warp arrays that require gradients: origins,
+        directions, and the vertices of the last refit (docs/gradients.md).
 
         Parameters
         ----------
         origins, directions : (N, 3) array_like, or Warp arrays (N,) of vec3
-            Real numbers, taken as float32, and read in place if they are float32 without gaps. Coordinates of origins up to 1e37;
-            directions of any length but 0. The values of Warp arrays are not checked.
+            Real numbers, converted to float32; contiguous float32 arrays are read in place. Coordinates of origins are at most 1e37;
+            directions have any length but 0. The values of Warp arrays are not checked.
         t_min, t_max : float or (N,) array_like
-            Segment in units of the direction's length, t_min >= 0. A Warp array on a GPU is not checked.
+            Ends of the segment in units of the direction's length, t_min >= 0. The values of Warp arrays on a GPU are not checked.
         threads : int, optional
             Threads on the CPU; one per core by default.
         counters, trace : bool
-            Count the costs of each ray (`hits.counters`); `trace` also records every fetch, in a second run.
+            Count the nodes and primitives that each ray visits (`hits.counters`); `trace` also records every fetch, in a second run.
         out : Hits, optional
-            Hits of N rays whose arrays take the results. They must not overlap with the arrays of the rays.
+            Hits of N rays whose arrays receive the results. These must not overlap with the arrays of the rays.
         world : int or (N,) array_like of int, optional
-            World that each ray sees; required over several worlds. In an unchecked Warp array, a world that does not exist is empty.
+            Index of the world that each ray sees; required over several worlds. Warp arrays are not checked: in a world that does
+            not exist, a ray misses.
 
         Returns
         -------
@@ -135,13 +136,13 @@ class Accelerator:
         InputError
             Names the argument and what was expected. The arrays of `out` may have been overwritten.
         """
-        threads, rays, give = thread_count(threads), rays_of(origins, directions, t_min, t_max, True), returned(origins, directions)
+        threads, rays, give = thread_count(threads), rays_of(origins, directions, t_min, t_max, True), to_tensor_like(origins, directions)
         if not (out is None or isinstance(out, Hits)):
             raise InputError(f"must be Hits, got {shown(out)}", argument="out")
-        given = None if out is None else [out.t, out.u, out.v, out.prim_id]
-        t, u, v, prim_id = arrays = answer_arrays(HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None,
+        callers = None if out is None else [out.t, out.u, out.v, out.prim_id]
+        t, u, v, prim_id = arrays = answer_arrays(HIT_TYPES, callers, len(rays.origins), self.device if rays.as_warp else None,
                                              give is not None)
-        snapshot = self._snapshot  # once: a refit may replace it meanwhile
+        snapshot = self._snapshot  # read once, because a refit may replace it during the query
         worlds = check_world(snapshot, world, len(t))
         query, costs = Query(rays, arrays, threads, worlds), None
         if counters or trace:
@@ -165,14 +166,14 @@ class Accelerator:
                 threads: int | None = ..., *, out: TensorT | None = ..., world: ArrayLike | None = ...) -> TensorT: ...
     def any_hit(self, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
                 threads: int | None = None, *, out: object = None, world: ArrayLike | None = None) -> object:
-        """Test whether each ray hits anything in its segment: exactly where `closest_hit` finds a hit.
+        """Test whether each ray hits anything in its segment: True exactly where `closest_hit` finds a hit.
 
         Parameters
         ----------
         origins, directions, t_min, t_max, threads, world
             See `closest_hit`.
         out : (N,) bool, optional
-            Array that takes the answers.
+            Array that receives the results.
 
         Returns
         -------
@@ -184,9 +185,9 @@ class Accelerator:
         InputError
             Names the argument and what was expected.
         """
-        threads, rays, give = thread_count(threads), rays_of(origins, directions, t_min, t_max), returned(origins, directions)
-        given = None if out is None else [out]
-        arrays = answer_arrays(ANY_HIT_TYPES, given, len(rays.origins), self.device if rays.as_warp else None, give is not None)
+        threads, rays, give = thread_count(threads), rays_of(origins, directions, t_min, t_max), to_tensor_like(origins, directions)
+        callers, device = None if out is None else [out], self.device if rays.as_warp else None
+        arrays = answer_arrays(ANY_HIT_TYPES, callers, len(rays.origins), device, give is not None)
         snapshot = self._snapshot
         trace_query(snapshot, Query(rays, arrays, threads, check_world(snapshot, world, len(arrays[0]))))
         return arrays[0] if give is None else give(arrays[0])
@@ -194,7 +195,7 @@ class Accelerator:
 
 def snapshot_of(accel: Accelerator) -> Snapshot:
     """Return the snapshot of a structure over one mesh without spheres. Raises InputError for any other."""
-    message = f"accel must be a structure over one mesh (wrt.build), got {shown(accel)}"
+    message = f"accel must be a structure over one mesh without spheres (wrt.build), got {shown(accel)}"
     if not isinstance(accel, Accelerator):
         raise InputError(message, argument="accel")
     accel.structure.require_one_mesh(message)

@@ -12,11 +12,11 @@ import warp as wp
 
 from wrt.accel.queries.accelerator import Accelerator, snapshot_of
 from wrt.accel.queries.answers import Hits
-from wrt.accel.queries.hit_points import surroundings
+from wrt.accel.queries.hit_points import device_scene
 from wrt.accel.queries.raw_kernel import RawKernel, memory_of
 from wrt.accel.queries.rays import Rays, arrays_on, host_arrays, rays_of
 from wrt.accel.structure import Structure
-from wrt.core.arrays import returned, to_numpy, to_warp
+from wrt.core.arrays import to_numpy, to_tensor_like, to_warp
 from wrt.core.checks import as_integer, as_one
 from wrt.core.device import MOST_ROWS, made_once, upload
 from wrt.core.errors import InputError
@@ -27,19 +27,19 @@ from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import Hit
 
 ALL = (1 << 30) - 1
-RAYS_AT_ONCE = 1 << 18  # whose lists of the first walk take 32 MiB
+RAYS_AT_ONCE = 1 << 18  # the hit lists of so many rays take 32 MiB in the first traversal
 HIT_KINDS = wp.float32, wp.float32, wp.float32, wp.int32  # of HitArrays
 COPY_HITS = RawKernel(copy_hits, RayArrays(), HitLists(), None, HitArrays())
 
 
 @dataclass(frozen=True, eq=False)
 class AllHits(Generic[ArrayT]):
-    """M hits of N rays in order of t and, where that is equal, of prim_id. Arrays of NumPy, PyTorch or JAX.
+    """M hits of N rays, ray by ray, in order of t and, at equal t, of prim_id. Arrays of NumPy, PyTorch or JAX.
 
     Attributes
     ----------
     first : (N + 1,) int64
-        The hits of ray i are rows first[i] to first[i + 1] of the other arrays.
+        Rows first[i] .. first[i + 1] - 1 of the other arrays are the hits of ray i.
     t, u, v : (M,) float32
         As in `Hits`.
     prim_id : (M,) int32
@@ -63,9 +63,9 @@ class AllHits(Generic[ArrayT]):
 
     @property
     def ray_id(self) -> ArrayT:
-        """Ray of each hit, (M,) int64."""
+        """Index of the ray of each hit, (M,) int64."""
         ray_id: Any = np.repeat(np.arange(len(self)), to_numpy(self.counts))
-        give: Any = returned(self.first)
+        give: Any = to_tensor_like(self.first)
         return ray_id if give is None else give(wp.array(ray_id, dtype=wp.int64, device=to_warp(self.first).device))
 
     def __repr__(self) -> str:
@@ -85,7 +85,7 @@ class _Lists(NamedTuple):
 
 
 class ListQuery:
-    """A structure in its present state and rays: `of` sets the rays; `all`, `first` and `counts` answer."""
+    """Query of a snapshot of a structure for lists of hits. `of` sets the rays; `all`, `first` and `counts` return results."""
 
     n = 0
     rays: Rays
@@ -97,14 +97,14 @@ class ListQuery:
         self.memory: Any = memory_of(self.device)
         self.crossings, self.mesh = as_one(crossings, bool, "crossings"), (None, None)
         if crossings:
-            surfaces = surroundings(self.snapshot).surfaces
+            surfaces = device_scene(self.snapshot).surfaces
             self.mesh = surfaces.vertices, surfaces.faces
 
     def of(self, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf) -> ListQuery:
         """Set the rays. Raises InputError that names the argument."""
         rays = rays_of(origins, directions, t_min, t_max)
         self.n, self.rays = len(rays.origins), host_arrays(rays) if self.device.is_cpu else arrays_on(self.device, rays)
-        self.give = returned(origins, directions) or to_numpy
+        self.give = to_tensor_like(origins, directions) or to_numpy
         return self
 
     def all(self, limit: int = ALL) -> AllHits[Any]:
@@ -116,10 +116,10 @@ class ListQuery:
             counts.append(of_each)
             self._copy(rays, lists, first, parts[-1])
         if len(parts) == 1:
-            return AllHits(self.given(first), *map(self.give, parts[0]))
+            return AllHits(self.converted(first), *map(self.give, parts[0]))
         first = _begins(np.concatenate(counts))
         hits = [self._joined(kind, arrays) for kind, *arrays in zip(HIT_KINDS, *parts, strict=True)]
-        return AllHits(self.given(first), *map(self.give, hits))
+        return AllHits(self.converted(first), *map(self.give, hits))
 
     def first(self, k: int) -> Hits[Any]:
         """Find the first k hits of each ray, in arrays (N, k)."""
@@ -133,18 +133,18 @@ class ListQuery:
         return Hits(*(self.give(array.reshape((self.n, k))) for array in hits))
 
     def counts(self) -> np.ndarray:
-        """Count the hits of each ray, (N,) int64. If no triangle is in several leaves, the first walk has the counts."""
+        """Count the hits of each ray, (N,) int64. If no triangle is in several leaves, the first traversal is enough."""
         counting = self.snapshot.stats.references == len(self.snapshot.geometry)
         return np.concatenate([np.zeros(0, np.int64), *(of_each for _, _, of_each in self._listed(ALL, counting))])
 
-    def given(self, numbers: np.ndarray) -> Array:
-        """Return int64 numbers as an array of the caller's library."""
-        return numbers if self.give is to_numpy else self.give(upload(numbers, wp.int64, self.device))
+    def converted(self, values: np.ndarray) -> Array:
+        """Convert int64 values to an array of the caller's library."""
+        return values if self.give is to_numpy else self.give(upload(values, wp.int64, self.device))
 
     def _listed(self, limit: int, counting: bool = False) -> Iterator[tuple[object, list[_Lists], np.ndarray]]:
-        """Yield parts of the rays with their lists of hits, and the number of hits of each ray, at most `limit`.
+        """Yield, for each part of the rays: the rays, one or two lists of their hits, and the number of hits of each ray.
 
-        A ray has its hits in one of the lists. counting: the numbers are complete, the lists may not be.
+        Each ray has its hits in one of the lists, at most `limit`. counting: only the numbers of hits are needed.
         """
         limit = min(limit, ALL)
         for begin in range(0, self.n, RAYS_AT_ONCE):
@@ -160,7 +160,7 @@ class ListQuery:
             yield rays, lists, counts
 
     def _filled(self, rays: object, first: np.ndarray, limit: int) -> _Lists:
-        """Walk, and return the lists; that of ray i begins at row first[i] of them."""
+        """Traverse the structure and return lists of hits. The list of ray i has the rows first[i] .. first[i + 1] - 1."""
         rows, n = rows_of(first[-1]), len(first) - 1
         lists = _Lists(limit, self.crossings, *self.mesh, self.memory.array(first, wp.int32),
                        self.memory.array(np.zeros(n, np.int32), wp.int32), self.memory.empty(rows, Hit))
@@ -183,16 +183,16 @@ class ListQuery:
 
 
 def _begins(counts: np.ndarray) -> np.ndarray:
-    """Return where each of N lists of these lengths begins, and the end of the last, (N + 1,) int64."""
+    """Return the first row of each of N adjacent lists, and the end of the last list, (N + 1,) int64."""
     out = np.zeros(len(counts) + 1, np.int64)
     np.cumsum(counts, out=out[1:])
     return out
 
 
 def rows_of(hits: int) -> int:
-    """Return the size of an array of hits. Raises InputError above 2^31 - 1, the largest index of a kernel."""
+    """Return the size of an array of hits. Raises InputError above 2^31 - 1, the largest size that kernels can index."""
     if hits > MOST_ROWS:
-        raise InputError(f"{hits} hits are more than an array can have, 2^31 - 1", hint="ask fewer rays at a time")
+        raise InputError(f"{hits} hits do not fit into an array of at most 2^31 - 1", hint="query fewer rays at a time")
     return int(hits)
 
 
@@ -213,8 +213,8 @@ def all_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike, t_mi
              threads: int | None = None, crossings: bool = False) -> AllHits[Any]:
     """Find every hit of each ray in its segment, in order of distance. A ray hits each triangle at most once.
 
-    No ray is lost between two triangles: through their common edge it hits one or both, depending on rounding. n hits take n log n
-    steps, also if many are at the same t.
+    No ray passes between two adjacent triangles: through their common edge it hits one or both, depending on rounding. The time
+    for n hits of a ray grows as n log n, even if many hits have the same t.
 
     Parameters
     ----------
@@ -223,9 +223,9 @@ def all_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike, t_mi
     origins, directions, t_min, t_max, threads
         See `Accelerator.closest_hit`.
     crossings : bool
-        Find crossings of the surface instead: at a shared edge or corner the ray counts as moved aside by an infinitesimal distance.
-        It then hits one triangle where the surface goes on, and none or two at an outline. A ray that begins and ends outside of a
-        closed mesh crosses it an even number of times; with the watertight test, exactly.
+        Find crossings of the surface instead. At a shared edge or corner, the ray counts as shifted by an infinitesimal distance:
+        it hits one triangle inside a surface, and none or two at a silhouette. A ray that begins and ends outside of a closed mesh
+        crosses it an even number of times. With the watertight test this holds without exception.
 
     Returns
     -------
@@ -248,7 +248,7 @@ def count_hits(accel: Accelerator, origins: TensorT, directions: TensorT, t_min:
                threads: int | None = ..., crossings: bool = ...) -> TensorT: ...
 def count_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
                threads: int | None = None, crossings: bool = False) -> object:
-    """Count the hits of each ray in its segment, without memory for them unless the structure has triangles in several leaves.
+    """Count the hits of each ray in its segment. The hits take no memory unless the structure has triangles in several leaves.
 
     Parameters
     ----------
@@ -266,7 +266,7 @@ def count_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike, t_
         Names the argument and what was expected.
     """
     query = ListQuery(accel, threads, crossings).of(origins, directions, t_min, t_max)
-    return query.given(query.counts())
+    return query.converted(query.counts())
 
 
 @overload
@@ -277,7 +277,7 @@ def first_hits(accel: Accelerator, k: int, origins: TensorT, directions: TensorT
                threads: int | None = ..., crossings: bool = ...) -> Hits[TensorT]: ...
 def first_hits(accel: Accelerator, k: int, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0,
                t_max: ArrayLike = np.inf, threads: int | None = None, crossings: bool = False) -> Hits[Any]:
-    """Find the first k hits of each ray in order of distance; the walk ends at the k-th.
+    """Find the first k hits of each ray in order of distance. The traversal ends at the k-th hit.
 
     Parameters
     ----------
@@ -289,7 +289,7 @@ def first_hits(accel: Accelerator, k: int, origins: ArrayLike, directions: Array
     Returns
     -------
     Hits
-        Arrays (N, k); a ray with fewer hits has misses at the end. They have no points and normals.
+        Arrays (N, k); a ray with fewer hits has misses at the end. These Hits have no points and normals.
 
     Raises
     ------

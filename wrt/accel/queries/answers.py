@@ -1,4 +1,4 @@
-"""Answers of a structure: hits, what they cost, and the arrays that take them."""
+"""Results of queries: hits, counters of their cost, and the arrays that receive both."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy.typing as npt
 import warp as wp
 
 from wrt.accel.queries.hit_points import HitPoints, Source
-from wrt.core.arrays import taken, to_numpy, to_warp
+from wrt.core.arrays import from_tensor, to_numpy, to_warp
 from wrt.core.checks import shown
 from wrt.core.device import empty_aligned
 from wrt.core.errors import InputError
@@ -25,14 +25,14 @@ ANY_HIT_TYPES = {"out": np.bool_}
 
 @dataclass(frozen=True, eq=False)
 class Counters:
-    """Costs of each ray of a query: `counters.nodes`, `counters.primitives` and the other fields of `counts` are (N,) arrays.
+    """Costs of each ray of a query. `counters.nodes`, `counters.primitives` and the other fields of `counts` are (N,) arrays.
 
     Attributes
     ----------
     counts : (N,) structured array
-        Counts as `kernels.traverse.counters.Counts` has them.
+        Records of `kernels.traverse.counters.Counts`.
     first : (N + 1,) int64
-        The fetches of ray i are rows first[i] to first[i + 1] of `address` and `size`; all 0 without `trace=True`.
+        Rows first[i] .. first[i + 1] - 1 of `address` and `size` are the fetches of ray i; all 0 without `trace=True`.
     address, size : (M,) int64
         Address and size of each fetch in bytes. Addresses of primitives begin at `PRIMITIVE_SPACE`.
     """
@@ -49,13 +49,13 @@ class Counters:
 
     def __repr__(self) -> str:
         means = ", ".join(f"{name} {self.counts[name].mean():.2f}" for name in self.counts.dtype.names or ())
-        return f"Counters({len(self.counts)} rays; a ray: {means})" if len(self.counts) else "Counters(0 rays)"
+        return f"Counters({len(self.counts)} rays; mean per ray: {means})" if len(self.counts) else "Counters(0 rays)"
 
     def _repr_html_(self) -> str:
         names = (self.counts.dtype.names or ()) if len(self.counts) else ()
         rows = [(name, float(self.counts[name].mean()), int(self.counts[name].max()), int(self.counts[name].sum(dtype=np.int64)))
                 for name in names]
-        return html_table(f"Counters of {len(self.counts)} rays", ("", "a ray", "largest", "sum"), rows)
+        return html_table(f"Counters of {len(self.counts)} rays", ("", "mean per ray", "largest", "sum"), rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,11 +67,11 @@ class Hits(HitPoints[ArrayT]):
     t : (N,) float32
         Distance in units of the direction's length; inf on a miss.
     u, v : (N,) float32
-        The point is (1 - u - v) v0 + u v1 + v v2. Both are 0 on a miss and on a sphere.
+        Barycentric coordinates: the point is (1 - u - v) v0 + u v1 + v v2. Both are 0 on a miss and on a sphere.
     prim_id : (N,) int32
         Index of the face, or number of faces plus index of the sphere; -1 on a miss.
     counters : Counters or None
-        Costs of each ray, if the query was asked to count.
+        Costs of each ray, if the query had `counters=True` or `trace=True`.
     source : tuple or None
         Snapshot and rays from which points, normals and ids are computed. Pickled hits have none.
     """
@@ -113,30 +113,30 @@ class Hits(HitPoints[ArrayT]):
         return Hits(convert(self.t), convert(self.u), convert(self.v), convert(self.prim_id), self.counters, self.source)
 
 
-def answer_arrays(types: Mapping[str, type], given: list[Any] | None, n: int, device: Device | None,
+def answer_arrays(types: Mapping[str, type], out: list[Any] | None, n: int, device: Device | None,
                   shared: bool = False) -> list[Array]:
-    """Return an array (N,) of each type for the answers: NumPy's (`device` is None) or Warp's; `given` ones are checked.
+    """Return one array (n,) per entry of `types`: of NumPy if `device` is None, else of Warp. Arrays in `out` are checked.
 
-    shared: another library takes them; JAX would copy an array that does not begin with a cache line. Raises InputError that names
-    the array by its key in `types`.
+    shared: begin each array at a cache line, because JAX copies an array that does not. Raises InputError that names the array by
+    its key in `types`.
     """
-    if given is None:
+    if out is None:
         empty = empty_aligned if shared else np.empty
         return [empty(n, dtype) if device is None else wp.empty(n, dtype=wp.dtype_from_numpy(dtype), device=device)
                 for dtype in types.values()]
-    given = [taken(array, name, None) for name, array in zip(types, given, strict=True)]
-    for (name, dtype), array in zip(types.items(), given, strict=True):
+    out = [from_tensor(array, name, None) for name, array in zip(types, out, strict=True)]
+    for (name, dtype), array in zip(types.items(), out, strict=True):
         if device is None:
             fits = isinstance(array, np.ndarray) and array.dtype == dtype and array.flags.carray
         else:
             fits = (isinstance(array, wp.array) and array.dtype == wp.dtype_from_numpy(dtype) and array.device == device
                     and (array.is_contiguous or n == 0))
         if not (fits and array.shape == (n,)):
-            kind, place = ("NumPy", "writeable and") if device is None else ("Warp", f"on {device},")
-            raise InputError(f"must be a {kind} array ({n},) of {np.dtype(dtype)}, {place} without gaps, got {shown(array)}",
+            kind, place = ("NumPy", "writeable and") if device is None else ("Warp", f"on {device} and")
+            raise InputError(f"must be a {kind} array ({n},) of {np.dtype(dtype)}, {place} contiguous, got {shown(array)}",
                              argument=name)
-    # The arrays have no gaps, so that their bounds tell all.
-    for (name, one), (other, two) in combinations(zip(types, given, strict=True), 2) if len(given) > 1 else ():
+    # The arrays are contiguous, so that they overlap exactly if their bounds do.
+    for (name, one), (other, two) in combinations(zip(types, out, strict=True), 2) if len(out) > 1 else ():
         if np.may_share_memory(one, two) if device is None else abs((one.ptr or 0) - (two.ptr or 0)) < n * one.strides[0]:
             raise InputError(f"shares memory with {other}", argument=name)
-    return given
+    return out

@@ -1,4 +1,4 @@
-"""Launches of a query: its rays in parts over threads, by a kernel for many rays at a time where the structure has one."""
+"""Kernel launches of a query, on CPU threads or a GPU. Some structures have a CPU kernel that traces many rays at a time."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ from wrt.kernels.structs import Surfaces
 from wrt.kernels.warp_private import fields_of
 from wrt.kernels.wide.packets import ANY_REFUSED, REPORT_SIZE, Scratch
 
-# Rays of a launch: some milliseconds of work, so that the launch itself costs little and Ctrl-C is answered soon. Up to FEWEST are
-# one launch. A thread takes 1 / SHARES of its part of the remaining rays, at least LEAST, so that all threads end together.
+# Rays per launch, which lasts some milliseconds, so that its overhead is small and Ctrl-C acts soon. A query of at most FEWEST rays
+# is one launch. Else each launch gets 1 / (SHARES threads) of the remaining rays, LEAST to MOST, so that all threads end together.
 FEWEST, MOST, LEAST, SHARES = 8192, 131072, 4096, 2
-RAYS_PER_LAUNCH = 16384  # by kernels for one ray
-MOST_ON_GPU = 1 << 26  # rays from the host on a GPU at once: 3 GB with their hits; a kernel counts in int32
-BYTES_OF_RAY = 48  # with its hit
-SURE = 1 << 20  # rays that every GPU has memory for, so that it is not asked
-MOST_PACKED = (1 << 31) - 64  # a kernel counts in int32, and its last block may pass the end
-SMALL = 1024  # up to so many rays, a copy takes less time than records of the caller's arrays
+RAYS_PER_LAUNCH = 16384  # for kernels that trace one ray at a time
+MOST_ON_GPU = 1 << 26  # largest number of rays that are copied to a GPU at once: 3 GB with their hits
+BYTES_OF_RAY = 48  # a ray and its hit
+FITS_ANY_GPU = 1 << 20  # for so many rays the free memory of the GPU is not queried
+MOST_PACKED = (1 << 31) - 64  # rays: kernels index in int32, and their last block may exceed the range
+SMALL = 1024  # up to so many rays, a copy is faster than kernel records of the caller's arrays
 
 
 class Query(NamedTuple):
-    """A call of closest_hit or any_hit. out: the arrays for the answers, of HIT_TYPES or of ANY_HIT_TYPES."""
+    """A call of closest_hit or any_hit. out: arrays for the results, of HIT_TYPES or of ANY_HIT_TYPES."""
 
     rays: Rays
     out: list[Array]
@@ -46,7 +46,7 @@ class Query(NamedTuple):
 
 
 def trace_query(snapshot: Snapshot, query: Query) -> None:
-    """Write the answers of a structure to the query's arrays. Raises InputError for invalid rays, after some answers are written."""
+    """Trace the rays and write the results to query.out. Raises InputError for invalid rays, after some results are written."""
     if query.worlds is not None:
         trace_worlds(snapshot, query, query.worlds)
     elif snapshot.device.is_cuda:
@@ -56,7 +56,7 @@ def trace_query(snapshot: Snapshot, query: Query) -> None:
 
 
 def parts(n: int, threads: int, block: int) -> list[tuple[int, int]]:
-    """Divide n rays into ranges [first, end) of multiples of `block`: large ones first, and small ones last for balance."""
+    """Divide n rays into ranges [first, end) of multiples of `block`. The last ranges are small, to balance the threads."""
     out, first = [], 0
     while first < n:
         size = MOST if threads == 1 else max(LEAST, min((n - first) // (SHARES * threads), MOST))
@@ -67,11 +67,11 @@ def parts(n: int, threads: int, block: int) -> list[tuple[int, int]]:
 
 
 class Tracer:
-    """Queries on the CPU: the kernel for a structure, and its workers, which later calls use again."""
+    """Queries on the CPU: the kernel for a structure, and workers that later calls reuse."""
 
     def __init__(self, structure: Structure, any_hit: bool) -> None:
         stream: KernelModule = structure.accel.stream
-        # A kernel for many rays at a time, or None if the structure has a kernel for one ray only.
+        # Kernel that traces many rays at a time, or None if the structure has no such kernel.
         self.stream = stream and stream.make_stream(structure.units, any_hit)
         self.kernel = self.stream or (any_hit_kernel if any_hit else closest_hit_kernel)(structure)
         self.block = stream.stream_block if self.stream else 1
@@ -84,11 +84,11 @@ class Tracer:
         """Trace on the CPU, as trace_query. Invalid rays are found after tracing."""
         load_kernel(self.kernel, cpu := wp.get_device("cpu"))
         rays, threads = query.rays.on(cpu), query.threads
-        if not self.stream:  # a kernel for many rays reports invalid ones itself
+        if not self.stream:  # `self.stream` reports invalid rays itself
             rays = rays.checked()
-        given, answers = [np.asarray(array) for array in rays], [np.asarray(array) for array in query.out]
-        n = len(given[0])
-        packed = pack(given, answers) if SMALL < n <= MOST_PACKED and all(map(readable, given)) else None
+        inputs, results = [np.asarray(array) for array in rays], [np.asarray(array) for array in query.out]
+        n = len(inputs[0])
+        packed = pack(inputs, results) if SMALL < n <= MOST_PACKED and all(map(readable, inputs)) else None
         if packed and self.stream:
             ranges = parts(n, threads, self.block) if n > FEWEST else [(0, n)]
         else:
@@ -101,18 +101,18 @@ class Tracer:
             if packed:
                 worker.launch(snapshot, packed, first, end)
             else:
-                copy(given, slice(first, end), worker.given, slice(end - first))
+                copy(inputs, slice(first, end), worker.rays, slice(end - first))
                 worker.launch(snapshot, worker.packed, 0, end - first)
-                copy(worker.answers, slice(end - first), answers, slice(first, end))
+                copy(worker.results, slice(end - first), results, slice(first, end))
             refused.append(bool(worker.report[ANY_REFUSED]))
-            self.free.append(worker)  # not after an error, when a thread may still use it
+            self.free.append(worker)  # not after an exception, because a thread may still use it
 
         run_all([partial(job, *each) for each in ranges], threads)
         if any(refused):
             rays.checked()
 
     def borrow(self) -> Worker:
-        """Take a worker for one launch."""
+        """Return a free worker for one launch."""
         try:
             return self.free.pop()
         except IndexError:
@@ -123,7 +123,7 @@ tracer = made_once(Tracer)
 
 
 def new_scratch(sizes: tuple[int, ...]) -> WarpStruct:
-    """Return Scratch with arrays of these sizes, which begin at cache lines, so that no row of lanes lies in two."""
+    """Return Scratch with arrays of these sizes. They begin at cache lines, so that no vector of lanes lies in two lines."""
     out: WarpStruct = Scratch()
     for (name, kind), size in zip(fields_of(Scratch).items(), sizes, strict=False):
         setattr(out, name, to_warp(empty_aligned((size,), wp.dtype_to_numpy(kind.dtype))))
@@ -131,15 +131,15 @@ def new_scratch(sizes: tuple[int, ...]) -> WarpStruct:
 
 
 class Worker:
-    """A recorded launch, its scratch memory, and buffers for rays and answers that a kernel cannot use in place.
+    """A recorded launch, its scratch memory, and buffers for rays and results that a kernel cannot use in place.
 
     One thread uses it at a time.
     """
 
     def __init__(self, tracer: Tracer) -> None:
-        self.given = [np.empty((FEWEST, 3), np.float32), np.empty((FEWEST, 3), np.float32), *np.empty((2, FEWEST), np.float32)]
-        self.answers = [np.empty(FEWEST, dtype) for dtype in tracer.types.values()]
-        self.packed = pack(self.given, self.answers)
+        self.rays = [np.empty((FEWEST, 3), np.float32), np.empty((FEWEST, 3), np.float32), *np.empty((2, FEWEST), np.float32)]
+        self.results = [np.empty(FEWEST, dtype) for dtype in tracer.types.values()]
+        self.packed = pack(self.rays, self.results)
         self.block, self.scratch = tracer.block, new_scratch(tracer.sizes)
         self.report = self.scratch.report.numpy() if tracer.stream else np.zeros(REPORT_SIZE, np.int32)
         own = [self.scratch, 0] if tracer.stream else []
@@ -150,9 +150,9 @@ class Worker:
         self.own = [record_of(self.scratch)] if tracer.stream else []
 
     def launch(self, snapshot: Snapshot, packed: tuple[Any, Any], first: int, end: int) -> None:
-        """Trace the rays [first, end). report[ANY_REFUSED] is set if the kernel met an invalid one."""
+        """Trace the rays [first, end). Afterwards report[ANY_REFUSED] tells whether any of them was invalid."""
         inputs = [record_of(snapshot.data), record_of(snapshot.surfaces), *packed, *self.own, first, end]
-        for i, last in enumerate(self.inputs):  # without `end` for the kernel for one ray
+        for i, last in enumerate(self.inputs):  # a kernel that traces one ray at a time has no argument `end`
             if inputs[i] is not last:
                 self.command.set_param_at_index_from_ctype(i, inputs[i])
                 self.inputs[i] = inputs[i]
@@ -168,9 +168,9 @@ def readable(array: np.ndarray) -> bool:
     return array.dtype == np.float32 and array.flags.aligned and (array.flags.c_contiguous or array.strides == (0,))
 
 
-def pack(given: list[np.ndarray], answers: list[np.ndarray]) -> tuple[Any, Any]:
-    """Make a kernel's records of rays and answers: RayArrays, and HitArrays or an array of bool. They do not keep the memory."""
-    return struct_record(RayArrays, given), struct_record(HitArrays, answers) if len(answers) > 1 else array_record(answers[0])
+def pack(rays: list[np.ndarray], results: list[np.ndarray]) -> tuple[Any, Any]:
+    """Make kernel records of rays and results: RayArrays, and HitArrays or an array of bool. The caller must keep the arrays."""
+    return struct_record(RayArrays, rays), struct_record(HitArrays, results) if len(results) > 1 else array_record(results[0])
 
 
 def copy(sources: list[np.ndarray], rows: slice, targets: list[np.ndarray], to: slice) -> None:
@@ -184,12 +184,12 @@ def copy(sources: list[np.ndarray], rows: slice, targets: list[np.ndarray], to: 
 
 
 def rays_on_gpu(n: int, device: Device) -> int:
-    """Return the number of rays from the host to trace at once: half of the free memory, or MOST_ON_GPU."""
-    return MOST_ON_GPU if n <= SURE else max(FEWEST, min(MOST_ON_GPU, int(memory_of(device) / 2.0 / BYTES_OF_RAY)))
+    """Return the number of rays to copy to a GPU at once: they fill at most half of its free memory."""
+    return MOST_ON_GPU if n <= FITS_ANY_GPU else max(FEWEST, min(MOST_ON_GPU, int(memory_of(device) / 2.0 / BYTES_OF_RAY)))
 
 
 def trace_on_gpu(snapshot: Snapshot, query: Query) -> None:
-    """Trace on a GPU, as trace_query: Warp arrays in one launch, rays from the host in parts."""
+    """Trace on a GPU, as trace_query. Warp arrays are traced in one launch, NumPy arrays in parts."""
     device, structure, rays, out = snapshot.device, snapshot.structure, query.rays, query.out
     structure = structure._replace(units=structure.units._replace(stack=stack_on(device.alias)))
     kernel = (closest_hit_kernel if len(out) > 1 else any_hit_kernel)(structure)
@@ -197,8 +197,8 @@ def trace_on_gpu(snapshot: Snapshot, query: Query) -> None:
     part = n if rays.as_warp else rays_on_gpu(n, device)
     for first in range(0, n, max(part, 1)):
         some = slice(first, min(first + part, n))
-        given = rays_on(device, rays if part == n else Rays(*(array[some] for array in rays)))
-        launch_over(device, kernel, [snapshot.data, snapshot.surfaces, given], [array[some] for array in out])
+        copied = rays_on(device, rays if part == n else Rays(*(array[some] for array in rays)))
+        launch_over(device, kernel, [snapshot.data, snapshot.surfaces, copied], [array[some] for array in out])
 
 
 def trace_worlds(snapshot: Snapshot, query: Query, worlds: WorldIds) -> None:
@@ -209,13 +209,13 @@ def trace_worlds(snapshot: Snapshot, query: Query, worlds: WorldIds) -> None:
 
 
 def launch_over(device: Device, kernel: Kernel, inputs: list[Any], out: list[Array], threads: int = 1) -> None:
-    """Launch a kernel for one ray over all rays whose answers `out` takes."""
-    there = [to_warp(array) if device.is_cpu or isinstance(array, wp.array)
-             else wp.empty(len(array), dtype=wp.dtype_from_numpy(array.dtype), device=device) for array in out]
+    """Launch a kernel that traces one ray per thread over all rays, and write the results to `out`."""
+    on_device = [to_warp(array) if device.is_cpu or isinstance(array, wp.array)
+                 else wp.empty(len(array), dtype=wp.dtype_from_numpy(array.dtype), device=device) for array in out]
     hits: WarpStruct = HitArrays()
-    for name, array in zip(fields_of(HitArrays), there, strict=False) if len(out) > 1 else ():
+    for name, array in zip(fields_of(HitArrays), on_device, strict=False) if len(out) > 1 else ():
         setattr(hits, name, array)
-    launch_on(device, kernel, len(out[0]), *inputs, hits if len(out) > 1 else there[0], None, threads=threads, step=RAYS_PER_LAUNCH)
-    for array, found in zip(out, there, strict=True):
+    launch_on(device, kernel, len(out[0]), *inputs, hits if len(out) > 1 else on_device[0], None, threads=threads, step=RAYS_PER_LAUNCH)
+    for array, result in zip(out, on_device, strict=True):
         if not isinstance(array, wp.array) and device.is_cuda:
-            array[:] = found.numpy()
+            array[:] = result.numpy()

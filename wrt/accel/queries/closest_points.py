@@ -10,7 +10,7 @@ import warp as wp
 
 from wrt.accel.queries.accelerator import Accelerator, snapshot_of
 from wrt.accel.queries.contains import contains
-from wrt.accel.queries.hit_points import surroundings
+from wrt.accel.queries.hit_points import device_scene
 from wrt.accel.queries.rays import vectors
 from wrt.accel.queries.winding import winding_number
 from wrt.core.checks import require_known
@@ -29,7 +29,7 @@ SIGNS = ("crossings", "winding")
 
 @dataclass(frozen=True, eq=False)
 class ClosestPoints:
-    """Closest points of a mesh; without faces, distances are inf, prim_ids -1, and the rest 0.
+    """Closest points on a mesh. For a mesh without faces, `distance` is inf, `prim_id` -1, and the rest 0.
 
     Attributes
     ----------
@@ -38,9 +38,9 @@ class ClosestPoints:
     point : (N, 3) float32
         Closest point.
     u, v : (N,) float32
-        The closest point is (1 - u - v) v0 + u v1 + v v2.
+        Barycentric coordinates: the closest point is (1 - u - v) v0 + u v1 + v v2.
     prim_id : (N,) int32
-        Face of the closest point.
+        Index of the face that the closest point is on.
     """
 
     distance: np.ndarray
@@ -57,19 +57,19 @@ class ClosestPoints:
 
 
 def closest_points(accel: Accelerator, points: ArrayLike, threads: int | None = None) -> ClosestPoints:
-    """Find the point of a mesh that is closest to each query point; of faces at the same distance, on that of the lowest prim_id.
+    """Find the point on a mesh that is closest to each query point. Among faces at equal distance, the lowest prim_id wins.
 
-    The result does not depend on the tree. It is computed in float64 and rounded once. The relative error of a distance is 2^-23;
-    its absolute error is 1e-15 times the mesh's largest coordinate times the ratio of a triangle's length to its height. Distances
-    that differ by less may change places. Faces without area count as the segment or point that they are, though no ray hits them;
-    faces with corners that are not finite are ignored.
+    The result does not depend on the tree. It is computed in float64 and rounded once. The error of a distance has two parts: 2^-23
+    of the distance, and 1e-15 times the mesh's largest coordinate times the ratio of a triangle's length to its height. Faces whose
+    distances differ by less than the error may be confused. A face without area counts as a segment or point, though no ray hits
+    it. A face with a corner that is not finite is ignored.
 
     Parameters
     ----------
     accel : Accelerator
         A bvh4, bvh8 or bvh8c over one mesh without spheres, with the watertight triangle test.
     points : (N, 3) array_like
-        Query points, taken as float32.
+        Query points, converted to float32.
     threads : int, optional
         Threads on the CPU; one per core by default.
 
@@ -87,15 +87,15 @@ def closest_points(accel: Accelerator, points: ArrayLike, threads: int | None = 
     structure = snapshot.structure
     kernels: KernelModule = structure.accel.kernels
     if not isinstance(kernels, WideTraversal) or structure.units.triangle != "watertight":
-        raise InputError("closest points are asked of a bvh4, bvh8 or bvh8c with the watertight triangle test, not of a"
+        raise InputError("closest points need a bvh4, bvh8 or bvh8c with the watertight triangle test, got a"
                          f" {structure.accel.name} with {structure.units.triangle!r}")
     rows, device = vectors(points, "points", FARTHEST), snapshot.device
     n, out = len(rows), PointArrays()
     for name, field in fields_of(PointArrays).items():
         setattr(out, name, wp.empty(n, dtype=field.dtype, device=device))
-    kernel, given = make_closest_point_kernel(kernels.layout), upload(rows, wp.vec3, device)
-    surfaces = surroundings(snapshot).surfaces
-    launch_on(device, kernel, n, snapshot.data, surfaces, given, out, None, threads=thread_count(threads), step=POINTS_PER_LAUNCH)
+    kernel, queries = make_closest_point_kernel(kernels.layout), upload(rows, wp.vec3, device)
+    surfaces = device_scene(snapshot).surfaces
+    launch_on(device, kernel, n, snapshot.data, surfaces, queries, out, None, threads=thread_count(threads), step=POINTS_PER_LAUNCH)
     return ClosestPoints(*(getattr(out, name).numpy() for name in fields_of(PointArrays)))
 
 

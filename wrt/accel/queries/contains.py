@@ -13,7 +13,7 @@ from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.all_hits import ListQuery
 from wrt.accel.queries.rays import vectors
 from wrt.accel.snapshot import Snapshot, once
-from wrt.core.arrays import returned
+from wrt.core.arrays import to_tensor_like
 from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.core.types import ArrayLike, NumpyLike, TensorT, WarpArray
@@ -26,7 +26,7 @@ def finite_faces(geometry: Geometry) -> np.ndarray:
 
 
 def open_edges(geometry: Geometry) -> int:
-    """Count edges with an odd number of finite faces, vertices of equal coordinates taken as one. 0: the mesh is closed."""
+    """Count edges of an odd number of finite faces; 0 means that the mesh is closed. Vertices with equal coordinates are merged."""
     _, corner = np.unique(geometry.vertices + np.float32(0.0), axis=0, return_inverse=True)  # -0 becomes 0
     faces = corner.reshape(-1)[geometry.faces[finite_faces(geometry)]]
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
@@ -43,7 +43,7 @@ def open_edges_of(snapshot: Snapshot) -> int:
 
 @once
 def used_bounds(snapshot: Snapshot) -> tuple[np.ndarray, np.ndarray]:
-    """Return the box of all finite faces: low and high, (3,); inf and -inf without faces."""
+    """Return the bounding box of all finite faces: low and high, (3,) each; inf and -inf without faces."""
     geometry = snapshot.mesh
     used = geometry.vertices[geometry.faces[finite_faces(geometry)]].reshape(-1, 3)
     return used.min(axis=0, initial=np.inf), used.max(axis=0, initial=-np.inf)
@@ -54,17 +54,17 @@ def contains(accel: Accelerator, points: NumpyLike | WarpArray, threads: int | N
 @overload
 def contains(accel: Accelerator, points: TensorT, threads: int | None = None) -> TensorT: ...
 def contains(accel: Accelerator, points: ArrayLike, threads: int | None = None) -> object:
-    """Test whether points are inside a closed mesh: a ray from the point crosses the surface an odd number of times.
+    """Test whether points are inside a closed mesh: a ray from an inside point crosses the surface an odd number of times.
 
-    A point inside two overlapping parts is therefore outside. With the watertight test the answer is exact for every direction of
-    the ray; on the surface, to rounding, it may be either.
+    By this rule a point inside two overlapping parts is outside. With the watertight test the result does not depend on the ray's
+    direction. For a point within a rounding error of the surface, the result may be True or False.
 
     Parameters
     ----------
     accel : Accelerator
         Structure over one closed mesh without spheres.
     points : (N, 3) array_like
-        Points, taken as float32.
+        Points, converted to float32.
     threads : int, optional
         Threads on the CPU; one per core by default.
 
@@ -78,7 +78,7 @@ def contains(accel: Accelerator, points: ArrayLike, threads: int | None = None) 
     InputError
         For a mesh that is not closed, other structures, and points that are not finite.
     """
-    rows, give = vectors(points, "points", FARTHEST), returned(points)
+    rows, give = vectors(points, "points", FARTHEST), to_tensor_like(points)
     query = ListQuery(accel, threads, crossings=True)
     if count := open_edges_of(query.snapshot):
         raise InputError(f"the mesh is not closed: {count} edges have an odd number of faces"

@@ -1,4 +1,4 @@
-"""Queries that count the costs of each ray, and can record its fetches."""
+"""Queries that count the nodes and primitives of each ray, and can record the address of every fetch."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from wrt.kernels.traverse.counters import SIZE_RANGE, Counts
 
 
 def counted(snapshot: Snapshot, query: Query, fetches_too: bool) -> Counters:
-    """Answer the query and count. For the fetches it is traced twice, because the first run tells how many each ray has."""
+    """Trace the query and count its costs. With fetches_too, trace it twice: the first run counts the fetches of each ray."""
     n, device = len(query.out[0]), snapshot.device
 
     def run(first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        # A copy of the struct, because each call records into arrays of its own.
+        # A copy of the struct, because each call needs arrays of its own.
         own = copied(snapshot.data)
         own.recorder.counts = wp.zeros(n, dtype=Counts, device=device)
         own.recorder.first = upload(first, wp.int64, device)
@@ -35,7 +35,7 @@ def counted(snapshot: Snapshot, query: Query, fetches_too: bool) -> Counters:
 
 
 def copied(data: WarpStruct) -> WarpStruct:
-    """Return a Warp struct with the same arrays and numbers, whose fields may be set."""
+    """Copy a Warp struct but not its arrays, so that fields of the copy can be set."""
     out = type(data)()
     out.assign(data)
     return out

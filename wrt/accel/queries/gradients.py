@@ -1,4 +1,4 @@
-"""Derivatives of closest hits in closed form: one adjoint for NumPy, wp.Tape, PyTorch and JAX."""
+"""Gradients of closest hits in closed form, shared by NumPy, wp.Tape, PyTorch and JAX."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from wrt.core.types import Array, ArrayLike, ArrayT
 from wrt.core.warp_private import recording_tape
 
 ONE_MESH = "only hits of a structure over one mesh, without spheres, have gradients"
-HITS_PER_JOB = 8192  # whose intermediate arrays stay in the cache
+HITS_PER_JOB = 8192  # the intermediate arrays of so many hits stay in the cache
 
 
 class Gradients(NamedTuple, Generic[ArrayT]):
-    """Derivatives of a number by the inputs of a query.
+    """Gradient of a loss with respect to the inputs of a query.
 
     Attributes
     ----------
     vertices : (V, 3) float64
-        By the vertices of the mesh.
+        Gradient with respect to the vertices of the mesh.
     origins, directions : (N, 3) float64
-        By the rays; 0 for rays that missed.
+        Gradient with respect to the rays; 0 for rays that missed.
     """
 
     vertices: ArrayT
@@ -37,7 +37,7 @@ class Gradients(NamedTuple, Generic[ArrayT]):
 
 
 class Cotangents(NamedTuple):
-    """Derivatives of a number by hits: (N,) each, point (N, 3). None: the number does not depend on them."""
+    """Gradient of a loss with respect to N hits: (N,) each, point (N, 3). None: the loss does not depend on that field."""
 
     t: ArrayLike | None = None
     u: ArrayLike | None = None
@@ -45,8 +45,8 @@ class Cotangents(NamedTuple):
     point: ArrayLike | None = None
 
     def checked(self, n: int) -> Cotangents:
-        """Return the same as NumPy arrays. Raises InputError for other shapes."""
-        arrays = [given if given is None else to_numpy(given) for given in self]
+        """Convert the fields to NumPy arrays. Raises InputError for other shapes."""
+        arrays = [field if field is None else to_numpy(field) for field in self]
         for name, array in zip(self._fields, arrays, strict=True):
             shape = (n, 3) if name == "point" else (n,)
             if array is not None and (array.shape != shape or array.dtype.kind not in "iuf"):
@@ -54,29 +54,29 @@ class Cotangents(NamedTuple):
         return Cotangents(*arrays)
 
     def at(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the derivatives by (t, u, v) and by the point for some rays: two (3, len(rays)) float64."""
+        """Return the gradients for some rays with respect to (t, u, v) and to the point: two arrays (3, len(rays)) float64."""
         by_tuv = np.zeros((3, len(rays)))
-        for target, given in zip(by_tuv, self[:3], strict=True):
-            target[:] = 0.0 if given is None else np.asarray(given)[rays]
+        for target, field in zip(by_tuv, self[:3], strict=True):
+            target[:] = 0.0 if field is None else np.asarray(field)[rays]
         return by_tuv, np.zeros((3, 1)) if self.point is None else columns(np.asarray(self.point)[rays])
 
 
 def adjoint(geometry: Geometry, origins: Array, directions: Array, prim_id: Array, cotangents: Cotangents,
             threads: int | None = None) -> Gradients:
-    """Compute derivatives by vertices, origins and directions, at fixed prim_id, from the derivatives by hits.
+    """Compute the gradient of a loss L with respect to vertices, origins and directions, at fixed prim_id.
 
-    A hit solves o + t d = (1 - u - v) v0 + u v1 + v v2. With M = [d, v0 - v1, v0 - v2] that is M (t, u, v) = v0 - o, so that a
-    change of either side by x changes (t, u, v) by M^-1 x. One vector per ray, lambda = M^-T (dL/dt, dL/du, dL/dv), is therefore
-    enough. The corners get lambda times their weights, the origin -lambda, the direction -t lambda; the point o + t d adds its own.
+    cotangents: gradient of L with respect to the hits. A hit solves o + t d = (1 - u - v) v0 + u v1 + v v2. With the matrix
+    M = [d, v0 - v1, v0 - v2] this is M (t, u, v) = v0 - o. If a side of this equation changes by x, (t, u, v) changes by M^-1 x.
+    So one vector per ray is enough: lambda = M^-T (dL/dt, dL/du, dL/dv). The corners get lambda times their barycentric weights,
+    the origin -lambda, the direction -t lambda. To these, dL/d(point) adds its part through point = o + t d.
 
-    All values are float64, also t, u and v. The sum at a vertex runs in the order of the rays, so that its bits do not depend on
-    threads. Derivatives are 0 for misses, for triangles without area, and for rays in their triangle's plane to the last bit of
-    float64. Near the plane they are right and grow as 1 / cos of the angle to the normal.
+    All values are float64. The sum at a vertex runs in the order of the rays, so that its bits do not depend on threads. The gradient
+    is 0 for misses and if M is singular in float64. It grows as 1 / cos of the angle between ray and normal.
     """
-    prim_id, o, d = to_numpy(prim_id), float32(to_numpy(origins)), float32(to_numpy(directions))  # as they were traced
+    prim_id, o, d = to_numpy(prim_id), float32(to_numpy(origins)), float32(to_numpy(directions))  # float32, as in the query
     vertices, faces = geometry.vertices, geometry.faces
     n = len(prim_id)
-    given = cotangents.checked(n)
+    by_hits = cotangents.checked(n)
     out = Gradients(np.zeros((len(vertices), 3)), np.zeros((n, 3)), np.zeros((n, 3)))
     rows = np.flatnonzero((prim_id >= 0) & (prim_id < len(faces)))
     corners = faces[prim_id[rows]]
@@ -86,12 +86,12 @@ def adjoint(geometry: Geometry, origins: Array, directions: Array, prim_id: Arra
         some = slice(first, first + HITS_PER_JOB)
         ray = rows[some]
         way, place = columns(d[ray]), columns(o[ray])
-        by_tuv, by_point = given.at(ray)
+        by_tuv, by_point = by_hits.at(ray)
         v0, v1, v2 = (columns(vertices[corners[some, i]]) for i in range(3))
         inverse, exists = inverse_rows(way, v1 - v0, v2 - v0)
         t, u, v = (inverse * (v0 - place)).sum(axis=1)
         by_tuv[0] += (by_point * way).sum(axis=0)
-        at_hit = (inverse * by_tuv[:, None]).sum(axis=0)  # lambda, above
+        at_hit = (inverse * by_tuv[:, None]).sum(axis=0)  # lambda in the docstring
         at_origin = np.where(exists, by_point - at_hit, 0.0)
         out.origins[ray], out.directions[ray] = at_origin.T, (t * at_origin).T
         for axis in range(3):
@@ -104,9 +104,9 @@ def adjoint(geometry: Geometry, origins: Array, directions: Array, prim_id: Arra
 
 
 def record(hits: Any, **outputs: Any) -> None:
-    """Make the recording wp.Tape propagate gradients of `outputs`, arrays of hits by their names in Cotangents.
+    """Register the backward pass of hits on the recording wp.Tape. outputs: arrays of the hits by their names in Cotangents.
 
-    They go to origins, directions and the vertices of the last refit, where these require gradients.
+    Gradients flow to origins, directions and the vertices of the last refit, if these require gradients.
     """
     (snapshot, rays, _), tape = hits.source, recording_tape()
     leaves: Gradients[Any] = Gradients(snapshot.followed, rays.origins, rays.directions)
@@ -115,7 +115,7 @@ def record(hits: Any, **outputs: Any) -> None:
         return
     snapshot.structure.require_one_mesh(ONE_MESH)
     if not rays.as_warp:
-        raise InputError("a wp.Tape is recording, with gradients in vertices: give rays as Warp arrays, or ask outside of it")
+        raise InputError("a wp.Tape is recording gradients of vertices: pass rays as Warp arrays, or query outside of the tape")
     for array in outputs.values():
         array.requires_grad = True
 
@@ -129,19 +129,18 @@ def record(hits: Any, **outputs: Any) -> None:
 
 
 def check_recorded(hits: Any, name: str) -> None:
-    """Raise InputError if a tape would expect gradients of a property that has none."""
+    """Raise InputError if the recording tape would need gradients of hits.`name`, which has none."""
     snapshot, rays, _ = hits.source
-    given = {"vertices": snapshot.followed, "origins": rays.origins, "directions": rays.directions}
-    check_no_gradients(f"hits.{name}", **given)
+    check_no_gradients(f"hits.{name}", vertices=snapshot.followed, origins=rays.origins, directions=rays.directions)
 
 
 def columns(rows: np.ndarray) -> np.ndarray:
-    """Return (N, 3) as (3, N) float64."""
+    """Transpose (N, 3) to (3, N) float64."""
     return np.ascontiguousarray(rows.T, np.float64)
 
 
 def inverse_rows(d: np.ndarray, e1: np.ndarray, e2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows of [d, -e1, -e2]^-1, (3, 3, N), 0 where it does not exist, and a mask (N,) of where it does."""
+    """Return the rows of M^-1 for M = [d, -e1, -e2], (3, 3, N), 0 if M is singular, and the mask (N,) of invertible M."""
     adjugate = np.stack([_cross(e1, e2), _cross(d, e2), _cross(e1, d)])
     with np.errstate(all="ignore"):
         inverse = adjugate / (d * adjugate[0]).sum(axis=0)
@@ -151,5 +150,5 @@ def inverse_rows(d: np.ndarray, e1: np.ndarray, e2: np.ndarray) -> tuple[np.ndar
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Cross product of (3, N) arrays; np.cross takes longer."""
+    """Return the cross product of (3, N) arrays, faster than np.cross."""
     return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])

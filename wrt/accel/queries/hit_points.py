@@ -1,4 +1,4 @@
-"""Points of hits with error bounds, normals, texture coordinates and ids, computed on first use."""
+"""Properties of hits, computed on access: points with error bounds, normals, texture coordinates and ids."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from wrt.accel.queries.gradients import ONE_MESH, Cotangents, Gradients, adjoint
 from wrt.accel.queries.rays import Rays, rays_on
 from wrt.accel.queries.world_ids import WorldIds, over_worlds
 from wrt.accel.snapshot import Snapshot, once
-from wrt.core.arrays import returned, to_warp
+from wrt.core.arrays import to_tensor_like, to_warp
 from wrt.core.device import launch_on, records, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
@@ -28,8 +28,8 @@ HITS_PER_LAUNCH = 65536
 Source: TypeAlias = tuple[Snapshot, Rays, WorldIds | None]
 
 
-class Surroundings(NamedTuple):
-    """Inputs of the kernel `hit_places`, and the scene that they come from."""
+class DeviceScene(NamedTuple):
+    """Scene of a structure, and the same scene on the device as arguments of the kernel `hit_places`."""
 
     scene: FlatScene
     surfaces: WarpStruct
@@ -37,10 +37,10 @@ class Surroundings(NamedTuple):
 
 
 class HitPoints(Generic[ArrayT]):
-    """Properties of hits that `closest_hit` found, as arrays of the library of the hits.
+    """Properties of hits that `closest_hit` found, as arrays of the same library as the hits.
 
-    Each access computes its property anew from the arrays of hits and rays. These are not copied: do not write to them before.
-    Properties raise InputError where the hits have no `source`, or the structure does not have the property.
+    Each access computes the property again from the arrays of hits and rays. These arrays are not copied: do not modify them.
+    A property raises InputError if the hits have no `source`, or the structure lacks the data for the property.
     """
 
     t: ArrayT
@@ -53,33 +53,33 @@ class HitPoints(Generic[ArrayT]):
     def point(self) -> ArrayT:
         """Point where each ray meets its primitive, in world space, to within `point_error`: (N, 3) float32, NaN on a miss.
 
-        It is computed from the ray in float64 and rounded once, because u and v have large errors on needles. If the ray passes its
-        triangle by, to rounding, the point is moved onto the triangle, and the error contains the move. If the ray lies in the
-        triangle's plane, the point comes from u and v, and the error is the triangle's size.
+        It is computed from the ray in float64 and rounded once, because u and v are inaccurate on needle-shaped triangles. If the
+        exact ray misses the triangle by a rounding error, the point is moved onto the triangle, and `point_error` includes the
+        move. If the ray lies in the triangle's plane, the point comes from u and v, and `point_error` is the triangle's size.
         """
         return self._filled("point")
 
     @property
     def point_error(self) -> ArrayT:
-        """Bound of the error of each component of `point`, mostly half a float32 step: (N, 3) float32, NaN on a miss."""
+        """Error bound of each coordinate of `point`, usually half a float32 rounding step: (N, 3) float32, NaN on a miss."""
         return self._filled("error")
 
     @property
     def normal(self) -> ArrayT:
-        """Unit normal of the flat triangle on its counter-clockwise side, of a sphere outwards: (N, 3) float32, NaN on a miss."""
+        """Unit geometric normal, on a triangle's counter-clockwise side or outwards of a sphere: (N, 3) float32, NaN on a miss."""
         return self._filled("normal")
 
     @property
     def shading_normal(self) -> ArrayT:
-        """Unit normal interpolated from those of the mesh as it was built, on the side of `normal`: (N, 3) float32, NaN on a miss.
+        """Unit normal interpolated from vertex normals, on the side of `normal`: (N, 3) float32, NaN on a miss.
 
-        It equals `normal` where the mesh has no normals.
+        Without vertex normals it equals `normal`. A refit does not change the vertex normals.
         """
         return self._filled("shading")
 
     @property
     def uv(self) -> ArrayT:
-        """Interpolated texture coordinates, (0, 0) being the top left of a picture: (N, 2) float32, NaN on a miss.
+        """Interpolated texture coordinates, with (0, 0) at the top left of the texture: (N, 2) float32, NaN on a miss.
 
         In a scene they are (0, 0) on objects without texture coordinates.
         """
@@ -87,12 +87,12 @@ class HitPoints(Generic[ArrayT]):
 
     @property
     def object(self) -> ArrayT:
-        """Index into `scene.objects`, or their number plus the index into `scene.spheres`: (N,) int32, -1 on a miss."""
+        """Index into `scene.objects`, or len(scene.objects) plus the index into `scene.spheres`: (N,) int32, -1 on a miss."""
         return self._filled("object")
 
     @property
     def instance(self) -> ArrayT:
-        """Index that `Instances.move` takes: `object` over a scene, else a row of `accel.geometry.to_world`. (N,) int32, -1 on a miss."""
+        """Index for `Instances.move`: `object` over a scene, else the row of `accel.geometry.to_world`. (N,) int32, -1 on a miss."""
         return self._filled("instance")
 
     @property
@@ -102,16 +102,16 @@ class HitPoints(Generic[ArrayT]):
 
     def gradients(self, t: ArrayLike | None = None, u: ArrayLike | None = None, v: ArrayLike | None = None,
                   point: ArrayLike | None = None) -> Gradients[ArrayT]:
-        """Compute derivatives of a number by vertices, origins and directions from its derivatives by these hits.
+        """Compute the gradient of a loss with respect to vertices, origins and directions from its gradient with respect to hits.
 
-        Each ray keeps its prim_id: the movement of outlines is not in it (docs/gradients.md).
+        The prim_id of each ray is fixed, so that the gradient ignores the motion of silhouettes (docs/gradients.md).
 
         Parameters
         ----------
         t, u, v : (N,) array_like, optional
-            Derivatives of the number by `t`, `u` and `v`; zero by default. Those of misses are ignored.
+            Gradient of the loss with respect to `t`, `u` and `v`; zero by default. Values of misses are ignored.
         point : (N, 3) array_like, optional
-            Derivatives of the number by `point`; zero by default.
+            Gradient of the loss with respect to `point`; zero by default.
 
         Returns
         -------
@@ -127,19 +127,19 @@ class HitPoints(Generic[ArrayT]):
         snapshot.structure.require_one_mesh(ONE_MESH)
         prim_id: Any = self.prim_id
         found: Gradients[Any] = adjoint(snapshot.mesh, rays.origins, rays.directions, prim_id, Cotangents(t, u, v, point))
-        give: Any = returned(self.t)
+        give: Any = to_tensor_like(self.t)
         return found if give is None else Gradients(*map(give, found))
 
     def _source(self) -> Source:
         if self.source is None:
-            raise InputError("these hits do not know their rays: only those of closest_hit have points, normals and ids")
+            raise InputError("these hits have no rays, from which points, normals and ids are computed: use the result of closest_hit")
         return self.source
 
     def _filled(self, name: str) -> ArrayT:
         snapshot, rays, worlds = self._source()
         if name in ("error", "normal", "shading", "uv"):
             check_recorded(self, name)
-        scene, surfaces, object_ids = surroundings(snapshot)
+        scene, surfaces, object_ids = device_scene(snapshot)
         if name == "shading" and scene.normals is None:
             name = "normal"
         _require(scene, name)
@@ -159,7 +159,7 @@ class HitPoints(Generic[ArrayT]):
             if name == "point":
                 record(self, point=array)
             return array
-        give: Any = returned(self.t)
+        give: Any = to_tensor_like(self.t)
         return array.numpy() if give is None else give(array)
 
 
@@ -171,12 +171,12 @@ def _require(scene: FlatScene, name: str) -> None:
         raise InputError("the structure has no instances")
     if name in ("object", "material") and scene.objects is None:
         if over_worlds(scene.geometry):
-            raise InputError(f"hits over worlds do not know their {name} yet; hits.instance is known")
-        raise InputError(f"the structure is not over a scene: there is no {name}")
+            raise InputError(f"hits in a structure over worlds have no {name} yet: use hits.instance")
+        raise InputError(f"hits have no {name}, because the structure is not over a scene")
 
 
 @once
-def surroundings(snapshot: Snapshot) -> Surroundings:
+def device_scene(snapshot: Snapshot) -> DeviceScene:
     """Upload the scene of a structure to its device."""
     geometry, device = snapshot.geometry, snapshot.device
     scene, surfaces = snapshot.attributes or flat_scene_of(geometry), structs.Surfaces()
@@ -193,25 +193,20 @@ def surroundings(snapshot: Snapshot) -> Surroundings:
         object_ids.first_prim = upload(scene.objects, wp.int32, device)
     if placed is not None and isinstance(geometry, InstancedGeometry):
         surfaces.instances = upload(instance_records(placed), structs.Instance, device)
-        object_ids.instance = upload(_instance_of(placed, geometry), wp.int32, device)
-    return Surroundings(scene, surfaces, object_ids)
-
-
-def _instance_of(placed: Placed, geometry: InstancedGeometry) -> np.ndarray:
-    """Return the instance of each run of primitives; 0 for joined objects and spheres."""
-    out = np.zeros(len(placed.first_prim), np.int32)
-    out[run_of(placed, geometry)] = np.nonzero(geometry.is_placed)[0]
-    return out
+        instance = np.zeros(len(placed.first_prim), np.int32)  # of each run; 0 for joined objects and spheres
+        instance[run_of(placed, geometry)] = np.flatnonzero(geometry.is_placed)
+        object_ids.instance = upload(instance, wp.int32, device)
+    return DeviceScene(scene, surfaces, object_ids)
 
 
 def instance_records(placed: Placed) -> np.ndarray:
-    """Return the runs as records of kernels.structs.Instance."""
+    """Convert the runs of primitives to records of kernels.structs.Instance."""
     out = records(structs.Instance, len(placed.first_prim))
     for name in ("first_prim", "first_face", "first_material", "material_step"):
         out[name] = getattr(placed, name)
     linear = placed.to_world[:, :, :3]
     inverse = np.linalg.inv(linear)
-    inverse /= np.abs(inverse).max(axis=(1, 2), keepdims=True)  # a factor changes no direction, and its square is a float32
+    inverse /= np.abs(inverse).max(axis=(1, 2), keepdims=True)  # normals keep their directions, and squares do not overflow
     for i, axis in enumerate("xyz"):
         out[f"world_{axis}"], out[f"normal_{axis}"] = placed.to_world[:, i], inverse[:, i]
     out["handedness"] = np.where(np.linalg.det(linear) < 0.0, -1.0, 1.0)

@@ -1,6 +1,6 @@
-"""Launches with hand-made arguments, for kernels that launch others, and the self-test before the first one.
+"""Kernel launches through hand-made argument records, and a self-test before the first such launch.
 
-Warp's own launch takes longer than a small query or a wave of paths.
+Warp's own wp.launch takes longer than a small query or a wave of paths. A kernel can also launch other kernels in this way.
 """
 
 from __future__ import annotations
@@ -15,24 +15,24 @@ from wrt.kernels.launch_probe import PER_THREAD, Canary, probe
 from wrt.kernels.launches import Launch
 
 GUARD = -0x21524111  # initial value of the self-test's memory
-GUARDS = 64  # words before and behind its arrays, which a launch with wrong arguments may read or write
+GUARDS = 64  # words before and behind the self-test's arrays, because a launch with wrong arguments may read or write there
 
 
 class Launches:
-    """Recorded launches for kernels that launch others (wrt.kernels.launches), and the objects that their addresses point into."""
+    """Makes records of launches for kernels that launch other kernels, and keeps alive the memory that the records point into."""
 
     def __init__(self) -> None:
-        self.kept: list[object] = []
+        self.owners: list[object] = []
 
     def recorded(self, command: wp.Launch, block: int = 1) -> WarpStruct:
-        """Return a record of wp.launch(..., device="cpu", record_cmd=True) for the device. Raises InputError if the self-test fails."""
+        """Convert wp.launch(..., device="cpu", record_cmd=True) to a kernels.launches.Launch. Raises InputError if the self-test fails."""
         check_raw_launches()
         return self.of(command, block)
 
     def of(self, command: wp.Launch, block: int) -> WarpStruct:
-        """Return a record without the self-test."""
+        """Convert a launch without the self-test."""
         launch = warp_private.recorded(command)
-        self.kept.append(launch.owners)
+        self.owners.append(launch.owners)
         record = Launch()
         record.entry, record.bounds, record.args, record.tail = launch.entry, launch.bounds, launch.args, launch.last
         record.block = block
@@ -40,32 +40,32 @@ class Launches:
 
 
 def preload_headers() -> None:
-    """Begin to precompile Warp's headers with the self-test's kernel (wrt.core.device.preload_headers)."""
+    """Start precompiling Warp's headers, by means of the self-test's kernel (wrt.core.device.preload_headers)."""
     device.preload_headers(probe)
 
 
 def check_raw_launches() -> None:
-    """Test hand-made launches, once per process. Raises InputError that names the versions of Warp that wrt works with."""
+    """Test hand-made launches, once per process. Raises InputError that names the versions of Warp that wrt supports."""
     load_kernel(probe, wp.get_device("cpu"))
     _test_once()
 
 
 @made_once
 def _test_once() -> None:
-    memory, given = np.full(256, GUARD, np.int32), np.arange(256, dtype=np.float32)
+    memory, source = np.full(256, GUARD, np.int32), np.arange(256, dtype=np.float32)
     try:
         for what, passes in (("records of arrays", _has_records), ("arguments of launches", _has_arguments),
                              ("launches by kernels", _launches_itself)):
-            if not passes(memory, given):
+            if not passes(memory, source):
                 raise warp_private.refusal(what)
     except (AttributeError, TypeError) as error:
         raise warp_private.refusal(str(error)) from error
 
 
-def _has_records(memory: np.ndarray, given: np.ndarray) -> bool:
-    """Return whether records of arrays equal Warp's. Nothing is launched before."""
-    one_for_all = np.ndarray(given.shape, np.float32, given, strides=(0,))
-    for array in (given[8:], one_for_all):
+def _has_records(memory: np.ndarray, source: np.ndarray) -> bool:
+    """Return whether hand-made records of arrays equal the records that Warp makes. This runs before any launch."""
+    constant = np.ndarray(source.shape, np.float32, source, strides=(0,))
+    for array in (source[8:], constant):
         same = wp.array(ptr=array.ctypes.data, dtype=wp.float32, shape=array.shape, strides=array.strides, device="cpu")
         if bytes(warp_private.array_record(array)) != bytes(warp_private.record_of(same)):
             return False
@@ -74,39 +74,39 @@ def _has_records(memory: np.ndarray, given: np.ndarray) -> bool:
     return bytes(warp_private.struct_record(Canary, [memory])) == bytes(warp_private.record_of(canary))
 
 
-def _has_arguments(memory: np.ndarray, given: np.ndarray) -> bool:
-    """Return whether a launch receives hand-made arguments and the given size."""
+def _has_arguments(memory: np.ndarray, source: np.ndarray) -> bool:
+    """Return whether a launch receives hand-made arguments and the size that set_dim sets."""
     first, end = 3, 11
-    command = _command(memory, given, Launch())
+    command = _command(memory, source, Launch())
     command.set_param_at_index_from_ctype(3, first)
     command.set_param_at_index_from_ctype(4, end)
     command.set_dim((end - first) // PER_THREAD)
     command.launch()
-    return _wrote(memory, given, first, end)
+    return _wrote(memory, source, first, end)
 
 
-def _launches_itself(memory: np.ndarray, given: np.ndarray) -> bool:
-    """Return whether a kernel passes a range to the kernel that it launches: its last two arguments, and its size."""
+def _launches_itself(memory: np.ndarray, source: np.ndarray) -> bool:
+    """Return whether a kernel that launches another kernel passes the range on: as two arguments, and as the size of the launch."""
     first, end = 20, 42
     launches = Launches()
-    command = _command(memory, given, launches.of(_command(memory, given, Launch()), PER_THREAD))
+    command = _command(memory, source, launches.of(_command(memory, source, Launch()), PER_THREAD))
     command.set_param_at_index_from_ctype(3, first)
     command.set_param_at_index_from_ctype(4, end)
     command.launch()
-    return _wrote(memory, given, first, end)
+    return _wrote(memory, source, first, end)
 
 
-def _command(memory: np.ndarray, given: np.ndarray, launch: WarpStruct) -> wp.Launch:
-    """Record a launch of the kernel with one thread and hand-made arrays."""
+def _command(memory: np.ndarray, source: np.ndarray, launch: WarpStruct) -> wp.Launch:
+    """Record a launch of `probe` with one thread and hand-made records of the inner words of both arrays."""
     command = wp.launch(probe, dim=1, inputs=[Canary(), None, launch, 0, 0], device="cpu", record_cmd=True, record_tape=False)
     command.set_param_at_index_from_ctype(0, warp_private.struct_record(Canary, [memory[GUARDS:-GUARDS]]))
-    command.set_param_at_index_from_ctype(1, warp_private.array_record(given[GUARDS:-GUARDS]))
+    command.set_param_at_index_from_ctype(1, warp_private.array_record(source[GUARDS:-GUARDS]))
     return command
 
 
-def _wrote(memory: np.ndarray, given: np.ndarray, first: int, end: int) -> bool:
-    """Return whether the kernel wrote these words and no others, and reset the memory."""
+def _wrote(memory: np.ndarray, source: np.ndarray, first: int, end: int) -> bool:
+    """Return whether the kernel wrote the words [first, end) and no others; reset the memory."""
     expected = np.full_like(memory, GUARD)
-    expected[GUARDS + first : GUARDS + end] = given[GUARDS + first : GUARDS + end] + end
+    expected[GUARDS + first : GUARDS + end] = source[GUARDS + first : GUARDS + end] + end
     written, memory[:] = memory.copy(), GUARD
     return np.array_equal(written, expected)

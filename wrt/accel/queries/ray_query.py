@@ -1,4 +1,4 @@
-"""Queries from kernels of the user: `wrt.ray_query`."""
+"""Ray queries inside the user's own Warp kernels: `wrt.ray_query`."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from wrt.kernels.traverse.common import Units
 
 
 class RayQuery(NamedTuple):
-    """Warp functions and types for kernels over structures of one kind, with the bits of `Accelerator.closest_hit`.
+    """Warp functions and types with which kernels query structures of one kind. Hits have the bits of `Accelerator.closest_hit`.
 
     Attributes
     ----------
     World : type
         Type of the kernel argument `accel.world`.
     Ray, Hit : type
-        Structs with `t_min` and `t_max`, and with `t`, `u`, `v` and `prim_id` (-1 on a miss).
+        Structs. A Ray has `t_min` and `t_max`; a Hit has `t`, `u`, `v` and `prim_id` (-1 on a miss).
     ray : (origin, direction) -> Ray
         Ray from the origin to infinity.
     closest_hit : (world, ray) -> Hit
         Closest hit in the ray's segment.
     any_hit : (world, ray) -> bool
-        Whether the ray hits anything.
+        Whether the ray hits anything in its segment.
     next_hit : (world, ray, hit) -> Hit
-        Next hit of the ray in the order of t and prim_id.
+        Next hit of the ray after `hit`, in the order of t and prim_id.
     """
 
     World: WarpType
@@ -46,29 +46,29 @@ class RayQuery(NamedTuple):
 
 
 def ray_query(accel: Accelerator | str, *, triangle: str | None = None, box: str | None = None) -> RayQuery:
-    """Return functions and types with which kernels query structures, on the CPU and on CUDA.
+    """Return functions and types with which Warp kernels query structures, on the CPU and on CUDA.
 
-    Make the kernel with `@wrt.kernel`. A kernel that is compiled with fused multiply-add, or gets a structure of another kind,
-    prints so once, and its rays hit nothing.
+    Make the kernel with `@wrt.kernel`. If a kernel is compiled with fused multiply-add, or receives a structure of another kind,
+    it prints a message once, and its rays hit nothing.
 
     Parameters
     ----------
     accel : Accelerator or str
-        A structure over one mesh, or the name in `wrt.ACCELERATORS` of all structures of a kind.
+        A structure over one mesh; or a name in `wrt.ACCELERATORS`, for all structures of that kind.
     triangle, box : str, optional
-        Intersection tests of the structures, with a name only.
+        Intersection tests of the structures; only if `accel` is a name.
 
     Returns
     -------
     RayQuery
-        Made once per kind of structure and tests.
+        The same object for the same kind of structure and the same tests.
 
     Raises
     ------
     InputError
         For unknown names, and for structures over several meshes.
     """
-    message = "accel must be a structure over one mesh, or the name of one"
+    message = "accel must be a structure over one mesh without spheres, or a name in wrt.ACCELERATORS"
     if isinstance(accel, str):
         units = Units(as_one(triangle or Units().triangle, str, "triangle"), as_one(box or Units().box, str, "box"))
         ACCELERATORS.check(accel, "accel")
@@ -88,21 +88,21 @@ def ray_query(accel: Accelerator | str, *, triangle: str | None = None, box: str
 
 @made_once
 def query_of(structure: Structure) -> tuple[WarpType, DeviceFunction, DeviceFunction, DeviceFunction]:
-    """Make the type World, closest_hit, any_hit and next_hit of a kind of structure."""
+    """Make the fields World, closest_hit, any_hit and next_hit of RayQuery for a kind of structure."""
     resuming = structure._replace(units=structure.units._replace(resumes=True))
     return make_ray_query(structure.struct, structure.traversal(any_hit=False), structure.traversal(any_hit=True),
                           resuming.traversal(any_hit=False), kind_of(structure))
 
 
 def kind_of(structure: Structure) -> int:
-    """Return a hash of the structure's name and its triangle test."""
+    """Return a hash of the structure's name and triangle test, with which kernels recognise a structure of another kind."""
     return zlib.crc32(f"{structure.accel.name} {structure.units.triangle}".encode()) & 0x7FFFFFFF
 
 
 def kernel_argument(snapshot: Snapshot) -> WarpStruct:
-    """Return the structure as one record. Raises InputError unless it is over one mesh."""
+    """Return the structure as one kernel argument, RayQuery.World. Raises InputError unless it is over one mesh without spheres."""
     structure = snapshot.structure
-    structure.require_one_mesh("kernels of one's own ask structures over one mesh")
+    structure.require_one_mesh("a kernel can only query a structure over one mesh without spheres")
     world = query_of(structure)[0]()
     world.kind = kind_of(structure)
     world.accel, world.surfaces = snapshot.data, snapshot.surfaces

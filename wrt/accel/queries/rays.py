@@ -1,4 +1,4 @@
-"""Rays of a query: the caller's arrays, their checks, and the form that kernels take."""
+"""Rays of a query: checks of the caller's arrays, and their conversion for kernels."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from wrt.core.arrays import check_no_gradients, float32, real_numbers, taken
+from wrt.core.arrays import check_no_gradients, float32, from_tensor, real_numbers
 from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.core.types import Array, ArrayLike, Device, WarpArray
@@ -20,9 +20,10 @@ LOWEST = {"t_min": 0.0, "t_max": -np.inf}
 
 
 class Rays(NamedTuple):
-    """Rays with checked shapes and unchecked values.
+    """Rays whose shapes are checked and whose values are not.
 
-    NumPy arrays (N, 3) and (N,) of real numbers, a stride of 0 meaning one number for all rays; or Warp's of vec3 and float32.
+    Either NumPy arrays (N, 3) and (N,) of real numbers, or Warp arrays of vec3 and float32. A NumPy array t_min or t_max has stride
+    0 if one value holds for all rays.
     """
 
     origins: Array
@@ -35,13 +36,13 @@ class Rays(NamedTuple):
         return isinstance(self.origins, wp.array)
 
     def on(self, device: Device) -> Rays:
-        """Copy Warp arrays of other devices to this one."""
+        """Copy Warp arrays of other devices to `device`."""
         return Rays(*[array.to(device) if isinstance(array, wp.array) else array for array in self])
 
     def checked(self) -> Rays:
-        """Return the rays as float32 without gaps. Raises InputError for the first value that kernels must not get.
+        """Convert the rays to contiguous float32. Raises InputError for the first value that is not valid.
 
-        Of Warp arrays, only t_min and t_max on the CPU are checked.
+        If the rays are Warp arrays, only t_min and t_max are checked, and only on the CPU.
         """
         if self.as_warp:
             rays: Any = self[:2]
@@ -53,13 +54,13 @@ class Rays(NamedTuple):
 
 
 def rays_of(origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike, t_max: ArrayLike, gradients: bool = False) -> Rays:
-    """Check shapes and types of a query's rays. gradients: whether origins and directions may require gradients.
+    """Check shapes and types of a query's arguments. gradients: origins and directions may require gradients.
 
     Raises InputError that names the argument.
     """
     without: dict[str, Any] = {} if gradients else {"origins": origins, "directions": directions}
     check_no_gradients(t_min=t_min, t_max=t_max, **without)
-    rays: list[Any] = [taken(origins, "origins"), taken(directions, "directions")]
+    rays: list[Any] = [from_tensor(origins, "origins"), from_tensor(directions, "directions")]
     if any(isinstance(array, wp.array) for array in rays):
         if any(not isinstance(array, wp.array) or array.dtype != wp.vec3 for array in rays):
             raise InputError("and directions must both be Warp arrays of vec3, or both NumPy arrays", argument="origins")
@@ -85,7 +86,7 @@ def arrays_on(device: Device, rays: Rays) -> Rays:
     for array, dtype in zip(rays.checked().on(device), (wp.vec3, wp.vec3, wp.float32, wp.float32), strict=True):
         if not isinstance(array, wp.array):
             one = len(array) > 0 and array.strides == (0,)
-            array = one_for_all(float(array[0]), len(array), device) if one else upload(array, dtype, device)
+            array = constant_array(float(array[0]), len(array), device) if one else upload(array, dtype, device)
         out.append(array)
     return Rays(*out)
 
@@ -95,8 +96,8 @@ def host_arrays(rays: Rays) -> Rays:
     return Rays(*map(np.asarray, rays.on(wp.get_device("cpu")).checked()))
 
 
-def one_for_all(value: float, n: int, device: Device) -> WarpArray:
-    """Return an array of stride 0 that repeats one number. The device writes it, so that a graph can capture it."""
+def constant_array(value: float, n: int, device: Device) -> WarpArray:
+    """Return an array (n,) of stride 0, all of whose elements are `value`. A CUDA graph can capture this call."""
     one = wp.full(1, value, dtype=wp.float32, device=device)
     out = wp.array(ptr=one.ptr, shape=(n,), strides=(0,), dtype=wp.float32, device=device)
     keep(out, one)
@@ -104,8 +105,8 @@ def one_for_all(value: float, n: int, device: Device) -> WarpArray:
 
 
 def _segment_ends(value: ArrayLike, n: int, name: str) -> Array:
-    if type(value) is not float:  # most are
-        value = taken(value, name, wp.float32)
+    if type(value) is not float:  # a float, the usual case, needs no conversion
+        value = from_tensor(value, name, wp.float32)
     if isinstance(value, wp.array):
         if value.dtype != wp.float32 or value.shape != (n,):
             raise InputError(f"must be ({n},) float32, got {value.shape} {value.dtype.__name__}", argument=name)
@@ -134,7 +135,7 @@ def _checked_ends(array: Array, name: str) -> Array:
 
 
 def _check_ends(least: float, name: str) -> None:
-    """Raise InputError for a bad minimum of t_min or t_max; it is NaN if any value is."""
+    """Raise InputError if the least value of t_min or t_max is not valid. It is NaN if any value is NaN."""
     if not least >= LOWEST[name]:
         raise InputError("must not be NaN" + (" or below 0" if name == "t_min" else ""), argument=name)
 
@@ -147,7 +148,7 @@ def _rows(value: ArrayLike, name: str) -> np.ndarray:
 
 
 def vectors(value: ArrayLike, name: str, most: float = float(np.finfo(np.float32).max)) -> np.ndarray:
-    """Return (N, 3) float32. Raises InputError for other shapes, and for components that are NaN or beyond `most`."""
+    """Convert to (N, 3) float32. Raises InputError for other shapes, and for components that are NaN or beyond +-`most`."""
     array = float32(_rows(value, name))
     numbers = array.reshape(-1)
     if not (numbers.min(initial=0.0) >= -most and numbers.max(initial=0.0) <= most):  # False for NaN

@@ -15,9 +15,9 @@ from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.all_hits import first_hits
 from wrt.accel.queries.answers import ANY_HIT_TYPES, answer_arrays
-from wrt.accel.queries.hit_points import surroundings
+from wrt.accel.queries.hit_points import device_scene
 from wrt.accel.queries.rays import vectors
-from wrt.core.arrays import check_no_gradients, real_numbers, returned, taken, to_numpy
+from wrt.core.arrays import check_no_gradients, from_tensor, real_numbers, to_numpy, to_tensor_like
 from wrt.core.checks import shown
 from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError
@@ -28,7 +28,7 @@ from wrt.kernels.shade.segments import Pairs, segments, to_visible
 from wrt.kernels.structs import Surfaces
 
 PAIRS_PER_LAUNCH = 65536
-_kept_extents: WeakKeyDictionary[Geometry, tuple[float, float]] = WeakKeyDictionary()
+_cached_extents: WeakKeyDictionary[Geometry, tuple[float, float]] = WeakKeyDictionary()
 
 
 @overload
@@ -42,11 +42,11 @@ def visible(accel: Accelerator, a: TensorT, b: TensorT, on_a: ArrayLike | None =
             threads: int | None = ..., *, out: TensorT | None = ...) -> TensorT: ...
 def visible(accel: Accelerator, a: ArrayLike, b: ArrayLike, on_a: ArrayLike | None = None, on_b: ArrayLike | None = None,
             threads: int | None = None, *, out: object = None) -> object:
-    """Test whether each point of `a` sees its point of `b`: nothing meets the open segment between them.
+    """Test whether each point of `a` sees the point of `b` in the same row: no surface meets the open segment between them.
 
-    The result is the same with `a` and `b` exchanged, to the bit. Surfaces within a margin of an end point are ignored, so that a
-    point on a surface sees away from it. The margin is 3.8e-6 times the larger of two lengths: the largest coordinate of the point,
-    and the size of the largest primitive. It is at most the margin of the other point if that has larger coordinates. Points nearer
+    Exchanging `a` and `b` does not change the result. Surfaces within a margin of an end point are ignored, so that a surface does
+    not hide a point that lies on it. The margin is 3.8e-6 times the larger of two lengths: the largest coordinate of the point, and
+    the size of the largest primitive. It is at most the margin of the other point if that has larger coordinates. Points nearer
     to each other than both margins always see each other. Along the surface itself the margin is not enough: pass `on_a`, `on_b`.
 
     Parameters
@@ -54,14 +54,14 @@ def visible(accel: Accelerator, a: ArrayLike, b: ArrayLike, on_a: ArrayLike | No
     accel : Accelerator
         Structure over a mesh or a scene, not over several worlds.
     a, b : (N, 3) array_like, or Warp arrays (N,) of vec3
-        Points, taken as float32. Values of Warp arrays on a GPU are not checked; a point that is not finite sees nothing.
+        Points, converted to float32. Values of Warp arrays on a GPU are not checked; a point that is not finite sees nothing.
     on_a, on_b : (N,) array_like of int, optional
-        Primitive on which each point lies (`hits.prim_id` of `hits.point`), -1 for none. The point is moved off that triangle or
-        sphere by its rounding error, as for shadow rays; over one mesh the triangle cannot block. Not for instances.
+        Primitive on which each point lies (`hits.prim_id` for `hits.point`), or -1. The point is moved off that triangle or
+        sphere by its rounding error, as for shadow rays. Over one mesh, that triangle cannot block. Not for instances.
     threads : int, optional
         Threads on the CPU; one per core by default.
     out : (N,) bool, optional
-        Array that takes the answers.
+        Array that receives the results.
 
     Returns
     -------
@@ -79,18 +79,18 @@ def visible(accel: Accelerator, a: ArrayLike, b: ArrayLike, on_a: ArrayLike | No
     threads, device = thread_count(threads), accel.device
     check_no_gradients(a=a, b=b)
     p, q = (_points(value, name, device) for value, name in ((a, "a"), (b, "b")))
-    n, as_warp, give = len(p), isinstance(taken(a, "a"), wp.array), returned(a, b)
+    n, as_warp, give = len(p), isinstance(from_tensor(a, "a"), wp.array), to_tensor_like(a, b)
     if len(q) != n:
         raise InputError(f"must have as many rows as a ({n}), got {len(q)}", argument="b")
     array: Any = answer_arrays(ANY_HIT_TYPES, None if out is None else [out], n, device if as_warp else None, give is not None)[0]
-    snapshot, known, surfaces = accel.snapshot, on_a is not None or on_b is not None, Surfaces()
+    snapshot, has_ids, surfaces = accel.snapshot, on_a is not None or on_b is not None, Surfaces()
     if isinstance(snapshot.geometry, InstancedGeometry) and snapshot.geometry.n_worlds > 1:
-        raise InputError("must not be over several worlds: visible does not take such a structure yet", argument="accel")
-    if known:
+        raise InputError("must not be over several worlds: visible does not support worlds yet", argument="accel")
+    if has_ids:
         if accel.structure.units.instances:
             raise InputError("is for structures without instances", argument="on_a" if on_a is not None else "on_b")
-        surfaces = surroundings(snapshot).surfaces
-    ids = [_prim_ids(value, name, n, len(snapshot.geometry)) if known else np.zeros(0, np.int32)
+        surfaces = device_scene(snapshot).surfaces
+    ids = [_prim_ids(value, name, n, len(snapshot.geometry)) if has_ids else np.zeros(0, np.int32)
            for value, name in ((on_a, "on_a"), (on_b, "on_b"))]
 
     def run(kernel: Kernel, *inputs: object) -> None:
@@ -103,23 +103,23 @@ def visible(accel: Accelerator, a: ArrayLike, b: ArrayLike, on_a: ArrayLike | No
     pairs: WarpStruct = Pairs()
     pairs.a, pairs.b, pairs.on_a, pairs.on_b = p, q, *(upload(each, wp.int32, device) for each in ids)
     run(segments, surfaces, pairs, size, rays)
-    given = rays.origin, rays.direction, rays.t_min, rays.t_max
-    seen = accel.any_hit(*given, threads=threads)
+    arrays = rays.origin, rays.direction, rays.t_min, rays.t_max
+    seen = accel.any_hit(*arrays, threads=threads)
     run(to_visible, p, q, seen)
-    answer = np.array(to_numpy(seen)) if known else seen
-    if known and not accel.structure.units.spheres:
-        _without(accel, given, ids, answer, threads)
+    result = np.array(to_numpy(seen)) if has_ids else seen
+    if has_ids and not accel.structure.units.spheres:
+        _ignore_own_triangles(accel, arrays, ids, result, threads)
     if as_warp:
-        array.assign(answer)
+        array.assign(result)
     else:
-        array[:] = to_numpy(answer)
+        array[:] = to_numpy(result)
     return array if give is None else give(array)
 
 
 def largest_size(geometry: Geometry | InstancedGeometry) -> float:
     """Return the largest extent of a finite primitive along an axis.
 
-    Of instances, return the largest coordinate in a mesh's own space, where rays are rounded once more, as a length in world space.
+    For instances, return the largest coordinate in a mesh's own space, scaled to world space, because rays are rounded there again.
     """
     if isinstance(geometry, InstancedGeometry):
         reach = np.array([_extents(part)[1] for part in geometry.parts])
@@ -129,17 +129,18 @@ def largest_size(geometry: Geometry | InstancedGeometry) -> float:
 
 
 def _extents(geometry: Geometry) -> tuple[float, float]:
-    """Return the largest extent of a finite primitive's box, and the largest finite coordinate."""
-    if geometry not in _kept_extents:
+    """Return the largest extent of a finite primitive's box along an axis, and the largest absolute coordinate of these boxes."""
+    if geometry not in _cached_extents:
         low, high = geometry.bounds()
         finite = np.isfinite(high - low).all(axis=1)
         low, high = low[finite], high[finite]
-        _kept_extents[geometry] = (float((high - low).max(initial=0.0)), float(np.maximum(-low, high).max(initial=0.0)))
-    return _kept_extents[geometry]
+        _cached_extents[geometry] = (float((high - low).max(initial=0.0)), float(np.maximum(-low, high).max(initial=0.0)))
+    return _cached_extents[geometry]
 
 
-def _without(accel: Accelerator, rays: tuple[WarpArray, ...], ids: list[np.ndarray], seen: np.ndarray, threads: int) -> None:
-    """Set `seen` also where nothing lies between two points but the triangles on which they lie."""
+def _ignore_own_triangles(accel: Accelerator, rays: tuple[WarpArray, ...], ids: list[np.ndarray], seen: np.ndarray,
+                          threads: int) -> None:
+    """Set `seen` to True for pairs that only the triangles under the two points hide. ids: prim_ids of these triangles."""
     origin, way, t_min, t_max = (each.numpy() for each in rays)
     rows = np.nonzero(~seen & (t_max > 0.0))[0]
     prim_id = first_hits(accel, 3, origin[rows], way[rows], t_min[rows], t_max[rows], threads).prim_id
@@ -148,7 +149,7 @@ def _without(accel: Accelerator, rays: tuple[WarpArray, ...], ids: list[np.ndarr
 
 def _points(value: ArrayLike, name: str, device: Device) -> WarpArray:
     """Return points as a Warp array on the device. Raises InputError that names the argument."""
-    value = taken(value, name)
+    value = from_tensor(value, name)
     if isinstance(value, wp.array):
         if value.dtype != wp.vec3 or value.ndim != 1:
             raise InputError(f"must be (N,) vec3, got {value.shape} {value.dtype.__name__}", argument=name)
@@ -159,7 +160,7 @@ def _points(value: ArrayLike, name: str, device: Device) -> WarpArray:
 
 
 def _prim_ids(value: ArrayLike | None, name: str, n: int, count: int) -> np.ndarray:
-    """Return (N,) int32, all -1 for None. Raises InputError that names the argument."""
+    """Convert prim_ids to (n,) int32; None becomes -1. Raises InputError that names the argument."""
     if value is None:
         return np.full(n, -1, np.int32)
     array = real_numbers(value, name, f"({n},) prim_ids")

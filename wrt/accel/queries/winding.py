@@ -1,4 +1,4 @@
-"""Winding numbers of points."""
+"""Winding numbers of a mesh around points."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy.typing as npt
 import warp as wp
 
 from wrt.accel.queries.accelerator import Accelerator, snapshot_of
-from wrt.accel.queries.hit_points import surroundings
+from wrt.accel.queries.hit_points import device_scene
 from wrt.accel.queries.rays import vectors
 from wrt.accel.queries.winding_tree import winding_tree
-from wrt.core.arrays import returned
+from wrt.core.arrays import to_tensor_like
 from wrt.core.device import launch_on, upload
 from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike, NumpyLike, TensorT, WarpArray
@@ -43,7 +43,7 @@ def winding_number(accel: Accelerator, points: ArrayLike, threads: int | None = 
     accel : Accelerator
         Structure over one mesh without spheres.
     points : (N, 3) array_like
-        Points, taken as float32.
+        Points, converted to float32.
     threads : int, optional
         Threads on the CPU; one per core by default.
     exact : bool
@@ -65,8 +65,8 @@ def winding_number(accel: Accelerator, points: ArrayLike, threads: int | None = 
     Schmidt, Levin and Jacobson 2018, "Fast Winding Numbers for Soups and Clouds".
     """
     snapshot = snapshot_of(accel)
-    rows, give, device = vectors(points, "points", FARTHEST), returned(points), snapshot.device
-    turns, surfaces = wp.empty(len(rows), dtype=wp.vec3d, device=device), surroundings(snapshot).surfaces
+    rows, give, device = vectors(points, "points", FARTHEST), to_tensor_like(points), snapshot.device
+    turns, surfaces = wp.empty(len(rows), dtype=wp.vec3d, device=device), device_scene(snapshot).surfaces
     kernel, inputs = (wind, [surfaces]) if exact else (wind_by_tree, [surfaces, *winding_tree(snapshot)])
     launch_on(device, kernel, len(rows), *inputs, upload(rows, wp.vec3, device), turns, None, threads=thread_count(threads),
               step=POINTS_PER_LAUNCH)

@@ -10,7 +10,7 @@ import warp as wp
 from wrt.accel.bvh.builders import BvhOptions, build_binary
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.contains import finite_faces
-from wrt.accel.queries.hit_points import surroundings
+from wrt.accel.queries.hit_points import device_scene
 from wrt.accel.snapshot import Snapshot, once
 from wrt.core.device import launch_on, records, upload
 from wrt.core.threads import thread_count
@@ -39,7 +39,7 @@ def winding_tree(snapshot: Snapshot) -> WindingTree:
     nodes, order = nodes_over(Geometry(mesh.vertices, mesh.faces[used], np.zeros((0, 4), np.float32)), threads)
     begin, end = ranges_of(nodes)
     tree = WindingTree(upload(nodes, WindingNode, device), upload(used[order], wp.int32, device))
-    launch_on(device, expand_nodes, len(nodes), surroundings(snapshot).surfaces, tree.faces, upload(begin, wp.int32, device),
+    launch_on(device, expand_nodes, len(nodes), device_scene(snapshot).surfaces, tree.faces, upload(begin, wp.int32, device),
               upload(end, wp.int32, device), tree.nodes, None, threads=threads, step=NODES_PER_LAUNCH)
     return tree
 

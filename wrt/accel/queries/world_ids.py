@@ -1,4 +1,4 @@
-"""World that each ray of a query sees, in a structure over several."""
+"""Indices of the worlds that the rays of a query see, in a structure over several worlds."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from wrt.kernels.query import Worlds
 
 
 class WorldIds:
-    """World of each of n rays, in arrays for kernels on the structure's device."""
+    """Index of the world of each of n rays, in arrays on the structure's device."""
 
     def __init__(self, snapshot: Snapshot, first_prim: np.ndarray, world: ArrayLike, n: int) -> None:
-        """first_prim: (W,) first prim_id of each world."""
+        """first_prim: (W,) index of each world's first primitive among the primitives of all worlds."""
         self.first_prim = first_prim
         self.arrays: WarpStruct = Worlds()
         self.arrays.id, self.arrays.root = self._on(snapshot.device, world, n), snapshot.roots
@@ -39,7 +39,7 @@ class WorldIds:
         return upload(np.broadcast_to(ids, (n,)).astype(np.int32), wp.int32, device)
 
     def over_all(self, prim_id: ArrayLike) -> np.ndarray:
-        """Convert prim_ids of hits in their worlds to indices among the primitives of all worlds, (N,) int32."""
+        """Convert prim_ids, which count the primitives of one world, to indices among those of all worlds, (N,) int32."""
         own, world = to_numpy(prim_id), self.arrays.id.numpy()
         return np.where(own >= 0, own + self.first_prim[np.where(own >= 0, world, 0)], -1).astype(np.int32)
 
@@ -50,12 +50,12 @@ def over_worlds(geometry: object) -> TypeGuard[InstancedGeometry]:
 
 
 def check_world(snapshot: Snapshot, world: ArrayLike | None, n: int) -> WorldIds | None:
-    """Return the worlds that n rays see, or None without worlds. Raises InputError that names the argument `world`."""
+    """Check and convert the argument `world` of a query with n rays; None stays None. Raises InputError that names `world`."""
     geometry = snapshot.geometry
     if world is None:
         if over_worlds(geometry) and geometry.n_worlds > 1:
-            raise InputError(f"must be given: the structure is over {geometry.n_worlds} worlds", argument="world")
+            raise InputError(f"must not be None: the structure is over {geometry.n_worlds} worlds", argument="world")
         return None
     if not over_worlds(geometry):
-        raise InputError("is for structures over worlds: wrt.build takes a list of them", argument="world")
+        raise InputError("is for structures over worlds, which wrt.build makes from a list of meshes or scenes", argument="world")
     return WorldIds(snapshot, geometry.world_first_prim, world, n)

@@ -1,1 +1,1 @@
-"""Scenes: how meshes, scenes and their files become structures."""
+"""Conversion of meshes, scenes and their files to acceleration structures."""

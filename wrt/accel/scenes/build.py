@@ -20,7 +20,7 @@ from wrt.accel.scenes.worlds import worlds_over
 from wrt.accel.store import read
 from wrt.accel.structure import default_options
 from wrt.accel.structures import ACCELERATORS
-from wrt.core.arrays import is_tensor, taken, to_numpy
+from wrt.core.arrays import from_tensor, is_tensor, to_numpy
 from wrt.core.checks import as_one, shown
 from wrt.core.errors import InputError
 from wrt.core.types import ArrayLike, PathLike
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 
 class BuildOptions(TypedDict, total=False):
-    """Options of `build`. Each structure has some of them, with defaults of its own (docs/acceleration.md)."""
+    """Options of `build`. Each structure accepts some of them and has its own defaults (docs/acceleration.md)."""
 
     triangle: str  # all structures
     box: str
@@ -124,14 +124,14 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = "cpu", t
           **options: Unpack[BuildOptions]) -> OneMesh | Instances:
     """Build an acceleration structure over a mesh, a scene or several worlds.
 
-    In a scene, prim_ids count the faces of its objects in their order, then the spheres. Meshes of several objects are stored once
-    where that saves much memory; the structure is then `Instances`. Of a list, each mesh or scene without spheres is a world, and a
-    query names the world that a ray sees. Its prim_ids count the faces of the world; `Instances.move` moves its objects.
+    In a scene, prim_ids number the faces of all objects in order, then the spheres. A mesh that several objects share is stored once
+    if that saves much memory; the structure is then `Instances`. In a list, each entry is a world: a mesh, or a scene without
+    spheres. A query names the world that each ray sees. Its prim_ids number the faces of that world; `Instances.move` moves objects.
 
     Parameters
     ----------
     mesh : Mesh, Scene, path, trimesh mesh or scene, pair (vertices, faces), geometry, or list of these
-        What the structure is over. A path is that of a mesh file or of a scene file.
+        Surfaces that rays can hit. A path names a mesh file or a scene file.
     accel : str
         Name in `wrt.ACCELERATORS`; "bvh" is bvh8.
     device : str
@@ -139,12 +139,12 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = "cpu", t
     threads : int, optional
         Threads that build and refit; one per core by default.
     **options
-        `triangle` and `box`, the intersection tests, and the options of the structure (`BuildOptions`).
+        Intersection tests `triangle` and `box`, and the options of the structure (`BuildOptions`).
 
     Returns
     -------
     OneMesh or Instances
-        Of the structure's own class, such as `Bvh8`; `Instances` over a list, and over a scene with shared meshes.
+        An object of the structure's class, such as `Bvh8`; `Instances` for a list, and for a scene whose shared meshes are stored once.
 
     Raises
     ------
@@ -153,8 +153,8 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = "cpu", t
     """
     ACCELERATORS.check(as_one(accel, str, "accel"), "accel")
     kind, device = ACCELERATORS[accel], as_one(device, str, "device")
-    flat = (worlds_over([shape_given(each) for each in mesh]) if isinstance(mesh, list)
-             else None if isinstance(mesh, Geometry | InstancedGeometry) else flat_scene_given(mesh))  # of a geometry no more is known
+    flat = (worlds_over([to_mesh_or_scene(each) for each in mesh]) if isinstance(mesh, list)
+             else None if isinstance(mesh, Geometry | InstancedGeometry) else to_flat_scene(mesh))  # a geometry has no attributes
     geometry = mesh if flat is None else flat.geometry
     if isinstance(geometry, InstancedGeometry):
         return Instances(kind, geometry, flat, device=device, threads=threads, **options)
@@ -169,40 +169,42 @@ def load_accel(path: PathLike, mesh: MeshLike, device: str = "cpu", threads: int
     path : str or path
         File with the suffix .accel.
     mesh, device, threads
-        See `build`; the mesh must be the one that the structure was built over.
+        See `build`; the mesh must equal the one that the structure was built over.
 
     Returns
     -------
     OneMesh
-        Structure with the options and tests that it was built with.
+        Structure with the same intersection tests as the saved one.
 
     Raises
     ------
     InputError
-        For a file that is missing, foreign, damaged, of another version or over another mesh.
+        If the file is missing, damaged, not a structure, of another version, or over another mesh.
     """
-    flat = flat_scene_given(mesh)
-    return read(path, one_geometry(flat), flat, as_one(device, str, "device"), threads)
+    flat = to_flat_scene(mesh)
+    if not isinstance(flat.geometry, Geometry):
+        raise InputError("must not be a scene with instances, because no file holds a structure over it", argument="mesh")
+    return read(path, flat.geometry, flat, as_one(device, str, "device"), threads)
 
 
-def flat_scene_given(mesh: MeshLike) -> FlatScene:
-    """Return the mesh or scene of `build` as arrays. Raises InputError for other things, and for a bad file."""
+def to_flat_scene(mesh: MeshLike) -> FlatScene:
+    """Convert the argument `mesh` of `build` to a FlatScene. Raises InputError for other types, and for a bad file."""
     if isinstance(mesh, Geometry | InstancedGeometry):
         return flat_scene_of(mesh)
-    mesh = shape_given(mesh)
+    mesh = to_mesh_or_scene(mesh)
     if isinstance(mesh, Scene):
         return flatten(mesh, instanced_meshes(mesh))
     return flat_scene_of(Geometry.of(mesh), mesh.normals, mesh.uvs)
 
 
-def shape_given(mesh: MeshLike) -> Mesh | Scene:
-    """Load or convert the argument `mesh` of `build`, except geometries. Raises InputError as flat_scene_given."""
+def to_mesh_or_scene(mesh: MeshLike) -> Mesh | Scene:
+    """Load or convert the argument `mesh` of `build`, if it is no geometry. Raises InputError for other types and a bad file."""
     if isinstance(mesh, str | os.PathLike) and Path(os.fsdecode(mesh)).suffix.lower() in LOADERS:
         mesh = load_scene(mesh)
     elif isinstance(mesh, str | os.PathLike):
         mesh = load_mesh(mesh)
     elif isinstance(mesh, tuple) and len(mesh) == 2:
-        vertices, faces = (np.array(to_numpy(taken(each, name, None))) if is_tensor(each) else each  # it may be written to
+        vertices, faces = (np.array(to_numpy(from_tensor(each, name, None))) if is_tensor(each) else each  # copy: the caller may modify it
                            for each, name in zip(mesh, ("vertices", "faces"), strict=True))
         mesh = Mesh(vertices, faces)  # type: ignore[arg-type]  # which converts them
     elif type(mesh).__module__.split(".")[0] == "trimesh":
@@ -211,10 +213,3 @@ def shape_given(mesh: MeshLike) -> Mesh | Scene:
         return mesh
     raise InputError("must be a Mesh, a Scene, the path of a mesh or scene file, a trimesh.Trimesh or trimesh.Scene, or a pair"
                      f" (vertices, faces), got {shown(mesh)}", argument="mesh")
-
-
-def one_geometry(flat: FlatScene) -> Geometry:
-    """Return the geometry of a scene without instances. Raises InputError for others."""
-    if not isinstance(flat.geometry, Geometry):
-        raise InputError("a scene with instances has no structure in a file")
-    return flat.geometry

@@ -19,39 +19,39 @@ MOST = 2**31 - 2  # faces, and vertices
 
 
 def flatten(scene: Scene, meshes: frozenset[int] = frozenset()) -> FlatScene:
-    """Flatten a scene. meshes: id()s of the meshes that are stored once (wrt.accel.scenes.instancing)."""
+    """Convert a scene to arrays. meshes: id() of each mesh that is stored once (wrt.accel.scenes.instancing)."""
     return flatten_instanced(scene, meshes) if meshes else flatten_joined(scene)
 
 
 def flatten_joined(scene: Scene) -> FlatScene:
-    """Transform and join all objects. Positions are computed in float64 and rounded once.
+    """Transform all objects to world space and join their arrays. Positions are computed in float64 and rounded once.
 
-    `wrt.scene.clean.flip_collinear` treats faces whose corners rounding puts on a line.
+    Rounding may put the corners of a face on a line; `wrt.scene.clean.flip_collinear` repairs such faces.
     """
     index = {id(material): i for i, material in enumerate(scene.materials)}
     joined = _joined(scene.objects, index)
-    _require_room(len(joined.vertices), len(joined.faces))
+    _check_size(len(joined.vertices), len(joined.faces))
     geometry = Geometry(joined.vertices, joined.faces, _spheres(scene))
     return FlatScene(geometry, joined.vertices, joined.faces, joined.normals if _is_smooth(scene) else None, joined.uvs,
                  np.concatenate([joined.material, _sphere_materials(scene, index)]), objects=_first_prims(scene))
 
 
 def flatten_instanced(scene: Scene, meshes: frozenset[int]) -> FlatScene:
-    """Flatten a scene with instances of the meshes of those id()s. Other objects are joined in world space, as part 0."""
+    """Convert a scene to arrays with instances of `meshes`, a set of id()s. Other objects are joined in world space as part 0."""
     index = {id(material): i for i, material in enumerate(scene.materials)}
     flat = _joined(tuple(thing for thing in scene.objects if not is_instance(thing, meshes)), index)
     parts = {0: flat}  # then by id of the mesh
     materials: dict[tuple[int, ...], tuple[int, np.ndarray]] = {(): (0, flat.material)}
     n_material = len(flat.material)
     rows: list[tuple[int, int, int, int, np.ndarray]] = []  # first_prim, part, first material, step, to_world
-    numbers: list[np.ndarray] = []
+    prim_ids: list[np.ndarray] = []  # of part 0
     first_prim = n_flat = 0
     for thing in scene.objects:
         count = len(thing.mesh.faces)
         if not is_instance(thing, meshes):
-            if not rows or rows[-1][1] != 0:  # else the last run goes on
+            if not rows or rows[-1][1] != 0:  # otherwise the object extends the last run
                 rows.append((first_prim, 0, n_flat, 1, np.eye(4)))
-            numbers.append(np.arange(first_prim, first_prim + count, dtype=np.int64))
+            prim_ids.append(np.arange(first_prim, first_prim + count, dtype=np.int64))
             n_flat += count
         else:
             part = parts.get(id(thing.mesh)) or parts.setdefault(id(thing.mesh), _own_space(thing.mesh))
@@ -63,30 +63,29 @@ def flatten_instanced(scene: Scene, meshes: frozenset[int]) -> FlatScene:
                 n_material += len(each)
             rows.append((first_prim, id(thing.mesh), materials[key][0], int(thing.face_material is not None), thing.transform))
         first_prim += count
-    _require_room(sum(len(part.vertices) for part in parts.values()), first_prim)
-    return _placed_scene(scene, index, parts, rows, materials, numbers, first_prim)
+    _check_size(sum(len(part.vertices) for part in parts.values()), first_prim)
+    return _placed_scene(scene, index, parts, rows, materials, prim_ids, first_prim)
 
 
 def _placed_scene(scene: Scene, index: dict[int, int], parts: dict[int, _Joined], rows: list[tuple[int, int, int, int, np.ndarray]],
-                  materials: dict[tuple[int, ...], tuple[int, np.ndarray]], numbers: list[np.ndarray], n_triangles: int) -> FlatScene:
-    """Assemble the result of `flatten_instanced`."""
+                  materials: dict[tuple[int, ...], tuple[int, np.ndarray]], prim_ids: list[np.ndarray], n_triangles: int) -> FlatScene:
+    """Assemble the result of `flatten_instanced` from its local variables."""
     spheres = _spheres(scene)
-    of_spheres = _sphere_materials(scene, index)
-    numbers.append(np.arange(n_triangles, n_triangles + len(spheres), dtype=np.int64))
-    prim_material = np.concatenate([*(each for _, each in materials.values()), of_spheres]).astype(np.int32)
+    prim_ids.append(np.arange(n_triangles, n_triangles + len(spheres), dtype=np.int64))
+    prim_material = np.concatenate([*(each for _, each in materials.values()), _sphere_materials(scene, index)]).astype(np.int32)
     place = {key: i for i, key in enumerate(parts)}
     first_vertex = np.cumsum([0, *(len(part.vertices) for part in parts.values())])
     first_face = np.cumsum([0, *(len(part.faces) for part in parts.values())])
     joined = list(parts.values())
     flat = joined[0]
-    geometries = (NumberedGeometry(flat.vertices, flat.faces, spheres, np.concatenate(numbers).astype(np.int32)),
+    geometries = (NumberedGeometry(flat.vertices, flat.faces, spheres, np.concatenate(prim_ids).astype(np.int32)),
                   *(Geometry(part.vertices, part.faces, spheres[:0]) for part in joined[1:]))
     instances = [(place[key], matrix[:3], first) for first, key, _, _, matrix in rows if key]
     if len(geometries[0]):
         instances.insert(0, (0, np.eye(4)[:3], 0))
     geometry = InstancedGeometry(geometries, np.array([i[0] for i in instances], np.int32), np.array([i[1] for i in instances]),
                                  np.array([i[2] for i in instances], np.int64), n_triangles)
-    # A flat object's faces are where its materials are: both are numbered in the order of part 0.
+    # Faces and face materials of joined objects have the same indices, in the order of part 0.
     runs = [(first, material if key == 0 else int(first_face[place[key]]), material, step, matrix[:3])
             for first, key, material, step, matrix in rows]
     runs.append((n_triangles, 0, len(prim_material) - len(spheres), 1, np.eye(4)[:3]))
@@ -116,14 +115,14 @@ def _sphere_materials(scene: Scene, index: dict[int, int]) -> np.ndarray:
     return np.array([index[id(s.material)] for s in scene.spheres], np.int32)
 
 
-def _require_room(vertices: int, faces: int) -> None:
+def _check_size(vertices: int, faces: int) -> None:
     if vertices > MOST or faces > MOST:
-        raise InputError("the scene has more than 2^31 vertices or faces")
+        raise InputError("the scene has more than 2^31 - 2 vertices or faces")
 
 
 @dataclass(frozen=True, eq=False)
 class _Joined:
-    """Joined objects, or one mesh. source: (F,) the original face of each face."""
+    """Arrays of joined objects, or of one mesh. source: (F,) index of each face before flip_collinear."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -134,7 +133,7 @@ class _Joined:
 
 
 def _joined(objects: tuple[Object, ...], index: dict[int, int]) -> _Joined:
-    """Join objects in world space; material: of each face, by `index` of its id()."""
+    """Join objects in world space. index: index of each material in the scene, by its id()."""
     parts, material, first = [], [np.zeros(0, np.int32)], 0
     for thing in objects:
         v, f, n, t = _transformed(thing)
@@ -142,10 +141,10 @@ def _joined(objects: tuple[Object, ...], index: dict[int, int]) -> _Joined:
         table = np.array([index[id(m)] for m in thing.materials], np.int32)
         material.append(np.full(len(f), table[0]) if thing.face_material is None else table[thing.face_material])
         first += len(v)
-        _require_room(first, 0)
-    none = [np.zeros((0, width), dtype) for width, dtype in ((3, np.float32), (3, np.int32), (3, np.float32), (2, np.float32))]
-    vertices, faces, normals, uvs = map(np.concatenate, zip(*parts, strict=True)) if parts else none
-    # Far from 0, rounding puts corners on a line. One call for all objects, because a call for each of many boxes takes long.
+        _check_size(first, 0)
+    empty = [np.zeros((0, width), dtype) for width, dtype in ((3, np.float32), (3, np.int32), (3, np.float32), (2, np.float32))]
+    vertices, faces, normals, uvs = map(np.concatenate, zip(*parts, strict=True)) if parts else empty
+    # Far from the origin, rounding puts corners on a line. One call for all objects is faster than a call for each.
     faces, source = flip_collinear(vertices, faces)
     return _Joined(vertices, faces, normals, uvs, source, np.concatenate(material)[source])
 
@@ -156,7 +155,7 @@ def _own_space(mesh: Mesh) -> _Joined:
 
 
 def _attributes(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """Return normals and uvs of the vertices, 0 if the mesh has none."""
+    """Return normals and uvs of the vertices; zeros if the mesh has none."""
     return (np.zeros_like(mesh.vertices) if mesh.normals is None else mesh.normals,
             np.zeros((len(mesh.vertices), 2), np.float32) if mesh.uvs is None else mesh.uvs)
 
@@ -169,8 +168,8 @@ def _transformed(thing: Object) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
         return mesh.vertices, faces, normals, uvs
     linear = matrix[:3, :3]
     vertices = (mesh.vertices.astype(np.float64) @ linear.T + matrix[:3, 3]).astype(np.float32)
-    # Normals go by the cofactors: the inverse transpose times the determinant, which exists for flat objects too. Its sign
-    # turns them inwards where the object is mirrored, and so it is taken out; the faces are turned round instead.
+    # The cofactor matrix transforms normals. It is the inverse transpose times the determinant, and exists for flat objects too.
+    # For a mirrored object, the determinant's sign would turn normals inwards: it is removed, and the faces are reversed instead.
     mirrored = np.linalg.det(linear) < 0.0
     if mirrored:
         faces = faces[:, [0, 2, 1]]

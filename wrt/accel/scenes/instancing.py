@@ -11,12 +11,11 @@ from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene
 
 INSTANCING = ("auto", "always", "never")
-# Copies of one mesh with so many triangles together are worth a second level (docs/moving.md, "Instances").
-MIN_SAVED = 250_000
+MIN_SAVED = 250_000  # triangles that instances of a mesh must save to be worth a second level (docs/moving.md, "Instances")
 
 
 def instanced_meshes(scene: Scene, instancing: str = "auto") -> frozenset[int]:
-    """Return the id() of each mesh to store once: where that saves MIN_SAVED triangles ("auto"), or for all shared ones ("always").
+    """Return the id() of each mesh to store once: meshes that save MIN_SAVED triangles ("auto"), or all shared meshes ("always").
 
     Objects whose transform flattens or shears too much (MAX_SPREAD) are always copied. Raises InputError for an unknown choice.
     """
@@ -31,10 +30,10 @@ def instanced_meshes(scene: Scene, instancing: str = "auto") -> frozenset[int]:
                      and (sum(map(is_invertible, things)) - 1) * len(things[0].mesh.faces) >= least)
 
 
-def stored_meshes(scene: Scene, kept_once: frozenset[int]) -> list[Mesh]:
-    """Return the meshes that a structure stores: those of `kept_once` (of instanced_meshes), and one for each copy."""
-    once = {id(thing.mesh): thing.mesh for thing in scene.objects if is_instance(thing, kept_once)}
-    return [*once.values(), *(thing.mesh for thing in scene.objects if not is_instance(thing, kept_once))]
+def stored_meshes(scene: Scene, meshes: frozenset[int]) -> list[Mesh]:
+    """Return the meshes that a structure stores: `meshes` (from instanced_meshes) once, other meshes once per object."""
+    once = {id(thing.mesh): thing.mesh for thing in scene.objects if is_instance(thing, meshes)}
+    return [*once.values(), *(thing.mesh for thing in scene.objects if not is_instance(thing, meshes))]
 
 
 def is_instance(thing: Object, meshes: frozenset[int]) -> bool:
@@ -43,7 +42,7 @@ def is_instance(thing: Object, meshes: frozenset[int]) -> bool:
 
 def is_invertible(thing: Object) -> bool:
     """Return whether rays can be transformed to the object's own space without much loss."""
-    from wrt.accel.instanced_geometry import MAX_SPREAD  # imports Warp, which the help of `render` does without
+    from wrt.accel.instanced_geometry import MAX_SPREAD  # not at the top, because it imports Warp, which slows `render --help`
 
     linear = thing.transform[:3, :3]
     with np.errstate(all="ignore"):

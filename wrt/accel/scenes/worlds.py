@@ -17,20 +17,20 @@ from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene
 
 
-def worlds_over(given: Sequence[Mesh | Scene]) -> FlatScene:
-    """Make one geometry over several worlds; each mesh is stored once. Raises InputError for spheres and flattened objects."""
-    for number, scene in enumerate(given):
+def worlds_over(worlds: Sequence[Mesh | Scene]) -> FlatScene:
+    """Join several worlds in one geometry; each mesh is stored once. Raises InputError for spheres and flattened objects."""
+    for index, scene in enumerate(worlds):
         for thing in scene.objects if isinstance(scene, Scene) else ():
             if not is_invertible(thing):
                 raise InputError("is flattened or sheared too much to be an instance",
-                                 place=f"world {number}: object {thing.name!r}")
+                                 place=f"world {index}: object {thing.name!r}")
         if isinstance(scene, Scene) and scene.spheres:
-            raise InputError("has spheres; worlds are of meshes", place=f"world {number}")
+            raise InputError("has spheres, but worlds must consist of meshes", place=f"world {index}")
     grey = (Material(),)
-    objects = [scene.objects if isinstance(scene, Scene) else (Object(scene, grey),) for scene in given]
+    objects = [scene.objects if isinstance(scene, Scene) else (Object(scene, grey),) for scene in worlds]
     together = tuple(thing for each in objects for thing in each)
     if not together:
-        raise InputError("must have at least one object between them", argument="worlds")
+        raise InputError("must have at least one object in all its worlds together", argument="mesh")
     flat = flatten(Scene(together), frozenset(id(thing.mesh) for thing in together))
     geometry = flat.geometry
     assert isinstance(geometry, InstancedGeometry)

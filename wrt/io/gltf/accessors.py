@@ -16,22 +16,21 @@ from wrt.io.gltf.document import Document
 _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _MAX_COUNT = 2**31 - 1
-_MAX_IMPLICIT_COUNT = 2**22  # of zeros without a buffer: a file of a few bytes must not ask for all memory
+_MAX_IMPLICIT_COUNT = 2**22  # elements without a buffer, which are zeros: a file of a few bytes must not fill the memory
 
 
 class Accessors:
-    """A reader of a document's accessors, each once. The arrays are shared and read-only."""
+    """Reader of a document's accessors. Each is decoded once, into a shared read-only array."""
 
     def __init__(self, document: Document) -> None:
         self._document = document
         self._arrays: dict[int, np.ndarray] = {}
 
     def read(self, index: int, kind: str, place: str) -> np.ndarray:
-        """Return accessor `index` as (count, width of `kind`): float32, or its own integer type if it is not normalised.
+        """Return accessor `index` as an array (count, width of `kind`): float32, or the accessor's integer type if not normalised.
 
         kind: "SCALAR", "VEC2", "VEC3" or "VEC4". Raises InputError at `place` if the accessor has another kind, does not fit into its
-        buffer view, or holds a float that is not finite.
-        """
+        buffer view, or holds a float that is not finite."""
         accessor = self._document.item("accessors", index, place)
         if accessor.type != kind:
             raise InputError(f"must be of type {kind}, but accessors[{index}] is {short(accessor.type)}", place=place)
@@ -58,27 +57,26 @@ class Accessors:
             bad = ~np.isfinite(array).all(axis=1)
             if bad.any():
                 row = int(np.nonzero(bad)[0][0])
-                raise InputError(f"element {row} is {array[row].tolist()} ({int(bad.sum())} not finite in all)",
-                                 place=where)
+                raise InputError(f"must be finite, but element {row} is {array[row].tolist()} ({bad.sum()} such elements)", place=where)
         array.flags.writeable = False
         return array
 
     def _elements(self, view: int, offset: int, dtype: np.dtype, shape: tuple[int, int], where: str) -> np.ndarray:
-        """Return elements of a buffer view as a packed array of `shape`; they need not be aligned."""
+        """Return elements of a buffer view, which may be unaligned, as a packed array of `shape`."""
         data, stride = self._document.view(view, f"{where}.bufferView")
         size = dtype.itemsize * shape[1]
         stride = stride or size
         if stride < size:
-            raise InputError(f"is {stride}, but an element has {size} bytes", place=f"bufferViews[{view}].byteStride")
+            raise InputError(f"is {stride} bytes, but an element has {size}", place=f"bufferViews[{view}].byteStride")
         end = offset + (shape[0] - 1) * stride + size
         if offset < 0 or end > len(data):
             raise InputError(f"{shape[0]} elements reach from byte {offset} to {end} of bufferViews[{view}], "
-                             f"which has {len(data)}", place=where)
+                             f"which has {len(data)} bytes", place=where)
         elements = np.ndarray(shape, dtype, data.data, offset, (stride, dtype.itemsize))
         return elements.astype(dtype.newbyteorder("="))
 
     def _with_sparse(self, array: np.ndarray, sparse: Any, where: str) -> np.ndarray:
-        """Replace the listed elements of `array`."""
+        """Replace the elements of `array` that the sparse accessor lists."""
         if not 1 <= sparse.count <= len(array):
             raise InputError(f"must be 1 to {len(array)}, got {sparse.count}", place=f"{where}.count")
         index_type = _dtype(sparse.indices.componentType, f"{where}.indices")
@@ -87,7 +85,7 @@ class Accessors:
         rows = self._elements(sparse.indices.bufferView, sparse.indices.byteOffset or 0, index_type, (sparse.count, 1),
                               f"{where}.indices")[:, 0]
         if rows.max() >= len(array):
-            raise InputError(f"holds {int(rows.max())}, but there are {len(array)} elements", place=f"{where}.indices")
+            raise InputError(f"holds the index {int(rows.max())}, but there are {len(array)} elements", place=f"{where}.indices")
         values = sparse.values
         array[rows] = self._elements(values.bufferView, values.byteOffset or 0, array.dtype.newbyteorder("<"),
                                      (sparse.count, array.shape[1]), f"{where}.values")
@@ -96,13 +94,12 @@ class Accessors:
 
 def _dtype(component_type: int, where: str) -> np.dtype:
     if component_type not in _DTYPES:
-        raise InputError(f"must be one of {', '.join(map(str, _DTYPES))}, got {component_type}",
-                         place=f"{where}.componentType")
+        raise InputError(f"must be one of {', '.join(map(str, _DTYPES))}, got {component_type}", place=f"{where}.componentType")
     return np.dtype(_DTYPES[component_type])
 
 
 def _normalised(array: np.ndarray, where: str) -> np.ndarray:
-    """Map integers to float32 in [0, 1] or [-1, 1] by the specification's table, which clamps the most negative value."""
+    """Map 8- and 16-bit integers to float32 in [0, 1] or [-1, 1] by the specification's table, which clamps the most negative value."""
     if array.dtype.kind == "f" or array.dtype.itemsize > 2:
         raise InputError("only 8- and 16-bit integers can be normalised", place=f"{where}.normalized")
     return np.maximum(array.astype(np.float32) / np.float32(np.iinfo(array.dtype).max), np.float32(-1.0))

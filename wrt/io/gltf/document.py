@@ -33,7 +33,7 @@ SUPPORTED_EXTENSIONS = frozenset({
     "KHR_materials_transmission", "KHR_materials_volume", "KHR_materials_ior", "KHR_materials_emissive_strength",
     "KHR_materials_unlit", "EXT_texture_webp", "EXT_texture_avif",
 })
-# These describe the file or its use and change no pixel.
+# Extensions that describe the file or its use, and change no pixel.
 METADATA_EXTENSIONS = frozenset({
     "KHR_xmp", "KHR_xmp_json_ld", "KHR_animation_pointer", "KHR_interactivity", "KHR_node_selectability",
     "KHR_node_hoverability", "KHR_audio_emitter", "EXT_structural_metadata", "EXT_mesh_features",
@@ -48,17 +48,17 @@ _CODECS = frozenset({
 
 
 class LeftOut:
-    """Features of a file that the picture leaves out, each with its places."""
+    """Features of a file that wrt leaves out of the picture, each with the objects that have it."""
 
     def __init__(self) -> None:
         self._places: dict[str, dict[str, dict[str, None]]] = {}
 
     def add(self, feature: str, kind: str, name: str) -> None:
-        """Note `feature` at `name`, which is of the kind `kind` ("material", "node", ...)."""
+        """Record that the object `name` has `feature`. kind: the object's kind, such as "material" or "node"."""
         self._places.setdefault(feature, {}).setdefault(kind, {})[name] = None
 
     def add_extensions(self, extensions: JsonObject | None, kind: str, name: str) -> None:
-        """Note each extension that wrt does not read and that could change the picture."""
+        """Record each extension of an object that wrt does not read and that could change the picture."""
         for extension in extensions or ():
             if extension not in SUPPORTED_EXTENSIONS and extension not in METADATA_EXTENSIONS:
                 self.add(extension, kind, name)
@@ -67,7 +67,7 @@ class LeftOut:
         return feature in self._places
 
     def sentence(self) -> str:
-        """Return all features in one line, or ""; long lists of names are cut."""
+        """Return all features with their objects in one line, or "" without features; long lists of names are cut."""
         return ", ".join(f"{feature} ({self._where(kinds)})" for feature, kinds in self._places.items())
 
     @staticmethod
@@ -80,10 +80,7 @@ class LeftOut:
 
 
 class Document:
-    """The typed JSON of a file (`gltf`, a pygltflib.GLTF2) and the bytes that it refers to.
-
-    An InputError has the place in the JSON; the caller adds the file.
-    """
+    """Typed JSON of a file (`gltf`, a pygltflib.GLTF2) and the bytes that it refers to. The caller adds the file to each InputError."""
 
     def __init__(self, path: PathLike) -> None:
         with needed_by("a glTF file"):
@@ -92,7 +89,7 @@ class Document:
         self.path = Path(path)
         raw, self._binary = _read_container(self.path)
         if not isinstance(raw, dict):
-            raise InputError("is not a glTF file: the JSON holds no object")
+            raise InputError("is not a glTF file: its JSON is not an object")
         _check_version(raw)
         self.gltf: Any = read_as(pygltflib.GLTF2, raw, "")
         _check_required_extensions(self.gltf.extensionsRequired)
@@ -112,7 +109,7 @@ class Document:
         return None if raw is None else read_as(cls, raw, f"{place}.extensions.{name}".removeprefix("."))
 
     def view(self, index: int, place: str) -> tuple[np.ndarray, int | None]:
-        """Return the bytes of a buffer view (N,) uint8, and its stride."""
+        """Return the bytes (N,) uint8 of a buffer view, and its stride in bytes or None."""
         view = self.item("bufferViews", index, place)
         where = f"bufferViews[{index}]"
         data = self._buffer(view.buffer, f"{where}.buffer")
@@ -121,7 +118,7 @@ class Document:
             raise InputError(f"must be at least 1, got {length}", place=f"{where}.byteLength")
         if start < 0 or start + length > len(data):
             raise InputError(f"bytes {start} to {start + length} reach outside of buffers[{view.buffer}], "
-                             f"which has {len(data)}", place=where)
+                             f"which has {len(data)} bytes", place=where)
         return data[start:start + length], view.byteStride
 
     def _buffer(self, index: int, place: str) -> np.ndarray:
@@ -141,7 +138,7 @@ class Document:
         return self._buffers[index]
 
     def resource(self, uri: str, place: str) -> bytes:
-        """Return the bytes of a data: URI or of a file by its relative path, in the folder of the glTF file or below."""
+        """Return the bytes of a data: URI, or of a file whose relative path stays in the folder of the glTF file."""
         if uri[:5].lower() == "data:":
             with at(place):
                 return _decode_data_uri(uri)
@@ -153,7 +150,7 @@ class Document:
 
 
 def _read_container(path: Path) -> tuple[object, bytes | memoryview | None]:
-    """Return the parsed JSON and the binary chunk of a .gltf or .glb file; the first bytes tell the format."""
+    """Return the parsed JSON and the binary chunk of a .gltf or .glb file, whose first four bytes distinguish the formats."""
     data = read_file(path)
     if data[:4] == GLB_MAGIC:
         return _read_glb(data)
@@ -169,16 +166,14 @@ def _read_glb(data: bytes) -> tuple[object, bytes | memoryview | None]:
     if version != 2:
         raise InputError(f"is glTF {version}; wrt reads 2.0", place="header.version")
     if length > len(data):
-        raise InputError(f"is truncated: {length} bytes according to its header, but there are {len(data)}",
-                         place="header.length")
+        raise InputError(f"is truncated: {length} bytes according to its header, but there are {len(data)}", place="header.length")
     chunks: list[tuple[int, memoryview]] = []
     offset = 12
     while offset + 8 <= length:
         size, kind = struct.unpack_from("<II", data, offset)
         if offset + 8 + size > length:
-            raise InputError(f"is truncated: it ends at byte {offset + 8 + size}, the file at {length}",
-                             place=f"chunk {len(chunks)}")
-        if len(chunks) < 2:  # others have no meaning
+            raise InputError(f"is truncated: it ends at byte {offset + 8 + size}, the file at {length}", place=f"chunk {len(chunks)}")
+        if len(chunks) < 2:  # further chunks have no meaning
             chunks.append((kind, memoryview(data)[offset + 8:offset + 8 + size]))
         offset += 8 + size
     if not chunks or chunks[0][0] != _CHUNK_JSON:
@@ -207,7 +202,7 @@ def _check_version(raw: JsonObject) -> None:
     asset = raw.get("asset")
     if not isinstance(asset, dict) or not isinstance(asset.get("version"), str):
         raise InputError("must be a string such as '2.0'", place="asset.version")
-    for key, readable in (("version", r"2\.\d+"), ("minVersion", r"2\.0")):  # a later 2.x may be read as 2.0
+    for key, readable in (("version", r"2\.\d+"), ("minVersion", r"2\.0")):  # readers of 2.0 may read any 2.x
         version = asset.get(key)
         if version is not None and not re.fullmatch(readable, str(version)):
             raise InputError(f"is {short(version)}; wrt reads 2.0", place=f"asset.{key}")
@@ -217,9 +212,8 @@ def _check_required_extensions(required: Iterable[str]) -> None:
     unknown = sorted(set(required) - SUPPORTED_EXTENSIONS - METADATA_EXTENSIONS - DEFAULT_LOOK)
     if unknown:
         codecs = [name for name in unknown if name in _CODECS]
-        hint = f"; there is no decoder for {', '.join(codecs)}: save the file without compression" if codecs else ""
-        raise InputError(f"the file needs {listed(unknown)}, which wrt does not support{hint}",
-                         place="extensionsRequired")
+        hint = f"there is no decoder for {', '.join(codecs)}: save the file without compression" if codecs else None
+        raise InputError(f"the file needs {listed(unknown)}, which wrt does not support", place="extensionsRequired", hint=hint)
 
 
 def _decode_data_uri(uri: str) -> bytes:
@@ -234,7 +228,7 @@ def _decode_data_uri(uri: str) -> bytes:
 
 
 def _local_name(uri: str, place: str) -> str:
-    """Return the relative path of a URI. Raises InputError for a path outside of the folder, because the file is untrusted."""
+    """Return the relative path of a URI. Raises InputError for a path that leaves the folder, because the file is untrusted."""
     try:
         name = unquote_to_bytes(uri).decode("utf-8").replace("\\", "/")
     except UnicodeError:

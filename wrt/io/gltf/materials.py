@@ -1,7 +1,7 @@
 """Images, textures and materials of glTF files, converted to those of a wrt scene.
 
-Three things are left out without a warning. Occlusion textures hold baked ambient shadow, which a ray tracer computes. A ray meets the
-far side of a volume itself, without thickness textures. Back faces are not culled in spite of `doubleSided`, because light would leak.
+Three features are ignored without a warning. Occlusion textures hold baked ambient shadow, which a ray tracer computes. Thickness
+textures are not needed, because rays hit the far side of a volume. Back faces are never culled, because light would leak through them.
 Source: Khronos, glTF 2.0 specification, sections 3.8 (texture data) and 3.9 (materials), and each extension's own text.
 """
 
@@ -25,7 +25,7 @@ _NEAREST = 9728
 _DARKEST = 1e-6  # channel of an attenuation colour; 0 would need infinite absorption
 _ALPHA_MODES = {"OPAQUE": "opaque", "MASK": "mask", "BLEND": "blend"}
 
-# Values with which an extension that wrt does not read has no effect, so that no warning names it.
+# Values with which an unsupported extension has no effect: the warning then leaves it out.
 _NEUTRAL: dict[str, dict[str, Any]] = {
     "KHR_materials_clearcoat": {"clearcoatFactor": 0},
     "KHR_materials_sheen": {"sheenColorFactor": [0, 0, 0]},
@@ -39,7 +39,7 @@ _NEUTRAL: dict[str, dict[str, Any]] = {
 
 
 class Textures:
-    """A cache of textures: each image is decoded once, and equal settings of one image share a Texture."""
+    """Cache of textures: each image is decoded once, and equal settings of one image share a Texture."""
 
     def __init__(self, document: Document) -> None:
         self._document = document
@@ -47,7 +47,7 @@ class Textures:
         self._textures: dict[tuple[Any, ...], Texture] = {}
 
     def texture(self, info: GltfObject, srgb: bool, material: str, place: str) -> Texture | None:
-        """Return the texture of a textureInfo, or None for no textureInfo, no image, or a second set of coordinates."""
+        """Return the texture of a textureInfo. None: there is no textureInfo or no image, or it uses another set than TEXCOORD_0."""
         if info is None:
             return None
         document = self._document
@@ -117,8 +117,7 @@ def _uv_transform(transform: TextureTransform, place: str) -> np.ndarray:
     """Return the (2, 3) matrix that scales, then rotates, then offsets (u, v, 1).
 
     A positive rotation is counter-clockwise in the image, with v downwards, as in the prose, the example and the sample models of
-    KHR_texture_transform. The GLSL listing in its text turns the other way.
-    """
+    KHR_texture_transform. The GLSL listing in that specification rotates the other way."""
     offset_u, offset_v = exactly(transform.offset, 2, f"{place}.offset")
     scale_u, scale_v = exactly(transform.scale, 2, f"{place}.scale")
     cosine, sine = math.cos(transform.rotation), math.sin(transform.rotation)
@@ -126,7 +125,7 @@ def _uv_transform(transform: TextureTransform, place: str) -> np.ndarray:
 
 
 class Materials:
-    """A cache of materials: each index gives one Material object."""
+    """Cache of materials: each index gives one Material object."""
 
     def __init__(self, document: Document) -> None:
         self._document = document
@@ -134,7 +133,7 @@ class Materials:
         self._materials: dict[int | None, Material] = {}
 
     def material(self, index: int | None, place: str) -> Material:
-        """Return the material `index`, or for None the specification's default: white, metallic, rough."""
+        """Return the material `index`; for None the default material of the specification: white, metallic, rough."""
         if index not in self._materials:
             if index is None:
                 self._materials[None] = Material(kind="metallic_roughness", name="default", albedo=(1.0, 1.0, 1.0),
@@ -147,7 +146,10 @@ class Materials:
     def _make(self, source: GltfObject, name: str, place: str) -> Material:
         import pygltflib
 
-        self._name_unread_extensions(source, name)
+        for extension, raw in (source.extensions or {}).items():
+            neutral = _NEUTRAL.get(extension) if isinstance(raw, dict) else None
+            if neutral is None or any(raw.get(key, value) != value for key, value in neutral.items()):
+                self._document.left_out.add_extensions({extension: raw}, "material", name)
         if source.pbrMetallicRoughness is None:
             source.pbrMetallicRoughness = pygltflib.PbrMetallicRoughness()
         fields = self._base(source, name, place)
@@ -159,27 +161,19 @@ class Materials:
         with at(place):
             return Material(**fields)
 
-    def _name_unread_extensions(self, source: GltfObject, name: str) -> None:
-        for extension, raw in (source.extensions or {}).items():
-            neutral = _NEUTRAL.get(extension) if isinstance(raw, dict) else None
-            if neutral is None or any(raw.get(key, value) != value for key, value in neutral.items()):
-                self._document.left_out.add_extensions({extension: raw}, "material", name)
-
     def _base(self, source: GltfObject, name: str, place: str) -> dict[str, Any]:
-        """Return the fields that unlit materials have, too: name, base colour, alpha and sides."""
+        """Return the fields that lit and unlit materials share: name, base colour, alpha and sides."""
         pbr = source.pbrMetallicRoughness
         factor = exactly(pbr.baseColorFactor, 4, f"{place}.pbrMetallicRoughness.baseColorFactor")
         if source.alphaMode not in _ALPHA_MODES:
-            raise InputError(f"must be one of {', '.join(_ALPHA_MODES)}, got {short(source.alphaMode)}",
-                             place=f"{place}.alphaMode")
+            raise InputError(f"must be one of {', '.join(_ALPHA_MODES)}, got {short(source.alphaMode)}", place=f"{place}.alphaMode")
         alpha, cutoff = factor[3], 0.5 if source.alphaCutoff is None else source.alphaCutoff
-        if cutoff > 1.0:  # allowed; then nothing of it is visible
+        if cutoff > 1.0:  # allowed; the surface is then invisible
             alpha, cutoff = 0.0, 1.0
         return {
             "name": name, "albedo": tuple(factor[:3]), "alpha": alpha, "alpha_mode": _ALPHA_MODES[source.alphaMode],
             "alpha_cutoff": cutoff, "two_sided": source.doubleSided,
-            "albedo_texture": self._textures.texture(pbr.baseColorTexture, True, name,
-                                                     f"{place}.pbrMetallicRoughness.baseColorTexture"),
+            "albedo_texture": self._textures.texture(pbr.baseColorTexture, True, name, f"{place}.pbrMetallicRoughness.baseColorTexture"),
         }
 
     def _reflection(self, source: GltfObject, name: str, place: str) -> dict[str, Any]:
@@ -191,21 +185,20 @@ class Materials:
             fields["normal_texture"] = self._textures.texture(normal, False, name, f"{place}.normalTexture")
             fields["normal_scale"] = normal.scale
         if (ior := self._document.extension(source, "KHR_materials_ior", Ior, place)) is not None:
-            if ior.ior == 0.0:  # stands for infinite, kept for an older workflow
+            if ior.ior == 0.0:  # means an infinite index, for older specular-glossiness materials
                 self._document.left_out.add("KHR_materials_ior of 0", "material", name)
             else:
                 fields["ior"] = ior.ior
         return fields
 
     def _transmission(self, source: GltfObject, name: str, place: str) -> dict[str, Any]:
-        """Return the fields of glass: a thin pane unless there is a volume with a thickness."""
+        """Return the fields of glass: a thin pane, or solid glass if KHR_materials_volume gives a thickness above 0."""
         transmission = self._document.extension(source, "KHR_materials_transmission", Transmission, place)
         if transmission is None or transmission.transmissionFactor == 0.0:
             return {}
         fields: dict[str, Any] = {"transmission": transmission.transmissionFactor, "thin": True}
         fields["transmission_texture"] = self._textures.texture(
-            transmission.transmissionTexture, False, name,
-            f"{place}.extensions.KHR_materials_transmission.transmissionTexture")
+            transmission.transmissionTexture, False, name, f"{place}.extensions.KHR_materials_transmission.transmissionTexture")
         volume = self._document.extension(source, "KHR_materials_volume", Volume, place)
         if volume is not None and volume.thicknessFactor > 0.0:
             with at(f"{place}.extensions.KHR_materials_volume"):
@@ -221,13 +214,13 @@ class Materials:
         if source.emissiveTexture is None:
             return {"emission": emission}
         texture = self._textures.texture(source.emissiveTexture, True, name, f"{place}.emissiveTexture")
-        if texture is None:  # it could not be read, and without it the whole surface would glow
+        if texture is None:  # left out with a warning; without a texture the whole surface would glow
             return {}
         return {"emission": emission, "emission_texture": texture}
 
 
 def absorption(volume: Volume) -> Color:
-    """Beer-Lambert's coefficient per unit of world length (KHR_materials_volume): exp(-a * distance) is the colour."""
+    """Return the coefficient a (Beer-Lambert) per unit of world length: exp(-a attenuationDistance) is the attenuationColor."""
     color = as_vector(volume.attenuationColor, "attenuationColor", low=0.0, high=1.0)
     if math.isinf(volume.attenuationDistance):
         return BLACK
@@ -238,9 +231,8 @@ def absorption(volume: Volume) -> Color:
 
 def _unlit(fields: dict[str, Any]) -> dict[str, Any]:
     """Return the fields of a surface that emits its base colour and lights nothing."""
-    base, texture = fields["albedo"], fields["albedo_texture"]
+    texture = fields["albedo_texture"]
     return fields | {
-        "kind": "diffuse", "albedo": BLACK, "emission": base, "emission_texture": texture, "two_sided": True,
-        "emits_light": False,
-        "albedo_texture": texture if fields["alpha_mode"] != "opaque" else None,  # its alpha still counts
+        "kind": "diffuse", "albedo": BLACK, "emission": fields["albedo"], "emission_texture": texture, "two_sided": True,
+        "emits_light": False, "albedo_texture": texture if fields["alpha_mode"] != "opaque" else None,  # its alpha still counts
     }

@@ -1,4 +1,4 @@
-"""The meshes of a glTF file, and the instances of a node.
+"""Meshes of a glTF file, and instances of its nodes.
 
 Source: Khronos, glTF 2.0 specification, section 3.7; EXT_mesh_gpu_instancing, KHR_mesh_quantization.
 """
@@ -19,10 +19,10 @@ from wrt.scene.clean import clean
 from wrt.scene.mesh import Mesh, unit_rows
 from wrt.scene.values import require_count
 
-# Attributes that wrt reads, that other warnings name (skins, textures), or that belong to an application (underscore). A warning names
-# TANGENT if there is a normal map: wrt makes tangents from texture coordinates.
-_NAMED_ELSEWHERE = ("POSITION", "NORMAL", "TANGENT", "TEXCOORD_", "JOINTS_", "WEIGHTS_", "_")
-# Attributes of a node's instances, with their defaults.
+# Attributes that need no warning here: wrt reads them, another warning names them (skins, textures, TANGENT beside a normal map), or an
+# application defines them (underscore).
+_NO_WARNING = ("POSITION", "NORMAL", "TANGENT", "TEXCOORD_", "JOINTS_", "WEIGHTS_", "_")
+# Attributes of a node's instances, with their types and defaults.
 _INSTANCE_ATTRIBUTES: dict[str, tuple[str, tuple[float, ...]]] = {
     "TRANSLATION": ("VEC3", (0.0, 0.0, 0.0)),
     "ROTATION": ("VEC4", (0.0, 0.0, 0.0, 1.0)),
@@ -44,7 +44,7 @@ _NOT_TRIANGLES = {0: "points", 1: "lines", 2: "lines", 3: "lines"}
 
 
 class Meshes:
-    """A cache of meshes: primitives with the same accessors and mode share a Mesh."""
+    """Cache of meshes: primitives with the same accessors and mode share a Mesh."""
 
     def __init__(self, document: Document) -> None:
         self._document = document
@@ -53,7 +53,7 @@ class Meshes:
         self._instances = 0
 
     def mesh(self, primitive: GltfObject, name: str, place: str) -> Mesh | None:
-        """Return the mesh of a primitive, or None if no triangle has an area."""
+        """Return the mesh of a primitive, or None if it has no triangle with an area."""
         left_out, attributes = self._document.left_out, primitive.attributes
         if primitive.mode not in TRIANGULATE and primitive.mode not in _NOT_TRIANGLES:
             raise InputError(f"must be 0 to 6, got {primitive.mode}", place=f"{place}.mode")
@@ -61,7 +61,7 @@ class Meshes:
             left_out.add(_NOT_TRIANGLES.get(primitive.mode, "primitives without POSITION"), "mesh", name)
             return None
         for attribute in sorted(attributes):
-            if not attribute.startswith(_NAMED_ELSEWHERE):
+            if not attribute.startswith(_NO_WARNING):
                 left_out.add(attribute, "mesh", name)
         if primitive.targets:
             left_out.add("morph targets", "mesh", name)
@@ -79,8 +79,7 @@ class Meshes:
         assert positions is not None
         for attribute, array in (("NORMAL", normals), ("TEXCOORD_0", uvs)):
             if array is not None and len(array) != len(positions):
-                raise InputError(f"has {len(array)} elements, POSITION has {len(positions)}",
-                                 place=f"{place}.attributes.{attribute}")
+                raise InputError(f"has {len(array)} elements, but POSITION has {len(positions)}", place=f"{place}.attributes.{attribute}")
         indices = self._indices(primitive, len(positions), place)
         if primitive.mode == 4 and len(indices) % 3:
             self._document.left_out.add("incomplete last triangles", "mesh", name)
@@ -88,7 +87,7 @@ class Meshes:
             cleaned = clean(positions, TRIANGULATE[primitive.mode](indices), normals, uvs)
             if not len(cleaned.faces):
                 return None
-            normals = None if cleaned.normals is None else unit_rows(cleaned.normals)  # quantised normals are off by a percent
+            normals = None if cleaned.normals is None else unit_rows(cleaned.normals)  # the length of quantised ones is off by 1 %
             return Mesh(cleaned.vertices, cleaned.faces, normals, cleaned.uvs, dropped=cleaned.dropped, name=name)
 
     def _attribute(self, primitive: GltfObject, attribute: str, kind: str, place: str) -> np.ndarray | None:
@@ -107,10 +106,10 @@ class Meshes:
         if indices.max() >= count:
             i = int(np.argmax(indices >= count))
             raise InputError(f"index {i} is {int(indices[i])}, but there are {count} vertices", place=where)
-        return indices.astype(np.int32)  # accessors end at 2^31 - 1
+        return indices.astype(np.int32)  # no overflow: an accessor has at most 2^31 - 1 elements
 
     def instances(self, node: GltfObject, place: str) -> np.ndarray | None:
-        """Return transforms (N, 4, 4) of a node's instances relative to the node, or None without instances."""
+        """Return the transforms (N, 4, 4) of a node's instances, instance to node, or None if the node has no instances."""
         instancing = self._document.extension(node, "EXT_mesh_gpu_instancing", Instancing, place)
         if instancing is None:
             return None
@@ -120,7 +119,7 @@ class Meshes:
                  for name, index in instancing.attributes.items() if name in wanted}
         counts = {len(array) for array in found.values()}
         if len(counts) != 1:
-            raise InputError(f"must hold accessors of one length, got {sorted(counts) or 'none'}", place=place)
+            raise InputError(f"must hold accessors of equal length, got {sorted(counts) or 'none'}", place=place)
         if "ROTATION" in found and not found["ROTATION"].any(axis=1).all():
             raise InputError("must hold unit quaternions, but one is zero", place=f"{place}.ROTATION")
         count = counts.pop()

@@ -13,10 +13,9 @@ from wrt.scene.values import as_transform
 
 
 def walk(document: Document) -> Iterator[tuple[int, GltfObject, np.ndarray]]:
-    """Yield index, node and matrix to world space (4, 4) float64 of each node of the default scene, parents before children.
+    """Yield index, node and matrix to world space, (4, 4) float64, of each node of the default scene, parents before children.
 
-    Raises InputError if any node of the file has two parents or is its own ancestor.
-    """
+    Raises InputError if any node of the file has two parents or is its own ancestor."""
     _check_forest(document)
     stack = [(index, place, np.eye(4)) for index, place in reversed(_roots(document))]
     seen: set[int] = set()
@@ -26,7 +25,7 @@ def walk(document: Document) -> Iterator[tuple[int, GltfObject, np.ndarray]]:
         if index in seen:
             raise InputError(f"nodes[{index}] is in the scene twice", place=place)
         seen.add(index)
-        with np.errstate(over="ignore", invalid="ignore"):  # the objects of the node report an overflow
+        with np.errstate(over="ignore", invalid="ignore"):  # `Object` refuses infinite matrices
             world = parent @ local_matrix(node, f"nodes[{index}]")
         yield index, node, world
         children = [(child, f"nodes[{index}].children[{i}]", world) for i, child in enumerate(node.children)]
@@ -38,10 +37,10 @@ def _roots(document: Document) -> list[tuple[int, str]]:
     if gltf.scene is None and not gltf.scenes:
         children = {child for node in gltf.nodes for child in node.children}
         return [(index, "nodes") for index in range(len(gltf.nodes)) if index not in children]
-    number = gltf.scene or 0
-    scene = document.item("scenes", number, "scene")
-    document.left_out.add_extensions(scene.extensions, "scene", scene.name or str(number))
-    return [(index, f"scenes[{number}].nodes[{i}]") for i, index in enumerate(scene.nodes)]
+    first = gltf.scene or 0
+    scene = document.item("scenes", first, "scene")
+    document.left_out.add_extensions(scene.extensions, "scene", scene.name or str(first))
+    return [(index, f"scenes[{first}].nodes[{i}]") for i, index in enumerate(scene.nodes)]
 
 
 def _check_forest(document: Document) -> None:
@@ -54,7 +53,7 @@ def _check_forest(document: Document) -> None:
             if child in parent:
                 raise InputError(f"nodes[{child}] has two parents, the first is nodes[{parent[child]}]", place=place)
             parent[child] = index
-    # Nodes with one parent each that no root reaches are on a cycle or below one.
+    # Here every node has at most one parent, so that a node that no root reaches is on a cycle or below a cycle.
     reached = [index for index in range(len(nodes)) if index not in parent]
     for index in reached:
         reached += nodes[index].children
@@ -77,10 +76,7 @@ def local_matrix(node: GltfObject, place: str) -> np.ndarray:
 
 
 def compose(translation: np.ndarray, rotation: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Return matrices (N, 4, 4) translation * rotation * scale from (N, 3), (N, 4) and (N, 3).
-
-    The rotations are quaternions x, y, z, w of any length but 0.
-    """
+    """Return matrices (N, 4, 4), translation * rotation * scale, from (N, 3), quaternions x, y, z, w (N, 4) of any length, and (N, 3)."""
     rotation = rotation / np.abs(rotation).max(axis=1, keepdims=True)  # the square of the length must not underflow
     x, y, z, w = (rotation / np.linalg.norm(rotation, axis=1, keepdims=True)).T
     columns = [

@@ -1,8 +1,8 @@
 """glTF 2.0 files (.gltf, .glb) as wrt scenes: the node graph, meshes, instances, cameras and lights.
 
-Positions, cameras and lights keep the file's units. Light intensities (candela, lux) count as radiometric ones, as in most renderers. A
-camera's aspect ratio and clipping planes are ignored. Skinned and animated objects have their rest pose. Without a default scene the
-first one is read, and without scenes every root node.
+Positions, cameras and lights keep the file's units. Photometric light intensities (candela, lux) are read as radiometric ones, as in
+most renderers. A camera's aspect ratio and clipping planes are ignored. Skinned and animated objects have their rest pose. Without a
+default scene the first scene is read, and without scenes every root node.
 Source: Khronos, glTF 2.0 specification, section 3; KHR_lights_punctual, EXT_mesh_gpu_instancing, KHR_mesh_quantization.
 """
 
@@ -33,27 +33,23 @@ from wrt.scene.values import require_count
 
 
 def load_gltf(path: PathLike, *, staged: bool = True) -> Scene:
-    """Read a glTF 2.0 file. Meshes, materials and textures that it shares are shared objects in the scene.
+    """Read a glTF 2.0 file. The scene shares the meshes, materials and textures that the file shares.
 
-    staged: add a camera or lights to a file without them (wrt.scene.defaults), and refuse a file without triangles; False: for a file
-    that another one includes. One SceneWarning names everything left out or added. Settings are the defaults, but glass_shadows is
-    "tinted" if the file has solid glass (KHR_materials_volume). Raises InputError with the file and the place in its JSON.
-    """
+    staged: add a camera or lights to a file without them (wrt.scene.defaults), and refuse a file without triangles; False for a file
+    that a scene file includes. One SceneWarning names everything left out or added. Settings are the defaults, but glass_shadows is
+    "tinted" if the file has solid glass (KHR_materials_volume). Raises InputError with the file and the place in its JSON."""
     with at(path=path):
         document = Document(path)
         scene = _Reader(document).scene()
-        left_out = [f"not supported and left out: {left_out}" for left_out in [document.left_out.sentence()] if left_out]
+        left_out = [f"not supported and left out: {features}" for features in [document.left_out.sentence()] if features]
         if not scene.objects and (staged or not (scene.lights or scene.cameras)):
             raise InputError("; ".join(["the scene has no triangles", *left_out]))
         scene, added = stage(scene) if staged else (scene, [])
         if staged and not scene.lights:
-            added.append(f"it has no lights but {emission_named(scene)}: what that does not reach is black")
+            added.append(f"it has no lights but {emission_named(scene)}: surfaces that it does not reach are black")
     if left_out or added:
         warn(f"{os.fspath(path)}: {'; '.join(left_out + added)}")
     return scene
-
-
-# --- lights -----------------------------------------------------------------------------------------------------------
 
 
 LIGHTS: dict[str, Callable[..., Light]] = {
@@ -62,9 +58,6 @@ LIGHTS: dict[str, Callable[..., Light]] = {
     "spot": lambda place, direction, color, cone, name: SpotLight(
         place, direction, color, cone.innerConeAngle, cone.outerConeAngle, name),
 }
-
-
-# --- the scene --------------------------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -77,7 +70,7 @@ class _Reader:
     def __post_init__(self) -> None:
         self._meshes = Meshes(self.document)
         self._materials = Materials(self.document)
-        self._parts: dict[int, list[tuple[Mesh, Material]]] = {}  # by the mesh's index
+        self._parts: dict[int, list[tuple[Mesh, Material]]] = {}  # by the index of the mesh in the file
         lights = self.document.extension(self.document.gltf, "KHR_lights_punctual", PunctualLights, "")
         self._punctual = lights.lights if lights else []
 
@@ -97,7 +90,7 @@ class _Reader:
             if extension not in left_out:
                 left_out.add_extensions({extension: raw}, "file", document.path.name)
         scene = Scene(tuple(self.objects), (), tuple(self.lights), tuple(self.cameras), name=document.path.stem)
-        # Other viewers light objects inside of glass; shadow rays that pass through it do, too.
+        # As in other viewers, light then reaches objects inside of glass.
         solid_glass = any(material.transmission > 0.0 and not material.thin for material in scene.materials)
         return replace(scene, settings=Settings(glass_shadows="tinted" if solid_glass else "opaque"))
 
@@ -116,12 +109,12 @@ class _Reader:
                 require_count(len(self.objects) + len(transforms), "objects")
                 self.objects += [Object(mesh, (material,), transform, name=name) for transform in transforms]
 
-    def _parts_of(self, source: GltfObject, number: int) -> Iterator[tuple[Mesh, Material]]:
+    def _parts_of(self, source: GltfObject, index: int) -> Iterator[tuple[Mesh, Material]]:
         """Yield the mesh and the material of each primitive with triangles; called once for all nodes with this mesh."""
-        left_out, mesh_name = self.document.left_out, source.name or f"mesh {number}"
+        left_out, mesh_name = self.document.left_out, source.name or f"mesh {index}"
         for i, primitive in enumerate(source.primitives):
-            where = f"meshes[{number}].primitives[{i}]"
-            # A compressed copy beside plain accessors has no effect; a file without plain accessors would require the extension.
+            where = f"meshes[{index}].primitives[{i}]"
+            # A compressed copy of plain accessors has no effect: a file without plain accessors would require the extension.
             extensions = {k: v for k, v in (primitive.extensions or {}).items() if k != "KHR_draco_mesh_compression"}
             left_out.add_extensions(extensions, "mesh", mesh_name)
             mesh = self._meshes.mesh(primitive, mesh_name, where)
@@ -132,7 +125,7 @@ class _Reader:
                 yield mesh, material
 
     def _placements(self, node: GltfObject, world: np.ndarray, name: str, place: str) -> np.ndarray:
-        """Return matrices to world space (N, 4, 4) of a node's mesh or its instances, except for those with determinant 0."""
+        """Return the matrices to world space (N, 4, 4) of a node's mesh or its instances, without singular matrices."""
         instances = self._meshes.instances(node, place)
         with np.errstate(over="ignore", invalid="ignore"):
             transforms = world[None] if instances is None else world @ instances
@@ -147,8 +140,7 @@ class _Reader:
         self.document.left_out.add_extensions(source.extensions, "camera", name)
         lens = getattr(source, source.type) if source.type in ("perspective", "orthographic") else None
         if lens is None:
-            raise InputError("must be 'perspective' or 'orthographic', with the object of that name",
-                             place=f"cameras[{node.camera}].type")
+            raise InputError("must be 'perspective' or 'orthographic', with the object of that name", place=f"cameras[{node.camera}].type")
         with at(f"{place}.camera"):
             self.cameras.append(Camera(world, lens.yfov, name=name) if source.type == "perspective" else
                                 OrthographicCamera(world, 2.0 * lens.ymag, name=name))

@@ -1,7 +1,7 @@
-"""The schema of glTF documents: JSON values become typed objects, each checked against its declared type.
+"""Schema of glTF documents: JSON values become dataclass instances, each value checked against its declared type.
 
-The core's objects are pygltflib's dataclasses; the extensions that wrt reads have theirs here. Its own decoder is not used: it
-turns 1.5 and "1" into the index 1, and its errors have no place in the file.
+pygltflib has the dataclasses of core glTF, this file those of the extensions that wrt reads. The decoder of pygltflib is not used: it
+turns 1.5 and "1" into the index 1, and its errors name no place in the file.
 """
 
 from __future__ import annotations
@@ -119,9 +119,8 @@ _SCALARS: dict[Any, tuple[str, tuple[type, ...]]] = {
 def read_as(hint: Any, raw: object, place: str) -> Any:
     """Convert the JSON value `raw` to the type `hint`: a scalar, a list, a dict, or a dataclass (here or of pygltflib).
 
-    Unknown keys and `extras` are left out; null is a missing key. Raises InputError with the place of a value of another type, a number
-    that is not finite, or a missing key that is required.
-    """
+    Unknown keys and `extras` are left out; null counts as a missing key. Raises InputError with the place of a value of another type, of
+    a number that is not finite, or of a required key that is missing."""
     hint = _without_none(hint)
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if hint in _SCALARS:
@@ -134,13 +133,13 @@ def read_as(hint: Any, raw: object, place: str) -> Any:
         raise _wrong("an object", raw, place)
     if origin is dict:
         return raw if arguments[1] is Any else {k: read_as(arguments[1], v, f"{place}.{k}") for k, v in raw.items()}
-    if hint.__name__ == "Attributes":  # the only class of pygltflib that is no dataclass: accessors by name
+    if hint.__name__ == "Attributes":  # accessors by name, in the only class of pygltflib that is no dataclass
         return {k: read_as(int, v, f"{place}.{k}") for k, v in raw.items()}
     return _object(hint, raw, place)
 
 
 def exactly(values: list[float], count: int, place: str) -> list[float]:
-    """Return `values`. Raises InputError at `place` unless there are `count` of them."""
+    """Return `values` unchanged. Raises InputError at `place` unless there are `count` values."""
     if len(values) != count:
         raise InputError(f"must hold {count} numbers, got {len(values)}", place=place)
     return values
@@ -150,9 +149,7 @@ def _object(cls: Any, raw: dict[str, Any], place: str) -> Any:
     for name in _required(cls):
         if raw.get(name) is None:
             raise InputError("is required", place=_join(place, name))
-    values = {name: read_as(hint, raw[name], _join(place, name))
-              for name, hint in _fields(cls).items() if raw.get(name) is not None}
-    return cls(**values)
+    return cls(**{name: read_as(hint, raw[name], _join(place, name)) for name, hint in _fields(cls).items() if raw.get(name) is not None})
 
 
 @functools.cache

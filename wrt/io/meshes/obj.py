@@ -1,8 +1,8 @@
 """Wavefront OBJ text: positions, normals, texture coordinates and named groups of faces.
 
-Why not trimesh 5.2: it fails with an IndexError on relative indices (`f -4 -3 -2 -1`), sorts the faces by material, and loses the
-names of materials without an .mtl file. If positions and normals are indexed apart, it keeps one normal for each position. Scene files
-refer to a material's faces and their order.
+trimesh 5.2 is not used, because scene files refer to materials and to the order of faces. It sorts faces by material and loses the names
+of materials without an .mtl file. It fails with an IndexError on relative indices (`f -4 -3 -2 -1`). If positions and normals are indexed
+apart, it keeps one normal for each position.
 """
 
 from __future__ import annotations
@@ -22,33 +22,33 @@ from wrt.core.files import read_file, utf8
 from wrt.io.mesh_file import RawMesh
 from wrt.io.polygons import triangulate
 
-# The parts of a corner `v/vt/vn`, each with the count of numbers that wrt keeps of its lines.
-_KEEP = {"v": 3, "vt": 2, "vn": 3}
+# Keywords of the parts of a corner `v/vt/vn`, with the count of numbers that wrt reads from a line with that keyword.
+_WIDTHS = {"v": 3, "vt": 2, "vn": 3}
 _CORNER = "face corner {} is not v, v/vt, v//vn or v/vt/vn"
 
 
 class _Text:
-    """The lines of an OBJ file by their keyword, with absolute indices."""
+    """Content of an OBJ file by keyword, with absolute indices."""
 
     def __init__(self) -> None:
-        self.numbers = {key: array("d") for key in _KEEP}
-        self.lines = {key: array("q") for key in _KEEP}
+        self.numbers = {key: array("d") for key in _WIDTHS}
+        self.lines = {key: array("q") for key in _WIDTHS}
         self.counts, self.face_lines = array("q"), array("q")
-        # Each distinct corner text with its index in the order of the file, and the index of every corner.
-        self.different: dict[str, int] = defaultdict(count().__next__)
+        # Index of each distinct corner text, in the order of the file; and the index of every corner's text.
+        self.distinct: dict[str, int] = defaultdict(count().__next__)
         self.corners = array("i")
-        # For each keyword the distinct names with their index ("" is 0), and for each span its first polygon and its name's index. Of
-        # several spans that begin at one polygon, the last counts.
+        # For each keyword: the index of each distinct name ("" is 0); and for each span of polygons the first polygon and the index of
+        # its name. If several spans begin at one polygon, the last one counts.
         self.names: dict[str, dict[str, int]] = {
             key: defaultdict(count(1).__next__, {"": 0}) for key in ("usemtl", "g", "o")}
         self.spans = {key: (array("q"), array("i")) for key in self.names}
-        self.absent: dict[str, None] = {}  # vt or vn, if faces refer to them and the file has none
+        self.absent: dict[str, None] = {}  # vt or vn, if faces refer to it and the file has no such lines
 
     def fail(self, line: int, message: str) -> NoReturn:
         raise InputError(message, place=f"line {line}")
 
     def read(self, data: bytes) -> None:
-        pending, number = "", 0  # pending: lines that continue
+        pending, number = "", 0  # pending: the lines before that end in a backslash
         for number, line in enumerate(io.TextIOWrapper(io.BytesIO(data), "utf-8", "replace"), 1):
             if line.endswith(("\\\n", "\\")):
                 pending += line.removesuffix("\n")[:-1] + " "
@@ -62,7 +62,7 @@ class _Text:
         if not words:
             return
         key = words[0]
-        if key in _KEEP:
+        if key in _WIDTHS:
             self._numbers(key, words, number)
         elif key == "f":
             self._corners(words[1:], number)
@@ -70,17 +70,17 @@ class _Text:
             self._span(key, line.split(None, 1)[1].strip() if len(words) > 1 else "")
 
     def _numbers(self, key: str, words: list[str], line: int) -> None:
-        keep = _KEEP[key]
-        given = words[1:keep + 1]
-        if len(given) < keep:
-            if key != "vt" or not given:
-                self.fail(line, f"{key} needs {keep} numbers, got {len(given)}")
-            given.append("0")  # a 1D texture coordinate
+        width = _WIDTHS[key]
+        values = words[1:width + 1]
+        if len(values) < width:
+            if key != "vt" or not values:
+                self.fail(line, f"{key} needs {width} numbers, got {len(values)}")
+            values.append("0")  # a 1D texture coordinate
         self.lines[key].append(line)
         try:
-            self.numbers[key].extend(map(float, given))
+            self.numbers[key].extend(map(float, values))
         except ValueError:
-            bad = given[len(self.numbers[key]) % keep]  # the numbers before it were appended
+            bad = values[len(self.numbers[key]) % width]  # the numbers before it were appended
             self.fail(line, f"{key} holds {short(bad)}, which is not a number")
 
     def _corners(self, corners: list[str], line: int) -> None:
@@ -88,17 +88,17 @@ class _Text:
             corners = [self._absolute(corner, line) for corner in corners]
         self.counts.append(len(corners))
         self.face_lines.append(line)
-        self.corners.extend(map(self.different.__getitem__, corners))
+        self.corners.extend(map(self.distinct.__getitem__, corners))
 
     def _span(self, key: str, name: str) -> None:
-        starts, which = self.spans[key]
+        starts, name_index = self.spans[key]
         starts.append(len(self.counts))
-        which.append(self.names[key][name])
+        name_index.append(self.names[key][name])
 
     def _absolute(self, corner: str, line: int) -> str:
-        """Replace relative indices in a corner (-1 is the latest) by absolute ones (1 is the first)."""
+        """Replace relative indices in a corner (-1 is the latest element) by absolute indices (1 is the first element)."""
         parts = corner.split("/")
-        for i, (part, key) in enumerate(zip(parts, _KEEP, strict=False)):
+        for i, (part, key) in enumerate(zip(parts, _WIDTHS, strict=False)):
             if part.startswith("-"):
                 count = len(self.lines[key])
                 try:
@@ -106,25 +106,24 @@ class _Text:
                 except ValueError:
                     self.fail(line, _CORNER.format(short(corner)))
                 if not count and key != "v":
-                    continue  # `triples` knows whether the file has any
+                    continue  # lines may follow; if none does, `triples` leaves the index out
                 if not -count <= index < 0:
-                    self.fail(line, f"face corner {short(corner)}: {key} index {short(index)}, but only {count} {key} stand before")
+                    self.fail(line, f"face corner {short(corner)}: {key} index {short(index)}, but only {count} {key} lines before it")
                 parts[i] = str(count + 1 + index)
         return "/".join(parts)
 
     def array(self, key: str) -> np.ndarray:
         """Return the numbers of all `key` lines, (N, 2 or 3) float64."""
-        return np.frombuffer(self.numbers[key], np.float64).reshape(-1, _KEEP[key])
+        return np.frombuffer(self.numbers[key], np.float64).reshape(-1, _WIDTHS[key])
 
     def triples(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the distinct corners (U, 3) int64 as zero-based v, vt, vn (-1: none), and the index of each corner (C,) int32.
+        """Return zero-based v, vt, vn (-1: none) of the distinct corners, (U, 3) int64; and for each corner its row there, (C,) int32.
 
-        Corners are sorted by v first, so that the vertices keep the order of the file.
-        """
+        The rows are sorted by v first, so that the vertices keep the order of the file."""
         index = np.frombuffer(self.corners, np.int32)
-        different = np.zeros((len(self.different), 3), dtype=np.int64)
-        keys = list(_KEEP)
-        for i, corner in enumerate(self.different):
+        triples = np.zeros((len(self.distinct), 3), dtype=np.int64)
+        keys = list(_WIDTHS)
+        for i, corner in enumerate(self.distinct):
             for k, part in enumerate(corner.split("/")):
                 if k > 2 or (k == 0 and not part):
                     self.fail(self._first_line(index, i), _CORNER.format(short(corner)))
@@ -132,27 +131,27 @@ class _Text:
                     self.absent[keys[k]] = None
                 elif part:
                     number = int(part) if part.isdecimal() and len(part) < 19 else 0
-                    different[i, k] = number
+                    triples[i, k] = number
                     if not 1 <= number <= len(self.lines[keys[k]]):
                         self.fail(self._first_line(index, i), f"face corner {short(corner)}: {keys[k]} index {part[:30]} is not "
                                                               f"in 1 to {len(self.lines[keys[k]])}")
-        order = np.lexsort(different.T[::-1])
+        order = np.lexsort(triples.T[::-1])
         rank = np.empty(len(order), dtype=np.int32)
         rank[order] = np.arange(len(order))
-        return different[order] - 1, rank[index]
+        return triples[order] - 1, rank[index]
 
     def _first_line(self, index: np.ndarray, corner: int) -> int:
         face = np.searchsorted(np.cumsum(self.counts), np.argmax(index == corner), side="right")
         return self.face_lines[int(face)]
 
     def groups(self) -> tuple[tuple[str, ...], np.ndarray | None]:
-        """Return the names of the parts and each polygon's part: by material, else by group, else by object; () if there are none."""
+        """Return the names of the groups, and the index of each polygon's group or None: from usemtl, else from g, else from o lines."""
         key = next((key for key, (starts, _) in self.spans.items() if starts), None)
         if key is None:
             return (), None
-        starts, which = self.spans[key]
-        names, numbers = list(self.names[key]), np.concatenate([[0], np.frombuffer(which, np.int32)])
-        polygon_group = numbers[np.searchsorted(starts, np.arange(len(self.counts)), side="right")]
+        starts, name_index = self.spans[key]
+        names, of_span = list(self.names[key]), np.concatenate([[0], np.frombuffer(name_index, np.int32)])
+        polygon_group = of_span[np.searchsorted(starts, np.arange(len(self.counts)), side="right")]
         used, polygon_group = np.unique(polygon_group, return_inverse=True)
         return tuple(names[i] for i in used), polygon_group
 
@@ -161,18 +160,17 @@ def read(path: Path) -> RawMesh:
     """Read the faces of an OBJ file in its order; nothing is merged.
 
     Each distinct combination of position, texture coordinate and normal becomes a vertex. A corner without a normal gets a zero normal
-    (flat there), one without a texture coordinate (0, 0). If the file has no vt, or no vn, at all, a SceneWarning says that their indices
-    are left out. Groups are the spans of `usemtl`, else of `g`, else of `o`; faces before the first have the name "". Vertex colours,
-    lines, points and curves are not read. Raises InputError with the line for words that are no numbers, indices out of range and
-    positions that are not finite.
-    """
+    (flat shading), a corner without a texture coordinate gets (0, 0). If faces refer to vt or vn lines and the file has none, their
+    indices are left out with a SceneWarning. Groups are the spans of `usemtl`, else of `g`, else of `o`; faces before the first span
+    are in the group "". Vertex colours, lines, points and curves are not read. Raises InputError with the line for words that are no
+    numbers, indices out of range and positions that are not finite."""
     text = _Text()
     text.read(utf8(read_file(path)))
     positions = text.array("v")
     corner_triples, corners = text.triples()
-    text.different.clear()
+    text.distinct.clear()
     if text.absent:
-        warn(f"{path}: indices of {' and '.join(text.absent)} in its faces are left out: the file has no such lines")
+        warn(f"{path}: the indices of {' and '.join(text.absent)} in its faces are left out: the file has no such lines")
     counts = np.array(text.counts, dtype=np.int64)
 
     with np.errstate(over="ignore"):
@@ -200,7 +198,7 @@ def read(path: Path) -> RawMesh:
 
 
 def _gather(values: np.ndarray, index: np.ndarray) -> np.ndarray | None:
-    """Return values[index], zero where the index is -1; None if it is -1 everywhere."""
+    """Return values[index], with zeros for an index of -1; None if all are -1."""
     if not (index >= 0).any():
         return None
     return np.where((index >= 0)[:, None], values[index], 0.0)

@@ -1,7 +1,7 @@
 """PLY files (Stanford polygon format), text and binary: positions, normals, texture coordinates, faces of any size, strips.
 
-Why not trimesh 5.2: it refuses binary files that mix triangles with other polygons ("unexpected length"). It puts the second halves of all
-quads behind the first ones, and computes normals anew for files with texture coordinates.
+trimesh 5.2 is not used. It refuses binary files that mix triangles with other polygons ("unexpected length"). It puts the second halves
+of all quads after all first halves, and recomputes the normals of files with texture coordinates.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from array import array
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,19 +31,19 @@ _SIZES = [name for name, kind in _TYPES.items() if kind[0] != "f"]  # types of a
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _UV_NAMES = (("u", "v"), ("s", "t"), ("texture_u", "texture_v"), ("texcoord_u", "texcoord_v"))
 _INDEX_NAMES = ("vertex_indices", "vertex_index")
-BYTES_AT_ONCE = 1 << 18  # of text that become numbers together
+BYTES_AT_ONCE = 1 << 18  # of text, read and converted together
 _WORD = re.compile(rb"\S+")
 
 
 class _Property(NamedTuple):
     name: str
     type: str  # NumPy's name without byte order
-    count_type: str | None = None  # of a list
+    count_type: str | None = None  # type of a list's length; None: not a list
 
 
 @dataclass
 class _Element:
-    """An `element` of the header, with the values of each property in sequence and their count in each row."""
+    """An `element` of the header. By property: its values of all rows in sequence, and the number of values in each row."""
 
     name: str
     rows: int
@@ -53,23 +53,21 @@ class _Element:
 
 
 def read(path: Path) -> RawMesh:
-    """Read a PLY file's vertices and faces in the order of the file; larger faces are triangulated.
+    """Read the vertices and faces of a PLY file in the order of the file; faces of more than three corners are triangulated.
 
     The triangles of `tristrips` follow the faces; -1 begins a new strip. Vertex normals are nx, ny, nz. Texture coordinates are a
     vertex's u, v (or s, t or texture_u, texture_v), else the `texcoord` lists of faces; a vertex is split if its faces disagree. Colours
     and other properties are not read. Raises InputError with the header's line, or with the element and row of a value that is missing,
-    not a number, or out of range.
-    """
-    source = _Source(path)
-    elements = {element.name: element for element in source.elements}
+    not a number, or out of range."""
+    elements = {element.name: element for element in _Source(path).elements}
     if "vertex" not in elements or not {"x", "y", "z"} <= elements["vertex"].values.keys():
-        source.fail(f"holds no vertices with x, y and z (its elements: {', '.join(elements) or 'none'})")
+        raise InputError(f"has no vertices with x, y and z (its elements: {', '.join(elements) or 'none'})")
     vertex = elements["vertex"].values
     with np.errstate(over="ignore", invalid="ignore"):
         vertices = np.stack([vertex[axis] for axis in "xyz"], axis=1).astype(np.float32)
-    corners, counts, texcoord = _faces(source, elements.get("face"), len(vertices))
+    corners, counts, texcoord = _faces(elements.get("face"), len(vertices))
     if "tristrips" in elements:
-        strips = _strips(source, elements["tristrips"], len(vertices))
+        strips = _strips(elements["tristrips"], len(vertices))
         corners, counts = np.concatenate([corners, strips]), np.concatenate([counts, np.full(len(strips) // 3, 3)])
         texcoord = None  # strips have none
 
@@ -77,7 +75,7 @@ def read(path: Path) -> RawMesh:
     referenced[corners] = True
     finite = np.isfinite(vertices)
     if not finite.all() and len(bad := np.flatnonzero(referenced & ~finite.all(axis=1))):
-        source.fail(f"position {vertices[bad[0]].tolist()} is not finite ({len(bad)} in all)", f"vertex {bad[0]}")
+        raise InputError(f"position {vertices[bad[0]].tolist()} is not finite ({len(bad)} in all)", place=f"vertex {bad[0]}")
 
     normals = _columns(vertex, ("nx", "ny", "nz"))
     uvs = next((uv for names in _UV_NAMES if (uv := _columns(vertex, names)) is not None), None)
@@ -101,64 +99,69 @@ def _columns(columns: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarr
     return np.stack([columns[name] for name in names], axis=1).astype(np.float64)
 
 
-def _faces(source: _Source, face: _Element | None, vertices: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+def _faces(face: _Element | None, vertices: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Return the corners of all faces (C,), the corner count of each face (P,), and texture coordinates (C, 2) or None."""
     if face is None or face.rows == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64), None
-    given, counts = _indices(source, face)
-    corners = _within(source, given, counts, vertices, "face")
+    corners, counts = _indices(face)
+    corners = _within(corners, counts, vertices, "face")
     texcoord = None
     if "texcoord" in face.values and (face.counts["texcoord"] == 2 * counts).all():
         texcoord = face.values["texcoord"].reshape(-1, 2).astype(np.float64)
     return corners, counts, texcoord
 
 
-def _strips(source: _Source, strips: _Element, vertices: int) -> np.ndarray:
-    """Return the corners of the triangles of all strips (3 T,)."""
+def _strips(strips: _Element, vertices: int) -> np.ndarray:
+    """Return the corners (3 T,) of the triangles of all strips."""
     if strips.rows == 0:
         return np.zeros(0, np.int64)
-    given, counts = _indices(source, strips)
-    ends = given == -1
-    indices = _within(source, np.where(ends, 0, given), counts, vertices, "tristrips")
+    indices, counts = _indices(strips)
+    ends = indices == -1
+    indices = _within(np.where(ends, 0, indices), counts, vertices, "tristrips")
     begin = np.union1d(np.cumsum(counts), np.flatnonzero(ends))
     runs = zip(np.split(indices, begin), np.split(ends, begin), strict=True)
     return np.concatenate([strip(run[~end]).reshape(-1) for run, end in runs])
 
 
-def _indices(source: _Source, element: _Element) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values of the element's lists of vertices in sequence, and their counts."""
+def _indices(element: _Element) -> tuple[np.ndarray, np.ndarray]:
+    """Return the vertex indices of all rows of an element in sequence, and the number of indices in each row."""
     name = next((name for name in _INDEX_NAMES if name in element.values), None)
     if name is None:
-        source.fail(f"has no list {' or '.join(_INDEX_NAMES)}", f"element {element.name}")
+        raise InputError(f"has no list {' or '.join(_INDEX_NAMES)}", place=f"element {element.name}")
     return element.values[name], element.counts[name]
 
 
-def _within(source: _Source, given: np.ndarray, counts: np.ndarray, vertices: int, kind: str) -> np.ndarray:
-    """Return the indices as integers. Raises InputError, with the row of the `kind`, for an index without a vertex."""
+def _within(values: np.ndarray, counts: np.ndarray, vertices: int, element: str) -> np.ndarray:
+    """Return values as integers. Raises InputError, with the element and the row, for a value that is no index of a vertex."""
     with np.errstate(invalid="ignore"):
-        indices: np.ndarray = given.astype(np.int32 if vertices < 1 << 31 else np.int64)
-    wrong = (indices < 0) | (indices >= vertices) | (indices != given)
+        indices: np.ndarray = values.astype(np.int32 if vertices < 1 << 31 else np.int64)
+    wrong = (indices < 0) | (indices >= vertices) | (indices != values)
     if wrong.any():
         where = int(np.argmax(wrong))
         row = int(np.searchsorted(np.cumsum(counts), where, side="right"))
-        source.fail(f"index {given[where]:g}, but there are {vertices} vertices", f"{kind} {row}")
+        raise InputError(f"index {values[where]:g}, but there are {vertices} vertices", place=f"{element} {row}")
     return indices
 
 
 def _split(corners: np.ndarray, texcoord: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Make a vertex of each distinct (vertex, u, v). Returns the vertex it comes from, the new corners and its uv."""
+    """Make a vertex of each distinct (vertex, u, v). Returns the old index of each new vertex, the new corners, and the new uvs."""
     rows, renumbered = np.unique(np.column_stack([corners, texcoord]), axis=0, return_inverse=True)
     return rows[:, 0].astype(np.int64), renumbered.reshape(-1), rows[:, 1:]
 
 
+def _truncated(element: _Element, row: int) -> InputError:
+    what = f"is truncated: the header announces {element.rows} rows, but the file ends in row {row}"
+    return InputError(what, place=f"element {element.name}")
+
+
 class _Source:
-    """A PLY file: its header and the elements."""
+    """Reader of a PLY file's header and elements."""
 
     def __init__(self, path: Path) -> None:
         self.data = utf8(read_file(path))
         form, self.elements, self.at = self._header()
         self.order = _ORDERS[form]
-        if form == "ascii":  # becomes a binary file of float64, which holds every index exactly
+        if form == "ascii":  # converted to a binary file of float64, which represents every index exactly
             self.data, self.at = self._numbers(), 0
             for element in self.elements:
                 element.properties = [p._replace(type="f8", count_type=p.count_type and "f8") for p in element.properties]
@@ -166,13 +169,10 @@ class _Source:
             if element.rows and element.properties:
                 self._read(element)
 
-    def fail(self, message: str, place: str | None = None) -> NoReturn:
-        raise InputError(message, place=place)
-
     def _header(self) -> tuple[str, list[_Element], int]:
-        """Return the format, the elements without their data, and the offset of the data."""
+        """Return the format, the elements without their values, and the offset of the data in bytes."""
         if not self.data.startswith(b"ply"):
-            self.fail("is not a PLY file: it does not begin with 'ply'")
+            raise InputError("is not a PLY file: it does not begin with 'ply'")
         elements: list[_Element] = []
         form, begin = "", 0
         for number, line in enumerate(self.data[:1 << 20].splitlines(keepends=True), 1):
@@ -192,15 +192,15 @@ class _Source:
                 case ["property", kind, name] if elements and kind in _TYPES:
                     elements[-1].properties.append(_Property(name, _TYPES[kind]))
                 case _:
-                    self.fail(f"cannot read {line[:60].decode('latin-1').strip()!r} in the header", f"line {number}")
+                    raise InputError(f"cannot read {line[:60].decode('latin-1').strip()!r} in the header", place=f"line {number}")
         else:
-            self.fail("the header does not end: no end_header so far", f"line {number}")
+            raise InputError("the header has no end_header", place=f"line {number}")
         if not form:
-            self.fail("the header names no format")
+            raise InputError("the header has no line `format`")
         return form, elements, begin
 
     def _read(self, element: _Element) -> None:
-        """Read all rows at once if their lists are as long as those of the first row (nearly always), else row by row."""
+        """Read all rows at once if every list is as long as in the first row (nearly always), else row by row."""
         begin = self.at
         sizes = [len(part) for part in self._row(element, 0)]
         self.at = begin
@@ -216,7 +216,7 @@ class _Source:
                 element.counts[p.name] = np.array([len(row[i]) for row in rows], dtype=np.int64)
 
     def _take_table(self, element: _Element, table: list[np.ndarray], sizes: list[int]) -> bool:
-        """Keep the columns of a table; return False if a list has another length than in `sizes`."""
+        """Store the columns of a table in the element. Return False if a list has another length than in `sizes`."""
         columns = iter(table)
         for p, size in zip(element.properties, sizes, strict=True):
             if p.count_type and (next(columns) != size).any():
@@ -233,21 +233,18 @@ class _Source:
             if p.count_type:
                 count = self._take(p.count_type, 1)
                 if count is None:
-                    self._truncated(element, row)
+                    raise _truncated(element, row)
                 if not (0 <= count[0] < np.inf and count[0] == int(count[0])):
-                    self.fail(f"a list of {count[0]:g} values", f"{element.name} {row}")
+                    raise InputError(f"has a list of {count[0]:g} values", place=f"{element.name} {row}")
                 size = int(count[0])
             values = self._take(p.type, size)
             if values is None:
-                self._truncated(element, row)
+                raise _truncated(element, row)
             parts.append(values)
         return parts
 
-    def _truncated(self, element: _Element, row: int) -> NoReturn:
-        self.fail(f"truncated: the header promises {element.rows}, but the file ends in number {row}", f"element {element.name}")
-
     def _take(self, kind: str, count: int) -> np.ndarray | None:
-        """Return the next values, or None if the file ends before."""
+        """Return the next `count` values of a type, or None if the file ends before."""
         dtype = np.dtype(self.order + kind)
         if self.at + count * dtype.itemsize > len(self.data):
             return None
@@ -255,7 +252,7 @@ class _Source:
         return np.frombuffer(self.data, dtype, count, self.at - count * dtype.itemsize)
 
     def _table(self, fields: list[tuple[str, int]], rows: int) -> list[np.ndarray] | None:
-        """Return an array (rows, n) for each field (type, n) of consecutive records, or None if the file ends before."""
+        """Return an array (rows, n) for each field (type, n) of the next records, or None if the file ends before."""
         record = np.dtype([(f"f{i}", self.order + kind, (n,)) for i, (kind, n) in enumerate(fields)])
         if self.at + rows * record.itemsize > len(self.data):
             return None
@@ -264,7 +261,7 @@ class _Source:
         return [table[f"f{i}"] for i in range(len(fields))]
 
     def _numbers(self) -> bytes:
-        """Return the words of the text as float64."""
+        """Return the words of a text file as the bytes of float64 numbers."""
         numbers, stream = array("d"), io.BytesIO(self.data)
         stream.seek(self.at)
         while text := b"".join(stream.readlines(BYTES_AT_ONCE)):
@@ -274,5 +271,5 @@ class _Source:
             except ValueError:
                 bad = next(islice(_WORD.finditer(text), len(numbers) - before, None))  # the numbers before it were appended
                 line = self.data.count(b"\n", 0, stream.tell() - len(text) + bad.start()) + 1
-                self.fail(f"{short(bad[0].decode('latin-1'))} is not a number", f"line {line}")
+                raise InputError(f"{short(bad[0].decode('latin-1'))} is not a number", place=f"line {line}") from None
         return numbers.tobytes()

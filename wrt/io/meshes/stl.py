@@ -1,7 +1,7 @@
 """STL files, text and binary.
 
-Why not trimesh 5.2: it leaves out the triangles before a missing `endsolid`. It logs a traceback for each facet normal that is no number,
-and lets NumPy warn of positions that are not finite.
+trimesh 5.2 is not used. It leaves out the triangles before a missing `endsolid`, and logs a traceback for each facet normal that is no
+number. It lets NumPy warn of positions that are not finite.
 """
 
 from __future__ import annotations
@@ -22,15 +22,14 @@ _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribut
 
 
 def read(path: Path) -> RawMesh:
-    """Read the triangles of an STL file in the order of the file; each has three vertices of its own.
+    """Read the triangles of an STL file in the order of the file. Triangles share no vertices.
 
-    The solids of a text file become groups. Facet normals are not read, because the winding tells the same. Raises InputError for a file
-    that is truncated or no STL, and for a position that is not finite.
-    """
+    The solids of a text file become groups. Facet normals are not read, because the winding gives the same direction. Raises InputError
+    for a file that is truncated or no STL file, and for a position that is not finite."""
     data = read_file(path)
     groups: tuple[str, ...] = ()
     sizes: list[int] = []
-    if len(data) >= 84 and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little"):  # as its header says
+    if len(data) >= 84 and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little"):  # a binary file
         vertices = np.frombuffer(data, _RECORD, (len(data) - 84) // 50, 84)["corners"].reshape(-1, 3)
     else:
         vertices, groups, sizes = _read_text(utf8(data))
@@ -48,11 +47,10 @@ def read(path: Path) -> RawMesh:
 
 
 def _read_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...], list[int]]:
-    """Return positions (3 T, 3) float64, and names and triangle counts of the solids. Later solids of a name get name_1, name_2 ..."""
+    """Return positions (3 T, 3) float64, and names and triangle counts of the solids. Repeated names become name_1, name_2 ..."""
 
     def fail(number: int, message: str) -> NoReturn:
-        raise InputError(f"truncated, or no STL file: {message}, and the length is not that of a binary STL file",
-                         place=f"line {number}")
+        raise InputError(f"is truncated or no STL file: {message}, and the length does not fit a binary STL file", place=f"line {number}")
 
     numbers = array("d")
     names: list[str] = []
@@ -77,16 +75,16 @@ def _read_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...], list[int]]:
         elif key not in (b"", b"facet", b"outer", b"endloop", b"endfacet"):
             fail(number, f"cannot read {line[:60].decode('latin-1').strip()!r}")
         if key in (b"solid", b"endloop", b"endfacet", b"endsolid") and len(numbers) % 9:
-            fail(number, "a loop that has not three vertices")
+            fail(number, "a loop must have three vertices")
     if inside or not names or ends[-1] * 3 != len(numbers):
-        fail(number, "no solid that is closed" if inside or not names else "vertices outside of a solid")
+        fail(number, "endsolid is missing" if inside else "vertices outside of a solid" if names else "there is no solid")
     vertices = np.frombuffer(numbers, np.float64).reshape(-1, 3)
     sizes = [(end - begin) // 3 for begin, end in zip([0, *ends], ends, strict=False)]
     return vertices, _each_once(names), sizes
 
 
 def _each_once(names: list[str]) -> tuple[str, ...]:
-    known: dict[str, int] = {}  # the last suffix of each
+    known: dict[str, int] = {}  # the last suffix of each name
     for name in names:
         unique = name
         while unique in known:

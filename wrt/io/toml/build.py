@@ -17,7 +17,7 @@ from wrt.core.files import read_file
 from wrt.io.toml.kinds import make, values_of
 from wrt.io.toml.meshes import Meshes
 from wrt.io.toml.report import raise_all, unknown_materials
-from wrt.io.toml.transforms import transform, turn
+from wrt.io.toml.transforms import cosine_sine, transform
 from wrt.scene import shapes
 from wrt.scene.backgrounds import BACKGROUNDS, Background, ConstantBackground
 from wrt.scene.cameras import CAMERAS, Camera, CameraKind
@@ -36,11 +36,10 @@ if TYPE_CHECKING:
 
 
 def build(table: tables.SceneTable, path: Path) -> Scene:
-    """Make the scene of the tables; names of files are relative to the folder of `path`.
+    """Make the scene of a checked scene file at `path`; the names of files in it are relative to the folder of `path`.
 
-    A file that is named twice is read once, and its mesh or texture is one object. Raises one InputError that lists all unknown names,
-    unusable files and values that the scene refuses.
-    """
+    A file that is named twice is read once, and its mesh or texture is shared. Raises one InputError that lists all unknown names,
+    unusable files and values that the scene refuses."""
     builder = _Builder(path)
     with at(path=path):
         scene = builder.scene(table)
@@ -54,7 +53,7 @@ class _Builder:
         self.path = path
         self.problems: list[InputError] = []
         self.materials: dict[str, Material] = {}
-        self._included: dict[Path, Scene] = {}  # by path
+        self._included: dict[Path, Scene] = {}
         self._included_objects = 0
         self._images: dict[Path, np.ndarray] = {}
         self._textures: dict[tuple[str, bool], Texture | Checkerboard] = {}
@@ -62,7 +61,7 @@ class _Builder:
 
     @contextlib.contextmanager
     def at(self, place: str) -> Iterator[None]:
-        """Note an InputError as a problem at that place, and go on."""
+        """Record an InputError that the block raises as a problem at `place`, and continue after the block."""
         try:
             yield
         except InputError as error:
@@ -70,8 +69,6 @@ class _Builder:
 
     def file(self, name: str) -> Path:
         return self.path.parent / name
-
-    # --- the whole ---
 
     def scene(self, table: tables.SceneTable) -> Scene | None:
         for name, material in table.materials.items():
@@ -81,7 +78,7 @@ class _Builder:
             included += self.included(entry, f"include[{i}]")
         included = self.overridden(included, table)
         known = {m.name: m for scene in included for m in scene.materials} | self.materials
-        # A wrong material counts as known, so that one mistake gives one line.
+        # A material with a mistake counts as known, so that the message has one line for it.
         self.problems += unknown_materials(table.model_dump(exclude_unset=True), {**known, **table.materials})
         self.materials = known
 
@@ -91,16 +88,15 @@ class _Builder:
         cameras: list[CameraKind] = []
         for i, sphere in enumerate(table.spheres):
             with self.at(f"spheres[{i}]"):
-                spheres += [Sphere(**{**sphere.given(), "material": m}) for m in self.found(sphere.material)]
+                spheres += [Sphere(**{**sphere.given(), "material": m}) for m in self.material_named(sphere.material)]
         for i, quad in enumerate(table.quads):
             with self.at(f"quads[{i}]"):
                 mesh = shapes.quad(quad.corner, quad.edge_u, quad.edge_v)
-                objects += [Object(mesh, (m,), name=quad.name or f"quads[{i}]") for m in self.found(quad.material)]
+                objects += [Object(mesh, (m,), name=quad.name or f"quads[{i}]") for m in self.material_named(quad.material)]
         for i, box in enumerate(table.boxes):
             with self.at(f"boxes[{i}]"):
                 mesh, matrix = shapes.box(box.low, box.high), transform(box.transform)
-                objects += [Object(mesh, (m,), matrix, name=box.name or f"boxes[{i}]")
-                            for m in self.found(box.material)]
+                objects += [Object(mesh, (m,), matrix, name=box.name or f"boxes[{i}]") for m in self.material_named(box.material)]
         for i, each in enumerate(table.meshes):
             with self.at(f"meshes[{i}]"):
                 objects += self.meshes.objects(each, f"meshes[{i}]", self.materials)
@@ -130,11 +126,9 @@ class _Builder:
             name=table.title or self.path.stem,
         )
 
-    def found(self, name: str | None) -> list[Material]:
-        """Return the material of that name in a list, or [] for an unknown name, which unknown_materials reports."""
+    def material_named(self, name: str) -> list[Material]:
+        """Return the material of a name in a list, or [] for an unknown name, which unknown_materials reports."""
         return [self.materials[name]] if name in self.materials else []
-
-    # --- included files ---
 
     def included(self, entry: str | tables.IncludeTable, place: str) -> list[Scene]:
         from wrt.io.gltf.reader import load_gltf
@@ -142,7 +136,7 @@ class _Builder:
         name, to_world = (entry, None) if isinstance(entry, str) else (entry.file, entry.transform)
         with self.at(place):
             if not name.lower().endswith((".gltf", ".glb")):
-                raise InputError(f"{name!r} is no .gltf or .glb file", hint="a mesh file belongs into [[meshes]]")
+                raise InputError(f"{name!r} is no .gltf or .glb file", hint="mesh files belong into [[meshes]]")
             path = self.file(name)
             if path not in self._included:
                 self._included[path] = load_gltf(path, staged=False)
@@ -153,7 +147,7 @@ class _Builder:
         return []
 
     def overridden(self, included: list[Scene], table: tables.SceneTable) -> list[Scene]:
-        """Return the included scenes with the materials that the file overrides."""
+        """Return the included scenes with materials replaced by those of the same name in [override]."""
         names = list(dict.fromkeys(m.name for scene in included for m in scene.materials))
         new: dict[str, Material] = {}
         for name, material in table.override.items():
@@ -165,10 +159,8 @@ class _Builder:
             replace(thing, materials=tuple(new.get(m.name, m) for m in thing.materials)) for thing in scene.objects))
             for scene in included]
 
-    # --- materials ---
-
     def material(self, table: MaterialTable, name: str, place: str) -> dict[str, Material]:
-        """Return the material by its name, or {} if it is wrong."""
+        """Return {name: material}, or {} if the table has a mistake."""
         fields = table.given("metal", *SLOTS)
         if table.metal is not None:
             fields["eta"], fields["k"] = CONDUCTORS[table.metal]
@@ -187,13 +179,13 @@ class _Builder:
             if (checkerboard := getattr(table, "checkerboard", None)) is not None:
                 self._textures[key] = Checkerboard(**checkerboard.given())
             else:
-                cosine, sine = turn(table.rotation)
+                cosine, sine = cosine_sine(table.rotation)
                 (u, v), (du, dv) = table.scale, table.offset
                 self._textures[key] = Texture(
                     self.image(self.file(str(table.file))),
                     srgb=is_color if table.srgb is None else table.srgb,
                     wrap=(table.wrap[0], table.wrap[1]),
-                    # As in KHR_texture_transform: scale, then turn (v points down), then move.
+                    # As in KHR_texture_transform: scale, then rotate (v points down), then translate.
                     uv_transform=np.array([[cosine * u, sine * v, du], [-sine * u, cosine * v, dv]]),
                     name=str(table.file),
                 )
@@ -210,13 +202,12 @@ class _Builder:
     def background(self, table: tables.SceneTable) -> Background:
         from wrt.picture.image import read_image
 
-        given = table.background
-        if given is None:
+        if table.background is None:
             return ConstantBackground()
-        return make(BACKGROUNDS[given.type], given, "", lambda name: read_image(self.file(name)))
+        return make(BACKGROUNDS[table.background.type], table.background, "", lambda name: read_image(self.file(name)))
 
     def light(self, table: TypedTable, name: str) -> Light | Object:
-        """Return a light, or for a rectangle an object that emits and reflects nothing."""
+        """Return a light; for a rectangle light, an object that emits and reflects nothing."""
         from wrt.io.toml.schema import RectangleLightTable
         from wrt.picture.image import read_image
 
@@ -227,14 +218,14 @@ class _Builder:
 
 
 def settings(table: Table, included: Sequence[Scene]) -> Settings:
-    """Return the file's settings. Without glass_shadows in the file, it is "tinted" if an included file needs that."""
+    """Return the settings of a scene file. glass_shadows is "tinted" by default if an included file has solid glass."""
     tinted = any(scene.settings.glass_shadows == "tinted" for scene in included)
     needed = {"glass_shadows": "tinted"} if tinted else {}
     return Settings(**{**needed, **table.given()})
 
 
 def moved(scene: Scene, matrix: np.ndarray) -> Scene:
-    """Transform a scene's shapes, lights and cameras by a (4, 4) matrix. Intensities stay the same, as in glTF."""
+    """Return a scene with objects, lights and cameras transformed by a (4, 4) matrix. Intensities stay the same, as in glTF."""
     if np.array_equal(matrix, np.eye(4)):
         return scene
     return replace(
@@ -246,7 +237,7 @@ def moved(scene: Scene, matrix: np.ndarray) -> Scene:
 
 
 def make_camera(table: PoseTable, name: str) -> CameraKind:
-    """Make a camera from position and target or from a matrix, and a perspective one from its angle of view or a real lens."""
+    """Make a camera: its pose from position and target or a matrix, a perspective camera's angle of view from fov_y or a real lens."""
     kind = CAMERAS[table.type]
     values: dict[str, Any] = {}
     if "focus_distance" in forms(kind) and table.position is not None and table.target is not None:

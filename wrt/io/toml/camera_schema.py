@@ -17,9 +17,9 @@ class PoseTable(TypedTable):
     """Give position and target, or matrix."""
 
     type: str = Camera.kind
-    position: Point | None = Field(None, description="of the camera")
+    position: Point | None = Field(None, description="position of the camera")
     target: Point | None = Field(None, description="point in the middle of the picture")
-    up: Vector = Field([0.0, 1.0, 0.0], description="direction that is up in the picture")
+    up: Vector = Field([0.0, 1.0, 0.0], description="direction that points up in the picture")
     matrix: Matrix | None = Field(None, description="camera to world; the camera looks along -z, +y is up")
 
     @model_validator(mode="after")
@@ -30,7 +30,7 @@ class PoseTable(TypedTable):
         return self
 
     def problems(self) -> list[str]:
-        """Return the mistakes of the table as a whole."""
+        """Return a message for each wrong combination of keys."""
         if (self.matrix is None) == (self.position is None and self.target is None):
             return ["give either position and target, or matrix"]
         return ["needs both position and target"] if self.matrix is None and (self.position is None or self.target is None) else []
@@ -39,15 +39,14 @@ class PoseTable(TypedTable):
 class LensTable(PoseTable):
     """Give position and target, or matrix; fov_y, or focal_length."""
 
-    focal_length: Length | None = Field(None, description="of a real lens, in place of fov_y")
-    sensor_height: Length | None = Field(None, description="of a real lens")
-    f_number: Positive | None = Field(
-        None, description="of a real lens: the aperture's radius is focal_length / (2 f_number)")
+    focal_length: Length | None = Field(None, description="focal length of a real lens, in place of fov_y")
+    sensor_height: Length | None = Field(None, description="height of the sensor behind a real lens")
+    f_number: Positive | None = Field(None, description="f-number of a real lens: the aperture's radius is focal_length / (2 f_number)")
 
     def problems(self) -> list[str]:
         problems, given = super().problems(), self.model_fields_set
         if self.focal_length is None and (self.sensor_height is not None or self.f_number is not None):
-            problems.append("sensor_height and f_number belong to a focal_length")
+            problems.append("sensor_height and f_number need a focal_length")
         if self.focal_length is not None:
             if "fov_y" in given:
                 problems.append("give either fov_y or focal_length")
@@ -71,6 +70,6 @@ def _type_of_camera(table: object) -> str:
 
 
 def any_camera(kinds: tuple[type[CameraKind], ...]) -> Annotation:
-    """Return the annotation of a table of one of these kinds, chosen by its `type`."""
+    """Return the annotation of a camera table of any of these kinds. The key `type` of a table gives its kind."""
     tables: list[Any] = [Annotated[camera_table(kind), Tag(kind.kind)] for kind in kinds]
     return Annotated[reduce(or_, tables), Discriminator(_type_of_camera)]

@@ -1,4 +1,4 @@
-"""Tables of a TOML scene file made from the described fields of a class, and lights and backgrounds made from such tables."""
+"""Pydantic tables made from the described fields of a class (wrt.scene.kinds), and lights and backgrounds made from such tables."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ TYPES: dict[str, Callable[[Limits], Annotation]] = {
     "number": lambda limits: float, "whole": lambda limits: int, "flag": lambda limits: bool, "size": lambda limits: Size,
     "choice": lambda limits: _literal[limits["among"]], "image": lambda limits: str,
 }
-BOUNDED = ("number", "whole", "angle")  # forms whose limits become bounds; the other types have theirs
+BOUNDED = ("number", "whole", "angle")  # forms whose limits become bounds in the schema; TYPES of other forms have bounds
 
 
 def described(kind: type, types: Mapping[str, Callable[[Limits], Annotation]] = TYPES) -> dict[str, Annotation]:
-    """Return the keys of a class's table: the fields that wrt.scene.kinds describes, angles in degrees, an image by its file."""
-    found: dict[str, Any] = {}
+    """Return the keys of a class's table: its described fields, with angles in degrees and the key "file" for an image."""
+    keys: dict[str, Any] = {}
     for key, each in forms(kind).items():
         form, limits = each.metadata["form"], each.metadata["limits"]
         bounds = limits if form in BOUNDED else {}
@@ -39,18 +39,18 @@ def described(kind: type, types: Mapping[str, Callable[[Limits], Annotation]] = 
         default = ... if each.default is MISSING else _written(form, each.default)
         if each.default is None:
             value = value | None
-        found["file" if form == "image" else key] = (value, Field(default, description=each.metadata["about"], **bounds))
-    return found
+        keys["file" if form == "image" else key] = (value, Field(default, description=each.metadata["about"], **bounds))
+    return keys
 
 
 def kind_table(kind: type[Kind], what: str) -> type[TypedTable]:
-    """Make the table of a kind, such as PointLightTable for `what` Light."""
-    found = {"type": (_literal[kind.kind], ...), **described(kind)}
-    if "file" not in found and _has_name(kind):
-        found["name"] = (str, Field("", description="for messages"))
+    """Make the table of a kind: for the kind "point", PointLightTable if `what` is "Light"."""
+    keys = {"type": (_literal[kind.kind], ...), **described(kind)}
+    if "file" not in keys and _has_name(kind):
+        keys["name"] = (str, Field("", description="name in messages"))
     summary = (kind.__doc__ or kind.__name__).split("\n\n")[0]
     name = "".join(part.capitalize() for part in kind.kind.split("_"))
-    return create_model(f"{name}{what}Table", __base__=TypedTable, __doc__=summary, **found)
+    return create_model(f"{name}{what}Table", __base__=TypedTable, __doc__=summary, **keys)
 
 
 def _has_name(kind: type[Kind]) -> bool:
@@ -58,14 +58,14 @@ def _has_name(kind: type[Kind]) -> bool:
 
 
 def _written(form: str, value: Any) -> Any:
-    """Return a default in the form of a file."""
+    """Return a default value as a scene file writes it."""
     if form == "angle":
         return math.degrees(value)
     return list(value) if isinstance(value, tuple) else value
 
 
 def values_of(kind: type, table: Table) -> dict[str, Any]:
-    """Return the values that a checked table gives, by the class's fields; an image by its file."""
+    """Return the values that a checked table sets, by the fields of its class. An image stays a file's name."""
     values: dict[str, Any] = {}
     for key, each in forms(kind).items():
         form = each.metadata["form"]
@@ -77,7 +77,7 @@ def values_of(kind: type, table: Table) -> dict[str, Any]:
 
 
 def make(kind: type[K], table: Table, name: str, read: Callable[[str], np.ndarray]) -> K:
-    """Make the light or background of a checked table. read: returns the image of a file's name."""
+    """Make the light or background of a checked table. read: function that returns the image of a file name."""
     values: dict[str, Any] = ({"name": name} if _has_name(kind) else {}) | values_of(kind, table)
     for key, each in forms(kind).items():
         if each.metadata["form"] == "image":

@@ -10,8 +10,6 @@ from wrt.io.toml.kinds import TYPES, described
 from wrt.io.toml.values import Angle, Scale2, Table, Wraps, require_one
 from wrt.scene.materials import MATERIALS, Checkerboard, Material, kinds_that_use
 
-# --- textures ---------------------------------------------------------------------------------------------------------
-
 _checkerboard: Any = create_model("_Checkerboard", __base__=Table, **described(Checkerboard))
 
 
@@ -20,13 +18,11 @@ class CheckerboardTable(_checkerboard):
 
 
 class _PlacedImage(Table):
-    srgb: bool | None = Field(
-        None, description="RGB is sRGB-encoded (default: for albedo and emission)")
-    wrap: Wraps = Field(["repeat", "repeat"], description="beyond the image, in u and in v (one for both)")
+    srgb: bool | None = Field(None, description="RGB is sRGB-encoded (default: true for albedo and emission, else false)")
+    wrap: Wraps = Field(["repeat", "repeat"], description="lookup outside the image, in u and in v (one for both)")
     scale: Scale2 = Field([1.0, 1.0], description="repetitions in one unit of u and of v")
-    offset: Annotated[list[float], Field(min_length=2, max_length=2)] = Field(
-        [0.0, 0.0], description="added to u and v")
-    rotation: Angle = Field(0.0, description="about uv (0, 0): turns the image clockwise")
+    offset: Annotated[list[float], Field(min_length=2, max_length=2)] = Field([0.0, 0.0], description="added to u and v")
+    rotation: Angle = Field(0.0, description="rotation of the image about uv (0, 0), clockwise")
 
 
 class ImageTable(_PlacedImage):
@@ -39,17 +35,14 @@ class ColorTextureTable(_PlacedImage):
     """An image file, or a checkerboard."""
 
     file: str | None = Field(None, description="image file, relative to the scene file")
-    checkerboard: CheckerboardTable | None = Field(None, description="in place of an image file")
+    checkerboard: CheckerboardTable | None = Field(None, description="checkerboard, in place of an image file")
 
     @model_validator(mode="after")
     def _check(self) -> ColorTextureTable:
         require_one(self, ("file",), ("checkerboard",))
         if self.checkerboard is not None and len(self.model_fields_set) > 1:
-            raise ValueError("a checkerboard takes no other fields beside it; its scale stands inside it")
+            raise ValueError("a checkerboard takes no other keys beside it; its scale is a key of the checkerboard")
         return self
-
-
-# --- materials --------------------------------------------------------------------------------------------------------
 
 
 class MaterialTable(Table):

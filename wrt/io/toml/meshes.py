@@ -1,4 +1,4 @@
-"""Meshes of a scene file, read or made by a formula, with their materials, transforms and motion."""
+"""Meshes of a TOML scene file, from mesh files or formulas, with their materials, transforms and motion."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 
 
 class Meshes:
-    """A cache of the meshes of [[meshes]]. Names of files are relative to `folder`."""
+    """Cache of the meshes of [[meshes]]. Names of files are relative to `folder`."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._meshes: dict[tuple[object, ...], Mesh] = {}
 
     def objects(self, table: MeshTable, place: str, materials: Mapping[str, Material]) -> list[Object]:
-        """Make an object for each instance; none if a material is unknown, which unknown_materials reports."""
+        """Return an object for each instance; [] if a material is unknown, which unknown_materials reports."""
         parts = table.parts or []
         mesh = self._smoothed(table, tuple((part.first, part.count) for part in parts), table.smooth)
         by_group: Mapping[str, str] = table.materials or {str(i): part.material for i, part in enumerate(parts)}
@@ -41,26 +41,25 @@ class Meshes:
             if group not in groups:
                 raise unknown(group, "group of " + mesh.name, mesh.groups, place="materials")
         used = np.unique(mesh.face_group).tolist() if mesh.face_group is not None else []
-        wanted = [by_group.get(mesh.groups[group], table.material) for group in used] if by_group else [table.material]
-        for group, name in zip(used, wanted, strict=False):
+        used_names = [by_group.get(mesh.groups[group], table.material) for group in used] if by_group else [table.material]
+        for group, name in zip(used, used_names, strict=False):
             if name is None:
-                raise InputError(f"the triangles of group {mesh.groups[group]!r} have no material",
-                                 hint="give `material` for the rest")
-        names = list(dict.fromkeys(str(name) for name in wanted))
+                raise InputError(f"the triangles of group {mesh.groups[group]!r} have no material", hint="give `material` for the rest")
+        names = list(dict.fromkeys(str(name) for name in used_names))
         if not materials.keys() >= set(names):
             return []
         face_material = None
         if by_group and mesh.face_group is not None:
             of_group = np.zeros(len(mesh.groups), dtype=np.int32)
-            number = {name: i for i, name in enumerate(names)}
-            of_group[used] = [number[str(name)] for name in wanted]
+            index = {name: i for i, name in enumerate(names)}
+            of_group[used] = [index[str(name)] for name in used_names]
             face_material = of_group[mesh.face_group]
-        each = [] if table.instances else [np.eye(4)]
-        for i, one in enumerate(table.instances or ()):
+        placements = [] if table.instances else [np.eye(4)]
+        for i, instance in enumerate(table.instances or ()):
             with at(f"instances[{i}]"):
-                each.append(transform(one))
-        whole, shown, motion = transform(table.transform), tuple(materials[name] for name in names), self._motion(table)
-        return [Object(mesh, shown, whole @ matrix, face_material, table.name or place, motion) for matrix in each]
+                placements.append(transform(instance))
+        to_world, used_materials, motion = transform(table.transform), tuple(materials[name] for name in names), self._motion(table)
+        return [Object(mesh, used_materials, to_world @ matrix, face_material, table.name or place, motion) for matrix in placements]
 
     def _motion(self, table: MeshTable) -> Motion | None:
         if table.motion is None and table.morph is None:
@@ -68,8 +67,8 @@ class Meshes:
         keys = None if table.motion is None else np.array([[key.translate, key.rotate, key.scale] for key in table.motion])
         return Motion(keys, None if table.morph is None else self._smoothed(table.morph, (), table.smooth))
 
-    def _smoothed(self, table: MeshTable | MorphTable, parts: tuple[tuple[int, int], ...], wanted: bool | None) -> Mesh:
-        """Return the mesh of the table's file or shape. wanted: True adds missing normals, False drops them."""
+    def _smoothed(self, table: MeshTable | MorphTable, parts: tuple[tuple[int, int], ...], normals: bool | None) -> Mesh:
+        """Return the mesh of the table's file or shape. normals: True adds missing vertex normals, False drops vertex normals."""
         shape = table.shape
         if shape is not None:
             key: tuple[object, ...] = (shape.model_dump_json(),)
@@ -78,9 +77,9 @@ class Meshes:
             path = self._folder / str(table.file)
             key = (path, parts)
             plain = self._once(key, lambda: load_mesh(path, parts))
-        if wanted is None:
+        if normals is None:
             return plain
-        return self._once((*key, wanted), lambda: smooth(plain) if wanted else replace(plain, normals=None))
+        return self._once((*key, normals), lambda: smooth(plain) if normals else replace(plain, normals=None))
 
     def _once(self, key: tuple[object, ...], make: Callable[[], Mesh]) -> Mesh:
         if key not in self._meshes:

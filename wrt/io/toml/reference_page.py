@@ -11,7 +11,7 @@ from wrt.io.load import schema
 
 Schema = dict[str, Any]
 TOP = "SceneTable"
-SHARED_KEYS = 4  # keys that two tables must share for the page to describe them once
+SHARED_KEYS = 4  # the page describes so many equal keys of two tables once
 WORDS = {"string": "text", "boolean": "true or false", "integer": "whole number"}
 HEAD = """\
 # Scene files
@@ -20,15 +20,11 @@ A scene is a [TOML](https://toml.io) file: `python -m wrt render scene.toml`, `w
 validate scene.toml` reports every mistake with its place. `python -m wrt schema` prints the JSON Schema for editors, and this page with
 `--markdown`.
 
-- World space is right-handed, +y is up. Matrices are 16 numbers, row by row, and act on column vectors.
-- *length* is in the scene's own unit. A scene must be at least 1e-15 units across, and no shape may reach farther than 1e18 from the
-  origin ([known limits](accuracy.md#known-limits)).
-- Angles are in degrees here, and in radians in Python.
-- Colours are linear Rec. 709. One number stands for a grey.
-- *radiance*, *irradiance* and *radiant intensity* share one arbitrary scale: a white diffuse surface that receives the irradiance pi has
-  the radiance 1 and is displayed as white.
+- [Concepts](concepts.md#spaces-and-units) describes spaces and units. Angles are in degrees here, and in radians in Python.
+- Matrices are 16 numbers, row by row, and act on column vectors. One number for a colour is a grey.
+- [Known limits](accuracy.md#known-limits) has the smallest and the largest size of a scene.
 - File names are relative to the scene file.
-- A scene without a camera or without any light gets one, with a message.
+- A scene without a camera, or without any light, gets a default one; a message says so.
 
 ## Example
 """
@@ -51,12 +47,12 @@ def scene_format() -> str:
 
 
 def _title(name: str) -> str:
-    """CameraTable: Camera; PointLightTable: Point light."""
+    """Return the title of a table: "Point light" for PointLightTable."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", re.sub(r"(Table|Shape)$", "", name)).capitalize()
 
 
 def _described_before(tables: dict[str, Schema], name: str, before: list[str]) -> tuple[list[str], str]:
-    """Return the keys that an earlier table describes in the same words, if there are several, and the table."""
+    """Return the keys that an earlier table describes in the same words, if they are SHARED_KEYS or more, and that table's name."""
     for each in before:
         there = tables[each]["properties"]
         if len(known := [key for key, value in tables[name]["properties"].items() if there.get(key) == value]) >= SHARED_KEYS:
@@ -70,7 +66,7 @@ def _link(reference: str) -> str:
 
 
 def _places(tables: dict[str, Schema]) -> dict[str, list[str]]:
-    """Each table, in the order of a file, with the keys where it stands."""
+    """Return the places of each table in a file, such as "meshes[].transform"; tables are in the order of the page."""
     places: dict[str, list[str]] = {TOP: []}
 
     def visit(name: str, prefix: str) -> None:
@@ -87,7 +83,7 @@ def _places(tables: dict[str, Schema]) -> dict[str, list[str]]:
 
 
 def _references(value: Any, place: str) -> list[tuple[str, str]]:
-    """Return the tables that a value may be, each with its place: [] marks a list, NAME any key."""
+    """Return the tables that a value may hold, each with its place: [] marks a list, NAME any key."""
     if "$ref" in value:
         return [(value["$ref"], place)]
     parts = [(each, place) for each in (*value.get("anyOf", ()), *value.get("oneOf", ()))]
@@ -146,7 +142,7 @@ def _default(value: Schema) -> str:
 
 
 def _find(value: Any, key: str) -> str:
-    """Return what the value or a part of it has for the key, or ""."""
+    """Return the text of a key of the schema of a value or of its parts, or "" without this key."""
     if key in value:
         return str(value[key])
     inner = [*value.get("anyOf", ()), *([value["items"]] if isinstance(value.get("items"), dict) else [])]

@@ -27,7 +27,7 @@ _EXPECTED = {
 
 
 def check(data: JsonObject, path: Path) -> SceneTable:
-    """Convert a file's tables to models. Raises one InputError that lists all mistakes."""
+    """Convert the tables of a scene file to pydantic models. Raises one InputError that lists all mistakes."""
     from wrt.io.toml.schema import scene_table
 
     materials = data.get("materials")
@@ -36,14 +36,14 @@ def check(data: JsonObject, path: Path) -> SceneTable:
 
 
 def check_settings(values: JsonObject, origin: str) -> JsonObject:
-    """Check settings by the rules of a file's [settings]. Raises one InputError that lists all mistakes."""
+    """Check settings by the rules of [settings] in a scene file. Raises one InputError that lists all mistakes."""
     from wrt.io.toml.schema import SettingsTable
 
     return _models(SettingsTable, values, Path(origin)).given()
 
 
 def _models(table: Any, data: dict[str, Any], path: Path, others: Sequence[InputError] = ()) -> Any:
-    """Convert `data` to that table. Raises one InputError that lists its mistakes and the `others`."""
+    """Convert `data` to a model `table`. Raises one InputError that lists all mistakes of `data`, and the `others`."""
     from pydantic import ValidationError
 
     known_keys: dict[int, list[str]] = {}
@@ -65,7 +65,7 @@ def raise_all(problems: Sequence[InputError], path: Path) -> None:
 
 
 def unknown_materials(data: JsonObject, known: Collection[str]) -> list[InputError]:
-    """Return an error for each reference to an unknown material. Values of a wrong type are left to the schema."""
+    """Return an error for each reference to an unknown material. The schema reports values of a wrong type."""
     found: list[tuple[str, Any]] = []
     for kind in ("spheres", "quads", "boxes", "meshes"):
         for i, table in enumerate(_tables(data.get(kind))):
@@ -111,11 +111,9 @@ def _text(value: object) -> str:
 
 
 def _place(location: Sequence[str | int], data: Any, missing: bool) -> tuple[str, Any]:
-    """Return the path in the file, and the table of the last key.
+    """Return the place of a mistake in the file, such as "meshes[0].file", and the table that holds its last key.
 
-    pydantic's location also has names of union members, which are not in the file. Parts that lead nowhere are left out, except for a
-    last part that is missing.
-    """
+    pydantic's location also names members of unions. Parts that are not keys of the file are left out, except a missing last key."""
     place, parent = "", data
     for i, part in enumerate(location):
         if isinstance(part, str) and isinstance(data, dict) and (part in data or (missing and i == len(location) - 1)):
@@ -128,5 +126,5 @@ def _place(location: Sequence[str | int], data: Any, missing: bool) -> tuple[str
 
 
 def _key(name: str) -> str:
-    """Quote a key in the form of TOML."""
+    """Return a key as TOML writes it, in quotes if necessary."""
     return name if name and name.replace("_", "").replace("-", "").isalnum() and name.isascii() else f'"{name}"'

@@ -1,7 +1,7 @@
-"""The schema of TOML scene files: pydantic models, from which the JSON Schema is made.
+"""Schema of TOML scene files: pydantic models, from which the JSON Schema is made.
 
-Names, bounds and defaults are those of the dataclasses in wrt/scene/. Angles are in degrees here and in radians there; lengths
-have the scene's own unit; colours are linear Rec. 709. Wherever a colour stands, one number is a grey.
+Names, bounds and defaults are those of the dataclasses in wrt/scene/. Angles are in degrees in scene files and in radians in wrt/scene/;
+lengths have the scene's own unit; colours are linear Rec. 709. A single number in place of a colour is a grey.
 """
 
 from __future__ import annotations
@@ -16,23 +16,7 @@ from pydantic import Discriminator, Field, Tag, create_model, model_validator
 from wrt.io.toml.camera_schema import any_camera
 from wrt.io.toml.kinds import described, kind_table
 from wrt.io.toml.material_schema import MaterialTable, material_table
-from wrt.io.toml.values import (
-    Angle,
-    Angles,
-    Length,
-    Matrix,
-    Point,
-    Profile,
-    Radiance,
-    Scale3,
-    Segments,
-    Subdivisions,
-    Table,
-    TypedTable,
-    Vector,
-    require_one,
-    unit,
-)
+from wrt.io.toml.values import LENGTH, Angle, Angles, Length, Matrix, Point, Radiance, Scale3, Table, TypedTable, Vector, require_one, unit
 from wrt.scene.backgrounds import BACKGROUNDS
 from wrt.scene.cameras import CAMERAS, CameraKind
 from wrt.scene.kinds import Kind
@@ -42,29 +26,29 @@ from wrt.scene.settings import Settings
 from wrt.scene.shapes import SHAPES
 
 RADIANCE = unit("radiance")
+Profile = Annotated[list[Annotated[list[float], Field(min_length=2, max_length=2), LENGTH]], Field(min_length=2)]
+Segments = Annotated[int, Field(ge=3, le=4096)]
 SettingsTable: Any = create_model(
     "SettingsTable", __base__=Table, __doc__="Defaults of a render; the command line overrides them.",
     **described(Settings))
-
-# --- shapes -----------------------------------------------------------------------------------------------------------
 
 
 class TransformTable(Table):
     """Scales first, then rotates, then translates; or a matrix."""
 
-    translate: Point = Field([0.0, 0.0, 0.0], description="last")
-    rotate: Angles = Field([0.0, 0.0, 0.0], description="about x, then y, then z")
+    translate: Point = Field([0.0, 0.0, 0.0], description="translation, applied last")
+    rotate: Angles = Field([0.0, 0.0, 0.0], description="rotation about x, then y, then z")
     axis: Vector | None = Field(None, description="axis of a rotation, in place of rotate")
-    angle: Angle | None = Field(None, description="about axis, counter-clockwise seen against it")
-    scale: Scale3 = Field([1.0, 1.0, 1.0], description="first; one number or one for each axis")
-    matrix: Matrix | None = Field(None, description="object to world, in place of all else")
+    angle: Angle | None = Field(None, description="rotation about axis, counter-clockwise if the axis points to the viewer")
+    scale: Scale3 = Field([1.0, 1.0, 1.0], description="scale, applied first; one number, or one for each axis")
+    matrix: Matrix | None = Field(None, description="object to world, in place of all other keys")
 
     @model_validator(mode="after")
     def _check(self) -> TransformTable:
         if self.matrix is not None and len(self.model_fields_set) > 1:
-            raise ValueError("a matrix takes no other fields beside it")
+            raise ValueError("a matrix takes no other keys beside it")
         if (self.axis is None) != (self.angle is None):
-            raise ValueError("axis and angle belong together")
+            raise ValueError("give both axis and angle")
         if self.axis is not None and "rotate" in self.model_fields_set:
             raise ValueError("give either rotate, or axis and angle")
         if self.axis is not None and not any(self.axis):
@@ -78,27 +62,26 @@ class IncludeTable(Table):
     """A glTF file, placed as a whole."""
 
     file: str = Field(description="glTF file, relative to the scene file")
-    transform: TransformTable | None = Field(
-        None, description="file to world, of shapes, cameras and lights; intensities stay")
+    transform: TransformTable | None = Field(None, description="file to world, for shapes, cameras and lights; intensities stay the same")
 
 
 class SphereTable(Table):
     """An exact sphere."""
 
-    center: Point = Field(description="its centre")
-    radius: Length = Field(description="its radius")
+    center: Point = Field(description="centre of the sphere")
+    radius: Length = Field(description="radius of the sphere")
     material: str = Field(description="name of a material")
-    name: str = Field("", description="for messages")
+    name: str = Field("", description="name in messages")
 
 
 class QuadTable(Table):
     """A parallelogram; its front is towards cross(edge_u, edge_v), uvs run from 0 to 1."""
 
-    corner: Point = Field(description="lower left of the upright front")
-    edge_u: Point = Field(description="from the corner to the right")
-    edge_v: Point = Field(description="from the corner up")
+    corner: Point = Field(description="lower left corner, seen from the front")
+    edge_u: Point = Field(description="edge from the corner to the right")
+    edge_v: Point = Field(description="edge from the corner up")
     material: str = Field(description="name of a material")
-    name: str = Field("", description="for messages")
+    name: str = Field("", description="name in messages")
 
 
 class BoxTable(Table):
@@ -108,21 +91,22 @@ class BoxTable(Table):
     high: Point = Field(description="highest corner")
     material: str = Field(description="name of a material")
     transform: TransformTable | None = Field(None, description="object to world")
-    name: str = Field("", description="for messages")
+    name: str = Field("", description="name in messages")
 
 
 # The type and the description of each parameter of SHAPES.
 SHAPE_KEYS: dict[str, dict[str, tuple[Any, str]]] = {
-    "icosphere": {"subdivisions": (Subdivisions, "each makes four triangles of one"), "radius": (Length, "of the ball")},
-    "torus": {"radius": (Length, "from the axis to the middle of the tube"), "tube_radius": (Length, "of the tube"),
-              "segments": (Segments, "around the axis"), "tube_segments": (Segments, "around the tube")},
-    "lathe": {"profile": (Profile, "points (radius, height), bottom up; a repeated one makes a sharp edge"),
-              "segments": (Segments, "around the axis")},
-    "prism": {"sides": (Segments, "of the polygon"), "radius": (Length, "of the circle through its corners"),
-              "length": (Length, "along z")},
-    "tube": {"points": (Annotated[list[Point], Field(min_length=2)], "the line"),
-             "radius": (Length | list[Length], "one, or one for each point"), "segments": (Segments, "around the tube")},
-    "teapot": {"segments": (Segments, "around its axis")},
+    "icosphere": {"subdivisions": (Annotated[int, Field(ge=0, le=9)], "number of times that each triangle is split into four"),
+                  "radius": (Length, "radius of the sphere")},
+    "torus": {"radius": (Length, "distance from the axis to the middle of the tube"), "tube_radius": (Length, "radius of the tube"),
+              "segments": (Segments, "number around the axis"), "tube_segments": (Segments, "number around the tube")},
+    "lathe": {"profile": (Profile, "points (radius, height), bottom up; a repeated point makes a sharp edge"),
+              "segments": (Segments, "number around the axis")},
+    "prism": {"sides": (Segments, "sides of the polygon"), "radius": (Length, "radius of the circle through the polygon's corners"),
+              "length": (Length, "length along z")},
+    "tube": {"points": (Annotated[list[Point], Field(min_length=2)], "points of the line in the middle of the tube"),
+             "radius": (Length | list[Length], "one radius, or one for each point"), "segments": (Segments, "number around the tube")},
+    "teapot": {"segments": (Segments, "number around the axis")},
 }
 
 
@@ -148,16 +132,16 @@ else:
 class PartTable(Table):
     """A range of a mesh file's triangles, in the order of the file."""
 
-    first: int = Field(ge=0, description="index of the first triangle")
-    count: int = Field(ge=0, description="how many")
+    first: int = Field(ge=0, description="index of the first triangle, from 0")
+    count: int = Field(ge=0, description="number of triangles")
     material: str = Field(description="name of a material")
 
 
 class MorphTable(Table):
-    """A mesh with the same faces; in an animation, the vertices move to it and back."""
+    """A mesh with the same faces; in an animation, the vertices move to its vertices and back."""
 
     file: str | None = Field(None, description="mesh file, relative to the scene file")
-    shape: Shape | None = Field(None, description="in place of a file")
+    shape: Shape | None = Field(None, description="shape, in place of a file")
 
     @model_validator(mode="after")
     def _check(self) -> MorphTable:
@@ -168,28 +152,28 @@ class MorphTable(Table):
 class KeyTable(Table):
     """Placement in an animation, interpolated linearly. Scales, then rotates, then translates."""
 
-    translate: Point = Field([0.0, 0.0, 0.0], description="last")
-    rotate: Angles = Field([0.0, 0.0, 0.0], description="about x, then y, then z; not limited to 360")
-    scale: Scale3 = Field([1.0, 1.0, 1.0], description="first; one number or one for each axis")
+    translate: Point = Field([0.0, 0.0, 0.0], description="translation, applied last")
+    rotate: Angles = Field([0.0, 0.0, 0.0], description="rotation about x, then y, then z; not limited to 360")
+    scale: Scale3 = Field([1.0, 1.0, 1.0], description="scale, applied first; one number, or one for each axis")
 
 
 class MeshTable(Table):
     """A mesh from a file or made by a formula."""
 
     file: str | None = Field(None, description="mesh file, relative to the scene file")
-    shape: Shape | None = Field(None, description="in place of a file")
-    material: str | None = Field(None, description="name of a material, or that of the rest beside materials or parts")
+    shape: Shape | None = Field(None, description="shape, in place of a file")
+    material: str | None = Field(None, description="name of a material; with materials or parts, for all other triangles")
     materials: dict[str, str] | None = Field(
         None, description="material of each group of the file (OBJ: usemtl, else g, else o; STL: solid)")
-    parts: list[PartTable] | None = Field(None, description="materials by ranges of triangles; later ranges win")
+    parts: list[PartTable] | None = Field(None, description="materials by ranges of triangles; later ranges override earlier ones")
     smooth: bool | None = Field(None, description="true: compute missing vertex normals; false: flat (default: as in the file)")
     transform: TransformTable | None = Field(None, description="object to world")
     instances: Annotated[list[TransformTable], Field(min_length=1)] | None = Field(
-        None, description="a copy of the mesh for each, before `transform`; stored once")
+        None, description="transforms, each of one copy of the mesh, applied before `transform`; the mesh is stored once")
     motion: Annotated[list[KeyTable], Field(min_length=2)] | None = Field(
-        None, description="of `wrt animate`: placements evenly spread over the period, before instances and transform")
-    morph: MorphTable | None = Field(None, description="of `wrt animate`: another shape, and back")
-    name: str = Field("", description="for messages")
+        None, description="for `wrt animate`: placements evenly spread over the period, applied before instances and transform")
+    morph: MorphTable | None = Field(None, description="for `wrt animate`: mesh to which the vertices move, and back")
+    name: str = Field("", description="name in messages")
 
     @model_validator(mode="after")
     def _check(self) -> MeshTable:
@@ -201,19 +185,16 @@ class MeshTable(Table):
         return self
 
 
-# --- lights -----------------------------------------------------------------------------------------------------------
-
-
 class RectangleLightTable(TypedTable):
-    """A parallelogram that shines; its front is towards cross(edge_u, edge_v)."""
+    """A parallelogram that emits light; its front is towards cross(edge_u, edge_v)."""
 
     type: Literal["rectangle"]
     corner: Point = Field(description="one corner")
-    edge_u: Point = Field(description="from it along one side")
-    edge_v: Point = Field(description="from it along the other")
-    radiance: Annotated[Radiance, RADIANCE] = Field(description="emitted, the same in all directions")
-    two_sided: bool = Field(False, description="both sides shine")
-    name: str = Field("", description="for messages")
+    edge_u: Point = Field(description="edge from the corner")
+    edge_v: Point = Field(description="other edge from the corner")
+    radiance: Annotated[Radiance, RADIANCE] = Field(description="emitted radiance, the same in all directions")
+    two_sided: bool = Field(False, description="both sides emit")
+    name: str = Field("", description="name in messages")
 
 
 IncludeEntry = Annotated[
@@ -224,15 +205,15 @@ IncludeEntry = Annotated[
 class SceneTable(Table):
     """A wrt scene file."""
 
-    title: str = Field("", description="what the picture shows")
-    include: list[IncludeEntry] = Field(
-        [], description="glTF files; their shapes, cameras and lights follow this file's")
+    title: str = Field("", description="title of the picture")
+    include: list[IncludeEntry] = Field([], description="glTF files; their shapes, cameras and lights are added after those of this file")
     settings: Any = Field(default_factory=SettingsTable, description="defaults of a render")
-    cameras: dict[str, Any] = Field({}, description="by name; the first is the default")
+    cameras: dict[str, Any] = Field({}, description="cameras by name; the first is the default")
     background: Any = Field(None, description="radiance of rays that hit nothing (default: black)")
-    ambient: Annotated[Radiance, RADIANCE] = Field([0.0, 0.0, 0.0], description="added to every diffuse surface, unshadowed")
-    materials: dict[str, MaterialTable] = Field({}, description="by name")
-    override: dict[str, MaterialTable] = Field({}, description="replaces included materials")
+    ambient: Annotated[Radiance, RADIANCE] = Field(
+        [0.0, 0.0, 0.0], description="radiance that every diffuse surface receives from all directions, unshadowed")
+    materials: dict[str, MaterialTable] = Field({}, description="materials by name")
+    override: dict[str, MaterialTable] = Field({}, description="materials that replace included materials of the same name")
     spheres: list[SphereTable] = Field([], description="exact spheres")
     quads: list[QuadTable] = Field([], description="parallelograms")
     boxes: list[BoxTable] = Field([], description="closed boxes")
@@ -241,7 +222,7 @@ class SceneTable(Table):
 
 
 def scene_table() -> type[SceneTable]:
-    """Return the SceneTable of all registered kinds of cameras, lights, backgrounds and materials."""
+    """Return a SceneTable that knows all registered kinds of cameras, lights, backgrounds and materials."""
     return _scene_table(tuple(CAMERAS.values()), tuple(LIGHTS.values()), tuple(BACKGROUNDS.values()), tuple(MATERIALS))
 
 

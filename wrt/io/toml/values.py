@@ -1,4 +1,4 @@
-"""Types of the values of a TOML scene file, and the base class of its tables. One number in place of a colour is a grey."""
+"""Types of the values in a TOML scene file, and the base class of its tables. A single number in place of a colour is a grey."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationIn
 from wrt.core.types import JsonObject
 from wrt.scene.materials import WRAPS
 
-Annotation: TypeAlias = Any  # a type, or metadata of one, that is made while the program runs
+Annotation: TypeAlias = Any  # a type, or metadata of a type, made at run time
 
 
 def _repeated(count: int) -> Callable[[object], object]:
-    """Return a function that turns a single number into a list of `count`."""
+    """Return a function that turns a single number into a list of `count` equal numbers."""
     return lambda value: [value] * count if isinstance(value, int | float) and not isinstance(value, bool) else value
 
 
@@ -24,37 +24,30 @@ def _or_one(values: dict[str, Any], count: int) -> WithJsonSchema:
 
 
 def unit(name: str) -> Annotation:
-    """Return the metadata that gives a number its unit in the schema."""
+    """Return metadata that gives a number a unit in the schema."""
     return Field(json_schema_extra={"unit": name})
 
 
 LENGTH, DEGREES = unit("length"), unit("degrees")
-Unit = Annotated[float, Field(ge=0.0, le=1.0)]
-NotNegative = Annotated[float, Field(ge=0.0)]
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 Matrix = Annotated[list[float], Field(min_length=16, max_length=16)]
 Positive = Annotated[float, Field(gt=0.0)]
 Point = Annotated[list[float], Field(min_length=3, max_length=3), LENGTH]
 Length = Annotated[float, Field(gt=0.0), LENGTH]
-Profile = Annotated[list[Annotated[list[float], Field(min_length=2, max_length=2), LENGTH]], Field(min_length=2)]
 Angle = Annotated[float, DEGREES]
 Angles = Annotated[list[float], Field(min_length=3, max_length=3), DEGREES]
 Share = Annotated[  # a colour that reflects or transmits
-    list[Unit], Field(min_length=3, max_length=3), BeforeValidator(_repeated(3)),
+    list[Annotated[float, Field(ge=0.0, le=1.0)]], Field(min_length=3, max_length=3), BeforeValidator(_repeated(3)),
     _or_one({"type": "number", "minimum": 0, "maximum": 1}, 3)]
 Radiance = Annotated[  # a colour without an upper bound
-    list[NotNegative], Field(min_length=3, max_length=3), BeforeValidator(_repeated(3)),
+    list[Annotated[float, Field(ge=0.0)]], Field(min_length=3, max_length=3), BeforeValidator(_repeated(3)),
     _or_one({"type": "number", "minimum": 0}, 3)]
-Scale3 = Annotated[list[float], Field(min_length=3, max_length=3), BeforeValidator(_repeated(3)),
-                   _or_one({"type": "number"}, 3)]
-Scale2 = Annotated[list[float], Field(min_length=2, max_length=2), BeforeValidator(_repeated(2)),
-                   _or_one({"type": "number"}, 2)]
+Scale3 = Annotated[list[float], Field(min_length=3, max_length=3), BeforeValidator(_repeated(3)), _or_one({"type": "number"}, 3)]
+Scale2 = Annotated[list[float], Field(min_length=2, max_length=2), BeforeValidator(_repeated(2)), _or_one({"type": "number"}, 2)]
 WrapMode = Literal["repeat", "clamp", "mirror"]
 Wraps = Annotated[list[WrapMode], Field(min_length=2, max_length=2),
                   BeforeValidator(lambda value: [value] * 2 if isinstance(value, str) else value),
                   _or_one({"type": "string", "enum": list(WRAPS)}, 2)]
-Subdivisions = Annotated[int, Field(ge=0, le=9)]
-Segments = Annotated[int, Field(ge=3, le=4096)]
 Size = Annotated[list[Annotated[int, Field(ge=1, le=32768)]], Field(min_length=2, max_length=2)]
 
 
@@ -66,24 +59,24 @@ class Table(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _note_keys(cls, data: Any, info: ValidationInfo) -> Any:
-        """Keep the known keys for the report of an unknown key."""
+        """Record the keys of this table in the context of the validation, for the message about an unknown key."""
         if isinstance(info.context, dict) and isinstance(data, dict):
             info.context[id(data)] = list(cls.model_fields)
         return data
 
     def given(self, *leave_out: str) -> JsonObject:
-        """Return the fields that the file gives, as plain values."""
+        """Return the fields that the file sets, as plain values."""
         return self.model_dump(exclude_unset=True, exclude=set(leave_out))
 
 
 class TypedTable(Table):
-    """A table whose `type` names its kind."""
+    """A table whose key `type` gives its kind."""
 
     type: str
 
 
 def require_one(table: Table, *choices: tuple[str, ...]) -> None:
-    """Raise ValueError unless exactly one of the groups of fields is given."""
+    """Raise ValueError unless the table sets fields of exactly one of the groups."""
     given = [names for names in choices if any(getattr(table, name) is not None for name in names)]
     if len(given) != 1:
         raise ValueError("give exactly one of " + ", or ".join(" and ".join(names) for names in choices))

@@ -1,1 +1,1 @@
-"""Rivals and measurements: speed is reported with the error beside it."""
+"""Measurements of wrt and of other libraries; reports show speed together with error."""

@@ -1,4 +1,4 @@
-"""`python -m wrt bench accel`: time to build, memory and time to search of every structure, on the same rays."""
+"""`python -m wrt bench accel`: build time, memory and traversal time of every structure, on the same rays."""
 
 from __future__ import annotations
 
@@ -26,27 +26,29 @@ from wrt.lab.plans import Accel as Plan
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 
-YARDSTICK = "bvh2"  # all rays are compared with it; with brute force, as many as BRUTE_FORCE_TESTS allow
-BRUTE_FORCE_TESTS = 200_000_000
-COUNTED_RAYS = 20_000
+YARDSTICK = "bvh2"  # the structure whose answers all others are compared with
+BRUTE_FORCE_TESTS = 200_000_000  # most ray-triangle tests of the comparison with brute force
+COUNTED_RAYS = 20_000  # most rays whose traversal steps are counted
 TITLE = "Structures"
 COLUMNS: Columns = {
     "structure": "{structure}", "rays": "{kind}", "build ms": lambda row: f"{1e3 * row.build_median:.3g}",
-    "B/triangle": "{bytes_per_triangle:.0f}", "peak B": lambda row: f"{row.peak_bytes / row.triangles:.0f}",
-    "SAH": "{sah_cost:.3g}", "depth": "{depth}", "refs": lambda row: f"{row.references / row.triangles:.2f}",
-    "nodes": "{nodes:.3g}", "boxes": "{boxes:.3g}", "triangles": "{primitives:.3g}", "Mray/s": lambda row: spread(row.mrays),
-    "/ first": "{over_first:.2f}", "differ": "{differ}", "wrong": "{wrong} of {checked}"}
+    "B/triangle": "{bytes_per_triangle:.0f}",
+    "peak B/triangle": lambda row: f"{row.peak_bytes / row.triangles:.0f}", "SAH cost": "{sah_cost:.3g}", "depth": "{depth}",
+    "references/triangle": lambda row: f"{row.references / row.triangles:.2f}", "nodes/ray": "{nodes:.3g}", "boxes/ray": "{boxes:.3g}",
+    "triangles/ray": "{primitives:.3g}", "Mray/s": lambda row: spread(row.mrays), "speed / first": "{over_first:.2f}",
+    "differ": "{differ}", "wrong": "{wrong} of {checked}"}
 REFUSED: Columns = {"structure": "{structure}", "mesh": "{mesh}", "reason": "{reason}"}
 LEGEND = f"""\
-build: median of the builds, all cores. B/triangle: bytes of the whole structure, triangles included; peak B: growth of the process at
-the first build; both a triangle. SAH: expected nodes and triangles of a random line through the root, each of cost 1. refs: primitives
-in all leaves over triangles. nodes, boxes, triangles: fetched and tested, a ray (closest hit). Mray/s: median of the alternating runs,
-quartiles in brackets; / first: ratio to the first structure of the table, run by run. differ: rays with another prim_id or another bit
-of t than {YARDSTICK}; wrong: the same against brute force, for as many rays as 2e8 tests allow. Both must be 0."""
+build: median time of the builds, on all cores. B/triangle: bytes of the whole structure, triangles included. peak B/triangle: growth
+of the process's memory at the first build. SAH cost: nodes and triangles that a random line through the root's box is expected to
+visit. references: entries of all leaves. nodes/ray, boxes/ray, triangles/ray: nodes fetched, boxes and triangles tested, for a closest
+hit. Mray/s: median of the alternating runs, quartiles in brackets. speed / first: median of the ratios to the first structure of the
+table, run by run. differ: rays whose prim_id or t, bit for bit, is not that of {YARDSTICK}. wrong: rays whose answer is not that of
+brute force, for as many rays as 2e8 tests allow. Both must be 0."""
 
 
 def names(plan: Plan) -> list[str]:
-    """Return the names of the structures, by default in the registry's order without aliases."""
+    """Return the names of the structures to measure; by default the registry's, without aliases and brute force."""
     if plan.structures:
         return list(dict.fromkeys(plan.structures))
     return [name for name, cls in ACCELERATORS.items() if name == cls.name and name != "brute_force"]
@@ -62,7 +64,7 @@ def rows(plan: Plan) -> Iterator[Row]:
 
 
 def mesh_rows(plan: Plan, mesh: Mesh) -> Iterator[Row]:
-    """Yield a row for each structure that refuses the mesh, with its reason, and one for each kind of ray and each other structure."""
+    """Yield a row with the reason for each structure that refuses the mesh, then a row for each kind of ray and other structure."""
     yardstick = build(Geometry.of(mesh), YARDSTICK)
     sets = ray_sets(yardstick, plan.rays, plan.seed)
     mesh = in_stadium(mesh) if plan.stadium else mesh
@@ -99,7 +101,7 @@ def mesh_rows(plan: Plan, mesh: Mesh) -> Iterator[Row]:
 
 
 def timing(rays: int, seconds: np.ndarray, first: np.ndarray) -> dict[str, object]:
-    """Return seconds and million rays a second of each run, and how many times as fast as the first structure, run by run."""
+    """Return seconds and million rays a second of each run, and the median of first / seconds over the runs, a ratio of speeds."""
     mrays = rays / seconds / 1e6
     return {"seconds": seconds.tolist(), "mrays": mrays.tolist(), "mrays_median": float(np.median(mrays)),
             "over_first": float(np.median(first / seconds))}
@@ -107,7 +109,7 @@ def timing(rays: int, seconds: np.ndarray, first: np.ndarray) -> dict[str, objec
 
 @cache
 def warm_up(structure: str) -> None:
-    """Compile the kernels of a structure's builder before a build is timed, by building over a small ball."""
+    """Compile the kernels of a structure's builder before a build is timed: build over a small sphere."""
     with suppress(InputError):  # a refusal is reported for the measured mesh
         build(Geometry.of(icosphere(3)), structure)
 
@@ -119,14 +121,14 @@ def answer(accel: Accelerator, rays: RaySet, threads: int | None) -> Hits | np.n
 
 
 def differing(found: Hits | np.ndarray, truth: Hits | np.ndarray) -> int:
-    """Count the rays with another prim_id or another bit of t, or another answer to an any-hit query."""
+    """Count the rays whose prim_id, bits of t or any-hit answer differ from the truth."""
     if isinstance(found, Hits) and isinstance(truth, Hits):
         return int(((found.prim_id != truth.prim_id) | (found.t.view(np.int32) != truth.t.view(np.int32))).sum())
     return int((np.asarray(found) != np.asarray(truth)).sum())
 
 
 def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
-    """Return a table for each mesh, and the refused structures."""
+    """Return a table for each mesh, and a table of the structures that refused a mesh."""
     refused = [row for row in rows if "reason" in vars(row)]
     by_mesh = grouped((row for row in rows if row not in refused), "mesh", "triangles").items()
     return [*(tabled(COLUMNS, group, f"{mesh}, {triangles} triangles") for (mesh, triangles), group in by_mesh),
@@ -134,7 +136,7 @@ def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
 
 
 def machine(plan: Plan) -> str:
-    return machine_line(f"{plan.threads} used to search", f"{plan.runs} runs of {plan.rays} rays")
+    return machine_line(f"{plan.threads} threads trace", f"{plan.runs} runs of {plan.rays} rays")
 
 
 def line(row: Row) -> str:

@@ -1,4 +1,4 @@
-"""`python -m wrt bench bvh`: builders of binary BVHs, and boxes, spheres and 14-DOPs around the same tree."""
+"""`python -m wrt bench bvh`: compare builders of binary BVHs, and boxes, spheres and 14-DOPs as bounding volumes of one tree."""
 
 from __future__ import annotations
 
@@ -30,26 +30,26 @@ from wrt.lab.bench.timing import alternate, peak_bytes, spread
 from wrt.lab.plans import Bvh as Plan
 
 VOLUMES = ("bvh2", "bvh2_sphere", "bvh2_kdop")
-TESTED_RAYS, TESTED_NODES = 1024, 1024
+TESTED_RAYS, TESTED_NODES = 1024, 1024  # rays and nodes that time one bounding volume alone
 TITLE = "Builders of binary BVHs, and bounding volumes"
 BUILDERS: Columns = {
-    "builder": "{builder}", "SAH": "{sah_cost:.2f}", "cost": "{cost:.2f}", "nodes": "{nodes:.2f}", "leaves": "{leaves:.2f}",
-    "triangles": "{triangles:.2f}", "depth": "{depth}", "refs": lambda row: f"{row.references / row.n_triangles:.2f}",
-    "build s": lambda row: spread(row.seconds), "CPU s": "{cpu_seconds:.3g}",
-    "peak B": lambda row: f"{row.peak_bytes / row.n_triangles:.0f}"}
+    "builder": "{builder}", "SAH cost": "{sah_cost:.2f}", "cost/ray": "{cost:.2f}", "nodes/ray": "{nodes:.2f}",
+    "leaves/ray": "{leaves:.2f}", "triangles/ray": "{triangles:.2f}", "depth": "{depth}",
+    "references/triangle": lambda row: f"{row.references / row.n_triangles:.2f}", "build s": lambda row: spread(row.seconds),
+    "CPU s": "{cpu_seconds:.3g}", "peak B/triangle": lambda row: f"{row.peak_bytes / row.n_triangles:.0f}"}
 VOLUME: Columns = {
     "volume": "{volume}", "B/node": "{node_bytes}", "inner area": "{inner_area:.3f}", "leaf area": "{leaf_area:.3f}",
-    "SAH": "{sah_cost:.2f}", "nodes": "{nodes:.2f}", "triangles": "{triangles:.2f}",
-    "ns/test": lambda row: spread(row.test_seconds, 1e9), "/ box": lambda row: spread(row.ratios),
+    "SAH cost": "{sah_cost:.2f}", "nodes/ray": "{nodes:.2f}", "triangles/ray": "{triangles:.2f}",
+    "ns/test": lambda row: spread(row.test_seconds, 1e9), "time / box": lambda row: spread(row.ratios),
     "Mray/s": lambda row: spread(row.rays / np.array(row.seconds) / 1e6), "differ": "{differ}"}
 LEGEND = """\
-Rays start on the sphere around the root's box, inwards with a cosine distribution, and meet the box. SAH: expected nodes and triangles
-of a random line through the root's box, each of cost 1. cost: nodes and leaves popped and triangles tested, a ray, if nothing that was
-pushed is dropped (as tinybvh counts); nodes, leaves, triangles: fetches of wrt's own traversal. refs: primitives in all leaves over
-triangles. build s: of the tree alone, median with quartiles. CPU s: of all threads, less sensitive to other load. peak B: growth of the
-process at the first build, a triangle. inner area, leaf area: surfaces of all children that are nodes, or leaves, over those of their
-boxes. ns/test: of one volume on one thread, with nothing around it; / box: ratio to the box, run by run. Mray/s: one thread. differ:
-rays with another prim_id or another bit of t than bvh2."""
+Rays start on the sphere around the root's box, go inwards with a cosine distribution, and meet the box. SAH cost: nodes and triangles
+that a random line through the root's box is expected to visit. cost/ray: nodes and leaves popped plus triangles tested, where every
+pushed entry is popped again (as tinybvh counts). nodes, leaves, triangles: counts of wrt's own traversal. references: entries of all
+leaves. build s: seconds to build the tree alone, median with quartiles. CPU s: sum over all threads, less sensitive to other load. peak
+B: growth of the process's memory at the first build. inner area, leaf area: total surface of the volumes of inner nodes, or of leaves,
+over the surface of their boxes. ns/test: time to test one volume on one thread, without traversal. time / box: ratio to the box, run by
+run. Mray/s: on one thread. differ: rays whose prim_id or t, bit for bit, is not that of bvh2."""
 
 
 def rows(plan: Plan) -> Iterator[Row]:
@@ -61,7 +61,7 @@ def rows(plan: Plan) -> Iterator[Row]:
 
 
 def inward(geometry: Geometry, n: int, seed: int = 0) -> RaySet:
-    """Return n rays that meet the geometry's box, uniform over lines: from the sphere around it, inwards with a cosine distribution."""
+    """Return n rays that meet the geometry's box, uniform over lines: from the box's bounding sphere, inwards by a cosine distribution."""
     lo, hi, center, radius = ball_around(geometry)
     rng = np.random.default_rng(seed)
     origins, directions = np.empty((0, 3), np.float32), np.empty((0, 3), np.float32)
@@ -94,7 +94,7 @@ def builder_rows(plan: Plan, geometry: Geometry, rays: RaySet) -> Iterator[dict[
 
 
 def published_cost(accel: OneMesh, rays: RaySet) -> float:
-    """Return the nodes and leaves popped and triangles tested, a ray, as tinybvh counts."""
+    """Return the mean number of nodes and leaves popped plus triangles tested for a ray, as tinybvh counts them."""
     hits = accel.closest_hit(rays.origins, rays.directions)
     counts = [wp.zeros(len(rays), dtype=wp.int32, device=accel.device) for _ in range(2)]
     device_rays = rays_on(accel.device, rays_of(rays.origins, rays.directions, 0.0, rays.t_max))
@@ -104,7 +104,7 @@ def published_cost(accel: OneMesh, rays: RaySet) -> float:
 
 
 def surfaces(accel: OneMesh) -> np.ndarray:
-    """Return the surfaces of both children of every node, (2, N)."""
+    """Return the surface areas of the bounding volumes of both children of every node, (2, N)."""
     nodes = accel.built.arrays["nodes"]
     if accel.name == "bvh2_sphere":
         radius = np.stack([nodes["sphere_0"][:, 3], nodes["sphere_1"][:, 3]]).astype(np.float64)
@@ -135,7 +135,7 @@ def volume_rows(plan: Plan, geometry: Geometry, rays: RaySet) -> Iterator[dict[s
 
 
 def tester_of(accel: OneMesh, rays: RaySet) -> Callable[[], int]:
-    """Return a function that tests all rays against nodes from the whole tree, and returns the number of tests."""
+    """Return a function that tests rays against both children of nodes from the whole tree, and returns the number of tests."""
     units = accel.structure.units
     record = units.triangle_test.record
     volumes = {"bvh2": lambda: box_volumes(record, units.box_test), "bvh2_sphere": lambda: sphere_volumes(record),

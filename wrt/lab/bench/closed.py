@@ -24,19 +24,21 @@ from wrt.lab.plans import Closed as Plan
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import box, icosphere, lathe, merged, teapot, torus, tube
 
-Answer = Callable[..., np.ndarray]  # of points: which are inside; of origins and directions: numbers of hits
-CHUNK = 1 << 18
-AT_EDGE = 2.0**-23  # error of a weight in float32
+Answer = Callable[..., np.ndarray]  # Points -> flags of those inside; or origins and directions -> numbers of hits.
+CHUNK = 1 << 18  # Points or rays at once.
+AT_EDGE = 2.0**-23  # Largest 1 - u - v that float32 rounding may leave on an edge.
+# Directions of the rays by which wrt.contains (its first ray), trimesh and Open3D find points inside, and an axis.
 AIMS = np.array([np.random.default_rng(0).normal(size=3), [0.4395064455, 0.617598629942, 0.652231566745], [1.0, 1.0, 1.0],
-                 [0.0, 0.0, 1.0]])  # the first direction of wrt.contains, the only ones of trimesh and of Open3D, and an axis
+                 [0.0, 0.0, 1.0]])
 TITLE = "Closed meshes: points inside, and crossings"
-COLUMNS: Columns = {"what": "{what}", "mesh": "{mesh}", "triangles": "{triangles}", "who": "{who}", "asked": "{asked}",
-                    "wrong": "{wrong}", "touching": "{touching}", "us each": "{microseconds:.2f}"}
+COLUMNS: Columns = {"test": "{what}", "mesh": "{mesh}", "triangles": "{triangles}", "library": "{who}", "queries": "{asked}",
+                    "wrong": "{wrong}", "touching": "{touching}", "us/answer": "{microseconds:.2f}"}
 LEGEND = """\
-inside: points in the mesh's box; from a third of them, a corner lies in a direction that wrt, trimesh or Open3D send rays in. wrong:
-another answer than exact arithmetic on rays that meet no edge; touching: wrong points within 1e-6 of the mesh's size of the surface.
-crossings: rays from outside at corners and edges, through the mesh; wrong: an odd number. wrt: count_hits with crossings. Rays that touch
-an outline (touching) do not count as wrong for other libraries, which may see one hit there. us each: microseconds a point or a crossing.
+inside: is a point inside? Points lie in the mesh's box. For a third of them, the library's own ray from the point goes through a corner.
+wrong: the answer is not that of exact arithmetic. touching: wrong points closer to the surface than 1e-6 of the mesh's size.
+crossings: how often does a ray cross the surface? Rays start outside, aim at corners and edges, and leave the mesh. wrong: the number is
+odd. touching: rays that touch an outline; other libraries may report one hit there, and it does not count as wrong. wrt answers by
+count_hits with crossings. us/answer: microseconds a point or a crossing.
 """
 
 
@@ -44,7 +46,7 @@ def rows(plan: Plan) -> Iterator[Row]:
     for mesh in [*made(), *map(as_mesh, plan.meshes)]:
         geometry = Geometry.of(mesh)
         if open_edges(geometry):
-            raise InputError("the mesh is not closed", place=mesh.name)
+            raise InputError("the mesh is not closed: each edge needs two faces of opposite directions", place=mesh.name)
         reference, accel = Reference(geometry), build(geometry)
         known = {"mesh": mesh_name(mesh), "triangles": len(geometry.faces)}
         for who, n in asked(plan, plan.points):
@@ -58,7 +60,7 @@ def rows(plan: Plan) -> Iterator[Row]:
 
 
 def made() -> list[Mesh]:
-    """Return a box, a ball, a torus, a knot, a solid of revolution, a teapot, and a ball with a hollow."""
+    """Return seven closed meshes: box, ball, torus, knot, solid of revolution, teapot, and a ball with a hollow."""
     a = np.linspace(0.0, 2.0 * np.pi, 120)
     knot = np.stack([np.sin(a) + 2.0 * np.sin(2.0 * a), np.cos(a) - 2.0 * np.cos(2.0 * a), -np.sin(3.0 * a)], axis=1)
     parts = {"box": box(), "ball": icosphere(5), "torus": torus(), "knot": tube(knot, 0.3, 16),
@@ -68,7 +70,7 @@ def made() -> list[Mesh]:
 
 
 def asked(plan: Plan, n: int) -> Iterator[tuple[str, int]]:
-    """Yield the name of each library and its number of queries: other libraries get fewer."""
+    """Yield the name of each library and its number of queries: n for wrt, fewer for other libraries."""
     yield "wrt", n
     for name, (package, _) in OTHERS.items():
         most = plan.others // (100 if name == "trimesh" else 1)
@@ -91,7 +93,7 @@ def points_wrong(geometry: Geometry, reference: Reference, answer: Answer, n: in
 
 
 def points_in(geometry: Geometry, rng: np.random.Generator, n: int) -> np.ndarray:
-    """Return (n, 3) float32 points in the mesh's box; from every third, a ray along one of AIMS meets a corner."""
+    """Return (n, 3) float32 points in the mesh's box. From every third point, a ray along one of AIMS meets a corner."""
     low, high = geometry.vertices.min(axis=0).astype(np.float64), geometry.vertices.max(axis=0)
     points = rng.uniform(low, high, (n, 3))
     aimed = np.arange(0, n, 3)
@@ -102,8 +104,8 @@ def points_in(geometry: Geometry, rng: np.random.Generator, n: int) -> np.ndarra
 
 
 def exactly_inside(reference: Reference, points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return which points are inside, and which exactly on the surface (either answer is right there), (N,) bool each.
-    Count the crossings of a random ray by exact arithmetic; try another ray where it meets an edge."""
+    """Return which points are inside, and which lie exactly on the surface, where either answer is right: (N,) bool each.
+    Count the crossings of a random ray by exact arithmetic; if the ray meets an edge, take another ray."""
     inside, on_surface = np.zeros((2, len(points)), bool)
     left = np.arange(len(points))
     while len(left):
@@ -127,8 +129,8 @@ def distances(geometry: Geometry, points: np.ndarray) -> np.ndarray:
 
 
 def crossed(geometry: Geometry, accel: Accelerator, count: Answer, own: bool, n: int, seed: int) -> dict[str, object]:
-    """Count odd numbers of crossings of rays that begin and end outside. count: hits by another library; None: wrt's crossings.
-    A ray that touches an outline is not held against the other library, which may see one hit there."""
+    """Count the rays that begin and end outside and cross the surface an odd number of times by `count`.
+    own: `count` is wrt's. Another library may see one hit where a ray touches an outline, so such rays are not wrong for it."""
     rng, wrong, touching, hits, seconds = np.random.default_rng(seed), 0, 0, 0, 0.0
     low, high = (bound.astype(np.float64) for bound in (geometry.vertices.min(axis=0), geometry.vertices.max(axis=0)))
     for first in range(0, n, CHUNK):
@@ -146,9 +148,9 @@ def crossed(geometry: Geometry, accel: Accelerator, count: Answer, own: bool, n:
 
 
 def crossings_of(geometry: Geometry, found: AllHits, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return how often each ray crosses the surface, and how often it touches it, (N,) each.
-    Faces that a ray meets at the same edge or corner are one crossing if their signed angles around it add up to a whole turn. A ray meets
-    an edge where two faces say so: rounding hides whether one weight, 1 - u - v, is 0."""
+    """Return how often each ray crosses the surface, and how often it touches the surface without crossing it, (N,) each.
+    Faces that a ray meets at one edge or corner are one crossing if their signed angles around it add up to a whole turn. A hit counts
+    as on an edge only if both faces of the edge report it: rounding hides whether the weight 1 - u - v is 0."""
     corners = geometry.vertices[geometry.faces[found.prim_id]].astype(np.float64)
     d, ray = directions[found.ray_id].astype(np.float64), found.ray_id
     side = np.sign((np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) * d).sum(axis=1))
@@ -184,7 +186,7 @@ def _angles(corners: np.ndarray, d: np.ndarray, k: np.ndarray) -> np.ndarray:
 
 
 def open3d_answers(geometry: Geometry) -> tuple[Answer, Answer]:
-    """Return Open3D's functions that decide which points are inside, and that count the hits of rays."""
+    """Return two functions of Open3D: which points are inside, and how many hits each ray has."""
     import open3d
 
     tensor = open3d.core.Tensor.from_numpy
@@ -195,7 +197,7 @@ def open3d_answers(geometry: Geometry) -> tuple[Answer, Answer]:
 
 
 def trimesh_answers(module: str, geometry: Geometry) -> tuple[Answer, Answer]:
-    """Return the same two functions of trimesh."""
+    """Return two functions of trimesh: which points are inside, and how many hits each ray has."""
     import trimesh
 
     mesh = trimesh.Trimesh(geometry.vertices, geometry.faces, process=False)
@@ -203,7 +205,7 @@ def trimesh_answers(module: str, geometry: Geometry) -> tuple[Answer, Answer]:
     return rays.contains_points, lambda origins, directions: np.bincount(rays.intersects_id(origins, directions)[1], minlength=len(origins))
 
 
-# By name: the package that a library needs, and its two functions for a geometry.
+# Name -> the package that a library needs, and its two functions for a geometry.
 OTHERS: dict[str, tuple[str, Callable[[Geometry], tuple[Answer, Answer]]]] = {
     "Open3D": ("open3d", open3d_answers), "trimesh, Embree": ("embreex", partial(trimesh_answers, "ray_pyembree")),
     "trimesh": ("rtree", partial(trimesh_answers, "ray_triangle"))}
@@ -214,7 +216,7 @@ def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
     for what, who in dict.fromkeys((row.what, row.who) for row in rows):
         mine = [row for row in rows if (row.what, row.who) == (what, who)]
         counts = {name: sum(getattr(row, name) for row in mine) for name in ("asked", "wrong", "touching")}
-        found = [row.hits if what == "crossings" else row.asked for row in mine]  # the seconds are divided by them
+        found = [row.hits if what == "crossings" else row.asked for row in mine]  # answers, as in row.microseconds
         each = sum(row.microseconds * n for row, n in zip(mine, found, strict=True)) / max(sum(found), 1)
         total.append(Row(what=what, mesh="all", triangles="", who=who, **counts, microseconds=each))
     return [tabled(COLUMNS, total, "All meshes"), tabled(COLUMNS, rows, "By mesh")]

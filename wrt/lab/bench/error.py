@@ -1,7 +1,7 @@
-"""`python -m wrt bench error`: speed beside error, over the knobs of a render.
+"""`python -m wrt bench error`: time and error of a render as its settings vary.
 
-Each picture is compared with one reference of the same scene. One knob at a time is turned; each value is rendered with 1, 2, 4 ...
-samples a pixel and several seeds."""
+A knob is a setting or option that the study varies, one knob at a time. Each value is rendered with 1, 2, 4 ... samples per pixel and
+several seeds. Every picture is compared with one reference of the same scene."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ from wrt.scene.model import Scene
 from wrt.scene.settings import SAMPLERS
 
 REFERENCE_SEEDS = 8
-REFERENCE_DEPTH, REFERENCE_THROUGHPUT = 32, 1e-5
-BRUTE_FORCE_LIMIT = 5000  # primitives
+REFERENCE_DEPTH, REFERENCE_THROUGHPUT = 32, 1e-5  # least max_depth and largest min_throughput of the reference
+BRUTE_FORCE_LIMIT = 5000  # most primitives for which brute force is measured
 
 
 @dataclass(frozen=True)
 class Knob:
-    """A field of Settings or Options that the study turns, the values to try, and whether it changes anything in a scene (`matters`)."""
+    """A field of Settings or Options that the study varies. values: those to try; matters: True if the field can change a picture."""
 
     name: str
     kind: Literal["settings", "options"]
@@ -55,20 +55,20 @@ def triangles(scene: Scene) -> int:
 
 
 def structures(scene: Scene) -> list[str]:
-    """Return each structure's first name; brute force only for few primitives."""
+    """Return the registry's name of each structure without aliases; brute force only for few primitives."""
     first = {cls: name for name, cls in reversed(list(ACCELERATORS.items()))}.values()
     small = triangles(scene) + len(scene.spheres) <= BRUTE_FORCE_LIMIT
     return [name for name in ACCELERATORS if name in first and (name != "brute_force" or small)]
 
 
-def branches(scene: Scene, features: Features) -> bool:
+def has_secondary_rays(scene: Scene, features: Features) -> bool:
     return features.reflection or features.refraction or features.blend
 
 
 KNOBS = {knob.name: knob for knob in (
     Knob("sampler", "settings", lambda scene: SAMPLERS),
-    Knob("max_depth", "settings", lambda scene: (0, 1, 2, 4, 8, 16), branches),
-    Knob("min_throughput", "settings", lambda scene: (0.1, 0.01, 0.001, 0.0001), branches),
+    Knob("max_depth", "settings", lambda scene: (0, 1, 2, 4, 8, 16), has_secondary_rays),
+    Knob("min_throughput", "settings", lambda scene: (0.1, 0.01, 0.001, 0.0001), has_secondary_rays),
     Knob("fresnel", "settings", lambda scene: ("exact", "schlick"), lambda scene, _: any(m.uses("ior") for m in scene.materials)),
     Knob("triangle", "options", lambda scene: RAY_TRIANGLE, lambda scene, _: triangles(scene) > 0),
     Knob("box", "options", lambda scene: RAY_AABB),
@@ -78,7 +78,7 @@ KNOBS = {knob.name: knob for knob in (
 
 @dataclass(frozen=True)
 class Variant:
-    """One knob at one value (knob "", value None: nothing is turned), ready to be rendered."""
+    """The scene and options with one knob at one value; knob "" and value None are the unchanged scene."""
 
     knob: str
     value: Any
@@ -91,7 +91,7 @@ class Variant:
 
 
 def variants(scene: Scene, options: Options, features: Features, knobs: Sequence[str]) -> tuple[list[Variant], list[str]]:
-    """Return the scene as it is and every value of every knob, and a sentence for each knob that changes nothing."""
+    """Return the unchanged scene and a variant for every other value of every knob; also a sentence for each knob without effect."""
     found, left_out = [Variant("", None, scene, options)], []
     for name in knobs:
         knob = KNOBS[name]
@@ -106,9 +106,9 @@ def variants(scene: Scene, options: Options, features: Features, knobs: Sequence
 
 
 def make_reference(scene: Scene, options: Options, spp: int, seeds: Sequence[int], depth: int | None = None) -> Row:
-    """Render the reference: exact Fresnel, Sobol samples, default tests, deep paths, a low cut-off; float64 mean over the seeds.
-    - pixels: (H, W, 3) float64; variance: of the mean, averaged over pixels and channels.
-    - lost_throughput_per_sample: the share of light that was not followed, a bound on what the reference's own cuts hide."""
+    """Render the reference: the float64 mean over the seeds, with exact Fresnel, Sobol samples, default tests and deep paths.
+    - pixels: (H, W, 3) float64; variance: variance of this mean, averaged over pixels and channels.
+    - lost_throughput_per_sample: throughput of the rays that were cut; it bounds the light that the reference itself lacks."""
     settings = scene.settings
     depth = max(settings.max_depth, REFERENCE_DEPTH) if depth is None else depth
     throughput = min(settings.min_throughput, REFERENCE_THROUGHPUT)
@@ -131,7 +131,7 @@ def finished(film: Film) -> Film:
 
 
 def measure(variant: Variant, renderer: Renderer, spp: int, seeds: Sequence[int], truth: Row) -> Row:
-    """Render with every seed and compare with the reference."""
+    """Render a variant with every seed; return time, error against the reference `truth`, and their confidence intervals."""
     films = [finished(renderer.run(seed=seed, spp=spp)) for seed in seeds]
     n, settings = len(films), variant.scene.settings
     seconds = np.array([film.stats["seconds"]["trace"] for film in films])
@@ -160,7 +160,7 @@ def measure(variant: Variant, renderer: Renderer, spp: int, seeds: Sequence[int]
 
 
 def slope_of(rows: Sequence[Row], known: float, sampler: str) -> Row:
-    """Fit slopes over the rows of one variant. known: the reference's variance."""
+    """Fit the slopes of log error over log spp to the rows of one variant. known: variance of the reference."""
 
     def fit(of: Callable[[np.ndarray], float]) -> statistics.Estimate:
         return statistics.slope([row.spp for row in rows], lambda some: [of(row.products[np.ix_(some, some)]) for row in rows],
@@ -178,16 +178,16 @@ def same_pixels(rows: Sequence[Row]) -> list[str]:
 
 
 def sweep(scene: Scene, plan: Plan, options: Options, report: Callable[[str], None] = lambda text: None) -> Sweep:
-    """Measure all variants. `report` gets a line before each step; options.seed decides on all seeds.
-    Interrupted by Ctrl-C, return the finished rows; raise KeyboardInterrupt if there are none."""
-    words = [int(word) for word in np.random.SeedSequence(options.seed).generate_state(REFERENCE_SEEDS + plan.repeats)]
+    """Measure all variants. `report` receives a line before each step; all seeds follow from options.seed.
+    After Ctrl-C, return the finished rows, or raise KeyboardInterrupt if no row is finished."""
+    seeds = [int(word) for word in np.random.SeedSequence(options.seed).generate_state(REFERENCE_SEEDS + plan.repeats)]
     base = Renderer(scene, options)
     found, left_out = variants(scene, options, base.prepared.plan.features, plan.knobs or tuple(KNOBS))
     reference_spp = plan.reference_spp or 8 * plan.max_spp
-    for_truth, for_each = REFERENCE_SEEDS * reference_spp, plan.repeats * sum(plan.levels)
-    left = TimeLeft(for_truth + len(found) * for_each)  # in samples, as if all took equally long
+    truth_samples, variant_samples = REFERENCE_SEEDS * reference_spp, plan.repeats * sum(plan.levels)
+    left = TimeLeft(truth_samples + len(found) * variant_samples)  # as if all samples took the same time
     report(f"reference: {REFERENCE_SEEDS} seeds of {reference_spp} spp")
-    truth = make_reference(scene, options, reference_spp, words[:REFERENCE_SEEDS])
+    truth = make_reference(scene, options, reference_spp, seeds[:REFERENCE_SEEDS])
     machine = {"device": base.prepared.device.name or "CPU", "threads": base.prepared.threads, "system": platform.machine(),
                "wrt": wrt.__version__}
     result = Sweep(scene=scene.name, size=list(scene.settings.size), repeats=plan.repeats, seed=options.seed, confidence=CONFIDENCE,
@@ -195,16 +195,16 @@ def sweep(scene: Scene, plan: Plan, options: Options, report: Callable[[str], No
     rows: dict[str, list[Row]] = {variant.label: [] for variant in found}
     try:
         for number, variant in enumerate(found):
-            left.done = for_truth + number * for_each
+            left.done = truth_samples + number * variant_samples
             renderer = base if variant.knob == "" else Renderer(variant.scene, variant.options)
-            finished(renderer.run(spp=1))  # the first launch is not timed
+            finished(renderer.run(spp=1))  # the first launch is slower, and not timed
             for spp in plan.levels:
                 likely = 2.0 * rows[variant.label][-1].seconds.value * plan.repeats if rows[variant.label] else 0.0
                 if likely > plan.row_limit:
-                    result.left_out.append(f"{variant.label} from {spp} spp on: a row would take some {likely:.0f} s")
+                    result.left_out.append(f"{variant.label} from {spp} spp on: its seeds would take about {likely:.0f} s")
                     break
                 report(f"{number + 1}/{len(found)} {variant.label}: {spp} spp{left}")
-                rows[variant.label].append(measure(variant, renderer, spp, words[REFERENCE_SEEDS:], truth))
+                rows[variant.label].append(measure(variant, renderer, spp, seeds[REFERENCE_SEEDS:], truth))
                 left.done += plan.repeats * spp
     except KeyboardInterrupt as stop:
         if not any(rows.values()):

@@ -8,21 +8,21 @@ from wrt.lab.bench.error_statistics import CONFIDENCE, Estimate
 from wrt.lab.bench.report import Columns, Part, Row, markdown, tabled, tables_page
 
 BASE = "as it is"
-# Slopes of the variance. Independent samples: -1. Scrambled nets: -3 if the integrand is smooth (Owen 1997, "Scrambled Net Variance for
-# Integrals of Smooth Functions"). An edge across d dimensions makes it -1 - 1/d (He and Wang 2015, "On the Convergence Rate of Randomized
-# Quasi-Monte Carlo for Discontinuous Functions"): -1.5 here. Each pair of dimensions is a net of its own. So whatever depends on two
-# pairs at once (pixel and lens, pixel and light) falls as for independent samples.
+# Slopes of log variance over log spp. Independent samples have -1. Scrambled nets have -3 if the integrand is smooth (Owen 1997,
+# "Scrambled Net Variance for Integrals of Smooth Functions"). They have -1 - 1/d if an edge crosses d dimensions (He and Wang 2015, "On
+# the Convergence Rate of Randomized Quasi-Monte Carlo for Discontinuous Functions"). Here d is 2: each pair of dimensions is a net by
+# itself. An integrand that depends on two pairs at once (pixel and lens, pixel and light) has -1, as for independent samples.
 THEORY = {"independent": "-1", "sobol": "-1 to -3"}
 
 
 class Sweep(Row):
     """Results of a sweep over knobs.
 
-    - rows: a variant (one knob at one value; None: nothing is turned) at one number of samples; products: statistics.gram of its repeats.
-    - rmse: of one picture, without the reference's own error; NaN below that error. rmse^2 = bias^2 + noise^2, root mean squares.
-    - bias: NaN if noise hides it; `bias_below` bounds it. efficiency: 1 / (mse x seconds).
-    - slopes: of a variant's log mse, and of the log of its variance alone, over log spp.
-    - same_pixels: variants with the pixels of the unchanged scene. interrupted: number of the signal that ended the sweep early."""
+    - rows: one row for each variant and number of samples per pixel; knob None is the unchanged scene. products: `gram` of its pictures.
+    - rmse: root mean square error of one picture, without the reference's own error; NaN below that error. rmse^2 = bias^2 + noise^2.
+    - bias: root mean square bias, NaN if noise hides it; bias_below: its upper bound. efficiency: 1 / (mse x seconds).
+    - slopes: for each variant, the slopes of log mse and of log variance over log spp.
+    - same_pixels: variants whose pixels equal those of the unchanged scene. interrupted: number of the signal that ended the sweep."""
 
     def _repr_html_(self) -> str:
         return tables_page(tables(self))
@@ -33,7 +33,7 @@ def number(value: float) -> str:
 
 
 def interval(x: Estimate) -> str:
-    """Return the value and half its confidence interval in percent."""
+    """Format a value, and half the width of its confidence interval in percent of the value."""
     if math.isnan(x.value):
         return "-"
     half = 0.5 * (x.high - x.low) / abs(x.value) if x.value else math.nan
@@ -54,29 +54,30 @@ SLOPE_COLUMNS: Columns = {"setting": "{variant}", "slope of MSE": lambda slope: 
 
 
 def notes(sweep: Sweep) -> list[str]:
-    """Return what a reader must know about the figures, a sentence or two each."""
+    """Return paragraphs that explain how the figures were measured."""
     r, machine = sweep.reference, sweep.machine
     lines = [
         f"{sweep.size[0]}x{sweep.size[1]} pixels, {sweep.repeats} seeds each, on {machine['device']},"
         f" {machine['threads']} threads ({machine['system']}), wrt {machine['wrt']}.",
-        f"Reference: the mean (float64) of {r.seeds} seeds of {r.spp_each} spp, exact Fresnel, max_depth {r.max_depth},"
-        f" min_throughput {r.min_throughput:g}, in {r.seconds:.0f} s. Its standard error is {number(r.rmse)} (root mean square"
-        f" over the pixels, whose mean is {number(r.mean)}); {number(r.lost_throughput_per_sample)} of the light was not followed.",
-        f"Seconds are of tracing alone. Intervals are {CONFIDENCE:.0%}, from the seeds. The reference's variance is subtracted from RMSE,"
-        " bias and efficiency, not from relMSE and FLIP. RMSE^2 = bias^2 + noise^2; < is a bias that noise hides. Efficiency is"
-        " 1 / (MSE x seconds). * is on the Pareto front: nothing else is faster and as accurate, within 1%.",
-        "Slopes, in theory: -1 for independent samples. For scrambled nets -3 where the integrand is smooth and -1.5 where an edge"
-        " crosses it. Each pair of dimensions is a net of its own: light that depends on two pairs at once (pixel and lens, pixel and"
-        " light) falls with -1.",
+        f"Reference: the mean (float64) of {r.seeds} pictures with {r.spp_each} spp each, exact Fresnel, max_depth {r.max_depth},"
+        f" min_throughput {r.min_throughput:g}, rendered in {r.seconds:.0f} s. Its standard error is {number(r.rmse)} (root mean square"
+        f" over the pixels, whose mean is {number(r.mean)}). Cut rays had {number(r.lost_throughput_per_sample)} of the throughput.",
+        f"Seconds are those of tracing alone. The seeds give {CONFIDENCE:.0%} confidence intervals. RMSE, bias and efficiency exclude the"
+        " reference's variance; relMSE and FLIP include it. RMSE^2 = bias^2 + noise^2. A bias with < is an upper bound, because noise"
+        " hides the bias. Efficiency is 1 / (MSE x seconds). front: * marks the Pareto front; no other row is as fast and more accurate"
+        " by over 1%.",
+        "Theory of the slopes: -1 for independent samples. Scrambled nets have -3 if the integrand is smooth and -1.5 if an edge"
+        " crosses it. Each pair of dimensions is a net by itself: light that depends on two pairs (pixel and lens, pixel and light) has"
+        " -1.",
     ]
     if sweep.same_pixels:
-        lines.append(f"The same pixels as with the scene as it is, bit for bit: {', '.join(sweep.same_pixels)}.")
+        lines.append(f"Pixels equal to those of the unchanged scene, bit for bit: {', '.join(sweep.same_pixels)}.")
     return lines + [f"Left out: {line}." for line in sweep.left_out]
 
 
 def tables(sweep: Sweep) -> list[Part]:
     return [tabled(COLUMNS, sweep.rows, f"Speed against error: {sweep.scene}"),
-            tabled(SLOPE_COLUMNS, sweep.slopes, "How fast the error falls", "Log MSE, and log variance alone, over log spp.")]
+            tabled(SLOPE_COLUMNS, sweep.slopes, "Slopes of the error", "Slopes of log MSE, and of log variance (noise), over log spp.")]
 
 
 def text(sweep: Sweep) -> str:

@@ -1,4 +1,4 @@
-"""Statistics of repeated renders: bias and noise with confidence intervals, slopes, and the Pareto front."""
+"""Statistics of renders with several seeds: bias and noise with confidence intervals, slopes, and the Pareto front."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True)
 class Estimate:
-    """A value and the ends of its confidence interval (CONFIDENCE); NaN if unknown."""
+    """A value and the ends of its CONFIDENCE interval; NaN if unknown."""
 
     value: float
     low: float
@@ -24,36 +24,34 @@ UNKNOWN = Estimate(math.nan, math.nan, math.nan)
 
 
 def gram(pictures: Sequence[np.ndarray], truth: np.ndarray) -> np.ndarray:
-    """Return (K, K) float64: the mean over pixels and channels of the product of the errors of pictures i and j."""
+    """Return products (K, K) float64: for pictures i and j, the mean over pixels and channels of error i times error j."""
     errors = np.stack([picture.astype(np.float64).ravel() - truth.ravel() for picture in pictures])
     return errors @ errors.T / errors.shape[1]
 
 
 def mse_of(products: np.ndarray, known: float) -> float:
-    """Return the mean squared error. products: `gram`; known: the mean variance of the truth, which is in every product."""
+    """Return the mean squared error of a picture. products: result of `gram`; known: variance of the truth, part of every product."""
     return float(np.diag(products).mean()) - known
 
 
 def squared_bias_of(products: np.ndarray, known: float) -> float:
-    """Return an unbiased estimate of the mean squared bias: noise is in no product of two different pictures."""
+    """Return an unbiased estimate of the mean squared bias: products of two different pictures contain no noise on average."""
     n = len(products)
     return float(products.sum() - np.trace(products)) / (n * (n - 1)) - known
 
 
 def noise_of(products: np.ndarray) -> float:
-    """Return the mean over pixels of the variance: mse = squared bias + noise."""
+    """Return the variance of a picture, averaged over pixels: mse = squared bias + this variance."""
     return mse_of(products, 0.0) - squared_bias_of(products, 0.0)
 
 
 def jackknife(statistic: Callable[[np.ndarray], float], n: int) -> tuple[float, float]:
-    """Return a statistic of n repeats, and its standard error from leaving out one repeat at a time.
-    Source: Efron and Tibshirani 1993, "An Introduction to the Bootstrap", chapter 11. For n of about 8, percentiles of a bootstrap are too
-    narrow; a jackknife with Student's t is not."""
+    """Return a statistic of n repeats and its standard error, NaN if unknown: leave out one repeat at a time.
+    Source: Efron and Tibshirani 1993, "An Introduction to the Bootstrap", chapter 11. For n of about 8, a bootstrap's percentile intervals
+    are too narrow; a jackknife with Student's t is not. statistic: function of the indices of the repeats that count."""
     everything = np.arange(n)
     parts = np.array([statistic(np.delete(everything, i)) for i in range(n)])
-    if not np.isfinite(parts).all():
-        return statistic(everything), math.nan
-    return statistic(everything), math.sqrt((n - 1.0) * float(parts.var()))
+    return statistic(everything), math.sqrt((n - 1.0) * float(parts.var())) if np.isfinite(parts).all() else math.nan
 
 
 def student_t(freedom: int) -> float:
@@ -64,7 +62,7 @@ def student_t(freedom: int) -> float:
 
 
 def estimate(statistic: Callable[[np.ndarray], float], n: int, *, logarithmic: bool = False) -> Estimate:
-    """Return a statistic of n repeats with its interval. logarithmic: for positive values that vary by factors."""
+    """Return a statistic of n repeats with its interval. logarithmic: take the interval of the logarithm, for positive values."""
 
     def logarithm(indices: np.ndarray) -> float:
         value = statistic(indices)
@@ -84,7 +82,7 @@ def mean_estimate(values: Sequence[float]) -> Estimate:
 
 
 def bias_with_bound(products: np.ndarray, known: float) -> tuple[float, float]:
-    """Return the root mean square bias, NaN if its square is within its own interval plus the truth's variance; and a bound on it."""
+    """Return the root mean square bias and an upper bound. The bias is NaN if noise or the truth's variance may explain its square."""
     n = len(products)
     squared, spread = jackknife(lambda i: squared_bias_of(products[np.ix_(i, i)], known), n)
     reach = student_t(n - 1) * spread + known
@@ -92,7 +90,7 @@ def bias_with_bound(products: np.ndarray, known: float) -> tuple[float, float]:
 
 
 def slope(spp: Sequence[int], errors: Callable[[np.ndarray], Sequence[float]], repeats: int) -> Estimate:
-    """Fit log error over log spp by least squares. errors: of chosen repeats, a value for each spp.
+    """Fit a line to log error over log spp by least squares; return its slope. errors: indices of repeats -> an error for each spp.
     Return UNKNOWN for fewer than three values of spp, or if an error is not positive."""
     def fit(indices: np.ndarray) -> float:
         y = np.asarray(errors(indices))
@@ -102,9 +100,9 @@ def slope(spp: Sequence[int], errors: Callable[[np.ndarray], Sequence[float]], r
 
 
 def pareto_front(points: Sequence[tuple[float, float]], tolerance: float = 0.01) -> list[int]:
-    """Return the indices of the points (cost, error) that no other point beats in both, by rising cost, without NaN.
-    A higher cost must lower the error by more than the share `tolerance`, so settings with equal error give one point of the front. Source:
-    epsilon-dominance of Laumanns et al. 2002, in the error alone."""
+    """Return the indices of the points (cost, error) that no other point beats in both, by rising cost; skip NaN.
+    A point of higher cost must lower the error by more than the share `tolerance`. So settings with equal error give one point.
+    Source: epsilon-dominance (Laumanns et al. 2002), applied to the error only."""
     usable = [i for i, point in enumerate(points) if all(math.isfinite(x) for x in point)]
     front: list[int] = []
     for i in sorted(usable, key=lambda i: points[i]):

@@ -1,4 +1,4 @@
-"""`python -m wrt bench pictures`: waves of samples against one ray at a time, in whole pictures."""
+"""`python -m wrt bench pictures`: compare rendering by waves of samples with rendering one ray at a time."""
 
 from __future__ import annotations
 
@@ -22,15 +22,16 @@ from wrt.renderer.plan import plan_of, render_kernel
 from wrt.renderer.prepare import Prepared, prepare
 from wrt.renderer.tiles import Work
 
-TITLE = "Pictures by waves against one ray at a time"
+TITLE = "Rendering by waves and one ray at a time"
 COLUMNS: Columns = {
-    "scene": "{scene}", "triangles": "{triangles}", "rays a sample": "{rays:.2f}",
-    "loop ns": lambda row: spread(row.loop), "waves ns": lambda row: spread(row.waves),
+    "scene": "{scene}", "triangles": "{triangles}", "rays/sample": "{rays:.2f}",
+    "loop ns/sample": lambda row: spread(row.loop), "waves ns/sample": lambda row: spread(row.waves),
     "loop / waves": lambda row: spread(row.ratio), "differ": "{differ}"}
 LEGEND = """\
-loop: one ray at a time, as on CUDA; waves: many samples share queues that packets trace (kernels/loops/wave.py). Nanoseconds of a thread's
-CPU time a sample: camera ray, tracing, shading and film; medians of runs in turn, quartiles in brackets; loop / waves run by run. rays a
-sample: with shadow rays. differ: pixels with another value (must be 0)."""
+loop: one ray at a time, as on CUDA. waves: many samples share queues of rays, which packets trace (kernels/loops/wave.py). ns/sample:
+nanoseconds of CPU time of one thread for a sample: camera ray, tracing, shading and film. Times are medians of alternating runs, with
+quartiles in brackets; loop / waves is a ratio run by run. rays/sample includes shadow rays. differ: pixels whose value differs (must be
+0)."""
 
 
 def rows(plan: Plan) -> Iterator[Row]:
@@ -57,7 +58,7 @@ def row_of(name: str, ways: dict[str, Prepared], plan: Plan) -> Row:
     loop, waves = (seconds[way] * 1e9 / samples for way in ("loop", "waves"))
     pixels = [np.asarray(films[way].groups[0].mean.numpy()).view(np.int32) for way in ways]
     differ = int((pixels[0] != pixels[1]).reshape(len(pixels[0]), -1).any(axis=1).sum())
-    return Row(scene=name, triangles=ways["waves"].facts()["triangles"], rays=films["waves"].rays / samples, loop=loop.tolist(),
+    return Row(scene=name, triangles=ways["waves"].facts()["triangles"], rays=films["waves"].count("rays") / samples, loop=loop.tolist(),
                waves=waves.tolist(), ratio=(loop / waves).tolist(), ratio_median=float(np.median(loop / waves)), differ=differ)
 
 

@@ -1,4 +1,4 @@
-"""Histograms by matplotlib, side by side, as an array of pixels."""
+"""Draw histograms with matplotlib, as an array of pixels."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DPI = 100
-BINS = 60
+BINS = 60  # most bins of a histogram
 
 
 def histograms(panels: Mapping[str, Mapping[str, np.ndarray]], title: str) -> np.ndarray:
-    """Return (H, W, 3) uint8: a panel for each counter, and in it a line for each kind of ray.
-    Across: the cost of a ray, up to the 99.9th percentile of all rays. Upwards: the share of the kind's rays, logarithmic."""
+    """Return the picture, (H, W, 3) uint8: a panel for each counter, with a line for each kind of ray.
+    The x axis is the value, up to the 99.9th percentile. The y axis is the share of the rays, logarithmic.
+    `panels` maps a counter to a kind of ray to the value of each ray."""
     rows = math.ceil(len(panels) / 2)
     figure = new_figure(8.0, 0.7 + 2.4 * rows)
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -27,7 +28,7 @@ def histograms(panels: Mapping[str, Mapping[str, np.ndarray]], title: str) -> np
     figure.suptitle(title, fontsize="medium")
     colors: dict[str, str] = {}
     for axes, (counter, kinds) in zip(figure.subplots(rows, 2, squeeze=False).flat, panels.items(), strict=False):
-        axes.set(title=counter, yscale="log")
+        axes.set(title=counter, xlabel="number a ray", ylabel="share of rays", yscale="log")
         edges = bins(kinds)
         for name, values in kinds.items():
             color = colors.setdefault(name, f"C{len(colors) % 10}")
@@ -41,14 +42,14 @@ def histograms(panels: Mapping[str, Mapping[str, np.ndarray]], title: str) -> np
 
 
 def bins(values: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return bin edges, whole numbers apart, up to the 99.9th percentile of the values."""
+    """Return bin edges, whole numbers at equal distances, up to the largest 99.9th percentile of the arrays."""
     top = max((float(np.percentile(each, 99.9)) for each in values.values() if len(each)), default=1.0)
     width = max(1, math.ceil((top + 1.0) / BINS))
     return np.arange(0, math.ceil((top + 1.0) / width) + 1) * width
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Return an empty matplotlib Figure, sizes in inches. Raise InputError without matplotlib."""
+    """Return an empty matplotlib Figure of this size in inches. Raise InputError if matplotlib is missing."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:

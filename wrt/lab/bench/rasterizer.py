@@ -1,7 +1,7 @@
-"""Primary visibility in both orders: by z-buffer (the pixels of each triangle) and by rays (the triangle of each pixel).
+"""Primary visibility by two methods that share no code: a z-buffer and ray casting.
 
-Both give depth (H, W) float32, the distance along the ray through the pixel's centre (inf on a miss), and prim_id (H, W) int32 (-1 on a
-miss). They share no code on the way."""
+Both return depth (H, W) float32, the distance along the ray through the pixel's centre (inf on a miss), and prim_id (H, W) int32 (-1 on a
+miss)."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from wrt.renderer.pixel_rays import camera_rays
 from wrt.renderer.upload import camera_struct
 from wrt.scene.cameras import Camera, CameraKind
 
-NOTHING = np.uint64(0x7F800000_FFFFFFFF)  # depth inf, prim_id -1
+NOTHING = np.uint64(0x7F800000_FFFFFFFF)  # key of a pixel without a triangle: depth inf, prim_id -1
 TRIANGLES_PER_LAUNCH = 65536
-BANDS_PER_THREAD = 4  # rows differ in their numbers of triangles
-ROWS_ON_CUDA = 16  # of a band; one thread draws a triangle's part of it
+BANDS_PER_THREAD = 4  # several bands a thread, because bands differ in their numbers of triangles
+ROWS_ON_CUDA = 16  # rows of a band; a CUDA thread draws the part of one triangle in one band
 
 
 def as_perspective(camera: CameraKind) -> Camera:
-    """Raise InputError for a camera that does not keep straight edges straight."""
+    """Return the camera. Raise InputError for a camera under which straight edges may appear curved."""
     if not isinstance(camera, Camera):
-        raise InputError(f"is {camera.kind}; only a perspective camera suits z-buffer and rays", place=f"camera {camera.name!r}")
+        raise InputError(f"is {camera.kind}; the rasterizer needs a perspective camera", place=f"camera {camera.name!r}")
     return camera
 
 
 def directions_from_pixels(camera: CameraKind, size: tuple[int, int]) -> np.ndarray:
-    """Return the (3, 3) float64 matrix from (x, y, 1), pixels from the top left corner, to the direction through that point.
-    It is made of the float32 numbers that the ray units get: the exact value of what they compute, before normalisation."""
+    """Return the (3, 3) float64 matrix from (x, y, 1), in pixels from the top left corner, to the ray's direction, not normalised.
+    It uses the float32 camera of the render kernels, so the direction is the exact value of what these kernels round."""
     c = camera_struct(as_perspective(camera), size)
     right, up, forward = (np.array(list(v), np.float64) for v in (c.right, c.up, c.forward))
     tan_x, tan_y = (float(np.float32(value)) for value in (c.tan_x, c.tan_y))  # the struct still holds float64
@@ -46,7 +46,7 @@ def directions_from_pixels(camera: CameraKind, size: tuple[int, int]) -> np.ndar
 
 
 def view_struct(camera: CameraKind, size: tuple[int, int], shift: tuple[float, float] = (0.0, 0.0)) -> kernels.View:
-    """Return the View of a camera. shift: of all pixel centres, in pixels, right and down."""
+    """Return the View of a camera. shift: offset of the samples from the pixel centres, in pixels to the right and down."""
     from_pixels = directions_from_pixels(camera, size) @ np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]], [0.0, 0.0, 1.0]])
     view = kernels.View()
     view.origin = wp.vec3d(*list(camera_struct(camera, size).origin))
@@ -56,11 +56,11 @@ def view_struct(camera: CameraKind, size: tuple[int, int], shift: tuple[float, f
 
 
 class Rasterizer:
-    """A z-buffer over a geometry's triangles: call `draw`, then `depth` and `prim_id`. Nothing is built beforehand."""
+    """A z-buffer over a geometry's triangles: call `draw`, then `depth` and `prim_id`. It builds no acceleration structure."""
 
     def __init__(self, geometry: Geometry, device: str = "cpu", threads: int | None = None) -> None:
         if len(geometry.spheres):
-            raise InputError(f"has {len(geometry.spheres)} spheres, and a rasterizer draws triangles only", argument="geometry")
+            raise InputError(f"has {len(geometry.spheres)} spheres; a rasterizer draws only triangles", argument="geometry")
         self.device, self.threads = start(device), thread_count(threads)
         self.triangles = len(geometry.faces)
         self.vertices = upload(geometry.vertices, wp.vec3, self.device)
@@ -74,7 +74,7 @@ class Rasterizer:
             load_kernel(kernel, self.device)
 
     def draw(self, camera: CameraKind, size: tuple[int, int], shift: tuple[float, float] = (0.0, 0.0)) -> None:
-        """Draw all triangles, seen from the middle of the camera's lens. shift: of the sample from the pixel's centre, in pixels."""
+        """Draw all triangles, seen from the centre of the lens. shift: offset of the samples from the pixel centres, in pixels."""
         width, height = size
         view = view_struct(camera, size, shift)
         if self.size != size:
@@ -97,17 +97,17 @@ class Rasterizer:
                  for first in range(0, n, step)], self.threads)
 
     def _draw_bands(self, view: Any) -> None:
-        """Give each thread a band of rows on the CPU, with the triangles in it, so that no two threads write the same pixel."""
+        """Draw bands of rows in parallel on the CPU, each with the triangles in it, so that no two threads write the same pixel."""
         boxes = self.boxes.numpy()
-        there = np.flatnonzero(boxes[:, 0] <= boxes[:, 2]).astype(np.int32)
-        top, bottom = boxes[there, 1], boxes[there, 3]
+        visible = np.flatnonzero(boxes[:, 0] <= boxes[:, 2]).astype(np.int32)
+        top, bottom = boxes[visible, 1], boxes[visible, 3]
         bands = min(BANDS_PER_THREAD * self.threads, view.height)
         rows = -(-view.height // bands)
 
         def draw(first: int) -> None:
-            mine = there[(top < first + rows) & (bottom >= first)]
-            if len(mine):
-                self._launch(view, (1, len(mine)), wp.array(mine, dtype=wp.int32, device=self.device), first, rows)
+            in_band = visible[(top < first + rows) & (bottom >= first)]
+            if len(in_band):
+                self._launch(view, (1, len(in_band)), wp.array(in_band, dtype=wp.int32, device=self.device), first, rows)
 
         run_all([partial(draw, first) for first in range(0, view.height, rows)], self.threads)
 
@@ -127,25 +127,25 @@ class Rasterizer:
 
 
 class RayCaster:
-    """The same pictures by one ray a pixel, through a structure that is built here."""
+    """The pictures of Rasterizer by one ray per pixel: call `draw`, then `depth` and `prim_id`. It builds the structure itself."""
 
     def __init__(self, geometry: Geometry, accel: str = "bvh", device: str = "cpu", threads: int | None = None) -> None:
         ACCELERATORS.check(accel, "accel")
         self.accel, self.threads = build(geometry, accel, device, threads), threads
-        self.seen: tuple[CameraKind | None, tuple[int, int]] = None, (0, 0)  # camera and size of the rays
+        self.view: tuple[CameraKind | None, tuple[int, int]] = None, (0, 0)  # camera and picture size of the rays
 
     def draw(self, camera: CameraKind, size: tuple[int, int]) -> None:
-        """Cast the ray through each pixel's centre from the middle of the lens. Rays of the same camera are made once."""
-        if self.seen != (camera, size):
+        """Cast a ray from the centre of the lens through each pixel's centre. Rays are generated once for a camera and size."""
+        if self.view != (camera, size):
             self.origins, self.directions = (wp.array(rays, dtype=wp.vec3, device=self.accel.device)
                                              for rays in camera_rays(as_perspective(camera), size))
-            self.seen = camera, size
+            self.view = camera, size
         self.hits = self.accel.closest_hit(self.origins, self.directions, threads=self.threads)
         if self.accel.device.is_cuda:
             wp.synchronize_device(self.accel.device)
 
     def depth(self) -> np.ndarray:
-        return self.hits.t.numpy().reshape(self.seen[1][::-1])
+        return self.hits.t.numpy().reshape(self.view[1][::-1])
 
     def prim_id(self) -> np.ndarray:
-        return self.hits.prim_id.numpy().reshape(self.seen[1][::-1])
+        return self.hits.prim_id.numpy().reshape(self.view[1][::-1])

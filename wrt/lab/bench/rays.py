@@ -1,4 +1,4 @@
-"""Rays to measure structures with: those of a picture (primary, shadow, diffuse), and incoherent ones (random)."""
+"""Sets of rays that measure structures: primary, shadow and diffuse rays of a picture, and incoherent random rays."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.queries.accelerator import Accelerator
 
 RAY_KINDS = ("primary", "shadow", "diffuse", "random")
-SEEN = 0.55  # half of the picture's height over its distance: a field of view of 58 degrees
-OFFSET = 1e-4  # of the radius: start of rays above the visible surface
+TAN_HALF_FOV = 0.55  # a field of view of 58 degrees
+OFFSET = 1e-4  # start of shadow and diffuse rays above the surface, over the radius of the mesh's bounding sphere
 
 
 @dataclass(frozen=True, eq=False)
 class RaySet:
-    """Rays of one kind; t_max: (N,) float32; any_hit: a shadow ray, which asks for any hit and not for the closest."""
+    """Rays of one kind. origins, directions: (N, 3) float32; t_max: (N,) float32; any_hit: True for shadow rays, which need any hit."""
 
     kind: str
     origins: np.ndarray
@@ -33,7 +33,7 @@ class RaySet:
 
 
 def mean_counters(accel: Accelerator, rays: RaySet, **names: str) -> dict[str, float]:
-    """Return the means of counters of closest hits, a ray. names: of each result its counter."""
+    """Return means over the rays of counters of a closest-hit query. names: name in the result = name of the counter."""
     counters = accel.closest_hit(rays.origins, rays.directions, 0.0, rays.t_max, counters=True).counters
     return {name: float(getattr(counters, counter).mean()) for name, counter in names.items()}
 
@@ -43,7 +43,7 @@ def unit(v: np.ndarray) -> np.ndarray:
 
 
 def ball_around(geometry: Geometry) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Return the corners of the geometry's box, float64, and the centre and radius of the sphere around it."""
+    """Return the lowest and highest corner of the geometry's box, and the centre and radius of that box's bounding sphere."""
     lo, hi = (bound.astype(np.float64) for bound in geometry.bounds())
     lo, hi = lo.min(axis=0), hi.max(axis=0)
     return lo, hi, 0.5 * (lo + hi), 0.5 * float(np.linalg.norm(hi - lo))
@@ -54,30 +54,30 @@ def endless(n: int) -> np.ndarray:
 
 
 def shadow(origins: np.ndarray, outward: np.ndarray, center: np.ndarray, radius: float) -> RaySet:
-    """Return any-hit rays from visible points to one point light above the mesh."""
+    """Return any-hit rays from surface points to one point light above the mesh, t_max at the light. outward: unit normals."""
     light = center + radius * np.array([0.8, 1.7, 0.6])
     directions = light - origins
-    turned = (directions * outward).sum(axis=1) < 0.0
-    origins = np.where(turned[:, None], origins - 2.0 * OFFSET * radius * outward, origins)
+    backfacing = (directions * outward).sum(axis=1) < 0.0
+    origins = np.where(backfacing[:, None], origins - 2.0 * OFFSET * radius * outward, origins)
     return RaySet("shadow", origins.astype(np.float32), (light - origins).astype(np.float32), np.ones(len(origins), np.float32),
                   any_hit=True)
 
 
 def diffuse(origins: np.ndarray, outward: np.ndarray, rng: np.random.Generator) -> RaySet:
-    """Return rays from visible points into the hemisphere above the surface, with a cosine distribution."""
+    """Return rays from surface points into the hemisphere around the normal `outward`, with a cosine distribution."""
     directions = unit(outward + 0.999 * unit(rng.normal(size=origins.shape)))
     return RaySet("diffuse", origins.astype(np.float32), directions.astype(np.float32), endless(len(origins)))
 
 
 def random(n: int, center: np.ndarray, radius: float, rng: np.random.Generator) -> RaySet:
-    """Return rays between random points on the sphere around the mesh: uniform lines."""
+    """Return rays between random points on the mesh's bounding sphere, which are uniform lines."""
     a, b = (center + radius * unit(rng.normal(size=(n, 3))) for _ in range(2))
     return RaySet("random", a.astype(np.float32), unit(b - a).astype(np.float32), endless(n))
 
 
 def ray_sets(accel: Accelerator, n: int, seed: int = 0, inside: bool = False) -> dict[str, RaySet]:
-    """Return about n rays of every kind (for primary rays the next lower square number), the same for the same arguments.
-    The structure finds what the camera sees. inside: the camera stands in the middle of the mesh's box, as in a room."""
+    """Return a RaySet of every kind, each with the largest square number of rays up to n; equal arguments give equal rays.
+    Shadow and diffuse rays start where `accel` finds the camera's rays to hit. inside: put the camera at the centre of the mesh's box."""
     g: Any = accel.geometry  # a Geometry: the structure is over one mesh
     _, _, center, radius = ball_around(g)
     rng = np.random.default_rng(seed)
@@ -97,8 +97,8 @@ def ray_sets(accel: Accelerator, n: int, seed: int = 0, inside: bool = False) ->
     normals = np.where(((points - eye) * normals).sum(axis=1, keepdims=True) > 0.0, -normals, normals)
 
     def starts() -> tuple[np.ndarray, np.ndarray]:
-        """Return points just above visible surfaces, one for each pixel and in their order, and normals towards the camera."""
-        if not len(points):  # nothing is seen: the sphere's surface, inwards
+        """Return a start point just above a visible surface for each pixel, and the normals there, towards the camera."""
+        if not len(points):  # no primary ray hits: start on the bounding sphere, inwards
             inwards = -unit(rng.normal(size=(len(seen), 3)))
             return center - radius * inwards, inwards
         row = np.arange(len(seen)) * len(points) // len(seen)
@@ -109,12 +109,12 @@ def ray_sets(accel: Accelerator, n: int, seed: int = 0, inside: bool = False) ->
 
 
 def _camera(eye: np.ndarray, target: np.ndarray, n: int) -> RaySet:
-    """Return a camera's rays through a square of pixels, in rows."""
+    """Return a camera's rays through a square of pixels, row by row."""
     side = max(int(np.sqrt(n)), 1)
     forward = unit(target - eye)
     right = unit(np.cross(forward, [0.0, 1.0, 0.0]))
     up = np.cross(right, forward)
     x, y = np.meshgrid((np.arange(side) + 0.5) / side * 2.0 - 1.0, 1.0 - (np.arange(side) + 0.5) / side * 2.0)
-    directions = unit(forward + SEEN * (x[..., None] * right + y[..., None] * up)).reshape(-1, 3)
+    directions = unit(forward + TAN_HALF_FOV * (x[..., None] * right + y[..., None] * up)).reshape(-1, 3)
     origins = np.broadcast_to(eye, directions.shape)
     return RaySet("primary", origins.astype(np.float32), directions.astype(np.float32), endless(len(directions)))

@@ -1,4 +1,4 @@
-"""Machine, rows, and tables as Markdown and HTML, for all measurements."""
+"""What all measurements share: description of the machine, rows, and tables as Markdown and HTML."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from wrt.lab.plans import Plan
 
 
 def machine_line(used: str = "", *more: str, device: str = "cpu") -> str:
-    """Describe the device, its load, the threads in use and wrt's version: no time means anything without them."""
+    """Describe in one line the conditions under which times were measured: device, load, threads (`used`) and wrt's version."""
     line = next((line for line in describe_devices() if line.startswith(f"{device}:")), device)
     load = f"load average {os.getloadavg()[0]:.1f} at the start" if hasattr(os, "getloadavg") else ""
     return "; ".join([", ".join(filter(None, [line, used, load])), f"wrt {wrt.__version__}", *more])
 
 
 def versions(*packages: str) -> str:
-    """Return the versions of the packages that are installed."""
+    """Return names and versions of those packages that are installed."""
     from importlib.metadata import PackageNotFoundError, version
 
     found = []
@@ -40,15 +40,15 @@ def versions(*packages: str) -> str:
 
 
 class Row(SimpleNamespace):
-    """Figures of one measured thing, by name; the LEGEND of its study explains the names.
-    JSON gets all of them but NumPy's arrays, and names that begin with _."""
+    """Results of one measurement, as attributes; the LEGEND of the study explains their names.
+    JSON contains all attributes except NumPy arrays and names that begin with _."""
 
     def as_dict(self) -> JsonObject:
         return {name: plain(value) for name, value in vars(self).items() if not (name.startswith("_") or isinstance(value, np.ndarray))}
 
 
 def plain(value: object) -> object:
-    """Return a value as JSON takes it, rows within rows, too."""
+    """Return a value, which may contain rows and dataclasses, as lists, dictionaries and numbers for JSON."""
     if isinstance(value, list):
         return [plain(each) for each in value]
     if isinstance(value, dict):
@@ -56,17 +56,17 @@ def plain(value: object) -> object:
     return value.as_dict() if hasattr(value, "as_dict") else vars(value) if is_dataclass(value) else value
 
 
-# Columns of a table by their titles: the value of a row, as a format of the row's names or as a function of the row.
+# Heading of a column -> its cell for a row: a format string over the row's attributes, or a function of the row.
 Columns = Mapping[str, str | Callable[[Any], str]]
 
 
 def cells(columns: Columns, row: object) -> list[str]:
-    """Return one line of a table."""
+    """Return the cells of one row of a table."""
     return [column.format_map(vars(row)) if isinstance(column, str) else column(row) for column in columns.values()]
 
 
 def grouped(rows: Iterable[Row], *names: str) -> dict[tuple[Any, ...], list[Row]]:
-    """Group rows by the values of these names, in their order."""
+    """Group rows by the values of these attributes, in the order of first appearance."""
     out: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         out.setdefault(tuple(getattr(row, name) for name in names), []).append(row)
@@ -76,14 +76,14 @@ def grouped(rows: Iterable[Row], *names: str) -> dict[tuple[Any, ...], list[Row]
 def study_of(plan: Plan) -> ModuleType:
     """Return the module that measures a plan.
 
-    It has rows(plan), which yields each Row as it is done, TITLE, LEGEND, and COLUMNS or parts(rows, plan): tables and text. It may have
-    machine(plan), line(row) for the progress, and facts(rows, plan) for JSON beside the rows."""
+    The module has rows(plan), which yields each Row once it is measured, TITLE, LEGEND, and COLUMNS or parts(rows, plan), the tables.
+    It may have machine(plan), line(row) for a line of progress, and facts(rows, plan) for more JSON fields."""
     return importlib.import_module(plan.STUDY)
 
 
 def run(plan: Plan, report: Callable[[Row], None] | None = None) -> Rows[Row]:
-    """Measure everything; `report` gets each row as it is done."""
-    out = Rows[Row]([], partial(page, plan))  # no lambda: a worker sends it back
+    """Measure everything and return the rows; `report` receives each row once it is measured."""
+    out = Rows[Row]([], partial(page, plan))  # a lambda could not be pickled by a worker
     for row in study_of(plan).rows(plan):
         out.append(row)
         if report is not None:
@@ -92,7 +92,7 @@ def run(plan: Plan, report: Callable[[Row], None] | None = None) -> Rows[Row]:
 
 
 def parts_of(rows: Sequence[Row], plan: Plan) -> list[Part]:
-    """Return the tables and texts of a study; one table of its COLUMNS unless the study says otherwise."""
+    """Return the tables and texts of a study: its parts(), or one table with its COLUMNS."""
     study = study_of(plan)
     return study.parts(rows, plan) if hasattr(study, "parts") else [tabled(study.COLUMNS, rows)]
 
@@ -103,12 +103,12 @@ def page(plan: Plan, rows: Sequence[Row]) -> str:
 
 
 def mesh_name(mesh: object) -> str:
-    """Return the name of a mesh, or of a mesh's file, without its folder."""
+    """Return the name of a mesh, or the name of a mesh file without its folder."""
     return Path(getattr(mesh, "name", mesh) or "mesh").name  # type: ignore[arg-type]
 
 
 def line(plan: Plan, row: Row) -> str:
-    """Return a row as a line of progress."""
+    """Format a row as a line of progress."""
     study = study_of(plan)
     if hasattr(study, "line"):
         return study.line(row)
@@ -116,7 +116,7 @@ def line(plan: Plan, row: Row) -> str:
 
 
 def data(rows: Sequence[Row], plan: Plan) -> JsonObject:
-    """Return all as JSON takes it."""
+    """Return the rows and further fields of a study for JSON."""
     facts: Any = getattr(study_of(plan), "facts", lambda rows, plan: {})
     return {"rows": [row.as_dict() for row in rows], **facts(rows, plan)}
 
@@ -129,7 +129,7 @@ def text(rows: Sequence[Row], plan: Plan, machine: str) -> str:
 
 
 def repeating(plan: Plan) -> str:
-    """Return the command line that measures the same; files by their names only."""
+    """Return the command line that repeats the measurement, with the names of files without folders."""
     words = [f"python -m wrt {plan.COMMAND}"]
     for each in fields(plan):
         value, flag = getattr(plan, each.name), f"--{each.name.replace('_', '-')}"
@@ -145,7 +145,7 @@ def repeating(plan: Plan) -> str:
 
 @dataclass(frozen=True)
 class Part:
-    """A piece of a report: a heading, paragraphs, and a table (head, lines)."""
+    """A section of a report: heading, paragraphs and a table. head: headings of its columns; lines: cells of its rows."""
 
     title: str = ""
     text: str = ""
@@ -158,7 +158,7 @@ def tables_page(parts: Iterable[Part]) -> str:
 
 
 def table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """Return a Markdown table whose columns are also aligned as plain text, numbers to the right."""
+    """Return a Markdown table that is aligned as plain text, too: the first column to the left, the others to the right."""
     texts = [[str(cell).replace("|", "\\|") for cell in line] for line in (head, *lines)]
     width = [max(len(line[i]) for line in texts) for i in range(len(head))]
 
@@ -178,5 +178,5 @@ def markdown(parts: Iterable[Part]) -> str:
 
 
 def tabled(columns: Columns, rows: Iterable[object], title: str = "", text: str = "") -> Part:
-    """Return a part with the table of some rows."""
+    """Return a Part with a table of the rows."""
     return Part(title, text, tuple(columns), [cells(columns, row) for row in rows])

@@ -1,4 +1,4 @@
-"""A detailed mesh in a scene a thousand times its size, which no single cell size fits.
+"""A detailed mesh in a scene a thousand times as large: no single cell size of a uniform grid suits both.
 
 The teapot in a stadium: Haines 1988, "Spline Surface Rendering, and What's Wrong with Octrees", Ray Tracing News 1(2)."""
 
@@ -9,11 +9,11 @@ import numpy as np
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import merged
 
-TIMES = 1000.0
+TIMES = 1000.0  # size of the stadium over that of the mesh
 
 
 def stands(tiers: int = 50, seats: int = 400) -> Mesh:
-    """Return 2 + 4 tiers seats triangles: steps around a pitch at y = 0, from radius 0.6 to 1 and up to y = 0.25."""
+    """Return a stadium of 2 + 4 tiers seats triangles: a pitch at y = 0, and steps from radius 0.6 to 1 that rise to y = 0.25."""
     radius, height = np.linspace(0.6, 1.0, tiers + 1), np.linspace(0.0, 0.25, tiers + 1)
     r, y = np.repeat(radius, 2)[:-1], np.repeat(height, 2)[1:]
     angle = 2.0 * np.pi * np.arange(seats) / seats
@@ -28,7 +28,7 @@ def stands(tiers: int = 50, seats: int = 400) -> Mesh:
 
 
 def in_stadium(mesh: Mesh, times: float = TIMES) -> Mesh:
-    """Put the mesh on the pitch of a stadium `times` its size; its own faces come first."""
+    """Return the mesh on the pitch of a stadium that is `times` as large; the mesh's faces come first."""
     lo, hi = mesh.vertices.min(axis=0).astype(np.float64), mesh.vertices.max(axis=0).astype(np.float64)
     around = stands()
     scale = times * 0.5 * float(np.linalg.norm(hi - lo))

@@ -1,7 +1,6 @@
-"""Sweeps on the workers of an executor.
+"""Measurements on the workers of an executor.
 
-Counts may come from any worker. Times compare within a worker, so one worker measures a whole case: a mesh with all that is compared on
-it."""
+Times are comparable only within one worker. So one worker measures everything that is compared on a mesh."""
 
 from __future__ import annotations
 
@@ -25,7 +24,7 @@ _alone = threading.Lock()
 
 
 def submitter(executor: object) -> Executor | Submitter:
-    """Return an Executor as it is, and a Submitter for a dask.distributed.Client."""
+    """Return the executor itself, or a Submitter if it is a dask.distributed.Client."""
     if not hasattr(executor, "get_executor"):
         return cast(Executor, executor)
     from wrt.renderer.distributed.dask import Submitter
@@ -34,11 +33,11 @@ def submitter(executor: object) -> Executor | Submitter:
 
 
 def result(pool: Executor | Submitter, future: Future[T]) -> T:
-    """Return the result of a future. Raise the worker's error, or InputError if the result will never come."""
+    """Return the result of a future. Raise the worker's error, or InputError if the work was cancelled or the executor broke."""
     try:
         return future.result()
     except CancelledError as error:
-        raise (pool.lost() if hasattr(pool, "lost") else InputError("has cancelled the work", argument="executor")) from error
+        raise (pool.lost() if hasattr(pool, "lost") else InputError("cancelled the work", argument="executor")) from error
     except BrokenExecutor as error:
         raise InputError(str(error), argument="executor") from error
 
@@ -53,13 +52,12 @@ def cancel(pool: Executor | Submitter, futures: Iterable[Future[T]]) -> None:
 
 
 def by_mesh(run: Callable[..., list[T]], plan: Any, report: Callable[[T], None], executor: object = None) -> list[T]:
-    """Return the rows of run(plan, report), each mesh measured by one worker, or all of them here without an executor.
-    A worker reads a file at the same path. `report` gets the rows of a mesh together, meshes in their order. Raise InputError if the plan
-    has no meshes."""
+    """Return the rows of run(plan, report). With an executor, one worker measures each mesh, and reads its file at the same path.
+    `report` receives the rows in the order of the meshes. Raise InputError if a plan for an executor has no meshes."""
     if executor is None:
         return run(plan, report)
     if not plan.meshes:
-        raise InputError("must be given: a cluster measures each mesh on one worker", argument="meshes")
+        raise InputError("must be given for a cluster, where each mesh is measured by one worker", argument="meshes")
     pool, rows = submitter(executor), []
     meshes = [mesh if isinstance(mesh, Mesh) else os.path.abspath(mesh) for mesh in plan.meshes]
     futures = [pool.submit(one_at_a_time, DIGEST, run, replace(plan, meshes=(mesh,))) for mesh in meshes]
@@ -75,9 +73,9 @@ def by_mesh(run: Callable[..., list[T]], plan: Any, report: Callable[[T], None],
 
 
 def one_at_a_time(digest: str, function: Callable[..., T], *arguments: object) -> T:
-    """Call a function on a worker, one at a time in a process: concurrent timings slow each other down.
+    """Call a function on a worker, one call at a time in a process, because concurrent timings slow each other down.
     Raise InputError if the worker's code has another digest."""
     if digest != DIGEST:
-        raise InputError(f"worker {worker_name()} has other code of wrt, another Python, NumPy or Warp: all must have the same")
+        raise InputError(f"worker {worker_name()} has another version of wrt, Python, NumPy or Warp; all workers need the same versions")
     with _alone:
         return function(*arguments)

@@ -1,4 +1,4 @@
-"""Times of several jobs, run in turn in one process so that disturbances hit all of them; and the peak of memory."""
+"""Time several jobs by turns in one process, so that disturbances hit all of them alike; measure the peak of memory."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ T = TypeVar("T")
 
 
 def alternate(jobs: Mapping[K, Callable[[], object]], runs: int, clock: Callable[[], float] = time.perf_counter) -> dict[K, np.ndarray]:
-    """Return seconds (runs,) of each job, after one uncounted run of each. Each round begins with the next job."""
+    """Return seconds (runs,) of each job, after one run that is not timed. Jobs alternate; each round begins with the next job."""
     seconds: dict[K, list[float]] = {name: [] for name in jobs}
     names = list(jobs)
     for job in jobs.values():
@@ -40,20 +40,20 @@ def quartiles(values: npt.ArrayLike) -> Quartiles:
 
 
 def shown(values: Quartiles, digits: int = 3) -> str:
-    """Format the median, with the quartiles in brackets."""
+    """Format quartiles as the median, with the low and high quartile in brackets."""
     return f"{values[1]:.{digits}g} [{values[0]:.{digits}g}, {values[2]:.{digits}g}]"
 
 
 def spread(values: npt.ArrayLike, scale: float = 1.0) -> str:
-    """Format many values, times `scale`, as `shown`."""
+    """Format the median and quartiles of values times `scale`."""
     return shown(quartiles(scale * np.asarray(values)))
 
 
 def peak_bytes(work: Callable[[], T]) -> tuple[T, float]:
     """Return the result of `work`, and the growth of the process's peak memory in bytes (Linux; else NaN).
-    Memory that was freed but kept could be used without growth: first it goes back to the system, as far as possible."""
+    First return freed memory to the system, as far as possible: reusing it would not show as growth."""
     gc.collect()
-    with suppress(AttributeError, OSError, TypeError):  # no such library, or (Windows) none without a name
+    with suppress(AttributeError, OSError, TypeError):  # no malloc_trim, or Windows, where CDLL needs a name
         ctypes.CDLL(None).malloc_trim(0)
     try:
         Path("/proc/self/clear_refs").write_text("5")  # reset the peak

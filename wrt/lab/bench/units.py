@@ -1,4 +1,4 @@
-"""`python -m wrt bench units`: the price of the default intersection tests beside the others, as ratios with their spread."""
+"""`python -m wrt bench units`: compare the time of the default intersection tests with that of the other tests."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from wrt.lab.hard_cases.common import soup
 from wrt.lab.plans import Units as Plan
 from wrt.scene.shapes import icosphere, teapot
 
-ALONE = 64  # triangles without a structure: the triangle unit by itself
-TITLE = "The price of the default intersection tests"
-COLUMNS: Columns = {"mesh": "{mesh}", "triangles": "{triangles}", "rays": "{rays}", "unit": "{unit}",
-                    "Mray/s": lambda row: shown(row.mrays), "default's price": lambda row: shown(row.price),
-                    "from": "{extremes[0]:.3g}", "to": "{extremes[1]:.3g}", "B/tri": "{bytes_per_triangle:.0f}"}
+ALONE = 64  # triangles without a structure, to time the triangle test alone
+TITLE = "Time of the default intersection tests over that of the others"
+COLUMNS: Columns = {"mesh": "{mesh}", "triangles": "{triangles}", "rays": "{rays}", "test": "{unit}",
+                    "Mray/s": lambda row: shown(row.mrays), "default / test": lambda row: shown(row.price),
+                    "lowest": "{extremes[0]:.3g}", "highest": "{extremes[1]:.3g}", "B/triangle": "{bytes_per_triangle:.0f}"}
 LEGEND = """\
-One thread, runs in turn: median [quartiles], lowest and highest. The default is watertight triangles in conservative boxes. Its price is
-its time over that of the row's unit, run by run: above 1 the default is slower."""
+One thread, alternating runs. The default is the watertight triangle test in conservative boxes. default / test: time of the default over
+the time of the row's test, run by run, as median [quartiles], lowest and highest. Above 1 the default is slower."""
 
 
 def rows(plan: Plan) -> Iterator[Row]:
-    """Yield every triangle test in the default boxes and every box test with the default triangles; last, triangle tests alone."""
+    """Yield rows for each triangle test with default boxes, each box test with default triangles, and each triangle test alone."""
     triangles = [{"triangle": name} for name in RAY_TRIANGLE]
     boxes = [{"box": name} for name in list(RAY_AABB)[1:]]
     for mesh in map(as_mesh, plan.meshes or [icosphere(6), terrain(300), teapot(64)]):
@@ -47,7 +47,7 @@ def rows(plan: Plan) -> Iterator[Row]:
 
 
 def priced(plan: Plan, mesh: str, geometry: Geometry, rays: RaySet, accel: str, units: Sequence[dict[str, Any]]) -> Iterator[Row]:
-    """Time all units in turn; the first is the default."""
+    """Time all tests alternately; the first one is the default."""
     built = {" ".join(f"{value}{' boxes' if key == 'box' else ''}" for key, value in options.items()):
              build(geometry, accel, threads=1, **options) for options in units}
     seconds = alternate({unit: partial(structure.closest_hit, rays.origins, rays.directions, threads=1)
@@ -61,4 +61,4 @@ def priced(plan: Plan, mesh: str, geometry: Geometry, rays: RaySet, accel: str, 
 
 
 def machine(plan: Plan) -> str:
-    return machine_line("one used", f"structure {plan.accel}, {plan.runs} runs")
+    return machine_line("one thread used", f"structure {plan.accel}, {plan.runs} runs")

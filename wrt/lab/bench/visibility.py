@@ -1,4 +1,4 @@
-"""`python -m wrt bench visibility`: the cost of rasterising and of ray casting, as triangles and pixels grow."""
+"""`python -m wrt bench visibility`: compare rasterising with ray casting as the numbers of triangles and pixels grow."""
 
 from __future__ import annotations
 
@@ -26,33 +26,33 @@ from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene
 from wrt.scene.shapes import icosphere
 
-MIN_SIDE = 64  # pixels; the sweep over pixels doubles it
-SWEEP_TRIANGLES = 80_000  # about as many in the sweep over pixels
+MIN_SIDE = 64  # pixels; the sweep over picture sizes starts here and doubles the side
+SWEEP_TRIANGLES = 80_000  # about the triangles of the mesh in the sweep over picture sizes
 MAX_BUILDS = 3
-SPHERES, TERRAINS = range(3, 10), [22 * 2**k for k in range(8)]  # subdivisions, cells a side
+SPHERES, TERRAINS = range(3, 10), [22 * 2**k for k in range(8)]  # subdivisions of an icosphere; cells a side of a terrain
 TITLE = "Rasterising against ray casting"
 COLUMNS: Columns = {
     "surface": lambda row: Path(row.surface).name, "triangles": "{triangles}", "pixels": "{pixels}",
     "covered": lambda row: f"{row.agreement.covered / row.agreement.pixels:.1%}", "raster ms": lambda row: spread(row.raster, 1e3),
     "cast ms": lambda row: spread(row.cast, 1e3), "build ms": lambda row: f"{1e3 * row.build_median:.3g}",
     "cast / raster": lambda row: spread(np.array(row.cast) / np.array(row.raster)),
-    "with build": "{cast_and_build_over_raster:.3g}",
+    "(cast + build) / raster": "{cast_and_build_over_raster:.3g}",
     "differ": "{agreement.differ}", "ties": "{agreement.ties}", "silhouettes": "{agreement.silhouettes}",
     "unexplained": "{agreement.unexplained}", "depth error": "{agreement.depth_error:.1e}",
-    "of bound": "{agreement.depth_share:.2f}"}
+    "error / bound": "{agreement.depth_share:.2f}"}
 EXPONENTS: Columns = {"cost": "{cost}", "surface": lambda row: Path(row.surface).name, "n": "{sweep}",
-                      "exponent": "{exponent:.3f} ± {error:.3f}", "at the end": "{last:.3f}"}
+                      "exponent": "{exponent:.3f} ± {error:.3f}", "last exponent": "{last:.3f}"}
 LEGEND = """\
-covered: pixels with a triangle. raster: a z-buffer, all triangles; cast: one ray a pixel, made beforehand, through a structure built
-beforehand; build: of that structure. Medians of alternating runs, quartiles in brackets, ratios run by run. cast / raster above 1:
-rasterising is cheaper; with build: as if the structure were built for this one picture. differ: pixels with another prim_id: ties
-(depths agree within their bound: common edges, coincident triangles), silhouettes (within a rounding error of the centre, some 1e-4
-pixels, the rays' answer is exact) and unexplained (must be 0). depth error: the largest relative one where prim_id agrees; of bound: its
-share of the derived bound (at most 1)."""
+covered: pixels with a triangle. raster: time of a z-buffer over all triangles. cast: time of one ray a pixel; rays and structure are made
+beforehand. build: time to build that structure. Medians of alternating runs, quartiles in brackets, ratios run by run. cast / raster:
+above 1 rasterising is faster. (cast + build) / raster: the structure serves one picture only. differ: pixels whose prim_id differs, the
+sum of the next three. ties: depths agree within their bound (common edges, coincident triangles). silhouettes: the rays' answer is exact
+at a point within a rounding error, some 1e-4 pixels, of the centre. unexplained: must be 0. depth error: largest relative difference
+where prim_id agrees. error / bound: its share of the derived bound (at most 1)."""
 
 
 def row_of(raster: Sequence[float], cast: Sequence[float], build: Sequence[float], agreement: Row, **subject: object) -> Row:
-    """Return the row of one mesh in one picture. raster, cast: seconds of each run; build: of each build; subject: more columns."""
+    """Return the row of one mesh in one picture. raster, cast, build: seconds of each run; subject: further fields of the row."""
     ratio = [np.median((np.array(cast) + extra) / np.array(raster)) for extra in (0.0, np.median(build))]
     return Row(**subject, raster=list(raster), cast=list(cast), build=list(build), agreement=agreement,
                raster_median=float(np.median(raster)), cast_median=float(np.median(cast)), build_median=float(np.median(build)),
@@ -60,7 +60,7 @@ def row_of(raster: Sequence[float], cast: Sequence[float], build: Sequence[float
 
 
 def terrain(cells: int) -> Mesh:
-    """Return 2 cells^2 triangles over the square from -1 to 1: hills of a fixed form."""
+    """Return hills of a fixed shape over the square [-1, 1]^2 in x and z, with 2 cells^2 triangles."""
     x, z = np.meshgrid(np.linspace(-1.0, 1.0, cells + 1), np.linspace(-1.0, 1.0, cells + 1), indexing="ij")
     y = sum(0.3 / k * np.sin(k * (2.1 * x + 0.7 * z) + k * k) * np.cos(k * (1.9 * z - 0.6 * x) + 2.0 * k) for k in (1, 2, 4, 8))
     i, j = np.meshgrid(np.arange(cells), np.arange(cells), indexing="ij")
@@ -71,7 +71,7 @@ def terrain(cells: int) -> Mesh:
 
 
 def subdivided(mesh: Mesh) -> Mesh:
-    """Cut each triangle into four at the middles of its sides; the mesh is flat-shaded."""
+    """Cut each triangle into four at the midpoints of its sides; the result has no vertex normals."""
     from trimesh.remesh import subdivide
 
     vertices, faces = subdivide(mesh.vertices.astype(np.float64), mesh.faces)
@@ -80,7 +80,7 @@ def subdivided(mesh: Mesh) -> Mesh:
 
 @dataclass(frozen=True)
 class Surface:
-    """One shape at rising resolution, and the camera for it (square pictures)."""
+    """One shape as meshes of growing numbers of triangles, and its camera for square pictures."""
 
     name: str
     meshes: list[Mesh]
@@ -88,7 +88,7 @@ class Surface:
 
 
 def surfaces(plan: Plan) -> Iterator[Surface]:
-    """Yield surfaces of up to plan.max_triangles, and of each the coarsest mesh in any case."""
+    """Yield surfaces with meshes of up to plan.max_triangles triangles, and always their coarsest mesh."""
     for path in plan.meshes:
         mesh = as_mesh(path)
         finer = [replace(mesh, normals=None)]
@@ -119,7 +119,7 @@ def rows(plan: Plan) -> Iterator[Row]:
 
 
 def ready(plan: Plan, surface: Surface, geometry: Geometry) -> Callable[[str, int], Row]:
-    """Prepare one geometry for both methods; the result measures a picture of `side` x `side` pixels for a sweep."""
+    """Prepare one geometry for both methods; return a function that measures a picture of `side` x `side` pixels for a sweep."""
     rasterizer = Rasterizer(geometry, plan.device, plan.threads)
     caster = RayCaster(geometry, plan.accel, plan.device, plan.threads)
     again = [build(geometry, plan.accel, plan.device, plan.threads) for _ in range(min(plan.runs, MAX_BUILDS) - 1)]
@@ -137,7 +137,7 @@ def ready(plan: Plan, surface: Surface, geometry: Geometry) -> Callable[[str, in
 
 def fit(n: Sequence[float], seconds: Sequence[float]) -> dict[str, float]:
     """Fit seconds ~ n^exponent by least squares on logarithms.
-    error: one standard deviation of the exponent (NaN for two points); last: the exponent between the two largest n."""
+    error: standard deviation of the exponent (NaN for two points); last: exponent between the last two points."""
     from scipy.stats import linregress
 
     x, y = np.log(np.asarray(n, np.float64)), np.log(np.asarray(seconds, np.float64))
@@ -149,13 +149,13 @@ def fit(n: Sequence[float], seconds: Sequence[float]) -> dict[str, float]:
 
 
 def series(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
-    """Group rows by (sweep, surface), in order of the growing quantity."""
+    """Group rows by (sweep, surface); sort each group by the quantity that the sweep varies."""
     return {(sweep, surface): sorted(group, key=lambda row: getattr(row, sweep))
             for (sweep, surface), group in grouped(rows, "sweep", "surface").items()}
 
 
 def fits(rows: Sequence[Row]) -> list[dict[str, object]]:
-    """Return the exponents of rasterising, casting and, over triangles, building, of every sweep with at least two points."""
+    """Return the exponents of each sweep with two or more points: of rasterising, casting and, over triangles, building."""
     return [{"sweep": sweep, "surface": surface, "cost": cost,
              **fit([getattr(row, sweep) for row in group], [getattr(row, f"{cost}_median") for row in group])}
             for (sweep, surface), group in series(rows).items() if len(group) > 1
@@ -163,7 +163,7 @@ def fits(rows: Sequence[Row]) -> list[dict[str, object]]:
 
 
 def machine(plan: Plan) -> str:
-    threads = f"{thread_count(plan.threads)} used" if plan.device == "cpu" else ""
+    threads = f"{thread_count(plan.threads)} threads used" if plan.device == "cpu" else ""
     return machine_line(threads, f"structure {plan.accel}, {plan.runs} runs", device=plan.device)
 
 
@@ -173,7 +173,7 @@ def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
         lines = [row for key, group in series(rows).items() if key[0] == sweep for row in group]
         out += [tabled(COLUMNS, lines, f"As {sweep} grow")] if lines else []
     found = [Row(**each) for each in fits(rows)]
-    note = "seconds ~ n^exponent over the whole sweep (± one standard deviation), and between its two last points."
+    note = "seconds ~ n^exponent over the whole sweep (± one standard deviation). last exponent: between the last two points alone."
     return [*out, *([tabled(EXPONENTS, found, "Exponents", note)] if found else [])]
 
 

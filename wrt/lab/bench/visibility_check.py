@@ -1,4 +1,4 @@
-"""Comparison of z-buffer and rays: each pixel where they differ is explained by rounding, or counted."""
+"""Compare z-buffer and rays: rounding must explain each pixel where they differ; count the others."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from wrt.lab.bench.report import Row
 from wrt.renderer.upload import camera_struct
 from wrt.scene.cameras import Camera
 
-# Bound on the ray units' roundings that move a corner, in units of roundoff times its distance. The direction's sum and length, the
-# offset from the origin, and the shear take a few each.
+# Bound on how far rounding in a ray's generation and triangle test moves a corner, in ROUNDOFF times the corner's distance. The sum and
+# length of the direction, the offset from the origin, and the shear add a few roundings each.
 ROUNDINGS = 16.0
 ROUNDOFF = 2.0**-24
 AROUND = [(np.cos(a), np.sin(a)) for a in np.arange(8) * (np.pi / 4.0)]
-MAX_RINGS = 8  # the last of 128 times the smallest radius
+MAX_RINGS = 8  # each ring has twice the radius of the last
 
 
 def agreement(rasterizer: Rasterizer, caster: RayCaster, geometry: Geometry, camera: Camera, size: tuple[int, int]) -> Row:
-    """Draw the same picture with both and `compare`. The rasterizer holds another picture afterwards."""
+    """Draw a picture with both methods and compare them. Afterwards the rasterizer holds a shifted picture."""
     caster.draw(camera, size)
     return compare(rasterizer, caster.depth(), caster.prim_id(), geometry, camera, size)
 
@@ -28,10 +28,10 @@ def compare(rasterizer: Rasterizer, depth: np.ndarray, prim_id: np.ndarray, geom
             size: tuple[int, int]) -> Row:
     """Compare a picture by rays, depth (H, W) float32 and prim_id (H, W) int32, with the rasterizer's, pixel by pixel.
 
-    - covered: pixels where the z-buffer has a triangle. differ: pixels with another prim_id, split into the next three.
-    - ties: depths agree within their bound: the centre is on a common edge, or triangles coincide.
-    - silhouettes: less than a rounding error (some 1e-4 pixels) beside the centre, the exact depth is that of the rays.
-    - unexplained: the rest. depth_error: largest relative difference at the same prim_id; depth_share: its share of the bound."""
+    - covered: pixels where the z-buffer has a triangle. differ: pixels whose prim_id differs: the sum of the next three.
+    - ties: depths agree within their bound, because the centre is on a common edge or triangles coincide.
+    - silhouettes: the rays' depth is exact at a point within a rounding error, some 1e-4 pixels, of the pixel's centre.
+    - unexplained: all others. depth_error: largest relative difference at equal prim_id; depth_share: its share of the bound."""
     rasterizer.draw(camera, size)
     exact_depth, exact_id = rasterizer.depth(), rasterizer.prim_id()
     same = (exact_id == prim_id) & (exact_id >= 0)
@@ -44,12 +44,12 @@ def compare(rasterizer: Rasterizer, depth: np.ndarray, prim_id: np.ndarray, geom
     differ = exact_id != prim_id
     bound = bound + depth_bound(geometry, camera, size, prim_id)
     tied = differ & _close(exact_depth, depth, bound)
-    asked = differ & ~tied
+    untied = differ & ~tied
     reach = np.maximum(edge_reach(geometry, camera, size, exact_id, exact_depth), edge_reach(geometry, camera, size, prim_id, depth))
-    beside = _beside(rasterizer, depth, bound, np.where(asked, reach, 0.0), camera, size, geometry)
+    beside = _beside(rasterizer, depth, bound, np.where(untied, reach, 0.0), camera, size, geometry)
     return Row(
         pixels=differ.size, covered=int((exact_id >= 0).sum()), differ=int(differ.sum()), ties=int(tied.sum()),
-        silhouettes=int(beside.sum()), unexplained=int((asked & ~beside).sum()),
+        silhouettes=int(beside.sum()), unexplained=int((untied & ~beside).sum()),
         depth_error=float(relative.max(initial=0.0)), depth_share=float(share.max(initial=0.0)))
 
 
@@ -59,15 +59,14 @@ def _close(a: np.ndarray, b: np.ndarray, bound: np.ndarray) -> np.ndarray:
 
 
 def _corners(geometry: Geometry, camera: Camera, size: tuple[int, int], prim_id: np.ndarray) -> np.ndarray:
-    """Return the corners of the triangles of prim_id as offsets from the camera: (N, 3 corners, 3) float64."""
+    """Return the corners of the triangles `prim_id` as offsets from the camera: (N, 3 corners, 3) float64."""
     origin = np.array(list(camera_struct(camera, size).origin), np.float64)
     return geometry.vertices[geometry.faces[prim_id]].astype(np.float64) - origin
 
 
 def depth_bound(geometry: Geometry, camera: Camera, size: tuple[int, int], prim_id: np.ndarray) -> np.ndarray:
-    """Bound the error of a ray's depth on the triangles of `prim_id` (H, W), to first order; 0 on a miss.
-    Corners that are off by e move the plane by at most e and the hit by e / cos(angle of incidence), and by no more than the triangle's
-    size."""
+    """Bound the error of a ray's depth on the triangles `prim_id` (H, W), to first order; 0 on a miss.
+    An error e of the corners moves the hit by at most e / cos(angle of incidence), and by at most the triangle's size along the ray."""
     row, column = np.nonzero(prim_id >= 0)
     out = np.zeros(prim_id.shape)
     corners = _corners(geometry, camera, size, prim_id[row, column])
@@ -85,25 +84,25 @@ def depth_bound(geometry: Geometry, camera: Camera, size: tuple[int, int], prim_
 
 def _beside(rasterizer: Rasterizer, depth: np.ndarray, bound: np.ndarray, reach: np.ndarray, camera: Camera,
             size: tuple[int, int], geometry: Geometry) -> np.ndarray:
-    """Return where the exact picture has the rays' depth within `reach` pixels of the centre (0: not looked for).
-    Look on rings around the centre, each of twice the radius."""
+    """Return the pixels (H, W) where the z-buffer has the rays' depth at a point within `reach` pixels of the centre (0: skip the pixel).
+    Search on rings around the centre, each with twice the radius of the last."""
     found = np.zeros(depth.shape, bool)
     radius = reach[reach > 0.0].min(initial=np.inf)
     for _ in range(MAX_RINGS):
-        left = ~found & (reach >= radius)
-        if not left.any():
+        pending = ~found & (reach >= radius)
+        if not pending.any():
             break
         for x, y in AROUND:
             rasterizer.draw(camera, size, (radius * x, radius * y))
-            there = np.where(left, rasterizer.prim_id(), -1)
-            found |= left & _close(rasterizer.depth(), depth, bound + depth_bound(geometry, camera, size, there))
+            nearby = np.where(pending, rasterizer.prim_id(), -1)
+            found |= pending & _close(rasterizer.depth(), depth, bound + depth_bound(geometry, camera, size, nearby))
         radius *= 2.0
     return found
 
 
 def edge_reach(geometry: Geometry, camera: Camera, size: tuple[int, int], prim_id: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Bound how far rounding moves an edge of the triangles of `prim_id` (H, W) at `depth`, in pixels; 0 on a miss.
-    The error of a far corner counts where a near part of the triangle is seen, too."""
+    """Bound in pixels how far rounding moves an edge of the triangles `prim_id` (H, W), seen at `depth`; 0 on a miss.
+    The farthest corner sets the error of the whole triangle, also where a near part is seen."""
     c = camera_struct(camera, size)
     per_radian = 0.5 * max(size[0] / c.tan_x, size[1] / c.tan_y) * (1.0 + c.tan_x**2 + c.tan_y**2)
     out = np.zeros(prim_id.shape)

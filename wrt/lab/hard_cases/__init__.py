@@ -1,1 +1,1 @@
-"""Rays that are hard to get right, and who gets them right."""
+"""Rays on which intersection tests fail, and tests of wrt and other libraries with them."""

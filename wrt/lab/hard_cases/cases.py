@@ -1,12 +1,12 @@
-"""The hard cases: geometry and rays at which intersection tests fail, seeded, in any number, with what the answers must be.
+"""The hard cases: random geometry and rays on which intersection tests fail, and the answers that are right.
 
-The first letter of a name is its group:
-- A dense spheres near and far from 0; B a jittered sphere; C re-intersection; D bad triangles; E along the axes;
-- F slivers, edge-on and grazing; G sheets, coincident triangles, a shared vertex; H scale and the segment's ends;
-- I lengths, underflow, and values that are not finite.
+The first letter of a name is the group of the case:
+- A: dense spheres near the origin and far from it. B: a jittered sphere. C: rays that start on a surface. D: bad triangles.
+- E: rays along the axes. F: slivers; edge-on and grazing rays. G: close sheets, coincident triangles, a shared vertex.
+- H: scale, and the ends of the segment. I: lengths of directions, underflow, and values that are not finite.
 
-A ray "aimed at" a point p has the direction fl32(p - o). It meets p exactly only if p - o is a float32 value; else it passes p by at most
-2^-24 of the distance on each axis.
+A ray from o "aimed at" a point p has the direction p - o, rounded to float32. It meets p exactly only if p - o is a float32 value;
+otherwise it passes p by at most 2^-24 of the distance on each axis.
 
 >>> for case in chunks("A_far_vertices", 1_000_000, seed=0):
 ...     verdict += judge(case, accel.closest_hit(case.origins, case.directions, case.t_min, case.t_max))"""
@@ -22,10 +22,10 @@ import numpy as np
 from wrt.core.checks import require_known
 from wrt.lab.hard_cases import closed as inside
 from wrt.lab.hard_cases import open as outside
-from wrt.lab.hard_cases.common import AIMS, ASK, HIT, MISS, HardCase, Seed
+from wrt.lab.hard_cases.common import AIMS, HIT, MISS, UNKNOWN, HardCase, Seed
 from wrt.lab.hard_cases.judge import Verdict, check, judge, judge_all_hits, judge_next
 
-__all__ = ["ASK", "HARD_CASES", "HIT", "MISS", "HardCase", "Verdict", "check", "chosen", "chunks", "fewer",
+__all__ = ["HARD_CASES", "HIT", "MISS", "UNKNOWN", "HardCase", "Verdict", "check", "chosen", "chunks", "fewer",
            "generate", "judge", "judge_all_hits", "judge_next"]
 
 HARD_CASES: dict[str, Callable[[np.random.Generator, int], HardCase]] = {
@@ -63,11 +63,11 @@ HARD_CASES: dict[str, Callable[[np.random.Generator, int], HardCase]] = {
     "I_rays_not_finite": outside.rays_not_finite,
     "I_mesh_not_finite": outside.mesh_not_finite,
 }
-COSTLY = {"G_fan": 100}  # 10,000 triangles at one vertex are all tested: so many times fewer rays
+COSTLY = {"G_fan": 100}  # divisor of the number of rays: a ray tests all 10,000 triangles at one vertex
 
 
 def generate(name: str, n: int, seed: Seed = 0) -> HardCase:
-    """Return n rays of one case. Raise InputError for an unknown name."""
+    """Return one case with n rays. Raise InputError for an unknown name."""
     require_known(name, HARD_CASES, "hard case")
     make = HARD_CASES[name]
     notes = (make.func if isinstance(make, partial) else make).__doc__ or ""
@@ -75,13 +75,13 @@ def generate(name: str, n: int, seed: Seed = 0) -> HardCase:
 
 
 def chunks(name: str, n: int, seed: int = 0, chunk: int = 2**18) -> Iterator[HardCase]:
-    """Yield n rays in parts of at most `chunk`, each with its own seed; some cases have another geometry in each part."""
+    """Yield a case with n rays in parts of at most `chunk` rays. Each part has its own seed, and in some cases its own geometry."""
     for first in range(0, n, chunk):
         yield generate(name, min(chunk, n - first), (seed, first // chunk))
 
 
 def chosen(cases: Sequence[str]) -> list[str]:
-    """Return the names of cases from names and letters of groups. Raise InputError for an unknown one."""
+    """Return the names of the cases that names and letters of groups select; () selects all. Raise InputError for an unknown name."""
     names: list[str] = []
     for case in cases or list(HARD_CASES):
         found = [name for name in HARD_CASES if name == case or name.split("_")[0] == case]
@@ -92,5 +92,5 @@ def chosen(cases: Sequence[str]) -> list[str]:
 
 
 def fewer(name: str, rays: int) -> int:
-    """Return the number of rays of a case if other cases get `rays`: costly cases get fewer."""
+    """Return the number of rays for a case: `rays`, or fewer for a costly case."""
     return max(1, rays // next((divisor for start, divisor in COSTLY.items() if name.startswith(start)), 1))

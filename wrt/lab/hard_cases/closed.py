@@ -1,11 +1,13 @@
 """Rays that start inside a closed surface: every one must hit.
 
-This is a theorem. Let the origin have a winding number other than 0 with respect to the surface as stored, in float32. Then every ray
-meets the surface, even where triangles have lost their area. It also meets a triangle that is not parallel to it. Proof: shift the ray
-sideways by less and less, in a direction that lies in none of the planes that contain the ray. The shifted rays start inside and miss
-the triangles in those planes, so each hits another triangle. One of finitely many triangles is hit infinitely often. It is closed, so
-the ray itself hits it. HIT therefore needs only an origin inside. Rounding moves a vertex by less than the origin's distance to the
-surface, and a surface that never passes over the origin keeps its winding number."""
+This is a theorem. Let the float32 surface have a winding number other than 0 around the origin of a ray. Then the ray meets a triangle
+that is not parallel to it, even if some triangles have lost their area. Proof: shift the ray sideways by distances that tend to 0, in a
+direction outside every plane that contains the ray and a triangle. The shifted rays start inside and miss the triangles in those planes,
+so each hits another triangle. One of these finitely many triangles is hit infinitely often. The triangle is closed, so the ray itself
+hits it.
+
+A case with HIT therefore needs only origins inside. Rounding to float32 moves a vertex by less than the origin's distance to the surface,
+so the surface never passes over the origin and keeps its winding number."""
 
 from __future__ import annotations
 
@@ -37,22 +39,22 @@ def _dense(position: str) -> Geometry:
 
 def dense_sphere(rng: np.random.Generator, n: int, *, position: str, aim: str) -> HardCase:
     """A: a sphere of radius 2 with 159,200 triangles, and origins in the cube of side 2 around its centre.
-    The cube's corners are 0.26 from the surface; float32 moves a point 2e5 from 0 by at most 0.012. At "far", rounding puts the corners of
-    2356 faces on a line; they are flipped as in every scene (wrt.scene.clean.flip_collinear)."""  # noqa: D401
+    The cube's corners are 0.26 from the surface; float32 moves a point 2e5 from 0 by at most 0.012. At "far", rounding makes the corners
+    of 2356 faces collinear; wrt.scene.clean.flip_collinear flips their edges, as in every scene."""  # noqa: D401
     center = np.array(POSITIONS[position])
     return inside(_dense(position), center + rng.uniform(-1.0, 1.0, (n, 3)), rng, aim)
 
 
 def jittered_sphere(rng: np.random.Generator, n: int, *, aim: str) -> HardCase:
-    """B (pbrt-v4, shapes_test, Triangle.Watertight): 16 x 16, each vertex at radius 1 + 5 U, origins in a ball of 0.5.
-    Corners of a face are at most 26 degrees apart, so no face is closer to the centre than cos 26 = 0.89."""
+    """B (pbrt-v4, shapes_test, Triangle.Watertight): a sphere of 16 x 16 quads, each vertex at radius 1 + 5 U; origins within 0.5 of 0.
+    U is uniform in [0, 1]. Corners of a face are at most 26 degrees apart, so no face is closer to 0 than cos 26 degrees = 0.89."""
     vertices, faces = lat_long(16, 16, 1.0 + 5.0 * rng.random(2 + 16 * 15))
     return inside(surface(vertices, faces), in_ball(rng, n, 0.5), rng, aim)
 
 
 def needles(rng: np.random.Generator, n: int, *, aim: str) -> HardCase:
-    """F: a sphere squeezed by 10^-U(1.5, 4) along two axes, each by its own factor: triangles of aspect 1e3 to 1e8.
-    Coordinates are rounded relative to themselves, which squeezing does not change: origins within half the radius are inside."""
+    """F: a sphere squeezed along two axes, by factors 10^-U(1.5, 4) and less, so that triangles have aspect ratios of 1e3 to 1e8.
+    Rounding is relative to a coordinate, so squeezing does not change it: origins within half the squeezed radius are inside."""
     squeeze = np.ones(3)
     axes = rng.permutation(3)
     squeeze[axes[0]] = 10.0 ** -rng.uniform(1.5, 4.0)
@@ -60,7 +62,7 @@ def needles(rng: np.random.Generator, n: int, *, aim: str) -> HardCase:
     vertices, faces = lat_long(32, 32)
     geometry = surface(vertices * squeeze, faces)
     case = inside(geometry, in_ball(rng, n, 0.5) * squeeze, rng, aim)
-    if aim == "uniform":  # half of them uniform in the squeezed space, so that they meet the flat sides too
+    if aim == "uniform":  # half are uniform in the squeezed space, to meet the flat sides, too
         half = (unit_vectors(rng, n) * np.where(rng.random((n, 1)) < 0.5, squeeze, 1.0)).astype(np.float32)
         return replace(case, directions=half)
     return case
@@ -72,7 +74,7 @@ def _sheets() -> Geometry:
 
 
 def two_sheets(rng: np.random.Generator, n: int, *, aim: str) -> HardCase:
-    """G: glass in glass: two spheres with the same corners but for 4e-5 of the radius; the inner one comes first."""
+    """G: two concentric spheres, as glass in glass; the outer radius is larger by 4e-5, and the inner sphere's faces come first."""
     return inside(_sheets(), in_ball(rng, n, 0.9), rng, aim)
 
 
@@ -85,7 +87,7 @@ def _coincident() -> Geometry:
 
 
 def coincident(rng: np.random.Generator, n: int, *, aim: str) -> HardCase:
-    """G: a sphere three times over, in a shuffled order: of each tie the lowest prim_id."""
+    """G: a sphere whose faces exist three times, in random order: the lowest prim_id of each tie is right."""
     return inside(_coincident(), in_ball(rng, n, 0.9), rng, aim)
 
 
@@ -101,17 +103,17 @@ def _fan() -> Geometry:
 
 
 def shared_vertex(rng: np.random.Generator, n: int, *, aim: str) -> HardCase:
-    """G: a double cone whose apexes 10,000 triangles share; "vertices": aimed at the two apexes."""
+    """G: a double cone; 10,000 triangles share each apex. Aim "vertices" means the two apexes."""
     geometry = _fan()
     origins = in_ball(rng, n, 0.5).astype(np.float32)
     directions = aimed(geometry, rng, origins, aim)
     if aim == "vertices":
         directions = geometry.vertices[rng.integers(2, size=n)].astype(np.float64) - origins
-    return replace(hard_case(geometry, origins, directions, HIT, closed=True), asked=20)
+    return replace(hard_case(geometry, origins, directions, HIT, closed=True), compared=20)
 
 
 def scaled(rng: np.random.Generator, n: int, *, scale: float, aim: str) -> HardCase:
-    """H: the same sphere and the same rays, times 1e-6, 1 and 1e6."""
+    """H: a sphere and its rays, scaled by 1e-6, 1 or 1e6."""
     return inside(sphere(64, 32, scale), in_ball(rng, n, 0.9 * scale), rng, aim)
 
 
@@ -123,7 +125,7 @@ def _stadium() -> tuple[Geometry, Geometry]:
 
 
 def stadium(rng: np.random.Generator, n: int) -> HardCase:
-    """H: a teapot in a sphere 1e5 times its size; rays from near the pot and from far away, at its corners and past it."""
+    """H: a teapot in a sphere 1e5 times as large; rays from near and far, half aimed at the teapot's corners, half in any direction."""
     pot, both = _stadium()
     origins = (in_ball(rng, n) * np.where(rng.random((n, 1)) < 0.5, 3.0, 5e4)).astype(np.float32)
     at_pot = aimed(pot, rng, origins, "vertices")
@@ -139,7 +141,7 @@ def lengths(rng: np.random.Generator, n: int) -> HardCase:
 
 
 def underflowing(rng: np.random.Generator, n: int) -> HardCase:
-    """I: one or two components of the direction are denormal or underflow to 0 (of either sign)."""
+    """I: up to two components of the direction are tiny: 1e-36 or less, some denormal or 0 of either sign."""
     case = inside(sphere(32, 16), in_ball(rng, n, 0.9), rng, "uniform")
     small = rng.random((n, 3)) < 0.5
     small[np.arange(n), rng.integers(3, size=n)] = False
@@ -148,7 +150,7 @@ def underflowing(rng: np.random.Generator, n: int) -> HardCase:
 
 
 def denormal(rng: np.random.Generator, n: int) -> HardCase:
-    """I: the whole direction is denormal, 1e-41 to 1e-38 long; the sphere is so small that t is at most 4e37."""
+    """I: all components of the direction are denormal, its length is 1e-41 to 1e-38; the sphere is so small that t is at most 4e37."""
     case = inside(sphere(32, 16, 1e-4), in_ball(rng, n, 0.9e-4), rng, "uniform")
     directions = case.directions.astype(np.float64) * 10.0 ** rng.uniform(-41.0, -38.0, (n, 1))
     directions = directions.astype(np.float32)
@@ -163,10 +165,9 @@ def _grid() -> Geometry:
 
 
 def axis_parallel(rng: np.random.Generator, n: int) -> HardCase:
-    """E: along the axes, both ways, zeros of both signs, through a block of 4 x 4 x 4 unit cubes whose faces coincide.
+    """E: rays along the axes in both directions, with zeros of both signs, through a block of 4 x 4 x 4 touching unit cubes.
     Rays run in faces, along edges and through corners. They start inside or before the block, so a face is always ahead. On the block's
-    outer
-    faces the weight of the edge is exactly 0, in float32, too: a closed triangle is hit."""
+    outer faces the weight at the edge is exactly 0, also in float32, so the closed triangle is hit."""
     row, axis = np.arange(n), rng.integers(3, size=n)
     origins = np.where(rng.random((n, 3)) < 0.7, rng.integers(0, 9, (n, 3)) / 2.0, rng.uniform(0.0, 4.0, (n, 3)).astype(np.float32))
     sign = rng.choice([-1.0, 1.0], n)

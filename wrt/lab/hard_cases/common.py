@@ -1,4 +1,4 @@
-"""Type of a hard case, aiming of rays, and meshes that several cases share."""
+"""The type HardCase, aimed rays, and meshes that several cases share."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from wrt.accel.queries.rays import rays_of, rays_on
 from wrt.core.types import Device
 from wrt.kernels.query import RayArrays
 
-HIT, ASK, MISS = 1, 0, -1  # what a ray's exact answer must be; ASK: the oracle knows
+HIT, UNKNOWN, MISS = 1, 0, -1  # exact answer of a ray; for UNKNOWN only the oracle can tell
 AIMS = ("uniform", "vertices", "edges")
 NO_SPHERES = np.zeros((0, 4), np.float32)
 
@@ -22,15 +22,16 @@ Seed = int | Sequence[int]
 
 @dataclass(frozen=True, eq=False)
 class HardCase:
-    """Rays at a geometry that are hard to get right, and what is known of their answers.
+    """A geometry, rays that are hard to intersect with it, and what is known of the right answers.
 
-    - origins, directions: (N, 3) float32; t_min, t_max: (N,) float32; expected: (N,) int8 of HIT, MISS, ASK. HIT is proved by the
-    generator.
-    - closed: each edge has two faces of opposite directions: no ray may pass through. `judge` then uses the winding number where a nearer
-      crossing is left out.
-    - next_directions: where the ray continues from its hit (case C), of any length, or None; on a sphere turned to the outside first.
-    - refused: the host must refuse these arrays with an InputError; on the device, rays that are not finite miss.
-    - asked: of how many reported hits `judge` asks the oracle whether they are the closest."""
+    - origins, directions: (N, 3) float32; t_min, t_max: (N,) float32.
+    - expected: (N,) int8 of HIT, MISS, UNKNOWN; HIT and MISS follow from the way the rays are generated.
+    - closed: each edge has two faces of opposite directions, so no ray may pass through. `judge` then tests skipped crossings by the
+      winding number.
+    - next_directions: (N, 3) directions of any length in which rays continue from their hits (case C), or None. On a sphere they are
+      first turned to the outside.
+    - refused: queries must refuse these arrays with an InputError; arrays that are already on the device miss instead.
+    - compared: most reported hits that `judge` compares with the oracle's closest hit."""
 
     geometry: Geometry
     origins: np.ndarray
@@ -41,7 +42,7 @@ class HardCase:
     closed: bool = False
     next_directions: np.ndarray | None = None
     refused: bool = False
-    asked: int = 20_000
+    compared: int = 20_000
     name: str = ""
     notes: str = ""
 
@@ -54,7 +55,7 @@ class HardCase:
 
 def hard_case(geometry: Geometry, origins: np.ndarray, directions: np.ndarray, expected: int | np.ndarray, *,
               t_min: float | np.ndarray = 0.0, t_max: float | np.ndarray = np.inf, closed: bool = False) -> HardCase:
-    """Return a case with arrays of the right types. A direction that is rounded to 0 becomes (1, 0, 0)."""
+    """Return a HardCase with arrays of the right types. A direction that rounds to 0 becomes (1, 0, 0)."""
     n = len(origins)
     with np.errstate(over="ignore"):
         origins, directions = (np.ascontiguousarray(x, dtype=np.float32) for x in (origins, directions))
@@ -70,7 +71,7 @@ def surface(vertices: np.ndarray, faces: np.ndarray, spheres: np.ndarray = NO_SP
 
 
 def soup(corners: np.ndarray) -> Geometry:
-    """Return triangles (N, 3, 3) that share no vertex."""
+    """Return the geometry of triangles (N, 3, 3) that share no vertex."""
     return surface(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
 
 
@@ -92,7 +93,7 @@ def in_ball(rng: np.random.Generator, n: int, radius: float = 1.0) -> np.ndarray
 
 
 def targets(geometry: Geometry, rng: np.random.Generator, n: int, aim: str) -> np.ndarray:
-    """Return (n, 3) float64 points on random faces of the mesh: vertices, or points on edges."""
+    """Return (n, 3) float64 targets on random faces: corners if `aim` is "vertices", else points on edges."""
     face = geometry.faces[rng.integers(len(geometry.faces), size=n)]
     corner = rng.integers(3, size=n)
     row = np.arange(n)
@@ -101,8 +102,8 @@ def targets(geometry: Geometry, rng: np.random.Generator, n: int, aim: str) -> n
 
 
 def aimed(geometry: Geometry, rng: np.random.Generator, origins: np.ndarray, aim: str) -> np.ndarray:
-    """Return (n, 3) float64 directions from origins (n, 3) float32: unit vectors for "uniform", else target - origin.
-    Rounding to float32 moves the ray beside its target by up to 2^-24 of the distance on each axis: the hard part of the case."""
+    """Return (n, 3) float64 directions from origins (n, 3) float32: unit vectors if `aim` is "uniform", else target - origin.
+    Rounding to float32 moves the ray off its target by up to 2^-24 of the distance on each axis, which makes the case hard."""
     if aim == "uniform":
         return unit_vectors(rng, len(origins))
     return targets(geometry, rng, len(origins), aim) - origins.astype(np.float64)
@@ -110,7 +111,7 @@ def aimed(geometry: Geometry, rng: np.random.Generator, origins: np.ndarray, aim
 
 def lat_long(slices: int, stacks: int, radii: np.ndarray | float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices (V, 3) float64 and faces of a closed sphere around 0: 2 slices (stacks - 1) triangles, poles on z.
-    The outside is counter-clockwise. radii: one for all, or one for each vertex (2 + slices (stacks - 1), poles first)."""
+    Faces are counter-clockwise from outside. radii: one number, or one for each of the 2 + slices (stacks - 1) vertices, poles first."""
     theta = np.pi * np.arange(1, stacks) / stacks
     phi = 2.0 * np.pi * np.arange(slices) / slices
     ring = np.stack([np.sin(theta)[:, None] * np.cos(phi), np.sin(theta)[:, None] * np.sin(phi),
@@ -128,13 +129,13 @@ def lat_long(slices: int, stacks: int, radii: np.ndarray | float = 1.0) -> tuple
 
 @cache
 def sphere(slices: int, stacks: int, radius: float = 1.0, center: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Geometry:
-    """Return a closed lat-long sphere, moved and then rounded to float32."""
+    """Return a closed latitude-longitude sphere around `center`, rounded to float32."""
     vertices, faces = lat_long(slices, stacks)
     return surface(radius * vertices + np.array(center), faces)
 
 
 def cube(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return eight vertices and twelve faces, the outside counter-clockwise."""
+    """Return eight vertices and twelve faces of a box, counter-clockwise from outside."""
     vertices = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (high - low) + low
     quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
     return vertices, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])

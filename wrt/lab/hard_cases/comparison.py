@@ -1,4 +1,4 @@
-"""`python -m wrt bench hard-cases`: the hard cases against other libraries' closest hits."""
+"""`python -m wrt bench hard-cases`: test the closest hits of wrt and other libraries on the hard cases."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ from collections.abc import Iterator, Sequence
 from statistics import median
 
 from wrt.lab.bench.report import Columns, Part, Row, cells, grouped, machine_line, versions
-from wrt.lab.hard_cases.conformance import COLUMNS as OF_A_CASE
+from wrt.lab.hard_cases.conformance import COLUMNS as CASE_COLUMNS
 from wrt.lab.hard_cases.conformance import results
 from wrt.lab.hard_cases.libraries import LIBRARIES, usable
 from wrt.lab.plans import HardCases as Plan
 
 KINDS = ("lost", "invented", "wrong_triangle")
 TITLE = "The hard cases and ray libraries"
-COLUMNS: Columns = {"library": "{library}", **OF_A_CASE}
+COLUMNS: Columns = {"library": "{library}", **CASE_COLUMNS}
 LEGEND = """\
-lost: rays that must hit and are reported to miss. invented: hits of a triangle that the ray passes by more than float32's rounding, or
-that are not on the ray. wrong triangle: a triangle nearer by more than the rounding was left out. Of faces at the same distance any is
-right. ulp: the largest error of t, in float32 steps of the exact one. Input that is not finite may be refused."""
+lost: rays that must hit but are reported to miss. invented: reported hits of a triangle that the ray misses by more than float32
+rounding, or reported points that are not on the ray. wrong triangle: another triangle is nearer by more than the rounding. At equal
+distance any face is right. ulp: largest error of t, in float32 steps at the exact t. Input that is not finite may be refused."""
 
 
 def rows(plan: Plan) -> Iterator[Row]:
@@ -39,32 +39,32 @@ def machine(plan: Plan) -> str:
 
 
 def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
-    asked = [row for row in rows if not row.missing]
-    by_name = {name: group for (name,), group in grouped(asked, "library").items()}
-    names, cases = list(by_name), {case: group for (case,), group in grouped(asked, "case").items()}
+    measured = [row for row in rows if not row.missing]
+    by_name = {name: group for (name,), group in grouped(measured, "library").items()}
+    names, cases = list(by_name), {case: group for (case,), group in grouped(measured, "case").items()}
     groups: dict[str, list[Row]] = {}
-    for row in asked:
+    for row in measured:
         groups.setdefault(row.case[0], []).append(row)
     lines = [(letter, *_counted(group, names)) for letter, group in groups.items()]
-    lines += [("all", *_counted(asked, names))] if asked else []
+    lines += [("all", *_counted(measured, names))] if measured else []
     lines += [(kind.replace("_", " "), "", *(str(sum(getattr(row, kind) for row in group)) for group in by_name.values()))
               for kind in KINDS]
-    lines += [("ulp in the middle case", "", *(f"{median(row.t_ulp for row in group):.3g}" for group in by_name.values()))]
+    lines += [("median case: largest error of t, ulp", "", *(f"{median(row.t_ulp for row in group):.3g}" for group in by_name.values()))]
     every = []
     for case, group in cases.items():
         ulp = {row.library: row.t_ulp for row in group}
         rays, *counts = _counted(group, names)
         every.append((case, rays, *(f"{count} / {ulp[name]:.3g}" for name, count in zip(names, counts, strict=True))))
     missing = "\n\n".join(f"{row.library}: {row.missing}." for row in rows if row.missing)
-    return [Part("Rays lost, invented and given to a wrong triangle", missing, ("group", "rays", *names), lines),
-            Part("The same by case, and the largest error of t in ulp", "", ("case", "rays", *names), every)]
+    return [Part("Wrong rays: lost, invented or wrong triangle", missing, ("group", "rays", *names), lines),
+            Part("Wrong rays / largest error of t in ulp, by case", "", ("case", "rays", *names), every)]
 
 
 def _counted(group: Sequence[Row], names: Sequence[str]) -> list[str]:
-    """Return the number of rays, and of each library the number of wrong ones."""
-    mine = {name: [row for row in group if row.library == name] for name in names}
-    out = [str(sum(row.rays for row in mine[names[0]]))]
-    for rows in mine.values():
+    """Return the number of rays, and the number of wrong rays of each library."""
+    by_library = {name: [row for row in group if row.library == name] for name in names}
+    out = [str(sum(row.rays for row in by_library[names[0]]))]
+    for rows in by_library.values():
         errors = sum(bool(row.raised) and not row.refused for row in rows)
         out.append(f"{sum(row.wrong for row in rows)}{f' and {errors} errors' if errors else ''}")
     return out

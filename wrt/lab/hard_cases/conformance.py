@@ -1,4 +1,4 @@
-"""The hard cases for any library's closest hit, as a function of arrays, judged ray by ray by the oracle."""
+"""Test the closest-hit function of any ray library on the hard cases; the oracle judges each ray."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from wrt.lab.bench.report import Columns, Row, cells, table
 from wrt.lab.hard_cases.cases import HARD_CASES, HardCase, Verdict, chosen, chunks, fewer, generate, judge
 
 ClosestHit = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Any]
-NOT_ASKED = ("C_spheres", "H_exact_ends")  # not of triangles, and rays that begin after their origin
+EXCLUDED_CASES = ("C_spheres", "H_exact_ends")  # spheres, and t_min > 0, which `closest_hit` does not have
 COLUMNS: Columns = {"case": "{case}", "rays": "{rays}", "lost": "{lost}", "invented": "{invented}",
                     "wrong triangle": "{wrong_triangle}", "t ulp": "{t_ulp:.3g}", "": lambda row: row.note}
 
@@ -25,10 +25,10 @@ COLUMNS: Columns = {"case": "{case}", "rays": "{rays}", "lost": "{lost}", "inven
 class Result:
     """Result of one case.
 
-    - lost: rays that must hit and are reported to miss; wrong_triangle: a nearer hit was left out.
-    - invented: hits of a triangle that the ray passes by more than float32's rounding, or that are not on the ray.
-    - t_ulp: the largest error of t, in float32 steps of the exact one. examples: the first wrong rays, and why.
-    - raised: the error that the function raised; refused: it was raised for input that is not finite, which is right."""
+    - lost: rays that must hit but are reported to miss; wrong_triangle: rays for which another triangle is nearer.
+    - invented: reported hits of a triangle that the ray misses by more than float32 rounding, or reported points that are not on the ray.
+    - t_ulp: largest error of t, in float32 steps at the exact t. examples: the first wrong rays, each with the reason.
+    - raised: the error that the function raised; refused: the input was not finite, so raising was right."""
 
     case: str
     rays: int
@@ -47,18 +47,18 @@ class Result:
 
     @property
     def ok(self) -> bool:
-        """True if no ray is wrong and nothing was raised, but for input that is not finite."""
+        """True if no ray is wrong, and no error was raised for finite input."""
         return not (self.wrong or (self.raised and not self.refused))
 
     @property
     def note(self) -> str:
-        """The error that was raised, or "refused" if that was right; "" without an error."""
+        """The error that the function raised, "refused" if raising was right, or "" without an error."""
         return "refused" if self.refused else self.raised
 
     def __str__(self) -> str:
-        counted = f"{self.lost} lost, {self.invented} invented, {self.wrong_triangle} of a wrong triangle"
+        counted = f"{self.lost} lost, {self.invented} invented, {self.wrong_triangle} with a wrong triangle"
         lines = [f"{self.case}: of {self.rays} rays {counted}{f'; {self.note}' if self.note else ''}"]
-        lines += ["  ray {row}: {why}; said: triangle {prim_id}; origin {origin}, direction {direction}".format_map(ray)
+        lines += ["  ray {row}: {why}; reported triangle: {prim_id}; origin {origin}, direction {direction}".format_map(ray)
                   for ray in self.examples]
         return "\n".join(lines)
 
@@ -71,7 +71,7 @@ class Report:
 
     @property
     def ok(self) -> bool:
-        """True if all results are."""
+        """True if all results are ok."""
         return all(result.ok for result in self.results)
 
     @property
@@ -91,7 +91,7 @@ class Report:
 
 
 class Case:
-    """One hard case of wrt.testing.CASES: meshes with `rays` rays in all, made anew at each access."""
+    """One hard case of wrt.testing.CASES: meshes with `rays` rays in all, generated again at each access."""
 
     def __init__(self, name: str, rays: int = 1000, seed: int = 0) -> None:
         self.name, *more = case_names([name])
@@ -101,7 +101,7 @@ class Case:
 
     @property
     def parts(self) -> Iterator[HardCase]:
-        """Yield the meshes with their rays: geometry.vertices, geometry.faces, origins, directions. Only very many rays take several."""
+        """Yield HardCases (geometry.vertices, geometry.faces, origins, directions): one, or several if the rays exceed 2^18."""
         return chunks(self.name, self.rays, self.seed)
 
     @property
@@ -110,12 +110,12 @@ class Case:
         return generate(self.name, 1).notes
 
     def result(self, closest_hit: ClosestHit) -> Result:
-        """Judge `closest_hit` (see `hard_cases`). An error that it raises is part of the result."""
+        """Test `closest_hit` (see `hard_cases`) on this case. An error that it raises becomes part of the result."""
         return self._judged(closest_hit, keep_errors=True)
 
     def check(self, closest_hit: ClosestHit) -> None:
-        """Raise AssertionError that shows the rays that `closest_hit` loses, invents or gives to a wrong triangle.
-        Its own errors pass through, except for input that is not finite, which it may refuse."""
+        """Raise AssertionError with the wrong rays: lost, invented or with a wrong triangle.
+        Errors of `closest_hit` pass through; only for input that is not finite may it raise one."""
         result = self._judged(closest_hit, keep_errors=False)
         if not result.ok:
             raise AssertionError(f"{result}\n({self.about})")
@@ -125,15 +125,15 @@ class Case:
         for part in self.parts:
             geometry = part.geometry
             try:
-                said = closest_hit(geometry.vertices.copy(), geometry.faces.copy(), part.origins.copy(), part.directions.copy())
+                answer = closest_hit(geometry.vertices.copy(), geometry.faces.copy(), part.origins.copy(), part.directions.copy())
             except Exception as error:
                 if not (part.refused or keep_errors):
                     raise
-                said = f"{type(error).__name__}: {error}".splitlines()[0][:100]
-                return Result(self.name, self.rays, raised=said, refused=part.refused)
-            t, prim_id = _answer(said, len(part))
-            prim_id = np.where((prim_id >= 0) & (t > part.t_max), -1, prim_id)  # as a query with the case's t_max would report it
-            verdict += judge(part, Hits(t, None, None, prim_id), lowest=False)  # type: ignore[arg-type]  # None: t alone is measured
+                raised = f"{type(error).__name__}: {error}".splitlines()[0][:100]
+                return Result(self.name, self.rays, raised=raised, refused=part.refused)
+            t, prim_id = _checked(answer, len(part))
+            prim_id = np.where((prim_id >= 0) & (t > part.t_max), -1, prim_id)  # apply t_max, which closest_hit does not have
+            verdict += judge(part, Hits(t, None, None, prim_id), lowest=False)  # type: ignore[arg-type]  # judge t without u and v
         return Result(self.name, verdict.rays, verdict.misses, verdict.false_hits, verdict.wrong_prim, verdict.t.largest,
                       examples=tuple(verdict.examples))
 
@@ -142,11 +142,11 @@ class Case:
 
 
 def case_names(cases: str | Sequence[str] = ()) -> list[str]:
-    """Return the cases of names and letters of groups; by default all that a closest hit on triangles can answer."""
+    """Return the names of the cases that names and letters of groups select; by default all but EXCLUDED_CASES."""
     cases = as_tuple(cases, str, "cases")
-    for name in set(cases).intersection(NOT_ASKED):
-        raise InputError("is not for a closest hit on triangles without t_min", argument=name)
-    return [name for name in chosen(cases or list(HARD_CASES)) if name not in NOT_ASKED]
+    for name in set(cases).intersection(EXCLUDED_CASES):
+        raise InputError("needs spheres or t_min, which closest_hit does not have", argument=name)
+    return [name for name in chosen(cases or list(HARD_CASES)) if name not in EXCLUDED_CASES]
 
 
 def results(closest_hit: ClosestHit, cases: str | Sequence[str] = (), rays: int = 1000, seed: int = 0) -> Iterator[Result]:
@@ -156,18 +156,20 @@ def results(closest_hit: ClosestHit, cases: str | Sequence[str] = (), rays: int 
 
 
 def hard_cases(closest_hit: ClosestHit, cases: str | Sequence[str] = (), rays: int = 1000, seed: int = 0) -> Report:
-    """Put the hard cases to a ray library: count the rays that it loses, invents and gives to a wrong triangle.
+    """Test a ray library on the hard cases: count rays that are lost, invented or have a wrong triangle.
 
     Parameters
     ----------
     closest_hit : function of (vertices, faces, origins, directions)
-        It gets (V, 3) float32, (F, 3) int32, (N, 3) float32 and (N, 3) float32; directions have any length. It returns t and prim_id, (N,)
-        each, as a pair or as attributes. t is the distance in units of |direction| and counts for hits only. A prim_id is the index of a
-        face, -1 on a miss. Any of several faces at the same distance is right.
-    cases : names, or letters of groups
-        All cases by default.
-    rays, seed : int
-        Number of rays of each case. Another seed gives other rays.
+        It receives (V, 3) float32, (F, 3) int32, (N, 3) float32 and (N, 3) float32. Directions have any length. It returns t and prim_id,
+        (N,) each, as a pair or as attributes. The distance t is in units of |direction|, and ignored on a miss. The index of the face,
+        prim_id, is -1 on a miss. At equal distance any face is right.
+    cases : names or letters of groups
+        Default: all cases.
+    rays : int
+        Number of rays of each case.
+    seed : int
+        Seed of the random geometry and rays.
 
     Returns
     -------
@@ -176,17 +178,17 @@ def hard_cases(closest_hit: ClosestHit, cases: str | Sequence[str] = (), rays: i
     Raises
     ------
     InputError
-        An unknown name, or closest_hit returns something else."""
+        An unknown name, or closest_hit returns other arrays."""
     return Report(tuple(results(closest_hit, cases, rays, seed)))
 
 
-def _answer(said: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
-    if hasattr(said, "prim_id") and hasattr(said, "t"):
-        said = said.t, said.prim_id
+def _checked(answer: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
+    if hasattr(answer, "prim_id") and hasattr(answer, "t"):
+        answer = answer.t, answer.prim_id
     try:
-        t, prim_id = (np.asarray(each) for each in said)
+        t, prim_id = (np.asarray(each) for each in answer)
     except (TypeError, ValueError):
-        raise InputError(f"must return t and prim_id, got {type(said).__name__}", argument="closest_hit") from None
+        raise InputError(f"must return t and prim_id, got {type(answer).__name__}", argument="closest_hit") from None
     if t.shape != (n,) or prim_id.shape != (n,) or t.dtype.kind not in "iuf" or prim_id.dtype.kind not in "iu":
         raise InputError(f"must return t ({n},) of real numbers and prim_id ({n},) of integers, got {t.shape} of "
                          f"{t.dtype} and {prim_id.shape} of {prim_id.dtype}", argument="closest_hit")

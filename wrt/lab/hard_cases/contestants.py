@@ -1,4 +1,4 @@
-"""Algorithms for the hard cases: wrt's tests through its BVH, and the ray queries of other libraries (peers)."""
+"""Algorithms that find closest hits: wrt's intersection tests in its structures, and the queries of other libraries (peers)."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from wrt.lab.bench.rays import RaySet
 
 
 class Algorithm(ABC):
-    """A way to find closest hits: call prepare() for each geometry, then closest() on one thread."""
+    """An algorithm that finds closest hits: call prepare() for each geometry, then closest(), which uses one thread."""
 
     name: str
     bytes_per_triangle: float = float("nan")
     is_peer: ClassVar[bool] = False
-    has_threads: ClassVar[bool] = True  # search() can use several
-    package: ClassVar[str] = ""  # what a peer imports
+    has_threads: ClassVar[bool] = True  # search() can use several threads
+    package: ClassVar[str] = ""  # package that a peer imports
 
     @classmethod
     def is_installed(cls) -> bool:
@@ -35,18 +35,18 @@ class Algorithm(ABC):
 
     @abstractmethod
     def prepare(self, geometry: Geometry) -> bool:
-        """Build for this geometry; return False if the library cannot take it (spheres)."""
+        """Build the structure for a geometry; return False if the library does not support it (spheres)."""
 
     @abstractmethod
     def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf) -> Hits:
-        """Return closest hits, as wrt.accel.base.Accelerator.closest_hit."""
+        """Return closest hits; arguments and result as for wrt.accel.base.Accelerator.closest_hit."""
 
     @abstractmethod
     def search(self, rays: RaySet, threads: int) -> Callable[[], object]:
-        """Return the work to time, with rays and results in the library's own arrays."""
+        """Return the function to time: it traces the rays, with rays and results in the library's own arrays."""
 
     def occluded(self, out: Any) -> np.ndarray:
-        """Return the result of a search with any-hit rays."""
+        """Return flags of the occluded rays. out: result of the function from search(), for any-hit rays."""
         return out.numpy().astype(bool)
 
 
@@ -78,7 +78,7 @@ class Own(Algorithm):
 
 
 class Peer(Algorithm):
-    """Another library: triangles only. If it has no t_min, hits before it are removed after the query."""
+    """Another library, for triangles only. Hits outside [t_min, t_max] are removed after the query."""
 
     is_peer = True
     has_threads = False
@@ -91,7 +91,7 @@ class Peer(Algorithm):
 
     @abstractmethod
     def load(self, geometry: Geometry) -> None:
-        """Hand the triangles to the library."""
+        """Pass the triangles to the library."""
 
 
 class Embree(Peer):
@@ -108,9 +108,9 @@ class Embree(Peer):
         try:
             self.scene = EmbreeScene(robust=self.robust)
         except TypeError as error:
-            raise InputError("embreex is too old to be asked for a mode", hint='pip install "embreex>=4.4"') from error
+            raise InputError("embreex is too old: it has no choice of the mode", hint='pip install "embreex>=4.4"') from error
         self.mesh = TriangleMesh(self.scene, geometry.vertices, geometry.faces)
-        self.closest(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))  # it builds at its first query
+        self.closest(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))  # Embree builds at the first query
 
     def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf) -> Hits:
         out = self.scene.run(np.ascontiguousarray(origins), np.ascontiguousarray(directions), output=True)
@@ -128,14 +128,14 @@ class Embree(Peer):
 
 
 class EmbreeFast(Embree):
-    """Embree 4 through embreex without its robust flag, Embree's own default: faster, and rays are lost at edges."""
+    """Embree 4 through embreex without the robust flag, which is Embree's own default: faster, but it loses rays at edges."""
 
     name = "Embree fast"
     robust = False
 
 
 class WarpMesh(Peer):
-    """Warp's mesh_query_ray on wp.Mesh with one of its constructors. It has no t_min."""
+    """Warp's mesh_query_ray, which has no t_min, on a wp.Mesh built by one of Warp's constructors."""
 
     name = "Warp mesh_query_ray"
 
@@ -158,11 +158,11 @@ class WarpMesh(Peer):
         found: Any = self.search(RaySet("", origins, directions, np.ones(len(origins))), 1)()
         t, u, v, prim_id = (array.numpy() for array in found)
         length = np.linalg.norm(directions.astype(np.float64), axis=1)
-        # Warp's u and v belong to the first two corners; wrt's to the last two.
+        # Warp's u and v are the weights of the first two corners; wrt's u and v are the weights of the last two.
         return cut((t / length).astype(np.float32), prim_id, v, 1.0 - u - v, t_min, t_max)
 
     def search(self, rays: RaySet, threads: int) -> Callable[[], object]:
-        """Return the query with unit directions, which Warp requires, and with a length beside them for any-hit rays."""
+        """Return the function to time. Warp requires unit directions, so any-hit rays also have a length."""
         import warp as wp
 
         from wrt.core.device import load_kernel
@@ -218,7 +218,7 @@ class Open3D(Peer):
 
 
 def cut(t: np.ndarray, prim_id: np.ndarray, u: np.ndarray, v: np.ndarray, t_min: ArrayLike, t_max: ArrayLike) -> Hits:
-    """Remove the hits outside of the segment."""
+    """Return Hits in which hits outside [t_min, t_max] are misses."""
     outside = (prim_id < 0) | ~((t >= np.asarray(t_min)) & (t <= np.asarray(t_max)))
     return Hits(np.where(outside, np.float32(np.inf), t), np.where(outside, 0, u), np.where(outside, 0, v),
                 np.where(outside, np.int32(-1), prim_id))

@@ -1,4 +1,4 @@
-"""Embree in packets of 16, its fastest modes, through the C library in the embreex package."""
+"""Embree's queries for packets of 16 rays, its fastest ones, called in the C library of the embreex package."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from wrt.core.types import ArrayLike
 from wrt.lab.bench.rays import RaySet
 from wrt.lab.hard_cases.contestants import Peer, cut
 
-# rtcore_scene.h, rtcore_geometry.h, rtcore_buffer.h, rtcore_common.h
+# Constants of rtcore_scene.h, rtcore_geometry.h, rtcore_buffer.h and rtcore_common.h.
 ROBUST_SCENE, TRIANGLES, INDICES, VERTICES, UINT3, FLOAT3 = 1 << 2, 0, 0, 1, 0x5003, 0x9003
 SLACK = 16  # bytes that Embree may read behind the last vertex
 
@@ -27,7 +27,7 @@ def library() -> ctypes.CDLL:
     """Load Embree 4. Raise InputError without embreex."""
     with needed_by("Embree"):
         from embreex import rtcore_scene
-    embree = ctypes.CDLL(rtcore_scene.__file__)  # a symbol is looked for in what it is linked to, too
+    embree = ctypes.CDLL(rtcore_scene.__file__)  # also finds symbols of the libraries that it links to
     pointer = ctypes.c_void_p
     for name in ("rtcNewDevice", "rtcNewScene", "rtcNewGeometry"):
         getattr(embree, name).restype = pointer
@@ -41,7 +41,7 @@ def library() -> ctypes.CDLL:
 
 
 class EmbreePackets(Peer):
-    """rtcIntersect16 and rtcOccluded16 of a robust scene, with the flag for coherent rays."""
+    """Embree's rtcIntersect16 and rtcOccluded16 on a robust scene, with the flag for coherent rays."""
 
     name = "Embree robust, 16 coherent"
     package = "embreex"
@@ -55,7 +55,7 @@ class EmbreePackets(Peer):
         triangles = embree.rtcNewGeometry(device, TRIANGLES)
         vertices = np.concatenate([np.ascontiguousarray(geometry.vertices).reshape(-1), np.zeros(SLACK // 4, np.float32)])
         faces = geometry.faces.astype(np.uint32)
-        self.buffers = vertices, faces  # Embree reads them where they are
+        self.buffers = vertices, faces  # Embree reads these arrays without a copy
         for kind, form, array, count in ((VERTICES, FLOAT3, vertices, len(geometry.vertices)), (INDICES, UINT3, faces, len(faces))):
             embree.rtcSetSharedGeometryBuffer(triangles, kind, 0, form, array.ctypes.data, 0, 12, count)
         embree.rtcCommitGeometry(triangles)
@@ -99,7 +99,7 @@ class EmbreePackets(Peer):
 
 
 class EmbreeIncoherentPackets(EmbreePackets):
-    """The same without the flag for coherent rays."""
+    """EmbreePackets without the flag for coherent rays."""
 
     name = "Embree robust, 16 incoherent"
     coherent = False

@@ -1,9 +1,9 @@
-"""Verdicts on the answers of an algorithm to a hard case, ray by ray, by the oracle.
+"""Judge an algorithm's answers to a hard case, ray by ray, with the oracle.
 
-Three kinds of answers are wrong. A *miss*: a hit that must be found is not. A *false hit*: the ray passes the triangle by more than the
-algorithm's rounding, or t is outside of the segment. A *wrong prim_id*: a nearer hit had to be found. Answers that the derived error
-bound (wrt.lab.oracle.bounds) cannot settle are not wrong, but counted: borderline misses and hits, ties (exactly equal t) and near ties
-(within the bound)."""
+Three kinds of answers are wrong. A *miss* reports no hit where one must be found. A *false hit* names a triangle that the ray misses by
+more than the algorithm's rounding, or a t outside the segment. A *wrong prim_id* names a primitive although a nearer one must be found.
+The derived error bound (wrt.lab.oracle.bounds) cannot settle all answers. Those it leaves open are not wrong, but counted: borderline
+misses and hits, ties (exactly equal t) and near ties (t equal within the bound)."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ import numpy as np
 
 from wrt.accel.queries.answers import Hits
 from wrt.core.types import JsonObject
-from wrt.lab.hard_cases.common import ASK, HIT, MISS, HardCase
+from wrt.lab.hard_cases.common import HIT, MISS, UNKNOWN, HardCase
 from wrt.lab.oracle.oracle import AllHits, Place, Reference, reference_of, sure
 
 RAYS_AT_ONCE = 1 << 16
-FACES_AT_ONCE = 4096  # whose float64 temporaries stay in the cache
-EXAMPLES = 8
+FACES_AT_ONCE = 4096  # few enough that float64 temporaries stay in the cache
+EXAMPLES = 8  # wrong rays that a verdict stores
 BINS_PER_OCTAVE, LOWEST_OCTAVE, N_BINS = 8, -12, 8 * 160
 
 
 @dataclass
 class Errors:
-    """Errors of one quantity, in float32 ulp of the exact t, or of u and v in 2^-24.
-    - largest, histogram (for percentiles): over hits that are exact ones.
-    - largest_ratio to the derived bound, over (the bound): also over borderline hits, whose plane may be met far outside of the
-    triangle."""
+    """Errors of one quantity: of t in float32 ulp at the exact t, of u and v in units of 2^-24.
+    - largest: largest error; histogram: counts of errors, for percentiles; both over exact hits only.
+    - largest_ratio: largest error over its derived bound; over: number of errors above the bound. Both include borderline hits, which
+      may lie far outside the triangle in its plane."""
 
     largest: float = 0.0
     largest_ratio: float = 0.0
@@ -36,7 +36,7 @@ class Errors:
     histogram: np.ndarray = field(default_factory=lambda: np.zeros(N_BINS, np.int64))
 
     def add(self, error: np.ndarray, unit: np.ndarray | float, bound: np.ndarray, exact_hit: np.ndarray) -> np.ndarray:
-        """Count absolute errors (NaN counts as infinite); return where they exceed the bound."""
+        """Add absolute errors, where NaN counts as infinite; return flags of the errors above the bound. unit: of `largest`."""
         error = np.where(np.isnan(error), np.inf, error)
         over = (error > bound) | np.isinf(error)
         ratio = np.full(len(error), np.inf)
@@ -51,7 +51,7 @@ class Errors:
         return over
 
     def percentile(self, q: float) -> float:
-        """Return an upper bound, within a ninth, on the q-th percentile; NaN if nothing was counted."""
+        """Return an upper bound on the q-th percentile, at most a ninth too large; NaN if the histogram is empty."""
         total = int(self.histogram.sum())
         if not total:
             return float("nan")
@@ -72,9 +72,9 @@ class Errors:
 
 @dataclass
 class Verdict:
-    """Counts over rays; verdicts of parts of a case can be added.
-    - asked: reported hits that the oracle compared with the closest one; examples: the first few wrong rays.
-    - self_hits, duplicate_hits: from judge_next and judge_all_hits."""
+    """Counts over rays; the verdicts on parts of a case can be added.
+    - asked: reported hits that the oracle compared with the closest hit; examples: the first wrong rays.
+    - self_hits is counted by judge_next, duplicate_hits by judge_all_hits."""
 
     rays: int = 0
     hits: int = 0
@@ -112,7 +112,7 @@ class Verdict:
         return {f.name: value.as_dict() if isinstance(value := getattr(self, f.name), Errors) else value for f in fields(Verdict)}
 
     def wrong(self, count: str, case: HardCase, rows: np.ndarray, why: str, prim_id: np.ndarray | None = None) -> None:
-        """Count these rays under the name `count`, and keep some as examples."""
+        """Add the rays `rows` to the field named `count` ("": to none), and store the first ones as examples."""
         if count:
             setattr(self, count, getattr(self, count) + len(rows))
         for row in rows[: EXAMPLES - len(self.examples)].tolist():
@@ -122,44 +122,44 @@ class Verdict:
                 "t_min": float(case.t_min[row]), "t_max": float(case.t_max[row])})
 
 
-# What a unit says of the rays `row`, and what is exact for the primitive that it names.
+# A reported hit: index of its ray, reported t and prim_id, and for this primitive: bound on t, whether a report is allowed, exact hit.
 CLAIM = np.dtype([("row", np.int64), ("t", np.float64), ("prim_id", np.int64), ("t_bound", np.float64), ("sound", bool), ("hit", bool)])
 
 
-def judge(case: HardCase, hits: Hits, asked: int | None = None, *, lowest: bool = True) -> Verdict:
+def judge(case: HardCase, hits: Hits, compared: int | None = None, *, lowest: bool = True) -> Verdict:
     """Judge closest hits: t, u, v, prim_id (N,), prim_id -1 on a miss (wrt.accel.queries.answers.Hits).
 
-    - Each reported hit is compared with its own primitive, exactly. The oracle looks for nearer hits of `asked` of them (None: case.asked),
-      chosen at random, always the same. It traces each ray that is reported to miss, unless the ray is known to hit.
-    - lowest: of identical triangles the lowest prim_id must be reported, which is wrt's rule. Without u and v, errors of t are only
-      measured: the bounds are those of wrt's test."""
+    - Each reported hit is tested exactly against the primitive that it names. For `compared` hits (None: case.compared), chosen at
+      random with a fixed seed, the oracle also looks for nearer hits. It traces each ray that is reported to miss and not known to hit.
+    - lowest: among identical triangles the lowest prim_id is right, which is wrt's rule.
+    - u and v may be None. The bounds are those of wrt's triangle test."""
     reference = reference_of(case.geometry)
     t, u, v, prim_id = (None if value is None else np.asarray(value) for value in (hits.t, hits.u, hits.v, hits.prim_id))
     assert t is not None and prim_id is not None
     reported = prim_id >= 0
-    verdict, possible = _plain_faults(case, t, prim_id, reference.finite)
+    verdict, possible = _obvious_faults(case, t, prim_id, reference.finite)
     rows = np.flatnonzero(possible & (case.expected != MISS))
     parts = [_claims(case, reference, rows[i:i + RAYS_AT_ONCE], (t, u, v, prim_id), verdict) for i in range(0, len(rows), RAYS_AT_ONCE)]
     if parts:
         claims = np.concatenate(parts).view(np.recarray)
-        asked = case.asked if asked is None else asked
+        compared = case.compared if compared is None else compared
         chosen = np.flatnonzero(claims.sound)
-        if len(chosen) > asked:
-            chosen = np.sort(np.random.default_rng(0).choice(chosen, asked, replace=False))
+        if len(chosen) > compared:
+            chosen = np.sort(np.random.default_rng(0).choice(chosen, compared, replace=False))
         _judge_closeness(case, reference, claims[chosen], verdict, lowest)
-    _judge_misses(case, reference, np.flatnonzero(~reported & (case.expected == ASK)), verdict)
+    _judge_misses(case, reference, np.flatnonzero(~reported & (case.expected == UNKNOWN)), verdict)
     return verdict
 
 
 def check(case: HardCase, hits: Hits) -> Verdict:
-    """Judge without the oracle, for any number of rays: expected hits and misses, and t inside of the segment.
-    Rays whose answer only the oracle knows (ASK) may miss. Arguments as for `judge`."""
+    """Judge closest hits without the oracle: test expected hits and misses, and that t is inside the segment.
+    Rays with the expectation UNKNOWN may miss. Arguments as for `judge`."""
     every = np.ones(len(case.geometry), bool)
-    return _plain_faults(case, np.asarray(hits.t), np.asarray(hits.prim_id), every)[0]
+    return _obvious_faults(case, np.asarray(hits.t), np.asarray(hits.prim_id), every)[0]
 
 
-def _plain_faults(case: HardCase, t: np.ndarray, prim_id: np.ndarray, finite: np.ndarray) -> tuple[Verdict, np.ndarray]:
-    """Find what is wrong whatever the oracle says, and the rays whose reported hit may be one. finite: flags of the primitives."""
+def _obvious_faults(case: HardCase, t: np.ndarray, prim_id: np.ndarray, finite: np.ndarray) -> tuple[Verdict, np.ndarray]:
+    """Count the faults that need no oracle; also return flags of the reported hits that may be right. finite: flags of the primitives."""
     reported = prim_id >= 0
     verdict = Verdict(rays=len(case), hits=int(reported.sum()))
     verdict.wrong("misses", case, np.flatnonzero(~reported & (case.expected == HIT)), "must hit, is reported to miss")
@@ -168,14 +168,15 @@ def _plain_faults(case: HardCase, t: np.ndarray, prim_id: np.ndarray, finite: np
     possible[possible] &= finite[prim_id[possible]]
     possible &= np.isfinite(case.origins).all(axis=1) & np.isfinite(case.directions).all(axis=1)
     verdict.wrong("false_hits", case, np.flatnonzero(reported & ~possible & (case.expected != MISS)),
-                  "t outside of the segment, or nothing that can be hit", prim_id)
+                  "t is outside the segment, or the ray or primitive is not finite or does not exist", prim_id)
     return verdict, possible
 
 
-def _claims(case: HardCase, reference: Reference, rows: np.ndarray, said: tuple[Any, ...], verdict: Verdict) -> Any:
-    """Compare reported hits with the primitives that they name: false hits, and errors of t, u and v."""
-    u, v = (None if x is None else x[rows].astype(np.float64) for x in said[1:3])
-    t, prim_id = said[0][rows].astype(np.float64), said[3][rows]
+def _claims(case: HardCase, reference: Reference, rows: np.ndarray, hits: tuple[Any, ...], verdict: Verdict) -> Any:
+    """Compare the reported hits of the rays `rows` with the primitives that they name; return a CLAIM for each.
+    Count false hits, and errors of t, u and v. hits: t, u, v, prim_id of all rays."""
+    u, v = (None if x is None else x[rows].astype(np.float64) for x in hits[1:3])
+    t, prim_id = hits[0][rows].astype(np.float64), hits[3][rows]
     exact_t, exact_u, exact_v = np.empty((3, len(rows)))
     bound = np.full((3, len(rows)), np.inf)
     sound, hit = np.zeros((2, len(rows)), bool)
@@ -195,7 +196,7 @@ def _claims(case: HardCase, reference: Reference, rows: np.ndarray, said: tuple[
         bound[0, i] = np.take_along_axis(t_bound, end[None], axis=0)[0]
         exact_u[i], exact_v[i], bound[1:, i] = 0.0, 0.0, 1e-30
         sound[i], hit[i] = ball.hit | allowed, ball.hit
-    verdict.wrong("false_hits", case, rows[~sound], "passes the primitive by more than rounding", said[3])
+    verdict.wrong("false_hits", case, rows[~sound], "misses the primitive by more than rounding", hits[3])
     verdict.borderline_hits += int((sound & ~hit).sum())
 
     known = sound & np.isfinite(exact_t)
@@ -205,12 +206,12 @@ def _claims(case: HardCase, reference: Reference, rows: np.ndarray, said: tuple[
     if u is not None and v is not None:
         over[known] |= verdict.u.add(np.abs(u - exact_u)[known], 2.0**-24, bound[1, known], hit[known])
         over[known] |= verdict.v.add(np.abs(v - exact_v)[known], 2.0**-24, bound[2, known], hit[known])
-        verdict.wrong("", case, rows[over], "t, u or v is off by more than the derived bound", said[3])
+        verdict.wrong("", case, rows[over], "the error of t, u or v is above the derived bound", hits[3])
     return np.rec.fromarrays([rows, t, prim_id, bound[0], sound, hit], dtype=CLAIM)
 
 
 def _judge_closeness(case: HardCase, reference: Reference, claims: Any, verdict: Verdict, lowest: bool) -> None:
-    """Find hits nearer than the reported ones, and ties."""
+    """Count claims for which a nearer hit must be found, ties and near ties."""
     n = len(claims.row)
     verdict.asked += n
     o, d = case.origins[claims.row], case.directions[claims.row]
@@ -219,7 +220,7 @@ def _judge_closeness(case: HardCase, reference: Reference, claims: Any, verdict:
     answer = reference.closest_of(found, o, d)
     certain, bound = _certain(case, reference, found, claims.row, o, d)
 
-    passed = claims.t[found.ray] > found.t + bound  # exact hits that the claimed one is clearly behind
+    passed = claims.t[found.ray] > found.t + bound  # exact hits that are clearly nearer than the claim
     other = found.prim_id != claims.prim_id[found.ray]
     wrong = np.zeros(n, bool)
     wrong[found.ray[passed & certain & other]] = True
@@ -235,12 +236,12 @@ def _judge_closeness(case: HardCase, reference: Reference, claims: Any, verdict:
     rows = claims.row[wrong]
     prim_id = np.full(len(case), -1)
     prim_id[claims.row] = claims.prim_id
-    verdict.wrong("wrong_prim", case, rows, "something nearer had to be found", prim_id)
+    verdict.wrong("wrong_prim", case, rows, "another primitive is nearer and must be found", prim_id)
 
 
 def _certain(case: HardCase, reference: Reference, found: AllHits, row: np.ndarray, o: np.ndarray,
              d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return which exact hits an algorithm within its bounds must report, and the bounds on their t."""
+    """Return flags of the exact hits `found` that an algorithm within the error bounds must find, and the bounds on their t."""
     certain, bound = np.zeros(len(found), bool), np.full(len(found), np.inf)
     i = np.flatnonzero(found.prim_id < reference.n_triangles)
     if len(i):
@@ -258,7 +259,7 @@ def _certain(case: HardCase, reference: Reference, found: AllHits, row: np.ndarr
 
 
 def _judge_misses(case: HardCase, reference: Reference, rows: np.ndarray, verdict: Verdict) -> None:
-    """Find rays that are reported to miss although a hit had to be found."""
+    """Count the rays `rows`, which are reported to miss, that must hit or may hit (borderline)."""
     for first in range(0, len(rows), RAYS_AT_ONCE):
         part = rows[first:first + RAYS_AT_ONCE]
         o, d = case.origins[part], case.directions[part]
@@ -271,31 +272,30 @@ def _judge_misses(case: HardCase, reference: Reference, rows: np.ndarray, verdic
             left = ~missed[found.ray] & np.isfinite(bound)
             missed |= _leaks(case, found[left], bound[left], part, np.full(len(part), np.inf))
         verdict.borderline_misses += int((border & ~missed).sum())
-        verdict.wrong("misses", case, part[missed], "has a hit that had to be found")
+        verdict.wrong("misses", case, part[missed], "has a hit that must be found")
 
 
 def _leaks(case: HardCase, skipped: AllHits, bound: np.ndarray, row: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return which of the rays `row` pass through a closed surface by crossings that were left out, (n,) bool.
-    The winding number behind such a crossing, before the next one or before end[i], differs from that at the segment's start. Crossings
-    whose
-    bounds on t overlap are taken together: a ray may cut off a corner by less than the bound."""
+    """Return flags of the rays `row` that leak through a closed surface at crossings that were not reported, (n,) bool.
+    A ray leaks if the winding number behind such a crossing, before the next one or end[i], differs from the one at the segment's start.
+    Crossings whose bounds on t overlap count as one, because a ray may cut off a corner by less than the bound."""
     leaks, rays, points = np.zeros(len(row), bool), np.unique(skipped.ray), [np.zeros((0, 3))]
     for i in rays:
-        mine = skipped.ray == i
-        low, high = skipped.t[mine] - bound[mine], np.maximum.accumulate(skipped.t[mine] + bound[mine])
+        own = skipped.ray == i
+        low, high = skipped.t[own] - bound[own], np.maximum.accumulate(skipped.t[own] + bound[own])
         low = np.append(np.minimum.accumulate(low[::-1])[::-1], end[i] if np.isfinite(end[i]) else 2.0 * high[-1] + 1.0)
         gap = np.flatnonzero(high < low[1:])
         at = np.array([float(case.t_min[row[i]]), *(0.5 * (high[gap] + low[gap + 1]))])
         o, d = (x[row[i]].astype(np.float64) for x in (case.origins, case.directions))
         points.append(o + at[:, None] * d)
     winding = np.round(winding_number(case, np.concatenate(points)))
-    for i, mine in zip(rays, np.split(winding, np.cumsum([len(each) for each in points]))[1:], strict=False):
-        leaks[i] = bool((mine[1:] != mine[0]).any())
+    for i, along_ray in zip(rays, np.split(winding, np.cumsum([len(each) for each in points]))[1:], strict=False):
+        leaks[i] = bool((along_ray[1:] != along_ray[0]).any())
     return leaks
 
 
 def winding_number(case: HardCase, points: np.ndarray) -> np.ndarray:
-    """Return how often the surface winds round each point: the signed solid angle over 4 pi (van Oosterom and Strackee 1983)."""
+    """Return the winding number of the surface around each point: signed solid angle over 4 pi (van Oosterom and Strackee 1983)."""
     corners = case.geometry.vertices[case.geometry.faces].astype(np.float64)
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).any(axis=1)
     corners, out = corners[area], np.zeros(len(points))
@@ -311,7 +311,7 @@ def winding_number(case: HardCase, points: np.ndarray) -> np.ndarray:
 
 
 def _lower_twin(case: HardCase, prim_id: int, tied: np.ndarray) -> bool:
-    """Return True if a lower prim_id of the tie has the same corners in the same order: then t is the same, and the lower one wins."""
+    """Return True if a lower prim_id of the tie has the same corners in the same order, so that its computed t is the same."""
     faces, vertices = case.geometry.faces, case.geometry.vertices
     lower = tied[tied < min(prim_id, len(faces))]
     if prim_id >= len(faces) or not len(lower):
@@ -320,37 +320,36 @@ def _lower_twin(case: HardCase, prim_id: int, tied: np.ndarray) -> bool:
 
 
 def judge_next(case: HardCase, first_prim_id: np.ndarray, next_prim_id: np.ndarray) -> Verdict:
-    """Judge case C: rays that start at the first hits (on a sphere: to its outside) must not hit the same primitive.
-    - prim_id: (N,) each, -1 on a miss. A miss of the first ray is ignored.
-    - Add the verdict to judge's, which counts rays and hits."""
+    """Judge case C: a ray that starts at a hit (on a sphere: to its outside) must not hit the same primitive.
+    Arrays are (N,), -1 on a miss; rays whose first hit is a miss are skipped. Add the verdict to judge's, which counts rays and hits."""
     verdict = Verdict()
     again = np.flatnonzero((first_prim_id >= 0) & (next_prim_id == first_prim_id))
-    verdict.wrong("self_hits", case, again, "hits the primitive that it starts on", next_prim_id)
+    verdict.wrong("self_hits", case, again, "hits the primitive on which it starts", next_prim_id)
     return verdict
 
 
 def judge_all_hits(case: HardCase, ray: np.ndarray, prim_id: np.ndarray, t: np.ndarray) -> Verdict:
-    """Judge all-hits queries over triangles: one row a reported hit, in any order. Add the result to judge's verdict.
-    A duplicate is a primitive twice on a ray. Crossings of a closed surface alternate between in and out. So two in a row in the same
-    direction, whose bounds on t overlap, are one crossing of an edge that was reported twice."""
+    """Judge an all-hits query over triangles; ray, prim_id and t describe the reported hits, in any order.
+    A primitive that a ray reports twice is a duplicate. Crossings of a closed surface alternate between in and out. So two successive
+    crossings in the same direction, whose bounds on t overlap, are one crossing of an edge, and also count as a duplicate."""
     reference = reference_of(case.geometry)
     order = np.lexsort((prim_id, t, ray))
     ray, prim_id, t = ray[order], prim_id[order], t[order].astype(np.float64)
     verdict = Verdict()
     exact, limit = reference.against(case.origins[ray], case.directions[ray], prim_id)
     sound = limit.touches & (exact.place != Place.DEGENERATE)
-    verdict.wrong("false_hits", case, ray[~sound], "passes the primitive by more than rounding")
+    verdict.wrong("false_hits", case, ray[~sound], "misses the primitive by more than rounding")
     _, first = np.unique(np.stack([ray, prim_id]), axis=1, return_index=True)
     twice = np.ones(len(ray), bool)
     twice[first] = False
     if case.closed and len(ray) > 1:
         pair = (ray[1:] == ray[:-1]) & (np.diff(t) <= limit.t[1:] + limit.t[:-1])
         twice[1:] |= pair & (np.sign(exact.slope[1:]) == np.sign(exact.slope[:-1]))
-    verdict.wrong("duplicate_hits", case, ray[twice], "one crossing, reported twice")
+    verdict.wrong("duplicate_hits", case, ray[twice], "one crossing is reported twice")
 
     found = reference.all_hits(case.origins, case.directions, case.t_min, case.t_max)
     certain, _ = _certain(case, reference, found, np.arange(len(case)), case.origins, case.directions)
     reported = set(zip(ray.tolist(), prim_id.tolist(), strict=True))
     lost = [r for r, p in zip(found.ray[certain].tolist(), found.prim_id[certain].tolist(), strict=True) if (r, p) not in reported]
-    verdict.wrong("misses", case, np.array(lost, dtype=np.int64), "has a hit that had to be found")
+    verdict.wrong("misses", case, np.array(lost, dtype=np.int64), "has a hit that must be found")
     return verdict

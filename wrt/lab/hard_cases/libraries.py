@@ -1,4 +1,4 @@
-"""Ray libraries as one function each: closest_hit(vertices, faces, origins, directions) -> t, prim_id."""
+"""Each ray library as one function: closest_hit(vertices, faces, origins, directions) -> t, prim_id."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from wrt.lab.mitsuba.process import require_llvm
 from wrt.lab.mitsuba.shapes import Triangles, make_mesh
 from wrt.lab.mitsuba.translate import mitsuba
 
-TRIMESH_RAYS = 64  # at once: trimesh tests all triangles in a box around each ray
+TRIMESH_RAYS = 64  # rays a call; trimesh gathers all triangles in a box around each ray, which takes much memory
 
 Answer = tuple[np.ndarray, np.ndarray]
 
 
 def peer(kind: type[Peer], vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> Hits:
-    """Ask a library of `bench peers`."""
-    who = kind()
-    who.prepare(surface(vertices, faces))
-    return who.closest(origins, directions)
+    """Return the closest hits of a Peer."""
+    algorithm = kind()
+    algorithm.prepare(surface(vertices, faces))
+    return algorithm.closest(origins, directions)
 
 
 def mitsuba_closest(vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> Answer:
-    """Ask Mitsuba's variant llvm_ad_rgb, which uses Embree."""
+    """Return the closest hits of Mitsuba's variant llvm_ad_rgb, which uses Embree."""
     require_llvm()
     with mitsuba("llvm_ad_rgb") as mi:
         mesh = make_mesh(mi, "mesh", Triangles(vertices, faces, None, None), {})
@@ -43,15 +43,15 @@ def mitsuba_closest(vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray
 
 
 def trimesh_closest(vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> Answer:
-    """Ask trimesh's own class, float64 in NumPy, not the one that uses Embree."""
+    """Return the closest hits of trimesh's own intersector, which computes in float64 with NumPy and does not use Embree."""
     import trimesh
     from trimesh.ray.ray_triangle import RayMeshIntersector
 
-    ask = RayMeshIntersector(trimesh.Trimesh(vertices, faces, process=False))
+    intersector = RayMeshIntersector(trimesh.Trimesh(vertices, faces, process=False))
     t, prim_id = np.full(len(origins), np.inf), np.full(len(origins), -1)
     for first in range(0, len(origins), TRIMESH_RAYS):
         o, d = (rays[first:first + TRIMESH_RAYS].astype(np.float64) for rays in (origins, directions))
-        face, ray, where = ask.intersects_id(o, d, multiple_hits=False, return_locations=True)
+        face, ray, where = intersector.intersects_id(o, d, multiple_hits=False, return_locations=True)
         if len(ray):
             t[first + ray] = ((where - o[ray]) * d[ray]).sum(axis=1) / (d[ray] ** 2).sum(axis=1)
             prim_id[first + ray] = face
@@ -60,7 +60,7 @@ def trimesh_closest(vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray
 
 @dataclass(frozen=True)
 class Library:
-    """A library's function, and the packages that it imports (`needs`)."""
+    """A ray library. name: for tables; needs: packages that closest_hit imports."""
 
     name: str
     closest_hit: ClosestHit
@@ -79,7 +79,7 @@ LIBRARIES = {
 
 
 def usable(name: str) -> str:
-    """Return why a library cannot be used here; "" if it can."""
+    """Return the reason why a library cannot be used on this machine, or ""."""
     missing = [package for package in LIBRARIES[name].needs if importlib.util.find_spec(package) is None]
     if missing:
         return f"not installed: {', '.join(missing)}"

@@ -1,4 +1,4 @@
-"""Rays at open surfaces, bad triangles and spheres: mostly, only the oracle knows the answer."""
+"""Rays at open surfaces, bad triangles and spheres; for most rays only the oracle knows the right answer."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 
 from wrt.accel.geometry import Geometry
-from wrt.lab.hard_cases.common import ASK, HIT, MISS, HardCase, cube, hard_case, in_ball, joined, soup, sphere, surface, unit_vectors
+from wrt.lab.hard_cases.common import HIT, MISS, UNKNOWN, HardCase, cube, hard_case, in_ball, joined, soup, sphere, surface, unit_vectors
 
 # pbrt-v4, shapes_test, Triangle.BadCases: three collinear points and a ray that must miss them (published numbers).
 BAD_TRIANGLE = ((-1113.45459, -79.049614, -56.2431908), (-1113.45459, -87.0922699, -56.2431908), (-1113.45459, -79.2090149, -56.2431908))
@@ -17,34 +17,33 @@ TURN = np.array([[np.cos(0.4), np.sin(0.4), 0.0], [-np.sin(0.4), np.cos(0.4), 0.
 
 
 def _signed_powers(rng: np.random.Generator, shape: tuple[int, ...], low: float, high: float) -> np.ndarray:
-    """Return +-10^U(low, high)."""
+    """Return random numbers +-10^U(low, high), where U is uniform."""
     return rng.choice([-1.0, 1.0], shape) * 10.0 ** rng.uniform(low, high, shape)
 
 
 def _points(geometry: Geometry, rng: np.random.Generator, n: int, spread: float = 1.0) -> np.ndarray:
-    """Return (n, 3) float64 points inside random triangles; spread < 1 draws them towards corners and edges."""
+    """Return (n, 3) float64 points inside random triangles; a spread below 1 concentrates them near corners and edges."""
     corners = geometry.vertices[geometry.faces[rng.integers(len(geometry.faces), size=n)]].astype(np.float64)
     return np.einsum("ni,nij->nj", rng.dirichlet([spread] * 3, n), corners)
 
 
 def _towards(geometry: Geometry, rng: np.random.Generator, origins: np.ndarray, points: np.ndarray) -> HardCase:
     origins = origins.astype(np.float32)
-    return hard_case(geometry, origins, points - origins.astype(np.float64), ASK)
+    return hard_case(geometry, origins, points - origins.astype(np.float64), UNKNOWN)
 
 
 def respawned_triangles(rng: np.random.Generator, n: int) -> HardCase:
-    """C (pbrt-v4, Triangle.Reintersect): 8 triangles with coordinates +-10^U(-8, 8), and rays at them from such points.
-    A ray from the hit along next_directions must not hit the same triangle, on whichever side it starts."""
+    """C (pbrt-v4, Triangle.Reintersect): 8 triangles and origins with coordinates +-10^U(-8, 8), and rays at the triangles.
+    A ray from the hit along next_directions must not hit the same triangle, on either side."""
     geometry = soup(_signed_powers(rng, (8, 3, 3), -8.0, 8.0))
     case = _towards(geometry, rng, _signed_powers(rng, (n, 3), -8.0, 8.0), _points(geometry, rng, n))
     return replace(case, next_directions=unit_vectors(rng, n).astype(np.float32))
 
 
 def respawned_spheres(rng: np.random.Generator, n: int) -> HardCase:
-    """C: 8 spheres of radius 10^U(-4, 4), moved by up to 1e4, with rays at them from outside and inside.
-    A ray from the hit, turned to the outside of the sphere, must not hit it again. A sphere is moved by at most 2^22 radii: one smaller
-    than
-    the float32 spacing at its centre has no outside."""
+    """C: 8 spheres of radius 10^U(-4, 4), up to 1e4 from the origin, with rays at them from outside and inside.
+    A ray from the hit to the outside of the sphere must not hit the sphere again. Centres are at most 2^22 radii from the origin: a sphere
+    smaller than the float32 spacing at its centre has no outside."""
     radius = 10.0 ** rng.uniform(-4.0, 4.0, (8, 1))
     moved = np.minimum(10.0 ** rng.uniform(-4.0, 4.0, (8, 1)), 2.0**22 * radius)
     spheres = np.concatenate([unit_vectors(rng, 8) * moved, radius], axis=1)
@@ -58,7 +57,7 @@ def respawned_spheres(rng: np.random.Generator, n: int) -> HardCase:
 
 @cache
 def _without_area() -> Geometry:
-    """Return triangles with three corners on a line (small whole numbers, thus exactly), two or three of them equal."""
+    """Return triangles with exactly collinear corners (multiples of 1/8): a third have distinct corners, two thirds repeated ones."""
     rng = np.random.default_rng(0)
     start, step = rng.integers(-8, 9, (2, 96, 1, 3)) / 8.0
     along = np.stack([rng.permutation(4)[:3] for _ in range(96)])[:, :, None]
@@ -69,14 +68,14 @@ def _without_area() -> Geometry:
 
 @cache
 def _line_through_zero() -> Geometry:
-    """Return triangles with corners on a line through 0, up to 2^60 apart in size: float64 rounds their differences and products."""
+    """Return triangles with corners on a line through 0, whose sizes differ by up to 2^60: float64 rounds differences and products."""
     rng = np.random.default_rng(0)
     step = rng.uniform(-4.0, 4.0, (96, 1, 3)).astype(np.float32).astype(np.float64)
     return soup(2.0 ** -rng.integers(0, 60, (96, 3, 1)) * step)
 
 
 def without_area(rng: np.random.Generator, n: int, *, wide: bool = False) -> HardCase:
-    """D: collinear and repeated corners are never hit, whatever rounding says. wide: corners of very different size."""
+    """D: triangles with collinear or repeated corners, which must never be hit. wide: coordinates of very different size."""
     geometry = _line_through_zero() if wide else _without_area()
     origins = in_ball(rng, n, 4.0)
     origins[::2] = (origins[::2] * 8.0).round() / 8.0
@@ -84,14 +83,14 @@ def without_area(rng: np.random.Generator, n: int, *, wide: bool = False) -> Har
 
 
 def among_bad(rng: np.random.Generator, n: int) -> HardCase:
-    """D: a closed sphere with such triangles inside: the sphere must be hit, through them."""
+    """D: triangles without area inside a closed sphere: rays aimed at the triangles must hit the sphere."""
     origins = in_ball(rng, n, 0.5).astype(np.float32)
     directions = _points(_without_area(), rng, n) - origins.astype(np.float64)
     return hard_case(joined(sphere(32, 16, 8.0), _without_area()), origins, directions, HIT, closed=True)
 
 
 def published_bad(rng: np.random.Generator, n: int) -> HardCase:
-    """D: pbrt's three collinear points. The first ray is the published one; the others start some float32 steps beside it."""
+    """D: pbrt's three collinear points. The first ray is the published one; other rays differ from it by some float32 steps."""
     steps = rng.integers(-8, 9, (2, n, 3)) * 2.0**-24
     steps[:, :1] = 0.0
     origins, directions = (np.array(x) * (1.0 + s) for x, s in zip((BAD_ORIGIN, BAD_DIRECTION), steps, strict=True))
@@ -99,7 +98,7 @@ def published_bad(rng: np.random.Generator, n: int) -> HardCase:
 
 
 def huge(rng: np.random.Generator, n: int) -> HardCase:
-    """D: triangles and origins at 1e30: areas are beyond float32."""
+    """D: triangles of size 1e30, whose areas overflow float32; origins up to 1e30."""
     geometry = soup(1e30 * rng.uniform(-1.0, 1.0, (32, 3, 3)))
     origins = 1e30 * rng.uniform(-1.0, 1.0, (n, 3)) * 10.0 ** (-30.0 * (rng.random((n, 1)) < 0.3))
     case = _towards(geometry, rng, origins, _points(geometry, rng, n))
@@ -109,21 +108,20 @@ def huge(rng: np.random.Generator, n: int) -> HardCase:
 
 
 def tiny(rng: np.random.Generator, n: int) -> HardCase:
-    """D: triangles of 1e-42 to 1e-36, mostly denormal, from as near and from 1e-30 away."""
+    """D: triangles of size 1e-42 to 1e-36, mostly denormal, seen from 1e-42 to 1e-30 away."""
     size = 10.0 ** rng.uniform(-42.0, -36.0, (32, 1, 1))
     geometry = soup(size * rng.uniform(-1.0, 1.0, (32, 3, 3)))
     origins = in_ball(rng, n) * 10.0 ** rng.uniform(-42.0, -30.0, (n, 1))
     origins = origins.astype(np.float32)
     directions = _points(geometry, rng, n) - origins.astype(np.float64)
     length = np.linalg.norm(directions, axis=1, keepdims=True)
-    return hard_case(geometry, origins, directions / np.where(length > 0.0, length, 1.0), ASK)
+    return hard_case(geometry, origins, directions / np.where(length > 0.0, length, 1.0), UNKNOWN)
 
 
 def tiny_components(rng: np.random.Generator, n: int) -> HardCase:
-    """I: triangles of size 1e-20 to 1 with corners on a lattice, and rays with one or two tiny components of the direction.
-    They are 2^-20 to 2^-149 of the longest. On those axes the ray starts exactly at its target's coordinate, mostly a face of the
-    triangle's
-    box; half of the rays leave their target behind. Directions are 1e-15 to 1e15 long."""
+    """I: triangles of size 1e-20 to 1 with corners on a lattice, and directions of length 1e-15 to 1e15 with up to two tiny components.
+    A tiny component is 2^-20 to 2^-149 of the longest. On its axis the ray starts exactly at its target's coordinate, mostly on a face of
+    the triangle's box. Half of the rays point away from their target."""
     corners = rng.integers(-4, 5, (32, 3, 3)) * 10.0 ** rng.uniform(-20.0, 0.0, (32, 1, 1))
     geometry = soup(corners)
     chosen, weights = rng.integers(32, size=n), rng.dirichlet([0.3] * 3, n)
@@ -140,11 +138,11 @@ def tiny_components(rng: np.random.Generator, n: int) -> HardCase:
     longest = np.abs(directions).max(axis=1, keepdims=True)
     directions = np.where(tiny, longest * _signed_powers(rng, (n, 3), -45.0, -6.0), directions)
     length = 10.0 ** rng.uniform(-15.0, 15.0, (n, 1))
-    return hard_case(geometry, origins, directions / np.where(longest > 0.0, longest, 1.0) * length, ASK)
+    return hard_case(geometry, origins, directions / np.where(longest > 0.0, longest, 1.0) * length, UNKNOWN)
 
 
 def slivers(rng: np.random.Generator, n: int) -> HardCase:
-    """F: single triangles of aspect 1e3 to 1e8, some along the axes, where float32 resolves their width, and some turned."""
+    """F: single triangles of aspect ratio 1e3 to 1e8. Half lie along the axes, where float32 resolves their width; half are rotated."""
     width = 10.0 ** -rng.uniform(3.0, 8.0, 32)
     corners = np.zeros((32, 3, 3))
     corners[:, 0, 0], corners[:, 1, 0], corners[:, 2, 0] = -1.0, 1.0, rng.uniform(-1.0, 1.0, 32)
@@ -157,8 +155,8 @@ def slivers(rng: np.random.Generator, n: int) -> HardCase:
 
 
 def edge_on(rng: np.random.Generator, n: int) -> HardCase:
-    """F: rays in the plane of a triangle (half of them exactly: never hit), or out of it by 10^-U(3, 12) rad.
-    All planes are parallel, so a ray in one of them hits no other triangle."""
+    """F: half of the rays lie exactly in the plane of a triangle and must miss; half are inclined to it by 10^-U(3, 12) rad.
+    The planes of all triangles are parallel, so a ray in one plane hits no other triangle."""
     axis = rng.integers(3)
     corners = rng.uniform(-1.0, 1.0, (24, 3, 3))
     corners[:, :, axis] = rng.integers(-4, 5, (24, 1)) / 4.0
@@ -171,11 +169,11 @@ def edge_on(rng: np.random.Generator, n: int) -> HardCase:
     origins[:, axis] = points[:, axis] + tilt * np.linalg.norm(origins - points, axis=1)
     case = _towards(geometry, rng, origins, points)
     flat = case.directions[:, axis] == 0.0
-    return replace(case, expected=np.where(flat, MISS, ASK).astype(np.int8))
+    return replace(case, expected=np.where(flat, MISS, UNKNOWN).astype(np.int8))
 
 
 def _square(size: float, cells: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return two coordinates of the corners of cells x cells quads over [-size, size]^2, and their triangles."""
+    """Return two coordinates of the vertices of a grid of cells x cells quads over [-size, size]^2, and the triangles."""
     x = np.linspace(-size, size, cells + 1)
     i, j = np.meshgrid(x, x, indexing="ij")
     first = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).reshape(-1, 1)
@@ -190,10 +188,9 @@ def _floor(turned: bool) -> Geometry:
 
 
 def grazing(rng: np.random.Generator, n: int, *, turned: bool) -> HardCase:
-    """F: a floor of 2048 triangles, met at 10^U(-7, 0) rad.
-    On the level floor, at y = 0, the exact hit is o - d o_y / d_y. Where it is 1 % inside the border the ray must hit: all edges there have
-    a
-    triangle on both sides."""
+    """F: rays at angles of 10^U(-7, 0) rad to a floor of 2048 triangles, horizontal or rotated.
+    On the horizontal floor, at y = 0, the exact hit is o - d o_y / d_y. If it is 1 % or more inside the border, the ray must hit,
+    because all edges there have a triangle on both sides."""
     points = np.stack([rng.uniform(-90.0, 90.0, n), np.zeros(n), rng.uniform(-90.0, 90.0, n)], axis=1)
     angle, heading = 10.0 ** rng.uniform(-7.0, 0.0, n), rng.uniform(0.0, 2.0 * np.pi, n)
     away = np.stack([np.cos(heading) * np.cos(angle), np.sin(angle), np.sin(heading) * np.cos(angle)], axis=1)
@@ -204,9 +201,9 @@ def grazing(rng: np.random.Generator, n: int, *, turned: bool) -> HardCase:
     if turned:
         return case
     o, d = case.origins.astype(np.float64), case.directions.astype(np.float64)
-    met = o - d * (o[:, 1:2] / np.where(d[:, 1:2] < 0.0, d[:, 1:2], np.inf))
-    surely = (o[:, 1] > 0.0) & (d[:, 1] < 0.0) & (np.abs(met) < 99.0).all(axis=1)
-    return replace(case, expected=np.where(surely, HIT, ASK).astype(np.int8))
+    hit = o - d * (o[:, 1:2] / np.where(d[:, 1:2] < 0.0, d[:, 1:2], np.inf))
+    surely = (o[:, 1] > 0.0) & (d[:, 1] < 0.0) & (np.abs(hit) < 99.0).all(axis=1)
+    return replace(case, expected=np.where(surely, HIT, UNKNOWN).astype(np.int8))
 
 
 @cache
@@ -217,8 +214,8 @@ def _plates() -> Geometry:
 
 
 def exact_ends(rng: np.random.Generator, n: int) -> HardCase:
-    """H: t_min and t_max exactly at the hit, which still counts, and one float32 step past it, which does not.
-    All numbers are powers of two and sixteenths: no test has anything to round."""
+    """H: t_min or t_max exactly at a hit, which counts, or one float32 step past it, where it does not count.
+    All numbers are powers of two or sixteenths, so that no test rounds."""
     origins = np.concatenate([rng.integers(-15, 16, (n, 2)) / 16.0, np.zeros((n, 1))], axis=1)
     length = 2.0 ** rng.integers(-20, 21, n)
     plate = rng.integers(3, size=n)
@@ -235,7 +232,7 @@ def exact_ends(rng: np.random.Generator, n: int) -> HardCase:
 
 
 def beside_boxes(rng: np.random.Generator, n: int) -> HardCase:
-    """E: along the axes, one float32 step inside and outside of a cube's faces, and in them."""
+    """E: rays along the axes in the faces of a cube, and one float32 step inside and outside of them."""
     row, axis = np.arange(n), rng.integers(3, size=n)
     side = np.float32(1.0)
     places = np.array([np.nextafter(side, np.float32(2.0)), np.nextafter(side, np.float32(0.0)), 1.0, 0.5])
@@ -244,11 +241,11 @@ def beside_boxes(rng: np.random.Generator, n: int) -> HardCase:
     origins[row, axis] = -3.0 * sign
     directions = np.where(rng.random((n, 3)) < 0.5, 0.0, -0.0)
     directions[row, axis] = sign
-    return hard_case(surface(*cube(np.full(3, -1.0), np.full(3, 1.0))), origins, directions, ASK, closed=True)
+    return hard_case(surface(*cube(np.full(3, -1.0), np.full(3, 1.0))), origins, directions, UNKNOWN, closed=True)
 
 
 def rays_not_finite(rng: np.random.Generator, n: int) -> HardCase:
-    """I: half of the rays have a NaN or an infinity; the others must hit all the same."""
+    """I: half of the rays have a NaN or an infinity and must miss; the others must hit."""
     rows = np.concatenate([in_ball(rng, n, 0.9), unit_vectors(rng, n)], axis=1).astype(np.float32)
     bad = rng.random(n) < 0.5
     bad[:1] = True
@@ -267,6 +264,6 @@ def _sphere_not_finite() -> Geometry:
 
 
 def mesh_not_finite(rng: np.random.Generator, n: int) -> HardCase:
-    """I: a closed sphere, and 30 more triangles with a NaN or an infinity, which are never hit."""
+    """I: a closed sphere, which must be hit, and 30 triangles with a NaN or an infinity, which must not be hit."""
     case = hard_case(_sphere_not_finite(), in_ball(rng, n, 0.9), unit_vectors(rng, n), HIT)
     return replace(case, refused=True)

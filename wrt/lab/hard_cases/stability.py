@@ -1,4 +1,4 @@
-"""`python -m wrt stability`: the hard cases against the intersection tests, speed beside error."""
+"""`python -m wrt stability`: run the hard cases on the intersection tests, and measure errors and speed."""
 
 from __future__ import annotations
 
@@ -16,13 +16,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.geometry import Geometry
 from wrt.accel.queries.all_hits import all_hits
 from wrt.accel.structure import Structure
 from wrt.core.device import load_kernel, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
-from wrt.core.types import Device, JsonObject, Kernel
+from wrt.core.types import JsonObject, Kernel
 from wrt.kernels.shade.surface import make_surface_at
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.study.respawn import Respawn, make_respawn_kernel
@@ -30,18 +29,18 @@ from wrt.lab.bench.report import Columns
 from wrt.lab.bench.report import Row as Line
 from wrt.lab.bench.sweep import cancel, one_at_a_time, result, submitter
 from wrt.lab.bench.timing import alternate, quartiles
-from wrt.lab.hard_cases.cases import ASK, HardCase, Verdict, check, chosen, chunks, fewer, generate, judge, judge_all_hits, judge_next
+from wrt.lab.hard_cases.cases import UNKNOWN, HardCase, Verdict, check, chosen, chunks, fewer, generate, judge, judge_all_hits, judge_next
 from wrt.lab.hard_cases.contestants import PEERS, Algorithm, Own, own_algorithms
 from wrt.lab.plans import Stability as Plan
 from wrt.renderer.distributed.installed import DIGEST
 from wrt.renderer.distributed.workers import worker_name
 from wrt.renderer.progress import TimeLeft
 
-ALL_HITS_TESTS = 20_000_000  # ray-primitive tests of a case's all-hits check, at most
-ALL_HITS_RAYS = 2000
+ALL_HITS_TESTS = 20_000_000  # most ray-primitive tests of a case's all-hits check
+ALL_HITS_RAYS = 2000  # rays of the all-hits check
 SPEED_RAYS = 200_000
-ASKED = 2000  # hits of a case that the oracle checks for nearer ones; of the default, all
-CHUNK = 2**18
+COMPARED = 2000  # hits of a case that the oracle compares with the closest hit, except for the default algorithm
+CHUNK = 2**18  # rays beyond the sample at once
 
 COLUMNS: Columns = {
     "case": "{case}", "algorithm": "{algorithm}",
@@ -55,7 +54,7 @@ COLUMNS: Columns = {
 
 @dataclass
 class Row:
-    """One case with one algorithm. judged: rays that the oracle judged; refused: whether the host refused input that is not finite."""
+    """Result of one case and algorithm. judged: number of rays that the oracle judged; refused: None for finite input, else a flag."""
 
     case: str
     algorithm: str
@@ -68,18 +67,18 @@ class Row:
 
 
 class Result(Line):
-    """Results of `run`: rows by case and algorithm; speed by algorithm (`measure_speed`).
-    - not_installed: missing peers; undone: the cases that are not finished; interrupted: number of the signal that ended the run early."""
+    """Results of `run`. rows: a Row for each case and algorithm; speed: algorithm -> result of `measure_speed`.
+    - not_installed: names of missing libraries; undone: names of unfinished cases; interrupted: number of the signal that ended the run."""
 
 
 def run(plan: Plan, report: Callable[[Row], None] = lambda row: None,
         progress: Callable[[str], None] = lambda line: None, executor: object = None) -> Result:
-    """Put every chosen case to every algorithm, the same rays for all.
+    """Run every chosen case with every algorithm, on the same rays.
 
-    - report: called with each finished row; progress: called now and then with a line of text, from any thread.
-    - executor: a concurrent.futures.Executor or dask.distributed.Client whose workers trace and judge. Speed is measured here.
+    - report: receives each finished row; progress: receives lines of text from any thread.
+    - executor: a concurrent.futures.Executor or dask.distributed.Client whose workers trace and judge. This process measures the speed.
 
-    Interrupted by Ctrl-C, return the finished rows; raise KeyboardInterrupt if there are none. Raise InputError for an unknown case."""
+    After Ctrl-C, return the finished rows, or raise KeyboardInterrupt if no row is finished. Raise InputError for an unknown case."""
     begin, names, algorithms = time.perf_counter(), chosen(plan.cases), all_algorithms(plan)
     progress("measuring the speed")
     found = Result(rows=[], speed=measure_speed(algorithms, plan.runs), interrupted=None, undone=[],
@@ -100,46 +99,46 @@ def run(plan: Plan, report: Callable[[Row], None] = lambda row: None,
 
 
 def all_algorithms(plan: Plan) -> list[Algorithm]:
-    """Return wrt's tests, the default first, and the wanted peers that are installed."""
+    """Return wrt's tests, the default first, and with plan.peers the other libraries that are installed."""
     return [*own_algorithms(), *(peer() for peer in PEERS.values() if plan.peers and peer.is_installed())]
 
 
 def _rows(names: list[str], algorithms: list[str], plan: Plan, progress: Callable[[str], None], pool: Any) -> Iterator[Row]:
-    """Yield the row of each case with each algorithm; with a pool, each is a task, and so is each chunk of rays beyond the sample."""
+    """Yield the row of each case and algorithm. A pool gets a task for each row and for each chunk of rays beyond the sample."""
     tasks = [(name, algorithm) for name in names for algorithm in algorithms]
-    futures, more = {}, {}
+    futures, further = {}, {}
     if pool is not None:
         futures = {task: pool.submit(one_at_a_time, DIGEST, case_row, *task, plan) for task in tasks}
-        more = {name: [pool.submit(one_at_a_time, DIGEST, more_part, name, plan, index) for index in range(parts(name, plan))]
-                for name in names}
+        further = {name: [pool.submit(one_at_a_time, DIGEST, further_chunk, name, plan, index) for index in range(n_chunks(name, plan))]
+                   for name in names}
     left = TimeLeft(len(tasks))
     try:
         for i, (name, algorithm) in enumerate(tasks):
             left.done = i
-            progress(f"{i} of {len(tasks)} are done; {name}, {algorithm}{left}")
+            progress(f"{i} of {len(tasks)} rows are done; now {name}, {algorithm}{left}")
             row = result(pool, futures[name, algorithm]) if pool is not None else case_row(name, algorithm, plan)
             if row is None:
                 continue
             if algorithm == algorithms[0] and row.refused is None:
-                rest = (result(pool, part) for part in more[name]) if pool is not None else run_more(name, plan, progress)
+                rest = (result(pool, part) for part in further[name]) if pool is not None else judge_further(name, plan, progress)
                 row.verdict = sum(rest, row.verdict)
             yield row
     finally:
         if pool is not None:
-            cancel(pool, chain(futures.values(), *more.values()))
+            cancel(pool, chain(futures.values(), *further.values()))
 
 
 def case_row(name: str, algorithm: str, plan: Plan) -> Row | None:
-    """Run an algorithm by name. Raise InputError if this worker does not have it."""
+    """Run a case with the algorithm of this name. Raise InputError if this worker does not have the algorithm."""
     known = {each.name: each for each in all_algorithms(plan)}
     if algorithm not in known:
-        raise InputError(f"worker {worker_name()} has no {algorithm}, which is installed here")
+        raise InputError(f"worker {worker_name()} lacks {algorithm}, which the client has installed")
     return run_case(name, fewer(name, min(plan.sample, plan.rays)), known[algorithm], plan.seed)
 
 
 def run_case(name: str, rays: int, algorithm: Algorithm, seed: int = 0) -> Row | None:
-    """Run one case, judged by the oracle; return None if the algorithm cannot take it.
-    Peers take no spheres, no input that is not finite and no segments that begin after the origin."""
+    """Run one case, let the oracle judge it, and return its row, or None if the algorithm does not support the case.
+    Peers support no spheres, no input that is not finite, and no t_min above 0."""
     row = Row(name, algorithm.name)
     for case in chunks(name, rays, seed):
         if case.refused:
@@ -151,7 +150,7 @@ def run_case(name: str, rays: int, algorithm: Algorithm, seed: int = 0) -> Row |
             return None
         hits = algorithm.closest(case.origins, case.directions, case.t_min, case.t_max)
         is_default = algorithm.name == Own().name
-        row.verdict += judge(case, hits, None if is_default else min(ASKED, case.asked), lowest=not algorithm.is_peer)
+        row.verdict += judge(case, hits, None if is_default else min(COMPARED, case.compared), lowest=not algorithm.is_peer)
         row.judged += len(case)
         if isinstance(algorithm, Own):
             if case.next_directions is not None:
@@ -161,50 +160,50 @@ def run_case(name: str, rays: int, algorithm: Algorithm, seed: int = 0) -> Row |
     return row
 
 
-def run_more(name: str, plan: Plan, progress: Callable[[str], None]) -> Iterator[Verdict]:
-    """Yield verdicts on the rays beyond the sample through the default tests, on all threads, without the oracle."""
+def judge_further(name: str, plan: Plan, progress: Callable[[str], None]) -> Iterator[Verdict]:
+    """Yield verdicts, without the oracle, on the rays beyond the sample, traced by the default algorithm on all threads."""
     left, begin = fewer(name, plan.rays) - fewer(name, plan.sample), time.perf_counter()
-    own = threading.local()  # a structure for each thread
+    own = threading.local()  # each thread has its own structure
 
     def part(index: int) -> Verdict:
         own.default = getattr(own, "default", None) or Own()
-        return more_part(name, plan, index, own.default)
+        return further_chunk(name, plan, index, own.default)
 
     pool = ThreadPoolExecutor(thread_count(plan.threads))
     try:
-        for i, verdict in enumerate(pool.map(part, range(parts(name, plan))), 1):
+        for i, verdict in enumerate(pool.map(part, range(n_chunks(name, plan))), 1):
             done = min(CHUNK * i, left) / 1e6
-            progress(f"{name}, {done:.1f} of {left / 1e6:.1f} M rays more, {done / (time.perf_counter() - begin):.2f} Mray/s")
+            progress(f"{name}, {done:.1f} of {left / 1e6:.1f} M further rays, {done / (time.perf_counter() - begin):.2f} Mray/s")
             yield verdict
     finally:
         pool.shutdown(cancel_futures=True)
 
 
-def parts(name: str, plan: Plan) -> int:
+def n_chunks(name: str, plan: Plan) -> int:
     """Return the number of chunks of rays beyond the sample; 0 for a case that only the oracle can judge."""
     left = fewer(name, plan.rays) - fewer(name, plan.sample)
     if left <= 0:
         return 0
     probe = generate(name, 64, plan.seed)
-    return 0 if (probe.expected == ASK).all() and probe.next_directions is None else -(-left // CHUNK)
+    return 0 if (probe.expected == UNKNOWN).all() and probe.next_directions is None else -(-left // CHUNK)
 
 
-def more_part(name: str, plan: Plan, index: int, own: Own | None = None) -> Verdict:
-    """Return the verdict on one chunk of the rays beyond the sample."""
+def further_chunk(name: str, plan: Plan, index: int, own: Own | None = None) -> Verdict:
+    """Return the verdict, without the oracle, on one chunk of the rays beyond the sample."""
     own = own or Own()
     left = fewer(name, plan.rays) - fewer(name, plan.sample)
-    first = -(-fewer(name, plan.sample) // CHUNK)  # `chunks` has used the seeds below it
+    first = -(-fewer(name, plan.sample) // CHUNK)  # the sample has used the seeds below
     case = generate(name, min(CHUNK, left - index * CHUNK), (plan.seed, first + index))
     own.prepare(case.geometry)
     verdict = check(case, own.closest(case.origins, case.directions, case.t_min, case.t_max))
     if case.next_directions is None:
-        verdict.rays -= int((case.expected == ASK).sum())  # they were not checked
+        verdict.rays -= int((case.expected == UNKNOWN).sum())  # these rays were not judged
         return verdict
     return verdict + judge_next(case, *respawn(own, case))
 
 
 def _is_refused(case: HardCase, algorithm: Algorithm) -> bool:
-    """Return True if input that is not finite raises InputError: rays in the query, vertices in Mesh."""
+    """Return True if Mesh or the query raises InputError for a case whose input is not finite."""
     from wrt.scene.mesh import Mesh
 
     with suppress(InputError):
@@ -215,16 +214,6 @@ def _is_refused(case: HardCase, algorithm: Algorithm) -> bool:
     return True
 
 
-def _surfaces(geometry: Geometry, device: Device) -> Surfaces:
-    surfaces = Surfaces()
-    surfaces.n_triangles = len(geometry.faces)
-    surfaces.vertices = upload(geometry.vertices, wp.vec3, device)
-    surfaces.faces = upload(geometry.faces, wp.vec3i, device)
-    surfaces.spheres = upload(geometry.spheres, wp.vec4, device)
-    surfaces.prim_material = wp.zeros(len(geometry), dtype=wp.int32, device=device)
-    return surfaces
-
-
 @cache
 def _respawn_kernel(structure: Structure) -> Kernel:
     surface_at = make_surface_at(structure.units.spheres, False, False, False)
@@ -232,7 +221,7 @@ def _respawn_kernel(structure: Structure) -> Kernel:
 
 
 def respawn(algorithm: Own, case: HardCase) -> tuple[np.ndarray, np.ndarray]:
-    """Return prim_id of each ray's hit, and of the ray from the hit along case.next_directions."""
+    """Return prim_id of each ray's hit, and prim_id of the next hit from there along case.next_directions, (N,) int32 each."""
     accel, n = algorithm.accel, len(case)
     assert case.next_directions is not None
     kernel = _respawn_kernel(accel.structure)
@@ -241,13 +230,17 @@ def respawn(algorithm: Own, case: HardCase) -> tuple[np.ndarray, np.ndarray]:
     out.direction = upload(case.next_directions, wp.vec3, accel.device)
     out.exclude = 1
     out.first_prim_id, out.next_prim_id = (wp.empty(n, dtype=wp.int32, device=accel.device) for _ in range(2))
-    surfaces = _surfaces(case.geometry, accel.device)
+    surfaces, geometry = Surfaces(), case.geometry
+    surfaces.n_triangles = len(geometry.faces)
+    surfaces.vertices, surfaces.faces = upload(geometry.vertices, wp.vec3, accel.device), upload(geometry.faces, wp.vec3i, accel.device)
+    surfaces.spheres = upload(geometry.spheres, wp.vec4, accel.device)
+    surfaces.prim_material = wp.zeros(len(geometry), dtype=wp.int32, device=accel.device)
     wp.launch(kernel, dim=n, inputs=[accel.data, surfaces, case.on(accel.device), out, 0], device=accel.device)
     return out.first_prim_id.numpy(), out.next_prim_id.numpy()
 
 
 def _judge_all(algorithm: Own, case: HardCase) -> Verdict:
-    """Judge all hits of the first ALL_HITS_RAYS rays; return the duplicates only."""
+    """Judge all hits of the first ALL_HITS_RAYS rays; return a verdict with the duplicates only."""
     part = replace(case, **{name: getattr(case, name)[:ALL_HITS_RAYS] for name in ("origins", "directions", "t_min", "t_max", "expected")})
     hits = all_hits(algorithm.accel, part.origins, part.directions, part.t_min, part.t_max)
     verdict = judge_all_hits(part, hits.ray_id, hits.prim_id, hits.t)
@@ -255,8 +248,8 @@ def _judge_all(algorithm: Own, case: HardCase) -> Verdict:
 
 
 def measure_speed(algorithms: Sequence[Algorithm], runs: int) -> dict[str, Line]:
-    """Measure all algorithms in turn on one thread, on case A's sphere of 159,200 triangles.
-    Return Mray/s, the share of the default's (the first algorithm) run by run, and bytes a triangle."""
+    """Measure all algorithms on one thread in alternating runs, on case A's sphere of 159,200 triangles.
+    Return quartiles of Mray/s and of its ratio to the default's (the first algorithm), and bytes per triangle."""
     case = generate("A_origin_uniform", SPEED_RAYS, seed=1)
     for algorithm in algorithms:
         algorithm.prepare(case.geometry)

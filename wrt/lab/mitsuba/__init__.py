@@ -1,1 +1,1 @@
-"""The same scene in Mitsuba 3: translated, rendered, compared."""
+"""Comparison with Mitsuba 3: translate a scene, render it, compare time and error."""

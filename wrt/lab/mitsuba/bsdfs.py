@@ -1,4 +1,4 @@
-"""Materials and textures for Mitsuba; those without a counterpart are refused."""
+"""Translate materials and textures to Mitsuba; refuse those without an exact counterpart."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from wrt.scene.materials import Checkerboard, Material, Texture
 from wrt.scene.values import Color
 
 Plugin: TypeAlias = dict[str, Any]  # for mitsuba.load_dict
-MitsubaObject: TypeAlias = Any  # of a class that Mitsuba makes when its variant is set
+MitsubaObject: TypeAlias = Any  # its class exists only after a variant of Mitsuba is set
 BSDFS: dict[str, Plugin] = {"diffuse": {"type": "diffuse"}, "mirror": {"type": "conductor", "material": "none"},
                                     "conductor": {"type": "conductor"}, "glass": {"ext_ior": 1.0}}
-# What the albedo is there.
+# Kind of material -> the property of Mitsuba's BSDF that is the albedo.
 COLORED = {"diffuse": "reflectance", "mirror": "specular_reflectance", "glass": "specular_transmittance"}
 
 
 def refuse(what: str, where: str = "") -> NoReturn:
-    """Raise InputError for what Mitsuba cannot draw exactly: pictures of different light cannot be compared."""
+    """Raise InputError for a feature that Mitsuba cannot render exactly: pictures of different light cannot be compared."""
     raise InputError(f"not translatable exactly: {what}", place=f"Mitsuba: {where}" if where else "Mitsuba")
 
 
@@ -29,13 +29,13 @@ def bsdf(mi: ModuleType, material: Material) -> Plugin:
     """Return the material as a dictionary for `mitsuba.load_dict`."""
     where = f"material {material.name!r}"
     if material.kind not in BSDFS:
-        refuse(f"{material.kind} (Mitsuba's principled BSDF is another)", where)
+        refuse(f"{material.kind} (Mitsuba's principled BSDF is different)", where)
     if material.normal_texture is not None:
-        refuse("normal texture (Mitsuba has tangents of its own)", where)
+        refuse("normal texture (Mitsuba uses different tangents)", where)
     if max(material.specular) > 0.0:
         refuse("Blinn-Phong highlight", where)
     result = _bsdf(mi, material)
-    if material.kind != "glass":  # which has two sides by nature; everything else answers light on its back as on its front
+    if material.kind != "glass":  # all other materials reflect light on the back as on the front
         result = {"type": "twosided", "bsdf": result}
     elif not material.thin and material.alpha_mode == "blend":
         refuse("blended solid glass", where)
@@ -44,15 +44,15 @@ def bsdf(mi: ModuleType, material: Material) -> Plugin:
 
 
 def emission(mi: ModuleType, material: Material) -> Plugin:
-    """Return an area emitter; one that does not light other surfaces is never sampled."""
+    """Return an area emitter. If the material does not light other surfaces, the emitter has the sampling weight 0."""
     if material.alpha_mode != "opaque":
-        refuse("emission of a surface that is partly transparent", f"material {material.name!r}")
+        refuse("emission of a partly transparent surface", f"material {material.name!r}")
     radiance = _color(mi, material.emission, material.emission_texture)
     return {"type": "area", "radiance": radiance, "sampling_weight": 1.0 if material.lights_others else 0.0}
 
 
 def _bsdf(mi: ModuleType, material: Material) -> Plugin:
-    """Return the material without its back side and its opacity."""
+    """Return the material's BSDF for the front side, without opacity."""
     result = dict(BSDFS[material.kind])
     if material.kind == "conductor":
         result |= {"eta": rgb(material.eta), "k": rgb(material.k)}
@@ -72,7 +72,7 @@ def rgb(color: Color) -> Plugin:
 
 
 def _color(mi: ModuleType, factor: Color, texture: Texture | Checkerboard | None) -> Plugin:
-    """Return factor times the texture's RGB, linear."""
+    """Return factor times the texture, as linear RGB."""
     if texture is None:
         return rgb(factor)
     if isinstance(texture, Checkerboard):
@@ -81,7 +81,7 @@ def _color(mi: ModuleType, factor: Color, texture: Texture | Checkerboard | None
 
 
 def _checkerboard(mi: ModuleType, factor: Color, texture: Checkerboard) -> Plugin:
-    # Mitsuba's board has two squares to one unit of its coordinates, and color0 in the one at the origin.
+    # Mitsuba's checkerboard has two squares in a unit of u or v, and color0 in the square at the origin.
     first, second = (rgb(np.multiply(color, factor).tolist()) for color in (texture.color_a, texture.color_b))
     to_uv = mi.ScalarTransform3f().scale([0.5 * texture.scale, 0.5 * texture.scale])
     return {"type": "checkerboard", "color0": first, "color1": second, "to_uv": to_uv}
@@ -94,7 +94,7 @@ def linear_rgb(texture: Texture) -> np.ndarray:
 
 
 def _bitmap(mi: ModuleType, texture: Texture, values: np.ndarray) -> Plugin:
-    """Return texels (H, W, C) float32 with the texture's filter and transform; row 0 is at v = 0 in both programs."""
+    """Return a bitmap of texels (H, W, C) float32 with the texture's filter and transform; row 0 is at v = 0 in wrt and Mitsuba."""
     if texture.wrap[0] != texture.wrap[1]:
         refuse("wrap that differs between the axes", f"texture {texture.name!r}")
     to_uv = np.vstack([texture.uv_transform, (0.0, 0.0, 1.0)])
@@ -103,12 +103,12 @@ def _bitmap(mi: ModuleType, texture: Texture, values: np.ndarray) -> Plugin:
 
 
 def _opacity(mi: ModuleType, material: Material) -> MitsubaObject:
-    """Return None if opaque, else a number or a bitmap."""
+    """Return the opacity as a number or a bitmap, or None for an opaque material."""
     if material.alpha_mode == "opaque":
         return None
     texture = material.albedo_texture if isinstance(material.albedo_texture, Texture) else None
     if texture is None:
         return material.alpha if material.alpha_mode == "blend" else float(material.alpha >= material.alpha_cutoff)
     if material.alpha_mode != "blend":
-        refuse("alpha mask (Mitsuba would cut at whole texels)", f"material {material.name!r}")
+        refuse("alpha mask with a texture (Mitsuba would cut at whole texels)", f"material {material.name!r}")
     return _bitmap(mi, texture, texture.image[..., 3:4].astype(np.float32) / 255.0 * np.float32(material.alpha))

@@ -1,4 +1,4 @@
-"""Lights and backgrounds for Mitsuba."""
+"""Translate lights and backgrounds to Mitsuba."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import numpy as np
 
 from wrt.core.errors import InputError
 from wrt.lab.mitsuba.bsdfs import Plugin, refuse, rgb
-from wrt.scene.backgrounds import Background, ConstantBackground, EnvironmentBackground, GradientBackground
+from wrt.scene.backgrounds import Background, EnvironmentBackground, GradientBackground
 from wrt.scene.lights import Light, SpotLight
 
-# Rows of a gradient's picture: linear interpolation of a cosine over steps of pi / 1024 errs by at most 1.2e-6.
+# Rows of a gradient's picture: linear interpolation of a cosine over steps of pi / 1024 has an error of at most 1.2e-6.
 GRADIENT_ROWS = 1025
-SPOT_TEXELS = 1024
-WIDEST_SPOT = math.radians(80.0)
+SPOT_TEXELS = 1024  # columns and rows of the texture that holds a spot light's falloff
+WIDEST_SPOT = math.radians(80.0)  # largest half angle of a spot light with a soft edge
 
 
 def light_emitter(mi: ModuleType, light: Light) -> Plugin:
@@ -28,11 +28,9 @@ def light_emitter(mi: ModuleType, light: Light) -> Plugin:
 
 
 def _spot(mi: ModuleType, light: SpotLight) -> Plugin:
-    """Return a spot light as a dictionary for `mitsuba.load_dict`, with wrt's falloff in the light's projected texture.
-
-    Mitsuba's own falloff is linear in the angle and differs from wrt's, so `beam_width` is set to switch it off.
-    Raises InputError for a soft edge beyond 80 degrees from the axis.
-    """
+    """Return a spot light as a dictionary for `mitsuba.load_dict`; the light's projected texture holds wrt's falloff.
+    Mitsuba's own falloff is linear in the angle, so `beam_width` switches it off. Raise InputError if a soft edge ends beyond 80
+    degrees from the axis."""
     direction = np.array(light.direction)
     up = np.eye(3)[int(np.argmin(np.abs(direction)))]
     cutoff = math.degrees(light.outer)
@@ -44,7 +42,7 @@ def _spot(mi: ModuleType, light: SpotLight) -> Plugin:
     if light.inner >= light.outer:
         return spot
     if light.outer > WIDEST_SPOT:
-        refuse("a spot wider than 80 degrees", f"light {light.name!r}")
+        refuse("a soft spot light of more than 80 degrees from its axis", f"light {light.name!r}")
     x = (2.0 * (np.arange(SPOT_TEXELS) + 0.5) / SPOT_TEXELS - 1.0) * math.tan(light.outer)
     cosine = 1.0 / np.sqrt(1.0 + x[None, :] ** 2 + x[:, None] ** 2)
     ramp = (cosine - math.cos(light.outer)) / (math.cos(light.inner) - math.cos(light.outer))
@@ -69,10 +67,6 @@ def background_emitter(mi: ModuleType, background: Background) -> Plugin | None:
     return BACKGROUNDS[background.kind](mi, background)
 
 
-def _constant(mi: ModuleType, background: ConstantBackground) -> Plugin | None:
-    return {"type": "constant", "radiance": rgb(background.color)} if max(background.color) > 0.0 else None
-
-
 def _gradient(mi: ModuleType, background: GradientBackground) -> Plugin:
     height = np.cos(np.linspace(0.0, math.pi, GRADIENT_ROWS))[:, None]
     share = 0.5 * (height + 1.0)
@@ -84,18 +78,18 @@ def _gradient(mi: ModuleType, background: GradientBackground) -> Plugin:
 def _environment(mi: ModuleType, background: EnvironmentBackground) -> Plugin:
     image = background.image
     if image.shape[1] < 3:
-        raise InputError(f"Mitsuba needs 3 columns or more, got {image.shape[1]}", place=f"environment {background.name!r}")
-    # Mitsuba's first and last row lie at the poles, wrt's half a row away from them. Between two rows both are linear,
-    # so that a picture with the rows and their midpoints in turn is the same function.
+        raise InputError(f"Mitsuba needs a picture of 3 columns or more, got {image.shape[1]}", place=f"environment {background.name!r}")
+    # Mitsuba's first and last row lie at the poles, wrt's lie half a row from them. Both interpolate linearly between rows. So a picture
+    # in which rows alternate with the means of neighbouring rows is the same function.
     above, below = np.concatenate([image[:1], image]), np.concatenate([image, image[-1:]])
     rows = np.empty((2 * len(image) + 1, *image.shape[1:]), np.float32)
     rows[0::2] = 0.5 * (above + below)
     rows[1::2] = image
-    # Mitsuba's left edge is at -z, wrt's middle: half a turn.
+    # -z is the left edge of Mitsuba's picture, but the middle of wrt's: turn by 180 degrees.
     turn = mi.ScalarTransform4f().rotate([0.0, 1.0, 0.0], math.degrees(background.rotation) + 180.0)
     return {"type": "envmap", "bitmap": mi.Bitmap(rows), "scale": background.scale, "to_world": turn}
 
 
 BACKGROUNDS: dict[str, Callable[[Any, Any], Plugin | None]] = {
-    "constant": _constant, "gradient": _gradient, "environment": _environment,
-}
+    "constant": lambda mi, sky: {"type": "constant", "radiance": rgb(sky.color)} if max(sky.color) > 0.0 else None,
+    "gradient": _gradient, "environment": _environment}

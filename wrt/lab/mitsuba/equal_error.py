@@ -1,8 +1,8 @@
-"""`python -m wrt bench mitsuba`: the same picture by wrt and Mitsuba 3 to the same error, each variant of Mitsuba in its own process.
+"""`python -m wrt bench mitsuba`: time that wrt and Mitsuba 3 need for a picture of the same error.
 
-All pictures are compared with one reference. wrt takes a given number of samples. Mitsuba takes about as many as the same error needs.
-The exact need follows from the error that it reaches: its samples are independent, so its mean squared error falls as 1 / time. Runs
-alternate, each with its own seed; all use the same number of threads."""
+All pictures are compared with one reference. wrt takes a fixed number of samples; Mitsuba takes about as many as the same error needs.
+Its time for exactly that error follows from its own error: its samples are independent, so its mean squared error falls as 1 / time. Runs
+alternate, each with its own seed, and use the same number of threads. Each variant of Mitsuba has its own process."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from wrt.scene.cameras import Camera
 from wrt.scene.materials import Material
 from wrt.scene.model import Scene
 
-PILOT_SPP = 16
-SAME = 0.25  # of the squared error; a larger squared bias means that the pictures show different light
+PILOT_SPP = 16  # samples per pixel of the picture that estimates how many samples Mitsuba needs
+SAME = 0.25  # largest squared bias over squared error at which two pictures show the same light
 
 
 def matte(scene: Scene) -> Scene:
-    """Return the scene with diffuse surfaces and round apertures, which Mitsuba's "direct" draws exactly.
-    Albedos stay; emission that lights no other surface is left out."""
+    """Return the scene with diffuse surfaces and round apertures, which Mitsuba's integrator "direct" renders exactly.
+    Albedos stay the same; emission that does not light other surfaces is removed."""
     changed = {id(m): Material(name=m.name, albedo=m.albedo, albedo_texture=m.albedo_texture, two_sided=m.two_sided,
                                emission=m.emission if m.lights_others else (0.0, 0.0, 0.0)) for m in scene.materials}
     objects = tuple(replace(thing, materials=tuple(changed[id(m)] for m in thing.materials)) for thing in scene.objects)
@@ -47,9 +47,9 @@ def matte(scene: Scene) -> Scene:
 
 
 def side_of(spp: int, runs: Sequence[tuple[float, np.ndarray]], truth: Row, prepare: float, start: float) -> Row:
-    """Return the figures of one renderer.
-    - rmse, bias: over all its pictures, against the reference; bias is NaN if noise hides it, `bias_below` bounds it.
-    - prepare_seconds: structure and scene; process_seconds: a whole process at this spp, `start` seconds of it without tracing."""
+    """Return the figures of one renderer. runs: seconds and pixels of each picture; start: seconds of a process without tracing.
+    - rmse, bias: error of its pictures against the reference; bias is NaN if noise hides it, and bias_below is its upper bound.
+    - prepare_seconds: time to prepare scene and structure; process_seconds: time of a whole process with one picture at this spp."""
     seconds, films = zip(*runs, strict=True)
     products = statistics.gram(films, truth.pixels)
     bias, below = statistics.bias_with_bound(products, truth.variance)
@@ -58,7 +58,7 @@ def side_of(spp: int, runs: Sequence[tuple[float, np.ndarray]], truth: Row, prep
 
 
 class _Measured:
-    """A variant of Mitsuba while it is measured."""
+    """A variant of Mitsuba and its measurements."""
 
     def __init__(self, job: Job, process: MitsubaProcess) -> None:
         self.job, self.process = job, process
@@ -66,8 +66,8 @@ class _Measured:
         self.spp, self.start = PILOT_SPP, math.nan
 
     def choose_spp(self, seed: int, truth: Row, target: float, longest: float) -> None:
-        """Choose samples for the squared error `target`, within `longest` seconds a picture.
-        The first picture at each number of samples is not timed: Mitsuba compiles kernels for it."""
+        """Set spp for the squared error `target`, limited to pictures of `longest` seconds.
+        Mitsuba compiles kernels at the first picture with each number of samples, which is therefore not timed."""
         self.process.render(PILOT_SPP, seed)
         seconds, film = self.process.render(PILOT_SPP, seed)
         needed = PILOT_SPP * statistics.mse_of(statistics.gram([film], truth.pixels), truth.variance) / max(target, 1e-30)
@@ -78,7 +78,7 @@ class _Measured:
         self.runs.append(self.process.render(self.spp, seed))
 
     def time_starts(self, times: int) -> None:
-        """Time a process without tracing, with its first picture at 1 spp, as wrt's process is timed. The scene comes as arrays."""
+        """Set `start`: median seconds of imports, of loading the scene from arrays, and of a first picture at 1 spp, as for wrt."""
         program = f"import mitsuba as mi; mi.set_variant({self.job.variant!r})"
         imports = process_seconds(["-c", program], times)
         rest = [self._load_and_first_picture() for _ in range(times + 1 if times else 0)]
@@ -89,8 +89,8 @@ class _Measured:
             return process.load_seconds + process.render(1, 0)[0]
 
     def result(self, ours: Row, truth: Row) -> Row:
-        """Add to `side_of` the ratios of Mitsuba's seconds to wrt's, both at wrt's error: tracing alone, and as whole processes.
-        - same_light: False if its picture has another expectation than wrt's, by more than noise at equal error explains."""
+        """Return `side_of` with ratios of Mitsuba's time to wrt's at wrt's error, for tracing alone and for whole processes.
+        The flag same_light is False if Mitsuba's bias is larger than noise at equal error explains: the pictures show different light."""
         side = side_of(self.spp, self.runs, truth, self.process.load_seconds, self.start)
         factor = (side.rmse / ours.rmse) ** 2
         side.process_seconds = self.start + factor * float(np.median(side.seconds))
@@ -99,7 +99,7 @@ class _Measured:
 
 
 class _Rivals:
-    """The usable variants, and why others are not. Raise NotAvailable if none is usable."""
+    """The usable variants of Mitsuba, and the reasons why others are not available. Raise NotAvailable if no variant is usable."""
 
     def __init__(self, jobs: list[Job], stack: ExitStack) -> None:
         self.jobs, self.stack = {job.variant: job for job in jobs}, stack
@@ -123,10 +123,9 @@ class _Rivals:
 
 def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = None,
         report: Callable[[str], None] = lambda line: None) -> Row:
-    """Measure. command: arguments of `python -m wrt` that render this scene at 1 spp, to time a process (None: not timed).
-    Unusable variants are left out and named in the result. Raise InputError if none is usable, or if Mitsuba cannot draw the scene
-    exactly."""
-    scene = scene.with_settings(filter="box")  # Mitsuba takes the pixels of no other filter by themselves
+    """Measure wrt and Mitsuba. command: arguments of `python -m wrt` that render this scene at 1 spp, to time a process (None: do not).
+    The result names unusable variants. Raise InputError if no variant is usable, or if Mitsuba cannot render the scene exactly."""
+    scene = scene.with_settings(filter="box")  # with other filters of Mitsuba a sample adds to several pixels
     seeds = [int(word) for word in np.random.SeedSequence(plan.seed).generate_state(REFERENCE_SEEDS + plan.repeats)]
     pictures, starts = seeds[REFERENCE_SEEDS:], plan.starts if command else 0
     threads, ours = thread_count(options.threads), []
@@ -157,7 +156,7 @@ def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = 
         report("whole processes")
         rivals.each(lambda name: rivals.measured[name].time_starts(starts))
     ready = renderer.prepared.seconds
-    prepare = max(ready["compile"], ready["upload"] + ready["build"])  # beside each other
+    prepare = max(ready["compile"], ready["upload"] + ready["build"])  # these run in parallel
     side = side_of(plan.spp, ours, truth, prepare, process_seconds(["-m", "wrt", *(command or [])], starts))
     require_error(side.rmse)
     found = {variant: measured.result(side, truth) for variant, measured in rivals.measured.items()}
@@ -166,14 +165,14 @@ def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = 
 
 
 def require_error(error: float) -> None:
-    """Raise InputError if wrt's error, without the reference's own noise, is not above 0."""
+    """Raise InputError unless wrt's error, without the reference's noise, is above 0."""
     if not error > 0.0:
-        raise InputError("wrt's pictures are as exact as the reference: no error that Mitsuba could reach",
+        raise InputError("wrt's pictures are as exact as the reference, so that Mitsuba has no error to reach",
                          hint="try a lower --spp")
 
 
 def process_seconds(arguments: list[str], times: int) -> float:
-    """Return the median wall-clock seconds of a Python process, after one uncounted run; NaN for 0 times."""
+    """Return the median wall-clock seconds of a Python process, after one run that is not timed; NaN if `times` is 0."""
     seconds = []
     for _ in range(times + 1 if times else 0):
         begin = time.perf_counter()
@@ -189,13 +188,13 @@ def known(value: float, form: str) -> str:
 
 
 COLUMNS: Columns = {
-    "": "{name}", "spp": "{spp}", "seconds, tracing": lambda side: spread(side.seconds), "RMSE": "{rmse:.4g}",
+    "renderer": "{name}", "spp": "{spp}", "tracing, s": lambda side: spread(side.seconds), "RMSE": "{rmse:.4g}",
     "bias against the reference":
         lambda side: f"below {side.bias_below:.2g}" if math.isnan(side.bias) else f"{side.bias:.2g}",
     "scene and structure, s": "{prepare_seconds:.2f}",
-    "process to wrt's error, s": lambda side: known(side.process_seconds, "{:.2f}"),
-    "times wrt's, tracing": lambda side: shown(side.ratio) if side.ratio else "1",
-    "times wrt's, process": lambda side: known(side.process_ratio, "{:.3g}")}
+    "process at wrt's error, s": lambda side: known(side.process_seconds, "{:.2f}"),
+    "tracing / wrt's": lambda side: shown(side.ratio) if side.ratio else "1",
+    "process / wrt's": lambda side: known(side.process_ratio, "{:.3g}")}
 
 
 def text(result: Row) -> str:
@@ -204,12 +203,13 @@ def text(result: Row) -> str:
              *(Row(**vars(rival), name=f"Mitsuba {variant}, {result.integrator}") for variant, rival in result.mitsuba.items())]
     width, height = result.size
     notes = [f"Mitsuba {variant} is not available: {why}." for variant, why in result.not_available.items()]
-    notes += [f"The picture of {variant} is not of the same light: its ratio says nothing. Try --matte, or another --integrator."
+    notes += [f"The picture of {variant} is not of the same light, so that its ratio has no meaning. Try --matte, or another --integrator."
              for variant, rival in result.mitsuba.items() if not rival.same_light]
     head = f"{result.scene}, {width}x{height}, {result.threads} threads; the reference's own RMSE is {result.reference.rmse:.2g}."
     return markdown([tabled(COLUMNS, sides, "", head), Part("", "\n".join([LEGEND, *notes]))]).rstrip()
 
 
 LEGEND = """\
-times wrt's: how many times as long Mitsuba takes to wrt's error, tracing alone (median and quartiles) and as a whole process with start,
-imports, scene, structure and compiler. The compilers' caches on disk were filled before. Mitsuba traces with Embree in its robust mode."""
+tracing / wrt's, process / wrt's: Mitsuba's time to reach wrt's error over wrt's time, for tracing alone (median [quartiles]) and for a
+whole process (start, imports, scene, structure, compiler). Kernels came from the caches on disk. Mitsuba traces with Embree in its robust
+mode."""

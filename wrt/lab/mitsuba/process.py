@@ -1,6 +1,6 @@
-"""Mitsuba with one variant and one scene in its own process, so that a crash ends no measurement.
+"""Run Mitsuba with one variant and one scene in its own process, so that a crash does not end the measurement.
 
-An unsuitable LLVM library (15, 16) ends the whole process at the first picture."""
+For example, LLVM 15 and 16 crash at the first picture."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ from wrt.scene.model import Scene
 
 PATH_VARIABLE = "DRJIT_LIBLLVM_PATH"  # where Mitsuba's compiler, Dr.Jit, looks for LLVM
 VARIANTS = ("scalar_rgb", "llvm_ad_rgb")
-SECONDS_TO_END = 10.0
+SECONDS_TO_END = 10.0  # time to exit before the process is killed
 
 
 class NotAvailable(InputError):
-    """A variant of Mitsuba that cannot be used here, and why."""
+    """A variant of Mitsuba cannot be used on this machine; the message says why."""
 
 
 def require_llvm() -> None:
     """Raise NotAvailable unless DRJIT_LIBLLVM_PATH names a file."""
     library = os.environ.get(PATH_VARIABLE, "")
     if not os.path.isfile(library):
-        is_now = f"names no file: {library}" if library else "is not set"
-        raise NotAvailable(f"llvm_ad_rgb needs an LLVM library, and {PATH_VARIABLE} {is_now}; set it to libLLVM's path (19 works)")
+        problem = f"names no file: {library}" if library else "is not set"
+        raise NotAvailable(f"llvm_ad_rgb needs an LLVM library, and {PATH_VARIABLE} {problem}; set it to the path of libLLVM (19 works)")
 
 
 class Job(NamedTuple):
-    """Work of a process: a variant of VARIANTS, a scene with its camera (or the camera's name or index), an integrator, and threads."""
+    """Task of a process: variant, scene, camera (or its name or index in the scene), integrator, and number of threads."""
 
     variant: str
     scene: Scene
@@ -48,17 +48,16 @@ class Job(NamedTuple):
 
 
 class MitsubaProcess:
-    """A process that has loaded the scene, in `load_seconds`, and renders until it is closed.
+    """A process that loads the scene, in `load_seconds`, and then renders pictures until it is closed.
 
-    Raise NotAvailable if the variant is not usable here or the process has ended, and InputError for a scene that Mitsuba cannot draw
-    exactly
-    or if Mitsuba is missing."""
+    Raise NotAvailable if the variant is not usable or the process has ended. Raise InputError if Mitsuba is missing or cannot render the
+    scene exactly."""
 
     def __init__(self, job: Job) -> None:
         if importlib.util.find_spec("mitsuba") is None:
             raise InputError("Mitsuba 3 is not usable (not installed)", hint='pip install "wrt[peers]" installs it')
         if job.variant != "scalar_rgb" and job.integrator == "whitted":
-            raise NotAvailable('the integrator "whitted" is Python that only scalar_rgb can run')
+            raise NotAvailable('the integrator "whitted" is written in Python, which only scalar_rgb can run')
         if job.variant.startswith("llvm"):
             require_llvm()
         spawn = multiprocessing.get_context("spawn")
@@ -74,7 +73,7 @@ class MitsubaProcess:
             raise
 
     def render(self, spp: int, seed: int) -> tuple[float, np.ndarray]:
-        """Return seconds, and the picture (H, W, 3) float32."""
+        """Render a picture; return its seconds and pixels (H, W, 3) float32."""
         return self._ask((spp, seed % 2**31))
 
     def _ask(self, *questions: tuple[int, int]) -> Any:
@@ -103,14 +102,14 @@ class MitsubaProcess:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
         if kind is not None:
-            self._process.kill()  # it may be in the middle of a picture that nobody waits for
+            self._process.kill()  # it may still render a picture that is not needed
         self.close()
 
 
 def serve(pipe: Connection, job: Job) -> None:
     """Load the scene, then render on request until the pipe closes."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
-    os.dup2(2, 1)  # the parent's standard output may be JSON
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent, which ends this process
+    os.dup2(2, 1)  # output to stderr, since the parent's standard output may be JSON
     try:
         with mitsuba(job.variant) as mi:
             importlib.import_module("drjit").set_thread_count(job.threads)
@@ -126,5 +125,5 @@ def serve(pipe: Connection, job: Job) -> None:
         return
     except InputError as error:
         pipe.send(error)
-    except (ImportError, RuntimeError) as error:  # a library that cannot be loaded
+    except (ImportError, RuntimeError) as error:  # for example a library that cannot be loaded
         pipe.send(NotAvailable(str(error)))

@@ -1,4 +1,4 @@
-"""Shapes for Mitsuba: one mesh for each material of an object, in world space, and exact spheres."""
+"""Translate objects and spheres to Mitsuba: a mesh in world space for each material of an object, and exact spheres."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from wrt.scene.model import Object, Sphere
 
 
 class Part(NamedTuple):
-    """Content of one Mitsuba shape. face_index: (F,) indices of its faces in the object's mesh, None for a sphere."""
+    """Origin of one Mitsuba shape. object_id: objects first, then spheres; face_index: (F,) its faces in the object's mesh, or None."""
 
     object_id: int
     face_index: np.ndarray | None
@@ -28,19 +28,20 @@ class Triangles(NamedTuple):
     uvs: np.ndarray | None
 
     def of(self, vertices: np.ndarray, faces: np.ndarray) -> Triangles:
-        """Return faces of these vertices."""
+        """Return triangles from the chosen vertices (indices); `faces` holds indices into this choice."""
         normals, uvs = (None if array is None else array[vertices] for array in (self.normals, self.uvs))
         return Triangles(self.vertices[vertices], faces.reshape(-1, 3), normals, uvs)
 
 
 def object_parts(mi: ModuleType, thing: Object, object_id: int) -> Iterator[tuple[str, MitsubaObject, Part]]:
-    """Yield (shape id, `mitsuba.Mesh`, Part) for each material that a face of the object has."""
+    """Yield (shape id, `mitsuba.Mesh`, Part) for each material that the object's faces use."""
     world = _to_world(thing)
     of_face = np.zeros(len(world.faces), np.int32) if thing.face_material is None else thing.face_material
     for index in np.unique(of_face).tolist():
         material = thing.materials[index]
         chosen = np.flatnonzero(of_face == index)
-        triangles = _select(world, chosen)
+        used, faces = np.unique(world.faces[chosen], return_inverse=True)
+        triangles = world if len(chosen) == len(world.faces) else world.of(used, faces)
         if material.textures and triangles.uvs is None:
             triangles = triangles._replace(uvs=np.zeros((len(triangles.vertices), 2), np.float32))
         name = f"object{object_id}_{index}"
@@ -49,7 +50,7 @@ def object_parts(mi: ModuleType, thing: Object, object_id: int) -> Iterator[tupl
 
 
 def sphere_shape(mi: ModuleType, sphere: Sphere) -> Plugin:
-    """Return a sphere, turned: Mitsuba's u runs around z from x and its v down from +z; z becomes +y and x becomes -x."""
+    """Return a sphere, rotated for its texture coordinates: Mitsuba's u runs around z, wrt's around y. +z becomes +y, +x becomes -x."""
     pose = np.eye(4)
     pose[:3, :3] = sphere.radius * np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
     pose[:3, 3] = sphere.center
@@ -57,7 +58,7 @@ def sphere_shape(mi: ModuleType, sphere: Sphere) -> Plugin:
 
 
 def _properties(mi: ModuleType, material: Material) -> Plugin:
-    """Return a shape's nested plugins: its BSDF, its emitter, the medium inside."""
+    """Return the plugins of a shape: its BSDF, its emitter and the medium inside."""
     nested: Plugin = {"bsdf": bsdf(mi, material)}
     if material.is_emissive:
         if material.two_sided:
@@ -71,10 +72,10 @@ def _properties(mi: ModuleType, material: Material) -> Plugin:
 
 
 def _to_world(thing: Object) -> Triangles:
-    """Return world-space triangles by float64 arithmetic, rounded to float32 once, as in wrt."""
+    """Return triangles in world space, computed in float64 and rounded once to float32, as in wrt."""
     mesh, linear = thing.mesh, thing.transform[:3, :3]
     vertices = mesh.vertices.astype(np.float64) @ linear.T + thing.transform[:3, 3]
-    # A mirroring transform turns the winding around; exchanging two corners keeps the outside outside.
+    # A mirroring transform reverses the winding; exchanging two corners restores it.
     faces = mesh.faces if np.linalg.det(linear) >= 0.0 else mesh.faces[:, [0, 2, 1]]
     world = Triangles(vertices.astype(np.float32), faces, None, mesh.uvs)
     if mesh.normals is None:
@@ -85,23 +86,15 @@ def _to_world(thing: Object) -> Triangles:
     normals = (normals / np.where(length > 0.0, length, 1.0)).astype(np.float32)
     if not flat[faces].any():
         return world._replace(normals=normals)
-    # Zero means flat there: such corners get their face's own normal, so that no corner may be shared any more.
+    # A zero normal means a flat corner, which gets the normal of its face. So faces can no longer share vertices.
     corners = world._replace(normals=normals).of(faces.reshape(-1), np.arange(faces.size))
     assert corners.normals is not None
     own = np.repeat(_face_normals(corners), 3, axis=0)
     return corners._replace(normals=np.where(np.any(corners.normals, axis=1, keepdims=True), corners.normals, own))
 
 
-def _select(triangles: Triangles, chosen: np.ndarray) -> Triangles:
-    """Return the chosen faces with the vertices that they use."""
-    if len(chosen) == len(triangles.faces):
-        return triangles
-    used, faces = np.unique(triangles.faces[chosen], return_inverse=True)
-    return triangles.of(used, faces)
-
-
 def _face_normals(triangles: Triangles) -> np.ndarray:
-    """Return (F, 3) float32 unit normals; zero for a triangle without area."""
+    """Return (F, 3) float32 unit normals of the faces; zero for a triangle without area."""
     a, b, c = (triangles.vertices[triangles.faces[:, corner]].astype(np.float64) for corner in range(3))
     normals = np.cross(b - a, c - a)
     length = np.linalg.norm(normals, axis=1, keepdims=True)

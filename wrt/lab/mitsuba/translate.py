@@ -1,14 +1,14 @@
-"""Mitsuba 3 as an independent oracle and a rival: the same scene, rays and camera, rendered by other code.
+"""Translate a scene to Mitsuba 3, which serves as an independent oracle in tests and as a rival in measurements.
 
-The oracle is the variant scalar_rgb, in this process; the rival is also llvm_ad_rgb, in its own process (process.py). Both trace with
-Embree in its robust mode, which is requested: Mitsuba's default is the fast mode.
+Tests use the variant scalar_rgb in their own process. Measurements also use llvm_ad_rgb, in a process of its own (process.py). Both trace
+with Embree's robust mode, which wrt requests, because Mitsuba's default is the fast mode.
 
-Exactly comparable (Mitsuba's estimate has the expectation of wrt's picture):
-- integrator "whitted" (whitted.py): any scene of diffuse, mirror, conductor and glass surfaces;
-- "path" and "volpath": specular surfaces only, under a background and emissive shapes (glass with absorption: "volpath"). On diffuse
-  surfaces they add interreflection, which a Whitted tracer leaves out;
-- "direct": diffuse surfaces, with no mirror or glass in view.
-Mitsuba never cuts rays by their throughput: compare with min_throughput = 0. All else is refused with an InputError."""
+Mitsuba's picture has the expectation of wrt's picture in these cases:
+- integrator "whitted" (whitted.py): any scene of diffuse, mirror, conductor and glass surfaces.
+- "path" and "volpath": only specular surfaces, a background and emissive shapes; glass with absorption needs "volpath". On diffuse
+  surfaces both add interreflection, which a Whitted tracer does not have.
+- "direct": diffuse surfaces, without a mirror or glass in view.
+Mitsuba never cuts rays by their throughput, so compare with min_throughput = 0. All other features are refused with an InputError."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ INTEGRATORS = ("auto", "whitted", "path", "direct", "volpath")
 
 @contextmanager
 def mitsuba(variant: str = VARIANT) -> Iterator[ModuleType]:
-    """Set a variant of the module `mitsuba` while the block runs. Raise InputError if Mitsuba is missing."""
+    """Context that imports `mitsuba`, sets a variant, and restores the former one. Raise InputError if Mitsuba is missing."""
     try:
         mi = importlib.import_module("mitsuba")
     except ImportError as error:
@@ -43,7 +43,7 @@ def mitsuba(variant: str = VARIANT) -> Iterator[ModuleType]:
     before = mi.variant()
     mi.set_variant(variant)
     level = mi.log_level()
-    mi.set_log_level(mi.LogLevel.Error)  # it warns of every integrator written in Python
+    mi.set_log_level(mi.LogLevel.Error)  # Mitsuba warns of every integrator that is written in Python
     try:
         yield mi
     finally:
@@ -53,17 +53,17 @@ def mitsuba(variant: str = VARIANT) -> Iterator[ModuleType]:
 
 
 class Translation(NamedTuple):
-    """scene: the `mitsuba.Scene`; parts: shape id -> the object and faces of the shape."""
+    """Result of `translate`. scene: the `mitsuba.Scene`; parts: shape id -> the Part of wrt's scene that became this shape."""
 
     scene: MitsubaObject
     parts: dict[str, Part]
 
 
 def translate(mi: ModuleType, scene: Scene, camera: CameraKind | str | int | None = None, integrator: str = "auto") -> Translation:
-    """Return the scene for the module `mitsuba` with its current variant, with sensor, film, sampler and integrator.
+    """Return the scene for the module `mitsuba` in its current variant, with sensor, film, sampler and integrator.
 
-    camera: a camera, or the name or index of the scene's. integrator: of INTEGRATORS; "auto" is "volpath" if something absorbs or is partly
-    transparent, else "path". Raise InputError for what cannot be translated exactly."""
+    camera: a camera, or the name or index of a camera of the scene. integrator: one of INTEGRATORS. "auto" means "volpath" if a material
+    absorbs or is partly transparent, else "path". Raise InputError for features that cannot be translated exactly."""
     as_choice(integrator, INTEGRATORS, "integrator")
     contents: Plugin = {"type": "scene", "embree_use_robust_intersections": True}
     parts: dict[str, Part] = {}
@@ -76,15 +76,15 @@ def translate(mi: ModuleType, scene: Scene, camera: CameraKind | str | int | Non
         parts[name] = Part(len(scene.objects) + index, None, sphere.material)
 
     if integrator == "auto":
-        passes = any(m.alpha_mode != "opaque" or max(m.absorption) > 0.0 for m in scene.materials)
-        integrator = "volpath" if passes else "path"
+        needs_volpath = any(m.alpha_mode != "opaque" or max(m.absorption) > 0.0 for m in scene.materials)
+        integrator = "volpath" if needs_volpath else "path"
     for index, light in enumerate(scene.lights):
         contents[f"light{index}"] = light_emitter(mi, light)
     background = background_emitter(mi, scene.background)
     if background is not None:
         contents["background"] = background
     lit = bool(scene.lights) or background is not None or any(m.lights_others for m in scene.materials)
-    if not lit:  # Mitsuba refuses a scene whose emitters are all never sampled
+    if not lit:  # Mitsuba refuses a scene in which no emitter has a sampling weight above 0
         contents["darkness"] = {"type": "point", "position": [0.0, 0.0, 0.0], "intensity": 0.0}
     _check_light_transport(scene, integrator)
 
@@ -97,15 +97,15 @@ def translate(mi: ModuleType, scene: Scene, camera: CameraKind | str | int | Non
 
 
 def _check_light_transport(scene: Scene, integrator: str) -> None:
-    """Refuse features of wrt's light transport that the integrator does not have."""
+    """Raise InputError for light transport of wrt that the integrator of Mitsuba does not have."""
     materials = scene.materials
     if scene.settings.fresnel == "schlick" and any(m.kind == "glass" for m in materials):
         refuse('fresnel = "schlick"')
     if scene.lights and any(m.is_rough for m in materials if m.kind != "metallic_roughness"):
-        refuse("highlights of point lights on rough surfaces (GGX's, where wrt takes Blinn's or none)")
+        refuse("highlights of point lights on rough surfaces (Mitsuba's are GGX, wrt's are Blinn-Phong or missing)")
     if integrator == "whitted":
         mixed = [m.name for m in materials if m.kind == "metallic_roughness"]
-        if mixed:  # Mitsuba's principled BSDF cannot sample its mirror-like part by itself
+        if mixed:  # Mitsuba's principled BSDF cannot sample its specular part alone
             raise InputError(f'integrator "whitted" cannot render metallic_roughness (material {mixed[0]!r})', place="Mitsuba")
         if scene.settings.glass_shadows == "tinted" and any(m.kind == "glass" and not m.thin for m in materials):
             refuse('glass_shadows = "tinted"')
@@ -113,7 +113,7 @@ def _check_light_transport(scene: Scene, integrator: str) -> None:
     if max(scene.ambient) > 0.0:
         refuse("the ambient term")
     if any(m.is_emissive and not m.lights_others for m in materials):
-        refuse("emission that is only seen")
+        refuse("emission that does not light other surfaces")
     if integrator != "volpath":
         if any(max(m.absorption) > 0.0 for m in materials):
             refuse(f'absorption with integrator "{integrator}"')
@@ -131,13 +131,13 @@ def _integrator(mi: ModuleType, name: str, scene: Scene, lit: bool, parts: dict[
         return whitted_integrator(mi, Walk(mi, max_depth, scene.ambient, lit, inside, blended))
     if name == "direct":
         return {"type": "direct"}
-    # Mitsuba counts a path's edges: 1 is emission seen by the camera, 2 direct light. No Russian roulette: less noise.
+    # Mitsuba counts edges of a path: 1 edge is visible emission, 2 edges are direct light. A large rr_depth disables Russian roulette.
     return {"type": name, "max_depth": max_depth + 2, "rr_depth": 1 << 16}
 
 
 def _sensor(mi: ModuleType, scene: Scene, camera: CameraKind) -> Plugin:
     far, (width, height) = _farthest(scene, camera), scene.settings.size
-    # Mitsuba's camera looks along +z with +x to the left: half a turn about y away from glTF's.
+    # Mitsuba's camera looks along +z with +x to the left: glTF's camera turned by 180 degrees about y.
     pose = camera.camera_to_world @ np.diag([-1.0, 1.0, -1.0, 1.0])
     sensor: Plugin = {
         "near_clip": 1e-5 * far, "far_clip": 4.0 * far,
@@ -161,7 +161,7 @@ def _sensor(mi: ModuleType, scene: Scene, camera: CameraKind) -> Plugin:
 
 
 def _farthest(scene: Scene, camera: CameraKind) -> float:
-    """Return an upper bound of the distance from the camera to any shape and to its focus."""
+    """Return an upper bound on the distances from the camera to all shapes and to the plane of focus."""
     focus = camera.focus_distance if isinstance(camera, Camera) else 1.0
     if not scene.objects and not scene.spheres:
         return focus

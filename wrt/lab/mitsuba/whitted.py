@@ -1,4 +1,4 @@
-"""A Whitted integrator inside Mitsuba: its geometry, BSDFs and emitters, with wrt's light transport."""
+"""A Whitted integrator for Mitsuba: wrt's light transport on Mitsuba's geometry, BSDFs and emitters."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from types import ModuleType
 from wrt.lab.mitsuba.bsdfs import MitsubaObject
 from wrt.scene.values import Color
 
-MAX_TRANSPARENT = 256  # surfaces in a row that a ray may go straight through
+MAX_TRANSPARENT = 256  # most successive surfaces that a ray passes straight through
 
 
 class Walk:
-    """Paths whose expectation is wrt's picture: direct light and ambient at diffuse surfaces, where paths end.
+    """Random paths whose mean is wrt's picture. Diffuse surfaces end a path and add direct and ambient light.
 
-    Reflection, refraction and transparency are followed, one of them at random where wrt follows all.
-    - max_depth: bounces after the first hit; lights: True if there is an emitter to sample.
-    - absorption: shape id -> coefficient inside; blended: ids of shapes that rays pass by their alpha, which is no bounce."""
+    Where wrt follows reflection, refraction and transparency, a path follows one of them at random.
+    - max_depth: most bounces after the first hit; lights: True if the scene has an emitter to sample.
+    - absorption: shape id -> absorption coefficient inside; blended: ids of shapes with alpha, which rays pass without a bounce."""
 
     def __init__(self, mi: ModuleType, max_depth: int, ambient: Color, lights: bool, absorption: dict[str, Color],
                  blended: set[str]) -> None:
@@ -31,7 +31,7 @@ class Walk:
         self.inside = {shape: mi.Color3f(value) for shape, value in absorption.items()}
 
     def transmittance(self, scene: MitsubaObject, si: MitsubaObject, light: MitsubaObject) -> MitsubaObject:
-        """Return the share of the light that passes a shadow ray's surfaces: solid ones block all, cut-outs and thin panes a part."""
+        """Return the share of the light that reaches a point: solid surfaces block it, cut-outs and thin panes transmit a part."""
         share = self.mi.Color3f(1.0)
         ray = si.spawn_ray_to(light.p)
         for _ in range(MAX_TRANSPARENT):
@@ -46,7 +46,7 @@ class Walk:
         return self.mi.Color3f(0.0)
 
     def direct_light(self, scene: MitsubaObject, sampler: MitsubaObject, si: MitsubaObject, bsdf: MitsubaObject) -> MitsubaObject:
-        """Sample one light once; traced reflections find lights with an area."""
+        """Return the light of one sampled emitter on a diffuse surface; on others only that of lights without area."""
         light, weight = scene.sample_emitter_direction(si, sampler.next_2d(), False)
         if light.pdf == 0.0 or not (light.delta or bsdf.flags() & self.diffuse):
             return self.mi.Color3f(0.0)
@@ -54,17 +54,17 @@ class Walk:
         return value * self.transmittance(scene, si, light) if max(value) > 0.0 else value
 
     def reflected(self, scene: MitsubaObject, sampler: MitsubaObject, si: MitsubaObject, bsdf: MitsubaObject) -> MitsubaObject:
-        """Return the light of emitters and of the ambient that a surface reflects back along the path."""
+        """Return the direct and ambient light that a surface reflects back along the path."""
         radiance = self.mi.Color3f(0.0)
         if self.lights and bsdf.flags() & self.smooth:
             radiance += self.direct_light(scene, sampler, si, bsdf)
         if bsdf.flags() & self.diffuse and max(self.ambient) > 0.0:
-            there = 1.0 - bsdf.eval_null_transmission(si)
-            radiance += self.ambient * bsdf.eval_diffuse_reflectance(si) * there
+            opacity = 1.0 - bsdf.eval_null_transmission(si)
+            radiance += self.ambient * bsdf.eval_diffuse_reflectance(si) * opacity
         return radiance
 
     def sample(self, scene: MitsubaObject, sampler: MitsubaObject, ray: MitsubaObject) -> tuple[MitsubaObject, bool, list[str]]:
-        """Return radiance along a ray, whether it hit anything, and no AOVs, as Mitsuba's SamplingIntegrator.sample."""
+        """Return radiance, a flag for a hit, and no AOVs: the interface of Mitsuba's SamplingIntegrator.sample."""
         radiance, throughput, within = self.mi.Color3f(0.0), self.mi.Color3f(1.0), None
         depth = passed = 0
         while depth <= self.max_depth and passed <= MAX_TRANSPARENT:
@@ -85,20 +85,20 @@ class Walk:
             if not max(throughput) > 0.0:
                 break
             direction = si.to_world(bounce.wo)
-            if bounce.eta != 1.0:  # refracted, and now on the side where it goes
+            if bounce.eta != 1.0:  # refracted: the ray enters or leaves a medium
                 within = self.inside.get(si.shape.id()) if direction @ si.n < 0.0 else None
             ray = si.spawn_ray(direction)
             if si.shape.id() in self.blended and bounce.sampled_component == bsdf.component_count() - 1:
-                passed += 1  # straight on past a blended surface (the last component of Mitsuba's mask): no bounce
+                passed += 1  # straight through a blended surface (the last component of Mitsuba's mask): no bounce
             else:
                 depth, passed = depth + 1, 0
         return radiance, True, []
 
 
 def whitted_integrator(mi: MitsubaObject, walk: Walk) -> MitsubaObject:
-    """Return an integrator that samples a Walk, in Python: some 10 microseconds a bounce, for small pictures."""
+    """Return a Mitsuba integrator that samples a Walk in Python, at about 10 microseconds a bounce: for small pictures only."""
 
-    class Whitted(mi.SamplingIntegrator):  # its base exists only once Mitsuba's variant is set
+    class Whitted(mi.SamplingIntegrator):  # the base class exists only after a variant is set
         def __init__(self) -> None:
             super().__init__(mi.Properties())
 

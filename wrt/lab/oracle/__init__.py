@@ -1,1 +1,1 @@
-"""Hits of rays in float64 and exact arithmetic, and the error bounds that float32 answers must keep."""
+"""Exact hits of rays, and bounds on the errors of float32 hits."""

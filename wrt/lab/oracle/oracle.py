@@ -1,9 +1,9 @@
-"""The oracle: exact hits of rays, in NumPy. Slow, clear, and independent of Warp and of every unit under test.
+"""The oracle: exact hits of rays, in NumPy. It is slow and clear, and shares no code with Warp or the tests that it judges.
 
-A hit is where the ray o + t d, with t in the closed segment [t_min, t_max], meets the closed triangle and is not parallel to its plane.
-So a ray in the plane does not hit, and a triangle without area or with a coordinate that is not finite never does. A sphere is hit where
-the ray enters and where it leaves, or once where the ray only touches it. Both sides count. Coordinates are float32 values, taken as
-exact. `wrt.scene.exact` explains how signs are decided, and `wrt.lab.oracle.bounds` how far a float32 unit may be off.
+A ray o + t d, with t in the closed segment [t_min, t_max], hits a triangle if it meets the closed triangle and is not parallel to its
+plane. So a ray in the plane does not hit, and a triangle without area or with a coordinate that is not finite is never hit. A sphere is
+hit where the ray enters and where it leaves, or once where the ray only touches it. Both sides of a surface count. Coordinates are float32
+values, treated as exact. `wrt.scene.exact` explains how signs are decided, and `wrt.lab.oracle.bounds` bounds the errors of float32 tests.
 
 >>> answer = closest(mesh, origins, directions)         # mesh: anything with vertices, faces and perhaps spheres
 >>> answer.prim_id[answer.tie]                          # rays that meet several triangles at exactly the same t"""
@@ -29,14 +29,14 @@ if TYPE_CHECKING:
     from wrt.accel.geometry import Geometry
     from wrt.scene.mesh import Mesh
 
-WIDTH = 4  # children of a node
+WIDTH = 4  # children of a node of the tree
 RAYS_AT_ONCE = 8192
 PAIRS_AT_ONCE = 1_000_000
-SLAB = 8.0 * UNIT  # a slab's distance carries three roundings in float64
+SLAB = 8.0 * UNIT  # relative error of a slab's distance, which has three float64 roundings, with a margin
 
 
-# Every hit, ordered by ray, then t, then prim_id; place: of Place; t to 1e-14 relative; t_error: bound on |t - exact t|; u = v = 0
-# on spheres. Of an array of hits these are attributes: hits.ray.
+# Row of an array of hits, which is ordered by ray, then t, then prim_id. The relative error of t is at most 1e-14, and t_error bounds
+# |t - exact t|. On spheres u = v = 0. A recarray has these names as attributes: hits.ray.
 HIT = np.dtype([("ray", np.int64), ("prim_id", np.int32), ("t", np.float64), ("u", np.float64), ("v", np.float64),
                 ("t_error", np.float64), ("place", np.int8)])
 AllHits = Any  # np.recarray, whose stubs do not know its attributes
@@ -44,9 +44,9 @@ AllHits = Any  # np.recarray, whose stubs do not know its attributes
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """The closest hit of each ray, (N,) each.
-    - t: float64, inf on a miss; prim_id: int32, -1 on a miss, the lowest of an exact tie; place: int8 of Place, on prim_id.
-    - tie: several primitives are hit at exactly this t; ties: all of them, ascending, by ray."""
+    """The closest hit of each ray, arrays (N,).
+    - t: float64, inf on a miss; prim_id: int32, -1 on a miss, the lowest of an exact tie; place: int8, the Place on that primitive.
+    - tie: flags of rays that hit several primitives at exactly this t; ties: ray -> these primitives, ascending."""
 
     t: np.ndarray
     prim_id: np.ndarray
@@ -63,7 +63,7 @@ def _hits(*columns: np.ndarray) -> AllHits:
 
 @dataclass(frozen=True, eq=False)
 class _Rays:
-    """Rays as (3, N) float64; inverse: the reciprocal direction; near: which row of a box is the near plane, on each axis."""
+    """Rays as (3, N) float64. inverse: 1 / direction; near: for each axis, the row of a box (6 planes) with the near plane."""
 
     origin: np.ndarray
     direction: np.ndarray
@@ -90,7 +90,7 @@ class Reference:
     """A geometry prepared for queries: its primitives in a tree of conservative boxes.
 
     - geometry: vertices (V, 3), faces (F, 3) and perhaps spheres (S, 4) of centre and radius; float32 values.
-    - prim_id counts the faces first, then the spheres. finite: (N,) bool, which primitives can be hit at all."""
+    - prim_id numbers the faces first, then the spheres. finite: (N,) flags of the primitives with finite coordinates."""
 
     def __init__(self, geometry: Geometry | Mesh) -> None:
         vertices = np.asarray(geometry.vertices, dtype=np.float32).astype(np.float64)
@@ -105,12 +105,12 @@ class Reference:
         self.leaf_prim, self.levels = _tree(*_widened(lo, hi, self.n_triangles, self.finite))
 
     def triangles(self, prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the corners of these triangles, three (3, N) float64."""
+        """Return the corners of the triangles `prim_id`, three arrays (3, N) float64."""
         a, b, c = (np.take(corner, prim_id, axis=1) for corner in self.corners)
         return a, b, c
 
     def candidates(self, rays: _Rays) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Yield pairs (ray, prim_id) that may hit, in parts; a ray is in one part only."""
+        """Yield pairs (ray, prim_id) that may hit, in parts; all pairs of a ray are in one part."""
         n = len(rays.t_min)
         usable = np.isfinite(rays.origin).all(axis=0) & np.isfinite(rays.direction).all(axis=0) & rays.direction.any(axis=0)
         stack = [np.flatnonzero(usable[i:i + RAYS_AT_ONCE]) + i for i in reversed(range(0, n, RAYS_AT_ONCE))]
@@ -123,7 +123,7 @@ class Reference:
                 yield rows[pairs[0]], pairs[1]
 
     def _descend(self, rays: _Rays, n: int) -> tuple[np.ndarray, np.ndarray] | None:
-        """Trace all rays down the tree, level by level; return None if that takes too many pairs at once."""
+        """Trace all rays down the tree, level by level; return pairs (ray, prim_id), or None if there are too many pairs at once."""
         ray, node = np.arange(n), np.zeros(n, np.int64)
         for boxes in self.levels:
             keep = _meets(boxes, node, rays, ray)
@@ -137,15 +137,15 @@ class Reference:
         return ray, self.leaf_prim[node]
 
     def all_hits(self, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf) -> AllHits:
-        """Return every hit of each ray in its closed segment. origins, directions: (N, 3), taken as float32; t_min, t_max: numbers or (N,).
-        Rays that are not finite, or have no direction, hit nothing."""
+        """Return every hit of each ray in its closed segment. Rays that are not finite or have the direction 0 hit nothing.
+        origins, directions: (N, 3), rounded to float32; t_min, t_max: numbers or (N,)."""
         rays = _Rays.of(origins, directions, t_min, t_max)
         found = [self._tested(rays, ray, prim_id) for ray, prim_id in self.candidates(rays)]
         hits = np.concatenate([np.recarray(0, HIT), *found]).view(np.recarray)
         return hits[np.lexsort((hits.prim_id, hits.t, hits.ray))]
 
     def _tested(self, rays: _Rays, ray: np.ndarray, prim_id: np.ndarray) -> AllHits:
-        """Return the hits among these pairs."""
+        """Test pairs (ray, prim_id) exactly; return the hits."""
         triangle = prim_id < self.n_triangles
         parts = [self._tested_triangles(rays, ray[triangle], prim_id[triangle])]
         if not triangle.all():
@@ -166,7 +166,7 @@ class Reference:
         t, error = found.t[keep], found.t_error[keep]
         low, high = rays.t_min[ray[keep]], rays.t_max[ray[keep]]
         inside = (t - error >= low) & (t + error <= high)
-        # Too close to an end of the segment for float64 to say: whole numbers do.
+        # Some t are too close to an end of the segment for float64 to decide: compare exact fractions.
         close = np.flatnonzero(~inside & (t + error >= low) & (t - error <= high))
         if len(close):
             rows = keep[close]
@@ -180,11 +180,11 @@ class Reference:
         return rays.origin[:, ray], rays.direction[:, ray], self.center[:, sphere], self.radius[sphere]
 
     def closest(self, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf) -> Answer:
-        """Return the closest hit of each ray in its closed segment; arguments as for all_hits."""
+        """Return the closest hit of each ray in its closed segment; arguments as for `all_hits`."""
         return self.closest_of(self.all_hits(origins, directions, t_min, t_max), origins, directions)
 
     def closest_of(self, hits: AllHits, origins: ArrayLike, directions: ArrayLike) -> Answer:
-        """Return the closest of each ray's hits, which all_hits found for these rays."""
+        """Return the closest hit of each ray. hits: result of `all_hits` for these rays."""
         n = len(np.asarray(origins))
         answer = Answer(np.full(n, np.inf), np.full(n, -1, np.int32), np.zeros(n), np.zeros(n), np.zeros(n, np.int8), np.zeros(n, bool))
         if not len(hits):
@@ -193,8 +193,8 @@ class Reference:
         reach = np.minimum.reduceat(hits.t + hits.t_error, first)
         close = np.flatnonzero(hits.t - hits.t_error <= reach[group])
         winner = first.copy()
-        crowd = np.flatnonzero(np.bincount(group[close], minlength=len(ray)) > 1)
-        for k, tied in self._first_exactly(hits, close[np.isin(group[close], crowd)], group, origins, directions):
+        contested = np.flatnonzero(np.bincount(group[close], minlength=len(ray)) > 1)
+        for k, tied in self._first_exactly(hits, close[np.isin(group[close], contested)], group, origins, directions):
             winner[k] = tied[0]
             if len(np.unique(hits.prim_id[tied])) > 1:
                 answer.tie[ray[k]] = True
@@ -205,7 +205,7 @@ class Reference:
 
     def _first_exactly(self, hits: AllHits, rows: np.ndarray, group: np.ndarray, origins: ArrayLike,
                        directions: ArrayLike) -> Iterator[tuple[int, list[int]]]:
-        """Yield, for each group among the rows, those with exactly the lowest t, by prim_id. Spheres are compared in float64."""
+        """Yield each group of the hits `rows` with its hits of exactly lowest t, by prim_id. Spheres are compared in float64."""
         rays = _Rays.of(origins, directions, 0.0, np.inf)
         triangle = hits.prim_id[rows] < self.n_triangles
         exact: dict[int, Any] = {int(row): Fraction(float(hits.t[row])) for row in rows[~triangle]}
@@ -219,8 +219,8 @@ class Reference:
             yield int(group[part[0]]), sorted(tied, key=lambda row: int(hits.prim_id[row]))
 
     def against(self, origins: ArrayLike, directions: ArrayLike, prim_id: np.ndarray) -> tuple[Crossings, Bounds]:
-        """Intersect ray i with triangle prim_id[i] alone, anywhere on the ray's line; all must be finite.
-        Return the exact crossings, and how far off a float32 unit may be."""
+        """Intersect the whole line of ray i with triangle prim_id[i]; all coordinates must be finite.
+        Return the exact crossings, and bounds on the errors of the float32 test."""
         rays = _Rays.of(origins, directions, 0.0, np.inf)
         corners = self.triangles(prim_id)
         found = triangle_crossings(rays.origin, rays.direction, corners, all_rows=True)
@@ -228,7 +228,7 @@ class Reference:
 
     def against_sphere(self, origins: ArrayLike, directions: ArrayLike,
                        prim_id: np.ndarray) -> tuple[SphereCrossings, np.ndarray, np.ndarray]:
-        """Return the crossings of ray i with sphere prim_id[i], bounds on the two t's (2, N), and whether a hit may be reported."""
+        """Return the crossings of ray i with sphere prim_id[i], bounds on both t (2, N), and flags of hits that may be reported."""
         rays = _Rays.of(origins, directions, 0.0, np.inf)
         columns = self._sphere_columns(rays, np.arange(len(prim_id)), prim_id)
         found = sphere_crossings(*columns)
@@ -237,7 +237,7 @@ class Reference:
 
 
 def _fractions(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, ...]) -> list[Fraction]:
-    """Return the exact t of hits, one a column."""
+    """Return the exact t of hits as fractions; o, d and v have one ray a column."""
     if not o.shape[1]:
         return []
     _, (numerator, slope, _), _, power = exact_plane(o, d, v)
@@ -246,8 +246,7 @@ def _fractions(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, ...]) -> list[
 
 
 def _widened(lo: np.ndarray, hi: np.ndarray, n_triangles: int, finite: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return boxes (3, N) that surely contain their primitives: spheres' boxes are rounded outwards; primitives that are not finite get
-    empty ones."""
+    """Return boxes (3, N) that surely contain their primitives: rounded outwards for spheres, empty if not finite."""
     with np.errstate(invalid="ignore"):
         lo[:, n_triangles:] -= 4.0 * UNIT * np.abs(lo[:, n_triangles:])
         hi[:, n_triangles:] += 4.0 * UNIT * np.abs(hi[:, n_triangles:])
@@ -257,7 +256,7 @@ def _widened(lo: np.ndarray, hi: np.ndarray, n_triangles: int, finite: np.ndarra
 
 def _tree(lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
     """Build a complete tree with WIDTH children a node; return the primitive of each leaf, and the boxes (6, nodes) of each level.
-    All ranges of a level are halved at once, at the median of the centroids' longest axis."""
+    Halve all ranges of a level at once, at the median along the longest axis of their centres."""
     n = lo.shape[1]
     depth = 0
     while WIDTH**depth < n:
@@ -287,8 +286,8 @@ def _tree(lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]
 
 
 def _meets(boxes: np.ndarray, node: np.ndarray, rays: _Rays, ray: np.ndarray) -> np.ndarray:
-    """Return whether each ray's segment may meet the box, conservatively.
-    In a plane of the box and along it, 0 * inf is NaN, which fmin and fmax ignore."""
+    """Return flags of the pairs (node, ray) whose segment may meet the box; never miss one that does.
+    For a ray that lies in a plane of the box, 0 * inf is NaN, which fmin and fmax ignore."""
     enter, leave = np.full(len(ray), -np.inf), np.full(len(ray), np.inf)
     flat = boxes.reshape(-1)
     with np.errstate(invalid="ignore", over="ignore"):
@@ -306,7 +305,7 @@ def _meets(boxes: np.ndarray, node: np.ndarray, rays: _Rays, ray: np.ndarray) ->
 
 @lru_cache(maxsize=4)
 def reference_of(geometry: Geometry | Mesh) -> Reference:
-    """Return the Reference of a geometry object, built once."""
+    """Return the Reference of a geometry; the same object is built only once."""
     return Reference(geometry)
 
 
@@ -314,15 +313,14 @@ def closest(geometry: Geometry | Mesh, origins: ArrayLike, directions: ArrayLike
             t_max: ArrayLike = np.inf) -> Answer:
     """Return the closest hit of each ray in the closed segment [t_min, t_max]; at exactly equal t the lowest prim_id.
 
-    geometry: as for `Reference`; origins, directions: (N, 3), taken as float32; t_min, t_max: numbers or (N,). t is good to 1e-14 relative,
-    u
-    and v to 1e-14. A ray that is not finite misses."""
+    geometry: as for `Reference`; origins, directions: (N, 3), rounded to float32; t_min, t_max: numbers or (N,). The relative error of t
+    and the errors of u and v are at most 1e-14. A ray that is not finite misses."""
     return reference_of(geometry).closest(origins, directions, t_min, t_max)
 
 
 def t_bound(origins: ArrayLike, directions: ArrayLike, triangles: ArrayLike) -> np.ndarray:
-    """Return how far the watertight test's t for ray i and triangle i may be from the exact one: (N,) float64, inf without a bound.
-    See `wrt.lab.oracle.bounds`."""
+    """Return the bound on the error of the watertight test's t for ray i and triangle i: (N,) float64, inf for no bound.
+    `wrt.lab.oracle.bounds` derives the bound. Shape of triangles: (N, 3 corners, 3)."""
     rays = _Rays.of(origins, directions, 0.0, np.inf)
     a, b, c = (np.ascontiguousarray(each.T) for each in np.asarray(triangles, np.float32).astype(np.float64).transpose(1, 0, 2))
     found = triangle_crossings(rays.origin, rays.direction, (a, b, c), all_rows=True)

@@ -1,1 +1,1 @@
-"""The cost of rays on an RT core: counters, caches, warps, machine code, and a model of rays a second."""
+"""A model of the RT core: counters of ray costs, caches, warps, machine code, and rays a second."""

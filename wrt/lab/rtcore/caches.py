@@ -1,4 +1,4 @@
-"""Simulation of the caches: which recorded fetches miss in the L1 of each SM and in the L2 behind them, in the order of the warps."""
+"""Simulate the caches of a GPU: which recorded fetches miss in the L1 of each SM and in the shared L2."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from wrt.core.threads import run_all, thread_count
 from wrt.kernels.study.cache_lru import Caches, Missed, Trace, replay_lru, replay_warps
 from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
 
-LINE = 128  # bytes: of a cache line on NVIDIA's GPUs since Volta
+LINE = 128  # bytes of a cache line on NVIDIA GPUs since Volta
 
 
 @dataclass(frozen=True)
 class Cache:
-    """Size in bytes, and lines a set (`ways`). A cache has as many sets as fit."""
+    """A set-associative cache. size: bytes; ways: lines in a set."""
 
     size: int
     ways: int
@@ -31,7 +31,7 @@ class Cache:
 
 @dataclass(frozen=True, eq=False)
 class Level1:
-    """Accesses of all L1s, and the lanes that want them. Of each miss: its line, its round (`time`) and the lanes that wait for it."""
+    """Result of `first_level`. accesses: to all L1s; wanted: lanes that need them; line, time, lanes: of each miss, its round and lanes."""
 
     accesses: int
     wanted: int
@@ -42,9 +42,9 @@ class Level1:
 
 @dataclass(frozen=True)
 class Misses:
-    """Counts over all rays.
-    - accesses: to the L1s; l1, l2: misses there, each one line read from below; compulsory: different lines.
-    - wanted, wait_l2, wait_dram: lanes that want a line, wait for the L2, wait for DRAM. Lanes that share an access count each."""
+    """Cache counts, summed over all rays.
+    - accesses: to the L1s; l1, l2: misses; each reads one line from the next level; compulsory: different lines.
+    - wanted, wait_l2, wait_dram: lanes that need a line, wait for the L2, wait for DRAM. Each lane of a shared access counts."""
 
     accesses: int
     l1: int
@@ -56,7 +56,7 @@ class Misses:
 
 
 def lines_of(address: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the cache lines that fetches touch, one after another, and the fetch of each; both (M,) int64."""
+    """Return the cache lines that the fetches touch, in their order, and the index of each line's fetch, (M,) int64 each."""
     begin, end = address // LINE, (address + size - 1) // LINE
     count = end - begin + 1
     fetch = np.repeat(np.arange(len(address)), count)
@@ -65,7 +65,7 @@ def lines_of(address: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def distinct_lines(first: np.ndarray, address: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Count the different cache lines of each ray, (N,) int64; ray i has the fetches first[i] to first[i + 1] - 1."""
+    """Count the different cache lines that each ray fetches, (N,) int64. Ray i has the fetches first[i] to first[i + 1] - 1."""
     line, fetch = lines_of(address, size)
     owner = np.repeat(np.arange(len(first) - 1), np.diff(first))[fetch]
     count = int(line.max(initial=0)) + 1
@@ -74,7 +74,7 @@ def distinct_lines(first: np.ndarray, address: np.ndarray, size: np.ndarray) -> 
 
 
 def replay(line: np.ndarray, cache: Cache) -> np.ndarray:
-    """Return which accesses find their line, (M,) bool, in an LRU cache that begins empty. Line n belongs in set n modulo `sets`."""
+    """Return flags of the accesses that hit, (M,) bool, in an LRU cache that is empty at first. Line n belongs to set n modulo `sets`."""
     cpu = start("cpu")
     hit = wp.zeros(len(line), dtype=wp.int8, device=cpu)
     load_kernel(replay_lru, cpu)
@@ -91,18 +91,19 @@ def caches_of(cache: Cache, count: int) -> Caches:
 
 
 def first_level(warp: np.ndarray, fetches: Counters, sms: int, slots: int, l1: Cache) -> Level1:
-    """Simulate one L1 an SM. warp: (N,) the warp of each ray, ascending, at most 32 rays each; fetches: of the rays in that order.
-    Warps go to the SMs in turn and begin when one of the SM's slots is free. In each round every lane of a warp makes its next fetch, and
-    each line that the lanes touch is accessed once. Nothing waits for memory: the length of a warp alone decides when its slot is free."""
+    """Simulate the L1 of each SM. warp: (N,) warp of each ray, ascending, at most 32 rays in each; fetches: of the rays, in their order.
+    SM i runs every sms-th warp from warp i on; a warp begins when a slot of its SM is free. In each round every lane of a warp makes its
+    next fetch, and each cache line that the lanes touch is accessed once. Rounds do not wait for memory: a warp holds its slot for as many
+    rounds as its longest ray has fetches."""
     cpu = start("cpu")
-    # As in one memory, primitives follow the nodes.
+    # Place the primitives behind the nodes, as in one memory.
     space, node = int(PRIMITIVE_SPACE), fetches.address < int(PRIMITIVE_SPACE)
     behind = LINE * -(-int((fetches.address + fetches.size)[node].max(initial=0)) // LINE)
     address = np.where(node, fetches.address, fetches.address - space + behind)
     touched = (address + fetches.size - 1) // LINE - address // LINE + 1
     count = int(warp[-1]) + 1 if len(warp) else 0
     warp_first = np.searchsorted(warp, np.arange(count + 1))
-    most = np.diff(np.concatenate([[0], np.cumsum(touched)])[fetches.first[warp_first]])  # lines, a warp
+    most = np.diff(np.concatenate([[0], np.cumsum(touched)])[fetches.first[warp_first]])  # most misses of each warp
     begin = np.concatenate([[0], np.cumsum([int(most[sm::sms].sum()) for sm in range(sms)])])
     trace = Trace()
     trace.sms, trace.slots = sms, slots
@@ -125,7 +126,7 @@ def first_level(warp: np.ndarray, fetches: Counters, sms: int, slots: int, l1: C
 
 
 def second_level(missed: Level1, l2: Cache, warm: bool = False) -> Misses:
-    """Simulate the L2 behind all L1s, in the order of time. warm: it has seen the same accesses once before."""
+    """Simulate the L2 for the misses of all L1s, in the order of their rounds. warm: the L2 has seen the same accesses once before."""
     order = np.argsort(missed.time, kind="stable")
     line, lanes = missed.line[order], missed.lanes[order]
     again = np.concatenate([line, line]) if warm else line

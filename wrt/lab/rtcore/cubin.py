@@ -1,8 +1,8 @@
-"""Code, registers, stack and instructions of the kernels in a CUDA binary, read without NVIDIA's tools.
+"""Read code, registers, stack and instructions of the kernels in a CUDA binary, without NVIDIA's tools.
 
-Instructions have 16 bytes from Volta on. Their lowest 9 bits are the operation, and NVIDIA never published which. OPERATIONS was read
-off binaries of known source, as Jia et al. did (2019, "Dissecting the NVIDIA Turing T4 GPU via Microbenchmarking"); a test compiles
-some of it again. Unknown operations count as "other"."""
+Since Volta an instruction has 16 bytes, and its lowest 9 bits are the operation. NVIDIA has not published these numbers. OPERATIONS comes
+from binaries of known source, a method of Jia et al. (2019, "Dissecting the NVIDIA Turing T4 GPU via Microbenchmarking"). A test compiles
+some operations and checks their numbers. Unknown operations count as "other"."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any
 from wrt.core.errors import InputError
 from wrt.core.packages import needed_by
 
-# Turing's operations of each class.
+# Class of instructions -> number -> name of Turing's operations.
 CLASSES: dict[str, dict[int, str]] = {
     "fp32": {0x020: "FMUL", 0x021: "FADD", 0x023: "FFMA", 0x009: "FMNMX", 0x00B: "FSETP", 0x00A: "FSET", 0x008: "FSEL"},
     "fp64": {0x028: "DMUL", 0x029: "DADD", 0x02A: "DSETP", 0x02B: "DFMA"},
@@ -35,12 +35,12 @@ CLASSES: dict[str, dict[int, str]] = {
 CLASS_OF = {number: name for name, operations in CLASSES.items() for number in operations}
 OPERATIONS = {number: name for operations in CLASSES.values() for number, name in operations.items()}
 
-_REGISTERS, _FRAME = 0x2F, 0x11  # entries of .nv.info: registers a thread, bytes of stack
+_REGISTERS, _FRAME = 0x2F, 0x11  # entries of .nv.info: registers of a thread, bytes of a thread's stack
 
 
 @dataclass(frozen=True)
 class KernelCode:
-    """Instructions of a kernel, registers of a thread, and bytes: of a thread's stack (arrays, spills) and of a block's shared memory."""
+    """Machine code of a kernel. registers: of a thread; stack: bytes of a thread (arrays, spills); shared: bytes of a block."""
 
     name: str
     code: bytes
@@ -49,7 +49,7 @@ class KernelCode:
     shared: int = 0
 
     def opcodes(self) -> list[int]:
-        """Return the operation of each instruction, without the branch to itself and the padding behind the end."""
+        """Return the operation number of each instruction, without the branch to itself and the padding at the end."""
         words = struct.unpack(f"<{len(self.code) // 8}Q", self.code)
         out = [word & 0x1FF for word in words[::2]]
         while out and OPERATIONS.get(out[-1]) in ("NOP", "BRA"):
@@ -57,7 +57,7 @@ class KernelCode:
         return out
 
     def operations(self) -> Counter[str]:
-        """Count each operation in the code, which is not how often it runs."""
+        """Count how often each operation stands in the code (not how often it runs)."""
         return Counter(OPERATIONS.get(each, f"0x{each:03x}") for each in self.opcodes())
 
     def classes(self) -> Counter[str]:
@@ -80,16 +80,16 @@ def read_cubin(data: bytes) -> dict[str, KernelCode]:
             out[name] = KernelCode(name, sections[f".text.{name}"].data(), facts.get((_REGISTERS, number), 0),
                                    facts.get((_FRAME, number), 0), shared.data_size if shared else 0)
     except (ELFError, KeyError, struct.error) as error:
-        raise InputError("this is no readable CUDA binary") from error
+        raise InputError("this is no readable CUDA binary (a 64-bit ELF file with kernels)") from error
     return out
 
 
 def _facts(info: bytes) -> dict[tuple[int, int], int]:
-    """Return (entry, symbol) -> value of the section .nv.info, which describes all kernels."""
+    """Return (entry, symbol) -> value from the section .nv.info, which describes all kernels."""
     out, at = {}, 0
     while at < len(info):
         form, entry, size = struct.unpack_from("<BBH", info, at)
-        at += 4 + (size if form == 4 else 0)  # of form 4 `size` bytes follow
+        at += 4 + (size if form == 4 else 0)  # form 4 has `size` more bytes
         if form == 4 and size == 8:
             symbol, value = struct.unpack_from("<II", info, at - 8)
             out[entry, symbol] = value

@@ -1,6 +1,6 @@
-"""`python -m wrt bench float64`: how often the triangle unit needs float64 on a GPU.
+"""`python -m wrt bench float64`: count how often the watertight triangle test needs float64 on a GPU.
 
-Record the triangle tests of closest-hit queries through bvh2, and classify each one again by itself. Runs on the CPU."""
+Record the triangle tests of closest-hit queries through bvh2, then classify each test. Both steps run on the CPU."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from wrt.lab.bench.rays import RaySet, ray_sets
 from wrt.lab.bench.report import Columns, Row, mesh_name
 from wrt.lab.plans import Float64 as Plan
 
-TITLE = "How often the triangle unit needs float64 on a GPU"
+TITLE = "How often the triangle test needs float64 on a GPU"
 COLUMNS: Columns = {
-    "mesh": "{mesh}", "rays": "{kind}", "tests a ray": lambda row: f"{row.tests / row.rays:.2f}",
-    "accepted in float32, a ray": lambda row: f"{row.accepted / row.rays:.2f}", "hard tests": "{hard}",
-    "of the tests": lambda row: f"{row.hard / max(row.tests, 1):.1e}", "of the rays": lambda row: f"{row.hard_rays / row.rays:.1e}"}
+    "mesh": "{mesh}", "rays": "{kind}", "tests/ray": lambda row: f"{row.tests / row.rays:.2f}",
+    "accepted in float32/ray": lambda row: f"{row.accepted / row.rays:.2f}", "hard tests": "{hard}",
+    "hard tests/test": lambda row: f"{row.hard / max(row.tests, 1):.1e}", "hard rays/ray": lambda row: f"{row.hard_rays / row.rays:.1e}"}
 LEGEND = """\
-Closest hits through bvh2. Float-float arithmetic settles the bits of most tests that float32 does not refuse; the others are hard and
-take float64. of the rays: share of rays with at least one hard test."""
+Closest hits through bvh2. accepted in float32: tests that float32 cannot refuse. Float-float arithmetic decides the bits of most of
+them; the others are hard and take float64. hard rays: rays with at least one hard test."""
 
 
 def rows(plan: Plan) -> Iterator[Row]:
@@ -40,7 +40,7 @@ def rows(plan: Plan) -> Iterator[Row]:
 
 
 def counted(accel: Accelerator, rays: RaySet) -> dict[str, int]:
-    """Count the triangle tests of all rays, and the hard ones among them. accel: a bvh2 over triangles, on the CPU."""
+    """Count the triangle tests of all rays, and the hard tests. accel: a bvh2 over triangles, on the CPU."""
     counters = accel.closest_hit(rays.origins, rays.directions, t_max=rays.t_max, trace=True).counters
     assert counters is not None
     of_ray = np.repeat(np.arange(len(rays)), np.diff(counters.first))
@@ -53,13 +53,13 @@ def counted(accel: Accelerator, rays: RaySet) -> dict[str, int]:
 
 
 def classified(accel: Accelerator, rays: RaySet, of_ray: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Return REFUSED, SURE or HARD for each test, (N,): ray of_ray[i] against the record at place[i]."""
-    given = RayArrays()
-    given.origin, given.direction = (upload(rows, wp.vec3, accel.device) for rows in (rays.origins, rays.directions))
-    given.t_min, given.t_max = wp.zeros(len(rays), device=accel.device), upload(rays.t_max, wp.float32, accel.device)
+    """Return REFUSED, SURE or HARD for each test, (N,): ray of_ray[i] against the primitive record place[i]."""
+    arrays = RayArrays()
+    arrays.origin, arrays.direction = (upload(rows, wp.vec3, accel.device) for rows in (rays.origins, rays.directions))
+    arrays.t_min, arrays.t_max = wp.zeros(len(rays), device=accel.device), upload(rays.t_max, wp.float32, accel.device)
     out = wp.zeros(len(of_ray), dtype=wp.int32, device=accel.device)
     load_kernel(classify, accel.device)
-    numbers = [upload(each, wp.int32, accel.device) for each in (of_ray, place)]
-    wp.launch(classify, len(of_ray), [accel.data.primitives, given, *numbers, out], device=accel.device)
+    indices = [upload(each, wp.int32, accel.device) for each in (of_ray, place)]
+    wp.launch(classify, len(of_ray), [accel.data.primitives, arrays, *indices, out], device=accel.device)
     return out.numpy()
 

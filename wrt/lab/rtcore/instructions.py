@@ -1,6 +1,7 @@
-"""Machine code of the units for Turing, and registers, stack and code of traversals, also for Hopper.
+"""Count the instructions of box and triangle tests for Turing, and registers, stack and code of traversals for Turing and Hopper.
 
-Read from the binary, without a GPU. Counts are static: how often an instruction stands in the code, not how often a ray runs it."""
+The counts come from compiled binaries, without a GPU. They are static: how often an instruction stands in the code, not how often it
+runs."""
 
 from __future__ import annotations
 
@@ -24,21 +25,21 @@ from wrt.kernels.units.triangle import RAY_TRIANGLE
 from wrt.lab.bench.report import Part, tabled
 from wrt.lab.rtcore.cubin import CLASSES, KernelCode, read_cubin
 
-ARCH = 75
-ARCHS = (75, 90)  # of the traversals
-REGISTERS = 65536  # of an SM, in four parts; a warp gets them in blocks of 256
-SMS = {75: (64 << 10, 16, 32), 90: (228 << 10, 32, 64)}  # by architecture: shared bytes, blocks and warps of an SM
+ARCH = 75  # Compute capability of Turing.
+ARCHS = (75, 90)  # Architectures of the traversals: Turing, Hopper.
+REGISTERS = 65536  # Registers of an SM, in four parts; a warp allocates blocks of 256.
+SMS = {75: (64 << 10, 16, 32), 90: (228 << 10, 32, 64)}  # Architecture -> shared bytes, most blocks and most warps of an SM.
 QUERIES = {"closest hit": closest_hit_kernel, "any hit": any_hit_kernel}
-# Tests in a probe. The compiler keeps one body for so many, and does not unroll the loop over the grid around it.
+# Tests in a probe kernel. For these numbers the compiler does not unroll the loop over the grid, so each test stands in the code once.
 FEW, MANY = 8, 16
-# Additions of the probes. A kernel with a unit also adds up its results: one addition for a box, three and a selection for a triangle. A
-# kernel that only reads has an addition for each number that it reads.
+# Additions in the probe kernels. A kernel with tests also sums their results: one addition for a box, three and a selection for a
+# triangle. A kernel that only reads has one addition for each number that it reads.
 BOX_NUMBERS, BOX_RESULTS, TRIANGLE_RESULTS = 6, 1, 4
 
 
 @dataclass(frozen=True)
 class UnitCode:
-    """Instructions of a test (`unit`: "box" or "triangle") by class of cubin.CLASSES, without fetching its data from memory."""
+    """Instructions of one test by class of cubin.CLASSES, without the loads of its data. unit: "box" or "triangle"; test: its name."""
 
     unit: str
     test: str
@@ -50,7 +51,7 @@ class UnitCode:
 
 
 def compiled(kernel: Kernel, arch: int = ARCH, block_dim: int | None = None) -> KernelCode:
-    """Return a kernel's machine code, by default for Turing and Warp's own blocks."""
+    """Compile a kernel and return its machine code, by default for Turing and the module's block size."""
     start("cpu")
     before = wp.get_module_options(kernel.module)["block_dim"]
     wp.set_module_options({"block_dim": block_dim or before}, kernel.module)
@@ -64,7 +65,7 @@ def compiled(kernel: Kernel, arch: int = ARCH, block_dim: int | None = None) -> 
 
 
 def resident_warps(code: KernelCode, arch: int, block_dim: int) -> int:
-    """Return how many warps registers, shared memory and blocks let an SM hold at a time."""
+    """Return the most warps that an SM holds at a time, as registers, shared memory and numbers of blocks and warps allow."""
     shared, blocks, most = SMS[arch]
     warps = block_dim // 32
     by_registers = 4 * (REGISTERS // 4 // (-(-code.registers * 32 // 256) * 256))
@@ -72,9 +73,9 @@ def resident_warps(code: KernelCode, arch: int, block_dim: int) -> int:
 
 
 def per_unit(few: KernelCode, many: KernelCode) -> dict[str, float]:
-    """Return the instructions by class that one more unit adds to a kernel. Raise InputError where the compiler unrolls the loop."""
+    """Return the instructions by class that one more test adds to a kernel. Raise InputError if the compiler unrolls the loop."""
     if few.operations()["STG"] != 1 or many.operations()["STG"] != 1:
-        raise InputError("this compiler unrolls the probe kernels: the instructions of one unit cannot be separated")
+        raise InputError("this compiler unrolls the probe kernels, so that the instructions of one test cannot be separated")
     a, b = few.classes(), many.classes()
     return {name: (b[name] - a[name]) / (MANY - FEW) for name in (*CLASSES, "other")}
 
@@ -91,25 +92,25 @@ def triangle_unit(test: str) -> UnitCode:
 
 
 def without_probe(unit: dict[str, float], adding: dict[str, float], additions: int) -> dict[str, float]:
-    """Subtract the instructions of a kernel that only reads and adds the same numbers; give `additions` of them back to the unit."""
+    """Return the instructions of a test: those of its probe less those of a kernel that only reads and adds, plus `additions`."""
     return {name: unit[name] - adding[name] + (additions if name == "fp32" else 0) for name in unit}
 
 
 def units() -> list[UnitCode]:
-    """Compile every box test and triangle test of the tables; takes half a minute."""
+    """Compile every box test and triangle test; this takes half a minute."""
     return [box_unit(test) for test in RAY_AABB] + [triangle_unit(test) for test in RAY_TRIANGLE]
 
 
 def traversals(names: Sequence[str]) -> dict[tuple[str, str, str, int], KernelCode]:
-    """Compile the queries' kernels in the default block size, by structure, query, place of the stack and architecture."""
+    """Compile the query kernels in the default block size; return (structure, query, memory of the stack, architecture) -> code."""
     return {(name, query, stack, arch): compiled(make(Structure(ACCELERATORS[name], Units(stack=stack))), arch, cuda.block_dim)
             for name in names for query, make in QUERIES.items() for stack in cuda.STACKS for arch in ARCHS}
 
 
 LEGEND = """\
-Static counts: a ray runs less, as the watertight test refuses most triangles early. Its fp64 (1/32 of fp32's rate on Turing) serves
-hard cases only and stands once in a kernel, in a function: traversals count it, the unit only calls it. The units' counts leave out
-fetching the box or triangle, the stack and the loop."""
+Counts are static: a ray runs fewer instructions, because the watertight test refuses most triangles early. Its fp64 instructions (1/32
+of fp32's rate on Turing) serve hard cases only. They stand once in a kernel, in a function: traversals include them, the test only calls
+them. Counts of the tests exclude loading the box or triangle, the stack and the loop."""
 
 
 def tables(units: Sequence[UnitCode], codes: dict[tuple[str, str, str, int], KernelCode]) -> list[Part]:
@@ -120,6 +121,6 @@ def tables(units: Sequence[UnitCode], codes: dict[tuple[str, str, str, int], Ker
     return [
         tabled({"unit": "{unit}", "test": "{test}", "instructions": lambda unit: f"{unit.instructions:.0f}",
                 **{name: f"{{classes[{name}]:.0f}}" for name in shown}}, units),
-        Part("", "", ("traversal", "query", "stack", "for", "registers", "local bytes", "shared bytes of a block", "warps of an SM",
+        Part("", "", ("traversal", "query", "stack", "architecture", "registers", "local bytes", "shared bytes/block", "warps/SM",
                       "instructions", *CLASSES, "other"), lines),
         Part("", LEGEND)]

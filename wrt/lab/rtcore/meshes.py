@@ -1,4 +1,4 @@
-"""`python -m wrt bench rtcore`: the model of the RT core on meshes, with primary and diffuse rays through every structure."""
+"""`python -m wrt bench rtcore`: apply the model of the RT core to meshes, structures and kinds of rays."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from wrt.lab.rtcore.warps import WARP, blocks
 
 
 def bvhs() -> list[str]:
-    """Return the names of the registry's BVHs: every structure that is built from a binary tree."""
+    """Return the names of the registry's BVHs, without aliases: all structures that are built from a binary tree."""
     return [name for name, cls in ACCELERATORS.items() if name == cls.name and issubclass(cls, Bvh2 | WideBvh)]
 
 
 def in_warps(accel: Accelerator, sets: dict[str, RaySet]) -> dict[str, RaySet]:
-    """Put the rays into the order of warps and lanes: blocks of 8 x 4 pixels of the camera's picture.
-    A ray that starts at a hit stands where its pixel is; rays between random points stay as they are."""
+    """Sort the rays into warps and lanes; a warp is a block of 8 x 4 pixels of the camera's picture.
+    Shadow and diffuse rays have the place of the pixel in which they start. Random rays keep their order."""
     primary = sets["primary"]
     side = round(len(primary) ** 0.5)
     warp, lane = blocks(side, side)
@@ -43,9 +43,9 @@ def in_warps(accel: Accelerator, sets: dict[str, RaySet]) -> dict[str, RaySet]:
 
 TITLE = "The model of the RT core on meshes"
 COLUMNS: Columns = {
-    "structure": "{structure}", "kind": "{name}", "B/triangle": lambda row: f"{row.bytes / row.mesh_triangles:.0f}",
+    "structure": "{structure}", "rays": "{name}", "B/triangle": lambda row: f"{row.bytes / row.mesh_triangles:.0f}",
     **{head: column for head, column in MODEL_COLUMNS.items() if head != "rays"},
-    "SIMT": "{simt_efficiency[as they come]:.0%}", "sorted": "{simt_efficiency[sorted]:.0%}"}
+    "SIMT efficiency": "{simt_efficiency[as they come]:.0%}", "if sorted": "{simt_efficiency[sorted]:.0%}"}
 
 
 def rows(plan: Plan) -> Iterator[Row]:
@@ -55,14 +55,14 @@ def rows(plan: Plan) -> Iterator[Row]:
             accel = build(geometry, name)
             sets = sets or in_warps(accel, ray_sets(accel, plan.rays, plan.seed, plan.inside))
             for rays in (sets[kind] for kind in plan.kinds):
-                work = trace_rays(accel, rays.kind, rays.origins, rays.directions, rays.t_max)  # closest hits for shadow rays, too
+                work = trace_rays(accel, rays.kind, rays.origins, rays.directions, rays.t_max)  # shadow rays also search the closest hit
                 efficiencies = simt(work.counters.counts, work.warp, rays.origins, rays.directions)
                 yield model_row(work, GPUS[plan.gpu], efficiencies, mesh=mesh_name(mesh),
                                 mesh_triangles=len(geometry), structure=name, bytes=accel.stats.bytes)
 
 
 def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
-    """Return a table for each mesh, with the structures' memory, and the parameters."""
+    """Return a table for each mesh, and the table of the model's parameters."""
     tables = [tabled(COLUMNS, group, f"{mesh}, {triangles} triangles")
               for (mesh, triangles), group in grouped(rows, "mesh", "mesh_triangles").items()]
     return [*tables, parameters()]

@@ -1,8 +1,8 @@
-"""A model of the RT core: clocks from the counted work of rays, and rays a second from clocks.
+"""A model of the RT core: it predicts clocks per ray, and rays a second, from the counted work of rays.
 
-An RT core tests boxes and triangles at fixed rates, reads nodes and triangles through an L1, an L2 and DRAM, and holds some warps at a
-time. Each of these is a term in clocks a ray. The terms overlap, so the largest decides (a roofline). Turing's rates were never
-published: results are ranges over assumptions, for orderings and sensitivities."""
+An RT core tests boxes and triangles at fixed rates, reads nodes and triangles through L1, L2 and DRAM, and holds a few warps at a time.
+Each of these limits is a term, in clocks per ray. The terms overlap in time, so the largest term decides, as in a roofline model. NVIDIA
+has not published Turing's rates. So results are ranges over assumptions; they serve to order variants and to find sensitivities."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ TERMS = ("box", "triangle", "L1", "L2", "DRAM", "latency")
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """Rays in the order of warps and lanes, with the counters of closest_hit(trace=True). warp: (N,) int64, ascending from 0."""
+    """Rays in the order of warps and lanes. counters: result of closest_hit(trace=True); warp: (N,) int64, warp of each ray, from 0 on."""
 
     name: str
     counters: Counters
@@ -45,32 +45,32 @@ class Work:
         return {}
 
     def misses(self, gpu: Gpu, core: Core) -> Misses:
-        """Simulate the caches of a GPU, once for each pair of sizes."""
-        above = (gpu.sms, core.warps, gpu.l1)
-        if above not in self._simulated:
-            self._simulated[above] = first_level(self.warp, self.counters, *above)
-        key = (*above, gpu.l2, core.warm)
+        """Simulate the caches of a GPU; equal sizes are simulated once."""
+        first_key = (gpu.sms, core.warps, gpu.l1)
+        if first_key not in self._simulated:
+            self._simulated[first_key] = first_level(self.warp, self.counters, *first_key)
+        key = (*first_key, gpu.l2, core.warm)
         if key not in self._simulated:
-            self._simulated[key] = second_level(self._simulated[above], gpu.l2, core.warm)
+            self._simulated[key] = second_level(self._simulated[first_key], gpu.l2, core.warm)
         return self._simulated[key]
 
 
 class Prediction(Row):
-    """Result of `predict`.
-    clocks: of a ray and RT core, by TERMS; limit: the largest term; utilisation: each term over the largest, 0 to 1; rays_per_second."""
+    """Result of `predict`: rays_per_second of the GPU, and
+    clocks: term of TERMS -> clocks of an RT core per ray; limit: the largest term; utilisation: each term over the largest."""
 
 
 def predict(work: Work, gpu: Gpu, core: Core = BASE) -> Prediction:
-    """Return the clocks that a ray takes of an RT core, term by term.
-    A ray waits, one after another, for each fetch (the mean time of a lane's fetches) and for each test. A warp holds its place until its
-    longest ray ends."""
+    """Return the clocks of an RT core per ray, term by term.
+    The term "latency": a ray waits for each of its fetches and tests in turn, and a warp holds its place until its longest ray ends. Each
+    fetch takes the mean time of all fetches."""
     n, counts, misses = len(work), work.counters.counts, work.misses(gpu, core)
     fetches = np.diff(work.counters.first)
     l2_share, dram_share = misses.wait_l2 / max(misses.wanted, 1), misses.wait_dram / max(misses.wanted, 1)
     fetch = core.l1_latency + l2_share * core.l2_latency + dram_share * core.dram_latency
     wait = fetches * fetch + counts["box_operations"] * core.box_latency + counts["primitives"] * core.triangle_latency
     terms = {
-        # Where a structure has planes or cells and no boxes, their tests take the box unit instead.
+        # In structures with planes or cells instead of boxes, the box unit tests these.
         "box": max(work.mean("boxes"), work.mean("box_operations")) / core.boxes,
         "triangle": work.mean("primitives") / core.triangles,
         "L1": misses.accesses / n / core.l1_lines,
@@ -84,9 +84,7 @@ def predict(work: Work, gpu: Gpu, core: Core = BASE) -> Prediction:
 
 
 def sweep(work: Work, gpu: Gpu, core: Core = BASE, names: tuple[str, ...] = ("boxes", "triangles")) -> list[Prediction]:
-    """Return a prediction for each combination of assumed values.
-
-    names: the fields of Core that vary, each over its values in SWEEPS. `core` gives the other fields."""
+    """Return a prediction for each combination of assumed values: the fields `names` of Core vary over SWEEPS."""
     return [predict(work, gpu, each) for each in variants(core, names)]
 
 
@@ -97,13 +95,13 @@ def variants(core: Core, names: tuple[str, ...]) -> Iterator[Core]:
 
 
 def span(predictions: list[Prediction]) -> tuple[float, float]:
-    """Return the lowest and the highest rays a second."""
+    """Return the lowest and highest rays_per_second."""
     rates = [each.rays_per_second for each in predictions]
     return min(rates), max(rates)
 
 
 def sensitivity(work: Work, gpu: Gpu, core: Core = BASE) -> dict[str, float]:
-    """Sweep each assumption alone; return the factor between lowest and highest rays a second, the largest factor first."""
+    """Sweep each assumption alone; return its name -> highest over lowest rays a second, the largest factor first."""
     factors = {}
     for name in SWEEPS:
         low, high = span(sweep(work, gpu, core, (name,)))
@@ -112,8 +110,8 @@ def sensitivity(work: Work, gpu: Gpu, core: Core = BASE) -> dict[str, float]:
 
 
 def simt(counts: np.ndarray, warp: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> dict[str, float]:
-    """Return the SIMT efficiency of the given warps, of the same rays packed without gaps, and packed after sorting them by coherence.
-    A ray costs its box operations and triangle tests. counts: rows of kernels.traverse.counters.Counts."""
+    """Return the SIMT efficiency of the warps, of the rays packed into full warps, and of the rays sorted by coherence, then packed.
+    The cost of a ray is its number of box operations and triangle tests. counts: (N,) kernels.traverse.counters.Counts."""
     cost = counts["box_operations"].astype(np.float64) + counts["primitives"]
     order = by_coherence(origins, directions)
     return {"as they come": efficiency(cost, warp), "packed": efficiency(cost, packed(len(cost))),
@@ -121,13 +119,13 @@ def simt(counts: np.ndarray, warp: np.ndarray, origins: np.ndarray, directions: 
 
 
 def trace_rays(accel: Accelerator, name: str, origins: np.ndarray, directions: np.ndarray, t_max: ArrayLike = np.inf) -> Work:
-    """Trace closest hits of rays in the order of lanes, counted and recorded; a warp is 32 rays in a row."""
+    """Trace closest hits of rays, count and record their work; 32 successive rays are a warp."""
     counters = accel.closest_hit(origins, directions, t_max=t_max, trace=True).counters
     assert counters is not None
     return Work(name, counters, packed(len(origins)))
 
 
-RANGE = ("boxes", "triangles", "warps")  # fields of Core that the reported range is swept over
+RANGE = ("boxes", "triangles", "warps")  # fields of Core that vary in the reported range
 
 
 def term(name: str) -> Callable[[Row], str]:
@@ -135,24 +133,25 @@ def term(name: str) -> Callable[[Row], str]:
 
 
 MODEL_COLUMNS: Columns = {
-    "rays": "{name}", "nodes": "{nodes:.1f}", "boxes": "{boxes:.1f}", "triangles": "{triangles:.1f}", "lines": "{lines:.1f}",
+    "rays": "{name}", "nodes/ray": "{nodes:.1f}", "boxes/ray": "{boxes:.1f}", "triangles/ray": "{triangles:.1f}",
+    "lines/ray": "{lines:.1f}",
     **{name: term(name) for name in TERMS}, "limit": "{limit}", "Grays/s": lambda row: f"{row.rays_per_second / 1e9:.2f}",
-    "range": lambda row: f"{row.low / 1e9:.2f} to {row.high / 1e9:.2f}",
+    "range, Grays/s": lambda row: f"{row.low / 1e9:.2f} to {row.high / 1e9:.2f}",
     "moved most by": lambda row: ", ".join(f"{name} {factor:.2g}x" for name, factor in list(row.factors.items())[:2])}
 SIMT_COLUMNS: Columns = {"rays": "{name}", **{name: f"{{simt_efficiency[{name}]:.0%}}" for name in ("as they come", "packed", "sorted")}}
 LEGEND = f"""\
-nodes, boxes, triangles: a ray; lines: cache lines a ray that its warp accesses. {", ".join(TERMS)}: clocks a ray and RT core that
-each part needs by itself; in brackets its use while the slowest part (limit) is fully used. Grays/s: with the assumptions in the table
-of parameters (4 boxes or 1 triangle a clock, 4 warps at a time, L2 empty). range: over {", ".join(RANGE)} =
+nodes, boxes, triangles: fetched or tested; lines: cache lines that the warps access. {", ".join(TERMS)}: clocks of an RT core per ray that
+this part alone needs; in brackets its use while the slowest part (limit) is fully used. Grays/s: under the assumptions in the table of
+parameters (4 boxes or 1 triangle a clock, 4 warps at a time, L2 empty at first). range: over {", ".join(RANGE)} =
 {"; ".join(", ".join(f"{value:g}" for value in SWEEPS[name]) for name in RANGE)}. moved most by: the assumptions that change Grays/s most
-when each is swept alone, with the factor from lowest to highest. Nothing here is measured: Turing's rates and node format were never
-published."""
+if each varies alone, with the factor from lowest to highest. Nothing here is measured: NVIDIA has not published Turing's rates and node
+format."""
 
 
 def model_row(work: Work, gpu: Gpu, simt: dict[str, float], **facts: object) -> Row:
-    """Return all that the model says of this work: the prediction with the basic assumptions and the work's means a ray.
-    - low, high: rays a second over RANGE; factors: the sensitivity.
-    - simt: the result of `simt`; facts: more columns."""
+    """Return the row of a Work: the prediction under the assumptions BASE, and means over the rays.
+    - low, high: rays a second over RANGE; factors: result of `sensitivity`.
+    - simt: result of the function `simt`; facts: further fields of the row."""
     prediction = vars(predict(work, gpu))
     low, high = span(sweep(work, gpu, names=RANGE))
     return Row(**facts, **{name: value for name, value in prediction.items() if name != "work"}, name=work.name, rays=len(work),
@@ -162,11 +161,11 @@ def model_row(work: Work, gpu: Gpu, simt: dict[str, float], **facts: object) -> 
 
 
 def model_page(rows: Sequence[Row]) -> str:
-    """Return both tables as HTML."""
+    """Return the tables of the model and of SIMT efficiency as HTML."""
     gpu = rows[0].gpu if rows else "a GPU"
     return tables_page([tabled(MODEL_COLUMNS, rows, f"Model of {gpu}"), tabled(SIMT_COLUMNS, rows, "SIMT efficiency")])
 
 
 def parameters() -> Part:
-    """Return the table of the model's parameters, each with its status and source."""
-    return Part("The parameters of the model", "", ("parameter", "value", "status", "swept over", "source"), PARAMETERS)
+    """Return the table of the model's parameters."""
+    return Part("The parameters of the model", "", ("parameter", "value", "status", "values in sweeps", "source"), PARAMETERS)

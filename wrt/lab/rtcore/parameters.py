@@ -1,4 +1,4 @@
-"""Parameters of the model of the RT core, published and assumed, each with its source and its status."""
+"""Parameters of the model of the RT core: published and assumed values with their sources."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ PASCAL = "NVIDIA GeForce GTX 1080 Ti, product data (2017)"
 VULKAN_SIM = "Vulkan-Sim, configs/tested-cfgs/SM75_RTX2060/gpgpusim.config (Saed et al., MICRO 2022)"
 
 
-# Name, value as the source states it, status (derived: from published values), values that are swept if it is unknown, source.
+# Name, value as the source states it, status (derived: computed from published values), values in sweeps, source.
 PARAMETERS = (
-    ("RTX 2080 Ti: SMs, RT cores", "68, one a SM", PUBLISHED, "", TURING),
+    ("RTX 2080 Ti: SMs, RT cores", "68, one RT core in each SM", PUBLISHED, "", TURING),
     ("RTX 2080 Ti: clock", "1.545 GHz (boost)", PUBLISHED, "", TURING),
     ("RTX 2080 Ti: DRAM", "616 GB/s", PUBLISHED, "", TURING),
     ("RTX 2080 Ti: L2", "5632 KB", PUBLISHED, "", TURING),
-    ("Turing: L1 with shared memory", "96 KB a SM", PUBLISHED, "", TURING),
+    ("Turing: L1 with shared memory", "96 KB in each SM", PUBLISHED, "", TURING),
     ("RTX 2080 Ti: rays", "10 Grays/s claimed", PUBLISHED, "", TURING),
     ("RTX 2080 Ti: clocks a ray and RT core", "10.5", DERIVED, "", "68 x 1.545 GHz / 10 Grays/s"),
     ("GTX 1080 Ti: rays in software", "1.1 Grays/s claimed", PUBLISHED, "", TURING),
@@ -28,25 +28,25 @@ PARAMETERS = (
     ("RTX 2060: DRAM, L2", "336 GB/s, 3 MB", PUBLISHED, "", "NVIDIA GeForce RTX 2060, product data (2019)"),
     ("cache line", "128 bytes", PUBLISHED, "", VULKAN_SIM),
     ("L2: ways", "16", ASSUMED, "", VULKAN_SIM),
-    ("L1: ways", "4", ASSUMED, "", "nobody; Vulkan-Sim has a fully associative one"),
-    ("L1: lines a clock", "1", ASSUMED, "0.5, 1, 2", "128 bytes a clock, as Turing's L1 gives to a SM"),
-    ("L2: bytes a clock and SM", "32", ASSUMED, "16, 32, 64", "nobody; Vulkan-Sim's crossbar moves flits of about that"),
+    ("L1: ways", "4", ASSUMED, "", "no source; Vulkan-Sim has a fully associative L1"),
+    ("L1: lines a clock", "1", ASSUMED, "0.5, 1, 2", "128 bytes a clock, as from Turing's L1 to an SM"),
+    ("L2: bytes a clock and SM", "32", ASSUMED, "16, 32, 64", "no source; Vulkan-Sim's crossbar has flits of about this size"),
     ("R_box: boxes a clock and RT core", "4", ASSUMED, "1, 2, 4, 8", "never published; RayFlex (2024) has 4"),
     ("R_tri: triangles a clock and RT core", "1", ASSUMED, "0.5, 1, 2", "never published; RayFlex (2024) has 1"),
     ("node: children", "2", ASSUMED, "every structure of the registry", "never published"),
-    ("warps at a time in a RT core", "4", ASSUMED, "2, 4, 8, 16, 32", VULKAN_SIM + "; Arches: 64 rays"),
+    ("warps at a time in an RT core", "4", ASSUMED, "2, 4, 8, 16, 32", VULKAN_SIM + "; Arches: 64 rays"),
     ("latency of a box operation", "8 clocks", ASSUMED, "3, 8, 13", VULKAN_SIM + "; Arches: 3, GauTracer: 13"),
     ("latency of a triangle test", "8 clocks", ASSUMED, "8, 22, 37", VULKAN_SIM + "; Arches: 22, GauTracer: 37"),
     ("latency of the L1", "20 clocks", ASSUMED, "", VULKAN_SIM),
-    ("latency of the L2, more", "160 clocks", ASSUMED, "", VULKAN_SIM),
-    ("latency of DRAM, more", "100 clocks", ASSUMED, "", VULKAN_SIM),
-    ("L2 at the beginning", "empty", ASSUMED, "empty, warm", "warm: it has seen the same rays once before"),
+    ("latency of the L2, beyond the L1's", "160 clocks", ASSUMED, "", VULKAN_SIM),
+    ("latency of DRAM, beyond the L2's", "100 clocks", ASSUMED, "", VULKAN_SIM),
+    ("L2 at the beginning", "empty", ASSUMED, "empty, warm", "warm: the L2 has seen the same rays once before"),
 )
 
 
 @dataclass(frozen=True)
 class Gpu:
-    """Clock in Hz as the source states it (RTX 2080 Ti: boost, RTX 2060: base), DRAM in bytes a second."""
+    """A GPU. clock: Hz, as the source states it (RTX 2080 Ti: boost, RTX 2060: base); dram: bytes a second; l1: of each SM."""
 
     name: str
     sms: int
@@ -64,9 +64,9 @@ GPUS = {
 
 @dataclass(frozen=True)
 class Core:
-    """Assumptions on one RT core and its memory, see PARAMETERS.
-    - boxes, triangles: tests a clock; warps: at a time; warm: the L2 has seen the same rays before.
-    - *_latency: clocks, of L2 and DRAM on top of the level above; l1_lines, l2_bytes: a clock."""
+    """Assumptions about one RT core and its memory; PARAMETERS has the sources.
+    - boxes, triangles: tests a clock; warps: warps at a time; warm: the L2 has seen the same rays before.
+    - *_latency: clocks; those of L2 and DRAM add to the level above. l1_lines, l2_bytes: lines and bytes a clock."""
 
     boxes: float = 4.0
     triangles: float = 1.0
@@ -83,7 +83,7 @@ class Core:
 
 BASE = Core()
 
-# Values of the fields of a Core: swept one at a time for the sensitivity, those of model.RANGE together for the reported range.
+# Field of Core -> its values in sweeps. Fields vary one at a time for the sensitivity, those of model.RANGE together for the range.
 SWEEPS: dict[str, tuple[float, ...]] = {
     "boxes": (1.0, 2.0, 4.0, 8.0),
     "triangles": (0.5, 1.0, 2.0),

@@ -1,4 +1,4 @@
-"""Results of `profile`: the model's work in warps, tables, heat maps with their scale, EXR layers and histograms."""
+"""Report of `profile`: tables, the model of the RT core, heat maps, EXR layers and histograms."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ GROUPS = {"primary": ("primary",), "shadow": ("shadow",), "secondary": ("reflect
 
 
 def warp_order(profile: Profile, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rays in the order of warps and lanes, and the warp of each, from 0 on.
-    A warp is a block of 8 x 4 pixels. Those of its pixels that trace an n-th ray of the same kind and depth trace it together."""
+    """Return the rays `rows` in the order of warps and lanes, and the warp of each ray, from 0 on.
+    A block of 8 x 4 pixels traces the n-th rays of the same kind and depth of all its pixels together, as one warp."""
     rays = profile.rays
     pixel, kind, depth = rays.pixel[rows].astype(np.int64), rays.kind[rows].astype(np.int64), rays.depth[rows].astype(np.int64)
     deepest = int(depth.max(initial=0)) + 1
@@ -34,7 +34,7 @@ def warp_order(profile: Profile, rows: np.ndarray) -> tuple[np.ndarray, np.ndarr
     fresh = np.ones(len(rows), bool)
     fresh[1:] = group[order][1:] != group[order][:-1]
     begin = np.maximum.accumulate(np.where(fresh, np.arange(len(rows)), 0))
-    turn = np.empty(len(rows), np.int64)  # rays of this kind and depth that the pixel traced before
+    turn = np.empty(len(rows), np.int64)  # number of earlier rays of the same kind and depth of the pixel
     turn[order] = np.arange(len(rows)) - begin
     warp, lane = blocks(*profile.size)
     step = ((warp[pixel] * deepest + depth) * len(KINDS) + kind) * (int(turn.max(initial=0)) + 1) + turn
@@ -43,16 +43,16 @@ def warp_order(profile: Profile, rows: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def work_of(profile: Profile, group: str) -> Work | None:
-    """Return the traced rays of a group of GROUPS as the model's work, or None if there are none."""
+    """Return the rays of a group of GROUPS whose fetches were recorded, or None if there are none."""
     rays = profile.rays
     kinds = [KINDS.index(name) for name in GROUPS[group]]
     at = np.flatnonzero(np.isin(rays.kind[rays.trace_rows], kinds))
     if not len(at):
         return None
-    place = np.full(len(rays), -1)
-    place[rays.trace_rows] = np.arange(len(rays.trace_rows))
+    position = np.full(len(rays), -1)
+    position[rays.trace_rows] = np.arange(len(rays.trace_rows))
     rows, warp = warp_order(profile, rays.trace_rows[at])
-    which = place[rows]
+    which = position[rows]
     first, length = rays.trace_first[which], np.diff(rays.trace_first)[which]
     begin = np.concatenate([[0], np.cumsum(length)])
     fetch = np.repeat(first - begin[:-1], length) + np.arange(begin[-1])
@@ -62,37 +62,37 @@ def work_of(profile: Profile, group: str) -> Work | None:
 PER_RAY = ("nodes", "boxes", "primitives", "leaves", "stack", "lines")
 LAYERS, HISTOGRAMS, REPORT = "counters.exr", "histograms.png", "profile.md"
 DEPTHS: Columns = {
-    "depth": "{depth}", "kind": "{kind}", "rays": "{probes}", "hit": lambda row: f"{row.hits / row.probes:.0%}",
+    "depth": "{depth}", "kind": "{kind}", "rays": "{probes}", "hits": lambda row: f"{row.hits / row.probes:.0%}",
     **{head: partial(lambda row, name: f"{getattr(row, name) / row.probes:.1f}", name=name) for head, name in
        {"nodes": "nodes", "boxes": "boxes", "triangles": "primitives", "leaves": "leaves"}.items()},
     "bytes": lambda row: f"{(row.node_bytes + row.primitive_bytes) / row.probes:.0f}",
-    "lines": lambda row: f"{row.lines / row.probes:.1f}", "stack (most)": "{stack}"}
+    "lines": lambda row: f"{row.lines / row.probes:.1f}", "largest stack": "{stack}"}
 
 
 def percentiles(profile: Profile) -> Part:
-    """Return the table of each counter a ray, by kind of ray."""
+    """Return the table of mean and percentiles of each counter over the rays, by kind of ray."""
     lines = []
     for name in PER_RAY:
         for kind, values in by_kind(profile, name).items():
             shares = np.percentile(values, (50, 90, 99, 99.9))
             lines.append((TITLES[name], kind, f"{values.mean():.1f}", *(f"{x:.0f}" for x in shares), f"{values.max()}"))
-    return Part("What a ray costs", "", ("counter", "kind", "mean", "50%", "90%", "99%", "99.9%", "largest"), lines)
+    return Part("Cost per ray", "", ("counter", "rays", "mean", "50%", "90%", "99%", "99.9%", "largest"), lines)
 
 
 def by_kind(profile: Profile, name: str) -> dict[str, np.ndarray]:
-    """Return a counter of all rays, split by the kinds that occur."""
+    """Return kind of ray -> values of a counter, for the kinds that occur."""
     values = profile.rays.lines if name == "lines" else profile.rays.counts[name]
     return {kind: values[profile.rays.kind == i] for i, kind in enumerate(KINDS) if (profile.rays.kind == i).any()}
 
 
 def model_rows(profile: Profile, gpu: Gpu) -> Rows[Row]:
-    """Apply the model to the traced rays of each group; SIMT efficiency counts all rays."""
+    """Apply the model to the recorded rays of each group; SIMT efficiency includes all rays of the group."""
     rows = []
     for group in GROUPS:
         work = work_of(profile, group)
         if work is None:
             continue
-        every = np.flatnonzero(np.isin(profile.rays.kind, [KINDS.index(name) for name in GROUPS[group]]))  # traced or not
+        every = np.flatnonzero(np.isin(profile.rays.kind, [KINDS.index(name) for name in GROUPS[group]]))  # recorded or not
         order, warp = warp_order(profile, every)
         chosen = profile.rays.rays[order]
         rows.append(model_row(work, gpu, simt(profile.rays.counts[order], warp, chosen["origin"], chosen["direction"])))
@@ -104,27 +104,27 @@ def summary(profile: Profile, rows: Sequence[Row], gpu: Gpu) -> str:
     seconds = ", ".join(f"{name} {value:.1f}" for name, value in profile.seconds.items())
     head = (f"{profile.scene}: {profile.size[0]}x{profile.size[1]}, {profile.spp} spp, {len(rays)} rays; {profile.accel.name} over"
             f" {len(profile.accel.geometry)} primitives, {stats.nodes} nodes, {stats.bytes / 1e6:.1f} MB; seconds: {seconds}")
-    traced = f"{len(rays.trace_rows) / max(len(rays), 1):.0%} of the rays, in whole tiles"
+    recorded = f"{len(rays.trace_rows) / max(len(rays), 1):.0%} of the rays, in whole tiles"
     return markdown([
-        Part("", head), tabled(DEPTHS, [Row(**row) for row in profile.by_depth()], "Rays by depth and kind (means a ray)"),
-        percentiles(profile), tabled(MODEL_COLUMNS, rows, f"Model of {gpu.name} ({traced})"), Part("", LEGEND),
+        Part("", head), tabled(DEPTHS, [Row(**row) for row in profile.by_depth()], "Rays by depth and kind (means over the rays)"),
+        percentiles(profile), tabled(MODEL_COLUMNS, rows, f"Model of {gpu.name} ({recorded})"), Part("", LEGEND),
         tabled(SIMT_COLUMNS, rows, "SIMT efficiency",
-               "Warps of 8 x 4 pixels: as they come, packed without gaps, and sorted by origin and direction.")])
+               "As they come: warps of 8 x 4 pixels. Packed: full warps. Sorted: full warps of rays sorted by origin and direction.")])
 
 
 def check_folder(folder: Path) -> None:
-    """Make the folder if missing. Raise InputError if write_report could not write to it, or without matplotlib."""
+    """Create the folder if it is missing. Raise InputError if write_report cannot write to it, or if matplotlib is missing."""
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
-        raise InputError(f"no folder to write to: {error.strerror}", path=folder) from error
+        raise InputError(f"cannot be used as the output folder: {error.strerror}", path=folder) from error
     for name in (LAYERS, HISTOGRAMS):
         check_writable(folder / name)
     new_figure(1.0, 1.0)
 
 
 def write_report(profile: Profile, text: str, folder: Path) -> list[Path]:
-    """Write heat maps, layers, histograms and the report; return their paths. Raise InputError if the system refuses."""
+    """Write heat maps, EXR layers, histograms and the report `text`; return their paths. Raise InputError if a file cannot be written."""
     paths = []
     for name in PICTURES:
         if profile.maps[name].any():
@@ -133,6 +133,6 @@ def write_report(profile: Profile, text: str, folder: Path) -> list[Path]:
     write_exr(folder / LAYERS, {name: profile.maps[name].astype(np.float32) for name in PICTURES},
               {"scene": profile.scene, "spp": profile.spp})
     kinds = {TITLES[name]: by_kind(profile, name) for name in PER_RAY}
-    write_codes(folder / HISTOGRAMS, histograms(kinds, f"{profile.scene}: what a ray costs, and the share of rays that cost it"))
+    write_codes(folder / HISTOGRAMS, histograms(kinds, f"{profile.scene}: distribution of the cost per ray"))
     write_bytes(folder / REPORT, f"# Profile of {text}".encode())
     return [*paths, folder / LAYERS, folder / HISTOGRAMS, folder / REPORT]

@@ -1,4 +1,4 @@
-"""`wrt.profile`: every ray that a picture takes, with its counters and the addresses that it fetches."""
+"""`wrt.profile`: record every ray of a picture, with its counters and the addresses of its fetches."""
 
 from __future__ import annotations
 
@@ -39,22 +39,22 @@ TITLES = {
     "probes": "ray probes", "nodes": "nodes fetched", "boxes": "box tests", "box_operations": "operations of the box unit",
     "primitives": "triangle tests", "leaves": "leaves entered", "pushes": "stack pushes", "pops": "stack pops",
     "stack": "most entries on the stack", "node_bytes": "bytes of nodes", "primitive_bytes": "bytes of triangles",
-    "lines": "distinct cache lines, ray by ray", **{f"probes_{kind}": f"{kind} rays" for kind in KINDS},
+    "lines": "distinct cache lines of a ray", **{f"probes_{kind}": f"{kind} rays" for kind in KINDS},
 }
 TILE_SIZE = 64
-BYTES_OF_RAY = 200  # with all that is derived from it
-TRACE_LIMIT = 4_000_000  # fetches to keep
+BYTES_OF_RAY = 200  # memory for a ray, with all arrays derived from it
+TRACE_LIMIT = 4_000_000  # largest number of recorded fetches, about
 
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Every ray of a picture, (N,) each: tile by tile, pixel by pixel, and in the order in which each pixel traced them.
+    """Every ray of a picture, arrays (N,): sorted by tile, then by pixel, then in the order of tracing.
 
-    - rays: kernels.study.ray_log.LoggedRay; counts: kernels.traverse.counters.Counts; lines: distinct cache lines.
-    - pixel: row * width + column; kind: index in KINDS ("straight": continues unbent through a blended surface).
+    - rays: kernels.study.ray_log.LoggedRay; counts: kernels.traverse.counters.Counts; lines: number of distinct cache lines.
+    - pixel: row * width + column; kind: index in KINDS. A "straight" ray continues through a blended surface without refraction.
     - depth: bounces before the ray; a shadow ray has the depth of the ray whose hit it starts from.
-    - trace_rows: indices of the rays whose fetches were kept; trace_first: the first fetch of each.
-    - address, size: of each fetch, in bytes (wrt.accel.queries.answers.Counters)."""
+    - trace_rows: indices of the rays whose fetches were recorded; trace_first: index of the first fetch of each, and the end.
+    - address, size: of each recorded fetch, in bytes (wrt.accel.queries.answers.Counters)."""
 
     rays: np.ndarray
     counts: np.ndarray
@@ -73,7 +73,7 @@ class Rays:
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """Result of `profile`: size (width, height); pixels (H, W, 3), the picture; rays; accel, the structure; seconds by stage."""
+    """Result of `profile`. size: width, height; pixels: the picture (H, W, 3); accel: the structure; seconds: time of each stage."""
 
     scene: str
     size: tuple[int, int]
@@ -93,7 +93,8 @@ class Profile:
     @cached_property
     def maps(self) -> dict[str, np.ndarray]:
         """Maps by name (PICTURES), (H, W) float64 each, row 0 on top.
-        A pixel holds the mean over its samples of a counter summed over a sample's rays (`stack`: the largest), or its rays of one kind."""
+        A pixel of a counter's map is the sum over all rays of a sample, averaged over samples (`stack`: the largest value). A pixel of
+        `probes_KIND` is the number of rays of that kind per sample."""
         rays, n = self.rays, self.size[0] * self.size[1]
         sums = {name: np.bincount(rays.pixel, rays.counts[name], n) / self.spp for name in COUNTERS}
         sums["stack"] = np.zeros(n)
@@ -104,17 +105,17 @@ class Profile:
         return {name: value.reshape(self.size[1], self.size[0]) for name, value in sums.items()}
 
     def heatmap(self, name: str) -> Image.Image:
-        """Return one of `maps` as a PIL image with its scale, which notebooks show. Raise InputError for an unknown name."""
+        """Return a map of `maps` as a PIL image with a colour scale. Raise InputError for an unknown name."""
         from PIL import Image
 
         from wrt.picture.heatmap import heatmap
 
         if name not in PICTURES:
-            raise InputError(f"no picture {name!r}", hint=f"there is {', '.join(PICTURES)}")
+            raise InputError(f"no map {name!r}", hint=f"there is {', '.join(PICTURES)}")
         return Image.fromarray(heatmap(self.maps[name], TITLES[name] + ("" if name == "stack" else " a sample")))
 
     def by_depth(self) -> list[dict[str, object]]:
-        """Return a row for each kind of ray at each depth: depth, kind, hits, and each counter summed (`stack`: the largest)."""
+        """Return a row for each depth and kind of ray: depth, kind, hits, and the sum of each counter (`stack`: the largest value)."""
         rays, rows = self.rays, []
         for depth in np.unique(rays.depth):
             for i, kind in enumerate(KINDS):
@@ -128,7 +129,7 @@ class Profile:
 
 
 class ProfileOptions(SettingChanges, total=False):
-    """Keyword arguments of `profile`: settings of the scene, and options of the render."""
+    """Keyword arguments of `profile`: settings of the scene and options of the render."""
 
     seed: int
     device: str
@@ -145,18 +146,18 @@ class ProfileOptions(SettingChanges, total=False):
 
 
 def profile(scene: Scene | Mesh | PathLike, **options: Unpack[ProfileOptions]) -> Profile:
-    """Render a scene and record what each of its rays costs.
+    """Render a scene and record the cost of each ray.
 
-    The rays are exactly those of `wrt.render` with the same arguments. The addresses that rays fetch are kept for some tiles, evenly
-    chosen: at most about four million fetches.
+    The rays are exactly those of `wrt.render` with the same arguments. The addresses of their fetches are recorded for evenly spaced
+    tiles, about four million fetches at most.
 
     Parameters
     ----------
     scene : Scene, Mesh or path
         As for `wrt.render`.
     **options
-        Settings and options of `wrt.render`, listed in `ProfileOptions`. `spp` is 1 unless given, whatever the scene says.
-        `progress` is called during three runs over the picture.
+        Settings and options of `wrt.render`, listed in `ProfileOptions`. The default of `spp` is 1, not the scene's value.
+        `progress` counts the samples of three passes over the picture.
 
     Returns
     -------
@@ -167,18 +168,18 @@ def profile(scene: Scene | Mesh | PathLike, **options: Unpack[ProfileOptions]) -
     InputError
         An unknown argument, a scene that cannot be rendered, or more rays than fit into memory.
     """
-    given: dict[str, Any] = {**options}
-    settings = {name: given.pop(name) for name in SETTINGS if name in given}
+    others: dict[str, Any] = {**options}
+    settings = {name: others.pop(name) for name in SETTINGS if name in others}
     settings = {"spp": 1, **{name: value for name, value in settings.items() if value is not None}}
-    for name in given:
+    for name in others:
         if name not in ProfileOptions.__optional_keys__:
-            raise InputError("is no argument of a profile", argument=name)
-    return Profiler(as_scene(scene).with_settings(**settings), Options(**{"tile_size": TILE_SIZE, **given})).measure()
+            raise InputError("is not an argument of wrt.profile", argument=name)
+    return Profiler(as_scene(scene).with_settings(**settings), Options(**{"tile_size": TILE_SIZE, **others})).measure()
 
 
 @dataclass
 class _Tile:
-    """Rays of each pixel (`used`) and fetches of a tile; after the second pass its rays, their counts, and the trace if kept."""
+    """A tile. used: number of rays of each pixel; fetches: their number; the second pass adds rays, counts, lines and perhaps a trace."""
 
     rectangle: Rectangle
     used: np.ndarray
@@ -190,7 +191,7 @@ class _Tile:
 
 
 class Profiler:
-    """Three passes over each tile: count the rays of each pixel, record them with their counters, and record their fetches."""
+    """Make three passes over each tile: count the rays of each pixel, record the rays with their counters, record their fetches."""
 
     def __init__(self, scene: Scene, options: Options) -> None:
         device, plan = start(options.device), plan_of(scene, options)
@@ -200,14 +201,14 @@ class Profiler:
 
     def measure(self) -> Profile:
         self.begin, self.done, self.rays, self.lock = time.perf_counter(), 0, 0, threading.Lock()
-        self.films = [self.counter.film() for _ in range(3)]  # the same samples three times: only the first is used
+        self.films = [self.counter.film() for _ in range(3)]  # one for each pass; all three get the same samples
         tiles: list[_Tile] = []
         self.counter.each(lambda rectangle: tiles.append(self._count(rectangle)), self.prepared.tiles(1))
         tiles.sort(key=lambda tile: tile.rectangle[1::-1])
         total = sum(int(tile.used.sum(dtype=np.int64)) for tile in tiles)
         if total * BYTES_OF_RAY > 0.5 * memory_of(self.prepared.device):
-            raise InputError(f"a profile of {total / 1e6:.0f} million rays takes {total * BYTES_OF_RAY / 2**30:.0f} GiB;"
-                             " take a smaller size, fewer samples or a crop")
+            raise InputError(f"a profile of {total / 1e6:.0f} million rays needs {total * BYTES_OF_RAY / 2**30:.0f} GiB, more than half"
+                             " of the memory; use a smaller size, fewer samples or a crop")
         step = max(1, -(-sum(tile.fetches for tile in tiles) // TRACE_LIMIT))
         self.counter.each(self._record, [(tile, i % step == step // 2) for i, tile in enumerate(tiles)])
         seconds = {**self.prepared.seconds, "trace": time.perf_counter() - self.begin}
@@ -222,7 +223,7 @@ class Profiler:
         return _Tile(rectangle, used.copy(), fetches)
 
     def _report(self, rectangle: Rectangle, runs: int, rays: int) -> None:
-        """Tell `progress` that a tile has finished `runs` more passes."""
+        """Report to `progress` that a tile has finished `runs` more passes."""
         progress, settings = self.plan.options.progress, self.plan.scene.settings
         if progress is not None:
             with self.lock:
@@ -260,9 +261,12 @@ class Profiler:
     def _gather(self, tiles: list[_Tile]) -> Rays:
         rays = np.concatenate([tile.rays for tile in tiles])
         counts = np.concatenate([tile.counts for tile in tiles])
-        pixel = np.concatenate([np.repeat(self._pixels(tile.rectangle), tile.used) for tile in tiles])
+        x0, y0, x1, y1 = self.plan.crop
+        index = np.arange((y1 - y0) * (x1 - x0)).reshape(y1 - y0, x1 - x0)
+        pixel = np.concatenate([np.repeat(index[y - y0:y - y0 + height, x - x0:x - x0 + width].ravel(), tile.used)
+                                for tile in tiles for x, y, width, height in [tile.rectangle]])
         label = rays["label"]
-        path = np.maximum.accumulate(np.where(label > 0, np.arange(len(rays)), 0))  # of a shadow ray: the last path ray before it
+        path = np.maximum.accumulate(np.where(label > 0, np.arange(len(rays)), 0))  # for a shadow ray, the last path ray before it
         shadow = KINDS.index("shadow")
         kind = np.where(label > 0, (label - 1) % int(BRANCHES), shadow).astype(np.int8)
         depth = (label[path] - 1) // int(BRANCHES)
@@ -272,10 +276,3 @@ class Profiler:
         fetches = np.concatenate(trace) if trace else np.zeros(0, np.int64)
         return Rays(rays, counts, pixel, kind, depth, np.concatenate([tile.lines for tile in tiles]), np.flatnonzero(kept),
                     np.concatenate([[0], np.cumsum(length)]), fetches // int(SIZE_RANGE), fetches % int(SIZE_RANGE))
-
-    def _pixels(self, rectangle: Rectangle) -> np.ndarray:
-        """Return the indices of a tile's pixels within the crop, row by row."""
-        x0, y0, x1, _ = self.plan.crop
-        x, y, width, height = rectangle
-        column, row = np.meshgrid(np.arange(x - x0, x - x0 + width), np.arange(y - y0, y - y0 + height))
-        return (row * (x1 - x0) + column).ravel().astype(np.int64)

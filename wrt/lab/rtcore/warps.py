@@ -1,4 +1,4 @@
-"""Warps of 32 rays, and the share of their lanes that works: rays as they come, packed, or sorted."""
+"""Assign rays to warps of 32 lanes, and compute SIMT efficiency, the share of the lanes' time that rays use."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 WARP = 32
 BLOCK = (8, 4)  # pixels of a warp: columns, rows
-MORTON_BITS = 10
+MORTON_BITS = 10  # bits of each coordinate in a Morton code
 
 
 def blocks(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
@@ -17,29 +17,29 @@ def blocks(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def packed(n: int) -> np.ndarray:
-    """Return the warp of each of n rays without gaps, (n,)."""
+    """Return the warp of each of n rays that fill all warps but the last, (n,)."""
     return np.arange(n) // WARP
 
 
 def efficiency(cost: np.ndarray, warp: np.ndarray) -> float:
-    """Return the share of the lanes' time that rays use, 1 if nothing costs anything. cost, warp: (N,) of each ray.
-    A warp takes as long as its longest ray and holds all of its 32 lanes for that time."""
+    """Return the SIMT efficiency, 0 to 1; it is 1 if all costs are 0. cost, warp: (N,) of each ray.
+    A warp occupies its 32 lanes for as long as its longest ray."""
     longest = longest_of(cost, warp)
     total = WARP * float(longest.sum())
     return float(cost.sum()) / total if total > 0.0 else 1.0
 
 
 def longest_of(cost: np.ndarray, warp: np.ndarray) -> np.ndarray:
-    """Return the cost of each warp's longest ray, (W,) float64, for costs of 0 or more."""
+    """Return the largest cost of a ray in each warp, (W,) float64. cost: (N,), not negative."""
     out = np.zeros(int(warp.max(initial=-1)) + 1)
     np.maximum.at(out, warp, cost)
     return out
 
 
 def by_coherence(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Return an order, (N,) int64, that puts similar rays beside each other.
-    Sort by the octant of the direction, then along a Morton curve through the origins, then likewise by direction (after Pharr et al. 1997
-    and Garanzha and Loop 2010)."""
+    """Return an order, (N,) int64, in which similar rays are neighbours.
+    Sort by the octant of the direction, then along a Morton curve through the origins, then along one through the directions. Sources:
+    Pharr et al. 1997, Garanzha and Loop 2010."""
     octant = (directions < 0.0) @ np.array([4, 2, 1])
     unit = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), np.finfo(np.float32).tiny)
     return np.lexsort((morton(unit), morton(origins), octant))

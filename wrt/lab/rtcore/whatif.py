@@ -1,6 +1,6 @@
-"""`python -m wrt whatif`: change one thing of the RT core's design, count the same rays again, and apply the model.
+"""`python -m wrt whatif`: change one part of the RT core's design, trace the same rays again, and apply the model.
 
-Every variant must find the same hits; the column `differ` counts the rays that have another one (none may)."""
+Every variant must find the same hits; the column `differ` counts the rays whose hit differs (must be 0)."""
 
 from __future__ import annotations
 
@@ -30,35 +30,35 @@ from wrt.lab.rtcore.model import TERMS, Work, predict, simt, variants
 from wrt.lab.rtcore.parameters import BASE, GPUS, Gpu
 from wrt.lab.rtcore.warps import by_coherence, packed
 
-FRAME_BYTES = 16  # the corner (12), and an exponent of the step for each axis
-REFERENCE_BYTES = 16  # of a binary node, as Bvh2Node has them
+FRAME_BYTES = 16  # of a node's frame: corner (12), and an exponent of the step for each axis
+REFERENCE_BYTES = 16  # of the children's references in a binary node, as in Bvh2Node
 
 
 @cache
 def studied(study: Study) -> type[Bvh2]:
-    """Return the structure class whose kernels are those of a study."""
+    """Return a Bvh2 class that traverses with the kernels of a study."""
     return type("Bvh2Study", (Bvh2,), {"kernels": study, "__doc__": Bvh2.__doc__})
 
 
 def with_traversal(accel: OneMesh, study: Study) -> OneMesh:
-    """Return the same tree with another traversal. Raise InputError if it is too deep for a restart trail."""
+    """Return the tree with the traversal of a study. Raise InputError if the tree is too deep for a restart trail."""
     if study.entries < STACK_SIZE and accel.stats.depth > LEVELS:
-        raise InputError(f"the tree is {accel.stats.depth} levels deep, and a restart trail has bits for {LEVELS}")
+        raise InputError(f"the tree is {accel.stats.depth} levels deep; a restart trail has bits for {LEVELS} levels")
     return studied(study).restore(accel.built, accel.geometry)
 
 
 def quantised(lo: np.ndarray, hi: np.ndarray, bits: int) -> tuple[np.ndarray, np.ndarray, int]:
     """Round boxes outwards to planes of `bits` bits in the frame of their node; return the boxes and the bytes of a node.
 
-    lo, hi: (N, C, 3) float32, of C children; empty ones (lo = inf) stay empty. A frame is the node's lowest corner and a power of two as
-    the step of each axis (Ylitie, Karras and Laine 2017, section 3.1). No box shrinks: a plane moves one step more where float32
-    arithmetic would still cut something off."""
+    lo, hi: (N, C, 3) float32, the boxes of C children; empty boxes (lo = inf) stay empty. A frame is the node's lowest corner and, for each
+    axis, a power of two as the step (Ylitie, Karras and Laine 2017, section 3.1). No box shrinks: if float32 rounding would cut off a part
+    of a box, the plane moves one step farther."""
     empty = ~(lo <= hi).all(axis=2, keepdims=True)
     low = np.where(empty, np.inf, lo).min(axis=1, keepdims=True)
     high = np.where(empty, -np.inf, hi).max(axis=1, keepdims=True)
     origin = np.where(np.isfinite(low), low, 0.0).astype(np.float32)
     extent = np.where(np.isfinite(high - low), high.astype(np.float64) - low, 0.0)
-    # One step to spare, for planes that have to move on.
+    # Leave one step free, for planes that move one step farther.
     step = np.exp2(np.ceil(np.log2(np.maximum(extent / ((1 << bits) - 2), 2.0**-100)))).astype(np.float32)
 
     def plane(code: np.ndarray) -> np.ndarray:
@@ -75,7 +75,7 @@ def quantised(lo: np.ndarray, hi: np.ndarray, bits: int) -> tuple[np.ndarray, np
 
 
 def with_planes(accel: OneMesh, bits: int) -> tuple[OneMesh, int]:
-    """Return the same tree with planes of `bits` bits, and the bytes of a node."""
+    """Return the tree with box planes of `bits` bits, and the bytes of a node."""
     nodes = accel.built.arrays["nodes"].copy()
     lo, hi = (np.stack([nodes[f"{end}_{side}"] for side in (0, 1)], axis=1) for end in ("lo", "hi"))
     lo, hi, size = quantised(lo, hi, bits)
@@ -86,7 +86,7 @@ def with_planes(accel: OneMesh, bits: int) -> tuple[OneMesh, int]:
 
 
 def resized(counters: Counters, before: int, after: int) -> Counters:
-    """Return the same fetches from nodes of another size."""
+    """Return the counters as if a node had `after` bytes instead of `before` bytes."""
     node = counters.address < int(PRIMITIVE_SPACE)
     counts: Any = counters.counts.copy()
     counts["node_bytes"] = counts["nodes"] * after
@@ -94,33 +94,34 @@ def resized(counters: Counters, before: int, after: int) -> Counters:
                     np.where(node, after, counters.size))
 
 
-MANY_WARPS = replace(BASE, warps=32, warm=True)  # latency is hidden and the L2 full: units and lines decide
+MANY_WARPS = replace(BASE, warps=32, warm=True)  # hides latency and fills the L2, so that test units and cache lines decide
 ENTRIES = (STACK_SIZE, 8, 4, 2, 1, 0)
 BITS = (16, 8, 6, 4)
 TITLE = "What if"
 COLUMNS: Columns = {
-    "variant": "{variant}", "rays": "{kind}", "B/node": "{node_bytes}", "nodes": "{nodes:.1f}", "boxes": "{boxes:.1f}",
-    "triangles": "{triangles:.1f}", "B/ray": "{bytes:.0f}", "lines": "{lines:.1f}", "L1 missed": "{l1_missed:.0%}",
-    "SIMT": "{simt:.0%}", f"Grays/s, {BASE.warps} warps": lambda row: f"{row.few_warps.rays_per_second / 1e9:.2f}",
+    "variant": "{variant}", "rays": "{kind}", "B/node": "{node_bytes}", "nodes/ray": "{nodes:.1f}", "boxes/ray": "{boxes:.1f}",
+    "triangles/ray": "{triangles:.1f}", "B/ray": "{bytes:.0f}", "lines/ray": "{lines:.1f}", "L1 misses": "{l1_missed:.0%}",
+    "SIMT efficiency": "{simt:.0%}", f"Grays/s, {BASE.warps} warps": lambda row: f"{row.few_warps.rays_per_second / 1e9:.2f}",
     f"limit, {BASE.warps} warps": "{few_warps.limit}",
     f"Grays/s, {MANY_WARPS.warps} warps": lambda row: f"{row.many_warps.rays_per_second / 1e9:.2f}",
     f"limit, {MANY_WARPS.warps} warps": "{many_warps.limit}", "differ": "{differ}"}
 RATES: Columns = {
-    "structure": "{structure}", "rays": "{kind}", "boxes a clock": "{boxes:g}", "triangles a clock": "{triangles:g}",
+    "structure": "{structure}", "rays": "{kind}", "boxes/clock": "{boxes:g}", "triangles/clock": "{triangles:g}",
     "Grays/s": lambda row: f"{row.rays_per_second / 1e9:.2f}", "limit": "{limit}",
     **{name: f"{{clocks[{name}]:.3g}}" for name in TERMS}, "twice the triangles": "{doubled:.2f}x"}
 LEGEND = f"""\
-nodes, boxes, triangles: a ray; B/ray: bytes of nodes and triangles that a ray fetches; lines: cache lines that its warp accesses, a
-ray; L1 missed: their share that the L1 misses. SIMT: share of the lanes' time that rays use. Grays/s: the model's, with
-{BASE.boxes:g} boxes and {BASE.triangles:g} triangle a clock: {BASE.warps} warps at a time in each RT core and an empty L2, or
-{MANY_WARPS.warps} warps and an L2 that has seen the same rays. limit: the largest term. The model's numbers serve to compare variants.
-differ: rays with another hit than the first variant's; must be 0. Study of rates: clocks a ray and RT core of each term, with
-{MANY_WARPS.warps} warps and an L2 that has seen the same rays; twice the triangles: factor on rays a second of twice that rate."""
+B/ray: bytes of nodes and triangles that a ray fetches. lines/ray: cache lines that its warp accesses. L1 misses: share of the lines that
+miss the L1. SIMT efficiency: share of the lanes' time that rays use. Grays/s: predicted with {BASE.boxes:g} boxes and
+{BASE.triangles:g} triangle a clock, for {BASE.warps} warps at a time in each RT core and an L2 that is empty at first, and for
+{MANY_WARPS.warps} warps and an L2 that has seen the same rays. limit: the largest term of the model. Predictions serve to compare
+variants. differ: rays whose hit is not that of the first variant; must be 0. Study of rates: {", ".join(TERMS)} are clocks of an RT core
+per ray, for {MANY_WARPS.warps} warps and an L2 that has seen the same rays. twice the triangles: factor on Grays/s if the rate of triangle
+tests doubles."""
 
 
 @dataclass(frozen=True)
 class Variant:
-    """Hits and cost of the rays, in the order of `rays`."""
+    """A variant of the design: hits and counters of the rays, in the order of `rays`, and the bytes of a node."""
 
     name: str
     rays: RaySet
@@ -131,7 +132,7 @@ class Variant:
 
 
 def traced(name: str, accel: OneMesh, rays: RaySet, node_bytes: tuple[int, int] | None = None) -> Variant:
-    """Trace closest hits. node_bytes: the size of a node in memory, and the size to count."""
+    """Trace closest hits and return the Variant. node_bytes: size of a node in memory, and the size that counts instead."""
     hits = accel.closest_hit(rays.origins, rays.directions, t_max=rays.t_max, trace=True)
     counters = hits.counters
     assert counters is not None
@@ -143,18 +144,18 @@ def traced(name: str, accel: OneMesh, rays: RaySet, node_bytes: tuple[int, int] 
 
 
 def width(tree: Bvh2, rays: RaySet) -> Iterator[Variant]:
-    """Compare node widths, node formats and bounding volumes: every BVH of the registry."""
+    """Yield variants of width, format and bounding volume of nodes: every BVH of the registry."""
     return (traced(name, build(tree.geometry, name), rays) for name in bvhs())
 
 
 def stack(tree: Bvh2, rays: RaySet) -> Iterator[Variant]:
-    """Compare a full stack with short ones that restart."""
+    """Yield variants of the stack: a full one, and short ones with restarts."""
     for entries in ENTRIES:
         yield traced("full stack" if entries == STACK_SIZE else f"{entries} entries", with_traversal(tree, Study(entries)), rays)
 
 
 def planes(tree: Bvh2, rays: RaySet) -> Iterator[Variant]:
-    """Compare float32 box planes with planes of few bits in the frame of the node, rounded outwards."""
+    """Yield variants of the box planes: float32, and few bits in the frame of the node, rounded outwards."""
     first = traced("fp32", tree, rays)
     yield first
     for bits in BITS:
@@ -163,14 +164,14 @@ def planes(tree: Bvh2, rays: RaySet) -> Iterator[Variant]:
 
 
 def order(tree: Bvh2, rays: RaySet) -> Iterator[Variant]:
-    """Switch off the nearer child first, and the early stop."""
+    """Yield variants of the traversal: with and without visiting the nearer child first, with and without early stop."""
     for name, study in (("both", Study()), ("early stop alone", Study(ordered=False)), ("order alone", Study(early=False)),
                         ("neither", Study(ordered=False, early=False))):
         yield traced(name, with_traversal(tree, study), rays)
 
 
 def sorting(tree: Bvh2, rays: RaySet) -> Iterator[Variant]:
-    """Trace rays in the order of the picture, sorted by origin and direction, and shuffled."""
+    """Yield variants of the order of the rays: that of the picture, sorted by origin and direction, and shuffled."""
     orders = {"as they come": np.arange(len(rays)), "sorted": by_coherence(rays.origins, rays.directions),
               "shuffled": np.random.default_rng(0).permutation(len(rays))}
     for name, which in orders.items():
@@ -178,7 +179,7 @@ def sorting(tree: Bvh2, rays: RaySet) -> Iterator[Variant]:
         yield replace(variant, prim_id=variant.prim_id[back], t=variant.t[back])
 
 
-# Rates, of boxes against triangles, ask the model about the variants of width.
+# The study "rates" applies the model with other test rates to the variants of "width".
 STUDIES: dict[str, Callable[[Bvh2, RaySet], Iterator[Variant]]] = {
     "width": width, "stack": stack, "planes": planes, "order": order, "sorting": sorting, "rates": width}
 
@@ -208,8 +209,8 @@ def row_of(variant: Variant, first: Variant, kind: str, gpu: Gpu) -> Row:
 
 
 def rate_rows(variant: Variant, kind: str, gpu: Gpu) -> Iterator[Row]:
-    """Predict every pair of box and triangle rates with MANY_WARPS, where rates matter most.
-    doubled: how many times more rays a second twice the triangle rate gives."""
+    """Yield a prediction for every pair of box and triangle rates, with MANY_WARPS, where the rates matter most.
+    doubled: factor on the rays a second if the triangle rate doubles."""
     work = Work(variant.name, variant.counters, packed(len(variant.rays)))
     for core in variants(MANY_WARPS, ("boxes", "triangles")):
         now, twice = predict(work, gpu, core), predict(work, gpu, replace(core, triangles=2.0 * core.triangles))

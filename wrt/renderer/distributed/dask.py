@@ -1,7 +1,7 @@
-"""Dask workers on one machine or many: connection to a scheduler, and tiles as tasks.
+"""Dask workers on one or several machines: connection to a scheduler, and tiles as tasks.
 
-The scheduler repeats the tasks of a worker that died. The scene is scattered once, and again if all workers that held it have died. Dask
-is imported at first use.
+The scheduler repeats the tasks of a worker that died. The scene is scattered to the workers once, and again if all workers that had it
+died. Dask is imported at first use.
 """
 
 from __future__ import annotations
@@ -19,30 +19,29 @@ from typing import TYPE_CHECKING, Any, cast
 from wrt.core.device import describe_devices
 from wrt.core.errors import InputError
 from wrt.core.version import VERSION
-from wrt.renderer.distributed.installed import INSTALLED, difference
+from wrt.renderer.distributed.installed import INSTALLED, SAME_EVERYWHERE, difference
 from wrt.renderer.distributed.workers import ExecutorWorkers, Package, Reply, ReplyFuture
 
 if TYPE_CHECKING:
     from distributed import Client
 
-CONNECT_SECONDS = 5.0  # to reach the scheduler
-WORKER_SECONDS = 10.0  # until the first worker must have come
-RESULT_SECONDS = 30.0  # to fetch the results of workers
-PATIENCE = 60.0  # seconds of a render without any worker
+CONNECT_SECONDS = 5.0  # time limit for reaching the scheduler
+WORKER_SECONDS = 10.0  # time limit for the first worker to connect
+RESULT_SECONDS = 30.0  # time limit for fetching results from workers
+PATIENCE = 60.0  # seconds without any worker after which a render fails
 
 
 @contextmanager
 def connected(address: str) -> Iterator[Client]:
     """Yield a Client of the scheduler at an address such as tcp://host:8786.
 
-    Raises InputError if there is no answer, no worker, or a worker with another installation.
-    """
+    Raises InputError if the scheduler does not answer or has no worker, or if a worker has a different installation."""
     try:
         from distributed import Client
     except ImportError:
         raise InputError("a cluster needs dask.distributed", hint="pip install 'wrt[cluster]'") from None
     for name in [name for name in logging.root.manager.loggerDict if name.split(".")[0] == "distributed"]:
-        logging.getLogger(name).setLevel(logging.CRITICAL)  # errors are reported by InputError
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # InputError reports the errors
     try:
         kind = asyncio.run(asyncio.wait_for(_identity(address), CONNECT_SECONDS))
         if kind != "Scheduler":
@@ -50,7 +49,7 @@ def connected(address: str) -> Iterator[Client]:
         client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
     except TimeoutError as error:
         raise InputError(f"no Dask scheduler at {address!r}: no answer in {CONNECT_SECONDS:g} s") from error
-    except Exception as error:  # of any kind, if another program answers
+    except Exception as error:  # if another program answers, the error can have any type
         raise InputError(f"no Dask scheduler at {address!r}: {error}") from error
     with client:
         check_workers(client)
@@ -58,17 +57,17 @@ def connected(address: str) -> Iterator[Client]:
 
 
 async def _identity(address: str) -> str:
-    """Return the type of the server at an address. A Client alone would wait forever for a silent server."""
+    """Return the type of the Dask server at an address. Used before Client, which would wait forever for a silent server."""
     from distributed.core import rpc
     from distributed.security import Security
 
-    how = Security().get_connection_args("client")  # as Dask configures a Client
+    how = Security().get_connection_args("client")  # from Dask's configuration, like a Client
     async with rpc(address, timeout=CONNECT_SECONDS, connection_args=how) as there:
         return str((await there.identity())["type"])
 
 
 def check_workers(client: Client) -> None:
-    """Raise InputError if there are no workers, or one without wrt, or with another installation than this process."""
+    """Raise InputError if there is no worker, or if a worker lacks wrt or has a different installation than this process."""
     if client.asynchronous:
         raise InputError("is an asynchronous Client", argument="executor", hint="make one without asynchronous=True")
     where = client.scheduler.address  # type: ignore[union-attr]
@@ -76,25 +75,25 @@ def check_workers(client: Client) -> None:
         client.wait_for_workers(1, timeout=WORKER_SECONDS)
     except TimeoutError as error:
         raise InputError(f"no worker at {where}", hint=f"start some with `dask worker {where}`") from error
-    # `resolve_name` exists on workers without wrt, and the first name in every version of wrt.
+    # Workers without wrt can run `resolve_name`, and every version of wrt has `__version__`.
     for name in ("wrt:__version__", "wrt.renderer.distributed.installed:INSTALLED"):
         for worker, found in client.run(pkgutil.resolve_name, name, on_error="return").items():
             if isinstance(found, BaseException):
-                raise InputError(f"worker {worker} has no such wrt ({found}): wrt {VERSION} must be installed there")
+                raise InputError(f"worker {worker} lacks this version of wrt ({found})", hint=f"install wrt {VERSION} on the worker")
             if isinstance(found, str) and found != VERSION:
-                raise InputError(f"worker {worker} has wrt {found} (here {VERSION}): all must have the same")
+                raise InputError(f"worker {worker} has wrt {found} (here {VERSION})", hint=SAME_EVERYWHERE)
             if isinstance(found, dict) and (differs := difference(INSTALLED, found)):
-                raise InputError(f"worker {worker} has {differs}: all must have the same")
+                raise InputError(f"worker {worker} has {differs}", hint=SAME_EVERYWHERE)
 
 
 def machines(client: Client) -> str:
-    """Describe the devices of the workers, with the number of workers of each."""
+    """Return the devices of the workers as text, with the number of workers on each device."""
     devices = [lines[0] for lines in client.run(describe_devices).values()]
     return "; ".join(f"{devices.count(line)} workers of {line}" for line in dict.fromkeys(devices))
 
 
 class Submitter:
-    """The methods of an Executor that a sweep needs, for a dask.distributed.Client."""
+    """The methods of an Executor that wrt.lab.bench.sweep and ClusterWorkers need, for a dask.distributed.Client."""
 
     def __init__(self, client: object) -> None:
         self.client = cast(Any, client)
@@ -107,12 +106,12 @@ class Submitter:
 
     def cancel(self, futures: Iterable[ReplyFuture]) -> None:
         if self.client.status == "running":
-            with suppress(Exception):  # the connection may be lost, and the futures with it
+            with suppress(Exception):  # the connection may be lost, together with the futures
                 self.client.cancel(list(futures))
 
     @contextmanager
     def guarded(self) -> Iterator[None]:
-        """Raise `lost` in place of the errors of many types that a broken connection causes."""
+        """Raise `lost()` in place of the various errors that a broken connection causes in the block."""
         try:
             yield
         except Exception as error:
@@ -136,7 +135,7 @@ class ClusterWorkers(ExecutorWorkers):
         super().__init__(self.submitter, key, package)
         self.client, self.address = self.submitter.client, self.submitter.address
         self.scattered: Any = None
-        self.fetches: dict[Future[list[Any]], list[ReplyFuture]] = {}  # replies under way, and their futures
+        self.fetches: dict[Future[list[Any]], list[ReplyFuture]] = {}  # transfers of replies, and the futures of the replies
         self.fetched: dict[str, Reply | None] = {}
         self.has_workers, self.next_look = True, 0.0
         self.alone_since: float | None = None
@@ -149,11 +148,11 @@ class ClusterWorkers(ExecutorWorkers):
         return self.scattered
 
     def ready(self) -> bool:
-        """Return True if there are workers, and the scene is scattered if one requested it."""
+        """Return True if there are workers, and the scene is scattered in case a worker requested it."""
         if self.client.status not in ("running", "connecting"):
             raise self.submitter.lost()
         try:
-            if self.client.status == "running" and self._is_sent():
+            if self.client.status == "running" and self._send_scene():
                 self.alone_since = None
                 return True
         except Exception as error:
@@ -164,14 +163,15 @@ class ClusterWorkers(ExecutorWorkers):
             raise InputError("no worker is left", path=self.address)
         return False
 
-    def _is_sent(self) -> bool:
+    def _send_scene(self) -> bool:
+        """Scatter the scene if workers need it; return True if there are workers and the scene is not missing."""
         sent = not self.requests or (self.scattered is not None and self.scattered.status in ("pending", "finished"))
         if not sent or time.monotonic() >= self.next_look:
             self.has_workers, self.next_look = bool(self.client.nthreads()), time.monotonic() + 1.0
         if sent or not self.has_workers:
             return self.has_workers
-        with suppress(TimeoutError):  # the last worker has left
-            # A list of one: a dict alone would become a dict of futures.
+        with suppress(TimeoutError):  # the last worker is gone
+            # The package is in a list, because Dask would scatter the values of a dict one by one.
             self.scattered = self.client.scatter([self.package], broadcast=True, hash=False)[0]
             return True
         return False
@@ -203,13 +203,13 @@ class ClusterWorkers(ExecutorWorkers):
             futures = self.fetches.pop(fetch)
             with self.submitter.guarded(), suppress(TimeoutError, CancelledError):
                 replies = fetch.result()
-                if len(replies) == len(futures):  # otherwise a worker died before it sent its replies
+                if len(replies) == len(futures):  # otherwise a worker died before sending its replies
                     self.fetched |= {future.key: reply for future, reply in zip(futures, replies, strict=True)}
             done += futures
         return done
 
     async def _fetch(self, futures: list[Any]) -> list[Any]:
-        """Return the replies of several futures in one call, within RESULT_SECONDS."""
+        """Fetch the replies of several futures in one call, in RESULT_SECONDS at most."""
         return await asyncio.wait_for(self.client.gather(futures, errors="skip", asynchronous=True), RESULT_SECONDS)
 
     def result(self, future: ReplyFuture) -> Reply | None:
@@ -226,4 +226,4 @@ class ClusterWorkers(ExecutorWorkers):
             raise InputError(f"tiles kill their workers, one after another: {error}", path=self.address) from error
         except (CancelledError, TimeoutError):
             pass
-        return None  # its input, or its result, died with its worker
+        return None  # the input or the result was lost when a worker died

@@ -1,6 +1,6 @@
-"""Distributed renders: workers trace the tiles, and this process has the film, the passes, limits and checkpoints.
+"""Distributed renders: workers trace the tiles; this process keeps the film and controls passes, limits and checkpoints.
 
-The pixels have the bits of a render by threads."""
+The pixels have the same bits as those of a render on one device."""
 
 from __future__ import annotations
 
@@ -27,30 +27,30 @@ from wrt.renderer.tiles import Rectangle, Work, tiles
 from wrt.renderer.upload import warn_left_out
 from wrt.scene.model import Scene
 
-TILES_EACH = 4  # of a pass, for each slot
-SIDES = {"cpu": (32, 256), "cuda": (256, 1024)}  # limits of a tile's side: a smaller one is not worth a message, a larger one takes long
+TILES_EACH = 4  # tiles of a pass for each slot of the workers
+SIDES = {"cpu": (32, 256), "cuda": (256, 1024)}  # limits of a tile's side: smaller tiles cost more to send, larger tiles take long
 
 
 class DistributedRenderer:
-    """A scene prepared by workers, for options with `devices` or an `executor`; the Tracer of its own runs."""
+    """A scene prepared by workers, for options with `devices` or an `executor`. It is also the Tracer of its runs."""
 
     def __init__(self, scene: Scene, options: Options) -> None:
-        self.device = start("cpu")  # of the film
+        self.device = start("cpu")  # the film's device
         self.plan = plan_of(scene, options)
         self.plan.require_memory(self.device)
         warn_left_out(scene)
         self.workers = workers_for(self.plan)
         self.tiles_by: Counter[str] = Counter()
-        self.kind, self.seconds, self.counts = self._made_ready()
+        self.kind, self.seconds, self.counts = self._prepare_workers()
         self.checkpoint = checkpoint_of(self.plan, self.kind)
 
     def run(self) -> Film:
-        """Render until samples, time limit or target error end it."""
+        """Render until the samples, the time limit or the target error are reached."""
         self.tiles_by.clear()
         return Run(self, self.checkpoint).film()
 
-    def _made_ready(self) -> tuple[str, dict[str, float], dict[str, Any]]:
-        """Return the kind of the workers' devices, and the seconds and facts (Prepared.ready) of their preparation."""
+    def _prepare_workers(self) -> tuple[str, dict[str, float], dict[str, Any]]:
+        """Let the workers prepare the scene; return the kind of their devices, the seconds of each stage, and Prepared.facts."""
         begin, reported, replies = time.perf_counter(), self.plan.options.progress is None, []
         for done in self.workers.run([("ready",)] * self.workers.slots()):
             seconds = time.perf_counter() - begin
@@ -71,13 +71,13 @@ class DistributedRenderer:
         return {**self.counts, "workers": dict(self.tiles_by)}
 
     def tiles(self, samples: int) -> Iterator[Rectangle]:
-        """Yield large tiles for any number of samples: a call to a worker costs more than a wave."""
+        """Yield the tiles of a pass. They are large whatever the number of samples, since a call to a worker costs more than a wave."""
         low, high = SIDES["cuda" if self.plan.options.device.startswith("cuda") else "cpu"]
         side = math.ceil(math.sqrt(self.plan.area / (TILES_EACH * self.workers.slots())))
         return tiles(self.plan.crop, self.plan.options.tile_size or min(max(side, low), high))
 
     def trace(self, film: DeviceFilm | AovFilm, work: list[Work], due: Callable[[], bool]) -> Steps:
-        """Trace, as Tracer defines. Whole tiles are written to the film here, so that no pixel is ever half done."""
+        """Trace as Tracer defines. The film receives whole tiles only, so that each step may say that no tile is running."""
         jobs: Iterable[Job]
         if isinstance(film, AovFilm):
             views = [film.view(name) for name in self.plan.options.aov]
@@ -91,7 +91,7 @@ class DistributedRenderer:
             for done in running:
                 if done is not None:
                     (_, part, *_), reply = done
-                    _check_kind(reply, self.kind)  # a worker may have joined since
+                    _check_kind(reply, self.kind)  # a new worker may have connected meanwhile
                     self.tiles_by[reply[0]] += 1
                     total += part.total
                     for view, array in zip(views, reply[2], strict=True):
@@ -121,11 +121,11 @@ def workers_for(plan: Plan) -> ExecutorWorkers:
 
 
 def _waited_for(replies: list[Reply], waited: float) -> dict[str, float]:
-    """Return the seconds of the slowest worker, limited to the wait, since it may have prepared the scene earlier."""
+    """Return the slowest worker's seconds of each stage. A worker may have prepared the scene earlier, so `waited` is the upper limit."""
     seconds: dict[str, float] = max((reply[2]["seconds"] for reply in replies), key=lambda each: max(each.values()))
     return {name: min(value, waited) for name, value in seconds.items()}
 
 
 def _check_kind(reply: Reply, kind: str) -> None:
     if reply[1] != kind:
-        raise InputError(f"the workers' devices are of several kinds, which do not round alike: {kind}, and at {reply[0]} {reply[1]}")
+        raise InputError(f"the workers' devices are of several kinds, which round differently: {kind}, and {reply[1]} of {reply[0]}")

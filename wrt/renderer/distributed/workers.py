@@ -1,7 +1,7 @@
 """Workers of a distributed render: the devices of this machine, or the workers of an executor.
 
-A tile is a pure function of the scene, the samples to take and its previous state (Prepared.trace_tile). Any worker can compute it, and
-repeat it after another has died. A worker process prepares a scene once, and caches it under its digest.
+A tile is a pure function of the scene, the samples to trace and the tile's previous state (Prepared.trace_tile). Any worker can compute
+it, and repeat it after another worker died. A worker process prepares a scene once, and caches it under its digest.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from typing import Any
 from wrt.core.device import start
 from wrt.core.errors import InputError, SceneWarning
 from wrt.core.threads import Pool
-from wrt.renderer.distributed.installed import INSTALLED, difference
+from wrt.renderer.distributed.installed import INSTALLED, SAME_EVERYWHERE, difference
 from wrt.renderer.options import Options
 from wrt.renderer.plan import plan_of
 from wrt.renderer.prepare import Prepared, kind_of, prepare
-from wrt.scene.digest import scene_digest
+from wrt.scene.digest import digest
 from wrt.scene.model import Scene
 from wrt.scene.pack import pack, unpack
 
-QUEUED = 3  # Submitted calls for each slot, so that no worker is idle.
-SLOTS = 32  # Slots of an executor that does not know its number.
-DEAD_SECONDS = 5.0  # Until the death of a process is an error.
-CACHED = 2  # Prepared scenes of a worker process.
+QUEUED = 3  # Submitted jobs for each slot, so that no worker is idle.
+SLOTS = 32  # Assumed number of slots of an executor that does not state it.
+DEAD_SECONDS = 5.0  # Seconds without a reply after the death of a process, until it is an error.
+CACHED = 2  # Largest number of prepared scenes in a worker process.
 OPTIONS_SENT = ("device", "accel", "aov", "target_error", "triangle", "box", "instancing", "accel_options")
 LOCAL: dict[str, Any] = {"executor": None, "devices": None, "checkpoint": None, "resume": False, "progress": None}
 
@@ -46,12 +46,11 @@ ReplyFuture = Any  # A Future of concurrent.futures or dask.distributed; its res
 class ExecutorWorkers:
     """The workers of any concurrent.futures.Executor: threads, processes, or other machines with wrt.
 
-    A job has the digest of its scene; a worker process that does not know it requests the scene by the reply None.
-    """
+    A job contains the digest of its scene. A worker process without that scene replies None, which requests the scene."""
 
     def __init__(self, executor: Any, key: str, package: Package) -> None:
         self.executor, self.key, self.package = executor, key, package
-        self.requests = 0  # for the scene
+        self.requests = 0  # number of open requests for the scene
         self.dead_since: float | None = None
 
     def slots(self) -> int:
@@ -59,20 +58,20 @@ class ExecutorWorkers:
         return int(getattr(self.executor, "_max_workers", None) or SLOTS)
 
     def _scene(self) -> Any:
+        """Return the package to send with the next job, or None if no worker requests it."""
         if not self.requests:
             return None
         self.requests -= 1
         return self.package
 
     def submit(self, job: Job) -> ReplyFuture:
-        """Submit a job."""
         try:
             return self.executor.submit(call, self.key, self._scene(), *job)
         except (BrokenExecutor, RuntimeError) as error:
             raise InputError(str(error), argument="executor") from error
 
     def finished(self, pending: Iterable[ReplyFuture]) -> Iterable[ReplyFuture]:
-        """Return futures that are done; wait a tenth of a second at most."""
+        """Wait a tenth of a second at most, and return the futures that are done."""
         done = wait(pending, timeout=0.1, return_when=FIRST_COMPLETED).done
         processes = dict(getattr(self.executor, "_processes", None) or {})
         if done or all(process.is_alive() for process in processes.values()):
@@ -80,12 +79,12 @@ class ExecutorWorkers:
         elif self.dead_since is None:
             self.dead_since = time.monotonic()
         elif time.monotonic() - self.dead_since > DEAD_SECONDS:
-            # Killed while it wrote a reply: the pool would wait for the rest forever.
+            # The process was killed while it wrote a reply, and the pool would wait forever for the rest of the reply.
             raise InputError("a process of the pool was killed", argument="executor")
         return done
 
     def result(self, future: ReplyFuture) -> Reply | None:
-        """Return the reply of a finished future; None: its job must be submitted again. Raises the exception of the worker."""
+        """Return the reply of a finished future; None: the job must be submitted again. Raises the worker's exception."""
         try:
             reply = future.result()
         except BrokenExecutor as error:
@@ -94,14 +93,13 @@ class ExecutorWorkers:
         return reply
 
     def ready(self) -> bool:
-        """Return True if there are workers for jobs. Raises InputError if that will not change."""
+        """Return True if there are workers for jobs. Raises InputError if none will come."""
         return True
 
     def run(self, jobs: Iterable[Job]) -> Generator[tuple[Job, Reply] | None, None, None]:
-        """Run jobs, and yield each with its reply once it is done, in any order; None about every tenth of a second without a reply.
+        """Run jobs. Yield each job with its reply, in any order; without a reply, yield None about every tenth of a second.
 
-        Jobs are drawn from `jobs` shortly before they are submitted. When the caller closes the generator, waiting jobs are cancelled.
-        """
+        A job is taken from `jobs` just before it is submitted. When the caller closes the generator, waiting jobs are cancelled."""
         coming, again = iter(jobs), deque[Job]()
         pending: dict[ReplyFuture, Job] = {}
         limit, done = QUEUED * self.slots(), False
@@ -126,13 +124,13 @@ class ExecutorWorkers:
             self.cancel(pending)
 
     def cancel(self, futures: Iterable[ReplyFuture]) -> None:
-        """Cancel futures that have not begun."""
+        """Cancel the futures whose jobs have not begun."""
         for future in futures:
             future.cancel()
 
 
 class DeviceWorkers(ExecutorWorkers):
-    """Several devices of this machine: a thread for each, which prepares the scene on its device."""
+    """Several devices of this machine. Each has a thread, which prepares the scene on its device."""
 
     def __init__(self, scene: Scene, options: Options) -> None:
         assert options.devices is not None
@@ -150,25 +148,24 @@ class DeviceWorkers(ExecutorWorkers):
         i, prepared = self.free.get()
         try:
             if prepared is None:
-                with self.lock:  # so that the first device of a kind compiles for the others
+                with self.lock:  # the first device of a kind compiles the kernels for all devices of that kind
                     prepared = _prepared(self.scene, replace(self.options, device=self.names[i]))
             return f"{self.names[i]} ({i})", kind_of(prepared.device), getattr(prepared, method)(*arguments)
         finally:
             self.free.put((i, prepared))
 
 
-# --- what is sent, and the worker's side ------------------------------------------------------------------------------
+# --- packages, and functions that workers run -------------------------------------------------------------------------
 
 
 def packaged(scene: Scene, options: Options, kernels: str) -> tuple[str, Package]:
-    """Return the key of a scene with its options, equal for equal pixels, and the package for workers.
+    """Return a key of a scene with its options (equal keys mean equal pixels), and the package for workers.
 
-    kernels: hash of the kernels; a worker whose kernels have another hash refuses the package.
-    """
+    kernels: hash of the kernels. A worker whose kernels have another hash refuses the package."""
     text, arrays = pack(scene)
     package = {"installed": INSTALLED, "kernels": kernels, "options": {name: getattr(options, name) for name in OPTIONS_SENT},
                "scene": text}
-    key = sha256(f"{package}{scene_digest(scene)}".encode()).hexdigest()
+    key = sha256(f"{package}{digest(scene)}".encode()).hexdigest()
     return key, {**package, "arrays": arrays}
 
 
@@ -177,10 +174,9 @@ _lock = threading.Lock()
 
 
 def call(key: str, package: Package | None, method: str, *arguments: object) -> Reply | None:
-    """Call a method of the Prepared cached under `key`, on a worker; prepare it from `package` if it is missing.
+    """Call a method of the Prepared that this worker caches under `key`; if it is missing, prepare it from `package` first.
 
-    Returns None if it is missing and there is no package. Raises InputError if the installation differs from the caller's.
-    """
+    Returns None if the Prepared is missing and there is no package. Raises InputError if the caller has a different installation."""
     with _lock:
         if key not in _ready:
             if package is None:
@@ -195,17 +191,17 @@ def call(key: str, package: Package | None, method: str, *arguments: object) -> 
 
 def _unpacked(package: Package) -> Prepared:
     if differs := difference(package["installed"], INSTALLED):
-        raise InputError(f"worker {worker_name()} has {differs}: all must have the same")
+        raise InputError(f"worker {worker_name()} has {differs}", hint=SAME_EVERYWHERE)
     prepared = _prepared(unpack(package["scene"], package["arrays"]), Options(**package["options"]))
     if prepared.plan.kernels_hash() != package["kernels"]:
-        raise InputError(f"worker {worker_name()} makes other kernels of the same code", hint="install the same warp-lang everywhere")
+        raise InputError(f"worker {worker_name()} generates other kernels from the same code", hint="install the same warp-lang everywhere")
     return prepared
 
 
 def _prepared(scene: Scene, options: Options) -> Prepared:
     plan, device = plan_of(scene, options), start(options.device)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", SceneWarning)  # reported by the caller
+        warnings.simplefilter("ignore", SceneWarning)  # the caller reports the warnings
         return prepare(plan, device)
 
 

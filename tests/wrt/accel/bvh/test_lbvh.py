@@ -1,4 +1,4 @@
-"""The builder along a Morton curve: one tree on every device, no deeper than the stack, whatever it is over."""
+"""The LBVH builder makes the same tree on every device, and no tree is deeper than the traversal stack."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FIELDS = "t", "u", "v", "prim_id"
 
 
 def geometry_at(places: np.ndarray, size: float = 0.1) -> Geometry:
-    """A triangle at each place."""
+    """Return a geometry with a triangle at each place, (N, 3)."""
     corners = places[:, None] + size * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 1]])
     vertices = corners.astype(np.float32).reshape(-1, 3)
     return Geometry(vertices, np.arange(len(vertices), dtype=np.int32).reshape(-1, 3), np.zeros((0, 4), np.float32))
@@ -45,7 +45,7 @@ def test_the_tree_is_one_and_fits_the_stack(name: str, max_leaf: int) -> None:
     assert nodes.device == parents.device == order.device == DEVICE
     rows = nodes.numpy()
     assert len(rows) == root.inner_nodes and root.height <= sum((bits_of(len(geometry))[0], 3 * bits_of(len(geometry))[1]))
-    check_binary(rows, len(geometry), root.height)  # a parent stands before its children
+    check_binary(rows, len(geometry), root.height)  # parents come before their children
     assert np.array_equal(np.sort(order.numpy()), np.arange(len(geometry)))
     above = parents.numpy()
     for side in "01":

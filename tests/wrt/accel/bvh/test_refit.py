@@ -1,4 +1,4 @@
-"""Refit: a tree that follows its vertices answers as exactly as a new one, and tells what it has come to cost."""
+"""Refit: hits in a refitted tree are as exact as in a new tree, and Refit.growth is the growth of the SAH cost."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_cost_grows_as_the_motion_mixes_and_a_new_tree_is_built_past_the_thresho
     mixed = BALL.vertices[np.random.default_rng(0).permutation(len(BALL.vertices))]
     done = accel.refit(mixed)
     assert done.growth > 2.0 and not done.rebuilt and accel.stats.sah_cost == pytest.approx(done.growth * built_cost)
-    assert accel.refit(BALL.vertices).growth == pytest.approx(1.0)  # measured against the tree as it was built
+    assert accel.refit(BALL.vertices).growth == pytest.approx(1.0)  # relative to the last build
     done = accel.refit(mixed, rebuild_at=1.5)
     assert done.rebuilt and done.growth > 2.0 and accel.stats.sah_cost < done.growth * built_cost
     assert accel.refit(mixed, rebuild_at=1.5).rebuilt is False
@@ -69,7 +69,7 @@ def test_spheres_stay_where_they_are() -> None:
     assert hits.prim_id[0] == len(BALL.faces) and hits.t[0] == pytest.approx(5.5)
 
 
-def test_the_caller_may_change_his_array() -> None:
+def test_the_caller_may_change_its_array() -> None:
     vertices = BALL.vertices.copy()
     accel = build(BALL, "bvh2")
     accel.refit(vertices)

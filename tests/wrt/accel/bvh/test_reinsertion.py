@@ -1,4 +1,4 @@
-"""What moving subtrees gains. That the trees are right is tested for every builder: tests/kernels/build/test_bvh2.py."""
+"""Reinsertion reduces the cost of trees. tests/kernels/build/test_bvh2.py tests for every builder that trees are valid."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from wrt.scene.shapes import icosphere
 
 
 def room() -> Geometry:
-    """Small things everywhere, and large triangles through all of them, as in architecture."""
+    """Return small objects everywhere and large triangles across all of them, as in a model of a building."""
     rng = np.random.default_rng(8)
     ball = icosphere(2)
     places, walls = rng.random((200, 1, 3)), rng.random((40, 3, 3))
@@ -32,7 +32,7 @@ def test_the_largest_boxes_bring_much_of_the_gain(accel: str) -> None:
 
 @pytest.mark.parametrize("effort", [EVERY_NODE, LARGEST_NODES], ids=["every", "largest"])
 def test_what_the_areas_fell_by_is_what_they_fell_by(effort: Effort) -> None:
-    """They are kept up to date move by move."""
+    """The kernel updates the areas after each move."""
     tree = build_binary(room(), BvhOptions("binned", 1), 1)
     before = links_of(tree)
     links, _, fell = optimized(tree, effort, 1)

@@ -1,4 +1,4 @@
-"""Wide trees over few primitives, which no kernel makes."""
+"""Wide trees over few primitives, which are built in Python."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ pytestmark = cpu_only
 
 
 def soup(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Boxes of very different sizes, some of them flat, some the same."""
+    """Return boxes of very different sizes; some are flat, and some are equal."""
     rng = np.random.default_rng(seed)
     lo = rng.normal(size=(n, 3)).astype(np.float32)
     size = np.exp(rng.normal(-2.0, 2.0, (n, 3))) * (rng.random((n, 3)) > 0.2)
@@ -38,7 +38,7 @@ def assert_is_tree(tree: WideTree, lo: np.ndarray, hi: np.ndarray, options: BvhO
     assert tree.leaves == (tree.children < 0).sum()
 
     def below(node: int) -> tuple[list[int], int]:
-        """The primitives, each box being that of what is below it, and the height."""
+        """Return the primitives and the height of a subtree; check that each box is the box around the subtree."""
         found, height = [], 0
         for place, reference in enumerate(tree.children[node]):
             if reference == EMPTY:
@@ -54,7 +54,7 @@ def assert_is_tree(tree: WideTree, lo: np.ndarray, hi: np.ndarray, options: BvhO
             assert np.array_equal(tree.lo[node, place], lo[items].min(axis=0))
             assert np.array_equal(tree.hi[node, place], hi[items].max(axis=0))
             found, height = found + items, max(height, deeper)
-        there = tree.children[node] != EMPTY  # what any-hit queries visit first stands last: leaves, and of those the largest
+        there = tree.children[node] != EMPTY  # any-hit queries visit the last child first: leaves before inner nodes, the largest first
         keys = list(zip(tree.children[node][there] < 0, tree.areas[node][there], strict=True))
         assert keys == sorted(keys)
         return found, height + 1
@@ -83,12 +83,12 @@ def test_costs_and_boxes_beyond_all_numbers() -> None:
             options = options_for(8, max_leaf, costs)
             assert_is_tree(small_tree(lo, hi, options), lo, hi, options)
     lo, hi = soup(40)
-    lo[7] = np.nan  # as of a Geometry made by hand: it ends
+    lo[7] = np.nan  # a Geometry may hold NaN: the build must still end
     check_wide(small_tree(lo, hi, options_for(8)).children, 40, 8)
 
 
 def cost(tree: WideTree, width: int) -> float:
-    """Nodes and rows that a random line through the root's box meets."""
+    """Return the expected number of nodes and rows that a random line through the root's box visits."""
     count = np.where(tree.children < 0, leaf_count.func(tree.children), 0)
     return 1.0 + float((tree.areas * np.where(tree.children > 0, 1, -(-count // width))).sum()) / tree.root_area
 
@@ -98,7 +98,7 @@ def test_two_clusters_are_two_leaves() -> None:
     tree = small_tree(lo, lo + 1.0, options_for(8))
     assert tree.leaves == 2 and len(tree.children) == 1
     assert sorted(sorted(row) for row in tree.order.tolist()) == [[*range(8)], [*range(8, 16)]]
-    # Half the surfaces: of two cubes, and of the box around both.
+    # Half the surface areas of the two cubes, and of the box around both.
     assert cost(tree, 8) == pytest.approx(1.0 + 2.0 * 3.0 / (11.0 + 11.0 + 1.0))
 
 
@@ -141,7 +141,7 @@ def test_options_are_refused_as_ever(n: int) -> None:
 
 
 def nested(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles, each half as large as the one before: a tree over them is a chain."""
+    """Return triangles, each half as large as the previous triangle, so that a tree over them is a chain."""
     size = np.float32(0.5) ** np.arange(n, dtype=np.float32)
     corners = size[:, None, None] * np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], np.float32)
     return corners.reshape(-1, 3), np.arange(3 * n).reshape(-1, 3)

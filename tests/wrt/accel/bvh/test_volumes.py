@@ -1,4 +1,4 @@
-"""Trees with other volumes: they hold what is below them, are as tight as they should be, and cost what lines pay."""
+"""BVHs of spheres and 14-DOPs: volumes contain their subtrees and are tight, and random lines take as many steps as the SAH cost."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ KINDS = ["soup", "coincident", "flat", "progression", "mixed", "only_spheres", "
 
 
 def below(nodes: np.ndarray, order: np.ndarray) -> list[tuple[int, str, np.ndarray]]:
-    """(node, side, the primitives in that subtree) of every child that exists."""
+    """Return (node, side, primitives in the subtree) for every existing child."""
     out, inside = [], {}
     for i in reversed(range(len(nodes))):
         for side in "01":
@@ -33,7 +33,7 @@ def below(nodes: np.ndarray, order: np.ndarray) -> list[tuple[int, str, np.ndarr
 
 
 def of_all_sizes(rng: np.random.Generator) -> Geometry:
-    """Triangles that make the builder "refined" move some subtrees."""
+    """Return triangles for which the builder "refined" moves some subtrees."""
     n = 2000
     corners = rng.uniform(-1.0, 1.0, (n, 1, 3)) + rng.uniform(-1.0, 1.0, (n, 3, 3)) * 10.0 ** rng.uniform(-3.0, 0.0, (n, 1, 1))
     faces = np.arange(3 * n, dtype=np.int32).reshape(-1, 3)
@@ -67,7 +67,7 @@ def test_planes_hold_the_triangles_and_spheres_below_them(kind: str) -> None:
 
 
 def test_a_sphere_around_a_ball_is_hardly_larger_than_the_ball() -> None:
-    # Half of it each: the smallest sphere around half a ball is the ball's own.
+    # Each child has half of the ball, and the smallest sphere around half a ball is the whole ball.
     nodes = build(icosphere(4), "bvh2_sphere").built.arrays["nodes"]
     for side in "01":
         assert 0.98 < nodes[0]["sphere_" + side][3] < 1.06
@@ -92,7 +92,7 @@ def test_the_surface_of_a_14_dop_that_cuts_nothing_is_the_box_and_of_a_flat_one_
 
 
 def test_the_cost_is_that_of_random_lines() -> None:
-    # Lines through the root's box: the 14-DOPs cost them what their surfaces say, nodes and primitives counted, all hits taken.
+    # Random lines through the root's box visit as many nodes and primitives as the areas of the 14-DOPs predict.
     rng = np.random.default_rng(3)
     corners = rng.uniform(-1.0, 1.0, (300, 1, 3)) + 0.1 * rng.normal(size=(300, 3, 3))
     geometry = Geometry(corners.reshape(-1, 3).astype(np.float32), np.arange(900, dtype=np.int32).reshape(-1, 3),

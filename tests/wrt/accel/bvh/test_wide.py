@@ -57,7 +57,7 @@ def test_arrays_of_a_file_are_checked(name: str) -> None:
     inner = np.argwhere(children > 0)
     leaf = np.argwhere(children < 0)
     for (i, j), value, message in [
-        (inner[0], 0, (None, "no tree")), (inner[0], len(children), (None, "leads out")), (inner[-1], 1, (None, "leads out")),
+        (inner[0], 0, (None, "form a tree")), (inner[0], len(children), (None, "leads out")), (inner[-1], 1, (None, "leads out")),
         (leaf[0], 0, (None, "other primitives")), (leaf[0], children[tuple(leaf[0])] - 64, (None, "other primitives")),
         (leaf[1], -(2**31), (None, "other primitives")), (leaf[0], 1, (None, "leads out"))]:
         spoiled = children.copy()
@@ -70,7 +70,7 @@ def test_arrays_of_a_file_are_checked(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["bvh4", "bvh8"])
 def test_a_child_that_does_not_exist_has_no_box(name: str) -> None:
-    # A ray that entered it would begin again at the root.
+    # A ray that entered a missing child would restart at the root.
     accel = build(BALL, name)
     none = accel._references(accel.built) == 0
     assert none.any()
@@ -122,7 +122,7 @@ def test_options_out_of_range_are_refused(options, message: Refusal) -> None:
 
 @pytest.mark.parametrize("name", WIDE)
 def test_any_number_of_threads_makes_the_same_nodes_and_rows(name: str) -> None:
-    ball = icosphere(6)  # more triangles than one thread takes at a time
+    ball = icosphere(6)  # more triangles than one job of a thread
     one, *others = (build(ball, name, threads=threads).data for threads in (1, 2, 3))
     for other in others:
         assert one.nodes.numpy().tobytes() == other.nodes.numpy().tobytes()

@@ -1,4 +1,4 @@
-"""Calls with NumPy arrays: what is read in place, what is converted, where the answers go, and what a call costs beside tracing."""
+"""Calls with NumPy arrays: which are read in place or converted, where results go, and the overhead of a call."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from wrt.accel.queries.answers import Hits
 from wrt.accel.queries.batches import FEWEST
 from wrt.accel.scenes.build import build
 from wrt.core.arrays import to_numpy, to_warp
-from wrt.core.errors import InputError
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 
@@ -60,7 +59,7 @@ def frozen(a: np.ndarray) -> np.ndarray:
 @cpu_only
 @pytest.mark.parametrize("n", [1, MANY])
 def test_the_way_of_a_query_is_short(n: int) -> None:
-    """The Python files between the call and the launch: those that wrt.accel.queries names, and what they use of wrt.core."""
+    """Between call and launch, Python runs only the files that the docstring of wrt.accel.queries names, and wrt.core."""
     accel, rays, files = build(icosphere(3)), some_rays(n), set()
     accel.closest_hit(*rays, threads=1)
 
@@ -119,7 +118,7 @@ def test_one_number_for_all_segments_is_as_an_array_of_it(ball: Accelerator, n: 
         assert isinstance(on_warp.t, wp.array) and bits(on_warp) == bits(asked)
 
 
-# --- where the answers go ---------------------------------------------------------------------------------------------
+# --- where results go -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("as_warp", [False, True])
@@ -144,7 +143,7 @@ def test_answers_go_where_the_caller_says(ball: Accelerator, n: int, as_warp: bo
 @pytest.mark.parametrize(("field", "array", "message"), [
     ("t", np.zeros(4, np.float32), ("out.t", "NumPy array (3,)")),
     ("t", np.zeros(3), ("out.t", "float32")),
-    ("u", np.zeros((3, 1), np.float32), ("out.u", "(3,)")), ("v", np.zeros(6, np.float32)[::2], ("out.v", "gaps")),
+    ("u", np.zeros((3, 1), np.float32), ("out.u", "(3,)")), ("v", np.zeros(6, np.float32)[::2], ("out.v", "contiguous")),
     ("v", frozen(np.zeros(3, np.float32)), ("out.v", "writeable")), ("prim_id", np.zeros(3, np.int64), ("out.prim_id", "int32")),
     ("prim_id", [0, 0, 0], ("out.prim_id", "NumPy array")), ("t", None, ("out.t", "NumPy array")),
     ("t", "warp", ("out.t", "NumPy array (3,)")),
@@ -159,7 +158,7 @@ def test_room_that_does_not_fit_is_named(ball: Accelerator, field: str, array: A
 
 @pytest.mark.parametrize("as_warp", [False, True])
 def test_arrays_that_share_memory_are_refused(ball: Accelerator, as_warp: bool) -> None:
-    """Also where they have the same bytes as other types, and where only a part is shared; one behind the other is right."""
+    """Arrays of different types or that share only a part are refused, too. Adjacent arrays are accepted."""
     rays: tuple[Any, ...] = some_rays(4)
     memory, own = np.zeros(16, np.float32), [np.zeros(4, np.float32) for _ in range(2)]
     whole: Any = to_warp(memory).to(DEVICE) if as_warp else memory
@@ -171,10 +170,10 @@ def test_arrays_that_share_memory_are_refused(ball: Accelerator, as_warp: bool) 
         return part.view(wp.int32) if as_warp else part.view(np.int32)
 
     t = whole[:4]
-    for room, named in (((t, own[0], t, ids(8)), "out.t and out.v"), ((own[0], own[1], t, ids(0)), "out.v and out.prim_id"),
-                        ((own[0], t, whole[3:7], ids(8)), "out.u and out.v"), ((whole[5:9], own[0], own[1], ids(2)),
-                                                                             "out.t and out.prim_id")):
-        with pytest.raises(InputError, match=named.replace(" and", " shares memory with")):
+    for room, named in (((t, own[0], t, ids(8)), ("out.t", "out.v")), ((own[0], own[1], t, ids(0)), ("out.v", "out.prim_id")),
+                        ((own[0], t, whole[3:7], ids(8)), ("out.u", "out.v")), ((whole[5:9], own[0], own[1], ids(2)),
+                                                                             ("out.t", "out.prim_id"))):
+        with refused(*named):
             ball.closest_hit(*rays, out=Hits(*room))
     room = t, whole[4:8], whole[12:], ids(8)
     assert bits(ball.closest_hit(*rays, out=Hits(*room))) == bits(ball.closest_hit(*rays))
@@ -187,7 +186,7 @@ def test_room_of_another_kind_is_named(ball: Accelerator) -> None:
         ball.closest_hit(*rays, out=np.zeros(3))  # type: ignore[arg-type]
     with refused("out", "NumPy array (3,)"):
         ball.any_hit(*rays, out=np.zeros(3, np.float32))
-    with pytest.raises(InputError, match=rf"out must be a Warp array \(3,\) of bool, on {DEVICE}, without gaps, got an array"):
+    with refused("out", "Warp array (3,)"):
         ball.any_hit(*on_warp, out=np.zeros(3, bool))
     for wrong in (wp.zeros(4, dtype=wp.bool, device=DEVICE), wp.zeros(3, dtype=wp.int32, device=DEVICE),
                   wp.zeros(6, dtype=wp.bool, device=DEVICE)[::2]):
@@ -204,30 +203,30 @@ def test_room_of_another_kind_is_named(ball: Accelerator) -> None:
 def test_the_first_row_that_is_wrong_is_named(ball: Accelerator, n: int, form: str) -> None:
     good = *some_rays(n), np.zeros(n, np.float32), np.ones(n, np.float32)
     last = n - 1
-    for which, value, rows, message in (
-            (0, np.nan, (last,), f"origins must be finite; row {last} is"), (0, -np.inf, (n // 2, last), f"row {n // 2} is"),
-            (0, 1.1e37, (last, 7), r"origins must be within 1e\+37; row 7 is"),
-            (1, np.inf, (0, last), "directions must be finite; row 0 is"),
-            (1, 0.0, (n - 2, last), f"directions must not be zero; row {n - 2} is"),
-            (2, np.nan, (last,), "t_min must not be NaN or below 0"), (2, -1e-30, (last,), "t_min must not be NaN or below 0"),
-            (3, np.nan, (last,), "t_max must not be NaN")):
+    for which, value, rows, *message in (
+            (0, np.nan, (last,), "origins", f"finite; row {last} is"), (0, -np.inf, (n // 2, last), "origins", f"row {n // 2} is"),
+            (0, 1.1e37, (last, 7), "origins", "within 1e+37; row 7 is"),
+            (1, np.inf, (0, last), "directions", "finite; row 0 is"),
+            (1, 0.0, (n - 2, last), "directions", f"zero; row {n - 2} is"),
+            (2, np.nan, (last,), "t_min"), (2, -1e-30, (last,), "t_min", "below 0"),
+            (3, np.nan, (last,), "t_max", "NaN")):
         arrays = [array.copy() for array in good]
         arrays[which][list(rows)] = value
         if form != "as it is":
             arrays = [FORMS[form](array) for array in arrays]
         for threads in (1, 2):
             for query in (ball.closest_hit, ball.any_hit):
-                with pytest.raises(InputError, match=message):
+                with refused(*message):
                     query(*arrays, threads=threads)  # type: ignore[operator]
     arrays = [array.copy() for array in good]
-    arrays[3][::2] = -np.inf  # an empty segment is no error
+    arrays[3][::2] = -np.inf  # an empty segment is valid
     assert (ball.closest_hit(*arrays).prim_id[::2] == -1).all()
 
 
 def test_origins_are_named_before_what_follows(ball: Accelerator) -> None:
     origins, directions = some_rays(MANY)
     origins[-1], directions[0], directions[1] = np.nan, 0.0, np.inf
-    with pytest.raises(InputError, match=f"origins must be finite; row {MANY - 1} is"):
+    with refused("origins", f"row {MANY - 1} is"):
         ball.closest_hit(origins, directions, np.full(MANY, -1.0), threads=2)
     with refused("directions", "row 1"):
         ball.closest_hit(origins[:-1], directions[:-1], threads=2)
@@ -297,7 +296,7 @@ def test_rays_in_place_need_no_memory_of_their_size() -> None:
     out, dark = accel.closest_hit(origins, directions), accel.any_hit(origins, directions)
 
     def peak(*arguments: Any, **options: Any) -> float:
-        """Bytes a ray."""
+        """Return the peak memory of a call in bytes per ray."""
         accel.closest_hit(*arguments, threads=1, **options)
         tracemalloc.start()
         try:
@@ -307,7 +306,7 @@ def test_rays_in_place_need_no_memory_of_their_size() -> None:
             tracemalloc.stop()
 
     assert peak(origins, directions, 0.0, 5.0, out=out) < 1.0
-    assert 16.0 <= peak(origins, directions) < 17.0  # the answers
+    assert 16.0 <= peak(origins, directions) < 17.0  # the results
     assert peak(origins.astype(np.float64), np.asfortranarray(directions), np.zeros(n), 5.0, out=out) < 1.0
     assert dark.nbytes == n
 
@@ -325,7 +324,7 @@ def test_a_small_call_wakes_no_thread(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_call_packs_no_launch_and_makes_no_warp_array(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Each costs as much as the rest of a call of one ray.
+    # Each of these costs as much as the rest of a call with one ray.
     accel = build(icosphere(1), "bvh8", device="cpu")
     asked = [some_rays(n) for n in (1, 5000)]
     expected = [(bits(accel.closest_hit(*rays)), accel.any_hit(*rays).tobytes()) for rays in asked]

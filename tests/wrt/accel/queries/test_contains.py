@@ -17,7 +17,7 @@ from wrt.scene import shapes
 
 
 def lattice(low: float, high: float, n: int) -> np.ndarray:
-    """Points in rows along the axes, so that rays between them and corners run through edges."""
+    """Return a lattice of points along the axes, so that many rays pass through edges."""
     return np.stack(np.meshgrid(*[np.linspace(low, high, n)] * 3), axis=-1).reshape(-1, 3)
 
 
@@ -80,7 +80,7 @@ def test_a_mesh_that_a_refit_in_place_opens_is_open() -> None:
     box = shapes.box()
     corners = box.vertices[box.faces].reshape(-1, 3)
     accel = wrt.build((corners, np.arange(36).reshape(-1, 3)), "bvh2", DEVICE)
-    for scale in (1.0, 3.0):  # bounds, too, are those of now
+    for scale in (1.0, 3.0):  # the bounds are computed again, too
         accel.refit(points_of(scale * corners), in_place=True)
         assert wrt.contains(accel, [[0.1, 0.2, 0.3], [0.6, 0.0, 0.0]]).tolist() == [True, scale == 3.0]
     corners[:3] += np.float32(0.1)

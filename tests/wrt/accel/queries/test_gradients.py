@@ -1,4 +1,4 @@
-"""Derivatives of hits: against central differences, with NumPy and on a tape."""
+"""Gradients of hits agree with central differences, with NumPy and on a wp.Tape."""
 
 from __future__ import annotations
 
@@ -22,28 +22,28 @@ vec3s = partial(wp.array, dtype=wp.vec3, device=DEVICE)
 
 
 def soup(rng: np.random.Generator, n: int = 400) -> wrt.Mesh:
-    """Triangles of all shapes about the origin, a tenth of them needles."""
+    """Return triangles of all shapes around the origin; a tenth are needles."""
     corners = rng.normal(size=(n, 3, 3)) * rng.uniform(0.05, 1.0, (n, 1, 1)) + rng.normal(size=(n, 1, 3))
     corners[::10, 2] = corners[::10, 1] + 0.02 * (corners[::10, 2] - corners[::10, 1])
     return wrt.Mesh(np.float32(corners.reshape(-1, 3)), np.arange(3 * n, dtype=np.int32).reshape(-1, 3))
 
 
 def rays(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """From around the origin to its neighbourhood, with directions of all lengths."""
+    """Return rays from outside towards the neighbourhood of the origin, with directions of all lengths."""
     origins = rng.normal(size=(n, 3)) * 3.0
     return np.float32(origins), np.float32((rng.normal(size=(n, 3)) - origins) * rng.uniform(0.1, 10.0, (n, 1)))
 
 
 def hit_of(corners: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """t, u, v and the point by an own road: the solution of o + t d = v0 + u (v1 - v0) + v (v2 - v0), (N, 6) float64."""
+    """Return t, u, v and the point, (N, 6) float64, as solutions of o + t d = v0 + u (v1 - v0) + v (v2 - v0), without wrt."""
     matrix = np.stack([direction, corners[:, 0] - corners[:, 1], corners[:, 0] - corners[:, 2]], axis=2)
     tuv = np.linalg.solve(matrix, (corners[:, 0] - origin)[..., None])[..., 0]
     return np.concatenate([tuv, origin + tuv[:, :1] * direction], axis=1)
 
 
 def by_differences(corners: np.ndarray, origin: np.ndarray, direction: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Derivatives of the weighted sum of each ray's t, u, v and point by its corners, origin and direction, (N, 5, 3): central
-    differences of float64, with Richardson's extrapolation and steps by the size of what is met."""
+    """Return the gradient of the weighted sum of each ray's t, u, v and point with respect to corners, origin and direction,
+    (N, 5, 3). It comes from central differences in float64 with Richardson's extrapolation; steps scale with the triangle."""
     size = np.abs(corners - corners[:, [1, 2, 0]]).max(axis=(1, 2))
     slim = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / size
     length = np.linalg.norm(direction, axis=1)
@@ -64,7 +64,7 @@ def by_differences(corners: np.ndarray, origin: np.ndarray, direction: np.ndarra
 
 
 def facing(corners: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Cosine between the ray and its triangle's normal."""
+    """Return the cosine of the angle between each ray and its triangle's normal."""
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return (normal * direction).sum(axis=1) / (np.linalg.norm(normal, axis=1) * np.linalg.norm(direction, axis=1))
 
@@ -74,8 +74,8 @@ def cotangents(rng: np.random.Generator, n: int) -> Cotangents:
 
 
 def test_against_central_differences_for_10_000_random_hits() -> None:
-    """Each ray has its own triangle, so that the sum at a vertex is the derivative of one ray; the error is relative to the norm
-    of all 15 derivatives of a ray."""
+    """Each ray has its own triangle, so that the gradient at a vertex is of one ray. The error is relative to the norm of all 15
+    derivatives of a ray."""
     rng = np.random.default_rng(0)
     mesh = soup(rng)
     accel = wrt.build(mesh)
@@ -94,7 +94,7 @@ def test_against_central_differences_for_10_000_random_hits() -> None:
     print(f"relative error of a ray's 15 derivatives: {error.max():.1e} at most, {np.median(error):.1e} median of {N} hits")
     assert error.max() < 1e-4
     assert np.median(error) < 1e-9
-    # The same hits at the vertices that they share
+    # The same hits on a mesh with shared vertices.
     whole = adjoint(accel.geometry, o, d, hits.prim_id[chosen], given)
     added = np.zeros((len(mesh.vertices), 3))
     np.add.at(added, mesh.faces[hits.prim_id[chosen]], found.vertices.reshape(N, 3, 3))
@@ -117,7 +117,7 @@ def test_misses_have_no_part_and_no_derivatives_whatever_is_given_for_them() -> 
 
 
 def test_a_ray_along_a_plane_and_a_triangle_without_area_have_none() -> None:
-    """At the plane the limit is infinite; nearly along it derivatives are large, and right."""
+    """In the plane the limit is infinite. Near the plane, derivatives are large and correct."""
     corners = np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 2, 2], [2, 2, 2], [3, 3, 3]])
     geometry = Geometry(corners, np.int32([[0, 1, 2], [3, 4, 5]]), np.zeros((0, 4)))
     o = np.float32([[-1.0, 0.2, 0.0], [2.0, 2.0, 5.0], [-1.0, 0.2, 1e-6]])
@@ -162,7 +162,7 @@ def test_what_is_refused() -> None:
                         ({"u": np.full(5, "a")}, ("u", "(5,)"))):
         with refused(*said):
             hits.gradients(**given)
-    with refused(what="do not know"):
+    with refused(what="have no rays"):
         pickle.loads(pickle.dumps(hits)).gradients(t=np.ones(5))
     ball = Geometry(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.float32([[0, 0, 0, 1]]))
     with refused("accel", "structure over one mesh"):
@@ -215,7 +215,7 @@ def test_what_a_tape_would_wait_for_in_vain_is_refused() -> None:
     structure, points = wrt.build(ball, "bvh2"), vec3s(ball.vertices, requires_grad=True)
     calls: list[tuple[Refusal, Callable[[], object]]] = [
         (("vertices", "normal has none"), lambda: structure.closest_hit(origins, directions).normal),
-        ((None, "vertices: give rays"), lambda: structure.closest_hit(origins.numpy(), directions.numpy())),
+        ((None, "pass rays as Warp arrays"), lambda: structure.closest_hit(origins.numpy(), directions.numpy())),
         (("vertices", "refit in place"), lambda: structure.refit(points, in_place=True))]
     structure.refit(points)
     for said, ask in calls:

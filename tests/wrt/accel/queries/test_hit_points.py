@@ -1,4 +1,4 @@
-"""Points, normals, coordinates and ids of hits, against exact arithmetic."""
+"""Points, normals, texture coordinates and ids of hits agree with exact arithmetic."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PROPERTIES = [name for name, value in vars(HitPoints).items() if isinstance(valu
 
 
 def triangles(rng: np.random.Generator, kind: str) -> np.ndarray:
-    """(60, 3, 3) corners."""
+    """Return the corners of 60 triangles, (60, 3, 3)."""
     corners = rng.uniform(-1.0, 1.0, (60, 1, 3)) + 0.5 * rng.normal(size=(60, 3, 3))
     if kind == "needles":
         way = corners[:, 1] - corners[:, 0]
@@ -40,7 +40,7 @@ def triangles(rng: np.random.Generator, kind: str) -> np.ndarray:
 
 
 def aimed(rng: np.random.Generator, corners: np.ndarray, kind: str) -> tuple[np.ndarray, np.ndarray]:
-    """Rays at points of the triangles; grazing: nearly within their planes."""
+    """Return rays towards points on the triangles. Kind "grazing": nearly in the planes of the triangles."""
     chosen = corners[rng.integers(0, len(corners), N)]
     target = (rng.dirichlet((1.0, 1.0, 1.0), N)[:, :, None] * chosen).sum(axis=1)
     size = np.abs(chosen - chosen.mean(axis=1, keepdims=True)).max(axis=(1, 2))[:, None]
@@ -69,7 +69,7 @@ def minus(a: list[Fraction], b: list[Fraction]) -> list[Fraction]:
 
 
 def meeting(corners: list[list[Fraction]], origin: list[Fraction], direction: list[Fraction]) -> list[Fraction] | None:
-    """The point that a ray and a triangle have in common; None where there is none, or more than one."""
+    """Return the intersection point of a ray and a triangle; None if they have no point or several points in common."""
     edges = minus(corners[1], corners[0]), minus(corners[2], corners[0])
     normal = cross(*edges)
     slope = dot(normal, direction)
@@ -88,7 +88,7 @@ def placed_corners(matrix: np.ndarray, corners: np.ndarray) -> list[list[Fractio
 
 
 def worst(hits: Any, corners_of: Any, origin: np.ndarray, direction: np.ndarray) -> tuple[int, float]:
-    """Of how many hits the true point is there, and the largest error over its bound."""
+    """Return the number of hits that have an exact point, and the largest ratio of an error to its bound."""
     point, error, found, most = hits.point, hits.point_error, 0, 0.0
     for i in np.nonzero(hits.prim_id >= 0)[0]:
         true = meeting(corners_of(hits.prim_id[i]), exact(origin[i]), exact(direction[i]))
@@ -209,7 +209,7 @@ def test_what_a_scene_says_of_a_hit(instances: bool) -> None:
     assert np.array_equal(hits.material[hit], flat.prim_material[prim_id]) and (hits.material[~hit] == -1).all()
     which = np.searchsorted([0, 12, 332, 652], prim_id, side="right") - 1
     assert np.array_equal(hits.object[hit], which) and np.bincount(which).min() > 50 and (hits.object[~hit] == -1).all()
-    for number, thing in enumerate(given.objects[1:], 1):  # the unit ball's uvs and normals are functions of its points
+    for number, thing in enumerate(given.objects[1:], 1):  # uvs and normals of the unit ball are functions of its points
         chosen = which == number
         inverse = np.linalg.inv(thing.transform)
         local = point[chosen] @ inverse[:3, :3].T + inverse[:3, 3]
@@ -236,14 +236,14 @@ def test_warp_arrays_give_warp_arrays_and_the_same_bits() -> None:
 
 
 def test_points_at_outlines_are_on_the_surface() -> None:
-    """Rays at corners, some of which pass the body by, to rounding: their planes are met outside of it."""
+    """Some rays towards corners miss the body by a rounding error: they meet the planes of its faces outside of the faces."""
     ball = shapes.icosphere(3)
     rng = np.random.default_rng(4)
     origin = np.float32(3.0 * rng.normal(size=(20_000, 3)))
     hits = wrt.build(ball).closest_hit(origin, np.float32(ball.vertices[rng.integers(0, len(ball.vertices), 20_000)] - origin))
     hit = hits.prim_id >= 0
     assert hit.sum() > 15_000 and np.linalg.norm(hits.point[hit].astype(np.float64), axis=1).max() < 1.0 + 2e-7
-    assert 1e-6 < hits.point_error[hit].max() < 1e-3  # which is as large as the move
+    assert 1e-6 < hits.point_error[hit].max() < 1e-3  # as large as the move onto the triangle
 
 
 def test_hits_are_of_the_shape_that_was_asked() -> None:
@@ -270,7 +270,7 @@ def test_hits_can_be_pickled() -> None:
     hits = wrt.build(shapes.icosphere(1)).closest_hit([[0.1, 0.2, 5.0]], [[0.0, 0.0, -1.0]])
     again = pickle.loads(pickle.dumps(hits))
     assert again.t == hits.t and again.prim_id == hits.prim_id
-    with refused(what="do not know"):
+    with refused(what="have no rays"):
         _ = again.point
 
 
@@ -283,7 +283,7 @@ def test_what_is_not_there() -> None:
                        ("instance", (None, "no instances"))):
         with refused(*said):
             getattr(hits, name)
-    with refused(what="do not know"):
+    with refused(what="have no rays"):
         _ = wrt.first_hits(wrt.build(shapes.icosphere(1)), 2, origin, direction).point
     assert wrt.build(scene()).closest_hit(np.zeros((0, 3)), np.zeros((0, 3))).point.shape == (0, 3)
 

@@ -1,4 +1,4 @@
-"""The self-test before the first launch whose arguments wrt makes by hand: it sees each assumption that no longer holds."""
+"""The self-test of hand-made launches detects each assumption about Warp that no longer holds."""
 
 from __future__ import annotations
 
@@ -54,14 +54,14 @@ def longer(data: int, ndim: int, shape: Any, strides: Any, array_t: Any = warp_p
 
 
 def other_size(launch: warp_private.Recorded) -> warp_private.Recorded:
-    """As if a kernel did not read its size from the place that wrt writes."""
+    """Simulate a Warp whose kernels read their size from another address."""
     bounds, code = type(launch.owners[1])(1), Code(launch.entry)
     called = Code(lambda _, args: code(ctypes.addressof(bounds), args))
     return launch._replace(entry=ctypes.cast(called, ctypes.c_void_p).value, owners=(launch.owners, bounds, code, called))
 
 
 def other_last(launch: warp_private.Recorded) -> warp_private.Recorded:
-    """As if there were another argument behind the last one."""
+    """Simulate a Warp whose launches have another argument after the last one."""
     return launch._replace(last=launch.last - 4)
 
 
@@ -72,11 +72,11 @@ def other_code(launch: warp_private.Recorded) -> warp_private.Recorded:
 
 @pytest.fixture
 def not_tested(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As in a process that has launched nothing."""
+    """Reset the state, as in a process without launches."""
     start("cpu")
     raw_launches.check_raw_launches()
     monkeypatch.setattr(raw_launches, "_test_once", made_once(raw_launches._test_once.__wrapped__))
-    monkeypatch.setattr(batches, "tracer", made_once(batches.Tracer))  # the others have workers that were tested
+    monkeypatch.setattr(batches, "tracer", made_once(batches.Tracer))  # existing tracers have tested workers
 
 
 def query() -> Any:
@@ -152,7 +152,7 @@ def test_a_command_without_its_parts_is_refused(name: str, monkeypatch: pytest.M
 
 @pytest.mark.usefixtures("not_tested")
 def test_a_write_beside_the_array_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One word before the array."""
+    """The write goes to the word before the array."""
     struct = warp_private.struct_record
 
     def longer(kind: Any, arrays: list[np.ndarray]) -> Any:

@@ -1,4 +1,4 @@
-"""Hits from inside a kernel of one's own."""
+"""Ray queries inside the user's own kernels."""
 
 import ctypes
 
@@ -14,7 +14,7 @@ from wrt.scene import shapes
 
 
 def make_kernel(query, decorate):
-    """closest_hit and any_hit of rays."""
+    """Make a kernel that calls closest_hit and any_hit for each ray."""
 
     def asking(world: query.World, origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3),
                t_min: wp.array(dtype=float), t_max: wp.array(dtype=float), t: wp.array(dtype=float),
@@ -63,7 +63,7 @@ def test_one_query_is_for_all_structures_of_a_kind_and_follows_a_refit() -> None
 def test_a_kernel_that_fuses_says_so_and_hits_nothing(capfd: pytest.CaptureFixture[str]) -> None:
     accel = wrt.build(shapes.icosphere(1), "bvh2")
     asked = np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32), np.zeros(1, np.float32), np.full(1, np.inf, np.float32)
-    # As CUDA's compiler does by Warp's default; the CPU's compiler needs the option.
+    # By default, Warp compiles CUDA kernels with fused multiply-add; on the CPU this needs an option.
     options = {"cpu_compiler_flags": f"{wp.config.cpu_compiler_flags} -ffp-contract=fast"}
     kernel = make_kernel(wrt.ray_query(accel), lambda function: wp.kernel(function, enable_backward=False, module="unique",
                                                                           module_options=options))
@@ -74,7 +74,7 @@ def test_a_kernel_that_fuses_says_so_and_hits_nothing(capfd: pytest.CaptureFixtu
 
 
 def test_a_world_of_another_kind_is_told_and_hits_nothing(capfd: pytest.CaptureFixture[str]) -> None:
-    # Of the same size: Warp would take it as it is.
+    # Both structs have the same size, so that Warp accepts the argument.
     mesh = shapes.icosphere(1)
     asked = np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32), np.zeros(1, np.float32), np.full(1, np.inf, np.float32)
     kernel = make_kernel(wrt.ray_query("bvh2"), wrt.kernel)
@@ -89,7 +89,7 @@ def test_a_world_of_another_kind_is_told_and_hits_nothing(capfd: pytest.CaptureF
 def test_tests_that_there_are_not(arguments: dict, said: Refusal) -> None:
     with refused(*said):
         wrt.ray_query("bvh", **arguments)
-    with pytest.raises(wrt.InputError, match="triangle and box belong to a structure's name"):
+    with refused(next(iter(arguments))):
         wrt.ray_query(wrt.build(shapes.icosphere(1)), **arguments)
 
 

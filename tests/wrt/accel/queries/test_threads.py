@@ -1,4 +1,4 @@
-"""One structure, several threads: what is asked at a time is answered as if it were asked alone."""
+"""Several threads use one structure at the same time: each query has the same result as alone."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def moved(*offset: float) -> np.ndarray:
 
 
 def structure(name: str) -> Accelerator:
-    """A ball, or two places of it under "instances NAME"."""
+    """Build a structure over a ball, or, for "instances NAME", over two instances of the ball."""
     geometry = Geometry.of(BALL)
     if name.startswith("instances"):
         return build(place((geometry, np.eye(4)), (geometry, moved(1.5, 0.0, 0.0))), name.split()[1])
@@ -65,7 +65,7 @@ def bits(hits: Hits) -> tuple[bytes, ...]:
 
 @pytest.fixture
 def often() -> Iterator[None]:
-    """Threads take turns as often as they can."""
+    """Make Python switch between threads as often as possible."""
     before = sys.getswitchinterval()
     sys.setswitchinterval(1e-5)
     yield
@@ -73,7 +73,7 @@ def often() -> Iterator[None]:
 
 
 def at_a_time(*jobs: Callable[[], None]) -> None:
-    """Run each job on a thread of its own, all from the same moment on; the first error of any is raised."""
+    """Run each job on its own thread, start all jobs at the same time, and raise the first error."""
     errors: list[BaseException] = []
     barrier = threading.Barrier(len(jobs))
 
@@ -112,12 +112,12 @@ def test_counters_and_traces_are_those_of_the_call(name: str, often: None) -> No
 
     at_a_time(*(lambda i=i: ask(i) for i in range(8)))  # type: ignore[misc]
     assert not wrong
-    assert len(accel.data.recorder.counts or ()) == len(accel.data.recorder.fetches or ()) == 0  # nothing of a call stays
+    assert len(accel.data.recorder.counts or ()) == len(accel.data.recorder.fetches or ()) == 0  # the structure keeps nothing of a call
 
 
 @pytest.mark.parametrize("name", REFITTED)
 def test_what_is_asked_during_refits_is_of_one_shape(name: str, often: None) -> None:
-    ball = icosphere(1)  # brute force asks each of its triangles
+    ball = icosphere(1)  # small, because brute force tests all of its triangles
     shapes = ball.vertices, (ball.vertices * np.float32([1.0, 0.5, 0.8])).astype(np.float32)
     accel, rays = build(ball, name), some_rays(3 * RAYS_PER_LAUNCH)
     known = []
@@ -227,7 +227,7 @@ def test_instances_stay_where_they_were_when_their_structure_is_refitted() -> No
     accel, rays = structure("instances bvh2"), some_rays(2000)
     assert isinstance(accel, Instances)
     before = bits(accel.closest_hit(*rays, trace=True))
-    for scale in (2.0, 3.0, 4.0):  # what is replaced is freed, and its memory used again
+    for scale in (2.0, 3.0, 4.0):  # replaced arrays are freed, and their memory is reused
         accel.bottoms[0].refit(scale * BALL.vertices)
     junk = [wp.full(1 << 14, 1e30, dtype=wp.float32, device="cpu") for _ in range(100)]
     assert bits(accel.closest_hit(*rays, trace=True)) == before and junk

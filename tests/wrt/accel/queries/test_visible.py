@@ -1,4 +1,4 @@
-"""Pairs of points that see each other."""
+"""Visibility between pairs of points."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def sphere(center: float, radius: float) -> Geometry:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_between_points_in_space_it_is_what_testing_every_triangle_says(seed: int) -> None:
-    """Plücker coordinates in float64: pairs that are nearer to an edge than rounding are left out."""
+    """The reference uses Plücker coordinates in float64. Pairs closer to an edge than rounding errors are excluded."""
     mesh, (a, b) = soup(seed), pairs(2000, seed=seed)
     p, q = a.astype(np.float64)[:, None], b.astype(np.float64)[:, None]
     v = mesh.vertices[mesh.faces].astype(np.float64)
@@ -59,7 +59,7 @@ def test_between_points_in_space_it_is_what_testing_every_triangle_says(seed: in
 
 @pytest.mark.parametrize("name", ["bvh", "bvh2"])
 def test_whoever_is_seen_sees(name: str) -> None:
-    """Also of points on the surface, of pairs that touch edges and corners, and with the triangles told."""
+    """Visibility is symmetric, also for points on surfaces, for pairs that touch edges and corners, and with on_a and on_b."""
     mesh = soup()
     accel = wrt.build(mesh, name)
     a, b = pairs()
@@ -74,7 +74,7 @@ def test_whoever_is_seen_sees(name: str) -> None:
 
 
 def test_points_on_a_convex_surface_see_all_outside_that_is_in_front_of_them() -> None:
-    """Each point is a hit's, and the other end is in front of its triangle's plane, often along it: nothing may be in the way."""
+    """Each point is a hit point; the other end is in front of the triangle's plane, often near the plane. Nothing may block."""
     ball = shapes.icosphere(3)
     for offset in (0.0, 3000.0):
         mesh = wrt.Mesh(ball.vertices + np.float32(offset), ball.faces)
@@ -89,17 +89,17 @@ def test_points_on_a_convex_surface_see_all_outside_that_is_in_front_of_them() -
         along = np.cross(normal, rng.normal(size=normal.shape))
         other = np.float32(point + 2.0 * along + 2.0 * angle * normal)
         way = other.astype(np.float64) - point
-        # In front of the faces around, too: of a convex body these are all that matter.
+        # Only pairs in front of the neighbouring faces, too; no other face of a convex body can block.
         height = np.einsum("ij,ij->i", way, normal) / np.linalg.norm(way, axis=1)
         front = (height > 0.15) if offset == 0.0 else height > 0.3
         assert front.sum() > 1000 and wrt.visible(accel, point, other, on)[front].all()
         behind = np.float32(point - 0.5 * normal)
-        assert wrt.visible(accel, point, behind, on)[np.linalg.norm(behind - offset, axis=1) < 0.9].all()  # from within, too
+        assert wrt.visible(accel, point, behind, on)[np.linalg.norm(behind - offset, axis=1) < 0.9].all()  # also from inside
         assert not wrt.visible(accel, behind, other, None, None)[front].any()
 
 
 def test_along_a_floor_of_many_triangles() -> None:
-    """From points on it, as hits give them, nothing of the same plane is in the way, at any angle."""
+    """From hit points on a plane, no triangle of the plane blocks, at any angle."""
     n, rng = 24, np.random.default_rng(3)
     x, y = np.meshgrid(np.linspace(-40.0, 60.0, n), np.linspace(-30.0, 70.0, n))
     turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
@@ -128,7 +128,7 @@ def test_the_ends_are_left_out() -> None:
 
 @pytest.mark.parametrize("far", [1e3, 3e5, 1e6, 1e12, 1e30])
 def test_an_end_far_away_takes_nothing_from_what_is_near_the_other(far: float) -> None:
-    """Between two ends on either side of a ball is the ball, however far away one of them is; beside it there is nothing."""
+    """A ball between two points blocks, and a ball beside their segment does not, however far away one point is."""
     ball, rng = shapes.icosphere(3), np.random.default_rng(4)
     accels = [wrt.build(ball), wrt.build(place((Geometry.of(ball), np.eye(4)))), wrt.build(sphere(0.0, 1.0))]
     near, way = np.float32(2.0 * unit_vectors(500, 5)), unit_vectors(500, 6)
@@ -144,7 +144,7 @@ def test_an_end_far_away_takes_nothing_from_what_is_near_the_other(far: float) -
 @pytest.mark.parametrize("far", [2.0, 1e3, 1e6])
 @pytest.mark.parametrize("name", ["ball", "floor", "patch"])
 def test_a_hit_sees_where_it_was_seen_from(name: str, far: float) -> None:
-    """Also near the origin of coordinates on a large triangle through it, whose corners are far away."""
+    """This holds also near the coordinate origin on a large triangle whose corners are far away."""
     turn = np.linalg.qr(np.random.default_rng(7).normal(size=(3, 3)))[0]
     floor = shapes.quad()
     mesh = shapes.icosphere(3) if name == "ball" else wrt.Mesh(floor.vertices @ turn.T, floor.faces)
@@ -172,7 +172,7 @@ def test_points_of_a_sphere_see_all_that_is_outwards_and_nothing_through_it(cent
     assert hit.sum() > 10_000 and wrt.visible(accel, point, other, on).all() and wrt.visible(accel, other, point, None, on).all()
     across = np.float32(point - 3.0 * radius * normal)
     assert not wrt.visible(accel, point, across, on).any() and not wrt.visible(accel, across, point, None, on).any()
-    assert wrt.visible(accel, point, np.float32(point - 0.5 * radius * normal), on).all()  # within it
+    assert wrt.visible(accel, point, np.float32(point - 0.5 * radius * normal), on).all()  # inside the sphere
 
 
 def test_only_the_triangle_that_is_told_is_not_in_the_way() -> None:

@@ -1,4 +1,4 @@
-"""Winding numbers."""
+"""Winding numbers of meshes around points."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from wrt.scene import shapes
 
 
 def solid_angles(mesh: wrt.Mesh, points: np.ndarray) -> np.ndarray:
-    """Over 4 pi, one arctangent a triangle."""
+    """Return the sum of solid angles over 4 pi, with one arctangent per triangle."""
     a, b, c = (mesh.vertices[mesh.faces[:, i]].astype(np.float64)[None] - points.astype(np.float32).astype(np.float64)[:, None]
                for i in range(3))
     la, lb, lc = (np.linalg.norm(x, axis=2) for x in (a, b, c))

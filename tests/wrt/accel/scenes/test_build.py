@@ -1,4 +1,4 @@
-"""wrt.build: what it takes, and what it says of anything else."""
+"""wrt.build: the arguments that it accepts, and its errors for others."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ORIGINS, DIRECTIONS = (np.random.default_rng(0).normal(size=(2, 500, 3)) * [[[3.
 
 
 def forms(folder: Path) -> dict[str, Any]:
-    """One ball in every form."""
+    """Return the same ball in every form that wrt.build accepts."""
     as_trimesh = BALL.to_trimesh()
     as_trimesh.export(folder / "ball.ply")
     as_trimesh.export(folder / "ball.glb")

@@ -1,4 +1,4 @@
-"""Worlds with instances: the same primitives, materials and corners as when everything is copied."""
+"""Flat scenes with instances have the same primitives, materials and corners as when all meshes are copied."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def placed(scale: float, *move: float) -> np.ndarray:
 
 
 def mixed_scene() -> Scene:
-    """Instances between objects that are copied; with one material, with materials by face, and mirrored; and spheres."""
+    """Return a scene with spheres, copied objects, and instances: with one material, with materials by face, and mirrored."""
     ball, ring, cube = icosphere(1), torus(segments=6, tube_segments=4), box()
     which = (np.arange(len(ball.faces)) % 3).astype(np.int32)
     squashed = np.diag([1.0, 1.0, 0.0, 1.0])
@@ -46,10 +46,10 @@ def test_the_same_primitives_as_when_all_is_copied() -> None:
     prim_id = np.arange(len(flat.geometry))
     np.testing.assert_array_equal(world.materials(prim_id), flat.prim_material)
     np.testing.assert_array_equal(world.geometry.spheres, flat.geometry.spheres)
-    # Faces of mirrored objects are turned round when they are copied: the corners are the same, in another order.
+    # Copies of mirrored objects have reversed faces: the same corners in another order.
     corners = [np.sort(w.corners(prim_id[:flat.geometry.n_triangles]), axis=1) for w in (flat, world)]
     np.testing.assert_allclose(corners[1], corners[0], atol=1e-5)
-    # Each mesh once, and what is copied: two boxes, the quad and the squashed ball.
+    # Each instanced mesh once, and the copies: two boxes, the quad and the squashed ball.
     parts = [len(part.faces) for part in world.geometry.parts]
     assert parts == [2 * 12 + 2 + 80, 80, 48] and len(world.faces) == sum(parts)
     assert world.geometry.part.tolist() == [0, 1, 1, 2, 1, 2]
@@ -73,7 +73,7 @@ def shared_world(scene: Scene) -> FlatScene:
 
 
 def test_objects_that_cannot_be_instances_are_copied() -> None:
-    """A shear by 1e5, and two that flatten: what rays lose on their way there is too much."""
+    """A shear by 1e5 and two flattening matrices would make the rounding errors of rays too large."""
     ball, shear, flat = icosphere(1), np.eye(4), np.diag([1.0, 0.0, 1.0, 1.0])
     shear[0, 1] = 1e5
     objects = tuple(Object(ball, (RED,), matrix) for matrix in (np.eye(4), shear, flat, flat, placed(1e-9, 0.0, 0.0, 0.0)))
@@ -83,7 +83,7 @@ def test_objects_that_cannot_be_instances_are_copied() -> None:
 
 
 def test_corners_on_a_line_are_parted_in_a_mesh_of_its_own_space_too() -> None:
-    """A face without area between two others, as flatten_joined flips it; materials follow."""
+    """A face without area between two faces is flipped, as in flatten_joined, with its material."""
     corners = np.array([[0, 0, 0], [2, 0, 0], [1, 0, 0], [1, 1, 0], [1, -1, 0]], np.float32)
     mesh = Mesh(corners, np.array([[0, 2, 1], [0, 1, 3], [0, 4, 2], [2, 4, 1]], np.int32))
     which = np.array([0, 1, 2, 2], np.int32)

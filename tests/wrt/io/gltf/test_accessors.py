@@ -9,7 +9,6 @@ import pytest
 
 from tests.gltf_files import COMPONENT, KIND, GltfFile, load_warned, one_triangle
 from tests.refused import refused
-from wrt.core.errors import InputError
 from wrt.io.gltf.accessors import Accessors
 from wrt.io.gltf.document import Document
 
@@ -103,34 +102,35 @@ def test_arrays_are_read_once_and_are_read_only(tmp_path):
 SPARSE = {"count": 1, "indices": {"bufferView": 1, "componentType": 5121}, "values": {"bufferView": 0}}
 
 
-@pytest.mark.parametrize("changes, message", [
-    ({"count": 5}, r"accessors\[0\]: 5 elements reach from byte 0 to 60 of bufferViews\[0\], which has 48"),
-    ({"byteOffset": 4}, r"accessors\[0\]: 4 elements reach from byte 4 to 52"),
-    ({"byteOffset": -12}, r"accessors\[0\]: 4 elements reach from byte -12"),
-    ({"count": 0}, r"accessors\[0\].count: must be 1 to"),
-    ({"count": 10**15}, r"accessors\[0\].count: must be 1 to"),
-    ({"count": 10**9}, r"accessors\[0\]: 1000000000 elements reach"),
-    ({"count": "4"}, r"accessors\[0\].count: must be an integer, got '4'"),
-    ({"count": None}, r"accessors\[0\].count: is required"),
-    ({"componentType": 5124}, r"accessors\[0\].componentType: must be one of"),
-    ({"type": "VEC9"}, r"here: must be of type VEC3, but accessors\[0\] is 'VEC9'"),
-    ({"bufferView": 7}, r"accessors\[0\].bufferView: is 7, but there are 2 bufferViews"),
-    ({"bufferView": -1}, r"accessors\[0\].bufferView: is -1"),
-    ({"bufferView": None, "count": 2**22 + 1}, r"accessors\[0\].count: must be 1 to 4194304, got 4194305"),
-    ({"count": 10**300}, r"accessors\[0\].count: must be an integer of at most 64 bits, got 1000*\.\.\.$"),
-    ({"sparse": {**SPARSE, "count": 9}}, r"sparse.count: must be 1 to 4, got 9"),
-    ({"sparse": {**SPARSE, "indices": {"bufferView": 1, "componentType": 5126}}}, "must be an unsigned integer type"),
-    ({"sparse": SPARSE}, r"sparse.indices: holds 200, but there are 4 elements"),
-    ({"sparse": {**SPARSE, "values": {"bufferView": 0, "byteOffset": 40}}}, r"sparse.(indices|values)"),
-    ({"sparse": {"count": 1}}, r"accessors\[0\].sparse.indices: is required"),
-    ({"sparse": SPARSE, "bufferView": None, "count": 2**31 - 1}, r"accessors\[0\].count: must be 1 to"),
+@pytest.mark.parametrize("changes, what, place", [
+    ({"count": 5}, "5 elements reach from byte 0 to 60", "here: accessors[0]"),
+    ({"byteOffset": 4}, "4 elements reach from byte 4 to 52", "here: accessors[0]"),
+    ({"byteOffset": -12}, "4 elements reach from byte -12", "here: accessors[0]"),
+    ({"count": 0}, "must be 1 to", "here: accessors[0].count"),
+    ({"count": 10**15}, "must be 1 to", "here: accessors[0].count"),
+    ({"count": 10**9}, "1000000000 elements reach", "here: accessors[0]"),
+    ({"count": "4"}, "must be an integer, got '4'", "accessors[0].count"),
+    ({"count": None}, "is required", "accessors[0].count"),
+    ({"componentType": 5124}, "must be one of", "here: accessors[0].componentType"),
+    ({"type": "VEC9"}, "must be of type VEC3", "here"),
+    ({"bufferView": 7}, "is 7", "here: accessors[0].bufferView"),
+    ({"bufferView": -1}, "is -1", "here: accessors[0].bufferView"),
+    ({"bufferView": None, "count": 2**22 + 1}, "must be 1 to 4194304, got 4194305", "here: accessors[0].count"),
+    ({"count": 10**300}, "must be an integer of at most 64 bits, got 1000", "accessors[0].count"),
+    ({"sparse": {**SPARSE, "count": 9}}, "must be 1 to 4, got 9", "here: accessors[0].sparse.count"),
+    ({"sparse": {**SPARSE, "indices": {"bufferView": 1, "componentType": 5126}}},
+     "must be an unsigned integer type", "here: accessors[0].sparse.indices.componentType"),
+    ({"sparse": SPARSE}, "200", "here: accessors[0].sparse.indices"),
+    ({"sparse": {**SPARSE, "values": {"bufferView": 0, "byteOffset": 40}}}, "200", "here: accessors[0].sparse.indices"),
+    ({"sparse": {"count": 1}}, "is required", "accessors[0].sparse.indices"),
+    ({"sparse": SPARSE, "bufferView": None, "count": 2**31 - 1}, "must be 1 to", "here: accessors[0].count"),
 ])
-def test_accessors_that_do_not_fit(tmp_path, changes, message):
+def test_accessors_that_do_not_fit(tmp_path, changes, what, place):
     file = GltfFile()
     file.accessor(np.zeros((4, 3)))
     file.view(bytes([200]))
     file.json["accessors"][0].update(changes)
-    with pytest.raises(InputError, match=message):
+    with refused(what=what, place=place):
         read(file, tmp_path, "VEC3")
 
 
@@ -150,7 +150,7 @@ def test_an_accessor_without_data_is_zeros(tmp_path):
     ({"byteLength": 0}, (None, "at least 1", "here: bufferViews[0].byteLength")),
     ({"byteOffset": -4}, (None, "bytes -4", "here: bufferViews[0]")),
     ({"buffer": 3}, (None, "3, but there", "here: bufferViews[0].buffer")),
-    ({"byteStride": 8}, (None, "8, but", "here: bufferViews[0].byteStride")),
+    ({"byteStride": 8}, (None, "8 bytes, but", "here: bufferViews[0].byteStride")),
     ({"byteStride": -12}, (None, "-12", "here: bufferViews[0].byteStride")),
 ])
 def test_views_that_do_not_fit(tmp_path, changes, message):
@@ -167,5 +167,5 @@ def test_floats_that_are_not_finite(tmp_path, bad):
     values = np.zeros((4, 3))
     values[2, 1] = bad
     file.accessor(values)
-    with refused(what="(1 not finite", place="here: accessors[0]"):
+    with refused(what="(1 such elements)", place="here: accessors[0]"):
         read(file, tmp_path, "VEC3")

@@ -1,4 +1,4 @@
-"""Containers, JSON, URIs: what is not a sound glTF file is refused, with the place."""
+"""Containers, JSON, URIs: files that are not sound glTF are refused, with the place of the mistake."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import pytest
 
 from tests.gltf_files import TRIANGLE, load_warned, one_triangle, pack_glb
 from tests.refused import refused
-from wrt.core.errors import InputError
 from wrt.io.gltf.document import LeftOut
 from wrt.io.gltf.reader import load_gltf
 from wrt.io.gltf.schema import read_as
@@ -25,32 +24,31 @@ def patched(data: bytes, offset: int, value: int) -> bytes:
 
 
 @pytest.mark.parametrize("name, data, message", [
-    ("a.glb", b"", "is not a .glb file"),
-    ("a.glb", b"glTF", "header: is truncated"),
-    ("a.glb", b"GLTF" + GLB[4:], "is not a .glb file"),
-    ("a.glb", patched(GLB, 4, 1), "header.version: is glTF 1; wrt reads 2.0"),
-    ("a.glb", GLB[:-3], "header.length: is truncated: 48 bytes according to its header, but there are 45"),
-    ("a.glb", patched(GLB, 12, 1000), "chunk 0: is truncated"),
-    ("a.glb", patched(GLB, 16, 7), "chunk 0: must be JSON"),
-    ("a.glb", patched(GLB, 8, 12), "chunk 0: must be JSON"),
-    ("a.gltf", b"", "is not valid JSON"),
-    ("a.gltf", b"solid cube", "is not valid JSON: Expecting value: line 1 column 1"),
-    ("a.gltf", b'{"asset": {"version": "2.0"}', "is not valid JSON"),
-    ("a.gltf", b"\xff\x00", "is not a glTF file: not UTF-8"),
-    ("a.gltf", b"[" * 100000, "is not valid JSON: nested too deeply"),
-    ("a.gltf", b"[]", "holds no object"),
-    ("a.gltf", b'{"asset": {"version": "2.0"}, "scene": NaN}', "holds NaN"),
-    ("a.gltf", b'{"asset": {"version": "2.0"}, "scene": ' + b"9" * 5000 + b"}", "is not valid JSON"),
-    ("a.gltf", b"{}", "asset.version: must be a string"),
-    ("a.gltf", b'{"asset": {"version": "1.0"}}', "asset.version: is '1.0'; wrt reads 2.0"),
-    ("a.gltf", b'{"asset": {"version": "2.1", "minVersion": "2.1"}}', "asset.minVersion: is '2.1'"),
+    ("a.glb", b"", (None, "is not a .glb file")),
+    ("a.glb", b"glTF", (None, "is truncated", "header")),
+    ("a.glb", b"GLTF" + GLB[4:], (None, "is not a .glb file")),
+    ("a.glb", patched(GLB, 4, 1), (None, "is glTF 1; wrt reads 2.0", "header.version")),
+    ("a.glb", GLB[:-3], (None, "is truncated: 48 bytes according to its header, but there are 45", "header.length")),
+    ("a.glb", patched(GLB, 12, 1000), (None, "is truncated", "chunk 0")),
+    ("a.glb", patched(GLB, 16, 7), (None, "must be JSON", "chunk 0")),
+    ("a.glb", patched(GLB, 8, 12), (None, "must be JSON", "chunk 0")),
+    ("a.gltf", b"", (None, "is not valid JSON")),
+    ("a.gltf", b"solid cube", (None, "is not valid JSON: Expecting value: line 1 column 1")),
+    ("a.gltf", b'{"asset": {"version": "2.0"}', (None, "is not valid JSON")),
+    ("a.gltf", b"\xff\x00", (None, "is not a glTF file: not UTF-8")),
+    ("a.gltf", b"[" * 100000, (None, "is not valid JSON: nested too deeply")),
+    ("a.gltf", b"[]", (None, "is not an object")),
+    ("a.gltf", b'{"asset": {"version": "2.0"}, "scene": NaN}', (None, "holds NaN")),
+    ("a.gltf", b'{"asset": {"version": "2.0"}, "scene": ' + b"9" * 5000 + b"}", (None, "is not valid JSON")),
+    ("a.gltf", b"{}", (None, "must be a string", "asset.version")),
+    ("a.gltf", b'{"asset": {"version": "1.0"}}', (None, "is '1.0'; wrt reads 2.0", "asset.version")),
+    ("a.gltf", b'{"asset": {"version": "2.1", "minVersion": "2.1"}}', (None, "is '2.1'", "asset.minVersion")),
 ])
 def test_broken_containers(tmp_path, name, data, message):
     path = tmp_path / name
     path.write_bytes(data)
-    with pytest.raises(InputError) as error:
+    with refused(*message, path=path):
         load_gltf(path)
-    assert str(error.value).startswith(f"{path}: ") and message in str(error.value)
 
 
 def test_missing_file_and_folder(tmp_path):
@@ -105,9 +103,9 @@ def test_bad_uris(tmp_path, uri, message):
     file = one_triangle()
     file.json["buffers"] = [{"byteLength": len(file.binary), "uri": uri}]
     (tmp_path.parent / "b.bin").write_bytes(bytes(file.binary))
-    with pytest.raises(InputError, match=r"buffers\[0\]") as error:
+    with refused(what=message, path="a.gltf") as error:
         load_gltf(file.write(tmp_path, "a.gltf"))
-    assert message in str(error.value)
+    assert "buffers[0]" in error.value.place
 
 
 def test_data_uri_without_base64(tmp_path):
@@ -129,16 +127,16 @@ def test_buffer_without_data(tmp_path):
         load_gltf(path)
 
 
-@pytest.mark.parametrize("required, message", [
-    (["KHR_draco_mesh_compression"], "needs 'KHR_draco_mesh_compression'.*no decoder for KHR_draco_mesh_compression"),
-    (["EXT_meshopt_compression", "KHR_mesh_quantization"], "no decoder for EXT_meshopt_compression: save"),
-    (["KHR_texture_basisu"], "no decoder for KHR_texture_basisu"),
-    (["KHR_materials_clearcoat", "ACME_unheard_of"], "needs 'ACME_unheard_of', 'KHR_materials_clearcoat', which"),
+@pytest.mark.parametrize("required, what, hint", [
+    (["KHR_draco_mesh_compression"], "KHR_draco_mesh_compression", "no decoder"),
+    (["EXT_meshopt_compression", "KHR_mesh_quantization"], "EXT_meshopt_compression", "no decoder"),
+    (["KHR_texture_basisu"], "KHR_texture_basisu", "no decoder"),
+    (["KHR_materials_clearcoat", "ACME_unheard_of"], "'ACME_unheard_of', 'KHR_materials_clearcoat'", ""),
 ])
-def test_required_extensions_that_are_not_supported(tmp_path, required, message):
+def test_required_extensions_that_are_not_supported(tmp_path, required, what, hint):
     file = one_triangle()
     file.json["extensionsRequired"] = required
-    with pytest.raises(InputError, match=f"extensionsRequired: the file .*{message}"):
+    with refused(what=what, place="extensionsRequired", hint=hint):
         load_gltf(file.write(tmp_path))
 
 
@@ -148,7 +146,7 @@ def test_required_extensions_that_are_supported(tmp_path):
     assert len(load_gltf(file.write(tmp_path), staged=False).objects) == 1
 
 
-def test_of_variants_the_default_look_is_shown_even_where_they_are_required(tmp_path):
+def test_the_default_look_of_variants_is_shown_even_if_they_are_required(tmp_path):
     file = one_triangle(extensions={"KHR_materials_variants": {"mappings": [{"material": 0, "variants": [0]}]}})
     file.json |= {"extensionsRequired": ["KHR_materials_variants"],
                   "extensions": {"KHR_materials_variants": {"variants": [{"name": "red"}]}}}
@@ -156,15 +154,16 @@ def test_of_variants_the_default_look_is_shown_even_where_they_are_required(tmp_
     assert len(scene.objects) == 1 and "KHR_materials_variants (mesh" in told[0]
 
 
-@pytest.mark.parametrize("hint, raw, message", [
-    (int, 1.5, "must be an integer, got 1.5"), (int, "1", "must be an integer, got '1'"), (int, True, "an integer"),
-    (int, 1e400, "must be an integer"), (float, "x", "must be a number"), (float, False, "must be a number"),
-    (float, 1e400, "must be a finite number"), (float, 10**400, "a finite number"), (str, 1, "must be a string"),
-    (bool, 1, "must be true or false"), (list[float], 3, "must be an array"), (list[int], [0, None], r"x\[1\]: must"),
-    (dict[str, int], [], "must be an object"), (dict[str, int], {"A": "0"}, "x.A: must be an integer"),
+@pytest.mark.parametrize("hint, raw, what, place", [
+    (int, 1.5, "must be an integer, got 1.5", "x"), (int, "1", "must be an integer, got '1'", "x"), (int, True, "an integer", "x"),
+    (int, 1e400, "must be an integer", "x"), (float, "x", "must be a number", "x"), (float, False, "must be a number", "x"),
+    (float, 1e400, "must be a finite number", "x"), (float, 10**400, "a finite number", "x"), (str, 1, "must be a string", "x"),
+    (bool, 1, "must be true or false", "x"), (list[float], 3, "must be an array", "x"),
+    (list[int], [0, None], "must be an integer", "x[1]"),
+    (dict[str, int], [], "must be an object", "x"), (dict[str, int], {"A": "0"}, "must be an integer", "x.A"),
 ])
-def test_wrong_types_are_named(hint, raw, message):
-    with pytest.raises(InputError, match=message):
+def test_wrong_types_are_named(hint, raw, what, place):
+    with refused(what=what, place=place):
         read_as(hint, raw, "x")
 
 

@@ -270,7 +270,7 @@ def test_textures_whose_parts_are_not_there(tmp_path, texture, message):
     ({}, "textures without an image (material"),
 ])
 def test_a_texture_without_an_image_is_left_out_and_named(tmp_path, texture, message):
-    """glTF 2.0, texture.source: where it is not there, "behavior is undefined" but the file is valid."""
+    """By glTF 2.0, a file is valid if a texture has no source, but the behaviour is undefined."""
     file = one_material(base())
     file.add("textures", texture)
     scene, told = load_warned(file.write(tmp_path), staged=False)
@@ -281,7 +281,7 @@ def test_a_texture_without_an_image_is_left_out_and_named(tmp_path, texture, mes
 
 
 def png_header(width: int, height: int) -> bytes:
-    """A PNG that says it is of that size, and holds a single row of pixels."""
+    """A PNG with this size in its header, and a single row of pixels."""
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
@@ -322,13 +322,13 @@ def test_images_that_are_none():
 
 @pytest.mark.parametrize("size", [(MAX_SIDE + 1, 1), (1, MAX_SIDE + 1)])
 def test_images_beyond_the_limit(size):
-    with pytest.raises(InputError, match=f"it is {size[0]}x{size[1]}; at most {MAX_SIDE} a side"):
+    with refused(what=f"{size[0]}x{size[1]}"):
         decode_rgba8(png_header(*size))
     assert decode_rgba8(png_header(MAX_SIDE, 1)).shape == (1, MAX_SIDE, 4)
 
 
 def test_decompression_bombs():
-    with pytest.raises(InputError, match=f"it is 10000x16000; at most {MAX_SIDE} a side and 134217728 pixels are read"):
+    with refused(what="10000x16000"):
         decode_rgba8(png_header(10000, 16000))
     with refused(what="exceeds limit"):
         decode_rgba8(png_header(MAX_SIDE, MAX_SIDE))  # in Pillow's own words

@@ -21,12 +21,12 @@ SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
 
 
 def load(file: GltfFile, folder: Path) -> Scene:
-    """The scene as in the file; any warning fails the test."""
+    """Load the scene without additions; any warning fails the test."""
     return load_gltf(file.write(folder), staged=False)
 
 
 def matrix_of(node: dict[str, Any]) -> np.ndarray:
-    """A node's transform by SciPy's rotations: an oracle for the reader's own."""
+    """Return a node's transform by SciPy's rotations, to compare the reader with."""
     matrix = np.eye(4)
     rotation = Rotation.from_quat(node.get("rotation", [0, 0, 0, 1])).as_matrix()
     matrix[:3, :3] = rotation @ np.diag(node.get("scale", [1, 1, 1]))
@@ -179,7 +179,7 @@ def zigzag(count: int) -> np.ndarray:
 @pytest.mark.parametrize("indexed", [True, False])
 @pytest.mark.parametrize("count", [3, 4, 9, 10])
 def test_strips_face_one_way(tmp_path, count, indexed):
-    """Points that alternate between two rails: every triangle has the area 1/2 and must face as the first does."""
+    """Points that alternate between two rails: every triangle has the area 1/2 and must face the side that the first faces."""
     vertices = zigzag(count)
     order = np.random.default_rng(count).permutation(count) if indexed else np.arange(count)
     shuffled = np.empty_like(vertices)
@@ -335,7 +335,7 @@ def test_wrong_instances(tmp_path, attributes, message):
     (lambda f, p: p["attributes"].update(POSITION="0"), (None, "integer", "meshes[0].primitives[0].attributes.POSITION")),
     (lambda f, p: p["attributes"].update(POSITION=4), (None, "4, but", "meshes[0].primitives[0].attributes.POSITION")),
     (lambda f, p: p["attributes"].update(NORMAL=f.accessor(SQUARE)),
-     (None, "4 elements, POSITION", "meshes[0].primitives[0].attributes.NORMAL")),
+     (None, "4 elements, but POSITION", "meshes[0].primitives[0].attributes.NORMAL")),
     (lambda f, p: p["attributes"].update(TEXCOORD_0=f.accessor(TRIANGLE)),
      (None, "type VEC2", "meshes[0].primitives[0].attributes.TEXCOORD_0")),
     (lambda f, p: p["attributes"].update(POSITION=f.accessor([[0, 0, 0], [np.nan, 0, 0], [0, 1, 0]])),
@@ -349,9 +349,8 @@ def test_wrong_primitives(tmp_path, change, message):
     file = one_triangle()
     change(file, file.json["meshes"][0]["primitives"][0])
     path = file.write(tmp_path)
-    with refused(*message) as error:
+    with refused(*message, path=path):
         load_gltf(path)
-    assert str(error.value).startswith(f"{path}: ")
 
 
 # --- cameras and lights -----------------------------------------------------------------------------------------------
@@ -428,7 +427,7 @@ def test_light_defaults_and_range(tmp_path):
     ({"type": "point", "intensity": -1}, ("intensity", "lie", "extensions.KHR_lights_punctual.lights[0]: light 'light 0'")),
     ({"type": "spot", "spot": {"outerConeAngle": 2}}, ("outer", "", "extensions.KHR_lights_punctual.lights[0]: light 'light 0'")),
     ({"type": "spot", "spot": {"innerConeAngle": 1, "outerConeAngle": 0.5}},
-     ("inner", "larger", "extensions.KHR_lights_punctual.lights[0]: light 'light 0'")),
+     ("inner", "at most outer", "extensions.KHR_lights_punctual.lights[0]: light 'light 0'")),
     (3, (None, "object", "extensions.KHR_lights_punctual.lights[0]")),
 ])
 def test_wrong_lights(tmp_path, light, message):

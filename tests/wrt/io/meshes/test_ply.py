@@ -8,7 +8,6 @@ import pytest
 
 from tests.data import data_path
 from tests.refused import refused
-from wrt.core.errors import InputError
 from wrt.io.mesh_file import load_mesh
 from wrt.io.meshes.ply import read as read_ply
 
@@ -95,30 +94,29 @@ def test_every_truncation_is_refused(tmp_path: Path, form: str) -> None:
             load_mesh(path)
 
 
-@pytest.mark.parametrize(("old", "new", "place"), [
-    (b"3 1 4 5", b"3 1 4 6", "face 0: index 6"),
-    (b"3 1 4 5", b"3 1 -4 5", "face 0: index -4"),
-    (b"3 1 4 5", b"3 1 4.5 5", "face 0: index 4.5"),
-    (b"3 1 4 5", b"-3 1 4 5", "face 0: a list of -3"),
-    (b"2.0 1.0", b"nan 1.0", "vertex 5: position"),
-    (b"2.0 1.0", b"1e60 1.0", "vertex 5: position"),
-    (b"2.0 1.0", b"2.0 one", "line 20: 'one' is not a number"),
-    (b"float z", b"float w", "no vertices with x, y and z"),
-    (b"float z", b"vec3 z", "line 7: cannot read"),
-    (b"list uchar int v", b"list float int v", "cannot read"),
-    (b"vertex_indices", b"corners", "no list vertex_indices"),
-    (b"format ascii 1.0", b"format utf8", "line 2: cannot read"),
-    (b"format ascii 1.0\n", b"", "names no format"),
-    (b"vertex 6", b"vertex 99999999999999", "element vertex: truncated"),
-    (b"ply\n", b"PLY?\n", "is not a PLY file"),
+@pytest.mark.parametrize(("old", "new", "what", "place"), [
+    (b"3 1 4 5", b"3 1 4 6", "index 6", "face 0"),
+    (b"3 1 4 5", b"3 1 -4 5", "index -4", "face 0"),
+    (b"3 1 4 5", b"3 1 4.5 5", "index 4.5", "face 0"),
+    (b"3 1 4 5", b"-3 1 4 5", "a list of -3", "face 0"),
+    (b"2.0 1.0", b"nan 1.0", "position", "vertex 5"),
+    (b"2.0 1.0", b"1e60 1.0", "position", "vertex 5"),
+    (b"2.0 1.0", b"2.0 one", "'one' is not a number", "line 20"),
+    (b"float z", b"float w", "no vertices with x, y and z", None),
+    (b"float z", b"vec3 z", "cannot read", "line 7"),
+    (b"list uchar int v", b"list float int v", "cannot read", None),
+    (b"vertex_indices", b"corners", "no list vertex_indices", None),
+    (b"format ascii 1.0", b"format utf8", "cannot read", "line 2"),
+    (b"format ascii 1.0\n", b"", "no line `format`", None),
+    (b"vertex 6", b"vertex 99999999999999", "truncated", "element vertex"),
+    (b"ply\n", b"PLY?\n", "is not a PLY file", None),
 ])
-def test_errors_name_the_place(tmp_path: Path, old: bytes, new: bytes, place: str) -> None:
+def test_errors_name_the_place(tmp_path: Path, old: bytes, new: bytes, what: str, place: str | None) -> None:
     data = ply("ascii", [tuple(map(float, point)) for point in POINTS], [(1, 4, 5)])
     assert data.count(old) == 1
     path = write(tmp_path, data.replace(old, new))
-    with pytest.raises(InputError) as caught:
+    with refused(None, what, place, path):
         load_mesh(path)
-    assert str(caught.value).startswith(f"{path}: ") and place in str(caught.value)
 
 
 def test_windows_line_ends(tmp_path: Path) -> None:
@@ -137,23 +135,23 @@ def test_same_arrays_as_trimesh(name: str) -> None:
     np.testing.assert_array_equal(raw.vertices, np.asarray(other.vertices, dtype=np.float32))
 
 
-@pytest.mark.parametrize(("old", "new", "message"), [
-    (b"element vertex 3", b"element vertex 1000000000000", "element vertex: truncated: the header promises 1000000000000"),
-    (b"element vertex 3", b"element vertex " + b"9" * 5000, "line 4: cannot read 'element vertex 999"),
-    (b"element face 1", b"element face 1000000000000", "element face: truncated: the header promises 1000000000000"),
-    (b"element vertex", b"element nothing 1000000000000\nelement vertex", ""),
-    (b" 3 0 1 2", b" inf 0 1 2", "face 0: a list of inf values"),
-    (b" 3 0 1 2", b" nan 0 1 2", "face 0: a list of nan values"),
-    (b" 3 0 1 2", b" 1e300 0 1 2", "element face: truncated"),
+@pytest.mark.parametrize(("old", "new", "what", "place"), [
+    (b"element vertex 3", b"element vertex 1000000000000", "1000000000000", "element vertex"),
+    (b"element vertex 3", b"element vertex " + b"9" * 5000, "cannot read", "line 4"),
+    (b"element face 1", b"element face 1000000000000", "1000000000000", "element face"),
+    (b"element vertex", b"element nothing 1000000000000\nelement vertex", "", None),
+    (b" 3 0 1 2", b" inf 0 1 2", "inf values", "face 0"),
+    (b" 3 0 1 2", b" nan 0 1 2", "nan values", "face 0"),
+    (b" 3 0 1 2", b" 1e300 0 1 2", "truncated", "element face"),
 ])
-def test_absurd_counts(old: bytes, new: bytes, message: str, tmp_path: Path) -> None:
+def test_absurd_counts(old: bytes, new: bytes, what: str, place: str | None, tmp_path: Path) -> None:
     data = ply("ascii", [(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)])
     assert old in data
     path = write(tmp_path, data.replace(old, new))
-    if not message:  # rows that hold nothing need no room
+    if not what:  # rows that hold nothing need no room
         assert len(read_ply(path).faces) == 1
         return
-    with pytest.raises(InputError, match=message):
+    with refused(None, what, place, path):
         load_mesh(path)
 
 
@@ -179,7 +177,7 @@ def test_strips(form: str, strips: list[list[int]], tmp_path: Path) -> None:
 
 
 def test_a_strip_faces_one_way(tmp_path: Path) -> None:
-    """A flat sheet of two rows: every triangle has the normal of the first, also after a restart."""
+    """A flat sheet of two rows: every triangle has the normal of the first triangle, also after a restart."""
     points = [(float(i // 2), float(i % 2), 0.0) for i in range(12)]
     data = ply("ascii", points, [(*range(7), -1, *range(5, 12))]).replace(b"element face", b"element tristrips")
     raw = read_ply(write(tmp_path, data))
@@ -196,16 +194,16 @@ def test_strips_come_behind_faces(tmp_path: Path) -> None:
     assert raw.faces.tolist() == [[0, 1, 2], [0, 2, 3], [1, 4, 2], [4, 5, 2]] and raw.incomplete == 0
 
 
-@pytest.mark.parametrize(("bad", "message"), [("9", "index 9, but there are 6 vertices"), ("-2", "index -2, but there are 6 vert")])
-def test_a_strip_with_a_wrong_index(bad: str, message: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("bad", ["9", "-2"])
+def test_a_strip_with_a_wrong_index(bad: str, tmp_path: Path) -> None:
     data = ply("ascii", POINTS, [(0, 1, 2), (0, 1, int(bad))]).replace(b"element face", b"element tristrips")
-    with pytest.raises(InputError, match=rf"a\.ply: tristrips 1: {message}"):
+    with refused(None, f"index {bad}", "tristrips 1", "a.ply"):
         load_mesh(write(tmp_path, data))
 
 
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
-def test_a_word_that_is_no_number_is_told_with_its_line(end: str, tmp_path: Path) -> None:
+def test_a_word_that_is_no_number_is_reported_with_its_line(end: str, tmp_path: Path) -> None:
     data = ply("ascii", POINTS, [(0, 1, 2, 3), (1, 4, 5, 2)])
     line = 1 if end == "\r" else data.count(10) - 1
-    with pytest.raises(InputError, match=rf"line {line}: 'x4' is not a number"):
+    with refused(None, "'x4'", f"line {line}"):
         load_mesh(write(tmp_path, data.replace(b" 4 0 1", b" x4 0 1").replace(b"\n", end.encode())))

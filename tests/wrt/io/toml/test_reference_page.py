@@ -1,4 +1,4 @@
-"""The page on scene files says what the schema says, and its example is one."""
+"""The page on scene files agrees with the schema, and its example is a scene file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from wrt.io.toml.reference_page import EXAMPLE, scene_format
 from wrt.io.toml.report import check
 
 PAGE = ROOT / "docs" / "scene_format.md"
-# Numbers that are measured in nothing: shares, counts, factors, directions of any length, indices of refraction.
+# Numbers without a unit: shares, counts, factors, directions of any length, indices of refraction.
 NO_UNIT = {
     "albedo", "alpha", "alpha_cutoff", "axis", "blades", "color_a", "color_b", "count", "direction", "eta", "exponent",
     "f_number", "first", "ior", "k", "matrix", "max_depth", "metallic", "min_throughput", "normal_scale", "offset", "roughness",
@@ -62,10 +62,10 @@ def test_every_number_has_a_unit_or_is_known_to_have_none() -> None:
 @pytest.mark.parametrize(("section", "row"), [
     ("Settings", '| `size` | 2 whole numbers (pixels, 1 to 32768) | `[640,360]` | width and height |'),
     ("Camera", "| `fov_y` | number (degrees, 0.0005 to 179.94) | `45.0` | full vertical angle of view |"),
-    ("Sphere", "| `radius` | number (length, > 0) | required | its radius |"),
-    ("Tube", "| `radius` | number or list of numbers (length, > 0) | `0.1` | one, or one for each point |"),
-    ("Mesh", "| `instances` | list of [Transform](#transform) (1 or more) |  | a copy of the mesh for each, before"
-             " `transform`; stored once |"),
+    ("Sphere", "| `radius` | number (length, > 0) | required | radius of the sphere |"),
+    ("Tube", "| `radius` | number or list of numbers (length, > 0) | `0.1` | one radius, or one for each point |"),
+    ("Mesh", "| `instances` | list of [Transform](#transform) (1 or more) |  | transforms, each of one copy of the mesh,"
+             " applied before `transform`; the mesh is stored once |"),
     ("Gradient", "| `top` | 1 or 3 numbers (radiance, >= 0) | `[0.5,0.7,1.0]` | from straight above (+y) |"),
 ])
 def test_rows(section: str, row: str) -> None:

@@ -121,7 +121,7 @@ def test_the_tables_hold_what_was_measured() -> None:
     page = text([made("a", seconds=(1.0, 1.0)), made("b", seconds=(0.5, 0.5), differ=3)], Plan(), "")
     line = next(line for line in page.splitlines() if line.startswith("| b"))
     named = dict(zip(bench.COLUMNS, (cell.strip() for cell in line.strip("|").split("|")), strict=True))
-    assert named["Mray/s"] == "2 [2, 2]" and named["/ first"] == "2.00" and named["differ"] == "3" and named["build ms"] == "500"
+    assert named["Mray/s"] == "2 [2, 2]" and named["speed / first"] == "2.00" and named["differ"] == "3" and named["build ms"] == "500"
 
 
 def test_without_meshes_a_terrain_grows() -> None:

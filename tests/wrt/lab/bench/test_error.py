@@ -317,7 +317,7 @@ def test_an_interrupted_sweep_keeps_the_rows_that_are_done(rows: int, number: in
     Path(tmp_path / "box.obj").write_text(BOX_OBJ)
     common = ("bench", "error", tmp_path / "box.obj", "--size", "8x6", "--max-spp", "4", "--repeats", "3", "--reference-spp", "8")
     result = run_command(*common, "--knobs", "sampler", "--json", "-o", tmp_path / "box.md")
-    assert result.code == 128 + number and result.err.endswith("interrupted: what was done is kept\n")
+    assert result.code == 128 + number and result.err.endswith("interrupted: the results so far are kept\n")
     data = json.loads(result.out)
     assert len(data["rows"]) == rows and data["interrupted"] == number and len(data["slopes"]) == (1 if rows < 4 else 2)
     unfinished = "sampler = independent" if rows == 4 else "as it is, sampler = independent"

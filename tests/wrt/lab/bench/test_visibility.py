@@ -301,7 +301,7 @@ def test_the_tables_hold_what_was_measured() -> None:
     first = [cell.strip() for cell in lines[0].strip("|").split("|")]
     named = dict(zip(visibility.COLUMNS, first, strict=True))
     assert named["triangles"] == "1000" and named["covered"] == "50.0%" and named["raster ms"] == "2 [2, 2]"
-    assert named["cast / raster"] == "3 [3, 3]" and named["with build"] == "503" and named["build ms"] == "1e+03"
+    assert named["cast / raster"] == "3 [3, 3]" and named["(cast + build) / raster"] == "503" and named["build ms"] == "1e+03"
     assert (named["differ"], named["ties"], named["silhouettes"], named["unexplained"]) == ("3", "2", "1", "0")
     assert len({len(line) for line in page.splitlines() if line.startswith("| s ") and line.count("|") == 16}) == 1
 

@@ -23,7 +23,7 @@ from wrt.core.errors import InputError
 from wrt.kernels.shade.surface import make_surface_at, spawn_point
 from wrt.kernels.structs import Hit, Ray, Surfaces, kernel
 from wrt.lab.hard_cases import open as hard_cases_open
-from wrt.lab.hard_cases.cases import ASK, HARD_CASES, HIT, MISS, HardCase, Verdict, chunks, generate, judge, judge_all_hits, judge_next
+from wrt.lab.hard_cases.cases import HARD_CASES, HIT, MISS, UNKNOWN, HardCase, Verdict, chunks, generate, judge, judge_all_hits, judge_next
 from wrt.lab.hard_cases.common import sphere
 from wrt.lab.hard_cases.judge import winding_number
 from wrt.lab.oracle.oracle import Place, Reference, reference_of
@@ -56,7 +56,7 @@ def test_arrays_seeds_and_parts(name: str) -> None:
         assert array.shape == (50, 3) and array.dtype == np.float32
     for array in (case.t_min, case.t_max):
         assert array.shape == (50,) and array.dtype == np.float32
-    assert case.expected.dtype == np.int8 and set(case.expected) <= {HIT, ASK, MISS}
+    assert case.expected.dtype == np.int8 and set(case.expected) <= {HIT, UNKNOWN, MISS}
     assert case.directions.any(axis=1).all()
     assert case.refused == (name in REFUSED)
     again, other = generate(name, 50, seed=3), generate(name, 50, seed=4)
@@ -139,7 +139,7 @@ def test_theorems_agree_with_the_oracle() -> None:
 @pytest.mark.parametrize("name", [name for name in HARD_CASES if name not in REFUSED])
 def test_the_default_accelerator_loses_and_invents_no_ray(name: str) -> None:
     case = generate(name, rays_for(name), seed=11)
-    verdict = judge(case, trace(case), asked=3 if name == "G_fan_vertices" else len(case))
+    verdict = judge(case, trace(case), compared=3 if name == "G_fan_vertices" else len(case))
     assert verdict.ok, verdict.examples
     assert verdict.rays == len(case)
     assert verdict.hits > 0 or (case.expected == MISS).all()

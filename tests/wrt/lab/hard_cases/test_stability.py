@@ -106,7 +106,7 @@ def test_names_and_letters_choose_cases() -> None:
 
 
 def beyond_the_sample(name: str) -> Verdict:
-    return sum(stability.run_more(name, stability.Plan(rays=1000, sample=300), lambda line: None), Verdict())
+    return sum(stability.judge_further(name, stability.Plan(rays=1000, sample=300), lambda line: None), Verdict())
 
 
 def test_rays_beyond_the_sample_are_held_to_what_is_known_of_them() -> None:
@@ -138,7 +138,7 @@ def result():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stability, "SPEED_RAYS", 2000)
         found = stability.run(plan, progress=lines.append)
-    assert any("E_grid" in line and "M rays more" in line for line in lines)
+    assert any("E_grid" in line and "M further rays" in line for line in lines)
     return found, plan
 
 
@@ -174,7 +174,7 @@ def interrupted_after(count: int, monkeypatch, *options):
 def test_ctrl_c_keeps_the_rows_that_are_done(monkeypatch, tmp_path, rows, undone) -> None:
     path = tmp_path / "stability.md"
     done = interrupted_after(rows, monkeypatch, "-o", path)
-    assert done.code == 130 and done.err.endswith("interrupted: what was done is kept\n") and str(path) in done.out
+    assert done.code == 130 and done.err.endswith("interrupted: the results so far are kept\n") and str(path) in done.out
     for text in (done.out, path.read_text()):
         assert f"Interrupted; not done, or not with all algorithms: {', '.join(undone)}" in text and "A to H" in text
         assert sum(line.lstrip("| ").startswith("E_grid") for line in text.splitlines()) == rows

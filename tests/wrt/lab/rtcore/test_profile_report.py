@@ -66,7 +66,7 @@ def test_work_has_the_fetches_of_its_rays(measured: Profile) -> None:
 def test_a_notebook_shows_heat_maps_and_the_model(measured: Profile) -> None:
     picture = measured.heatmap("nodes")
     np.testing.assert_array_equal(np.asarray(picture), heatmap(measured.maps["nodes"], "nodes fetched a sample"))
-    with refused(what="no picture 'wings'"):
+    with refused(what="no map 'wings'"):
         measured.heatmap("wings")
     rows = model_rows(measured, GPUS["rtx2080ti"])
     page = rows._repr_html_()
@@ -106,7 +106,7 @@ def test_histograms_are_drawn_of_anything() -> None:
 
 def test_what_cannot_be_written_is_told_before_the_work(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with refused(what="no folder"):
+    with refused(what="output folder"):
         check_folder(tmp_path / "file")
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with refused(what="plots need matplotlib", hint="pip install \"wrt"):

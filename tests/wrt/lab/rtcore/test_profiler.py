@@ -138,7 +138,7 @@ def test_one_sample_is_taken_where_none_is_asked_for_and_progress_ends_at_all_sa
 
 def test_what_a_profile_cannot_do_is_refused(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("aov", "nonsense"):
-        with refused(name, "no argument of a profile"):
+        with refused(name, "not an argument"):
             profile(scene, **{name: "depth"})
     monkeypatch.setattr("wrt.lab.rtcore.profiler.memory_of", lambda device: 1000.0)
     with refused(what="million rays"):

@@ -1,4 +1,4 @@
-"""Dask workers in processes of their own trace the picture of this process, bit for bit, and may be killed at it."""
+"""Dask workers in other processes render the same bits as this process, even if some of them are killed."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ from wrt.renderer.render import render
 distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
 dask = pytest.importorskip("dask", reason="needs the extra cluster")
 
-HOW: dict[str, Any] = {"tile_size": 24, "pass_size": 8, "aov": "depth"}  # few calls: each takes a hundredth of a second
+HOW: dict[str, Any] = {"tile_size": 24, "pass_size": 8, "aov": "depth"}  # few tiles, since each call takes a hundredth of a second
 
 
 @pytest.fixture(scope="module")
 def local() -> Iterator[Any]:
-    """Two workers, each a process with one thread."""
+    """Start two workers, each a process with one thread."""
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0", silence_logs=50) as started:
         yield started
 
@@ -51,7 +51,7 @@ def local() -> Iterator[Any]:
 @pytest.fixture
 def client(local: Any) -> Iterator[Any]:
     with distributed.Client(local, set_as_default=False) as one:
-        one.wait_for_workers(2, timeout=60)  # one that was killed is started anew
+        one.wait_for_workers(2, timeout=60)  # a killed worker is restarted
         yield one
 
 
@@ -61,7 +61,7 @@ def whole() -> Film:
 
 
 def dies_in_a_tile(flags: list[str]) -> None:
-    """On a worker: one process for each flag is killed while it traces a tile."""
+    """Run on a worker: for each flag file, one process is killed while it traces a tile."""
     from wrt.renderer.prepare import Prepared
 
     trace = Prepared.trace_tile
@@ -89,7 +89,7 @@ def test_the_picture_is_the_same(client: Any, whole: Film) -> None:
 
 @pytest.mark.parametrize("killed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_killed_workers_cost_only_their_tiles(client: Any, whole: Film, tmp_path: Path, killed: int) -> None:
-    """If both of two workers die, the scene is lost too, and sent to the next ones."""
+    """If both workers die, the scene is lost, too, and is sent to the restarted workers."""
     flags = [str(tmp_path / str(i)) for i in range(killed)]
     before = set(client.run(os.getpid).values())
     client.run(dies_in_a_tile, flags)
@@ -116,7 +116,7 @@ def test_a_worker_that_hangs_does_not_stop_the_time_limit(client: Any, monkeypat
     late.start()
     try:
         film = render(SCENE, executor=client, spp=1 << 16, time_limit=0.5, progress=hang, tile_size=24, pass_size=8)
-        assert not late.finished.is_set()  # it was not waited for
+        assert not late.finished.is_set()  # the render did not wait for the hanging worker
     finally:
         late.cancel()
         os.kill(hung, signal.SIGCONT)
@@ -132,7 +132,7 @@ def test_a_worker_that_hangs_does_not_stop_the_time_limit(client: Any, monkeypat
 
 @pytest.fixture
 def threads() -> Iterator[Any]:
-    """A scheduler and a worker in this process: they are there at once."""
+    """Start a scheduler and a worker in this process, which takes no time."""
     with distributed.LocalCluster(n_workers=1, threads_per_worker=2, processes=False, protocol="tcp://", silence_logs=50,
                                   dashboard_address=":0") as started:
         yield started
@@ -163,11 +163,11 @@ def test_an_error_on_a_worker_is_the_one_that_is_raised(client: Any) -> None:
 @pytest.mark.parametrize(("change", "said"), [
     (lambda: sys.modules["wrt"].__dict__.update(__version__="0.0.9"), (None, "wrt 0.0.9 (here")),
     (lambda: sys.modules.update(kept=sys.modules["wrt"], wrt=None),  # type: ignore
-     (None, "installed there")),
+     (None, "lacks this version of wrt")),
     (lambda: sys.modules.update({"wrt.renderer.distributed.installed": None}),
      (None, "distributed.installed")),
 ])
-def test_a_worker_that_cannot_serve(client: Any, change: Any, said: Refusal) -> None:
+def test_a_worker_with_another_installation_is_refused(client: Any, change: Any, said: Refusal) -> None:
     version, first = wrt.__version__, next(iter(client.scheduler_info()["workers"]))
 
     def put_back() -> None:
@@ -188,7 +188,7 @@ def test_a_worker_that_cannot_serve(client: Any, change: Any, said: Refusal) -> 
 
 @contextmanager
 def workers_of_other_code(address: str, folder: Path, **env: str) -> Iterator[str]:
-    """A `dask worker` process whose wrt has one more line in io/obj.py; yields the name of its folder."""
+    """Start a `dask worker` process whose wrt has one more line in io/obj.py; yield the name of its folder."""
     for name in ("wrt", "kernels"):
         shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
     with open(folder / "wrt" / "io" / "obj.py", "a", encoding="utf-8") as file:
@@ -208,7 +208,7 @@ def test_a_worker_whose_code_differs_in_a_line_is_refused_by_name(threads: Any, 
                                                                                         mesh.parent / "other"):
         one.wait_for_workers(2, timeout=60)
         (address,) = [where for where, worker in one.scheduler_info(n_workers=-1)["workers"].items() if worker["id"] == "other"]
-        said = f"worker {address} has other code of wrt {wrt.__version__} (io/obj.py): all must have the same"
+        said = f"worker {address} has different code of wrt {wrt.__version__} (io/obj.py); install the same everywhere"
         with pytest.raises(InputError, match=f"^{re.escape(said)}$"):
             render(SCENE, executor=one)
         done = run("render", mesh, "-o", "a.png", "--cluster", threads.scheduler_address)
@@ -216,21 +216,21 @@ def test_a_worker_whose_code_differs_in_a_line_is_refused_by_name(threads: Any, 
 
 
 def test_a_worker_that_comes_later_is_compared_too(threads: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With a render: when it is asked to make the scene ready. With a sweep: at each task."""
+    """A render compares a new worker before it prepares the scene; a sweep compares it at each task."""
     with distributed.Client(threads, set_as_default=False) as one, workers_of_other_code(threads.scheduler_address,
                                                                                         tmp_path / "other"):
         one.wait_for_workers(2, timeout=60)
-        monkeypatch.setattr(cluster, "check_workers", lambda client: None)  # it was not there when they were looked at
-        with refused(what="(io/obj.py): all"):
+        monkeypatch.setattr(cluster, "check_workers", lambda client: None)  # the worker connects after the check
+        with refused(what="(io/obj.py)"):
             render(SCENE, executor=one, spp=256, tile_size=16, pass_size=4)
         (other,) = [where for where, worker in one.scheduler_info(n_workers=-1)["workers"].items() if worker["id"] == "other"]
         task = one.submit(sweep.one_at_a_time, installed.DIGEST, os.getpid, workers=[other], pure=False)
-        with refused(what="other code"):
+        with refused(what="another version of wrt"):
             task.result(timeout=60)
 
 
 def test_a_scene_that_is_lost_is_sent_again(threads: Any, whole: Film, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As by the death of all workers that held it."""
+    """This happens when all workers that had the scene die."""
     monkeypatch.setattr(workers, "_ready", type(workers._ready)())
     sent: list[Any] = []
     with distributed.Client(threads, set_as_default=False) as one:
@@ -245,7 +245,7 @@ def test_a_scene_that_is_lost_is_sent_again(threads: Any, whole: Film, monkeypat
     assert len(sent) == 2
 
 
-def test_without_any_worker_left_it_ends(threads: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_render_without_any_worker_ends(threads: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cluster, "PATIENCE", 0.3)
     with distributed.Client(threads, set_as_default=False) as one, refused(what="no worker is left"):
         render(SCENE, executor=one, spp=1 << 16, size=(200, 200), progress=lambda progress: threads.scale(0))
@@ -260,7 +260,7 @@ def test_a_scheduler_that_goes_away_leaves_a_checkpoint(threads: Any, tmp_path: 
 
     with distributed.Client(threads, set_as_default=False, timeout=1) as one:
         lost = "(the connection to the Dask scheduler is lost|no worker is left)"
-        with pytest.raises(InputError, match=rf"^tcp://[0-9.:]*: {lost}; {path} has what was done$"):
+        with pytest.raises(InputError, match=rf"^tcp://[0-9.:]*: {lost}; {path} has the samples so far$"):
             render(SCENE, executor=one, checkpoint=path, progress=progress, **HOW)
     film = render(SCENE, checkpoint=path, resume=True, aov="depth")
     assert film.stats["resumed"]["samples"] >= 1 and same(film, whole)
@@ -320,7 +320,7 @@ def test_wrong_addresses(mesh: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def certificate(tmp_path: Path) -> tuple[Path, Path]:
-    """Made as docs/cluster.md says: whoever has both files belongs to the cluster."""
+    """Return the certificate and the key that docs/cluster.md describes; both files give access to the cluster."""
     if shutil.which("openssl") is None:
         pytest.skip("needs openssl, to make a certificate")
     page = (ROOT / "docs" / "cluster.md").read_text(encoding="utf-8")
@@ -331,7 +331,7 @@ def certificate(tmp_path: Path) -> tuple[Path, Path]:
 
 
 def test_tls(certificate: tuple[Path, Path], mesh: Path) -> None:
-    """By Dask's configuration, as the environment gives it: wrt needs no option for it."""
+    """Dask's configuration, from the environment, turns TLS on; wrt needs no option for it."""
     file, key = map(str, certificate)
     page = (ROOT / "docs" / "cluster.md").read_text(encoding="utf-8")
     values = {"$PWD/wrt.pem": file, "$PWD/wrt.key": key, "true": True}
