@@ -1,6 +1,5 @@
 """Winding numbers of surfaces around points: the sum of the solid angles of all triangles, over 4 pi; far ones by expansions."""
 
-import numpy as np
 import warp as wp
 
 from wrt.kernels.structs import Surfaces, kernel
@@ -83,7 +82,7 @@ def wind(surfaces: Surfaces, points: wp.array(dtype=wp.vec3), turns: wp.array(dt
 # A subtree is far from a point if its center is at least this many of its radii away.
 FAR = wp.constant(3.25)
 SLIGHTLY_MORE = wp.constant(wp.float64(1.0 + 2.0**-20))  # for a radius that is rounded to float32
-SPHERE = wp.constant(wp.float64(4.0 * np.pi))  # the whole solid angle
+SPHERE = wp.constant(wp.float64(4.0 * wp.pi))  # the whole solid angle
 STACK_SIZE = 128  # two entries a level of a binary tree
 empty_stack = make_uninitialized(STACK_SIZE, wp.int32)
 vec10 = wp.types.vector(10, wp.float32)

@@ -82,7 +82,7 @@ BELOW_KERNELS = {
     "hit_lists": {"query", "units", "structs"},
     "placed_rays": {"query", "structs"},
     "ray_query": {"query", "structs"},
-    "winding": {"structs"},
+    "winding": {"traverse", "structs"},
     "wide": {"headers", "memory", "query", "traverse", "units", "structs"},
     "shade": {"warp_private", "headers", "memory", "rows", "query", "traverse", "units", "structs"},
     "loops": {"shade", "launches", "memory", "rows", "query", "traverse", "units", "structs"},
@@ -94,7 +94,7 @@ LIBRARIES_OF_KERNELS = {"warp", "dataclasses", "functools", "re", "typing", "col
 LONGEST_FUNCTION = 100  # Lines.
 LONG_FUNCTIONS = 10  # Functions with more than 60 lines.
 LONG_SIGNATURES = 3  # Functions with more than 7 parameters.
-MOST_LINES = 47_100  # Lines of wrt/ and kernels/, C++ headers included
+MOST_LINES = 47_200  # Lines of wrt/ and kernels/, C++ headers included
 
 
 def module(path: Path) -> str:

@@ -33,15 +33,15 @@ if TYPE_CHECKING:
     from wrt import testing as testing
     from wrt import torch as torch
     from wrt.accel.device_geometry import DeviceGeometry as DeviceGeometry
+    from wrt.accel.points.closest_points import closest_points as closest_points
+    from wrt.accel.points.closest_points import signed_distance as signed_distance
+    from wrt.accel.points.contains import contains as contains
+    from wrt.accel.points.winding import winding_number as winding_number
     from wrt.accel.queries.all_hits import all_hits as all_hits
     from wrt.accel.queries.all_hits import count_hits as count_hits
     from wrt.accel.queries.all_hits import first_hits as first_hits
-    from wrt.accel.queries.closest_points import closest_points as closest_points
-    from wrt.accel.queries.closest_points import signed_distance as signed_distance
-    from wrt.accel.queries.contains import contains as contains
     from wrt.accel.queries.ray_query import ray_query as ray_query
     from wrt.accel.queries.visible import visible as visible
-    from wrt.accel.queries.winding import winding_number as winding_number
     from wrt.accel.scenes.build import build as build
     from wrt.accel.scenes.build import load_accel as load_accel
     from wrt.accel.structures import ACCELERATORS as ACCELERATORS

@@ -17,9 +17,9 @@ from wrt.accel.bvh.binary import Bvh2
 from wrt.accel.bvh.wide import Bvh4, Bvh8
 from wrt.accel.cells.grid import Grid
 from wrt.accel.instances import Instances
+from wrt.accel.points.closest_points import ClosestPoints
 from wrt.accel.queries.all_hits import AllHits
 from wrt.accel.queries.answers import Counters, Hits
-from wrt.accel.queries.closest_points import ClosestPoints
 from wrt.accel.queries.gradients import Gradients
 from wrt.core.types import WarpArray
 from wrt.lab.rtcore.profiler import Profile

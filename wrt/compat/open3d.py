@@ -13,10 +13,10 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 
 from wrt.accel.geometry import Geometry
+from wrt.accel.points.closest_points import closest_points
+from wrt.accel.points.contains import odd_crossings
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.all_hits import ListQuery
-from wrt.accel.queries.closest_points import closest_points
-from wrt.accel.queries.contains import odd_crossings
 from wrt.accel.queries.raw_kernel import RawKernel
 from wrt.accel.queries.rays import vectors
 from wrt.accel.scenes.build import build

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from wrt.accel.points.contains import open_edges_of
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.all_hits import ALL, ListQuery, first_hits
-from wrt.accel.queries.contains import open_edges_of
 
 
 def every_hit(accel: Accelerator, origins: np.ndarray, directions: np.ndarray, threads: int | None,

@@ -13,8 +13,8 @@ import warp as wp
 from trimesh.caching import Cache, cache_decorator
 from trimesh.ray.ray_util import contains_points
 
+from wrt.accel.points.contains import contains, open_edges_of
 from wrt.accel.queries.answers import Hits
-from wrt.accel.queries.contains import contains, open_edges_of
 from wrt.accel.queries.raw_kernel import RawKernel
 from wrt.accel.scenes.build import build
 from wrt.compat.surfaces import every_hit

@@ -10,7 +10,7 @@ import pytest
 import wrt
 from tests.command_line import wrt as run
 from wrt.accel.geometry import Geometry
-from wrt.accel.queries.contains import open_edges
+from wrt.accel.points.contains import open_edges
 from wrt.lab.bench import closed
 from wrt.lab.bench.report import Row
 from wrt.lab.oracle.oracle import Reference

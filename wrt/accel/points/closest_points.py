@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from wrt.accel.points.contains import contains
+from wrt.accel.points.winding import winding_number
 from wrt.accel.queries.accelerator import Accelerator, snapshot_of
-from wrt.accel.queries.contains import contains
 from wrt.accel.queries.hit_points import device_scene
 from wrt.accel.queries.rays import vectors
-from wrt.accel.queries.winding import winding_number
 from wrt.core.checks import require_known
 from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError

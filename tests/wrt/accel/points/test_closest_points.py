@@ -208,7 +208,7 @@ def test_a_signed_distance_is_of_one_shape_whatever_is_refitted_meanwhile(monkey
         accel.refit(3.0 * ball.vertices)
         return inside
 
-    monkeypatch.setattr("wrt.accel.queries.closest_points.contains", contains)
+    monkeypatch.setattr("wrt.accel.points.closest_points.contains", contains)
     assert wrt.signed_distance(accel, np.zeros((1, 3))) == expected < -0.9
     assert wrt.signed_distance(accel, np.zeros((1, 3))) < 2.0 * expected
 

@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from wrt.accel.points.winding_tree import winding_tree
 from wrt.accel.queries.accelerator import Accelerator, snapshot_of
 from wrt.accel.queries.hit_points import device_scene
 from wrt.accel.queries.rays import vectors
-from wrt.accel.queries.winding_tree import winding_tree
 from wrt.core.arrays import to_tensor_like
 from wrt.core.device import launch_on, upload
 from wrt.core.threads import thread_count

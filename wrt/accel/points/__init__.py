@@ -1,0 +1,1 @@
+"""Queries of points: the closest surface, inside or outside."""
