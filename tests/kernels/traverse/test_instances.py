@@ -72,7 +72,7 @@ def expected(geometry, origins, directions, t_min, t_max):
         shape = geometry.parts[part]
         hits = build(Geometry(shape.vertices, shape.faces, shape.spheres), "brute_force").closest_hit(
             rows_times(rows, origins, 1.0), rows_times(rows, directions, 0.0), t_min, t_max)
-        numbers = getattr(shape, "numbers", np.arange(len(shape)) + first)
+        numbers = getattr(shape, "prim_ids", np.arange(len(shape)) + first)
         prim_id = np.where(hits.prim_id >= 0, numbers[hits.prim_id], -1)
         better = (prim_id >= 0) & ((hits.t < best["t"]) | ((hits.t == best["t"]) & (prim_id < best["prim_id"])))
         for name, values in (("t", hits.t), ("prim_id", prim_id), ("u", hits.u), ("v", hits.v)):

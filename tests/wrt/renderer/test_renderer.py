@@ -454,7 +454,7 @@ def test_what_is_no_scene_is_refused_by_name(value: Any) -> None:
 def test_a_path_and_a_mesh_are_rendered_as_the_command_line_does(tmp_path: Path) -> None:
     path = tmp_path / "box.obj"
     path.write_text(BOX_OBJ)
-    with pytest.warns(SceneWarning, match="box.obj: it has no camera: one that frames the scene was added; it has no lights"):
+    with pytest.warns(SceneWarning, match="box.obj: it has no camera: a camera that frames the scene was added; it has no lights"):
         expected = render(load_scene(path), spp=1, size=SIZE)
     for value in (path, str(path), load_mesh(path)):
         with pytest.warns(SceneWarning, match="box.obj: it has no camera"):
