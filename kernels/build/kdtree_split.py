@@ -20,8 +20,8 @@ class KdEvent:
 class KdOptions:
     """Conditions under which a cell becomes a leaf, and the SAH costs."""
 
-    max_leaf: int  # A cell with at most so many references becomes a leaf.
-    max_depth: int  # A cell at this depth becomes a leaf.
+    max_leaf: int  # A cell with at most max_leaf references becomes a leaf.
+    max_depth: int  # A cell at the depth max_depth becomes a leaf.
     by_cost: int  # 1: a cell becomes a leaf if no split costs less than the leaf.
     cost_traversal: wp.float64
     cost_intersection: wp.float64
@@ -36,7 +36,7 @@ class KdTask:
     hi: wp.vec3
     first: int  # Index of the cell's first event.
     count: int  # Number of the cell's events: six per reference.
-    budget: int  # Largest number of references in all leaves of the cell; an empty leaf counts as one.
+    budget: int  # Largest sum of the numbers of references in all leaves of the cell; an empty leaf counts as one.
     depth: int
     slot: int  # Index of the cell's node.
 
@@ -50,7 +50,7 @@ class KdWork:
     hi: wp.array(dtype=wp.vec3)
     side: wp.array(dtype=wp.uint8)  # Scratch.
     events: wp.array(dtype=KdEvent)  # The events of all pending cells, as a stack; length 6 * budget.
-    kept_left: wp.array(dtype=KdEvent)  # From here on: events of one split, length 6 n each. Kept events are copied, fresh ones clipped.
+    kept_left: wp.array(dtype=KdEvent)  # From here on: scratch of a split, length 6 n. kept: copied; fresh: of clipped references.
     kept_right: wp.array(dtype=KdEvent)
     fresh_left: wp.array(dtype=KdEvent)
     fresh_right: wp.array(dtype=KdEvent)
@@ -81,7 +81,7 @@ def split_cost(options: KdOptions, scale: wp.float64, face: wp.vec2d, below: wp.
 
 @wp.func
 def cheapest_split(work: KdWork, task: KdTask, options: KdOptions) -> KdSplit:
-    """Find the plane of least SAH cost whose references are within the budget. With by_cost, it must also be cheaper than a leaf."""
+    """Find the plane of least SAH cost with at most task.budget references in total. With by_cost, it must be cheaper than a leaf."""
     best = KdSplit()
     best.axis = -1
     n = task.count / 6

@@ -13,7 +13,7 @@ from wrt.kernels.units.box import FAR_PAD, BoxRay
 
 @wp.func
 def later(t: float) -> float:
-    """Return an upper bound of the exact distance whose rounded value is t (kernels.units.box.FAR_PAD), for any sign. Monotone."""
+    """Return an upper bound of the exact distance whose rounded value is t (see kernels.units.box.FAR_PAD). Any sign; monotone."""
     return wp.max(t * FAR_PAD, t * wp.static(2.0 - float(FAR_PAD)))
 
 
@@ -25,7 +25,7 @@ def earlier(t: float) -> float:
 
 @wp.func
 def cell_slack(ray: BoxRay, pad: float, extent: float) -> float:
-    """Return a bound on the change of t by clamping. pad: largest pad of any triangle's box; extent: largest extent of any box.
+    """Return a bound on the change of t by clamping. pad: largest pad of a triangle's box; extent: largest extent of a triangle's box.
     Axes with an infinite reciprocal direction do not change t."""
     steep = float(wp.inf)
     grazing = float(0.0)
