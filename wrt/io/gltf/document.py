@@ -80,7 +80,7 @@ class LeftOut:
 
 
 class Document:
-    """Typed JSON of a file (`gltf`, a pygltflib.GLTF2) and the bytes that it refers to. The caller adds the file to each InputError."""
+    """Typed JSON of a file (`gltf`, a pygltflib.GLTF2) and the bytes that it refers to. The caller adds the path to each InputError."""
 
     def __init__(self, path: PathLike) -> None:
         with needed_by("a glTF file"):

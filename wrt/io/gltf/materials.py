@@ -125,7 +125,7 @@ def _uv_transform(transform: TextureTransform, place: str) -> np.ndarray:
 
 
 class Materials:
-    """Cache of materials: each index gives one Material object."""
+    """Cache of materials: each index of a glTF material gives one Material object."""
 
     def __init__(self, document: Document) -> None:
         self._document = document
