@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from typing import Any, ClassVar
 
-# Names that an option accepts: their kind, as messages call it, and their table.
+# Names that an option accepts: what messages call such a name, and the table of the names.
 STRUCTURES = ("structure", "wrt.accel.structures:ACCELERATORS")
 KINDS = ("kind of ray", "wrt.lab.bench.rays:RAY_KINDS")
 GPUS = ("GPU", "wrt.lab.rtcore.parameters:GPUS")
@@ -22,8 +22,8 @@ MODELLED = "GPU to model: rtx2080ti or rtx2060"
 
 def option(default: Any, text: str = "", between: tuple[int, int] | None = None, of: tuple[str, str] | None = None) -> Any:
     """Return a field of a Plan.
-    - text: help of the option; "" makes the field an argument. between: lowest and highest value (None is always allowed).
-    - of: kind and table of the names that the field accepts; the table as "module:TABLE"."""
+    - text: help of the option; "" makes the field a positional argument. between: lowest and highest value (None is always allowed).
+    - of: for a field of names: what messages call such a name, and the table of the names as "module:TABLE"."""
     return field(default=default, metadata={"text": text, "between": between, "of": of})
 
 

@@ -38,7 +38,7 @@ def longest_of(cost: np.ndarray, warp: np.ndarray) -> np.ndarray:
 
 def by_coherence(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Return an order, (N,) int64, in which similar rays are neighbours.
-    Sort by the octant of the direction, then along a Morton curve through the origins, then along one through the directions. Sources:
+    Sort by the octant of the direction, then along Morton curves through the origins and through the directions. Sources:
     Pharr et al. 1997, Garanzha and Loop 2010."""
     octant = (directions < 0.0) @ np.array([4, 2, 1])
     unit = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), np.finfo(np.float32).tiny)

@@ -121,7 +121,7 @@ tests doubles."""
 
 @dataclass(frozen=True)
 class Variant:
-    """A variant of the design: hits and counters of the rays, in the order of `rays`, and the bytes of a node."""
+    """A variant of the design. node_bytes: size of a node; prim_id, t: hits in the order of all variants; counters: of `rays`."""
 
     name: str
     rays: RaySet
@@ -144,7 +144,7 @@ def traced(name: str, accel: OneMesh, rays: RaySet, node_bytes: tuple[int, int] 
 
 
 def width(tree: Bvh2, rays: RaySet) -> Iterator[Variant]:
-    """Yield variants of width, format and bounding volume of nodes: every BVH of the registry."""
+    """Yield variants of the nodes' width, format and bounding volume: every BVH of the registry."""
     return (traced(name, build(tree.geometry, name), rays) for name in bvhs())
 
 
@@ -171,7 +171,7 @@ def order(tree: Bvh2, rays: RaySet) -> Iterator[Variant]:
 
 
 def sorting(tree: Bvh2, rays: RaySet) -> Iterator[Variant]:
-    """Yield variants of the order of the rays: that of the picture, sorted by origin and direction, and shuffled."""
+    """Yield variants of the order of the rays: as in the picture, sorted by origin and direction, and shuffled."""
     orders = {"as they come": np.arange(len(rays)), "sorted": by_coherence(rays.origins, rays.directions),
               "shuffled": np.random.default_rng(0).permutation(len(rays))}
     for name, which in orders.items():
