@@ -49,7 +49,7 @@ def _stack_limit() -> float:
 
 @cache
 def _stack_size_lock(process: int) -> threading.Lock:
-    """Return a process's lock of threading.stack_size(). A forked process needs its own, as none of its threads would release another."""
+    """Return a process's lock of threading.stack_size(). No thread of a forked process would release the lock of its parent process."""
     return threading.Lock()
 
 
@@ -74,7 +74,7 @@ _here = threading.local()  # large: this thread's stack has STACK bytes
 
 
 def _has_stack() -> bool:
-    """Return True if this thread's stack has STACK bytes. A thread of the user counts as having the size of threads that start now."""
+    """Return True if this thread's stack has STACK bytes. A user's thread is assumed to have the stack of threads that start now."""
     if not hasattr(_here, "large"):
         if threading.current_thread() is threading.main_thread():
             _here.large = _stack_limit() >= STACK
@@ -129,7 +129,7 @@ def submit(task: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> Futur
 
 
 def run_all(tasks: Iterable[Callable[[], None]], threads: int) -> None:
-    """Run all tasks on `threads` threads, including this one. After an error no task starts. It is raised after the running tasks."""
+    """Run all tasks on `threads` threads, including this one. After an error no task starts; the error is raised in the end."""
     with_stack(partial(_run_all, list(tasks), threads))
 
 

@@ -171,7 +171,7 @@ def aov_path(path: PathLike, name: str) -> Path:
 
 
 def layer_channels(name: str, array: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the EXR channels of a layer by name: depth.Z, normal.X ... A layer not in LETTERS has `name`, or name.R, name.G, name.B."""
+    """Return the EXR channels of a layer by name: depth.Z, normal.X ... Layers not in LETTERS: `name`, or name.R, name.G, name.B."""
     if array.ndim == 3:
         return color_channels(name, array, LETTERS.get(name, "RGB"))
     return {f"{name}.{LETTERS[name]}" if name in LETTERS else name: array}

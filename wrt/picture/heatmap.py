@@ -45,7 +45,7 @@ def top_of(values: np.ndarray) -> float:
 
 
 def step_of(top: float) -> float:
-    """Return the distance of the marks of a scale from 0 to `top`: 1, 2 or 5 times a power of ten, for 4 to 10 distances."""
+    """Return the distance of the marks of a scale from 0 to `top`: 1, 2 or 5 times a power of ten. 4 to 10 distances reach `top`."""
     power = 10.0 ** math.floor(math.log10(top / 4.0))
     return next(power * factor for factor in (5.0, 2.0, 1.0) if top / (power * factor) >= 4.0 - 1e-9)
 

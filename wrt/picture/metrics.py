@@ -152,7 +152,7 @@ def flip_map(a: np.ndarray, b: np.ndarray, pixels_per_degree: float = PIXELS_PER
 
 # --- difference image -------------------------------------------------------------------------------------------------
 
-# Colours for differences from 0 to the limit.
+# Colours for differences from 0 to the limit of the colour scale.
 BRIGHTER = np.array([[0, 0, 0], [220, 40, 20], [255, 210, 60], [255, 255, 255]], dtype=np.float64)
 DARKER = np.array([[0, 0, 0], [30, 70, 230], [70, 220, 255], [255, 255, 255]], dtype=np.float64)
 NONFINITE_COLOR = (0, 200, 0)

@@ -97,8 +97,8 @@ def agx(linear: np.ndarray) -> np.ndarray:
     """Apply Troy Sobotka's AgX, base look: inset, log2 between -10 and +6.5 stops, sigmoid, outset, 2.2 power to linear.
 
     Sources: T. Sobotka, AgX-S2O3 (inset matrix, range, sigmoid), with the slope and powers of the NumPy version in the
-    AgX repository; B. Wrensch, "Minimal AgX Implementation" (2023), for undoing the inset after the curve and for the
-    2.2 power that the codes are meant for."""
+    AgX repository; B. Wrensch, "Minimal AgX Implementation" (2023), for the outset, the inverse of the inset, and for
+    the power of 2.2, which turns codes into light."""
     inset = linear @ AGX_INSET.T.astype(linear.dtype)
     stops = np.log2(np.maximum(inset / 0.18, 2.0**AGX_MIN_EV))
     x = np.clip((stops - AGX_MIN_EV) / (AGX_MAX_EV - AGX_MIN_EV), 0.0, 1.0)

@@ -20,7 +20,7 @@ import numpy as np
 UNIT = 2.0**-53  # unit roundoff of float64
 ACCURATE = 1e-14  # larger errors, relative in t and absolute in u and v, are recomputed in integers
 
-# Error bound of a triple product of differences, relative to the sum of its terms' magnitudes; either has 8 roundings in sequence.
+# Error bound of a triple product of differences, relative to the sum of its terms' magnitudes. Both have 8 roundings in sequence.
 TRIPLE = 10.0 * UNIT
 
 
@@ -71,7 +71,7 @@ def _triple_exact(a: list[Any], b: list[Any], c: list[Any]) -> Any:
 
 
 def whole_numbers(*arrays: np.ndarray) -> tuple[list[list[Any]], int]:
-    """Return the rows of each (3, N) array of float32 values as Python ints, in object arrays, and their exponent k: value = int * 2^k."""
+    """Return each (3, N) array of float32 values as 3 object arrays of Python ints, and the exponent k of all arrays: value = int * 2^k."""
     parts = [np.frexp(array) for array in arrays]
     used = [exponent[mantissa != 0.0] for mantissa, exponent in parts]
     k = min((int(e.min()) for e in used if e.size), default=0) - 24

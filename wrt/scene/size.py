@@ -42,7 +42,7 @@ def _finite_light(scene: Scene) -> str:
 
 
 def _size(scene: Scene, enough: float) -> float:
-    """Return the longest side of the box around all shapes and finite lights, or a smaller value of at least `enough`."""
+    """Return the longest side of the box around all shapes and finite lights, or a smaller value that is at least `enough`."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     size = 0.0
     for points in _points(scene):

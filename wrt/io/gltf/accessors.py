@@ -27,7 +27,7 @@ class Accessors:
         self._arrays: dict[int, np.ndarray] = {}
 
     def read(self, index: int, kind: str, place: str) -> np.ndarray:
-        """Return accessor `index` as an array (count, components of `kind`): normalised integers and floats as float32, others as they are.
+        """Return accessor `index` as an array (count, components of `kind`): float32 for floats and normalised integers, else integers.
 
         kind: "SCALAR", "VEC2", "VEC3" or "VEC4". Raises InputError at `place` if the accessor has another kind, does not fit into its
         buffer view, or holds a float that is not finite."""

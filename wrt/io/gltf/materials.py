@@ -47,7 +47,7 @@ class Textures:
         self._textures: dict[tuple[Any, ...], Texture] = {}
 
     def texture(self, info: GltfObject, srgb: bool, material: str, place: str) -> Texture | None:
-        """Return the texture of a textureInfo. None: there is no textureInfo or no image, or it uses another set than TEXCOORD_0."""
+        """Return the texture of a textureInfo. None: there is no textureInfo or no image, or it uses coordinates other than TEXCOORD_0."""
         if info is None:
             return None
         document = self._document

@@ -31,7 +31,7 @@ _SIZES = [name for name, kind in _TYPES.items() if kind[0] != "f"]  # types of a
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _UV_NAMES = (("u", "v"), ("s", "t"), ("texture_u", "texture_v"), ("texcoord_u", "texcoord_v"))
 _INDEX_NAMES = ("vertex_indices", "vertex_index")
-BYTES_AT_ONCE = 1 << 18  # of text, read and converted together
+BYTES_AT_ONCE = 1 << 18  # bytes of text that are read and converted together
 _WORD = re.compile(rb"\S+")
 
 
