@@ -64,7 +64,7 @@ class Structure(NamedTuple):
 
     @property
     def bottom(self) -> WarpType:
-        """Warp struct of a structure over one mesh; with instances, of the lower level."""
+        """Warp struct of a structure over one mesh: this structure, or, with instances, a structure of the lower level."""
         return struct_of(self._replace(units=self.units._replace(instances=False)))
 
     def require_one_mesh(self, message: str) -> None:

@@ -138,7 +138,7 @@ class RayMeshIntersector:
 
 
 class _ScaledStructure:
-    """A structure over a mesh that is shifted to the origin, if it is far from it, and scaled to size 1 by a power of two.
+    """A structure over a copy of a mesh. A mesh far from the origin is shifted there. scale_to_box: scale by a power of two to size 1.
 
     Faces with a corner that is not finite keep their indices and become faces without area, which no ray hits.
     """
@@ -167,7 +167,7 @@ class _ScaledStructure:
         return np.ldexp(points - self.shift, self.exponent)
 
     def local_rays(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray | None, np.ndarray, np.ndarray]:
-        """Return the rows of the valid rays (None: all rays), and these rays in the structure's coordinates, float32.
+        """Return the indices of the valid rays (None: all rays), and these rays in the structure's coordinates, float32.
 
         Far origins are moved to the mesh along their rays in float64, because rounding would displace them.
         """

@@ -73,7 +73,7 @@ class AllHits(Generic[ArrayT]):
 
 
 class ListQuery:
-    """Query of a snapshot of a structure for lists of hits. `of` sets the rays; `all`, `first` and `counts` return results."""
+    """A query for all hits of rays, on a snapshot of a structure. `of` sets the rays; `all`, `first` and `counts` return results."""
 
     n = 0
     rays: RayArrays
@@ -130,9 +130,9 @@ class ListQuery:
         return values if self.give is to_numpy else self.give(upload(values, wp.int64, self.device))
 
     def _listed(self, limit: int, counting: bool = False) -> Iterator[tuple[Any, list[Any], np.ndarray]]:
-        """Yield, for each part of the rays: the rays, one or two lists of their hits, and the number of hits of each ray.
+        """Yield, for each batch of the rays: these rays, one or two HitLists, and the number of hits of each ray.
 
-        Each ray has its hits in one of the lists, at most `limit`. counting: only the numbers of hits are needed.
+        All hits of a ray, at most `limit`, are in one of the HitLists. counting: the caller needs only the numbers of hits.
         """
         limit = min(limit, ALL)
         for begin in range(0, self.n, RAYS_AT_ONCE):
@@ -151,7 +151,7 @@ class ListQuery:
             yield rays, lists, counts
 
     def _filled(self, rays: RayArrays, capacity: np.ndarray, limit: int) -> WarpStruct:
-        """Traverse the structure and return HitLists with space for `capacity` hits of each ray."""
+        """Traverse the structure, and return HitLists with space for capacity[i] hits of ray i."""
         lists: WarpStruct = HitLists()
         lists.limit, lists.crossings = limit, self.lists.crossings
         lists.vertices, lists.faces = self.lists.vertices, self.lists.faces
@@ -185,7 +185,7 @@ class ListQuery:
 
 
 def rows_of(hits: int) -> int:
-    """Return the size of an array of hits. Raises InputError above 2^31 - 1, the largest size that kernels can index."""
+    """Return `hits` as the size of an array. Raises InputError above 2^31 - 1, the largest size that kernels can index."""
     if hits > MOST_ROWS:
         raise InputError(f"{hits} hits do not fit into an array of at most 2^31 - 1", hint="query fewer rays at a time")
     return int(hits)

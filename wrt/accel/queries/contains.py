@@ -26,7 +26,7 @@ def finite_faces(geometry: Geometry) -> np.ndarray:
 
 
 def open_edges(geometry: Geometry) -> int:
-    """Count edges of an odd number of finite faces; 0 means that the mesh is closed. Vertices with equal coordinates are merged."""
+    """Count the edges that an odd number of finite faces share; 0: a closed mesh. Vertices with equal coordinates are merged."""
     _, corner = np.unique(geometry.vertices + np.float32(0.0), axis=0, return_inverse=True)  # -0 becomes 0
     faces = corner.reshape(-1)[finite_faces(geometry)]
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
