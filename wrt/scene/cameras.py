@@ -115,7 +115,7 @@ class Camera(CameraKind):
     device = "wrt.kernels.shade.cameras.perspective"
 
     fov_y: float = field(default=math.pi / 4.0, metadata=given("angle", "full vertical angle of view", ge=0.0005, le=179.94))
-    aperture_radius: float = field(default=0.0, metadata=given("number", "0: a pinhole", "length", ge=0.0))
+    aperture_radius: float = field(default=0.0, metadata=given("number", "radius of the aperture; 0: a pinhole", "length", ge=0.0))
     focus_distance: float = field(default=1.0, metadata=given(
         "number", "distance along the axis to the plane in focus (default: the target's distance, else 1)", "length", ge=SMALLEST))
     blades: int = field(default=0, metadata=given("whole", "sides of the aperture, 3 or more; 0: round", ge=0, le=64))

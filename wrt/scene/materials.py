@@ -151,7 +151,7 @@ class Material:
     metallic: float = field(default=0.0, metadata=given("number", "0: dielectric, 1: metal (metallic_roughness)", ge=0.0, le=1.0))
     roughness: float = field(default=0.0, metadata=given(
         "number", "square root of the GGX alpha; 0: a perfect mirror (conductor, glass, metallic_roughness)", ge=0.0, le=1.0))
-    transmission: float = field(default=0.0, metadata=given("number", "transmitted share (metallic_roughness)", ge=0.0, le=1.0))
+    transmission: float = field(default=0.0, metadata=given("number", "share of the light that the body transmits (metallic_roughness)", ge=0.0, le=1.0))
     emission: Color = field(default=BLACK, metadata=given("color", "emitted by the front side", "radiance"))
     two_sided: bool = field(default=False, metadata=given("flag", "both sides emit"))
     emits_light: bool = field(default=True, metadata=given("flag", "the emission lights other surfaces; false: it is only visible"))

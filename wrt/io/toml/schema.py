@@ -99,14 +99,14 @@ SHAPE_KEYS: dict[str, dict[str, tuple[Any, str]]] = {
     "icosphere": {"subdivisions": (Annotated[int, Field(ge=0, le=9)], "number of times that each triangle is split into four"),
                   "radius": (Length, "radius of the sphere")},
     "torus": {"radius": (Length, "distance from the axis to the middle of the tube"), "tube_radius": (Length, "radius of the tube"),
-              "segments": (Segments, "number around the axis"), "tube_segments": (Segments, "number around the tube")},
+              "segments": (Segments, "segments around the axis"), "tube_segments": (Segments, "segments around the tube")},
     "lathe": {"profile": (Profile, "points (radius, height), bottom up; a repeated point makes a sharp edge"),
-              "segments": (Segments, "number around the axis")},
+              "segments": (Segments, "segments around the axis")},
     "prism": {"sides": (Segments, "sides of the polygon"), "radius": (Length, "radius of the circle through the polygon's corners"),
               "length": (Length, "length along z")},
     "tube": {"points": (Annotated[list[Point], Field(min_length=2)], "points of the line in the middle of the tube"),
-             "radius": (Length | list[Length], "one radius, or one for each point"), "segments": (Segments, "number around the tube")},
-    "teapot": {"segments": (Segments, "number around the axis")},
+             "radius": (Length | list[Length], "one radius, or one for each point"), "segments": (Segments, "segments around the tube")},
+    "teapot": {"segments": (Segments, "segments around the axis")},
 }
 
 
