@@ -1,7 +1,7 @@
 """Structs stored as a structure of arrays, for vectorised loops (kernels.memory).
 A struct of 9 numbers takes 9 rows of a two-dimensional block; column i holds struct i. A loop over i then accesses consecutive addresses,
-which the compiler vectorises. In an array of structs, equal fields would be 9 numbers apart. Functions `load` and `store` are C++ generated
-from the struct's fields, one copy per number (example: tests/kernels/test_rows.py)."""
+which the compiler vectorises. In an array of structs, equal fields would be 9 numbers apart. Functions `load` and `store` are C++ code with
+one statement per number of the struct (example: tests/kernels/test_rows.py)."""
 
 from functools import cache
 from typing import Any, NamedTuple

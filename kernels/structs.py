@@ -41,7 +41,7 @@ else:
 #endif
 """)
 def on_cuda() -> bool:
-    """Test whether the code runs on CUDA, to choose a faster form of the same arithmetic."""
+    """Test whether the code runs on CUDA. Callers then choose a faster form of the same arithmetic."""
 
 
 def size_of(struct: Any) -> int:
@@ -63,7 +63,7 @@ def largest(v: wp.vec3) -> float:
 
 @wp.func
 def lift(v: wp.vec3) -> float:
-    """Return the factor 2^80 for a vector with all components below 2^-40, whose square could be denormal; else 1. The product is exact."""
+    """Return 2^80 if all components are below 2^-40, because the square could be denormal; else 1. The product with v is exact."""
     return wp.where(largest(v) < wp.static(2.0**-40), wp.static(2.0**80), 1.0)
 
 
@@ -83,7 +83,7 @@ class Ray:
 
 @wp.func
 def any_positive(v: wp.vec3) -> bool:
-    """Test whether a component is above 0, False for NaN. A test with wp.max takes three times as long."""
+    """Test whether a component is above 0; NaN is not. A test with wp.max takes three times as long."""
     return v[0] > 0.0 or v[1] > 0.0 or v[2] > 0.0
 
 
@@ -147,12 +147,12 @@ class Texture:
     first: int  # Index of the image's first texel in Surfaces.texels; the image has `height` rows of `width` texels.
     width: int
     height: int
-    srgb: int
-    wrap_u: int
+    srgb: int  # 1: the texels are sRGB-encoded; 0: linear.
+    wrap_u: int  # wrap_u, wrap_v: kernels.shade.textures.WRAP_REPEAT, WRAP_CLAMP or WRAP_MIRROR.
     wrap_v: int
-    row_u: wp.vec3
+    row_u: wp.vec3  # row_u, row_v: rows of the affine map from a surface's uv to texture coordinates.
     row_v: wp.vec3
-    color_a: wp.vec3
+    color_a: wp.vec3  # Colour of the checkerboard's square at (0, 0); color_b: of its neighbours.
     color_b: wp.vec3
 
 
@@ -210,7 +210,7 @@ class Surfaces:
 
     n_triangles: int  # Primitives with prim_id >= n_triangles are spheres.
     vertices: wp.array(dtype=wp.vec3)
-    faces: wp.array(dtype=wp.vec3i)
+    faces: wp.array(dtype=wp.vec3i)  # Indices of each triangle's vertices.
     normals: wp.array(dtype=wp.vec3)  # One per vertex.
     uvs: wp.array(dtype=wp.vec2)  # One per vertex.
     spheres: wp.array(dtype=wp.vec4)  # (center, radius)
@@ -226,9 +226,9 @@ class Surfaces:
 class Light:
     """A light. The list names the fields that each kind of light uses; other fields are not read.
 
-    - Point, spot: position, color = radiant intensity.
+    - Point, spot: position, color = radiant intensity; spot also: direction = axis, cos_inner, cos_outer = cosines of the half angles.
     - Directional: direction of travel, color = irradiance.
-    - Sphere: position, radius, color = radiance, two_sided = 1 if it also shines inwards.
+    - Sphere: position = center, radius, color = radiance, two_sided = 1 if it also shines inwards.
     - Mesh: emitters first .. first + count - 1.
     """
 
@@ -263,13 +263,13 @@ class Background:
 
     bottom: wp.vec3
     top: wp.vec3
-    scale: float
-    rotation: float
+    scale: float  # Factor of the image's radiance.
+    rotation: float  # Angle of the image about +y in radians, counter-clockwise seen from above.
     width: int
     height: int
-    pixels: wp.array(dtype=wp.vec3)
-    row_cdf: wp.array(dtype=wp.float32)
-    column_cdf: wp.array(dtype=wp.float32)
+    pixels: wp.array(dtype=wp.vec3)  # `height` rows of `width` pixels.
+    row_cdf: wp.array(dtype=wp.float32)  # Cumulative distribution over the rows.
+    column_cdf: wp.array(dtype=wp.float32)  # Cumulative distribution over the columns of each row.
 
 
 @wp.struct
@@ -279,7 +279,7 @@ class Lighting:
     count: int  # Number of lights.
     lights: wp.array(dtype=Light)
     emitters: wp.array(dtype=Emitter)
-    emitter_cdf: wp.array(dtype=wp.float32)  # Share of the light's power in its emitters up to and including this one.
+    emitter_cdf: wp.array(dtype=wp.float32)  # Entry i: share of a light's power in its emitters up to and including emitter i.
     background: Background
     ambient: wp.vec3
 
@@ -288,8 +288,8 @@ class Lighting:
 class Limits:
     """Limits of the tree of rays, and the seed of the samples."""
 
-    max_depth: int
-    min_throughput: float
+    max_depth: int  # Largest number of bounces.
+    min_throughput: float  # Paths with less throughput are cut.
     seed: wp.uint32
 
 
@@ -303,15 +303,15 @@ class Film:
     x: int
     y: int
     columns: int
-    mean: wp.array(dtype=wp.vec3)
-    m2: wp.array(dtype=wp.vec3)
-    samples: wp.array(dtype=wp.int32)
+    mean: wp.array(dtype=wp.vec3)  # Running mean of the samples' radiance.
+    m2: wp.array(dtype=wp.vec3)  # Sum of squared deviations from the mean.
+    samples: wp.array(dtype=wp.int32)  # Number of samples.
     rays: wp.array(dtype=wp.int64)  # Number of closest-hit and any-hit rays.
     cut_depth: wp.array(dtype=wp.int32)  # Number of rays cut by max_depth.
     cut_throughput: wp.array(dtype=wp.int32)  # Number of rays cut by min_throughput.
     lost: wp.array(dtype=wp.float32)  # Sum of the throughputs of the cut rays, each averaged over the colour channels.
     not_finite: wp.array(dtype=wp.int32)  # Number of samples that were NaN or infinite; they enter the mean as 0.
-    filter_icdf: wp.array(dtype=wp.float32)
+    filter_icdf: wp.array(dtype=wp.float32)  # Inverse cumulative distribution of the pixel filter along x or y, in pixels.
 
 
 @wp.struct

@@ -10,8 +10,8 @@ SMALLEST, LARGEST = wp.constant(wp.float64(2.0**-900)), wp.constant(wp.float64(2
 
 @wp.struct
 class Turns:
-    """A sum of angles in [-pi, pi], as the argument of a product of complex numbers plus whole turns.
-    Unlike atan2 of the C library, it has the same bits on all machines."""
+    """A sum of angles in [-pi, pi], stored as the product of the complex numbers with these arguments, plus a number of whole turns.
+    Unlike a sum of results of atan2, it has the same bits on all machines."""
 
     re: wp.float64  # The product is re + i im.
     im: wp.float64
@@ -20,7 +20,7 @@ class Turns:
 
 @wp.func
 def corner(surfaces: Surfaces, vertex: int, point: wp.vec3) -> wp.vec3d:
-    """Return the vector from the point to a vertex, in float64."""
+    """Return the vector from `point` to vertex number `vertex`, in float64."""
     return wp.vec3d(surfaces.vertices[vertex]) - wp.vec3d(point)
 
 

@@ -13,7 +13,7 @@ from wrt.kernels.units.triangle import clamped, padded_interval
 @wp.func
 def ray_sphere(box: BoxRay, ray: Ray, center: wp.vec3, radius: float) -> Hit:
     """Return the first of the two intersections with t >= ray.t_min; prim_id is 0 on a hit, else NO_HIT. u = v = 0.
-    Center and ray are in the same space. t is clamped to the interval of the sphere's padded box."""
+    Center and ray are in the same space. The result's t is clamped to the interval in which the ray is in the sphere's padded box."""
     hit = Hit()
     hit.prim_id = NO_HIT
     hit.t = float(wp.inf)

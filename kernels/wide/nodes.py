@@ -23,7 +23,7 @@ ROW_PADS = {"conservative": LANE_PAD, "minmax": 1.0}
 
 @cache
 def make_plane(width: int, compressed: bool) -> Any:
-    """Return plane(nodes, first, k, lane): the coordinate of plane PLANES[k] of a child; and exists(nodes, first, lane) -> bool."""
+    """Return plane(nodes, first, k, lane), the coordinate of PLANES[k] of child `lane`; and exists(nodes, first, lane) -> bool."""
 
     @wp.func
     def plane(nodes: wp.array(dtype=wp.float32), first: int, k: int, lane: int) -> float:
@@ -148,5 +148,5 @@ def make_children(width: int, compressed: bool, box: str) -> Any:
 
 
 def far_pad(box: str) -> float:
-    """Return the factor for LaneRay.far_inv_dir; 1 for a box test without a vectorised form, which widens distances itself."""
+    """Return the factor for LaneRay.far_inv_dir. It is 1 for a box test without a vectorised form, which does not read far_inv_dir."""
     return ROW_PADS.get(box, 1.0)
