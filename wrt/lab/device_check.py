@@ -64,7 +64,7 @@ structure over that of the row's structure."""
 
 @dataclass(frozen=True)
 class Check:
-    """Options of the check. scenes: files, by default wrt's own; rays: number for each mesh and kind; cases: for each hard case."""
+    """Options of the check. scenes: files, by default wrt's own; rays: rays of each kind for each mesh; cases: rays of each hard case."""
 
     device: str
     scenes: Sequence[Path] = ()
@@ -138,7 +138,7 @@ def function_values(x: np.ndarray, y: np.ndarray, name: str) -> np.ndarray:
 
 
 def hit_rows(plan: Check) -> Iterator[Row]:
-    """Yield a row for each structure that compares the hits of all meshes and kinds of rays."""
+    """Yield for each structure a row that compares its hits with the CPU's, for all meshes and kinds of rays."""
     geometries = {name: Geometry.of(make()) for name, make in MESHES.items()}
     on_cpu = {name: build(geometry, device="cpu") for name, geometry in geometries.items()}
     rays = {name: ray_sets(accel, plan.rays) for name, accel in on_cpu.items()}

@@ -137,7 +137,7 @@ class Peers(Plan):
 class HardCases(Plan):
     """Run the hard cases on wrt and other ray libraries: count rays lost, hits invented and wrong triangles, and measure the error of t.
 
-    CASES: names such as E_grid, or letters of groups such as E; default: all."""
+    CASES: names such as E_grid, or letters of groups such as E; default: all that need no spheres and no t_min."""
 
     COMMAND, STUDY, QUICK = "bench hard-cases", "wrt.lab.hard_cases.comparison", {"rays": 100}
     cases: Sequence[str] = option(())
@@ -239,7 +239,7 @@ class WhatIf(Plan):
     """Change one part of the RT core's design, trace the same rays through MESH, and compare their cost.
 
     STUDY names the part. "width": children, format and bounding volume of a node. "stack": entries of a short stack with restarts.
-    "planes": bits of a box plane. "order": nearer child first, early stop. "sorting": order of the rays. "rates": tests a clock."""
+    "planes": bits of a box plane. "order": order of children, early stop. "sorting": order of the rays. "rates": tests a clock."""
 
     COMMAND, STUDY = "whatif", "wrt.lab.rtcore.whatif"
     study: str = option(MISSING, of=("study", "wrt.lab.rtcore.whatif:STUDIES"))

@@ -61,7 +61,7 @@ def rows(plan: Plan) -> Iterator[Row]:
 
 
 def inward(geometry: Geometry, n: int, seed: int = 0) -> RaySet:
-    """Return n rays along uniformly distributed lines that meet the geometry's box. They start on the box's bounding sphere, inwards."""
+    """Return n rays along uniformly distributed lines that meet the geometry's box. They start on its bounding sphere and go inwards."""
     lo, hi, center, radius = ball_around(geometry)
     rng = np.random.default_rng(seed)
     origins, directions = np.empty((0, 3), np.float32), np.empty((0, 3), np.float32)

@@ -19,7 +19,7 @@ class Sweep(Row):
     """Results of a sweep over knobs.
 
     - rows: one row for each variant and spp (samples per pixel); knob None: the unchanged scene; products: `gram` of the row's pictures.
-    - rmse: root of the mean squared error of one picture less the reference's variance; NaN if nothing is left.
+    - rmse: square root of one picture's mean squared error less the reference's variance; NaN unless this difference is above 0.
     - bias: root mean square bias, NaN if noise hides it; bias_below: its upper bound. rmse^2 = bias^2 + noise^2.
     - efficiency: 1 / (mse x seconds). slopes: for each variant, the slopes of log mse and of log variance over log spp.
     - same_pixels: variants whose pixels equal those of the unchanged scene. interrupted: number of the signal that ended the sweep."""

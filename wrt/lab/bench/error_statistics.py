@@ -62,7 +62,7 @@ def student_t(freedom: int) -> float:
 
 
 def estimate(statistic: Callable[[np.ndarray], float], n: int, *, logarithmic: bool = False) -> Estimate:
-    """Return a statistic of n repeats with its confidence interval. logarithmic: take that of the logarithm, for positive values."""
+    """Return a statistic of n repeats with its confidence interval. logarithmic: compute it on the logarithm, for positive values."""
 
     def logarithm(indices: np.ndarray) -> float:
         value = statistic(indices)

@@ -37,7 +37,7 @@ def as_perspective(camera: CameraKind) -> Camera:
 
 def directions_from_pixels(camera: CameraKind, size: tuple[int, int]) -> np.ndarray:
     """Return the (3, 3) float64 matrix that maps (x, y, 1), in pixels from the top left corner, to the ray's direction, not normalised.
-    It has the float32 camera of the render kernels. These kernels round the direction; the matrix gives it unrounded."""
+    The matrix has the render kernels' float32 camera. These kernels round the direction; the matrix gives it unrounded."""
     c = camera_struct(as_perspective(camera), size)
     right, up, forward = (np.array(list(v), np.float64) for v in (c.right, c.up, c.forward))
     tan_x, tan_y = (float(np.float32(value)) for value in (c.tan_x, c.tan_y))  # the struct still holds float64
@@ -127,7 +127,7 @@ class Rasterizer:
 
 
 class RayCaster:
-    """Ray casting with Rasterizer's results: call `draw`, then `depth` and `prim_id`. It builds its own acceleration structure."""
+    """The results of Rasterizer by ray casting: call `draw`, then `depth` and `prim_id`. It builds its own acceleration structure."""
 
     def __init__(self, geometry: Geometry, accel: str = "bvh", device: str = "cpu", threads: int | None = None) -> None:
         ACCELERATORS.check(accel, "accel")

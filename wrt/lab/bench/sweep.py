@@ -74,7 +74,7 @@ def by_mesh(run: Callable[..., list[T]], plan: Any, report: Callable[[T], None],
 
 def one_at_a_time(digest: str, function: Callable[..., T], *arguments: object) -> T:
     """Call a function on a worker, one call at a time in a process, because concurrent timings slow each other down.
-    Raise InputError unless `digest` is the worker's DIGEST, that of its versions of wrt, Python, NumPy and Warp."""
+    Raise InputError unless `digest` is the worker's DIGEST, computed from its versions of wrt, Python, NumPy and Warp."""
     if digest != DIGEST:
         raise InputError(f"worker {worker_name()} has another version of wrt, Python, NumPy or Warp; all workers need the same versions")
     with _alone:

@@ -21,7 +21,7 @@ T = TypeVar("T")
 
 
 def alternate(jobs: Mapping[K, Callable[[], object]], runs: int, clock: Callable[[], float] = time.perf_counter) -> dict[K, np.ndarray]:
-    """Return seconds (runs,) of each job, after one run that is not timed. A round runs every job; each round begins with the next job."""
+    """Return seconds (runs,) of each job, after one run that is not timed. Round k runs every job once, beginning with job k."""
     seconds: dict[K, list[float]] = {name: [] for name in jobs}
     names = list(jobs)
     for job in jobs.values():

@@ -32,7 +32,7 @@ the time of the row's test, run by run, as median [quartiles], lowest and highes
 
 
 def rows(plan: Plan) -> Iterator[Row]:
-    """Yield timings of each triangle test with the default box test, each box test with the default triangle test, and no box test."""
+    """Yield timings of triangle tests with the default box test, box tests with the default triangle test, and triangle tests alone."""
     triangles = [{"triangle": name} for name in RAY_TRIANGLE]
     boxes = [{"box": name} for name in list(RAY_AABB)[1:]]
     for mesh in map(as_mesh, plan.meshes or [icosphere(6), terrain(300), teapot(64)]):

@@ -29,7 +29,7 @@ def compare(rasterizer: Rasterizer, depth: np.ndarray, prim_id: np.ndarray, geom
     """Compare the rays' depth (H, W) float32 and prim_id (H, W) int32 with the rasterizer's, pixel by pixel.
 
     - covered: pixels where the z-buffer has a triangle. differ: pixels whose prim_id differs; each is a tie, silhouette or unexplained.
-    - ties: depths agree within their bound, because the centre is on a common edge or triangles coincide.
+    - ties: depths agree within their bound, because the pixel's centre is on a common edge or triangles coincide.
     - silhouettes: the z-buffer has the rays' depth at a point within a rounding error, some 1e-4 pixels, of the pixel's centre.
     - depth_error, depth_share: where prim_id agrees, the largest difference of depth over the depth, and over its bound."""
     rasterizer.draw(camera, size)
@@ -66,7 +66,7 @@ def _corners(geometry: Geometry, camera: Camera, size: tuple[int, int], prim_id:
 
 def depth_bound(geometry: Geometry, camera: Camera, size: tuple[int, int], prim_id: np.ndarray) -> np.ndarray:
     """Bound to first order the error of the depth of each pixel's ray on its triangle `prim_id` (H, W); 0 on a miss.
-    An error e of the corners moves the hit by at most e / cos(angle of incidence), or e plus the triangle's extent along the ray."""
+    An error e of the corners moves the hit by at most e / cos(angle of incidence), and at most e + the triangle's extent along the ray."""
     row, column = np.nonzero(prim_id >= 0)
     out = np.zeros(prim_id.shape)
     corners = _corners(geometry, camera, size, prim_id[row, column])

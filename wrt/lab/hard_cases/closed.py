@@ -39,7 +39,7 @@ def _dense(position: str) -> Geometry:
 
 def dense_sphere(rng: np.random.Generator, n: int, *, position: str, aim: str) -> HardCase:
     """A: a sphere of radius 2 with 159,200 triangles, and origins in the cube of side 2 around its centre.
-    The cube's corners are 0.26 from the surface; float32 moves a point 2e5 from 0 by at most 0.012. At position "far" the corners
+    The cube's corners are 0.26 from the surface; rounding moves a point 2e5 from 0 by at most 0.012. At position "far" the corners
     of 2356 faces round to a line; wrt.scene.clean.flip_collinear flips their edges, as in every scene."""  # noqa: D401
     center = np.array(POSITIONS[position])
     return inside(_dense(position), center + rng.uniform(-1.0, 1.0, (n, 3)), rng, aim)

@@ -99,7 +99,7 @@ class Verdict:
 
     @property
     def ok(self) -> bool:
-        """True without a miss, false hit, wrong prim_id, self hit or duplicate hit, and if every error is within its bound."""
+        """True if no miss, false hit, wrong prim_id, self hit or duplicate hit was counted, and every error is within its bound."""
         wrong = self.misses + self.false_hits + self.wrong_prim + self.self_hits + self.duplicate_hits
         return wrong + self.t.over + self.u.over + self.v.over == 0
 
@@ -131,7 +131,7 @@ def judge(case: HardCase, hits: Hits, compared: int | None = None, *, lowest: bo
 
     - Each reported hit is tested exactly against the primitive that it names. For `compared` hits (None: case.compared), chosen at
       random with a fixed seed, the oracle also looks for nearer hits. It traces each ray that is reported to miss and is UNKNOWN.
-    - lowest: among identical triangles only the lowest prim_id is right (wrt's rule), else any prim_id.
+    - lowest: True if of identical triangles only the lowest prim_id is right, which is wrt's rule; False if any of them is right.
     - u and v may be None. The error bounds are those of wrt's watertight triangle test and sphere test."""
     reference = reference_of(case.geometry)
     t, u, v, prim_id = (None if value is None else np.asarray(value) for value in (hits.t, hits.u, hits.v, hits.prim_id))
@@ -159,7 +159,7 @@ def check(case: HardCase, hits: Hits) -> Verdict:
 
 
 def _obvious_faults(case: HardCase, t: np.ndarray, prim_id: np.ndarray, finite: np.ndarray) -> tuple[Verdict, np.ndarray]:
-    """Count the faults that need no oracle; also return flags of the reported hits that may be right. finite: by primitive."""
+    """Count the faults that need no oracle. Also return flags of the reported hits that may be right. finite: flags, by primitive."""
     reported = prim_id >= 0
     verdict = Verdict(rays=len(case), hits=int(reported.sum()))
     verdict.wrong("misses", case, np.flatnonzero(~reported & (case.expected == HIT)), "must hit, is reported to miss")
@@ -259,7 +259,7 @@ def _certain(case: HardCase, reference: Reference, found: AllHits, row: np.ndarr
 
 
 def _judge_misses(case: HardCase, reference: Reference, rows: np.ndarray, verdict: Verdict) -> None:
-    """Add to `verdict` the rays of `rows` that must hit, and the borderline rays, which may hit. All are reported to miss."""
+    """Add to `verdict` the rays of `rows` that must hit, and the borderline rays, which may hit. All of `rows` are reported to miss."""
     for first in range(0, len(rows), RAYS_AT_ONCE):
         part = rows[first:first + RAYS_AT_ONCE]
         o, d = case.origins[part], case.directions[part]
@@ -321,7 +321,7 @@ def _lower_twin(case: HardCase, prim_id: int, tied: np.ndarray) -> bool:
 
 def judge_next(case: HardCase, first_prim_id: np.ndarray, next_prim_id: np.ndarray) -> Verdict:
     """Judge case C: a ray that starts at a hit (from a sphere to its outside) must not hit the same primitive.
-    Arrays are (N,), -1 on a miss; a ray without a first hit is right. The verdict has only self_hits: add it to that of `judge`."""
+    Arrays are (N,), -1 on a miss; a ray without a first hit is right. The verdict has only self_hits: add it to the verdict of `judge`."""
     verdict = Verdict()
     again = np.flatnonzero((first_prim_id >= 0) & (next_prim_id == first_prim_id))
     verdict.wrong("self_hits", case, again, "hits the primitive on which it starts", next_prim_id)

@@ -120,7 +120,7 @@ def tiny(rng: np.random.Generator, n: int) -> HardCase:
 
 def tiny_components(rng: np.random.Generator, n: int) -> HardCase:
     """I: triangles of size 1e-20 to 1 with corners on a lattice, and directions of length 1e-15 to 1e15 with up to two tiny components.
-    A tiny component is 2^-20 to 2^-149 of the longest. On this axis the ray starts exactly at its target's coordinate, mostly on a face of
+    A tiny component is 2^-20 to 2^-149 of the longest. On its axis the origin has exactly the target's coordinate, mostly on a face of
     the triangle's box. Half of the rays point away from their target."""
     corners = rng.integers(-4, 5, (32, 3, 3)) * 10.0 ** rng.uniform(-20.0, 0.0, (32, 1, 1))
     geometry = soup(corners)

@@ -54,7 +54,7 @@ COLUMNS: Columns = {
 
 @dataclass
 class Row:
-    """Result of one case and algorithm. judged: rays that the oracle judged; refused: whether input that is not finite was refused."""
+    """Result of one case and algorithm. judged: rays that the oracle judged; refused: None for finite input, True if refused."""
 
     case: str
     algorithm: str
@@ -138,7 +138,7 @@ def case_row(name: str, algorithm: str, plan: Plan) -> Row | None:
 
 def run_case(name: str, rays: int, algorithm: Algorithm, seed: int = 0) -> Row | None:
     """Run one case, let the oracle judge it, and return its row, or None if the algorithm does not support the case.
-    Peers support no spheres, no input that is not finite, and no t_min above 0."""
+    Peers support only triangles, finite input and t_min = 0."""
     row = Row(name, algorithm.name)
     for case in chunks(name, rays, seed):
         if case.refused:

@@ -89,7 +89,7 @@ class _Measured:
             return process.load_seconds + process.render(1, 0)[0]
 
     def result(self, ours: Row, truth: Row) -> Row:
-        """Return the figures of `side_of`, and the ratios of Mitsuba's time at wrt's error to wrt's time (tracing, and whole process).
+        """Return the figures of `side_of`. ratio, process_ratio: Mitsuba's time at wrt's error over wrt's time, to trace and in all.
         same_light: False if Mitsuba's squared bias is above SAME times wrt's squared error. Then the pictures show different light."""
         side = side_of(self.spp, self.runs, truth, self.process.load_seconds, self.start)
         factor = (side.rmse / ours.rmse) ** 2

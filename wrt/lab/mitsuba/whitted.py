@@ -31,7 +31,7 @@ class Walk:
         self.inside = {shape: mi.Color3f(value) for shape, value in absorption.items()}
 
     def transmittance(self, scene: MitsubaObject, si: MitsubaObject, light: MitsubaObject) -> MitsubaObject:
-        """Return the share of `light` that reaches the surface point `si`. Solid surfaces block it; cut-outs and thin panes do not."""
+        """Return the share of `light` that reaches the surface point `si`. Solid surfaces block all of it, cut-outs and thin panes some."""
         share = self.mi.Color3f(1.0)
         ray = si.spawn_ray_to(light.p)
         for _ in range(MAX_TRANSPARENT):

@@ -64,7 +64,7 @@ def sure(crossings: Crossings, bounds: Bounds) -> np.ndarray:
 
 
 def triangle_bounds(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, np.ndarray, np.ndarray], crossings: Crossings) -> Bounds:
-    """Return bounds for ray i and triangle i; o, d, v: arguments of `triangle_crossings`, one ray in a column; crossings: its result."""
+    """Return bounds for ray i and triangle i; o, d, v: arguments of `triangle_crossings`, a column for each ray; crossings: its result."""
     column = np.arange(d.shape[1])
     kz = np.argmax(np.abs(d), axis=0)
     kx, ky = (kz + 1) % 3, (kz + 2) % 3

@@ -45,7 +45,7 @@ AllHits = Any  # np.recarray, whose stubs do not know its attributes
 @dataclass(frozen=True, eq=False)
 class Answer:
     """The closest hit of each ray, arrays (N,).
-    - t: inf on a miss; prim_id: int32, -1 on a miss, the lowest of an exact tie; t, u, v: float64; place: int8, the hit's Place.
+    - t, u, v: float64, t inf on a miss; prim_id: int32, -1 on a miss, the lowest of an exact tie; place: int8, a wrt.scene.exact.Place.
     - tie: flags of rays that hit several primitives at exactly this t; ties: index of such a ray -> the primitives' prim_id, ascending."""
 
     t: np.ndarray
@@ -205,7 +205,7 @@ class Reference:
 
     def _first_exactly(self, hits: AllHits, rows: np.ndarray, group: np.ndarray, origins: ArrayLike,
                        directions: ArrayLike) -> Iterator[tuple[int, list[int]]]:
-        """Yield each ray's group of the hits `rows`, and its hits of exactly lowest t, by prim_id. Spheres are compared in float64."""
+        """Yield the number of each group of the hits `rows`, and its hits of exactly lowest t, by prim_id. For spheres, t is float64."""
         rays = _Rays.of(origins, directions, 0.0, np.inf)
         triangle = hits.prim_id[rows] < self.n_triangles
         exact: dict[int, Any] = {int(row): Fraction(float(hits.t[row])) for row in rows[~triangle]}
@@ -286,7 +286,7 @@ def _tree(lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]
 
 
 def _meets(boxes: np.ndarray, node: np.ndarray, rays: _Rays, ray: np.ndarray) -> np.ndarray:
-    """Return flags of the pairs in which the ray's segment may meet the node's box. If the segment meets the box, the flag is True.
+    """Return flags of the pairs (node, ray) in which the ray's segment may meet the node's box. All pairs that meet have the flag.
     For a ray that lies in a plane of the box, 0 * inf is NaN, which fmin and fmax ignore."""
     enter, leave = np.full(len(ray), -np.inf), np.full(len(ray), np.inf)
     flat = boxes.reshape(-1)
@@ -305,7 +305,7 @@ def _meets(boxes: np.ndarray, node: np.ndarray, rays: _Rays, ray: np.ndarray) ->
 
 @lru_cache(maxsize=4)
 def reference_of(geometry: Geometry | Mesh) -> Reference:
-    """Return the Reference of a geometry. The last four are cached."""
+    """Return the Reference of a geometry. The References of the last four geometries are cached."""
     return Reference(geometry)
 
 

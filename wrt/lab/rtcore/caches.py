@@ -31,7 +31,7 @@ class Cache:
 
 @dataclass(frozen=True, eq=False)
 class Level1:
-    """Result of `first_level`. accesses: number of L1 accesses; wanted: lanes that they serve, summed.
+    """Result of `first_level`. accesses: number of L1 accesses; wanted: sum over the accesses of the lanes that need the line.
     The arrays are (M,) int64 over the misses. line: the cache line; time: the miss's round; lanes: number of lanes that wait for it."""
 
     accesses: int

@@ -45,7 +45,7 @@ class Work:
         return {}
 
     def misses(self, gpu: Gpu, core: Core) -> Misses:
-        """Simulate the caches of a GPU. Repeat a result if caches, SMs, warps at a time and `warm` are equal."""
+        """Simulate the caches of a GPU. Reuse the result of a call with equal caches, SMs, warps at a time and `warm`."""
         first_key = (gpu.sms, core.warps, gpu.l1)
         if first_key not in self._simulated:
             self._simulated[first_key] = first_level(self.warp, self.counters, *first_key)
@@ -56,7 +56,7 @@ class Work:
 
 
 class Prediction(Row):
-    """Result of `predict`. rays_per_second: of the whole GPU; limit: the largest term of TERMS.
+    """Result of `predict`. rays_per_second: of the whole GPU; limit: name of the largest term (see TERMS).
     clocks: term -> clocks of an RT core per ray. utilisation: term -> its clocks over the clocks of the largest term."""
 
 
@@ -84,7 +84,7 @@ def predict(work: Work, gpu: Gpu, core: Core = BASE) -> Prediction:
 
 
 def sweep(work: Work, gpu: Gpu, core: Core = BASE, names: tuple[str, ...] = ("boxes", "triangles")) -> list[Prediction]:
-    """Return a prediction for each combination of assumed values: the fields `names` of Core vary over SWEEPS."""
+    """Return a prediction for each combination of assumed values: the fields `names` of Core take their values in SWEEPS."""
     return [predict(work, gpu, each) for each in variants(core, names)]
 
 

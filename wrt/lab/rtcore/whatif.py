@@ -36,7 +36,7 @@ REFERENCE_BYTES = 16  # of the children's references in a binary node, as in Bvh
 
 @cache
 def studied(study: Study) -> type[Bvh2]:
-    """Return a Bvh2 class that traverses with the kernels of a study."""
+    """Return a Bvh2 class that traverses with the kernels of `study` (kernels.study.bvh2_study)."""
     return type("Bvh2Study", (Bvh2,), {"kernels": study, "__doc__": Bvh2.__doc__})
 
 
@@ -121,7 +121,7 @@ tests doubles."""
 
 @dataclass(frozen=True)
 class Variant:
-    """A variant of the design. node_bytes: size of a node; prim_id, t: hits in the order of all variants; counters: of `rays`."""
+    """A variant of the design. node_bytes: size of a node; prim_id, t: hits in an order common to all variants; counters: of `rays`."""
 
     name: str
     rays: RaySet
@@ -132,7 +132,7 @@ class Variant:
 
 
 def traced(name: str, accel: OneMesh, rays: RaySet, node_bytes: tuple[int, int] | None = None) -> Variant:
-    """Trace closest hits and return the Variant. node_bytes: size of a node in memory, and the size that counts instead."""
+    """Trace closest hits and return the Variant. node_bytes: bytes of a node in memory, and the bytes to count instead."""
     hits = accel.closest_hit(rays.origins, rays.directions, t_max=rays.t_max, trace=True)
     counters = hits.counters
     assert counters is not None
