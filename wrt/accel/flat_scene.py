@@ -30,8 +30,8 @@ class FlatScene:
     """All shapes of a scene, or one mesh, as arrays. prim_ids number the faces of all objects in order, then the spheres.
 
     vertices: (V, 3); faces: (F, 3); normals: (V, 3) or None; uvs: (V, 2). Objects without normals or uvs have zeros; a mesh without
-    uvs has (0, 2). prim_material: index into the scene's materials. Without `placed`, arrays are in world space and in the order of
-    prim_id. With it, an instanced mesh is stored once, in its own space. objects: first prim_id of each object, then of each sphere.
+    uvs has (0, 2). prim_material: index in the scene's materials. Without `placed`, arrays are in world space, in the order of prim_id.
+    With `placed`, instanced meshes are stored once, in their own spaces. objects: first prim_id of each object, then of each sphere.
     """
 
     geometry: Geometry | InstancedGeometry

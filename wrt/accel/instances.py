@@ -29,7 +29,7 @@ ALIGNMENT = 64  # bytes, between the addresses of structures
 
 
 class Instances(Accelerator):
-    """A binary BVH over instances of meshes, made by `wrt.build`. Each mesh has one structure; all are of the same class.
+    """A binary BVH over instances of meshes, made by `wrt.build`. Each mesh has one structure; all structures are of one class.
 
     The closest hit does not depend on the tree: it is the closest of the hits that the meshes' structures find in their own spaces.
     """

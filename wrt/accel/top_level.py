@@ -22,7 +22,7 @@ from wrt.kernels.units.box import PAD_COORDINATE
 ROUNDOFF = 2.0**-24
 SLACK = 32.0 * ROUNDOFF  # see kernels.traverse.instances.enter
 BOXES = 1 << 22  # primitives' boxes to transform in a build, summed over all instances
-MOVED_BOXES = 1 << 18  # the same in a move, where fewer boxes give slightly larger boxes of instances in less time
+MOVED_BOXES = 1 << 18  # as BOXES, but in a move: fewer boxes take less time, and make the boxes of instances slightly larger
 MATRICES = 1 << 17  # boxes to transform at a time
 
 Boxes = tuple[np.ndarray, np.ndarray]  # centers and halves, (G, 3) float64 each

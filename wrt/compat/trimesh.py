@@ -138,7 +138,7 @@ class RayMeshIntersector:
 
 
 class _ScaledStructure:
-    """A structure over a copy of a mesh. A mesh far from the origin is shifted there. scale_to_box: scale by a power of two to size 1.
+    """A structure over a mesh, shifted to the origin if far from it, and, with scale_to_box, scaled to about size 1 by a power of two.
 
     Faces with a corner that is not finite keep their indices and become faces without area, which no ray hits.
     """

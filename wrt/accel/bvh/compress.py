@@ -36,7 +36,7 @@ def powers(biased: np.ndarray) -> np.ndarray:
 
 
 def compress(lo: np.ndarray, hi: np.ndarray, exists: np.ndarray) -> np.ndarray:
-    """Compress the boxes of the children of N nodes, as float32 words: the words of a node that precede its references.
+    """Compress the boxes of the children to the float32 entries of N nodes that precede the references.
 
     lo, hi: (N, W, 3) float32; exists: (N, W) bool, whether a child exists. Every compressed box contains the original box. Along an
     axis whose extent 8 bits cannot cover, the box is infinite.

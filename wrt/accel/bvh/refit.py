@@ -38,14 +38,14 @@ class Fitting:
         launch_on(self.device, bounds, self.primitives, shape, self.low, self.high, None, threads=threads, step=PRIMITIVES_PER_JOB)
 
     def fit(self, tree: WarpStruct, options: WarpStruct | None = None) -> None:
-        """Fit the tree's boxes to the primitives' boxes. With BuildOptions, also make leaves of subtrees where that costs no more."""
+        """Fit the tree's boxes to the primitives' boxes. options: BuildOptions, to make leaves of subtrees where that costs no more."""
         if options is None:
             options = BuildOptions()
             options.row = 1
         launch_on(self.device, kernels.fit, self.nodes, tree, options)
 
     def refit(self, tree: WarpStruct, shape: WarpStruct, threads: int = 1) -> None:
-        """Fit the tree's boxes to the whole primitives of `shape`, also where spatial splits clipped them. CUDA graphs can capture it."""
+        """Fit the tree's boxes to the whole primitives of `shape`, even if spatial splits clipped them. A CUDA graph can capture this."""
         self.find_bounds(shape, threads)
         self.fit(tree)
 

@@ -78,7 +78,7 @@ class _Subtree:
         self.choices += self.choices[-1:] * (self.options.row - len(self.choices))
 
     def _is_leaf_beside(self, cost: float) -> bool:
-        """Return whether the subtree has one primitive, or max_leaf allows a leaf that costs no more than `cost`, which may be inf."""
+        """Return whether a leaf is best: always for one primitive, else if max_leaf allows it and it costs at most `cost`, maybe inf."""
         return len(self.items) == 1 or (len(self.items) <= self.options.max_leaf and self.leaf_cost <= cost)
 
     @property

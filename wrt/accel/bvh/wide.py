@@ -95,7 +95,7 @@ class WideBvh(OneMesh):
         return {"nodes": nodes.reshape(-1)}
 
     def _tree(self, built: Built) -> WideTree:
-        """Convert the arrays that `_arrays` made back to a tree. Compressed boxes are decoded."""
+        """Convert arrays from `_arrays` back to a tree, and decode compressed boxes."""
         head = self._nodes(built)[:, : first_reference(self.width, self.compressed)]
         if self.compressed:
             lo, hi = decompress(head, self.width)

@@ -93,7 +93,7 @@ def refit(tree: WideTree, geometry: Geometry) -> WideTree:
 
 
 def packed(children: np.ndarray, unit: int) -> np.ndarray:
-    """Return the references with the leaves' first primitives renumbered without gaps, in units of `unit` primitives: 1 or a row."""
+    """Return the references with the leaves' first primitives renumbered without gaps, in units of `unit` primitives (1 or a row)."""
     leaf = children < 0
     references = children[leaf].astype(np.int64)
     count = leaf_count.func(references)

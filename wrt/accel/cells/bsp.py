@@ -32,7 +32,7 @@ SPARE = 1024
 MAX_ROOM = (2**31 - 1) // 6 - SPARE  # pieces: their points, six for each, are indexed in int32
 MAX_SUBTREES = 1024  # largest number of subtrees with launches of their own
 PIECE = {"prim_id": (wp.int32, ()), "first": (wp.int32, ()), "count": (wp.int32, ()), "lo": (wp.vec3d, (3,)),
-         "hi": (wp.vec3d, (3,)), "ball": (wp.vec4d, (4,)), "extent": (wp.float64, ())}  # of Pieces: Warp type and shape of a field
+         "hi": (wp.vec3d, (3,)), "ball": (wp.vec4d, (4,)), "extent": (wp.float64, ())}  # fields of Pieces: Warp type, shape
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ class Builder:
         self.done = 0
 
     def launch(self, source: WarpStruct, tasks: WarpArray, cells: WarpStruct, which: int, n: int, keep: int) -> Launch:
-        """Launch, and double the memory until it suffices. keep: cells of at most `keep` pieces become tasks for later; 0: no cells."""
+        """Launch, and double the memory until it suffices. keep: cells of at most `keep` pieces become tasks of later launches; 0: none."""
         room = ROOM * n + SPARE
         self.options.keep = keep
         while True:

@@ -34,7 +34,7 @@ Part = tuple[np.ndarray, np.ndarray, Any]  # nodes, order and totals of a subtre
 class KdOptions:
     """Options of the k-d tree. Raises InputError for values out of range.
 
-    max_leaf: cells with at most so many primitives are not split. max_depth: levels below the root; None: 8 + 1.3 log2 n. by_cost: do
+    max_leaf: cells of at most max_leaf primitives are not split. max_depth: levels below the root; None: 8 + 1.3 log2 n. by_cost: do
     not split if that costs more than a leaf. cost_traversal, cost_intersection: SAH cost of a node and of a primitive. empty_bonus:
     discount, 0 to 1, for splits that cut off empty space. perfect_below: cells with more primitives are split between 64 bins, other
     cells at the best of all planes. clip: clip triangles to cells exactly. max_growth: limit of references and empty leaves per primitive.

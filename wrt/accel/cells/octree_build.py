@@ -27,7 +27,7 @@ OCTANTS = np.arange(8)[:, None] >> np.arange(3) & 1  # (8, 3): 0 for the lower a
 class OctreeOptions:
     """Options of the octree. Raises InputError for values out of range.
 
-    max_leaf: cells with at most so many primitives are not split. max_depth: levels below the root, 0 to MAX_LEVELS. by_cost: do not
+    max_leaf: cells with at most max_leaf primitives are not split. max_depth: levels below the root, 0 to MAX_LEVELS. by_cost: do not
     split a cell whose octants cost a ray as much as the cell. max_growth: limit of references per primitive in every part of the
     tree. mailbox: avoid testing a ray against the same primitive in several cells.
     """
@@ -133,7 +133,7 @@ def build_tree(geometry: Geometry, options: OctreeOptions, threads: int) -> Buil
 
 
 def choose(cells: Cells, split: _Splitter, half: int, options: OctreeOptions) -> tuple[np.ndarray, np.ndarray, Cells]:
-    """Choose K cells to split; return the mask of these (M,), the number of references per octant (K, 8), and the next level's cells."""
+    """Choose K of M cells to split; return their mask (M,), the number of references per octant (K, 8), and the next level's cells."""
     chosen = cells.count > options.max_leaf if half else np.zeros(len(cells.corner), bool)
     large = cells.part(chosen)
     count = split.count(large, half)

@@ -29,7 +29,7 @@ from wrt.kernels.structs import Hit
 from wrt.kernels.warp_private import fields_of
 
 ALL = (1 << 30) - 1
-RAYS_AT_ONCE = 1 << 18  # the hit lists of so many rays take 32 MiB in the first traversal
+RAYS_AT_ONCE = 1 << 18  # rays per batch; their hit lists take 32 MiB in the first traversal
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,8 +218,8 @@ def all_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike, t_mi
         See `Accelerator.closest_hit`.
     crossings : bool
         Find crossings of the surface instead. At a shared edge or corner, the ray counts as shifted by an infinitesimal distance:
-        it hits one triangle inside a surface, and none or two at a silhouette. A ray that begins and ends outside of a closed mesh
-        crosses it an even number of times. With the watertight test this holds without exception.
+        it hits one triangle, but at a silhouette none or two. A ray that begins and ends outside of a closed mesh crosses it an even
+        number of times. With the watertight test this holds without exception.
 
     Returns
     -------

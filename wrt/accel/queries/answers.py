@@ -115,7 +115,7 @@ class Hits(HitPoints[ArrayT]):
 
 def answer_arrays(types: Mapping[str, type], out: list[Any] | None, n: int, device: Device | None,
                   shared: bool = False) -> list[Array]:
-    """Return one array (n,) per entry of `types`, of NumPy if `device` is None, else of Warp: those in `out`, checked, or new ones.
+    """Return one array (n,) per entry of `types`: checked arrays of `out`, or new ones. device: None for NumPy arrays, else Warp.
 
     shared: begin a new array at a cache line, because JAX would copy any other array. Raises InputError that names the array by its
     key in `types`.

@@ -31,9 +31,9 @@ FEWEST, MOST, LEAST, SHARES = 8192, 131072, 4096, 2
 RAYS_PER_LAUNCH = 16384  # for kernels that trace one ray at a time
 MOST_ON_GPU = 1 << 26  # largest number of rays that are copied to a GPU at once: 3 GB with their hits
 BYTES_OF_RAY = 48  # a ray and its hit
-FITS_ANY_GPU = 1 << 20  # for so many rays the free memory of the GPU is not queried
+FITS_ANY_GPU = 1 << 20  # up to this number of rays, the free memory of the GPU is not queried
 MOST_PACKED = (1 << 31) - 64  # rays: kernels index in int32, and their last block may exceed the range
-SMALL = 1024  # up to so many rays, a copy is faster than kernel records of the caller's arrays
+SMALL = 1024  # up to this number of rays, a copy is faster than kernel records of the caller's arrays
 
 
 class Query(NamedTuple):

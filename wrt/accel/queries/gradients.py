@@ -17,7 +17,7 @@ from wrt.core.types import Array, ArrayLike, ArrayT
 from wrt.core.warp_private import recording_tape
 
 ONE_MESH = "only hits of a structure over one mesh, without spheres, have gradients"
-HITS_PER_JOB = 8192  # the intermediate arrays of so many hits stay in the cache
+HITS_PER_JOB = 8192  # few enough that the intermediate arrays stay in the cache
 
 
 class Gradients(NamedTuple, Generic[ArrayT]):

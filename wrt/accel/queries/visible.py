@@ -45,10 +45,10 @@ def visible(accel: Accelerator, a: ArrayLike, b: ArrayLike, on_a: ArrayLike | No
     """Test whether each point of `a` sees the point of `b` in the same row: no surface meets the open segment between them.
 
     Exchanging `a` and `b` does not change the result. Surfaces within a margin of an end point are ignored, so that a surface does
-    not hide a point that lies on it. Let L be the largest absolute coordinate of a pair. At the point that has it, the margin is
-    3.8e-6 L. At the other point it is 3.8e-6 times its largest coordinate or the size of the largest primitive, whichever is larger,
-    but at most 3.8e-6 L. Points nearer to each other than the sum of both margins always see each other. For segments that run
-    almost along the surface at an end point, the margin is not enough: pass `on_a`, `on_b`.
+    not hide a point that lies on it. Let L be the largest absolute coordinate of a pair. At the point with this coordinate, the
+    margin is 3.8e-6 L. At the other point it is 3.8e-6 times the point's largest coordinate or the size of the largest primitive,
+    whichever is larger, but at most 3.8e-6 L. Points nearer to each other than the sum of both margins always see each other. For
+    segments that run almost along the surface at an end point, the margin is not enough: pass `on_a`, `on_b`.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def visible(accel: Accelerator, a: ArrayLike, b: ArrayLike, on_a: ArrayLike | No
 def largest_size(geometry: Geometry | InstancedGeometry) -> float:
     """Return the largest extent of a finite primitive along an axis.
 
-    For instances, return the largest coordinate in a mesh's own space, scaled to world space, because rays are rounded there again.
+    For instances, return the largest coordinate in a mesh's own space, scaled to world space, because rays are rounded in that space.
     """
     if isinstance(geometry, InstancedGeometry):
         reach = np.array([_extents(part)[1] for part in geometry.parts])
