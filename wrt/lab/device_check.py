@@ -64,7 +64,7 @@ structure over that of the row's structure."""
 
 @dataclass(frozen=True)
 class Check:
-    """Options of the check. scenes: files, by default wrt's own; rays: rays of each kind for each mesh; cases: rays of each hard case."""
+    """Options of the check. scenes: files, default: wrt's own; rays: number of each kind for each mesh; cases: rays of each hard case."""
 
     device: str
     scenes: Sequence[Path] = ()

@@ -36,7 +36,7 @@ class Errors:
     histogram: np.ndarray = field(default_factory=lambda: np.zeros(N_BINS, np.int64))
 
     def add(self, error: np.ndarray, unit: np.ndarray | float, bound: np.ndarray, exact_hit: np.ndarray) -> np.ndarray:
-        """Add absolute errors; NaN counts as infinite. Return flags of the errors above `bound`. unit: absolute size of one unit."""
+        """Add absolute errors; NaN counts as infinite. Return flags of errors above `bound`. unit: size of one unit; exact_hit: flags."""
         error = np.where(np.isnan(error), np.inf, error)
         over = (error > bound) | np.isinf(error)
         ratio = np.full(len(error), np.inf)
