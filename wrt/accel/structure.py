@@ -27,7 +27,7 @@ def check_units(triangle: str, box: str) -> None:
 
 @dataclass(frozen=True)
 class NoOptions:
-    """Options of a structure that has none."""
+    """Empty options, for a structure without options."""
 
 
 def options_of(name: str, options: type[T], values: dict[str, object]) -> T:

@@ -138,7 +138,7 @@ class Launch:
         self.output.cost = wp.zeros(1, dtype=wp.float64, device=self.cpu)
 
     def run(self, source: WarpStruct, tasks: WarpArray, cells: WarpStruct, which: int) -> bool:
-        """Launch, and return whether the memory sufficed. which: index of the task in `tasks`."""
+        """Launch build_cells for the task tasks[which], and return whether the memory sufficed."""
         launch(build_bsp.build_cells, 1, source, tasks, cells, which, self.tools, self.stack, self.output)
         self.results = self.output.results.numpy().copy()
         self.nodes = on_host(self.output.nodes)[: self.results[build_bsp.N_NODES]].copy()

@@ -88,7 +88,7 @@ def contains(accel: Accelerator, points: ArrayLike, threads: int | None = None) 
 
 
 def odd_crossings(query: ListQuery, rows: np.ndarray, seed: int = 0) -> np.ndarray:
-    """Return whether a ray from each point (N, 3) crosses the surface an odd number of times. `seed` chooses its direction."""
+    """Return whether a ray from each point in `rows`, (N, 3), crosses the surface an odd number of times. seed: of its direction."""
     inside = np.zeros(len(rows), bool)
     low, high = used_bounds(query.snapshot)
     within = np.nonzero(((rows >= low) & (rows <= high)).all(axis=1))[0]
