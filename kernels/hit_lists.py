@@ -118,7 +118,7 @@ def make_list_hits_kernel(accel_struct: Any, traverse: Any) -> Any:
 
 @kernel
 def copy_hits(rays: RayArrays, lists: HitLists, begin: wp.array(dtype=wp.int32), hits: HitArrays, start: int):
-    """Copy the list of ray i to the entries of `hits` from begin[i] on, with t in units of the caller's direction."""
+    """Copy the list of ray i = start + tid to the entries of `hits` from begin[i] on, with t in units of the caller's direction."""
     i = start + wp.tid()
     scale = direction_scale(rays.direction[i])
     for k in range(lists.count[i]):

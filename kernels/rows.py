@@ -38,8 +38,8 @@ class Rows(NamedTuple):
         return Rows(fields[name], self.length, self.first + sum(len(numbers_of(fields[each], "")) for each in before))
 
     def text(self, line: str, without: tuple[str, ...] = ()) -> str:
-        """Return the template `line` once per number of the struct, except in the fields `without`: {number} is the number's C++
-        expression, {place} its address in column i."""
+        """Return the template `line` once per number of the struct, except in the fields `without`. In the template, {number} is the
+        number's C++ expression, {place} its address in column i."""
         left_out = tuple(f"value.{name}{end}" for name in without for end in ("[", ".", ";"))
         return "".join(f"    {line}\n".format(number=number, place=f"rows.data + {row * self.length}ll + i")
                        for row, number in enumerate(numbers_of(self.dtype, "value"), self.first)

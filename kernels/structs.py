@@ -113,8 +113,8 @@ class Hit:
     """A hit: the point (1 - u - v) v0 + u v1 + v v2 on triangle prim_id.
     A miss has prim_id = NO_HIT during traversal, and -1 in the result of a traversal."""
 
-    t: float
-    u: float
+    t: float  # In units of the direction's length.
+    u: float  # u, v: barycentric coordinates; 0 on a sphere.
     v: float
     prim_id: int
 
@@ -132,7 +132,8 @@ class Primitive:
 
 @wp.struct
 class PlanePrimitive:
-    """A triangle by three planes (x, y, z: normal, w: offset), for tests with precomputed data; 52 bytes. Spheres: as in Primitive."""
+    """A triangle by three planes (x, y, z: normal, w: offset), for the tests units.triangle.plane_equation and baldwin_weber; 52 bytes.
+    Spheres: as in Primitive."""
 
     a: wp.vec4
     b: wp.vec4
@@ -205,8 +206,8 @@ class Instance:
 @wp.struct
 class Surfaces:
     """Attributes of primitives, read after a hit.
-    With instances, vertices, normals and faces are stored once per mesh, in the mesh's space. Without instances (length 0), they are in
-    world space, and prim_id indexes faces and prim_material. Arrays that a scene does not use have length 1."""
+    With instances, vertices, normals and faces are stored once per mesh, in the mesh's space. Without instances (array of length 0), they
+    are in world space, and prim_id indexes faces and prim_material. Arrays that a scene does not use have length 1."""
 
     n_triangles: int  # Primitives with prim_id >= n_triangles are spheres.
     vertices: wp.array(dtype=wp.vec3)
@@ -218,8 +219,8 @@ class Surfaces:
     prim_material: wp.array(dtype=wp.int32)  # Indices into `materials`.
     materials: wp.array(dtype=Material)
     textures: wp.array(dtype=Texture)
-    texels: wp.array(dtype=wp.uint32)
-    srgb_to_linear: wp.array(dtype=wp.float32)
+    texels: wp.array(dtype=wp.uint32)  # RGBA of 8 bits each, red in the lowest byte.
+    srgb_to_linear: wp.array(dtype=wp.float32)  # Linear values: of the 256 sRGB bytes, then of the 256 linear bytes.
 
 
 @wp.struct
@@ -316,7 +317,7 @@ class Film:
 
 @wp.struct
 class AovFilm:
-    """The first hit of the ray through each pixel's centre; width, height, x, y and columns are as in Film."""
+    """Layers of the first hit of the ray through each pixel's centre (wrt.picture.film.Film). width .. columns: as in structs.Film."""
 
     width: int
     height: int

@@ -26,7 +26,7 @@ def corner(surfaces: Surfaces, vertex: int, point: wp.vec3) -> wp.vec3d:
 
 @wp.func
 def add_angle(turns: Turns, re: wp.float64, im: wp.float64) -> Turns:
-    """Add the argument of the complex number re + i im."""
+    """Add the argument (angle) of the complex number re + i im to the sum `turns`."""
     zero = wp.float64(0.0)
     if re == zero and im == zero:  # the point is on an edge
         return turns
@@ -47,7 +47,7 @@ def add_angle(turns: Turns, re: wp.float64, im: wp.float64) -> Turns:
 
 @kernel
 def wind(surfaces: Surfaces, points: wp.array(dtype=wp.vec3), turns: wp.array(dtype=wp.vec3d), first: int):
-    """Store (re, im, whole) of `Turns`, the sum of half the triangles' solid angles, for points first .. first + dim - 1.
+    """Store (re, im, whole) of `Turns`, the sum of half the solid angles, for points first .. first + dim - 1 (dim: launch size).
     Van Oosterom and Strackee 1983, "The Solid Angle of a Plane Triangle". A triangle with a corner at the point adds 0."""
     i = first + wp.tid()
     point = points[i]

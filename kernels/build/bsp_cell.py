@@ -114,7 +114,7 @@ class CutFace:
     above: wp.vec3d  # Twice the area vector of the face's part above the plane.
     down: wp.vec3d  # Point where an edge crosses the plane downwards, if `crossed`.
     up: wp.vec3d  # Point where an edge crosses the plane upwards, if `crossed`.
-    crossed: bool
+    crossed: bool  # True if edges of the face cross the plane.
     highest: wp.float64  # Largest value of the plane at a corner, at least 0.
     lowest: wp.float64  # Smallest value of the plane at a corner, at most 0.
 

@@ -68,7 +68,7 @@ def choose_median(data: BuildData, task: BuildTask) -> int:
 
 @wp.func
 def choose_sweep(data: BuildData, task: BuildTask) -> int:
-    """Partition at the cheapest split, of all splits in the order of centroids along an axis; return the first index of the right side.
+    """Partition at the cheapest of all splits of the records sorted by centroid along an axis; return the first index of the right side.
     MacDonald and Booth 1990, "Heuristics for ray tracing using space subdivision". A stable partition keeps both sides sorted along all
     three axes."""
     n = data.boxes.shape[0]

@@ -1,7 +1,7 @@
 """The k-d tree's split: the plane of least cost by the surface area heuristic (SAH).
 Wald and Havran 2006, "On building fast kd-Trees for Ray Tracing, and on doing that in O(N log N)". The candidates are all faces of the
-references' boxes; a sweep over the sorted faces finds the best. Cells with more than `perfect_below` references are split between bins, at
-the same costs (wrt.accel.cells.kdtree_build.binned_split)."""
+references' boxes; a sweep over the sorted faces finds the best. The host splits cells with more than
+`perfect_below` references between bins, at the same costs (wrt.accel.cells.kdtree_build.binned_split)."""
 
 import warp as wp
 
@@ -48,7 +48,7 @@ class KdWork:
     prim_id: wp.array(dtype=wp.int32)
     lo: wp.array(dtype=wp.vec3)  # lo, hi: boxes of the references, clipped to the root's cell.
     hi: wp.array(dtype=wp.vec3)
-    side: wp.array(dtype=wp.uint8)  # Scratch.
+    side: wp.array(dtype=wp.uint8)  # Scratch: side of the plane (kdtree.mark_sides).
     events: wp.array(dtype=KdEvent)  # The events of all pending cells, as a stack; length 6 * budget.
     kept_left: wp.array(dtype=KdEvent)  # From here on: scratch of a split, length 6 n. kept: copied; fresh: of clipped references.
     kept_right: wp.array(dtype=KdEvent)

@@ -1,7 +1,8 @@
 """Build a binary BVH along a Morton curve, with one thread per node, on the CPU and on CUDA.
 Karras 2012, "Maximizing Parallelism in the Construction of BVHs, Octrees, and k-d Trees". Primitives are sorted by the Morton code of
 their boxes' middles. Each inner node computes its range of primitives and its split. Then `fit.fit` makes boxes and leaves from the bottom
-up, and `write_nodes` writes the remaining nodes in depth-first order."""
+up, and `write_nodes` writes the remaining nodes in depth-first order. A launch of size dim processes the
+items first .. first + dim - 1."""
 
 import warp as wp
 
@@ -66,7 +67,7 @@ def cell_of(x: float, begin: float, end: float, bits: int) -> wp.uint64:
 def write_keys(low: wp.array(dtype=wp.vec3), high: wp.array(dtype=wp.vec3), ends: wp.array(dtype=wp.vec3), bits: wp.vec2i,
                keys: wp.array(dtype=wp.uint64), order: wp.array(dtype=wp.int32), first: int):
     """Write the keys of primitives first .. first + dim - 1. A key's high bits are the Morton code of the middle, its low bits the index.
-    The numbers of bits are `bits` (see bits_of); dim is the launch size."""
+    The numbers of bits are `bits` (see bits_of)."""
     i = first + wp.tid()
     middle = middle_of(low[i], high[i])
     a = ends[0]

@@ -54,7 +54,7 @@ class BuildOptions:
 
 @wp.struct
 class BuildData:
-    """Arrays of a builder, with one entry per record unless a comment says otherwise. Some serve only the sweep or the spatial splits."""
+    """Arrays of a builder, with one entry per record unless a comment says otherwise. Some arrays serve only sweep or spatial splits."""
 
     records: wp.array(dtype=BuildRecord)  # The build reorders them.
     nodes: wp.array(dtype=Bvh2Node)

@@ -53,7 +53,7 @@ def carry(trail: Trail) -> Trail:
 
 
 def make_short_stack(units: Units, entries: int, any_hit: bool, accepts: Any = None) -> Any:
-    """Make the traversal with a stack of `entries` entries, for trees of at most LEVELS levels. With 0, each pop restarts at the root."""
+    """Make the traversal with a stack of `entries` entries, for trees of at most LEVELS levels. With 0 entries, each pop is a restart."""
     probe_of = make_probe(units)
     visit_leaf = make_leaf(units, any_hit, accepts)
     ray_aabb = units.box_test

@@ -11,8 +11,8 @@ LINE = wp.constant(wp.int64(128))  # bytes of a cache line
 class Caches:
     """One cache per thread, all of the same size."""
 
-    sets: int
-    ways: int
+    sets: int  # Number of sets of a cache.
+    ways: int  # Number of lines of a set.
     tags: wp.array(dtype=wp.int64)  # For each cache, `sets` sets of `ways` line indices, the most recently used first; -1: empty.
 
 

@@ -225,8 +225,8 @@ def draw_row(view: View, corners: Corners, columns: wp.vec2i, row: int, keys: wp
 @kernel
 def rasterize(view: View, projected: wp.array(dtype=wp.vec3d), faces: wp.array(dtype=wp.vec3i), boxes: wp.array(dtype=wp.vec4i),
               prim_ids: wp.array(dtype=wp.int32), bands: wp.vec2i, keys: wp.array(dtype=wp.uint64)):
-    """Draw triangles in bands of rows. The launch has the dimensions (bands, triangles); bands: (first row of the first, rows per band).
-    On CUDA, threads may share a pixel, because atomic_min is atomic. On the CPU it is not: each band needs a launch of its own."""
+    """Draw triangles in bands of rows. The launch has the dimensions (bands, triangles); bands: (first row, rows per band).
+    On CUDA, threads may share a pixel, because atomic_min is atomic. On the CPU it is not atomic: each band needs its own launch."""
     band, i = wp.tid()
     corners = Corners()
     corners.prim_id = prim_ids[i]

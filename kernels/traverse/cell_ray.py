@@ -1,8 +1,8 @@
-"""Margins of a walk through the cells of a grid or octree. A cell lists only triangles that meet the cell, not all whose boxes meet it.
+"""Margins of a walk through the cells of a grid or octree. A cell lists triangles that meet it, not all triangles whose boxes meet it.
 
 Before clamping, a hit is on its triangle, except for the triangle's pad and a few roundings. So it is in a cell that lists the triangle.
 Then t is clamped to the interval of the triangle's box (kernels.units.triangle.within_bounds). This moves the hit by up to the pad at right
-angles to a face of the box, which on a grazing ray is a long way along the ray. So the final hit lies up to `cell_slack` before or behind
+angles to a face of the box. On a grazing ray, that is a long way along the ray. So the final hit lies up to `cell_slack` before or behind
 the cells that list its triangle. The walk begins by cell_slack before t_min, and continues by cell_slack behind its best hit.
 """
 

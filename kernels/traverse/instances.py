@@ -47,16 +47,16 @@ class WidenedRay:
     """A ray set up for `enter`."""
 
     box: BoxRay
-    slack: float
+    slack: float  # As Instances.slack.
 
 
 @wp.func
 def enter(ray: BoxRay, lo: wp.vec3, hi: wp.vec3, slack: float, t_max: float) -> float:
     """Return the result of `ray_aabb` for the box widened by slack times the distance to the box's farthest corner.
 
-    In the structure's space, the ray is rounded to float32: its point at t is off by u (|o| + t |d|) per axis. A hit may be 17 u t |d|
-    outside its primitive's box (3 for the slabs, 14 for FAR_PAD). In world space, with the map A from the structure to the world, that is
-    at most u (2 + 17) |A| |A^-1| times the distance. The builder's box contains the part u |A| times the coordinates
+    In the structure's space, origin o and direction d are rounded to float32: a point is off by u (|o| + t |d|) per axis. A hit may
+    be 17 u t |d| outside its primitive's box (3 for the slabs, 14 for FAR_PAD). In world space, with the map A from the structure to the
+    world, that is at most u (2 + 17) |A| |A^-1| times the distance. The builder's box contains the part u |A| times the coordinates
     (wrt.accel.instances). The rounding of this test adds 4.
 
     slack = 32 u max |A| |A^-1| covers these errors; |A| is the largest sum of absolute values in a row. So the returned t is never greater

@@ -59,8 +59,8 @@ def make_struct(record: Any) -> Any:
 def clamp_slack(direction: wp.vec3, inv_dir: wp.vec3, reach: float) -> float:
     """Return a bound on the change of t by clamping to a triangle's box (`within_bounds`); reach: largest extent of a clipped triangle.
     The triangle unit may report a hit for a ray that misses the triangle by 16 u of its extent. After clamping t on a grazing ray, the hit
-    may be far from the triangle, outside the leaves that list it. The bound is 16 u extent / |d|, for the smallest component |d| that is
-    not 0. It is at most the length of the ray's part in the box."""
+    may be far from the triangle, outside the leaves that list it. The bound is 16 u reach / |d|, for the direction's smallest component d
+    that is not 0. It is at most the length of the ray's part in the box."""
     steepest = float(0.0)
     for axis in range(3):
         inverse = wp.abs(inv_dir[axis])

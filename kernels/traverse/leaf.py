@@ -35,7 +35,7 @@ def make_leaf(units: Units, any_hit: bool, accepts: Any = None) -> Any:
 
 
 def make_mailbox_leaf(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """Make visit_leaf(accel, surfaces, probe, leaf, mailbox, best, counts) -> (Mailbox, best Hit, Counts), for leaves of references."""
+    """Make visit_leaf(accel, surfaces, probe, leaf, mailbox, best, counts) -> (Mailbox, best Hit, Counts), for leaves of indices."""
     intersect = make_intersect(units, accepts)
     _, fetch_primitive, _, _ = make_counters(units, 0)
 

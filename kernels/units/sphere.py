@@ -1,7 +1,7 @@
 """The sphere unit: the intersection of a ray with a sphere that is a primitive.
-The discriminant is computed from the distance between center and line. One root would suffer from cancellation; it is computed from the
-product of both roots. Source: Haines, Guenther and Akenine-Moeller 2019, "Precision Improvements for Ray/Sphere Intersection", Ray Tracing
-Gems, chapter 7. In float64, because the distance to a large ground sphere is a small difference of two numbers near its radius."""
+The discriminant is computed from the distance between center and line. One root would suffer from cancellation: this root is computed from
+the product of both roots. Source: Haines, Guenther and Akenine-Moeller 2019, "Precision Improvements for Ray/Sphere Intersection", Ray
+Tracing Gems, chapter 7. In float64, because the distance to a large ground sphere is a small difference of two numbers near its radius."""
 
 import warp as wp
 

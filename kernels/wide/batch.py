@@ -2,8 +2,8 @@
 
 Sixteen rays with similar directions walk the tree as a packet (Wald et al. 2001, "Interactive Rendering with Coherent Ray Tracing"). At a
 node, a beam around all rays is tested first. The children that the beam enters are then tested against all sixteen rays at once. All other
-rays are interleaved: one thread has many rays in progress, and each ray takes one step in turn. So the core always has work, while single
-rays wait for memory or for their last result."""
+rays are interleaved: one thread has many rays in progress, and each ray takes one step in turn. So the core has work, while some rays
+wait for memory or for the result of an instruction."""
 
 from functools import cache
 from typing import Any

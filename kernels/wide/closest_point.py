@@ -1,11 +1,11 @@
 """Closest points on a mesh: a walk over a wide BVH in the order of distance from a point.
 
-A triangle without area has NaN in the first corner of its record, so that no ray hits it. But a point has a distance to it, as to a segment
-or a point: so the corners are read from the mesh.
+A triangle without area has NaN in the first corner of its record, so that no ray hits it. But points have a distance to it: it is a segment
+or a point. So its corners are read from the mesh.
 
 The distance to a triangle is computed in float64 (Ericson 2005, "Real-Time Collision Detection", section 5.1). It is clamped to at least
-the distance to the triangle's padded box. Rounding is monotone, so no box above a triangle is farther than the triangle. Therefore the
-nearest triangle does not depend on the tree."""
+the distance to the triangle's padded box. Rounding is monotone, so no box of a node above a triangle is farther than the triangle.
+Therefore the nearest triangle does not depend on the tree."""
 
 from functools import cache
 from typing import Any
@@ -243,7 +243,7 @@ def make_closest_point(layout: NodeLayout) -> Any:
 
 @cache
 def make_closest_point_kernel(layout: NodeLayout) -> Any:
-    """Return the kernel for points first .. first + dim - 1; the tree's primitives have the layout "corners"."""
+    """Return the kernel for points first .. first + dim - 1 (dim: launch size). The tree's primitives have the layout "corners"."""
     struct, closest_point = make_struct(Primitive), make_closest_point(layout)
 
     @kernel

@@ -5,7 +5,7 @@ Nodes are consecutive in a flat array of float32; layout.py has the constants.
   and an unused row that aligns nodes to cache lines.
 - A compressed node has 24 floats for bvh8c (Ylitie, Karras and Laine 2017, section 3.2). It has an origin (3 floats), a word with three
   exponents and the mask of existing children, six rows of `width` bytes, and the references. A plane is origin + byte * 2^(exponent - 127),
-  rounded once. The builder ensures that no plane cuts off a part of the box. With a NaN origin, an axis rejects no ray."""
+  rounded once. The builder ensures that no plane cuts off a part of the box. An axis with a NaN origin rejects no ray."""
 
 from functools import cache
 from typing import Any

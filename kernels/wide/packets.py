@@ -1,7 +1,8 @@
 """Packets and interleaved rays, for kernels of one CPU thread: each function calls C++ (packet.h, set_up.h, interleaved.h).
 
 The results have the bits of the box and triangle units (tests/kernels/wide/test_packets.py). The argument `base` is the index in
-Scratch.packets where a packet begins; `ray` is the index of a ray's column, base + lane."""
+Scratch.packets where a packet begins; `ray` is the index of a ray's column, base + lane. A beam bounds all rays of a packet
+(layout.BEAM)."""
 
 from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -58,7 +59,7 @@ def make_set_up(rays_struct: Any) -> Any:
     return wrt::set_up<{flag(plain)}>(wrt::pointers_to(rays, first, {excludes}), count, pad, scratch.packets.data + base);
     """)
     def set_up(rays: rays_struct, first: int, count: int, pad: float, scratch: Scratch, base: int) -> int:
-        """Set up rays first .. first + count - 1. Return the mask of rays whose segments are not empty, plus COHERENT if they have a beam.
+        """Set up rays first .. first + count - 1. Return the mask of rays whose segments are not empty, plus COHERENT if there is a beam.
 
         The factor `pad` is nodes.far_pad."""
 

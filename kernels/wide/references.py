@@ -13,7 +13,7 @@ MAX_FIRST = 1 << (31 - LEAF_BITS)  # Upper bound, exclusive, of a leaf's `first`
 
 @wp.func
 def leaf_reference(first: int, count: int) -> int:
-    """Return the reference of a leaf with `count` (1 .. MAX_LEAF) primitives; first: index below MAX_FIRST, in units of NodeLayout.unit."""
+    """Return the reference of a leaf with `count` (1 .. MAX_LEAF) primitives. first: index below MAX_FIRST in units of NodeLayout.unit."""
     return -1 - (MAX_LEAF * first + count - 1)
 
 
