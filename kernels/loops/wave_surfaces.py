@@ -17,7 +17,7 @@ FAR = 16  # Number of hits between the prefetch of a triangle's corners and thei
 
 @wp.func
 def hit_triangle(wave: Wave, surfaces: Surfaces, j: int) -> int:
-    """Return the prim_id of hit j's triangle. For a sphere, return any valid triangle; its result is ignored."""
+    """Return the prim_id of hit j's triangle. For a hit on a sphere, return any valid prim_id; nothing reads the result."""
     return wp.min(wave.queue.hits.prim_id[wave.outcomes.hit_rays[j]], surfaces.n_triangles - 1)
 
 
@@ -34,7 +34,7 @@ class Attributes:
 
 
 def make_load_triangles(has: Attributes) -> Any:
-    """Return load_triangles(wave, surfaces, first, end, hits): store the hits first .. end - 1 in the rows HITS. hits: number of all hits."""
+    """Return load_triangles(wave, surfaces, first, end, hits): store hits first .. end - 1 in the rows HITS. hits: number of hits."""
     smooth, uvs, tangents = has.smooth, has.uvs, has.tangents
     place_of, triangle_at = make_place_of(False), make_triangle_at(smooth, uvs, False)
     store_hit = HITS.store(*has.not_of_hits)

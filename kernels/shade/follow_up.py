@@ -37,7 +37,7 @@ class FollowUp:
 
 @wp.func
 def add_cuts(before: Sample, next: FollowUp) -> Sample:
-    """Add the number of cut paths of a hit, and the loss of its onward path, to the sample."""
+    """Add the numbers of a hit's cut paths to the sample, and the light that is lost if its onward path was cut."""
     out = before
     out.cut_depth += next.cut_depth
     out.cut_throughput += next.cut_throughput

@@ -20,7 +20,7 @@ SMALLEST = wp.constant(wp.float64(2.0**-149))  # The smallest positive float32.
 
 @wp.struct
 class HitPlaces:
-    """The results, one entry for each hit, in world space. Arrays of length 0 are not computed. A miss has NaN vectors and ids -1."""
+    """The results of hit_places, one entry for each hit, in world space. Arrays of length 0 stay empty. A miss has NaNs and ids -1."""
 
     point: wp.array(dtype=wp.vec3)
     error: wp.array(dtype=wp.vec3)  # Bound on the error of `point`, per axis.
@@ -205,7 +205,7 @@ def shading_normal(surfaces: Surfaces, place: Place, u: float, v: float, geometr
 
 @wp.func
 def last_entry(first: wp.array(dtype=wp.int32), prim_id: int) -> int:
-    """Return the last i with first[i] <= prim_id. An object without primitives has the same `first` as the next object."""
+    """Return the last i with first[i] <= prim_id. Objects without primitives are skipped: their entry equals the next entry."""
     low = int(0)
     high = int(first.shape[0])
     while high - low > 1:

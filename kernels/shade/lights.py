@@ -91,7 +91,7 @@ def choose_emitter(lighting: Lighting, light: Light, xi: float) -> tuple[int, fl
 
 @wp.func
 def emitter_corners(emitter: Emitter) -> Triangle:
-    """Return the emitter as a Triangle without attributes."""
+    """Return the emitter as a Triangle with corners only."""
     t = Triangle()
     t.v0 = emitter.v0
     t.v1 = emitter.v1

@@ -89,7 +89,7 @@ def conductor(m: Material, s: Surface, n: wp.vec3, wo: wp.vec3, out: Scatter) ->
 
 
 def make_glass(features: Features) -> Any:
-    """Return the function that reflects and refracts at a boundary to the index m.ior, or at a thin pane."""
+    """Return the function that reflects and refracts at a boundary to a medium of index m.ior, or at a thin pane."""
     fresnel = fresnel_schlick if features.schlick else fresnel_dielectric
 
     @wp.func

@@ -175,7 +175,7 @@ def polygon(xi: wp.vec2, sides: int, rotation: float) -> wp.vec2:
 
 @wp.func
 def triangle_numbers(x: float, y: float) -> tuple[float, float]:
-    """Return `triangle` as two floats. Like search_cdf it is branch-free, as a random branch is mispredicted half the time."""
+    """Return the result of `triangle` as two floats. Branch-free, because a random branch is mispredicted half the time."""
     half = 0.5 * wp.where(y > x, x, y)
     return wp.where(y > x, half, x - half), wp.where(y > x, y - half, half)
 
@@ -242,7 +242,7 @@ def ggx_normal(cap: wp.vec3, n: wp.vec3, wo: wp.vec3, alpha: float) -> wp.vec3:
 
 @wp.func
 def ggx_lambda(cos_theta: float, alpha: float) -> float:
-    """Return Smith's Lambda: hidden over visible microfacet area, seen at cosine cos_theta to the normal (Heitz 2014, eq. 72)."""
+    """Return Smith's Lambda, the ratio of hidden to visible microfacet area at an angle to the normal (Heitz 2014, eq. 72)."""
     c2 = cos_theta * cos_theta
     tan2 = wp.max(0.0, 1.0 - c2) / wp.max(c2, 1.0e-12)
     return 0.5 * (wp.sqrt(1.0 + alpha * alpha * tan2) - 1.0)

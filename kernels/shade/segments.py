@@ -13,7 +13,7 @@ END = 64.0  # Length cut off at each end of a segment, in units of rounding; see
 def lifted(surfaces: Surfaces, prim_id: int, point: wp.vec3, towards: wp.vec3) -> wp.vec3:
     """Move a point on a triangle or sphere off the surface, on the side of `towards`, by the point's rounding error.
 
-    A ray from there does not hit a neighbouring face in the same plane. A point with prim_id -1 or on a degenerate face stays."""
+    A ray from the moved point does not hit a neighbouring face in the same plane. Points with prim_id -1 or on degenerate faces stay."""
     if prim_id < 0:
         return point
     error = wp.vec3()

@@ -69,10 +69,10 @@ def make_pass_surface(features: Features, scatter: Any, is_solid: Any) -> Any:
 
     @wp.func
     def straight_transmittance(m: Material, from_outside: Surface, wo: wp.vec3) -> wp.vec3:
-        """Return the share of light that goes straight through a surface of alpha 1.
+        """Return the share of light that goes straight through a surface of alpha 1. from_outside: the surface, with front = 1.
 
-        An unbent ray meets both faces of solid glass at the angle that it has outside. So from_outside.front must be 1. With
-        front = 0, Fresnel's formula would find total reflection for a ray that leaves."""
+        An unbent ray meets both faces of solid glass at the angle that it has outside. With front = 0, Fresnel's formula would
+        find total reflection for some rays that leave the glass."""
         share = scatter(m, from_outside, wo, wp.vec3())
         if share.bends == 0:
             return share.transmitted

@@ -87,7 +87,7 @@ def emitted(m: Material, s: Surface) -> wp.vec3:
 
 @wp.struct
 class PendingLight:
-    """The light of a surface that is added to its sample after the surface's shadow rays are traced."""
+    """A surface's own light. It is added to the sample together with the direct light, after the shadow rays are traced."""
 
     light: wp.vec3  # Shaded.light.
     throughput: wp.vec3  # Shaded.throughput.

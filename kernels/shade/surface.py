@@ -139,7 +139,7 @@ class Triangle:
 
 @wp.func
 def corners_at(surfaces: Surfaces, index: int) -> Triangle:
-    """Return the corners of face `index`, in the space of its mesh, as a Triangle without attributes."""
+    """Return face `index` as a Triangle with corners only, in the space of its mesh."""
     face = surfaces.faces[index]
     triangle = Triangle()
     triangle.v0 = surfaces.vertices[face[0]]

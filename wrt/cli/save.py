@@ -49,7 +49,7 @@ def save_film(film: Film, output: Path, bits: int | None, layers: Sequence[str] 
 
 
 def remove_checkpoint(path: Path) -> None:
-    """Remove the checkpoint of a finished picture. Raises InputError if the system refuses."""
+    """Remove the checkpoint of a finished picture. Raises InputError if that fails."""
     if path.is_dir():  # not written by wrt; the render has warned that the checkpoint is not saved
         return
     try:

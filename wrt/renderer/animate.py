@@ -110,7 +110,7 @@ def frame_path(folder: Path, number: int, frames: int) -> Path:
 
 
 def save_movie(path: str | os.PathLike[str], frames: Sequence[np.ndarray], fps: float) -> None:
-    """Write pictures, (H, W, 3) uint8 each, as one looping animation. Raises InputError, and leaves no file, if the system refuses.
+    """Write pictures, (H, W, 3) uint8 each, as one looping animation. Raises InputError, and leaves no file, if writing fails.
 
     A .gif has 256 dithered colours per frame, and frame times in hundredths of a second. .png and .apng keep all colours."""
     with needed_by("a movie"):

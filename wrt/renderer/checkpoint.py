@@ -95,7 +95,7 @@ class Checkpoint:
     # --- writing ------------------------------------------------------------------------------------------------------
 
     def begin(self) -> None:
-        """Start the clock. Raises InputError if another render has written the file since the constructor looked for it."""
+        """Start the clock for `due`. Raises InputError if another render has written the file since the constructor looked for it."""
         if self.saved is None and os.path.lexists(self.path):
             raise InputError("exists: another render wrote it meanwhile", path=self.path)
         self._last = time.monotonic()
@@ -105,7 +105,7 @@ class Checkpoint:
         return time.monotonic() - self._last >= self.every
 
     def save(self, film: DeviceFilm, seconds: float) -> None:
-        """Write the film. If the system refuses, keep the old file and store the reason in `problem`, so that the render can continue."""
+        """Write the film. If writing fails, keep the old file and store the reason in `problem`, so that the render can continue."""
         samples = film.view(film.groups[0].samples)
         header = {"samples": [int(samples.min()), int(samples.max())], "seconds": seconds, "identity": self.identity}
         try:

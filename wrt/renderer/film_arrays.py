@@ -58,7 +58,7 @@ class DeviceFilm:
         return out
 
     def arrays(self) -> list[tuple[str, WarpArray]]:
-        """Return names and arrays of all that samples change: the arrays that the groups share, then the arrays of each group."""
+        """Return name and array for all arrays that samples change: the arrays that the groups share, then the arrays of each group."""
         own = [(f"{name} of group {i}", getattr(film, name)) for i, film in enumerate(self.groups) for name in OF_A_GROUP]
         return [(name, getattr(self.groups[0], name)) for name in SHARED] + own
 
@@ -105,7 +105,7 @@ class DeviceFilm:
     def pixels_and_variance(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the mean of the samples and the estimated variance of that mean, (H, W, 3) float32 each.
 
-        The variance is inf in a pixel with fewer than two samples; with several groups, in a pixel without samples."""
+        With one group, the variance is inf in a pixel with fewer than two samples. With several groups, it is inf without samples."""
         if len(self.groups) == 1:
             film = self.groups[0]
             n = self.picture(film.samples)[..., None].astype(np.float32)

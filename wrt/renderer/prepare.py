@@ -98,7 +98,7 @@ class Prepared:
         return {"facts": self.facts(), "seconds": self.seconds}
 
     def trace_tile(self, work: Work, seed: int, state: list[np.ndarray] | None) -> list[np.ndarray]:
-        """Add the samples of `work` to `state`, the arrays of its rectangle as in DeviceFilm.arrays (None: zeros). Return the new arrays.
+        """Return `state`, the arrays of DeviceFilm.arrays for the rectangle (None: zeros), with the samples of `work` added.
 
         This method has no side effects, so that several threads can call it, and a failed call can be repeated."""
         film = DeviceFilm(self.plan.scene.settings, corners(work.rectangle), self.device, seed, self.plan.groups)

@@ -77,20 +77,20 @@ class TextureTable:
 
 @cache
 def srgb_table() -> np.ndarray:
-    """Return the linear values of byte codes, (512,) float32: of the 256 sRGB codes (IEC 61966-2-1), then i / 255 for linear images."""
+    """Return linear values, (512,) float32: entry i decodes the sRGB code i (IEC 61966-2-1), entry 256 + i is i / 255."""
     code = np.arange(256) / 255.0
     return np.concatenate([decode_srgb(code), code]).astype(np.float32)
 
 
 def index_of(kind: str, table: Collection[str], group: str) -> int:
-    """Return the index of `kind` in a table of device functions. Raises InputError, with the word `group`, if the table lacks it."""
+    """Return the index of `kind` in a table of device functions. Raises InputError if the table lacks it. group: noun for the error."""
     if kind not in table:
         raise InputError(f"{group} {kind!r} has no device function in the tables of wrt.kernels.shade")
     return list(table).index(kind)
 
 
 def material_records(scene_materials: tuple[Material, ...], table: TextureTable) -> np.ndarray:
-    """Return the array of Material structs. Fields that a kind does not use are 0, but -1 for textures, 1 for `transmission` of glass."""
+    """Return the array of Material structs. Fields that the kind does not use are 0; textures -1; `transmission` 1 for clear kinds."""
     out = records(structs.Material, max(len(scene_materials), 1))
     some_use = kinds_that_use()
     for row, material in zip(out, scene_materials, strict=False):
@@ -157,7 +157,7 @@ def _emissive_groups(scene: Scene, world: FlatScene) -> list[np.ndarray]:
 
 
 def _emitters(scene: Scene, world: FlatScene, prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the emitters of one light and their cdf by power; both are empty if the total power is 0."""
+    """Return the emitters of the light with the faces `prim_id`, and their cdf by power; both are empty if the total power is 0."""
     corner = world.corners(prim_id)
     area = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
     power = np.array([LUMINANCE @ np.array(m.emission) for m in scene.materials])[world.materials(prim_id)] * area

@@ -61,7 +61,7 @@ begin_aov_kernel = made_once(wave_begin.make_begin_aov_kernel)
 
 @made_once
 def queue_kernel(structure: Structure, features: Features, any_hit: bool) -> tuple[Kernel, int]:
-    """Return the kernel that traces a queue of rays, and the number of rays per thread: ALL if the structure has a stream kernel, else 1.
+    """Return the kernel that traces a queue of rays, and its rays per thread: ALL with a stream kernel (wrt.accel.base), else 1.
 
     The kernel always handles spheres, so that scenes with and without spheres share it."""
     structure = structure._replace(units=structure.units._replace(spheres=True))

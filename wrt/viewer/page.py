@@ -1,6 +1,6 @@
 """The viewer in a browser: viser's orbit controls and panel over the pictures of a wrt.viewer.refine.Viewer.
 
-Several browsers share the panel; each browser has a camera. The Viewer renders the camera that moved last, for its browser only.
+Several browsers share the panel. The Viewer renders the camera that moved last, and only that camera's browser gets the picture.
 """
 
 from __future__ import annotations
@@ -282,6 +282,6 @@ def encoded(picture: Film | np.ndarray, suffix: str) -> bytes:
 
 
 def round_up(value: float) -> float:
-    """Return the next higher number of the form 1, 2 or 5 times a power of ten."""
+    """Return the smallest number that is at least `value`, and is 1, 2 or 5 times a power of ten."""
     power = 10.0 ** math.floor(math.log10(value))
     return next(power * factor for factor in (1.0, 2.0, 5.0, 10.0) if power * factor >= value * (1.0 - 1e-9))

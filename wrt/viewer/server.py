@@ -63,7 +63,7 @@ def import_viser() -> ModuleType:
 
 
 def listen(place: Place) -> socket.socket:
-    """Return a socket that listens at `place`. Raises InputError if the system refuses."""
+    """Return a socket that listens at `place`. Raises InputError if that fails."""
     host, port = place.host, place.port
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
@@ -104,7 +104,7 @@ class Guard:
         self._lock = threading.Lock()
 
     def open(self, listening: socket.socket, label: str) -> viser.ViserServer:
-        """Start a viser server on the socket `listening`. Raises InputError if viser does not call `serve` as expected."""
+        """Start a viser server behind this guard, on the socket `listening`. Raises InputError if viser does not call `serve` as expected."""
         viser = import_viser()
         websockets: Any = importlib.import_module("websockets.asyncio.server")
         warnings.filterwarnings("ignore", r"Queued a \w+ on a closed connection", UserWarning)  # from viser, after a browser disconnects
