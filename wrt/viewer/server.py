@@ -104,7 +104,7 @@ class Guard:
         self._lock = threading.Lock()
 
     def open(self, listening: socket.socket, label: str) -> viser.ViserServer:
-        """Start a viser server behind this guard, on the socket `listening`. Raises InputError if viser does not call `serve` as expected."""
+        """Start a viser server on the socket `listening`, behind this guard. Raises InputError if viser calls `serve` in another way."""
         viser = import_viser()
         websockets: Any = importlib.import_module("websockets.asyncio.server")
         warnings.filterwarnings("ignore", r"Queued a \w+ on a closed connection", UserWarning)  # from viser, after a browser disconnects
