@@ -24,8 +24,8 @@ def constants(numbers: Mapping[str, float], struct: str = "") -> str:
 
 
 def text_of(*files: str, **written: str) -> str:
-    """Return the text of headers, each once and after the headers that it includes. The paths `files` are below this folder, such as
-    "wide/packet.h". The texts `written` are of headers that are not files, by stem ("layout" for layout.h)."""
+    """Return the text of headers. Each is included once, and after the headers that it includes. Paths in `files`, such as "wide/packet.h",
+    are below this folder. Argument `written` has the texts of headers that are not files, by stem ("layout" for layout.h)."""
     out: list[str] = []
     seen: set[Path] = set()
     for file in files:

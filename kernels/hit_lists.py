@@ -13,7 +13,7 @@ FEW = wp.constant(8)  # hits: most rays have no more, and sorting so few takes n
 
 @wp.struct
 class HitLists:
-    """Lists of hits. A traversal unit with Units.lists gets them as its argument `surfaces`."""
+    """Lists of hits, one per ray. A traversal made with Units.lists gets them as its argument `surfaces`."""
 
     limit: int  # Largest number of hits to return for a ray; below 2^30.
     crossings: bool  # True: list only triangles that the ray crosses (units.triangle.is_crossed).
@@ -74,8 +74,8 @@ def sort_and_trim(rows: wp.array(dtype=Hit), first: int, count: int, limit: int)
 
 @wp.func
 def list_hit(lists: HitLists, ray: Ray, hit: Hit, best: Hit) -> Hit:
-    """Append a hit to the list of its ray. The returned `best` stays a miss; the walk may stop beyond its t.
-    If the list is too short, count[i] exceeds the list's length. A list for count[i] or 2 limit hits, whichever is less, suffices."""
+    """Append a hit to the list of its ray. The returned `best` stays a miss, but the walk may stop beyond best.t.
+    If the list is too short, count[i] exceeds the list's length. Then a list for count[i] or 2 limit hits suffices, whichever is less."""
     if lists.crossings:
         shear = triangle_ray(ray)
         face = lists.faces[hit.prim_id]
@@ -118,7 +118,7 @@ def make_list_hits_kernel(accel_struct: Any, traverse: Any) -> Any:
 
 @kernel
 def copy_hits(rays: RayArrays, lists: HitLists, begin: wp.array(dtype=wp.int32), hits: HitArrays, start: int):
-    """Copy the list of ray i to the entries of `hits` from begin[i] on, with t in units of the caller's direction."""
+    """Copy the list of ray i = start + tid to the entries of `hits` from begin[i] on, with t in units of the caller's direction."""
     i = start + wp.tid()
     scale = direction_scale(rays.direction[i])
     for k in range(lists.count[i]):

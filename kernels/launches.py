@@ -40,7 +40,7 @@ def set_range(launch: Launch, first: int, end: int) -> None: ...
 
 @wp.func
 def run_with(launch: Launch, last: int):
-    """Run the kernel with `last` as its last argument, which is an int."""
+    """Run the kernel with the int `last` as its last argument."""
     set_last(launch, last)
     run(launch)
 

@@ -19,7 +19,7 @@ import warp as wp
 
 @wp.func_native("return array.data[(long long)i][k];")
 def number_of_vec2(array: wp.array(dtype=wp.vec2), i: int, k: int) -> float:
-    """Return component k of entry i."""
+    """Return component k of array[i]."""
 
 
 @wp.func_native("array.data[(long long)i] = value;")

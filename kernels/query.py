@@ -15,7 +15,7 @@ LENGTHEN, SHORTEN = 2.0**96, 2.0**-64
 
 @wp.struct
 class RayArrays:
-    """Rays of a query in world space; t is in units of the direction's length. A stride of 0 in t_min or t_max: one value for all rays."""
+    """Rays of a query in world space; t is in units of the direction's length. t_min and t_max may have stride 0: one value for all."""
 
     origin: wp.array(dtype=wp.vec3)
     direction: wp.array(dtype=wp.vec3)
@@ -46,7 +46,7 @@ class HitArrays:
 
 @wp.func
 def direction_scale(direction: wp.vec3) -> float:
-    """Return a power of two by which to multiply a very short or long direction d; 1 for other directions.
+    """Return a power of two by which to multiply a very short or long direction; 1 for other directions.
     It keeps the longest component between 2^-64 and 2^64, so that its reciprocal is neither denormal nor infinite. The product is exact,
     except in components that become denormal. These are off by up to 2^-150, and then the longest component is at least 1."""
     longest = wp.abs(direction[0])
@@ -58,8 +58,8 @@ def direction_scale(direction: wp.vec3) -> float:
 
 @wp.func
 def scaled_ray(origin: wp.vec3, direction: wp.vec3, t_min: float, t_max: float) -> Ray:
-    """Make a ray with a scaled direction. The ray's t times `direction_scale` is t in units of the caller's direction.
-    The segment ends where the caller's t would exceed the largest float32, so no traversal returns a hit beyond."""
+    """Make a ray whose direction is multiplied by `direction_scale`. The ray's t times this scale is t in units of the caller's direction.
+    The segment ends where the caller's t would exceed the largest float32, so no traversal returns a hit beyond that end."""
     scale = direction_scale(direction)
     inverse = wp.where(scale > 1.0, wp.static(1.0 / LENGTHEN), wp.where(scale < 1.0, wp.static(1.0 / SHORTEN), 1.0))
     ray = Ray()
@@ -91,7 +91,7 @@ def make_closest_hit_kernel(accel_struct: Any, traverse: Any) -> Any:
 
 
 def make_any_hit_kernel(accel_struct: Any, traverse: Any) -> Any:
-    """Make the kernel that stores, for rays first .. first + dim - 1, whether they hit anything."""
+    """Make the kernel that stores whether each of the rays first .. first + dim - 1 hits anything, for the launch size dim."""
 
     @kernel
     def any_hit(accel: accel_struct, surfaces: Surfaces, rays: RayArrays, occluded: wp.array(dtype=wp.bool), first: int):
@@ -112,7 +112,7 @@ class Worlds:
 
 @wp.func
 def load_ray_of_world(rays: RayArrays, worlds: Worlds, i: int) -> Ray:
-    """Load a ray and set first_prim to the root node of its world. If the world does not exist, the ray hits nothing."""
+    """Load ray i and set first_prim to the root node of its world. If that world does not exist, the ray hits nothing."""
     ray = load_ray(rays, i)
     world = worlds.id[i]
     if world >= 0 and world < worlds.root.shape[0]:

@@ -52,7 +52,7 @@ def query_ray(origin: wp.vec3, direction: wp.vec3) -> QueryRay:
     return y * y - 1.00048828125f != 0.0f;
 """)
 def fused() -> bool:
-    """Test whether this kernel is compiled with fused multiply-add, with which rays slip between neighbouring triangles.
+    """Test whether this kernel is compiled with fused multiply-add, which lets rays slip between neighbouring triangles.
     Also True on a CPU if the kernel was made by wp.kernel."""
 
 
@@ -69,7 +69,7 @@ def warn_once(reason: int) -> None: ...
 
 @wp.func
 def traversal_ray(ray: QueryRay, is_other: bool) -> Ray:
-    """Make the ray for the traversal. If the kernel has fused multiply-add, or is_other (the World is of another type), it hits nothing."""
+    """Make the ray for the traversal. In a kernel with fused multiply-add, or if is_other (World of another type), it hits nothing."""
     out = scaled_ray(ray.origin, ray.direction, ray.t_min, ray.t_max)
     if is_other or fused():
         warn_once(wp.where(is_other, 1, 0))
@@ -96,7 +96,7 @@ def make_ray_query(accel_struct: Any, closest: Any, any_of: Any, resuming: Any, 
     class World:
         """A structure and its surfaces, as one argument of a kernel."""
 
-        kind: int  # The functions compare it with theirs, because Warp does not compare the types of structs.
+        kind: int  # The query functions compare it with their own `kind`, because Warp does not compare struct types.
         accel: accel_struct
         surfaces: Surfaces
 

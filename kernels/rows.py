@@ -1,7 +1,7 @@
 """Structs stored as a structure of arrays, for vectorised loops (kernels.memory).
 A struct of 9 numbers takes 9 rows of a two-dimensional block; column i holds struct i. A loop over i then accesses consecutive addresses,
-which the compiler vectorises. In an array of structs, equal fields would be 9 numbers apart. Functions `load` and `store` are C++ generated
-from the struct's fields, one copy per number (example: tests/kernels/test_rows.py)."""
+which the compiler vectorises. In an array of structs, equal fields would be 9 numbers apart. Functions `load` and `store` are C++ code with
+one statement per number of the struct (example: tests/kernels/test_rows.py)."""
 
 from functools import cache
 from typing import Any, NamedTuple
@@ -38,8 +38,8 @@ class Rows(NamedTuple):
         return Rows(fields[name], self.length, self.first + sum(len(numbers_of(fields[each], "")) for each in before))
 
     def text(self, line: str, without: tuple[str, ...] = ()) -> str:
-        """Return the template `line` once per number of the struct, except in the fields `without`: {number} is the number's C++
-        expression, {place} its address in column i."""
+        """Return the template `line` once per number of the struct, except in the fields `without`. In the template, {number} is the
+        number's C++ expression, {place} its address in column i."""
         left_out = tuple(f"value.{name}{end}" for name in without for end in ("[", ".", ";"))
         return "".join(f"    {line}\n".format(number=number, place=f"rows.data + {row * self.length}ll + i")
                        for row, number in enumerate(numbers_of(self.dtype, "value"), self.first)

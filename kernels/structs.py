@@ -41,7 +41,7 @@ else:
 #endif
 """)
 def on_cuda() -> bool:
-    """Test whether the code runs on CUDA, to choose a faster form of the same arithmetic."""
+    """Test whether the code runs on CUDA. Callers then choose a faster form of the same arithmetic."""
 
 
 def size_of(struct: Any) -> int:
@@ -63,7 +63,7 @@ def largest(v: wp.vec3) -> float:
 
 @wp.func
 def lift(v: wp.vec3) -> float:
-    """Return the factor 2^80 for a vector with all components below 2^-40, whose square could be denormal; else 1. The product is exact."""
+    """Return 2^80 if all components are below 2^-40, because the square could be denormal; else 1. The product with v is exact."""
     return wp.where(largest(v) < wp.static(2.0**-40), wp.static(2.0**80), 1.0)
 
 
@@ -83,7 +83,7 @@ class Ray:
 
 @wp.func
 def any_positive(v: wp.vec3) -> bool:
-    """Test whether a component is above 0, False for NaN. A test with wp.max takes three times as long."""
+    """Test whether a component is above 0; NaN is not. A test with wp.max takes three times as long."""
     return v[0] > 0.0 or v[1] > 0.0 or v[2] > 0.0
 
 
@@ -113,8 +113,8 @@ class Hit:
     """A hit: the point (1 - u - v) v0 + u v1 + v v2 on triangle prim_id.
     A miss has prim_id = NO_HIT during traversal, and -1 in the result of a traversal."""
 
-    t: float
-    u: float
+    t: float  # In units of the direction's length.
+    u: float  # u, v: barycentric coordinates; 0 on a sphere.
     v: float
     prim_id: int
 
@@ -132,7 +132,8 @@ class Primitive:
 
 @wp.struct
 class PlanePrimitive:
-    """A triangle by three planes (x, y, z: normal, w: offset), for tests with precomputed data; 52 bytes. Spheres: as in Primitive."""
+    """A triangle by three planes (x, y, z: normal, w: offset), for the tests units.triangle.plane_equation and baldwin_weber; 52 bytes.
+    Spheres: as in Primitive."""
 
     a: wp.vec4
     b: wp.vec4
@@ -147,12 +148,12 @@ class Texture:
     first: int  # Index of the image's first texel in Surfaces.texels; the image has `height` rows of `width` texels.
     width: int
     height: int
-    srgb: int
-    wrap_u: int
+    srgb: int  # 1: the texels are sRGB-encoded; 0: linear.
+    wrap_u: int  # wrap_u, wrap_v: kernels.shade.textures.WRAP_REPEAT, WRAP_CLAMP or WRAP_MIRROR.
     wrap_v: int
-    row_u: wp.vec3
+    row_u: wp.vec3  # row_u, row_v: rows of the affine map from a surface's uv to texture coordinates.
     row_v: wp.vec3
-    color_a: wp.vec3
+    color_a: wp.vec3  # Colour of the checkerboard's square at (0, 0); color_b: of its neighbours.
     color_b: wp.vec3
 
 
@@ -205,12 +206,12 @@ class Instance:
 @wp.struct
 class Surfaces:
     """Attributes of primitives, read after a hit.
-    With instances, vertices, normals and faces are stored once per mesh, in the mesh's space. Without instances (length 0), they are in
-    world space, and prim_id indexes faces and prim_material. Arrays that a scene does not use have length 1."""
+    With instances, vertices, normals and faces are stored once per mesh, in the mesh's space. Without instances (array of length 0), they
+    are in world space, and prim_id indexes faces and prim_material. Arrays that a scene does not use have length 1."""
 
     n_triangles: int  # Primitives with prim_id >= n_triangles are spheres.
     vertices: wp.array(dtype=wp.vec3)
-    faces: wp.array(dtype=wp.vec3i)
+    faces: wp.array(dtype=wp.vec3i)  # Indices of each triangle's vertices.
     normals: wp.array(dtype=wp.vec3)  # One per vertex.
     uvs: wp.array(dtype=wp.vec2)  # One per vertex.
     spheres: wp.array(dtype=wp.vec4)  # (center, radius)
@@ -218,17 +219,17 @@ class Surfaces:
     prim_material: wp.array(dtype=wp.int32)  # Indices into `materials`.
     materials: wp.array(dtype=Material)
     textures: wp.array(dtype=Texture)
-    texels: wp.array(dtype=wp.uint32)
-    srgb_to_linear: wp.array(dtype=wp.float32)
+    texels: wp.array(dtype=wp.uint32)  # RGBA of 8 bits each, red in the lowest byte.
+    srgb_to_linear: wp.array(dtype=wp.float32)  # Linear values: of the 256 sRGB bytes, then of the 256 linear bytes.
 
 
 @wp.struct
 class Light:
     """A light. The list names the fields that each kind of light uses; other fields are not read.
 
-    - Point, spot: position, color = radiant intensity.
+    - Point, spot: position, color = radiant intensity; spot also: direction = axis, cos_inner, cos_outer = cosines of the half angles.
     - Directional: direction of travel, color = irradiance.
-    - Sphere: position, radius, color = radiance, two_sided = 1 if it also shines inwards.
+    - Sphere: position = center, radius, color = radiance, two_sided = 1 if it also shines inwards.
     - Mesh: emitters first .. first + count - 1.
     """
 
@@ -263,13 +264,13 @@ class Background:
 
     bottom: wp.vec3
     top: wp.vec3
-    scale: float
-    rotation: float
+    scale: float  # Factor of the image's radiance.
+    rotation: float  # Angle of the image about +y in radians, counter-clockwise seen from above.
     width: int
     height: int
-    pixels: wp.array(dtype=wp.vec3)
-    row_cdf: wp.array(dtype=wp.float32)
-    column_cdf: wp.array(dtype=wp.float32)
+    pixels: wp.array(dtype=wp.vec3)  # `height` rows of `width` pixels.
+    row_cdf: wp.array(dtype=wp.float32)  # Cumulative distribution over the rows.
+    column_cdf: wp.array(dtype=wp.float32)  # Cumulative distribution over the columns of each row.
 
 
 @wp.struct
@@ -279,7 +280,7 @@ class Lighting:
     count: int  # Number of lights.
     lights: wp.array(dtype=Light)
     emitters: wp.array(dtype=Emitter)
-    emitter_cdf: wp.array(dtype=wp.float32)  # Share of the light's power in its emitters up to and including this one.
+    emitter_cdf: wp.array(dtype=wp.float32)  # Entry i: share of a light's power in its emitters up to and including emitter i.
     background: Background
     ambient: wp.vec3
 
@@ -288,8 +289,8 @@ class Lighting:
 class Limits:
     """Limits of the tree of rays, and the seed of the samples."""
 
-    max_depth: int
-    min_throughput: float
+    max_depth: int  # Largest number of bounces.
+    min_throughput: float  # Paths with less throughput are cut.
     seed: wp.uint32
 
 
@@ -303,20 +304,20 @@ class Film:
     x: int
     y: int
     columns: int
-    mean: wp.array(dtype=wp.vec3)
-    m2: wp.array(dtype=wp.vec3)
-    samples: wp.array(dtype=wp.int32)
+    mean: wp.array(dtype=wp.vec3)  # Running mean of the samples' radiance.
+    m2: wp.array(dtype=wp.vec3)  # Sum of squared deviations from the mean.
+    samples: wp.array(dtype=wp.int32)  # Number of samples.
     rays: wp.array(dtype=wp.int64)  # Number of closest-hit and any-hit rays.
     cut_depth: wp.array(dtype=wp.int32)  # Number of rays cut by max_depth.
     cut_throughput: wp.array(dtype=wp.int32)  # Number of rays cut by min_throughput.
     lost: wp.array(dtype=wp.float32)  # Sum of the throughputs of the cut rays, each averaged over the colour channels.
     not_finite: wp.array(dtype=wp.int32)  # Number of samples that were NaN or infinite; they enter the mean as 0.
-    filter_icdf: wp.array(dtype=wp.float32)
+    filter_icdf: wp.array(dtype=wp.float32)  # Inverse cumulative distribution of the pixel filter along x or y, in pixels.
 
 
 @wp.struct
 class AovFilm:
-    """The first hit of the ray through each pixel's centre; width, height, x, y and columns are as in Film."""
+    """Layers of the first hit of the ray through each pixel's centre (wrt.picture.film.Film). width .. columns: as in structs.Film."""
 
     width: int
     height: int

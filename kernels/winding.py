@@ -11,8 +11,8 @@ SMALLEST, LARGEST = wp.constant(wp.float64(2.0**-900)), wp.constant(wp.float64(2
 
 @wp.struct
 class Turns:
-    """A sum of angles in [-pi, pi], as the argument of a product of complex numbers plus whole turns.
-    Unlike atan2 of the C library, it has the same bits on all machines."""
+    """A sum of angles in [-pi, pi], stored as the product of the complex numbers with these arguments, plus a number of whole turns.
+    Unlike a sum of results of atan2, it has the same bits on all machines."""
 
     re: wp.float64  # The product is re + i im.
     im: wp.float64
@@ -21,13 +21,13 @@ class Turns:
 
 @wp.func
 def corner(surfaces: Surfaces, vertex: int, point: wp.vec3) -> wp.vec3d:
-    """Return the vector from the point to a vertex, in float64."""
+    """Return the vector from `point` to vertex number `vertex`, in float64."""
     return wp.vec3d(surfaces.vertices[vertex]) - wp.vec3d(point)
 
 
 @wp.func
 def add_angle(turns: Turns, re: wp.float64, im: wp.float64) -> Turns:
-    """Add the argument of the complex number re + i im."""
+    """Add the argument (angle) of the complex number re + i im to the sum `turns`."""
     zero = wp.float64(0.0)
     if re == zero and im == zero:  # the point is on an edge
         return turns
@@ -68,7 +68,7 @@ def add_triangle(total: Turns, surfaces: Surfaces, face: int, point: wp.vec3) ->
 
 @kernel
 def wind(surfaces: Surfaces, points: wp.array(dtype=wp.vec3), turns: wp.array(dtype=wp.vec3d), first: int):
-    """Store re, im and whole turns of the sum of half solid angles at each point."""
+    """Store (re, im, whole) of `Turns`, the sum of half the solid angles, for points first .. first + dim - 1 (dim: launch size)."""
     i = first + wp.tid()
     total = Turns()
     total.re = wp.float64(1.0)

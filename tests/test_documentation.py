@@ -275,7 +275,7 @@ def test_tables_have_the_sums_and_means_of_the_data(plots: dict[str, Any]) -> No
     for row, test, rays in (("Moeller-Trumbore", "moeller_trumbore", "sample"), ("Embree robust", "embree_robust", "peer_sample"),
                             ("Embree fast", "embree_fast", "peer_sample"), ("Warp's mesh query", "warp", "peer_sample")):
         sums = [sum(int(line[name]) for line in groups if line["group"] != "I") for name in (test, rays)]
-        assert [int(cell) for cell in cells("accuracy.md", row)] == sums
+        assert [int(cell) for cell in cells("accuracy.md", row)[:2]] == sums
     for row, library in (("wrt", "wrt"), ("Embree robust", "embree_robust"), ("Embree fast", "embree_fast"), ("Open3D", "open3d"),
                          ("Warp", "warp"), ("Mitsuba", "mitsuba"), ("trimesh", "trimesh")):
         rays = "trimesh_rays" if library == "trimesh" else "rays"

@@ -37,7 +37,7 @@ def closest_hit(accel: OneMesh, vertices: ArrayLike | None, origins: ArrayLike, 
     Raises
     ------
     InputError
-        Names the argument and what was expected; also without JAX.
+        Names the argument and what was expected. Also raised if JAX is not installed.
     """
     jnp = library("jax", "jax.numpy")
     inputs = (jnp.asarray(each) for each in (() if vertices is None else (vertices,)) + (origins, directions))

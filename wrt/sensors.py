@@ -63,7 +63,7 @@ class Sensor:
     def depth(self, hits: Hits) -> np.ndarray:
         """Return the distance of each hit along the sensor's axis, (rows, columns) float32 in scene units.
 
-        It is inf on a miss and negative behind the sensor. For a camera it is z in the camera's frame, as in depth images.
+        The depth is inf on a miss and negative behind the sensor. For a camera it is z in the camera's frame, as in depth images.
         """
         return self._scaled(hits, self.directions.astype(np.float64) @ self.axis)
 
@@ -146,7 +146,7 @@ def rotating_lidar(elevations: ArrayLike, steps: int, pose: ArrayLike | None = N
 def raster_lidar(fov: tuple[float, float], size: tuple[int, int] | str, pose: ArrayLike | None = None) -> Sensor:
     """Make the rays of a solid-state LiDAR: equal steps of azimuth and elevation, row by row from the top left.
 
-    Frame, pose, directions and errors are as for `rotating_lidar`.
+    The sensor's frame, the pose, the length of directions and the errors are those of `rotating_lidar`.
 
     Parameters
     ----------

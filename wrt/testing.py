@@ -1,4 +1,4 @@
-"""Hard cases for ray-tracing libraries: rays whose hits rounding errors easily change, with hits from exact arithmetic.
+"""Hard cases for ray-tracing libraries: rays whose hits rounding errors easily change, and the true hits from exact arithmetic.
 
 >>> report = wrt.testing.hard_cases(closest_hit)         # closest_hit(vertices, faces, origins, directions) -> t, prim_id
 >>> print(report)

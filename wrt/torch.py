@@ -42,7 +42,7 @@ def closest_hit(accel: OneMesh, vertices: Tensor | None, origins: ArrayLike, dir
     Raises
     ------
     InputError
-        Names the argument and what was expected; also without torch.
+        Names the argument and what was expected. Also raised if torch is not installed.
     """
     torch = library("torch")
     inputs = (each if each is None else torch.as_tensor(each) for each in (vertices, origins, directions))

@@ -31,7 +31,7 @@ BinCosts = wp.types.vector(BIN_COUNT, wp.float32)
 
 @wp.struct
 class Bins:
-    """Bins of centroids along each axis. Bin k of an axis begins at origin + k / scale.
+    """Bins of centroids, `count` along each axis. Bin k of an axis begins at the coordinate origin[axis] + k / scale[axis].
     The scale is 0 on an axis that cannot separate the centroids: these coincide, or the scale would over- or underflow."""
 
     count: int
@@ -45,7 +45,7 @@ class Split:
 
     axis: int
     bin: int
-    cost: float
+    cost: float  # As in binned_split.
     box_0: Row  # Box of the left side.
     box_1: Row  # Box of the right side.
 
@@ -58,7 +58,7 @@ def bin_of(center: wp.vec3, axis: int, bins: Bins) -> int:
 
 @wp.func
 def bins_of(task: BuildTask) -> Bins:
-    """Make the bins of a range: 8, plus one for every 8 records, at most BIN_COUNT."""
+    """Make the bins of a range. Their number along each axis is 8, plus 1 for every 8 records, but at most BIN_COUNT."""
     out = Bins()
     out.count = wp.min(8 + (task.end - task.begin) / 8, BINS)
     low = low_of(task.measures.centers)
@@ -74,7 +74,7 @@ def bins_of(task: BuildTask) -> Bins:
 @wp.func
 def binned_split(data: BuildData, task: BuildTask, bins: Bins) -> Split:
     """Find the cheapest split between two bins (Wald 2007, "On fast Construction of SAH-based Bounding Volume Hierarchies").
-    The cost is the sum over both sides of half surface area times number of records, with sides scaled by area_scale."""
+    The cost is the sum over both halves of half the surface area (row_area, with area_scale of the range) times the number of records."""
     scale = area_scale(task.measures.box)
     count = BinCounts()
     box = BinBoxes()
@@ -124,8 +124,8 @@ def binned_split(data: BuildData, task: BuildTask, bins: Bins) -> Split:
 @wp.func
 def partition_by_bin(data: BuildData, task: BuildTask, bins: Bins, split: Split) -> Halves:
     """Partition the records in place, with the left side in front; return both halves with their bounds.
-    Lomuto's partition, without its unpredictable branch. Every record is swapped with the first record of the right side. If it belongs to
-    the left side, the right side then begins behind it."""
+    Lomuto's partition, without its unpredictable branch. Every record is swapped with the first record of the right side. If the record
+    belongs to the left side, the beginning of the right side then moves on by one."""
     middle = int(task.begin)
     empty = empty_row()
     centers_0 = empty_row()
@@ -150,7 +150,7 @@ def partition_by_bin(data: BuildData, task: BuildTask, bins: Bins, split: Split)
 
 @wp.func
 def split_binned(data: BuildData, task: BuildTask) -> Halves:
-    """Split at the cheapest boundary between bins. If no axis separates the centroids, or the tree gets too deep, split by number."""
+    """Split at the cheapest boundary between bins. If no axis separates the centroids, or the tree gets too deep, halve the list."""
     n = task.end - task.begin
     if n > 2 and task.depth + balanced_depth(n) < MAX_DEPTH:
         bins = bins_of(task)

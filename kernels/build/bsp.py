@@ -1,6 +1,6 @@
 """The BSP builder, on the CPU: it splits cells, and clips their primitives, until no split is cheaper than a leaf.
-The host launches it once for the top of the tree, then on all cores for each deferred cell. A launch works depth first, so that it stores
-only the pieces (clipped primitives) along one path."""
+The host launches it once for the top of the tree, which defers small cells. It then launches it on all cores for the deferred cells. A
+launch works depth first, so that it stores only the pieces (clipped primitives) along one path."""
 
 import warp as wp
 
@@ -46,8 +46,8 @@ class BspTask:
     points_end: int  # Index behind the last point of the pieces.
     parent: int  # Index of the parent node; < 0: the cell is the root.
     side: int  # Side of the parent's plane: 0 below, 1 above.
-    depth: int
-    budget: int  # Largest number of references in all leaves of the cell.
+    depth: int  # Depth of the cell; the root's is 0.
+    budget: int  # Largest sum of the numbers of references in all leaves of the cell.
 
 
 @wp.struct
@@ -77,7 +77,7 @@ def copy_piece(source: Pieces, i: int, target: Pieces, to: int):
 @wp.func
 def clip_piece(pieces: Pieces, i: int, to: int, size: int, split: BspSplit, side: int) -> int:
     """Clip piece i to one side of a plane (0 below, 1 above), and store it as piece `to`, with its points from index `size` on.
-    Return the new number of points."""
+    Return the index behind its last point."""
     copy_piece(pieces, i, pieces, to)
     count = pieces.count[i]
     first = pieces.first[i]
@@ -138,7 +138,7 @@ def scope_of(tools: BspTools, task: BspTask, slot: int) -> Scope:
 
 @wp.func
 def choose(tools: BspTools, scope: Scope, depth: int) -> BspSplit:
-    """Return the cheapest split; axis < 0: no split is cheaper than a leaf."""
+    """Return the cheapest split of a cell at this depth; its axis is < 0 if no split is cheaper than a leaf."""
     best = BspSplit()
     best.axis = -1
     best.cost = tools.options.cost_intersection * wp.float64(scope.end - scope.begin)
@@ -150,7 +150,7 @@ def choose(tools: BspTools, scope: Scope, depth: int) -> BspSplit:
 
 @wp.func
 def link(output: BspOutput, task: BspTask, first: int, count: int):
-    """Store `first` and `count` of a finished cell in its parent node, or as the root's."""
+    """Store a cell's `first` and `count` (see BspNode and DEFERRED) in its parent node or, for the root, in output.results."""
     if task.parent < 0:
         output.results[ROOT_FIRST] = first
         output.results[ROOT_COUNT] = count
@@ -192,7 +192,7 @@ def write_node(output: BspOutput, task: BspTask, split: BspSplit, tolerance: flo
 
 @wp.func
 def count_below(tools: BspTools, task: BspTask, split: BspSplit) -> int:
-    """Return the number of pieces that are listed below the plane."""
+    """Return the number of the task's pieces that are listed below the plane."""
     n = int(0)
     for i in range(task.begin, task.end):
         sides = sides_of(extent_on(tools.pieces, i, split), split)
@@ -204,7 +204,7 @@ def count_below(tools: BspTools, task: BspTask, split: BspSplit) -> int:
 @wp.func
 def divide(tools: BspTools, task: BspTask, split: BspSplit, base: int, middle: int, size: int) -> wp.vec2i:
     """Clip the task's pieces to both sides of the plane. Store lower pieces from index `base` on, upper pieces from `middle` on, and new
-    points from `size` on. Return the ends (pieces, points), or (-1, -1) if the array of points is too short."""
+    points from `size` on. Return the indices behind the last piece and the last point; (-1, -1) if points do not fit."""
     pieces = tools.pieces
     low = int(base)
     high = int(middle)
@@ -228,7 +228,7 @@ def divide(tools: BspTools, task: BspTask, split: BspSplit, base: int, middle: i
 
 @wp.func
 def start_pieces(source: Pieces, begin: int, end: int, target: Pieces) -> int:
-    """Copy pieces with their points to the front of `target`; return the number of points, or -1 if `target` is too short."""
+    """Copy pieces begin .. end - 1 with their points to the front of `target`. Return the number of points, or -1 if they do not fit."""
     size = int(0)
     for i in range(begin, end):
         count = source.count[i]
@@ -244,7 +244,7 @@ def start_pieces(source: Pieces, begin: int, end: int, target: Pieces) -> int:
 
 @wp.func
 def start_root(task: BspTask, n_points: int) -> BspTask:
-    """Make a launch's first task, for the pieces that start_pieces has copied."""
+    """Make a launch's first task from `task`, for the pieces and the n_points points that start_pieces has copied."""
     task.end = task.end - task.begin
     task.begin = 0
     task.points_end = n_points
@@ -254,7 +254,7 @@ def start_root(task: BspTask, n_points: int) -> BspTask:
 
 @wp.func
 def defer(tools: BspTools, output: BspOutput, task: BspTask, slot: int):
-    """Append a cell to the deferred cells, for a later launch."""
+    """Append the cell in slot `slot` of tools.cells, with its task, to the deferred cells for a later launch."""
     left = output.results[N_DEFERRED]
     output.deferred[left] = task
     copy_cell(tools.cells, slot, output.deferred_cells, left)
@@ -264,7 +264,7 @@ def defer(tools: BspTools, output: BspOutput, task: BspTask, slot: int):
 
 @wp.func
 def child_of(task: BspTask, index: int, side: int, pieces: wp.vec3i, points_end: int) -> BspTask:
-    """Make the task of one side of node `index`. The side has the pieces from index pieces[side] to pieces[side + 1] - 1."""
+    """Make the task of side `side` (0 below, 1 above) of node `index`, with the pieces from index pieces[side] to pieces[side + 1] - 1."""
     child = BspTask()
     child.begin = pieces[side]
     child.end = pieces[side + 1]

@@ -11,8 +11,8 @@ MAX_POINTS = wp.constant(288)  # a convex polyhedron with f faces has at most 6 
 
 @wp.struct
 class Cells:
-    """Cells, each in a slot s. The points of face f begin at s * MAX_POINTS + first[s * (MAX_FACES + 1) + f], and end where face f + 1
-    begins."""
+    """Cells, each in a slot s, with n_faces[s] faces.
+    Face f begins at points[s * MAX_POINTS + first[s * (MAX_FACES + 1) + f]], and ends where face f + 1 begins."""
 
     n_faces: wp.array(dtype=wp.int32)
     first: wp.array(dtype=wp.int32)
@@ -28,7 +28,7 @@ def plane_side(n: wp.vec3d, d: wp.float64, p: wp.vec3d) -> wp.float64:
 
 @wp.func
 def snapped_side(n: wp.vec3d, d: wp.float64, eps: wp.float64, p: wp.vec3d) -> wp.float64:
-    """Return the plane's value at a point, or 0 for values within eps: so all corners of a face in the plane have the value 0."""
+    """Return the plane's value n . p + d at a point, or 0 if its size is at most eps. So all corners of a face in the plane get 0."""
     s = plane_side(n, d, p)
     return wp.where(wp.abs(s) > eps, s, wp.float64(0.0))
 
@@ -49,7 +49,7 @@ def turn(x: wp.float64, y: wp.float64) -> wp.float64:
 
 @wp.func
 def box_cell(cells: Cells, slot: int, lo: wp.vec3d, hi: wp.vec3d):
-    """Write a box to a slot: six quads."""
+    """Write the box lo .. hi, six quads, to a slot."""
     for face in range(6):
         axis = face / 2
         a = (axis + 1) % 3
@@ -70,7 +70,7 @@ def box_cell(cells: Cells, slot: int, lo: wp.vec3d, hi: wp.vec3d):
 
 @wp.func
 def points_of(cells: Cells, slot: int, face: int) -> wp.vec2i:
-    """Return the range (begin, end) of a face's points."""
+    """Return the range (begin, end) of a face's points in cells.points."""
     first = slot * (MAX_FACES + 1) + face
     return wp.vec2i(slot * MAX_POINTS + cells.first[first], slot * MAX_POINTS + cells.first[first + 1])
 
@@ -114,7 +114,7 @@ class CutFace:
     above: wp.vec3d  # Twice the area vector of the face's part above the plane.
     down: wp.vec3d  # Point where an edge crosses the plane downwards, if `crossed`.
     up: wp.vec3d  # Point where an edge crosses the plane upwards, if `crossed`.
-    crossed: bool
+    crossed: bool  # True if edges of the face cross the plane.
     highest: wp.float64  # Largest value of the plane at a corner, at least 0.
     lowest: wp.float64  # Smallest value of the plane at a corner, at most 0.
 
@@ -152,10 +152,10 @@ def cut_face(cells: Cells, points: wp.vec2i, n: wp.vec3d, d: wp.float64, eps: wp
 
 @wp.func
 def split_areas(cells: Cells, slot: int, n: wp.vec3d, d: wp.float64, eps: wp.float64) -> wp.vec2d:
-    """Return the surface areas (below, above) of a cell's parts on both sides of a plane; each includes the cut.
-    The cut is a convex polygon with an edge for each face that the plane crosses. Its area is the sum of the triangles of these edges with
-    a point of the polygon, in any order. If the plane contains a face, or the cell has no volume, one part has no volume, and counts the
-    cut twice."""
+    """Return the surface areas (below, above) of a cell's parts on both sides of a plane; eps: see snapped_side.
+    Each area includes the cut, the polygon in which the plane meets the cell. The cut has an edge for each face that the plane crosses. Its
+    area is the sum of the triangles of these edges with a point of the cut, in any order. If the plane contains a face, or the cell has no
+    volume, one part has no volume: its area is at least twice the cut's."""
     zero = wp.float64(0.0)
     half = wp.float64(0.5)
     below = wp.float64(0.0)
@@ -190,7 +190,7 @@ def split_areas(cells: Cells, slot: int, n: wp.vec3d, d: wp.float64, eps: wp.flo
 
 @wp.func
 def order_by_angle(rim: wp.array(dtype=wp.vec3d), count: int, center: wp.vec3d, n: wp.vec3d):
-    """Sort the corners `rim` of a cut by their angle around `center`, counterclockwise about -n."""
+    """Sort the first `count` points of `rim`, the corners of a cut, by their angle around `center`, counterclockwise about -n."""
     x_axis = wp.normalize(rim[0] - center)
     y_axis = wp.cross(x_axis, n)
     angle = wp.zeros(shape=48, dtype=wp.float64)

@@ -29,7 +29,7 @@ class Pieces:
     prim_id: wp.array(dtype=wp.int32)
     first: wp.array(dtype=wp.int32)  # The polygon of piece i is points[first[i]] .. points[first[i] + count[i] - 1].
     count: wp.array(dtype=wp.int32)  # Number of corners; 0 for a sphere.
-    lo: wp.array(dtype=wp.vec3d)
+    lo: wp.array(dtype=wp.vec3d)  # lo, hi: box of the piece.
     hi: wp.array(dtype=wp.vec3d)
     ball: wp.array(dtype=wp.vec4d)  # A sphere around the piece: (center, radius).
     extent: wp.array(dtype=wp.float64)  # Largest extent of the whole primitive along an axis.
@@ -40,12 +40,12 @@ class Pieces:
 class BspOptions:
     """Limits and SAH costs of the builder."""
 
-    cost_intersection: wp.float64
-    cost_axis: wp.float64
-    cost_plane: wp.float64
+    cost_intersection: wp.float64  # Cost of a primitive.
+    cost_axis: wp.float64  # Cost of a node whose plane is across an axis.
+    cost_plane: wp.float64  # Cost of a node with any other plane.
     samples: int  # Number of triangles per cell whose planes are tried.
     max_depth: int
-    keep: int  # If not 0, cells with at most so many pieces are deferred to later launches.
+    keep: int  # If not 0: cells with at most `keep` pieces are deferred to later launches.
     lo: wp.vec3d  # lo, hi: the root box.
     hi: wp.vec3d
 
@@ -62,13 +62,13 @@ class BspTools:
 
 @wp.struct
 class BspSplit:
-    """A plane normal . p + offset = 0, and its SAH cost."""
+    """The plane of the points p with `normal` . p + `offset` = 0, and its SAH cost."""
 
     normal: wp.vec3d
     offset: wp.float64
     axis: int  # As BspNode.axis.
     pad: wp.float64  # A piece that extends beyond the plane by at most `pad` is not listed on that side.
-    low_flat: bool  # True if pieces in the plane are listed below the plane, else above.
+    low_flat: bool  # True: pieces in the plane are listed below the plane; False: above it.
     cost: wp.float64
 
 
@@ -80,23 +80,22 @@ class Scope:
     end: int
     lo: wp.vec3d  # lo, hi: box of the pieces.
     hi: wp.vec3d
-    far: wp.vec3d  # Largest absolute coordinate on each axis.
-    extent: wp.float64  # Largest extent of a primitive.
+    far: wp.vec3d  # Largest absolute coordinate of a piece on each axis.
+    extent: wp.float64  # Largest extent of a piece's whole primitive along an axis.
     slot: int  # Slot of the cell in `Cells`.
     area: wp.float64  # Surface area of the cell.
-    budget: int  # Largest number of references in the cell's subtree.
+    budget: int  # As BspTask.budget.
 
 
 @wp.func
 def plane_noise(split: BspSplit, far: wp.vec3d) -> wp.float64:
-    """Return sum |n_i| far_i + |d|. Rounding errors of the plane and of its values are proportional to it."""
+    """Return the sum of |normal[i]| far[i] over i, plus |offset|. Rounding errors of the plane and its values are proportional to it."""
     return wp.dot(wp.abs(split.normal), far) + wp.abs(split.offset)
 
 
 @wp.func
 def plane_tolerance(split: BspSplit, scope: Scope) -> float:
-    """Return BspNode.tolerance: the builder's own pad, plus 8 u sqrt(3) times the largest extent, plus 4 u times plane_noise.
-    The sum is rounded up."""
+    """Return BspNode.tolerance: split.pad + 14 u scope.extent + 4 u plane_noise, rounded up. u = 2^-24; 14 is 8 sqrt(3) rounded up."""
     noise = plane_noise(split, scope.far)
     total = split.pad + wp.float64(14.0) * U * scope.extent + wp.float64(4.0) * U * noise
     return float(total * OUTWARDS) + SMALLEST
@@ -104,7 +103,7 @@ def plane_tolerance(split: BspSplit, scope: Scope) -> float:
 
 @wp.func
 def extent_on(pieces: Pieces, i: int, split: BspSplit) -> wp.vec2d:
-    """Return the lowest and highest value of the plane on a piece, or on the piece's sphere `ball` if that suffices to find its side."""
+    """Return the lowest and the highest value of the plane on piece i, as far as `sides_of` needs them: the sphere `ball` may suffice."""
     if split.axis < wp.static(PLANE):
         return wp.vec2d(pieces.lo[i][split.axis] + split.offset, pieces.hi[i][split.axis] + split.offset)
     ball = pieces.ball[i]
@@ -128,13 +127,13 @@ def extent_on(pieces: Pieces, i: int, split: BspSplit) -> wp.vec2d:
 
 @wp.func
 def sides_of(extent: wp.vec2d, split: BspSplit) -> int:
-    """Return the sides of the plane on which a piece is listed: 1 below, 2 above, 3 both; 0 for a piece in the plane."""
+    """Return the sides on which a piece with this result of extent_on is listed: 1 below, 2 above, 3 both; 0 for a piece in the plane."""
     return wp.where(extent[0] < -split.pad, 1, 0) + wp.where(extent[1] > split.pad, 2, 0)
 
 
 @wp.func
 def cheaper(tools: BspTools, scope: Scope, trial: BspSplit, best: BspSplit) -> BspSplit:
-    """Compute the cost of a trial split, and return the cheaper of `trial` and `best`. Stop early if the trial costs more."""
+    """Compute the cost of a trial split of a cell, and return the cheaper of `trial` and `best`. Stop once the cost reaches best.cost."""
     if not wp.isfinite(trial.offset):
         return best
     # A ray within a plane's tolerance visits both sides, so cutting off a sliver thinner than the tolerance saves nothing.
@@ -187,7 +186,7 @@ def across_axis(axis: int, position: wp.float64) -> BspSplit:
 
 @wp.func
 def best_across(tools: BspTools, scope: Scope, best: BspSplit) -> BspSplit:
-    """Return the cheapest of `best` and the planes across an axis, at the ends of each piece or at equal steps (EXACT, STEPS)."""
+    """Return the cheapest of `best` and the planes across an axis: at both ends of each piece, or at equal steps (EXACT, STEPS)."""
     for axis in range(3):
         if scope.end - scope.begin <= EXACT:
             for i in range(scope.begin, scope.end):
@@ -216,7 +215,7 @@ def plane_through(n: wp.vec3d, p: wp.vec3d) -> BspSplit:
 
 @wp.func
 def best_plane(tools: BspTools, scope: Scope, best: BspSplit) -> BspSplit:
-    """Return the cheapest of `best` and the planes (face, three edges) of `samples` triangles, evenly spread over the cell's list."""
+    """Return the cheapest of `best` and the planes through face and edges of options.samples triangles, spread evenly over the pieces."""
     n = scope.end - scope.begin
     tried = wp.min(n, tools.options.samples)
     for k in range(tried):

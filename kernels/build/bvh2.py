@@ -1,6 +1,6 @@
 """The inner loop of top-down builders of binary BVHs, on the CPU: it splits ranges of primitives in place.
-At the end, the records are in the order of the leaves. The host launches it for the root, then on all cores for the deferred ranges. The
-builders differ in the function that splits a range: SPLIT is the table of these functions."""
+At the end, the records are in the order of the leaves. The host launches it for the root. That launch defers small ranges, and further
+launches build them on all cores. The builders differ in the function that splits a range: SPLIT is the table of these functions."""
 
 from functools import cache
 from typing import Any
@@ -68,7 +68,7 @@ def choose_median(data: BuildData, task: BuildTask) -> int:
 
 @wp.func
 def choose_sweep(data: BuildData, task: BuildTask) -> int:
-    """Partition at the cheapest split, of all splits in the order of centroids along an axis; return the first index of the right side.
+    """Partition at the cheapest of all splits of the records sorted by centroid along an axis; return the first index of the right side.
     MacDonald and Booth 1990, "Heuristics for ray tracing using space subdivision". A stable partition keeps both sides sorted along all
     three axes."""
     n = data.boxes.shape[0]
@@ -133,7 +133,7 @@ SPLIT = {
 
 @wp.func
 def child_of(task: BuildTask, halves: Halves, side: int) -> BuildTask:
-    """Return the task of one side of a split range."""
+    """Return the task of one side of a split range: 0 left, 1 right."""
     child = BuildTask()
     child.begin = wp.where(side == 0, task.begin, halves.middle)
     child.end = child.begin + wp.where(side == 0, halves.count_0, halves.count_1)
@@ -151,7 +151,7 @@ def child_of(task: BuildTask, halves: Halves, side: int) -> BuildTask:
 
 @wp.func
 def split_pays(options: BuildOptions, task: BuildTask, halves: Halves) -> bool:
-    """Test whether a node with two leaves has a lower SAH cost than one leaf."""
+    """Test whether a node with the two halves as leaves has a lower SAH cost than one leaf with the whole range."""
     scale = area_scale(task.measures.box)
     area = row_area(task.measures.box, scale)
     parts = (row_area(halves.left.box, scale) * row_count(options, halves.count_0)
@@ -162,7 +162,7 @@ def split_pays(options: BuildOptions, task: BuildTask, halves: Halves) -> bool:
 
 @wp.func
 def write_node(data: BuildData, task: BuildTask, halves: Halves):
-    """Write the inner node of a split range. Both children are leaves until link_to_parent makes them inner nodes."""
+    """Write the inner node task.slot of a split range. Both children are leaves until link_to_parent makes them inner nodes."""
     data.used[task.slot] = wp.uint8(1)
     node = Bvh2Node()
     node.lo_0 = low_of(halves.left.box)
@@ -178,21 +178,21 @@ def write_node(data: BuildData, task: BuildTask, halves: Halves):
 
 @wp.func
 def mark_leaf(left: wp.array(dtype=wp.uint8), begin: int, end: int):
-    """Mark the records begin .. end - 1 as records of a leaf; the host removes unmarked records."""
+    """Set left[begin .. end - 1] to 1: these records are in a leaf. The host removes all other records."""
     for i in range(begin, end):
         left[i] = wp.uint8(1)
 
 
 @cache
 def make_build_ranges(split: Any, place: Any = None) -> Any:
-    """Make a builder's kernel from split(data, task) -> Halves, which moves the records to their sides. With spatial splits, it does not:
-    place(data, task, halves) -> Halves moves them, once the range is known not to become a leaf."""
+    """Make a builder's kernel from split(data, task) -> Halves, which moves the records to their sides. With spatial splits, `split` does
+    not move them. Instead place(data, task, halves) -> Halves does, once the range is known not to become a leaf."""
 
     @kernel
     def build_ranges(data: BuildData, tasks: wp.array(dtype=BuildTask), options: BuildOptions, stop_size: int,
                      deferred: wp.array(dtype=BuildTask), n_deferred: wp.array(dtype=wp.int32),
                      max_depth: wp.array(dtype=wp.int32)):
-        """Build the subtree of each task, except for ranges of at most stop_size records, which are appended to `deferred`.
+        """Build the subtree of each task. Append ranges of at most stop_size records to `deferred` instead. max_depth[0] gets the depth.
         A task has at least two records. A range with space for n records owns the node slots slot .. slot + n - 2; the host removes unused
         slots. If no ranges are deferred (stop_size 0), a subtree uses its first slots without gaps."""
         stack = wp.zeros(shape=wp.static(STACK_SIZE + 2), dtype=BuildTask)

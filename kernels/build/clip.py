@@ -1,7 +1,7 @@
 """Clip triangles to axis-aligned cells and return the boxes of the clipped polygons, for builders on the CPU.
 Sutherland and Hodgman 1974, "Reentrant Polygon Clipping", in float64. The triangle unit accepts hits slightly beside a triangle: within a
-few u of its extent. So the cell grows by twice this distance, and the resulting box grows by the same amount again. Then no hit on the
-triangle lies in a leaf that does not list the triangle."""
+few u (2^-24) of its extent. So the cell grows by a margin of twice this distance. The resulting box grows by the same margin. Then no hit
+on the triangle lies in a leaf that does not list the triangle."""
 
 import warp as wp
 
@@ -80,7 +80,7 @@ def cut_by_plane(polygon: wp.array(dtype=wp.vec3d), n: int, clipped: wp.array(dt
 @wp.func
 def clip_triangle(polygon: wp.array(dtype=wp.vec3d), clipped: wp.array(dtype=wp.vec3d), lo: wp.vec3d, hi: wp.vec3d) -> int:
     """Clip the triangle at the front of `polygon` to the box lo .. hi, in place; return the number of corners.
-    If it is MAX_CORNERS, corners may be missing, and the polygon is not usable. The array `clipped` is scratch."""
+    If the number is MAX_CORNERS, corners may be missing, and the polygon is not usable. The array `clipped` is scratch."""
     low = wp.min(wp.min(polygon[0], polygon[1]), polygon[2])
     high = wp.max(wp.max(polygon[0], polygon[1]), polygon[2])
     n = int(3)
@@ -98,7 +98,7 @@ def clip_triangle(polygon: wp.array(dtype=wp.vec3d), clipped: wp.array(dtype=wp.
 
 @wp.func
 def clip_to_cell(shapes: Clippable, prim_id: int, cell_lo: wp.vec3, cell_hi: wp.vec3) -> Box:
-    """Return the box of a primitive's part in a cell, grown by the margin and cut off at the cell; empty if there is no such part."""
+    """Return the box of a primitive's part in a cell, grown by the margin, then cut off at the cell. Without such a part, it is empty."""
     if shapes.exact[prim_id] == wp.uint8(0):
         return within_cell(shapes.lo[prim_id], shapes.hi[prim_id], cell_lo, cell_hi)
     polygon = wp.zeros(shape=wp.static(MAX_CORNERS), dtype=wp.vec3d)
@@ -130,7 +130,7 @@ def clip_to_cell(shapes: Clippable, prim_id: int, cell_lo: wp.vec3, cell_hi: wp.
 @kernel
 def clip_references(shapes: Clippable, prim_id: wp.array(dtype=wp.int32), cell_lo: wp.vec3, cell_hi: wp.vec3,
                     lo: wp.array(dtype=wp.vec3), hi: wp.array(dtype=wp.vec3)):
-    """Store clip_to_cell's box lo[i], hi[i] of each primitive prim_id[i]."""
+    """Store in lo[i] and hi[i] the box that clip_to_cell returns for the primitive prim_id[i]."""
     i = wp.tid()
     box = clip_to_cell(shapes, prim_id[i], cell_lo, cell_hi)
     lo[i] = box.lo

@@ -14,7 +14,7 @@ from wrt.kernels.traverse.bvh2 import STACK_SIZE
 class Children:
     """The children of all nodes: child k of node i has the index i * width + k; node 0 is the root."""
 
-    width: int
+    width: int  # Number of children of a node.
     lo: wp.array(dtype=wp.vec3)
     hi: wp.array(dtype=wp.vec3)
     first: wp.array(dtype=wp.int32)  # Index in `order` of a leaf's first primitive, or index of an inner node.
@@ -46,7 +46,7 @@ def area_inside(v0: wp.vec3d, v1: wp.vec3d, v2: wp.vec3d, lo: wp.vec3d, hi: wp.v
 
 @wp.func
 def belongs(tree: Children, child: int, prim_id: int) -> int:
-    """Return 1 if the leaf `child` lists the primitive, else 0."""
+    """Return 1 if the leaf with the index `child` lists the primitive, else 0."""
     for i in range(tree.first[child], tree.first[child] + tree.count[child]):
         if tree.order[i] == prim_id:
             return 1
@@ -56,8 +56,8 @@ def belongs(tree: Children, child: int, prim_id: int) -> int:
 @kernel
 def end_point_overlap(tree: Children, vertices: wp.array(dtype=wp.vec3), faces: wp.array(dtype=wp.vec3i), first: int,
                       out: wp.array(dtype=wp.float64)):
-    """Store the area of triangle i in the boxes of nodes whose subtrees do not contain the triangle. In a leaf, the area counts once for
-    each primitive. The walk visits all boxes that the triangle meets, depth first. At a subtree's end, it adds the box of its root."""
+    """Store the area of triangle i = first + tid in the boxes of nodes whose subtrees do not contain it. In a leaf's box, it counts once
+    for each primitive of the leaf. The walk visits all boxes that the triangle meets, and adds a node's box after the node's subtree."""
     i = first + wp.tid()
     face = faces[i]
     v0 = wp.vec3d(vertices[face[0]])

@@ -1,6 +1,6 @@
 """Compute the boxes of a binary BVH from the leaves to the root, in one launch, on the CPU and on CUDA: for builds and refits.
 Karras 2012, "Maximizing Parallelism in the Construction of BVHs, Octrees, and k-d Trees", section 4. One thread begins at each node without
-inner children. At a node, the first thread to arrive ends. The last one continues, and reads the results that other threads wrote below."""
+inner children, and moves up. Where two threads meet at a node, the first ends. The second reads the results of the first, and continues."""
 
 import warp as wp
 
@@ -71,7 +71,7 @@ def area_of(lo: wp.vec3, hi: wp.vec3) -> wp.float64:
 
 @wp.func
 def child_summary(tree: Tree, options: BuildOptions, first: int, count: int) -> SubtreeSummary:
-    """Return the summary of a child: of an inner node, another thread has stored it; of a leaf, compute it from the primitives."""
+    """Return the summary of a child. For an inner node, load what another thread has stored. For a leaf, compute it from the primitives."""
     out = SubtreeSummary()
     if count == 0 and first > 0:
         load_summary(tree.summaries, first, out)
@@ -90,7 +90,7 @@ def child_summary(tree: Tree, options: BuildOptions, first: int, count: int) -> 
 
 @wp.func
 def merge_summaries(options: BuildOptions, a: SubtreeSummary, b: SubtreeSummary, root: bool) -> SubtreeSummary:
-    """Return the summary of a node with the children a and b. The node becomes a leaf if a leaf costs no more and it is not the root."""
+    """Return the summary of a node with the children a and b. If a leaf costs no more, the node becomes a leaf, except for the root."""
     out = SubtreeSummary()
     out.lo = lower(a.lo, b.lo)
     out.hi = upper(a.hi, b.hi)
@@ -111,7 +111,7 @@ def merge_summaries(options: BuildOptions, a: SubtreeSummary, b: SubtreeSummary,
 
 @kernel
 def fit(tree: Tree, options: BuildOptions):
-    """Fit the tree, with one thread per node. If options.max_leaf is 0, no node becomes a leaf. The order of threads does not matter."""
+    """Fit the tree, with one thread per node, in any order of threads. If options.max_leaf is 0, no node becomes a leaf."""
     i = wp.tid()
     if inner_child_count(tree.nodes[i]) > 0:
         return
@@ -139,7 +139,7 @@ def fit(tree: Tree, options: BuildOptions):
 
 @kernel
 def find_parents(nodes: wp.array(dtype=Bvh2Node), parents: wp.array(dtype=wp.int32)):
-    """Store the parent of each node's inner children, with one thread per node. The root's entry is not written."""
+    """Store node i in the entries of its inner children in `parents`, with one thread per node i. The root's entry is not written."""
     i = wp.tid()
     node = nodes[i]
     if node.count_0 == 0 and node.first_0 > 0:

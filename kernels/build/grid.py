@@ -11,7 +11,7 @@ from wrt.kernels.traverse.grid import GridCell, GridLayout, grid_plane, slab_of
 
 @wp.func
 def slabs_of(layout: GridLayout, lo: wp.vec3, hi: wp.vec3, axis: int) -> wp.vec2i:
-    """Return the first and the last slab, which are closed, that the interval [lo[axis], hi[axis]] meets."""
+    """Return the first and the last slab of an axis that the interval [lo[axis], hi[axis]] meets. Slabs are closed intervals."""
     first = slab_of(layout, axis, lo[axis])
     last = slab_of(layout, axis, hi[axis])
     if last < layout.n[axis] - 1 and grid_plane(layout, axis, last + 1) <= hi[axis]:
@@ -27,7 +27,8 @@ def slab_lo(layout: GridLayout, x: int, y: int, z: int) -> wp.vec3:
 @kernel
 def list_cells(source: CellSource, layout: GridLayout, first: int, begin: wp.array(dtype=wp.int64), count: wp.array(dtype=wp.int32),
                cells: wp.array(dtype=wp.int32)):
-    """Write the cells that primitive i = first + tid meets to `cells`, from begin[i] on. If `cells` is empty, write only count[i]."""
+    """Write the indices of the cells that primitive i = first + tid meets to `cells`, from begin[i] on. If `cells` is empty, only count the
+    cells, in count[i]."""
     i = first + wp.tid()
     lo = source.lo[i]
     hi = source.hi[i]
@@ -61,7 +62,8 @@ def list_cells(source: CellSource, layout: GridLayout, first: int, begin: wp.arr
 @kernel
 def sort_by_cell(begin: wp.array(dtype=wp.int64), cell_of: wp.array(dtype=wp.int32), cells: wp.array(dtype=GridCell),
                  references: wp.array(dtype=wp.int32)):
-    """Sort the primitives by cell, and within a cell by index: a counting sort in one thread. All `cells` must be 0 before."""
+    """Sort the primitives by cell, and within a cell by index: a counting sort in one thread. On entry, all `cells` must be 0.
+    Primitive i meets the cells cell_of[begin[i]] .. cell_of[begin[i + 1] - 1]."""
     for r in range(cell_of.shape[0]):
         cells[cell_of[r]].count += 1
     total = int(0)

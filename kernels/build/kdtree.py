@@ -1,7 +1,7 @@
 """The k-d tree builder's inner loop, on the CPU: it builds a subtree by the surface area heuristic, trying all planes.
 Wald and Havran 2006 (kernels.build.kdtree_split). The faces of the references' boxes are events. They are sorted once per subtree, and a
-sweep over them finds the best plane. A split preserves the order of events. References that straddle the plane are clipped to both cells,
-and their events sorted and merged with the others. The host launches one subtree per task, on all cores."""
+sweep over them finds the best plane. A split preserves the order of events. References that straddle the plane are clipped to both cells.
+The events of the clipped references are sorted and merged with the other events. The host launches one subtree per task, on all cores."""
 
 import warp as wp
 
@@ -91,7 +91,7 @@ def sort(events: wp.array(dtype=KdEvent), first: int, count: int, scratch: wp.ar
 
 @wp.func
 def add_events(events: wp.array(dtype=KdEvent), count: int, lo: wp.vec3, hi: wp.vec3, reference: int) -> int:
-    """Append the events of the six faces of a reference's box; return the new count."""
+    """Write the six events of a reference's box, one per face, to `events` from index `count` on; return count + 6."""
     event = KdEvent()
     for axis in range(3):
         event.position = hi[axis]
@@ -105,7 +105,7 @@ def add_events(events: wp.array(dtype=KdEvent), count: int, lo: wp.vec3, hi: wp.
 
 @wp.func
 def moved(corner: wp.vec3, split: KdSplit) -> wp.vec3:
-    """Return a corner of the cell, moved into the splitting plane."""
+    """Return a corner of the cell with its coordinate along split.axis replaced by the splitting plane's."""
     out = corner
     out[split.axis] = split.position
     return out
@@ -113,7 +113,8 @@ def moved(corner: wp.vec3, split: KdSplit) -> wp.vec3:
 
 @wp.func
 def mark_sides(work: KdWork, task: KdTask, split: KdSplit):
-    """Store the side (LEFT, RIGHT, BOTH) of each reference. Every box has a volume, so it begins before it ends."""
+    """Store in work.side whether each reference is LEFT or RIGHT of the plane or on BOTH sides.
+    Every box has a volume, so the event where it begins comes before the event where it ends."""
     begins = 2 * split.axis + 1
     for i in range(task.first, task.first + task.count):
         event = work.events[i]
@@ -127,7 +128,7 @@ def mark_sides(work: KdWork, task: KdTask, split: KdSplit):
 
 @wp.func
 def divide(shapes: Clippable, work: KdWork, task: KdTask, split: KdSplit) -> wp.vec2i:
-    """Replace a task's events by the events of the right child, then the left child; return their numbers (right, left)."""
+    """Replace a task's events by the events of the right child, then of the left child; return the numbers of events (right, left)."""
     middle_hi = moved(task.hi, split)
     middle_lo = moved(task.lo, split)
     kept_left = int(0)

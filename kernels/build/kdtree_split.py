@@ -1,7 +1,7 @@
 """The k-d tree's split: the plane of least cost by the surface area heuristic (SAH).
 Wald and Havran 2006, "On building fast kd-Trees for Ray Tracing, and on doing that in O(N log N)". The candidates are all faces of the
-references' boxes; a sweep over the sorted faces finds the best. Cells with more than `perfect_below` references are split between bins, at
-the same costs (wrt.accel.cells.kdtree_build.binned_split)."""
+references' boxes; a sweep over the sorted faces finds the best. The host splits cells with more than
+`perfect_below` references between bins, at the same costs (wrt.accel.cells.kdtree_build.binned_split)."""
 
 import warp as wp
 
@@ -20,8 +20,8 @@ class KdEvent:
 class KdOptions:
     """Conditions under which a cell becomes a leaf, and the SAH costs."""
 
-    max_leaf: int  # A cell with at most so many references becomes a leaf.
-    max_depth: int  # A cell at this depth becomes a leaf.
+    max_leaf: int  # A cell with at most max_leaf references becomes a leaf.
+    max_depth: int  # A cell at the depth max_depth becomes a leaf.
     by_cost: int  # 1: a cell becomes a leaf if no split costs less than the leaf.
     cost_traversal: wp.float64
     cost_intersection: wp.float64
@@ -36,7 +36,7 @@ class KdTask:
     hi: wp.vec3
     first: int  # Index of the cell's first event.
     count: int  # Number of the cell's events: six per reference.
-    budget: int  # Largest number of references in all leaves of the cell; an empty leaf counts as one.
+    budget: int  # Largest sum of the numbers of references in all leaves of the cell; an empty leaf counts as one.
     depth: int
     slot: int  # Index of the cell's node.
 
@@ -48,9 +48,9 @@ class KdWork:
     prim_id: wp.array(dtype=wp.int32)
     lo: wp.array(dtype=wp.vec3)  # lo, hi: boxes of the references, clipped to the root's cell.
     hi: wp.array(dtype=wp.vec3)
-    side: wp.array(dtype=wp.uint8)  # Scratch.
+    side: wp.array(dtype=wp.uint8)  # Scratch: side of the plane (kdtree.mark_sides).
     events: wp.array(dtype=KdEvent)  # The events of all pending cells, as a stack; length 6 * budget.
-    kept_left: wp.array(dtype=KdEvent)  # From here on: events of one split, length 6 n each. Kept events are copied, fresh ones clipped.
+    kept_left: wp.array(dtype=KdEvent)  # From here on: scratch of a split, length 6 n. kept: copied; fresh: of clipped references.
     kept_right: wp.array(dtype=KdEvent)
     fresh_left: wp.array(dtype=KdEvent)
     fresh_right: wp.array(dtype=KdEvent)
@@ -81,7 +81,7 @@ def split_cost(options: KdOptions, scale: wp.float64, face: wp.vec2d, below: wp.
 
 @wp.func
 def cheapest_split(work: KdWork, task: KdTask, options: KdOptions) -> KdSplit:
-    """Find the plane of least SAH cost whose references are within the budget. With by_cost, it must also be cheaper than a leaf."""
+    """Find the plane of least SAH cost with at most task.budget references in total. With by_cost, it must be cheaper than a leaf."""
     best = KdSplit()
     best.axis = -1
     n = task.count / 6

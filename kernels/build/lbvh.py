@@ -1,7 +1,8 @@
 """Build a binary BVH along a Morton curve, with one thread per node, on the CPU and on CUDA.
 Karras 2012, "Maximizing Parallelism in the Construction of BVHs, Octrees, and k-d Trees". Primitives are sorted by the Morton code of
 their boxes' middles. Each inner node computes its range of primitives and its split. Then `fit.fit` makes boxes and leaves from the bottom
-up, and `write_nodes` writes the remaining nodes in depth-first order."""
+up, and `write_nodes` writes the remaining nodes in depth-first order. A launch of size dim processes the
+items first .. first + dim - 1."""
 
 import warp as wp
 
@@ -16,8 +17,8 @@ KEY_BITS = 63  # largest number of bits of a key
 
 def bits_of(n: int) -> tuple[int, int]:
     """Return the numbers of bits that a primitive's index and a coordinate have in the keys of n primitives.
-    A key contains the index, so all keys differ, and no path has more nodes than a key has bits. With KEY_BITS, a path fits on the stack of
-    the traversal. For more primitives, a coordinate has fewer bits: 14 for a million."""
+    A key contains the index, so all keys differ, and no path has more nodes than a key has bits. A path of KEY_BITS nodes fits on the stack
+    of the traversal. The more primitives, the fewer bits remain for a coordinate: 14 for a million."""
     index_bits = max(n - 1, 1).bit_length()
     return index_bits, min(MOST_BITS, (KEY_BITS - index_bits) // 3)
 
@@ -31,7 +32,7 @@ def middle_of(low: wp.vec3, high: wp.vec3) -> wp.vec3:
 
 @kernel
 def measure(low: wp.array(dtype=wp.vec3), high: wp.array(dtype=wp.vec3), ends: wp.array(dtype=wp.vec3)):
-    """Store the bounds of all middles in ends[0] and ends[1], which must be empty before (inf, -inf). Launch PARTS threads."""
+    """Store the bounds of the middles of all boxes in ends[0] and ends[1], which must be (inf, -inf) before. Launch PARTS threads."""
     i = wp.tid()
     a = wp.vec3(wp.inf, wp.inf, wp.inf)
     b = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
@@ -65,7 +66,8 @@ def cell_of(x: float, begin: float, end: float, bits: int) -> wp.uint64:
 @kernel
 def write_keys(low: wp.array(dtype=wp.vec3), high: wp.array(dtype=wp.vec3), ends: wp.array(dtype=wp.vec3), bits: wp.vec2i,
                keys: wp.array(dtype=wp.uint64), order: wp.array(dtype=wp.int32), first: int):
-    """Write the keys of primitives first .. first + dim - 1. A key is the Morton code of the middle, then the index; bits: see bits_of."""
+    """Write the keys of primitives first .. first + dim - 1. A key's high bits are the Morton code of the middle, its low bits the index.
+    The numbers of bits are `bits` (see bits_of)."""
     i = first + wp.tid()
     middle = middle_of(low[i], high[i])
     a = ends[0]
@@ -78,7 +80,7 @@ def write_keys(low: wp.array(dtype=wp.vec3), high: wp.array(dtype=wp.vec3), ends
 
 @wp.func
 def differ(keys: wp.array(dtype=wp.uint64), n: int, i: int, j: int) -> wp.uint64:
-    """Return the XOR of keys i and j, or only the highest bit set if there is no key j."""
+    """Return the XOR of keys i and j. If there is no key j, return a number with only the highest bit set. n: number of keys."""
     if j < 0 or j >= n:
         return wp.uint64(0x8000000000000000)
     return keys[i] ^ keys[j]
@@ -86,14 +88,14 @@ def differ(keys: wp.array(dtype=wp.uint64), n: int, i: int, j: int) -> wp.uint64
 
 @wp.func
 def nearer(a: wp.uint64, b: wp.uint64) -> bool:
-    """Test whether the highest bit set in a is below the highest bit set in b: two keys with the XOR a share the longer prefix."""
+    """Test whether the highest bit of a is below b's: two keys with the XOR a then share a longer prefix than two keys with the XOR b."""
     return a < b and a < (a ^ b)
 
 
 @kernel
 def link(keys: wp.array(dtype=wp.uint64), nodes: wp.array(dtype=Bvh2Node), parents: wp.array(dtype=wp.int32), first: int):
     """Write the inner nodes first .. first + dim - 1, one per thread, and their children's entries in `parents`. A leaf is one primitive.
-    There are at least two `keys`, in ascending order, and one node fewer than keys."""
+    The `keys` are in ascending order. There are at least two keys, and one node fewer than keys."""
     i = first + wp.tid()
     n = nodes.shape[0] + 1
     # Node i begins or ends at key i, and extends to the side whose neighbour shares the longer prefix.
@@ -140,8 +142,8 @@ def link(keys: wp.array(dtype=wp.uint64), nodes: wp.array(dtype=Bvh2Node), paren
 
 @kernel
 def write_nodes(tree: Tree, nodes: wp.array(dtype=Bvh2Node), parents: wp.array(dtype=wp.int32), first: int):
-    """Write the nodes first .. first + dim - 1 that are still inner nodes after `fit`, in depth-first order, left before right.
-    A node's new index is the number of nodes before it in this order: all its ancestors, and all nodes of their left siblings' subtrees."""
+    """Write those of the nodes first .. first + dim - 1 that are still inner nodes after `fit`, in depth-first order, left before right.
+    A node's new index is the number of nodes before it in this order: its ancestors, and all nodes left of the path from the root to it."""
     i = first + wp.tid()
     slot = int(0)
     at = int(i)

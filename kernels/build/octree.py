@@ -11,8 +11,8 @@ from wrt.kernels.traverse.octree import OctreeLayout, octant_corner, octree_plan
 
 @wp.func
 def octants_of_box(lo: wp.vec3, hi: wp.vec3, middle: wp.vec3, end: wp.vec3) -> int:
-    """Return the mask of the octants, which are closed, that a box meets. The box meets their cell. The planes `middle` divide the cell.
-    The planes `end` bound the root's cell: an upper half that begins at `end` is empty."""
+    """Return the mask of a cell's octants, closed boxes, that the box lo .. hi meets. The box meets the cell; `middle` divides the cell.
+    The root's cell ends at `end`, so an upper half that begins there is empty."""
     mask = int(0xFF)
     for axis in range(3):
         upper = wp.where(axis == 0, 0xAA, wp.where(axis == 1, 0xCC, 0xF0))
@@ -35,7 +35,7 @@ class SplitCells:
 @kernel
 def find_octants(source: CellSource, layout: OctreeLayout, first: int, cells: SplitCells, references: wp.array(dtype=wp.int32),
                  masks: wp.array(dtype=wp.int32)):
-    """Store masks[r], the mask of the octants of its cell that reference r = first + tid meets."""
+    """Store masks[r] for reference r = first + tid: the mask of the octants of the reference's cell that its primitive meets."""
     half = cells.half
     r = first + wp.tid()
     i = references[r]
@@ -58,7 +58,7 @@ def find_octants(source: CellSource, layout: OctreeLayout, first: int, cells: Sp
 
 @kernel
 def count_octants(first: int, begin: wp.array(dtype=wp.int32), masks: wp.array(dtype=wp.int32), count: wp.array2d(dtype=wp.int32)):
-    """Count the references of each octant of cell first + tid. A cell has the references begin[cell] .. begin[cell + 1] - 1."""
+    """Add to count[cell, k] the number of references begin[cell] .. begin[cell + 1] - 1 that meet octant k of `cell` = first + tid."""
     cell = first + wp.tid()
     for r in range(begin[cell], begin[cell + 1]):
         for octant in range(8):
@@ -68,7 +68,7 @@ def count_octants(first: int, begin: wp.array(dtype=wp.int32), masks: wp.array(d
 @kernel
 def fill_octants(first: int, begin: wp.array(dtype=wp.int32), masks: wp.array(dtype=wp.int32), references: wp.array(dtype=wp.int32),
                  next_place: wp.array2d(dtype=wp.int32), out: wp.array(dtype=wp.int32)):
-    """Copy the references of each octant k of cell first + tid to `out`, from index next_place[cell, k] on.
+    """Copy the references of each octant k of `cell` = first + tid to `out`, from index next_place[cell, k] on; masks: of find_octants.
     If next_place[cell, 0] < 0, the cell is not split, and nothing is copied."""
     cell = first + wp.tid()
     if next_place[cell, 0] < 0:

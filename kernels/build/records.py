@@ -30,7 +30,7 @@ class Measures:
 
 @wp.struct
 class BuildTask:
-    """A range of records begin .. end - 1, which becomes a child of node `parent` (-1: the root): a leaf, or the inner node `slot`."""
+    """A range of records begin .. end - 1, which becomes child `side` of node `parent` (-1: the root): a leaf, or the inner node `slot`."""
 
     begin: int
     end: int
@@ -47,14 +47,14 @@ class BuildOptions:
     """Limits and costs of a builder."""
 
     max_leaf: int  # Largest number of primitives in a leaf.
-    row: int  # Number of primitives that are tested at once.
+    row: int  # Number of primitives in a row: they are tested at once.
     cost_traversal: float  # SAH cost of a node.
     cost_intersection: float  # SAH cost of a row of primitives.
 
 
 @wp.struct
 class BuildData:
-    """Arrays of a builder, with one entry per record unless a comment says otherwise. Some serve only the sweep or the spatial splits."""
+    """Arrays of a builder, with one entry per record unless a comment says otherwise. Some arrays serve only sweep or spatial splits."""
 
     records: wp.array(dtype=BuildRecord)  # The build reorders them.
     nodes: wp.array(dtype=Bvh2Node)
@@ -82,7 +82,7 @@ class Halves:
 
 @wp.func
 def row_count(options: BuildOptions, n: int) -> float:
-    """Return the number of rows that n primitives fill."""
+    """Return the number of rows of options.row primitives that n primitives fill."""
     return float((n + options.row - 1) / options.row)
 
 
@@ -108,7 +108,7 @@ def high_of(row: Row) -> wp.vec3:
 
 @wp.func
 def lower(a: Row, b: Row) -> Row:
-    """Return the entry-wise minimum. wp.min also handles NaN, and takes three times as long."""
+    """Return the entry-wise minimum: the box around both boxes. wp.min also handles NaN, and takes three times as long."""
     out = Row()
     for k in range(8):
         out[k] = wp.where(b[k] < a[k], b[k], a[k])
@@ -117,14 +117,14 @@ def lower(a: Row, b: Row) -> Row:
 
 @wp.func
 def area_scale(box: Row) -> float:
-    """Return the factor that scales half of a box's longest side to 1: with it, `row_area` neither under- nor overflows."""
+    """Return the factor that scales half of a box's longest side to 1. With this factor, `row_area` neither under- nor overflows."""
     e = 0.5 * high_of(box) - 0.5 * low_of(box)
     return 1.0 / wp.max(wp.max(wp.max(e[0], e[1]), e[2]), 2.0**-126.0)
 
 
 @wp.func
 def row_area(box: Row, scale: float) -> float:
-    """Return half the surface area of a box with half its sides multiplied by `scale`; 0 for an empty box."""
+    """Return half the surface area of a box whose sides are first multiplied by scale / 2; 0 for an empty box."""
     half = 0.5 * scale * box
     x = -(half[0] + half[3])
     y = -(half[1] + half[4])
@@ -165,7 +165,7 @@ def measure(data: BuildData, begin: int, end: int) -> Measures:
 
 @wp.func
 def unmeasured_halves(task: BuildTask, middle: int) -> Halves:
-    """Return the halves of a range, without their bounds."""
+    """Return the halves of a range that is split before record `middle`, without their bounds."""
     out = Halves()
     out.middle = middle
     out.count_0 = middle - task.begin
@@ -175,7 +175,7 @@ def unmeasured_halves(task: BuildTask, middle: int) -> Halves:
 
 @wp.func
 def measure_halves(data: BuildData, task: BuildTask, middle: int) -> Halves:
-    """Return the halves of a range, with their bounds."""
+    """Return the halves of a range that is split before record `middle`, with their bounds."""
     out = unmeasured_halves(task, middle)
     out.left = measure(data, task.begin, middle)
     out.right = measure(data, middle, task.end)

@@ -45,7 +45,7 @@ def joined_area(a: Link, b: Link, scale: float) -> float:
 
 @kernel
 def find_moves(links: wp.array(dtype=Link), moves: wp.array(dtype=Move), first: int, scale: float):
-    """Find the best target for the node of each move, by branch and bound over the rest of the tree (section 3.1).
+    """Find the best target for the node of move first + tid, by branch and bound over the rest of the tree (section 3.1).
     The search visits the sibling subtree of the node and of each ancestor, upwards. The variable `saved` is the area by which the boxes up
     to this ancestor shrink without the node. An insertion costs the area of the new parent's box, and the growth of the boxes above it."""
     i = first + wp.tid()
@@ -204,7 +204,7 @@ def order_nodes(links: wp.array(dtype=Link), walk: Walk):
 
 @kernel
 def choose_leaves(links: wp.array(dtype=Link), walk: Walk, options: BuildOptions, scale: float):
-    """Turn a subtree into a leaf where the leaf costs no more, from the bottom up. To mark it, replace its root's left by -2 - left."""
+    """From the bottom up, turn each subtree into a leaf if that costs no more. To mark such a subtree, set its root's left to -2 - left."""
     n = walk.order.shape[0]
     for k in range(n):
         i = walk.order[n - 1 - k]

@@ -1,7 +1,7 @@
 """The inner loop of the builder of binary BVHs with spatial splits, on the CPU.
 Stich, Friedrich and Dietrich 2009, "Spatial Splits in Bounding Volume Hierarchies". If the sides of the best object split overlap, a plane
-may split the range instead; then both sides list the primitives that the plane cuts. The array has spare space for the additional
-references. The two sides of a range share its spare space in proportion to their sizes, so that all cores can build subtrees."""
+may split the range instead; then both sides list the primitives that the plane cuts. The array of references has spare space for the
+additional references. The two sides of a range share its spare space in proportion to their sizes, so that all cores can build subtrees."""
 
 import warp as wp
 
@@ -29,7 +29,7 @@ from wrt.kernels.units.box import box_pad, padded_hi, padded_lo
 
 @wp.func
 def crossing(a: wp.vec3, b: wp.vec3, axis: int, plane: float) -> wp.vec3:
-    """Return the intersection of the edge a b with a plane between its ends. It is rounded once; this error is far below the pads."""
+    """Return the intersection of the edge from a to b with a plane across an axis. Its rounding error is far below the pads of boxes."""
     s = (wp.float64(plane) - wp.float64(a[axis])) / (wp.float64(b[axis]) - wp.float64(a[axis]))
     p = wp.vec3d(a) + s * (wp.vec3d(b) - wp.vec3d(a))
     return wp.vec3(p)
@@ -37,11 +37,11 @@ def crossing(a: wp.vec3, b: wp.vec3, axis: int, plane: float) -> wp.vec3:
 
 @wp.func
 def clip_reference(record: BuildRecord, axis: int, low: float, high: float, corners: wp.array(dtype=wp.vec3)) -> BuildRecord:
-    """Clip a reference to the part between two planes across an axis; the result has lo > hi if nothing remains.
+    """Clip a reference to the part between the planes at `low` and `high` across an axis; the result has lo > hi if nothing remains.
 
     Conservative: the planes move outwards by the pads of the triangle's box. The box of the clipped part gets the same pads, and is cut off
-    at the reference's box. A hit is within these pads of the triangle, and so of one of its parts. But t is clamped to the triangle's box,
-    which moves it far if the ray grazes a triangle that lies in an axis plane. So of a triangle no thicker than its pads, the box is
+    at the reference's box. A hit is within these pads of the triangle, and so of one of its parts. But t is clamped to the triangle's box.
+    This moves the hit far if the ray grazes a triangle that lies in an axis plane. So if a triangle is no thicker than its pads, its box is
     clipped instead.
     """
     out = record
@@ -205,8 +205,8 @@ def cheaper_side(parts: Sides, box: Row, scale: float) -> int:
 
 @wp.func
 def partition_by_plane(data: BuildData, task: BuildTask, split: Split) -> wp.vec2i:
-    """Copy references left of the plane to data.boxes from task.begin upwards, the others from task.limit - 1 downwards.
-    Return both numbers. A reference that the plane cuts is split, unless it costs less on one side, or no space is left."""
+    """Copy references left of the plane to data.boxes from task.begin upwards, references right of it from task.limit - 1 downwards.
+    Return the numbers (left, right). A reference that the plane cuts is split, unless it costs less on one side, or no space is left."""
     scale = area_scale(task.measures.box)
     plane = plane_of(task.measures.box[split.axis], -task.measures.box[3 + split.axis], split.bin)
     parts = measure_sides(data, task, split.axis, plane)
@@ -250,7 +250,7 @@ def partition_by_plane(data: BuildData, task: BuildTask, split: Split) -> wp.vec
 
 @wp.func
 def object_split(data: BuildData, task: BuildTask) -> wp.vec2i:
-    """Copy references to data.boxes, as partition_by_plane does, but to the left or right by their centroids' bins; return both numbers."""
+    """Copy references to data.boxes as partition_by_plane does, but whole, by the bin of the centroid; return the numbers (left, right)."""
     n = task.end - task.begin
     middle = task.begin + n / 2
     if n > 2 and task.depth + balanced_depth(n) < MAX_DEPTH:
@@ -285,7 +285,7 @@ def box_of(records: wp.array(dtype=BuildRecord), begin: int, end: int) -> Row:
 
 @wp.func
 def copied_halves(data: BuildData, counts: wp.vec2i, task: BuildTask) -> Halves:
-    """Return the halves that were copied to data.boxes, with their boxes but without `middle` and the bounds of centroids."""
+    """Return the halves, counts[0] and counts[1] references, that were copied to data.boxes. Fields `middle` and `centers` are not set."""
     out = Halves()
     out.count_0 = counts[0]
     out.count_1 = counts[1]
@@ -319,7 +319,7 @@ def split_references(data: BuildData, task: BuildTask) -> Halves:
 
 @wp.func
 def share_space(data: BuildData, task: BuildTask, halves: Halves) -> Halves:
-    """Copy both sides back to data.records, with free space behind each in proportion to its number of references."""
+    """Copy both sides from data.boxes back to data.records, with free space behind each in proportion to its number of references."""
     free = task.limit - task.begin - halves.count_0 - halves.count_1
     share = int(wp.int64(free) * wp.int64(halves.count_0) / wp.int64(halves.count_0 + halves.count_1))
     middle = task.begin + halves.count_0 + share

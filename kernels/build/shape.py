@@ -1,5 +1,6 @@
 """Compute the boxes and records of triangles and spheres on any device, so that a moving mesh need not leave the GPU.
-The results have the bits of the host's functions (Geometry.bounds, wrt.accel.triangle_data.corners)."""
+The results equal those of the host's functions to the last bit (Geometry.bounds, wrt.accel.triangle_data.corners).
+A launch of size dim processes the primitives or records first .. first + dim - 1."""
 
 from typing import Any
 
@@ -96,7 +97,7 @@ def is_zero(terms: Terms) -> bool:
 
 @wp.func
 def with_products(terms: Terms, place: int, e: wp.vec2d, f: wp.vec2d, sign: wp.float64) -> Terms:
-    """Store the exact product sign (e[0] + e[1]) (f[0] + f[1]) as eight terms, from index `place` on."""
+    """Return `terms` with eight new terms from index `place` on. Their exact sum is sign * (e[0] + e[1]) * (f[0] + f[1])."""
     out = terms
     for i in range(2):
         for j in range(2):
@@ -108,7 +109,7 @@ def with_products(terms: Terms, place: int, e: wp.vec2d, f: wp.vec2d, sign: wp.f
 
 @wp.func
 def exactly_across(a: wp.vec3, b: wp.vec3, c: wp.vec3, i: int, j: int) -> bool:
-    """Test exactly whether component k of (b - a) x (c - a) differs from 0, where i and j are the two other axes.
+    """Test exactly whether component k of the cross product of b - a and c - a differs from 0; i and j are the two other axes.
     Nothing under- or overflows: all numbers are multiples of 2^-298 and below 2^258."""
     e_i = two_sum(wp.float64(b[i]), -wp.float64(a[i]))
     e_j = two_sum(wp.float64(b[j]), -wp.float64(a[j]))
@@ -120,7 +121,7 @@ def exactly_across(a: wp.vec3, b: wp.vec3, c: wp.vec3, i: int, j: int) -> bool:
 
 @wp.func
 def surely_across(a: wp.vec3, b: wp.vec3, c: wp.vec3, i: int, j: int) -> bool:
-    """Test as `exactly_across` does, but in float64; return False if rounding errors could change the result."""
+    """Test as `exactly_across` does, but in float64; return False also if rounding errors could change the result."""
     left = (wp.float64(b[i]) - wp.float64(a[i])) * (wp.float64(c[j]) - wp.float64(a[j]))
     right = (wp.float64(b[j]) - wp.float64(a[j])) * (wp.float64(c[i]) - wp.float64(a[i]))
     return not wp.abs(left - right) <= DOUBT * (wp.abs(left) + wp.abs(right))
@@ -138,7 +139,7 @@ def has_area(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> bool:
 
 @kernel
 def write_corners(shape: Shape, order: wp.array(dtype=wp.int32), out: wp.array(dtype=Primitive), first: int):
-    """Write the records first .. first + dim - 1 in the layout "corners"; order[i] is the prim_id of record i."""
+    """Write the records first .. first + dim - 1 with corners (the layout "corners"). order[i] is the prim_id of record i."""
     i = first + wp.tid()
     record = Primitive()
     record.prim_id = order[i]

@@ -54,7 +54,7 @@ def apart_along(u: wp.float64, v: wp.float64, a: wp.vec2d, b: wp.vec2d, half_u: 
 
 @wp.func
 def edge_apart(edge: wp.vec3d, on: wp.vec3d, off: wp.vec3d, half: wp.vec3d) -> bool:
-    """Test whether one of the three axes edge x (box axis) separates the triangle from a cell with the half sizes `half`.
+    """Test whether a cross product of `edge` with one of the three box axes separates the triangle from a cell with the half sizes `half`.
     Corner `on` of the edge and the opposite corner `off` are relative to the cell's center."""
     if apart_along(-edge[2], edge[1], wp.vec2d(on[1], on[2]), wp.vec2d(off[1], off[2]), half[1], half[2]):
         return True
@@ -66,7 +66,7 @@ def edge_apart(edge: wp.vec3d, on: wp.vec3d, off: wp.vec3d, half: wp.vec3d) -> b
 @wp.func
 def meets_cell(triangle: TriangleCell, lo: wp.vec3, hi: wp.vec3) -> bool:
     """Test whether the grown triangle meets the closed cell lo .. hi; the triangle's padded box must meet the cell.
-    Conservative: it may return True for a triangle near the cell, and does for an infinite cell. The triangle must be finite."""
+    Conservative: it may return True for a triangle near the cell, and always does for an infinite cell. The triangle must be finite."""
     half_one = wp.float64(0.5)
     low = wp.vec3d(lo)
     high = wp.vec3d(hi)

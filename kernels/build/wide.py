@@ -84,7 +84,7 @@ def count_of(node: Bvh2Node, side: int) -> int:
 
 @wp.func
 def child_size(trees: Subtrees, node: Bvh2Node, side: int) -> int:
-    """Return the number of primitives in a child."""
+    """Return the number of primitives below a child."""
     n = count_of(node, side)
     if n == 0:
         n = trees.size[first_of(node, side)]
@@ -143,7 +143,7 @@ def subtree_costs(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, tre
 
 @wp.func
 def write_roots(nodes: wp.array(dtype=Bvh2Node), trees: Subtrees, i: int, k: int, source: wp.array(dtype=wp.int32)) -> int:
-    """Write the cheapest choice of at most k roots for binary node i to `source`; return their number, at least two."""
+    """Write the cheapest choice of at most k roots for binary node i to `source`, as in WideTree; return their number, at least two."""
     node_of = wp.zeros(shape=wp.static(8), dtype=wp.int32)
     side_of = wp.zeros(shape=wp.static(8), dtype=wp.int32)
     k_of = wp.zeros(shape=wp.static(8), dtype=wp.int32)
@@ -185,7 +185,7 @@ def write_roots(nodes: wp.array(dtype=Bvh2Node), trees: Subtrees, i: int, k: int
 
 @wp.func
 def write_primitives(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), parent: int, side: int, out: WideTree, slot: int):
-    """Write the prim_id of all primitives in a child's subtree to out.order, from index `slot` on."""
+    """Write the prim_id of all primitives below child `side` of binary node `parent` to out.order, from index `slot` on."""
     stack = wp.zeros(shape=wp.static(STACK_SIZE + 2), dtype=wp.int32)
     stack[0] = 2 * parent + side
     size = int(1)
@@ -207,7 +207,7 @@ def write_primitives(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.i
 
 @wp.func
 def write_in_order(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, out: WideTree, base: int, n: int):
-    """Sort the n children of the wide node at `base` for any-hit rays, and write their references and boxes.
+    """Sort the n children of a wide node for any-hit rays, and write their references and boxes from index `base` on.
     An any-hit ray visits the last slot first. So the slots hold, from the first to the last: empty slots, inner nodes, leaves. Inner nodes
     are sorted by ascending box area, and so are leaves. The box of child i is in the binary node and side out.source[i]."""
     reference = wp.zeros(shape=wp.static(8), dtype=wp.int32)
@@ -241,8 +241,8 @@ def write_in_order(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, ou
 @wp.func
 def choose_roots(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, trees: Subtrees, task: WideTask, out: WideTree) -> int:
     """Choose the children of a wide node, and write them to out.source; return their number.
-    A node with n children leaves up to n - 1 entries on the stack while a traversal visits its last child. The subtree below needs one free
-    entry per level of the binary tree. If the best choice leaves too few free entries, the node gets fewer children."""
+    A node with n children leaves up to n - 1 entries on the stack while a traversal visits its last child. The subtree below this child
+    needs one free entry per level of the binary tree. If the best choice leaves too few free entries, the node gets fewer children."""
     k = int(options.width)
     n = int(0)
     while True:
@@ -261,8 +261,8 @@ def choose_roots(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, tree
 @wp.func
 def write_rows(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), code: int, count: int, width: int,
                out: WideTree) -> int:
-    """Append a leaf to the rows in out.order; return the number of rows that it fills. The leaf has the `count` primitives of `code`, which
-    is an entry of out.source."""
+    """Append a leaf's primitives to out.order, in rows of `width`; return the number of rows that they fill. The leaf has `count`
+    primitives. Its `code` is its entry in out.source."""
     rows = (count + width - 1) / width
     first = out.count[1] * width
     write_primitives(nodes, order, code / 2, code % 2, out, first)
@@ -326,7 +326,7 @@ def collapse(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), o
 def refit(children: wp.array(dtype=wp.int32), order: wp.array(dtype=wp.int32), width: int, low: wp.array(dtype=wp.vec3),
           high: wp.array(dtype=wp.vec3), lo: wp.array(dtype=wp.vec3), hi: wp.array(dtype=wp.vec3)):
     """Refit the boxes lo, hi of all children to moved primitives in one thread, from the last node to the first.
-    The arrays low, high have a box for each prim_id, then an empty box for entries of `order` without a primitive (-1)."""
+    The arrays low, high have a box for each prim_id. Their last entry is an empty box, for entries -1 of `order` (no primitive)."""
     n = children.shape[0]
     none = low.shape[0] - 1
     for k in range(n):

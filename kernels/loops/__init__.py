@@ -1,1 +1,1 @@
-"""The two loops around the integrator's step: one ray at a time (CUDA, counted rays), and waves of samples (CPU)."""
+"""The two render loops around the integrator's step (kernels/shade/step.py): one ray at a time on CUDA, and waves of samples on the CPU."""

@@ -1,7 +1,7 @@
 """One ray at a time: the render loop on CUDA, and on a CPU if rays are counted or logged.
 
-A thread follows a camera ray and all its children: it traces a ray, shades the hit (shade/step.py), and pushes the new paths on a
-small stack. A GPU hides the latency of one thread behind thousands of other threads. A CPU cannot, so wave.py traces and shades the
+A thread follows a camera ray and all rays that it causes. It traces a ray, shades the hit (shade/step.py), and pushes the new paths
+on a small stack. A GPU hides the latency of one thread behind thousands of other threads. A CPU cannot, so wave.py traces and shades the
 rays of many samples together. Both loops share the step and the follow-up, and take a sample's paths in the same order. So their films
 have the same bits (tests/wrt/renderer/test_waves.py, tests/test_random_scenes.py)."""
 
@@ -27,22 +27,22 @@ class Tile:
     """A rectangle of pixels, and the samples to add to each pixel."""
 
     x: int  # The left column in the picture.
-    y: int  # The top line.
+    y: int  # The top line in the picture.
     width: int  # In pixels.
-    first_sample: int
-    n_samples: int
+    first_sample: int  # Index of the first sample of each pixel.
+    n_samples: int  # Number of samples of each pixel.
     threads: int  # Number of threads that share the samples of a pixel: 1 or n_samples.
-    samples: wp.array(dtype=Sample)  # The result of each thread, if threads > 1.
+    samples: wp.array(dtype=Sample)  # The result of each thread, if threads > 1: sample i of pixel p of the tile at p * n_samples + i.
 
 
 def make_direct_light(features: Features, accel_struct: Any, transmittance: Any, step: Step) -> Any:
-    """Return direct_light, which traces one shadow ray to each light, and to the background if it is sampled."""
+    """Return direct_light, which traces one shadow ray to each light, and one to the background if Features.sky_light is set."""
     Shaded = make_shaded(features.counting)
     light_point = make_light_points(features).point
 
     @wp.func
     def direct_light(accel: accel_struct, surfaces: Surfaces, lighting: Lighting, shaded: Shaded, index: wp.uint32) -> DirectLight:
-        """Return the sum of the light that arrives; `cut` and `lost` count the shadow rays that MAX_TRANSPARENT cut."""
+        """Return the direct light that `shaded` reflects, summed over the lights. index: index of the sample."""
         out = DirectLight()
         for i in range(lighting.count + wp.static(step.extra_lights)):
             point = light_point(lighting, shaded.key, index, i)
@@ -55,7 +55,7 @@ def make_direct_light(features: Features, accel_struct: Any, transmittance: Any,
 
 
 def make_radiance(features: Features, accel_struct: Any, closest_hit: Any, any_hit: Any) -> Any:
-    """Return `radiance`, which follows one camera ray with all its children. Waiting paths are on a stack."""
+    """Return radiance(accel, surfaces, lighting, limits, camera_ray, key, index) -> Sample of a camera ray and all rays that it causes."""
     Path = make_path(features.counting)
     paths, shading = make_paths(features.counting), make_shading(features)
     step, follow_up = make_step(features, shading), make_follow_up(features)
@@ -115,7 +115,7 @@ def make_traversals(features: Features, structure: Any) -> Any:
 
 
 def make_camera_sample(features: Features, camera_kind: Any) -> Any:
-    """Return camera_sample(camera, film, x, y, xi, lens_xi) -> Ray of one sample of the pixel in column x and line y."""
+    """Return camera_sample(camera, film, x, y, xi, lens_xi) -> Ray. x, y: the pixel. xi, lens_xi: film and lens sample in [0, 1)^2."""
     camera_struct = camera_kind.Camera
     camera_ray = camera_kind.make_camera_ray(features)
 
@@ -132,7 +132,7 @@ def make_camera_sample(features: Features, camera_kind: Any) -> Any:
 
 
 def make_render_kernel(features: Features, structure: Any, camera_kind: Any) -> Any:
-    """Return the kernel that renders a tile with one thread for each pixel, or one thread for each sample (see add_samples).
+    """Return the kernel that renders a tile with one thread for each pixel, or one for each sample if Tile.threads > 1 (see add_samples).
 
     kernels/shade/cameras describes the module `camera_kind`. With features.counting, every ray is logged, and `structure` must come
     from kernels.study.ray_log."""

@@ -1,7 +1,7 @@
-"""The state of a wave: arrays with one entry for each pixel, sample, place in a queue, or hit.
+"""The state of a wave: arrays with one entry for each pixel, sample, place in a queue, or hit. A place is an index in a queue.
 
 The host writes Task and Pixels.order; kernels write the other arrays. wrt/renderer/waves.py allocates the arrays for up to `capacity`
-samples. Sample s belongs to pixel s / task.samples of the wave."""
+samples. Sample s belongs to pixel s / task.samples of the wave, rounded down."""
 
 import warp as wp
 
@@ -21,9 +21,9 @@ class Task:
     """The pixels and samples of a wave, all in one tile."""
 
     x: int  # The tile's left column in the picture.
-    y: int  # The tile's top line.
+    y: int  # The tile's top line in the picture.
     width: int  # Width of the tile in pixels.
-    pixels: int  # Number of pixels: entries of Pixels.order.
+    pixels: int  # Number of the wave's pixels: used entries of Pixels.order.
     first_sample: int  # Index of the first sample of each pixel.
     samples: int  # Number of samples of each pixel.
 
@@ -33,7 +33,7 @@ class Progress:
     """Counters of the wave in progress."""
 
     fresh: int  # 1 while camera rays are traced and shaded, then 0.
-    begun: int  # The queue's first place behind the camera rays.
+    begun: int  # Place behind the last camera ray.
     hits: int  # Number of hits among the rays that are being shaded.
     queued: int  # Number of rays that are traced next.
     receivers: int  # Number of surfaces that wait for shadow rays.
@@ -57,19 +57,19 @@ class Samples:
 
     film_point: wp.array(dtype=wp.vec2)  # Point in the picture, in pixels.
     lens_point: wp.array(dtype=wp.vec2)  # The lens sample, in [0, 1)^2.
-    total: wp.array(dtype=Sample)  # The light so far.
+    total: wp.array(dtype=Sample)  # Radiance and counts so far.
     traced_rays: wp.array(dtype=wp.int32)  # Number of rays so far, without shadow rays.
     pending: wp.array(dtype=wp.int32)  # Number of waiting paths.
-    paths: wp.array(dtype=Path)
+    paths: wp.array(dtype=Path)  # Indexed by level * capacity + s.
 
 
 @wp.struct
 class RayQueue:
-    """The queue of rays: arrays indexed by place k."""
+    """The queue of camera rays and path rays: arrays indexed by place k."""
 
     sample: wp.array(dtype=wp.int32)  # Index of the ray's sample.
     rays: RenderRays
-    hits: HitArrays
+    hits: HitArrays  # The closest hits of `rays`.
 
 
 @wp.struct
@@ -78,52 +78,52 @@ class Outcomes:
 
     hit_rays: wp.array(dtype=wp.int32)  # Places in the queue of the rays that hit.
     missed_rays: wp.array(dtype=wp.int32)  # Places in the queue of the rays that missed.
-    resumed_samples: wp.array(dtype=wp.int32)  # Samples of missed rays that have other paths waiting.
+    resumed_samples: wp.array(dtype=wp.int32)  # Indices of samples whose ray missed, and whose other paths wait.
 
 
 @wp.struct
 class Receivers:
-    """The surfaces that wait for shadow rays: arrays indexed by receiver a, and `shadow` by light * capacity + a."""
+    """The receivers, surfaces that wait for shadow rays: arrays indexed by receiver a, but `shadow` by light * capacity + a."""
 
     sample: wp.array(dtype=wp.int32)  # Index of the receiver's sample.
     pending_light: wp.array(dtype=PendingLight)
-    scatter: wp.array(dtype=Scatter)  # Only with transparent shadows.
+    scatter: wp.array(dtype=Scatter)  # Stored in scenes with transparent shadows only.
     shadow: wp.array(dtype=wp.int32)  # Slot of the shadow ray (see Shadows), or -1.
 
 
 @wp.struct
 class Shadows:
-    """The shadow rays: arrays indexed by slot = light * capacity + index."""
+    """The shadow rays: arrays indexed by slot. Shadow ray i to a light has the slot light * capacity + i."""
 
-    value: wp.array(dtype=wp.vec3)  # Radiance that the light adds if unoccluded.
+    value: wp.array(dtype=wp.vec3)  # Radiance that the light adds if nothing occludes it.
     walk: wp.array(dtype=ShadowWalk)  # The ray's progress, with transparent shadows.
 
 
 @wp.struct
 class ShadowQueue:
-    """The shadow rays that are traced next: arrays indexed by place = light * capacity + index.
+    """The shadow rays that are traced next: arrays indexed by place. The queue of a light begins at place light * capacity.
 
-    Without transparent shadows, the place of a ray is its slot."""
+    Without transparent shadows, the place of a ray is its slot in Shadows."""
 
     rays: RenderRays
-    occluded: wp.array(dtype=wp.bool)  # Without transparent shadows.
-    hits: HitArrays  # With transparent shadows.
-    slot: wp.array(dtype=wp.int32)  # With transparent shadows.
-    count: wp.array(dtype=wp.int32)  # Number of queued shadow rays, by light.
+    occluded: wp.array(dtype=wp.bool)  # Results in scenes without transparent shadows.
+    hits: HitArrays  # Results in scenes with transparent shadows.
+    slot: wp.array(dtype=wp.int32)  # Slot of the ray in Shadows; stored with transparent shadows only.
+    count: wp.array(dtype=wp.int32)  # Number of queued shadow rays. Indexed by light.
 
 
 @wp.struct
 class Block:
     """Intermediate values of up to BLOCK hits or missed rays, in the layout of wave_rows.py."""
 
-    rows: wp.array(dtype=wp.float32)
+    rows: wp.array(dtype=wp.float32)  # Row r begins at index r * BLOCK.
 
 
 @wp.struct
 class Wave:
     """The whole state of a wave. The arrays `task` and `progress` have one entry."""
 
-    capacity: int
+    capacity: int  # Largest number of samples.
     task: wp.array(dtype=Task)
     progress: wp.array(dtype=Progress)
     pixels: Pixels
@@ -150,7 +150,7 @@ def store_fields(samples: wp.array(dtype=Sample), i: int, radiance: wp.vec3, ray
 def store_sample(samples: wp.array(dtype=Sample), i: int, sample: Sample):
     """Store sample i field by field.
 
-    Storing the struct as a whole would read in 16-byte loads what was just written in 4-byte stores. The core would have to wait: it
+    If the struct were stored as a whole, 16-byte loads would read what 4-byte stores have just written. The core would have to wait: it
     cannot forward such stores to the load."""
     store_fields(samples, i, sample.radiance, sample.rays, sample.cut_depth, sample.cut_throughput, sample.lost)
 
@@ -163,7 +163,7 @@ def push_path(samples: Samples, capacity: int, s: int, pending: int, path: Path)
 
 @wp.func
 def queue_next(wave: Wave, k: int, s: int, pending: int):
-    """Pop the top of the `pending` waiting paths of sample s, and put its ray at place k of the queue."""
+    """Pop the top of the `pending` waiting paths of sample s, and put that path's ray at place k of the queue."""
     wave.samples.pending[s] = pending - 1
     wave.queue.sample[k] = s
     store_render_ray(wave.queue.rays, k, ray_of(wave.samples.paths[(pending - 1) * wave.capacity + s]))

@@ -8,14 +8,14 @@ the same bits (tests/wrt/renderer/test_waves.py).
 Python launches only the kernel trace_wave, which launches the others:
 1. For FRESH camera rays at a time, while they are in the cache: begin_wave (wave_begin.py), closest_hit, and shade_wave
    (wave_shade.py), which pushes new paths and requests shadow rays.
-2. Until no path waits: the shadow rays to each light, whose light add_direct_light adds; then closest_hit and shade_wave for the
-   top path of each sample.
-3. add_to_film for the finished samples.
+2. Until no path waits: trace the shadow rays to each light, and add the direct light (add_direct_light). Then run closest_hit and
+   shade_wave for the top path of each sample.
+3. Add the finished samples to the film (add_to_film).
 
-Each kernel is one thread that loops over its queue, so that it counts without atomics. The exception is closest_hit for structures
-without batches, which has one thread for each ray (query.py). Traversal and shading are separate kernels, so that a new scene does not
-recompile traversal. The vectorised parts are in wave_surfaces.py, wave_textures.py, wave_normals.py, wave_numbers.py and
-wave_lights.py. They store their results in the rows of wave_rows.py."""
+Each kernel is one thread that loops over its queue, so that it counts without atomics. The exceptions are the traversal kernels of
+structures without `stream` (wrt.accel.base), which have one thread for each ray. Traversal and shading are separate kernels, so that
+a new scene does not recompile traversal. The vectorised parts are in wave_surfaces.py, wave_textures.py, wave_normals.py,
+wave_numbers.py and wave_lights.py. They store their results in the rows of wave_rows.py."""
 
 from functools import cache
 from typing import Any
@@ -39,14 +39,14 @@ FRESH = 2048  # Number of camera rays that are made, traced and shaded together,
 
 @wp.func
 def film_index(task: Task, at: int, x: int, y: int, columns: int) -> int:
-    """Return the film's index of the tile's pixel `at`. (x, y) is the film's first pixel in the picture, `columns` its width."""
+    """Return the index in the film of the tile's pixel `at`. (x, y): the film's first pixel in the picture. columns: the film's width."""
     return (task.y + at / task.width - y) * columns + task.x + at % task.width - x
 
 
 def make_shadow_kernel(features: Features) -> Any:
-    """Return the kernel that advances each queued shadow ray of one light past the surface that it has just hit.
+    """Return the kernel that advances each queued shadow ray to one light past the surface that it has just hit.
 
-    Rays that are blocked, cut or at the light leave the queue. Only scenes with transparent shadows need this kernel."""
+    Rays that are blocked or cut, or that have reached the light, leave the queue. Only scenes with transparent shadows need this kernel."""
     advance_shadow = make_advance_shadow(features, make_shading(features))
 
     @kernel
@@ -67,7 +67,7 @@ def make_shadow_kernel(features: Features) -> Any:
 
 
 def make_add_direct_light(transparent_shadows: bool) -> Any:
-    """Return add_direct_light(wave, lights): add the light that reaches the receivers to their samples."""
+    """Return add_direct_light(wave, lights): add each receiver's light to its sample, after the shadow rays are traced."""
 
     @wp.func
     def add_direct_light(wave: Wave, lights: int):
@@ -98,12 +98,12 @@ def make_add_direct_light(transparent_shadows: bool) -> Any:
 
 @wp.func_native("wrt::add_sample(film, pixels.data + (long long)p, done.data + (long long)p * samples, samples);")
 def add_to_pixels(film: Film, pixels: wp.array(dtype=wp.int32), done: wp.array(dtype=Sample), p: int, samples: int) -> None:
-    """Add the samples from done[p * samples] on to the film's entries pixels[p] .. pixels[p + LANES - 1], by add_sample (film.h)."""
+    """Add `samples` samples to each of LANES pixels, with film indices pixels[p], pixels[p + 1] ...; done[p * samples] is the first."""
 
 
 @wp.func
 def add_to_film(wave: Wave, film: Film):
-    """Add the samples of a wave to their pixels, in the order of their indices."""
+    """Add the samples of a wave to their pixels, in the order of the samples' indices."""
     task = wave.task[0]
     for p in range(task.pixels):
         wave.pixels.film_index[p] = film_index(task, wave.pixels.order[p], film.x, film.y, film.columns)
@@ -127,8 +127,8 @@ class WaveLaunches:
     closest_hit: Launch
     shade: Launch
     shadow_any_hit: Launch  # In scenes without transparent shadows.
-    shadow_closest_hit: Launch  # In scenes with transparent shadows, as advance_shadow.
-    advance_shadow: Launch
+    shadow_closest_hit: Launch  # In scenes with transparent shadows.
+    advance_shadow: Launch  # In scenes with transparent shadows: the kernel of make_shadow_kernel.
 
 
 @cache
@@ -176,7 +176,7 @@ def make_loop_kernel(transparent_shadows: bool) -> Any:
 
 
 def make_aov_kernel(features: Features) -> Any:
-    """Return the kernel that writes the AOVs of the rays that begin_aov queued, from their closest hits."""
+    """Return the kernel that writes the AOVs from the closest hits of the rays that begin_aov (wave_begin.py) queued."""
     write_aovs = make_write_aovs(features)
 
     @kernel

@@ -16,7 +16,7 @@ from wrt.kernels.structs import AovFilm, Film, Limits, kernel
 
 
 def make_place_samples(features: Features) -> Any:
-    """Return place_samples(wave, film, limits, first, end): set keys, film points and lens points of the pixels first .. end - 1."""
+    """Return place_samples(wave, film, limits, first, end): draw keys, film points and lens points of the pixels first .. end - 1."""
     draw = make_draw(features)
 
     @wp.func
@@ -58,7 +58,7 @@ def make_place_samples(features: Features) -> Any:
 def make_queue_camera_rays(features: Features, camera_kind: Any) -> Any:
     """Return queue_camera_rays(wave, camera, film, first, end) -> int: queue the rays of the samples first .. end - 1, vectorised.
 
-    The ray of sample s is at place s. The result is the number of dead rays (no_ray), at film points that get no light."""
+    The ray of sample s is at place s. The result is the number of dead rays: no_ray() of film points that get no light."""
     camera_struct = camera_kind.Camera
     camera_ray = camera_kind.make_camera_ray(features)
 
@@ -93,9 +93,9 @@ def make_queue_camera_rays(features: Features, camera_kind: Any) -> Any:
 
 @wp.func
 def close_gaps(wave: Wave, first: int, end: int, queued: int) -> int:
-    """Remove the dead rays (no_ray) of the samples first .. end - 1 from the queue. Their samples are black.
+    """Remove the dead rays, no_ray(), of the samples first .. end - 1 from the queue. Samples with dead rays are black.
 
-    The other rays move to the places from `queued` on. Return the place behind the last ray."""
+    The live rays move to the places from `queued` on. Return the place behind the last live ray."""
     place = queued
     for s in range(first, end):
         ray = load_render_ray(wave.queue.rays, s)
@@ -116,7 +116,7 @@ def make_begin_kernel(features: Features, camera_kind: Any) -> Any:
 
     @lanes_kernel
     def begin_wave(wave: Wave, camera: camera_struct, limits: Limits, film: Film, first_pixel: int, end_pixel: int):
-        """Queue the rays of the pixels first_pixel .. end_pixel - 1, from the place of their first sample on."""
+        """Queue the camera rays of the pixels first_pixel .. end_pixel - 1, from place first_pixel * task.samples on."""
         samples = wave.task[0].samples
         queued = first_pixel * samples
         first = int(first_pixel)
@@ -134,7 +134,7 @@ def make_begin_kernel(features: Features, camera_kind: Any) -> Any:
 
 
 def make_begin_aov_kernel(camera_kind: Any) -> Any:
-    """Return the kernel that queues the rays through the pixels' centres; no_ray at centres that get no light."""
+    """Return the kernel that queues the rays through the pixels' centres. A centre that gets no light has no_ray()."""
     camera_struct = camera_kind.Camera
     camera_ray = camera_kind.make_camera_ray()
 

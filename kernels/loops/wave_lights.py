@@ -1,4 +1,4 @@
-"""Light samples for a wave's hits. Samples of the sky and of the first mesh light are vectorised."""
+"""Light samples for a wave's hits. Samples of the background (sky), and of light 0 if it is a mesh, are vectorised."""
 
 from typing import Any, NamedTuple
 
@@ -30,19 +30,19 @@ def first_is_mesh(lighting: Lighting) -> bool:
 
 
 class BlockSamples:
-    """The light samples of a scene that are computed for a whole block of hits at once."""
+    """Which light samples of a scene are computed for a whole block of hits at once."""
 
     def __init__(self, features: Features) -> None:
         kind = BACKGROUNDS[features.background]
         by_cosine = features.sky_light and kind.sample is None and kind.make_block_radiance is None
-        self.normals: Rows | None = normal_rows(features)  # None: shading normals are not in rows.
+        self.normals: Rows | None = normal_rows(features)  # Rows of the shading normals, if they are stored.
         self.mesh = "mesh" in features.lights and not features.instances  # Samples of light 0, if it is a mesh.
         self.sky = by_cosine and self.normals is not None  # Samples of the background.
-        self.points = by_cosine and self.normals is None  # Only sky_point of the background's samples.
+        self.points = by_cosine and self.normals is None  # Of the background's samples, only the result of sky_point.
 
 
 def make_store_spheres(features: Features, sampled: BlockSamples, shading: Shading, hit_surface: Any) -> Any:
-    """Return store_spheres(wave, surfaces, first, end): for hits on spheres, store the points and normals that light samples read."""
+    """Return store_spheres(wave, surfaces, first, end): store points and normals of hits on spheres in rows, for the light samples."""
     store_point, store_normal = SURFACES.field("point").store(), (sampled.normals or SURFACES.field("shading")).store()
     look_up, shading_normal = shading.look_up, shading.shading_normal
 
@@ -61,7 +61,7 @@ def make_store_spheres(features: Features, sampled: BlockSamples, shading: Shadi
 
 
 def make_sample_sky(features: Features, sampled: BlockSamples) -> Any:
-    """Return sample_sky(wave, lighting, count): store background samples in the rows SKY, or only sky_point in SKY_POINTS."""
+    """Return sample_sky(wave, lighting, count): store background samples in the rows SKY, or sky_point's results in SKY_POINTS."""
     sky_point, sky_sample, light_xi = make_sky_point(features), make_sky_sample(features), make_light_points(features).xi
     load_key, load_normal = KEYS.load(), (sampled.normals or SURFACES.field("shading")).load()
     store_point, store_sample = SKY_POINTS.store(), SKY.store("end", "distant", "area")
@@ -138,11 +138,11 @@ class Vertex:
 
     surface: Surface
     key: Key
-    i: int  # Index of its hit in the block.
+    i: int  # Index of the hit in the block.
 
 
 def make_light_at(features: Features, sampled: BlockSamples, sample_light: Any) -> Any:
-    """Return light_at(wave, surfaces, lighting, vertex, light) -> LightSample: load it if it is in rows, else call sample_light."""
+    """Return light_at(wave, surfaces, lighting, vertex, light) -> LightSample. It loads the sample from rows, or calls sample_light."""
     light_point = make_light_points(features).point
     load_light, load_sky, load_point = LIGHTS.load("distant", "area"), SKY.load("end", "distant", "area"), SKY_POINTS.load()
 
@@ -171,7 +171,7 @@ def make_light_at(features: Features, sampled: BlockSamples, sample_light: Any) 
 class WaveLights(NamedTuple):
     """The device functions for the light samples of a block of at most BLOCK hits."""
 
-    sample: Any  # (wave, surfaces, lighting, first, end): store the samples of the hits first .. end - 1, after their surfaces.
+    sample: Any  # (wave, surfaces, lighting, first, end): store samples for the hits first .. end - 1, after their surfaces.
     at: Any  # The result of make_light_at.
     needs_keys: bool  # True if `sample` reads the rows KEYS (wave_numbers.py).
 

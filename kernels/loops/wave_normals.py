@@ -23,7 +23,7 @@ def normal_rows(features: Features) -> Rows | None:
 
 
 def make_compute_normals(features: Features) -> Any:
-    """Return compute_normals(rows, count): fill the rows NORMALS of `count` hits from their surfaces and texels."""
+    """Return compute_normals(rows, count): fill the rows NORMALS of `count` hits from the rows HITS, SURFACES and TEXELS."""
     load_hit, load_surface, load_normal = HITS.load(), SURFACES.load(), TEXELS.field("normal").load()
     store_normal = NORMALS.store()
 
@@ -45,7 +45,7 @@ def make_compute_normals(features: Features) -> Any:
 def make_wave_normals(features: Features, shading_normal: Any) -> tuple[Any, Any]:
     """Return compute_normals or None, and normal_at(wave, surfaces, surface, texels, wo, i) -> vec3 for hit i of the block.
 
-    normal_at loads the result of compute_normals. Without a result, it calls `shading_normal` (from make_shading)."""
+    normal_at loads the result of compute_normals. If this is None, or for a sphere, it calls `shading_normal` (from make_shading)."""
     vectorised = normal_rows(features) == NORMALS
     load_normal = NORMALS.load()
 

@@ -12,7 +12,7 @@ store_key = KEYS.store()
 
 @wp.func
 def key_at(wave: Wave, s: int) -> wp.uint32:
-    """Return the key of the path that has just been traced for sample s."""
+    """Return Path.key, a seed, of the path of sample s whose ray has just been traced."""
     if wave.progress[0].fresh != 0:
         return wave.pixels.key[s / wave.task[0].samples]
     return wave.samples.paths[wave.samples.pending[s] * wave.capacity + s].key

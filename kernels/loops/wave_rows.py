@@ -1,4 +1,4 @@
-"""The layout of a block: each struct that vectorised loops load and store for BLOCK hits has rows of its own."""
+"""The layout of a block (kernels/rows.py): each struct that vectorised loops load and store for BLOCK hits has its own rows."""
 
 import warp as wp
 
@@ -15,12 +15,12 @@ class TriangleHit:
     """A hit on a triangle, with the data for its Surface and shading normal."""
 
     triangle: Triangle
-    u: float  # Barycentrics of the hit.
-    v: float
+    u: float  # Barycentric of corner v1.
+    v: float  # Barycentric of corner v2.
     direction: wp.vec3  # The ray's direction.
     material: int  # Material of the triangle; -1 if the ray hit a sphere.
     is_mapped: int  # 1 if the material has a normal map.
-    normal_scale: float
+    normal_scale: float  # Material.normal_scale.
 
 
 @wp.struct
@@ -37,7 +37,7 @@ class EmitterPoint:
 
     emitter: Emitter
     emission: wp.vec3  # Emission of the emitter's material.
-    two_sided: int
+    two_sided: int  # 1 if the emitter's material emits on both sides.
     xi: wp.vec2  # Places the point on the emitter, in [0, 1)^2.
 
 

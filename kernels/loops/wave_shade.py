@@ -37,12 +37,12 @@ class WaveHit:
     pending: int  # Number of waiting paths of the sample.
     traced: int  # Number of the sample's rays so far, with this ray and without shadow rays.
     path: Path  # The path of the ray.
-    total: Sample  # The light of the sample so far.
+    total: Sample  # Radiance and counts of the sample so far, with this ray.
 
 
 @wp.func
 def partition(queue: RayQueue, outcomes: Outcomes, first: int, end: int) -> int:
-    """Sort the places first .. end - 1 into outcomes.hit_rays and outcomes.missed_rays; return the number of hits.
+    """Sort the queue's places first .. end - 1 into outcomes.hit_rays and outcomes.missed_rays; return the number of hits.
 
     It is branch-free: hits and misses alternate unpredictably."""
     hits = int(0)
@@ -76,9 +76,9 @@ def load_wave_hit(wave: Wave, j: int) -> WaveHit:
 
 
 def make_add_background(features: Features) -> Any:
-    """Return add_background(wave, lighting, missed) -> int: add the background to the samples of the `missed` missed rays.
+    """Return add_background(wave, lighting, missed) -> int: add the background's radiance to the samples of all missed rays.
 
-    It stores the samples that have waiting paths in outcomes.resumed_samples, and returns their number."""
+    missed: number of missed rays. The result is the number of these samples that have waiting paths, stored in resumed_samples."""
     kind = BACKGROUNDS[features.background]
     radiance, store_direction, load_color = kind.radiance, MISS_DIRECTIONS.store(), MISS_COLORS.load()
     block_radiance = kind.make_block_radiance(MISS_DIRECTIONS, MISS_COLORS) if kind.make_block_radiance else None
@@ -135,8 +135,8 @@ class BlockFunctions(NamedTuple):
 def make_block_functions(features: Features, shading: Shading, step: Step) -> BlockFunctions:
     """Return the BlockFunctions of a scene.
 
-    In scenes with textures, rough surfaces or light samples by blocks, `prepare` is a kernel of its own. Two cores compile the two
-    kernels in 0.6 of the time that one kernel takes. In other scenes, two kernels would take longer."""
+    In scenes with vectorised textures, rough surfaces or vectorised light samples, `prepare` is a kernel of its own. Two cores compile
+    the two kernels in 0.6 of the time that one kernel takes. In other scenes, two kernels would take longer."""
     compute_surfaces, hit_surface = make_wave_surfaces(features, shading.surface_at)
     sample_textures, texels_at = make_wave_textures(features, shading.look_up)
     compute_normals, normal_at = make_wave_normals(features, shading.shading_normal)
@@ -176,7 +176,7 @@ def make_block_functions(features: Features, shading: Shading, step: Step) -> Bl
 def make_request_shadows(features: Features, step: Step, light_at: Any) -> Any:
     """Return request_shadows(wave, surfaces, lighting, shaded, hit, receiver) -> bool: queue the shadow rays of a hit.
 
-    It stores their slots in the receiver's Receivers.shadow, and returns True if it queued a ray."""
+    It stores the slots of the rays in Receivers.shadow, and returns True if it queued a ray. receiver: index of the receiver."""
 
     @wp.func
     def queue_shadow(wave: Wave, light: int, request: ShadowRequest) -> int:
@@ -213,7 +213,7 @@ def make_request_shadows(features: Features, step: Step, light_at: Any) -> Any:
 
 
 def make_push_paths(features: Features) -> Any:
-    """Return push_paths(wave, hit, shaded, next) -> the sample's number of waiting paths, after pushing the FOLLOWED paths."""
+    """Return push_paths(wave, hit, shaded, next) -> int: push the FOLLOWED paths (follow_up.py), return the number of waiting paths."""
 
     @wp.func
     def push_paths(wave: Wave, hit: WaveHit, shaded: Shaded, next: FollowUp) -> int:
@@ -236,7 +236,7 @@ def make_push_paths(features: Features) -> Any:
 
 
 def make_shade_kernels(features: Features) -> tuple[Any, Any]:
-    """Return the kernel that shades the queue, and the kernel of BlockFunctions.prepare, or None without own_kernel."""
+    """Return the kernel shade_wave, and prepare_block, which is the kernel of BlockFunctions.prepare, or None without own_kernel."""
     shading = make_shading(features)
     step, follow_up, add_background = make_step(features, shading), make_follow_up(features), make_add_background(features)
     block_functions = make_block_functions(features, shading, step)
@@ -244,7 +244,7 @@ def make_shade_kernels(features: Features) -> tuple[Any, Any]:
 
     @lanes_kernel
     def shade_wave(wave: Wave, surfaces: Surfaces, lighting: Lighting, limits: Limits, block: Launch, first: int, end: int):
-        """Shade the rays at the places first .. end - 1. New rays are queued from place progress.queued on, which is <= first."""
+        """Shade the rays at the places first .. end - 1. Queue new rays from place progress.queued <= first on. block: prepare_block."""
         queued = int(wave.progress[0].queued)
         receivers = int(wave.progress[0].receivers)
         hits = partition(wave.queue, wave.outcomes, first, end)

@@ -17,12 +17,12 @@ FAR = 16  # Number of hits between the prefetch of a triangle's corners and thei
 
 @wp.func
 def hit_triangle(wave: Wave, surfaces: Surfaces, j: int) -> int:
-    """Return the prim_id of hit j's triangle. For a sphere, return any valid triangle; its result is ignored."""
+    """Return the prim_id of hit j's triangle. For a hit on a sphere, return any valid prim_id; nothing reads the result."""
     return wp.min(wave.queue.hits.prim_id[wave.outcomes.hit_rays[j]], surfaces.n_triangles - 1)
 
 
 class Attributes:
-    """The attributes of a scene's surfaces, and the fields of the rows HITS and SURFACES that are not stored."""
+    """Which attributes a scene's surfaces have, and which fields of the rows HITS and SURFACES are therefore not stored."""
 
     def __init__(self, features: Features) -> None:
         self.smooth, self.tangents = features.smooth, features.normal_maps
@@ -34,7 +34,7 @@ class Attributes:
 
 
 def make_load_triangles(has: Attributes) -> Any:
-    """Return load_triangles(wave, surfaces, first, end, hits): store the triangles of the hits first .. end - 1 in the rows HITS."""
+    """Return load_triangles(wave, surfaces, first, end, hits): store hits first .. end - 1 in the rows HITS. hits: number of hits."""
     smooth, uvs, tangents = has.smooth, has.uvs, has.tangents
     place_of, triangle_at = make_place_of(False), make_triangle_at(smooth, uvs, False)
     store_hit = HITS.store(*has.not_of_hits)
@@ -76,7 +76,7 @@ def make_load_triangles(has: Attributes) -> Any:
 def make_compute_surfaces(has: Attributes) -> Any:
     """Return compute_surfaces(wave, surfaces, first, end, hits): fill the rows SURFACES for the hits first .. end - 1.
 
-    These are at most BLOCK of the wave's `hits` hits."""
+    hits: number of all hits, in outcomes.hit_rays. `end - first` is at most BLOCK."""
     load_triangles = make_load_triangles(has)
     on_triangle = make_on_triangle(has.smooth, has.uvs, has.tangents)
     load_hit, store_surface = HITS.load(*has.not_of_hits), SURFACES.store(*has.not_of_surfaces)
@@ -120,7 +120,7 @@ def make_hit_surface(has: Attributes, spheres: bool) -> Any:
 
 
 def make_wave_surfaces(features: Features, surface_at: Any) -> tuple[Any, Any]:
-    """Return compute_surfaces and hit_surface. In scenes with instances, these are None and a function that calls `surface_at`."""
+    """Return compute_surfaces and hit_surface. With instances, compute_surfaces is None, and hit_surface calls `surface_at`."""
 
     @wp.func
     def single_hit_surface(wave: Wave, surfaces: Surfaces, i: int, k: int) -> Surface:

@@ -18,7 +18,7 @@ def textures_vectorised(features: Features) -> bool:
 
 
 def make_sample_texture(name: str, texture: MaterialTexture) -> Any:
-    """Return sample_texture(surfaces, rows, count): sample one texture at `count` hits on triangles; store it in the rows TEXELS."""
+    """Return sample_texture(surfaces, rows, count): store texels of one entry of TEXTURES, at `count` hits, in the rows TEXELS."""
     material, u, v = (rows.first * BLOCK for rows in (HITS.field("material"), SURFACES.field("u"), SURFACES.field("v")))
     channels = sum(1 << channel for channel in texture.channels)
     to = TEXELS.field(next(iter(texture.fields))).first * BLOCK
@@ -51,7 +51,7 @@ def make_link(sample: Any, sample_others: Any) -> Any:
 def make_wave_textures(features: Features, look_up: Any) -> tuple[Any, Any]:
     """Return sample(surfaces, rows, count) or None, and texels_at(wave, surfaces, surface, i) -> Texels of hit i of the block.
 
-    texels_at loads the result of `sample`. Without a result, it calls `look_up` (from make_shading)."""
+    texels_at loads the result of `sample`. If `sample` is None, or for a sphere, it calls `look_up` (from make_shading)."""
     textures = textures_of(features) if textures_vectorised(features) else {}
     sample = None
     for name, texture in textures.items():

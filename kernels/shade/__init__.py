@@ -1,1 +1,1 @@
-"""The SM's work: camera, samples, surfaces, materials, lights, shadows, the integrator's step, the film."""
+"""All work but traversal: cameras, samples, surfaces, materials, lights, shadows, the integrator's step, and the film."""

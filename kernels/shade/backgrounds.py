@@ -1,4 +1,4 @@
-"""Background kinds: the radiance of rays that miss, and samples of the background as a light. Each is an entry of BACKGROUNDS."""
+"""Background kinds: the radiance of rays that miss, and samples of the background as a light. Each kind is an entry of BACKGROUNDS."""
 
 from typing import Any, NamedTuple
 
@@ -90,13 +90,13 @@ def environment(b: Background, direction: wp.vec3) -> wp.vec3:
     wrt::environment_at(background, x, x + length, x + 2 * (long long)length, count);
 """)
 def environment_colors(background: Background, rows: wp.array(dtype=wp.float32), at: int, length: int, count: int) -> None:
-    """Replace `count` columns x and rows y of the picture, stored from rows[at] on, by environment_at's red, green and blue.
+    """Replace `count` positions in the picture by colours (environment_at). Column x becomes red, row y green; blue has a third array.
 
-    Each of the three arrays has `length` entries and room for LANES - 1 more. For lanes_kernel (headers.py)."""
+    The arrays begin at rows[at + n * length], n = 0, 1, 2, with room for LANES - 1 more entries. For lanes_kernel (headers.py)."""
 
 
 def make_environment_block(directions: Rows, colors: Rows) -> Any:
-    """Return environment_block(b, rows, count): compute `environment` of the first `count` directions, vectorised."""
+    """Return environment_block(b, rows, count): store `environment` of the first `count` `directions` in `colors`, vectorised."""
     load_direction, store_place = directions.load(), colors.store()
 
     @wp.func
@@ -155,7 +155,7 @@ BACKGROUNDS = {
 
 
 def make_sky_point(features: Features) -> Any:
-    """Return sky_point(xi) -> vec3: the `point` for sky_sample. It is branch-free, so that loops vectorise."""
+    """Return sky_point(xi) -> vec3 for sky_sample: cosine_point(xi), or (xi[0], xi[1], 0) if the kind has a `sample`. Branch-free."""
     of_cosine = BACKGROUNDS[features.background].sample is None
 
     @wp.func

@@ -15,10 +15,10 @@ from wrt.kernels.structs import Lighting, Ray, Surfaces, any_positive, gamma, ma
 
 @wp.func
 def shadow_ray(s: Surface, sample: LightSample) -> Ray:
-    """Return the segment from a surface to a light, which ends at t = 1.
+    """Return the shadow ray from a surface to a light sample. It ends at the light, at t = 1, unless the light is at infinity.
 
-    For a light with an area, t_max is 32 roundings below 1, so that the light does not occlude itself. The rounding of the direction
-    and of t, about 16 ulps, grows with the distance, and the error bound of the light's point does not cover it."""
+    For a light with an area, t_max is 32 roundings below 1, so that the light does not occlude itself. Direction and t have rounding
+    errors of about 16 ulps, which grow with the distance. The error bound of the light's point does not cover them."""
     ray = make_ray(spawn_point(s.point, s.error, s.geometric, sample.wi), sample.wi)
     ray.exclude_plus_one = s.exclude_plus_one
     if sample.distant == 0:
@@ -28,7 +28,7 @@ def shadow_ray(s: Surface, sample: LightSample) -> Ray:
 
 
 def make_reflected_light(features: Features) -> Any:
-    """Return sample_light, which samples a light, and reflected_light, the unoccluded radiance that a sample sends to the eye."""
+    """Return sample_light, and reflected_light, the radiance that a surface reflects from an unoccluded light sample towards wo."""
     light_sample = make_light_sample(features)
     sky_sample = make_sky_sample(features)
     lights = bool(features.lights)
@@ -62,7 +62,7 @@ def make_reflected_light(features: Features) -> Any:
 
 
 class LightPoints(NamedTuple):
-    """The functions for random points on lights, in sample `index` at the hit of the path with the seed `key`."""
+    """The functions for random points on light i. key: seed of the hit that the light illuminates. index: index of the sample."""
 
     xi: Any  # (key, index, i) -> vec2 in [0, 1)^2, which places a sample on light i.
     point: Any  # (lighting, key, index, i) -> vec3: sky_point(xi) for the background, else (xi[0], xi[1], 0).

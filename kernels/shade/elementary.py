@@ -60,7 +60,7 @@ def nearest(x: float) -> float:
 
 @wp.func
 def upper(x: float) -> float:
-    """Clear the lower 12 of x's 24 bits: the product of two such numbers is exact."""
+    """Clear the lower 12 of the 24 significant bits of x. The product of two such numbers is exact."""
     return wp.cast(wp.cast(x, wp.uint32) & wp.static(wp.uint32(0xFFFFF000)), wp.float32)
 
 
@@ -74,8 +74,8 @@ def power_of_two(n: int) -> float:
 def reduced(x: float) -> wp.vec3:
     """Return (r, less, n) with |x| = r - less + k pi / 2 and n = k modulo 4, for 2^10 < |x| < inf.
 
-    This is the method of Payne and Hanek (1983). With |x| = m 2^e, only some bits of 2 / pi matter: those whose product with x is
-    neither a multiple of 4 nor below 2^-62."""
+    `less` is the rounding error of r. This is the method of Payne and Hanek (1983). With |x| = m 2^e, only some bits of 2 / pi matter:
+    the bits whose product with x is neither a multiple of 4 nor below 2^-62."""
     bits = wp.cast(wp.abs(x), wp.int32)
     m = wp.uint64((bits & 0x7FFFFF) | 0x800000)
     start = (bits >> 23) - 120  # e + 30: index of the first bit that matters
@@ -142,7 +142,7 @@ def sin_cos(x: float) -> tuple[float, float]:
 
 @wp.func
 def acos(x: float) -> float:
-    """Return the angle in [0, pi]; NaN for |x| > 1. For |x| > 1/2, acos |x| = 2 asin sqrt((1 - |x|) / 2)."""
+    """Return the angle in [0, pi] whose cosine is x; NaN for |x| > 1. For |x| > 1/2, acos |x| = 2 asin sqrt((1 - |x|) / 2)."""
     a = wp.abs(x)
     if not a <= 1.0:
         return nan()
@@ -181,7 +181,7 @@ def atan2(y: float, x: float) -> float:
 
 @wp.func
 def scaled_exp(r: float, n: float) -> float:
-    """Return 2^n e^r for |r| < 0.35 and |n| < 152. It multiplies by 2^n in two steps: a result below 2^-126 is rounded once."""
+    """Return 2^n e^r for |r| < 0.35 and |n| < 152. Multiply by 2^n in two steps, so that a result below 2^-126 is rounded once."""
     z = r * r
     p = 1.0 + (r + z * ((EXP_1 + r * EXP_2) + z * ((EXP_3 + r * EXP_4) + z * EXP_5)))
     first = int(n) >> 1

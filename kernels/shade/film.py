@@ -12,7 +12,7 @@ from wrt.kernels.structs import AovFilm, Film, Hit, Ray, Surfaces
 
 @wp.struct
 class Pixel:
-    """A local copy of one pixel of structs.Film, whose fields it has, while samples are added."""
+    """A local copy of one pixel of a Film (kernels/structs.py), whose arrays have the same names."""
 
     mean: wp.vec3
     m2: wp.vec3
@@ -52,7 +52,7 @@ def store_pixel(film: Film, i: int, pixel: Pixel):
 
 @wp.func
 def add_sample(before: Pixel, sample: Sample) -> Pixel:
-    """Update mean and sum of squared deviations (Welford 1962). A radiance that is not finite is counted, and black."""
+    """Add a sample to mean and sum of squared deviations (Welford 1962). If its radiance is not finite, count it and add black."""
     pixel = before
     color = sample.radiance
     if not wp.isfinite(color[0] + color[1] + color[2]):

@@ -1,7 +1,7 @@
 """The follow-up of a hit, for both loops: decides which new paths are followed or cut, and how much light the cuts lose.
 
-A path is cut after max_depth bounces, after it has passed MAX_TRANSPARENT surfaces straight in a row, or below min_throughput. All
-new paths of a sample are cut after MAX_RAYS rays: with min_throughput = 0, a tree of 64 levels would never end. The loops push the
+A new path is cut after max_depth bounces, after MAX_TRANSPARENT surfaces passed straight in a row, or below min_throughput. All new
+paths of a sample are cut after MAX_RAYS rays: with min_throughput = 0, a tree of 64 levels would never end. The loops push the
 FOLLOWED paths in the order onward, reflected, refracted, and trace the path pushed last first."""
 
 from typing import Any
@@ -24,20 +24,20 @@ CUT_BY_THROUGHPUT = wp.constant(3)
 
 @wp.struct
 class FollowUp:
-    """The verdicts on the three paths of a Shaded, and the light that the cuts lose."""
+    """The verdicts (NONE to CUT_BY_THROUGHPUT) on the three paths of a Shaded, and the light that the cuts lose."""
 
     onward: int
     reflected: int
     refracted: int
-    cut_depth: int  # Paths that are CUT_BY_DEPTH.
-    cut_throughput: int  # Paths that are CUT_BY_THROUGHPUT.
+    cut_depth: int  # Number of paths with the verdict CUT_BY_DEPTH.
+    cut_throughput: int  # Number of paths with the verdict CUT_BY_THROUGHPUT.
     lost: float  # What the onward path adds to Sample.lost: 0 unless it is cut.
     pending_light: PendingLight
 
 
 @wp.func
 def add_cuts(before: Sample, next: FollowUp) -> Sample:
-    """Add the number of cut paths of a hit, and the loss of its onward path, to the sample."""
+    """Add the numbers of a hit's cut paths to the sample, and the light that is lost if its onward path was cut."""
     out = before
     out.cut_depth += next.cut_depth
     out.cut_throughput += next.cut_throughput
@@ -46,7 +46,7 @@ def add_cuts(before: Sample, next: FollowUp) -> Sample:
 
 
 def make_follow_up(features: Features) -> Any:
-    """Return follow_up(surfaces, shaded, limits, traced) -> FollowUp; `traced` is the sample's number of rays without shadow rays."""
+    """Return follow_up(surfaces, shaded, limits, traced) -> FollowUp. traced: number of the sample's rays without shadow rays."""
     Path, Shaded = make_path(features.counting), make_shaded(features.counting)
 
     @wp.func

@@ -7,7 +7,7 @@ import warp as wp
 def fresnel_dielectric(cos_i: float, eta: float) -> float:
     """Return the reflectance of a dielectric for unpolarised light; 1 at total internal reflection (Born and Wolf, section 1.5).
 
-    cos_i >= 0 is the cosine of the angle of incidence. eta is the refractive index behind the boundary over that in front."""
+    cos_i >= 0 is the cosine of the angle of incidence. eta: the refractive index behind the boundary, divided by that in front."""
     sin2_t = (1.0 - cos_i * cos_i) / (eta * eta)
     if sin2_t >= 1.0:
         return 1.0
@@ -19,7 +19,7 @@ def fresnel_dielectric(cos_i: float, eta: float) -> float:
 
 @wp.func
 def fresnel_schlick(cos_i: float, eta: float) -> float:
-    """Return Schlick 1994's approximation, with the cosine in the medium of lower index; 1 at total internal reflection."""
+    """Return Schlick's approximation (1994) of fresnel_dielectric. It uses the cosine in the medium of lower index."""
     c = cos_i
     if eta < 1.0:
         sin2_t = (1.0 - cos_i * cos_i) / (eta * eta)

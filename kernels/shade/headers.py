@@ -1,6 +1,6 @@
 """The decorator `lanes_kernel`, for CPU kernels that call the vectorised C++ functions of this folder's headers.
 
-A header implements functions of the Python file of the same name. The C++ functions have the names of the Python functions and return
+A header implements functions of the Python file of the same name. A C++ function and its Python function have one name and return
 the same bits (tests/kernels/shade/test_twins.py)."""
 
 from functools import partial

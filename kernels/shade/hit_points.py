@@ -1,7 +1,7 @@
 """Points of hits with error bounds, normals, texture coordinates and ids, for ray queries.
 
-The point is the intersection of the float32 ray with the plane of the triangle, whose corners are float32. An instance transforms them
-in float64. The computation is in float64, with a running error bound (Higham 2002, section 3.3); the results are rounded to float32.
+The point is the intersection of the float32 ray with the plane of the triangle, whose corners are float32. An instance's corners are
+transformed in float64. The computation is in float64, with a running error bound (Higham 2002, section 3.3). Results are float32.
 kernels.shade.surface interpolates the corners by u and v instead. The error of u and v is large on needle-shaped triangles."""
 
 from typing import Any
@@ -20,21 +20,21 @@ SMALLEST = wp.constant(wp.float64(2.0**-149))  # The smallest positive float32.
 
 @wp.struct
 class HitPlaces:
-    """The results, one entry for each hit, in world space. Arrays of length 0 are not computed. A miss has NaN vectors and ids -1."""
+    """The results of hit_places, one entry for each hit, in world space. Arrays of length 0 stay empty. A miss has NaNs and ids -1."""
 
     point: wp.array(dtype=wp.vec3)
     error: wp.array(dtype=wp.vec3)  # Bound on the error of `point`, per axis.
     normal: wp.array(dtype=wp.vec3)  # Unit normal of the flat triangle or the sphere, on the outside.
     shading: wp.array(dtype=wp.vec3)  # Interpolated unit normal, on the outside.
-    uv: wp.array(dtype=wp.vec2)
-    object: wp.array(dtype=wp.int32)
-    instance: wp.array(dtype=wp.int32)
-    material: wp.array(dtype=wp.int32)
+    uv: wp.array(dtype=wp.vec2)  # Texture coordinates.
+    object: wp.array(dtype=wp.int32)  # Index of the object in the scene. Spheres come after the objects.
+    instance: wp.array(dtype=wp.int32)  # The user's id of the instance.
+    material: wp.array(dtype=wp.int32)  # Index of the material.
 
 
 @wp.struct
 class ObjectIds:
-    """The tables from primitives to the ids that users know."""
+    """The tables from primitives to the ids of objects and instances that users know."""
 
     first_prim: wp.array(dtype=wp.int32)  # First prim_id of each object, then of each sphere.
     instance: wp.array(dtype=wp.int32)  # The user's id of each entry of Surfaces.instances.
@@ -62,22 +62,22 @@ def to_world(i: Instance, p: wp.vec3d, w: wp.float64) -> wp.vec3d:
 
 @wp.func
 def to_world_size(i: Instance, p: wp.vec3d) -> wp.vec3d:
-    """Return the sums of the absolute terms of `to_world`, to which its rounding error is proportional."""
+    """Return the sum of the terms' absolute values, per axis, in to_world(i, p). The rounding error of to_world is proportional to it."""
     q = wp.vec4d(wp.abs(p[0]), wp.abs(p[1]), wp.abs(p[2]), wp.float64(1.0))
     return wp.vec3d(wp.dot(wp.abs(i.world_x), q), wp.dot(wp.abs(i.world_y), q), wp.dot(wp.abs(i.world_z), q))
 
 
 @wp.func
 def cross_size(a: wp.vec3d, b: wp.vec3d) -> wp.vec3d:
-    """Return wp.cross(a, b) with all terms added, for a, b >= 0."""
+    """Return wp.cross(a, b) with plus in place of minus signs, for a, b >= 0."""
     return wp.vec3d(a[1] * b[2] + a[2] * b[1], a[2] * b[0] + a[0] * b[2], a[0] * b[1] + a[1] * b[0])
 
 
 @wp.func
 def on_plane(v0: wp.vec3d, v1: wp.vec3d, v2: wp.vec3d, off: wp.vec3d, origin: wp.vec3d, direction: wp.vec3d) -> PlanePoint:
-    """Intersect a line with the plane through three corners, whose error per axis is at most `off`.
+    """Intersect a line with the plane through three corners. off: bound on the error of the corners, per axis.
 
-    If, to rounding, the line may be parallel to the plane, the result's error is infinite or NaN."""
+    If the line is parallel to the plane within the rounding error, the result's error is infinite or NaN."""
     out = PlanePoint()
     e1 = v1 - v0
     e2 = v2 - v0
@@ -129,7 +129,7 @@ def clamped_to_triangle(at: PlanePoint, v0: wp.vec3d, v1: wp.vec3d, v2: wp.vec3d
 
 @wp.func
 def on_triangle(surfaces: Surfaces, place: Place, u: float, v: float, origin: wp.vec3d, direction: wp.vec3d) -> PlanePoint:
-    """Return the intersection of a line with a face, with the normal on the outside, also for a mirrored instance."""
+    """Intersect a line with a face. The normal is on the outside, also for a mirrored instance. u, v: barycentrics of the hit."""
     t = corners_at(surfaces, place.face)
     v0 = wp.vec3d(t.v0)
     v1 = wp.vec3d(t.v1)
@@ -158,7 +158,7 @@ def on_triangle(surfaces: Surfaces, place: Place, u: float, v: float, origin: wp
 
 @wp.func
 def on_sphere(sphere: wp.vec4, t: float, origin: wp.vec3d, direction: wp.vec3d) -> PlanePoint:
-    """Intersect a line with a sphere. Of the two points, return the one on the same side of the chord's middle as parameter t."""
+    """Intersect a line with a sphere. Of the two points, return the point on the side of the chord's middle where the hit's t is."""
     center = wp.vec3d(wp.float64(sphere[0]), wp.float64(sphere[1]), wp.float64(sphere[2]))
     radius = wp.float64(sphere[3])
     unit = direction / longest(direction)
@@ -205,7 +205,7 @@ def shading_normal(surfaces: Surfaces, place: Place, u: float, v: float, geometr
 
 @wp.func
 def last_entry(first: wp.array(dtype=wp.int32), prim_id: int) -> int:
-    """Return the last i with first[i] <= prim_id. An object without primitives has the same `first` as the next object."""
+    """Return the last i with first[i] <= prim_id. Objects without primitives are skipped: their entry equals the next entry."""
     low = int(0)
     high = int(first.shape[0])
     while high - low > 1:
@@ -219,7 +219,7 @@ def last_entry(first: wp.array(dtype=wp.int32), prim_id: int) -> int:
 
 @wp.func
 def place_of(surfaces: Surfaces, prim_id: int) -> Place:
-    """Return the indices of a primitive's data. Without instances or materials, their index is -1."""
+    """Return the indices of a primitive's data. An index of an instance or material that does not exist is -1."""
     place = Place()
     place.face = prim_id
     place.instance = -1
@@ -281,7 +281,7 @@ def write_interpolated(surfaces: Surfaces, place: Place, u: float, v: float, nor
 
 @kernel
 def hit_places(surfaces: Surfaces, object_ids: ObjectIds, rays: RayArrays, hits: HitArrays, out: HitPlaces, first: int):
-    """Write the results of the hits first .. first + dim - 1. A prim_id below 0 or beyond the last primitive is a miss."""
+    """Write the results of the hits first .. first + dim - 1, for the launch size dim. An invalid prim_id is a miss."""
     i = first + wp.tid()
     prim_id = hits.prim_id[i]
     count = surfaces.n_triangles + surfaces.spheres.shape[0]

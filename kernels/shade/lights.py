@@ -26,7 +26,7 @@ class LightSample:
     """A sampled point or direction of a light, as seen from a surface."""
 
     wi: wp.vec3  # Unit direction to the light.
-    end: wp.vec3  # End of the shadow ray, unless `distant`.
+    end: wp.vec3  # Point where the shadow ray ends. Unread if `distant`.
     distant: int  # 1 if the light is at infinity, else 0.
     weight: wp.vec3  # Radiance over density per steradian. For a light without area: irradiance at normal incidence.
     area: int  # 1 if a ray can hit this light, else 0.
@@ -82,7 +82,7 @@ def spot_light(lighting: Lighting, surfaces: Surfaces, light: Light, s: Surface,
 
 @wp.func
 def choose_emitter(lighting: Lighting, light: Light, xi: float) -> tuple[int, float]:
-    """Choose an emitter by power. Return its index, and a random number in [0, 1) that is uniform and can be used again."""
+    """Choose an emitter by power. Return its index, and a uniform random number in [0, 1) that the choice has not used up."""
     chosen = search_cdf(lighting.emitter_cdf, light.first, light.count, xi)
     share = share_of_row(lighting.emitter_cdf, light.first, chosen)
     left = lighting.emitter_cdf[light.first + chosen] - xi
@@ -91,7 +91,7 @@ def choose_emitter(lighting: Lighting, light: Light, xi: float) -> tuple[int, fl
 
 @wp.func
 def emitter_corners(emitter: Emitter) -> Triangle:
-    """Return the emitter as a Triangle without attributes."""
+    """Return the emitter as a Triangle with corners only."""
     t = Triangle()
     t.v0 = emitter.v0
     t.v1 = emitter.v1
@@ -102,7 +102,7 @@ def emitter_corners(emitter: Emitter) -> Triangle:
 @wp.func
 def from_emitter(point: wp.vec3, error: wp.vec3, n: wp.vec3, emission: wp.vec3, two_sided: bool, pdf_area: float,
                  eye: wp.vec3) -> LightSample:
-    """Return the sample of an emitter's point, with normal n, as seen from `eye`. It is branch-free, so that loops vectorise."""
+    """Return the sample for a point with normal n on an emitter, as seen from the point `eye`. Branch-free, so that loops vectorise."""
     sample = LightSample()
     to_light = point - eye
     distance2 = wp.dot(to_light, to_light)
@@ -143,7 +143,7 @@ def make_mesh_light(features: Features) -> Any:
 
 @wp.func
 def is_within(light: Light, s: Surface, to_center: wp.vec3) -> bool:
-    """Return whether surface s is inside a sphere light. If s is on the sphere, to rounding, the normal of s decides."""
+    """Return whether surface s is inside a sphere light. If s is on the sphere within the rounding error, the normal of s decides."""
     rounding = wp.length(s.error) + wp.static(16.0 * 2.0**-24) * (light.radius + wp.length(light.position))
     distance = wp.length(to_center)
     if distance < light.radius - rounding:
@@ -153,7 +153,7 @@ def is_within(light: Light, s: Surface, to_center: wp.vec3) -> bool:
 
 @wp.func
 def sphere_light_from_within(light: Light, s: Surface, to_center: wp.vec3, xi: wp.vec2) -> LightSample:
-    """Sample the hemisphere of the normal by the cosine, as all directions meet the sphere's inside; no light if one-sided."""
+    """Sample the hemisphere of s by the cosine: all directions meet the sphere's inside. A one-sided light gives no light there."""
     sample = LightSample()
     if light.two_sided == 0:
         return sample

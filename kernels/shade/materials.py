@@ -33,7 +33,7 @@ class Scatter:
 def blinn_phong(n: wp.vec3, wi: wp.vec3, wo: wp.vec3, exponent: float) -> float:
     """Return Blinn's highlight per steradian, scaled so that at normal incidence no more light leaves than arrives.
 
-    (e + 2)(e + 4) / (8 pi (2^(-e/2) + e)) cos^e (Akenine-Moeller et al. 2008, "Real-Time Rendering", 3rd ed., section 7.6)."""
+    `(e + 2)(e + 4) / (8 pi (2^(-e/2) + e)) cos^e` (Akenine-Moeller et al. 2008, "Real-Time Rendering", 3rd ed., section 7.6)."""
     h = wp.normalize(wi + wo)
     scale = (exponent + 2.0) * (exponent + 4.0) / (8.0 * PI * (exp(-0.5 * LOG_2 * exponent) + exponent))
     return scale * power(wp.max(0.0, wp.dot(n, h)), exponent)
@@ -41,7 +41,7 @@ def blinn_phong(n: wp.vec3, wi: wp.vec3, wo: wp.vec3, exponent: float) -> float:
 
 @wp.func
 def with_highlight(m: Material, before: Scatter) -> Scatter:
-    """Add the highlight of lights that no ray can hit, as wide as the rough reflection (Walter et al. 2007, eq. 41)."""
+    """Add to a rough surface a highlight for lights that no ray can hit, as wide as its reflection (Walter et al. 2007, eq. 41)."""
     out = before
     alpha = m.roughness * m.roughness
     if alpha > SMOOTH:
@@ -89,7 +89,7 @@ def conductor(m: Material, s: Surface, n: wp.vec3, wo: wp.vec3, out: Scatter) ->
 
 
 def make_glass(features: Features) -> Any:
-    """Return the function that reflects and refracts at a boundary to the index m.ior, or at a thin pane."""
+    """Return the function that reflects and refracts at a boundary to a medium of index m.ior, or at a thin pane."""
     fresnel = fresnel_schlick if features.schlick else fresnel_dielectric
 
     @wp.func
@@ -159,7 +159,7 @@ MATERIALS = {
 
 
 def make_of_kind(features: Features) -> Any:
-    """Return the function that scatters at a surface of any kind of the scene, one `if` after another.
+    """Return the function that scatters at a surface of any kind in the scene. It tests one kind after another.
 
     A kernel that looked up MATERIALS would not be recompiled after an edit of the table: Warp does not hash it."""
     of_kind = no_kind
@@ -192,7 +192,7 @@ def make_scatter(features: Features) -> Any:
 
     @wp.func
     def scatter(m: Material, s: Surface, wo: wp.vec3, facet: wp.vec3) -> Scatter:
-        """Scatter a ray of direction -wo. `facet`, a cap_point, places the microfacet of a rough surface."""
+        """Scatter a ray of direction -wo. facet: the result of cap_point, which chooses the microfacet of a rough surface."""
         out = Scatter()
         n = s.shading
         rough = bool(False)

@@ -16,7 +16,7 @@ BRANCHES = wp.constant(4)
 
 @wp.func
 def label(branch: int, depth: int) -> int:
-    """Return the Ray.slot with which a path's ray reaches the ray log. A shadow ray has 0: it belongs to the path ray logged before."""
+    """Return the Ray.slot that gives branch and depth to the ray log. A shadow ray has 0: it belongs to the path ray logged before it."""
     return 1 + branch + BRANCHES * depth
 
 
@@ -37,7 +37,7 @@ def make_path(counting: bool) -> Any:
         exclude_plus_one: int  # 1 + prim_id of the triangle that the ray starts on and ignores; 0: none.
         key: wp.uint32  # Seed of the random numbers at the ray's hit.
         if counting:
-            branch: int  # CAMERA to ONWARD.
+            branch: int  # CAMERA, REFLECTED, REFRACTED or ONWARD.
 
     return Path
 

@@ -1,4 +1,4 @@
-"""The kernel for a camera's rays outside of a render, and the ray of a film point that gets no light."""
+"""The kernel that makes camera rays for ray queries, and the ray of a film point that gets no light."""
 
 from typing import Any
 

@@ -1,6 +1,6 @@
 """Samples: points of a low-discrepancy sequence in [0, 1)^2, and maps from the unit square to disks, triangles and directions.
 
-Every random number depends on (pixel, sample, dimension, seed) alone, so that pictures do not depend on tiles, threads or passes.
+Random numbers depend on seed, pixel, path, sample and dimension only, so that pictures do not depend on tiles, threads or passes.
 Each pair of dimensions is the two-dimensional Sobol sequence, shuffled and Owen-scrambled by hashing (Burley 2020, "Practical
 Hash-based Owen Scrambling", JCGT 9(4)). The hash of the nested scramble has the constants of Vegdahl 2021 ("Building a Better LK
 Hash"). Independent random numbers serve for comparison."""
@@ -37,7 +37,7 @@ def hash_u32(x: wp.uint32) -> wp.uint32:
 
 @wp.func
 def hash_pair(a: wp.uint32, b: wp.uint32) -> wp.uint32:
-    """Hash two integers, whose order matters, to one."""
+    """Hash two integers to one. Their order matters."""
     return hash_u32(a + wp.static(wp.uint32(0x9E3779B9)) * hash_u32(b + wp.static(wp.uint32(0x85EBCA6B))))
 
 
@@ -63,7 +63,7 @@ def laine_karras(x: wp.uint32, seed: wp.uint32) -> wp.uint32:
 
 @wp.func
 def sobol_second(index: wp.uint32) -> wp.uint32:
-    """Return the bits of the second Sobol dimension, lowest bit first: the Pascal matrix modulo 2.
+    """Return the bits of the second Sobol dimension, lowest bit first: the Pascal matrix modulo 2 times the bits of `index`.
 
     Entry (i, j) is odd exactly if the set bits of j are also set in i (Lucas), so that five xor-shifts compute the product."""
     x = index
@@ -82,7 +82,7 @@ def unit_float(x: wp.uint32) -> float:
 
 @wp.func
 def sample_2d(key: wp.uint32, index: wp.uint32, dimension: int) -> wp.vec2:
-    """Return point `index` in [0, 1)^2 of the sequence of (key, dimension). Each 2^k-aligned block of 2^k points is a (0, k, 2)-net."""
+    """Return point `index`, in [0, 1)^2, of the sequence for key and dimension. Each aligned block of 2^k points is a (0, k, 2)-net."""
     seed = hash_pair(key, wp.uint32(dimension))
     i = reverse_bits(laine_karras(reverse_bits(index), seed))
     x = reverse_bits(laine_karras(i, hash_u32(seed ^ wp.static(wp.uint32(SEED_X)))))
@@ -101,31 +101,31 @@ def independent_2d(key: wp.uint32, index: wp.uint32, dimension: int) -> wp.vec2:
 
 @wp.func_native("wrt::sample_2d(seed, first, count, (float*)(out.data + (long long)at));")
 def sample_points(seed: wp.uint32, first: int, count: int, out: wp.array(dtype=wp.vec2), at: int) -> None:
-    """Store the points first, first + 1 ... of sample_2d's sequence in out[at], out[at + 1] ..., for lanes_kernel (headers.py).
+    """Store the points first, first + 1 ... of sample_2d's sequence in out[at], out[at + 1] ... For kernels with lanes_kernel (headers.py).
 
     `seed` is hash_pair(key, dimension). `out` must have room for LANES - 1 more points, which are overwritten."""
 
 
 @wp.func_native("wrt::quantile(icdf.data, icdf.shape[0], (float*)(points.data + (long long)first), 2 * count);")
 def quantiles(icdf: wp.array(dtype=wp.float32), points: wp.array(dtype=wp.vec2), first: int, count: int) -> None:
-    """Replace both coordinates of points first .. first + count - 1 by their `quantile`. For lanes_kernel (headers.py)."""
+    """Replace both coordinates of the points first .. first + count - 1 by `quantile`. For kernels with lanes_kernel (headers.py)."""
 
 
 @wp.func
 def quantile(icdf: wp.array(dtype=wp.float32), x: float) -> float:
-    """Return the value of a distribution for the sample x in [0, 1); `icdf`, its inverse, is interpolated linearly."""
+    """Map the sample x in [0, 1) to a value of a distribution. icdf: its inverse cdf, which is interpolated linearly."""
     position = x * float(icdf.shape[0] - 1)
     i = wp.min(int(position), icdf.shape[0] - 2)
     return wp.lerp(icdf[i], icdf[i + 1], position - float(i))
 
 
 def make_draw(features: Features) -> Any:
-    """Return the function that draws many samples of one pixel, for the CPU."""
+    """Return draw(key, dimension, first, count, out, at), which draws many samples of one pixel on the CPU."""
     sample = make_sample_2d(features)
 
     @wp.func
     def draw(key: wp.uint32, dimension: int, first: int, count: int, out: wp.array(dtype=wp.vec2), at: int):
-        """Store sample_2d(key, first + i, dimension) in out[at + i] for i < count. `out` needs the room that sample_points needs."""
+        """Store sample_2d(key, first + i, dimension) in out[at + i] for i < count. `out` needs room for LANES - 1 more points."""
         if wp.static(features.independent):
             for i in range(count):
                 out[at + i] = sample(key, wp.uint32(first + i), dimension)
@@ -149,7 +149,7 @@ def point_at(angle: float) -> wp.vec2:
 
 @wp.func
 def disk(xi: wp.vec2) -> wp.vec2:
-    """Map [0, 1)^2 uniformly to the unit disk, concentric squares to circles (Shirley and Chiu 1997)."""
+    """Map [0, 1)^2 uniformly to the unit disk, so that concentric squares become circles (Shirley and Chiu 1997)."""
     a = 2.0 * xi[0] - 1.0
     b = 2.0 * xi[1] - 1.0
     wide = wp.abs(a) > wp.abs(b)
@@ -175,7 +175,7 @@ def polygon(xi: wp.vec2, sides: int, rotation: float) -> wp.vec2:
 
 @wp.func
 def triangle_numbers(x: float, y: float) -> tuple[float, float]:
-    """Return `triangle` as two floats. Like search_cdf it is branch-free, as a random branch is mispredicted half the time."""
+    """Return the result of `triangle` as two floats. Branch-free, because a random branch is mispredicted half the time."""
     half = 0.5 * wp.where(y > x, x, y)
     return wp.where(y > x, half, x - half), wp.where(y > x, y - half, half)
 
@@ -223,14 +223,14 @@ def cosine_hemisphere(xi: wp.vec2, n: wp.vec3) -> wp.vec3:
 
 @wp.func
 def cap_point(xi: wp.vec2) -> wp.vec3:
-    """Map [0, 1)^2 to a spherical cap: x and y are a point of the unit circle, z is the relative depth below the pole."""
+    """Map [0, 1)^2 to a spherical cap. (x, y) is a point on the unit circle; z is the depth below the pole over the cap's height."""
     sin, cos = near_sin_cos(TWO_PI * xi[0])
     return wp.vec3(cos, sin, xi[1])
 
 
 @wp.func
 def ggx_normal(cap: wp.vec3, n: wp.vec3, wo: wp.vec3, alpha: float) -> wp.vec3:
-    """Return a GGX microfacet normal, drawn from those visible from wo (Dupuy and Benyoub 2023); `cap` is a cap_point."""
+    """Return a GGX microfacet normal, drawn from the normals visible from wo (Dupuy and Benyoub 2023). cap: result of cap_point."""
     x = frame_x(n)
     y = wp.cross(n, x)
     w = wp.normalize(wp.vec3(alpha * wp.dot(wo, x), alpha * wp.dot(wo, y), wp.dot(wo, n)))
@@ -242,7 +242,7 @@ def ggx_normal(cap: wp.vec3, n: wp.vec3, wo: wp.vec3, alpha: float) -> wp.vec3:
 
 @wp.func
 def ggx_lambda(cos_theta: float, alpha: float) -> float:
-    """Return Smith's Lambda: hidden over visible microfacet area, seen at cosine cos_theta to the normal (Heitz 2014, eq. 72)."""
+    """Return Smith's Lambda, the ratio of hidden to visible microfacet area at an angle to the normal (Heitz 2014, eq. 72)."""
     c2 = cos_theta * cos_theta
     tan2 = wp.max(0.0, 1.0 - c2) / wp.max(c2, 1.0e-12)
     return 0.5 * (wp.sqrt(1.0 + alpha * alpha * tan2) - 1.0)

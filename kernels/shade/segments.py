@@ -13,7 +13,7 @@ END = 64.0  # Length cut off at each end of a segment, in units of rounding; see
 def lifted(surfaces: Surfaces, prim_id: int, point: wp.vec3, towards: wp.vec3) -> wp.vec3:
     """Move a point on a triangle or sphere off the surface, on the side of `towards`, by the point's rounding error.
 
-    A ray from there does not hit a neighbouring face in the same plane. A point with prim_id -1 or on a degenerate face stays."""
+    A ray from the moved point does not hit a neighbouring face in the same plane. Points with prim_id -1 or on degenerate faces stay."""
     if prim_id < 0:
         return point
     error = wp.vec3()
@@ -50,12 +50,12 @@ class Pairs:
     a: wp.array(dtype=wp.vec3)
     b: wp.array(dtype=wp.vec3)
     on_a: wp.array(dtype=wp.int32)  # prim_id of the primitive that a lies on, -1: none. Length 0: unknown for all points.
-    on_b: wp.array(dtype=wp.int32)  # The same for b.
+    on_b: wp.array(dtype=wp.int32)  # As on_a, for b.
 
 
 @kernel
 def segments(surfaces: Surfaces, pairs: Pairs, size: float, rays: RayArrays, first: int):
-    """Make the rays between a and b, shortened at both ends. A ray does not depend on which of its two points is called a.
+    """Make rays along the segments from a to b, shortened at both ends. Swapping a and b does not change a ray.
 
     `size` is the size of the largest primitive. A segment that is not finite, or not longer than its two cuts, becomes a ray that
     hits nothing.
@@ -92,7 +92,7 @@ def segments(surfaces: Surfaces, pairs: Pairs, size: float, rays: RayArrays, fir
 
 @kernel
 def to_visible(a: wp.array(dtype=wp.vec3), b: wp.array(dtype=wp.vec3), occluded: wp.array(dtype=wp.bool), first: int):
-    """Replace `occluded` by visibility in place. A pair with a point that is not finite is not visible."""
+    """Replace `occluded` in place by True for each visible pair. A pair with a point that is not finite is not visible."""
     i = first + wp.tid()
     finite = largest(a[i]) < wp.inf and largest(b[i]) < wp.inf and wp.isfinite(a[i]) and wp.isfinite(b[i])
     occluded[i] = finite and not occluded[i]

@@ -18,7 +18,7 @@ MASK, BLEND = 1, 2  # Values of Material.alpha_mode; 0 is opaque.
 
 @wp.struct
 class Texels:
-    """The linear values of a material's textures at a point; 1 without a texture. Fields of textures that no material has are unread."""
+    """The linear values of a material's textures at a point; 1 without a texture. Fields are unread if no material has the texture."""
 
     albedo: wp.vec3
     alpha: float
@@ -30,7 +30,7 @@ class Texels:
 
 
 class MaterialTexture(NamedTuple):
-    """A texture of a material: the neighbouring fields of Texels that it sets, and the channels (of "rgba") that each field takes."""
+    """A texture of a material. fields: neighbouring fields of Texels, and the channels (of "rgba") that each field takes."""
 
     fields: dict[str, str]
     feature: str = "parameter_textures"  # The field of Features that compiles it in; "": compiled in with any texture.
@@ -77,7 +77,7 @@ def no_texels(surfaces: Surfaces, s: Surface) -> Texels:
 
 
 def make_texture_link(name: str, texture: MaterialTexture, sample_texture: Any, others: Any) -> Any:
-    """Return a look_up that calls the look_up `others` and then samples one more texture."""
+    """Return a function look_up that calls the look_up function `others` and then samples one more texture."""
 
     @wp.func_native(f"return materials.data[(long long)material].{name};")
     def index_of(materials: wp.array(dtype=Material), material: int) -> int: ...
@@ -116,7 +116,7 @@ def make_resolve(features: Features) -> Any:
 def make_cutout(features: Features) -> Any:
     """Return accepts(surfaces, prim_id, u, v) -> bool, or None in scenes without cut-outs.
 
-    It is False for a hit whose alpha is below the cutoff. Traversal ignores such hits."""
+    The result is False for a hit whose alpha is below the cutoff. Traversal ignores such hits."""
     if not features.cutout:
         return None
     sample_texture = make_sample_texture(features.textures, features.checkerboards)
@@ -139,7 +139,7 @@ def make_cutout(features: Features) -> Any:
 
 @wp.func
 def bump(s: Surface, scale: float, color: wp.vec3) -> wp.vec3:
-    """Return the unit shading normal for the normal map's linear RGB `color`. It is branch-free, so that loops vectorise."""
+    """Return the unit shading normal for a normal map's linear RGB. scale: Material.normal_scale. Branch-free, so that loops vectorise."""
     side = wp.where(s.front != 0, 1.0, -1.0)
     outward = side * s.shading
     t = s.tangent - wp.dot(s.tangent, outward) * outward

@@ -43,8 +43,8 @@ class Passage:
 
     transmittance: wp.vec3  # Of all surfaces that the ray has passed, without the glass of `medium`.
     medium: int  # Material of the solid glass around the point, or OUTSIDE.
-    coverage: float  # The glass's alpha where it was entered.
-    inside: wp.vec3  # Transmittance of the glass so far, with the face where the ray entered.
+    coverage: float  # Alpha of this glass at the point where the ray entered it.
+    inside: wp.vec3  # Transmittance of this glass so far, including the face where the ray entered.
 
 
 @wp.func
@@ -69,10 +69,10 @@ def make_pass_surface(features: Features, scatter: Any, is_solid: Any) -> Any:
 
     @wp.func
     def straight_transmittance(m: Material, from_outside: Surface, wo: wp.vec3) -> wp.vec3:
-        """Return the share of light that goes straight through a surface of alpha 1.
+        """Return the share of light that goes straight through a surface of alpha 1. from_outside: the surface, with front = 1.
 
-        An unbent ray meets both faces of solid glass at the angle that it has outside. So from_outside.front must be 1. With
-        front = 0, Fresnel's formula would find total reflection for a ray that leaves."""
+        An unbent ray meets both faces of solid glass at the angle that it has outside. With front = 0, Fresnel's formula would
+        find total reflection for some rays that leave the glass."""
         share = scatter(m, from_outside, wo, wp.vec3())
         if share.bends == 0:
             return share.transmitted
@@ -120,11 +120,11 @@ class ShadowWalk:
     """A shadow ray that passes one transparent surface after another."""
 
     ray: Ray  # The part that is not traced yet.
-    end: wp.vec3  # End of the segment, at the light.
+    end: wp.vec3  # Point on the light where the ray ends. Unread if the light is at infinity.
     passage: Passage
-    surfaces: int  # Surfaces passed so far.
+    surfaces: int  # Number of surfaces passed so far.
     shadow: Shadow  # The result, once done = 1.
-    done: int
+    done: int  # 1 if the walk has ended, else 0.
 
 
 @wp.func
@@ -190,7 +190,7 @@ def make_advance_shadow(features: Features, shading: Shading) -> Any:
 
     @wp.func
     def advance_shadow(surfaces: Surfaces, before: ShadowWalk, hit: Hit) -> ShadowWalk:
-        """Advance the walk past `hit`, the closest hit of walk.ray, or to the light if it is a miss."""
+        """Advance the walk past `hit`, the closest hit of the walk's ray. If `hit` is a miss, advance to the light."""
         walk = before
         walk.shadow.rays += 1
         if hit.prim_id < 0:
@@ -208,9 +208,9 @@ def make_advance_shadow(features: Features, shading: Shading) -> Any:
 
 
 def make_transmittance(features: Features, shading: Shading, accel_struct: Any, closest_hit: Any, any_hit: Any) -> Any:
-    """Return transmittance(accel, surfaces, ray, end) -> Shadow: trace the shadow ray `ray`, whose segment ends at `end`.
+    """Return transmittance(accel, surfaces, ray, end) -> Shadow: trace the shadow ray `ray`, which ends at the point `end`.
 
-    This takes one any-hit query, or one closest-hit query after another if the scene has transparent shadows."""
+    It takes one any-hit query. In scenes with transparent shadows, it takes one closest-hit query after another."""
     advance_shadow = make_advance_shadow(features, shading)
 
     @wp.func

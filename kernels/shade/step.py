@@ -36,9 +36,9 @@ def make_shaded(counting: bool) -> Any:
         throughput: wp.vec3  # Weight of this surface's light in the sample.
         surface: Surface  # The surface at the hit, where shadow rays start.
         scatter: Scatter
-        wo: wp.vec3
+        wo: wp.vec3  # Unit vector from the hit to the origin of the path's ray.
         key: wp.uint32  # Seed of the light samples.
-        onward: path_struct
+        onward: path_struct  # Straight through a partly transparent surface.
         reflected: path_struct
         refracted: path_struct
 
@@ -50,8 +50,8 @@ class ShadowRequest:
     """A shadow ray, and the radiance that it adds if nothing occludes the light."""
 
     value: wp.vec3  # Radiance towards the eye, if unoccluded. 0: there is no ray to trace.
-    ray: Ray  # The segment to the light.
-    end: wp.vec3  # End of the segment, unless the light is at infinity.
+    ray: Ray  # The shadow ray.
+    end: wp.vec3  # Point on the light where the ray ends. Unread if the light is at infinity.
 
 
 @wp.struct
@@ -59,9 +59,9 @@ class Sample:
     """The radiance along one camera ray, and counts of the rays traced and cut for it."""
 
     radiance: wp.vec3
-    rays: int
-    cut_depth: int
-    cut_throughput: int
+    rays: int  # Number of rays, with shadow rays.
+    cut_depth: int  # Number of rays cut by max_depth, MAX_TRANSPARENT or MAX_RAYS.
+    cut_throughput: int  # Number of rays cut by min_throughput.
     lost: float  # Radiance (mean of channels) that the cut rays would have added if all surroundings had radiance 1.
 
 
@@ -87,7 +87,7 @@ def emitted(m: Material, s: Surface) -> wp.vec3:
 
 @wp.struct
 class PendingLight:
-    """The light of a surface that is added to its sample after the surface's shadow rays are traced."""
+    """A surface's own light. It is added to the sample together with the direct light, after the shadow rays are traced."""
 
     light: wp.vec3  # Shaded.light.
     throughput: wp.vec3  # Shaded.throughput.
@@ -97,12 +97,12 @@ class PendingLight:
 
 @wp.struct
 class DirectLight:
-    """The light that arrives at a surface from all lights, as reflected radiance, and counts of its shadow rays."""
+    """The radiance that a surface reflects from all lights, and counts of its shadow rays."""
 
     radiance: wp.vec3
     lost: wp.vec3  # What the cut shadow rays would have added if the lights were surroundings of radiance 1.
     rays: int
-    cut: int
+    cut: int  # Number of shadow rays cut by MAX_TRANSPARENT.
 
 
 @wp.func
@@ -113,7 +113,7 @@ def receives_light(scatter: Scatter) -> bool:
 
 @wp.func
 def add_light(before: DirectLight, value: wp.vec3, scatter: Scatter, shadow: Shadow) -> DirectLight:
-    """Add one light, of the unoccluded radiance `value`, to the direct light."""
+    """Add one light to the direct light. value: the light's ShadowRequest.value."""
     out = before
     out.radiance += wp.cw_mul(value, shadow.transmittance)
     out.rays += shadow.rays
@@ -144,7 +144,7 @@ def make_transparency(features: Features, is_solid: Any) -> Any:
     def transparency(m: Material, s: Surface, medium: int) -> float:
         """Return 1 - alpha for a blended surface, else 0.
 
-        Solid glass whose medium is known has one answer for front and back, found at the front. A path that went straight through
+        For solid glass, if the path's medium is known, the front decides for the back, too. A path that went straight through
         the front ignores the back (1). A path that was refracted at the front meets all of the back (0). Otherwise a path could
         enter unbent and leave with ior^2 of its light."""
         if m.alpha_mode != wp.static(BLEND):
@@ -164,7 +164,7 @@ def make_straight_on(features: Features, is_solid: Any) -> Any:
 
     @wp.func
     def straight_on(surfaces: Surfaces, path: Path, m: Material, s: Surface, share: float, distance: float) -> Path:
-        """Return the path that goes straight on with `share` of the throughput. This is no bounce: the depth stays."""
+        """Return the path that goes straight on with the share `share` of the throughput. This is no bounce: the depth stays."""
         onward = child(path, s, path.direction, share * path.throughput, ONWARD)
         onward.depth = path.depth
         onward.passed = path.passed + 1
@@ -186,7 +186,7 @@ def make_shade(features: Features, shading: Shading) -> Any:
 
     @wp.func
     def medium_at(m: Material, s: Surface, medium: int) -> int:
-        """Correct `medium` at a surface of solid glass: a ray that meets its back face must be inside it."""
+        """Correct `medium` at solid glass: a ray at a back face is inside that glass; an UNKNOWN medium at a front face is OUTSIDE."""
         if not shading.is_solid(m):
             return medium
         return wp.where(s.front == 0, s.material, wp.where(medium == UNKNOWN, OUTSIDE, medium))
@@ -194,7 +194,7 @@ def make_shade(features: Features, shading: Shading) -> Any:
     @wp.func
     def shade(surfaces: Surfaces, lighting: Lighting, arriving: Path, surface: Surface, texels: Texels, t: float,
               facet: wp.vec3) -> Shaded:
-        """Shade `surface`, which path `arriving` hits at distance t (world units). wo must see `surface.shading`."""
+        """Shade `surface`, which path `arriving` hits at distance t (world units). surface.shading: result of Shading.shading_normal."""
         out = Shaded()
         path = arriving
         s = surface

@@ -37,7 +37,7 @@ def next_away(x: float, direction: float) -> float:
 
 @wp.func
 def spawn_point(point: wp.vec3, error: wp.vec3, normal: wp.vec3, direction: wp.vec3) -> wp.vec3:
-    """Return the origin of a ray that leaves a surface point towards `direction`, moved along the normal to the direction's side.
+    """Return the origin of a ray in `direction` from a surface point: the point, moved along the normal to the side of `direction`.
 
     The origin is just outside the box of the point's error (Pharr, Jakob and Humphreys 2023, "Physically Based Rendering", section
     6.8.6). Unlike a fixed epsilon, the step scales with the coordinates."""
@@ -52,8 +52,8 @@ class Place:
     """The indices of a primitive's data."""
 
     face: int  # In Surfaces.faces; unread for a sphere.
-    material: int
-    instance: int
+    material: int  # In Surfaces.materials.
+    instance: int  # In Surfaces.instances.
 
 
 @wp.func
@@ -98,7 +98,7 @@ def make_place_of(instances: bool) -> Any:
 
 @wp.func
 def transformed(row_x: wp.vec4d, row_y: wp.vec4d, row_z: wp.vec4d, v: wp.vec3, w: float) -> wp.vec3:
-    """Transform a point (w = 1) or a direction (w = 0) by an affine map, in float64, rounded once."""
+    """Transform a point (w = 1) or a direction (w = 0) by the rows of a 3x4 matrix, in float64, rounded to float32 at the end."""
     p = wp.vec4d(wp.float64(v[0]), wp.float64(v[1]), wp.float64(v[2]), wp.float64(w))
     return wp.vec3(float(wp.dot(row_x, p)), float(wp.dot(row_y, p)), float(wp.dot(row_z, p)))
 
@@ -118,19 +118,19 @@ def world_normal(i: Instance, n: wp.vec3) -> wp.vec3:
 def world_error(i: Instance, p: wp.vec3, error: wp.vec3, world: wp.vec3) -> wp.vec3:
     """Bound the error per axis of `world`, the image in world space of a point p with the error bound `error`.
 
-    The bound includes two roundings in the mesh's space: the origin of the next ray is transformed back there and rounded."""
+    The bound includes two roundings in the mesh's space: the origin of the next ray is transformed into that space and rounded."""
     e = error + gamma(2.0) * wp.abs(p)
     return transformed(wp.abs(i.world_x), wp.abs(i.world_y), wp.abs(i.world_z), e, 0.0) + gamma(2.0) * wp.abs(world)
 
 
 @wp.struct
 class Triangle:
-    """A triangle: corners in the space of its mesh, and, if the scene has any, normals in world space and texture coordinates."""
+    """A triangle. Normals and texture coordinates are unread if no mesh of the scene has them."""
 
-    v0: wp.vec3
+    v0: wp.vec3  # Corners in the space of the mesh.
     v1: wp.vec3
     v2: wp.vec3
-    n0: wp.vec3
+    n0: wp.vec3  # Normals at the corners in world space.
     n1: wp.vec3
     n2: wp.vec3
     u: wp.vec3  # Texture coordinates u of the three corners.
@@ -139,7 +139,7 @@ class Triangle:
 
 @wp.func
 def corners_at(surfaces: Surfaces, index: int) -> Triangle:
-    """Return the corners of face `index`, in the space of its mesh, as a Triangle without attributes."""
+    """Return face `index` as a Triangle with corners only, in the space of its mesh."""
     face = surfaces.faces[index]
     triangle = Triangle()
     triangle.v0 = surfaces.vertices[face[0]]
@@ -149,7 +149,7 @@ def corners_at(surfaces: Surfaces, index: int) -> Triangle:
 
 
 def make_triangle_at(smooth: bool, uvs: bool, instances: bool) -> Any:
-    """Return triangle_at(surfaces, place) -> Triangle with the attributes that the scene has."""
+    """Return triangle_at(surfaces, place) -> Triangle, with normals and texture coordinates if the scene has them."""
 
     @wp.func
     def triangle_at(surfaces: Surfaces, place: Place) -> Triangle:

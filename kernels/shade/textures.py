@@ -14,7 +14,7 @@ FARTHEST = wp.constant(2.0**30)  # Largest distance from a picture's first texel
 
 @wp.func
 def wrapped(i: int, size: int, wrap: int) -> int:
-    """Wrap column (or line) i into 0 .. size - 1."""
+    """Wrap column (or line) i into 0 .. size - 1. wrap: WRAP_REPEAT, WRAP_CLAMP or WRAP_MIRROR."""
     if i >= 0 and i < size:  # Usually true; the division below is as slow as the rest of a look-up.
         return i
     if wrap == wp.static(WRAP_CLAMP):
@@ -41,7 +41,7 @@ def texel(surfaces: Surfaces, texture: Texture, column: int, row: int) -> wp.vec
 
 @wp.func
 def texel_place(at: float, size: int) -> float:
-    """Convert a texture coordinate to texels, with 0 at the centre of the first texel."""
+    """Convert a texture coordinate to a position in texels, with 0 at the centre of the first texel. size: number of texels."""
     # The bound keeps the integer below 2^31: beyond that, its value depends on the device.
     return wp.clamp(at * float(size) - 0.5, -FARTHEST, FARTHEST)
 
@@ -74,7 +74,7 @@ def checkerboard(texture: Texture, u: float, v: float) -> wp.vec4:
 
 
 def make_sample_texture(pictures: bool, checkerboards: bool) -> Any:
-    """Return sample_texture(surfaces, index, uv) -> RGBA, with code for the kinds of texture that the scene has."""
+    """Return sample_texture(surfaces, index, uv) -> RGBA. It has code only for the kinds of texture in the scene."""
 
     @wp.func
     def sample_texture(surfaces: Surfaces, index: int, uv: wp.vec2) -> wp.vec4:

@@ -1,7 +1,7 @@
 """Variants of the binary BVH's traversal, to count their steps: without order, without early stop, or with a short stack; same hits.
 A short stack overwrites its oldest entries. When the stack is empty, the walk restarts at the root and follows a trail. The trail has one
-bit per level, which is set if only the last child of the level remains. Laine 2010, "Restart Trail for Stackless BVH Traversal";
-Vaidyanathan et al. 2019, "Wide BVH Traversal with a Short Stack"."""
+bit per level of the tree. The bit is set if only the last child of the level remains to be visited. Laine 2010, "Restart Trail for
+Stackless BVH Traversal"; Vaidyanathan et al. 2019, "Wide BVH Traversal with a Short Stack"."""
 
 from typing import Any, NamedTuple
 
@@ -19,7 +19,7 @@ NONE = wp.constant(wp.uint64(0))
 
 
 class Study(NamedTuple):
-    """A variant, in place of a structure's traversal module. The variant with a short stack is always ordered and early."""
+    """A variant, in place of a structure's traversal module. With a short stack, `ordered` and `early` have no effect."""
 
     entries: int = STACK_SIZE  # Number of stack entries; STACK_SIZE: as many as needed.
     ordered: bool = True  # Visit the nearer child first.
@@ -37,9 +37,9 @@ class Study(NamedTuple):
 
 @wp.struct
 class Trail:
-    """The path from the root to the present node. A level is one bit; the root's is TOP, and each step down halves it."""
+    """The path from the root to the present node. A level is one bit: TOP for the root, and half the value with each step down."""
 
-    done: wp.uint64  # Levels where only the last child remains.
+    done: wp.uint64  # Mask of the levels where only the last child remains.
     level: wp.uint64  # Level of the present node.
     resumed: wp.uint64  # Level whose last child is next.
 
@@ -53,7 +53,7 @@ def carry(trail: Trail) -> Trail:
 
 
 def make_short_stack(units: Units, entries: int, any_hit: bool, accepts: Any = None) -> Any:
-    """Make the traversal with a stack of `entries` entries, for trees of at most LEVELS levels. With 0, each pop restarts at the root."""
+    """Make the traversal with a stack of `entries` entries, for trees of at most LEVELS levels. With 0 entries, each pop is a restart."""
     probe_of = make_probe(units)
     visit_leaf = make_leaf(units, any_hit, accepts)
     ray_aabb = units.box_test

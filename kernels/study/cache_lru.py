@@ -11,14 +11,14 @@ LINE = wp.constant(wp.int64(128))  # bytes of a cache line
 class Caches:
     """One cache per thread, all of the same size."""
 
-    sets: int
-    ways: int
+    sets: int  # Number of sets of a cache.
+    ways: int  # Number of lines of a set.
     tags: wp.array(dtype=wp.int64)  # For each cache, `sets` sets of `ways` line indices, the most recently used first; -1: empty.
 
 
 @wp.func
 def access(caches: Caches, which: int, line: wp.int64) -> bool:
-    """Return whether a line is in cache `which`, and put it there. The line's set is `line` modulo `sets`."""
+    """Return whether a line is in cache `which`, and make it the most recent line of its set. The set is `line` modulo `sets`."""
     begin = (which * caches.sets + int(line % wp.int64(caches.sets))) * caches.ways
     moved = line
     for way in range(caches.ways):
@@ -51,7 +51,7 @@ class Trace:
 
 @wp.struct
 class Missed:
-    """Misses in the L1 cache of each SM, and scratch. SM s has the misses first[s] .. first[s] + misses[s] - 1 of line, time and lanes."""
+    """Misses in the L1 cache of each SM, and scratch. SM s has the entries first[s] .. first[s] + misses[s] - 1 of line, time and lanes."""
 
     first: wp.array(dtype=wp.int64)
     line: wp.array(dtype=wp.int64)  # Line of each miss.
@@ -69,7 +69,7 @@ class Missed:
 
 @wp.func
 def play_round(trace: Trace, caches: Caches, out: Missed, sm: int, warp: int, step: wp.int64, time: wp.int64) -> bool:
-    """Replay fetch `step` of each lane of a warp. Lanes that fetch the same line share one access. Return whether more fetches follow."""
+    """Replay fetch `step` of each ray of a warp. Rays that fetch the same line share one access. Return whether more fetches follow."""
     more = bool(False)
     begin = sm * out.seen_size
     seen = int(0)

@@ -27,6 +27,6 @@ def packets(function: wp.uint64, scene: wp.uint64, coherent: bool, any_hit: bool
 @embree_kernel
 def embree_packets(function: wp.uint64, scene: wp.uint64, coherent: bool, any_hit: bool, origins: wp.array(dtype=wp.vec3),
                    directions: wp.array(dtype=wp.vec3), hits: HitArrays):
-    """Trace all rays. On entry, hits.t has t_max of each ray; then it has t of the hit or, with any_hit, -inf for a ray that hits.
-    The address `function` is of Embree's rtcIntersect16 or rtcOccluded16. With any_hit, the other arrays of `hits` do not change."""
+    """Trace all rays. On entry, hits.t has t_max of each ray. Then it has t of the hit; with any_hit, it has -inf for a ray that hits.
+    `function`: address of Embree's rtcIntersect16 or rtcOccluded16. With any_hit, the other arrays of `hits` do not change."""
     packets(function, scene, coherent, any_hit, origins, directions, hits)

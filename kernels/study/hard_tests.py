@@ -12,7 +12,7 @@ REFUSED, SURE, HARD = 0, 1, 2  # rejected in float32; hit computed in float-floa
 @kernel
 def classify(primitives: wp.array(dtype=Primitive), rays: RayArrays, ray: wp.array(dtype=wp.int32),
              primitive: wp.array(dtype=wp.int32), out: wp.array(dtype=wp.int32)):
-    """Store REFUSED, SURE or HARD for the test of ray number ray[i] against primitive number primitive[i]."""
+    """Store how the test of ray ray[i] against record primitive[i] is decided: REFUSED, SURE or HARD."""
     i = wp.tid()
     tested = load_ray(rays, ray[i])
     shear = triangle_ray(tested)

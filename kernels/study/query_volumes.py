@@ -1,4 +1,4 @@
-"""The cost of bounding volumes: kernels with tests alone, and counts of walks in the way of another library (tinybvh)."""
+"""The cost of bounding volumes: kernels with tests alone, and numbers of visits and tests as another library (tinybvh) counts them."""
 
 from functools import cache
 from typing import Any
@@ -36,7 +36,7 @@ def make_enter_kernel(volumes: Volumes) -> Any:
 @kernel
 def count_popped(nodes: wp.array(dtype=Bvh2Node), order: wp.array(dtype=wp.int32), rays: RayArrays, t: wp.array(dtype=wp.float32),
                  prim_id: wp.array(dtype=wp.int32), visits: wp.array(dtype=wp.int32), primitives: wp.array(dtype=wp.int32)):
-    """Count visits and primitive tests of rays with known closest hits (t, prim_id), in the way of tinybvh.
+    """Count visits and primitive tests of rays with known closest hits (t, prim_id), as tinybvh counts them.
     Each popped node or leaf counts as a visit, even if it begins behind the closest hit."""
     i = wp.tid()
     box = box_ray(load_ray(rays, i))

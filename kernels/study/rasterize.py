@@ -1,9 +1,9 @@
 """A rasterizer with a z-buffer, in float64.
 
-It computes the same hits as rays through the pixels' centres, by another method and without code of the ray units, so that each can check
-the other. Triangles are in homogeneous pixel coordinates (Olano and Greer 1997, "Triangle scan conversion using 2D homogeneous
-coordinates"), so that a triangle through the camera's plane needs no clipping. Each pixel stores the smallest key (depth, prim_id), so the
-order of triangles does not matter.
+It computes the same hits as rays through the pixels' centres, by another method and without code of the ray units. So rasterizer and ray
+units can check each other. Triangles are in homogeneous pixel coordinates (Olano and Greer 1997, "Triangle scan conversion using 2D
+homogeneous coordinates"), so that a triangle through the camera's plane needs no clipping. Each pixel stores the smallest key (depth,
+prim_id), so the order of triangles does not matter.
 """
 
 import warp as wp
@@ -53,7 +53,7 @@ def has_extent(v0: wp.vec3, v1: wp.vec3, v2: wp.vec3) -> bool:
 
 @wp.func
 def centres_between(low: wp.float64, high: wp.float64, size: int) -> wp.vec2i:
-    """Return the first and the last of the pixels 0 .. size - 1 with a centre in [low, high]; first > last if no pixel has."""
+    """Return the first and the last of the pixels 0 .. size - 1 with a centre in [low, high]; first > last if there is no such pixel."""
     end = wp.float64(size)
     first = wp.ceil(wp.clamp(low, ZERO, end) - HALF - CENTRE_PAD)
     last = wp.floor(wp.clamp(high, ZERO, end) - HALF + CENTRE_PAD)
@@ -94,7 +94,7 @@ def pixel_box(view: View, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> wp.vec4i:
 @kernel
 def bound(view: View, vertices: wp.array(dtype=wp.vec3), projected: wp.array(dtype=wp.vec3d), faces: wp.array(dtype=wp.vec3i), first: int,
           boxes: wp.array(dtype=wp.vec4i)):
-    """Store the pixel_box of each triangle. It is empty for most small triangles, which lie between the pixels' centres."""
+    """Store the pixel_box of each triangle. The box is empty for most small triangles, because they lie between the pixels' centres."""
     i = first + wp.tid()
     f = faces[i]
     box = pixel_box(view, projected[f[0]], projected[f[1]], projected[f[2]])
@@ -109,7 +109,7 @@ def edge_between(p: wp.vec3d, q: wp.vec3d, size: wp.vec2d) -> Edge:
     """Return the edge function of Olano and Greer: the plane through the camera and the edge's ends p and q. `size`: of the picture.
     Exchanging p and q negates the function exactly. The `slack` bounds the difference from `turn` at the same pixel: `turn` rounds
     p - (x, y) p_w in each factor, and this function rounds three products. The products are below (|p_x| + width |p_w|)
-    (|q_y| + height |q_w|), or the same with p and q exchanged."""
+    (|q_y| + height |q_w|), or below the same expression with p and q exchanged."""
     edge = Edge()
     edge.normal = wp.cross(p, q)
     p_x = wp.abs(p[0]) + size[0] * wp.abs(p[2])
@@ -122,7 +122,7 @@ def edge_between(p: wp.vec3d, q: wp.vec3d, size: wp.vec2d) -> Edge:
 
 @wp.func
 def cut(span: wp.vec2d, edge: Edge, side: wp.float64, y: wp.float64) -> wp.vec2d:
-    """Clip a span of a row, from x = span[0] to x = span[1], to one side (1 or -1) of an edge, moved outwards by edge.slack."""
+    """Clip the pixel row y's span from x = span[0] to span[1] to one side (1 or -1) of an edge that is moved outwards by edge.slack."""
     slope = side * edge.normal[0]
     rest = side * (edge.normal[1] * y + edge.normal[2]) + edge.slack
     if slope > ZERO:
@@ -168,7 +168,7 @@ def owns(p: wp.vec2d, q: wp.vec2d, area: wp.float64) -> bool:
 
 @wp.func
 def depth_at(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, x: wp.float64, y: wp.float64) -> wp.float64:
-    """Return the depth at which the line through a pixel's centre meets a triangle, in units of the direction (x, y, 1); -1 on a miss.
+    """Return the depth at which the line through a pixel's centre meets a triangle, in units of the direction (x, y, 1); < 0 on a miss.
     The corners are moved so that the centre is the origin. This rounds, but equally for all triangles that share a corner. Later decisions
     are exact, so no centre falls between two triangles. Both sides of a triangle count. Edge-on or behind the camera is a miss."""
     p = wp.vec2d(a[0] - x * a[2], a[1] - y * a[2])
@@ -210,7 +210,7 @@ class Corners:
 
 @wp.func
 def draw_row(view: View, corners: Corners, columns: wp.vec2i, row: int, keys: wp.array(dtype=wp.uint64)):
-    """Update the keys of the pixels in part of a row that a triangle covers."""
+    """Update the keys of those pixels columns[0] .. columns[1] of a row that a triangle covers."""
     y = wp.float64(row) + HALF
     for column in range(columns[0], columns[1] + 1):
         x = wp.float64(column) + HALF
@@ -225,8 +225,8 @@ def draw_row(view: View, corners: Corners, columns: wp.vec2i, row: int, keys: wp
 @kernel
 def rasterize(view: View, projected: wp.array(dtype=wp.vec3d), faces: wp.array(dtype=wp.vec3i), boxes: wp.array(dtype=wp.vec4i),
               prim_ids: wp.array(dtype=wp.int32), bands: wp.vec2i, keys: wp.array(dtype=wp.uint64)):
-    """Draw triangles in bands of rows. The launch has the dimensions (bands, triangles); bands: (first row of the first, rows per band).
-    On CUDA, threads may share a pixel, because atomic_min is atomic. On the CPU it is not: each band needs a launch of its own."""
+    """Draw triangles in bands of rows. The launch has the dimensions (bands, triangles); bands: (first row, rows per band).
+    On CUDA, threads may share a pixel, because atomic_min is atomic. On the CPU it is not atomic: each band needs its own launch."""
     band, i = wp.tid()
     corners = Corners()
     corners.prim_id = prim_ids[i]

@@ -12,7 +12,7 @@ from wrt.kernels.structs import Hit, Ray, Surfaces
 
 @wp.struct
 class LoggedRay:
-    """The fields of a structs.Ray, its kind, and whether it hit."""
+    """A ray as in structs.Ray, its kind, and whether it hit."""
 
     origin: wp.vec3
     direction: wp.vec3
@@ -26,7 +26,7 @@ class LoggedRay:
 
 @wp.struct
 class RayLog:
-    """The log of a tile."""
+    """The log of a tile, a rectangle of pixels; `used` and `first` have an entry per pixel."""
 
     used: wp.array(dtype=wp.int32)  # Number of rays of each pixel so far.
     first: wp.array(dtype=wp.int64)  # Index in `rays` of each pixel's first ray. Length 0: count rays, but do not log them.
@@ -47,7 +47,7 @@ def make_struct(accel_struct: Any) -> Any:
 
 
 def make_traversal(accel_struct: Any, traverse: Any, any_hit: bool) -> Any:
-    """Wrap `traverse` with a log. Ray.slot, the index for counters, becomes the ray's index in the log or, without a log, the pixel's."""
+    """Wrap `traverse` with a log. Ray.slot, the index for counters, becomes the ray's index in the log; without a log, the pixel's."""
     struct = make_struct(accel_struct)
 
     @wp.func

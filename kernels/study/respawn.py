@@ -20,7 +20,7 @@ class Respawn:
 
 
 def make_respawn_kernel(accel_struct: Any, traverse: Any, surface_at: Any) -> Any:
-    """Make the kernel that stores the hit of each ray, and the hit of a second ray that starts there.
+    """Make the kernel that stores the hit of each ray, and the hit of a second ray that starts at the first hit.
     On a sphere, the second direction is turned outwards, because an inward ray correctly hits the sphere again."""
 
     @kernel

@@ -36,13 +36,13 @@ def make_box_probe(test: str | None, count: int) -> Any:
 
 
 def numbers_of(record: Any) -> int:
-    """Return how many numbers of a record a test reads: all except prim_id."""
+    """Return the number of 4-byte values of a record that a test reads: all except prim_id."""
     return size_of(record) // 4 - 1
 
 
 @cache
 def make_add_numbers(record: Any) -> Any:
-    """Make add_numbers(total, record), which adds to total the numbers that a test reads."""
+    """Make add_numbers(total, record), which returns `total` plus all floats of a record."""
     layout = record.numpy_dtype()
     prim_id = layout["offsets"][layout["names"].index("prim_id")] // 4
 
@@ -61,7 +61,7 @@ def make_add_numbers(record: Any) -> Any:
 
 @cache
 def make_triangle_probe(test: str, count: int, adding: bool = False) -> Any:
-    """Make the kernel that sums t, u and v of `count` tests RAY_TRIANGLE[test]; with `adding`, it sums the records' numbers instead."""
+    """Make the kernel that sums t, u and v of `count` tests RAY_TRIANGLE[test]; with `adding`, it sums the records' floats instead."""
     unit = RAY_TRIANGLE[test].intersect
     record = RAY_TRIANGLE[test].record
     add_numbers = make_add_numbers(record)

@@ -50,7 +50,7 @@ INNER = -1  # Value of `count` for a child that is an inner node.
 @wp.struct
 class BspNode:
     """A plane normal . p + offset = 0 and its two children: 0 below the plane (negative values), 1 above it.
-    A child is the inner node `first` (count = INNER), or a leaf with the primitives first .. first + count - 1; count may be 0."""
+    Child k is the inner node first_k (count_k = INNER), or a leaf with the count_k >= 0 primitives from index first_k on."""
 
     normal: wp.vec3
     offset: float
@@ -66,15 +66,15 @@ class BspNode:
 class Reach:
     """The part of a ray that the walk follows."""
 
-    t_0: float  # t at the begin.
-    t_1: float  # t at the end.
+    t_0: float  # t where the part begins.
+    t_1: float  # t where the part ends.
     beyond: float  # Length, in t, by which the walk continues behind the best hit: `reach` of the proof.
-    drift: float  # Half thickness of a plane per unit of t.
+    drift: float  # Half of a plane's thickness that is proportional to the ray's distance, per unit of t.
 
 
 @wp.func
 def reach_of(box: BoxRay, ray: Ray, t_max: float, lo: wp.vec3, hi: wp.vec3, extent: float) -> Reach:
-    """Compute the part of the ray to follow, by steps 2 and 3 of the proof. If the ray misses the root box, t_0 <= t_1 is False."""
+    """Return the part of the ray to follow, by steps 2 and 3 of the proof; lo, hi: root box. If the ray misses it, t_0 <= t_1 is False."""
     grow = REACH * wp.max(largest(lo - ray.origin), largest(hi - ray.origin)) + SMALLEST
     margin = wp.vec3(grow, grow, grow)
     interval = slab_interval(box, lo - margin, hi + margin)
@@ -93,7 +93,7 @@ def reach_of(box: BoxRay, ray: Ray, t_max: float, lo: wp.vec3, hi: wp.vec3, exte
 
 @cache
 def make_struct(record: Any) -> Any:
-    """Make the structure's type, for primitives stored as `record`. `first` and `count` describe the root, as they do a node's child."""
+    """Make the structure's type, for primitives stored as `record`. The root is a child as in BspNode, with `first` and `count`."""
 
     @wp.struct
     class Bsp:
@@ -115,7 +115,7 @@ class Sides:
 
     near: Child
     far: Child
-    meets_near: bool
+    meets_near: bool  # True if the ray meets the nearer child, and that child is not an empty leaf.
     meets_far: bool
     near_t_1: float  # Latest t at which the ray leaves the nearer child.
     far_t_0: float  # Earliest t at which the ray enters the farther child.
@@ -150,7 +150,7 @@ def cut_by_plane(node: BspNode, box: BoxRay, direction: wp.vec3, t_0: float, t_1
 
 
 def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
-    """Make walk(accel, surfaces, probe, reach) -> (best Hit, Counts)."""
+    """Make walk(accel, surfaces, probe, reach) -> (best Hit, Counts), which visits the cells along the ray's part `reach`."""
     visit_leaf = make_leaf(units, any_hit, accepts)
     fetch_node, _, push, _ = make_counters(units, size_of(BspNode))
 
@@ -212,7 +212,7 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
 
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found. units.box is not used."""
+    """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found. Units.box has no effect."""
     probe_of = make_probe(units)
     walk = make_walk(units, any_hit, accepts)
     _, _, _, finish = make_counters(units, 0)

@@ -22,8 +22,8 @@ ENTRY = 12  # size of a stack entry in bytes: a key of 8 and a count of 4
 
 @wp.struct
 class Bvh2Node:
-    """Two children. A child has a box, and is the inner node `first` (count = 0) or a leaf with the primitives first .. first + count - 1.
-    A missing child has an empty box (lo = inf, hi = -inf)."""
+    """Two children. Child k has the box lo_k .. hi_k. It is the inner node first_k (count_k = 0), or a leaf with the count_k primitives
+    from index first_k on. A missing child has an empty box (lo = inf, hi = -inf)."""
 
     lo_0: wp.vec3
     hi_0: wp.vec3
@@ -60,7 +60,7 @@ class Volumes(NamedTuple):
 
 @cache
 def box_volumes(record: Any, box_test: Any) -> Volumes:
-    """Make the Volumes of boxes; box_test: an entry of RAY_AABB."""
+    """Make the Volumes of boxes; box_test: a function of the table RAY_AABB."""
     struct = make_struct(record)
 
     @wp.func
@@ -91,15 +91,15 @@ def child_of(node: Any, second: bool) -> Child:
 
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found."""
+    """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found; accepts: common.make_better."""
     volumes = box_volumes(units.triangle_test.record, units.box_test)
     return make_binary_traversal(units, volumes, make_leaf(units, any_hit, accepts), any_hit)
 
 
 def make_binary_traversal(units: Units, volumes: Volumes, visit_leaf: Any, any_hit: bool, ordered: bool = True,
                           early: bool = True) -> Any:
-    """Make the traversal of a tree with these volumes; visit_leaf: see kernels.traverse.leaf. The laboratory switches off `ordered` (visit
-    the nearer child first) and `early` (drop nodes that begin behind the best hit)."""
+    """Make the traversal of a tree with these volumes; visit_leaf: made by kernels.traverse.leaf.make_leaf. The laboratory switches off
+    `ordered` (visit the nearer child first) and `early` (drop nodes that begin behind the best hit)."""
     probe_of = make_probe(units)
     struct, set_up, enter, root = volumes.struct, volumes.set_up, volumes.enter, volumes.root
     fetch_node, _, push, finish = make_counters(units, size_of(volumes.node))

@@ -14,7 +14,7 @@ from wrt.kernels.units.kdop import KdopRay, kdop_ray, ray_kdop
 
 @wp.struct
 class KdopNode:
-    """A Bvh2Node with the diagonal slabs of both children: cut_lo <= units.kdop.project(x - middle) <= cut_hi."""
+    """A Bvh2Node with diagonal slabs too: for a point x of child k, cut_lo_k <= units.kdop.project(x - middle) <= cut_hi_k."""
 
     lo_0: wp.vec3
     hi_0: wp.vec3
@@ -37,7 +37,7 @@ def make_struct(record: Any) -> Any:
     @wp.struct
     class Bvh2Kdop:
         nodes: wp.array(dtype=KdopNode)
-        middle: wp.vec3
+        middle: wp.vec3  # Middle of the scene.
         primitives: wp.array(dtype=record)
         recorder: Recorder
 
@@ -62,6 +62,6 @@ def kdop_volumes(record: Any) -> Volumes:
 
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found. units.box is not used."""
+    """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found. Units.box has no effect."""
     volumes = kdop_volumes(units.triangle_test.record)
     return make_binary_traversal(units, volumes, make_leaf(units, any_hit, accepts), any_hit)

@@ -14,7 +14,7 @@ from wrt.kernels.units.bounding_sphere import SphereRay, ray_bounding_sphere, sp
 
 @wp.struct
 class SphereNode:
-    """A Bvh2Node with spheres (center, radius) instead of boxes; a missing child has radius -1."""
+    """A Bvh2Node with a sphere (center, radius) per child instead of a box; a missing child has radius -1."""
 
     sphere_0: wp.vec4
     sphere_1: wp.vec4
@@ -45,6 +45,6 @@ def sphere_volumes(record: Any) -> Volumes:
 
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found. units.box is not used."""
+    """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found. Units.box has no effect."""
     volumes = sphere_volumes(units.triangle_test.record)
     return make_binary_traversal(units, volumes, make_leaf(units, any_hit, accepts), any_hit)

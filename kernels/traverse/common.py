@@ -18,7 +18,7 @@ class Units(NamedTuple):
     spheres: bool = False  # True if primitives may be spheres.
     counters: bool = False  # True to count fetches and tests (kernels.traverse.counters).
     instances: bool = False  # True if the structure is placed by instances: Ray.first_prim is added to each prim_id.
-    resumes: bool = False  # True to resume behind a hit: of hits at t_min, only those with prim_id >= Ray.slot count; no spheres.
+    resumes: bool = False  # True to resume behind a hit: a hit at t_min counts only if prim_id >= Ray.slot. No spheres.
     lists: bool = False  # True to list all hits (kernels.hit_lists) instead of the best hit.
     stack: str = "local"  # Name in kernels.traverse.stack.PLACES: where the stack is, in the structures that support the choice.
 
@@ -69,12 +69,12 @@ def make_probe(units: Units) -> Any:
 
 def make_better(units: Units, accepts: Any = None) -> Any:
     """Make better(ray, surfaces, hit, prim_id, best), which returns the better of two hits.
-    accepts(surfaces, prim_id, u, v) -> bool may reject a hit, as cut-outs do; None accepts all hits. With units.lists, its form is
-    accepts(lists, ray, hit, best) -> Hit: it stores the hit in `lists`, the walk's argument `surfaces`, and returns the next `best`."""
+    accepts(surfaces, prim_id, u, v) -> bool may reject a hit, as cut-outs do; None accepts all hits. With units.lists, the signature is
+    accepts(lists, ray, hit, best) -> Hit. It stores the hit in `lists`, which is passed as `surfaces`, and returns the next `best`."""
 
     @wp.func
     def better(ray: Ray, surfaces: Any, hit: Hit, prim_id: int, best: Hit) -> Hit:
-        """Return the closer of `best` and a primitive's hit, if that is in [t_min, best.t]; at equal t, the hit with the lower prim_id."""
+        """Return the hit of primitive prim_id if t is in [t_min, best.t], else `best`; at equal t, the hit with the lower prim_id."""
         if hit.prim_id == NO_HIT or not (hit.t >= ray.t_min and hit.t <= best.t):
             return best
         if hit.t == best.t and prim_id > best.prim_id:
@@ -101,7 +101,7 @@ def sphere_hit(probe: Probe, surfaces: Surfaces, prim_id: int) -> Hit:
 
 
 def make_intersect(units: Units, accepts: Any = None) -> Any:
-    """Make intersect(probe, surfaces, primitive, best): test one primitive, return the better hit. accepts: as in make_better."""
+    """Make intersect(probe, surfaces, primitive, best), which tests one primitive and returns the better hit; accepts: see make_better."""
     record = units.triangle_test.record
     ray_triangle = units.triangle_test.intersect
     better = make_better(units, accepts)

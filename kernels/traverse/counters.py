@@ -43,7 +43,7 @@ class Recorder:
 
 @wp.func
 def write_fetch(recorder: Recorder, slot: int, counts: Counts, address: wp.int64, size: int):
-    """Append a fetch to the trace of a slot, which belongs to one ray. `counts` does not yet include this fetch."""
+    """Append a fetch of `size` bytes at `address` to the trace of a slot (one ray). `counts` does not yet include this fetch."""
     if recorder.first.shape[0] > 0:
         before = recorder.counts[slot]  # counts of the structures that the ray has left
         place = recorder.first[slot] + wp.int64(before.nodes + before.primitives + counts.nodes + counts.primitives)
@@ -52,7 +52,7 @@ def write_fetch(recorder: Recorder, slot: int, counts: Counts, address: wp.int64
 
 @wp.func
 def add_counts(recorder: Recorder, slot: int, counts: Counts):
-    """Add `counts` to the recorder's entry `slot`; of `stack`, store the maximum."""
+    """Add `counts` to the recorder's counts of a slot; the entry `stack` becomes the maximum of both."""
     total = recorder.counts[slot]
     total.probes += counts.probes
     total.nodes += counts.nodes
@@ -69,7 +69,7 @@ def add_counts(recorder: Recorder, slot: int, counts: Counts):
 
 
 def make_counters(units: Units, node_bytes: int) -> Any:
-    """Make fetch_node, fetch_primitive and push, which each return the new counts, and finish. node_bytes: size of a node."""
+    """Make fetch_node, fetch_primitive, push and finish. The first three return the new counts. node_bytes: size of a node."""
     on = units.counters
     node_size = int(node_bytes)
     primitive_size = size_of(units.triangle_test.record)

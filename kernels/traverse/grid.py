@@ -1,7 +1,7 @@
 """Traversal of the uniform grid: a step from cell to cell along the ray (3D-DDA).
 Amanatides and Woo 1987, "A Fast Voxel Traversal Algorithm for Ray Tracing", changed to lose no ray. The distance to each plane is computed
 from the plane's coordinate, so that errors do not accumulate. A ray that leaves a cell near an edge or corner, within rounding, also visits
-the other cells at the edge or corner. The walk visits each cell that the conservative box test would enter once, and no other cell."""
+the other cells at the edge or corner. The walk visits exactly the cells that the conservative box test would enter, once each."""
 
 from functools import cache
 from typing import Any
@@ -26,7 +26,7 @@ class GridCell:
 
 @wp.struct
 class GridLayout:
-    """A grid of cells from lo to hi with n cells along each axis. Cells have the edges `size`, except for rounding."""
+    """A grid of cells from lo to hi with n cells along each axis. Except for rounding, each cell has the edges `size`."""
 
     lo: wp.vec3
     hi: wp.vec3
@@ -42,7 +42,7 @@ def grid_plane(layout: GridLayout, axis: int, i: int) -> float:
 
 @wp.func
 def guessed_slab(layout: GridLayout, axis: int, x: float) -> int:
-    """Return the approximate index of the slab that contains x, where an exact search can begin. A slab is a layer of cells."""
+    """Return the approximate index of the slab (layer of cells) that contains x. An exact search can begin there."""
     guess = (x - layout.lo[axis]) / layout.size[axis]
     return int(wp.where(guess > 0.0, wp.min(guess, float(layout.n[axis] - 1)), 0.0))
 
@@ -67,7 +67,7 @@ def exit_distance(layout: GridLayout, ray: BoxRay, axis: int, cell: int) -> floa
 
 @wp.func
 def first_slab(layout: GridLayout, ray: BoxRay, direction: wp.vec3, axis: int, t: float) -> int:
-    """Return the first slab along the ray that the ray may not have left at t. For a parallel ray: the lowest slab with the origin."""
+    """Return the first slab along the ray that the ray may not have left at t. For a ray parallel to the slabs: slab_of its origin."""
     last = layout.n[axis] - 1
     if parallel(ray, axis):
         return slab_of(layout, axis, ray.origin[axis])
@@ -83,7 +83,7 @@ def first_slab(layout: GridLayout, ray: BoxRay, direction: wp.vec3, axis: int, t
 
 @wp.func
 def slabs_left(layout: GridLayout, ray: BoxRay, axis: int, slab: int, t_exit: float, limit: float) -> int:
-    """Count the slabs behind `slab` that the ray enters at t <= limit. t_exit: t where the ray leaves `slab`."""
+    """Return the number of slabs behind `slab` that the ray enters at t <= limit. t_exit: t where the ray leaves `slab`."""
     n = int(0)
     step = wp.where(ray.inv_dir[axis] < 0.0, -1, 1)
     while t_exit <= limit and slab + step >= 0 and slab + step < layout.n[axis]:
@@ -107,7 +107,7 @@ def make_struct(record: Any) -> Any:
         extent: float  # Largest extent of a triangle's box.
         mailbox: int  # 1: use a mailbox (kernels.traverse.leaf); 0: do not.
         cells: wp.array(dtype=GridCell)  # Cell (x, y, z) has the index x + n[0] * (y + n[1] * z).
-        references: wp.array(dtype=wp.int32)  # Indices of primitives.
+        references: wp.array(dtype=wp.int32)  # Indices into `primitives`.
         primitives: wp.array(dtype=record)
         recorder: Recorder
 
@@ -125,7 +125,7 @@ def layout_of(accel: Any) -> GridLayout:
 
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found. units.box is not used."""
+    """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found. Units.box has no effect."""
     probe_of = make_probe(units)
     visit_leaf = make_mailbox_leaf(units, any_hit, accepts)
     fetch_node, _, _, finish = make_counters(units, size_of(GridCell))

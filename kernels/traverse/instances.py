@@ -1,7 +1,7 @@
 """Traversal of two levels: a binary BVH (TLAS) over placed structures (BLAS), each in its own space.
 The lower level is any traversal of kernels.traverse or kernels.wide. It gets the ray in its structure's space, so that a closed mesh stays
-watertight when it is placed. The direction is not normalised, so t is equal in both spaces. The upper level must not miss a structure that
-contains a hit: see `enter`."""
+watertight when it is placed. The direction is not normalised, so t is equal in both spaces except for a power of two (local_scale). The
+upper level must not miss a structure that contains a hit: see `enter`."""
 
 from functools import cache
 from typing import Any
@@ -32,7 +32,7 @@ def make_struct(bottom: Any) -> Any:
 
     @wp.struct
     class Instances:
-        nodes: wp.array(dtype=Bvh2Node)  # One tree per world; leaves are ranges of placements.
+        nodes: wp.array(dtype=Bvh2Node)  # One tree per world (separate scene); leaves are ranges of placements.
         placements: wp.array(dtype=Placement)
         bottoms: wp.array(dtype=bottom)
         bases: wp.array(dtype=wp.int64)  # Address at which each structure begins in traces (Recorder.base).
@@ -47,16 +47,16 @@ class WidenedRay:
     """A ray set up for `enter`."""
 
     box: BoxRay
-    slack: float
+    slack: float  # As Instances.slack.
 
 
 @wp.func
 def enter(ray: BoxRay, lo: wp.vec3, hi: wp.vec3, slack: float, t_max: float) -> float:
     """Return the result of `ray_aabb` for the box widened by slack times the distance to the box's farthest corner.
 
-    In the structure's space, the ray is rounded to float32: its point at t is off by u (|o| + t |d|) per axis. A hit may be 17 u t |d|
-    outside its primitive's box (3 for the slabs, 14 for FAR_PAD). In world space, with the map A from the structure to the world, that is
-    at most u (2 + 17) |A| |A^-1| times the distance. The builder's box contains the part u |A| times the coordinates
+    In the structure's space, origin o and direction d are rounded to float32: a point is off by u (|o| + t |d|) per axis. A hit may
+    be 17 u t |d| outside its primitive's box (3 for the slabs, 14 for FAR_PAD). In world space, with the map A from the structure to the
+    world, that is at most u (2 + 17) |A| |A^-1| times the distance. The builder's box contains the part u |A| times the coordinates
     (wrt.accel.instances). The rounding of this test adds 4.
 
     slack = 32 u max |A| |A^-1| covers these errors; |A| is the largest sum of absolute values in a row. So the returned t is never greater
@@ -73,7 +73,7 @@ def enter(ray: BoxRay, lo: wp.vec3, hi: wp.vec3, slack: float, t_max: float) -> 
 
 @wp.func
 def power_of_two(longest: wp.float64) -> wp.float64:
-    """Return the power of two that scales a number > 0 to between 2^-64 and 2^64, the range for a direction's longest component."""
+    """Return a power of two. Its product with `longest` (> 0) is between 2^-64 and 2^64, the range for a direction's longest component."""
     scale = wp.float64(1.0)
     x = longest
     steps = int(0)
@@ -90,7 +90,7 @@ def power_of_two(longest: wp.float64) -> wp.float64:
 
 @wp.func
 def local_scale(place: Placement, direction: wp.vec3) -> wp.float64:
-    """Return the power of two by which `local_ray` scales the direction; t in the structure's space times it is t in world space."""
+    """Return the power of two by which `local_ray` scales the direction. Multiplied by it, a local t becomes t in world space."""
     d = wp.vec4d(wp.float64(direction[0]), wp.float64(direction[1]), wp.float64(direction[2]), wp.float64(0.0))
     return power_of_two(
         wp.max(wp.max(wp.abs(wp.dot(place.local_x, d)), wp.abs(wp.dot(place.local_y, d))), wp.abs(wp.dot(place.local_z, d)))
@@ -99,7 +99,7 @@ def local_scale(place: Placement, direction: wp.vec3) -> wp.float64:
 
 @wp.func
 def local_ray(place: Placement, ray: Ray, scale: wp.float64) -> Ray:
-    """Transform a ray to the structure's space, in float64, rounded once; scale: `local_scale`."""
+    """Transform a ray to the structure's space, in float64, rounded once; scale: the result of `local_scale`."""
     o = wp.vec4d(wp.float64(ray.origin[0]), wp.float64(ray.origin[1]), wp.float64(ray.origin[2]), wp.float64(1.0))
     d = wp.vec4d(wp.float64(ray.direction[0]), wp.float64(ray.direction[1]), wp.float64(ray.direction[2]), wp.float64(0.0))
     out = Ray()
@@ -120,7 +120,7 @@ def make_placed_leaf(units: Units, any_hit: bool, bottom: Any, struct: Any) -> A
 
     @wp.func
     def visit(accel: struct, surfaces: Surfaces, ray: Ray, index: int, best: Hit) -> Hit:
-        """Return the closer of `best` and the hit in one placed structure; at equal t, the hit with the lower prim_id."""
+        """Return the closer of `best` and the hit in placement `index`; at equal t, the hit with the lower prim_id."""
         place = accel.placements[index]
         structure = accel.bottoms[place.bottom]
         if wp.static(units.counters):
@@ -151,7 +151,7 @@ def make_placed_leaf(units: Units, any_hit: bool, bottom: Any, struct: Any) -> A
 
 
 def make_traversal(units: Units, any_hit: bool, bottom: Any, bottom_struct: Any) -> Any:
-    """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found. It walks the world whose root is
+    """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found. The root of the upper level is
     node ray.first_prim. bottom: the lower level's traversal, made with the same units."""
     struct = make_struct(bottom_struct)
 

@@ -31,8 +31,8 @@ CLAMP_GRAZING = wp.constant(2.0**-20)
 
 @wp.struct
 class KdNode:
-    """A node of 8 bytes. In an inner node, split is the plane's coordinate and word = 4 * left + axis; the right child is node left + 1.
-    In a leaf, split is the number of primitives and word = 4 * first + LEAF, for the first primitive's index."""
+    """A node of 8 bytes. In an inner node, `split` is the plane's coordinate, word = 4 * left + axis, and the right child is node left + 1.
+    In a leaf, `split` is the number of primitives, and word = 4 * first + LEAF, where `first` is the first primitive's index."""
 
     split: float
     word: int
@@ -59,8 +59,8 @@ def make_struct(record: Any) -> Any:
 def clamp_slack(direction: wp.vec3, inv_dir: wp.vec3, reach: float) -> float:
     """Return a bound on the change of t by clamping to a triangle's box (`within_bounds`); reach: largest extent of a clipped triangle.
     The triangle unit may report a hit for a ray that misses the triangle by 16 u of its extent. After clamping t on a grazing ray, the hit
-    may be far from the triangle, outside the leaves that list it. The bound is 16 u extent / |d|, for the smallest component |d| that is
-    not 0. It is at most the length of the ray's part in the box."""
+    may be far from the triangle, outside the leaves that list it. The bound is 16 u reach / |d|, for the direction's smallest component d
+    that is not 0. It is at most the length of the ray's part in the box."""
     steepest = float(0.0)
     for axis in range(3):
         inverse = wp.abs(inv_dir[axis])
@@ -71,12 +71,12 @@ def clamp_slack(direction: wp.vec3, inv_dir: wp.vec3, reach: float) -> float:
 
 @wp.func
 def limit_of(t: float, slack: float) -> float:
-    """Return the distance up to which a cell may begin that contains a hit with a smaller or equal t."""
+    """Return an upper bound of the t where a ray enters a cell that contains a hit at or before t; slack: clamp_slack."""
     return t * CLAMP_RELATIVE + slack
 
 
 def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
-    """Make walk(accel, surfaces, probe, part, slack, counts) -> (best Hit, Counts); part: (t_enter, t_exit) in the root's cell."""
+    """Make walk(accel, surfaces, probe, part, slack, counts) -> (best Hit, Counts). part: (t_enter, t_exit) of the root's cell."""
     visit_leaf = make_leaf(units, any_hit, accepts)
     fetch_node, _, push, _ = make_counters(units, size_of(KdNode))
 
@@ -138,7 +138,7 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
 
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found."""
+    """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found; accepts: common.make_better."""
     probe_of = make_probe(units)
     ray_aabb = units.box_test
     walk = make_walk(units, any_hit, accepts)

@@ -16,7 +16,7 @@ Mailbox = wp.types.vector(MAILBOX_SIZE, wp.int32)  # 1 + index of a primitive; 0
 
 
 def make_leaf(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """Make visit_leaf(accel, surfaces, probe, first, count, best, counts) -> (best Hit, Counts); accepts: as in common.make_better."""
+    """Make visit_leaf(accel, surfaces, probe, first, count, best, counts) -> (best Hit, Counts); accepts: see common.make_better."""
     intersect = make_intersect(units, accepts)
     _, fetch_primitive, _, _ = make_counters(units, 0)
 
@@ -35,7 +35,7 @@ def make_leaf(units: Units, any_hit: bool, accepts: Any = None) -> Any:
 
 
 def make_mailbox_leaf(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """Make visit_leaf(accel, surfaces, probe, leaf, mailbox, best, counts) -> (Mailbox, best Hit, Counts), for leaves of references."""
+    """Make visit_leaf(accel, surfaces, probe, leaf, mailbox, best, counts) -> (Mailbox, best Hit, Counts), for leaves of indices."""
     intersect = make_intersect(units, accepts)
     _, fetch_primitive, _, _ = make_counters(units, 0)
 

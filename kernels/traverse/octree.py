@@ -30,7 +30,8 @@ class OctreeNode:
 
 @wp.struct
 class OctreeLayout:
-    """The root's cell lo .. hi, and the finest cells: cubes of edge `size`, 2^levels along each axis from lo on, cut off at hi."""
+    """The root's cell lo .. hi, and the finest cells: cubes of edge `size`, 2^levels along each axis. They begin at lo and are cut off at
+    hi."""
 
     lo: wp.vec3
     hi: wp.vec3
@@ -40,14 +41,14 @@ class OctreeLayout:
 
 @wp.func
 def octree_planes(layout: OctreeLayout, corner: wp.vec3i) -> wp.vec3:
-    """Return the coordinates of a corner that is given in finest cells. Monotone, and inside the root's cell.
+    """Return the coordinates of a corner that is given in units of the finest cells. Monotone, and inside the root's cell.
     Builder and traversal share this function."""
     return wp.min(layout.lo + layout.size * wp.vec3(float(corner[0]), float(corner[1]), float(corner[2])), layout.hi)
 
 
 @wp.func
 def octant_corner(octant: int, half: int) -> wp.vec3i:
-    """Return an octant's lowest corner minus its cell's lowest corner; half: half the cell's edge. Both in finest cells."""
+    """Return an octant's lowest corner minus its cell's lowest corner. half: half the cell's edge. Units are the finest cells."""
     return half * wp.vec3i(octant & 1, (octant >> 1) & 1, (octant >> 2) & 1)
 
 
@@ -75,7 +76,7 @@ def earliest(t: wp.vec3, end: float) -> float:
 
 @wp.func
 def in_order(mask: int, flip: int) -> int:
-    """Permute an 8-bit mask: bit k of the result is bit k ^ flip."""
+    """Permute the bits of an 8-bit mask: bit k of the result is bit k ^ flip of `mask`."""
     out = mask
     out = wp.where((flip & 1) != 0, ((out & 0x55) << 1) | ((out >> 1) & 0x55), out)
     out = wp.where((flip & 2) != 0, ((out & 0x33) << 2) | ((out >> 2) & 0x33), out)
@@ -84,10 +85,10 @@ def in_order(mask: int, flip: int) -> int:
 
 @wp.func
 def octants_met(occupied: int, enter: float, middle: wp.vec3, leave: float) -> int:
-    """Return the mask of the occupied octants that the ray meets in a cell, in which it is from `enter` to `leave` (widened).
-    Octants are in the order of the ray: the bits of value 1, 2, 4 in an index are 0 for the nearer half in x, y, z. Argument `middle` has
-    the distances to the planes between the halves. The ray meets an octant unless the octant's interval on one axis begins after that on
-    another axis ends. The result equals box tests of all octants."""
+    """Return the mask of the occupied octants of a cell that the ray meets. It is in the cell from t = `enter` to `leave`, both widened.
+    Octants are in the order of the ray: the bits of value 1, 2, 4 in an index are 0 for the nearer half in x, y, z. Argument `middle` has t
+    at the planes between the halves. Each axis gives an octant an interval of t. The ray meets the octant unless one interval begins after
+    another ends. The result equals box tests of all octants."""
     met = occupied
     x = later(middle[0])
     y = later(middle[1])
@@ -120,7 +121,7 @@ def make_struct(record: Any) -> Any:
         extent: float  # Largest extent of a triangle's box.
         mailbox: int  # 1: use a mailbox (kernels.traverse.leaf); 0: do not.
         nodes: wp.array(dtype=OctreeNode)
-        references: wp.array(dtype=wp.int32)  # Indices of primitives.
+        references: wp.array(dtype=wp.int32)  # Indices into `primitives`.
         primitives: wp.array(dtype=record)
         recorder: Recorder
 
@@ -158,14 +159,14 @@ def octree_ray(accel: Any, box: BoxRay, t_min: float) -> OctreeRay:
 
 @wp.func
 def distance_to_cell(ray: OctreeRay, corner: wp.vec3i, size: int) -> float:
-    """Return t, at least ray.begin, where the ray enters the cell with this lowest corner and the edge `size`, in finest cells."""
+    """Return t, at least ray.begin, where the ray enters a cell. Its lowest corner and edge `size` are in units of the finest cells."""
     return latest(distances(ray.layout, ray.box, corner + size * ray.backwards), ray.begin)
 
 
 @wp.func
 def enter_octants(ray: OctreeRay, occupied: int, corner: wp.vec3i, size: int, enter: float, limit: float) -> int:
     """Return the mask, in the order of the ray, of the occupied octants that the ray meets at t <= limit in a cell.
-    The cell has the lowest corner `corner` and the edge `size`, in finest cells. The ray enters the cell at t = enter."""
+    The cell has the lowest corner `corner` and the edge `size`, in units of the finest cells. The ray enters the cell at t = enter."""
     forwards = wp.vec3i(1, 1, 1) - ray.backwards
     leave = later(earliest(distances(ray.layout, ray.box, corner + size * forwards), float(wp.inf)))
     half = size >> 1
@@ -174,7 +175,7 @@ def enter_octants(ray: OctreeRay, occupied: int, corner: wp.vec3i, size: int, en
 
 
 def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
-    """Make walk(accel, surfaces, probe, set_up, enter, counts) -> (best Hit, Counts); enter: t where the ray enters the root's cell."""
+    """Make walk(accel, surfaces, probe, set_up, enter, counts) -> (best Hit, Counts); set_up: OctreeRay; enter: t at the root's cell."""
     visit_leaf = make_mailbox_leaf(units, any_hit, accepts)
     fetch_node, _, push, _ = make_counters(units, size_of(OctreeNode))
 
@@ -241,7 +242,7 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
 
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
-    """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found. units.box is not used."""
+    """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found. Units.box has no effect."""
     probe_of = make_probe(units)
     walk = make_walk(units, any_hit, accepts)
     _, _, _, finish = make_counters(units, 0)

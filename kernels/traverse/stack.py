@@ -34,14 +34,14 @@ def make_uninitialized(length: int, dtype: Any) -> Any:
 
 @cache
 def make_stack(place: str, size: int, dtype: Any, entry_bytes: int) -> Stack:
-    """Make a stack of `size` values of a type. entry_bytes: size of an entry, summed over the parallel stacks of a walk. All stacks of the
-    same place and type share one block of shared memory."""
+    """Make a stack of `size` values of type `dtype`. entry_bytes: bytes per entry of all parallel stacks of a walk together. All stacks of
+    the same place and type share one block of shared memory."""
     vector = wp.types.vector(size, dtype)
     short = SHARED // entry_bytes if place == "shared" else 0
     at = f"((wp::{dtype.__name__}*)shared)[i * WP_TILE_BLOCK_DIM]"
 
     def on_cuda(text: str, otherwise: str) -> str:
-        """Return C++ that is `text` on CUDA, and `otherwise` on the CPU or if the place is "local"."""
+        """Return C++ that is `text` on CUDA with the place "shared", and `otherwise` elsewhere."""
         return f"\n#if defined(__CUDA_ARCH__)\n    {text}\n#else\n    {otherwise}\n#endif\n" if short else otherwise
 
     # In shared memory, the entries i of all threads are adjacent, so that the threads of a warp have no bank conflicts.
@@ -60,7 +60,7 @@ def make_stack(place: str, size: int, dtype: Any, entry_bytes: int) -> Stack:
 
 @wp.func
 def key_of(t: float, reference: int) -> wp.uint64:
-    """Pack t and a reference into a stack entry. Keys sort by t, which must be at least 0 and not -0."""
+    """Pack t and a reference into a stack entry. Entries sort by t, which must be at least 0 and not -0."""
     return (wp.uint64(wp.cast(t, wp.uint32)) << wp.uint64(32)) | wp.uint64(wp.cast(reference, wp.uint32))
 
 

@@ -42,8 +42,8 @@ def sphere_ray(ray: Ray) -> SphereRay:
 @wp.func
 def ray_bounding_sphere(ray: SphereRay, sphere: wp.vec4, t_max: float) -> float:
     """Return t where the segment [t_min, t_max] enters the sphere: t_min for an origin inside, inf for a miss or an empty sphere.
-    Conservative: the radius grows by SPHERE_PAD (distance + radius), which bounds all rounding errors. The domain is the same as for
-    `box.ray_aabb`. A ray with NaN may enter."""
+    Conservative: the radius grows by SPHERE_PAD times (distance of origin and center + radius), which bounds all rounding errors. The
+    domain is the same as for `box.ray_aabb`. A ray with NaN may enter."""
     x = ray.origin[0] - sphere[0]
     y = ray.origin[1] - sphere[1]
     z = ray.origin[2] - sphere[2]

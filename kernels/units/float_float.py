@@ -14,7 +14,7 @@ import warp as wp
 #endif
 """)
 def product_error(a: float, b: float, product: float) -> float:
-    """Return the rounding error a b - product, exactly; product: a b rounded to float32."""
+    """Return the exact rounding error a b - product, where `product` is a b rounded to float32."""
 
 
 @wp.func

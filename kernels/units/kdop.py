@@ -24,7 +24,7 @@ class KdopRay:
 
     box: BoxRay
     origin: wp.vec4  # Projections of the ray's origin onto the four diagonals.
-    inv_dir: wp.vec4  # 1 / projections of the direction.
+    inv_dir: wp.vec4  # Reciprocals of the direction's projections onto the four diagonals.
     pad: float  # Amount by which the diagonal planes move outwards, in units of the projections.
 
 
@@ -50,8 +50,8 @@ def kdop_ray(ray: Ray, box: BoxRay, middle: wp.vec3) -> KdopRay:
 @wp.func
 def ray_kdop(ray: KdopRay, lo: wp.vec3, hi: wp.vec3, cut_lo: wp.vec4, cut_hi: wp.vec4, t_max: float) -> float:
     """Return t where the segment [t_min, t_max] enters the box lo .. hi; inf if it misses the box, or if its line misses the 14-DOP.
-    Conservative, as `ray_aabb` is. The diagonal slabs may reject the line, but do not change the distance. For a hit's t is clamped to the
-    triangle's box, and on a grazing ray it may then lie in front of the diagonal slabs."""
+    Conservative, as `ray_aabb` is. The diagonal slabs may reject the line, but do not change the distance. The reason: a hit's t is clamped
+    to the triangle's box, so on a grazing ray it may lie in front of the diagonal slabs."""
     interval = slab_interval(ray.box, lo, hi)
     near = float(interval[0])
     far = interval[1] * FAR_PAD

@@ -1,7 +1,7 @@
 """The sphere unit: the intersection of a ray with a sphere that is a primitive.
-The discriminant is computed from the distance between center and line. One root would suffer from cancellation; it is computed from the
-product of both roots. Source: Haines, Guenther and Akenine-Moeller 2019, "Precision Improvements for Ray/Sphere Intersection", Ray Tracing
-Gems, chapter 7. In float64, because the distance to a large ground sphere is a small difference of two numbers near its radius."""
+The discriminant is computed from the distance between center and line. One root would suffer from cancellation: this root is computed from
+the product of both roots. Source: Haines, Guenther and Akenine-Moeller 2019, "Precision Improvements for Ray/Sphere Intersection", Ray
+Tracing Gems, chapter 7. In float64, because the distance to a large ground sphere is a small difference of two numbers near its radius."""
 
 import warp as wp
 
@@ -13,7 +13,7 @@ from wrt.kernels.units.triangle import clamped, padded_interval
 @wp.func
 def ray_sphere(box: BoxRay, ray: Ray, center: wp.vec3, radius: float) -> Hit:
     """Return the first of the two intersections with t >= ray.t_min; prim_id is 0 on a hit, else NO_HIT. u = v = 0.
-    Center and ray are in the same space. t is clamped to the interval of the sphere's padded box."""
+    Center and ray are in the same space. The result's t is clamped to the interval in which the ray is in the sphere's padded box."""
     hit = Hit()
     hit.prim_id = NO_HIT
     hit.t = float(wp.inf)

@@ -76,7 +76,7 @@ def sheared(v: wp.vec3, shear_x: float, shear_y: float) -> wp.vec3:
 
 @wp.func
 def to_ray_space(v: wp.vec3, shear: TriangleRay) -> wp.vec3:
-    """Transform a corner, relative to the ray's origin, to the space in which the ray is the z axis: reorder axes, then shear."""
+    """Reorder the axes of a corner, relative to the ray's origin, and shear it: into the space in which the ray is the z axis."""
     turned = wp.vec3(component(v, shear.kx), component(v, shear.ky), component(v, shear.kz))
     return sheared(turned, shear.shear_x, shear.shear_y)
 
@@ -89,7 +89,7 @@ def edge_areas(a: Any, b: Any, c: Any):
 
 @wp.func
 def outside(areas: Any) -> bool:
-    """Test whether two of the areas have opposite signs, which means that the z axis misses the triangle. NaN counts as no sign."""
+    """Test whether two of the areas have opposite signs, which means that the z axis misses the triangle. NaN has no sign here."""
     zero = areas.dtype(0.0)
     return ((areas[0] < zero or areas[1] < zero or areas[2] < zero)
             and (areas[0] > zero or areas[1] > zero or areas[2] > zero))
@@ -153,7 +153,7 @@ def crossing(a: wp.vec3, b: wp.vec3, c: wp.vec3, shear_z: float) -> Hit:
 
 @noinline
 def hard_crossing(a: wp.vec3, b: wp.vec3, c: wp.vec3, shear_z: float) -> Hit:
-    """Call `crossing`, without inlining: so a GPU traversal has its float64 code, which takes many registers, in one function."""
+    """Call `crossing`, without inlining. So the float64 code, which takes many registers, occurs only once in a GPU traversal."""
     return crossing(a, b, c, shear_z)
 
 
@@ -327,7 +327,7 @@ def moeller_trumbore(box: BoxRay, shear: TriangleRay, ray: Ray, triangle: Primit
 
 @wp.func
 def on_plane(plane: wp.vec4, point: wp.vec3) -> float:
-    """Return the value of the plane's equation at a point."""
+    """Return the value of the plane's equation, normal . point + offset, at a point."""
     return plane[0] * point[0] + plane[1] * point[1] + plane[2] * point[2] + plane[3]
 
 
@@ -340,8 +340,8 @@ def along(plane: wp.vec4, direction: wp.vec3) -> float:
 @wp.func
 def plane_equation(box: BoxRay, shear: TriangleRay, ray: Ray, triangle: PlanePrimitive) -> Hit:
     """Solve the equation of the triangle's plane for t, then compute u and v of the point at t.
-    The record's plane `c` is the triangle's plane; `a` and `b` evaluate to u and v. The point is inside if u, v >= 0 and u + v <= 1. A ray
-    parallel to the plane (divisor 0) misses."""
+    The record's plane `c` is the triangle's plane; the values of planes `a` and `b` at the point are u and v. The point is inside if u, v
+    >= 0 and u + v <= 1. A ray parallel to the plane (divisor 0) misses."""
     slope = along(triangle.c, ray.direction)
     if slope == 0.0:
         return no_triangle()
@@ -379,7 +379,7 @@ class TriangleTest(NamedTuple):
     intersect: Any  # Function (BoxRay, TriangleRay, Ray, record) -> Hit.
     record: Any  # Primitive or PlanePrimitive.
     layout: str  # Name in wrt.accel.triangle_data.LAYOUTS of the function that converts corners to records.
-    uses_shear: bool = False  # True if the test reads the TriangleRay.
+    uses_shear: bool = False  # True if `intersect` reads the TriangleRay.
 
 
 RAY_TRIANGLE = {

@@ -2,8 +2,8 @@
 
 Sixteen rays with similar directions walk the tree as a packet (Wald et al. 2001, "Interactive Rendering with Coherent Ray Tracing"). At a
 node, a beam around all rays is tested first. The children that the beam enters are then tested against all sixteen rays at once. All other
-rays are interleaved: one thread has many rays in progress, and each ray takes one step in turn. So the core always has work, while single
-rays wait for memory or for their last result."""
+rays are interleaved: one thread has many rays in progress, and each ray takes one step in turn. So the core has work, while some rays
+wait for memory or for the result of an instruction."""
 
 from functools import cache
 from typing import Any
@@ -72,13 +72,13 @@ MAX_FAILED, PAUSE = 4, 32
 
 @wp.func
 def vector(packet: wp.array(dtype=wp.float32), first: int) -> wp.vec3:
-    """Return three consecutive fields of one ray as a vec3; first: index in `packet` of the ray's first field."""
+    """Return three consecutive fields of one ray as a vec3; first: index in `packet` of the ray's entry in the first of these fields."""
     return wp.vec3(number(packet, first), number(packet, first + LANES), number(packet, first + 2 * LANES))
 
 
 @wp.func
 def probe_at(packet: wp.array(dtype=wp.float32), ray: int) -> Probe:
-    """Return the sphere unit's input for one ray of a packet; ray: the ray's column in `packet`."""
+    """Return the sphere unit's input for one ray of a packet; ray: index of the ray's column in `packet`."""
     probe = Probe()
     probe.ray.origin = vector(packet, ray + wp.static(FIELD["origin_x"]))
     probe.ray.direction = vector(packet, ray + wp.static(FIELD["direction_x"]))
@@ -109,7 +109,7 @@ def store_best(packet: wp.array(dtype=wp.float32), ray: int, best: Hit):
 
 
 def make_sphere_test(units: Units, any_hit: bool, accepts: Any) -> Any:
-    """Return test_spheres, which tests the spheres of a row that are in the mask against one ray.
+    """Return test_spheres, which tests the spheres in the mask of a row against one ray (`ray`: index of its column).
     It returns whether the ray is finished: for any-hit rays, whether the ray hits a sphere; else False."""
     better = make_better(units, accepts)
 
@@ -132,11 +132,11 @@ def make_sphere_test(units: Units, any_hit: bool, accepts: Any) -> Any:
 
 
 def make_accepted(any_hit: bool, accepts: Any, ray_triangles: Any) -> Any:
-    """Return nearest_accepted: the triangle test of make_row_test for triangles whose hits `accepts` may reject (cut-outs)."""
+    """Return nearest_accepted, which make_row_test uses for triangles whose hits `accepts` may reject (cut-outs)."""
 
     @wp.func
     def nearest_accepted(accel: WideBvh, first: int, mask: int, surfaces: Surfaces, scratch: Scratch, ray: int) -> bool:
-        """Find the nearest hit in the mask; if `accepts` rejects it, drop the triangle from the mask and repeat."""
+        """Find the nearest hit on a triangle in the mask. If `accepts` rejects the hit, drop the triangle from the mask, and repeat."""
         before = best_at(scratch.packets, ray)
         while True:
             lane = ray_triangles(accel, first, mask, scratch, ray)
@@ -178,7 +178,7 @@ def make_row_test(units: Units, any_hit: bool, accepts: Any, inlined: bool) -> A
 
 
 def make_packet_leaf(units: Units, any_hit: bool, accepts: Any) -> Any:
-    """Return test_leaf, which tests a leaf against the packet's rays in the mask: all at once, or one by one (FEW_RAYS)."""
+    """Return test_leaf, which tests a leaf against the packet's rays in its argument `mask`: all at once, or one by one (FEW_RAYS)."""
     test_row = make_row_test(units, any_hit, accepts, False)
     triangles = make_triangles(any_hit)
 
@@ -209,12 +209,12 @@ def make_packet_leaf(units: Units, any_hit: bool, accepts: Any) -> Any:
 
 
 def make_packet_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
-    """Return walk, which takes a packet that has a beam through the tree."""
+    """Return walk, which traces a packet that has a beam through the tree."""
     children, test_leaf = make_children(any_hit), make_packet_leaf(units, any_hit, accepts)
 
     @wp.func
     def walk(accel: WideBvh, surfaces: Surfaces, scratch: Scratch, base: int, active: int) -> bool:
-        """Return whether the packet succeeded: on average, at least MIN_VISITS of its rays visited each node."""
+        """Trace the rays in the mask `active`. Return whether on average at least MIN_VISITS of them visited each node."""
         nodes = int(0)
         visits = int(0)
         size = int(0)
@@ -240,7 +240,7 @@ def make_packet_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
 
 
 def make_interleaved(units: Units, any_hit: bool, accepts: Any) -> Any:
-    """Return interleaved, which takes rays of PACKETS packets through the tree, one step of each ray in turn.
+    """Return interleaved, which traces rays of PACKETS packets through the tree, one step of each ray in turn.
 
     The mask `waiting` has a bit for each ray to trace: bit LANES * packet + lane."""
     test_row = make_row_test(units, any_hit, accepts, True)  # Inlining makes closest hits 1.02 times, any hits 1.05 times as fast.
@@ -248,13 +248,13 @@ def make_interleaved(units: Units, any_hit: bool, accepts: Any) -> Any:
 
     @wp.func
     def start(accel: WideBvh, scratch: Scratch, slot: int, ray: int):
-        """Put a ray into a slot. Ray is LANES * packet + lane. It enters a child of the root (rays_meeting_root), so a next node exists."""
+        """Put ray `ray` = LANES * packet + lane into a slot. It enters a child of the root (rays_meeting_root), so a next node exists."""
         column = ray / LANES * PACKET_SIZE + ray % LANES
         prefetch_next(accel, begin(accel, scratch, slot, column))
 
     @wp.func
     def turn(accel: WideBvh, surfaces: Surfaces, scratch: Scratch, slot: int) -> bool:
-        """Visit a slot's node or leaf, and choose the next one; return False if the ray is finished."""
+        """Visit the node or leaf of a slot's ray, and choose the next one. Return False if the ray is finished."""
         words = slot * SLOT_SIZE
         reference = slot_at(scratch.slots, words + wp.static(SLOT["next"]))
         if reference < 0:
@@ -348,7 +348,7 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
 
 
 class BatchTraversal(WideTraversal):
-    """The traversal of plain nodes with 8 children (bvh8), which also has a kernel for many rays."""
+    """The traversal for plain nodes (not compressed) with 8 children (bvh8). It also has a kernel for many rays."""
 
     stream_block = PACKETS * LANES
     stream_sizes = PACKETS * PACKET_SIZE, STACK_WORDS * SLOTS, SLOT_SIZE * SLOTS, REPORT_SIZE  # Lengths of the arrays in Scratch.

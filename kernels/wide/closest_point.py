@@ -1,11 +1,11 @@
 """Closest points on a mesh: a walk over a wide BVH in the order of distance from a point.
 
-A triangle without area has NaN in the first corner of its record, so that no ray hits it. But a point has a distance to it, as to a segment
-or a point: so the corners are read from the mesh.
+A triangle without area has NaN in the first corner of its record, so that no ray hits it. But points have a distance to it: it is a segment
+or a point. So its corners are read from the mesh.
 
 The distance to a triangle is computed in float64 (Ericson 2005, "Real-Time Collision Detection", section 5.1). It is clamped to at least
-the distance to the triangle's padded box. Rounding is monotone, so no box above a triangle is farther than the triangle. Therefore the
-nearest triangle does not depend on the tree."""
+the distance to the triangle's padded box. Rounding is monotone, so no box of a node above a triangle is farther than the triangle.
+Therefore the nearest triangle does not depend on the tree."""
 
 from functools import cache
 from typing import Any
@@ -39,7 +39,7 @@ class Nearest:
 
 @wp.struct
 class PointArrays:
-    """Closest points, one entry per query point. Without a triangle, distance is inf, prim_id -1, and all else 0."""
+    """Closest points, one entry per query point. If no triangle was found, distance is inf, prim_id is -1, and all other entries are 0."""
 
     distance: wp.array(dtype=wp.float32)
     point: wp.array(dtype=wp.vec3)
@@ -71,7 +71,7 @@ def before(a: wp.vec3d, b: wp.vec3d) -> bool:
 
 @wp.func
 def along_edge(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d) -> wp.float64:
-    """Return the parameter of the edge's point closest to p: 0 at a, 1 at b. For a = b it is 1, because wp.min ignores NaN."""
+    """Return the parameter of the point closest to p on the edge a b: 0 at a, 1 at b. For a = b it is 1, because wp.min ignores NaN."""
     edge = b - a
     t = wp.dot(p - a, edge) / wp.dot(edge, edge)
     return wp.max(wp.min(t, wp.float64(1.0)), wp.float64(0.0))
@@ -79,7 +79,7 @@ def along_edge(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d) -> wp.float64:
 
 @wp.func
 def nearer_edge(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, best: Nearest, corner_a: int, corner_b: int) -> Nearest:
-    """Return the nearer of `best` and the point closest to p on the edge from a to b; these are corners corner_a and corner_b (0 .. 2).
+    """Return the closer to p of `best` and the point closest to p on the edge from a (corner number corner_a, 0 .. 2) to b (corner_b).
     Both triangles at an edge get the same bits, because the edge's ends are first sorted."""
     turned = before(b, a)
     start = wp.where(turned, b, a)
@@ -103,7 +103,7 @@ def nearer_edge(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, best: Nearest, corner_a: 
 
 @wp.func
 def on_edges(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> Nearest:
-    """Return the point closest to p on a triangle's three edges."""
+    """Return the point closest to p on the three edges of the triangle a b c."""
     out = Nearest()
     out.d2 = wp.float64(wp.inf)
     out = nearer_edge(p, a, b, out, 0, 1)
@@ -113,7 +113,7 @@ def on_edges(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> Nearest:
 
 @wp.func
 def on_triangle(point: wp.vec3, triangle: Primitive) -> Nearest:
-    """Return the closest point on a triangle: inside the triangle if the query point projects into it, else on an edge.
+    """Return the triangle's point closest to `point`: inside the triangle if `point` projects into it, else on an edge.
 
     If a corner is NaN or infinite, as in the record of a triangle without area, d2 is infinite."""
     p = wp.vec3d(point)
@@ -143,7 +143,7 @@ def on_triangle(point: wp.vec3, triangle: Primitive) -> Nearest:
 
 @wp.func
 def nearer_of(p: wp.vec3, triangle: Primitive, on: Nearest, best: Nearest) -> Nearest:
-    """Return the nearer of `best` and `on`, a point on this triangle; at equal distance, the point with the lower prim_id."""
+    """Return the closer to p of `best` and `on`, a point on this triangle. At equal distance, return the point with the lower prim_id."""
     lo = lower(lower(triangle.v0, triangle.v1), triangle.v2)
     hi = upper(upper(triangle.v0, triangle.v1), triangle.v2)
     pad = box_pad(lo, hi)
@@ -157,7 +157,7 @@ def nearer_of(p: wp.vec3, triangle: Primitive, on: Nearest, best: Nearest) -> Ne
 
 @noinline
 def nearer_flat(p: wp.vec3, surfaces: Surfaces, prim_id: int, best: Nearest) -> Nearest:
-    """Return nearer_of for a triangle without area. It consists of its edges, and its corners are read from the mesh."""
+    """Return the closer to p of `best` and a triangle without area: its three edges. The corners are read from the mesh."""
     face = surfaces.faces[prim_id]
     triangle = Primitive()
     triangle.v0 = surfaces.vertices[face[0]]
@@ -171,7 +171,7 @@ def nearer_flat(p: wp.vec3, surfaces: Surfaces, prim_id: int, best: Nearest) -> 
 
 
 def make_leaf_search(layout: NodeLayout) -> Any:
-    """Return nearest_in_leaf(accel, surfaces, reference, p, best) -> Nearest: the nearest point of `best` and a leaf's triangles."""
+    """Return nearest_in_leaf(accel, surfaces, reference, p, best): the closer to p of `best` and the points on the leaf's triangles."""
     struct, gather = make_struct(Primitive), make_gather(Primitive, layout.width)
     width, size_of_row = layout.width, row_size(Primitive, layout.width)
 
@@ -192,7 +192,7 @@ def make_leaf_search(layout: NodeLayout) -> Any:
 
 
 def make_closest_point(layout: NodeLayout) -> Any:
-    """Return closest_point(accel, surfaces, p) -> Nearest: the point of all triangles closest to p."""
+    """Return closest_point(accel, surfaces, p) -> Nearest: the point closest to p on any triangle."""
     struct, nearest_in_leaf = make_struct(Primitive), make_leaf_search(layout)
     plane, exists = make_plane(layout.width, layout.compressed)
 
@@ -243,7 +243,7 @@ def make_closest_point(layout: NodeLayout) -> Any:
 
 @cache
 def make_closest_point_kernel(layout: NodeLayout) -> Any:
-    """Return the kernel for points first .. first + dim - 1; the tree's primitives have the layout "corners"."""
+    """Return the kernel for points first .. first + dim - 1 (dim: launch size). The tree's primitives have the layout "corners"."""
     struct, closest_point = make_struct(Primitive), make_closest_point(layout)
 
     @kernel

@@ -36,9 +36,9 @@ class LaneRay:
 
 
 def lanes_only(body: str, otherwise: str = "0") -> str:
-    """Return the body of a native function that exists only with the headers of wide/, in CPU kernels of structs.kernel.
+    """Return the C++ body of a native function that needs the headers of wide/. Only CPU kernels of structs.kernel include them.
 
-    Elsewhere the function returns `otherwise` and is not called: CUDA uses the plain form, and ray_query.fused rejects wp.kernel."""
+    Elsewhere it returns `otherwise`, and is never called: CUDA runs the form in plain Warp, and ray_query.fused rejects wp.kernel."""
     return f"\n#if defined(WRT_INLINE)\n{body}\n#else\n    return {otherwise};\n#endif\n"
 
 
@@ -80,11 +80,11 @@ def row_type(width: int) -> Any:
 
 @cache
 def make_plain_cull(width: int) -> Any:
-    """Return the function of `make_cull` in plain Warp, one lane after another."""
+    """Return the function of `make_cull` in plain Warp: it processes one lane after another."""
 
     @wp.func
     def corner(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay) -> wp.vec3:
-        """Return a corner in the space where the ray is the z axis. Its x, y, z are rows[first], [first + width], [first + 2 width]."""
+        """Return a corner in the space where the ray is the z axis. In world space, its coordinate k is rows[first + k * width]."""
         x = value(rows, first + width * ray.kx)
         y = value(rows, first + width * ray.ky)
         z = value(rows, first + width * ray.kz)
@@ -118,7 +118,7 @@ def make_native_cull(width: int) -> Any:
 
 @cache
 def make_cull(width: int) -> Any:
-    """Return cull(rows, first, ray), which returns the mask of a row's triangles that the watertight test does not reject in float32."""
+    """Return cull(rows, first, ray): the mask of the triangles, in the row at rows[first], that the float32 areas do not reject."""
     plain, vector = make_plain_cull(width), make_native_cull(width)
 
     @wp.func

@@ -28,7 +28,7 @@ STACK_SIZE = 64
 
 
 def first_reference(width: int, compressed: bool) -> int:
-    """Return the index of the first child's reference in a node, in floats."""
+    """Return the index, in floats, of the first child's reference within a node."""
     return FIRST_BYTES + len(PLANES) * width // 4 if compressed else len(PLANES) * width
 
 
@@ -53,7 +53,7 @@ class NodeLayout(NamedTuple):
 
     @property
     def unit(self) -> int:
-        """Unit in which a leaf's reference counts primitives: a whole row, or 1 with compressed nodes, whose leaves share rows."""
+        """Number of primitives in the unit of a leaf's reference: a row of `width`, or 1 with compressed nodes, whose leaves share rows."""
         return 1 if self.compressed else self.width
 
 

@@ -5,7 +5,7 @@ Nodes are consecutive in a flat array of float32; layout.py has the constants.
   and an unused row that aligns nodes to cache lines.
 - A compressed node has 24 floats for bvh8c (Ylitie, Karras and Laine 2017, section 3.2). It has an origin (3 floats), a word with three
   exponents and the mask of existing children, six rows of `width` bytes, and the references. A plane is origin + byte * 2^(exponent - 127),
-  rounded once. The builder ensures that no plane cuts off a part of the box. With a NaN origin, an axis rejects no ray."""
+  rounded once. The builder ensures that no plane cuts off a part of the box. An axis with a NaN origin rejects no ray."""
 
 from functools import cache
 from typing import Any
@@ -23,7 +23,7 @@ ROW_PADS = {"conservative": LANE_PAD, "minmax": 1.0}
 
 @cache
 def make_plane(width: int, compressed: bool) -> Any:
-    """Return plane(nodes, first, k, lane): the coordinate of plane PLANES[k] of a child; and exists(nodes, first, lane) -> bool."""
+    """Return plane(nodes, first, k, lane), the coordinate of PLANES[k] of child `lane`; and exists(nodes, first, lane) -> bool."""
 
     @wp.func
     def plane(nodes: wp.array(dtype=wp.float32), first: int, k: int, lane: int) -> float:
@@ -148,5 +148,5 @@ def make_children(width: int, compressed: bool, box: str) -> Any:
 
 
 def far_pad(box: str) -> float:
-    """Return the factor for LaneRay.far_inv_dir; 1 for a box test without a vectorised form, which widens distances itself."""
+    """Return the factor for LaneRay.far_inv_dir. It is 1 for a box test without a vectorised form, which does not read far_inv_dir."""
     return ROW_PADS.get(box, 1.0)

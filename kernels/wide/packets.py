@@ -1,7 +1,8 @@
 """Packets and interleaved rays, for kernels of one CPU thread: each function calls C++ (packet.h, set_up.h, interleaved.h).
 
 The results have the bits of the box and triangle units (tests/kernels/wide/test_packets.py). The argument `base` is the index in
-Scratch.packets where a packet begins; `ray` is the index of a ray's column, base + lane."""
+Scratch.packets where a packet begins; `ray` is the index of a ray's column, base + lane. A beam bounds all rays of a packet
+(layout.BEAM)."""
 
 from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -37,7 +38,7 @@ class Scratch:
     packets: wp.array(dtype=wp.float32)  # PACKET_SIZE floats per packet.
     stacks: wp.array(dtype=wp.uint32)  # STACK_WORDS words per slot; during a packet's walk, the packet's stack.
     slots: wp.array(dtype=wp.int32)  # SLOT_SIZE words per slot.
-    report: wp.array(dtype=wp.int32)  # Entries FAILED, PAUSED and ANY_REFUSED, which remain from launch to launch.
+    report: wp.array(dtype=wp.int32)  # Entries FAILED, PAUSED and ANY_REFUSED, which a launch sets to 0 first.
 
 
 def flag(value: bool) -> str:
@@ -58,7 +59,7 @@ def make_set_up(rays_struct: Any) -> Any:
     return wrt::set_up<{flag(plain)}>(wrt::pointers_to(rays, first, {excludes}), count, pad, scratch.packets.data + base);
     """)
     def set_up(rays: rays_struct, first: int, count: int, pad: float, scratch: Scratch, base: int) -> int:
-        """Set up rays first .. first + count - 1. Return the mask of rays whose segments are not empty, plus COHERENT if they have a beam.
+        """Set up rays first .. first + count - 1. Return the mask of rays whose segments are not empty, plus COHERENT if there is a beam.
 
         The factor `pad` is nodes.far_pad."""
 
@@ -72,9 +73,9 @@ def make_children(any_hit: bool) -> Any:
                                           scratch.stacks.data, size);
     """)
     def children(accel: WideBvh, scratch: Scratch, base: int, reference: int, mask: int, size: int) -> int:
-        """Push the children of a node that rays of the mask enter onto a stack of `size` entries; return the new size.
+        """Push the children of node `reference` that rays of the mask enter onto a stack of `size` entries; return the new size.
 
-        The nearest child is on top or, for any-hit rays, the node's last entered child. The packet must have a beam."""
+        The nearest child is on top. For any-hit rays, the node's last entered child is on top. The packet must have a beam."""
 
     return children
 
@@ -86,7 +87,7 @@ def rays_meeting_root(accel: WideBvh, scratch: Scratch, base: int, mask: int) ->
 
 @wp.func_native("return wrt::rays_reaching(t_entry, scratch.packets.data + base);")
 def rays_reaching(t_entry: float, scratch: Scratch, base: int) -> int:
-    """Return the mask of the rays whose t is at least t_entry."""
+    """Return the mask of the packet's rays whose t (best hit so far, or t_max) is at least t_entry."""
 
 
 @cache
@@ -97,7 +98,7 @@ def make_triangles(any_hit: bool) -> Any:
     def triangles(accel: WideBvh, first: int, count: int, mask: int, scratch: Scratch, base: int) -> int:
         """Test the first `count` triangles of a row against the rays of the mask; return the mask of rays that hit a triangle.
 
-        In any-hit rays that hit, t becomes -inf."""
+        For any-hit rays that hit a triangle, t becomes -inf."""
 
     return triangles
 
@@ -126,7 +127,7 @@ def rays_at(stacks: wp.array(dtype=wp.uint32), i: int) -> int:
 class Steps(NamedTuple):
     """Functions for the steps of an interleaved ray. Each returns the next reference, or EMPTY if the ray is finished.
 
-    The next child is the nearest pending child or, for any-hit rays, the last."""
+    The next child is the nearest pending child. For any-hit rays, it is the last pending child."""
 
     begin: Any  # Put a ray into a slot, and choose the first child of the root.
     step: Any  # Visit a node, and choose the next child: of this node or from the stack.
@@ -151,7 +152,7 @@ def make_steps(any_hit: bool) -> Steps:
 
 @wp.func_native("return mask & wrt::spheres_of(accel.primitives.data + first, n_triangles);")
 def spheres_of(accel: WideBvh, first: int, mask: int, n_triangles: int) -> int:
-    """Return the mask of the primitives in `mask` of a row that are spheres."""
+    """Return the mask of the spheres among the primitives of a row that are in `mask`."""
 
 
 @cache
@@ -160,7 +161,7 @@ def make_ray_triangles(any_hit: bool, inlined: bool) -> Any:
 
     @wp.func_native(f"return wrt::{name}<{flag(any_hit)}>(accel.primitives.data + first, mask, scratch.packets.data + ray);")
     def ray_triangles(accel: WideBvh, first: int, mask: int, scratch: Scratch, ray: int) -> int:
-        """Test the triangles of a row that are in the mask. Store the nearest hit in the ray's column; return its lane, or -1 on a miss.
+        """Test the triangles in the mask of a row. Store the nearest hit in the ray's column; return the triangle's lane, or -1 on a miss.
 
         For any-hit rays, the result tells only hit (0) or miss (-1), and u and v are not set."""
 

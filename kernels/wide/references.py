@@ -1,6 +1,6 @@
 """References: an int32 that describes a child of a wide node.
 
-A reference is EMPTY (0), the index of an inner node (positive), or a leaf (negative), as its first primitive and number of primitives.
+A reference is EMPTY (0), the index of an inner node (positive), or a leaf (negative): the index of its first primitive, and their number.
 The functions below are device code. The host calls `leaf_first.func(...)`, for example, with ints or NumPy arrays of int64."""
 
 import warp as wp
@@ -13,7 +13,7 @@ MAX_FIRST = 1 << (31 - LEAF_BITS)  # Upper bound, exclusive, of a leaf's `first`
 
 @wp.func
 def leaf_reference(first: int, count: int) -> int:
-    """Return the reference of a leaf with `count` (1 .. MAX_LEAF) primitives; first: index below MAX_FIRST, in units of NodeLayout.unit."""
+    """Return the reference of a leaf with `count` (1 .. MAX_LEAF) primitives. first: index below MAX_FIRST in units of NodeLayout.unit."""
     return -1 - (MAX_LEAF * first + count - 1)
 
 

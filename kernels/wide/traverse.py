@@ -1,11 +1,11 @@
 """Traversal of the wide BVHs for one ray. Nodes have 4 or 8 children, whose boxes are tested as one row; so are the triangles of a leaf.
 
 Wald, Benthin and Boulos 2008, "Getting Rid of Packets"; Afra and Ernst 2008 and 2010. The test of a row of triangles only rejects triangles
-that the watertight unit would reject in float32. The unit itself tests the others, so that hits have the same bits as in other structures.
-With another triangle test, the unit tests every primitive of a leaf.
+that the watertight unit would reject in float32. The unit itself tests the remaining triangles, so that hits have the same bits as in other
+structures. With another triangle test, the unit tests every primitive of a leaf.
 
-The walk visits the nearest child next, and pushes the others, with the nearest of them on top. It drops a popped child that begins behind
-the closest hit. Any-hit rays need no order: the last child is next, and the builder puts leaves and large boxes last."""
+The walk visits the nearest child next. It pushes the other entered children, with the nearest of these on top. It drops a popped child that
+begins behind the closest hit. Any-hit rays need no order: the last child is next, and the builder puts leaves and large boxes last."""
 
 from functools import cache
 from typing import Any
@@ -28,9 +28,9 @@ from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
 def make_struct(record: Any) -> Any:
     """Return the type of a wide BVH whose primitives are stored as `record`.
 
-    A row holds as many primitives as a node has children: the first float of all records, then the second float, and so on. A leaf begins
-    with a new row, and its reference counts rows. With compressed nodes, leaves follow each other without a gap, and references count
-    primitives."""
+    A row holds as many primitives as a node has children: the first float of all its records, then the second float, and so on. A leaf
+    begins with a new row, and its reference counts rows. With compressed nodes, leaves follow each other without a gap, and references
+    count primitives."""
 
     @wp.struct
     class WideBvh:
@@ -87,7 +87,7 @@ def make_gather(record: Any, width: int) -> Any:
 
 
 def make_row_test(units: Units, any_hit: bool, accepts: Any, width: int) -> Any:
-    """Return test_row, which tests the primitives of a row that are in the mask, and returns the best hit; first: index of the row."""
+    """Return test_row, which tests the primitives in the mask of the row at rows[first]; it returns the best hit so far."""
     intersect = make_intersect(units, accepts)
     gather = make_gather(units.triangle_test.record, width)
     cull = make_cull(width)
@@ -269,7 +269,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
 
 
 class WideTraversal:
-    """The traversal of one node layout. It has the functions make_struct and make_traversal, as the modules of kernels.traverse have."""
+    """The traversal of one node layout, with the functions make_struct and make_traversal like a module of kernels.traverse."""
 
     def __init__(self, width: int, compressed: bool = False) -> None:
         self.layout = NodeLayout(width, compressed)

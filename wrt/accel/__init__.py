@@ -1,1 +1,1 @@
-"""Acceleration structures: what they are built over, what they answer, the table of them, and the way to build one."""
+"""Acceleration structures: their geometry, their builders, their queries, and the table of their names."""

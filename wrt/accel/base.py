@@ -32,16 +32,16 @@ from wrt.kernels.warp_private import fields_of
 class OneMesh(Accelerator, ABC):
     """An acceleration structure over one mesh. Subclasses set `name`, `kernels` and `options`, and implement `_build`.
 
-    options: frozen dataclass, which raises InputError for values out of range. kernels: module with make_struct(record) and
-    make_traversal(units, any_hit, accepts). can_refit: `_refit` is implemented. stream: module of a CPU kernel that traces many rays
-    at a time, with make_stream(units, any_hit) -> kernel or None, stream_block and stream_sizes (wrt.accel.queries.batches).
+    record: Warp struct of a primitive. units: kernels.traverse.common.Units. accepts: Warp function that can reject hits. A module
+    `stream` has make_stream(units, any_hit) -> kernel or None, stream_block (number of rays), and stream_sizes (lengths of the arrays
+    in kernels.wide.packets.Scratch).
     """
 
-    name: ClassVar[str]
-    kernels: KernelModule
-    stream: ClassVar[KernelModule | None] = None
-    options: ClassVar[type[Any]]  # a dataclass
-    can_refit: ClassVar[bool] = False
+    name: ClassVar[str]  # key in wrt.ACCELERATORS
+    kernels: KernelModule  # with make_struct(record) -> Warp struct of the arrays, and make_traversal(units, any_hit, accepts)
+    stream: ClassVar[KernelModule | None] = None  # module of a CPU kernel that traces many rays at a time, if there is one
+    options: ClassVar[type[Any]]  # a frozen dataclass, which raises InputError for values out of range
+    can_refit: ClassVar[bool] = False  # whether `_refit` is implemented
 
     def __init__(self, geometry: Geometry, attributes: FlatScene | None = None, /, device: str = "cpu", threads: int | None = None, *,
                  triangle: str = "watertight", box: str = "conservative", **options: object) -> None:
@@ -54,7 +54,7 @@ class OneMesh(Accelerator, ABC):
     @classmethod
     def restore(cls, built: Built, geometry: Geometry, attributes: FlatScene | None = None, /, device: str = "cpu",
                 threads: int | None = None, *, units: Units | None = None, built_with: object = None) -> Self:
-        """Make a structure from saved arrays and options (None: defaults). Raises InputError if arrays do not fit the geometry."""
+        """Make a structure from saved arrays, or raise InputError if they do not fit. units: intersection tests; built_with: options."""
         self = cls.__new__(cls)
         Accelerator.__init__(self, Structure(cls, units or Units()), geometry.unshared(), attributes, device, threads)
         self.built_with = cls.options() if built_with is None else built_with
@@ -76,7 +76,7 @@ class OneMesh(Accelerator, ABC):
 
     @property
     def built(self) -> Built:
-        """Arrays of the builder or of the last refit, on the host."""
+        """Result of the builder or of the last refit, in NumPy arrays."""
         return self._snapshot.arrays.on_host()
 
     @property
@@ -124,8 +124,8 @@ class OneMesh(Accelerator, ABC):
     def refit(self, vertices: ArrayLike, rebuild_at: float = np.inf, *, in_place: bool = False) -> Refit:
         """Fit the boxes of the tree to moved vertices. The topology of the tree does not change.
 
-        Hits have the bits of a new structure, but queries become slower if neighbouring primitives move apart. Queries in other
-        threads that begin before the refit ends see the old vertices.
+        Hits are bit for bit those of a new structure, but queries become slower if neighbouring primitives move apart. Queries in
+        other threads that begin before the refit ends see the old vertices.
 
         Parameters
         ----------
@@ -141,7 +141,7 @@ class OneMesh(Accelerator, ABC):
         Returns
         -------
         Refit
-            Growth of the SAH cost (NaN in place), and whether a new tree was built.
+            Growth of the SAH cost (NaN if `in_place`), and whether a new tree was built.
 
         Raises
         ------
@@ -206,7 +206,7 @@ class OneMesh(Accelerator, ABC):
         return data
 
     def _primitives(self, built: Built) -> np.ndarray | WarpArray:
-        """Return the records that the triangle test reads, in the order of the leaves."""
+        """Return the records that the triangle test reads, in the order of `built.order`."""
         return self.geometry.primitives(self.structure.units, built.order, self.threads)
 
     def save(self, path: PathLike) -> None:

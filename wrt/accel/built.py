@@ -15,9 +15,10 @@ from wrt.core.types import WarpArray
 class Built:
     """Result of a builder, in NumPy arrays, or in Warp arrays if it was built on the device.
 
-    arrays: one array for each field of the structure's struct except `primitives` and `recorder`. order: (R,) int32, prim_id of
-    each record in `primitives`; a prim_id may occur several times. If cells share records, arrays["references"] holds their
-    indices. nodes, leaves, depth, sah_cost: as in AccelStats. parents: parent of each node, on the device only.
+    arrays: one array for each field of the structure's Warp struct, except `primitives` (records of the triangle test) and
+    `recorder`. order: (R,) int32, prim_id of each record in `primitives`; a prim_id may occur several times. In a grid or octree,
+    cells share records: arrays["references"] lists the indices of each cell's records. nodes, leaves, depth, sah_cost: as in
+    AccelStats. parents: index of each node's parent, in a Warp array; None if `arrays` are NumPy arrays.
     """
 
     arrays: dict[str, Any]
@@ -49,7 +50,7 @@ class AccelStats:
     build_seconds : float
         Wall-clock time of the build, without the compilation of kernels.
     nodes, leaves, depth : int
-        Size of the tree; 0 without a tree.
+        Number of nodes, number of leaves, and depth of the tree. The nodes of a grid are its cells, with depth 1. Brute force has 0.
     references : int
         Number of primitives in all leaves together. A structure that splits space counts some primitives several times.
     bytes : int
@@ -76,7 +77,7 @@ class Refit:
     seconds : float
         Wall-clock time.
     growth : float
-        SAH cost of the refitted tree divided by the SAH cost at the last build.
+        SAH cost of the refitted tree divided by the SAH cost at the last build; NaN after a refit in place.
     rebuilt : bool
         Whether `growth` exceeded `rebuild_at`, so that a new tree was built.
     """

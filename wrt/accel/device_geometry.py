@@ -66,7 +66,7 @@ class DeviceGeometry(Geometry):
 
     @staticmethod
     def unchecked(points: WarpArray, indices: WarpArray, spheres: np.ndarray) -> DeviceGeometry:
-        """Make a geometry with spheres from valid arrays. indices: (F,) of vec3i."""
+        """Make a geometry from arrays that are known to be valid. indices: (F,) of vec3i; spheres: as in Geometry."""
         return DeviceGeometry.__new__(DeviceGeometry)._set(points, indices, spheres)
 
     def unshared(self) -> DeviceGeometry:

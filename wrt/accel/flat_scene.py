@@ -12,10 +12,10 @@ from wrt.accel.instanced_geometry import InstancedGeometry
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """Runs of consecutive prim_ids: an instance, a series of joined objects, or, as the last run, all spheres.
+    """Runs of consecutive prim_ids. A run is an instance or a series of joined objects; in a scene, the last run is all spheres.
 
-    (I,) int64 each: first_prim; first_face, an index into FlatScene.faces; first_material, an index into FlatScene.prim_material;
-    material_step, 1, or 0 if the run has one material. to_world: (I, 3, 4) float64.
+    (I,) int64 each: first_prim, a run's first prim_id; first_face, its index in FlatScene.faces; first_material, its index in
+    FlatScene.prim_material; material_step, 0 if the run has one material, else 1. to_world: (I, 3, 4) float64.
     """
 
     first_prim: np.ndarray
@@ -30,8 +30,8 @@ class FlatScene:
     """All shapes of a scene, or one mesh, as arrays. prim_ids number the faces of all objects in order, then the spheres.
 
     vertices: (V, 3); faces: (F, 3); normals: (V, 3) or None; uvs: (V, 2). Objects without normals or uvs have zeros; a mesh without
-    uvs has (0, 2). prim_material: index into the scene's materials. Without `placed`, arrays are in world space and in the order of
-    prim_id. With it, instanced meshes are stored once, in their own spaces. objects: first prim_id of each object, then sphere.
+    uvs has (0, 2). prim_material: index in the scene's materials. Without `placed`, arrays are in world space, in the order of prim_id.
+    With `placed`, instanced meshes are stored once, in their own spaces. objects: first prim_id of each object, then of each sphere.
     """
 
     geometry: Geometry | InstancedGeometry
@@ -44,7 +44,7 @@ class FlatScene:
     objects: np.ndarray | None = None
 
     def places(self, prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the row of each triangle in `faces`, and its run in `placed` (0 without `placed`), (N,) each."""
+        """Return the index of each triangle in `faces`, and the index of its run in `placed` (0 without `placed`), (N,) each."""
         if self.placed is None:
             return prim_id, np.zeros(len(prim_id), np.int32)
         run, local = self._run(prim_id)
@@ -96,5 +96,5 @@ def placed_now(scene: FlatScene, geometry: Geometry | InstancedGeometry) -> Plac
 
 
 def run_of(placed: Placed, geometry: InstancedGeometry) -> np.ndarray:
-    """Return the index of the run of each instance with its own transform. An instance without primitives gets another one's run."""
+    """Return the index of the run of each instance in `geometry.is_placed`. An instance without primitives gets another run."""
     return np.searchsorted(placed.first_prim, geometry.first_prim[geometry.is_placed], side="right") - 1

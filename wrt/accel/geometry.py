@@ -96,7 +96,7 @@ class Geometry:
         return lo, hi
 
     def primitives(self, units: Units, order: np.ndarray | None = None, threads: int = 1) -> np.ndarray:
-        """Return the records that the triangle test of `units` reads: one for each prim_id in `order`, or one for each primitive."""
+        """Return the records that the triangle test of `units` reads: one for each prim_id in `order`; None: for each primitive."""
         if order is not None and len(order) > len(self):  # make each record once
             return self.primitives(units, None, threads)[order]
         prim_id = np.arange(len(self), dtype=np.int32) if order is None else order

@@ -16,7 +16,7 @@ MAX_SPREAD = 1e4
 
 @dataclass(frozen=True, eq=False)
 class NumberedGeometry(Geometry):
-    """A geometry whose primitives have other prim_ids in the scene: prim_ids (N,) int32, ascending."""
+    """A geometry with other prim_ids in the scene: primitive i has prim_ids[i]. prim_ids: (N,) int32, ascending."""
 
     prim_ids: np.ndarray
 
@@ -47,7 +47,7 @@ class InstancedGeometry:
 
     @property
     def first_instance(self) -> np.ndarray:
-        """First instance of each world, and the number of instances: (W + 1,) int64."""
+        """Index of the first instance of each world, and, as the last entry, the number of instances: (W + 1,) int64."""
         return np.array([0, len(self.part)] if self.worlds is None else self.worlds, np.int64)
 
     @property
@@ -64,7 +64,7 @@ class InstancedGeometry:
 
     @property
     def first_prim_in_world(self) -> np.ndarray:
-        """First prim_id of each instance in its world, (I,) int64."""
+        """First prim_id of each instance, counted from the first primitive of its world, (I,) int64."""
         return self.first_prim - np.repeat(self.world_first_prim, np.diff(self.first_instance))
 
     @property
@@ -77,7 +77,7 @@ class InstancedGeometry:
 
     @property
     def is_placed(self) -> np.ndarray:
-        """Whether each instance is of one object, with its own transform, (I,) bool; False for joined objects."""
+        """Mask of instances, (I,) bool: True for one object with its own transform, False for joined objects."""
         return np.array([not isinstance(self.parts[part], NumberedGeometry) for part in self.part], bool)
 
 

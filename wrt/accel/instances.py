@@ -29,9 +29,9 @@ ALIGNMENT = 64  # bytes, between the addresses of structures
 
 
 class Instances(Accelerator):
-    """A binary BVH over instances of structures. These are of one class and built once each, by `wrt.build`.
+    """A binary BVH over instances of meshes, made by `wrt.build`. Each mesh has one structure; all structures are of one class.
 
-    The closest hit does not depend on the tree: it is the closest of the hits that the structures find in their own spaces.
+    The closest hit does not depend on the tree: it is the closest of the hits that the meshes' structures find in their own spaces.
     """
 
     name = "instances"
@@ -68,15 +68,15 @@ class Instances(Accelerator):
         self._snapshot = replace(self._snapshot, geometry=geometry, data=data, stats=total, built_cost=built_cost, roots=self._roots)
 
     def move(self, instance: ArrayLike, matrix: ArrayLike, rebuild_at: float = np.inf) -> Refit:
-        """Move instances to new matrices and fit the boxes of the upper level. Hits have the bits of a new structure.
+        """Move instances to new matrices and fit the boxes of the upper level. Hits are bit for bit those of a new structure.
 
         Other threads may query at the same time, as during `OneMesh.refit`.
 
         Parameters
         ----------
         instance : int or (R,) array_like of int
-            Values of `hits.instance`, each at most once: over a scene, indices of objects; else rows of `geometry.to_world`.
-            Over worlds, row `geometry.first_instance[w] + k` is object k of world w.
+            Values of `hits.instance`, without repeats. Over a scene they are indices of objects; else they are rows of
+            `geometry.to_world`. Over several worlds, row `geometry.first_instance[w] + k` is object k of world w.
         matrix : (4, 4) or (R, 4, 4) array_like
             Affine maps from object to world space.
         rebuild_at : float
@@ -136,7 +136,7 @@ def rows_of(geometry: InstancedGeometry, scene: FlatScene | None) -> np.ndarray:
 
 
 def checked_moves(row_of: np.ndarray, instance: ArrayLike, matrix: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Check the arguments of Instances.move and return (R,) rows and (R, 3, 4) float64; row_of: see `rows_of`.
+    """Check the arguments of Instances.move; return rows (R,) of to_world and matrices (R, 3, 4) float64. row_of: from `rows_of`.
 
     Raises InputError that names the argument.
     """

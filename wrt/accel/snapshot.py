@@ -22,10 +22,10 @@ UNBUILT = AccelStats()
 class Snapshot:
     """State of a structure. A refit makes a new one; only a refit in place modifies its arrays.
 
-    surfaces: kernels.structs.Surfaces, of which only n_triangles and spheres are set. attributes: normals, materials and the like,
-    if the structure was not built from a geometry. built: None for instances. built_cost: SAH cost at the last build. roots: for
-    instances, the root of each world (W,). followed: vertices of the last refit, if they require gradients. changes: refits in
-    place modify the arrays.
+    surfaces: kernels.structs.Surfaces, of which only n_triangles and spheres are set. attributes: normals, materials and the like;
+    None if the structure was built from a geometry. data: Warp struct of the arrays. built: None for instances. built_cost: SAH cost
+    at the last build. roots: for instances, (W,) index of each world's root node. followed: vertices of the last refit, if they
+    require gradients. changes: True if refits in place modify the arrays.
     """
 
     structure: Structure

@@ -113,7 +113,7 @@ def check_binary(nodes: np.ndarray, n_primitives: int, max_depth: int) -> None:
 
 
 def check_links(nodes: np.ndarray, empties: list[np.ndarray], n_primitives: int, max_depth: int) -> None:
-    """Check the links of a binary tree, as check_binary. empties: for each side, mask (N,) of the nodes without that child."""
+    """Check the links of a binary tree, as check_binary does. empties: for each side, mask (N,) of the nodes without that child."""
     inner_of = []
     for side, empty in zip(("0", "1"), empties, strict=True):
         first, count = nodes["first_" + side].astype(np.int64), nodes["count_" + side].astype(np.int64)

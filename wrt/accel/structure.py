@@ -28,7 +28,7 @@ def check_units(triangle: str, box: str) -> None:
 
 @dataclass(frozen=True)
 class NoOptions:
-    """Options of a structure that has none."""
+    """Empty options, for a structure without options."""
 
 
 @cache
@@ -71,7 +71,7 @@ class Structure(NamedTuple):
 
     @property
     def bottom(self) -> WarpType:
-        """Warp struct of a structure over one mesh; with instances, of the lower level."""
+        """Warp struct of a structure over one mesh: this structure, or, with instances, a structure of the lower level."""
         return struct_of(self._replace(units=self.units._replace(instances=False)))
 
     def require_one_mesh(self, message: str) -> None:

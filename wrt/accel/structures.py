@@ -1,4 +1,4 @@
-"""Table of acceleration structures: name -> module and class, imported on first use; the command line's help needs no Warp."""
+"""Table of acceleration structures: name -> module and class. Modules are imported on first use: `--help` does not wait for Warp."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ from wrt.kernels.units.box import PAD_COORDINATE
 ROUNDOFF = 2.0**-24
 SLACK = 32.0 * ROUNDOFF  # see kernels.traverse.instances.enter
 BOXES = 1 << 22  # primitives' boxes to transform in a build, summed over all instances
-MOVED_BOXES = 1 << 18  # the same in a move, where fewer boxes give slightly larger boxes of instances in less time
+MOVED_BOXES = 1 << 18  # as BOXES, but in a move: fewer boxes take less time, and make the boxes of instances slightly larger
 MATRICES = 1 << 17  # boxes to transform at a time
 
 Boxes = tuple[np.ndarray, np.ndarray]  # centers and halves, (G, 3) float64 each
@@ -32,9 +32,9 @@ Boxes = tuple[np.ndarray, np.ndarray]  # centers and halves, (G, 3) float64 each
 class TopLevel:
     """Trees over instances.
 
-    nodes: (N,) Bvh2Node records, one tree per world, each with its root first. roots: (W,) rows of the roots. parents: (N,) int32,
+    nodes: (N,) Bvh2Node records, one tree per world, each with its root first. roots: (W,) indices of the roots. parents: (N,) int32,
     -1 for a root. order: (I,) int32, instance of each leaf. depth: depth of the deepest tree. low, high: (I, 3) float32, boxes of
-    the instances. spread: (I,), see `spread_of`. placements: (I,) records in the order of the leaves.
+    the instances. spread: (I,), see `spread_of`. placements: (I,) Placement records in the order of the leaves.
     """
 
     nodes: np.ndarray
@@ -97,7 +97,7 @@ def split_worlds(low: np.ndarray, high: np.ndarray, first: np.ndarray) -> tuple[
 
 
 def write_placements(top: TopLevel, geometry: InstancedGeometry, rows: np.ndarray) -> TopLevel:
-    """Return the trees with placements and spreads of the instances `rows` computed from `geometry`."""
+    """Return `top` with the placements and spreads of the instances `rows` computed anew from `geometry`."""
     place = np.empty(len(top.order), np.int64)
     place[top.order] = np.arange(len(top.order))
     placements, spread = top.placements.copy(), top.spread.copy()
@@ -116,7 +116,7 @@ def spread_of(to_world: np.ndarray, to_local: np.ndarray) -> np.ndarray:
 
 
 def refit_top(top: TopLevel, geometry: InstancedGeometry, rows: np.ndarray, low: np.ndarray, high: np.ndarray) -> TopLevel:
-    """Return the trees refitted to instances that moved; the tree structure stays.
+    """Return the trees refitted to instances that moved; the topology stays.
 
     geometry: already has the new matrices. rows: (R,) indices of the moved instances, without repeats. low, high: (R, 3) float32, the
     new boxes of these instances in world space.
@@ -134,7 +134,8 @@ def refit_top(top: TopLevel, geometry: InstancedGeometry, rows: np.ndarray, low:
 def world_boxes(geometry: InstancedGeometry, rows: np.ndarray, boxes: list[Boxes]) -> tuple[np.ndarray, np.ndarray]:
     """Return a box of each instance in `rows` around the transformed boxes of its primitives: low and high (R, 3) float32.
 
-    A box around the transformed mesh is not enough: t of a hit lies in the padded box of its primitive, which extends beyond the mesh.
+    A box around the transformed mesh is not enough: a hit may lie anywhere in its primitive's padded box, which extends beyond the mesh.
+    boxes: from `part_boxes`.
     """
     lo, hi = np.full((len(rows), 3), np.inf, np.float32), np.full((len(rows), 3), -np.inf, np.float32)
     for index, (center, half) in enumerate(boxes):
@@ -167,7 +168,7 @@ def grouped_boxes(geometry: Geometry, order: np.ndarray, groups: int) -> tuple[n
 
 
 def rounded_out(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Round corners outwards to float32, with a margin for the rounding of the origin's coordinates."""
+    """Round corners of boxes outwards to float32, with a margin for the rounding of a ray origin's coordinates."""
     pad = 2.0 * PAD_COORDINATE * np.maximum(np.abs(low), np.abs(high))
     return np.nextafter((low - pad).astype(np.float32), np.float32(-np.inf)), \
         np.nextafter((high + pad).astype(np.float32), np.float32(np.inf))

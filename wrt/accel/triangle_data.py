@@ -10,7 +10,7 @@ from wrt.scene.clean import corners_have_area
 
 
 def corners(record: np.ndarray, v0: np.ndarray, v1: np.ndarray, v2: np.ndarray) -> None:
-    """Write the corners. A triangle without area gets NaN for v0, so that no ray hits it.
+    """Write the corners to the records. A triangle without area gets NaN for v0, so that no ray hits it.
 
     Collinearity is decided here in exact arithmetic, because a query in float64 could not decide it.
     """
@@ -19,13 +19,13 @@ def corners(record: np.ndarray, v0: np.ndarray, v1: np.ndarray, v2: np.ndarray) 
 
 
 def edges(record: np.ndarray, v0: np.ndarray, v1: np.ndarray, v2: np.ndarray) -> None:
-    """Write a corner and the two edges from it, rounded to float32."""
+    """Write the corner v0 and the edges v1 - v0 and v2 - v0, rounded to float32, to the records."""
     with np.errstate(over="ignore"):
         record["v0"], record["v1"], record["v2"] = v0, v1 - v0, v2 - v0
 
 
 def transform(record: np.ndarray, v0: np.ndarray, v1: np.ndarray, v2: np.ndarray) -> None:
-    """Write the affine map from world space to the unit triangle: rows a (u), b (v), c (height), in float64 and rounded once.
+    """Write the affine map from world space to the unit triangle, computed in float64: row a gives u, row b gives v, row c the height.
 
     The third axis is the unit normal, so that c is the triangle's plane. A triangle without area gets zeros, so that no ray hits it.
     """

@@ -1,4 +1,4 @@
-"""The command `build`, which saves an acceleration structure."""
+"""The command `build`, which builds an acceleration structure and saves it in a file."""
 
 from __future__ import annotations
 

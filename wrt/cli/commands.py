@@ -1,4 +1,4 @@
-"""The table of commands: name, and "module:function", which is imported when the command runs or --help lists it."""
+"""The table of commands, from name to "module:function". The module is imported when the command runs or --help lists it."""
 
 from __future__ import annotations
 

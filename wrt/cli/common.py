@@ -36,7 +36,7 @@ HINT_SHARE = 0.003  # Smallest share of dark pixels for a hint: 26x26 pixels of 
 
 
 class PatternType(click.ParamType):
-    """Text that matches a pattern. form: the pattern in words, for errors; value: converts the pattern's groups to the value."""
+    """Text that matches a regular expression. form: the pattern in words, for errors. value: function from the groups to the value."""
 
     def __init__(self, name: str, pattern: str, form: str, value: Callable[..., object]) -> None:
         self.name, self.pattern, self.form, self.value = name, pattern, form, value
@@ -67,7 +67,7 @@ class Names(click.ParamType):
 
 
 class Commands(click.Group):
-    """A group of commands that suggests a similar option for an unknown one. The dashes, common to all, are not compared."""
+    """A group of commands that suggests a similar option for an unknown option. It compares the names without their dashes."""
 
     def invoke(self, ctx: click.Context) -> object:
         try:
@@ -82,9 +82,9 @@ class Commands(click.Group):
 
 
 class OneOf(click.ParamType):
-    """A name in a table. place: the table as "module:TABLE". This type only lists the names, for --help and completion.
+    """A name in a table, such as an acceleration structure. place: the table as "module:TABLE".
 
-    The function that receives the name checks it, and suggests a similar name."""
+    This type lists the names for --help and completion. It does not check them: the function that receives the name does."""
 
     name = "NAME"
 
@@ -146,7 +146,7 @@ SHARED = {
 
 
 def shared(*names: str) -> Decorator:
-    """Return a decorator that adds entries of SHARED to a command."""
+    """Return a decorator that adds the entries `names` of SHARED, options and arguments, to a command."""
     return lambda command: functools.reduce(lambda wrapped, name: SHARED[name](wrapped), reversed(names), command)
 
 
@@ -156,9 +156,9 @@ def names_of(kind: type) -> list[str]:
 
 
 def option_group(name: str, make: Callable[..., object], names: Sequence[str], options: Sequence[Decorator]) -> Decorator:
-    """Return a decorator that adds `options` to a command, and passes `make(**values)` to it as the argument `name`.
+    """Return a decorator that adds `options` to a command. The command receives make(**values of the options) as its argument `name`.
 
-    names: the parameters of `make`; a parameter without an option keeps its default."""
+    names: the parameters of `make`. A parameter without an option keeps its default."""
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(command)
@@ -177,7 +177,7 @@ def option_group(name: str, make: Callable[..., object], names: Sequence[str], o
 def values_of(assignments: Assignments, **reserved: str) -> dict[str, Parsed]:
     """Return the values of --set by name. Raises InputError for a name with two different values.
 
-    reserved: names that this command refuses in --set, each with the option that decides on the value instead."""
+    reserved: names that this command refuses in --set; the value is the option to use instead."""
     values: dict[str, Parsed] = {}
     for name, value in assignments:
         if name in reserved:
@@ -189,9 +189,9 @@ def values_of(assignments: Assignments, **reserved: str) -> dict[str, Parsed]:
 
 
 def settings_of(assignments: Assignments, flags: Mapping[str, Parsed] | None = None, **reserved: str) -> SettingChanges:
-    """Return the scene's settings from --set, and from `flags`: options such as --spp, by the setting's name (None: absent).
+    """Return changes of the scene's settings from --set and from `flags`, the values of options such as --spp by setting (None: absent).
 
-    reserved: see values_of. Raises InputError for an invalid setting, and if --set and a flag differ."""
+    reserved: see values_of. Raises InputError for an invalid setting, and if --set and an option give different values."""
     from wrt.core.checks import as_size
     from wrt.io.toml.report import check_settings
 
@@ -217,7 +217,7 @@ def depth_hint(visibly_cut: float, max_depth: int, option: str = "--max-depth") 
 
 
 def device_options(cluster: str | None, device: str) -> dict[str, Parsed]:
-    """Return the options of `wrt.render` for --cluster and --device."""
+    """Return the options `device`, `devices` and `executor` of `wrt.render` for --cluster and --device."""
     names = [name.strip() for name in device.split(",")]
     if cluster is None:
         return {"device": device} if len(names) == 1 else {"devices": names}
@@ -228,7 +228,7 @@ def device_options(cluster: str | None, device: str) -> dict[str, Parsed]:
 
 
 def client_of(cluster: str | None) -> Client | None:
-    """Return a Dask client, which stays connected until the command ends; None without a cluster."""
+    """Return a Dask client of the scheduler at address `cluster`, connected until the command ends; None if `cluster` is None."""
     if cluster is None:
         return None
     from wrt.renderer.distributed.dask import connected
@@ -250,7 +250,7 @@ def load(path: Path, quiet: bool) -> Scene:
 
 @contextlib.contextmanager
 def warnings_reported(quiet: bool) -> Iterator[None]:
-    """Write the block's warnings to stderr when it ends, one per line; no warnings if it fails, since its error is enough."""
+    """Write the warnings of the `with` block to stderr when it ends, one per line. If the block fails, write none: its error is enough."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", SceneWarning)
         yield
@@ -261,7 +261,7 @@ def warnings_reported(quiet: bool) -> Iterator[None]:
 
 @contextlib.contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Add the scene's path to an InputError of the block that has no path, since it was raised after reading."""
+    """Add the scene's path to an InputError of the `with` block, if the error has no path: it was raised after reading."""
     try:
         yield
     except InputError as error:
@@ -298,7 +298,7 @@ def say(text: object, err: bool = True) -> None:
 def progress_writer(quiet: bool, every: float = 10.0) -> Callable[[str], None]:
     """Return a function that writes a line of progress to stderr.
 
-    On a terminal, each line replaces the last one; elsewhere, at most one line is written in `every` seconds."""
+    On a terminal, each line replaces the last one. Otherwise, at most one line is written in `every` seconds."""
     terminal = sys.stderr is not None and sys.stderr.isatty()
     due = time.monotonic()
 

@@ -1,8 +1,8 @@
 """The command line: it parses arguments, calls wrt and prints results.
 
-stdout is for data, stderr for messages. Exit code 1 means that `compare` or `devices --check` found more difference than allowed. 2 means
-a user's mistake, which one message describes. After an interrupt the exit code is 128 plus the signal's number: 130 for Ctrl-C, 143 for
-SIGTERM, 129 for SIGHUP. Each command function imports slow modules itself, so that --help is fast.
+stdout is for data, stderr for messages. Exit code 1 means that `compare` or `devices --check` found more difference than allowed. Code 2
+means a user's mistake, which one message describes. After an interrupt, the code is 128 plus the signal's number: 130 for Ctrl-C, 143
+for SIGTERM, 129 for SIGHUP. Each command function imports slow modules itself, so that --help is fast.
 """
 
 from __future__ import annotations

@@ -113,7 +113,7 @@ def render(scene: Path, output: Path | None, assignments: Assignments, quiet: bo
 
 
 def check_options(output: Path, assignments: Assignments, options: dict[str, Parsed]) -> SettingChanges:
-    """Return the scene's settings, and convert `options` to the options of `wrt.render` in place.
+    """Return changes of the scene's settings, and convert `options` in place to the options of `wrt.render`.
 
     Raises InputError for an invalid setting or option, before the scene is read."""
     from wrt.renderer.options import Options
@@ -131,7 +131,7 @@ def check_options(output: Path, assignments: Assignments, options: dict[str, Par
 
 
 def trace(loaded: Scene, path: Path, spp: int | None, options: dict[str, Parsed], quiet: bool) -> Film:
-    """Render a scene, with progress on stderr. Raises Interrupted if an interrupt came before the first sample."""
+    """Render a scene, with progress on stderr. path: the scene's file. Raises Interrupted if interrupted before the first sample."""
     from wrt.renderer.progress import progress_reporter
     from wrt.renderer.render import render as render_scene
     from wrt.renderer.result import plain_text
@@ -145,7 +145,7 @@ def trace(loaded: Scene, path: Path, spp: int | None, options: dict[str, Parsed]
 
 
 def _summary(film: Film) -> str:
-    """Return samples, rays, cuts and the seconds of each stage ("compile" overlaps "upload" and "build")."""
+    """Return a text with samples, rays, cut rays, and the seconds of each stage ("compile" overlaps "upload" and "build")."""
     s = film.stats
     cut = f"cut: {s['cut_by_depth']} rays by depth, {s['cut_by_throughput']} by throughput"
     end = "interrupted" if s["interrupted"] else "time limit" if s["timed_out"] else ""

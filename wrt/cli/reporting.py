@@ -67,9 +67,9 @@ class Reporting:
             write_bytes(self.output, (text.rstrip("\n") + "\n").encode())
 
     def end(self, text: str, data: Mapping[str, object], paths: Sequence[Path] = (), interrupted: int | None = None) -> None:
-        """Print the result as JSON, or as text with the names of the written files (`paths`; if empty, `output`).
+        """Print `data` as JSON if `as_json` is set. Otherwise, print `text` and the written files: `paths`, or `output` if that is empty.
 
-        interrupted: number of the signal that ended the work, which sets the exit code."""
+        interrupted: number of the signal that ended the work; it sets the exit code. None: the work was not interrupted."""
         if self.as_json:
             say_json(data)
         else:
@@ -82,7 +82,7 @@ class Reporting:
 
 def reporting(report: str = "Write the tables as Markdown (.md)", *, cluster: bool = False,
               quiet: str = "Print no progress and no warnings") -> Decorator:
-    """Return a decorator that adds the options of a Reporting, which the command receives as `how`. report, quiet: help of -o and -q."""
+    """Return a decorator that adds the options of Reporting. The command receives the object as `how`. report, quiet: help of -o and -q."""
     options = [SHARED["as_json"],
                click.option("-q", "--quiet", is_flag=True, help=quiet),
                click.option("-o", "--output", type=click.Path(path_type=Path), help=report)]
@@ -90,9 +90,9 @@ def reporting(report: str = "Write the tables as Markdown (.md)", *, cluster: bo
 
 
 def planned(plan: type[Plan]) -> Decorator:
-    """Return a decorator that adds a plan's options, which the command receives as `plan`.
+    """Return a decorator that adds the options of a Plan (wrt.lab.plans). The command receives the object as `plan`.
 
-    --quick takes the values of the plan's QUICK for options that the command line leaves out, and lists them on stderr."""
+    --quick sets the options that the command line leaves out to the values in plan.QUICK, and lists them on stderr."""
 
     def make(quick: bool, **values: Parsed) -> Plan:
         if quick:
@@ -109,7 +109,7 @@ def planned(plan: type[Plan]) -> Decorator:
 
 
 def parameter(each: dataclasses.Field[object]) -> Decorator:
-    """Return a decorator that adds a field of a plan to a command, as an argument or an option."""
+    """Return a decorator that adds a plan's field `each` to a command, as an argument or an option."""
     known, needed = each.metadata, each.default is MISSING
     kind = TYPES.get(str(each.type), click.Path(path_type=Path))
     if not known["text"]:
@@ -126,7 +126,7 @@ def parameter(each: dataclasses.Field[object]) -> Decorator:
 
 
 def measured(plan: type[Plan]) -> click.Command:
-    """Return the command that runs a plan's study (wrt.lab.bench.report.study_of). With --cluster, a worker measures a whole mesh."""
+    """Return the command that runs a plan's study (wrt.lab.bench.report.study_of). With --cluster, each worker measures whole meshes."""
 
     @click.command(plan.COMMAND.split()[-1], help=plan.__doc__)
     @planned(plan)

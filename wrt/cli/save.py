@@ -1,4 +1,4 @@
-"""Files of a long render: its checkpoint, and another folder for a picture that cannot be written."""
+"""Files of a long render: its checkpoint, and a second folder for a picture that cannot be written to the first."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def checkpoint_options(output: Path, every: float | None, file: Path | None, res
 
 
 def save_film(film: Film, output: Path, bits: int | None, layers: Sequence[str] | None) -> tuple[list[Path], list[int], InputError | None]:
-    """Write the picture to `output`, or if that fails into a new folder wrt-* in the folder for temporary files (TMPDIR).
+    """Write the picture to `output`. If that fails, write it to a new folder wrt-* in the folder for temporary files (TMPDIR).
 
     Returns the paths written, the numbers of the signals that arrived meanwhile, and the error if writing to `output` failed. Raises
     InputError if both folders fail."""
@@ -49,7 +49,7 @@ def save_film(film: Film, output: Path, bits: int | None, layers: Sequence[str] 
 
 
 def remove_checkpoint(path: Path) -> None:
-    """Remove the checkpoint of a finished picture. Raises InputError if the system refuses."""
+    """Remove the checkpoint of a finished picture. Raises InputError if that fails."""
     if path.is_dir():  # not written by wrt; the render has warned that the checkpoint is not saved
         return
     try:

@@ -81,5 +81,5 @@ def in_browser(url: str) -> Iterator[None]:
 
 
 def has_desktop() -> bool:
-    """Return True if a browser opens in a window, and not in the terminal."""
+    """Return True if this machine has a desktop, where a browser opens in a window instead of the terminal."""
     return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

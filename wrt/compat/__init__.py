@@ -1,4 +1,4 @@
-"""Ray classes of other libraries, implemented with wrt's queries: a program changes only its import. wrt does not use them."""
+"""Ray classes of other libraries, implemented with wrt's queries: a program changes only its import. wrt itself does not use them."""
 
 from __future__ import annotations
 

@@ -169,8 +169,8 @@ class RaycastingScene:
         Returns
         -------
         dict
-            points (..., 3), geometry_ids and primitive_ids (...) uint32, primitive_uvs (..., 2), primitive_normals (..., 3);
-            INVALID_ID and 0 without a mesh.
+            points (..., 3), geometry_ids and primitive_ids (...) uint32, primitive_uvs (..., 2), primitive_normals (..., 3).
+            Without a mesh, IDs are INVALID_ID, and all other values are 0.
         """
         shape, valid, points = _valid_points(query_points)
         accel, _, normals = self._scene()
@@ -210,16 +210,16 @@ class RaycastingScene:
         Parameters
         ----------
         *given, **named
-            Either (intrinsic_matrix, extrinsic_matrix, width_px, height_px): (3, 3), and (4, 4) from world to camera. Or (fov_deg,
-            center, eye, up, width_px, height_px): horizontal field of view in degrees, point to look at, and camera position. In
-            this case y is up, as in Open3D, so that the first row is the lowest.
+            Either intrinsic_matrix (3, 3), extrinsic_matrix (4, 4) from world to camera, width_px, height_px. Or fov_deg (horizontal
+            field of view in degrees), center (point to look at), eye (camera position), up, width_px, height_px. In the second case
+            y is up, as in Open3D, so that the first row is the lowest.
         """
         make = _rays_looking_at if len(given) + len(named) == 6 else _rays_of_matrices
         rays = make(*given, **named)
         return _answer(rays.reshape(-1, 6), rays.shape[:2])
 
     def _scene(self) -> tuple[Accelerator, np.ndarray, np.ndarray]:
-        """Return the structure, the first prim_id of each mesh, and the unit normals of all faces, then a zero for index -1."""
+        """Return the structure, the first prim_id of each mesh, and the unit normals of all faces, with a last row 0 for prim_id -1."""
         if self._built is None:
             vertices, faces = [np.zeros((1, 3), np.float32)], [np.zeros((0, 3), np.int64)]
             for positions, indices in self._meshes:
@@ -274,7 +274,7 @@ def _arrays_of(mesh: Any) -> tuple[Any, Any]:
 
 
 def _rows(value: Any, name: str, width: int) -> tuple[tuple[int, ...], np.ndarray]:
-    """Return the leading shape, and (N, width) float32."""
+    """Return the leading shape of `value`, (..., width), and its rows, (N, width) float32."""
     array = _numbers(value, name, f"(..., {width})")
     if array.ndim < 1 or array.shape[-1] != width:
         raise InputError(f"must be (..., {width}), got {array.shape}", argument=name)
@@ -282,7 +282,7 @@ def _rows(value: Any, name: str, width: int) -> tuple[tuple[int, ...], np.ndarra
 
 
 def _normals(mesh: Geometry) -> np.ndarray:
-    """Compute the normals for RaycastingScene._scene."""
+    """Compute the unit normals of all faces, with a last row 0, for RaycastingScene._scene."""
     a, b, c = (mesh.vertices[mesh.faces[:, i]].astype(np.float64) for i in range(3))
     with np.errstate(invalid="ignore"):  # for corners that are not finite
         normal = np.cross(b - a, c - a)
@@ -292,7 +292,7 @@ def _normals(mesh: Geometry) -> np.ndarray:
 
 
 def _valid_rays(value: Any, nthreads: int) -> tuple[tuple[int, ...], np.ndarray | None, np.ndarray, np.ndarray]:
-    """Return the leading shape, the mask of finite rays with a direction (None: all), and these rays' origins and directions."""
+    """Return the leading shape, the mask of finite rays with nonzero directions (None: all), and the origins and directions of these."""
     shape, rays = _rows(value, "rays", 6)
     origins, directions = np.empty((2, len(rays), 3), np.float32)
     kind = np.empty(len(rays), np.int8)

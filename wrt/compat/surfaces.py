@@ -14,7 +14,7 @@ def every_hit(accel: Accelerator, origins: np.ndarray, directions: np.ndarray, t
     """Return ray, face, t, u and v of each hit, ray by ray in order of distance, at most `limit` per ray.
 
     A ray hits the faces that it crosses (`all_hits` with crossings). A ray that only touches faces hits the first touched face. If
-    the mesh is closed, it hits the first two, as entry and exit, or one if it begins there.
+    the mesh is closed, that ray hits up to two touched faces, the nearest ones, as entry and exit.
     """
     crossed = ListQuery(accel, threads, crossings=True).of(origins, directions).all(limit)
     found = [crossed.ray_id, crossed.prim_id, crossed.t, crossed.u, crossed.v]

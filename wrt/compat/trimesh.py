@@ -136,7 +136,7 @@ class RayMeshIntersector:
 
 
 class _ScaledStructure:
-    """A structure over a mesh that is shifted to the origin, if it is far from it, and scaled to size 1 by a power of two.
+    """A structure over a mesh, shifted to the origin if far from it, and, with scale_to_box, scaled to about size 1 by a power of two.
 
     Faces with a corner that is not finite keep their indices and become faces without area, which no ray hits.
     """
@@ -170,7 +170,7 @@ class _ScaledStructure:
         return np.ldexp(points - self.shift, self.exponent)
 
     def local_rays(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray | None, np.ndarray, np.ndarray]:
-        """Return the rows of the valid rays (None: all rays), and these rays in the structure's coordinates, float32."""
+        """Return the indices of the valid rays (None: all rays), and these rays in the structure's coordinates, float32."""
         placed_origins, placed_directions = np.empty((2, *origins.shape), np.float32)
         valid = np.empty(len(origins), bool)
         arrays = origins, directions, placed_origins, placed_directions, valid

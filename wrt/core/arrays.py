@@ -26,7 +26,7 @@ def to_numpy(array: ArrayLike) -> np.ndarray:
 
 
 def to_warp(array: ArrayLike, dtype: WarpType = None) -> WarpArray:
-    """Return a Warp array of the same memory, or a copy of a read-only array. NumPy arrays stay on the CPU.
+    """Return a Warp array of the same memory, or a copy of a read-only NumPy array. NumPy arrays stay on the CPU.
 
     dtype: a Warp type, such as vec3 for arrays of three columns; None keeps the array's type."""
     if not isinstance(array, np.ndarray):
@@ -96,7 +96,7 @@ def from_tensor(value: object, name: str, dtype: WarpType = wp.vec3) -> Any:
 def to_tensor_like(*arguments: object) -> Callable[[Array], Tensor] | None:
     """Return a function that turns an array into a tensor of the same library as the first tensor in `arguments`, without a copy.
 
-    An array on a GPU is copied if that tensor is on the CPU. None without a tensor, or if its library has no `from_dlpack`."""
+    An array on a GPU is copied if that tensor is on the CPU. Returns None without a tensor, or if the library has no `from_dlpack`."""
     for value in arguments:
         if is_tensor(value):
             namespace = getattr(value, "__array_namespace__", None)  # the array API's; torch has none
@@ -106,5 +106,5 @@ def to_tensor_like(*arguments: object) -> Callable[[Array], Tensor] | None:
 
 
 def _to_tensor(from_dlpack: Callable[[Array], Tensor], to_cpu: bool, array: Array) -> Tensor:
-    """Convert an array by `from_dlpack`. On the CPU a NumPy array is passed, because NumPy has all versions of the protocol."""
+    """Convert an array by `from_dlpack`. On the CPU a NumPy array is passed, because NumPy supports all versions of DLPack."""
     return from_dlpack(to_numpy(array) if to_cpu or not isinstance(array, wp.array) or array.device.is_cpu else array)

@@ -1,4 +1,4 @@
-"""Checks of arguments, which also convert them. `what` is the argument's name, after its place: "camera 'main': fov_y" (`wrong`)."""
+"""Checks of arguments, which also convert them. `what` names the argument, if need be after its place: "camera 'main': fov_y"."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LARGEST = 1e30  # largest absolute value of a number in a scene; float32 ends at
 
 
 def as_integer(value: object, what: str, low: int, high: int) -> int:
-    """Return a Python or NumPy integer in [low, high] as int. Raises InputError for others, and for any float, even 1.0."""
+    """Return a Python or NumPy integer in [low, high] as int. Raises InputError for other values, even for the float 1.0."""
     try:
         number = operator.index(value)  # type: ignore[arg-type]
     except TypeError:
@@ -33,7 +33,7 @@ def as_integer(value: object, what: str, low: int, high: int) -> int:
 
 
 def as_size(value: object, what: str = "size", high: int = 32768) -> tuple[int, int]:
-    """Return width and height in pixels from a pair or a text such as "640x360"."""
+    """Return width and height in pixels, 1 to `high` each, from a pair or a text such as "640x360"."""
     if isinstance(value, str) and (match := re.fullmatch(r"\s*([0-9]{1,9})\s*[xX]\s*([0-9]{1,9})\s*", value)):
         value = (int(match[1]), int(match[2]))
     try:
@@ -94,14 +94,14 @@ def as_choice(value: str, choices: Collection[str], what: str) -> str:
 
 
 def require_known(name: str, known: Collection[str], what: str, argument: str | None = None) -> None:
-    """Raise InputError if `name` is not in `known`. what: the kind of thing that the name stands for."""
+    """Raise InputError if `name` is not in `known`. what: noun for the named thing in the message, such as "camera"."""
     if name not in known:
         raise InputError(f"no {what} {shown(name)}", argument=argument,
                          hint=f"{did_you_mean(name, known)}there is {', '.join(known) or 'none'}")
 
 
 def unknown(name: str, what: str, known: Iterable[str], *, argument: str | None = None, place: str | None = None) -> InputError:
-    """Return the error about an unknown name. Its hint is the most similar known name, and a list of the known names, cut at 100."""
+    """Return the error about an unknown name. Its hint has the most similar known name, and the first 100 known names."""
     names = [str(each) for each in known]
     hint = f"{did_you_mean(name, names)}known are {listed(names, 100)}" if names else "there are none"
     return InputError(f"unknown {what} {short(name)}", argument=argument, place=place, hint=hint)
@@ -131,7 +131,7 @@ def at_thing(kind: str, name: str) -> str:
 
 
 def shown(value: object) -> str:
-    """Return a value for a message: numbers, text and lists as they are, but short; arrays by shape and type, others by type."""
+    """Return a value for a message: numbers, text and lists as they are, but short; arrays by shape and type, other objects by type."""
     if isinstance(value, str | int | float | tuple | list) or value is None:
         return short(value)
     if isinstance(value, np.ndarray):

@@ -43,9 +43,9 @@ _making = threading.RLock()
 
 
 def made_once(make: Callable[P, T]) -> Callable[P, T]:
-    """Cache a function's results. If several threads need a result at once, one calls `make` and the others wait.
+    """Cache a function's results. If several threads need the same result at once, one thread calls `make` and the others wait.
 
-    Without a cache, two kernels of the same code would be compiled twice, and two structs of the same fields be different types to Warp."""
+    Without a cache, a kernel made twice would be compiled twice, and Warp would take a struct made twice for two different types."""
     known: dict[tuple[object, ...], T] = {}
 
     @wraps(make)
@@ -98,7 +98,7 @@ def _start_warp() -> None:
 
 @made_once
 def start(device: str) -> Device:
-    """Start Warp and return its device of a name, such as "cpu" or "cuda:0".
+    """Start Warp and return the device with a name such as "cpu" or "cuda:0".
 
     Raises InputError for an unknown name, with the known names, and if the folder of the kernel cache cannot be made."""
     _start_warp()
@@ -120,7 +120,7 @@ def describe_devices() -> list[str]:
 
 
 def block_dim(device: Device) -> int:
-    """Return the number of threads in a block; 1 on the CPU, where kernels for other sizes would be compiled in vain."""
+    """Return the number of threads in a block; on the CPU always 1, as Warp would compile a kernel anew for each block size."""
     return 1 if device.is_cpu else cuda.block_dim
 
 
@@ -135,7 +135,7 @@ def memory_of(device: Device) -> float:
 
 
 class _Loaded:
-    """Names of devices, and block sizes, for which a kernel is loaded. Without this record Warp would read files at each call."""
+    """Pairs (name of the device, block size) for which a kernel is loaded. Without this record, Warp would read files at each launch."""
 
     def __init__(self) -> None:
         self.devices: set[tuple[str, int]] = set()
@@ -176,7 +176,7 @@ def preloading(*kernels: Kernel) -> Iterator[None]:
 def preload_headers(kernel: Kernel) -> None:
     """If the cache is empty, compile this small kernel in the background, which precompiles Warp's headers.
 
-    Only for processes of wrt: a process that is forked meanwhile would wait for ever. Errors are raised by the next kernel."""
+    Only for wrt's command line: a process that the user forks meanwhile would wait for ever. Errors are raised by the next kernel."""
     cpu = start("cpu")
     if not any(Path(wp.config.kernel_cache_dir).glob(warp_private.IN_CACHE)):
         submit(partial(load_kernel, kernel, cpu))
@@ -276,7 +276,7 @@ def empty_aligned(shape: int | tuple[int, ...], dtype: npt.DTypeLike) -> np.ndar
 def record_dtype(struct: WarpType) -> np.dtype:
     """Return the memory layout of a Warp struct as a NumPy type.
 
-    It is cached, because NumPy parses the layout with `ast`: CPython 3.11 raises SystemError if two threads do so at once."""
+    The result is cached, because NumPy parses the layout with `ast`: CPython 3.11 raises SystemError if two threads do so at once."""
     return np.dtype(struct.numpy_dtype())
 
 
@@ -299,8 +299,8 @@ def launch(kernel: Kernel, n: int, *inputs: object, threads: int = 1, step: int 
 def launch_on(device: Device, kernel: Kernel, n: int, *inputs: object, threads: int = 1, step: int = 0) -> None:
     """Launch a kernel over n elements.
 
-    With a step, the CPU launches it once for each range of `step` elements, on `threads` threads; an input of None is replaced by the
-    first index of the range. On a GPU there is one launch, in blocks of wrt.core.cuda.block_dim threads."""
+    With a step, the CPU launches the kernel once for each range of `step` elements, on `threads` threads. An input of None is replaced
+    by the first index of the range. On a GPU there is one launch, in blocks of wrt.core.cuda.block_dim threads."""
     if n == 0:
         return
     load_kernel(kernel, device)

@@ -51,7 +51,7 @@ class InputError(ValueError):
         return _restore, (type(self), self.args, self.__dict__)
 
     def at(self, path: str | os.PathLike[str] | None = None, place: str | None = None, hint: str | None = None) -> Self:
-        """Return a copy of the error with a file and a place. If the error has a file, the new ones say what includes that file."""
+        """Return a copy of the error with a file, a place and a further hint. If it has a file already, the new file includes that one."""
         error = copy.copy(self)
         if self.path is None:
             vars(error).update(path=path, place=_joined(place, self.place) or None)
@@ -70,7 +70,7 @@ class InputErrors(InputError):
 
 
 def wrong(name: str, what: str, hint: str | None = None) -> InputError:
-    """Return the error of an argument. Its place may precede its name: "camera 'main': fov_y"."""
+    """Return the error about an argument. In `name`, its place may precede its name: "camera 'main': fov_y"."""
     place, _, argument = name.rpartition(": ")
     return InputError(what, argument=argument, place=place or None, hint=hint)
 
@@ -99,7 +99,7 @@ class SceneWarning(UserWarning):
 
 
 def warn(message: str) -> None:
-    """Issue a SceneWarning that points to the line of the caller outside of wrt."""
+    """Issue a SceneWarning that points to the line outside of wrt that led to it."""
     frame, level = sys._getframe(1), 2  # of warnings.warn: 1 is this function
     while frame.f_back is not None and frame.f_code.co_filename.startswith(_PACKAGE):  # skip_file_prefixes is of Python 3.12
         frame, level = frame.f_back, level + 1

@@ -1,4 +1,4 @@
-"""Ctrl-C between the tiles of a render, in place of an exception in the middle of a tile.
+"""Signals that end a render early: Ctrl-C takes effect between two tiles, in place of an exception in the middle of a tile.
 
 On the command line SIGTERM and SIGHUP act like Ctrl-C, so that the picture so far survives the end of a batch job or a terminal."""
 
@@ -42,10 +42,10 @@ def exit_code(number: int | None) -> int:
 
 @contextmanager
 def held_interrupts() -> Iterator[list[int]]:
-    """Defer Ctrl-C during the block; yield a list that collects the numbers of the signals that arrive.
+    """Hold Ctrl-C back during the block. Yield a list of the signal numbers that arrive; the caller reacts to them.
 
-    After raise_on_termination, SIGTERM and SIGHUP are deferred, too. Signals that raise no KeyboardInterrupt in this thread are not
-    deferred: outside the main thread, or if the user handles or ignores them."""
+    After raise_on_termination, SIGTERM and SIGHUP are held back, too. Nothing is held back outside the main thread. Signals that the
+    user handles or ignores are not held back."""
     arrived: list[int] = []
     held = []
     if threading.current_thread() is threading.main_thread():

@@ -42,7 +42,7 @@ def shared_headers(key: str, precompile: Callable[[Path], None], leftover: re.Pa
 def _make_headers(folder: Path, precompile: Callable[[Path], None]) -> None:
     """Make the folder under another name, and rename it when it is complete.
 
-    Threads of a process wait for one of them. If several processes make the folder, the first stays, because it is in use."""
+    One thread of a process makes the folder; others wait. If several processes make it, the first folder stays, because it is in use."""
     aside = Path(mkdtemp(prefix=f"{folder.name}-", dir=folder.parent))
     try:
         precompile(aside)
@@ -78,7 +78,7 @@ def remove(path: Path) -> None:
 
 
 def seal(path: Path) -> None:
-    """Append its SHA-256 to an object file. Linkers ignore bytes after the object."""
+    """Append to an object file the SHA-256 of its content. Linkers ignore bytes after the object."""
     with path.open("r+b") as file:
         file.write(sha256(file.read()).digest())
 

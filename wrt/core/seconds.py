@@ -1,4 +1,4 @@
-"""Clock for the build time of structures, without the loading of kernels."""
+"""Clock for the build time of acceleration structures, without the loading of kernels."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ def thread_count(threads: int | None) -> int:
 
 @cache
 def _stack_limit() -> float:
-    """Return the bytes of the main thread's stack, or infinity if unknown. New threads have as many if threading.stack_size() is 0."""
+    """Return the bytes of the main thread's stack, or infinity if unknown. New threads have the same if threading.stack_size() is 0."""
     with contextlib.suppress(ImportError):
         import resource
 
@@ -49,15 +49,15 @@ def _stack_limit() -> float:
 
 @cache
 def _stack_size_lock(process: int) -> threading.Lock:
-    """Return the lock of a process. A forked process needs its own, because no thread of it would release an inherited lock."""
+    """Return a process's lock of threading.stack_size(). No thread of a forked process would release the lock of its parent process."""
     return threading.Lock()
 
 
 @contextlib.contextmanager
 def _large_stacks() -> Iterator[bool]:
-    """Start threads in the block with stacks of STACK bytes or more; yield True if the default stack is that large.
+    """Give threads that start in the block stacks of STACK bytes or more. Yield True if the default stack is that large.
 
-    If it is not, threads that the user starts meanwhile get large stacks, too: threading.stack_size() holds for the whole process."""
+    Otherwise threads that the user starts meanwhile get large stacks, too: threading.stack_size() holds for the whole process."""
     with _stack_size_lock(os.getpid()):
         before = threading.stack_size(STACK)
         large = (before or _stack_limit()) >= STACK
@@ -74,7 +74,7 @@ _here = threading.local()  # large: this thread's stack has STACK bytes
 
 
 def _has_stack() -> bool:
-    """Return True if this thread's stack has STACK bytes. A thread of the user counts as having the size of threads that start now."""
+    """Return True if this thread's stack has STACK bytes. A user's thread is assumed to have the stack of threads that start now."""
     if not hasattr(_here, "large"):
         if threading.current_thread() is threading.main_thread():
             _here.large = _stack_limit() >= STACK
@@ -129,7 +129,7 @@ def submit(task: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> Futur
 
 
 def run_all(tasks: Iterable[Callable[[], None]], threads: int) -> None:
-    """Run all tasks on `threads` threads, including this one. After an error no task starts; it is raised when running tasks have ended."""
+    """Run all tasks on `threads` threads, including this one. After an error no task starts; the error is raised in the end."""
     with_stack(partial(_run_all, list(tasks), threads))
 
 
@@ -175,8 +175,8 @@ def _run_in_turn(begin: Callable[[T], tuple[Callable[[], object], Callable[[], I
 def run_growing(begin: Callable[[T], tuple[Callable[[], object], Callable[[], Iterable[T]]]], tasks: Iterable[T], threads: int) -> None:
     """Run all tasks, and the further tasks that they produce, on `threads` threads.
 
-    begin(task) returns a job, and a function to call after the job, which returns more tasks. Jobs run on other threads, the two
-    functions on this thread; with one thread, jobs run on it, too. The first error is raised when all running jobs have ended."""
+    begin(task) returns (job, after). after() is called when the job has ended, and returns further tasks. Jobs run on other threads,
+    or on this one if `threads` is 1; begin and after run on this thread. The first error is raised when all running jobs have ended."""
     if threads == 1:
         with_stack(partial(_run_in_turn, begin, deque(tasks)))
         return

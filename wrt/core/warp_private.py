@@ -68,7 +68,7 @@ def struct_record(struct: WarpType, fields: Iterable[object]) -> Record:
 
 
 def keep(array: WarpArray, memory: object) -> None:
-    """Make a Warp array, made from an address, keep the owner of the memory alive."""
+    """Let a Warp array that was made from an address keep `memory`, the owner of the address, alive."""
     array._ref = memory
 
 
@@ -269,6 +269,6 @@ def _headers_key(options: dict[str, Any]) -> str:
 
 @cache
 def _native_headers() -> list[tuple[str, int, int]]:
-    """Return path, size and time of each of Warp's headers."""
+    """Return path, size in bytes and modification time of each of Warp's headers."""
     native = Path(wp.__file__).resolve().parent / "native"
     return [(str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in sorted(native.rglob("*.h"))]

@@ -26,7 +26,7 @@ from wrt.scene.model import Object, Scene
 def load_scene(path: PathLike) -> Scene:
     """Read a scene file: TOML (.toml), glTF 2.0 (.gltf, .glb), or a mesh in light grey.
 
-    A scene without a camera gets one that frames it, and a scene without a light gets lights; a SceneWarning names them.
+    A scene without a camera gets one that frames it, and a scene without a light gets lights; a SceneWarning names the additions.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def load_scene(path: PathLike) -> Scene:
 
 
 def as_scene(value: Scene | Mesh | PathLike) -> Scene:
-    """Return a Scene unchanged; else the scene of a Mesh or of a file, with the warnings of `load_scene`. Raises InputError otherwise."""
+    """Return a Scene unchanged, or the scene of a Mesh or file, with the warnings of `load_scene`. Raises InputError for other values."""
     if isinstance(value, Scene):
         return value
     if isinstance(value, Mesh):
@@ -124,7 +124,7 @@ def _require_64_bits(value: object) -> None:
 
 
 def _staged(scene: Scene, path: PathLike, notes: Sequence[str] = ()) -> Scene:
-    """Add a camera and lights to a scene without them, and warn with `notes` and the additions."""
+    """Add a camera and lights to a scene without them, and issue one SceneWarning with `notes` and the additions."""
     with at(path=path):
         scene, added = stage(scene)
     if notes or added:

@@ -71,8 +71,8 @@ def load_mesh(path: PathLike, parts: Sequence[tuple[int, int]] = ()) -> Mesh:
     Raises
     ------
     InputError
-        If the file is missing, truncated or without triangles, if an index is out of range or a position not finite. It names the file
-        and the place.
+        If the file is missing, truncated or without triangles, if an index is out of range or a position not finite. The message names
+        the file and the place.
     """
     path = as_path(path, "path")
     if path.suffix.lower() not in MESH_FORMATS:

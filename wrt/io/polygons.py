@@ -13,7 +13,7 @@ def triangulate(corners: np.ndarray, counts: np.ndarray, vertices: np.ndarray) -
     corners: (C,) integers, the vertex indices of all polygons in sequence; counts: (P,), the number of corners of each polygon;
     vertices: (V, 3). Returns (T, 3) integers, indices into `corners`, and (T,), the index of each triangle's polygon. A polygon of n
     corners gives n - 2 triangles, or none for n < 3. Convex polygons become the fan about their first corner. A polygon is concave if
-    a triangle of its fan faces against its area vector; it is projected along that vector and cut by ear clipping (mapbox-earcut).
+    a triangle of its fan faces against its area vector. It is then projected along that vector and cut by ear clipping (mapbox-earcut).
     Self-intersecting polygons have no right answer; they also give n - 2 triangles."""
     counts, corners = np.asarray(counts, dtype=np.int64), np.asarray(corners)
     fan = np.maximum(counts - 2, 0)
@@ -44,7 +44,7 @@ def strip(indices: np.ndarray) -> np.ndarray:
 
 def _areas(corners: np.ndarray, counts: np.ndarray, vertices: np.ndarray, triangles: np.ndarray,
            polygon: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return area vectors (P, 3) of twice the area's length (0 for up to three corners), and the indices of the concave polygons."""
+    """Return area vectors (P, 3), of length 2 * area (0 for polygons of up to three corners), and the indices of the concave polygons."""
     area, against = np.zeros((len(counts), 3)), np.zeros(len(counts), dtype=bool)
     large = counts > 3  # triangles are convex
     size, several = counts[large] - 2, large[polygon]

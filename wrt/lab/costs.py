@@ -47,7 +47,7 @@ class LoggedStructure(NamedTuple):
 
 
 class CostCounter:
-    """A render that counts traversal steps. built: the same scene prepared for pictures; the counter shares its structure and arrays."""
+    """A render that counts traversal steps. built: the scene prepared for pictures, whose structure and arrays the counter shares."""
 
     def __init__(self, plan: Plan, device: Device, built: Prepared | None = None) -> None:
         counting = plan.structure._replace(units=plan.structure.units._replace(counters=True))
@@ -56,7 +56,7 @@ class CostCounter:
 
     @classmethod
     def beside(cls, built: Prepared) -> CostCounter:
-        """Return a counter that shares the structure and arrays of a scene prepared for pictures."""
+        """Return a counter that shares the structure and arrays of `built`, a scene prepared for pictures."""
         return cls(built.plan, built.device, built)
 
     def aim(self, camera: CameraKind, angles_of: tuple[int, int] | None = None, **settings: Any) -> None:
@@ -83,7 +83,7 @@ class CostCounter:
         return wp.zeros(n, dtype=dtype, device=self.prepared.device)
 
     def totals(self, rectangle: Rectangle, film: DeviceFilm) -> tuple[np.ndarray, np.ndarray]:
-        """Return the number of rays of each pixel of a tile, row by row, and the sums of their counters."""
+        """Trace a tile; return each pixel's number of rays, and the sums of these rays' counters, row by row."""
         n = rectangle[2] * rectangle[3]
         recorder, log = Recorder(), ray_log.RayLog()
         recorder.counts, log.used = self.zeros(n, Counts), self.zeros(n, wp.int32)
@@ -91,7 +91,7 @@ class CostCounter:
         return log.used.numpy(), on_host(recorder.counts)
 
     def costs(self, go_on: Callable[[int], bool] = lambda done: True) -> dict[str, np.ndarray] | None:
-        """Return a map (H, W) int32 for each of COUNTERS: the sum over a pixel's rays (stack: the largest).
+        """Return a map (H, W) int32 for each of COUNTERS: the sum over a pixel's rays (for `stack` the largest value).
         After each tile, a thread calls `go_on` with the number of finished pixels. If it returns False, stop and return None."""
         film = self.film()
         x0, y0, x1, y1 = self.prepared.plan.crop

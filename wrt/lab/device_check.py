@@ -64,7 +64,7 @@ structure over that of the row's structure."""
 
 @dataclass(frozen=True)
 class Check:
-    """Options of the check. scenes: files, by default wrt's own; rays, cases: number for each mesh and kind, and for each hard case."""
+    """Options of the check. scenes: files, default: wrt's own; rays: number of each kind for each mesh; cases: rays of each hard case."""
 
     device: str
     scenes: Sequence[Path] = ()
@@ -120,7 +120,7 @@ def compile_all(plan: Check) -> None:
 
 
 def function_rows(plan: Check) -> Iterator[Row]:
-    """Yield a row for each elementary function, compared for numbers that are usual in shading and for random bits."""
+    """Yield a row for each elementary function. Its arguments are numbers that are usual in shading, and random bits."""
     rng = np.random.default_rng(0)
     common = rng.normal(0.0, 4.0, size=(2, 50_000)).astype(np.float32)
     x, y = np.concatenate([common, rng.integers(0, 2**32, size=common.shape, dtype=np.uint32).view(np.float32)], axis=1)
@@ -138,7 +138,7 @@ def function_values(x: np.ndarray, y: np.ndarray, name: str) -> np.ndarray:
 
 
 def hit_rows(plan: Check) -> Iterator[Row]:
-    """Yield a row for each structure, with the hits of all meshes and kinds of rays."""
+    """Yield for each structure a row that compares its hits with the CPU's, for all meshes and kinds of rays."""
     geometries = {name: Geometry.of(make()) for name, make in MESHES.items()}
     on_cpu = {name: build(geometry, device="cpu") for name, geometry in geometries.items()}
     rays = {name: ray_sets(accel, plan.rays) for name, accel in on_cpu.items()}
@@ -153,7 +153,7 @@ def hit_rows(plan: Check) -> Iterator[Row]:
 
 
 def compare(accel: Accelerator, truth: Accelerator, rays: RaySet) -> np.ndarray:
-    """Return flags of the rays whose hits differ in a bit, (N,)."""
+    """Return flags of the rays whose hits in `accel` and `truth` differ in a bit, (N,)."""
     found, expected = (answer(each, rays, None) for each in (accel, truth))
     if not (isinstance(found, Hits) and isinstance(expected, Hits)):
         return different(np.asarray(found), np.asarray(expected))
@@ -161,13 +161,13 @@ def compare(accel: Accelerator, truth: Accelerator, rays: RaySet) -> np.ndarray:
 
 
 def different(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return flags of the rows whose bits differ, (N,)."""
+    """Return flags of the rows of two arrays whose bits differ, (N,)."""
     a, b = (np.ascontiguousarray(each).reshape(len(each), -1).view(np.uint8) for each in (a, b))
     return (a != b).any(axis=1)
 
 
 def hard_row(plan: Check) -> Row:
-    """Return the row of the default structure's hits in all hard cases whose rays and meshes wrt accepts."""
+    """Return the row that compares the default structure's hits in all hard cases whose rays and meshes wrt accepts."""
     differ = dict[str, np.ndarray]()
     for name in HARD_CASES:
         case = generate(name, plan.cases)
@@ -178,13 +178,13 @@ def hard_row(plan: Check) -> Row:
 
 
 def row(part: str, what: str, differ: dict[str, np.ndarray]) -> Row:
-    """Return the row that counts the differences. differ: place -> a flag for each result."""
+    """Return the row that counts the differences. differ: name of meshes or rays -> flags of their results that differ."""
     return Row(part=part, what=what, count=sum(map(len, differ.values())), differ=sum(int(each.sum()) for each in differ.values()),
                where=[place for place, each in differ.items() if each.any() and place])
 
 
 def speed_rows(plan: Check) -> tuple[list[Row], str]:
-    """Measure wrt's structures and Warp's mesh query with each constructor. Return the rows and the reasons of skipped constructors.
+    """Time wrt's structures, and Warp's mesh query with each BVH constructor. Return the rows, and why constructors were skipped.
     If the device runs none of Warp's queries, return no rows."""
     geometry, device = Geometry.of(terrain(TIMED_CELLS)), start(plan.device)
     algorithms: dict[str, Any] = {f"wrt {name}": Own(structure=name, device=plan.device) for name in structures() if name != "brute_force"}

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from typing import Any, ClassVar
 
-# Names that an option accepts: their kind, as messages call it, and their table.
+# Names that an option accepts: what messages call such a name, and the table of the names.
 STRUCTURES = ("structure", "wrt.accel.structures:ACCELERATORS")
 KINDS = ("kind of ray", "wrt.lab.bench.rays:RAY_KINDS")
 GPUS = ("GPU", "wrt.lab.rtcore.parameters:GPUS")
@@ -22,8 +22,8 @@ MODELLED = "GPU to model: rtx2080ti or rtx2060"
 
 def option(default: Any, text: str = "", between: tuple[int, int] | None = None, of: tuple[str, str] | None = None) -> Any:
     """Return a field of a Plan.
-    - text: help of the option; "" makes the field an argument. between: lowest and highest value (None is always allowed).
-    - of: kind and table of the names that the field accepts; the table as "module:TABLE"."""
+    - text: help of the option; "" makes the field a positional argument. between: lowest and highest value (None is always allowed).
+    - of: for a field of names: what messages call such a name, and the table of the names as "module:TABLE"."""
     return field(default=default, metadata={"text": text, "between": between, "of": of})
 
 
@@ -137,7 +137,7 @@ class Peers(Plan):
 class HardCases(Plan):
     """Run the hard cases on wrt and other ray libraries: count rays lost, hits invented and wrong triangles, and measure the error of t.
 
-    CASES: names such as E_grid, or letters of groups such as E; default: all."""
+    CASES: names such as E_grid, or letters of groups such as E; default: all that need no spheres and no t_min."""
 
     COMMAND, STUDY, QUICK = "bench hard-cases", "wrt.lab.hard_cases.comparison", {"rays": 100}
     cases: Sequence[str] = option(())
@@ -239,7 +239,7 @@ class WhatIf(Plan):
     """Change one part of the RT core's design, trace the same rays through MESH, and compare their cost.
 
     STUDY names the part. "width": children, format and bounding volume of a node. "stack": entries of a short stack with restarts.
-    "planes": bits of a box plane. "order": nearer child first, early stop. "sorting": order of the rays. "rates": tests a clock."""
+    "planes": bits of a box plane. "order": order of children, early stop. "sorting": order of the rays. "rates": tests a clock."""
 
     COMMAND, STUDY = "whatif", "wrt.lab.rtcore.whatif"
     study: str = option(MISSING, of=("study", "wrt.lab.rtcore.whatif:STUDIES"))

@@ -86,7 +86,7 @@ def tune(device: str, seconds: float = 1.0) -> dict[str, str]:
     device : str
         Name of the device: "cpu", "cuda:0" ...
     seconds : float
-        Time to measure, in all. Compiling and building come before and take longer.
+        Total time of the measurements. Compiling and building come before and take longer.
 
     Returns
     -------
@@ -120,7 +120,7 @@ def measured(device: str, seconds: float = 1.0, clock: Callable[[], float] = tim
 
 def measure(choices: list[Choice], geometry: Geometry, rays: Mapping[str, RaySet], device: Device, seconds: float,
             clock: Callable[[], float]) -> tuple[list[Row], dict[Choice, float]]:
-    """Measure all choices; return the rows and each choice's speed over the first one's, the default."""
+    """Measure all choices; return the rows, and choice -> its speed over the speed of the first choice, the default."""
     jobs: dict[tuple[Choice, str], Callable[[], None]] = {}
     for accel in dict.fromkeys(choice.accel for choice in choices):
         own = Own(structure=accel, device=device.alias)
@@ -140,7 +140,7 @@ def measure(choices: list[Choice], geometry: Geometry, rays: Mapping[str, RaySet
 
 
 def fastest(speeds: Mapping[Choice, float]) -> Choice:
-    """Return the fastest choice, or DEFAULT if no choice is faster by MARGIN. speeds: speed over the default's."""
+    """Return the fastest choice, or DEFAULT if no choice is MARGIN times as fast. speeds: choice -> speed over the default's."""
     best = max(speeds, key=lambda choice: speeds[choice])
     return best if speeds[best] >= MARGIN else DEFAULT
 

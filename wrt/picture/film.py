@@ -15,7 +15,7 @@ from wrt.core.types import PathLike, WarpArray
 from wrt.picture.image import as_half, check_writable, color_channels, encode_png, output_format, write_codes, write_exr, write_image
 from wrt.picture.tonemap import to_codes
 
-# Letters of the channels of a layer in an EXR file; any other layer has one channel of its own name.
+# Letters of the channels of a layer in an EXR file. Any other layer has one channel of its own name, or R, G and B.
 LETTERS = {"variance": "RGB", "depth": "Z", "normal": "XYZ", "albedo": "RGB"}
 
 
@@ -34,16 +34,16 @@ class Film:
     samples
         (H, W) int32, number of samples of each pixel.
     aov
-        Layers by name, (H, W) or (H, W, 3) each. A value is that of the first hit of one ray through the centre of the pixel and of the
-        lens: it is neither filtered nor averaged over samples. Rays hit surfaces of alpha mode "blend", but not what "mask" cuts out.
+        Layers by name, (H, W) or (H, W, 3) each. Each value comes from the first hit of one ray, through the centres of the pixel
+        and of the lens. It is neither filtered nor averaged. The ray hits surfaces of alpha mode "blend", but not what "mask" cuts out.
 
         - "depth", float32: distance from the camera along the ray, in scene units (not along the camera's axis); inf on a miss.
         - "normal", float32: unit shading normal in world space, on the side of the camera; 0 on a miss.
         - "albedo", float32: albedo of the material, with its texture; 0 on a miss.
-        - "prim_id", int32: index of the triangle, all objects in order, then of the sphere; -1 on a miss.
+        - "prim_id", int32: index of the triangle or sphere: first the triangles of all objects in order, then the spheres; -1 on a miss.
         - "material_id", int32: index into `scene.materials`; -1 on a miss.
     stats
-        Counts and times. `stats["seconds"]` has the wall-clock seconds of each stage, including those before a resume: "compile" (runs
+        Counts and times. `stats["seconds"]` has the wall-clock seconds of each stage, also of the runs before a resume: "compile" (runs
         beside "upload" and "build"), "aov" and "trace". "lost_throughput_per_sample" is the radiance that cut rays would have added in
         surroundings of radiance 1. "visibly_cut" is the share of pixels that lose 5 % or more of their radiance by `max_depth`.
     metadata
@@ -171,7 +171,7 @@ def aov_path(path: PathLike, name: str) -> Path:
 
 
 def layer_channels(name: str, array: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the EXR channels of a layer by name: depth.Z, normal.X ...; a layer that is not in LETTERS has one channel, `name`."""
+    """Return the EXR channels of a layer by name: depth.Z, normal.X ... Layers not in LETTERS: `name`, or name.R, name.G, name.B."""
     if array.ndim == 3:
         return color_channels(name, array, LETTERS.get(name, "RGB"))
     return {f"{name}.{LETTERS[name]}" if name in LETTERS else name: array}

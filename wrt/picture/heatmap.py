@@ -45,7 +45,7 @@ def top_of(values: np.ndarray) -> float:
 
 
 def step_of(top: float) -> float:
-    """Return the distance of the marks of a scale from 0 to `top`, for 4 to 10 marks: 1, 2 or 5 times a power of ten."""
+    """Return the distance of the marks of a scale from 0 to `top`: 1, 2 or 5 times a power of ten. 4 to 10 distances reach `top`."""
     power = 10.0 ** math.floor(math.log10(top / 4.0))
     return next(power * factor for factor in (5.0, 2.0, 1.0) if top / (power * factor) >= 4.0 - 1e-9)
 
@@ -58,7 +58,7 @@ def colored(values: np.ndarray, top: float) -> np.ndarray:
 def heatmap(values: np.ndarray, title: str, top: float | None = None) -> np.ndarray:
     """Draw values (h, w) >= 0, row 0 on top, as (H, W, 3) uint8 with a title and a colour scale.
 
-    top: end of the scale, whose colour larger values have, too; None: `top_of(values)`. The mean and the largest value follow the title."""
+    top: end of the scale; larger values have its colour; None: `top_of(values)`. The mean and the largest value follow the title."""
     with needed_by("a heat map"):
         from PIL import Image, ImageDraw
 
@@ -85,7 +85,7 @@ def heatmap(values: np.ndarray, title: str, top: float | None = None) -> np.ndar
 
 
 def short(value: float) -> str:
-    """Format a value with three digits; from ten thousand on in k (thousands), from ten million on in M (millions)."""
+    """Format a value with three digits (four from 1000 on); in k (thousands) from ten thousand on, in M (millions) from ten million on."""
     for factor, letter in ((1e6, "M"), (1e3, "k")):
         if value >= 10.0 * factor:
             return f"{value / factor:.3g}{letter}"

@@ -34,7 +34,7 @@ def compare(a: np.ndarray, b: np.ndarray, *, exposure: float = 0.0, tonemap: str
         From linear values of all pixels and channels: "mse"; "relmse", the mean of (a - b)^2 / (b^2 + 0.01) [1]_; "max_abs", the
         largest difference; "mean_ratio", mean(a) / mean(b). From displayed values: "psnr" of sRGB codes with peak 1, in dB (inf if
         equal); "flip", the mean of `flip_map`. These are NaN if no pixel is finite. Counts: "pixels"; "nonfinite_a" and "nonfinite_b",
-        pixels with NaN or infinity; "nonfinite_differ", such pixels at which a and b differ.
+        pixels with NaN or infinity; "nonfinite_differ", pixels with NaN or infinity in a or b at which a and b differ.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def failures(result: Mapping[str, float], limits: Mapping[str, float | None]) ->
         Result of `compare`.
     limits
         Limits by name: a lower limit for psnr, upper limits for other measures; None for no limit. NaN violates every limit. With any
-        limit, pixels that are not finite and differ are a failure, too.
+        limit, pixels that are NaN or infinite in a picture and at which the two differ are a failure, too.
     """
     active = {name: limit for name, limit in limits.items() if limit is not None}
     sentences = []
@@ -152,7 +152,7 @@ def flip_map(a: np.ndarray, b: np.ndarray, pixels_per_degree: float = PIXELS_PER
 
 # --- difference image -------------------------------------------------------------------------------------------------
 
-# Colours for differences from 0 to the limit.
+# Colours for differences from 0 to the limit of the colour scale.
 BRIGHTER = np.array([[0, 0, 0], [220, 40, 20], [255, 210, 60], [255, 255, 255]], dtype=np.float64)
 DARKER = np.array([[0, 0, 0], [30, 70, 230], [70, 220, 255], [255, 255, 255]], dtype=np.float64)
 NONFINITE_COLOR = (0, 200, 0)
@@ -194,7 +194,7 @@ def difference_image(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _heat(share: np.ndarray) -> np.ndarray:
-    """Return colours, (..., 3) uint8, of shares of the limit, clipped to [-1, 1]."""
+    """Return colours, (..., 3) uint8, of differences as shares of the colour scale's limit, clipped to [-1, 1]."""
     steps = np.linspace(0.0, 1.0, len(BRIGHTER))
     size = np.clip(np.abs(share), 0.0, 1.0)
     colors = [np.where(share >= 0.0, np.interp(size, steps, BRIGHTER[:, i]), np.interp(size, steps, DARKER[:, i])) for i in range(3)]

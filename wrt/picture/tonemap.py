@@ -49,7 +49,7 @@ def reinhard(linear: np.ndarray) -> np.ndarray:
     return linear * ((1.0 + bright / REINHARD_WHITE**2) / (1.0 + bright))
 
 
-# Matrices that act on columns of RGB. In: Rec. 709 to AP1 with the desaturation of the RRT; out: AP1 to Rec. 709 with that of the ODT.
+# Matrices that act on columns of RGB. In: Rec. 709 to AP1 with the desaturation of the RRT; out: AP1 to Rec. 709, with the ODT's.
 ACES_IN = np.array([[0.59719, 0.35458, 0.04823], [0.07600, 0.90834, 0.01566], [0.02840, 0.13383, 0.83777]])
 ACES_OUT = np.array([[1.60475, -0.53108, -0.07367], [-0.10208, 1.10813, -0.00605], [-0.00327, -0.07276, 1.07602]])
 
@@ -71,13 +71,13 @@ AGX_INSET = np.array([
 ])
 AGX_INSET /= AGX_INSET.sum(axis=1, keepdims=True)
 AGX_OUTSET = np.linalg.inv(AGX_INSET)
-AGX_MIN_EV, AGX_MAX_EV = -10.0, 6.5  # stops about mid-grey, 0.18
+AGX_MIN_EV, AGX_MAX_EV = -10.0, 6.5  # stops below and above mid-grey, 0.18
 AGX_PIVOT = (AGX_MIN_EV / (AGX_MIN_EV - AGX_MAX_EV), 0.5)
 AGX_SLOPE, AGX_TOE_POWER, AGX_SHOULDER_POWER = 2.0, 3.0, 3.25
 
 
 def _agx_half(reach: np.ndarray, x_span: float, y_span: float, power: float) -> np.ndarray:
-    """Evaluate one half of the sigmoid at `reach` from the pivot: from (0, 0) with slope AGX_SLOPE to the end (x_span, y_span)."""
+    """Evaluate half of the sigmoid at the distance `reach` from the pivot. It goes from (0, 0), at slope AGX_SLOPE, to (x_span, y_span)."""
     scale = (((AGX_SLOPE * x_span / y_span) ** power - 1.0) * (AGX_SLOPE * x_span) ** -power) ** (-1.0 / power)
     term = AGX_SLOPE * reach / scale
     return scale * term / (1.0 + term**power) ** (1.0 / power)
@@ -97,8 +97,8 @@ def agx(linear: np.ndarray) -> np.ndarray:
     """Apply Troy Sobotka's AgX, base look: inset, log2 between -10 and +6.5 stops, sigmoid, outset, 2.2 power to linear.
 
     Sources: T. Sobotka, AgX-S2O3 (inset matrix, range, sigmoid), with the slope and powers of the NumPy version in the
-    AgX repository; B. Wrensch, "Minimal AgX Implementation" (2023), for undoing the inset after the curve and for the
-    2.2 power that the codes are meant for."""
+    AgX repository; B. Wrensch, "Minimal AgX Implementation" (2023), for the outset, the inverse of the inset, and for
+    the power of 2.2, which turns codes into light."""
     inset = linear @ AGX_INSET.T.astype(linear.dtype)
     stops = np.log2(np.maximum(inset / 0.18, 2.0**AGX_MIN_EV))
     x = np.clip((stops - AGX_MIN_EV) / (AGX_MAX_EV - AGX_MIN_EV), 0.0, 1.0)

@@ -1,1 +1,1 @@
-"""From a scene to a film: features, upload, structure, kernels, tiles and passes, checkpoints, workers."""
+"""The renderer, from a scene to a film: kernel features, upload, acceleration structure, kernels, passes, checkpoints, workers."""

@@ -30,8 +30,8 @@ class Animation:
     """Parameters of an animation. Raises InputError for values out of range.
 
     - frames: number of frames, at the times 0, 1 / frames, 2 / frames ... of one period; the animation loops seamlessly.
-    - degrees: orbit of the camera in one period (None: 360, or 0 if an object moves).
-    - rebuild_at: factor by which the SAH cost grows until the structure is rebuilt instead of refitted.
+    - degrees: angle in degrees that the camera orbits in one period. None: 360, or 0 if an object moves.
+    - rebuild_at: growth of the SAH cost since the last build, a factor. Above it, the structure is rebuilt instead of refitted.
     """
 
     frames: int = 36
@@ -49,8 +49,8 @@ class Animation:
 def animate(scene: Scene, animation: Animation, options: Options) -> Iterator[Film]:
     """Yield the frames one by one. After Ctrl-C, the interrupted frame is the last.
 
-    Each film has stats["frame"]: number, time in the period, "structure" ("built", "kept", "refitted" or "rebuilt"), seconds for the
-    structure, and growth of its SAH cost. Moving meshes are not instanced. Raises InputError if nothing moves."""
+    Each film has the dict stats["frame"]: "number", "time" (0 to 1 in the period), "structure" ("built", "kept", "refitted" or "rebuilt"),
+    its "seconds", and the "growth" of its SAH cost. If an object moves, no mesh is instanced. Raises InputError if nothing moves."""
     degrees = animation.degrees if animation.degrees is not None else (0.0 if moves(scene) else 360.0)
     if animation.frames > 1 and degrees == 0.0 and not moves(scene):
         raise InputError("nothing moves: no object has a motion, and the camera orbits by 0 degrees")
@@ -74,7 +74,7 @@ def animate(scene: Scene, animation: Animation, options: Options) -> Iterator[Fi
 
 
 def orbited(camera: CameraKind, middle: np.ndarray, degrees: float) -> CameraKind:
-    """Return the camera rotated about the +y axis through the point on its viewing axis closest to `middle` (3,)."""
+    """Rotate the camera about a vertical (+y) axis, which passes through the point closest to `middle` (3,) on the viewing ray."""
     if degrees == 0.0:
         return camera
     pose = camera.camera_to_world
@@ -89,7 +89,7 @@ def orbited(camera: CameraKind, middle: np.ndarray, degrees: float) -> CameraKin
 
 
 def check_output(path: str | os.PathLike[str]) -> Path:
-    """Return a movie's path, with a suffix of MOVIES, or a folder's path, after creating it. Raises InputError if that fails."""
+    """Check the output path: a movie file with a suffix in MOVIES, or a folder, which is created. Raises InputError if it is unusable."""
     path = Path(path)
     if path.suffix.lower() in MOVIES:
         check_writable(path)
@@ -105,12 +105,12 @@ def check_output(path: str | os.PathLike[str]) -> Path:
 
 
 def frame_path(folder: Path, number: int, frames: int) -> Path:
-    """Return a file name for a frame; the names sort in the order of the frames."""
+    """Return the file of frame `number` of `frames`. Leading zeros make the names sort in the order of the frames."""
     return folder / f"frame_{number:0{max(len(str(frames - 1)), 3)}d}.png"
 
 
 def save_movie(path: str | os.PathLike[str], frames: Sequence[np.ndarray], fps: float) -> None:
-    """Write pictures, (H, W, 3) uint8 each, as one looping animation. Raises InputError, and leaves no file, if the system refuses.
+    """Write pictures, (H, W, 3) uint8 each, as one looping animation. Raises InputError, and leaves no file, if writing fails.
 
     A .gif has 256 dithered colours per frame, and frame times in hundredths of a second. .png and .apng keep all colours."""
     with needed_by("a movie"):

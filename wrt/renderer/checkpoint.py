@@ -1,8 +1,8 @@
-"""Checkpoints of long renders: the film in a file that is complete at any moment (wrt.core.write_file).
+"""Checkpoints of long renders: the film in a file, which is replaced as a whole, so that it is never incomplete (wrt.core.write_file).
 
 A checkpoint is a file with checksums (wrt.core.checked_file). It contains the identity of its render (everything that can change a
 pixel), the progress, and the film's arrays with the number of samples of each pixel. A render can resume from any state between two
-tiles. If two renders write the same checkpoint, it has the last complete state of one of them.
+tiles. If two renders write the same checkpoint, the file has the film of the render that wrote last.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ DIFFERENT = {"scene": "the scene differs", "camera": "the camera differs", "kern
 
 @dataclass(frozen=True)
 class Saved:
-    """Contents of a checkpoint. samples: smallest and largest number of samples of a pixel per group; seconds: time of tracing."""
+    """Contents of a checkpoint file. Groups of samples: see wrt.renderer.film_arrays."""
 
-    samples: tuple[int, int]
-    seconds: float
-    identity: dict[str, Any]
-    body: memoryview
+    samples: tuple[int, int]  # Samples in one group: of the pixel with the fewest, and of the pixel with the most.
+    seconds: float  # Time of tracing.
+    identity: dict[str, Any]  # See Checkpoint.
+    body: memoryview  # The film's arrays, in the order of DeviceFilm.arrays.
 
 
 def read(path: str | os.PathLike[str]) -> Saved:
@@ -61,7 +61,7 @@ def read(path: str | os.PathLike[str]) -> Saved:
 
 
 class Checkpoint:
-    """The checkpoint of one render. identity: JSON values that must be equal on resume; groups: number of groups of samples.
+    """The checkpoint of one render. identity: JSON values that must be equal on resume. groups: number of the film's groups of samples.
 
     With `resume`, the constructor reads an existing file and refuses it if its identity differs. Without `resume`, it refuses any
     existing file. It also checks that the file can be written."""
@@ -95,7 +95,7 @@ class Checkpoint:
     # --- writing ------------------------------------------------------------------------------------------------------
 
     def begin(self) -> None:
-        """Start the clock. Raises InputError if another render has written the file since the constructor looked for it."""
+        """Start the clock for `due`. Raises InputError if another render has written the file since the constructor looked for it."""
         if self.saved is None and os.path.lexists(self.path):
             raise InputError("exists: another render wrote it meanwhile", path=self.path)
         self._last = time.monotonic()
@@ -105,7 +105,7 @@ class Checkpoint:
         return time.monotonic() - self._last >= self.every
 
     def save(self, film: DeviceFilm, seconds: float) -> None:
-        """Write the film. If the system refuses, keep the old file and store the reason in `problem`, so that the render can continue."""
+        """Write the film. If writing fails, keep the old file and store the reason in `problem`, so that the render can continue."""
         samples = film.view(film.groups[0].samples)
         header = {"samples": [int(samples.min()), int(samples.max())], "seconds": seconds, "identity": self.identity}
         try:
@@ -119,7 +119,7 @@ class Checkpoint:
     # --- reading ------------------------------------------------------------------------------------------------------
 
     def restore(self, film: DeviceFilm) -> None:
-        """Copy the arrays of the file into an empty film. Raises InputError if they are invalid."""
+        """Copy the arrays of the file into an empty film. Raises InputError if the arrays are invalid."""
         assert self.saved is not None
         if len(self.saved.body) != sum(film.view(array).nbytes for _, array in film.arrays()):
             raise InputError("is damaged: its arrays have the wrong size", path=self.path)
@@ -138,7 +138,7 @@ class Checkpoint:
 
 
 def checkpoint_of(plan: Plan, kind: str) -> Checkpoint | None:
-    """Return the checkpoint that the plan's options name, or None. kind: kind of the device (wrt.renderer.prepare.kind_of).
+    """Return the checkpoint that the plan's options ask for, or None. kind: kind of the device (wrt.renderer.prepare.kind_of).
 
     Raises InputError if the checkpoint cannot be written or resumed."""
     options, settings = plan.options, plan.scene.settings

@@ -1,4 +1,4 @@
-"""Features that the render kernels of a scene are compiled with."""
+"""The Features (kernels/shade/features.py) with which the render kernels of a scene are compiled."""
 
 from __future__ import annotations
 

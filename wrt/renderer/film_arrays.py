@@ -26,7 +26,7 @@ OF_AOVS = {"depth": wp.float32, "normal": wp.vec3, "albedo": wp.vec3, "prim_id":
 
 
 class DeviceFilm:
-    """Arrays with one entry for each pixel of the crop, for the render kernel: a struct and a seed for each group of samples.
+    """The film of the render kernel: arrays with one entry for each pixel of the crop, and a struct Film and a seed for each group.
 
     The samples of a group form one scrambled sequence. Its points are evenly spread, so that the variance of the samples overestimates
     the error of their mean. Groups with different scrambles have independent means. The variance of these means, divided by the number
@@ -52,13 +52,13 @@ class DeviceFilm:
         self._read: dict[int, np.ndarray] | None = None  # in a snapshot: host copies of arrays, by device address
 
     def snapshot(self) -> DeviceFilm:
-        """Return a copy of this object for reading. It copies each array from a GPU only once, at the first use."""
+        """Return a read-only copy of this object. The copy fetches each array from a GPU only once, at its first use."""
         out = copy(self)
         out._read = {}
         return out
 
     def arrays(self) -> list[tuple[str, WarpArray]]:
-        """Return all arrays that samples change, with names: the shared arrays, then the arrays of each group."""
+        """Return name and array for all arrays that samples change: the arrays that the groups share, then the arrays of each group."""
         own = [(f"{name} of group {i}", getattr(film, name)) for i, film in enumerate(self.groups) for name in OF_A_GROUP]
         return [(name, getattr(self.groups[0], name)) for name in SHARED] + own
 
@@ -80,19 +80,19 @@ class DeviceFilm:
         return self.view(array).copy()
 
     def count(self, name: str) -> int:
-        """Return the sum over all pixels of an array of counts in SHARED, such as "rays"."""
+        """Return the sum over all pixels of an array of counts. name: its key in SHARED, such as "rays"."""
         return int(self.view(getattr(self.groups[0], name)).sum(dtype=np.int64))
 
     def lost_throughput(self) -> float:
-        """Return the throughput of all rays that were cut, summed over all samples."""
+        """Return the sum of the throughputs of all cut rays, over all samples and pixels."""
         return sum(float(self.picture(film.lost).sum(dtype=np.float64)) for film in self.groups)
 
     def visibly_cut(self, most_by_throughput: float) -> float:
         """Return a lower bound of the share of pixels that are visibly too dark because of max_depth.
 
-        Visibly too dark: the rays cut by max_depth would have added VISIBLE or more to the pixel, in surroundings of radiance 1.
+        Visibly too dark: in surroundings of radiance 1, the rays cut by max_depth would have added more than VISIBLE to the pixel.
 
-        most_by_throughput: upper bound of the throughput of a ray cut by min_throughput. The array `lost` contains these rays too."""
+        most_by_throughput: upper bound of the throughput of one ray cut by min_throughput, which `lost` contains, too."""
         film = self.groups[0]
         lost = sum((self.view(group.lost) for group in self.groups[1:]), self.view(film.lost))
         by_depth = np.where(self.view(film.cut_depth) > 0, lost - most_by_throughput * self.view(film.cut_throughput), 0.0)
@@ -105,7 +105,7 @@ class DeviceFilm:
     def pixels_and_variance(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the mean of the samples and the estimated variance of that mean, (H, W, 3) float32 each.
 
-        The variance is inf in a pixel with fewer than two samples; with several groups, in a pixel without samples."""
+        With one group, the variance is inf in a pixel with fewer than two samples. With several groups, it is inf without samples."""
         if len(self.groups) == 1:
             film = self.groups[0]
             n = self.picture(film.samples)[..., None].astype(np.float32)
@@ -130,7 +130,7 @@ class DeviceFilm:
 
 
 class AovFilm:
-    """Arrays with one entry for each pixel of the crop, for the AOV kernel."""
+    """The film of the AOV kernel: arrays with one entry for each pixel of the crop."""
 
     def __init__(self, settings: Settings, crop: tuple[int, int, int, int], device: Device) -> None:
         x0, y0, x1, y1 = crop

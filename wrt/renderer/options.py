@@ -35,15 +35,15 @@ class Progress:
     Parameters
     ----------
     done, total
-        Number of samples done, and of all samples, summed over the pixels. In the stages before "trace": percent done, and 100.
+        Number of samples done, and of all samples, summed over the pixels. Before the stage "trace": percent done, and 100.
     rays, seconds
-        Number of rays traced so far, and seconds of tracing; before "trace", seconds since preparing began.
+        Number of rays traced so far, and seconds of tracing. Before the stage "trace": 0, and seconds since preparing began.
     stage
-        "trace"; before it, if preparing takes longer than a second, "compile" (reported once) and "build".
+        "trace" while rays are traced. If preparing takes over a second, "compile" (reported once) and "build" come before.
     note
-        A problem that does not end the render, or "".
+        Text about a problem that does not end the render, or "".
     picture
-        Function that makes a Film (pixels, variance, samples) of the samples so far. Running tiles may be incomplete in it.
+        Function that returns a Film of the samples so far, with pixels, variance and samples only. Running tiles may be incomplete.
     """
 
     done: int
@@ -67,7 +67,7 @@ class Progress:
 
 @dataclass
 class Options:
-    """The options of `render` as one object, without the scene's settings. The docstring of `render` defines each.
+    """The options of `render` as one object, without the scene's settings. The docstring of `render` defines each option.
 
     Raises
     ------

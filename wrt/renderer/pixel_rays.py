@@ -1,4 +1,4 @@
-"""The camera rays of a picture as arrays, for queries."""
+"""The camera rays of a picture as arrays, for ray queries."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ camera_rays_kernel = made_once(make_camera_rays_kernel)
 
 
 def camera_rays(camera: CameraKind, size: tuple[int, int] | str) -> tuple[np.ndarray, np.ndarray]:
-    """Make one ray for each pixel, through the centres of the lens and of the pixel. The AOVs of a Film use the same rays.
+    """Make one ray for each pixel, through the centres of the lens and of the pixel. The AOVs of a Film come from the same rays.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def camera_rays(camera: CameraKind, size: tuple[int, int] | str) -> tuple[np.nda
 
 
 def film_rays(camera: CameraKind, size: tuple[int, int], film: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Make rays through points (N, 2) of a picture of `size` pixels; (0, 0) is its top left corner, (1, 1) the bottom right."""
+    """Make rays through the points `film` (N, 2) of a picture; its top left corner is (0, 0), its bottom right corner (1, 1)."""
     device = start("cpu")
     kernel = camera_rays_kernel(import_module(as_one(camera, CameraKind, "camera").device))
     origins, directions = (wp.empty(len(film), dtype=wp.vec3, device=device) for _ in range(2))

@@ -1,6 +1,6 @@
-"""Rendering with threads that trace one ray at a time (wrt.kernels.loops.one_ray): on CUDA, and for counters.
+"""Rendering with threads that trace one ray at a time (wrt.kernels.loops.one_ray): on CUDA, and on a CPU if rays are counted.
 
-A thread renders a pixel. If there are too few pixels to occupy all multiprocessors of a GPU, a thread renders one sample.
+A thread renders all samples of a pixel. If the pixels are too few to occupy a GPU, a thread renders one sample only.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ ROUNDS = 4  # threads in one launch for each resident thread
 
 def film_launch(device: Device, kernel: Kernel, scene: SceneRecords, limits: list[WarpStruct], film: DeviceFilm,
                 always_by_pixels: bool) -> Callable[[Work], int]:
-    """Return a function that adds samples to the film and returns the number of samples, summed over pixels.
+    """Return a function that adds the samples of a Work to the film, and returns their number, summed over the pixels.
 
-    limits: one struct for each group of the film; always_by_pixels: a thread renders a pixel, never one sample."""
+    limits: a struct Limits for each group of the film. always_by_pixels: each thread renders all samples of a pixel."""
     most_threads = 0 if always_by_pixels else device.sm_count * THREADS_OF_SM * ROUNDS
     samples = wp.empty(0, dtype=Sample, device=device)
 
@@ -50,7 +50,7 @@ def film_launch(device: Device, kernel: Kernel, scene: SceneRecords, limits: lis
 
 
 def aov_launch(device: Device, kernel: Kernel, scene: SceneRecords, film: AovFilm) -> Callable[[Work], int]:
-    """Return a function that writes the AOVs of a rectangle to the film and returns the number of pixels."""
+    """Return a function that writes the AOVs of a Work's rectangle to the film, and returns the number of pixels."""
 
     def trace(work: Work) -> int:
         launch_on(device, kernel, work.rectangle[2] * work.rectangle[3], scene.accel, scene.surfaces, scene.camera, film.struct,

@@ -43,8 +43,8 @@ def aov_kernel(features: Features, structure: Structure) -> Kernel:
 class Plan:
     """A scene and the options of its render, with defaults resolved.
 
-    - accel: the structure's real name ("bvh" is an alias); meshes: id()s of the instanced meshes (wrt.accel.scenes.instancing).
-    - structure: a Structure, or a class with its members; crop: x0, y0, x1, y1 in pixels.
+    - accel: the acceleration structure's real name ("bvh" is an alias). structure: a Structure, or a class with the same members.
+    - meshes: id()s of the instanced meshes (wrt.accel.scenes.instancing). crop: x0, y0, x1, y1 in pixels.
     - deepest: largest max_depth for which the kernels' stacks suffice.
     """
 
@@ -79,7 +79,7 @@ class Plan:
 
     @property
     def by_waves(self) -> bool:
-        """True if many samples are traced in a wave: on the CPU, without counters. Otherwise a thread traces one ray at a time."""
+        """True if samples are traced in waves: on the CPU, unless rays are counted. Otherwise a thread traces one ray at a time."""
         return self.options.device == "cpu" and not self.structure.units.counters
 
     @property
@@ -88,7 +88,7 @@ class Plan:
 
     @property
     def kernels(self) -> list[Kernel]:
-        """All kernels to compile. Without waves: the render kernel; for AOVs, the AOV kernel; on GPUs, add_samples."""
+        """All kernels to compile: those of the waves; or the render kernel, the AOV kernel (if needed) and, on GPUs, add_samples."""
         if self.by_waves:
             return self.wave_kernels.all()
         makes = [render_kernel, aov_kernel] if self.options.aov else [render_kernel]
@@ -96,7 +96,7 @@ class Plan:
         return [make(self.features, self.structure) for make in makes] + folds
 
     def kernels_hash(self) -> str:
-        """Return a hash of the code of all kernels except the AOV kernels, equal in every process."""
+        """Return a hash of the code of all kernels but the AOV kernels. The hash is equal in every process."""
         block_dim = 1 if self.options.device == "cpu" else None
         kernels = replace(self, options=replace(self.options, aov=())).kernels
         hashes = [module_hash(kernel, block_dim) for kernel in kernels]
@@ -109,9 +109,9 @@ class Plan:
         return limits
 
     def aimed(self, camera: CameraKind, **settings: Unpack[SettingChanges]) -> Plan:
-        """Return the plan for another camera and other settings (of AIMED), with the same kernels.
+        """Return the plan with another camera and other settings (those in AIMED), for the same kernels.
 
-        Raises InputError if the kernels lack a feature: for another kind of camera, a lens in place of a pinhole, more bounces."""
+        Raises InputError if the kernels do not suffice: for another kind of camera, a lens in place of a pinhole, or more bounces."""
         scene = self.scene.with_settings(**settings)
         lacks = [name for name, needed, has in (
             (f"a camera of the kind {camera.kind}", camera.device != self.features.camera, False),
@@ -123,7 +123,7 @@ class Plan:
         return replace(self, scene=scene, camera=camera, crop=_crop(scene.settings, self.options))
 
     def moved(self, scene: Scene) -> Plan:
-        """Return the plan for a scene with the same objects, which have moved."""
+        """Return the plan for a scene with the same objects in other places."""
         return replace(self, scene=scene, meshes=instanced_meshes(scene, self.options.instancing))
 
 

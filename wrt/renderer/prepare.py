@@ -35,9 +35,9 @@ PREPARING_REPORTED = 1.0  # Seconds of compiling and building after which `progr
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """A prepared scene.
+    """A scene that is ready to render on one device.
 
-    - kernels: Plan.kernels, compiled; arrays: the scene on the device; camera: device struct; waves: None unless Plan.by_waves.
+    - kernels: Plan.kernels, compiled. camera: the device's struct Camera. waves: None unless Plan.by_waves.
     - seconds: time of the stages "upload" and "build", and of "compile", which runs in parallel until the last kernel is loaded.
     """
 
@@ -52,15 +52,15 @@ class Prepared:
     seconds: dict[str, float]
 
     def aimed(self, camera: CameraKind, angles_of: tuple[int, int] | None = None, **settings: Unpack[SettingChanges]) -> Prepared:
-        """Return this scene with another camera and other settings, as Plan.aimed allows.
+        """Return this scene with another camera and other settings; Plan.aimed says which.
 
-        angles_of: width and height for the camera's aspect ratio; None: the picture's size, which may be rounded."""
+        angles_of: width and height whose ratio is the camera's aspect ratio. None: the picture's own width and height."""
         plan = self.plan.aimed(camera, **settings)
         plan.require_memory(self.device)
         return replace(self, plan=plan, camera=camera_struct(camera, angles_of or plan.scene.settings.size))
 
     def facts(self) -> dict[str, object]:
-        """Return the counts of the scene and its structure for Film.stats."""
+        """Return entries of Film.stats: the counts of triangles and spheres, and the structure's statistics."""
         return {"triangles": self.accel.geometry.n_triangles, "stored_triangles": len(self.arrays.world.faces),
                 "spheres": len(self.accel.geometry.spheres),
                 "accel": {"name": self.plan.accel, **asdict(self.accel.stats)}}
@@ -68,7 +68,7 @@ class Prepared:
     def tiles(self, samples: int) -> Iterator[Rectangle]:
         """Yield the tiles of a pass with `samples` samples per pixel.
 
-        On CUDA, one tile is the whole crop. On the CPU, a tile fills about two waves, or less if a thread would get too few tiles."""
+        On CUDA, one tile is the whole crop. On the CPU, a tile fills about two waves, or less if each thread would get too few tiles."""
         x0, y0, x1, y1 = self.plan.crop
         side = TILE_SIZE
         if self.device.is_cuda:
@@ -79,9 +79,9 @@ class Prepared:
         return tiles(self.plan.crop, side if self.device.is_cuda else self.plan.options.tile_size or side)
 
     def launch(self, film: DeviceFilm | AovFilm, accel: WarpStruct | None = None) -> Callable[[Work], int]:
-        """Return a function that traces some work, adds it to the film, and returns the number of samples.
+        """Return a function that traces the samples of a Work, adds them to the film, and returns their number.
 
-        accel: device struct that replaces the acceleration structure's."""
+        accel: device struct to use in place of self.accel.data."""
         accel = self.accel.data if accel is None else accel
         scene = SceneRecords(accel, self.arrays.surfaces, self.arrays.lighting, self.camera)
         limits = [] if isinstance(film, AovFilm) else [self.plan.limits(seed) for seed in film.seeds]
@@ -98,7 +98,7 @@ class Prepared:
         return {"facts": self.facts(), "seconds": self.seconds}
 
     def trace_tile(self, work: Work, seed: int, state: list[np.ndarray] | None) -> list[np.ndarray]:
-        """Return the arrays (DeviceFilm.arrays) of a film of the rectangle: `state` (None: zeros) with the samples of `work` added.
+        """Return `state`, the arrays of DeviceFilm.arrays for the rectangle (None: zeros), with the samples of `work` added.
 
         This method has no side effects, so that several threads can call it, and a failed call can be repeated."""
         film = DeviceFilm(self.plan.scene.settings, corners(work.rectangle), self.device, seed, self.plan.groups)
@@ -108,14 +108,14 @@ class Prepared:
         return [film.picture(array) for _, array in film.arrays()]
 
     def aov_tile(self, work: Work) -> list[np.ndarray]:
-        """Return the AOVs of a rectangle, in the order of the options."""
+        """Return the AOVs of the rectangle of `work`, in the order of Options.aov."""
         film = AovFilm(self.plan.scene.settings, corners(work.rectangle), self.device)
         self.launch(film)(work)
         return [film.picture(name) for name in self.plan.options.aov]
 
 
 def kind_of(device: Device) -> str:
-    """Return the kind of a device. Devices of one kind render the same bits."""
+    """Return the kind of a device as text. Devices of one kind render the same bits."""
     return f"cuda, sm_{device.arch}" if device.is_cuda else "cpu"
 
 
@@ -133,7 +133,7 @@ def prepare(plan: Plan, device: Device, built: Prepared | None = None) -> Prepar
 
 
 class _Preparation:
-    """Threads that prepare a scene: one uploads and builds, while the others compile."""
+    """Threads that prepare a scene: one thread uploads and builds, while the other threads compile."""
 
     arrays: DeviceScene
     accel: Accelerator

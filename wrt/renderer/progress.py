@@ -19,7 +19,7 @@ LINE_EVERY = 10.0  # seconds between lines, if stderr is no terminal
 
 
 def describe(progress: Progress) -> str:
-    """Return rays per second, the time left, and the note as text."""
+    """Return a text with the rays per second, the time left, and the note."""
     note = f"; {progress.note}" if progress.note else ""
     return f"{progress.rays_per_second / 1e6:.1f} Mray/s, {time_left(progress.seconds_left)}{note}"
 
@@ -30,13 +30,13 @@ def time_left(seconds: float) -> str:
 
 
 class TimeLeft:
-    """Estimate of the time left, at the mean speed so far. total: size of the work; done: set by the caller, in the same unit."""
+    """Estimate of the time left, at the mean speed so far. total: amount of work, in any unit. The caller sets `done` in this unit."""
 
     def __init__(self, total: float) -> None:
         self.total, self.done, self.begin = total, 0.0, time.perf_counter()
 
     def __str__(self) -> str:
-        """Return a suffix for a line, such as ", about 1:30 left"; empty while `done` is 0."""
+        """Return a text to append to a line, such as ", about 1:30 left"; empty while `done` is 0."""
         if self.done <= 0.0:
             return ""
         seconds = (time.perf_counter() - self.begin) * max(self.total - self.done, 0.0) / self.done

@@ -35,7 +35,7 @@ REFINED_FROM = 8  # smallest number of camera samples per triangle for which ref
 class Renderer:
     """A prepared scene, which `run` renders any number of times. Raises InputError if the scene cannot be rendered.
 
-    once: the caller needs one picture only; wrt then builds the structure faster if the picture has few samples."""
+    once: True if the caller needs one picture only. If this picture has few samples, wrt then chooses a faster builder (`builder_for`)."""
 
     def __init__(self, scene: Scene, options: Options, *, once: bool = False) -> None:
         if options.executor is not None or options.devices is not None:
@@ -53,16 +53,16 @@ class Renderer:
         return self.prepared.accel
 
     def aim(self, camera: CameraKind, angles_of: tuple[int, int] | None = None, **settings: Unpack[SettingChanges]) -> None:
-        """Set the camera and settings of the next `run`, with the same kernels and structure, as Prepared.aimed allows."""
+        """Set the camera and settings of the next `run`. Kernels and structure stay. The parameters are those of Prepared.aimed."""
         if self.checkpoint is not None:
             raise InputError("a renderer with a checkpoint cannot change its camera or settings")
         self.prepared = self.prepared.aimed(camera, angles_of, **settings)
 
     def move_objects(self, scene: Scene, rebuild_at: float) -> dict[str, object]:
-        """Replace the scene by a scene with the same objects, which have moved: upload the surfaces, and refit the structure.
+        """Replace the scene by a scene with the same objects in other places: upload the surfaces, and refit the structure.
 
-        The structure is rebuilt if it cannot be refitted, or if its SAH cost would grow by the factor `rebuild_at` or more. Returns
-        "structure" ("refitted" or "rebuilt"), "seconds", and "growth" of the SAH cost (a factor; NaN: unknown)."""
+        The structure is rebuilt if it cannot be refitted, or if its SAH cost would grow by more than the factor `rebuild_at`. Returns
+        "structure" ("refitted" or "rebuilt"), "seconds", and "growth", the factor by which the SAH cost grew (NaN: unknown)."""
         old = self.prepared
         plan = old.plan.moved(scene)
         with warnings.catch_warnings():
@@ -80,19 +80,19 @@ class Renderer:
         return {"structure": "rebuilt", "seconds": accel.stats.build_seconds, "growth": float("nan")}
 
     def run(self, *, seed: int | None = None, spp: int | None = None) -> Film:
-        """Render until the samples, the time limit or the target error are reached. seed, spp: replace the options' and the scene's."""
+        """Render one picture. seed, spp: replace the options' seed and the scene's spp; None keeps them."""
         if self.checkpoint is not None and (seed is not None or spp is not None):
             raise InputError("a renderer with a checkpoint cannot change its seed or spp")
         return Run(LocalTracer(self.prepared), self.checkpoint, seed, spp).film()
 
 
 def builder_for(plan: Plan) -> dict[str, str]:
-    """Return the option `builder` for a single picture: "binned" if the default builder would take longer than it saves, else nothing."""
+    """Return {"builder": "binned"} if, for a single picture, the default builder takes longer than it saves; else {}."""
     triangles = sum(len(mesh.faces) for mesh in stored_meshes(plan.scene, plan.meshes))
     few = triangles > SMALL and plan.area * plan.scene.settings.spp < REFINED_FROM * triangles
     return {"builder": "binned"} if few and default_options(plan.accel).get("builder") == "refined" else {}
 
 
 def same_faces(before: Geometry, now: Geometry | InstancedGeometry) -> bool:
-    """Return True if only vertices differ. The faces differ if rounding made a face collinear, which is then left out."""
+    """Return True if only vertex positions differ. A face whose corners become collinear is left out, so that the faces differ."""
     return (isinstance(now, Geometry) and np.array_equal(before.faces, now.faces) and before.vertices.shape == now.vertices.shape)

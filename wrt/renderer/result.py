@@ -16,7 +16,7 @@ Facts = dict[str, Any]  # entries of a film's stats
 
 
 def film_of(plan: Plan, arrays: DeviceFilm, seed: int, aov: dict[str, np.ndarray], seconds: dict[str, float], facts: Facts) -> Film:
-    """Return the film with its statistics. facts: entries of the stats about the scene, its structure and the end of the run."""
+    """Return the film with its statistics. facts: entries of Film.stats about the scene, its structure and the end of the run."""
     arrays = arrays.snapshot()
     options, settings, samples = plan.options, plan.scene.settings, arrays.samples()
     total = max(int(samples.sum()), 1)
@@ -44,7 +44,7 @@ def film_of(plan: Plan, arrays: DeviceFilm, seed: int, aov: dict[str, np.ndarray
 
 
 def bare_film(plan: Plan, arrays: DeviceFilm) -> Film:
-    """Return a film with pixels, variance and samples only. arrays: a snapshot."""
+    """Return a film with pixels, variance and samples only. arrays: result of DeviceFilm.snapshot."""
     settings = plan.scene.settings
     return Film(*arrays.pixels_and_variance(), arrays.samples(), exposure=settings.exposure, tonemap=settings.tonemap)
 

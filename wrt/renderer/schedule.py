@@ -41,15 +41,15 @@ Steps = Generator[tuple[int, bool], None, None]
 
 
 class OutOfTime(Exception):
-    """The time limit has passed, and the tracer finishes no more tiles."""
+    """The time limit has passed, and for some seconds the tracer has finished no tile."""
 
 
 class Tracer(Protocol):
     """Traces the tiles of a run, with threads of this process or with workers (wrt.renderer.distributed).
 
-    - device: the film's device; seconds: time of each stage of the preparation; facts: entries of Film.stats.
-    - trace: yields a step about every tenth of a second, and one at the end. If `due()` is true, it waits for the running tiles before
-      the next step. If the caller closes the generator early, running tiles are finished, and no others begin."""
+    - device: the film's device. seconds: time by stage of the preparation. facts: entries of Film.stats. tiles: tiles of a pass.
+    - trace: yields an item of Steps about every tenth of a second, and one at the end. If `due()` is true, it first waits for the
+      running tiles. If the caller closes the generator early, it finishes the running tiles and begins no other tile."""
 
     plan: Plan
     device: Device
@@ -63,7 +63,7 @@ class Tracer(Protocol):
 
 
 class LocalTracer:
-    """Traces on the device of a prepared scene: on the CPU with all threads, on CUDA tile by tile."""
+    """Traces on the device of a prepared scene. On the CPU, all threads share the tiles. On CUDA, one tile is traced after another."""
 
     def __init__(self, prepared: Prepared) -> None:
         self.prepared, self.plan, self.device, self.seconds = prepared, prepared.plan, prepared.device, prepared.seconds
@@ -118,11 +118,12 @@ class LocalTracer:
 
 
 class Passes:
-    """Iterator over passes: the first sample and the number of samples, in each group. A pass has 1, 3, 12, 48, 64, 64 ... samples.
+    """Iterator over passes: index of the first sample, and number of samples, of each pixel in each group.
 
-    The time limit counts from the first pass on. A pass has only as many samples as will probably be done in the time left, and in
-    `every` seconds. Each pixel gets at least one sample. samples: smallest and largest number of samples that the pixels have already.
-    If they differ, because the checkpoint was written within a pass, the first passes bring all pixels to the largest number."""
+    With one group and no limits, the passes have 1, 3, 12, 48, 64, 64 ... samples. The time limit counts from the first pass on. A pass
+    has only as many samples as will probably be done in the time left, and in `every` seconds. Each pixel gets at least one sample.
+    samples: smallest and largest number of samples that the pixels have already in each group. The two numbers differ if the checkpoint
+    was written within a pass. The first passes then bring all pixels to the larger number."""
 
     def __init__(self, film: DeviceFilm, options: Options, spp: int, samples: tuple[int, int], every: float) -> None:
         self.film, self.options, self.every = film, options, every
@@ -156,11 +157,11 @@ class Passes:
             count = self._size(first)
 
     def _size(self, first: int) -> int:
-        """Return the number of samples of a pass that begins at sample `first`, before the limits of time and error."""
+        """Return the number of samples of a pass that begins at sample `first`. The limits of time and error may reduce it."""
         return self.options.pass_size or min(max((GROWTH - 1) * first, 1), self.largest)
 
     def _precise_enough(self, samples: int) -> bool:
-        """Return True if the target error is reached. samples: number in each group; the error is estimated at powers of 2 only."""
+        """Return True if the target error is reached. samples: number in each group; False unless a power of 2."""
         target = self.options.target_error
         if target is None or samples == 0 or samples & (samples - 1):
             return False
@@ -220,7 +221,7 @@ class Run:
             return film_of(self.plan, self.arrays, self.seed, self.aov, self.seconds, facts)
 
     def _facts(self, interrupted: bool, out_of_time: bool) -> Facts:
-        """Return entries of Film.stats about the scene, the end of the run and the checkpoint."""
+        """Return the entries of Film.stats about the scene, the end of the run and the checkpoint."""
         end = {"interrupted": interrupted, "signal": int(self.interrupts[0]) if self.interrupts else None,
                "timed_out": (out_of_time or self.passes.timed_out) and not interrupted}
         return self.tracer.facts() | end | ({} if self.checkpoint is None else self.checkpoint.facts())
@@ -255,9 +256,9 @@ class Run:
         self.aov = {name: arrays.picture(name) for name in self.plan.options.aov}
 
     def _trace(self, film: DeviceFilm | AovFilm, work: list[Work], report: Callable[[int, float], None], overtime: float) -> None:
-        """Trace, save checkpoints and report. Raises KeyboardInterrupt after Ctrl-C; running tiles are finished first.
+        """Trace, save checkpoints, and call report(samples done, seconds without a finished tile). Ctrl-C raises KeyboardInterrupt.
 
-        Raises OutOfTime if no tile was finished for `overtime` seconds after the time limit."""
+        Raises OutOfTime if, after the time limit, no tile was finished for `overtime` seconds."""
         total = sum(job.total for job in work)
         if self.interrupts:
             raise KeyboardInterrupt
@@ -276,7 +277,7 @@ class Run:
                     raise OutOfTime
 
     def _report(self, done: int, silent: float) -> None:
-        """Call `progress`. done: samples of one group, summed over the pixels; silent: seconds without a finished tile."""
+        """Call Options.progress. done: samples of one group, summed over the pixels. silent: seconds without a finished tile."""
         plan = self.plan
         if plan.options.progress is None:
             return

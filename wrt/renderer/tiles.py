@@ -11,7 +11,7 @@ Rectangle = tuple[int, int, int, int]  # x, y, width, height
 
 
 class Work(NamedTuple):
-    """Samples `first` to `first + n - 1` of each pixel of a rectangle."""
+    """Work for a tracer: the samples `first` to `first + n - 1` of each pixel of a rectangle."""
 
     rectangle: Rectangle
     first: int
@@ -24,7 +24,7 @@ class Work(NamedTuple):
 
 
 def tiles(crop: tuple[int, int, int, int], step: int) -> Iterator[Rectangle]:
-    """Yield squares of side `step`, smaller at the right and the bottom, that cover the rectangle x0, y0, x1, y1, row by row."""
+    """Yield the tiles that cover `crop` (x0, y0, x1, y1), row by row: squares of side `step`, cut at the right and bottom edges."""
     x0, y0, x1, y1 = crop
     for y in range(y0, y1, step):
         for x in range(x0, x1, step):
@@ -32,15 +32,15 @@ def tiles(crop: tuple[int, int, int, int], step: int) -> Iterator[Rectangle]:
 
 
 def corners(rectangle: Rectangle) -> tuple[int, int, int, int]:
-    """Return x0, y0, x1, y1 of a rectangle."""
+    """Return x0, y0, x1, y1 of a rectangle x, y, width, height."""
     x, y, width, height = rectangle
     return x, y, x + width, y + height
 
 
 def work_left(work: list[Work], samples: np.ndarray, crop: tuple[int, int, int, int]) -> list[Work]:
-    """Return the part of the work that is not done yet. samples: number of samples of each pixel of the crop, (H, W) int32.
+    """Return the part of the work that is not done yet. samples: samples that each pixel of the crop has, (H, W) int32.
 
-    Rectangles are halved until all pixels of a part have equally many samples. An earlier run left whole tiles with equal numbers."""
+    Rectangles are halved until all pixels of a part have equally many samples. This ends soon: the earlier run finished whole tiles."""
     out = []
     stack = work[::-1]
     while stack:

@@ -35,7 +35,7 @@ WRAPS = {"repeat": textures.WRAP_REPEAT, "clamp": textures.WRAP_CLAMP, "mirror":
 
 
 class TextureTable:
-    """Table of the textures, and the texels of all images one after another. An image that several textures use is stored once."""
+    """Table of the textures, and the texels of all images one after another. Several textures can share one stored image."""
 
     def __init__(self) -> None:
         self.rows: list[Texture | Checkerboard] = []
@@ -77,20 +77,20 @@ class TextureTable:
 
 @cache
 def srgb_table() -> np.ndarray:
-    """Return the linear values of the 256 sRGB codes (IEC 61966-2-1), then i / 255 for the codes i of linear images; (512,) float32."""
+    """Return linear values, (512,) float32: entry i decodes the sRGB code i (IEC 61966-2-1), entry 256 + i is i / 255."""
     code = np.arange(256) / 255.0
     return np.concatenate([decode_srgb(code), code]).astype(np.float32)
 
 
 def index_of(kind: str, table: Collection[str], group: str) -> int:
-    """Return the index of a kind in a table of device functions. Raises InputError if the table lacks it. group: name for the error."""
+    """Return the index of `kind` in a table of device functions. Raises InputError if the table lacks it. group: noun for the error."""
     if kind not in table:
         raise InputError(f"{group} {kind!r} has no device function in the tables of wrt.kernels.shade")
     return list(table).index(kind)
 
 
 def material_records(scene_materials: tuple[Material, ...], table: TextureTable) -> np.ndarray:
-    """Return the device's materials. A field that the kind does not use is 0, or -1 for a texture; `transmission` of clear kinds is 1."""
+    """Return the array of Material structs. Fields that the kind does not use are 0; textures -1; `transmission` 1 for clear kinds."""
     out = records(structs.Material, max(len(scene_materials), 1))
     some_use = kinds_that_use()
     for row, material in zip(out, scene_materials, strict=False):
@@ -110,7 +110,7 @@ def material_records(scene_materials: tuple[Material, ...], table: TextureTable)
 
 
 def light_records(scene: Scene, world: FlatScene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the device's lights, the emitters (emissive triangles), and the cdf of each mesh light's emitters (float32).
+    """Return arrays of device structs Light and Emitter (emissive triangle), and the cdf of each mesh light's emitters (float32).
 
     Each object with emissive faces is one light. More than MAX_MESH_LIGHTS such objects form one light together."""
     rows: list[dict[str, Any]] = []
@@ -157,7 +157,7 @@ def _emissive_groups(scene: Scene, world: FlatScene) -> list[np.ndarray]:
 
 
 def _emitters(scene: Scene, world: FlatScene, prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the emitters of one light and their cdf by power; both are empty if the total power is 0."""
+    """Return the emitters of the light with the faces `prim_id`, and their cdf by power; both are empty if the total power is 0."""
     corner = world.corners(prim_id)
     area = 0.5 * np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
     power = np.array([LUMINANCE @ np.array(m.emission) for m in scene.materials])[world.materials(prim_id)] * area
@@ -180,7 +180,7 @@ def _emitters(scene: Scene, world: FlatScene, prim_id: np.ndarray) -> tuple[np.n
 
 
 def unit_normals(v0: np.ndarray, v1: np.ndarray, v2: np.ndarray) -> np.ndarray:
-    """Return unit normals (N, 3) float32 of corners (N, 3) float32 each, with the bits of wrt.kernels.shade.surface.triangle_normal."""
+    """Return unit normals of triangles, with the bits of wrt.kernels.shade.surface.triangle_normal. All arrays: (N, 3) float32."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore", under="ignore"):
         a, b = (edge / np.abs(edge).max(axis=1, keepdims=True) for edge in (v1 - v0, v2 - v0))
         n = a[:, [1, 2, 0]] * b[:, [2, 0, 1]] - a[:, [2, 0, 1]] * b[:, [1, 2, 0]]
@@ -203,7 +203,7 @@ def background_struct(background: Background, device: Device) -> WarpStruct:
 
 @dataclass(frozen=True, eq=False)
 class DeviceScene:
-    """A scene on a device: surfaces and lighting for the kernels, and on the host the flat scene with the structure's geometry."""
+    """A scene on a device: structs `surfaces` and `lighting` for the kernels, and `world`, the flattened scene on the host."""
 
     world: FlatScene
     surfaces: WarpStruct
@@ -211,7 +211,7 @@ class DeviceScene:
 
 
 def warn_left_out(scene: Scene) -> None:
-    """Issue a SceneWarning for each part that a picture leaves out. Raises InputError if the scene cannot be rendered."""
+    """Issue a SceneWarning for each part of the scene that a picture leaves out. Raises InputError if the scene cannot be rendered."""
     require_size(scene)
     for sphere in scene.spheres:
         if sphere.material.alpha_mode == "mask" and sphere.material.albedo_texture is not None:
@@ -259,7 +259,7 @@ def upload_scene(scene: Scene, device: Device, meshes: frozenset[int] = frozense
 
 
 def camera_struct(camera: CameraKind, size: tuple[int, int]) -> WarpStruct:
-    """Return the device's camera. size: width and height of the picture, whose aspect ratio the camera takes."""
+    """Return the device's struct Camera. size: width and height of the picture, whose ratio is the camera's aspect ratio."""
     c = import_module(camera.device).Camera()
     pose = camera.camera_to_world
     c.origin = wp.vec3(*pose[:3, 3])

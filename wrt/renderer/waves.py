@@ -48,7 +48,7 @@ class SceneRecords(NamedTuple):
 
 
 def keep_only(features: Features, names: tuple[str, ...]) -> Features:
-    """Reset every switch outside `names`, so that scenes that differ only in those share a kernel."""
+    """Reset every feature outside `names`. Scenes that differ only in reset features then share a kernel."""
     return Features(**{name: getattr(features, name) for name in names})
 
 
@@ -61,7 +61,7 @@ begin_aov_kernel = made_once(wave_begin.make_begin_aov_kernel)
 
 @made_once
 def queue_kernel(structure: Structure, features: Features, any_hit: bool) -> tuple[Kernel, int]:
-    """Return the kernel that traces a queue of rays, and the number of rays per thread: ALL if the structure has a stream kernel, else 1.
+    """Return the kernel that traces a queue of rays, and its rays per thread: ALL with a stream kernel (wrt.accel.base), else 1.
 
     The kernel always handles spheres, so that scenes with and without spheres share it."""
     structure = structure._replace(units=structure.units._replace(spheres=True))
@@ -75,17 +75,17 @@ def queue_kernel(structure: Structure, features: Features, any_hit: bool) -> tup
 
 @dataclass(frozen=True)
 class WaveKernels:
-    """The kernels of a picture; None: the picture does not need the kernel."""
+    """The kernels of a picture. None: the picture does not need this kernel."""
 
-    shade: Kernel
-    prepare: Kernel | None
+    shade: Kernel  # shade_wave (kernels/loops/wave_shade.py).
+    prepare: Kernel | None  # prepare_block (wave_shade.py).
     closest_hit: Kernel
-    any_hit: Kernel | None
-    shadow: Kernel | None
-    begin: Kernel
-    loop: Kernel
-    begin_aov: Kernel | None
-    aov: Kernel | None
+    any_hit: Kernel | None  # For shadow rays in scenes without transparent shadows.
+    shadow: Kernel | None  # shadow_wave (wave.py), in scenes with transparent shadows.
+    begin: Kernel  # begin_wave (wave_begin.py).
+    loop: Kernel  # trace_wave (wave.py).
+    begin_aov: Kernel | None  # begin_aov (wave_begin.py).
+    aov: Kernel | None  # aov_wave (wave.py).
     block: int  # Rays per thread of the traversals: ALL or 1.
 
     def all(self) -> list[Kernel]:
@@ -117,7 +117,7 @@ def wave_kernels(features: Features, structure: Structure, aov: bool) -> WaveKer
 
 @dataclass(frozen=True)
 class Waves:
-    """The kernels of a scene, and the working memory of the threads."""
+    """The wave kernels of a scene, and the working memory (Buffers) of the threads."""
 
     kernels: WaveKernels
     features: Features  # They determine the size of the buffers.
@@ -125,9 +125,9 @@ class Waves:
     free: list[Buffers] = field(default_factory=list)  # Buffers that no thread uses.
 
     def launch(self, scene: SceneRecords, limits: list[WarpStruct], film: DeviceFilm | AovFilm) -> Callable[[Work], int]:
-        """Return a function that renders some work, adds it to the film, and returns the number of samples.
+        """Return a function that renders the samples of a Work, adds them to the film, and returns their number.
 
-        Several threads may call this function at once. limits: one struct for each group of the film."""
+        Several threads may call this function at once. limits: a struct Limits for each group of the film."""
         recorded: dict[int, Picture | Aovs] = {}
 
         def trace(work: Work) -> int:
@@ -146,12 +146,12 @@ class Waves:
 
 
 def capacity(features: Features, lights: int) -> int:
-    """Return the number of samples in a wave. lights: number of shadow rays per hit."""
+    """Return the largest number of samples in a wave. lights: number of shadow rays per hit."""
     return max(min(CAPACITY, MAX_SLOTS // max(lights, features.stack_size)), 64)
 
 
 class Buffers:
-    """The working memory of one thread."""
+    """The working memory of one thread: the arrays of a wave (kernels/loops/state.py)."""
 
     def __init__(self, features: Features, lights: int) -> None:
         self.capacity = n = capacity(features, lights)
@@ -185,7 +185,7 @@ class Buffers:
             w.shadow_queue.occluded = empty(slots, wp.bool)
 
     def for_each_wave(self, work: Work, launch: Callable[[], None]) -> None:
-        """Split some work into waves; for each wave, set the task and call `launch`."""
+        """Split `work` into waves. For each wave, set its pixels and samples (Task, Pixels.order) and call `launch`."""
         task, (x, y, width, height) = self.task[0], work.rectangle
         task["x"], task["y"], task["width"] = x, y, width
         order, most = block_order(width, height), min(work.n, self.capacity)
@@ -200,7 +200,7 @@ class Buffers:
 
 
 class Picture:
-    """The launches of a picture with one thread's buffers. They are recorded once, since only the buffers' contents change."""
+    """The kernel launches that render a picture with one thread's buffers. They are recorded once: only the buffers' contents change."""
 
     def __init__(self, waves: Waves, buffers: Buffers, scene: SceneRecords, limits: list[WarpStruct], film: DeviceFilm) -> None:
         kernels, w = waves.kernels, buffers.wave
@@ -228,13 +228,13 @@ class Picture:
             self.groups.append(command(kernels.loop, w, of_group, waves.lights, group))
 
     def trace(self, work: Work) -> None:
-        """Trace all samples of some work."""
+        """Trace all samples of `work`."""
         for group in self.groups:
             self.buffers.for_each_wave(work, group.launch)
 
 
 class Aovs:
-    """The launches of AOVs with one thread's buffers."""
+    """The kernel launches that write AOVs with one thread's buffers."""
 
     def __init__(self, waves: Waves, buffers: Buffers, scene: SceneRecords, film: AovFilm) -> None:
         kernels, w = waves.kernels, buffers.wave
@@ -244,7 +244,7 @@ class Aovs:
         self.closest_hit = traversal(kernels, kernels.closest_hit, buffers, scene.accel, scene.surfaces, w.queue.rays, w.queue.hits)
 
     def trace(self, work: Work) -> None:
-        """Trace the AOVs of the rectangle of some work."""
+        """Trace the AOVs of the rectangle of `work`."""
         self.buffers.for_each_wave(work, self._trace_wave)
 
     def _trace_wave(self) -> None:
@@ -262,7 +262,7 @@ def command(kernel: Kernel | None, *inputs: object) -> wp.Launch:
 
 
 def traversal(kernels: WaveKernels, kernel: Kernel, buffers: Buffers, *inputs: object) -> wp.Launch:
-    """Record the launch of a traversal of a queue. Its last two arguments, first and end, are the range of rays, set before each run."""
+    """Record the launch of a kernel that traces a queue. The last two kernel arguments, the range first .. end, are set before each run."""
     return command(kernel, *inputs, *([buffers.scratch] if kernels.block > 1 else []), 0, 0)
 
 
@@ -285,7 +285,7 @@ def empty_hits(n: int) -> WarpStruct:
 
 @lru_cache(maxsize=64)
 def block_order(width: int, height: int) -> np.ndarray:
-    """Return the pixels of a rectangle, y * width + x (int32), in squares of 4x4 and 2x2, so that neighbours are traced together."""
+    """Return the indices y * width + x of a rectangle's pixels (int32), by squares of 4x4 and 2x2: neighbours are traced together."""
     y, x = np.mgrid[:height, :width]
     within = (x & 1) | (y & 1) << 1 | (x & 2) << 1 | (y & 2) << 2
     return np.lexsort((within.ravel(), x.ravel() // 4, y.ravel() // 4)).astype(np.int32)

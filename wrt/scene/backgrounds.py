@@ -11,7 +11,7 @@ from wrt.scene.values import BLACK, LUMINANCE, WHITE, Color
 
 
 class Background(Kind):
-    """Base class of backgrounds. kernels/shade/backgrounds.py has the device functions of each `kind`; arrays in `record` are uploaded."""
+    """Base class of backgrounds. kernels/shade/backgrounds.py has each kind's device functions; renders upload the arrays of `record()`."""
 
     what = "background"
     name = ""
@@ -25,7 +25,7 @@ class Background(Kind):
 
 @dataclass(frozen=True)
 class ConstantBackground(Background):
-    """The same radiance from everywhere."""
+    """The same radiance from every direction."""
 
     kind = "constant"
     color: Color = field(default=BLACK, metadata=given("color", "from every direction", "radiance"))
@@ -36,7 +36,7 @@ class ConstantBackground(Background):
 
 @dataclass(frozen=True)
 class GradientBackground(Background):
-    """Radiance that is linear in y of the unit direction."""
+    """Radiance that is linear in y of the ray's unit direction."""
 
     kind = "gradient"
     bottom: Color = field(default=WHITE, metadata=given("color", "from straight below (-y)", "radiance"))
@@ -66,7 +66,7 @@ class EnvironmentBackground(Background):
     name: str = ""
 
     def record(self) -> Record:
-        """Return the image, and cumulative distributions that sample a pixel in proportion to its brightness times its solid angle."""
+        """Return the image, the CDF of its rows and the CDFs of their columns. A pixel's weight is about brightness times solid angle."""
         # Bilinear lookup spreads a pixel into its neighbours, whose probability must therefore not be 0. A small share of the mean
         # keeps dark pixels above 0 despite rounding.
         height, width = self.image.shape[:2]

@@ -20,10 +20,10 @@ class CameraKind:
     """Base class of cameras: a pose and a name.
 
     camera_to_world: (4, 4) rotation and translation; a camera looks along its own -z, +y is up. A subclass adds its parameters as
-    fields, each with `field(metadata=given(...))`."""
+    fields, each with `field(metadata=given(...))` (wrt.scene.kinds.given)."""
 
     kind: ClassVar[str]  # name in scene files
-    device: ClassVar[str]  # module of the device functions, which wrt.kernels.shade.cameras describes
+    device: ClassVar[str]  # module of the kind's device functions; wrt.kernels.shade.cameras says which it needs
 
     camera_to_world: np.ndarray = field(default_factory=lambda: np.eye(4))
     name: str = field(default="", kw_only=True)
@@ -43,7 +43,7 @@ class CameraKind:
         check_fields(self, at)
 
     def as_in_files(self) -> dict[str, float]:
-        """Return the parameters in the units of scene files: angles in degrees."""
+        """Return the camera's parameters by name, in the units of scene files: angles in degrees."""
         values = {key: (getattr(self, key), each.metadata["form"]) for key, each in forms(type(self)).items()}
         return {key: math.degrees(value) if form == "angle" else value for key, (value, form) in values.items()}
 
@@ -61,7 +61,7 @@ class CameraKind:
         Raises
         ------
         InputError
-            If position and target are equal, or `up` is parallel to the viewing direction.
+            If position and target are equal, or `up` is zero or parallel to the viewing direction.
 
         Examples
         --------
@@ -85,11 +85,11 @@ class CameraKind:
         return {}
 
     def switches(self) -> dict[str, bool]:
-        """Return the kernel features that this camera sets, by name, such as `lens`: rays start at sampled points of a lens."""
+        """Return the kernel features that depend on the camera, by name. For example "lens": True if rays start at points of a lens."""
         return {}
 
     def opened(self) -> Self:
-        """Return a copy that has a lens if the kind can have one: a viewer then opens and closes the aperture without compiling."""
+        """Return a copy that has a lens, if the kind can have one. A viewer then opens and closes the aperture without compiling."""
         return self
 
 
@@ -97,7 +97,7 @@ class CameraKind:
 class Camera(CameraKind):
     """A pinhole camera, or a thin lens if the aperture is larger than 0.
 
-    `Camera.look_at` places one; `Camera.lens` computes the first three parameters from those of a real lens.
+    `Camera.look_at` places one; `Camera.lens` computes fov_y, aperture_radius and focus_distance from the data of a real lens.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ class Camera(CameraKind):
     device = "wrt.kernels.shade.cameras.perspective"
 
     fov_y: float = field(default=math.pi / 4.0, metadata=given("angle", "full vertical angle of view", ge=0.0005, le=179.94))
-    aperture_radius: float = field(default=0.0, metadata=given("number", "0: a pinhole", "length", ge=0.0))
+    aperture_radius: float = field(default=0.0, metadata=given("number", "radius of the aperture; 0: a pinhole", "length", ge=0.0))
     focus_distance: float = field(default=1.0, metadata=given(
         "number", "distance along the axis to the plane in focus (default: the target's distance, else 1)", "length", ge=SMALLEST))
     blades: int = field(default=0, metadata=given("whole", "sides of the aperture, 3 or more; 0: round", ge=0, le=64))
@@ -143,9 +143,9 @@ class Camera(CameraKind):
              aperture_radius: float | None = None) -> dict[str, float]:
         """Return fov_y, aperture_radius and focus_distance of a real thin lens, all lengths in scene units.
 
-        The sensor is at the image distance s' = f s / (s - f), so that focusing near narrows the view, as in a real camera. The
-        aperture's radius is f / (2 f_number). Raises InputError unless focus_distance exceeds focal_length and exactly one of
-        f_number and aperture_radius is given."""
+        With f = focal_length and s = focus_distance, the sensor is f s / (s - f) behind the lens. Focusing near therefore narrows the
+        view, as in a real camera. The aperture's radius is f / (2 f_number). Raises InputError unless focus_distance exceeds
+        focal_length, and unless exactly one of f_number and aperture_radius is given."""
         f = as_number(focal_length, "focal_length", low=SMALLEST)
         s = as_number(focus_distance, "focus_distance", low=SMALLEST)
         h = as_number(sensor_height, "sensor_height", low=SMALLEST)
@@ -179,7 +179,8 @@ class OrthographicCamera(CameraKind):
 class FisheyeCamera(CameraKind):
     """An equidistant fisheye; black beyond the image circle, whose diameter is the shorter side of the picture.
 
-    The angle to the axis is proportional to the distance from the centre. fov: full angle across the circle in radians."""
+    A ray's angle to the camera's axis is proportional to its pixel's distance from the centre of the picture. fov: full angle of view
+    across the image circle, in radians."""
 
     kind = "fisheye"
     device = "wrt.kernels.shade.cameras.fisheye"
@@ -188,13 +189,13 @@ class FisheyeCamera(CameraKind):
         "angle", "full angle of view across the image circle", ge=0.0005, le=360.0))
 
     def record(self, size: tuple[int, int]) -> Record:
-        """Return half the angle of view, and half the sides of the picture in radii of the image circle."""
+        """Return half the angle of view, and half the picture's width and height in units of the image circle's radius."""
         return {"half_angle": 0.5 * self.fov, "half_width": size[0] / min(size), "half_height": size[1] / min(size)}
 
 
 @dataclass(frozen=True, eq=False)
 class PanoramaCamera(CameraKind):
-    """All directions around a point, equirectangular, with the camera's axis in the middle.
+    """All directions around a point, equirectangular, with the camera's axis in the middle of the picture.
 
     A picture of aspect ratio 2:1 can serve as the image of an EnvironmentBackground."""
 

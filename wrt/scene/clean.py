@@ -9,7 +9,7 @@ import numpy as np
 from wrt.core.errors import InputError
 from wrt.scene.exact import whole_numbers
 
-AT_ONCE = 1 << 15  # faces of one batch, whose float64 temporaries fit in the cache
+AT_ONCE = 1 << 15  # faces of one batch, whose float64 temporaries fit in the processor's cache
 ROUNDS = 64  # largest number of rounds of flips
 
 
@@ -59,7 +59,7 @@ def require_indices(faces: np.ndarray, count: int, place: str | None = None) -> 
 
 
 def has_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return (F,) bool, exact: True if the corners of a face (vertices (V, 3) float32) are not collinear, or not all finite."""
+    """Return exact (F,) bool: True for a face whose corners are not collinear, or not all finite. vertices: (V, 3) float32."""
     out = np.ones(len(faces), dtype=bool)
     for first in range(0, len(faces), AT_ONCE):
         part = faces[first:first + AT_ONCE]
@@ -68,7 +68,7 @@ def has_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def corners_have_area(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """Return `has_area` of triangles with corners p, q, r, (N, 3) float32 each; fastest if 24 N float64 fit in the cache.
+    """Return `has_area` of triangles with corners p, q, r, (N, 3) float32 each; fastest if 24 N float64 fit in the processor's cache.
 
     The cross product of two edges is computed in float64, and again in integers if no component exceeds its rounding error."""
     a, b, c = (np.array(corner.T, np.float64, order="C") for corner in (p, q, r))
@@ -100,14 +100,14 @@ def _has_area_exactly(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray
 
 
 def flip_collinear(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Replace faces with collinear corners by flips of their longest edge; the surface stays the same.
+    """Flip the longest edge of each face with collinear corners; the surface stays the same.
 
     A collinear face (a, b, c), b between a and c, has no area, but it splits the edge from a to c in two. Without this face, its
-    neighbour (a, c, d) and the faces beyond b would share no edge, and rays could pass between them by rounding. The flip replaces the
-    face and its neighbour by (a, b, d) and (b, c, d): as many faces, and the same area.
+    neighbour (a, c, d) would share no edge with the faces on the other side, and rays could pass between them by rounding. The flip
+    replaces the face and its neighbour by (a, b, d) and (b, c, d): as many faces, and the same area.
 
-    vertices: (V, 3) float32; faces: (F, 3). Returns faces (F, 3) of the same dtype, and source (F,). A returned face lies in the input
-    face with the index `source`, and takes its material and group. Faces with two equal corners stay as they are, and so do faces whose
+    vertices: (V, 3) float32; faces: (F, 3). Returns faces (F, 3) of the same dtype, and source (F,). Returned face i lies in input
+    face source[i], whose material and group apply to it. Faces with two equal corners stay as they are, and so do faces whose
     longest edge does not belong to exactly two faces."""
     return _flipped(vertices, faces)[:2]
 
@@ -146,7 +146,7 @@ def _flipped(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _longest_edges(vertices: np.ndarray, faces: np.ndarray, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the flat faces (N,) with three distinct corners, the ends (N, 2) of their longest edges, and their third corners (N,)."""
+    """Return which faces in `flat` have distinct corners (N,), the ends (N, 2) of their longest edges, and their third corners (N,)."""
     corners = vertices[faces[flat]].astype(np.float64)
     edges = np.stack([corners[:, (i + 2) % 3] - corners[:, (i + 1) % 3] for i in range(3)], axis=1)  # edge opposite corner i
     apart = (edges != 0.0).any(axis=2).all(axis=1)
@@ -157,7 +157,7 @@ def _longest_edges(vertices: np.ndarray, faces: np.ndarray, flat: np.ndarray) ->
 
 
 def _across(faces: np.ndarray, flat: np.ndarray, ends: np.ndarray, n_vertices: int) -> np.ndarray:
-    """Return the face (N,) on the other side of the edge `ends` (N, 2) of each face in `flat` (N,); -1 unless there is exactly one."""
+    """Return the other face (N,) at the edge `ends` (N, 2) of each face in `flat` (N,); -1 unless exactly two faces share the edge."""
 
     def key(p: np.ndarray, q: np.ndarray) -> np.ndarray:
         return np.minimum(p, q).astype(np.int64) * n_vertices + np.maximum(p, q)

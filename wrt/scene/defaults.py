@@ -42,8 +42,8 @@ def bounding_sphere(scene: Scene) -> tuple[np.ndarray, float]:
 def frame_camera(scene: Scene, aspect: float = 16.0 / 9.0) -> Camera:
     """Return a pinhole camera in three-quarter view that sees the whole bounding sphere of the scene.
 
-    aspect: width / height of the picture. The vertical angle of view is 40 degrees; the narrower of the two angles determines the
-    distance. Raises InputError if the scene has no shapes."""
+    aspect: width / height of the picture. The vertical angle of view is 40 degrees. The camera is so far away that the sphere
+    fits into the narrower of the vertical and the horizontal angle. Raises InputError if the scene has no shapes."""
     center, radius = bounding_sphere(scene)
     half_angle = math.atan(math.tan(0.5 * FOV_Y) * min(aspect, 1.0))
     radius = max(radius, 1e-9 * float(np.abs(center).max()), SMALLEST)  # a single point has none
@@ -55,7 +55,7 @@ def frame_camera(scene: Scene, aspect: float = 16.0 / 9.0) -> Camera:
 def is_lit(scene: Scene) -> bool:
     """Return True if the scene has a light, a background, an ambient term or enough emission.
 
-    Emission is enough if it would give a white sphere around the scene a radiance of DARK or more."""
+    Emission is enough if it would light the scene's bounding sphere, if that were white, to a mean radiance of DARK or more."""
     if scene.lights or scene.background != ConstantBackground(BLACK) or scene.ambient != BLACK:
         return True
     power = _emitted_power(scene)
@@ -63,7 +63,7 @@ def is_lit(scene: Scene) -> bool:
 
 
 def _emitted_power(scene: Scene) -> float:
-    """Return emitted luminance times area, summed over the surfaces whose emission lights others."""
+    """Return emitted luminance times area, summed over the surfaces whose emission lights other surfaces."""
 
     def radiance(material: Material) -> float:
         return float(LUMINANCE @ material.emission) * (1 + material.two_sided) * material.lights_others
@@ -79,7 +79,7 @@ def _emitted_power(scene: Scene) -> float:
 
 
 def emission_named(scene: Scene) -> str:
-    """Return "the emission of ..." with the names of the materials whose emission lights others; "" if there are none."""
+    """Return "the emission of ..." with the names of the materials whose emission lights other surfaces; "" without such materials."""
     names = [material.name for material in scene.materials if material.lights_others]
     return f"the emission of {listed(names)}" if names else ""
 

@@ -17,7 +17,7 @@ LEFT_OUT: dict[type, tuple[str, ...]] = {
 
 
 def digest(thing: Scene | CameraKind) -> str:
-    """Return the SHA-256, in hexadecimal, of all fields of a scene or a camera but LEFT_OUT."""
+    """Return the SHA-256, in hexadecimal, of all fields of a scene or a camera except those in LEFT_OUT."""
     text, arrays = pack(thing, LEFT_OUT)
     out = sha256(text.encode())
     for array in arrays:

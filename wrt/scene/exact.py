@@ -2,10 +2,10 @@
 
 Inputs are float32 values in float64: integers times powers of two. The sign of a float64 result is accepted if the result exceeds a
 bound on its error. This is a static filter (Shewchuk 1997, "Adaptive Precision Floating-Point Arithmetic and Fast Robust Geometric
-Predicates"). Other signs, a few, are recomputed in Python's integers. A product of three float32 neither over- nor underflows in float64.
+Predicates"). The few other signs are recomputed in Python's integers. A product of three float32 neither over- nor underflows in float64.
 
-Let `a, b, c = v0 - o, v1 - o, v2 - o` and `N = (v1 - v0) x (v2 - v0)`. The line `o + t d` meets the plane at `t = a.N / d.N`, and the
-barycentric of v0 is `w0 = d.(b x c) / d.N`. The scalar triple products add up to `d.N`.
+For a triangle with corners v0, v1, v2, let `a, b, c = v0 - o, v1 - o, v2 - o` and `N = (v1 - v0) x (v2 - v0)`. The line `o + t d` meets
+the plane at `t = a.N / d.N`. There the barycentric of v0 is `w0 = d.(b x c) / d.N`. The triple products of w0, w1, w2 add up to `d.N`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 UNIT = 2.0**-53  # unit roundoff of float64
 ACCURATE = 1e-14  # larger errors, relative in t and absolute in u and v, are recomputed in integers
 
-# Error bound of a triple product of differences, relative to the sum of its terms' magnitudes; either has 8 roundings in sequence.
+# Error bound of a triple product of differences, relative to the sum of its terms' magnitudes. Both have 8 roundings in sequence.
 TRIPLE = 10.0 * UNIT
 
 
@@ -41,14 +41,14 @@ class Place(IntEnum):
 class Crossings:
     """Intersections of N lines with the planes of N triangles, (N,) each.
 
-    place: int8, of Place; t, u, v: float64, inf or NaN for a line parallel to the plane; t_error: bound on |t - exact t|; slope: d.N."""
+    t, u and v are inf or NaN for a line parallel to the plane. Misses can have NaN in all fields but `place`."""
 
-    place: np.ndarray
-    t: np.ndarray
-    u: np.ndarray
-    v: np.ndarray
-    t_error: np.ndarray
-    slope: np.ndarray
+    place: np.ndarray  # int8, values of Place
+    t: np.ndarray  # float64, in units of the direction's length
+    u: np.ndarray  # float64, barycentric of v1
+    v: np.ndarray  # float64, barycentric of v2
+    t_error: np.ndarray  # bound on |t - exact t|
+    slope: np.ndarray  # d.N, as the module's docstring defines it
 
     @property
     def hit(self) -> np.ndarray:
@@ -71,7 +71,7 @@ def _triple_exact(a: list[Any], b: list[Any], c: list[Any]) -> Any:
 
 
 def whole_numbers(*arrays: np.ndarray) -> tuple[list[list[Any]], int]:
-    """Return the rows of (3, N) float32 values as object arrays of Python ints, and the exponent k of all: value = int * 2^k."""
+    """Return each (3, N) array of float32 values as 3 object arrays of Python ints, and the exponent k of all arrays: value = int * 2^k."""
     parts = [np.frexp(array) for array in arrays]
     used = [exponent[mantissa != 0.0] for mantissa, exponent in parts]
     k = min((int(e.min()) for e in used if e.size), default=0) - 24
@@ -84,7 +84,7 @@ def whole_numbers(*arrays: np.ndarray) -> tuple[list[list[Any]], int]:
 
 
 def exact_plane(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, ...]) -> tuple[Any, Any, Any, int]:
-    """Return (w0, w1, w2), (numerator, slope, its power of 2), N and s in object arrays of ints: t = numerator / slope * 2^s."""
+    """Return integers w, (q, slope, p), normal, s: barycentrics w[i] / slope, t = q / slope * 2^s, d.N = slope * 2^p; normal is along N."""
     (origin, *corners), k = whole_numbers(o, *v)
     (direction,), k_d = whole_numbers(d)
     a, b, c = ([p - q for p, q in zip(corner, origin, strict=True)] for corner in corners)
@@ -123,7 +123,7 @@ def _resolve(rows: np.ndarray, o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray
 
 
 def triangle_crossings(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, np.ndarray, np.ndarray], *, all_rows: bool = False) -> Crossings:
-    """Intersect line i with triangle i. o, d and the corners in v: (3, N) float64 that hold finite float32 values.
+    """Intersect line i with triangle i. Origins o, directions d and the corners v[0 .. 2]: (3, N) float64 that hold finite float32 values.
 
     `place` is exact. For hits the relative error of t (bound: t_error) and the errors of u and v are at most ACCURATE.
 
@@ -163,18 +163,18 @@ def triangle_crossings(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, np.nda
 
 @dataclass(frozen=True, eq=False)
 class SphereCrossings:
-    """Intersections of N lines with spheres: entry t[0] and exit t[1], float64 (2, N), and bounds on their errors.
+    """Intersections of N lines with N spheres.
 
     t is NaN on a miss. A line that touches its sphere has equal t[0] and t[1]."""
 
-    hit: np.ndarray
-    touching: np.ndarray
-    t: np.ndarray
-    t_error: np.ndarray
+    hit: np.ndarray  # (N,) bool
+    touching: np.ndarray  # (N,) bool: the line is tangent to the sphere
+    t: np.ndarray  # (2, N) float64: entry t[0] and exit t[1], in units of the direction's length
+    t_error: np.ndarray  # (2, N) bounds on |t - exact t|
 
 
 def sphere_crossings(o: np.ndarray, d: np.ndarray, center: np.ndarray, radius: np.ndarray) -> SphereCrossings:
-    """Intersect line i with sphere i. o, d, center: (3, N), radius: (N,) > 0, float64 that hold float32 values.
+    """Intersect line i with sphere i. Origins o, directions d, center: (3, N); radius: (N,) > 0; all float64 that hold float32 values.
 
     The sign of the discriminant is exact: a line that touches the sphere hits it. The relative error of t is at most ACCURATE."""
     f = o - center

@@ -1,4 +1,4 @@
-"""Dataclass fields with a description, which scenes in Python, scene files and their reference page share; base of lights, backgrounds."""
+"""Descriptions of dataclass fields, for Python, for scene files and for the reference page; the base class of lights and backgrounds."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _image(value: Any, what: str, limits: Limits) -> np.ndarray:
     return image
 
 
-# Forms of a field. The function of a form checks and converts a value, from the value, its name in messages and the limits.
+# Forms of a field. The function of a form checks and converts a value. Its arguments: the value, its name in messages, the limits.
 FORMS: dict[str, Callable[[Any, str, Limits], Any]] = {
     "point": lambda value, what, limits: as_vector(value, what),  # in world space; a transform moves it
     "direction": lambda value, what, limits: _unit(as_vector(value, what), what),  # of any length, stored at 1; a transform turns it
@@ -52,8 +52,8 @@ FORMS: dict[str, Callable[[Any, str, Limits], Any]] = {
 def given(form: str, about: str, unit: str = "", **limits: Any) -> dict[str, Any]:
     """Return the `metadata` that describes a dataclass field.
 
-    - form: a key of FORMS; about: text in the reference of scene files; unit: "" if the form implies it, or without a unit.
-    - limits: ge, gt, le, lt of numbers, angles (in degrees) and colours, or the allowed values (among)."""
+    - form: a key of FORMS; about: text in the reference of scene files; unit: "" for none, or if the form implies the unit.
+    - limits: bounds ge, gt, le, lt of numbers, angles (in degrees) and colours; or the allowed values or classes (among)."""
     return {"form": form, "about": about, "unit": unit, "limits": limits}
 
 
@@ -63,7 +63,7 @@ def forms(kind: type[object]) -> dict[str, Field[Any]]:
 
 
 def check_fields(thing: object, at: str) -> None:
-    """Convert each described field of a dataclass instance to its form; a default of None stays. Messages of InputError begin with `at`."""
+    """Convert each described field of a dataclass instance to its form; None stays if it is the default. Messages begin with `at`."""
     for name, each in forms(type(thing)).items():
         value = getattr(thing, name)
         if value is not None or each.default is not None:
@@ -73,7 +73,7 @@ def check_fields(thing: object, at: str) -> None:
 class Kind:
     """Base of frozen dataclasses whose fields are described by `field(metadata=given(...))`, except `name: str = ""`.
 
-    kind: name of the class in scene files, in the table of kinds and in the table of device functions; what: name in messages."""
+    kind: name of the class in scene files, in LIGHTS or BACKGROUNDS, and in the table of device functions; what: noun in messages."""
 
     kind: ClassVar[str]
     what: ClassVar[str]
@@ -83,7 +83,7 @@ class Kind:
         check_fields(self, at_thing(self.what, self.name))
 
     def record(self) -> Record:
-        """Return the values that the device function reads, by the names of the fields in the struct of kernels/structs.py."""
+        """Return the values of the fields of the device struct, kernels.structs.Light or Background, by name."""
         raise NotImplementedError
 
     def moved(self: K, matrix: np.ndarray) -> K:

@@ -65,12 +65,12 @@ class Checkerboard:
 
 
 class MaterialKind(NamedTuple):
-    """Properties of a kind of material. kernels/shade/materials.py has the device function of the same name.
+    """Properties of a kind of material. kernels/shade/materials.py has the kind's device function, under the same name.
 
     - about: text in the reference of scene files.
-    - uses: fields that this kind reads and some other kind does not. A kind that does not use a field has 0 in its place on the device,
-      and refuses the field in a scene file.
-    - scatters: `albedo` is diffuse, at least in part; reflects: spawns reflected rays; clear: transmits light without `transmission`."""
+    - uses: fields that this kind reads and some other kind does not. A field that the kind does not use is 0 on the
+      device, and an error in a scene file.
+    - scatters: `albedo` is diffuse, at least in part; reflects: spawns reflected rays; clear: always transmits light."""
 
     about: str
     uses: tuple[str, ...] = ()
@@ -108,8 +108,8 @@ class Material:
     kind
         - "diffuse": Lambert with `albedo`, plus a normalised Blinn-Phong highlight of `specular` and `exponent`.
         - "mirror": reflectance `albedo` at every angle.
-        - "conductor": exact Fresnel reflection with the index of refraction `eta` + i `k` (presets in CONDUCTORS); `roughness`.
-        - "glass": dielectric of index `ior` that reflects and refracts; `albedo` tints transmission; `absorption`, `thin`, `roughness`.
+        - "conductor": exact Fresnel reflection with the index of refraction `eta` + i `k` (presets in CONDUCTORS) and `roughness`.
+        - "glass": dielectric of index `ior`; `albedo` tints transmission. Also reads `absorption`, `thin` and `roughness`.
         - "metallic_roughness": as in glTF 2.0, from `albedo` (base colour), `metallic`, `roughness`, `ior`, `transmission`.
     albedo
         Reflectance; for glass the transmittance of each surface.
@@ -122,11 +122,11 @@ class Material:
     emission, two_sided
         Emitted radiance, linear; True if both sides emit, and not only the front (corners counter-clockwise).
     emits_light
-        True: the emission lights other surfaces, unless the material has an emission texture or alpha. False: it is only visible.
+        True: the emission lights other surfaces, unless it has a texture or `alpha_mode` is not "opaque". False: it is only seen.
     alpha, alpha_mode, alpha_cutoff
         Opacity. "opaque" ignores it; "mask" ignores hits with alpha < alpha_cutoff; "blend" lets the share 1 - alpha of the light pass.
     albedo_texture, emission_texture, normal_texture
-        Factor on `albedo`, with a factor on `alpha` in its alpha; factor on `emission`; tangent-space normal map, scaled by `normal_scale`.
+        Factor on `albedo`, and its alpha channel on `alpha`; factor on `emission`; tangent-space normal map, scaled by `normal_scale`.
     metallic_roughness_texture, transmission_texture
         Factors on `roughness` (green) and `metallic` (blue); factor on `transmission` (red).
 
@@ -151,7 +151,8 @@ class Material:
     metallic: float = field(default=0.0, metadata=given("number", "0: dielectric, 1: metal (metallic_roughness)", ge=0.0, le=1.0))
     roughness: float = field(default=0.0, metadata=given(
         "number", "square root of the GGX alpha; 0: a perfect mirror (conductor, glass, metallic_roughness)", ge=0.0, le=1.0))
-    transmission: float = field(default=0.0, metadata=given("number", "transmitted share (metallic_roughness)", ge=0.0, le=1.0))
+    transmission: float = field(default=0.0, metadata=given(
+        "number", "share of the light that the body transmits (metallic_roughness)", ge=0.0, le=1.0))
     emission: Color = field(default=BLACK, metadata=given("color", "emitted by the front side", "radiance"))
     two_sided: bool = field(default=False, metadata=given("flag", "both sides emit"))
     emits_light: bool = field(default=True, metadata=given("flag", "the emission lights other surfaces; false: it is only visible"))
@@ -194,7 +195,7 @@ class Material:
 
     @property
     def is_emissive(self) -> bool:
-        """True if `emission` is not black. A texture may still be."""
+        """True if `emission` is not black. The emission texture may still be black."""
         return max(self.emission) > 0.0
 
     @property
@@ -215,6 +216,6 @@ SLOTS = {name: Checkerboard in each.metadata["limits"]["among"] for name, each i
 
 
 def kinds_that_use() -> dict[str, tuple[str, ...]]:
-    """Return the kinds that read a field, by field, for the fields that some kind does not read."""
+    """Return, by field, the kinds that read the field. Fields that every kind reads are left out."""
     used = dict.fromkeys(name for kind in MATERIALS.values() for name in kind.uses)
     return {name: tuple(kind for kind, row in MATERIALS.items() if name in row.uses) for name in used}

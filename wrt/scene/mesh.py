@@ -34,7 +34,7 @@ class Mesh:
     groups, face_group
         Names of the parts of the mesh; and the index of each face's part (F,), or None.
     dropped
-        Number of faces that the loader left out because their area is exactly zero.
+        Number of faces that the loader left out: their area is exactly zero, or they have fewer than three corners.
 
     Raises
     ------

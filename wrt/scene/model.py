@@ -110,7 +110,7 @@ class Scene:
     ambient
         Radiance that every diffuse surface receives from all directions, unshadowed (Whitted's ambient term).
     settings
-        Size, samples and other defaults of `render`, whose keywords override them.
+        Size, samples and other defaults of `render`. Its keywords override the settings.
 
     Raises
     ------
@@ -197,10 +197,10 @@ class Scene:
         return np.min(corners, axis=0), np.max(corners, axis=0)
 
     def outlines(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Yield for each object with faces its transform, after points (N, 3) float64 in object space whose convex hull holds its mesh.
+        """Yield (points, transform) of each object with faces. The points, (N, 3) float64, are in object space; their hull holds the mesh.
 
-        The points are the vertices of the mesh. For a shared mesh they are the corners of its box if all objects together have more
-        than MANY_VERTICES. Otherwise a file with one large mesh at many nodes would take hours."""
+        The points are the vertices of the mesh. If all objects together have more than MANY_VERTICES vertices, a shared mesh
+        yields the corners of its box. Otherwise a file with one large mesh at many nodes would take hours."""
         shown = [thing for thing in self.objects if len(thing.mesh.faces)]
         times = Counter(id(thing.mesh) for thing in shown)
         many = sum(len(thing.mesh.vertices) for thing in shown) > MANY_VERTICES

@@ -47,7 +47,7 @@ class Motion:
         object.__setattr__(self, "keys", keys)
 
     def check(self, mesh: Mesh) -> None:
-        """Raise InputError unless `mesh` has the faces of the target."""
+        """Raise InputError unless `mesh` has the same faces and as many vertices as the target."""
         if self.target is None:
             return
         if len(self.target.vertices) != len(mesh.vertices) or not np.array_equal(self.target.faces, mesh.faces):

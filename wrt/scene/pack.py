@@ -32,14 +32,14 @@ LEFT_OUT: dict[type, tuple[str, ...]] = {Object: ("motion",)}  # a single pictur
 def pack(scene: object, left_out: dict[type, tuple[str, ...]] = LEFT_OUT) -> tuple[str, list[np.ndarray]]:
     """Return the JSON text of a scene, and the arrays to which the text refers. Shared meshes, materials and textures are stored once.
 
-    left_out: fields to store as None, by their class (object: of every class)."""
+    left_out: names of the fields to store as None, by class; the key `object` stands for every class."""
     packer = _Packer(left_out)
     packer.plain(scene)
     return json.dumps(packer.things), packer.arrays
 
 
 def unpack(text: str, arrays: list[np.ndarray]) -> Scene:
-    """Return the packed scene, bit for bit and with the same sharing; it uses `arrays` without a copy. Raises InputError for other texts.
+    """Return the packed scene, bit for bit and with the same sharing; it uses `arrays` without a copy. Raises InputError for another text.
 
     Constructors are bypassed, because they would round the pose of a camera once more."""
     things: list[Any] = []
@@ -67,7 +67,7 @@ def unpack(text: str, arrays: list[np.ndarray]) -> Scene:
 
 
 class _Packer:
-    """Collector of `things`, [class name, {field: value}] each, and of `arrays`. A thing follows the things that it refers to."""
+    """Collector of `things` (instances, as [class name, {field: value}]) and of `arrays`. A thing comes after the things it refers to."""
 
     def __init__(self, left_out: dict[type, tuple[str, ...]]) -> None:
         self.left_out = left_out

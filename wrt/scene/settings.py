@@ -38,7 +38,7 @@ class Settings:
     sampler
         "sobol" (Owen-scrambled, evenly spread), or "independent" random numbers, whose noise falls more slowly.
     exposure, tonemap
-        Exposure in stops, factors of 2 on the displayed values; curve from linear to display: "none", "reinhard", "aces" or "agx".
+        Exposure in stops, factors of 2 on radiance; then the curve from linear to display: "none", "reinhard", "aces" or "agx".
 
     Raises
     ------

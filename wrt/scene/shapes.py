@@ -90,7 +90,7 @@ def torus(radius: float = 1.0, tube_radius: float = 0.35, segments: int = 64, tu
 def lathe(profile: Sequence[Point], segments: int = 64) -> Mesh:
     """Return a surface of revolution of a profile around the y axis.
 
-    profile: two or more points (radius, height). From the bottom up, the surface faces outwards; it is closed if both ends are on the
+    profile: two or more points (radius, height). If it runs upwards, the surface faces outwards. It is closed if both ends are on the
     axis. A repeated point makes a sharp edge; other points are smooth. u runs around the axis, v from the end of the profile to its start.
     """
     # In float32 like the vertices: points that are equal in float32 count as repeated.
@@ -122,7 +122,7 @@ def lathe(profile: Sequence[Point], segments: int = 64) -> Mesh:
 
 
 def prism(sides: int = 3, radius: float = 1.0, length: float = 2.0) -> Mesh:
-    """Return a closed, flat-shaded prism along z, without uvs. Its base is a regular polygon in a circle of `radius`, a corner at +y."""
+    """Return a closed, flat-shaded prism along z, without uvs. Its base is a regular polygon in a circle of `radius`, one corner at +y."""
     sides = as_integer(sides, "prism: sides", 3, 4096)
     radius, length = as_number(radius, "prism: radius", low=1e-30), as_number(length, "prism: length", low=1e-30)
     angle = np.pi / 2.0 + np.arange(sides) * (2.0 * np.pi / sides)
@@ -214,7 +214,7 @@ def merged(parts: Sequence[Mesh], name: str) -> Mesh:
 
 
 def _grid(points: np.ndarray, normals: np.ndarray, name: str) -> Mesh:
-    """Return the mesh of a grid of points (M, N, 3), without triangles of no area. u grows along the first axis, v against the second."""
+    """Return the mesh of a grid of points (M, N, 3), without triangles of zero area. u grows along axis 0, v falls along axis 1."""
     m, n = points.shape[:2]
     u, v = np.meshgrid(np.linspace(0.0, 1.0, m), np.linspace(1.0, 0.0, n), indexing="ij")
     i, j = np.meshgrid(np.arange(m - 1), np.arange(n - 1), indexing="ij")
@@ -225,7 +225,7 @@ def _grid(points: np.ndarray, normals: np.ndarray, name: str) -> Mesh:
 
 
 def _require_segments(shape: str, *segments: int, rows: int = 1) -> None:
-    """Raise InputError unless each number of segments is in range, and the triangles of a grid of `rows` times all segments, too."""
+    """Raise InputError if a number of segments is out of range, or a grid of `rows` times all segments exceeds MAX_FACES triangles."""
     for count in segments:
         as_integer(count, f"{shape}: segments", 3, 4096)
     if (faces := 2 * rows * math.prod(segments)) > MAX_FACES:

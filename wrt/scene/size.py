@@ -14,7 +14,7 @@ from wrt.scene.values import SMALLEST
 # Smallest size with a light at a finite distance. The squared distance to the light is a normal float32 down to a distance of 2^-63
 # (1.1e-19), a ten-thousandth of this size.
 SMALLEST_LIT = 1e-15
-FACES_AT_ONCE = 1 << 12
+FACES_AT_ONCE = 1 << 12  # faces whose corners `_points` yields together
 
 
 def require_size(scene: Scene) -> None:
@@ -42,7 +42,7 @@ def _finite_light(scene: Scene) -> str:
 
 
 def _size(scene: Scene, enough: float) -> float:
-    """Return the longest side of the box around all shapes and finite lights, or any lower bound of it that is at least `enough`."""
+    """Return the longest side of the box around all shapes and finite lights, or a smaller value that is at least `enough`."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     size = 0.0
     for points in _points(scene):
@@ -54,7 +54,7 @@ def _size(scene: Scene, enough: float) -> float:
 
 
 def _points(scene: Scene) -> Iterator[np.ndarray]:
-    """Yield the points of the scene in world space, (N, 3) float64, in parts."""
+    """Yield points (N, 3) float64 in world space, part by part: lights, two opposite corners of each sphere's box, corners of faces."""
     for light in scene.lights:
         if light.places():
             yield np.array(light.places())

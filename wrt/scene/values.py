@@ -59,7 +59,7 @@ def as_transform(value: object, what: str) -> np.ndarray:
 
 
 def require_count(count: int, what: str) -> None:
-    """Raise InputError if a scene would hold more than MAX_OBJECTS of something."""
+    """Raise InputError if `count` exceeds MAX_OBJECTS. what: the plural noun for what is counted, such as "lights"."""
     if count > MAX_OBJECTS:
         raise InputError(f"{count} {what}", hint=f"a scene holds at most {MAX_OBJECTS}")
 

@@ -22,7 +22,7 @@ PORTS = {"http": 80, "https": 443}  # default ports, which browsers leave out of
 
 
 class Refused(Exception):
-    """A refused request or message. kind: kind of refusal, which is reported once; message: for the user who started the viewer."""
+    """A refused request or message. kind: key of the refusal; each key is reported once. message: for the user that started the viewer."""
 
     def __init__(self, kind: str, message: str) -> None:
         super().__init__(message)
@@ -40,7 +40,7 @@ class Access:
     def check(self, hosts: Sequence[str], origins: Sequence[str], address: str) -> None:
         """Raise Refused unless the headers Host (one value) and Origin (at most one value) name this viewer.
 
-        address: the connection's local IP address, which is allowed too: DNS rebinding, which this check prevents, needs a name."""
+        address: the connection's local IP address, which may also be the host. The check prevents DNS rebinding, which needs a name."""
         own = self.origins | {origin_of("http", as_host(address), self.port)}
         if len(hosts) != 1 or hosts[0] not in {origin.partition("//")[2] for origin in own}:
             raise Refused("host", f"a request for the host {shown(hosts)}, which is not this viewer; --allow-origin can allow it")
@@ -48,9 +48,9 @@ class Access:
             raise Refused("origin", f"a request by a page of the origin {shown(origins)}; --allow-origin can allow it")
 
     def strip_token(self, target: str) -> tuple[str, str]:
-        """Return the path of a request's target without the token, and the relative address to redirect to ("": none).
+        """Return the path of a request without the token, and the relative address to redirect to ("": do not redirect).
 
-        Raises Refused unless the token is the first part of the path, or the value of `?token=`."""
+        target: path and query of the request. Raises Refused unless the path begins with the token, or the query has `token=` with it."""
         path, _, query = target.partition("?")
         first, slash, rest = path[1:].partition("/")
         if path.startswith("/") and self._is_token(first):
@@ -63,7 +63,7 @@ class Access:
         raise Refused("token", "a request without the token of the printed address")
 
     def _page(self, query: str) -> str:
-        """Return the page's address relative to the viewer's root, which a proxy may put under a sub-path."""
+        """Return the page's address, relative to the viewer's root, because a proxy may serve the viewer under a sub-path."""
         return f"{self.token}/" + (f"?{query}" if query else "")
 
     def _is_token(self, text: str) -> bool:
@@ -100,7 +100,7 @@ def access_for(place: Place, address: str, port: int) -> tuple[Access, str]:
 
 
 def as_host(address: str) -> str:
-    """Return an IP address or a name as URLs write it: IPv6 in brackets."""
+    """Return an IP address or a host name in the form of URLs: IPv6 addresses in brackets."""
     return f"[{address}]" if ":" in address else address
 
 
@@ -119,7 +119,7 @@ def as_origin(text: str) -> str:
 
 
 def shown(values: object) -> str:
-    """Return a value from a client as at most 60 characters, for a message."""
+    """Return a value from a client as text of at most 60 characters, for a message."""
     text = ", ".join(map(repr, values)) if isinstance(values, list) else repr(values)
     text = text or "no name"
     return text if len(text) <= 60 else text[:57] + "..."

@@ -1,4 +1,4 @@
-"""Conversion of cameras between a scene and the browser's viewport, and to a table of a TOML scene file.
+"""Conversion of cameras between a scene and the browser's viewport, and from a camera to a table of a TOML scene file.
 
 viser's camera looks along +z with +y down (OpenCV's convention). wrt's camera looks along -z with +y up. The viewport's space is the
 scene's space divided by `unit`, because viser's controls suit a scene of about size 1.
@@ -32,8 +32,8 @@ def unit_of(scene: Scene, camera: CameraKind) -> float:
 def orbited_point(scene: Scene, camera: CameraKind) -> np.ndarray:
     """Return the point (3,) on the camera's axis that the camera orbits, in world space.
 
-    This is the point in focus; without a focus, the point nearest to the middle of the scene. If the middle is behind the camera, it is
-    the point at the default focus distance."""
+    It is the point in focus. If the camera has no focus, it is the point nearest to the middle of the scene. If that middle is behind
+    the camera, it is the point at the default focus distance."""
     origin, forward = camera.camera_to_world[:3, 3], -camera.camera_to_world[:3, 2]
     distance = _focus(camera)
     if distance == NO_FOCUS and (scene.objects or scene.spheres):
@@ -51,7 +51,7 @@ def up_of(camera: CameraKind) -> np.ndarray:
 
 
 def from_viewport(camera: CameraKind, viewport: viser.CameraHandle, unit: float) -> CameraKind:
-    """Return the camera with the viewport's pose and, for a perspective camera, its angle of view."""
+    """Return the camera with the viewport's pose. A perspective camera gets the viewport's angle of view, too."""
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_quat(np.roll(viewport.wxyz, -1)).as_matrix() * (1.0, -1.0, -1.0)
     with np.errstate(over="ignore"):  # the camera's constructor refuses infinite values

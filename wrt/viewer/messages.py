@@ -1,4 +1,4 @@
-"""Checks of a browser's messages. It may send a camera, a click into the picture, and a control's value; nothing else."""
+"""Checks of a browser's messages. A browser may send a camera, a click into the picture, and a control's value; nothing else."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PIXELS = ("image_width", "image_height")
 
 
 def check_message(message: object, control_of: Callable[[str], Control | None]) -> None:
-    """Raise Refused unless a decoded message is allowed. control_of: returns viser's control for a uuid, or None."""
+    """Raise Refused unless a decoded message is allowed. control_of: function from a uuid to viser's control, or None if unknown."""
     table: dict[str, Any] = message if isinstance(message, dict) else {}
     kind = table.get("type")
     if kind == "ViewerCameraMessage":
@@ -77,7 +77,7 @@ def _check_update(message: dict[str, Any], control_of: Callable[[str], Control |
 
 
 def accepts(control: Control, value: object) -> bool:
-    """Return True if a browser may set a control to a value."""
+    """Return True if a browser may set `control` to `value`."""
     import viser
 
     if control.disabled or not control.visible:

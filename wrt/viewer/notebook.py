@@ -26,12 +26,12 @@ SHARE = 0.1  # largest share of the time that may go into showing pictures
 class LiveView:
     """A callback that shows a render's picture and progress in the output of a notebook's cell.
 
-    Interrupting the notebook's kernel ends the render, which returns the picture so far.
+    Interrupting the notebook's kernel ends the render, which then returns a Film with the samples so far.
 
     Parameters
     ----------
     every
-        Seconds between two pictures; more if showing pictures would take over a tenth of the time.
+        Seconds between two pictures. The pause is longer if showing pictures would take over a tenth of the time.
 
     Raises
     ------
@@ -81,16 +81,16 @@ TITLE, GAP = 22, 8  # pixels: height of a title above a picture, and space betwe
 
 
 def side_by_side(pictures: Mapping[str, Film | np.ndarray], columns: int = 2, scale: int = 1) -> Image.Image:
-    """Return an image of several pictures in rows, each under its name.
+    """Return an image of several pictures in rows, with a title above each picture.
 
     Parameters
     ----------
     pictures
-        Films or display codes (H, W, 3) uint8, by title ("": no title).
+        Pictures by title ("": no title). A picture is a Film or an array of display codes (H, W, 3) uint8.
     columns
-        Pictures in a row.
+        Number of pictures in a row.
     scale
-        Factor by which each pixel is repeated.
+        Size of each pixel in the image, in pixels along each side.
 
     Returns
     -------

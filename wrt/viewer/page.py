@@ -44,13 +44,13 @@ FARTHEST_FOCUS = 1e9  # in units of the viewport
 
 
 def full_size(size: tuple[int, int], before: tuple[int, int]) -> tuple[int, int]:
-    """Return a viewport's size from the size of its canvas, which viser shrinks if the browser is slow. before: last viewport size."""
+    """Return a viewport's size from its canvas's size, which viser shrinks if the browser is slow. before: last viewport size."""
     smaller = size[0] <= before[0] and abs(size[0] * before[1] - size[1] * before[0]) <= max(before)
     return before if smaller else size
 
 
 def status(shown: Shown, viewer: Viewer, full: tuple[int, int], browsers: int) -> str:
-    """Return the panel's text about a picture, as Markdown. full: viewport's size in pixels; browsers: number of connected browsers."""
+    """Return the panel's text about a picture, as Markdown. full: viewport's size in pixels. browsers: number of connected browsers."""
     height, width = shown.codes.shape[:2]
     rays = f"{shown.speed / 1e6:.2f} Mray/s, {shown.rays_per_sample:.1f} rays per sample"
     if shown.view.cost:
@@ -64,10 +64,10 @@ def status(shown: Shown, viewer: Viewer, full: tuple[int, int], browsers: int) -
 
 
 class Page:
-    """A server with the panel and one Viewer, which runs until `close`. `url` is the page's address with the token.
+    """A server with the panel and one Viewer. Both run until `close`. `url` is the page's address with the token.
 
-    spp, counter_of: see Viewer. warn: called once for each kind of refused request or message. Raises InputError if the server cannot
-    listen at `place`."""
+    spp, counter_of: see Viewer. warn: called with one line, once for each kind of refused request or message. Raises InputError if the
+    server cannot listen at `place`."""
 
     def __init__(self, scene: Scene, options: Options, place: Place = HERE, spp: int = 1024, *,
                  counter_of: CounterOf | None = None, warn: Callable[[str], None] = to_stderr) -> None:
@@ -220,7 +220,7 @@ class Page:
                 await self._moved(client.camera)
 
     def _safe(self, action: Callable[[Event], object]) -> Callable[[Event], None]:
-        """Return an action for a browser's event that reports its errors in one line, in place of raising them."""
+        """Return a function that calls `action` with a browser's event, and reports an error in one line in place of raising it."""
 
         def act(event: Event) -> None:
             try:
@@ -250,7 +250,7 @@ class Page:
 
 
 def place_camera(server: viser.ViserServer, camera: CameraKind, target: np.ndarray, unit: float) -> None:
-    """Set the first camera of every browser, which orbits `target` (3,). unit: viewport's unit in scene units."""
+    """Set the camera with which every browser starts. It orbits `target` (3,), in world space. unit: viewport's unit in scene units."""
     server.scene.set_up_direction(tuple(up_of(camera)))
     start = server.initial_camera
     start.position = tuple(camera.camera_to_world[:3, 3] / unit)
@@ -259,7 +259,7 @@ def place_camera(server: viser.ViserServer, camera: CameraKind, target: np.ndarr
 
 
 def show_camera(client: viser.ClientHandle | None, camera: CameraKind) -> None:
-    """Show a camera in a browser as a table of a scene file, with a button to save the table."""
+    """Show a camera in a browser as a table of a TOML scene file, with a button to save the table."""
     if client is None:
         return
     text = camera_toml(camera)
@@ -272,7 +272,7 @@ def show_camera(client: viser.ClientHandle | None, camera: CameraKind) -> None:
 
 
 def encoded(picture: Film | np.ndarray, suffix: str) -> bytes:
-    """Return the bytes of a picture's file. picture: a Film, or the codes (h, w, 3) uint8 of a heat map, which becomes a PNG."""
+    """Return the bytes of a picture's file. picture: a Film, or a heat map's display codes (h, w, 3) uint8, which become a PNG."""
     if isinstance(picture, np.ndarray):
         return encode_png(picture)
     with tempfile.TemporaryDirectory() as folder:
@@ -282,6 +282,6 @@ def encoded(picture: Film | np.ndarray, suffix: str) -> bytes:
 
 
 def round_up(value: float) -> float:
-    """Round up to 1, 2 or 5 times a power of ten."""
+    """Return the smallest number that is at least `value`, and is 1, 2 or 5 times a power of ten."""
     power = 10.0 ** math.floor(math.log10(value))
     return next(power * factor for factor in (1.0, 2.0, 5.0, 10.0) if power * factor >= value * (1.0 - 1e-9))

@@ -40,7 +40,7 @@ class _Work:
 
     view: View
     request: int  # value of Viewer._requested at the start
-    scale: int = 1
+    scale: int = 1  # as in Shown
     last_shown: float = -np.inf  # time of the last picture shown
 
 
@@ -52,7 +52,7 @@ class Pace(dict[tuple[str, bool], float]):
             self[view.accel, bool(view.cost)] = seconds / samples
 
     def scales(self, view: View) -> list[int]:
-        """Return the scales to render, down to 1. The first should take COARSE seconds at most; it is 8 without a measurement."""
+        """Return the scales (see SCALES) to render, down to 1. The first scale should take COARSE seconds at most; unmeasured, it is 8."""
         pace = self.get((view.accel, bool(view.cost)))
         seconds = COARSE * 8**2 if pace is None else pace * view.size[0] * view.size[1]
         first = next((scale for scale in SCALES if seconds / scale**2 <= COARSE), SCALES[-1])
@@ -62,11 +62,11 @@ class Pace(dict[tuple[str, bool], float]):
 class Viewer:
     """Renders the view that `change` requested last. The caller runs `run` in a thread of its own, until `stop`.
 
-    All other methods may be called from any thread and never wait for a picture. `change` and `pause` increase `_requested`. The
-    thread renders while `_requested` differs from `_completed` and the viewer is watched, which is from `change` until `pause`.
+    Any thread may call the other methods, which never wait for a picture. `change` and `pause` increase the counter `_requested`. The
+    viewer is watched from `change` until `pause`. Meanwhile `run` renders whenever `_requested` differs from `_completed`.
 
     - scene, options: as for Renderer; options.camera has the first view. counter_of: as for Renderers.
-    - show: called with each picture. report: called with a text about compiling, building and errors ("": nothing to report).
+    - show: called with each picture. report: called with a text about compiling, building or an error; "" clears the last text.
     - spp: samples per pixel of the finished picture.
     """
 
@@ -92,9 +92,9 @@ class Viewer:
     # --- from any thread ----------------------------------------------------------------------------------------------
 
     def change(self, **changes: Any) -> bool:
-        """Request a view with some fields of View changed; return True if it differs. camera: a camera, or a function of the current one.
+        """Request the view with some fields of View changed. `camera` is a camera, or a function from the current camera to the new one.
 
-        Raises InputError for an unknown structure or counter."""
+        Returns False if the view is watched and has the same pixels. Raises InputError for an unknown structure or counter."""
         if "accel" in changes:
             ACCELERATORS.check(changes["accel"], "accel")
         if changes.get("cost"):
@@ -137,7 +137,7 @@ class Viewer:
             self._condition.notify_all()
 
     def picture(self) -> Film | np.ndarray | None:
-        """Return the last picture for a file: a Film, or the codes (h, w, 3) uint8 of a heat map; None before the first picture."""
+        """Return the last picture, to save it: a Film, or a heat map's display codes (h, w, 3) uint8; None before the first picture."""
         with self._condition:
             film, shown = self._film, self.shown
         if film is None:
@@ -161,9 +161,9 @@ class Viewer:
         return self._watched and self._requested != self._completed
 
     def step(self) -> None:
-        """Refine the last request until it is done or the next request comes; without a request, show the last picture again.
+        """Render the requested view until it is done or the next request comes. If nothing is requested, show the last picture again.
 
-        While exposure or tone mapping change, the picture does not count as done, so that the page sends it as a smaller JPEG."""
+        While exposure or tone mapping change, the picture does not count as done, so that the page sends a smaller JPEG."""
         with self._condition:
             redraw, self._redraw = self._redraw, False
             work = _Work(self.view, self._requested) if self._pending else None
@@ -198,11 +198,11 @@ class Viewer:
         return True
 
     def _abandoned(self, work: _Work, seconds: float) -> bool:
-        """Return True if there is a newer request, and this view was shown at least once or took over PATIENCE seconds."""
+        """Return True if there is a newer request, and this view was shown at least once or has taken over PATIENCE seconds."""
         return self._requested != work.request and (work.last_shown > -np.inf or seconds > PATIENCE)
 
     def _trace(self, work: _Work) -> bool:
-        """Render and show the picture at one scale; return False if it was abandoned."""
+        """Render and show the picture at work.scale; return False if it was abandoned."""
         film = self.renderers.picture(work.view, work.scale, self.spp if work.scale == 1 else 1)
         if film.stats["interrupted"]:
             return False
@@ -210,7 +210,7 @@ class Viewer:
         return True
 
     def _on_progress(self, progress: Progress) -> None:
-        """Report a renderer's progress, and show pictures while it refines. Raises KeyboardInterrupt to end an abandoned render."""
+        """Report a renderer's progress, and show its picture every EVERY seconds. Raises KeyboardInterrupt to end an abandoned render."""
         if progress.stage != "trace" or self._work is None:
             done = f" {progress.done / progress.total:.0%}" if progress.stage == "build" else ""
             self.report("building the structure ..." + done if progress.stage == "build" else COMPILING)
@@ -237,7 +237,7 @@ class Viewer:
         self.show(shown if rests else replace(shown, done=False))
 
     def _count(self, work: _Work) -> bool:
-        """Render and show the heat map at one scale; return False if it was abandoned."""
+        """Render and show the heat map at work.scale; return False if it was abandoned."""
         begin = time.perf_counter()
 
         def go_on(done: int) -> bool:

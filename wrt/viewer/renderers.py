@@ -21,20 +21,20 @@ TILE_SIZE = 16  # pixels a side; small, because the next view waits until all ru
 
 
 class Counter(Protocol):
-    """Counts the work of each pixel, for heat maps."""
+    """Counts the work of each pixel, such as visited nodes, for heat maps."""
 
     def aim(self, camera: CameraKind, angles_of: tuple[int, int] | None = None, **settings: Any) -> None:
         """Set another camera and other settings, as Prepared.aimed does."""
 
     def costs(self, go_on: Callable[[int], bool]) -> dict[str, np.ndarray] | None:
-        """Return the counts by counter, (H, W) int32 each, or None once go_on(number of pixels so far) returns False."""
+        """Return an array (H, W) int32 for each counter, by its name. Return None once go_on(number of counted pixels) returns False."""
 
 
 CounterOf = Callable[[Prepared], Counter]
 
 
 class Renderers:
-    """The renderers of a scene and their counters, by name of the structure.
+    """The renderers of a scene and their counters, by name of the acceleration structure.
 
     progress: callback of all renderers. counter_of: makes the counter of a prepared scene; None: no heat maps."""
 
@@ -59,15 +59,15 @@ class Renderers:
         return renderer.run()
 
     def costs(self, view: View, scale: int, go_on: Callable[[int], bool]) -> dict[str, np.ndarray] | None:
-        """Return the counts of the view, with one pixel for each block of `scale` x `scale` pixels; see Counter.costs."""
+        """Return Counter.costs of the view, with one pixel for each block of `scale` x `scale` pixels."""
         counter = self.counters[view.accel]
         counter.aim(view.camera, view.size, **_settings(view, scale, 1))
         return counter.costs(go_on)
 
     def focus_at(self, view: View, x: float, y: float) -> float | None:
-        """Return the distance along the axis, in scene units, to the surface at a point of the picture.
+        """Return the distance along the camera's axis, in scene units, to the surface at a point of the picture.
 
-        x, y: 0 to 1 from the top left corner. None: the ray hits nothing, or the structure is not built yet."""
+        x, y: the point, 0 to 1 from the top left corner. None: the ray hits nothing, or the structure is not built yet."""
         if view.accel not in self.by_accel:
             return None
         origins, directions = film_rays(view.camera, view.size, np.array([[x, y]]))
@@ -76,7 +76,7 @@ class Renderers:
         return float(hits.t[0]) * along if hits.prim_id[0] >= 0 else None
 
     def describe(self, accel: str) -> str:
-        """Return a structure's name, size and build time as text; before it is built, the name."""
+        """Return a text with a structure's name, size and build time; before it is built, only the name."""
         if accel not in self.by_accel:
             return accel
         stats = self.by_accel[accel].accel.stats
@@ -113,9 +113,9 @@ class Shown:
     scale: int  # one pixel stands for scale x scale pixels of the view
     spp: int  # smallest number of samples of a pixel
     speed: float = 0.0  # rays per second
-    rays_per_sample: float = 0.0
+    rays_per_sample: float = 0.0  # mean
     done: bool = False  # True: the picture gets no finer
-    # For a heat map, counts per pixel: `top` has the last colour; mean and largest value.
+    # For a heat map, counts per pixel: the count shown in the last colour, the mean, and the largest count.
     top: float = 0.0
     mean: float = 0.0
     largest: float = 0.0

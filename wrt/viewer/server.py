@@ -1,7 +1,7 @@
 """viser's server behind a guard, which refuses requests without the token and messages that wrt.viewer.messages does not allow.
 
-viser serves its page and its WebSocket with one call of `websockets.asyncio.server.serve`, without a hook for checks. During that
-call, wrt replaces `serve`, to add its checks and a socket that wrt has bound. viser opens no other port. VERSIONS has the supported
+viser serves its page and its WebSocket with one call of `websockets.asyncio.server.serve`, without a hook for checks. While viser
+starts, wrt replaces `serve`, to add its checks and a socket that wrt has bound. viser opens no other port. VERSIONS has the supported
 versions of viser. With another version, or if viser does not call `serve`, the viewer does not start.
 """
 
@@ -63,7 +63,7 @@ def import_viser() -> ModuleType:
 
 
 def listen(place: Place) -> socket.socket:
-    """Return a socket that listens at `place`. Raises InputError if the system refuses."""
+    """Return a socket that listens at `place`. Raises InputError if that fails."""
     host, port = place.host, place.port
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
@@ -84,13 +84,13 @@ def to_stderr(text: str) -> None:
 
 @contextlib.contextmanager
 def without_stdout() -> Iterator[None]:
-    """Drop viser's output to stdout, because wrt's stdout is for data."""
+    """Drop viser's output to stdout in the `with` block, because wrt's stdout is for data."""
     with _PATCHING, contextlib.redirect_stdout(io.StringIO()):
         yield
 
 
 class Guard:
-    """Guard of a viser server: it checks every request and every message. `open` starts the server.
+    """Guard of a viser server, which checks every request and every message. `open` starts the server.
 
     warn: called with one line, once for each kind of refusal."""
 
@@ -104,7 +104,7 @@ class Guard:
         self._lock = threading.Lock()
 
     def open(self, listening: socket.socket, label: str) -> viser.ViserServer:
-        """Start a viser server behind this guard. Raises InputError if viser does not call `serve` as expected."""
+        """Start a viser server on the socket `listening`, behind this guard. Raises InputError if viser calls `serve` in another way."""
         viser = import_viser()
         websockets: Any = importlib.import_module("websockets.asyncio.server")
         warnings.filterwarnings("ignore", r"Queued a \w+ on a closed connection", UserWarning)  # from viser, after a browser disconnects
@@ -156,7 +156,7 @@ class Guard:
     # --- requests -----------------------------------------------------------------------------------------------------
 
     def _settings(self, page: Files | None) -> dict[str, Any]:
-        """Return the arguments of websockets' `serve` that replace viser's. page: viser's answers to requests for files."""
+        """Return the arguments of websockets' `serve` that replace viser's. page: viser's function that answers requests for files."""
         return {"process_request": lambda connection, request: self._answer(connection, request, page), "server_header": None,
                 "max_size": LARGEST_MESSAGE, "close_timeout": CLOSING, "logger": QUIET, "create_connection": _checked_connection(self)}
 
@@ -185,7 +185,7 @@ class Guard:
         return answer
 
     def _checking_version(self, handler: Handler) -> Handler:
-        """Return viser's handler for browsers with this version of viser; viser would report other versions on stdout."""
+        """Return a handler that calls viser's `handler`, but closes connections of other versions, which viser reports on stdout."""
         import viser
 
         async def check(connection: ServerConnection) -> None:

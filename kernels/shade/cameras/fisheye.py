@@ -20,7 +20,7 @@ class Camera:
     forward: wp.vec3
     half_angle: float  # Angle between the axis and the rays at the edge of the image circle, in radians.
     half_width: float  # Half the width of the picture, in radii of the image circle.
-    half_height: float
+    half_height: float  # Half the height, in the same unit.
 
 
 @wp.func

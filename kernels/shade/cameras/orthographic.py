@@ -10,7 +10,7 @@ from wrt.kernels.structs import Ray, make_ray
 
 @wp.struct
 class Camera:
-    """The picture spans origin +- half_width right +- half_height up."""
+    """The picture spans `origin +- half_width * right +- half_height * up`."""
 
     origin: wp.vec3
     right: wp.vec3

@@ -11,7 +11,7 @@ from wrt.kernels.structs import Ray, lift, make_ray, unit
 
 @wp.struct
 class Camera:
-    """The rays through the picture's edges have the directions forward +- tan_x right +- tan_y up."""
+    """The rays through the picture's corners have the directions `forward +- tan_x * right +- tan_y * up`."""
 
     origin: wp.vec3
     right: wp.vec3
@@ -19,15 +19,15 @@ class Camera:
     forward: wp.vec3
     tan_x: float
     tan_y: float
-    focus_distance: float
+    focus_distance: float  # Distance along the axis to the plane in focus.
     aperture_radius: float
-    blades: int
-    blade_rotation: float
+    blades: int  # Number of straight sides of the aperture; 0: round.
+    blade_rotation: float  # In radians.
 
 
 @wp.func
 def chief_ray(camera: Camera, film: wp.vec2) -> wp.vec3:
-    """Return the direction of the ray through the lens' centre; its `forward` component is 1."""
+    """Return the direction of the ray through the lens' centre, not normalised: its `forward` component is 1."""
     x = (2.0 * film[0] - 1.0) * camera.tan_x
     y = (1.0 - 2.0 * film[1]) * camera.tan_y
     return camera.forward + x * camera.right + y * camera.up

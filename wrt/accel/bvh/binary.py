@@ -31,7 +31,7 @@ RECORDS_PER_JOB = 32768
 
 
 class InPlace(NamedTuple):
-    """Arrays for refits in place. tree: kernels.build.fit.Tree; shape: the Shape into which a refit copies the points."""
+    """Arrays for refits in place. tree: kernels.build.fit.Tree; shape: kernels.build.shape.Shape, which receives the new points."""
 
     fitting: Fitting
     tree: WarpStruct
@@ -53,7 +53,7 @@ class BinaryBvh(OneMesh):
 
     @abstractmethod
     def _around(self, nodes: np.ndarray, order: np.ndarray, leaves: int, depth: int) -> Built:
-        """Make the structure from Bvh2Node records of a binary tree; arguments as in Built."""
+        """Make the builder's result from a binary tree. nodes: Bvh2Node records; other arguments as in Built."""
 
     def _check(self, built: Built) -> None:
         check_binary(built.arrays["nodes"], len(built.order), kernels.STACK_SIZE)
@@ -81,7 +81,7 @@ class Bvh2(BinaryBvh):
         return shape
 
     def _on_device(self, built: Built) -> Built:
-        """Copy the arrays to the device, and compute the parents."""
+        """Return `built` with its arrays copied to the device, and with the parents of the nodes."""
         nodes, order = built.arrays["nodes"], built.order
         if not isinstance(order, wp.array):
             nodes, order = upload(nodes.copy(), kernels.Bvh2Node, self.device), upload(order.copy(), wp.int32, self.device)
@@ -126,7 +126,7 @@ class Bvh2(BinaryBvh):
         self._write_corners(cached.shape, cached.tree.order, self.data.primitives)
 
     def save(self, path: PathLike) -> None:
-        """Save as OneMesh.save. After a refit in place, first compute the SAH cost."""
+        """Write the structure to a file, as OneMesh.save does. After a refit in place, first compute the SAH cost."""
         snapshot = self._snapshot
         built = snapshot.arrays
         if math.isnan(built.sah_cost):
@@ -144,7 +144,10 @@ class Bvh2(BinaryBvh):
         return InPlace(fitting, tree_of(fitting, self.data.nodes, built.parents, built.order), shape)
 
     def _primitives(self, built: Built) -> np.ndarray | WarpArray:
-        """Write the records on the device if `order` is there and the records are three corners; else on the host."""
+        """Return the triangle test's records.
+
+        The device makes them if `order` is a Warp array, a record holds three corners, and the geometry is no NumberedGeometry.
+        """
         if (not isinstance(built.order, wp.array) or self.structure.units.triangle_test.layout != "corners"
                 or isinstance(self.geometry, NumberedGeometry)):
             return super()._primitives(built.on_host())

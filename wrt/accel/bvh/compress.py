@@ -15,13 +15,13 @@ EXPONENT_SHIFTS = EXPONENT_BITS * np.arange(3, dtype=np.uint32)  # bit positions
 
 
 def decoded(origin: np.ndarray, step: np.ndarray, byte: np.ndarray) -> np.ndarray:
-    """Decode planes with the bits of the kernels: only the sum rounds. origin, step: (..., 1) float32; byte: (..., W)."""
+    """Decode planes origin + byte * step as kernels do: only the sum rounds. origin, step: (..., 1) float32; byte: (..., W)."""
     with np.errstate(invalid="ignore", over="ignore"):
         return origin + byte.astype(np.float32) * step
 
 
 def steps(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return the biased exponent of the least power of two p with low + 255 p >= high, or LARGEST_EXPONENT."""
+    """Return the biased exponent of the least power of two p with low + 255 p >= high; LARGEST_EXPONENT if no finite p suffices."""
     with np.errstate(invalid="ignore", over="ignore"):
         _, exponent = np.frexp((high.astype(np.float64) - low) / LARGEST_BYTE)
         biased = np.clip(np.where(high > low, exponent, -EXPONENT_BIAS) - 1 + EXPONENT_BIAS, 1, LARGEST_EXPONENT)
@@ -36,9 +36,10 @@ def powers(biased: np.ndarray) -> np.ndarray:
 
 
 def compress(lo: np.ndarray, hi: np.ndarray, exists: np.ndarray) -> np.ndarray:
-    """Compress boxes to the floats of a node that precede its references. lo, hi: (N, W, 3) float32; exists: (N, W) bool.
+    """Compress the boxes of the children to the float32 entries of N nodes that precede the references.
 
-    Every compressed box contains the original box. Along an axis whose extent 8 bits cannot cover, the box is infinite.
+    lo, hi: (N, W, 3) float32; exists: (N, W) bool, whether a child exists. Every compressed box contains the original box. Along an
+    axis whose extent 8 bits cannot cover, the box is infinite.
     """
     n, width = exists.shape
     low = np.where(exists[..., None], lo, np.float32(np.inf)).min(axis=1)
@@ -62,7 +63,7 @@ def compress(lo: np.ndarray, hi: np.ndarray, exists: np.ndarray) -> np.ndarray:
 
 
 def nearest(origin: np.ndarray, step: np.ndarray, planes: np.ndarray, upward: bool) -> np.ndarray:
-    """Return the byte whose decoded plane is nearest to each of `planes` on its lower side, or on its upper side (upward)."""
+    """Return, for each of `planes`, the byte whose decoded plane is the nearest not above it, or not below it if `upward`."""
     with np.errstate(over="ignore", invalid="ignore"):
         t = (planes.astype(np.float64) - origin) / step.astype(np.float64)
     byte = np.clip(np.where(np.isfinite(t), np.ceil(t) if upward else np.floor(t), 0.0), 0.0, LARGEST_BYTE)
@@ -74,13 +75,13 @@ def nearest(origin: np.ndarray, step: np.ndarray, planes: np.ndarray, upward: bo
 
 
 def existing_children(nodes: np.ndarray, width: int) -> np.ndarray:
-    """Return the mask of existing children, (N, W) bool, from the words of the nodes."""
+    """Return the mask of existing children, (N, W) bool, which each node stores in the bits of its entry WORD."""
     word = np.ascontiguousarray(nodes[:, WORD]).view(np.uint32)
     return (word[:, None] >> np.arange(EXIST_SHIFT, EXIST_SHIFT + width, dtype=np.uint32) & 1).astype(bool)
 
 
 def decompress(nodes: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the boxes with the bits of the kernels, lo and hi (N, W, 3); empty boxes for missing children."""
+    """Decompress the boxes of children, bit for bit as kernels do: lo, hi (N, W, 3). A missing child gets an empty box."""
     n = len(nodes)
     word = np.ascontiguousarray(nodes[:, WORD]).view(np.uint32)
     step = powers(word[:, None] >> EXPONENT_SHIFTS & LARGEST_EXPONENT)

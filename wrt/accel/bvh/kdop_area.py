@@ -9,7 +9,7 @@ Bounds = tuple[np.ndarray, np.ndarray]
 
 
 def kdop_areas(nodes: np.ndarray, middle: np.ndarray) -> np.ndarray:
-    """Return the surface area of both children of KdopNode records, (2, N) float64: 0 for a missing child, inf if not finite."""
+    """Return the area of both children of KdopNode records, (2, N): 0 for a missing child, inf if not finite. middle: origin of cuts."""
     out = np.empty((2, len(nodes)))
     for i, side in enumerate("01"):
         lo, hi = (nodes[f"{end}_{side}"].astype(np.float64) - middle for end in ("lo", "hi"))
@@ -21,7 +21,7 @@ def kdop_areas(nodes: np.ndarray, middle: np.ndarray) -> np.ndarray:
 
 
 def kdop_area(lo: np.ndarray, hi: np.ndarray, cut_lo: np.ndarray, cut_hi: np.ndarray) -> np.ndarray:
-    """Return the surface area (N,) of boxes lo, hi, (N, 3), cut by planes cut_lo, cut_hi, (N, 4), across DIAGONALS."""
+    """Return the surface area (N,) of boxes lo, hi, (N, 3), inside the slabs cut_lo .. cut_hi, (N, 4), along the four DIAGONALS."""
     axes = [(lo[:, i], hi[:, i]) for i in range(3)]
     # A plane outside of the box is moved to the box, because its distance would cancel all digits of an area.
     cuts = [(np.maximum(cut_lo[:, k], np.minimum(sign * lo, sign * hi).sum(axis=1)),
@@ -53,7 +53,7 @@ def wedge(t: np.ndarray) -> np.ndarray:
 
 
 def box_face(x: np.ndarray, y: Bounds, z: Bounds, sum_all: Bounds, minus_x: Bounds, minus_y: Bounds, minus_z: Bounds) -> np.ndarray:
-    """Return the area of the box's face at x, a rectangle y, z, inside the slabs of all four diagonals."""
+    """Return the area of the box's face at x inside all four slabs. sum_all: bounds of x + y + z; minus_x: of -x + y + z; and so on."""
     up = np.maximum(sum_all[0] - x, minus_x[0] + x), np.minimum(sum_all[1] - x, minus_x[1] + x)  # y + z
     across = np.maximum(minus_y[0] - x, x - minus_z[1]), np.minimum(minus_y[1] - x, x - minus_z[0])  # z - y
     area = (below(y, z, up[1], across[1]) - below(y, z, up[0], across[1])
@@ -62,7 +62,7 @@ def box_face(x: np.ndarray, y: Bounds, z: Bounds, sum_all: Bounds, minus_x: Boun
 
 
 def below(y: Bounds, z: Bounds, q: np.ndarray, s: np.ndarray) -> np.ndarray:
-    """Return the area of the rectangle y, z where y + z <= q and z - y <= s: a roof over y whose ridge is at (q - s) / 2."""
+    """Return the area of the rectangle y, z under a roof: the lines y + z = q and z - y = s, which meet at y = (q - s) / 2."""
     ridge = np.clip(0.5 * (q - s), y[0], y[1])
     height = z[1] - z[0]
 
@@ -75,7 +75,7 @@ def below(y: Bounds, z: Bounds, q: np.ndarray, s: np.ndarray) -> np.ndarray:
 
 
 def askew_faces(axes: list[Bounds], cuts: list[Bounds]) -> np.ndarray:
-    """Return the area of both faces across the first diagonal.
+    """Return the total area of the two faces perpendicular to the first diagonal. axes: bounds in x, y, z; cuts: along DIAGONALS.
 
     A face is a hexagon. Its projection along x is a rectangle in y and z, cut by two lines y + z = const.
     """

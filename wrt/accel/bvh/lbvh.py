@@ -28,9 +28,9 @@ def build_lbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryT
 
 def build_on(device: Device, shape: WarpStruct, options: BvhOptions,
              threads: int = 1) -> tuple[WarpArray, WarpArray, WarpArray, Root]:
-    """Build over a Shape of at least two primitives; return Bvh2Node records, their parents, prim_ids of the leaves, and a Root.
+    """Build over at least two primitives; return Bvh2Node records, the nodes' parents, prim_ids of the leaves, and a Root.
 
-    The arrays stay on the device.
+    shape: kernels.build.shape.Shape. All arrays stay on the device.
     """
     n = len(shape.faces) + len(shape.spheres)
     if n >= MOST:

@@ -17,7 +17,7 @@ PRIMITIVES_PER_JOB = 32768
 
 
 class Root(NamedTuple):
-    """Statistics of a whole tree. height: inner nodes on the longest path from the root; sah_cost: as in AccelStats."""
+    """Statistics of a whole tree. height: number of inner nodes on the longest path from the root; sah_cost: as in AccelStats."""
 
     inner_nodes: int
     height: int
@@ -25,7 +25,7 @@ class Root(NamedTuple):
 
 
 class Fitting:
-    """Scratch arrays on a device for fitting the boxes of a tree to its primitives. primitives, nodes: their numbers."""
+    """Scratch arrays on a device for fitting the boxes of a tree. primitives, nodes: number of primitives, number of inner nodes."""
 
     def __init__(self, device: Device, primitives: int, nodes: int) -> None:
         self.device, self.primitives, self.nodes = device, primitives, nodes
@@ -38,14 +38,14 @@ class Fitting:
         launch_on(self.device, bounds, self.primitives, shape, self.low, self.high, None, threads=threads, step=PRIMITIVES_PER_JOB)
 
     def fit(self, tree: WarpStruct, options: WarpStruct | None = None) -> None:
-        """Fit the boxes of the tree to the primitives' boxes. With options, subtrees become leaves where that costs no more."""
+        """Fit the tree's boxes to the primitives' boxes. options: BuildOptions, to make leaves of subtrees where that costs no more."""
         if options is None:
             options = BuildOptions()
             options.row = 1
         launch_on(self.device, kernels.fit, self.nodes, tree, options)
 
     def refit(self, tree: WarpStruct, shape: WarpStruct, threads: int = 1) -> None:
-        """Fit the boxes to the shape. A CUDA graph can capture this call. Boxes that spatial splits clipped become whole again."""
+        """Fit the tree's boxes to the whole primitives of `shape`, even if spatial splits clipped them. A CUDA graph can capture this."""
         self.find_bounds(shape, threads)
         self.fit(tree)
 

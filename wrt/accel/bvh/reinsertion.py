@@ -24,8 +24,8 @@ SMALL_LEAF = 4  # primitives per leaf at most while build_refined moves subtrees
 class Effort(NamedTuple):
     """Extent of the optimisation.
 
-    share: a round tries to move this fraction of the nodes, the largest ones. rounds: maximum number of rounds. least_gain: a round
-    that reduces the sum of areas by a smaller fraction is the last.
+    share: fraction of the nodes, the largest ones, that a round tries to move. rounds: maximum number of rounds. least_gain: the
+    optimisation ends after a round that reduces the sum of all boxes' areas by less than this fraction.
     """
 
     share: float
@@ -61,7 +61,7 @@ def build_refined(geometry: Geometry, options: BvhOptions, threads: int) -> Bina
 
 
 def leaf_begins(tree: BinaryTree) -> np.ndarray:
-    """Return the mask of the records at which a leaf begins, (R,) bool."""
+    """Return a mask over tree.order, (R,) bool: True at the first primitive of each leaf."""
     begins = np.zeros(len(tree.order), bool)
     for side in ("0", "1"):
         begins[tree.nodes["first_" + side][tree.nodes["count_" + side] > 0]] = True
@@ -69,7 +69,7 @@ def leaf_begins(tree: BinaryTree) -> np.ndarray:
 
 
 def links_of(tree: BinaryTree) -> np.ndarray:
-    """Convert a tree to Link records: inner nodes first, then the leaves in the order of their primitives."""
+    """Convert a tree to kernels.build.reinsertion.Link records: inner nodes first, then leaves in the order of their primitives."""
     nodes, n_inner = tree.nodes, len(tree.nodes)
     links, leaf_index = records(kernels.Link, 2 * n_inner + 1), np.cumsum(leaf_begins(tree), dtype=np.int32) - 1
     links["left"], links["right"] = -1, -1
@@ -102,7 +102,7 @@ def scale_of(links: np.ndarray) -> np.float32:
 
 
 def optimized(tree: BinaryTree, effort: Effort, threads: int) -> tuple[WarpArray, WarpStruct, float]:
-    """Return the optimised links, their kernels.build.reinsertion.Walk, and the fraction by which the sum of areas fell.
+    """Return the optimised links, their kernels.build.reinsertion.Walk, and the fraction by which the sum of all boxes' areas fell.
 
     If the tree becomes deeper than the traversal stack, the optimisation begins again with half as many rounds.
     """
@@ -117,9 +117,9 @@ def optimized(tree: BinaryTree, effort: Effort, threads: int) -> tuple[WarpArray
 
 
 def move(links: WarpArray, effort: Effort, rounds: int, threads: int) -> float:
-    """In each round, search the best place of each large node, and then make the moves in the order of their gains.
+    """In each round, find the best new place of each large node; then make these moves, the move with the largest gain first.
 
-    Return the fraction by which the sum of areas fell.
+    Return the fraction by which the sum of all boxes' areas fell.
     """
     cpu = start("cpu")
     view = on_host(links)
@@ -144,7 +144,7 @@ def move(links: WarpArray, effort: Effort, rounds: int, threads: int) -> float:
 
 
 def largest(links: np.ndarray, areas: np.ndarray, share: float) -> np.ndarray:
-    """Return the indices of the largest nodes that can move, (K,) int32. The root and its children cannot move."""
+    """Return the indices of the largest nodes (fraction `share`), (K,) int32, without the root and its children, which cannot move."""
     movable = links["parent"] > 0
     most = int(share * len(links))
     if share < 1.0 and 0 < most < len(links):
@@ -176,7 +176,7 @@ def with_leaves(tree: BinaryTree, links: np.ndarray, walk: WarpStruct) -> Binary
 
 
 def nodes_of(links: np.ndarray, inner: np.ndarray, begins: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Make Bvh2Node records of the links `inner`, parents first. begins, counts: first primitive and number of primitives of leaves."""
+    """Make Bvh2Node records of the links with indices `inner`. begins, counts: first primitive and number of primitives, for leaves."""
     nodes, boxes = records(Bvh2Node, len(inner)), np.concatenate([links["lo"], links["hi"]], axis=1)
     begins[inner], counts[inner] = np.arange(len(inner)), 0
     for side, name in (("0", "left"), ("1", "right")):

@@ -14,10 +14,10 @@ SMALL = 128  # primitives
 
 
 class _Choice(NamedTuple):
-    """Cheapest way to represent a subtree by at most some number of children of a wide node.
+    """Cheapest set of children, up to some number, by which a wide node represents a subtree.
 
-    cost: SAH cost of these children. children: their number. first: number of children from the subtree's first part; 0: the
-    subtree itself is the only child.
+    cost: SAH cost of the children. children: number of children. first: number of children that come from the subtree's parts[0];
+    0: the subtree itself is the only child.
     """
 
     cost: float
@@ -28,7 +28,8 @@ class _Choice(NamedTuple):
 class _Subtree:
     """Subtree of a binary tree: primitives `items` (n,), their boxes lo, hi (n, 3), and half the area of the box around them.
 
-    parts: the two children, after `split`. choices: best choice of at most 1, 2, .. children. opened: best choice of two or more.
+    `split` sets parts: two halves, or none for a single primitive. `choose` sets choices[k], the best choice of at most k + 1
+    children, and opened, the best choice of two or more children.
     """
 
     parts: list[_Subtree]
@@ -61,7 +62,7 @@ class _Subtree:
                       for part, area in ((order[: k + 1, axis], below), (order[k + 1 :, axis], above))]
 
     def choose(self) -> None:
-        """Find the least cost for every number of children, as kernels.build.wide. The parts must have chosen before."""
+        """Set `choices` and `opened` by dynamic programming, as kernels.build.wide does. Call it for the parts first."""
         self.choices = [_Choice(self.leaf_cost, 1, 0)]
         self.opened = _Choice(np.inf, 0, 0)
         if self.parts:
@@ -77,7 +78,7 @@ class _Subtree:
         self.choices += self.choices[-1:] * (self.options.row - len(self.choices))
 
     def _is_leaf_beside(self, cost: float) -> bool:
-        """Return whether a leaf costs no more than `cost`, which may be inf."""
+        """Return whether a leaf is best: always for one primitive, else if max_leaf allows it and it costs at most `cost`, maybe inf."""
         return len(self.items) == 1 or (len(self.items) <= self.options.max_leaf and self.leaf_cost <= cost)
 
     @property
@@ -91,16 +92,16 @@ class _Subtree:
         return first.roots(first.choices[choice.first - 1]) + second.roots(second.choices[choice.children - choice.first - 1])
 
     def children(self) -> list[_Subtree]:
-        """Return the children of the node over this subtree in the reverse of an any-hit ray's order: inner nodes first, by area."""
+        """Return the children of this subtree's node: inner nodes, then leaves, by ascending area. Any-hit rays visit the last first."""
         if self._is_leaf_beside(self.opened.cost):
             return [self]
         return sorted(self.roots(self.opened), key=lambda child: (child.is_leaf, child.area))
 
 
 def small_tree(lo: np.ndarray, hi: np.ndarray, options: BvhOptions) -> WideTree:
-    """Build the wide tree over boxes lo, hi (n, 3) float32, with options.row children per node.
+    """Build the wide tree over boxes lo, hi (n, 3) float32, with up to options.row children per node.
 
-    A binary tree down to single boxes, by the surface area heuristic (MacDonald and Booth 1990), is collapsed at the least cost.
+    Build a binary tree of single boxes by the surface area heuristic (MacDonald and Booth 1990), and collapse it at the least cost.
     """
     width = options.row
     subtrees = []

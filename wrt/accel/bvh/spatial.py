@@ -45,7 +45,7 @@ def build_sbvh(geometry: Geometry, options: BvhOptions, threads: int) -> BinaryT
 
 
 def compact(data: build_records.BuildData, depth: int) -> BinaryTree:
-    """Return the tree with its leaves' primitives one after another, without gaps."""
+    """Return the finished tree, without the gaps between the primitives of its leaves."""
     used = data.left.numpy() != 0
     nodes = squeeze(on_host(data.nodes), data.used.numpy() != 0)
     index = np.cumsum(used, dtype=np.int32) - 1

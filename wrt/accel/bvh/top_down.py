@@ -41,7 +41,7 @@ def build_sweep(geometry: Geometry, options: BvhOptions, threads: int) -> Binary
 
 
 def primitive_records(geometry: Geometry, threads: int) -> np.ndarray:
-    """Make BuildRecords of all primitives."""
+    """Make kernels.build.records.BuildRecord records of all primitives."""
     build = records(build_records.BuildRecord, len(geometry))
     build["prim_id"] = np.arange(len(geometry))
     geometry.bounds(threads, out=(build["lo"], build["hi"]))
@@ -64,7 +64,7 @@ def build_data(**arrays: np.ndarray) -> WarpStruct:
 
 
 def split_ranges(builder: str, build: np.ndarray, options: BvhOptions, threads: int, **arrays: np.ndarray) -> BinaryTree:
-    """Run a builder of kernels.build.bvh2 over BuildRecords `build`. arrays: the other fields of BuildData that the builder reads."""
+    """Build over the BuildRecords `build`. builder: key of kernels.build.bvh2.SPLIT. arrays: other fields of BuildData that it reads."""
     n = len(build)
     if n <= 1:
         return small_tree(build["lo"], build["hi"])
@@ -84,8 +84,8 @@ def build_options(options: BvhOptions) -> WarpStruct:
 def run_tasks(kernel: Kernel, data: WarpStruct, options: WarpStruct, n: int, threads: int, capacity: int = 0) -> int:
     """Build the tree over n records on all threads, and return its depth. The tree does not depend on `threads`.
 
-    A task splits a large range until the parts have at most half its size; these are new tasks. capacity: number of records that the
-    arrays can hold, for builders that duplicate references.
+    A task with a large range of records splits it into parts of about half its size or less. Each part becomes a new task.
+    capacity: number of records that the arrays can hold, for builders that duplicate references.
     """
     cpu = start("cpu")
     load_kernel(kernel, cpu)

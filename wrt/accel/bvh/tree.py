@@ -33,7 +33,7 @@ class BinaryOptions:
 
 @dataclass(frozen=True)
 class BvhOptions(BinaryOptions):
-    """Options of builders. row: number of primitives that one test handles, so that the cost of a leaf depends on its rows.
+    """Options of builders. row: number of primitives that are tested at once, which lowers the SAH cost of a leaf.
 
     Raises InputError for values out of range.
     """
@@ -76,7 +76,7 @@ def small_tree(lo: np.ndarray, hi: np.ndarray) -> BinaryTree:
 
 
 def squeeze(nodes: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Return the used nodes with new indices, in the same order: parents before children, left before right."""
+    """Return the nodes in the mask `used`, (N,) bool, with new indices, in the same order: parents before children."""
     index = np.cumsum(used, dtype=np.int32) - 1
     out = nodes[used]
     for side in ("0", "1"):
@@ -97,7 +97,7 @@ def root_area(nodes: np.ndarray) -> float:
 
 
 def expected_cost(root: float, areas: np.ndarray, counts: np.ndarray) -> float:
-    """Return the expected number of nodes visited, root included, and primitives tested by a random line through the root's box.
+    """Return the expected number of visited nodes, root included, plus tested primitives, for a random line through the root's box.
 
     root: area of the root's box. areas, counts: area and number of primitives of every child; 0 primitives mark an inner node.
     """

@@ -83,7 +83,7 @@ def cost_of(nodes: np.ndarray, areas: np.ndarray) -> float:
 
 
 def spans_of(nodes: np.ndarray) -> list[np.ndarray]:
-    """Return begin and end of the range of primitives below each child of Bvh2Node records; node i has children 2 i and 2 i + 1."""
+    """Return begin and end, (2 N,) each, of the range of primitives below each child. Node i has the children 2 i and 2 i + 1."""
     first, count = (np.stack([nodes[f"{what}_0"], nodes[f"{what}_1"]], axis=1).reshape(-1) for what in ("first", "count"))
     ends = []
     for side in range(2):
@@ -95,7 +95,7 @@ def spans_of(nodes: np.ndarray) -> list[np.ndarray]:
 
 
 def with_common_fields(struct: WarpType, nodes: np.ndarray) -> np.ndarray:
-    """Make records of `struct`, with the values of all fields that `nodes` have, too."""
+    """Make records of `struct`, and copy the values of all fields that `struct` and the records `nodes` have in common."""
     out = records(struct, len(nodes))
     for name in set(out.dtype.names or ()) & set(nodes.dtype.names or ()):
         out[name] = nodes[name]
@@ -140,7 +140,7 @@ def cuts(geometry: Geometry, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def project(v: np.ndarray) -> np.ndarray:
-    """Project points (N, 3) float32 to the four diagonals, (N, 4), with the bits of kernels.units.kdop.project."""
+    """Project points (N, 3) float32 onto the four diagonals, (N, 4), bit for bit as kernels.units.kdop.project does."""
     x, y, z = v[:, 0], v[:, 1], v[:, 2]
     return np.stack([x + y + z, y - x + z, x - y + z, x + y - z], axis=1)
 

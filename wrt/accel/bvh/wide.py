@@ -28,7 +28,7 @@ ROWS_PER_JOB = 4096
 
 @dataclass(frozen=True)
 class Bvh4Options(BinaryOptions):
-    """Options of wide structures: BinaryOptions, with cost_intersection for a row of primitives that one instruction tests.
+    """Options of wide BVHs: BinaryOptions, where cost_intersection is the SAH cost of a row of primitives, which are tested at once.
 
     max_leaf is by default the number of primitives in a row.
     """
@@ -95,7 +95,7 @@ class WideBvh(OneMesh):
         return {"nodes": nodes.reshape(-1)}
 
     def _tree(self, built: Built) -> WideTree:
-        """Return the tree that `_arrays` converted, with the decoded boxes if they are compressed."""
+        """Convert arrays from `_arrays` back to a tree, and decode compressed boxes."""
         head = self._nodes(built)[:, : first_reference(self.width, self.compressed)]
         if self.compressed:
             lo, hi = decompress(head, self.width)

@@ -24,8 +24,8 @@ class WideTree:
     """A tree of nodes with W children.
 
     lo, hi: (N, W, 3) float32, boxes of the children; empty boxes come first. children: (N, W) int32, see kernels.wide.references.
-    order: (rows, W) int32, prim_id in each lane of the leaves' rows, or -1. depth: nodes on the longest path from the root. stack:
-    largest number of entries on a traversal stack.
+    order: (rows, W) int32, prim_id in each lane of the leaves' rows; -1 in an unused lane. depth: number of nodes on the longest path
+    from the root. stack: largest number of entries on a traversal stack.
     """
 
     lo: np.ndarray
@@ -93,7 +93,7 @@ def refit(tree: WideTree, geometry: Geometry) -> WideTree:
 
 
 def packed(children: np.ndarray, unit: int) -> np.ndarray:
-    """Renumber the leaves in references without gaps, in units of `unit` primitives: 1, or the width of a row."""
+    """Return the references with the leaves' first primitives renumbered without gaps, in units of `unit` primitives (1 or a row)."""
     leaf = children < 0
     references = children[leaf].astype(np.int64)
     count = leaf_count.func(references)
@@ -107,7 +107,7 @@ def packed(children: np.ndarray, unit: int) -> np.ndarray:
 
 
 def lanes_of(children: np.ndarray, order: np.ndarray, width: int) -> np.ndarray:
-    """Return the prim_id in each lane of the leaves' rows, (rows, width), or -1.
+    """Return the prim_id in each lane of the leaves' rows, (rows, width); -1 in an unused lane.
 
     children: references in units of rows. order: (R,) prim_ids of the leaves, one leaf after another.
     """
@@ -123,9 +123,9 @@ def lanes_of(children: np.ndarray, order: np.ndarray, width: int) -> np.ndarray:
 
 
 def check_wide(children: np.ndarray, n_primitives: int, unit: int) -> None:
-    """Raise InputError unless references (N, width) form a tree with root 0 that the traversal stack suffices for.
+    """Raise InputError unless the references `children`, (N, width), form a tree with root 0 for which the traversal stack suffices.
 
-    The leaves must hold `n_primitives` without gaps, in units of `unit` primitives.
+    The leaves must hold n_primitives primitives without gaps. unit: number of primitives by which references to leaves count.
     """
     n = len(children)
     inner = children > 0
@@ -143,7 +143,7 @@ def check_wide(children: np.ndarray, n_primitives: int, unit: int) -> None:
 
 
 def stack_need(children: np.ndarray) -> int:
-    """Return the largest number of entries on the stack of a traversal."""
+    """Return the largest number of entries on the traversal stack, for a tree of references (N, width)."""
     level, used, most = np.zeros(1, np.int64), np.zeros(1, np.int64), 0
     while len(level):
         below = used + np.maximum((children[level] != EMPTY).sum(axis=1) - 1, 0)

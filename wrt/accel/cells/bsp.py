@@ -30,9 +30,9 @@ MAX_DEPTH = 60  # less than the size of the traversal stack
 ROOM = 8  # memory for pieces, nodes and references, per primitive; doubled until it suffices
 SPARE = 1024
 MAX_ROOM = (2**31 - 1) // 6 - SPARE  # pieces: their points, six for each, are indexed in int32
-MAX_SUBTREES = 1024  # that are built in launches of their own
+MAX_SUBTREES = 1024  # largest number of subtrees with launches of their own
 PIECE = {"prim_id": (wp.int32, ()), "first": (wp.int32, ()), "count": (wp.int32, ()), "lo": (wp.vec3d, (3,)),
-         "hi": (wp.vec3d, (3,)), "ball": (wp.vec4d, (4,)), "extent": (wp.float64, ())}
+         "hi": (wp.vec3d, (3,)), "ball": (wp.vec4d, (4,)), "extent": (wp.float64, ())}  # fields of Pieces: Warp type, shape
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class Bsp(OneMesh):
 
 
 class Launch:
-    """One launch of build_cells with memory for `room` pieces, and its results."""
+    """One launch of kernels.build.bsp.build_cells with memory for `room` pieces of primitives, and the launch's results."""
 
     def __init__(self, corners: WarpArray, options: WarpStruct, room: int, n_deferred: int) -> None:
         self.cpu = start("cpu")
@@ -138,7 +138,7 @@ class Launch:
         self.output.cost = wp.zeros(1, dtype=wp.float64, device=self.cpu)
 
     def run(self, source: WarpStruct, tasks: WarpArray, cells: WarpStruct, which: int) -> bool:
-        """Launch, and return whether the memory sufficed. which: index of the task in `tasks`."""
+        """Launch build_cells for the task tasks[which], and return whether the memory sufficed."""
         launch(build_bsp.build_cells, 1, source, tasks, cells, which, self.tools, self.stack, self.output)
         self.results = self.output.results.numpy().copy()
         self.nodes = on_host(self.output.nodes)[: self.results[build_bsp.N_NODES]].copy()
@@ -148,7 +148,7 @@ class Launch:
 
 
 class Subtree:
-    """Results of a launch, without its memory."""
+    """Results of a Launch, without the launch's memory."""
 
     def __init__(self, launch: Launch) -> None:
         self.results, self.nodes, self.order, self.cost = launch.results, launch.nodes, launch.order, launch.cost
@@ -168,7 +168,7 @@ class Builder:
         self.done = 0
 
     def launch(self, source: WarpStruct, tasks: WarpArray, cells: WarpStruct, which: int, n: int, keep: int) -> Launch:
-        """Launch with twice the memory until it suffices. keep: cells of at most so many pieces are deferred to tasks; 0: none."""
+        """Launch, and double the memory until it suffices. keep: cells of at most `keep` pieces become tasks of later launches; 0: none."""
         room = ROOM * n + SPARE
         self.options.keep = keep
         while True:
@@ -225,7 +225,7 @@ class Builder:
 
 
 def pieces_of(n: int, points: int) -> WarpStruct:
-    """Allocate n pieces, with `points` points in all pieces together."""
+    """Allocate kernels.build.bsp_split.Pieces with room for n pieces, and for `points` corners in all pieces together."""
     pieces = Pieces()
     for name, (dtype, _) in PIECE.items():
         setattr(pieces, name, wp.empty(n, dtype=dtype, device=start("cpu")))

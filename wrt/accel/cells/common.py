@@ -18,7 +18,7 @@ from wrt.kernels.warp_private import fields_of
 
 
 def cell_source(geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray]) -> WarpStruct:
-    """Upload the triangles and the padded boxes of all primitives."""
+    """Upload the triangles, and the padded boxes `bounds` of all primitives, as kernels.build.triangle_cell.CellSource."""
     cpu, source = start("cpu"), CellSource()
     source.vertices = upload(geometry.vertices, wp.vec3, cpu)
     source.faces = upload(geometry.faces, wp.vec3i, cpu)
@@ -27,7 +27,7 @@ def cell_source(geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray]) -> Wa
 
 
 def one_row(accel: Accelerator, built: Built) -> dict[str, np.ndarray]:
-    """Return the arrays of `built`, with one-row arrays of a file squeezed into vectors and scalars."""
+    """Return the arrays of `built`. Arrays of one row, as files have them, become the vectors and scalars of the structure's struct."""
     arrays = dict(built.arrays)
     for name, kind in fields_of(accel.structure.struct()).items():
         if name in arrays and not isinstance(kind, wp.array):
@@ -58,7 +58,7 @@ def require_between(**options: tuple[float, float, float]) -> None:
 
 
 def triangle_reach(geometry: Geometry, lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest padding and extent of the triangles' padded boxes, for kernels.traverse.cell_ray.cell_slack."""
+    """Return an upper bound of the padding, and the largest extent, of triangles' boxes (for kernels.traverse.cell_ray.cell_slack)."""
     n = len(geometry.faces)
     if not n:
         return np.zeros((), np.float32), np.zeros((), np.float32)

@@ -30,7 +30,7 @@ PRIMITIVES_PER_LAUNCH = 16384
 class GridOptions:
     """Options of the grid. Raises InputError for values out of range.
 
-    density: cells per primitive, 1e-3 to 1e3. mailbox: do not test a primitive of several cells again for the same ray.
+    density: cells per primitive, 1e-3 to 1e3. mailbox: avoid testing a ray against the same primitive in several cells.
     """
 
     density: float = 2.0
@@ -43,8 +43,8 @@ class GridOptions:
 class Grid(OneMesh):
     """A uniform grid. Options: GridOptions.
 
-    If there were more than MAX_CELLS cells, or an estimate of more than MAX_REFERENCES references, cells are enlarged and a
-    RuntimeWarning is issued. Spheres are listed in every cell of their box. The `box` test is not used.
+    If there would be more than MAX_CELLS cells or, by an estimate, more than MAX_REFERENCES references, the cells become larger, with
+    a RuntimeWarning. Every cell that overlaps a sphere's box lists the sphere. The option `box` has no effect.
     """
 
     name = "grid"
@@ -77,7 +77,7 @@ class Grid(OneMesh):
 
 
 def resolution(lo: np.ndarray, hi: np.ndarray, density: float) -> WarpStruct:
-    """Choose the layout: nearly cubic cells, about `density` per primitive (Cleary and Wyvill 1988)."""
+    """Choose the GridLayout over boxes lo, hi (N, 3): nearly cubic cells, about `density` per primitive (Cleary and Wyvill 1988)."""
     layout = kernels.GridLayout()
     low, high = lo.min(axis=0, initial=np.inf), hi.max(axis=0, initial=-np.inf)
     extent = high.astype(np.float64) - low.astype(np.float64)
@@ -104,7 +104,7 @@ def resolution(lo: np.ndarray, hi: np.ndarray, density: float) -> WarpStruct:
 
 
 def cells_along(extent: np.ndarray, most: np.ndarray, wanted: float) -> np.ndarray:
-    """Return the number of cells along each axis, (3,), in proportion to the extent and 1 to `most`; the product is about `wanted`."""
+    """Return the number of cells along each axis, (3,): proportional to `extent`, 1 to `most`, with a product of about `wanted`."""
     def along(log_scale: float) -> np.ndarray:
         return np.clip(extent * 2.0**log_scale, 1.0, most)
 
@@ -120,7 +120,7 @@ def cells_along(extent: np.ndarray, most: np.ndarray, wanted: float) -> np.ndarr
 
 
 def references_bound(lo: np.ndarray, hi: np.ndarray, size: np.ndarray) -> float:
-    """Estimate the number of references: a triangle whose box spans a x b x c cells overlaps up to ab + bc + ca cells."""
+    """Estimate the number of references: (ab + bc + ca) / 3 for a primitive whose box spans a x b x c cells of this size."""
     a, b, c = (((hi.astype(np.float64) - lo) / np.maximum(size, 1e-300)) + 1.0).T
     return float((a * b + b * c + c * a).sum()) / 3.0
 
@@ -153,8 +153,8 @@ def list_references(geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray], l
     return on_host(cells), references.numpy()
 
 
-def sah_cost(layout: WarpStruct, visits: int) -> float:
-    """Return the expected number of cells and primitives on a random line through the box. visits: number of cells and references."""
+def sah_cost(layout: WarpStruct, total: int) -> float:
+    """Return the expected number of cells plus primitives that a random line visits. total: all cells plus all references."""
     extent = np.array(layout.hi, np.float64) - np.array(layout.lo, np.float64)
     whole, cell = (float(half_areas(np.zeros(3), e)) for e in (extent, extent / np.array(layout.n, np.float64)))
-    return visits * cell / whole if whole > 0.0 else float(visits)
+    return total * cell / whole if whole > 0.0 else float(total)

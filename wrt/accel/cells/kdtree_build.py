@@ -34,10 +34,10 @@ Part = tuple[np.ndarray, np.ndarray, Any]  # nodes, order and totals of a subtre
 class KdOptions:
     """Options of the k-d tree. Raises InputError for values out of range.
 
-    max_leaf: cells with at most so many primitives are not split. max_depth: levels below the root; None: 8 + 1.3 log2 n. by_cost: do
+    max_leaf: cells of at most max_leaf primitives are not split. max_depth: levels below the root; None: 8 + 1.3 log2 n. by_cost: do
     not split if that costs more than a leaf. cost_traversal, cost_intersection: SAH cost of a node and of a primitive. empty_bonus:
     discount, 0 to 1, for splits that cut off empty space. perfect_below: cells with more primitives are split between 64 bins, other
-    cells at the best of all planes. clip: use exact overlap, not boxes. max_growth: limit of references and empty leaves per primitive.
+    cells at the best of all planes. clip: clip triangles to cells exactly. max_growth: limit of references and empty leaves per primitive.
     """
 
     max_leaf: int = 1
@@ -59,27 +59,27 @@ class KdOptions:
                         max_growth=(self.max_growth, 1.0, 1e4))
 
     def depth(self, n: int) -> int:
-        """Return max_depth, or 8 + 1.3 log2 n (Havran 2000; Pharr et al., "Physically Based Rendering", section 4.4)."""
+        """Return max_depth; None: 8 + 1.3 log2 n for n primitives (Havran 2000; Pharr et al., "Physically Based Rendering", 4.4)."""
         if self.max_depth is not None:
             return self.max_depth
         return min(round(8.0 + 1.3 * np.log2(max(n, 1))), STACK_SIZE)
 
 
 class Cell(NamedTuple):
-    """A cell to build a subtree in. prim_id: (n,), primitives that overlap it. lo, hi: (n, 3), boxes of the overlapping parts."""
+    """A cell in which a subtree is built."""
 
     cell_lo: np.ndarray
     cell_hi: np.ndarray
-    prim_id: np.ndarray
-    lo: np.ndarray
+    prim_id: np.ndarray  # (n,), primitives that overlap the cell
+    lo: np.ndarray  # lo, hi: (n, 3), boxes of the primitives' parts in the cell
     hi: np.ndarray
-    depth: int
-    budget: int
-    slot: int
+    depth: int  # levels below the tree's root
+    budget: int  # limit of references and empty leaves in the subtree
+    slot: int  # index of the cell's node
 
 
 def build_tree(geometry: Geometry, options: KdOptions, threads: int) -> Built:
-    """Build the tree over a geometry. It does not depend on `threads`. Built.sah_cost is at cost 1 per node and per primitive."""
+    """Build the tree, which does not depend on `threads`. Built.sah_cost counts 1 per node and 1 per primitive."""
     lo, hi = geometry.bounds()
     n = len(lo)
     if n == 0:
@@ -97,7 +97,7 @@ def build_tree(geometry: Geometry, options: KdOptions, threads: int) -> Built:
 
 
 def clippable(geometry: Geometry, lo: np.ndarray, hi: np.ndarray, clip: bool) -> tuple[WarpStruct, float]:
-    """Upload the primitives as kernels.build.clip.Clippable; return them, and the largest extent of all clipped triangles."""
+    """Upload the primitives as kernels.build.clip.Clippable; return them, and the largest extent of the triangles to be clipped."""
     cpu = start("cpu")
     with np.errstate(over="ignore"):
         extent = (hi - lo).max(axis=1)
@@ -111,7 +111,7 @@ def clippable(geometry: Geometry, lo: np.ndarray, hi: np.ndarray, clip: bool) ->
 
 
 def split_top(root: Cell, shapes: WarpStruct, options: KdOptions) -> tuple[list[tuple[float, int]], list[Cell], float]:
-    """Split large cells; return nodes (split, word), the cells to build subtrees in, and the sum of the nodes' half areas."""
+    """Split large cells; return nodes (split, word) as in KdNode, the cells that remain, and the sum of the split cells' half areas."""
     max_depth = options.depth(len(root.prim_id))
     nodes, tasks, area = [(0.0, 0)], [], 0.0
     todo = [root]
@@ -132,7 +132,7 @@ def split_top(root: Cell, shapes: WarpStruct, options: KdOptions) -> tuple[list[
 
 
 def binned_split(cell: Cell, options: KdOptions) -> tuple[int, np.float32] | None:
-    """Return the cheapest plane (axis, position) between bins within the budget; None if a leaf is cheaper, with by_cost.
+    """Return the cheapest plane (axis, position) between bins. None: no plane keeps the budget, or by_cost prefers a leaf.
 
     Boxes are counted in the bins where they begin and in the bins where they end (Shevtsov, Soupikov and Kapustin 2007, "Highly
     Parallel Fast KD-tree Construction").
@@ -235,7 +235,7 @@ def build_subtree(cell: Cell, shapes: WarpStruct, options: WarpStruct) -> tuple[
 
 def joined(top: list[tuple[float, int]], tasks: list[Cell], parts: list[Part], root: Cell, area: float,
            reach: float) -> Built:
-    """Join the top and the subtrees. The root of a subtree goes to its slot; its other nodes and its references are appended."""
+    """Join the top and the subtrees, whose roots go to their cells' slots. area: from `split_top`; reach: from `clippable`."""
     n_nodes = len(top) + sum(len(nodes) - 1 for nodes, _, _ in parts)
     n_references = sum(len(references) for _, references, _ in parts)
     if max(n_nodes, n_references) >= MAX_INDEX:

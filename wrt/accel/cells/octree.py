@@ -16,7 +16,7 @@ from wrt.kernels.traverse import octree as kernels
 class Octree(OneMesh):
     """An octree. Options: OctreeOptions.
 
-    Spheres are listed in every cell of their box. The `box` test is not used.
+    Every cell that overlaps a sphere's box lists the sphere. The option `box` has no effect.
     """
 
     name = "octree"

@@ -27,9 +27,9 @@ OCTANTS = np.arange(8)[:, None] >> np.arange(3) & 1  # (8, 3): 0 for the lower a
 class OctreeOptions:
     """Options of the octree. Raises InputError for values out of range.
 
-    max_leaf: cells with at most so many primitives are not split. max_depth: levels below the root, 0 to MAX_LEVELS. by_cost: do not
+    max_leaf: cells with at most max_leaf primitives are not split. max_depth: levels below the root, 0 to MAX_LEVELS. by_cost: do not
     split a cell whose octants cost a ray as much as the cell. max_growth: limit of references per primitive in every part of the
-    tree. mailbox: do not test a primitive of several cells again for the same ray.
+    tree. mailbox: avoid testing a ray against the same primitive in several cells.
     """
 
     max_leaf: int = 8
@@ -47,8 +47,8 @@ class OctreeOptions:
 class Cells:
     """The M cells of one level.
 
-    corner: (M, 3) int32, lowest corners in units of finest cells. references: prim_ids of cell i in [begin[i], begin[i + 1]).
-    growth: (M,) factor by which the number of references may grow in the leaves below a cell.
+    corner: (M, 3) int32, lowest corners in units of finest cells. references: (R,) prim_ids; references[begin[i] : begin[i + 1]] belong
+    to cell i. growth: (M,) factor by which the number of references may grow from a cell to the leaves below it.
     """
 
     corner: np.ndarray
@@ -61,7 +61,7 @@ class Cells:
         return np.diff(self.begin)
 
     def part(self, chosen: np.ndarray) -> Cells:
-        """Return the chosen cells, (M,) bool."""
+        """Return the cells in the mask `chosen`, (M,) bool."""
         count = self.count
         references = self.references[np.repeat(chosen, count)]
         begin = np.concatenate([[0], np.cumsum(count[chosen])]).astype(np.int32)
@@ -69,7 +69,7 @@ class Cells:
 
 
 def root_cell(lo: np.ndarray, hi: np.ndarray, max_depth: int) -> WarpStruct:
-    """Choose the layout around boxes lo, hi (N, 3): a cube from their lowest corner, clipped at their highest corner."""
+    """Choose the OctreeLayout of boxes lo, hi (N, 3): a cube from their lowest corner on, clipped at their highest corner."""
     layout = OctreeLayout()
     low, high = lo.min(axis=0, initial=np.inf), hi.max(axis=0, initial=-np.inf)
     layout.lo, layout.hi, layout.size, layout.levels = wp.vec3(*low), wp.vec3(*high), 0.0, 0
@@ -87,13 +87,13 @@ def root_cell(lo: np.ndarray, hi: np.ndarray, max_depth: int) -> WarpStruct:
 
 
 def planes(layout: WarpStruct, corner: np.ndarray) -> np.ndarray:
-    """Convert indices of planes (..., 3) to coordinates in float64. Kernels round them to float32."""
+    """Convert plane indices `corner`, (..., 3), to coordinates in float64. Kernels round the coordinates to float32."""
     lo, hi = np.array(layout.lo, np.float64), np.array(layout.hi, np.float64)
     return np.minimum(lo + corner * float(layout.size), hi)
 
 
 def areas(layout: WarpStruct, corner: np.ndarray, size: int) -> np.ndarray:
-    """Return half the surface area of cells. corner: (..., 3); size: edge in finest cells."""
+    """Return half the surface area of cells. corner: (..., 3), lowest corners; size: edge length; both in units of finest cells."""
     return half_areas(planes(layout, corner), planes(layout, corner + size))
 
 
@@ -133,7 +133,7 @@ def build_tree(geometry: Geometry, options: OctreeOptions, threads: int) -> Buil
 
 
 def choose(cells: Cells, split: _Splitter, half: int, options: OctreeOptions) -> tuple[np.ndarray, np.ndarray, Cells]:
-    """Choose K cells to split; return their mask (M,), their octants' numbers of references (K, 8), and the next level's cells."""
+    """Choose K of M cells to split; return their mask (M,), the number of references per octant (K, 8), and the next level's cells."""
     chosen = cells.count > options.max_leaf if half else np.zeros(len(cells.corner), bool)
     large = cells.part(chosen)
     count = split.count(large, half)
@@ -150,7 +150,7 @@ def choose(cells: Cells, split: _Splitter, half: int, options: OctreeOptions) ->
 
 
 class _Splitter:
-    """Launches of kernels.build.octree over one geometry."""
+    """Launcher of the kernels in kernels.build.octree over one geometry."""
 
     def __init__(self, geometry: Geometry, bounds: tuple[np.ndarray, np.ndarray], layout: WarpStruct, threads: int) -> None:
         self.cpu, self.layout, self.threads = start("cpu"), layout, threads
@@ -178,8 +178,8 @@ class _Splitter:
         """Return the next level: all octants that have references, cell after cell.
 
         Call it right after `self.count` of the same cells, because it reads the octant masks that `self.count` stored. corner: (M, 8, 3),
-        lowest corners of the octants. count: (M, 8), references of each octant, or 0 throughout for a cell that stays a leaf. growth:
-        (M,), the growth that a cell's octants inherit.
+        lowest corners of the octants. count: (M, 8), number of references of each octant; a cell that stays a leaf has a row of 0.
+        growth: (M,), the growth that a cell's octants inherit.
         """
         begin = np.concatenate([[0], np.cumsum(count.ravel())])
         first = np.where(count.any(axis=1, keepdims=True), begin[:-1].reshape(-1, 8), -1)

@@ -26,7 +26,7 @@ def finite_faces(geometry: Geometry) -> np.ndarray:
 
 
 def open_edges(geometry: Geometry) -> int:
-    """Count edges of an odd number of finite faces; 0 means that the mesh is closed. Vertices with equal coordinates are merged."""
+    """Count the edges that an odd number of finite faces share; 0: a closed mesh. Vertices with equal coordinates are merged."""
     _, corner = np.unique(geometry.vertices + np.float32(0.0), axis=0, return_inverse=True)  # -0 becomes 0
     faces = corner.reshape(-1)[geometry.faces[finite_faces(geometry)]]
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
@@ -88,7 +88,7 @@ def contains(accel: Accelerator, points: ArrayLike, threads: int | None = None) 
 
 
 def odd_crossings(query: ListQuery, rows: np.ndarray, seed: int = 0) -> np.ndarray:
-    """Return whether a ray from each point (N, 3) crosses the surface an odd number of times. `seed` chooses its direction."""
+    """Return whether a ray from each point in `rows`, (N, 3), crosses the surface an odd number of times. seed: of its direction."""
     inside = np.zeros(len(rows), bool)
     low, high = used_bounds(query.snapshot)
     within = np.nonzero(((rows >= low) & (rows <= high)).all(axis=1))[0]

@@ -194,7 +194,7 @@ class Accelerator:
 
 
 def snapshot_of(accel: Accelerator) -> Snapshot:
-    """Return the snapshot of a structure over one mesh without spheres. Raises InputError for any other."""
+    """Return the snapshot of a structure over one mesh without spheres. Raises InputError for any other structure."""
     message = f"accel must be a structure over one mesh without spheres (wrt.build), got {shown(accel)}"
     if not isinstance(accel, Accelerator):
         raise InputError(message, argument="accel")

@@ -27,7 +27,7 @@ from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import Hit
 
 ALL = (1 << 30) - 1
-RAYS_AT_ONCE = 1 << 18  # the hit lists of so many rays take 32 MiB in the first traversal
+RAYS_AT_ONCE = 1 << 18  # rays per batch; their hit lists take 32 MiB in the first traversal
 HIT_KINDS = wp.float32, wp.float32, wp.float32, wp.int32  # of HitArrays
 COPY_HITS = RawKernel(copy_hits, RayArrays(), HitLists(), None, HitArrays())
 
@@ -85,7 +85,7 @@ class _Lists(NamedTuple):
 
 
 class ListQuery:
-    """Query of a snapshot of a structure for lists of hits. `of` sets the rays; `all`, `first` and `counts` return results."""
+    """A query for all hits of rays, on a snapshot of a structure. `of` sets the rays; `all`, `first` and `counts` return results."""
 
     n = 0
     rays: Rays
@@ -142,9 +142,9 @@ class ListQuery:
         return values if self.give is to_numpy else self.give(upload(values, wp.int64, self.device))
 
     def _listed(self, limit: int, counting: bool = False) -> Iterator[tuple[object, list[_Lists], np.ndarray]]:
-        """Yield, for each part of the rays: the rays, one or two lists of their hits, and the number of hits of each ray.
+        """Yield, for each batch of the rays: these rays, one or two HitLists, and the number of hits of each ray.
 
-        Each ray has its hits in one of the lists, at most `limit`. counting: only the numbers of hits are needed.
+        All hits of a ray, at most `limit`, are in one of the HitLists. counting: the caller needs only the numbers of hits.
         """
         limit = min(limit, ALL)
         for begin in range(0, self.n, RAYS_AT_ONCE):
@@ -190,7 +190,7 @@ def _begins(counts: np.ndarray) -> np.ndarray:
 
 
 def rows_of(hits: int) -> int:
-    """Return the size of an array of hits. Raises InputError above 2^31 - 1, the largest size that kernels can index."""
+    """Return `hits` as the size of an array. Raises InputError above 2^31 - 1, the largest size that kernels can index."""
     if hits > MOST_ROWS:
         raise InputError(f"{hits} hits do not fit into an array of at most 2^31 - 1", hint="query fewer rays at a time")
     return int(hits)
@@ -224,8 +224,8 @@ def all_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike, t_mi
         See `Accelerator.closest_hit`.
     crossings : bool
         Find crossings of the surface instead. At a shared edge or corner, the ray counts as shifted by an infinitesimal distance:
-        it hits one triangle inside a surface, and none or two at a silhouette. A ray that begins and ends outside of a closed mesh
-        crosses it an even number of times. With the watertight test this holds without exception.
+        it hits one triangle, but at a silhouette none or two. A ray that begins and ends outside of a closed mesh crosses it an even
+        number of times. With the watertight test this holds without exception.
 
     Returns
     -------

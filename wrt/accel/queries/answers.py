@@ -34,7 +34,7 @@ class Counters:
     first : (N + 1,) int64
         Rows first[i] .. first[i + 1] - 1 of `address` and `size` are the fetches of ray i; all 0 without `trace=True`.
     address, size : (M,) int64
-        Address and size of each fetch in bytes. Addresses of primitives begin at `PRIMITIVE_SPACE`.
+        Address and size of each fetch in bytes. Addresses of primitives begin at kernels.traverse.counters.PRIMITIVE_SPACE.
     """
 
     counts: np.ndarray
@@ -109,16 +109,16 @@ class Hits(HitPoints[ArrayT]):
         return self.each(to_warp)
 
     def each(self, convert: Callable[[ArrayT], TensorT]) -> Hits[TensorT]:
-        """Return the hits with each of the four arrays passed through `convert`."""
+        """Return the hits with t, u, v and prim_id passed through `convert`."""
         return Hits(convert(self.t), convert(self.u), convert(self.v), convert(self.prim_id), self.counters, self.source)
 
 
 def answer_arrays(types: Mapping[str, type], out: list[Any] | None, n: int, device: Device | None,
                   shared: bool = False) -> list[Array]:
-    """Return one array (n,) per entry of `types`: of NumPy if `device` is None, else of Warp. Arrays in `out` are checked.
+    """Return one array (n,) per entry of `types`: checked arrays of `out`, or new ones. device: None for NumPy arrays, else Warp.
 
-    shared: begin each array at a cache line, because JAX copies an array that does not. Raises InputError that names the array by
-    its key in `types`.
+    shared: begin a new array at a cache line, because JAX would copy any other array. Raises InputError that names the array by its
+    key in `types`.
     """
     if out is None:
         empty = empty_aligned if shared else np.empty

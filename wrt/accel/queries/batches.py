@@ -31,13 +31,13 @@ FEWEST, MOST, LEAST, SHARES = 8192, 131072, 4096, 2
 RAYS_PER_LAUNCH = 16384  # for kernels that trace one ray at a time
 MOST_ON_GPU = 1 << 26  # largest number of rays that are copied to a GPU at once: 3 GB with their hits
 BYTES_OF_RAY = 48  # a ray and its hit
-FITS_ANY_GPU = 1 << 20  # for so many rays the free memory of the GPU is not queried
+FITS_ANY_GPU = 1 << 20  # up to this number of rays, the free memory of the GPU is not queried
 MOST_PACKED = (1 << 31) - 64  # rays: kernels index in int32, and their last block may exceed the range
-SMALL = 1024  # up to so many rays, a copy is faster than kernel records of the caller's arrays
+SMALL = 1024  # up to this number of rays, a copy is faster than kernel records of the caller's arrays
 
 
 class Query(NamedTuple):
-    """A call of closest_hit or any_hit. out: arrays for the results, of HIT_TYPES or of ANY_HIT_TYPES."""
+    """A call of closest_hit or any_hit. out: arrays for the results: t, u, v and prim_id, or one array of bool."""
 
     rays: Rays
     out: list[Array]
@@ -56,7 +56,7 @@ def trace_query(snapshot: Snapshot, query: Query) -> None:
 
 
 def parts(n: int, threads: int, block: int) -> list[tuple[int, int]]:
-    """Divide n rays into ranges [first, end) of multiples of `block`. The last ranges are small, to balance the threads."""
+    """Divide n rays into ranges [first, end); `first` is a multiple of `block`. The last ranges are small, to balance the threads."""
     out, first = [], 0
     while first < n:
         size = MOST if threads == 1 else max(LEAST, min((n - first) // (SHARES * threads), MOST))
@@ -67,7 +67,7 @@ def parts(n: int, threads: int, block: int) -> list[tuple[int, int]]:
 
 
 class Tracer:
-    """Queries on the CPU: the kernel for a structure, and workers that later calls reuse."""
+    """Tracer of queries on the CPU. It holds the kernel for a structure, and workers that later calls reuse."""
 
     def __init__(self, structure: Structure, any_hit: bool) -> None:
         stream: KernelModule = structure.accel.stream
@@ -81,7 +81,7 @@ class Tracer:
         self.free: list[Worker] = []
 
     def trace(self, snapshot: Snapshot, query: Query) -> None:
-        """Trace on the CPU, as trace_query. Invalid rays are found after tracing."""
+        """Trace on the CPU, as trace_query does. The rays are checked before tracing, or by a kernel that traces many rays at a time."""
         load_kernel(self.kernel, cpu := wp.get_device("cpu"))
         rays, threads = query.rays.on(cpu), query.threads
         if not self.stream:  # `self.stream` reports invalid rays itself
@@ -123,7 +123,7 @@ tracer = made_once(Tracer)
 
 
 def new_scratch(sizes: tuple[int, ...]) -> WarpStruct:
-    """Return Scratch with arrays of these sizes. They begin at cache lines, so that no vector of lanes lies in two lines."""
+    """Return kernels.wide.packets.Scratch with arrays of these sizes. They begin at cache lines, so that no vector crosses a line."""
     out: WarpStruct = Scratch()
     for (name, kind), size in zip(fields_of(Scratch).items(), sizes, strict=False):
         setattr(out, name, to_warp(empty_aligned((size,), wp.dtype_to_numpy(kind.dtype))))
@@ -150,7 +150,7 @@ class Worker:
         self.own = [record_of(self.scratch)] if tracer.stream else []
 
     def launch(self, snapshot: Snapshot, packed: tuple[Any, Any], first: int, end: int) -> None:
-        """Trace the rays [first, end). Afterwards report[ANY_REFUSED] tells whether any of them was invalid."""
+        """Trace the rays [first, end) of `packed`, from `pack`. Afterwards report[ANY_REFUSED] tells whether one of them was invalid."""
         inputs = [record_of(snapshot.data), record_of(snapshot.surfaces), *packed, *self.own, first, end]
         for i, last in enumerate(self.inputs):  # a kernel that traces one ray at a time has no argument `end`
             if inputs[i] is not last:
@@ -189,7 +189,7 @@ def rays_on_gpu(n: int, device: Device) -> int:
 
 
 def trace_on_gpu(snapshot: Snapshot, query: Query) -> None:
-    """Trace on a GPU, as trace_query. Warp arrays are traced in one launch, NumPy arrays in parts."""
+    """Trace on a GPU, as trace_query does: rays in Warp arrays in one launch, rays in NumPy arrays in parts."""
     device, structure, rays, out = snapshot.device, snapshot.structure, query.rays, query.out
     structure = structure._replace(units=structure.units._replace(stack=stack_on(device.alias)))
     kernel = (closest_hit_kernel if len(out) > 1 else any_hit_kernel)(structure)
@@ -202,7 +202,7 @@ def trace_on_gpu(snapshot: Snapshot, query: Query) -> None:
 
 
 def trace_worlds(snapshot: Snapshot, query: Query, worlds: WorldIds) -> None:
-    """Trace each ray in its own world, as trace_query; on a GPU in one launch."""
+    """Trace each ray in its own world, as trace_query does; on a GPU in one launch."""
     device = snapshot.device
     inputs = [snapshot.data, snapshot.surfaces, rays_on(device, query.rays), worlds.arrays]
     launch_over(device, worlds_kernel(snapshot.structure, len(query.out) == 1), inputs, query.out, query.threads)

@@ -14,7 +14,7 @@ from wrt.kernels.traverse.counters import SIZE_RANGE, Counts
 
 
 def counted(snapshot: Snapshot, query: Query, fetches_too: bool) -> Counters:
-    """Trace the query and count its costs. With fetches_too, trace it twice: the first run counts the fetches of each ray."""
+    """Trace the query and count its costs. fetches_too: record each fetch in a second run, after a first run that counts fetches."""
     n, device = len(query.out[0]), snapshot.device
 
     def run(first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

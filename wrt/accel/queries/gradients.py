@@ -17,7 +17,7 @@ from wrt.core.types import Array, ArrayLike, ArrayT
 from wrt.core.warp_private import recording_tape
 
 ONE_MESH = "only hits of a structure over one mesh, without spheres, have gradients"
-HITS_PER_JOB = 8192  # the intermediate arrays of so many hits stay in the cache
+HITS_PER_JOB = 8192  # few enough that the intermediate arrays stay in the cache
 
 
 class Gradients(NamedTuple, Generic[ArrayT]):
@@ -37,7 +37,7 @@ class Gradients(NamedTuple, Generic[ArrayT]):
 
 
 class Cotangents(NamedTuple):
-    """Gradient of a loss with respect to N hits: (N,) each, point (N, 3). None: the loss does not depend on that field."""
+    """Gradient of a loss with respect to N hits. t, u, v: (N,); point: (N, 3); None: the loss does not depend on that field."""
 
     t: ArrayLike | None = None
     u: ArrayLike | None = None
@@ -54,7 +54,7 @@ class Cotangents(NamedTuple):
         return Cotangents(*arrays)
 
     def at(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the gradients for some rays with respect to (t, u, v) and to the point: two arrays (3, len(rays)) float64."""
+        """Return the gradients with respect to (t, u, v) and to the point for the rays with indices `rays`: (3, len(rays)) float64 each."""
         by_tuv = np.zeros((3, len(rays)))
         for target, field in zip(by_tuv, self[:3], strict=True):
             target[:] = 0.0 if field is None else np.asarray(field)[rays]
@@ -66,9 +66,9 @@ def adjoint(geometry: Geometry, origins: Array, directions: Array, prim_id: Arra
     """Compute the gradient of a loss L with respect to vertices, origins and directions, at fixed prim_id.
 
     cotangents: gradient of L with respect to the hits. A hit solves o + t d = (1 - u - v) v0 + u v1 + v v2. With the matrix
-    M = [d, v0 - v1, v0 - v2] this is M (t, u, v) = v0 - o. If a side of this equation changes by x, (t, u, v) changes by M^-1 x.
+    M = [d, v0 - v1, v0 - v2] this is M (t, u, v) = v0 - o. If an input moves v0 - o - M (t, u, v) by x, (t, u, v) moves by M^-1 x.
     So one vector per ray is enough: lambda = M^-T (dL/dt, dL/du, dL/dv). The corners get lambda times their barycentric weights,
-    the origin -lambda, the direction -t lambda. To these, dL/d(point) adds its part through point = o + t d.
+    the origin -lambda, the direction -t lambda. A gradient with respect to the point adds terms, through point = o + t d.
 
     All values are float64. The sum at a vertex runs in the order of the rays, so that its bits do not depend on threads. The gradient
     is 0 for misses and if M is singular in float64. It grows as 1 / cos of the angle between ray and normal.
@@ -140,7 +140,7 @@ def columns(rows: np.ndarray) -> np.ndarray:
 
 
 def inverse_rows(d: np.ndarray, e1: np.ndarray, e2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows of M^-1 for M = [d, -e1, -e2], (3, 3, N), 0 if M is singular, and the mask (N,) of invertible M."""
+    """Return M^-1 for M = [d, -e1, -e2], (row, column, N), 0 where M is singular, and the mask (N,) of invertible M."""
     adjugate = np.stack([_cross(e1, e2), _cross(d, e2), _cross(e1, d)])
     with np.errstate(all="ignore"):
         inverse = adjugate / (d * adjugate[0]).sum(axis=0)

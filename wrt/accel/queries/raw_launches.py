@@ -19,7 +19,7 @@ GUARDS = 64  # words before and behind the self-test's arrays, because a launch 
 
 
 class Launches:
-    """Makes records of launches for kernels that launch other kernels, and keeps alive the memory that the records point into."""
+    """Maker of records of launches, for kernels that launch other kernels. It keeps alive the memory that the records point into."""
 
     def __init__(self) -> None:
         self.owners: list[object] = []
@@ -86,7 +86,7 @@ def _has_arguments(memory: np.ndarray, source: np.ndarray) -> bool:
 
 
 def _launches_itself(memory: np.ndarray, source: np.ndarray) -> bool:
-    """Return whether a kernel that launches another kernel passes the range on: as two arguments, and as the size of the launch."""
+    """Return whether a kernel that launches another kernel sets the range: the last two arguments, and the size of the launch."""
     first, end = 20, 42
     launches = Launches()
     command = _command(memory, source, launches.of(_command(memory, source, Launch()), PER_THREAD))
@@ -97,7 +97,7 @@ def _launches_itself(memory: np.ndarray, source: np.ndarray) -> bool:
 
 
 def _command(memory: np.ndarray, source: np.ndarray, launch: WarpStruct) -> wp.Launch:
-    """Record a launch of `probe` with one thread and hand-made records of the inner words of both arrays."""
+    """Record a launch of `probe` with one thread and hand-made records of both arrays, without GUARDS words at either end."""
     command = wp.launch(probe, dim=1, inputs=[Canary(), None, launch, 0, 0], device="cpu", record_cmd=True, record_tape=False)
     command.set_param_at_index_from_ctype(0, warp_private.struct_record(Canary, [memory[GUARDS:-GUARDS]]))
     command.set_param_at_index_from_ctype(1, warp_private.array_record(source[GUARDS:-GUARDS]))

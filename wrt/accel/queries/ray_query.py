@@ -18,7 +18,7 @@ from wrt.kernels.traverse.common import Units
 
 
 class RayQuery(NamedTuple):
-    """Warp functions and types with which kernels query structures of one kind. Hits have the bits of `Accelerator.closest_hit`.
+    """Warp functions and types with which kernels query structures of one kind, bit for bit like `Accelerator.closest_hit`.
 
     Attributes
     ----------

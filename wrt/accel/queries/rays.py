@@ -135,7 +135,7 @@ def _checked_ends(array: Array, name: str) -> Array:
 
 
 def _check_ends(least: float, name: str) -> None:
-    """Raise InputError if the least value of t_min or t_max is not valid. It is NaN if any value is NaN."""
+    """Raise InputError for an invalid t_min or t_max (`name`). least: its least value, or NaN if any of its values is NaN."""
     if not least >= LOWEST[name]:
         raise InputError("must not be NaN" + (" or below 0" if name == "t_min" else ""), argument=name)
 

@@ -45,9 +45,10 @@ def visible(accel: Accelerator, a: ArrayLike, b: ArrayLike, on_a: ArrayLike | No
     """Test whether each point of `a` sees the point of `b` in the same row: no surface meets the open segment between them.
 
     Exchanging `a` and `b` does not change the result. Surfaces within a margin of an end point are ignored, so that a surface does
-    not hide a point that lies on it. The margin is 3.8e-6 times the larger of two lengths: the largest coordinate of the point, and
-    the size of the largest primitive. It is at most the margin of the other point if that has larger coordinates. Points nearer
-    to each other than both margins always see each other. Along the surface itself the margin is not enough: pass `on_a`, `on_b`.
+    not hide a point that lies on it. Let L be the largest absolute coordinate of a pair. At the point with this coordinate, the
+    margin is 3.8e-6 L. At the other point it is 3.8e-6 times the point's largest coordinate or the size of the largest primitive,
+    whichever is larger, but at most 3.8e-6 L. Points nearer to each other than the sum of both margins always see each other. For
+    segments that run almost along the surface at an end point, the margin is not enough: pass `on_a`, `on_b`.
 
     Parameters
     ----------
@@ -56,8 +57,8 @@ def visible(accel: Accelerator, a: ArrayLike, b: ArrayLike, on_a: ArrayLike | No
     a, b : (N, 3) array_like, or Warp arrays (N,) of vec3
         Points, converted to float32. Values of Warp arrays on a GPU are not checked; a point that is not finite sees nothing.
     on_a, on_b : (N,) array_like of int, optional
-        Primitive on which each point lies (`hits.prim_id` for `hits.point`), or -1. The point is moved off that triangle or
-        sphere by its rounding error, as for shadow rays. Over one mesh, that triangle cannot block. Not for instances.
+        Primitive on which each point lies (`hits.prim_id` for `hits.point`), or -1. The point is moved off that triangle or sphere
+        by its rounding error, as for shadow rays. In a structure without spheres, that triangle cannot block. Not for instances.
     threads : int, optional
         Threads on the CPU; one per core by default.
     out : (N,) bool, optional
@@ -119,7 +120,7 @@ def visible(accel: Accelerator, a: ArrayLike, b: ArrayLike, on_a: ArrayLike | No
 def largest_size(geometry: Geometry | InstancedGeometry) -> float:
     """Return the largest extent of a finite primitive along an axis.
 
-    For instances, return the largest coordinate in a mesh's own space, scaled to world space, because rays are rounded there again.
+    For instances, return the largest coordinate in a mesh's own space, scaled to world space, because rays are rounded in that space.
     """
     if isinstance(geometry, InstancedGeometry):
         reach = np.array([_extents(part)[1] for part in geometry.parts])

@@ -21,7 +21,7 @@ class WorldIds:
     """Index of the world of each of n rays, in arrays on the structure's device."""
 
     def __init__(self, snapshot: Snapshot, first_prim: np.ndarray, world: ArrayLike, n: int) -> None:
-        """first_prim: (W,) index of each world's first primitive among the primitives of all worlds."""
+        """Check and upload the argument `world`. first_prim: (W,), index of each world's first primitive among those of all worlds."""
         self.first_prim = first_prim
         self.arrays: WarpStruct = Worlds()
         self.arrays.id, self.arrays.root = self._on(snapshot.device, world, n), snapshot.roots
@@ -39,7 +39,7 @@ class WorldIds:
         return upload(np.broadcast_to(ids, (n,)).astype(np.int32), wp.int32, device)
 
     def over_all(self, prim_id: ArrayLike) -> np.ndarray:
-        """Convert prim_ids, which count the primitives of one world, to indices among those of all worlds, (N,) int32."""
+        """Convert prim_ids, which count within a ray's world, to indices among the primitives of all worlds, (N,) int32; -1 stays."""
         own, world = to_numpy(prim_id), self.arrays.id.numpy()
         return np.where(own >= 0, own + self.first_prim[np.where(own >= 0, world, 0)], -1).astype(np.int32)
 

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 
 class BuildOptions(TypedDict, total=False):
-    """Options of `build`. Each structure accepts some of them and has its own defaults (docs/acceleration.md)."""
+    """Options of `build`. A comment names the structures that have an option and the options below it. See docs/acceleration.md."""
 
     triangle: str  # all structures
     box: str
@@ -126,7 +126,7 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = "cpu", t
 
     In a scene, prim_ids number the faces of all objects in order, then the spheres. A mesh that several objects share is stored once
     if that saves much memory; the structure is then `Instances`. In a list, each entry is a world: a mesh, or a scene without
-    spheres. A query names the world that each ray sees. Its prim_ids number the faces of that world; `Instances.move` moves objects.
+    spheres. A query names the world that each ray sees; prim_ids of hits number the faces of that world. `Instances.move` moves objects.
 
     Parameters
     ----------
@@ -198,7 +198,7 @@ def to_flat_scene(mesh: MeshLike) -> FlatScene:
 
 
 def to_mesh_or_scene(mesh: MeshLike) -> Mesh | Scene:
-    """Load or convert the argument `mesh` of `build`, if it is no geometry. Raises InputError for other types and a bad file."""
+    """Load or convert the argument `mesh` of `build`. Raises InputError for geometries, other types and a bad file."""
     if isinstance(mesh, str | os.PathLike) and Path(os.fsdecode(mesh)).suffix.lower() in LOADERS:
         mesh = load_scene(mesh)
     elif isinstance(mesh, str | os.PathLike):

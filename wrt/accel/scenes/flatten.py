@@ -37,7 +37,7 @@ def flatten_joined(scene: Scene) -> FlatScene:
 
 
 def flatten_instanced(scene: Scene, meshes: frozenset[int]) -> FlatScene:
-    """Convert a scene to arrays with instances of `meshes`, a set of id()s. Other objects are joined in world space as part 0."""
+    """Convert a scene to arrays with instances of `meshes`, given by id(). Other objects are joined in world space: parts[0]."""
     index = {id(material): i for i, material in enumerate(scene.materials)}
     flat = _joined(tuple(thing for thing in scene.objects if not is_instance(thing, meshes)), index)
     parts = {0: flat}  # then by id of the mesh
@@ -122,7 +122,7 @@ def _check_size(vertices: int, faces: int) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Joined:
-    """Arrays of joined objects, or of one mesh. source: (F,) index of each face before flip_collinear."""
+    """Arrays of joined objects, or of one mesh. source: (F,), index of the original face in which each face lies (flip_collinear)."""
 
     vertices: np.ndarray
     faces: np.ndarray

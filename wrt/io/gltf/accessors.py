@@ -20,14 +20,14 @@ _MAX_IMPLICIT_COUNT = 2**22  # elements without a buffer, which are zeros: a fil
 
 
 class Accessors:
-    """Reader of a document's accessors. Each is decoded once, into a shared read-only array."""
+    """Reader of a document's accessors. Each accessor is decoded once, into a read-only array that all callers share."""
 
     def __init__(self, document: Document) -> None:
         self._document = document
         self._arrays: dict[int, np.ndarray] = {}
 
     def read(self, index: int, kind: str, place: str) -> np.ndarray:
-        """Return accessor `index` as an array (count, width of `kind`): float32, or the accessor's integer type if not normalised.
+        """Return accessor `index` as an array (count, components of `kind`): float32 for floats and normalised integers, else integers.
 
         kind: "SCALAR", "VEC2", "VEC3" or "VEC4". Raises InputError at `place` if the accessor has another kind, does not fit into its
         buffer view, or holds a float that is not finite."""

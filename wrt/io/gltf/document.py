@@ -58,7 +58,7 @@ class LeftOut:
         self._places.setdefault(feature, {}).setdefault(kind, {})[name] = None
 
     def add_extensions(self, extensions: JsonObject | None, kind: str, name: str) -> None:
-        """Record each extension of an object that wrt does not read and that could change the picture."""
+        """Record the extensions of an object that could change the picture and are not read by wrt."""
         for extension in extensions or ():
             if extension not in SUPPORTED_EXTENSIONS and extension not in METADATA_EXTENSIONS:
                 self.add(extension, kind, name)
@@ -80,7 +80,7 @@ class LeftOut:
 
 
 class Document:
-    """Typed JSON of a file (`gltf`, a pygltflib.GLTF2) and the bytes that it refers to. The caller adds the file to each InputError."""
+    """Typed JSON of a file (`gltf`, a pygltflib.GLTF2) and the bytes that it refers to. The caller adds the path to each InputError."""
 
     def __init__(self, path: PathLike) -> None:
         with needed_by("a glTF file"):

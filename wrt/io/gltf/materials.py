@@ -47,7 +47,7 @@ class Textures:
         self._textures: dict[tuple[Any, ...], Texture] = {}
 
     def texture(self, info: GltfObject, srgb: bool, material: str, place: str) -> Texture | None:
-        """Return the texture of a textureInfo. None: there is no textureInfo or no image, or it uses another set than TEXCOORD_0."""
+        """Return the texture of a textureInfo. None: there is no textureInfo or no image, or it uses coordinates other than TEXCOORD_0."""
         if info is None:
             return None
         document = self._document
@@ -125,7 +125,7 @@ def _uv_transform(transform: TextureTransform, place: str) -> np.ndarray:
 
 
 class Materials:
-    """Cache of materials: each index gives one Material object."""
+    """Cache of materials: each index of a glTF material gives one Material object."""
 
     def __init__(self, document: Document) -> None:
         self._document = document

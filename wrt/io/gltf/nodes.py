@@ -76,7 +76,7 @@ def local_matrix(node: GltfObject, place: str) -> np.ndarray:
 
 
 def compose(translation: np.ndarray, rotation: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Return matrices (N, 4, 4), translation * rotation * scale, from (N, 3), quaternions x, y, z, w (N, 4) of any length, and (N, 3)."""
+    """Return matrices (N, 4, 4), translation * rotation * scale. rotation: quaternions x, y, z, w, (N, 4), of any length."""
     rotation = rotation / np.abs(rotation).max(axis=1, keepdims=True)  # the square of the length must not underflow
     x, y, z, w = (rotation / np.linalg.norm(rotation, axis=1, keepdims=True)).T
     columns = [

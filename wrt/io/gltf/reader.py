@@ -35,9 +35,9 @@ from wrt.scene.values import require_count
 def load_gltf(path: PathLike, *, staged: bool = True) -> Scene:
     """Read a glTF 2.0 file. The scene shares the meshes, materials and textures that the file shares.
 
-    staged: add a camera or lights to a file without them (wrt.scene.defaults), and refuse a file without triangles; False for a file
-    that a scene file includes. One SceneWarning names everything left out or added. Settings are the defaults, but glass_shadows is
-    "tinted" if the file has solid glass (KHR_materials_volume). Raises InputError with the file and the place in its JSON."""
+    staged: add a camera or lights to a file without them (wrt.scene.defaults), and refuse a file without triangles. It is False for a
+    file that a scene file includes. One SceneWarning names everything left out or added. Settings are the defaults, except that
+    glass_shadows is "tinted" if there is solid glass (KHR_materials_volume). Raises InputError with the file and the place in its JSON."""
     with at(path=path):
         document = Document(path)
         scene = _Reader(document).scene()
@@ -125,7 +125,7 @@ class _Reader:
                 yield mesh, material
 
     def _placements(self, node: GltfObject, world: np.ndarray, name: str, place: str) -> np.ndarray:
-        """Return the matrices to world space (N, 4, 4) of a node's mesh or its instances, without singular matrices."""
+        """Return the object-to-world matrices (N, 4, 4) of a node's mesh, or of its instances. Singular matrices are left out."""
         instances = self._meshes.instances(node, place)
         with np.errstate(over="ignore", invalid="ignore"):
             transforms = world[None] if instances is None else world @ instances

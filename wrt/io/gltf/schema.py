@@ -1,7 +1,7 @@
 """Schema of glTF documents: JSON values become dataclass instances, each value checked against its declared type.
 
-pygltflib has the dataclasses of core glTF, this file those of the extensions that wrt reads. The decoder of pygltflib is not used: it
-turns 1.5 and "1" into the index 1, and its errors name no place in the file.
+pygltflib has the dataclasses of core glTF; this file has the dataclasses of the extensions that wrt reads. The decoder of pygltflib is
+not used: it turns 1.5 and "1" into the index 1, and its errors name no place in the file.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ _SCALARS: dict[Any, tuple[str, tuple[type, ...]]] = {
 
 
 def read_as(hint: Any, raw: object, place: str) -> Any:
-    """Convert the JSON value `raw` to the type `hint`: a scalar, a list, a dict, or a dataclass (here or of pygltflib).
+    """Convert the JSON value `raw` to the type `hint`: a scalar, a list, a dict, or a dataclass of this file or of pygltflib.
 
     Unknown keys and `extras` are left out; null counts as a missing key. Raises InputError with the place of a value of another type, of
     a number that is not finite, or of a required key that is missing."""

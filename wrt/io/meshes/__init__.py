@@ -1,6 +1,6 @@
 """Mesh formats: each module of this folder has the name of a suffix, and its function `read` reads such files.
 
-The command line's help lists them, so that this file must not import NumPy.
+The command line's help lists the suffixes. This file must not import NumPy, which would delay the help.
 """
 
 from __future__ import annotations

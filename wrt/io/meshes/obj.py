@@ -1,8 +1,8 @@
 """Wavefront OBJ text: positions, normals, texture coordinates and named groups of faces.
 
 trimesh 5.2 is not used, because scene files refer to materials and to the order of faces. It sorts faces by material and loses the names
-of materials without an .mtl file. It fails with an IndexError on relative indices (`f -4 -3 -2 -1`). If positions and normals are indexed
-apart, it keeps one normal for each position.
+of materials without an .mtl file. It fails with an IndexError on relative indices (`f -4 -3 -2 -1`). If positions and normals have
+separate indices, it keeps one normal for each position.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ class _Text:
         return np.frombuffer(self.numbers[key], np.float64).reshape(-1, _WIDTHS[key])
 
     def triples(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return zero-based v, vt, vn (-1: none) of the distinct corners, (U, 3) int64; and for each corner its row there, (C,) int32.
+        """Return the distinct corners (U, 3) int64, as zero-based v, vt, vn (-1: none), and each corner's row in that array, (C,) int32.
 
         The rows are sorted by v first, so that the vertices keep the order of the file."""
         index = np.frombuffer(self.corners, np.int32)
@@ -145,7 +145,7 @@ class _Text:
         return self.face_lines[int(face)]
 
     def groups(self) -> tuple[tuple[str, ...], np.ndarray | None]:
-        """Return the names of the groups, and the index of each polygon's group or None: from usemtl, else from g, else from o lines."""
+        """Return the groups by `usemtl`, else by `g`, else by `o`: their names, and the group's index of each polygon (None: no groups)."""
         key = next((key for key, (starts, _) in self.spans.items() if starts), None)
         if key is None:
             return (), None
@@ -157,10 +157,10 @@ class _Text:
 
 
 def read(path: Path) -> RawMesh:
-    """Read the faces of an OBJ file in its order; nothing is merged.
+    """Read the faces of an OBJ file in the order of the file; nothing is merged.
 
     Each distinct combination of position, texture coordinate and normal becomes a vertex. A corner without a normal gets a zero normal
-    (flat shading), a corner without a texture coordinate gets (0, 0). If faces refer to vt or vn lines and the file has none, their
+    (flat shading), a corner without a texture coordinate gets (0, 0). If faces refer to vt or vn lines and the file has none, these
     indices are left out with a SceneWarning. Groups are the spans of `usemtl`, else of `g`, else of `o`; faces before the first span
     are in the group "". Vertex colours, lines, points and curves are not read. Raises InputError with the line for words that are no
     numbers, indices out of range and positions that are not finite."""

@@ -31,7 +31,7 @@ _SIZES = [name for name, kind in _TYPES.items() if kind[0] != "f"]  # types of a
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _UV_NAMES = (("u", "v"), ("s", "t"), ("texture_u", "texture_v"), ("texcoord_u", "texcoord_v"))
 _INDEX_NAMES = ("vertex_indices", "vertex_index")
-BYTES_AT_ONCE = 1 << 18  # of text, read and converted together
+BYTES_AT_ONCE = 1 << 18  # bytes of text that are read and converted together
 _WORD = re.compile(rb"\S+")
 
 
@@ -43,22 +43,22 @@ class _Property(NamedTuple):
 
 @dataclass
 class _Element:
-    """An `element` of the header. By property: its values of all rows in sequence, and the number of values in each row."""
+    """An `element` of the header, such as "vertex", and its data."""
 
     name: str
     rows: int
     properties: list[_Property] = field(default_factory=list)
-    values: dict[str, np.ndarray] = field(default_factory=dict)
-    counts: dict[str, np.ndarray] = field(default_factory=dict)
+    values: dict[str, np.ndarray] = field(default_factory=dict)  # by property: the values of all rows in sequence
+    counts: dict[str, np.ndarray] = field(default_factory=dict)  # by property: the number of values in each row
 
 
 def read(path: Path) -> RawMesh:
     """Read the vertices and faces of a PLY file in the order of the file; faces of more than three corners are triangulated.
 
-    The triangles of `tristrips` follow the faces; -1 begins a new strip. Vertex normals are nx, ny, nz. Texture coordinates are a
-    vertex's u, v (or s, t or texture_u, texture_v), else the `texcoord` lists of faces; a vertex is split if its faces disagree. Colours
-    and other properties are not read. Raises InputError with the header's line, or with the element and row of a value that is missing,
-    not a number, or out of range."""
+    The triangles of `tristrips` follow the faces; the index -1 begins a new strip. Vertex normals are nx, ny, nz. Texture coordinates
+    are a vertex's u, v (or s, t, or with the prefix texture_ or texcoord_), else the `texcoord` lists of faces. A vertex becomes several
+    if these lists disagree. Colours and other properties are not read. Raises InputError with the header's line, or with the
+    element and row of a value that is missing, not a number, or out of range."""
     elements = {element.name: element for element in _Source(path).elements}
     if "vertex" not in elements or not {"x", "y", "z"} <= elements["vertex"].values.keys():
         raise InputError(f"has no vertices with x, y and z (its elements: {', '.join(elements) or 'none'})")
@@ -200,7 +200,7 @@ class _Source:
         return form, elements, begin
 
     def _read(self, element: _Element) -> None:
-        """Read all rows at once if every list is as long as in the first row (nearly always), else row by row."""
+        """Read all rows of an element at once if every list is as long as in the first row (nearly always), else row by row."""
         begin = self.at
         sizes = [len(part) for part in self._row(element, 0)]
         self.at = begin
@@ -252,7 +252,7 @@ class _Source:
         return np.frombuffer(self.data, dtype, count, self.at - count * dtype.itemsize)
 
     def _table(self, fields: list[tuple[str, int]], rows: int) -> list[np.ndarray] | None:
-        """Return an array (rows, n) for each field (type, n) of the next records, or None if the file ends before."""
+        """Return an array (rows, n) for each field (type, n) of the next `rows` records, or None if the file ends before."""
         record = np.dtype([(f"f{i}", self.order + kind, (n,)) for i, (kind, n) in enumerate(fields)])
         if self.at + rows * record.itemsize > len(self.data):
             return None

@@ -127,7 +127,7 @@ class _Builder:
         )
 
     def material_named(self, name: str) -> list[Material]:
-        """Return the material of a name in a list, or [] for an unknown name, which unknown_materials reports."""
+        """Return [the material of a known name], or [] for an unknown name, which `unknown_materials` reports."""
         return [self.materials[name]] if name in self.materials else []
 
     def included(self, entry: str | tables.IncludeTable, place: str) -> list[Scene]:
@@ -147,7 +147,7 @@ class _Builder:
         return []
 
     def overridden(self, included: list[Scene], table: tables.SceneTable) -> list[Scene]:
-        """Return the included scenes with materials replaced by those of the same name in [override]."""
+        """Return the included scenes with materials replaced by the materials of the same name in [override]."""
         names = list(dict.fromkeys(m.name for scene in included for m in scene.materials))
         new: dict[str, Material] = {}
         for name, material in table.override.items():
@@ -207,7 +207,7 @@ class _Builder:
         return make(BACKGROUNDS[table.background.type], table.background, "", lambda name: read_image(self.file(name)))
 
     def light(self, table: TypedTable, name: str) -> Light | Object:
-        """Return a light; for a rectangle light, an object that emits and reflects nothing."""
+        """Return a light; for a rectangle light, an emissive object of albedo 0."""
         from wrt.io.toml.schema import RectangleLightTable
         from wrt.picture.image import read_image
 
@@ -237,7 +237,7 @@ def moved(scene: Scene, matrix: np.ndarray) -> Scene:
 
 
 def make_camera(table: PoseTable, name: str) -> CameraKind:
-    """Make a camera: its pose from position and target or a matrix, a perspective camera's angle of view from fov_y or a real lens."""
+    """Make a camera. Position and target or a matrix give its pose; fov_y or a real lens gives a perspective camera's angle of view."""
     kind = CAMERAS[table.type]
     values: dict[str, Any] = {}
     if "focus_distance" in forms(kind) and table.position is not None and table.target is not None:

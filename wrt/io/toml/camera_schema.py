@@ -37,7 +37,7 @@ class PoseTable(TypedTable):
 
 
 class LensTable(PoseTable):
-    """Give position and target, or matrix; fov_y, or focal_length."""
+    """Give position and target, or matrix. Give fov_y, or focal_length."""
 
     focal_length: Length | None = Field(None, description="focal length of a real lens, in place of fov_y")
     sensor_height: Length | None = Field(None, description="height of the sensor behind a real lens")

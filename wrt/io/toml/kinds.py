@@ -22,7 +22,7 @@ TYPES: dict[str, Callable[[Limits], Annotation]] = {
     "number": lambda limits: float, "whole": lambda limits: int, "flag": lambda limits: bool, "size": lambda limits: Size,
     "choice": lambda limits: _literal[limits["among"]], "image": lambda limits: str,
 }
-BOUNDED = ("number", "whole", "angle")  # forms whose limits become bounds in the schema; TYPES of other forms have bounds
+BOUNDED = ("number", "whole", "angle")  # forms whose limits become bounds in the schema; for other forms, the types in TYPES have bounds
 
 
 def described(kind: type, types: Mapping[str, Callable[[Limits], Annotation]] = TYPES) -> dict[str, Annotation]:
@@ -65,7 +65,7 @@ def _written(form: str, value: Any) -> Any:
 
 
 def values_of(kind: type, table: Table) -> dict[str, Any]:
-    """Return the values that a checked table sets, by the fields of its class. An image stays a file's name."""
+    """Return the values that a checked table sets, by the class's field names: angles in radians, an image as the name of its file."""
     values: dict[str, Any] = {}
     for key, each in forms(kind).items():
         form = each.metadata["form"]

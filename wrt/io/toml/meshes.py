@@ -68,7 +68,7 @@ class Meshes:
         return Motion(keys, None if table.morph is None else self._smoothed(table.morph, (), table.smooth))
 
     def _smoothed(self, table: MeshTable | MorphTable, parts: tuple[tuple[int, int], ...], normals: bool | None) -> Mesh:
-        """Return the mesh of the table's file or shape. normals: True adds missing vertex normals, False drops vertex normals."""
+        """Return the mesh of the table's file or shape. normals: True adds missing vertex normals, False drops them, None does neither."""
         shape = table.shape
         if shape is not None:
             key: tuple[object, ...] = (shape.model_dump_json(),)

@@ -11,7 +11,7 @@ from wrt.io.load import schema
 
 Schema = dict[str, Any]
 TOP = "SceneTable"
-SHARED_KEYS = 4  # the page describes so many equal keys of two tables once
+SHARED_KEYS = 4  # if two tables share so many equal keys or more, the page describes these keys once
 WORDS = {"string": "text", "boolean": "true or false", "integer": "whole number"}
 HEAD = """\
 # Scene files
@@ -83,7 +83,7 @@ def _places(tables: dict[str, Schema]) -> dict[str, list[str]]:
 
 
 def _references(value: Any, place: str) -> list[tuple[str, str]]:
-    """Return the tables that a value may hold, each with its place: [] marks a list, NAME any key."""
+    """Return (reference, place) of each table that a value may hold. In a place, [] marks a list and NAME stands for any key."""
     if "$ref" in value:
         return [(value["$ref"], place)]
     parts = [(each, place) for each in (*value.get("anyOf", ()), *value.get("oneOf", ()))]
@@ -142,7 +142,7 @@ def _default(value: Schema) -> str:
 
 
 def _find(value: Any, key: str) -> str:
-    """Return the text of a key of the schema of a value or of its parts, or "" without this key."""
+    """Return, as text, what the schema `value` or the first of its parts with this key has under `key`; "" if none has it."""
     if key in value:
         return str(value[key])
     inner = [*value.get("anyOf", ()), *([value["items"]] if isinstance(value.get("items"), dict) else [])]

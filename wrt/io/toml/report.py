@@ -14,7 +14,7 @@ from wrt.core.types import JsonObject
 if TYPE_CHECKING:
     from wrt.io.toml.schema import SceneTable
 
-MOST = 20  # problems reported of one file
+MOST = 20  # largest number of problems in the message about a file
 
 # The expected value by pydantic's type of error; {} is filled from the error's context.
 _EXPECTED = {
@@ -36,14 +36,14 @@ def check(data: JsonObject, path: Path) -> SceneTable:
 
 
 def check_settings(values: JsonObject, origin: str) -> JsonObject:
-    """Check settings by the rules of [settings] in a scene file. Raises one InputError that lists all mistakes."""
+    """Check settings by the rules of [settings] in a scene file. Raises one InputError that begins with `origin` and lists all mistakes."""
     from wrt.io.toml.schema import SettingsTable
 
     return _models(SettingsTable, values, Path(origin)).given()
 
 
 def _models(table: Any, data: dict[str, Any], path: Path, others: Sequence[InputError] = ()) -> Any:
-    """Convert `data` to a model `table`. Raises one InputError that lists all mistakes of `data`, and the `others`."""
+    """Convert `data` to the pydantic model `table`. If it has mistakes, raises one InputError that lists the mistakes and `others`."""
     from pydantic import ValidationError
 
     known_keys: dict[int, list[str]] = {}
@@ -55,7 +55,7 @@ def _models(table: Any, data: dict[str, Any], path: Path, others: Sequence[Input
 
 
 def raise_all(problems: Sequence[InputError], path: Path) -> None:
-    """Raise one InputError with a line for each problem, at most MOST, if there are any."""
+    """Raise one InputError with a line for each problem, at most MOST lines. Without problems, return."""
     lines = {str(problem): problem for problem in problems}
     if len(lines) == 1:
         raise problems[0].at(path)
@@ -113,7 +113,7 @@ def _text(value: object) -> str:
 def _place(location: Sequence[str | int], data: Any, missing: bool) -> tuple[str, Any]:
     """Return the place of a mistake in the file, such as "meshes[0].file", and the table that holds its last key.
 
-    pydantic's location also names members of unions. Parts that are not keys of the file are left out, except a missing last key."""
+    pydantic's `location` also names members of unions. The place leaves out parts that are no keys of the file, but keeps a missing key."""
     place, parent = "", data
     for i, part in enumerate(location):
         if isinstance(part, str) and isinstance(data, dict) and (part in data or (missing and i == len(location) - 1)):

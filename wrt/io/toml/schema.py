@@ -1,6 +1,6 @@
 """Schema of TOML scene files: pydantic models, from which the JSON Schema is made.
 
-Names, bounds and defaults are those of the dataclasses in wrt/scene/. Angles are in degrees in scene files and in radians in wrt/scene/;
+Names, bounds and defaults come from the dataclasses in wrt/scene/. Angles are in degrees in scene files and in radians in wrt/scene/;
 lengths have the scene's own unit; colours are linear Rec. 709. A single number in place of a colour is a grey.
 """
 
@@ -34,7 +34,7 @@ SettingsTable: Any = create_model(
 
 
 class TransformTable(Table):
-    """Scales first, then rotates, then translates; or a matrix."""
+    """A scale, then a rotation, then a translation; or a matrix."""
 
     translate: Point = Field([0.0, 0.0, 0.0], description="translation, applied last")
     rotate: Angles = Field([0.0, 0.0, 0.0], description="rotation about x, then y, then z")
@@ -99,14 +99,14 @@ SHAPE_KEYS: dict[str, dict[str, tuple[Any, str]]] = {
     "icosphere": {"subdivisions": (Annotated[int, Field(ge=0, le=9)], "number of times that each triangle is split into four"),
                   "radius": (Length, "radius of the sphere")},
     "torus": {"radius": (Length, "distance from the axis to the middle of the tube"), "tube_radius": (Length, "radius of the tube"),
-              "segments": (Segments, "number around the axis"), "tube_segments": (Segments, "number around the tube")},
+              "segments": (Segments, "segments around the axis"), "tube_segments": (Segments, "segments around the tube")},
     "lathe": {"profile": (Profile, "points (radius, height), bottom up; a repeated point makes a sharp edge"),
-              "segments": (Segments, "number around the axis")},
+              "segments": (Segments, "segments around the axis")},
     "prism": {"sides": (Segments, "sides of the polygon"), "radius": (Length, "radius of the circle through the polygon's corners"),
               "length": (Length, "length along z")},
     "tube": {"points": (Annotated[list[Point], Field(min_length=2)], "points of the line in the middle of the tube"),
-             "radius": (Length | list[Length], "one radius, or one for each point"), "segments": (Segments, "number around the tube")},
-    "teapot": {"segments": (Segments, "number around the axis")},
+             "radius": (Length | list[Length], "one radius, or one for each point"), "segments": (Segments, "segments around the tube")},
+    "teapot": {"segments": (Segments, "segments around the axis")},
 }
 
 
@@ -138,7 +138,7 @@ class PartTable(Table):
 
 
 class MorphTable(Table):
-    """A mesh with the same faces; in an animation, the vertices move to its vertices and back."""
+    """A mesh with the same faces as the mesh to be moved. In an animation, the vertices move to the vertices of this mesh and back."""
 
     file: str | None = Field(None, description="mesh file, relative to the scene file")
     shape: Shape | None = Field(None, description="shape, in place of a file")
@@ -150,7 +150,7 @@ class MorphTable(Table):
 
 
 class KeyTable(Table):
-    """Placement in an animation, interpolated linearly. Scales, then rotates, then translates."""
+    """A placement at one time of an animation: a scale, then a rotation, then a translation. All three are interpolated linearly."""
 
     translate: Point = Field([0.0, 0.0, 0.0], description="translation, applied last")
     rotate: Angles = Field([0.0, 0.0, 0.0], description="rotation about x, then y, then z; not limited to 360")

@@ -65,7 +65,7 @@ class Table(BaseModel):
         return data
 
     def given(self, *leave_out: str) -> JsonObject:
-        """Return the fields that the file sets, as plain values."""
+        """Return the fields that the file sets, except `leave_out`, as plain values."""
         return self.model_dump(exclude_unset=True, exclude=set(leave_out))
 
 
@@ -76,7 +76,7 @@ class TypedTable(Table):
 
 
 def require_one(table: Table, *choices: tuple[str, ...]) -> None:
-    """Raise ValueError unless the table sets fields of exactly one of the groups."""
+    """Raise ValueError unless the table sets fields of exactly one group in `choices`."""
     given = [names for names in choices if any(getattr(table, name) is not None for name in names)]
     if len(given) != 1:
         raise ValueError("give exactly one of " + ", or ".join(" and ".join(names) for names in choices))

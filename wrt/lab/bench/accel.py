@@ -48,7 +48,7 @@ brute force, for as many rays as 2e8 tests allow. Both must be 0."""
 
 
 def names(plan: Plan) -> list[str]:
-    """Return the names of the structures to measure; by default the registry's, without aliases and brute force."""
+    """Return the names of the structures to measure: plan.structures, or by default all of the registry but aliases and brute_force."""
     if plan.structures:
         return list(dict.fromkeys(plan.structures))
     return [name for name, cls in ACCELERATORS.items() if name == cls.name and name != "brute_force"]
@@ -64,7 +64,7 @@ def rows(plan: Plan) -> Iterator[Row]:
 
 
 def mesh_rows(plan: Plan, mesh: Mesh) -> Iterator[Row]:
-    """Yield a row with the reason for each structure that refuses the mesh, then a row for each kind of ray and other structure."""
+    """Yield a row with the reason for each structure that refuses the mesh, then a row for each kind of ray and each accepted structure."""
     yardstick = build(Geometry.of(mesh), YARDSTICK)
     sets = ray_sets(yardstick, plan.rays, plan.seed)
     mesh = in_stadium(mesh) if plan.stadium else mesh
@@ -101,7 +101,7 @@ def mesh_rows(plan: Plan, mesh: Mesh) -> Iterator[Row]:
 
 
 def timing(rays: int, seconds: np.ndarray, first: np.ndarray) -> dict[str, object]:
-    """Return seconds and million rays a second of each run, and the median of first / seconds over the runs, a ratio of speeds."""
+    """Return seconds and Mray/s of each run, and the median speed over the first structure's. first: seconds of that structure's runs."""
     mrays = rays / seconds / 1e6
     return {"seconds": seconds.tolist(), "mrays": mrays.tolist(), "mrays_median": float(np.median(mrays)),
             "over_first": float(np.median(first / seconds))}
@@ -121,7 +121,7 @@ def answer(accel: Accelerator, rays: RaySet, threads: int | None) -> Hits | np.n
 
 
 def differing(found: Hits | np.ndarray, truth: Hits | np.ndarray) -> int:
-    """Count the rays whose prim_id, bits of t or any-hit answer differ from the truth."""
+    """Count the rays whose closest hits differ from the truth in prim_id or in a bit of t, or whose any-hit answers differ."""
     if isinstance(found, Hits) and isinstance(truth, Hits):
         return int(((found.prim_id != truth.prim_id) | (found.t.view(np.int32) != truth.t.view(np.int32))).sum())
     return int((np.asarray(found) != np.asarray(truth)).sum())

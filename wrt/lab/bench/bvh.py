@@ -30,7 +30,7 @@ from wrt.lab.bench.timing import alternate, peak_bytes, spread
 from wrt.lab.plans import Bvh as Plan
 
 VOLUMES = ("bvh2", "bvh2_sphere", "bvh2_kdop")
-TESTED_RAYS, TESTED_NODES = 1024, 1024  # rays and nodes that time one bounding volume alone
+TESTED_RAYS, TESTED_NODES = 1024, 1024  # most rays and nodes that time one bounding volume alone
 TITLE = "Builders of binary BVHs, and bounding volumes"
 BUILDERS: Columns = {
     "builder": "{builder}", "SAH cost": "{sah_cost:.2f}", "cost/ray": "{cost:.2f}", "nodes/ray": "{nodes:.2f}",
@@ -61,7 +61,7 @@ def rows(plan: Plan) -> Iterator[Row]:
 
 
 def inward(geometry: Geometry, n: int, seed: int = 0) -> RaySet:
-    """Return n rays that meet the geometry's box, uniform over lines: from the box's bounding sphere, inwards by a cosine distribution."""
+    """Return n rays along uniformly distributed lines that meet the geometry's box. They start on its bounding sphere and go inwards."""
     lo, hi, center, radius = ball_around(geometry)
     rng = np.random.default_rng(seed)
     origins, directions = np.empty((0, 3), np.float32), np.empty((0, 3), np.float32)
@@ -94,7 +94,7 @@ def builder_rows(plan: Plan, geometry: Geometry, rays: RaySet) -> Iterator[dict[
 
 
 def published_cost(accel: OneMesh, rays: RaySet) -> float:
-    """Return the mean number of nodes and leaves popped plus triangles tested for a ray, as tinybvh counts them."""
+    """Return the mean over the rays of tinybvh's cost: nodes and leaves popped from the stack, plus triangles tested."""
     hits = accel.closest_hit(rays.origins, rays.directions)
     counts = [wp.zeros(len(rays), dtype=wp.int32, device=accel.device) for _ in range(2)]
     device_rays = rays_on(accel.device, rays_of(rays.origins, rays.directions, 0.0, rays.t_max))
@@ -135,7 +135,7 @@ def volume_rows(plan: Plan, geometry: Geometry, rays: RaySet) -> Iterator[dict[s
 
 
 def tester_of(accel: OneMesh, rays: RaySet) -> Callable[[], int]:
-    """Return a function that tests rays against both children of nodes from the whole tree, and returns the number of tests."""
+    """Return a function that tests up to 1024 rays against both children of up to 1024 nodes, and returns the number of tests."""
     units = accel.structure.units
     record = units.triangle_test.record
     volumes = {"bvh2": lambda: box_volumes(record, units.box_test), "bvh2_sphere": lambda: sphere_volumes(record),

@@ -24,10 +24,10 @@ from wrt.lab.plans import Closed as Plan
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import box, icosphere, lathe, merged, teapot, torus, tube
 
-Answer = Callable[..., np.ndarray]  # Points -> flags of those inside; or origins and directions -> numbers of hits.
+Answer = Callable[..., np.ndarray]  # Points -> flags of the points inside; or origins, directions -> number of hits of each ray.
 CHUNK = 1 << 18  # Points or rays at once.
 AT_EDGE = 2.0**-23  # Largest 1 - u - v that float32 rounding may leave on an edge.
-# Directions of the rays by which wrt.contains (its first ray), trimesh and Open3D find points inside, and an axis.
+# Directions of the rays by which wrt.contains (its first ray), trimesh and Open3D find points inside, and the z axis.
 AIMS = np.array([np.random.default_rng(0).normal(size=3), [0.4395064455, 0.617598629942, 0.652231566745], [1.0, 1.0, 1.0],
                  [0.0, 0.0, 1.0]])
 TITLE = "Closed meshes: points inside, and crossings"
@@ -70,7 +70,7 @@ def made() -> list[Mesh]:
 
 
 def asked(plan: Plan, n: int) -> Iterator[tuple[str, int]]:
-    """Yield the name of each library and its number of queries: n for wrt, fewer for other libraries."""
+    """Yield wrt and each installed library with its number of queries: n for wrt, at most plan.others for another library."""
     yield "wrt", n
     for name, (package, _) in OTHERS.items():
         most = plan.others // (100 if name == "trimesh" else 1)
@@ -93,7 +93,7 @@ def points_wrong(geometry: Geometry, reference: Reference, answer: Answer, n: in
 
 
 def points_in(geometry: Geometry, rng: np.random.Generator, n: int) -> np.ndarray:
-    """Return (n, 3) float32 points in the mesh's box. From every third point, a ray along one of AIMS meets a corner."""
+    """Return (n, 3) float32 points. Two of three are uniform in the mesh's box; from the third, a ray along one of AIMS meets a corner."""
     low, high = geometry.vertices.min(axis=0).astype(np.float64), geometry.vertices.max(axis=0)
     points = rng.uniform(low, high, (n, 3))
     aimed = np.arange(0, n, 3)
@@ -104,8 +104,8 @@ def points_in(geometry: Geometry, rng: np.random.Generator, n: int) -> np.ndarra
 
 
 def exactly_inside(reference: Reference, points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return which points are inside, and which lie exactly on the surface, where either answer is right: (N,) bool each.
-    Count the crossings of a random ray by exact arithmetic; if the ray meets an edge, take another ray."""
+    """Return flags of the points inside, and flags of the points exactly on the surface, where either answer is right: (N,) bool each.
+    Count the crossings of a random ray by exact arithmetic. If the ray meets an edge or corner, take another ray."""
     inside, on_surface = np.zeros((2, len(points)), bool)
     left = np.arange(len(points))
     while len(left):
@@ -129,8 +129,8 @@ def distances(geometry: Geometry, points: np.ndarray) -> np.ndarray:
 
 
 def crossed(geometry: Geometry, accel: Accelerator, count: Answer, own: bool, n: int, seed: int) -> dict[str, object]:
-    """Count the rays that begin and end outside and cross the surface an odd number of times by `count`.
-    own: `count` is wrt's. Another library may see one hit where a ray touches an outline, so such rays are not wrong for it."""
+    """Test n rays that begin and end outside: a ray is wrong if it crosses the surface an odd number of times by `count`.
+    own: `count` is wrt's. Another library may report one hit where a ray touches an outline, so such rays are not wrong for it."""
     rng, wrong, touching, hits, seconds = np.random.default_rng(seed), 0, 0, 0, 0.0
     low, high = (bound.astype(np.float64) for bound in (geometry.vertices.min(axis=0), geometry.vertices.max(axis=0)))
     for first in range(0, n, CHUNK):
@@ -149,8 +149,8 @@ def crossed(geometry: Geometry, accel: Accelerator, count: Answer, own: bool, n:
 
 def crossings_of(geometry: Geometry, found: AllHits, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return how often each ray crosses the surface, and how often it touches the surface without crossing it, (N,) each.
-    Faces that a ray meets at one edge or corner are one crossing if their signed angles around it add up to a whole turn. A hit counts
-    as on an edge only if both faces of the edge report it: rounding hides whether the weight 1 - u - v is 0."""
+    The faces that a ray hits at one edge or corner are one crossing if their signed angles, seen along the ray, sum to a whole turn. A
+    hit counts as on an edge only if both faces of the edge report it: rounding hides whether the weight 1 - u - v is 0."""
     corners = geometry.vertices[geometry.faces[found.prim_id]].astype(np.float64)
     d, ray = directions[found.ray_id].astype(np.float64), found.ray_id
     side = np.sign((np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) * d).sum(axis=1))
@@ -177,7 +177,7 @@ def crossings_of(geometry: Geometry, found: AllHits, directions: np.ndarray) -> 
 
 
 def _angles(corners: np.ndarray, d: np.ndarray, k: np.ndarray) -> np.ndarray:
-    """Return the angle at corner k of each triangle, as seen along the ray, (M,)."""
+    """Return the angle in radians at corner k[i] of triangle i, projected along the ray's direction d[i]: (M,)."""
     row = np.arange(len(k))
     d = d / np.linalg.norm(d, axis=1, keepdims=True)
     sides = [corners[row, (k + i) % 3] - corners[row, k] for i in (1, 2)]
@@ -186,7 +186,7 @@ def _angles(corners: np.ndarray, d: np.ndarray, k: np.ndarray) -> np.ndarray:
 
 
 def open3d_answers(geometry: Geometry) -> tuple[Answer, Answer]:
-    """Return two functions of Open3D: which points are inside, and how many hits each ray has."""
+    """Return two functions of Open3D: points -> flags of the points inside; origins, directions -> number of hits of each ray."""
     import open3d
 
     tensor = open3d.core.Tensor.from_numpy
@@ -197,7 +197,7 @@ def open3d_answers(geometry: Geometry) -> tuple[Answer, Answer]:
 
 
 def trimesh_answers(module: str, geometry: Geometry) -> tuple[Answer, Answer]:
-    """Return two functions of trimesh: which points are inside, and how many hits each ray has."""
+    """Return two functions of trimesh: points -> flags of the points inside; origins, directions -> number of hits of each ray."""
     import trimesh
 
     mesh = trimesh.Trimesh(geometry.vertices, geometry.faces, process=False)

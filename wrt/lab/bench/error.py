@@ -42,7 +42,7 @@ BRUTE_FORCE_LIMIT = 5000  # most primitives for which brute force is measured
 
 @dataclass(frozen=True)
 class Knob:
-    """A field of Settings or Options that the study varies. values: those to try; matters: True if the field can change a picture."""
+    """A field of Settings or Options that the study varies. values: the values to try; matters: False if the scene ignores the field."""
 
     name: str
     kind: Literal["settings", "options"]
@@ -55,7 +55,7 @@ def triangles(scene: Scene) -> int:
 
 
 def structures(scene: Scene) -> list[str]:
-    """Return the registry's name of each structure without aliases; brute force only for few primitives."""
+    """Return each structure's name in the registry, without aliases; brute_force only for up to BRUTE_FORCE_LIMIT primitives."""
     first = {cls: name for name, cls in reversed(list(ACCELERATORS.items()))}.values()
     small = triangles(scene) + len(scene.spheres) <= BRUTE_FORCE_LIMIT
     return [name for name in ACCELERATORS if name in first and (name != "brute_force" or small)]
@@ -78,7 +78,7 @@ KNOBS = {knob.name: knob for knob in (
 
 @dataclass(frozen=True)
 class Variant:
-    """The scene and options with one knob at one value; knob "" and value None are the unchanged scene."""
+    """The scene and options with one knob at one value. The unchanged scene has knob "" and value None."""
 
     knob: str
     value: Any
@@ -91,7 +91,7 @@ class Variant:
 
 
 def variants(scene: Scene, options: Options, features: Features, knobs: Sequence[str]) -> tuple[list[Variant], list[str]]:
-    """Return the unchanged scene and a variant for every other value of every knob; also a sentence for each knob without effect."""
+    """Return the unchanged scene and a variant for every other value of every knob. Also return a sentence for each knob without effect."""
     found, left_out = [Variant("", None, scene, options)], []
     for name in knobs:
         knob = KNOBS[name]
@@ -106,8 +106,8 @@ def variants(scene: Scene, options: Options, features: Features, knobs: Sequence
 
 
 def make_reference(scene: Scene, options: Options, spp: int, seeds: Sequence[int], depth: int | None = None) -> Row:
-    """Render the reference: the float64 mean over the seeds, with exact Fresnel, Sobol samples, default tests and deep paths.
-    - pixels: (H, W, 3) float64; variance: variance of this mean, averaged over pixels and channels.
+    """Render the reference with exact Fresnel, Sobol samples and default intersection tests. depth: max_depth, by default 32 or more.
+    - pixels: mean over the seeds, (H, W, 3) float64; variance: variance of this mean, averaged over pixels and channels.
     - lost_throughput_per_sample: throughput of the rays that were cut; it bounds the light that the reference itself lacks."""
     settings = scene.settings
     depth = max(settings.max_depth, REFERENCE_DEPTH) if depth is None else depth
@@ -160,7 +160,7 @@ def measure(variant: Variant, renderer: Renderer, spp: int, seeds: Sequence[int]
 
 
 def slope_of(rows: Sequence[Row], known: float, sampler: str) -> Row:
-    """Fit the slopes of log error over log spp to the rows of one variant. known: variance of the reference."""
+    """Fit the slopes of log error over log spp to the rows of one variant. known: variance of the reference; sampler: key of THEORY."""
 
     def fit(of: Callable[[np.ndarray], float]) -> statistics.Estimate:
         return statistics.slope([row.spp for row in rows], lambda some: [of(row.products[np.ix_(some, some)]) for row in rows],

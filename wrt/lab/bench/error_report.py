@@ -18,10 +18,10 @@ THEORY = {"independent": "-1", "sobol": "-1 to -3"}
 class Sweep(Row):
     """Results of a sweep over knobs.
 
-    - rows: one row for each variant and number of samples per pixel; knob None is the unchanged scene. products: `gram` of its pictures.
-    - rmse: root mean square error of one picture, without the reference's own error; NaN below that error. rmse^2 = bias^2 + noise^2.
-    - bias: root mean square bias, NaN if noise hides it; bias_below: its upper bound. efficiency: 1 / (mse x seconds).
-    - slopes: for each variant, the slopes of log mse and of log variance over log spp.
+    - rows: one row for each variant and spp (samples per pixel); knob None: the unchanged scene; products: `gram` of the row's pictures.
+    - rmse: square root of one picture's mean squared error less the reference's variance; NaN unless this difference is above 0.
+    - bias: root mean square bias, NaN if noise hides it; bias_below: its upper bound. rmse^2 = bias^2 + noise^2.
+    - efficiency: 1 / (mse x seconds). slopes: for each variant, the slopes of log mse and of log variance over log spp.
     - same_pixels: variants whose pixels equal those of the unchanged scene. interrupted: number of the signal that ended the sweep."""
 
     def _repr_html_(self) -> str:

@@ -13,7 +13,7 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True)
 class Estimate:
-    """A value and the ends of its CONFIDENCE interval; NaN if unknown."""
+    """A value and the ends of its confidence interval (of probability CONFIDENCE); NaN if unknown."""
 
     value: float
     low: float
@@ -24,45 +24,45 @@ UNKNOWN = Estimate(math.nan, math.nan, math.nan)
 
 
 def gram(pictures: Sequence[np.ndarray], truth: np.ndarray) -> np.ndarray:
-    """Return products (K, K) float64: for pictures i and j, the mean over pixels and channels of error i times error j."""
+    """Return (K, K) float64: element (i, j) is the mean over pixels and channels of picture i's error times picture j's error."""
     errors = np.stack([picture.astype(np.float64).ravel() - truth.ravel() for picture in pictures])
     return errors @ errors.T / errors.shape[1]
 
 
 def mse_of(products: np.ndarray, known: float) -> float:
-    """Return the mean squared error of a picture. products: result of `gram`; known: variance of the truth, part of every product."""
+    """Return the mean squared error of a picture. products: result of `gram`; known: variance of the truth, contained in each product."""
     return float(np.diag(products).mean()) - known
 
 
 def squared_bias_of(products: np.ndarray, known: float) -> float:
-    """Return an unbiased estimate of the mean squared bias: products of two different pictures contain no noise on average."""
+    """Return an unbiased estimate of the mean squared bias, from the products of different pictures: their noise averages to 0."""
     n = len(products)
     return float(products.sum() - np.trace(products)) / (n * (n - 1)) - known
 
 
 def noise_of(products: np.ndarray) -> float:
-    """Return the variance of a picture, averaged over pixels: mse = squared bias + this variance."""
+    """Return the variance of a picture, averaged over pixels and channels: mean squared error less squared bias."""
     return mse_of(products, 0.0) - squared_bias_of(products, 0.0)
 
 
 def jackknife(statistic: Callable[[np.ndarray], float], n: int) -> tuple[float, float]:
-    """Return a statistic of n repeats and its standard error, NaN if unknown: leave out one repeat at a time.
+    """Return a statistic of n repeats and its standard error by leaving out one repeat at a time. The error is NaN if unknown.
     Source: Efron and Tibshirani 1993, "An Introduction to the Bootstrap", chapter 11. For n of about 8, a bootstrap's percentile intervals
-    are too narrow; a jackknife with Student's t is not. statistic: function of the indices of the repeats that count."""
+    are too narrow; a jackknife with Student's t is not. statistic: indices of the repeats to use -> value."""
     everything = np.arange(n)
     parts = np.array([statistic(np.delete(everything, i)) for i in range(n)])
     return statistic(everything), math.sqrt((n - 1.0) * float(parts.var())) if np.isfinite(parts).all() else math.nan
 
 
 def student_t(freedom: int) -> float:
-    """Return the half width of a two-sided interval of CONFIDENCE, in standard errors."""
+    """Return half the width of a two-sided CONFIDENCE interval, in standard errors. freedom: degrees of freedom."""
     from scipy.stats import t
 
     return float(t.ppf(0.5 + 0.5 * CONFIDENCE, freedom))
 
 
 def estimate(statistic: Callable[[np.ndarray], float], n: int, *, logarithmic: bool = False) -> Estimate:
-    """Return a statistic of n repeats with its interval. logarithmic: take the interval of the logarithm, for positive values."""
+    """Return a statistic of n repeats with its confidence interval. logarithmic: compute it on the logarithm, for positive values."""
 
     def logarithm(indices: np.ndarray) -> float:
         value = statistic(indices)
@@ -76,13 +76,13 @@ def estimate(statistic: Callable[[np.ndarray], float], n: int, *, logarithmic: b
 
 
 def mean_estimate(values: Sequence[float]) -> Estimate:
-    """Return the mean of repeated values with Student's interval."""
+    """Return the mean of repeated values with its confidence interval."""
     array = np.asarray(values, dtype=np.float64)
     return estimate(lambda indices: float(array[indices].mean()), len(array))
 
 
 def bias_with_bound(products: np.ndarray, known: float) -> tuple[float, float]:
-    """Return the root mean square bias and an upper bound. The bias is NaN if noise or the truth's variance may explain its square."""
+    """Return the root mean square bias and its upper bound. The bias is NaN if noise or the truth's variance could explain it."""
     n = len(products)
     squared, spread = jackknife(lambda i: squared_bias_of(products[np.ix_(i, i)], known), n)
     reach = student_t(n - 1) * spread + known
@@ -100,7 +100,7 @@ def slope(spp: Sequence[int], errors: Callable[[np.ndarray], Sequence[float]], r
 
 
 def pareto_front(points: Sequence[tuple[float, float]], tolerance: float = 0.01) -> list[int]:
-    """Return the indices of the points (cost, error) that no other point beats in both, by rising cost; skip NaN.
+    """Return the indices of the Pareto-optimal points (cost, error), by rising cost; skip points that are not finite.
     A point of higher cost must lower the error by more than the share `tolerance`. So settings with equal error give one point.
     Source: epsilon-dominance (Laumanns et al. 2002), applied to the error only."""
     usable = [i for i, point in enumerate(points) if all(math.isfinite(x) for x in point)]

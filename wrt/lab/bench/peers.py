@@ -65,8 +65,8 @@ def thread_counts(plan: Plan) -> list[int]:
 
 def compared(algorithms: Sequence[Algorithm], rays: RaySet, threads: int, runs: int) -> Iterator[dict[str, object]]:
     """Yield the figures of each library for the same rays.
-    - hit: share of the rays that hit, in the first library; differ: rays whose answer is not the first library's.
-    - seconds: CPU time of the thread in each run, or wall-clock time if there are several threads."""
+    - hit: share of rays that hit, by the first library; differ: number of rays whose answer is not the first library's.
+    - seconds: time of each run, CPU time for one thread and wall-clock time for several threads."""
     searches = [searching(algorithm, rays, threads) for algorithm in algorithms]
     answers = [answer(algorithm, rays, search()) for algorithm, search in zip(algorithms, searches, strict=True)]
     hit = float(np.mean(answers[0].prim_id >= 0 if isinstance(answers[0], Hits) else answers[0]))
@@ -77,7 +77,7 @@ def compared(algorithms: Sequence[Algorithm], rays: RaySet, threads: int, runs: 
 
 
 def searching(algorithm: Algorithm, rays: RaySet, threads: int) -> Callable[[], list[object]]:
-    """Return a function that traces the rays in parts on all threads, and returns the results of the parts."""
+    """Return a function that traces parts of the rays on `threads` threads, and returns the result of each part."""
     count = len(rays) if algorithm.has_threads or threads == 1 else max(-(-len(rays) // (PARTS * threads)), 1)
     searches = [algorithm.search(rays.part(slice(first, first + count)), threads if algorithm.has_threads else 1)
                 for first in range(0, len(rays), count)]
@@ -94,14 +94,14 @@ def searching(algorithm: Algorithm, rays: RaySet, threads: int) -> Callable[[], 
 
 
 def answer(algorithm: Algorithm, rays: RaySet, out: list[object]) -> Hits | np.ndarray:
-    """Return closest hits, or flags of the occluded rays. out: results of the function that `searching` returns."""
+    """Return closest hits by a new query, or for any-hit rays flags of the occluded rays. out: result of the function from `searching`."""
     if rays.any_hit:
         return np.concatenate([algorithm.occluded(part) for part in out])
     return algorithm.closest(rays.origins, rays.directions, 0.0, rays.t_max)
 
 
 def differing(found: Hits | np.ndarray, truth: Hits | np.ndarray) -> int:
-    """Count the rays whose answers differ. Different primitives at the same t are not a difference."""
+    """Count the rays whose answers differ. Different primitives at t that agree within SAME_T are not a difference."""
     if isinstance(found, Hits) and isinstance(truth, Hits):
         hit, expected = found.prim_id >= 0, truth.prim_id >= 0
         both = hit & expected & (found.prim_id != truth.prim_id)
@@ -127,7 +127,7 @@ def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
 
 
 def means(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
-    """Return the geometric mean over the meshes of the first structure's speed over the library's, by library and kind of ray."""
+    """Return library -> kind of ray -> geometric mean over the meshes of the first structure's speed over the library's speed."""
     first = rows[0].name if rows else ""
     out: dict[str, dict[str, float]] = {}
     for (name, threads, kind), group in grouped([row for row in rows if row.name != first], "name", "threads", "kind").items():

@@ -20,7 +20,7 @@ BINS = 60  # most bins of a histogram
 def histograms(panels: Mapping[str, Mapping[str, np.ndarray]], title: str) -> np.ndarray:
     """Return the picture, (H, W, 3) uint8: a panel for each counter, with a line for each kind of ray.
     The x axis is the value, up to the 99.9th percentile. The y axis is the share of the rays, logarithmic.
-    `panels` maps a counter to a kind of ray to the value of each ray."""
+    panels: counter -> kind of ray -> the counter's value for each ray, (N,)."""
     rows = math.ceil(len(panels) / 2)
     figure = new_figure(8.0, 0.7 + 2.4 * rows)
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -42,7 +42,7 @@ def histograms(panels: Mapping[str, Mapping[str, np.ndarray]], title: str) -> np
 
 
 def bins(values: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return bin edges, whole numbers at equal distances, up to the largest 99.9th percentile of the arrays."""
+    """Return bin edges: whole numbers at equal distances, from 0 up to the largest of the arrays' 99.9th percentiles."""
     top = max((float(np.percentile(each, 99.9)) for each in values.values() if len(each)), default=1.0)
     width = max(1, math.ceil((top + 1.0) / BINS))
     return np.arange(0, math.ceil((top + 1.0) / width) + 1) * width

@@ -36,8 +36,8 @@ def as_perspective(camera: CameraKind) -> Camera:
 
 
 def directions_from_pixels(camera: CameraKind, size: tuple[int, int]) -> np.ndarray:
-    """Return the (3, 3) float64 matrix from (x, y, 1), in pixels from the top left corner, to the ray's direction, not normalised.
-    It uses the float32 camera of the render kernels, so the direction is the exact value of what these kernels round."""
+    """Return the (3, 3) float64 matrix that maps (x, y, 1), in pixels from the top left corner, to the ray's direction, not normalised.
+    The matrix has the render kernels' float32 camera. These kernels round the direction; the matrix gives it unrounded."""
     c = camera_struct(as_perspective(camera), size)
     right, up, forward = (np.array(list(v), np.float64) for v in (c.right, c.up, c.forward))
     tan_x, tan_y = (float(np.float32(value)) for value in (c.tan_x, c.tan_y))  # the struct still holds float64
@@ -97,7 +97,7 @@ class Rasterizer:
                  for first in range(0, n, step)], self.threads)
 
     def _draw_bands(self, view: Any) -> None:
-        """Draw bands of rows in parallel on the CPU, each with the triangles in it, so that no two threads write the same pixel."""
+        """Draw bands of pixel rows in parallel on the CPU. One thread draws a whole band, so no two threads write the same pixel."""
         boxes = self.boxes.numpy()
         visible = np.flatnonzero(boxes[:, 0] <= boxes[:, 2]).astype(np.int32)
         top, bottom = boxes[visible, 1], boxes[visible, 3]
@@ -127,7 +127,7 @@ class Rasterizer:
 
 
 class RayCaster:
-    """The pictures of Rasterizer by one ray per pixel: call `draw`, then `depth` and `prim_id`. It builds the structure itself."""
+    """The results of Rasterizer by ray casting: call `draw`, then `depth` and `prim_id`. It builds its own acceleration structure."""
 
     def __init__(self, geometry: Geometry, accel: str = "bvh", device: str = "cpu", threads: int | None = None) -> None:
         ACCELERATORS.check(accel, "accel")
@@ -135,7 +135,7 @@ class RayCaster:
         self.view: tuple[CameraKind | None, tuple[int, int]] = None, (0, 0)  # camera and picture size of the rays
 
     def draw(self, camera: CameraKind, size: tuple[int, int]) -> None:
-        """Cast a ray from the centre of the lens through each pixel's centre. Rays are generated once for a camera and size."""
+        """Cast a ray from the centre of the lens through each pixel's centre. Calls with the same camera and size reuse the rays."""
         if self.view != (camera, size):
             self.origins, self.directions = (wp.array(rays, dtype=wp.vec3, device=self.accel.device)
                                              for rays in camera_rays(as_perspective(camera), size))

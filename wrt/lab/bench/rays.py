@@ -17,7 +17,7 @@ OFFSET = 1e-4  # start of shadow and diffuse rays above the surface, over the ra
 
 @dataclass(frozen=True, eq=False)
 class RaySet:
-    """Rays of one kind. origins, directions: (N, 3) float32; t_max: (N,) float32; any_hit: True for shadow rays, which need any hit."""
+    """Rays of one kind. origins, directions: (N, 3) float32; t_max: (N,) float32; any_hit: trace for any hit (shadow rays)."""
 
     kind: str
     origins: np.ndarray
@@ -33,7 +33,7 @@ class RaySet:
 
 
 def mean_counters(accel: Accelerator, rays: RaySet, **names: str) -> dict[str, float]:
-    """Return means over the rays of counters of a closest-hit query. names: name in the result = name of the counter."""
+    """Trace closest hits; return means of counters over the rays. names: key in the result = name of the counter."""
     counters = accel.closest_hit(rays.origins, rays.directions, 0.0, rays.t_max, counters=True).counters
     return {name: float(getattr(counters, counter).mean()) for name, counter in names.items()}
 
@@ -54,7 +54,7 @@ def endless(n: int) -> np.ndarray:
 
 
 def shadow(origins: np.ndarray, outward: np.ndarray, center: np.ndarray, radius: float) -> RaySet:
-    """Return any-hit rays from surface points to one point light above the mesh, t_max at the light. outward: unit normals."""
+    """Return any-hit rays from surface points to one point light above the mesh, at t_max = 1. outward: unit normals of the surface."""
     light = center + radius * np.array([0.8, 1.7, 0.6])
     directions = light - origins
     backfacing = (directions * outward).sum(axis=1) < 0.0
@@ -70,14 +70,14 @@ def diffuse(origins: np.ndarray, outward: np.ndarray, rng: np.random.Generator) 
 
 
 def random(n: int, center: np.ndarray, radius: float, rng: np.random.Generator) -> RaySet:
-    """Return rays between random points on the mesh's bounding sphere, which are uniform lines."""
+    """Return n rays between random points on the mesh's bounding sphere; their lines are uniformly distributed."""
     a, b = (center + radius * unit(rng.normal(size=(n, 3))) for _ in range(2))
     return RaySet("random", a.astype(np.float32), unit(b - a).astype(np.float32), endless(n))
 
 
 def ray_sets(accel: Accelerator, n: int, seed: int = 0, inside: bool = False) -> dict[str, RaySet]:
     """Return a RaySet of every kind, each with the largest square number of rays up to n; equal arguments give equal rays.
-    Shadow and diffuse rays start where `accel` finds the camera's rays to hit. inside: put the camera at the centre of the mesh's box."""
+    Shadow and diffuse rays start at the primary rays' hits in `accel`. inside: put the camera at the centre of the mesh's box."""
     g: Any = accel.geometry  # a Geometry: the structure is over one mesh
     _, _, center, radius = ball_around(g)
     rng = np.random.default_rng(seed)
@@ -97,7 +97,7 @@ def ray_sets(accel: Accelerator, n: int, seed: int = 0, inside: bool = False) ->
     normals = np.where(((points - eye) * normals).sum(axis=1, keepdims=True) > 0.0, -normals, normals)
 
     def starts() -> tuple[np.ndarray, np.ndarray]:
-        """Return a start point just above a visible surface for each pixel, and the normals there, towards the camera."""
+        """Return a point just above a visible surface for each pixel, and the surface's unit normals towards the camera, (N, 3) each."""
         if not len(points):  # no primary ray hits: start on the bounding sphere, inwards
             inwards = -unit(rng.normal(size=(len(seen), 3)))
             return center - radius * inwards, inwards
@@ -109,7 +109,7 @@ def ray_sets(accel: Accelerator, n: int, seed: int = 0, inside: bool = False) ->
 
 
 def _camera(eye: np.ndarray, target: np.ndarray, n: int) -> RaySet:
-    """Return a camera's rays through a square of pixels, row by row."""
+    """Return a camera's rays through the centres of a square of at most n pixels, row by row."""
     side = max(int(np.sqrt(n)), 1)
     forward = unit(target - eye)
     right = unit(np.cross(forward, [0.0, 1.0, 0.0]))

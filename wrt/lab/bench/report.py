@@ -22,7 +22,7 @@ from wrt.lab.plans import Plan
 
 
 def machine_line(used: str = "", *more: str, device: str = "cpu") -> str:
-    """Describe in one line the conditions under which times were measured: device, load, threads (`used`) and wrt's version."""
+    """Describe the conditions of a measurement in one line: device, `used` (text about threads), load, wrt's version and `more` texts."""
     line = next((line for line in describe_devices() if line.startswith(f"{device}:")), device)
     load = f"load average {os.getloadavg()[0]:.1f} at the start" if hasattr(os, "getloadavg") else ""
     return "; ".join([", ".join(filter(None, [line, used, load])), f"wrt {wrt.__version__}", *more])
@@ -40,7 +40,7 @@ def versions(*packages: str) -> str:
 
 
 class Row(SimpleNamespace):
-    """Results of one measurement, as attributes; the LEGEND of the study explains their names.
+    """Results of one measurement, as attributes; LEGEND in the study's module explains their names.
     JSON contains all attributes except NumPy arrays and names that begin with _."""
 
     def as_dict(self) -> JsonObject:
@@ -48,7 +48,7 @@ class Row(SimpleNamespace):
 
 
 def plain(value: object) -> object:
-    """Return a value, which may contain rows and dataclasses, as lists, dictionaries and numbers for JSON."""
+    """Convert a value for JSON: rows and dataclasses in the value become dictionaries."""
     if isinstance(value, list):
         return [plain(each) for each in value]
     if isinstance(value, dict):
@@ -76,8 +76,8 @@ def grouped(rows: Iterable[Row], *names: str) -> dict[tuple[Any, ...], list[Row]
 def study_of(plan: Plan) -> ModuleType:
     """Return the module that measures a plan.
 
-    The module has rows(plan), which yields each Row once it is measured, TITLE, LEGEND, and COLUMNS or parts(rows, plan), the tables.
-    It may have machine(plan), line(row) for a line of progress, and facts(rows, plan) for more JSON fields."""
+    The module has TITLE, LEGEND, and rows(plan), which yields each Row once it is measured. COLUMNS or parts(rows, plan) make the tables.
+    Optional are machine(plan) for the report, line(row) for a line of progress, and facts(rows, plan) for more JSON fields."""
     return importlib.import_module(plan.STUDY)
 
 
@@ -129,7 +129,7 @@ def text(rows: Sequence[Row], plan: Plan, machine: str) -> str:
 
 
 def repeating(plan: Plan) -> str:
-    """Return the command line that repeats the measurement, with the names of files without folders."""
+    """Return the command line that repeats the measurement; names of files have no folders."""
     words = [f"python -m wrt {plan.COMMAND}"]
     for each in fields(plan):
         value, flag = getattr(plan, each.name), f"--{each.name.replace('_', '-')}"
@@ -145,7 +145,7 @@ def repeating(plan: Plan) -> str:
 
 @dataclass(frozen=True)
 class Part:
-    """A section of a report: heading, paragraphs and a table. head: headings of its columns; lines: cells of its rows."""
+    """A section of a report. title: heading; text: paragraphs; head: headings of the table's columns; lines: cells of each table row."""
 
     title: str = ""
     text: str = ""
@@ -158,7 +158,7 @@ def tables_page(parts: Iterable[Part]) -> str:
 
 
 def table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """Return a Markdown table that is aligned as plain text, too: the first column to the left, the others to the right."""
+    """Return a Markdown table that is also aligned as plain text: the first column to the left, other columns to the right."""
     texts = [[str(cell).replace("|", "\\|") for cell in line] for line in (head, *lines)]
     width = [max(len(line[i]) for line in texts) for i in range(len(head))]
 
@@ -178,5 +178,5 @@ def markdown(parts: Iterable[Part]) -> str:
 
 
 def tabled(columns: Columns, rows: Iterable[object], title: str = "", text: str = "") -> Part:
-    """Return a Part with a table of the rows."""
+    """Return a Part whose table has a line for each row."""
     return Part(title, text, tuple(columns), [cells(columns, row) for row in rows])

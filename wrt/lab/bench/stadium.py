@@ -13,7 +13,7 @@ TIMES = 1000.0  # size of the stadium over that of the mesh
 
 
 def stands(tiers: int = 50, seats: int = 400) -> Mesh:
-    """Return a stadium of 2 + 4 tiers seats triangles: a pitch at y = 0, and steps from radius 0.6 to 1 that rise to y = 0.25."""
+    """Return a stadium of `2 + 4 * tiers * seats` triangles: a pitch at y = 0, and steps from radius 0.6 to 1 that rise to y = 0.25."""
     radius, height = np.linspace(0.6, 1.0, tiers + 1), np.linspace(0.0, 0.25, tiers + 1)
     r, y = np.repeat(radius, 2)[:-1], np.repeat(height, 2)[1:]
     angle = 2.0 * np.pi * np.arange(seats) / seats

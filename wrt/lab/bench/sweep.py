@@ -52,7 +52,7 @@ def cancel(pool: Executor | Submitter, futures: Iterable[Future[T]]) -> None:
 
 
 def by_mesh(run: Callable[..., list[T]], plan: Any, report: Callable[[T], None], executor: object = None) -> list[T]:
-    """Return the rows of run(plan, report). With an executor, one worker measures each mesh, and reads its file at the same path.
+    """Return the rows of run(plan, report). With an executor, one worker measures each mesh; it reads a mesh file at the caller's path.
     `report` receives the rows in the order of the meshes. Raise InputError if a plan for an executor has no meshes."""
     if executor is None:
         return run(plan, report)
@@ -74,7 +74,7 @@ def by_mesh(run: Callable[..., list[T]], plan: Any, report: Callable[[T], None],
 
 def one_at_a_time(digest: str, function: Callable[..., T], *arguments: object) -> T:
     """Call a function on a worker, one call at a time in a process, because concurrent timings slow each other down.
-    Raise InputError if the worker's code has another digest."""
+    Raise InputError unless `digest` is the worker's DIGEST, computed from its versions of wrt, Python, NumPy and Warp."""
     if digest != DIGEST:
         raise InputError(f"worker {worker_name()} has another version of wrt, Python, NumPy or Warp; all workers need the same versions")
     with _alone:

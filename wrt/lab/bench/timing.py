@@ -15,13 +15,13 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-Quartiles = tuple[float, float, float]  # low, median, high
+Quartiles = tuple[float, float, float]  # first quartile, median, third quartile
 K = TypeVar("K")
 T = TypeVar("T")
 
 
 def alternate(jobs: Mapping[K, Callable[[], object]], runs: int, clock: Callable[[], float] = time.perf_counter) -> dict[K, np.ndarray]:
-    """Return seconds (runs,) of each job, after one run that is not timed. Jobs alternate; each round begins with the next job."""
+    """Return seconds (runs,) of each job, after one run that is not timed. Round k runs every job once, beginning with job k."""
     seconds: dict[K, list[float]] = {name: [] for name in jobs}
     names = list(jobs)
     for job in jobs.values():
@@ -40,18 +40,18 @@ def quartiles(values: npt.ArrayLike) -> Quartiles:
 
 
 def shown(values: Quartiles, digits: int = 3) -> str:
-    """Format quartiles as the median, with the low and high quartile in brackets."""
+    """Format quartiles as the median, with the first and third quartile in brackets."""
     return f"{values[1]:.{digits}g} [{values[0]:.{digits}g}, {values[2]:.{digits}g}]"
 
 
 def spread(values: npt.ArrayLike, scale: float = 1.0) -> str:
-    """Format the median and quartiles of values times `scale`."""
+    """Format the median and quartiles of the values, each multiplied by `scale`."""
     return shown(quartiles(scale * np.asarray(values)))
 
 
 def peak_bytes(work: Callable[[], T]) -> tuple[T, float]:
     """Return the result of `work`, and the growth of the process's peak memory in bytes (Linux; else NaN).
-    First return freed memory to the system, as far as possible: reusing it would not show as growth."""
+    Before, return freed memory to the system as far as possible: memory that `work` reuses would not show as growth."""
     gc.collect()
     with suppress(AttributeError, OSError, TypeError):  # no malloc_trim, or Windows, where CDLL needs a name
         ctypes.CDLL(None).malloc_trim(0)

@@ -32,7 +32,7 @@ the time of the row's test, run by run, as median [quartiles], lowest and highes
 
 
 def rows(plan: Plan) -> Iterator[Row]:
-    """Yield rows for each triangle test with default boxes, each box test with default triangles, and each triangle test alone."""
+    """Yield timings of triangle tests with the default box test, box tests with the default triangle test, and triangle tests alone."""
     triangles = [{"triangle": name} for name in RAY_TRIANGLE]
     boxes = [{"box": name} for name in list(RAY_AABB)[1:]]
     for mesh in map(as_mesh, plan.meshes or [icosphere(6), terrain(300), teapot(64)]):
@@ -47,7 +47,7 @@ def rows(plan: Plan) -> Iterator[Row]:
 
 
 def priced(plan: Plan, mesh: str, geometry: Geometry, rays: RaySet, accel: str, units: Sequence[dict[str, Any]]) -> Iterator[Row]:
-    """Time all tests alternately; the first one is the default."""
+    """Yield the timings of all `units` (options of `build`), measured alternately. The first of `units` is the default."""
     built = {" ".join(f"{value}{' boxes' if key == 'box' else ''}" for key, value in options.items()):
              build(geometry, accel, threads=1, **options) for options in units}
     seconds = alternate({unit: partial(structure.closest_hit, rays.origins, rays.directions, threads=1)

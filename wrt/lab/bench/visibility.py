@@ -60,7 +60,7 @@ def row_of(raster: Sequence[float], cast: Sequence[float], build: Sequence[float
 
 
 def terrain(cells: int) -> Mesh:
-    """Return hills of a fixed shape over the square [-1, 1]^2 in x and z, with 2 cells^2 triangles."""
+    """Return hills of a fixed shape over the square [-1, 1]^2 in x and z, with `2 * cells**2` triangles."""
     x, z = np.meshgrid(np.linspace(-1.0, 1.0, cells + 1), np.linspace(-1.0, 1.0, cells + 1), indexing="ij")
     y = sum(0.3 / k * np.sin(k * (2.1 * x + 0.7 * z) + k * k) * np.cos(k * (1.9 * z - 0.6 * x) + 2.0 * k) for k in (1, 2, 4, 8))
     i, j = np.meshgrid(np.arange(cells), np.arange(cells), indexing="ij")
@@ -88,7 +88,7 @@ class Surface:
 
 
 def surfaces(plan: Plan) -> Iterator[Surface]:
-    """Yield surfaces with meshes of up to plan.max_triangles triangles, and always their coarsest mesh."""
+    """Yield each surface with its meshes of up to plan.max_triangles triangles. The coarsest mesh may have more."""
     for path in plan.meshes:
         mesh = as_mesh(path)
         finer = [replace(mesh, normals=None)]
@@ -119,7 +119,7 @@ def rows(plan: Plan) -> Iterator[Row]:
 
 
 def ready(plan: Plan, surface: Surface, geometry: Geometry) -> Callable[[str, int], Row]:
-    """Prepare one geometry for both methods; return a function that measures a picture of `side` x `side` pixels for a sweep."""
+    """Prepare one geometry for both methods. Return a function (sweep, side) -> row that measures a picture of `side` x `side` pixels."""
     rasterizer = Rasterizer(geometry, plan.device, plan.threads)
     caster = RayCaster(geometry, plan.accel, plan.device, plan.threads)
     again = [build(geometry, plan.accel, plan.device, plan.threads) for _ in range(min(plan.runs, MAX_BUILDS) - 1)]
@@ -155,7 +155,7 @@ def series(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
 
 
 def fits(rows: Sequence[Row]) -> list[dict[str, object]]:
-    """Return the exponents of each sweep with two or more points: of rasterising, casting and, over triangles, building."""
+    """Return the exponents of rasterising and casting in each sweep with two or more points; over triangles, also those of building."""
     return [{"sweep": sweep, "surface": surface, "cost": cost,
              **fit([getattr(row, sweep) for row in group], [getattr(row, f"{cost}_median") for row in group])}
             for (sweep, surface), group in series(rows).items() if len(group) > 1

@@ -1,4 +1,4 @@
-"""Compare z-buffer and rays: rounding must explain each pixel where they differ; count the others."""
+"""Compare the pictures of z-buffer and rays: rounding must explain each pixel that differs; count the unexplained pixels."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ from wrt.lab.bench.report import Row
 from wrt.renderer.upload import camera_struct
 from wrt.scene.cameras import Camera
 
-# Bound on how far rounding in a ray's generation and triangle test moves a corner, in ROUNDOFF times the corner's distance. The sum and
+# Bound on how far rounding in a ray's generation and triangle test moves a corner, over ROUNDOFF times the corner's distance. The sum and
 # length of the direction, the offset from the origin, and the shear add a few roundings each.
 ROUNDINGS = 16.0
 ROUNDOFF = 2.0**-24
-AROUND = [(np.cos(a), np.sin(a)) for a in np.arange(8) * (np.pi / 4.0)]
+AROUND = [(np.cos(a), np.sin(a)) for a in np.arange(8) * (np.pi / 4.0)]  # points of a ring of radius 1
 MAX_RINGS = 8  # each ring has twice the radius of the last
 
 
 def agreement(rasterizer: Rasterizer, caster: RayCaster, geometry: Geometry, camera: Camera, size: tuple[int, int]) -> Row:
-    """Draw a picture with both methods and compare them. Afterwards the rasterizer holds a shifted picture."""
+    """Draw a picture with both methods and compare the results. Afterwards `rasterizer` may hold a picture of shifted samples."""
     caster.draw(camera, size)
     return compare(rasterizer, caster.depth(), caster.prim_id(), geometry, camera, size)
 
 
 def compare(rasterizer: Rasterizer, depth: np.ndarray, prim_id: np.ndarray, geometry: Geometry, camera: Camera,
             size: tuple[int, int]) -> Row:
-    """Compare a picture by rays, depth (H, W) float32 and prim_id (H, W) int32, with the rasterizer's, pixel by pixel.
+    """Compare the rays' depth (H, W) float32 and prim_id (H, W) int32 with the rasterizer's, pixel by pixel.
 
-    - covered: pixels where the z-buffer has a triangle. differ: pixels whose prim_id differs: the sum of the next three.
-    - ties: depths agree within their bound, because the centre is on a common edge or triangles coincide.
-    - silhouettes: the rays' depth is exact at a point within a rounding error, some 1e-4 pixels, of the pixel's centre.
-    - unexplained: all others. depth_error: largest relative difference at equal prim_id; depth_share: its share of the bound."""
+    - covered: pixels where the z-buffer has a triangle. differ: pixels whose prim_id differs; each is a tie, silhouette or unexplained.
+    - ties: depths agree within their bound, because the pixel's centre is on a common edge or triangles coincide.
+    - silhouettes: the z-buffer has the rays' depth at a point within a rounding error, some 1e-4 pixels, of the pixel's centre.
+    - depth_error, depth_share: where prim_id agrees, the largest difference of depth over the depth, and over its bound."""
     rasterizer.draw(camera, size)
     exact_depth, exact_id = rasterizer.depth(), rasterizer.prim_id()
     same = (exact_id == prim_id) & (exact_id >= 0)
@@ -65,8 +65,8 @@ def _corners(geometry: Geometry, camera: Camera, size: tuple[int, int], prim_id:
 
 
 def depth_bound(geometry: Geometry, camera: Camera, size: tuple[int, int], prim_id: np.ndarray) -> np.ndarray:
-    """Bound the error of a ray's depth on the triangles `prim_id` (H, W), to first order; 0 on a miss.
-    An error e of the corners moves the hit by at most e / cos(angle of incidence), and by at most the triangle's size along the ray."""
+    """Bound to first order the error of the depth of each pixel's ray on its triangle `prim_id` (H, W); 0 on a miss.
+    An error e of the corners moves the hit by at most e / cos(angle of incidence), and at most e + the triangle's extent along the ray."""
     row, column = np.nonzero(prim_id >= 0)
     out = np.zeros(prim_id.shape)
     corners = _corners(geometry, camera, size, prim_id[row, column])
@@ -84,8 +84,8 @@ def depth_bound(geometry: Geometry, camera: Camera, size: tuple[int, int], prim_
 
 def _beside(rasterizer: Rasterizer, depth: np.ndarray, bound: np.ndarray, reach: np.ndarray, camera: Camera,
             size: tuple[int, int], geometry: Geometry) -> np.ndarray:
-    """Return the pixels (H, W) where the z-buffer has the rays' depth at a point within `reach` pixels of the centre (0: skip the pixel).
-    Search on rings around the centre, each with twice the radius of the last."""
+    """Return flags of the pixels for which the z-buffer has the ray's depth at a point within `reach` pixels of the centre.
+    All arrays are (H, W). Skip pixels of reach 0. Search on rings around the centre, each with twice the radius of the last."""
     found = np.zeros(depth.shape, bool)
     radius = reach[reach > 0.0].min(initial=np.inf)
     for _ in range(MAX_RINGS):
@@ -101,8 +101,8 @@ def _beside(rasterizer: Rasterizer, depth: np.ndarray, bound: np.ndarray, reach:
 
 
 def edge_reach(geometry: Geometry, camera: Camera, size: tuple[int, int], prim_id: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Bound in pixels how far rounding moves an edge of the triangles `prim_id` (H, W), seen at `depth`; 0 on a miss.
-    The farthest corner sets the error of the whole triangle, also where a near part is seen."""
+    """Bound in pixels how far rounding moves an edge of each pixel's triangle `prim_id` (H, W), seen at `depth`; 0 on a miss.
+    The farthest corner sets the error of the whole triangle, also for a pixel that shows a nearer part."""
     c = camera_struct(camera, size)
     per_radian = 0.5 * max(size[0] / c.tan_x, size[1] / c.tan_y) * (1.0 + c.tan_x**2 + c.tan_y**2)
     out = np.zeros(prim_id.shape)

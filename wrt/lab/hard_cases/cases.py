@@ -81,7 +81,7 @@ def chunks(name: str, n: int, seed: int = 0, chunk: int = 2**18) -> Iterator[Har
 
 
 def chosen(cases: Sequence[str]) -> list[str]:
-    """Return the names of the cases that names and letters of groups select; () selects all. Raise InputError for an unknown name."""
+    """Return the names of the selected cases. `cases` has names and letters of groups; () selects all. Raise InputError if unknown."""
     names: list[str] = []
     for case in cases or list(HARD_CASES):
         found = [name for name in HARD_CASES if name == case or name.split("_")[0] == case]

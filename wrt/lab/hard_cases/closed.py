@@ -39,8 +39,8 @@ def _dense(position: str) -> Geometry:
 
 def dense_sphere(rng: np.random.Generator, n: int, *, position: str, aim: str) -> HardCase:
     """A: a sphere of radius 2 with 159,200 triangles, and origins in the cube of side 2 around its centre.
-    The cube's corners are 0.26 from the surface; float32 moves a point 2e5 from 0 by at most 0.012. At "far", rounding makes the corners
-    of 2356 faces collinear; wrt.scene.clean.flip_collinear flips their edges, as in every scene."""  # noqa: D401
+    The cube's corners are 0.26 from the surface; rounding moves a point 2e5 from 0 by at most 0.012. At position "far" the corners
+    of 2356 faces round to a line; wrt.scene.clean.flip_collinear flips their edges, as in every scene."""  # noqa: D401
     center = np.array(POSITIONS[position])
     return inside(_dense(position), center + rng.uniform(-1.0, 1.0, (n, 3)), rng, aim)
 
@@ -54,7 +54,7 @@ def jittered_sphere(rng: np.random.Generator, n: int, *, aim: str) -> HardCase:
 
 def needles(rng: np.random.Generator, n: int, *, aim: str) -> HardCase:
     """F: a sphere squeezed along two axes, by factors 10^-U(1.5, 4) and less, so that triangles have aspect ratios of 1e3 to 1e8.
-    Rounding is relative to a coordinate, so squeezing does not change it: origins within half the squeezed radius are inside."""
+    The rounding error is relative to each coordinate, so origins within half the squeezed radius are still inside."""
     squeeze = np.ones(3)
     axes = rng.permutation(3)
     squeeze[axes[0]] = 10.0 ** -rng.uniform(1.5, 4.0)
@@ -166,8 +166,8 @@ def _grid() -> Geometry:
 
 def axis_parallel(rng: np.random.Generator, n: int) -> HardCase:
     """E: rays along the axes in both directions, with zeros of both signs, through a block of 4 x 4 x 4 touching unit cubes.
-    Rays run in faces, along edges and through corners. They start inside or before the block, so a face is always ahead. On the block's
-    outer faces the weight at the edge is exactly 0, also in float32, so the closed triangle is hit."""
+    Rays run in faces, along edges and through corners. They start inside or before the block, so a face is always ahead. Where a ray
+    meets an edge of the block's outer faces, a weight is exactly 0, also in float32, so it hits the closed triangle."""
     row, axis = np.arange(n), rng.integers(3, size=n)
     origins = np.where(rng.random((n, 3)) < 0.7, rng.integers(0, 9, (n, 3)) / 2.0, rng.uniform(0.0, 4.0, (n, 3)).astype(np.float32))
     sign = rng.choice([-1.0, 1.0], n)

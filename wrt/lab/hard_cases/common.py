@@ -26,12 +26,12 @@ class HardCase:
 
     - origins, directions: (N, 3) float32; t_min, t_max: (N,) float32.
     - expected: (N,) int8 of HIT, MISS, UNKNOWN; HIT and MISS follow from the way the rays are generated.
-    - closed: each edge has two faces of opposite directions, so no ray may pass through. `judge` then tests skipped crossings by the
-      winding number.
+    - closed: each edge has two faces of opposite directions. So no ray may pass through. `judge` then tests by the winding
+      number whether a ray leaks through crossings that were not reported.
     - next_directions: (N, 3) directions of any length in which rays continue from their hits (case C), or None. On a sphere they are
       first turned to the outside.
-    - refused: queries must refuse these arrays with an InputError; arrays that are already on the device miss instead.
-    - compared: most reported hits that `judge` compares with the oracle's closest hit."""
+    - refused: Mesh or the query must refuse these NumPy arrays with an InputError. In device arrays, rays that are not finite miss.
+    - compared: largest number of reported hits that `judge` compares with the oracle's closest hit. notes: description of the case."""
 
     geometry: Geometry
     origins: np.ndarray
@@ -110,8 +110,8 @@ def aimed(geometry: Geometry, rng: np.random.Generator, origins: np.ndarray, aim
 
 
 def lat_long(slices: int, stacks: int, radii: np.ndarray | float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices (V, 3) float64 and faces of a closed sphere around 0: 2 slices (stacks - 1) triangles, poles on z.
-    Faces are counter-clockwise from outside. radii: one number, or one for each of the 2 + slices (stacks - 1) vertices, poles first."""
+    """Return vertices (V, 3) float64 and faces of a closed sphere around 0: `2 * slices * (stacks - 1)` triangles, poles on z.
+    Faces are counter-clockwise from outside. radii: one number, or one for each of `2 + slices * (stacks - 1)` vertices, poles first."""
     theta = np.pi * np.arange(1, stacks) / stacks
     phi = 2.0 * np.pi * np.arange(slices) / slices
     ring = np.stack([np.sin(theta)[:, None] * np.cos(phi), np.sin(theta)[:, None] * np.sin(phi),

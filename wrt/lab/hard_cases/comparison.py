@@ -61,7 +61,7 @@ def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
 
 
 def _counted(group: Sequence[Row], names: Sequence[str]) -> list[str]:
-    """Return the number of rays, and the number of wrong rays of each library."""
+    """Return cells of a table: the number of rays, then each library's number of wrong rays."""
     by_library = {name: [row for row in group if row.library == name] for name in names}
     out = [str(sum(row.rays for row in by_library[names[0]]))]
     for rows in by_library.values():

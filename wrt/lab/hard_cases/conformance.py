@@ -42,7 +42,7 @@ class Result:
 
     @property
     def wrong(self) -> int:
-        """Number of rays lost, invented or given to a wrong triangle."""
+        """Number of rays that are lost, invented or have a wrong triangle."""
         return self.lost + self.invented + self.wrong_triangle
 
     @property
@@ -91,7 +91,7 @@ class Report:
 
 
 class Case:
-    """One hard case of wrt.testing.CASES: meshes with `rays` rays in all, generated again at each access."""
+    """One hard case of wrt.testing.CASES. Each access to `parts` generates its meshes and, in all, `rays` rays again."""
 
     def __init__(self, name: str, rays: int = 1000, seed: int = 0) -> None:
         self.name, *more = case_names([name])
@@ -115,7 +115,7 @@ class Case:
 
     def check(self, closest_hit: ClosestHit) -> None:
         """Raise AssertionError with the wrong rays: lost, invented or with a wrong triangle.
-        Errors of `closest_hit` pass through; only for input that is not finite may it raise one."""
+        An error of `closest_hit` passes through, unless the input is not finite: then an error is a right answer."""
         result = self._judged(closest_hit, keep_errors=False)
         if not result.ok:
             raise AssertionError(f"{result}\n({self.about})")
@@ -142,7 +142,7 @@ class Case:
 
 
 def case_names(cases: str | Sequence[str] = ()) -> list[str]:
-    """Return the names of the cases that names and letters of groups select; by default all but EXCLUDED_CASES."""
+    """Return the names of the selected cases. `cases` has names and letters of groups; the default is all but EXCLUDED_CASES."""
     cases = as_tuple(cases, str, "cases")
     for name in set(cases).intersection(EXCLUDED_CASES):
         raise InputError("needs spheres or t_min, which closest_hit does not have", argument=name)
@@ -165,7 +165,7 @@ def hard_cases(closest_hit: ClosestHit, cases: str | Sequence[str] = (), rays: i
         (N,) each, as a pair or as attributes. The distance t is in units of |direction|, and ignored on a miss. The index of the face,
         prim_id, is -1 on a miss. At equal distance any face is right.
     cases : names or letters of groups
-        Default: all cases.
+        Default: all cases that need no spheres and no t_min.
     rays : int
         Number of rays of each case.
     seed : int
@@ -178,7 +178,7 @@ def hard_cases(closest_hit: ClosestHit, cases: str | Sequence[str] = (), rays: i
     Raises
     ------
     InputError
-        An unknown name, or closest_hit returns other arrays."""
+        An unknown name, a case that needs spheres or t_min, or closest_hit returns arrays of other shape or type."""
     return Report(tuple(results(closest_hit, cases, rays, seed)))
 
 

@@ -24,8 +24,8 @@ class Algorithm(ABC):
     """An algorithm that finds closest hits: call prepare() for each geometry, then closest(), which uses one thread."""
 
     name: str
-    bytes_per_triangle: float = float("nan")
-    is_peer: ClassVar[bool] = False
+    bytes_per_triangle: float = float("nan")  # size of the structure
+    is_peer: ClassVar[bool] = False  # another library than wrt
     has_threads: ClassVar[bool] = True  # search() can use several threads
     package: ClassVar[str] = ""  # package that a peer imports
 
@@ -35,7 +35,7 @@ class Algorithm(ABC):
 
     @abstractmethod
     def prepare(self, geometry: Geometry) -> bool:
-        """Build the structure for a geometry; return False if the library does not support it (spheres)."""
+        """Build the structure for a geometry; return False if the library does not support the geometry, for example spheres."""
 
     @abstractmethod
     def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf) -> Hits:
@@ -162,7 +162,7 @@ class WarpMesh(Peer):
         return cut((t / length).astype(np.float32), prim_id, v, 1.0 - u - v, t_min, t_max)
 
     def search(self, rays: RaySet, threads: int) -> Callable[[], object]:
-        """Return the function to time. Warp requires unit directions, so any-hit rays also have a length."""
+        """Return the function to time. Warp requires unit directions, so the t_max of any-hit rays is converted to a distance."""
         import warp as wp
 
         from wrt.core.device import load_kernel
@@ -225,7 +225,7 @@ def cut(t: np.ndarray, prim_id: np.ndarray, u: np.ndarray, v: np.ndarray, t_min:
 
 
 def own_algorithms() -> list[Own]:
-    """Return every triangle test with conservative boxes, and the default test with every other box test."""
+    """Return every triangle test with conservative boxes, and the default triangle test with every other box test."""
     from wrt.kernels.units.box import RAY_AABB
     from wrt.kernels.units.triangle import RAY_TRIANGLE
 

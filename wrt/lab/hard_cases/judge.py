@@ -2,7 +2,7 @@
 
 Three kinds of answers are wrong. A *miss* reports no hit where one must be found. A *false hit* names a triangle that the ray misses by
 more than the algorithm's rounding, or a t outside the segment. A *wrong prim_id* names a primitive although a nearer one must be found.
-The derived error bound (wrt.lab.oracle.bounds) cannot settle all answers. Those it leaves open are not wrong, but counted: borderline
+The derived error bound (wrt.lab.oracle.bounds) cannot settle all answers. Open answers are not wrong, but counted: borderline
 misses and hits, ties (exactly equal t) and near ties (t equal within the bound)."""
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from wrt.lab.oracle.oracle import AllHits, Place, Reference, reference_of, sure
 RAYS_AT_ONCE = 1 << 16
 FACES_AT_ONCE = 4096  # few enough that float64 temporaries stay in the cache
 EXAMPLES = 8  # wrong rays that a verdict stores
-BINS_PER_OCTAVE, LOWEST_OCTAVE, N_BINS = 8, -12, 8 * 160
+BINS_PER_OCTAVE, LOWEST_OCTAVE, N_BINS = 8, -12, 8 * 160  # of an error histogram; the first bin ends at 2^LOWEST_OCTAVE units
 
 
 @dataclass
 class Errors:
-    """Errors of one quantity: of t in float32 ulp at the exact t, of u and v in units of 2^-24.
-    - largest: largest error; histogram: counts of errors, for percentiles; both over exact hits only.
-    - largest_ratio: largest error over its derived bound; over: number of errors above the bound. Both include borderline hits, which
-      may lie far outside the triangle in its plane."""
+    """Errors of one quantity. The unit is a float32 ulp at the exact t for t, and 2^-24 for u and v.
+    - largest: largest error; histogram: counts of errors, for percentiles. These two fields cover exact hits only.
+    - largest_ratio: largest error over its derived bound; over: number of errors above the bound. These two fields include borderline
+      hits, which may lie far outside the triangle in its plane."""
 
     largest: float = 0.0
     largest_ratio: float = 0.0
@@ -36,7 +36,7 @@ class Errors:
     histogram: np.ndarray = field(default_factory=lambda: np.zeros(N_BINS, np.int64))
 
     def add(self, error: np.ndarray, unit: np.ndarray | float, bound: np.ndarray, exact_hit: np.ndarray) -> np.ndarray:
-        """Add absolute errors, where NaN counts as infinite; return flags of the errors above the bound. unit: of `largest`."""
+        """Add absolute errors; NaN counts as infinite. Return flags of errors above `bound`. unit: size of one unit; exact_hit: flags."""
         error = np.where(np.isnan(error), np.inf, error)
         over = (error > bound) | np.isinf(error)
         ratio = np.full(len(error), np.inf)
@@ -51,7 +51,7 @@ class Errors:
         return over
 
     def percentile(self, q: float) -> float:
-        """Return an upper bound on the q-th percentile, at most a ninth too large; NaN if the histogram is empty."""
+        """Return an upper bound on the q-th percentile, less than 10 % too large above 2^-12 units; NaN if the histogram is empty."""
         total = int(self.histogram.sum())
         if not total:
             return float("nan")
@@ -72,7 +72,7 @@ class Errors:
 
 @dataclass
 class Verdict:
-    """Counts over rays; the verdicts on parts of a case can be added.
+    """Counts over rays; the module's docstring explains most of them. The verdicts on parts of a case can be added.
     - asked: reported hits that the oracle compared with the closest hit; examples: the first wrong rays.
     - self_hits is counted by judge_next, duplicate_hits by judge_all_hits."""
 
@@ -99,7 +99,7 @@ class Verdict:
 
     @property
     def ok(self) -> bool:
-        """True if no ray is lost, invented or given to a wrong primitive, and every error is within its bound."""
+        """True if no miss, false hit, wrong prim_id, self hit or duplicate hit was counted, and every error is within its bound."""
         wrong = self.misses + self.false_hits + self.wrong_prim + self.self_hits + self.duplicate_hits
         return wrong + self.t.over + self.u.over + self.v.over == 0
 
@@ -112,7 +112,7 @@ class Verdict:
         return {f.name: value.as_dict() if isinstance(value := getattr(self, f.name), Errors) else value for f in fields(Verdict)}
 
     def wrong(self, count: str, case: HardCase, rows: np.ndarray, why: str, prim_id: np.ndarray | None = None) -> None:
-        """Add the rays `rows` to the field named `count` ("": to none), and store the first ones as examples."""
+        """Add the number of rays `rows` (indices) to the field `count` ("": to no field), and store the first rays as examples."""
         if count:
             setattr(self, count, getattr(self, count) + len(rows))
         for row in rows[: EXAMPLES - len(self.examples)].tolist():
@@ -122,7 +122,7 @@ class Verdict:
                 "t_min": float(case.t_min[row]), "t_max": float(case.t_max[row])})
 
 
-# A reported hit: index of its ray, reported t and prim_id, and for this primitive: bound on t, whether a report is allowed, exact hit.
+# A reported hit: index of its ray, its t, prim_id and bound on t; sound: the bounds allow the report; hit: the exact ray hits prim_id.
 CLAIM = np.dtype([("row", np.int64), ("t", np.float64), ("prim_id", np.int64), ("t_bound", np.float64), ("sound", bool), ("hit", bool)])
 
 
@@ -130,9 +130,9 @@ def judge(case: HardCase, hits: Hits, compared: int | None = None, *, lowest: bo
     """Judge closest hits: t, u, v, prim_id (N,), prim_id -1 on a miss (wrt.accel.queries.answers.Hits).
 
     - Each reported hit is tested exactly against the primitive that it names. For `compared` hits (None: case.compared), chosen at
-      random with a fixed seed, the oracle also looks for nearer hits. It traces each ray that is reported to miss and not known to hit.
-    - lowest: among identical triangles the lowest prim_id is right, which is wrt's rule.
-    - u and v may be None. The bounds are those of wrt's triangle test."""
+      random with a fixed seed, the oracle also looks for nearer hits. It traces each ray that is reported to miss and is UNKNOWN.
+    - lowest: True if of identical triangles only the lowest prim_id is right, which is wrt's rule; False if any of them is right.
+    - u and v may be None. The error bounds are those of wrt's watertight triangle test and sphere test."""
     reference = reference_of(case.geometry)
     t, u, v, prim_id = (None if value is None else np.asarray(value) for value in (hits.t, hits.u, hits.v, hits.prim_id))
     assert t is not None and prim_id is not None
@@ -159,7 +159,7 @@ def check(case: HardCase, hits: Hits) -> Verdict:
 
 
 def _obvious_faults(case: HardCase, t: np.ndarray, prim_id: np.ndarray, finite: np.ndarray) -> tuple[Verdict, np.ndarray]:
-    """Count the faults that need no oracle; also return flags of the reported hits that may be right. finite: flags of the primitives."""
+    """Count the faults that need no oracle. Also return flags of the reported hits that may be right. finite: flags, by primitive."""
     reported = prim_id >= 0
     verdict = Verdict(rays=len(case), hits=int(reported.sum()))
     verdict.wrong("misses", case, np.flatnonzero(~reported & (case.expected == HIT)), "must hit, is reported to miss")
@@ -173,8 +173,8 @@ def _obvious_faults(case: HardCase, t: np.ndarray, prim_id: np.ndarray, finite: 
 
 
 def _claims(case: HardCase, reference: Reference, rows: np.ndarray, hits: tuple[Any, ...], verdict: Verdict) -> Any:
-    """Compare the reported hits of the rays `rows` with the primitives that they name; return a CLAIM for each.
-    Count false hits, and errors of t, u and v. hits: t, u, v, prim_id of all rays."""
+    """Compare the reported hits of the rays `rows` with the primitives that they name; return a CLAIM for each ray.
+    Add false hits, borderline hits and errors of t, u and v to `verdict`. hits: t, u, v, prim_id of all rays."""
     u, v = (None if x is None else x[rows].astype(np.float64) for x in hits[1:3])
     t, prim_id = hits[0][rows].astype(np.float64), hits[3][rows]
     exact_t, exact_u, exact_v = np.empty((3, len(rows)))
@@ -211,7 +211,7 @@ def _claims(case: HardCase, reference: Reference, rows: np.ndarray, hits: tuple[
 
 
 def _judge_closeness(case: HardCase, reference: Reference, claims: Any, verdict: Verdict, lowest: bool) -> None:
-    """Count claims for which a nearer hit must be found, ties and near ties."""
+    """Add to `verdict` the claims for which a nearer hit must be found, the ties and the near ties."""
     n = len(claims.row)
     verdict.asked += n
     o, d = case.origins[claims.row], case.directions[claims.row]
@@ -241,7 +241,7 @@ def _judge_closeness(case: HardCase, reference: Reference, claims: Any, verdict:
 
 def _certain(case: HardCase, reference: Reference, found: AllHits, row: np.ndarray, o: np.ndarray,
              d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return flags of the exact hits `found` that an algorithm within the error bounds must find, and the bounds on their t."""
+    """Return flags of the exact hits `found` that an algorithm within the error bounds must report, and the bounds on these hits' t."""
     certain, bound = np.zeros(len(found), bool), np.full(len(found), np.inf)
     i = np.flatnonzero(found.prim_id < reference.n_triangles)
     if len(i):
@@ -259,7 +259,7 @@ def _certain(case: HardCase, reference: Reference, found: AllHits, row: np.ndarr
 
 
 def _judge_misses(case: HardCase, reference: Reference, rows: np.ndarray, verdict: Verdict) -> None:
-    """Count the rays `rows`, which are reported to miss, that must hit or may hit (borderline)."""
+    """Add to `verdict` the rays of `rows` that must hit, and the borderline rays, which may hit. All of `rows` are reported to miss."""
     for first in range(0, len(rows), RAYS_AT_ONCE):
         part = rows[first:first + RAYS_AT_ONCE]
         o, d = case.origins[part], case.directions[part]
@@ -276,8 +276,8 @@ def _judge_misses(case: HardCase, reference: Reference, rows: np.ndarray, verdic
 
 
 def _leaks(case: HardCase, skipped: AllHits, bound: np.ndarray, row: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return flags of the rays `row` that leak through a closed surface at crossings that were not reported, (n,) bool.
-    A ray leaks if the winding number behind such a crossing, before the next one or end[i], differs from the one at the segment's start.
+    """Return flags of the rays `row` that leak through a closed surface at the crossings `skipped`, which were not reported: (n,) bool.
+    A ray leaks if the winding number between two of these crossings, or between the last one and t = end[i], is not that at t_min.
     Crossings whose bounds on t overlap count as one, because a ray may cut off a corner by less than the bound."""
     leaks, rays, points = np.zeros(len(row), bool), np.unique(skipped.ray), [np.zeros((0, 3))]
     for i in rays:
@@ -311,7 +311,7 @@ def winding_number(case: HardCase, points: np.ndarray) -> np.ndarray:
 
 
 def _lower_twin(case: HardCase, prim_id: int, tied: np.ndarray) -> bool:
-    """Return True if a lower prim_id of the tie has the same corners in the same order, so that its computed t is the same."""
+    """Return True if a lower prim_id of `tied` has the same corners in the same order, so that its computed t is the same."""
     faces, vertices = case.geometry.faces, case.geometry.vertices
     lower = tied[tied < min(prim_id, len(faces))]
     if prim_id >= len(faces) or not len(lower):
@@ -320,8 +320,8 @@ def _lower_twin(case: HardCase, prim_id: int, tied: np.ndarray) -> bool:
 
 
 def judge_next(case: HardCase, first_prim_id: np.ndarray, next_prim_id: np.ndarray) -> Verdict:
-    """Judge case C: a ray that starts at a hit (on a sphere: to its outside) must not hit the same primitive.
-    Arrays are (N,), -1 on a miss; rays whose first hit is a miss are skipped. Add the verdict to judge's, which counts rays and hits."""
+    """Judge case C: a ray that starts at a hit (from a sphere to its outside) must not hit the same primitive.
+    Arrays are (N,), -1 on a miss; a ray without a first hit is right. The verdict has only self_hits: add it to the verdict of `judge`."""
     verdict = Verdict()
     again = np.flatnonzero((first_prim_id >= 0) & (next_prim_id == first_prim_id))
     verdict.wrong("self_hits", case, again, "hits the primitive on which it starts", next_prim_id)

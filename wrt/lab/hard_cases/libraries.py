@@ -79,7 +79,7 @@ LIBRARIES = {
 
 
 def usable(name: str) -> str:
-    """Return the reason why a library cannot be used on this machine, or ""."""
+    """Return the reason why a library cannot be used on this machine, or "" if it can."""
     missing = [package for package in LIBRARIES[name].needs if importlib.util.find_spec(package) is None]
     if missing:
         return f"not installed: {', '.join(missing)}"

@@ -33,7 +33,7 @@ def _towards(geometry: Geometry, rng: np.random.Generator, origins: np.ndarray, 
 
 
 def respawned_triangles(rng: np.random.Generator, n: int) -> HardCase:
-    """C (pbrt-v4, Triangle.Reintersect): 8 triangles and origins with coordinates +-10^U(-8, 8), and rays at the triangles.
+    """C (pbrt-v4, Triangle.Reintersect): 8 triangles and origins with coordinates +-10^U(-8, 8), and rays aimed at the triangles.
     A ray from the hit along next_directions must not hit the same triangle, on either side."""
     geometry = soup(_signed_powers(rng, (8, 3, 3), -8.0, 8.0))
     case = _towards(geometry, rng, _signed_powers(rng, (n, 3), -8.0, 8.0), _points(geometry, rng, n))
@@ -41,8 +41,8 @@ def respawned_triangles(rng: np.random.Generator, n: int) -> HardCase:
 
 
 def respawned_spheres(rng: np.random.Generator, n: int) -> HardCase:
-    """C: 8 spheres of radius 10^U(-4, 4), up to 1e4 from the origin, with rays at them from outside and inside.
-    A ray from the hit to the outside of the sphere must not hit the sphere again. Centres are at most 2^22 radii from the origin: a sphere
+    """C: 8 spheres of radius 10^U(-4, 4), up to 1e4 from the point 0, and rays aimed at them from outside and inside.
+    A ray from the hit to the outside of the sphere must not hit the sphere again. Centres are at most 2^22 radii from 0: a sphere
     smaller than the float32 spacing at its centre has no outside."""
     radius = 10.0 ** rng.uniform(-4.0, 4.0, (8, 1))
     moved = np.minimum(10.0 ** rng.uniform(-4.0, 4.0, (8, 1)), 2.0**22 * radius)
@@ -57,7 +57,7 @@ def respawned_spheres(rng: np.random.Generator, n: int) -> HardCase:
 
 @cache
 def _without_area() -> Geometry:
-    """Return triangles with exactly collinear corners (multiples of 1/8): a third have distinct corners, two thirds repeated ones."""
+    """Return triangles with exactly collinear corners (multiples of 1/8): a third have distinct corners, two thirds repeated corners."""
     rng = np.random.default_rng(0)
     start, step = rng.integers(-8, 9, (2, 96, 1, 3)) / 8.0
     along = np.stack([rng.permutation(4)[:3] for _ in range(96)])[:, :, None]
@@ -68,7 +68,7 @@ def _without_area() -> Geometry:
 
 @cache
 def _line_through_zero() -> Geometry:
-    """Return triangles with corners on a line through 0, whose sizes differ by up to 2^60: float64 rounds differences and products."""
+    """Return triangles with corners on a line through 0. Coordinates differ by up to 2^60, so that float64 rounds their differences."""
     rng = np.random.default_rng(0)
     step = rng.uniform(-4.0, 4.0, (96, 1, 3)).astype(np.float32).astype(np.float64)
     return soup(2.0 ** -rng.integers(0, 60, (96, 3, 1)) * step)
@@ -120,7 +120,7 @@ def tiny(rng: np.random.Generator, n: int) -> HardCase:
 
 def tiny_components(rng: np.random.Generator, n: int) -> HardCase:
     """I: triangles of size 1e-20 to 1 with corners on a lattice, and directions of length 1e-15 to 1e15 with up to two tiny components.
-    A tiny component is 2^-20 to 2^-149 of the longest. On its axis the ray starts exactly at its target's coordinate, mostly on a face of
+    A tiny component is 2^-20 to 2^-149 of the longest. On its axis the origin has exactly the target's coordinate, mostly on a face of
     the triangle's box. Half of the rays point away from their target."""
     corners = rng.integers(-4, 5, (32, 3, 3)) * 10.0 ** rng.uniform(-20.0, 0.0, (32, 1, 1))
     geometry = soup(corners)
@@ -173,7 +173,7 @@ def edge_on(rng: np.random.Generator, n: int) -> HardCase:
 
 
 def _square(size: float, cells: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return two coordinates of the vertices of a grid of cells x cells quads over [-size, size]^2, and the triangles."""
+    """Return a grid of cells x cells quads over [-size, size]^2: the vertices' first and second coordinates, and the triangles."""
     x = np.linspace(-size, size, cells + 1)
     i, j = np.meshgrid(x, x, indexing="ij")
     first = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).reshape(-1, 1)
@@ -189,8 +189,8 @@ def _floor(turned: bool) -> Geometry:
 
 def grazing(rng: np.random.Generator, n: int, *, turned: bool) -> HardCase:
     """F: rays at angles of 10^U(-7, 0) rad to a floor of 2048 triangles, horizontal or rotated.
-    On the horizontal floor, at y = 0, the exact hit is o - d o_y / d_y. If it is 1 % or more inside the border, the ray must hit,
-    because all edges there have a triangle on both sides."""
+    On the horizontal floor, at y = 0, the exact hit is `o - d * o_y / d_y`. If it is 1 % or more inside the border, the ray must
+    hit, because all edges in that region have a triangle on both sides."""
     points = np.stack([rng.uniform(-90.0, 90.0, n), np.zeros(n), rng.uniform(-90.0, 90.0, n)], axis=1)
     angle, heading = 10.0 ** rng.uniform(-7.0, 0.0, n), rng.uniform(0.0, 2.0 * np.pi, n)
     away = np.stack([np.cos(heading) * np.cos(angle), np.sin(angle), np.sin(heading) * np.cos(angle)], axis=1)
@@ -215,7 +215,7 @@ def _plates() -> Geometry:
 
 def exact_ends(rng: np.random.Generator, n: int) -> HardCase:
     """H: t_min or t_max exactly at a hit, which counts, or one float32 step past it, where it does not count.
-    All numbers are powers of two or sixteenths, so that no test rounds."""
+    All coordinates are powers of two or multiples of 1/16, so that no test rounds."""
     origins = np.concatenate([rng.integers(-15, 16, (n, 2)) / 16.0, np.zeros((n, 1))], axis=1)
     length = 2.0 ** rng.integers(-20, 21, n)
     plate = rng.integers(3, size=n)
@@ -232,7 +232,7 @@ def exact_ends(rng: np.random.Generator, n: int) -> HardCase:
 
 
 def beside_boxes(rng: np.random.Generator, n: int) -> HardCase:
-    """E: rays along the axes in the faces of a cube, and one float32 step inside and outside of them."""
+    """E: rays along the axes in the planes of a cube's faces, and one float32 step inside and outside of these planes."""
     row, axis = np.arange(n), rng.integers(3, size=n)
     side = np.float32(1.0)
     places = np.array([np.nextafter(side, np.float32(2.0)), np.nextafter(side, np.float32(0.0)), 1.0, 0.5])

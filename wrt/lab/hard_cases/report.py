@@ -85,7 +85,7 @@ def summary(result: Result) -> str:
 
 
 def _notes(result: Result) -> list[str]:
-    """Return sentences that name what is missing in the results."""
+    """Return sentences that name the unfinished cases and the libraries that are not installed."""
     undone = [f"Interrupted; not done, or not with all algorithms: {', '.join(result.undone)}"] if result.undone else []
     return [*undone, *(f"{name}: not installed" for name in result.not_installed)]
 

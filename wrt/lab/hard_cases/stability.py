@@ -54,7 +54,7 @@ COLUMNS: Columns = {
 
 @dataclass
 class Row:
-    """Result of one case and algorithm. judged: number of rays that the oracle judged; refused: None for finite input, else a flag."""
+    """Result of one case and algorithm. judged: rays that the oracle judged; refused: None for finite input, True if refused."""
 
     case: str
     algorithm: str
@@ -76,7 +76,7 @@ def run(plan: Plan, report: Callable[[Row], None] = lambda row: None,
     """Run every chosen case with every algorithm, on the same rays.
 
     - report: receives each finished row; progress: receives lines of text from any thread.
-    - executor: a concurrent.futures.Executor or dask.distributed.Client whose workers trace and judge. This process measures the speed.
+    - executor: a concurrent.futures.Executor or dask.distributed.Client; its workers trace and judge, and this process measures speed.
 
     After Ctrl-C, return the finished rows, or raise KeyboardInterrupt if no row is finished. Raise InputError for an unknown case."""
     begin, names, algorithms = time.perf_counter(), chosen(plan.cases), all_algorithms(plan)
@@ -99,7 +99,7 @@ def run(plan: Plan, report: Callable[[Row], None] = lambda row: None,
 
 
 def all_algorithms(plan: Plan) -> list[Algorithm]:
-    """Return wrt's tests, the default first, and with plan.peers the other libraries that are installed."""
+    """Return wrt's intersection tests, the default first. If plan.peers is True, also return the installed other libraries."""
     return [*own_algorithms(), *(peer() for peer in PEERS.values() if plan.peers and peer.is_installed())]
 
 
@@ -138,7 +138,7 @@ def case_row(name: str, algorithm: str, plan: Plan) -> Row | None:
 
 def run_case(name: str, rays: int, algorithm: Algorithm, seed: int = 0) -> Row | None:
     """Run one case, let the oracle judge it, and return its row, or None if the algorithm does not support the case.
-    Peers support no spheres, no input that is not finite, and no t_min above 0."""
+    Peers support only triangles, finite input and t_min = 0."""
     row = Row(name, algorithm.name)
     for case in chunks(name, rays, seed):
         if case.refused:
@@ -221,7 +221,7 @@ def _respawn_kernel(structure: Structure) -> Kernel:
 
 
 def respawn(algorithm: Own, case: HardCase) -> tuple[np.ndarray, np.ndarray]:
-    """Return prim_id of each ray's hit, and prim_id of the next hit from there along case.next_directions, (N,) int32 each."""
+    """Return prim_id of each ray's hit, and prim_id of the next hit from that point along case.next_directions, (N,) int32 each."""
     accel, n = algorithm.accel, len(case)
     assert case.next_directions is not None
     kernel = _respawn_kernel(accel.structure)
@@ -249,7 +249,7 @@ def _judge_all(algorithm: Own, case: HardCase) -> Verdict:
 
 def measure_speed(algorithms: Sequence[Algorithm], runs: int) -> dict[str, Line]:
     """Measure all algorithms on one thread in alternating runs, on case A's sphere of 159,200 triangles.
-    Return quartiles of Mray/s and of its ratio to the default's (the first algorithm), and bytes per triangle."""
+    Return for each one the quartiles of Mray/s and of the ratio to the first (default) algorithm's Mray/s, and bytes per triangle."""
     case = generate("A_origin_uniform", SPEED_RAYS, seed=1)
     for algorithm in algorithms:
         algorithm.prepare(case.geometry)

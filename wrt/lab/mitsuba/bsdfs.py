@@ -44,7 +44,7 @@ def bsdf(mi: ModuleType, material: Material) -> Plugin:
 
 
 def emission(mi: ModuleType, material: Material) -> Plugin:
-    """Return an area emitter. If the material does not light other surfaces, the emitter has the sampling weight 0."""
+    """Return the material's emission as an area emitter. If it does not light other surfaces, the emitter has the sampling weight 0."""
     if material.alpha_mode != "opaque":
         refuse("emission of a partly transparent surface", f"material {material.name!r}")
     radiance = _color(mi, material.emission, material.emission_texture)

@@ -61,7 +61,7 @@ LIGHTS: dict[str, Callable[[Any, Any], Plugin]] = {
 
 def background_emitter(mi: ModuleType, background: Background) -> Plugin | None:
     """Return the background as an emitter, or None for constant black.
-    Raise InputError for a picture under 3 columns wide, and for a kind that is not in BACKGROUNDS."""
+    Raise InputError for an environment picture of fewer than 3 columns, and for a kind that is not in BACKGROUNDS."""
     if background.kind not in BACKGROUNDS:
         raise InputError(f"not translatable: a background of kind {background.kind!r}", place="Mitsuba")
     return BACKGROUNDS[background.kind](mi, background)

@@ -1,8 +1,8 @@
 """`python -m wrt bench mitsuba`: time that wrt and Mitsuba 3 need for a picture of the same error.
 
-All pictures are compared with one reference. wrt takes a fixed number of samples; Mitsuba takes about as many as the same error needs.
-Its time for exactly that error follows from its own error: its samples are independent, so its mean squared error falls as 1 / time. Runs
-alternate, each with its own seed, and use the same number of threads. Each variant of Mitsuba has its own process."""
+All pictures are compared with one reference. wrt takes a fixed number of samples. Mitsuba takes about as many as it needs for
+the same error. Its samples are independent, so its mean squared error falls as 1 / time. Mitsuba's time for exactly wrt's error follows.
+Runs alternate, each with its own seed, and use the same number of threads. Each variant of Mitsuba has its own process."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def matte(scene: Scene) -> Scene:
 
 def side_of(spp: int, runs: Sequence[tuple[float, np.ndarray]], truth: Row, prepare: float, start: float) -> Row:
     """Return the figures of one renderer. runs: seconds and pixels of each picture; start: seconds of a process without tracing.
-    - rmse, bias: error of its pictures against the reference; bias is NaN if noise hides it, and bias_below is its upper bound.
+    - rmse, bias: error of the pictures against the reference; bias is NaN if noise hides it, and bias_below is its upper bound.
     - prepare_seconds: time to prepare scene and structure; process_seconds: time of a whole process with one picture at this spp."""
     seconds, films = zip(*runs, strict=True)
     products = statistics.gram(films, truth.pixels)
@@ -66,8 +66,8 @@ class _Measured:
         self.spp, self.start = PILOT_SPP, math.nan
 
     def choose_spp(self, seed: int, truth: Row, target: float, longest: float) -> None:
-        """Set spp for the squared error `target`, limited to pictures of `longest` seconds.
-        Mitsuba compiles kernels at the first picture with each number of samples, which is therefore not timed."""
+        """Set spp so that the mean squared error is about `target`, but that a picture takes at most about `longest` seconds.
+        Mitsuba compiles kernels at the first picture with each spp, so that picture is not timed."""
         self.process.render(PILOT_SPP, seed)
         seconds, film = self.process.render(PILOT_SPP, seed)
         needed = PILOT_SPP * statistics.mse_of(statistics.gram([film], truth.pixels), truth.variance) / max(target, 1e-30)
@@ -78,7 +78,7 @@ class _Measured:
         self.runs.append(self.process.render(self.spp, seed))
 
     def time_starts(self, times: int) -> None:
-        """Set `start`: median seconds of imports, of loading the scene from arrays, and of a first picture at 1 spp, as for wrt."""
+        """Set `start` to the median seconds of a process that imports, loads the scene from arrays and renders at 1 spp, as for wrt."""
         program = f"import mitsuba as mi; mi.set_variant({self.job.variant!r})"
         imports = process_seconds(["-c", program], times)
         rest = [self._load_and_first_picture() for _ in range(times + 1 if times else 0)]
@@ -89,8 +89,8 @@ class _Measured:
             return process.load_seconds + process.render(1, 0)[0]
 
     def result(self, ours: Row, truth: Row) -> Row:
-        """Return `side_of` with ratios of Mitsuba's time to wrt's at wrt's error, for tracing alone and for whole processes.
-        The flag same_light is False if Mitsuba's bias is larger than noise at equal error explains: the pictures show different light."""
+        """Return the figures of `side_of`. ratio, process_ratio: Mitsuba's time at wrt's error over wrt's time, to trace and in all.
+        same_light: False if Mitsuba's squared bias is above SAME times wrt's squared error. Then the pictures show different light."""
         side = side_of(self.spp, self.runs, truth, self.process.load_seconds, self.start)
         factor = (side.rmse / ours.rmse) ** 2
         side.process_seconds = self.start + factor * float(np.median(side.seconds))
@@ -123,8 +123,8 @@ class _Rivals:
 
 def run(scene: Scene, plan: Plan, options: Options, command: list[str] | None = None,
         report: Callable[[str], None] = lambda line: None) -> Row:
-    """Measure wrt and Mitsuba. command: arguments of `python -m wrt` that render this scene at 1 spp, to time a process (None: do not).
-    The result names unusable variants. Raise InputError if no variant is usable, or if Mitsuba cannot render the scene exactly."""
+    """Measure wrt and Mitsuba. command: arguments of `python -m wrt` that render this scene at 1 spp; None: time no process.
+    Field not_available: unusable variant -> reason. Raise InputError if no variant is usable or Mitsuba cannot render the scene exactly."""
     scene = scene.with_settings(filter="box")  # with other filters of Mitsuba a sample adds to several pixels
     seeds = [int(word) for word in np.random.SeedSequence(plan.seed).generate_state(REFERENCE_SEEDS + plan.repeats)]
     pictures, starts = seeds[REFERENCE_SEEDS:], plan.starts if command else 0

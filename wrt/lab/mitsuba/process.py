@@ -48,7 +48,7 @@ class Job(NamedTuple):
 
 
 class MitsubaProcess:
-    """A process that loads the scene, in `load_seconds`, and then renders pictures until it is closed.
+    """A process that loads the scene and then renders pictures until it is closed. load_seconds: time to load the scene.
 
     Raise NotAvailable if the variant is not usable or the process has ended. Raise InputError if Mitsuba is missing or cannot render the
     scene exactly."""

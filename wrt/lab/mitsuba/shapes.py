@@ -14,7 +14,7 @@ from wrt.scene.model import Object, Sphere
 
 
 class Part(NamedTuple):
-    """Origin of one Mitsuba shape. object_id: objects first, then spheres; face_index: (F,) its faces in the object's mesh, or None."""
+    """The part of a scene in one Mitsuba shape. object_id: objects first, then spheres; face_index: (F,) faces, None for a sphere."""
 
     object_id: int
     face_index: np.ndarray | None
@@ -28,7 +28,7 @@ class Triangles(NamedTuple):
     uvs: np.ndarray | None
 
     def of(self, vertices: np.ndarray, faces: np.ndarray) -> Triangles:
-        """Return triangles from the chosen vertices (indices); `faces` holds indices into this choice."""
+        """Return triangles over some of the vertices. vertices: indices of the vertices to keep; faces: indices into `vertices`."""
         normals, uvs = (None if array is None else array[vertices] for array in (self.normals, self.uvs))
         return Triangles(self.vertices[vertices], faces.reshape(-1, 3), normals, uvs)
 

@@ -1,7 +1,7 @@
 """Translate a scene to Mitsuba 3, which serves as an independent oracle in tests and as a rival in measurements.
 
-Tests use the variant scalar_rgb in their own process. Measurements also use llvm_ad_rgb, in a process of its own (process.py). Both trace
-with Embree's robust mode, which wrt requests, because Mitsuba's default is the fast mode.
+Tests use the variant scalar_rgb in their own process. Measurements also use llvm_ad_rgb, in a process of its own (process.py). Both
+variants trace with Embree's robust mode. wrt requests this mode, because Mitsuba's default is the fast mode.
 
 Mitsuba's picture has the expectation of wrt's picture in these cases:
 - integrator "whitted" (whitted.py): any scene of diffuse, mirror, conductor and glass surfaces.

@@ -31,7 +31,7 @@ class Walk:
         self.inside = {shape: mi.Color3f(value) for shape, value in absorption.items()}
 
     def transmittance(self, scene: MitsubaObject, si: MitsubaObject, light: MitsubaObject) -> MitsubaObject:
-        """Return the share of the light that reaches a point: solid surfaces block it, cut-outs and thin panes transmit a part."""
+        """Return the share of `light` that reaches the surface point `si`. Solid surfaces block all of it, cut-outs and thin panes some."""
         share = self.mi.Color3f(1.0)
         ray = si.spawn_ray_to(light.p)
         for _ in range(MAX_TRANSPARENT):
@@ -46,7 +46,7 @@ class Walk:
         return self.mi.Color3f(0.0)
 
     def direct_light(self, scene: MitsubaObject, sampler: MitsubaObject, si: MitsubaObject, bsdf: MitsubaObject) -> MitsubaObject:
-        """Return the light of one sampled emitter on a diffuse surface; on others only that of lights without area."""
+        """Return the reflected light of one sampled emitter. A surface without a diffuse part reflects only lights without area."""
         light, weight = scene.sample_emitter_direction(si, sampler.next_2d(), False)
         if light.pdf == 0.0 or not (light.delta or bsdf.flags() & self.diffuse):
             return self.mi.Color3f(0.0)

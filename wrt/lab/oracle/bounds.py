@@ -12,7 +12,7 @@ float64, where the products are exact. So a reported hit has weights l_i >= 0 wi
 *of the triangle* therefore has the sheared coordinates (x, y) with |x| <= delta_x = max e_x and |y| <= delta_y = max e_y.
 - `touches`: a hit may be reported only if the rectangle +-delta meets the exact sheared triangle (tested by separating axes).
 - Weights: l is also the exact barycentric coordinate of (x, y). With the sheared edge E opposite corner i and the sheared area
-  d.N / d_z / 2,
+  d.N / d_z / 2, where N is the cross product of two edges,
       |l_i - exact| <= (|E_y| delta_x + |E_x| delta_y) / |twice the sheared area|.
   A hit whose three exact weights are larger than this is always found: rounding the corners brings no weight to 0.
 - t: P lies at t_P = sum l_i Z_i / d_z, and the slope of the plane gives |t_P - exact| <= (|N_x| delta_x + |N_y| delta_y) / |d.N|.
@@ -64,7 +64,7 @@ def sure(crossings: Crossings, bounds: Bounds) -> np.ndarray:
 
 
 def triangle_bounds(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, np.ndarray, np.ndarray], crossings: Crossings) -> Bounds:
-    """Return bounds for ray i and triangle i; o, d, v: arguments of `triangle_crossings`, with one ray a column; crossings: its result."""
+    """Return bounds for ray i and triangle i; o, d, v: arguments of `triangle_crossings`, a column for each ray; crossings: its result."""
     column = np.arange(d.shape[1])
     kz = np.argmax(np.abs(d), axis=0)
     kx, ky = (kz + 1) % 3, (kz + 2) % 3
@@ -98,7 +98,7 @@ def triangle_bounds(o: np.ndarray, d: np.ndarray, v: tuple[np.ndarray, np.ndarra
 
 
 def _normal(v: tuple[np.ndarray, np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the absolute components of the normal N, and bounds on their rounding in float64, (3, N) each."""
+    """Return the absolute components of the triangles' normals, and bounds on their rounding in float64, (3, N) each."""
     e1, e2 = v[1] - v[0], v[2] - v[0]
     left = np.stack([e1[j] * e2[k] for j, k in ((1, 2), (2, 0), (0, 1))])
     right = np.stack([e1[k] * e2[j] for j, k in ((1, 2), (2, 0), (0, 1))])

@@ -35,7 +35,7 @@ PAIRS_AT_ONCE = 1_000_000
 SLAB = 8.0 * UNIT  # relative error of a slab's distance, which has three float64 roundings, with a margin
 
 
-# Row of an array of hits, which is ordered by ray, then t, then prim_id. The relative error of t is at most 1e-14, and t_error bounds
+# Row of an array of hits; rows are ordered by ray, then t, then prim_id. The relative error of t is at most 1e-14, and t_error bounds
 # |t - exact t|. On spheres u = v = 0. A recarray has these names as attributes: hits.ray.
 HIT = np.dtype([("ray", np.int64), ("prim_id", np.int32), ("t", np.float64), ("u", np.float64), ("v", np.float64),
                 ("t_error", np.float64), ("place", np.int8)])
@@ -45,8 +45,8 @@ AllHits = Any  # np.recarray, whose stubs do not know its attributes
 @dataclass(frozen=True, eq=False)
 class Answer:
     """The closest hit of each ray, arrays (N,).
-    - t: float64, inf on a miss; prim_id: int32, -1 on a miss, the lowest of an exact tie; place: int8, the Place on that primitive.
-    - tie: flags of rays that hit several primitives at exactly this t; ties: ray -> these primitives, ascending."""
+    - t, u, v: float64, t inf on a miss; prim_id: int32, -1 on a miss, the lowest of an exact tie; place: int8, a wrt.scene.exact.Place.
+    - tie: flags of rays that hit several primitives at exactly this t; ties: index of such a ray -> the primitives' prim_id, ascending."""
 
     t: np.ndarray
     prim_id: np.ndarray
@@ -63,7 +63,7 @@ def _hits(*columns: np.ndarray) -> AllHits:
 
 @dataclass(frozen=True, eq=False)
 class _Rays:
-    """Rays as (3, N) float64. inverse: 1 / direction; near: for each axis, the row of a box (6 planes) with the near plane."""
+    """Rays as (3, N) float64. inverse: 1 / direction; near: for each axis, the row of boxes (6, nodes) that has the near planes."""
 
     origin: np.ndarray
     direction: np.ndarray
@@ -110,7 +110,7 @@ class Reference:
         return a, b, c
 
     def candidates(self, rays: _Rays) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Yield pairs (ray, prim_id) that may hit, in parts; all pairs of a ray are in one part."""
+        """Yield two arrays, ray and prim_id, of pairs that may hit. All pairs of one ray come at once."""
         n = len(rays.t_min)
         usable = np.isfinite(rays.origin).all(axis=0) & np.isfinite(rays.direction).all(axis=0) & rays.direction.any(axis=0)
         stack = [np.flatnonzero(usable[i:i + RAYS_AT_ONCE]) + i for i in reversed(range(0, n, RAYS_AT_ONCE))]
@@ -123,7 +123,7 @@ class Reference:
                 yield rows[pairs[0]], pairs[1]
 
     def _descend(self, rays: _Rays, n: int) -> tuple[np.ndarray, np.ndarray] | None:
-        """Trace all rays down the tree, level by level; return pairs (ray, prim_id), or None if there are too many pairs at once."""
+        """Trace all rays down the tree, level by level; return pairs (ray, prim_id), or None if a level has too many pairs."""
         ray, node = np.arange(n), np.zeros(n, np.int64)
         for boxes in self.levels:
             keep = _meets(boxes, node, rays, ray)
@@ -205,7 +205,7 @@ class Reference:
 
     def _first_exactly(self, hits: AllHits, rows: np.ndarray, group: np.ndarray, origins: ArrayLike,
                        directions: ArrayLike) -> Iterator[tuple[int, list[int]]]:
-        """Yield each group of the hits `rows` with its hits of exactly lowest t, by prim_id. Spheres are compared in float64."""
+        """Yield the number of each group of the hits `rows`, and its hits of exactly lowest t, by prim_id. For spheres, t is float64."""
         rays = _Rays.of(origins, directions, 0.0, np.inf)
         triangle = hits.prim_id[rows] < self.n_triangles
         exact: dict[int, Any] = {int(row): Fraction(float(hits.t[row])) for row in rows[~triangle]}
@@ -256,7 +256,7 @@ def _widened(lo: np.ndarray, hi: np.ndarray, n_triangles: int, finite: np.ndarra
 
 def _tree(lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
     """Build a complete tree with WIDTH children a node; return the primitive of each leaf, and the boxes (6, nodes) of each level.
-    Halve all ranges of a level at once, at the median along the longest axis of their centres."""
+    Halve the primitives of all nodes of a level at once, at the median of the centres along the axis of their largest extent."""
     n = lo.shape[1]
     depth = 0
     while WIDTH**depth < n:
@@ -286,7 +286,7 @@ def _tree(lo: np.ndarray, hi: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]
 
 
 def _meets(boxes: np.ndarray, node: np.ndarray, rays: _Rays, ray: np.ndarray) -> np.ndarray:
-    """Return flags of the pairs (node, ray) whose segment may meet the box; never miss one that does.
+    """Return flags of the pairs (node, ray) in which the ray's segment may meet the node's box. All pairs that meet have the flag.
     For a ray that lies in a plane of the box, 0 * inf is NaN, which fmin and fmax ignore."""
     enter, leave = np.full(len(ray), -np.inf), np.full(len(ray), np.inf)
     flat = boxes.reshape(-1)
@@ -305,7 +305,7 @@ def _meets(boxes: np.ndarray, node: np.ndarray, rays: _Rays, ray: np.ndarray) ->
 
 @lru_cache(maxsize=4)
 def reference_of(geometry: Geometry | Mesh) -> Reference:
-    """Return the Reference of a geometry; the same object is built only once."""
+    """Return the Reference of a geometry. The References of the last four geometries are cached."""
     return Reference(geometry)
 
 

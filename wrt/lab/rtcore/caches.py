@@ -31,7 +31,8 @@ class Cache:
 
 @dataclass(frozen=True, eq=False)
 class Level1:
-    """Result of `first_level`. accesses: to all L1s; wanted: lanes that need them; line, time, lanes: of each miss, its round and lanes."""
+    """Result of `first_level`. accesses: number of L1 accesses; wanted: sum over the accesses of the lanes that need the line.
+    The arrays are (M,) int64 over the misses. line: the cache line; time: the miss's round; lanes: number of lanes that wait for it."""
 
     accesses: int
     wanted: int
@@ -43,8 +44,8 @@ class Level1:
 @dataclass(frozen=True)
 class Misses:
     """Cache counts, summed over all rays.
-    - accesses: to the L1s; l1, l2: misses; each reads one line from the next level; compulsory: different lines.
-    - wanted, wait_l2, wait_dram: lanes that need a line, wait for the L2, wait for DRAM. Each lane of a shared access counts."""
+    - accesses: to the L1s; l1, l2: misses of the L1s and of the L2, one line each; compulsory: number of different lines.
+    - wanted: lanes that need a line; wait_l2, wait_dram: lanes that wait for the L2 and for DRAM. Each lane of an access counts."""
 
     accesses: int
     l1: int
@@ -56,7 +57,7 @@ class Misses:
 
 
 def lines_of(address: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the cache lines that the fetches touch, in their order, and the index of each line's fetch, (M,) int64 each."""
+    """Return the cache lines that the fetches touch, in the fetches' order, and the index of each line's fetch, (M,) int64 each."""
     begin, end = address // LINE, (address + size - 1) // LINE
     count = end - begin + 1
     fetch = np.repeat(np.arange(len(address)), count)
@@ -74,7 +75,7 @@ def distinct_lines(first: np.ndarray, address: np.ndarray, size: np.ndarray) -> 
 
 
 def replay(line: np.ndarray, cache: Cache) -> np.ndarray:
-    """Return flags of the accesses that hit, (M,) bool, in an LRU cache that is empty at first. Line n belongs to set n modulo `sets`."""
+    """Return flags of the accesses that hit, (M,) bool, in an LRU cache that is empty at first. Line n is in set n modulo cache.sets."""
     cpu = start("cpu")
     hit = wp.zeros(len(line), dtype=wp.int8, device=cpu)
     load_kernel(replay_lru, cpu)
@@ -91,10 +92,10 @@ def caches_of(cache: Cache, count: int) -> Caches:
 
 
 def first_level(warp: np.ndarray, fetches: Counters, sms: int, slots: int, l1: Cache) -> Level1:
-    """Simulate the L1 of each SM. warp: (N,) warp of each ray, ascending, at most 32 rays in each; fetches: of the rays, in their order.
-    SM i runs every sms-th warp from warp i on; a warp begins when a slot of its SM is free. In each round every lane of a warp makes its
-    next fetch, and each cache line that the lanes touch is accessed once. Rounds do not wait for memory: a warp holds its slot for as many
-    rounds as its longest ray has fetches."""
+    """Simulate the L1 of each SM. warp: (N,) warp of each ray, ascending, at most 32 rays a warp; fetches: Counters of these rays.
+    SM i runs the warps i, i + sms, i + 2 sms ..., at most `slots` at a time. In each round every lane of a warp makes its next fetch, and
+    each cache line that the lanes touch is accessed once. Rounds do not wait for memory: a warp holds its slot for as many rounds as its
+    longest ray has fetches."""
     cpu = start("cpu")
     # Place the primitives behind the nodes, as in one memory.
     space, node = int(PRIMITIVE_SPACE), fetches.address < int(PRIMITIVE_SPACE)

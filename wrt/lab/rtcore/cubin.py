@@ -1,6 +1,6 @@
 """Read code, registers, stack and instructions of the kernels in a CUDA binary, without NVIDIA's tools.
 
-Since Volta an instruction has 16 bytes, and its lowest 9 bits are the operation. NVIDIA has not published these numbers. OPERATIONS comes
+Since Volta an instruction has 16 bytes, and its lowest 9 bits number the operation. NVIDIA has not published the numbers. OPERATIONS comes
 from binaries of known source, a method of Jia et al. (2019, "Dissecting the NVIDIA Turing T4 GPU via Microbenchmarking"). A test compiles
 some operations and checks their numbers. Unknown operations count as "other"."""
 
@@ -40,7 +40,7 @@ _REGISTERS, _FRAME = 0x2F, 0x11  # entries of .nv.info: registers of a thread, b
 
 @dataclass(frozen=True)
 class KernelCode:
-    """Machine code of a kernel. registers: of a thread; stack: bytes of a thread (arrays, spills); shared: bytes of a block."""
+    """Machine code of a kernel. registers: number for a thread; stack: bytes of a thread; shared: bytes of a block's shared memory."""
 
     name: str
     code: bytes
@@ -49,7 +49,7 @@ class KernelCode:
     shared: int = 0
 
     def opcodes(self) -> list[int]:
-        """Return the operation number of each instruction, without the branch to itself and the padding at the end."""
+        """Return the operation number of each instruction, without the padding at the end (NOPs and a branch to itself)."""
         words = struct.unpack(f"<{len(self.code) // 8}Q", self.code)
         out = [word & 0x1FF for word in words[::2]]
         while out and OPERATIONS.get(out[-1]) in ("NOP", "BRA"):
@@ -85,7 +85,7 @@ def read_cubin(data: bytes) -> dict[str, KernelCode]:
 
 
 def _facts(info: bytes) -> dict[tuple[int, int], int]:
-    """Return (entry, symbol) -> value from the section .nv.info, which describes all kernels."""
+    """Return (kind of entry, index of a kernel's symbol) -> value, from the section .nv.info."""
     out, at = {}, 0
     while at < len(info):
         form, entry, size = struct.unpack_from("<BBH", info, at)

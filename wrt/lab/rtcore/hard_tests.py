@@ -40,7 +40,7 @@ def rows(plan: Plan) -> Iterator[Row]:
 
 
 def counted(accel: Accelerator, rays: RaySet) -> dict[str, int]:
-    """Count the triangle tests of all rays, and the hard tests. accel: a bvh2 over triangles, on the CPU."""
+    """Count the triangle tests of all rays, and the hard tests, which need float64. accel: a bvh2 over triangles, on the CPU."""
     counters = accel.closest_hit(rays.origins, rays.directions, t_max=rays.t_max, trace=True).counters
     assert counters is not None
     of_ray = np.repeat(np.arange(len(rays)), np.diff(counters.first))
@@ -53,7 +53,7 @@ def counted(accel: Accelerator, rays: RaySet) -> dict[str, int]:
 
 
 def classified(accel: Accelerator, rays: RaySet, of_ray: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Return REFUSED, SURE or HARD for each test, (N,): ray of_ray[i] against the primitive record place[i]."""
+    """Return REFUSED, SURE or HARD (needs float64) for each test, (N,): of ray of_ray[i] with primitive record place[i] of `accel`."""
     arrays = RayArrays()
     arrays.origin, arrays.direction = (upload(rows, wp.vec3, accel.device) for rows in (rays.origins, rays.directions))
     arrays.t_min, arrays.t_max = wp.zeros(len(rays), device=accel.device), upload(rays.t_max, wp.float32, accel.device)

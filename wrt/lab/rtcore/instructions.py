@@ -39,7 +39,7 @@ BOX_NUMBERS, BOX_RESULTS, TRIANGLE_RESULTS = 6, 1, 4
 
 @dataclass(frozen=True)
 class UnitCode:
-    """Instructions of one test by class of cubin.CLASSES, without the loads of its data. unit: "box" or "triangle"; test: its name."""
+    """Number of instructions of one test by class (cubin.CLASSES), without loads of its data. unit: "box" or "triangle"; test: its name."""
 
     unit: str
     test: str
@@ -73,7 +73,7 @@ def resident_warps(code: KernelCode, arch: int, block_dim: int) -> int:
 
 
 def per_unit(few: KernelCode, many: KernelCode) -> dict[str, float]:
-    """Return the instructions by class that one more test adds to a kernel. Raise InputError if the compiler unrolls the loop."""
+    """Return the instructions by class of one test, from kernels with FEW and MANY tests. Raise InputError if a loop is unrolled."""
     if few.operations()["STG"] != 1 or many.operations()["STG"] != 1:
         raise InputError("this compiler unrolls the probe kernels, so that the instructions of one test cannot be separated")
     a, b = few.classes(), many.classes()
@@ -92,7 +92,7 @@ def triangle_unit(test: str) -> UnitCode:
 
 
 def without_probe(unit: dict[str, float], adding: dict[str, float], additions: int) -> dict[str, float]:
-    """Return the instructions of a test: those of its probe less those of a kernel that only reads and adds, plus `additions`."""
+    """Return a test's instructions by class: `unit` of its probe, less `adding` of a kernel that only reads and adds, plus `additions`."""
     return {name: unit[name] - adding[name] + (additions if name == "fp32" else 0) for name in unit}
 
 

@@ -28,8 +28,8 @@ def bvhs() -> list[str]:
 
 
 def in_warps(accel: Accelerator, sets: dict[str, RaySet]) -> dict[str, RaySet]:
-    """Sort the rays into warps and lanes; a warp is a block of 8 x 4 pixels of the camera's picture.
-    Shadow and diffuse rays have the place of the pixel in which they start. Random rays keep their order."""
+    """Sort the rays by warp and lane (index in the warp). A warp is a block of 8 x 4 pixels of the camera's picture.
+    A shadow or diffuse ray has the warp and lane of the pixel whose camera ray hit its start point. Random rays keep their order."""
     primary = sets["primary"]
     side = round(len(primary) ** 0.5)
     warp, lane = blocks(side, side)

@@ -27,7 +27,7 @@ TERMS = ("box", "triangle", "L1", "L2", "DRAM", "latency")
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """Rays in the order of warps and lanes. counters: result of closest_hit(trace=True); warp: (N,) int64, warp of each ray, from 0 on."""
+    """Rays in the order of warps and lanes. counters: Counters of closest_hit(trace=True); warp: (N,) int64, warp of each ray, from 0."""
 
     name: str
     counters: Counters
@@ -45,7 +45,7 @@ class Work:
         return {}
 
     def misses(self, gpu: Gpu, core: Core) -> Misses:
-        """Simulate the caches of a GPU; equal sizes are simulated once."""
+        """Simulate the caches of a GPU. Reuse the result of a call with equal caches, SMs, warps at a time and `warm`."""
         first_key = (gpu.sms, core.warps, gpu.l1)
         if first_key not in self._simulated:
             self._simulated[first_key] = first_level(self.warp, self.counters, *first_key)
@@ -56,13 +56,13 @@ class Work:
 
 
 class Prediction(Row):
-    """Result of `predict`: rays_per_second of the GPU, and
-    clocks: term of TERMS -> clocks of an RT core per ray; limit: the largest term; utilisation: each term over the largest."""
+    """Result of `predict`. rays_per_second: of the whole GPU; limit: name of the largest term (see TERMS).
+    clocks: term -> clocks of an RT core per ray. utilisation: term -> its clocks over the clocks of the largest term."""
 
 
 def predict(work: Work, gpu: Gpu, core: Core = BASE) -> Prediction:
     """Return the clocks of an RT core per ray, term by term.
-    The term "latency": a ray waits for each of its fetches and tests in turn, and a warp holds its place until its longest ray ends. Each
+    The term "latency": a ray waits for each of its fetches and tests in turn, and a warp stays in the core until its longest ray ends. Each
     fetch takes the mean time of all fetches."""
     n, counts, misses = len(work), work.counters.counts, work.misses(gpu, core)
     fetches = np.diff(work.counters.first)
@@ -84,7 +84,7 @@ def predict(work: Work, gpu: Gpu, core: Core = BASE) -> Prediction:
 
 
 def sweep(work: Work, gpu: Gpu, core: Core = BASE, names: tuple[str, ...] = ("boxes", "triangles")) -> list[Prediction]:
-    """Return a prediction for each combination of assumed values: the fields `names` of Core vary over SWEEPS."""
+    """Return a prediction for each combination of assumed values: the fields `names` of Core take their values in SWEEPS."""
     return [predict(work, gpu, each) for each in variants(core, names)]
 
 
@@ -101,7 +101,7 @@ def span(predictions: list[Prediction]) -> tuple[float, float]:
 
 
 def sensitivity(work: Work, gpu: Gpu, core: Core = BASE) -> dict[str, float]:
-    """Sweep each assumption alone; return its name -> highest over lowest rays a second, the largest factor first."""
+    """Vary each field of SWEEPS alone; return field -> highest over lowest rays a second, the largest factor first."""
     factors = {}
     for name in SWEEPS:
         low, high = span(sweep(work, gpu, core, (name,)))
@@ -110,7 +110,7 @@ def sensitivity(work: Work, gpu: Gpu, core: Core = BASE) -> dict[str, float]:
 
 
 def simt(counts: np.ndarray, warp: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> dict[str, float]:
-    """Return the SIMT efficiency of the warps, of the rays packed into full warps, and of the rays sorted by coherence, then packed.
+    """Return the SIMT efficiency for the warps `warp`, for the rays packed into full warps, and for rays sorted by coherence and packed.
     The cost of a ray is its number of box operations and triangle tests. counts: (N,) kernels.traverse.counters.Counts."""
     cost = counts["box_operations"].astype(np.float64) + counts["primitives"]
     order = by_coherence(origins, directions)
@@ -150,7 +150,7 @@ format."""
 
 def model_row(work: Work, gpu: Gpu, simt: dict[str, float], **facts: object) -> Row:
     """Return the row of a Work: the prediction under the assumptions BASE, and means over the rays.
-    - low, high: rays a second over RANGE; factors: result of `sensitivity`.
+    - low, high: lowest and highest rays a second as the fields RANGE of Core vary; factors: result of `sensitivity`.
     - simt: result of the function `simt`; facts: further fields of the row."""
     prediction = vars(predict(work, gpu))
     low, high = span(sweep(work, gpu, names=RANGE))

@@ -46,7 +46,7 @@ PARAMETERS = (
 
 @dataclass(frozen=True)
 class Gpu:
-    """A GPU. clock: Hz, as the source states it (RTX 2080 Ti: boost, RTX 2060: base); dram: bytes a second; l1: of each SM."""
+    """A GPU. sms: number of SMs; clock: Hz (RTX 2080 Ti: boost, RTX 2060: base); dram: bytes a second; l1: cache of each SM."""
 
     name: str
     sms: int
@@ -66,7 +66,7 @@ GPUS = {
 class Core:
     """Assumptions about one RT core and its memory; PARAMETERS has the sources.
     - boxes, triangles: tests a clock; warps: warps at a time; warm: the L2 has seen the same rays before.
-    - *_latency: clocks; those of L2 and DRAM add to the level above. l1_lines, l2_bytes: lines and bytes a clock."""
+    - *_latency: clocks; an access to DRAM takes the sum of all three levels. l1_lines, l2_bytes: lines and bytes a clock."""
 
     boxes: float = 4.0
     triangles: float = 1.0

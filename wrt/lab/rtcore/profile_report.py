@@ -25,7 +25,7 @@ GROUPS = {"primary": ("primary",), "shadow": ("shadow",), "secondary": ("reflect
 
 def warp_order(profile: Profile, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the rays `rows` in the order of warps and lanes, and the warp of each ray, from 0 on.
-    A block of 8 x 4 pixels traces the n-th rays of the same kind and depth of all its pixels together, as one warp."""
+    A warp has the n-th ray of one kind and depth from each pixel of a block of 8 x 4 pixels."""
     rays = profile.rays
     pixel, kind, depth = rays.pixel[rows].astype(np.int64), rays.kind[rows].astype(np.int64), rays.depth[rows].astype(np.int64)
     deepest = int(depth.max(initial=0)) + 1
@@ -43,7 +43,7 @@ def warp_order(profile: Profile, rows: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def work_of(profile: Profile, group: str) -> Work | None:
-    """Return the rays of a group of GROUPS whose fetches were recorded, or None if there are none."""
+    """Return the rays of a group of GROUPS whose fetches were recorded, or None if there is no such ray."""
     rays = profile.rays
     kinds = [KINDS.index(name) for name in GROUPS[group]]
     at = np.flatnonzero(np.isin(rays.kind[rays.trace_rows], kinds))

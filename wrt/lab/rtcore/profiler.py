@@ -53,7 +53,7 @@ class Rays:
     - rays: kernels.study.ray_log.LoggedRay; counts: kernels.traverse.counters.Counts; lines: number of distinct cache lines.
     - pixel: row * width + column; kind: index in KINDS. A "straight" ray continues through a blended surface without refraction.
     - depth: bounces before the ray; a shadow ray has the depth of the ray whose hit it starts from.
-    - trace_rows: indices of the rays whose fetches were recorded; trace_first: index of the first fetch of each, and the end.
+    - trace_rows: indices of the rays whose fetches were recorded; trace_first: index of each such ray's first fetch, and the end.
     - address, size: of each recorded fetch, in bytes (wrt.accel.queries.answers.Counters)."""
 
     rays: np.ndarray
@@ -179,7 +179,7 @@ def profile(scene: Scene | Mesh | PathLike, **options: Unpack[ProfileOptions]) -
 
 @dataclass
 class _Tile:
-    """A tile. used: number of rays of each pixel; fetches: their number; the second pass adds rays, counts, lines and perhaps a trace."""
+    """A tile. used: number of rays of each pixel; fetches: number of fetches. Later passes add rays, counts, lines and perhaps trace."""
 
     rectangle: Rectangle
     used: np.ndarray
@@ -223,7 +223,7 @@ class Profiler:
         return _Tile(rectangle, used.copy(), fetches)
 
     def _report(self, rectangle: Rectangle, runs: int, rays: int) -> None:
-        """Report to `progress` that a tile has finished `runs` more passes."""
+        """Report to `progress` that a tile has finished `runs` more passes. rays: number of rays of one pass."""
         progress, settings = self.plan.options.progress, self.plan.scene.settings
         if progress is not None:
             with self.lock:

@@ -17,13 +17,13 @@ def blocks(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def packed(n: int) -> np.ndarray:
-    """Return the warp of each of n rays that fill all warps but the last, (n,)."""
+    """Return the warp of each of n successive rays, (n,); all warps but the last are full."""
     return np.arange(n) // WARP
 
 
 def efficiency(cost: np.ndarray, warp: np.ndarray) -> float:
     """Return the SIMT efficiency, 0 to 1; it is 1 if all costs are 0. cost, warp: (N,) of each ray.
-    A warp occupies its 32 lanes for as long as its longest ray."""
+    A warp occupies its 32 lanes for the cost of its costliest ray."""
     longest = longest_of(cost, warp)
     total = WARP * float(longest.sum())
     return float(cost.sum()) / total if total > 0.0 else 1.0
@@ -38,7 +38,7 @@ def longest_of(cost: np.ndarray, warp: np.ndarray) -> np.ndarray:
 
 def by_coherence(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Return an order, (N,) int64, in which similar rays are neighbours.
-    Sort by the octant of the direction, then along a Morton curve through the origins, then along one through the directions. Sources:
+    Sort by the octant of the direction, then along Morton curves through the origins and through the directions. Sources:
     Pharr et al. 1997, Garanzha and Loop 2010."""
     octant = (directions < 0.0) @ np.array([4, 2, 1])
     unit = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), np.finfo(np.float32).tiny)

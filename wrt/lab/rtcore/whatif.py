@@ -36,7 +36,7 @@ REFERENCE_BYTES = 16  # of the children's references in a binary node, as in Bvh
 
 @cache
 def studied(study: Study) -> type[Bvh2]:
-    """Return a Bvh2 class that traverses with the kernels of a study."""
+    """Return a Bvh2 class that traverses with the kernels of `study` (kernels.study.bvh2_study)."""
     return type("Bvh2Study", (Bvh2,), {"kernels": study, "__doc__": Bvh2.__doc__})
 
 
@@ -121,7 +121,7 @@ tests doubles."""
 
 @dataclass(frozen=True)
 class Variant:
-    """A variant of the design: hits and counters of the rays, in the order of `rays`, and the bytes of a node."""
+    """A variant of the design. node_bytes: size of a node; prim_id, t: hits in an order common to all variants; counters: of `rays`."""
 
     name: str
     rays: RaySet
@@ -132,7 +132,7 @@ class Variant:
 
 
 def traced(name: str, accel: OneMesh, rays: RaySet, node_bytes: tuple[int, int] | None = None) -> Variant:
-    """Trace closest hits and return the Variant. node_bytes: size of a node in memory, and the size that counts instead."""
+    """Trace closest hits and return the Variant. node_bytes: bytes of a node in memory, and the bytes to count instead."""
     hits = accel.closest_hit(rays.origins, rays.directions, t_max=rays.t_max, trace=True)
     counters = hits.counters
     assert counters is not None
@@ -144,7 +144,7 @@ def traced(name: str, accel: OneMesh, rays: RaySet, node_bytes: tuple[int, int] 
 
 
 def width(tree: Bvh2, rays: RaySet) -> Iterator[Variant]:
-    """Yield variants of width, format and bounding volume of nodes: every BVH of the registry."""
+    """Yield variants of the nodes' width, format and bounding volume: every BVH of the registry."""
     return (traced(name, build(tree.geometry, name), rays) for name in bvhs())
 
 
@@ -171,7 +171,7 @@ def order(tree: Bvh2, rays: RaySet) -> Iterator[Variant]:
 
 
 def sorting(tree: Bvh2, rays: RaySet) -> Iterator[Variant]:
-    """Yield variants of the order of the rays: that of the picture, sorted by origin and direction, and shuffled."""
+    """Yield variants of the order of the rays: as in the picture, sorted by origin and direction, and shuffled."""
     orders = {"as they come": np.arange(len(rays)), "sorted": by_coherence(rays.origins, rays.directions),
               "shuffled": np.random.default_rng(0).permutation(len(rays))}
     for name, which in orders.items():

@@ -33,7 +33,7 @@ PATIENCE = 60.0  # seconds without any worker after which a render fails
 
 @contextmanager
 def connected(address: str) -> Iterator[Client]:
-    """Yield a Client of the scheduler at an address such as tcp://host:8786.
+    """Yield a dask.distributed.Client of the scheduler at an address such as tcp://host:8786.
 
     Raises InputError if the scheduler does not answer or has no worker, or if a worker has a different installation."""
     try:
@@ -87,13 +87,13 @@ def check_workers(client: Client) -> None:
 
 
 def machines(client: Client) -> str:
-    """Return the devices of the workers as text, with the number of workers on each device."""
+    """Return the devices of the workers as text, with the number of workers for each device."""
     devices = [lines[0] for lines in client.run(describe_devices).values()]
     return "; ".join(f"{devices.count(line)} workers of {line}" for line in dict.fromkeys(devices))
 
 
 class Submitter:
-    """The methods of an Executor that wrt.lab.bench.sweep and ClusterWorkers need, for a dask.distributed.Client."""
+    """A dask.distributed.Client with the methods of an Executor that wrt.lab.bench.sweep and ClusterWorkers need."""
 
     def __init__(self, client: object) -> None:
         self.client = cast(Any, client)
@@ -111,7 +111,7 @@ class Submitter:
 
     @contextmanager
     def guarded(self) -> Iterator[None]:
-        """Raise `lost()` in place of the various errors that a broken connection causes in the block."""
+        """Raise one error, from `lost`, in place of the various errors that a broken connection causes in the `with` block."""
         try:
             yield
         except Exception as error:
@@ -148,7 +148,7 @@ class ClusterWorkers(ExecutorWorkers):
         return self.scattered
 
     def ready(self) -> bool:
-        """Return True if there are workers, and the scene is scattered in case a worker requested it."""
+        """Return True if there are workers. If a worker requested the scene, the scene must also be on its way to the workers."""
         if self.client.status not in ("running", "connecting"):
             raise self.submitter.lost()
         try:
@@ -164,7 +164,7 @@ class ClusterWorkers(ExecutorWorkers):
         return False
 
     def _send_scene(self) -> bool:
-        """Scatter the scene if workers need it; return True if there are workers and the scene is not missing."""
+        """Scatter the scene if a worker requested it. Return False if there is no worker, or if scattering fails."""
         sent = not self.requests or (self.scattered is not None and self.scattered.status in ("pending", "finished"))
         if not sent or time.monotonic() >= self.next_look:
             self.has_workers, self.next_look = bool(self.client.nthreads()), time.monotonic() + 1.0

@@ -40,7 +40,7 @@ DIGEST = sha256(repr(INSTALLED).encode()).hexdigest()
 
 
 def difference(here: Installed, there: Installed) -> str:
-    """Return the differences of the installation `there` from `here` as text; "" if both are equal."""
+    """Return as text how the installation `there` differs from `here`; "" if both are equal."""
     ours, theirs = here["versions"], there["versions"]
     differ = [f"{name} {theirs.get(name)} (here {version})" for name, version in ours.items() if theirs.get(name) != version]
     files = sorted(name for name in {**here["files"], **there["files"]} if here["files"].get(name) != there["files"].get(name))

@@ -32,7 +32,7 @@ SIDES = {"cpu": (32, 256), "cuda": (256, 1024)}  # limits of a tile's side: smal
 
 
 class DistributedRenderer:
-    """A scene prepared by workers, for options with `devices` or an `executor`. It is also the Tracer of its runs."""
+    """A scene that workers have prepared, for options with `devices` or `executor`. It implements Tracer (wrt.renderer.schedule)."""
 
     def __init__(self, scene: Scene, options: Options) -> None:
         self.device = start("cpu")  # the film's device
@@ -45,12 +45,12 @@ class DistributedRenderer:
         self.checkpoint = checkpoint_of(self.plan, self.kind)
 
     def run(self) -> Film:
-        """Render until the samples, the time limit or the target error are reached."""
+        """Render until the number of samples, the time limit or the target error is reached."""
         self.tiles_by.clear()
         return Run(self, self.checkpoint).film()
 
     def _prepare_workers(self) -> tuple[str, dict[str, float], dict[str, Any]]:
-        """Let the workers prepare the scene; return the kind of their devices, the seconds of each stage, and Prepared.facts."""
+        """Let the workers prepare the scene. Return the kind of their devices, the seconds by stage, and Prepared.facts()."""
         begin, reported, replies = time.perf_counter(), self.plan.options.progress is None, []
         for done in self.workers.run([("ready",)] * self.workers.slots()):
             seconds = time.perf_counter() - begin
@@ -71,13 +71,13 @@ class DistributedRenderer:
         return {**self.counts, "workers": dict(self.tiles_by)}
 
     def tiles(self, samples: int) -> Iterator[Rectangle]:
-        """Yield the tiles of a pass. They are large whatever the number of samples, since a call to a worker costs more than a wave."""
+        """Yield the tiles of a pass. Tiles are large for any number of samples, since a call to a worker costs more than a wave."""
         low, high = SIDES["cuda" if self.plan.options.device.startswith("cuda") else "cpu"]
         side = math.ceil(math.sqrt(self.plan.area / (TILES_EACH * self.workers.slots())))
         return tiles(self.plan.crop, self.plan.options.tile_size or min(max(side, low), high))
 
     def trace(self, film: DeviceFilm | AovFilm, work: list[Work], due: Callable[[], bool]) -> Steps:
-        """Trace as Tracer defines. The film receives whole tiles only, so that each step may say that no tile is running."""
+        """Trace as Tracer.trace does. The film receives finished tiles only, so that each step may report that no tile is running."""
         jobs: Iterable[Job]
         if isinstance(film, AovFilm):
             views = [film.view(name) for name in self.plan.options.aov]
@@ -121,7 +121,7 @@ def workers_for(plan: Plan) -> ExecutorWorkers:
 
 
 def _waited_for(replies: list[Reply], waited: float) -> dict[str, float]:
-    """Return the slowest worker's seconds of each stage. A worker may have prepared the scene earlier, so `waited` is the upper limit."""
+    """Return the slowest worker's seconds by stage, at most `waited` each: a worker may have prepared the scene for an earlier render."""
     seconds: dict[str, float] = max((reply[2]["seconds"] for reply in replies), key=lambda each: max(each.values()))
     return {name: min(value, waited) for name, value in seconds.items()}
 

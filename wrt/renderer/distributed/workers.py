@@ -1,7 +1,7 @@
 """Workers of a distributed render: the devices of this machine, or the workers of an executor.
 
 A tile is a pure function of the scene, the samples to trace and the tile's previous state (Prepared.trace_tile). Any worker can compute
-it, and repeat it after another worker died. A worker process prepares a scene once, and caches it under its digest.
+it, also again after another worker died. A worker process prepares a scene once, and caches it under the scene's digest.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ ReplyFuture = Any  # A Future of concurrent.futures or dask.distributed; its res
 class ExecutorWorkers:
     """The workers of any concurrent.futures.Executor: threads, processes, or other machines with wrt.
 
-    A job contains the digest of its scene. A worker process without that scene replies None, which requests the scene."""
+    A job contains the digest of its scene. If a worker process lacks that scene, it replies None, which requests the scene."""
 
     def __init__(self, executor: Any, key: str, package: Package) -> None:
         self.executor, self.key, self.package = executor, key, package
@@ -58,7 +58,7 @@ class ExecutorWorkers:
         return int(getattr(self.executor, "_max_workers", None) or SLOTS)
 
     def _scene(self) -> Any:
-        """Return the package to send with the next job, or None if no worker requests it."""
+        """Return the package to send with the next job, or None if no worker has requested it."""
         if not self.requests:
             return None
         self.requests -= 1
@@ -84,7 +84,7 @@ class ExecutorWorkers:
         return done
 
     def result(self, future: ReplyFuture) -> Reply | None:
-        """Return the reply of a finished future; None: the job must be submitted again. Raises the worker's exception."""
+        """Return the reply of a finished future; None: the worker lacks the scene. Raises the worker's exception."""
         try:
             reply = future.result()
         except BrokenExecutor as error:
@@ -93,11 +93,11 @@ class ExecutorWorkers:
         return reply
 
     def ready(self) -> bool:
-        """Return True if there are workers for jobs. Raises InputError if none will come."""
+        """Return True if a job can be submitted now. Raises InputError if the workers are gone for good."""
         return True
 
     def run(self, jobs: Iterable[Job]) -> Generator[tuple[Job, Reply] | None, None, None]:
-        """Run jobs. Yield each job with its reply, in any order; without a reply, yield None about every tenth of a second.
+        """Run jobs. Yield each job with its reply, in any order. While no reply comes, yield None every tenth of a second.
 
         A job is taken from `jobs` just before it is submitted. When the caller closes the generator, waiting jobs are cancelled."""
         coming, again = iter(jobs), deque[Job]()
@@ -130,7 +130,7 @@ class ExecutorWorkers:
 
 
 class DeviceWorkers(ExecutorWorkers):
-    """Several devices of this machine. Each has a thread, which prepares the scene on its device."""
+    """Several devices of this machine. Each device has a thread, which prepares the scene and runs jobs."""
 
     def __init__(self, scene: Scene, options: Options) -> None:
         assert options.devices is not None
@@ -159,7 +159,7 @@ class DeviceWorkers(ExecutorWorkers):
 
 
 def packaged(scene: Scene, options: Options, kernels: str) -> tuple[str, Package]:
-    """Return a key of a scene with its options (equal keys mean equal pixels), and the package for workers.
+    """Return a digest of the scene and its options (equal digests mean equal pixels), and the package for workers.
 
     kernels: hash of the kernels. A worker whose kernels have another hash refuses the package."""
     text, arrays = pack(scene)
@@ -174,9 +174,9 @@ _lock = threading.Lock()
 
 
 def call(key: str, package: Package | None, method: str, *arguments: object) -> Reply | None:
-    """Call a method of the Prepared that this worker caches under `key`; if it is missing, prepare it from `package` first.
+    """Call a method of the prepared scene (Prepared) that this worker caches under `key`, after preparing it from `package` if needed.
 
-    Returns None if the Prepared is missing and there is no package. Raises InputError if the caller has a different installation."""
+    Returns None if the cache lacks the scene and `package` is None. Raises InputError if the caller has a different installation."""
     with _lock:
         if key not in _ready:
             if package is None:
