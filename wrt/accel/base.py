@@ -21,6 +21,7 @@ from wrt.accel.snapshot import Snapshot
 from wrt.accel.store import check_order, save
 from wrt.accel.structure import Structure, options_of
 from wrt.core.arrays import check_no_gradients, from_tensor
+from wrt.core.default_device import DEFAULT_DEVICE
 from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.core.seconds import build_clock
@@ -43,8 +44,8 @@ class OneMesh(Accelerator, ABC):
     options: ClassVar[type[Any]]  # a frozen dataclass, which raises InputError for values out of range
     can_refit: ClassVar[bool] = False  # whether `_refit` is implemented
 
-    def __init__(self, geometry: Geometry, attributes: FlatScene | None = None, /, device: str = "cpu", threads: int | None = None, *,
-                 triangle: str = "watertight", box: str = "conservative", **options: object) -> None:
+    def __init__(self, geometry: Geometry, attributes: FlatScene | None = None, /, device: str = DEFAULT_DEVICE,
+                 threads: int | None = None, *, triangle: str = "watertight", box: str = "conservative", **options: object) -> None:
         super().__init__(Structure(type(self), Units(triangle, box)), geometry.unshared(), attributes, device, threads)
         self.built_with = options_of(self.name, self.options, options)
         begin = build_clock()
@@ -52,7 +53,7 @@ class OneMesh(Accelerator, ABC):
         self._install(built, begin, built.sah_cost)
 
     @classmethod
-    def restore(cls, built: Built, geometry: Geometry, attributes: FlatScene | None = None, /, device: str = "cpu",
+    def restore(cls, built: Built, geometry: Geometry, attributes: FlatScene | None = None, /, device: str = DEFAULT_DEVICE,
                 threads: int | None = None, *, units: Units | None = None, built_with: object = None) -> Self:
         """Make a structure from saved arrays, or raise InputError if they do not fit. units: intersection tests; built_with: options."""
         self = cls.__new__(cls)

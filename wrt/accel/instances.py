@@ -16,6 +16,7 @@ from wrt.accel.structure import Structure
 from wrt.accel.top_level import BOXES, MOVED_BOXES, Boxes, build_top, part_boxes, refit_top, spread_of, world_boxes
 from wrt.core.arrays import real_numbers
 from wrt.core.checks import shown
+from wrt.core.default_device import DEFAULT_DEVICE
 from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.core.seconds import build_clock
@@ -36,8 +37,9 @@ class Instances(Accelerator):
 
     name = "instances"
 
-    def __init__(self, kind: type[OneMesh], geometry: InstancedGeometry, attributes: FlatScene | None = None, /, device: str = "cpu",
-                 threads: int | None = None, *, triangle: str = "watertight", box: str = "conservative", **options: object) -> None:
+    def __init__(self, kind: type[OneMesh], geometry: InstancedGeometry, attributes: FlatScene | None = None, /,
+                 device: str = DEFAULT_DEVICE, threads: int | None = None, *, triangle: str = "watertight",
+                 box: str = "conservative", **options: object) -> None:
         begin = build_clock()
         super().__init__(Structure(kind, Units(triangle, box, instances=True)), geometry, attributes, device, threads)
         self.bottoms = [kind(part, device=device, threads=threads, triangle=triangle, box=box, **options)

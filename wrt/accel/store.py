@@ -19,6 +19,7 @@ from wrt.accel.snapshot import Snapshot
 from wrt.accel.structure import Structure
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.checked_file import read_checked, write_checked
+from wrt.core.default_device import DEFAULT_DEVICE
 from wrt.core.device import row_type
 from wrt.core.errors import InputError
 from wrt.core.types import JsonObject, PathLike
@@ -61,7 +62,7 @@ def save(snapshot: Snapshot, path: PathLike) -> None:
         write_checked(file, MAGIC, header, body)
 
 
-def read(path: PathLike, geometry: Geometry, attributes: FlatScene | None = None, device: str = "cpu",
+def read(path: PathLike, geometry: Geometry, attributes: FlatScene | None = None, device: str = DEFAULT_DEVICE,
          threads: int | None = None) -> Any:
     """Read a structure over `geometry`.
 

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import click
 
+from wrt.core.default_device import DEFAULT_DEVICE
 from wrt.core.errors import InputError, SceneWarning
 
 if TYPE_CHECKING:
@@ -137,7 +138,7 @@ SHARED = {
         help="Change a setting of the scene, such as glass_shadows=tinted; repeatable. The settings are size, spp, max_depth,"
              " min_throughput, filter, fresnel, glass_shadows, sampler, exposure and tonemap (docs/scene_format.md)"),
     "seed": click.option("--seed", type=int, default=0, show_default=True, help="Seed of the samples: another seed gives other noise"),
-    "device": click.option("--device", default="cpu", show_default=True, help="cpu, cuda:0 ... (`devices` lists them)"),
+    "device": click.option("--device", default=DEFAULT_DEVICE, show_default=True, help="cpu, cuda:0 ... (`devices` lists them)"),
     "threads": click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]"),
     "accel": click.option("--accel", type=ACCEL, default="bvh", show_default=True, help="Acceleration structure"),
     "quiet": click.option("-q", "--quiet", is_flag=True, help="Print no progress and no warnings"),

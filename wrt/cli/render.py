@@ -28,6 +28,7 @@ from wrt.cli.common import (
     warnings_reported,
 )
 from wrt.cli.save import checkpoint_options, remove_checkpoint, save_film
+from wrt.core.default_device import DEFAULT_DEVICE
 from wrt.core.errors import InputError
 from wrt.core.interrupts import Interrupted, exit_code
 from wrt.io.meshes import SUFFIXES
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
 @click.option("-o", "--output", type=click.Path(path_type=Path),
               help="Picture to write: .png, .exr or .hdr  [default: the scene's file name with .png]")
 @shared("spp", "size", "seed")
-@click.option("--device", default="cpu", show_default=True,
+@click.option("--device", default=DEFAULT_DEVICE, show_default=True,
               help="cpu, cuda:0 ... (`devices` lists them). Several of one kind share the work: cuda:0,cuda:1")
 @CLUSTER
 @shared("threads", "crop", "camera", "max_depth")

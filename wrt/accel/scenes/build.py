@@ -22,6 +22,7 @@ from wrt.accel.structure import default_options
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.arrays import from_tensor, is_tensor, to_numpy
 from wrt.core.checks import as_one, shown
+from wrt.core.default_device import DEFAULT_DEVICE
 from wrt.core.errors import InputError
 from wrt.core.types import ArrayLike, PathLike
 from wrt.io.load import LOADERS, load_scene
@@ -120,7 +121,7 @@ def build(mesh: OneMeshLike, accel: str, device: str = ..., threads: int | None 
 @overload
 def build(mesh: SceneLike, accel: str = ..., device: str = ..., threads: int | None = ...,
           **options: Unpack[BuildOptions]) -> OneMesh | Instances: ...
-def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = "cpu", threads: int | None = None,
+def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = DEFAULT_DEVICE, threads: int | None = None,
           **options: Unpack[BuildOptions]) -> OneMesh | Instances:
     """Build an acceleration structure over a mesh, a scene or several worlds.
 
@@ -161,7 +162,7 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = "cpu", t
     return kind(geometry, flat, device=device, threads=threads, **options)
 
 
-def load_accel(path: PathLike, mesh: MeshLike, device: str = "cpu", threads: int | None = None) -> OneMesh:
+def load_accel(path: PathLike, mesh: MeshLike, device: str = DEFAULT_DEVICE, threads: int | None = None) -> OneMesh:
     """Read a structure that `OneMesh.save` or `wrt build` wrote.
 
     Parameters

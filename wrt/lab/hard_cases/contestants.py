@@ -13,6 +13,7 @@ from wrt.accel.base import Accelerator
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.answers import Hits
 from wrt.accel.scenes.build import BuildOptions, build
+from wrt.core.default_device import DEFAULT_DEVICE
 from wrt.core.errors import InputError
 from wrt.core.packages import needed_by
 from wrt.core.registry import Registry
@@ -55,7 +56,8 @@ class Own(Algorithm):
 
     accel: Accelerator  # after prepare()
 
-    def __init__(self, triangle: str = "watertight", box: str = "conservative", structure: str = "bvh", device: str = "cpu") -> None:
+    def __init__(self, triangle: str = "watertight", box: str = "conservative", structure: str = "bvh",
+                 device: str = DEFAULT_DEVICE) -> None:
         self.structure, self.device, self.units = structure, device, BuildOptions(triangle=triangle, box=box)
         self.name = triangle if box == "conservative" else f"{triangle}, {box} boxes"
 
@@ -139,7 +141,7 @@ class WarpMesh(Peer):
 
     name = "Warp mesh_query_ray"
 
-    def __init__(self, device: str = "cpu", constructor: str = "sah") -> None:
+    def __init__(self, device: str = DEFAULT_DEVICE, constructor: str = "sah") -> None:
         self.place, self.constructor = device, constructor
         if constructor != "sah":
             self.name = f"{type(self).name}, {constructor}"
