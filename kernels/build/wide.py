@@ -241,8 +241,8 @@ def write_in_order(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, ou
 @wp.func
 def choose_roots(nodes: wp.array(dtype=Bvh2Node), options: CollapseOptions, trees: Subtrees, task: WideTask, out: WideTree) -> int:
     """Choose the children of a wide node, and write them to out.source; return their number.
-    A node with n children leaves up to n - 1 entries on the stack while a traversal visits its last child. The subtree below this child
-    needs one free entry per level of the binary tree. If the best choice leaves too few free entries, the node gets fewer children."""
+    While a traversal is below one of n children, the other n - 1 may wait on its stack. Below that child, the traversal needs one
+    free entry per level even if all nodes are binary. If the best choice leaves fewer free entries, the node gets fewer children."""
     k = int(options.width)
     n = int(0)
     while True:

@@ -24,15 +24,16 @@ CUT_BY_THROUGHPUT = wp.constant(3)
 
 @wp.struct
 class FollowUp:
-    """The verdicts (NONE to CUT_BY_THROUGHPUT) on the three paths of a Shaded, and the light that the cuts lose."""
+    """The verdicts on the three new paths that begin at a hit, and the light that cut paths lose.
+    A verdict is NONE (no path), FOLLOWED, CUT_BY_DEPTH (too many bounces, surfaces or rays) or CUT_BY_THROUGHPUT (too little light)."""
 
-    onward: int
-    reflected: int
-    refracted: int
-    cut_depth: int  # Number of paths with the verdict CUT_BY_DEPTH.
-    cut_throughput: int  # Number of paths with the verdict CUT_BY_THROUGHPUT.
-    lost: float  # What the onward path adds to Sample.lost: 0 unless it is cut.
-    pending_light: PendingLight
+    onward: int  # Verdict on the path straight through a partly transparent surface.
+    reflected: int  # Verdict on the reflected path.
+    refracted: int  # Verdict on the refracted path.
+    cut_depth: int  # Number of these three paths that have the verdict CUT_BY_DEPTH.
+    cut_throughput: int  # Number of these three paths that have the verdict CUT_BY_THROUGHPUT.
+    lost: float  # If the onward path is cut: the radiance that it would have added in surroundings of radiance 1. Else 0.
+    pending_light: PendingLight  # The surface's own light and the losses of the other two paths, added after the shadow rays.
 
 
 @wp.func

@@ -64,12 +64,12 @@ class BspNode:
 
 @wp.struct
 class Reach:
-    """The part of a ray that the walk follows."""
+    """The part of a ray that the walk follows, and two tolerances that keep rounding from losing a hit."""
 
     t_0: float  # t where the part begins.
     t_1: float  # t where the part ends.
-    beyond: float  # Length, in t, by which the walk continues behind the best hit: `reach` of the proof.
-    drift: float  # Half of a plane's thickness that is proportional to the ray's distance, per unit of t.
+    beyond: float  # Upper bound on the error of a hit's t. The walk visits cells that begin up to this far behind the best hit.
+    drift: float  # A plane counts as a slab of half thickness BspNode.tolerance + drift * |t|, with the largest |t| in the node.
 
 
 @wp.func

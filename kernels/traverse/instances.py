@@ -44,10 +44,10 @@ def make_struct(bottom: Any) -> Any:
 
 @wp.struct
 class WidenedRay:
-    """A ray set up for `enter`."""
+    """A ray for the box test `enter`, which widens the boxes of the upper level so that rounding loses no hit."""
 
-    box: BoxRay
-    slack: float  # As Instances.slack.
+    box: BoxRay  # The ray in world space.
+    slack: float  # Widening of a box on each side, as a fraction of the distance to the box's farthest corner.
 
 
 @wp.func

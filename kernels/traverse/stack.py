@@ -34,8 +34,9 @@ def make_uninitialized(length: int, dtype: Any) -> Any:
 
 @cache
 def make_stack(place: str, size: int, dtype: Any, entry_bytes: int) -> Stack:
-    """Make a stack of `size` values of type `dtype`. entry_bytes: bytes per entry of all parallel stacks of a walk together. All stacks of
-    the same place and type share one block of shared memory."""
+    """Make the functions of a stack with `size` entries of type `dtype`. place: its memory, one of PLACES.
+    A walk may split its entries over several stacks, each with one part of every entry. entry_bytes: size of all parts together. Stacks
+    that are made with equal arguments share one block of shared memory."""
     vector = wp.types.vector(size, dtype)
     short = SHARED // entry_bytes if place == "shared" else 0
     at = f"((wp::{dtype.__name__}*)shared)[i * WP_TILE_BLOCK_DIM]"

@@ -209,7 +209,8 @@ def make_packet_leaf(units: Units, any_hit: bool, accepts: Any) -> Any:
 
 
 def make_packet_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
-    """Return walk, which traces a packet that has a beam through the tree."""
+    """Return walk, which traces a packet of rays through the tree.
+    The packet must have a beam: bounds of the origins and directions of all its rays, tested first at each node (layout.BEAM)."""
     children, test_leaf = make_children(any_hit), make_packet_leaf(units, any_hit, accepts)
 
     @wp.func

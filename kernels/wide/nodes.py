@@ -45,7 +45,7 @@ def make_plane(width: int, compressed: bool) -> Any:
 
 
 def lane_by_lane(width: int, compressed: bool, enters: Any) -> Any:
-    """Return the function of `make_children`, which tests one child after another by enters(nodes, first, lane, ray, t_max) -> t or inf."""
+    """Return children (see make_children), which tests a node's children one by one: enters(nodes, first, lane, ray, t_max) -> t or inf."""
     row = row_type(width)
     _, exists = make_plane(width, compressed)
 
@@ -65,7 +65,8 @@ def lane_by_lane(width: int, compressed: bool, enters: Any) -> Any:
 
 @cache
 def make_scalar(width: int, compressed: bool, box: str) -> Any:
-    """Return the function of `make_children` for a box test without a vectorised form: it calls RAY_AABB[box]."""
+    """Return children(nodes, first, ray, t_max) -> (row, mask) for a box test without a vectorised form.
+    It tests a node's children one by one with RAY_AABB[box]. `make_children` describes row and mask."""
     plane, _ = make_plane(width, compressed)
     ray_aabb = RAY_AABB[box]
 
@@ -80,7 +81,7 @@ def make_scalar(width: int, compressed: bool, box: str) -> Any:
 
 @cache
 def make_plain(width: int, compressed: bool) -> Any:
-    """Return the function of `make_children` in plain Warp."""
+    """Return children (see make_children) in plain Warp."""
     plane, _ = make_plane(width, compressed)
 
     @wp.func
@@ -104,7 +105,7 @@ def make_plain(width: int, compressed: bool) -> Any:
 
 @cache
 def make_native(width: int, compressed: bool) -> Any:
-    """Return the function of `make_children` in C++, for the CPU only."""
+    """Return children (see make_children) in C++, for the CPU only."""
     row = row_type(width)
     numbers = {"COMPRESSED": int(compressed), "WORD": WORD, "FIRST_BYTES": FIRST_BYTES, "EXPONENT_BITS": EXPONENT_BITS,
                "EXIST_SHIFT": EXIST_SHIFT, "MANTISSA_BITS": MANTISSA_BITS}

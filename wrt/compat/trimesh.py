@@ -228,7 +228,8 @@ def _rays(origins: ArrayLike, directions: ArrayLike) -> tuple[np.ndarray, np.nda
 
 
 def _first_hits_first(ray: np.ndarray) -> np.ndarray:
-    """Return the order of hits that has the first hit of every ray, then all second hits, and so on. ray: of each hit, in order."""
+    """Return indices that sort hits: the first hit of every ray, then all second hits, and so on.
+    ray: (M,) index of each hit's ray. The hits of a ray are consecutive, the nearest first."""
     begins = np.flatnonzero(np.diff(ray, prepend=-1))
     counts = np.diff(begins, append=len(ray))
     rank = np.arange(len(ray)) - np.repeat(begins, counts)  # 0 for the first hit of each ray

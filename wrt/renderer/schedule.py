@@ -242,7 +242,8 @@ class Run:
         return self.checkpoint is not None and self.checkpoint.due()
 
     def _trace_pass(self, first: int, count: int) -> None:
-        """Trace until every pixel has at least `first + count` samples in each group."""
+        """Trace until every pixel has at least `first + count` samples in each group of samples.
+        With a target error, each pixel has several groups, whose means estimate the error (DeviceFilm); else it has one."""
         work, before = [Work(tile, first, count) for tile in self.tracer.tiles(count)], first * self.plan.area
         if first < self.passes.most:  # after a resume
             samples = self.arrays.view(self.arrays.groups[0].samples)

@@ -36,10 +36,10 @@ def powers(biased: np.ndarray) -> np.ndarray:
 
 
 def compress(lo: np.ndarray, hi: np.ndarray, exists: np.ndarray) -> np.ndarray:
-    """Compress the boxes of the children to the float32 entries of N nodes that precede the references.
+    """Compress the boxes of N nodes' children. Return the start of each compressed node: all its floats before the references to children.
 
-    lo, hi: (N, W, 3) float32; exists: (N, W) bool, whether a child exists. Every compressed box contains the original box. Along an
-    axis whose extent 8 bits cannot cover, the box is infinite.
+    lo, hi: (N, W, 3) float32; exists: (N, W) bool, whether a child exists. Result: (N, F) float32 with F = first_reference(W, True).
+    Every compressed box contains the original box. Along an axis whose extent 8 bits cannot cover, the box is infinite.
     """
     n, width = exists.shape
     low = np.where(exists[..., None], lo, np.float32(np.inf)).min(axis=1)

@@ -176,7 +176,9 @@ def with_leaves(tree: BinaryTree, links: np.ndarray, walk: WarpStruct) -> Binary
 
 
 def nodes_of(links: np.ndarray, inner: np.ndarray, begins: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Make Bvh2Node records of the links with indices `inner`. begins, counts: first primitive and number of primitives, for leaves."""
+    """Convert a tree's inner nodes, links[inner], to Bvh2Node records in the order of `inner`.
+    begins, counts: one entry per link. For a leaf: position of its first primitive in the tree's order, and number of primitives.
+    For inner nodes, the function overwrites the entries."""
     nodes, boxes = records(Bvh2Node, len(inner)), np.concatenate([links["lo"], links["hi"]], axis=1)
     begins[inner], counts[inner] = np.arange(len(inner)), 0
     for side, name in (("0", "left"), ("1", "right")):

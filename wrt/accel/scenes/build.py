@@ -199,7 +199,8 @@ def to_flat_scene(mesh: MeshLike) -> FlatScene:
 
 
 def to_mesh_or_scene(mesh: MeshLike) -> Mesh | Scene:
-    """Load or convert the argument `mesh` of `build`. Raises InputError for geometries, other types and a bad file."""
+    """Convert the argument `mesh` of `build` to a Mesh or Scene; load it if it is a path.
+    Raises InputError for a bad file and for any other type, also for a Geometry and an InstancedGeometry."""
     if isinstance(mesh, str | os.PathLike) and Path(os.fsdecode(mesh)).suffix.lower() in LOADERS:
         mesh = load_scene(mesh)
     elif isinstance(mesh, str | os.PathLike):

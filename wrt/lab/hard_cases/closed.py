@@ -87,7 +87,8 @@ def _coincident() -> Geometry:
 
 
 def coincident(rng: np.random.Generator, n: int, *, aim: str) -> HardCase:
-    """G: a sphere whose faces exist three times, in random order: the lowest prim_id of each tie is right."""
+    """G: a sphere whose faces exist three times each, in random order. Of hits at equal t, the one with the lowest prim_id is right.
+    The rays start inside; `aim` names their targets (common.AIMS). G is the group of the case (cases.py)."""
     return inside(_coincident(), in_ball(rng, n, 0.9), rng, aim)
 
 
