@@ -198,35 +198,41 @@ WRT_INLINE int rays_meeting_root(const float* root, int mask, float* packet) {
 // Return the mask of the rays whose t is at least t_entry.
 WRT_INLINE int rays_reaching(float t_entry, float* packet) { return mask_of(AllRays{packet}[T] >= t_entry); }
 
+// Test a triangle against N rays of a packet, in the lanes of `mask`, and store hits; return their mask.
+template <int N, bool ANY_HIT> WRT_INLINE int test(const Triangle<N>& triangle, const SomeRays<N>& rays, int axes, int mask) {
+    typedef typename Lanes<N>::Floats Floats;
+    typedef typename Lanes<N>::Ints Ints;
+    const Hits<N> hit = ray_triangle<N>(triangle, rays, axes, mask);
+    if (hit.mask == 0) return 0;
+    const Ints on = in_mask<Ints>(hit.mask);
+    rays.put(T, on ? (ANY_HIT ? all<Floats>(-__builtin_inff()) : hit.t) : rays[T]);
+    rays.put_bits(PRIM_ID, on ? triangle.prim_id() : rays.bits(PRIM_ID));
+    if constexpr (!ANY_HIT) {
+        rays.put(U, on ? narrowed<N>(hit.areas[1] / hit.area) : rays[U]);
+        rays.put(V, on ? narrowed<N>(hit.areas[2] / hit.area) : rays[V]);
+    }
+    return hit.mask;
+}
+
 // Test the first `count` triangles of a row, one after another, against the rays of the mask, which have the same axes; return the mask of
-// the rays that hit a triangle.
-template <bool ANY_HIT> WRT_INLINE int triangles_along(int axes, const float* row, int count, int mask, const AllRays& packet) {
+// the rays that hit a triangle. The rays of one register are tested at a time: the values of more do not fit into sixteen registers.
+template <bool ANY_HIT> WRT_INLINE int triangles_along(int axes, const float* row, int count, int mask, float* numbers) {
+    constexpr int PARTS = LANES / REGISTER, FULL = (1 << REGISTER) - 1;
+    typedef Lanes<REGISTER>::Ints Ints;
     int found = 0;
     for (int j = 0; j < count; ++j) {
-        // One register at a time: the values of two do not fit into sixteen registers.
-        typedef Lanes<REGISTER>::Ints Ints;
-        Ints some[LANES / REGISTER], any_lane = {};
-        for (int k = 0; k < LANES / REGISTER; ++k) {
-            some[k] = candidates<REGISTER>(Triangle<REGISTER>(row, j), SomeRays<REGISTER>{packet.rows + REGISTER * k}, axes);
-            any_lane |= some[k];
+        const Triangle<REGISTER> triangle(row, j);
+        Ints some[PARTS], all_parts = {};
+        for (int k = 0; k < PARTS; ++k)
+            all_parts |= some[k] = candidates<REGISTER>(triangle, SomeRays<REGISTER>{numbers + REGISTER * k}, axes);
+        if (!any(all_parts)) continue;
+        int hits = 0;
+        for (int k = 0; k < PARTS; ++k) {
+            const int left = mask_of(some[k]) & mask >> REGISTER * k & FULL;
+            if (left) hits |= test<REGISTER, ANY_HIT>(triangle, {numbers + REGISTER * k}, axes, left) << REGISTER * k;
         }
-        if (!any(any_lane)) continue;
-        int left = 0;
-        for (int k = 0; k < LANES / REGISTER; ++k) left |= mask_of(some[k]) << REGISTER * k;
-        if ((left &= mask) == 0) continue;
-        const Triangle<LANES> triangle(row, j);
-        const Hits<LANES> hit = ray_triangle<LANES>(triangle, packet, axes, left);
-        if (hit.mask == 0) continue;
-        found |= hit.mask;
-        const RayInts on = in_mask<RayInts>(hit.mask);
-        packet.put(T, on ? (ANY_HIT ? all<Rays>(-__builtin_inff()) : hit.t) : packet[T]);
-        packet.put_bits(PRIM_ID, on ? triangle.prim_id() : packet.bits(PRIM_ID));
-        if constexpr (ANY_HIT) {
-            if ((mask &= ~hit.mask) == 0) break;
-        } else {
-            packet.put(U, on ? narrowed<LANES>(hit.areas[1] / hit.area) : packet[U]);
-            packet.put(V, on ? narrowed<LANES>(hit.areas[2] / hit.area) : packet[V]);
-        }
+        found |= hits;
+        if (ANY_HIT && (mask &= ~hits) == 0) break;
     }
     return found;
 }
@@ -239,7 +245,7 @@ template <bool ANY_HIT> WRT_CALLED int triangles(const float* row, int count, in
     while (mask) {
         const int axes = load<int>(numbers + AXES + lowest(mask));
         const int along = mask & mask_of(packet.bits(AXES) == axes);
-        found |= triangles_along<ANY_HIT>(axes, row, count, along, packet);
+        found |= triangles_along<ANY_HIT>(axes, row, count, along, numbers);
         mask &= ~along;
     }
     return found;
