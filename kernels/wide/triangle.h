@@ -34,15 +34,10 @@ template <class T> WRT_INLINE Vec3<T> edge_areas(const Vec3<T>& a, const Vec3<T>
     return {{c[0] * b[1] - c[1] * b[0], a[0] * c[1] - a[1] * c[0], b[0] * a[1] - b[1] * a[0]}};
 }
 
-// Return whether the areas have both signs. NaN has none: it is in neither extreme, because it compares as false.
 template <class T> WRT_INLINE auto outside(const Vec3<T>& areas) {
     const T zero = {};
-    T least = zero, most = zero;
-    for (int k = 0; k < 3; ++k) {
-        least = areas[k] < least ? areas[k] : least;
-        most = areas[k] > most ? areas[k] : most;
-    }
-    return (least < zero) & (most > zero);
+    return ((areas[0] < zero) | (areas[1] < zero) | (areas[2] < zero))
+           & ((areas[0] > zero) | (areas[1] > zero) | (areas[2] > zero));
 }
 
 // Return the mask of a row's triangles that the test does not reject in float32.
