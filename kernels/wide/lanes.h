@@ -73,15 +73,6 @@ template <class V> WRT_INLINE int mask_of(V holds) {
 #endif
 }
 
-// Return whether a comparison holds in any lane.
-template <class V> WRT_INLINE bool any(V holds) {
-#if defined(__clang__) && !defined(__AVX512F__)
-    return __builtin_reduce_or(holds) != 0;  // One test of a register, where a mask of 8 comparisons takes five instructions.
-#else
-    return mask_of(holds) != 0;
-#endif
-}
-
 // Return a mask as a comparison's result: -1 in the lanes whose bit is set, else 0.
 template <class Ints> WRT_INLINE Ints in_mask(int mask) {
     Ints lane;

@@ -53,21 +53,24 @@ template <int N> struct Triangle {
     WRT_MEMBER Triangle(const float* row, int j) : numbers(row + j) {}
     WRT_MEMBER float number(int corner, int k) const { return numbers[WIDTH * (3 * corner + k)]; }
     WRT_MEMBER auto component(int corner, int k) const { return all<typename Lanes<N>::Floats>(number(corner, k)); }
+    WRT_MEMBER auto component(int corner, typename Lanes<N>::Ints k) const {
+        return k == 0 ? component(corner, 0) : (k == 1 ? component(corner, 1) : component(corner, 2));
+    }
     WRT_MEMBER Vec3<float> corner(int i) const { return {{number(i, 0), number(i, 1), number(i, 2)}}; }
     WRT_MEMBER int id() const { return load<int>(numbers + WIDTH * PRIM_ID_ROW); }
     WRT_MEMBER auto prim_id() const { return all<typename Lanes<N>::Ints>(id()); }
 };
 
 // Return the rays' set-up for the triangle test. `axes` has the axes of all rays (layout.py: FIELDS).
-template <class Ray> WRT_INLINE auto triangle_ray(const Ray& ray, int axes) {
+template <class Ray, class Axes> WRT_INLINE auto triangle_ray(const Ray& ray, Axes axes) {
     auto s_x = ray[SHEAR_X], s_y = ray[SHEAR_Y];
-    return TriangleRay<int, decltype(s_x)>{axes & AXIS_MASK, axes >> AXIS_BITS & AXIS_MASK, axes >> 2 * AXIS_BITS, s_x, s_y,
+    return TriangleRay<Axes, decltype(s_x)>{axes & AXIS_MASK, axes >> AXIS_BITS & AXIS_MASK, axes >> 2 * AXIS_BITS, s_x, s_y,
                                            vector<decltype(s_x)>(ray, TURNED_X)};
 }
 
 // Return the lanes that the test in float32 does not reject, without a ray's own triangle.
-template <int N, class Triangles, class Ray>
-WRT_INLINE typename Lanes<N>::Ints candidates(const Triangles& triangles, const Ray& ray, int axes) {
+template <int N, class Triangles, class Ray, class Axes>
+WRT_INLINE typename Lanes<N>::Ints candidates(const Triangles& triangles, const Ray& ray, Axes axes) {
     const auto shear = triangle_ray(ray, axes);
     const auto areas = edge_areas(to_ray_space(triangles, 0, shear), to_ray_space(triangles, 1, shear), to_ray_space(triangles, 2, shear));
     return ~outside(areas) & (triangles.prim_id() + 1 != all<typename Lanes<N>::Ints>(ray.bits(EXCLUDE)));
@@ -75,8 +78,8 @@ WRT_INLINE typename Lanes<N>::Ints candidates(const Triangles& triangles, const 
 
 // Return the hits that are better than the best hit of each ray: with t in [t_min, T] and, at t = T, a prim_id that is not higher. The
 // steps are those of `watertight`, `within_bounds` and `better` (traverse/common.py) for candidates, in the lanes of `mask`.
-template <int N, class Triangles, class Ray>
-WRT_INLINE Hits<N> ray_triangle(const Triangles& triangles, const Ray& ray, int axes, int mask) {
+template <int N, class Triangles, class Ray, class Axes>
+WRT_INLINE Hits<N> ray_triangle(const Triangles& triangles, const Ray& ray, Axes axes, int mask) {
     typedef typename Lanes<N>::Floats Floats;
     typedef typename Lanes<N>::Ints Ints;
     const auto shear = triangle_ray(ray, axes);
@@ -199,7 +202,8 @@ WRT_INLINE int rays_meeting_root(const float* root, int mask, float* packet) {
 WRT_INLINE int rays_reaching(float t_entry, float* packet) { return mask_of(AllRays{packet}[T] >= t_entry); }
 
 // Test a triangle against N rays of a packet, in the lanes of `mask`, and store hits; return their mask.
-template <int N, bool ANY_HIT> WRT_INLINE int test(const Triangle<N>& triangle, const SomeRays<N>& rays, int axes, int mask) {
+template <int N, bool ANY_HIT, class Axes>
+WRT_INLINE int test(const Triangle<N>& triangle, const SomeRays<N>& rays, Axes axes, int mask) {
     typedef typename Lanes<N>::Floats Floats;
     typedef typename Lanes<N>::Ints Ints;
     const Hits<N> hit = ray_triangle<N>(triangle, rays, axes, mask);
@@ -216,20 +220,17 @@ template <int N, bool ANY_HIT> WRT_INLINE int test(const Triangle<N>& triangle, 
 
 // Test the first `count` triangles of a row, one after another, against the rays of the mask, which have the same axes; return the mask of
 // the rays that hit a triangle. The rays of one register are tested at a time: the values of more do not fit into sixteen registers.
-template <bool ANY_HIT> WRT_INLINE int triangles_along(int axes, const float* row, int count, int mask, float* numbers) {
+template <bool ANY_HIT, class Axes>
+WRT_INLINE int triangles_along(Axes axes, const float* row, int count, int mask, float* numbers) {
     constexpr int PARTS = LANES / REGISTER, FULL = (1 << REGISTER) - 1;
-    typedef Lanes<REGISTER>::Ints Ints;
     int found = 0;
     for (int j = 0; j < count; ++j) {
         const Triangle<REGISTER> triangle(row, j);
-        Ints some[PARTS], all_parts = {};
-        for (int k = 0; k < PARTS; ++k)
-            all_parts |= some[k] = candidates<REGISTER>(triangle, SomeRays<REGISTER>{numbers + REGISTER * k}, axes);
-        if (!any(all_parts)) continue;
         int hits = 0;
         for (int k = 0; k < PARTS; ++k) {
-            const int left = mask_of(some[k]) & mask >> REGISTER * k & FULL;
-            if (left) hits |= test<REGISTER, ANY_HIT>(triangle, {numbers + REGISTER * k}, axes, left) << REGISTER * k;
+            const SomeRays<REGISTER> rays = {numbers + REGISTER * k};
+            const int left = mask_of(candidates<REGISTER>(triangle, rays, axes)) & mask >> REGISTER * k & FULL;
+            if (left) hits |= test<REGISTER, ANY_HIT>(triangle, rays, axes, left) << REGISTER * k;
         }
         found |= hits;
         if (ANY_HIT && (mask &= ~hits) == 0) break;
@@ -241,6 +242,7 @@ template <bool ANY_HIT> WRT_INLINE int triangles_along(int axes, const float* ro
 // that hit, t becomes -inf. Rays with the same axes are tested together, so that corners need no selection by ray: mostly, these are all.
 template <bool ANY_HIT> WRT_CALLED int triangles(const float* row, int count, int mask, float* numbers) {
     const AllRays packet = {numbers};
+    if constexpr (REGISTER == LANES) return triangles_along<ANY_HIT>(packet.bits(AXES), row, count, mask, numbers);
     int found = 0;
     while (mask) {
         const int axes = load<int>(numbers + AXES + lowest(mask));
