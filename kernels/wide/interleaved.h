@@ -92,7 +92,9 @@ template <bool ANY_HIT> WRT_INLINE int pop(const float* nodes, float reach, unsi
 template <bool ANY_HIT> WRT_INLINE int ray_triangles_here(const float* row, int mask, float* column) {
     const OneRay ray = {column};
     const LeafRow triangles = {{row}};
-    const Hits<WIDTH> hit = ray_triangle<WIDTH>(triangles, ray, mask);
+    const int axes = ray.bits(AXES);
+    if ((mask &= mask_of(candidates<WIDTH>(triangles, ray, axes))) == 0) return -1;
+    const Hits<WIDTH> hit = ray_triangle<WIDTH>(triangles, ray, axes, mask);
     if (hit.mask == 0) return -1;
     if constexpr (ANY_HIT) {
         ray.put(T, -__builtin_inff());

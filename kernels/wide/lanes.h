@@ -15,6 +15,15 @@ template <int N> struct Lanes {
     typedef double Doubles __attribute__((vector_size(8 * N)));
 };
 
+// Lanes of one register.
+#if defined(__AVX512F__)
+constexpr int REGISTER = 16;
+#elif defined(__AVX__)
+constexpr int REGISTER = 8;
+#else
+constexpr int REGISTER = 4;
+#endif
+
 template <class V> constexpr int lanes_of = sizeof(V) / sizeof(V{}[0]);
 
 // Load from memory that need not be aligned.
@@ -72,6 +81,14 @@ template <class Ints> WRT_INLINE Ints in_mask(int mask) {
 }
 
 WRT_INLINE int lowest(unsigned mask) { return __builtin_ctz(mask); }
+
+// Hide from the compiler that a value stays the same in a loop: what is read through a pointer is then an operand in memory, where a copy
+// in a register would push others out.
+#if defined(__clang__)
+#define WRT_OPAQUE(value) __asm__("" : "+r"(value))
+#else
+#define WRT_OPAQUE(value)
+#endif
 
 // Tell the compiler that a condition is true about half the time, so that it avoids a branch.
 #if defined(__clang__)

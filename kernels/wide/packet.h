@@ -5,18 +5,22 @@
 
 namespace wrt {
 
-// --- access to the fields of all rays of a packet, or of one ray (layout.py: FIELDS) ---------------------------------------------
+// --- access to the fields of N rays of a packet, or of one ray (layout.py: FIELDS) -----------------------------------------------
 
 typedef Lanes<LANES>::Floats Rays;
 typedef Lanes<LANES>::Ints RayInts;
 
-struct AllRays {
+template <int N> struct SomeRays {
     float* rows;
-    WRT_MEMBER Rays operator[](int row) const { return load<Rays>(rows + row); }
-    WRT_MEMBER RayInts bits(int row) const { return load<RayInts>(rows + row); }
-    WRT_MEMBER void put(int row, Rays value) const { store(rows + row, value); }
-    WRT_MEMBER void put_bits(int row, RayInts value) const { store(rows + row, value); }
+    typedef typename Lanes<N>::Floats Floats;
+    typedef typename Lanes<N>::Ints Ints;
+    WRT_MEMBER Floats operator[](int row) const { return load<Floats>(rows + row); }
+    WRT_MEMBER Ints bits(int row) const { return load<Ints>(rows + row); }
+    WRT_MEMBER void put(int row, Floats value) const { store(rows + row, value); }
+    WRT_MEMBER void put_bits(int row, Ints value) const { store(rows + row, value); }
 };
+
+typedef SomeRays<LANES> AllRays;
 
 struct OneRay {
     float* rows;
@@ -42,46 +46,52 @@ struct LeafRow : Row<WIDTH> {
     WRT_MEMBER Ints prim_id() const { return load<Ints>(numbers + WIDTH * PRIM_ID_ROW); }
 };
 
-// Triangle j of a row, for all rays of a packet.
-struct Triangle {
-    Vec3<float> corners[3];
-    int id;
+// Triangle j of a row, for N rays of a packet.
+template <int N> struct Triangle {
+    const float* numbers;
 
-    WRT_MEMBER Triangle(const float* row, int j) : id(load<int>(row + WIDTH * PRIM_ID_ROW + j)) {
-        for (int i = 0; i < 3; ++i)
-            for (int k = 0; k < 3; ++k) corners[i][k] = row[WIDTH * (3 * i + k) + j];
+    WRT_MEMBER Triangle(const float* row, int j) : numbers(row + j) {}
+    WRT_MEMBER float number(int corner, int k) const { return numbers[WIDTH * (3 * corner + k)]; }
+    WRT_MEMBER auto component(int corner, int k) const { return all<typename Lanes<N>::Floats>(number(corner, k)); }
+    WRT_MEMBER auto component(int corner, typename Lanes<N>::Ints k) const {
+        return k == 0 ? component(corner, 0) : (k == 1 ? component(corner, 1) : component(corner, 2));
     }
-    WRT_MEMBER Rays component(int corner, RayInts k) const {
-        const Vec3<float>& v = corners[corner];
-        return k == 0 ? all<Rays>(v[0]) : (k == 1 ? all<Rays>(v[1]) : all<Rays>(v[2]));
-    }
-    WRT_MEMBER const Vec3<float>& corner(int i) const { return corners[i]; }
-    WRT_MEMBER RayInts prim_id() const { return all<RayInts>(id); }
+    WRT_MEMBER Vec3<float> corner(int i) const { return {{number(i, 0), number(i, 1), number(i, 2)}}; }
+    WRT_MEMBER int id() const { return load<int>(numbers + WIDTH * PRIM_ID_ROW); }
+    WRT_MEMBER auto prim_id() const { return all<typename Lanes<N>::Ints>(id()); }
 };
 
+// Return the rays' set-up for the triangle test. `axes` has the axes of all rays (layout.py: FIELDS).
+template <class Ray, class Axes> WRT_INLINE auto triangle_ray(const Ray& ray, Axes axes) {
+    auto s_x = ray[SHEAR_X], s_y = ray[SHEAR_Y];
+    return TriangleRay<Axes, decltype(s_x)>{axes & AXIS_MASK, axes >> AXIS_BITS & AXIS_MASK, axes >> 2 * AXIS_BITS, s_x, s_y,
+                                           vector<decltype(s_x)>(ray, TURNED_X)};
+}
+
+// Return the lanes that the test in float32 does not reject, without a ray's own triangle.
+template <int N, class Triangles, class Ray, class Axes>
+WRT_INLINE typename Lanes<N>::Ints candidates(const Triangles& triangles, const Ray& ray, Axes axes) {
+    const auto shear = triangle_ray(ray, axes);
+    const auto areas = edge_areas(to_ray_space(triangles, 0, shear), to_ray_space(triangles, 1, shear), to_ray_space(triangles, 2, shear));
+    return ~outside(areas) & (triangles.prim_id() + 1 != all<typename Lanes<N>::Ints>(ray.bits(EXCLUDE)));
+}
+
 // Return the hits that are better than the best hit of each ray: with t in [t_min, T] and, at t = T, a prim_id that is not higher. The
-// steps are those of `watertight`, `within_bounds` and `better` (traverse/common.py), in the lanes of `mask`, without a ray's own triangle.
-template <int N, class Triangles, class Ray>
-WRT_INLINE Hits<N> ray_triangle(const Triangles& triangles, const Ray& ray, int mask) {
+// steps are those of `watertight`, `within_bounds` and `better` (traverse/common.py) for candidates, in the lanes of `mask`.
+template <int N, class Triangles, class Ray, class Axes>
+WRT_INLINE Hits<N> ray_triangle(const Triangles& triangles, const Ray& ray, Axes axes, int mask) {
     typedef typename Lanes<N>::Floats Floats;
     typedef typename Lanes<N>::Ints Ints;
-    auto axes = ray.bits(AXES);
-    auto s_x = ray[SHEAR_X], s_y = ray[SHEAR_Y];
-    const TriangleRay<decltype(axes), decltype(s_x)> shear = {
-        axes & AXIS_MASK, axes >> AXIS_BITS & AXIS_MASK, axes >> 2 * AXIS_BITS, s_x, s_y, vector<decltype(s_x)>(ray, TURNED_X)};
+    const auto shear = triangle_ray(ray, axes);
     const Vec3<Floats> a = to_ray_space(triangles, 0, shear), b = to_ray_space(triangles, 1, shear), c = to_ray_space(triangles, 2, shear);
-    const Ints id = triangles.prim_id(), exclude = all<Ints>(ray.bits(EXCLUDE));
-    Hits<N> hit;
-    hit.mask = mask & mask_of(~outside(edge_areas(a, b, c)) & (id + 1 != exclude));
-    if (hit.mask == 0) return hit;
-    hit = crossing<N>(a, b, c, all<Floats>(ray[SHEAR_Z]), hit.mask);
+    Hits<N> hit = crossing<N>(a, b, c, all<Floats>(ray[SHEAR_Z]), mask);
     if (hit.mask == 0) return hit;
     const BoxRay<Floats> box = {vector<Floats>(ray, ORIGIN_X), vector<Floats>(ray, INVERSE_X)};
     const auto lo = lower(lower(triangles.corner(0), triangles.corner(1)), triangles.corner(2));
     const auto hi = upper(upper(triangles.corner(0), triangles.corner(1)), triangles.corner(2));
     within_bounds<Bounds>(box, hit, in_lanes<Floats>(lo), in_lanes<Floats>(hi));
     const Floats t_min = all<Floats>(ray[T_MIN]), best = all<Floats>(ray[T]);
-    const Ints best_id = all<Ints>(ray.bits(PRIM_ID));
+    const Ints id = triangles.prim_id(), best_id = all<Ints>(ray.bits(PRIM_ID));
     hit.mask &= mask_of((absolute(hit.t) < all<Floats>(__builtin_inff())) & (hit.t >= t_min) & (hit.t <= best));
     hit.mask &= mask_of(~((hit.t == best) & (id > best_id)));
     return hit;
@@ -151,13 +161,14 @@ WRT_CALLED int children(const float* nodes, const float* primitives, float* pack
     const float* const p = nodes + (long long)node * NODE_SIZE;
     const int near[3] = {(int)packet[BEAM_NEAR_ROW], (int)packet[BEAM_NEAR_ROW + 1], (int)packet[BEAM_NEAR_ROW + 2]};
     const Interval<Children> beam = beam_interval(packet, p, near);
-    const PacketRay ray = packet_ray({packet});
     const float *near_x = p + WIDTH * near[0], *near_y = p + WIDTH * near[1], *near_z = p + WIDTH * near[2];
     const float *far_x = p + WIDTH * (near[0] ^ 1), *far_y = p + WIDTH * (near[1] ^ 1), *far_z = p + WIDTH * (near[2] ^ 1);
     int left = mask_of(beam.enter <= beam.leave), top = size;
     for (; left; left &= left - 1) {
         const int child = lowest(left);
-        const Interval<Rays> t = interval_in(ray, in_lanes<Rays>(Vec3<float>{{near_x[child], near_y[child], near_z[child]}}),
+        float* rays = packet;
+        if constexpr (REGISTER < LANES) WRT_OPAQUE(rays);
+        const Interval<Rays> t = interval_in(packet_ray({rays}), in_lanes<Rays>(Vec3<float>{{near_x[child], near_y[child], near_z[child]}}),
                                              in_lanes<Rays>(Vec3<float>{{far_x[child], far_y[child], far_z[child]}}));
         const int met = mask_of(t.enter <= t.leave) & mask;
         if (!met) continue;
@@ -190,25 +201,54 @@ WRT_INLINE int rays_meeting_root(const float* root, int mask, float* packet) {
 // Return the mask of the rays whose t is at least t_entry.
 WRT_INLINE int rays_reaching(float t_entry, float* packet) { return mask_of(AllRays{packet}[T] >= t_entry); }
 
-// Test the first `count` triangles of a row, one after another, against the rays of the mask; return the mask of the rays that hit a
-// triangle. In any-hit rays that hit, t becomes -inf.
-template <bool ANY_HIT> WRT_CALLED int triangles(const float* row, int count, int mask, float* numbers) {
-    const AllRays packet = {numbers};
+// Test a triangle against N rays of a packet, in the lanes of `mask`, and store hits; return their mask.
+template <int N, bool ANY_HIT, class Axes>
+WRT_INLINE int test(const Triangle<N>& triangle, const SomeRays<N>& rays, Axes axes, int mask) {
+    typedef typename Lanes<N>::Floats Floats;
+    typedef typename Lanes<N>::Ints Ints;
+    const Hits<N> hit = ray_triangle<N>(triangle, rays, axes, mask);
+    if (hit.mask == 0) return 0;
+    const Ints on = in_mask<Ints>(hit.mask);
+    rays.put(T, on ? (ANY_HIT ? all<Floats>(-__builtin_inff()) : hit.t) : rays[T]);
+    rays.put_bits(PRIM_ID, on ? triangle.prim_id() : rays.bits(PRIM_ID));
+    if constexpr (!ANY_HIT) {
+        rays.put(U, on ? narrowed<N>(hit.areas[1] / hit.area) : rays[U]);
+        rays.put(V, on ? narrowed<N>(hit.areas[2] / hit.area) : rays[V]);
+    }
+    return hit.mask;
+}
+
+// Test the first `count` triangles of a row, one after another, against the rays of the mask, which have the same axes; return the mask of
+// the rays that hit a triangle. The rays of one register are tested at a time: the values of more do not fit into sixteen registers.
+template <bool ANY_HIT, class Axes>
+WRT_INLINE int triangles_along(Axes axes, const float* row, int count, int mask, float* numbers) {
+    constexpr int PARTS = LANES / REGISTER, FULL = (1 << REGISTER) - 1;
     int found = 0;
     for (int j = 0; j < count; ++j) {
-        const Triangle triangle(row, j);
-        const Hits<LANES> hit = ray_triangle<LANES>(triangle, packet, mask);
-        if (hit.mask == 0) continue;
-        found |= hit.mask;
-        const RayInts on = in_mask<RayInts>(hit.mask);
-        packet.put(T, on ? (ANY_HIT ? all<Rays>(-__builtin_inff()) : hit.t) : packet[T]);
-        packet.put_bits(PRIM_ID, on ? all<RayInts>(triangle.id) : packet.bits(PRIM_ID));
-        if constexpr (ANY_HIT) {
-            if ((mask &= ~hit.mask) == 0) break;
-        } else {
-            packet.put(U, on ? narrowed<LANES>(hit.areas[1] / hit.area) : packet[U]);
-            packet.put(V, on ? narrowed<LANES>(hit.areas[2] / hit.area) : packet[V]);
+        const Triangle<REGISTER> triangle(row, j);
+        int hits = 0;
+        for (int k = 0; k < PARTS; ++k) {
+            const SomeRays<REGISTER> rays = {numbers + REGISTER * k};
+            const int left = mask_of(candidates<REGISTER>(triangle, rays, axes)) & mask >> REGISTER * k & FULL;
+            if (left) hits |= test<REGISTER, ANY_HIT>(triangle, rays, axes, left) << REGISTER * k;
         }
+        found |= hits;
+        if (ANY_HIT && (mask &= ~hits) == 0) break;
+    }
+    return found;
+}
+
+// Test the first `count` triangles of a row against the rays of the mask; return the mask of the rays that hit a triangle. In any-hit rays
+// that hit, t becomes -inf. Rays with the same axes are tested together, so that corners need no selection by ray: mostly, these are all.
+template <bool ANY_HIT> WRT_CALLED int triangles(const float* row, int count, int mask, float* numbers) {
+    const AllRays packet = {numbers};
+    if constexpr (REGISTER == LANES) return triangles_along<ANY_HIT>(packet.bits(AXES), row, count, mask, numbers);
+    int found = 0;
+    while (mask) {
+        const int axes = load<int>(numbers + AXES + lowest(mask));
+        const int along = mask & mask_of(packet.bits(AXES) == axes);
+        found |= triangles_along<ANY_HIT>(axes, row, count, along, numbers);
+        mask &= ~along;
     }
     return found;
 }
