@@ -1,0 +1,138 @@
+"""Rays in float64 near a mesh in float32, and the points that they hit."""
+
+from concurrent.futures import ThreadPoolExecutor
+from fractions import Fraction
+
+import numpy as np
+import warp as wp
+
+from wrt.accel.queries.raw_kernel import RawKernel
+from wrt.core.warp_private import record_of, struct_record
+from wrt.kernels.placed_rays import (
+    SPLIT_FAR,
+    SPLIT_MISS,
+    SPLIT_VALID,
+    HitPoints64,
+    PlacedRays,
+    Placement,
+    SplitRays,
+    locate_hits,
+    place_rays,
+    split_rays,
+)
+
+PLACE, LOCATE = RawKernel(place_rays, Placement(), PlacedRays()), RawKernel(locate_hits, HitPoints64())
+SPLIT = RawKernel(split_rays, SplitRays())
+ODD = [0.0, -0.0, np.nan, np.inf, -np.inf, 1e300, -1e-300, 5e-324, 1e37, 2e37, 1.0]
+
+
+def placed(origins, directions, *, shift=(0.0, 0.0, 0.0), exponent=0, center=(0.0, 0.0, 0.0), radius=1.0, threads=1):
+    """Return placed origins, directions and valid; near: 4 radii."""
+    place = Placement()
+    place.shift, place.center, place.radius, place.near = wp.vec3d(*shift), wp.vec3d(*center), radius, 4.0 * radius
+    place.scale, place.scale_again = 2.0 ** (exponent // 2), 2.0 ** (exponent - exponent // 2)
+    n = len(origins)
+    arrays = origins, directions, np.empty((n, 3), np.float32), np.empty((n, 3), np.float32), np.empty(n, bool)
+    PLACE.launch(n, record_of(place), struct_record(PlacedRays, arrays), threads=threads)
+    return arrays[2:]
+
+
+def random_rays(n, seed):
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(n, 3)), rng.normal(size=(n, 3))
+
+
+def test_near_rays_are_shifted_scaled_and_rounded_once():
+    origins, directions = random_rays(1000, 0)
+    shift, exponent = np.array([3.0, -5.0, 7.0]), -5
+    got, turned, valid = placed(64.0 * origins + shift, directions, shift=shift, exponent=exponent, radius=10.0)
+    np.testing.assert_array_equal(got, ((64.0 * origins + shift - shift) / 32.0).astype(np.float32))
+    np.testing.assert_array_equal(turned, directions.astype(np.float32))
+    assert valid.all()
+
+
+def test_far_origins_move_along_their_rays_to_two_radii_before_the_center():
+    origins, directions = random_rays(1000, 1)
+    origins *= 1e9 / np.linalg.norm(origins, axis=1)[:, None]
+    center = np.array([1.0, 2.0, 3.0])
+    directions -= origins / 1e9 * (1.0 + np.einsum("ij,ij->i", directions, origins) / 1e9)[:, None]  # towards the center's side
+    got, turned, valid = placed(origins, directions, center=center, radius=0.5)
+    unit = turned / np.linalg.norm(turned, axis=1)[:, None]
+    ahead = np.einsum("ij,ij->i", center - got, unit)
+    forward = np.einsum("ij,ij->i", center - origins, unit) > 1.0
+    assert valid.all() and forward.mean() > 0.9
+    # Each moved origin has float32 coordinates of up to the ray's distance from the center.
+    away = np.linalg.norm(got - center, axis=1)
+    assert (np.abs(ahead - 1.0)[forward] <= 1e-6 * (1.0 + away[forward])).all()
+
+
+def test_directions_of_any_length_keep_their_direction():
+    _, directions = random_rays(500, 2)
+    for exponent in (-1050, -300, -31, 31, 300, 900):
+        _, turned, valid = placed(np.zeros((500, 3)), np.ldexp(directions, exponent))
+        longest = np.abs(turned).max(axis=1)
+        assert valid.all() and (longest > 2.0**-31).all() and (longest < 2.0**31).all()
+        cross = np.cross(turned.astype(np.float64), directions)
+        assert np.abs(cross).max() <= 1e-4 * longest.max() * np.abs(directions).max() if exponent > -1000 else np.isfinite(cross).all()
+
+
+def test_only_rays_with_finite_near_origins_and_directions_are_valid():
+    grid = np.ascontiguousarray(np.array(np.meshgrid(ODD, ODD, ODD)).reshape(3, -1).T)
+    ones = np.ones_like(grid)
+    _, _, valid = placed(ones, grid)
+    np.testing.assert_array_equal(valid, np.isfinite(grid).all(axis=1) & grid.any(axis=1))
+    origins, _, valid = placed(grid, ones, radius=1e38)  # no origin is far
+    finite = np.isfinite(grid).all(axis=1)
+    np.testing.assert_array_equal(valid, finite & (np.abs(np.where(finite[:, None], grid, 0.0)) <= 1e37).all(axis=1))
+    assert np.isfinite(origins[valid]).all()
+
+
+def test_threads_share_a_kernel():
+    origins, directions = random_rays(50_000, 3)
+    expected = placed(origins, directions)
+    with ThreadPoolExecutor(4) as pool:
+        for found in pool.map(lambda _: placed(origins, directions, threads=2), range(12)):
+            for one, two in zip(found, expected, strict=True):
+                np.testing.assert_array_equal(one, two)
+
+
+def exact_point(corners, origin, direction):
+    """Return the point where a line meets a triangle's plane, in rational arithmetic."""
+    a, b, c, o, d = ([Fraction(float(x)) for x in v] for v in (*corners, origin, direction))
+    def minus(x, y): return [p - q for p, q in zip(x, y, strict=True)]
+    def dot(x, y): return sum(p * q for p, q in zip(x, y, strict=True))
+    e, f = minus(b, a), minus(c, a)
+    normal = [e[1] * f[2] - e[2] * f[1], e[2] * f[0] - e[0] * f[2], e[0] * f[1] - e[1] * f[0]]
+    t = dot(minus(a, o), normal) / dot(d, normal)
+    return [float(p + t * q) for p, q in zip(o, d, strict=True)]
+
+
+def test_points_are_where_the_lines_meet_the_planes():
+    rng = np.random.default_rng(4)
+    corners = rng.normal(size=(200, 3, 3))
+    weights = rng.dirichlet([1.0, 1.0, 1.0], 200)
+    targets = np.einsum("nk,nkj->nj", weights, corners)
+    origins = rng.normal(size=(200, 3))
+    arrays = (origins, targets - origins, corners.reshape(-1, 3), np.arange(600).reshape(-1, 3), np.arange(200), np.arange(200),
+              weights[:, 1].astype(np.float32), weights[:, 2].astype(np.float32), np.empty((200, 3)))
+    LOCATE.launch(200, struct_record(HitPoints64, arrays))
+    expected = np.array([exact_point(*row) for row in zip(corners, origins, targets - origins, strict=True)])
+    np.testing.assert_allclose(arrays[-1], expected, rtol=0.0, atol=1e-11)
+    # Lines that miss in float64, and lines in the plane, have the point at u and v.
+    beside = (origins, np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), *arrays[2:-1], np.empty((200, 3)))
+    LOCATE.launch(200, struct_record(HitPoints64, (origins, np.zeros((200, 3)), *beside[2:])))
+    np.testing.assert_allclose(beside[-1], targets, rtol=0.0, atol=1e-6)
+
+
+def test_rows_of_six_are_split_and_sorted_into_kinds():
+    odd = np.array([0.0, np.nan, np.inf, 1e37, 1.1e37, -3e38, 1.0], np.float32)
+    rows = np.array(np.meshgrid(*[odd] * 2, [0.0, 1.0, np.nan, -1e-45], [0.0, -np.inf], [0.0], [2.0, 0.0], indexing="ij"), np.float32)
+    rows = np.ascontiguousarray(rows.reshape(6, -1).T)
+    n = len(rows)
+    origins, directions, kind = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32), np.empty(n, np.int8)
+    SPLIT.launch(n, struct_record(SplitRays, (rows, origins, directions, kind)))
+    np.testing.assert_array_equal(np.concatenate([origins, directions], axis=1), rows)
+    finite = np.isfinite(rows).all(axis=1)
+    far = finite & (np.abs(np.where(finite[:, None], rows[:, :3], 0.0)) > np.float32(1e37)).any(axis=1)
+    expected = np.where(far, SPLIT_FAR, np.where(finite & rows[:, 3:].any(axis=1), SPLIT_VALID, SPLIT_MISS))
+    np.testing.assert_array_equal(kind, expected)
