@@ -94,7 +94,7 @@ LIBRARIES_OF_KERNELS = {"warp", "dataclasses", "functools", "re", "typing", "col
 LONGEST_FUNCTION = 100  # Lines.
 LONG_FUNCTIONS = 10  # Functions with more than 60 lines.
 LONG_SIGNATURES = 3  # Functions with more than 7 parameters.
-MOST_LINES = 47_240  # of wrt and kernels, with headers
+MOST_LINES = 47_290  # of wrt and kernels, with headers
 
 
 def module(path: Path) -> str:
