@@ -82,13 +82,12 @@ template <class Ints> WRT_INLINE Ints in_mask(int mask) {
 
 WRT_INLINE int lowest(unsigned mask) { return __builtin_ctz(mask); }
 
-// Hide from the compiler that a value stays the same in a loop: what is read through a pointer is then an operand in memory, where a copy
-// in a register would push others out.
-#if defined(__clang__)
-#define WRT_OPAQUE(value) __asm__("" : "+r"(value))
-#else
-#define WRT_OPAQUE(value)
-#endif
+// Return the pointer, of which the compiler then does not know that it stays the same in a loop. What is read through it is an operand in
+// memory, where a copy in a register would push others out.
+template <class T> WRT_INLINE T* opaque(T* pointer) {
+    __asm__("" : "+r"(pointer));
+    return pointer;
+}
 
 // Tell the compiler that a condition is true about half the time, so that it avoids a branch.
 #if defined(__clang__)

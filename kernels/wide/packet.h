@@ -166,9 +166,8 @@ WRT_CALLED int children(const float* nodes, const float* primitives, float* pack
     int left = mask_of(beam.enter <= beam.leave), top = size;
     for (; left; left &= left - 1) {
         const int child = lowest(left);
-        float* rays = packet;
-        if constexpr (REGISTER < LANES) WRT_OPAQUE(rays);
-        const Interval<Rays> t = interval_in(packet_ray({rays}), in_lanes<Rays>(Vec3<float>{{near_x[child], near_y[child], near_z[child]}}),
+        const AllRays rays = {REGISTER < LANES ? opaque(packet) : packet};
+        const Interval<Rays> t = interval_in(packet_ray(rays), in_lanes<Rays>(Vec3<float>{{near_x[child], near_y[child], near_z[child]}}),
                                              in_lanes<Rays>(Vec3<float>{{far_x[child], far_y[child], far_z[child]}}));
         const int met = mask_of(t.enter <= t.leave) & mask;
         if (!met) continue;
