@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
+from multiprocessing.synchronize import Barrier
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -92,7 +93,8 @@ def test_threads(options: dict[str, Any], threads: Executor) -> None:
 
 
 def test_processes(whole: Film) -> None:
-    with ProcessPoolExecutor(2, multiprocessing.get_context("spawn"), initializer=die_late) as pool:
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(2, context, initializer=die_late, initargs=(context.Barrier(2),)) as pool:
         film = render(SCENE, aov=["depth", "normal", "material_id"], executor=pool, **HOW)
         assert same(film, whole)
         assert len(film.stats["workers"]) == 2 and f":{os.getpid()}" not in "".join(film.stats["workers"])
@@ -100,8 +102,9 @@ def test_processes(whole: Film) -> None:
             render(SCENE, executor=pool, spp=1 << 16, **HOW)
 
 
-def die_late() -> None:
-    """Run in a worker process: the process is killed at sample 64 of a tile."""
+def die_late(started: Barrier) -> None:
+    """Run in a worker process: the process works once all have started, and is killed at sample 64 of a tile."""
+    started.wait(60.0)
     trace = Prepared.trace_tile
 
     def deadly(self: Prepared, work: Any, *rest: Any) -> Any:
