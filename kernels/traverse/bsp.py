@@ -49,7 +49,7 @@ INNER = -1  # Value of `count` for a child that is an inner node.
 
 @wp.struct
 class BspNode:
-    """A plane normal . p + offset = 0 and its two children: 0 below the plane (negative values), 1 above it.
+    """The plane dot(normal, p) + offset = 0 and its two children: 0 below the plane (negative values), 1 above it.
     Child k is the inner node first_k (count_k = INNER), or a leaf with the count_k >= 0 primitives from index first_k on."""
 
     normal: wp.vec3
