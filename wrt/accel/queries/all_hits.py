@@ -13,7 +13,7 @@ import warp as wp
 from wrt.accel.queries.accelerator import Accelerator, snapshot_of
 from wrt.accel.queries.answers import Hits
 from wrt.accel.queries.hit_points import device_scene
-from wrt.accel.queries.raw_kernel import RawKernel, memory_of
+from wrt.accel.queries.raw_kernel import RawKernel, kernel_memory
 from wrt.accel.queries.rays import Rays, arrays_on, host_arrays, rays_of
 from wrt.accel.structure import Structure
 from wrt.core.arrays import to_numpy, to_tensor_like, to_warp
@@ -21,7 +21,7 @@ from wrt.core.checks import as_integer, as_one
 from wrt.core.device import MOST_ROWS, made_once, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
-from wrt.core.types import Array, ArrayLike, ArrayT, NumpyLike, TensorT, WarpArray, WarpType
+from wrt.core.types import Array, ArrayLike, ArrayT, NumpyLike, TensorT, WarpArray
 from wrt.kernels.hit_lists import FEW, HitLists, copy_hits, list_hit, make_list_hits_kernel
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import Hit
@@ -94,7 +94,7 @@ class ListQuery:
     def __init__(self, accel: Accelerator, threads: int | None, crossings: bool = False) -> None:
         self.snapshot = snapshot_of(accel)
         self.threads, self.device = thread_count(threads), self.snapshot.device
-        self.memory: Any = memory_of(self.device)
+        self.memory: Any = kernel_memory(self.device)
         self.crossings, self.mesh = as_one(crossings, bool, "crossings"), (None, None)
         if crossings:
             surfaces = device_scene(self.snapshot).surfaces
@@ -118,7 +118,8 @@ class ListQuery:
         if len(parts) == 1:
             return AllHits(self.converted(first), *map(self.give, parts[0]))
         first = _begins(np.concatenate(counts))
-        hits = [self._joined(kind, arrays) for kind, *arrays in zip(HIT_KINDS, *parts, strict=True)]
+        rows_of(first[-1])
+        hits = [self.memory.joined(arrays, kind) for kind, *arrays in zip(HIT_KINDS, *parts, strict=True)]
         return AllHits(self.converted(first), *map(self.give, hits))
 
     def first(self, k: int) -> Hits[Any]:
@@ -172,14 +173,6 @@ class ListQuery:
         for each in lists:
             self.memory.launch(COPY_HITS, len(each.counts), rays, self.memory.struct(HitLists, *each),
                                self.memory.array(begin, wp.int32), self.memory.struct(HitArrays, *hits), threads=self.threads)
-
-    def _joined(self, kind: WarpType, parts: list[Any]) -> Array:
-        out = self.memory.empty(rows_of(sum(map(len, parts))), kind)
-        at = 0
-        for part in parts:
-            out[at:at + len(part)] = part
-            at += len(part)
-        return out
 
 
 def _begins(counts: np.ndarray) -> np.ndarray:

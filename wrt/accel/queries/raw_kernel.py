@@ -36,7 +36,10 @@ class RawKernel:
         self._free: list[wp.Launch] = []  # recorded launches that no thread uses now
 
     def launch(self, n: int, *inputs: object, threads: int = 1) -> None:
-        """Run the kernel on the CPU over n elements: NumPy arrays, records and Warp structs in. The caller keeps their memory."""
+        """Run the kernel on the CPU over n elements: contiguous NumPy arrays, records and Warp structs in.
+
+        The caller keeps their memory.
+        """
         load_kernel(self.kernel, wp.get_device("cpu"))
         records = [array_record(each) if isinstance(each, np.ndarray) else record_of(each) if hasattr(each, "__ctype__") else each
                    for each in inputs]
@@ -71,6 +74,10 @@ class HostMemory:
         """Return an array's values."""
         return array
 
+    def joined(self, parts: list[np.ndarray], kind: WarpType) -> np.ndarray:
+        """Return the concatenation of one-dimensional arrays of a Warp type."""
+        return np.concatenate([self.empty(0, kind), *parts])
+
     def struct(self, kind: WarpType, *fields: object) -> object:
         """Return an argument of a struct's type; None is a field that the kernel does not read."""
         return struct_record(kind, fields)
@@ -95,6 +102,13 @@ class GpuMemory:
     def numpy(self, array: WarpArray) -> np.ndarray:
         return np.asarray(array.numpy())
 
+    def joined(self, parts: list[WarpArray], kind: WarpType) -> WarpArray:
+        out, first = self.empty(sum(map(len, parts)), kind), 0
+        for part in parts:
+            wp.copy(out, part, dest_offset=first, count=len(part))
+            first += len(part)
+        return out
+
     def struct(self, kind: WarpType, *fields: object) -> object:
         out = kind()
         for name, value in zip(fields_of(kind), fields, strict=False):
@@ -106,7 +120,7 @@ class GpuMemory:
         launch_on(self.device, kernel.kernel, n, *inputs, None)
 
 
-def memory_of(device: Device) -> HostMemory | GpuMemory:
+def kernel_memory(device: Device) -> HostMemory | GpuMemory:
     """Return the memory of kernels on a device."""
     return GpuMemory(device) if device.is_cuda else HostMemory()
 
