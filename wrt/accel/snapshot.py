@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Concatenate, ParamSpec, TypeVar
 from weakref import WeakKeyDictionary
 
 from wrt.accel.built import AccelStats, Built
@@ -14,6 +14,7 @@ from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.structure import Structure
 from wrt.core.types import Device, WarpArray, WarpStruct
 
+P = ParamSpec("P")
 T = TypeVar("T")
 UNBUILT = AccelStats()
 
@@ -59,13 +60,17 @@ class Snapshot:
         return replace(self, structure=self.structure._replace(units=units), data=data)
 
 
-def once(make: Callable[[Snapshot], T]) -> Callable[[Snapshot], T]:
-    """Cache the results of a function of a snapshot, except for snapshots that refits in place modify."""
+def once(make: Callable[Concatenate[Snapshot, P], T]) -> Callable[Concatenate[Snapshot, P], T]:
+    """Cache the results of a function of a snapshot, except for snapshots that refits in place modify.
+
+    The function's other arguments, such as `threads`, must not change its result.
+    """
     cache: WeakKeyDictionary[Snapshot, T] = WeakKeyDictionary()
 
-    def cached(snapshot: Snapshot) -> T:
+    def cached(snapshot: Snapshot, /, *arguments: P.args, **named: P.kwargs) -> T:
         if snapshot in cache:
             return cache[snapshot]
-        return make(snapshot) if snapshot.changes else cache.setdefault(snapshot, make(snapshot))
+        value = make(snapshot, *arguments, **named)
+        return value if snapshot.changes else cache.setdefault(snapshot, value)
 
     return cached

@@ -67,9 +67,9 @@ def winding_number(accel: Accelerator, points: ArrayLike, threads: int | None = 
     snapshot = snapshot_of(accel)
     rows, give, device = vectors(points, "points", FARTHEST), to_tensor_like(points), snapshot.device
     turns, surfaces = wp.empty(len(rows), dtype=wp.vec3d, device=device), device_scene(snapshot).surfaces
-    kernel, inputs = (wind, [surfaces]) if exact else (wind_by_tree, [surfaces, *winding_tree(snapshot)])
-    launch_on(device, kernel, len(rows), *inputs, upload(rows, wp.vec3, device), turns, None, threads=thread_count(threads),
-              step=POINTS_PER_LAUNCH)
+    threads = thread_count(threads)
+    kernel, inputs = (wind, [surfaces]) if exact else (wind_by_tree, [surfaces, *winding_tree(snapshot, threads)])
+    launch_on(device, kernel, len(rows), *inputs, upload(rows, wp.vec3, device), turns, None, threads=threads, step=POINTS_PER_LAUNCH)
     re, im, whole = turns.numpy().reshape(-1, 3).T
     out = whole + np.arctan2(im, re) / (2.0 * np.pi)
     return out if give is None else give(upload(out, wp.float64, device))

@@ -13,7 +13,6 @@ from wrt.accel.points.contains import finite_faces
 from wrt.accel.queries.hit_points import device_scene
 from wrt.accel.snapshot import Snapshot, once
 from wrt.core.device import launch_on, records, upload
-from wrt.core.threads import thread_count
 from wrt.core.types import WarpArray
 from wrt.kernels.winding import WindingNode, expand_nodes
 
@@ -32,9 +31,9 @@ class WindingTree(NamedTuple):
 
 
 @once
-def winding_tree(snapshot: Snapshot) -> WindingTree:
+def winding_tree(snapshot: Snapshot, threads: int) -> WindingTree:
     """Make the tree over the finite faces of a structure's mesh."""
-    mesh, device, threads = snapshot.mesh, snapshot.device, thread_count(None)
+    mesh, device = snapshot.mesh, snapshot.device
     used = finite_faces(mesh)
     nodes, order = nodes_over(Geometry(mesh.vertices, mesh.faces[used], np.zeros((0, 4), np.float32)), threads)
     begin, end = ranges_of(nodes)
