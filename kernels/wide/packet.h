@@ -71,9 +71,7 @@ template <class Ray, class Axes> WRT_INLINE auto triangle_ray(const Ray& ray, Ax
 // Return the lanes that the test in float32 does not reject, without a ray's own triangle.
 template <int N, class Triangles, class Ray, class Axes>
 WRT_INLINE typename Lanes<N>::Ints candidates(const Triangles& triangles, const Ray& ray, Axes axes) {
-    const auto shear = triangle_ray(ray, axes);
-    const auto areas = edge_areas(to_ray_space(triangles, 0, shear), to_ray_space(triangles, 1, shear), to_ray_space(triangles, 2, shear));
-    return ~outside(areas) & (triangles.prim_id() + 1 != all<typename Lanes<N>::Ints>(ray.bits(EXCLUDE)));
+    return accepted(triangles, triangle_ray(ray, axes)) & (triangles.prim_id() + 1 != all<typename Lanes<N>::Ints>(ray.bits(EXCLUDE)));
 }
 
 // Return the hits that are better than the best hit of each ray: with t in [t_min, T] and, at t = T, a prim_id that is not higher. The

@@ -40,12 +40,18 @@ template <class T> WRT_INLINE auto outside(const Vec3<T>& areas) {
            & ((areas[0] > zero) | (areas[1] > zero) | (areas[2] > zero));
 }
 
+// Return the lanes that the test in float32 does not reject.
+template <class Triangles, class Int, class Number>
+WRT_INLINE auto accepted(const Triangles& triangles, const TriangleRay<Int, Number>& ray) {
+    return ~outside(edge_areas(to_ray_space(triangles, 0, ray), to_ray_space(triangles, 1, ray), to_ray_space(triangles, 2, ray)));
+}
+
 // Return the mask of a row's triangles that the test does not reject in float32.
 template <int N, class LaneRay> WRT_INLINE int cull(const float* numbers, const LaneRay& ray) {
     const Row<N> row = {numbers};
     const TriangleRay<int, float> shear = {ray.kx, ray.ky, ray.kz, ray.shear_x, ray.shear_y,
                                            {{ray.origin[0], ray.origin[1], ray.origin[2]}}};
-    return mask_of(~outside(edge_areas(to_ray_space(row, 0, shear), to_ray_space(row, 1, shear), to_ray_space(row, 2, shear))));
+    return mask_of(accepted(row, shear));
 }
 
 template <int N> WRT_INLINE typename Lanes<N>::Doubles wide(typename Lanes<N>::Floats x) {

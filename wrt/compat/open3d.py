@@ -20,7 +20,7 @@ from wrt.accel.queries.all_hits import ListQuery
 from wrt.accel.queries.raw_kernel import RawKernel
 from wrt.accel.queries.rays import vectors
 from wrt.accel.scenes.build import build
-from wrt.compat.surfaces import every_hit
+from wrt.compat.surfaces import every_hit, given_rays, scatter
 from wrt.core.arrays import float32, real_numbers
 from wrt.core.checks import as_integer, shown
 from wrt.core.errors import InputError
@@ -137,13 +137,13 @@ class RaycastingScene:
         accel = self._scene()[0]
         shape, valid, origins, directions = _valid_rays(rays, nthreads)
         found = accel.any_hit(origins, directions, tnear, tfar, threads=_threads(nthreads))
-        return _answer(_scatter(found, valid, False), shape)
+        return _answer(scatter(found, valid, False), shape)
 
     def count_intersections(self, rays: ArrayLike, nthreads: int = 0) -> Answer:
         """Count the intersections of each ray with surfaces, (...) int32. An intersection at an edge or a corner counts once."""
         shape, valid, origins, directions = _valid_rays(rays, nthreads)
         ray, *_ = every_hit(self._scene()[0], origins, directions, _threads(nthreads))
-        return _answer(_scatter(np.bincount(ray, minlength=len(origins)).astype(np.int32), valid, 0), shape)
+        return _answer(scatter(np.bincount(ray, minlength=len(origins)).astype(np.int32), valid, 0), shape)
 
     def list_intersections(self, rays: ArrayLike, nthreads: int = 0) -> dict[str, Answer]:
         """List the M intersections that `count_intersections` counts, ray by ray in order of distance.
@@ -156,7 +156,7 @@ class RaycastingScene:
         """
         shape, valid, origins, directions = _valid_rays(rays, nthreads)
         ray, face, t, u, v = every_hit(self._scene()[0], origins, directions, _threads(nthreads))
-        rows = ray if valid is None else np.flatnonzero(valid)[ray]
+        rows = given_rays(ray, valid)
         splits = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=math.prod(shape)))])
         geometry_ids, primitive_ids = self._ids(face)
         found = {"ray_splits": splits.astype(np.uint32), "ray_ids": rows.astype(np.uint32), "t_hit": t,
@@ -183,14 +183,14 @@ class RaycastingScene:
     def compute_distance(self, query_points: ArrayLike, nthreads: int = 0) -> Answer:
         """Compute the distance of each point to the meshes, (...) float32: inf without a mesh, NaN for points that are not finite."""
         shape, valid, points = _valid_points(query_points)
-        return _answer(_scatter(closest_points(self._scene()[0], points, _threads(nthreads)).distance, valid, np.nan), shape)
+        return _answer(scatter(closest_points(self._scene()[0], points, _threads(nthreads)).distance, valid, np.nan), shape)
 
     def compute_signed_distance(self, query_points: ArrayLike, nthreads: int = 0, nsamples: int = 1) -> Answer:
         """Compute distances to the meshes, (...) float32; negative for points where `compute_occupancy` with `nsamples` is 1."""
         shape, valid, points = _valid_points(query_points)
         inside = self._inside(points, nthreads, nsamples)
         distance = closest_points(self._scene()[0], points, _threads(nthreads)).distance
-        return _answer(_scatter(np.where(inside, -distance, distance), valid, np.nan), shape)
+        return _answer(scatter(np.where(inside, -distance, distance), valid, np.nan), shape)
 
     def compute_occupancy(self, query_points: ArrayLike, nthreads: int = 0, nsamples: int = 1) -> Answer:
         """Return 1.0 for points inside and 0.0 for others, (...) float32. A ray from inside crosses surfaces an odd number of times.
@@ -201,7 +201,7 @@ class RaycastingScene:
             Odd number of rays; the majority decides. For closed surfaces one ray is exact (wrt.contains).
         """
         shape, valid, points = _valid_points(query_points)
-        return _answer(_scatter(self._inside(points, nthreads, nsamples).astype(np.float32), valid, 0.0), shape)
+        return _answer(scatter(self._inside(points, nthreads, nsamples).astype(np.float32), valid, 0.0), shape)
 
     @staticmethod
     def create_rays_pinhole(*given: Any, **named: Any) -> Answer:
@@ -320,15 +320,6 @@ def _finite(array: np.ndarray, name: str) -> np.ndarray:
     return valid
 
 
-def _scatter(array: np.ndarray, valid: np.ndarray | None, missing: float) -> np.ndarray:
-    """Return an array with the rows of `array` where `valid`, and with `missing` elsewhere. valid None: all rows."""
-    if valid is None:
-        return array
-    out = np.full((len(valid), *array.shape[1:]), missing, array.dtype)
-    out[valid] = array
-    return out
-
-
 def _answers(found: dict[str, np.ndarray], valid: np.ndarray | None, shape: tuple[int, ...]) -> dict[str, Any]:
     """Return results for all rays or points of the caller, as arrays or tensors.
 
@@ -336,7 +327,7 @@ def _answers(found: dict[str, np.ndarray], valid: np.ndarray | None, shape: tupl
     shape of the caller's rays or points.
     """
     missed = {"t_hit": np.inf, "geometry_ids": RaycastingScene.INVALID_ID, "primitive_ids": RaycastingScene.INVALID_ID}
-    return {name: _answer(_scatter(array, valid, missed.get(name, 0.0)), shape) for name, array in found.items()}
+    return {name: _answer(scatter(array, valid, missed.get(name, 0.0)), shape) for name, array in found.items()}
 
 
 def _answer(array: np.ndarray, shape: tuple[int, ...]) -> Answer:

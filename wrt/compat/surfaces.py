@@ -29,3 +29,17 @@ def every_hit(accel: Accelerator, origins: np.ndarray, directions: np.ndarray, t
         order = np.argsort(found[0], kind="stable")
         found = [array[order] for array in found]
     return tuple(found)
+
+
+def scatter(found: np.ndarray, valid: np.ndarray | None, missing: object) -> np.ndarray:
+    """Return an array with the rows of `found` where `valid`, and with `missing` elsewhere. valid None: all rows."""
+    if valid is None:
+        return found
+    out = np.full((len(valid), *found.shape[1:]), missing, found.dtype)
+    out[valid] = found
+    return out
+
+
+def given_rays(ray: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
+    """Convert indices among the valid rays to indices among all rays. valid None: all rays."""
+    return ray if valid is None else np.flatnonzero(valid)[ray]

@@ -17,7 +17,7 @@ from wrt.accel.points.contains import contains, open_edges_of
 from wrt.accel.queries.answers import Hits
 from wrt.accel.queries.raw_kernel import RawKernel
 from wrt.accel.scenes.build import build
-from wrt.compat.surfaces import every_hit
+from wrt.compat.surfaces import every_hit, given_rays, scatter
 from wrt.core.arrays import real_numbers
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
@@ -170,39 +170,36 @@ class _ScaledStructure:
         return np.ldexp(points - self.shift, self.exponent)
 
     def local_rays(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray | None, np.ndarray, np.ndarray]:
-        """Return the indices of the valid rays (None: all rays), and these rays in the structure's coordinates, float32."""
+        """Return the mask of the valid rays (None: all rays), and these rays in the structure's coordinates, float32."""
         placed_origins, placed_directions = np.empty((2, *origins.shape), np.float32)
         valid = np.empty(len(origins), bool)
         arrays = origins, directions, placed_origins, placed_directions, valid
         PLACE_RAYS.launch(len(origins), record_of(self.placement), struct_record(PlacedRays, arrays), threads=thread_count(self.threads))
         if valid.all():
             return None, placed_origins, placed_directions
-        rows = np.flatnonzero(valid)
-        return rows, placed_origins[rows], placed_directions[rows]
+        return valid, placed_origins[valid], placed_directions[valid]
 
     def first_hit(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return ray, face, u and v of each ray's first hit."""
-        rows, origins, directions = self.local_rays(origins, directions)
+        valid, origins, directions = self.local_rays(origins, directions)
         hits: Hits = self.accel.closest_hit(origins, directions, threads=self.threads)
         hit = np.flatnonzero(hits.prim_id >= 0)
-        return _of(rows, hit), hits.prim_id[hit].astype(np.int64), hits.u[hit], hits.v[hit]
+        return given_rays(hit, valid), hits.prim_id[hit].astype(np.int64), hits.u[hit], hits.v[hit]
 
     def first_face(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Return the face of each ray's first hit, (N,) int32; -1 on a miss."""
-        n = len(origins)
-        rows, origins, directions = self.local_rays(origins, directions)
-        return _scatter(rows, self.accel.closest_hit(origins, directions, threads=self.threads).prim_id, n, -1)
+        valid, origins, directions = self.local_rays(origins, directions)
+        return scatter(self.accel.closest_hit(origins, directions, threads=self.threads).prim_id, valid, -1)
 
     def every_hit(self, origins: np.ndarray, directions: np.ndarray, limit: int) -> tuple[np.ndarray, ...]:
         """Return ray, face, u and v of all hits, at most `limit` per ray, ray by ray in order of distance."""
-        rows, origins, directions = self.local_rays(origins, directions)
+        valid, origins, directions = self.local_rays(origins, directions)
         ray, face, _, u, v = every_hit(self.accel, origins, directions, self.threads, limit)
-        return _of(rows, ray), face.astype(np.int64), u, v
+        return given_rays(ray, valid), face.astype(np.int64), u, v
 
     def any_hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        n = len(origins)
-        rows, origins, directions = self.local_rays(origins, directions)
-        return _scatter(rows, self.accel.any_hit(origins, directions, threads=self.threads), n, False)
+        valid, origins, directions = self.local_rays(origins, directions)
+        return scatter(self.accel.any_hit(origins, directions, threads=self.threads), valid, False)
 
     def located(self, origins: np.ndarray, directions: np.ndarray, *hits: np.ndarray) -> np.ndarray:
         """Return the points (M, 3) float64 of hits: ray and face (M,) int64, u and v (M,) float32."""
@@ -236,16 +233,3 @@ def _first_hits_first(ray: np.ndarray) -> np.ndarray:
     if counts.max(initial=0) <= 1 << 16:
         rank = rank.astype(np.uint16)  # NumPy sorts short integers in linear time
     return np.argsort(rank, kind="stable")
-
-
-def _scatter(rows: np.ndarray | None, found: np.ndarray, n: int, missing: object) -> np.ndarray:
-    """Return an array of n rows: `found` in the given rows, `missing` elsewhere. rows None: all rows."""
-    if rows is None:
-        return found
-    out = np.full(n, missing, found.dtype)
-    out[rows] = found
-    return out
-
-
-def _of(rows: np.ndarray | None, ray: np.ndarray) -> np.ndarray:
-    return ray if rows is None else rows[ray]
