@@ -3,6 +3,7 @@
 import warp as wp
 
 from wrt.kernels.structs import Surfaces, kernel
+from wrt.kernels.traverse import bvh2
 from wrt.kernels.traverse.stack import make_uninitialized
 
 # A product below SMALLEST or above LARGEST is scaled to size 1, so that it neither under- nor overflows.
@@ -83,7 +84,7 @@ def wind(surfaces: Surfaces, points: wp.array(dtype=wp.vec3), turns: wp.array(dt
 FAR = wp.constant(3.25)
 SLIGHTLY_MORE = wp.constant(wp.float64(1.0 + 2.0**-20))  # for a radius that is rounded to float32
 SPHERE = wp.constant(wp.float64(4.0 * wp.pi))  # the whole solid angle
-STACK_SIZE = 128  # two entries a level of a binary tree
+STACK_SIZE = bvh2.STACK_SIZE + 2  # a level of the builder's tree leaves one entry, and the last level two
 empty_stack = make_uninitialized(STACK_SIZE, wp.int32)
 vec10 = wp.types.vector(10, wp.float32)
 vec10d = wp.types.vector(10, wp.float64)
@@ -223,7 +224,7 @@ def wind_by_tree(surfaces: Surfaces, nodes: wp.array(dtype=WindingNode), faces: 
             begin = nodes[index].first
             for k in range(begin, begin + nodes[index].count):
                 total = add_triangle(total, surfaces, faces[k], point)
-        elif size + 2 <= STACK_SIZE:
+        else:
             stack[size] = nodes[index].first
             stack[size + 1] = nodes[index].first + 1
             size = size + 2
