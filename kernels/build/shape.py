@@ -1,17 +1,19 @@
 """Compute the boxes and records of triangles and spheres on any device, so that a moving mesh need not leave the GPU.
-The results equal those of the host's functions to the last bit (Geometry.bounds, wrt.accel.triangle_data.corners).
+The results equal those of the host's functions to the last bit (Geometry.bounds, wrt.accel.triangle_data.corners). `write_rows` is for CPUs.
 A launch of size dim processes the primitives or records first .. first + dim - 1."""
 
 from typing import Any
 
 import warp as wp
 
-from wrt.kernels.structs import Primitive, kernel
+from wrt.kernels.memory import prefetch
+from wrt.kernels.structs import Primitive, kernel, noinline
 from wrt.kernels.units.box import box_pad, padded_hi, padded_lo
 from wrt.kernels.units.triangle import lower, upper
 
 SPLIT = wp.constant(wp.float64(2.0**27 + 1.0))  # Dekker's factor that splits a float64 into two halves
 DOUBT = wp.constant(wp.float64(2.0**-50))  # bound on the relative error of a float64 area, as in wrt.scene.clean.corners_have_area
+FACES_AHEAD, CORNERS_AHEAD = wp.constant(32), wp.constant(12)  # primitives between a prefetch and the use of its cache line
 Terms = wp.types.vector(16, wp.float64)
 
 
@@ -107,10 +109,11 @@ def with_products(terms: Terms, place: int, e: wp.vec2d, f: wp.vec2d, sign: wp.f
     return out
 
 
-@wp.func
+@noinline
 def exactly_across(a: wp.vec3, b: wp.vec3, c: wp.vec3, i: int, j: int) -> bool:
     """Test exactly whether component k of the cross product of b - a and c - a differs from 0; i and j are the two other axes.
-    Nothing under- or overflows: all numbers are multiples of 2^-298 and below 2^258."""
+    Nothing under- or overflows: all numbers are multiples of 2^-298 and below 2^258. Inlined, its long vectors would be cleared for each
+    triangle, in twice the time of all the rest."""
     e_i = two_sum(wp.float64(b[i]), -wp.float64(a[i]))
     e_j = two_sum(wp.float64(b[j]), -wp.float64(a[j]))
     f_i = two_sum(wp.float64(c[i]), -wp.float64(a[i]))
@@ -130,19 +133,20 @@ def surely_across(a: wp.vec3, b: wp.vec3, c: wp.vec3, i: int, j: int) -> bool:
 @wp.func
 def has_area(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> bool:
     """Test whether the corners are not on one line, as wrt.scene.clean.has_area does; True if a corner is not finite."""
-    if surely_across(a, b, c, 1, 2) or surely_across(a, b, c, 2, 0) or surely_across(a, b, c, 0, 1):
+    if surely_across(a, b, c, 1, 2):  # `or` computes all its operands
+        return True
+    if surely_across(a, b, c, 2, 0) or surely_across(a, b, c, 0, 1):
         return True
     if not (wp.isfinite(a) and wp.isfinite(b) and wp.isfinite(c)):
         return True
     return exactly_across(a, b, c, 1, 2) or exactly_across(a, b, c, 2, 0) or exactly_across(a, b, c, 0, 1)
 
 
-@kernel
-def write_corners(shape: Shape, order: wp.array(dtype=wp.int32), out: wp.array(dtype=Primitive), first: int):
-    """Write the records first .. first + dim - 1 with corners (the layout "corners"). order[i] is the prim_id of record i."""
-    i = first + wp.tid()
+@wp.func
+def corners_of(shape: Shape, prim_id: int) -> Primitive:
+    """Return a primitive's record with corners (the layout "corners")."""
     record = Primitive()
-    record.prim_id = order[i]
+    record.prim_id = prim_id
     if record.prim_id < shape.faces.shape[0]:
         face = shape.faces[record.prim_id]
         record.v0 = shape.vertices[face[0]]
@@ -150,7 +154,45 @@ def write_corners(shape: Shape, order: wp.array(dtype=wp.int32), out: wp.array(d
         record.v2 = shape.vertices[face[2]]
         if not has_area(record.v0, record.v1, record.v2):
             record.v0 = wp.vec3(wp.nan, wp.nan, wp.nan)
-    out[i] = record
+    return record
+
+
+@kernel
+def write_corners(shape: Shape, order: wp.array(dtype=wp.int32), out: wp.array(dtype=Primitive), first: int):
+    """Write the records first .. first + dim - 1 with corners. order[i] is the prim_id of record i."""
+    i = first + wp.tid()
+    out[i] = corners_of(shape, order[i])
+
+
+# Faster than assignments to elements, for which Warp computes an address each.
+@wp.func_native("""
+    const int numbers = sizeof(record) / sizeof(float);
+    float* to = rows.data + (long long)row * numbers * width + lane;
+    const char* from = (const char*)&record;
+    for (int k = 0; k < numbers; ++k) memcpy(to + k * width, from + k * sizeof(float), sizeof(float));
+""")
+def store_lane(rows: wp.array(dtype=wp.float32), row: int, lane: int, width: int, record: Primitive) -> None: ...
+
+
+@kernel
+def write_rows(shape: Shape, order: wp.array(dtype=wp.int32), start: wp.array(dtype=wp.int32), width: int,
+               out: wp.array(dtype=wp.float32), first: int):
+    """Write the rows first .. first + dim - 1 of `width` records with corners: a row has `width` values for each number of a record.
+    Row r holds the primitives order[start[r] .. start[r + 1] - 1], at least one. Its unused lanes repeat the last of them.
+    The shape has at least one face."""
+    row = first + wp.tid()
+    begin = start[row]
+    count = start[row + 1] - begin
+    last = order.shape[0] - 1
+    record = Primitive()
+    for lane in range(width):
+        if lane < count:
+            prefetch(shape.faces, order[wp.min(begin + lane + FACES_AHEAD, last)])
+            face = shape.faces[wp.min(order[wp.min(begin + lane + CORNERS_AHEAD, last)], shape.faces.shape[0] - 1)]
+            for corner in range(3):
+                prefetch(shape.vertices, face[corner])
+            record = corners_of(shape, order[begin + lane])
+        store_lane(out, row, lane, width, record)
 
 
 @kernel

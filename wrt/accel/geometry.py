@@ -54,15 +54,16 @@ class Geometry:
         """Return the SHA-256 of the arrays."""
         out = sha256()
         for array in (self.vertices, self.faces, self.spheres):
-            out.update(f"{array.shape}{array.dtype.str}".encode() + np.ascontiguousarray(array).tobytes())
+            out.update(f"{array.shape}{array.dtype.str}".encode())
+            out.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
         return out.hexdigest()
 
     def on(self, device: Device, faces: WarpArray | None = None) -> WarpStruct:
         """Upload to a device, as kernels.build.shape.Shape. faces: the faces, if they are on the device already."""
         shape = Shape()
-        shape.vertices = upload(self.vertices, wp.vec3, device)
-        shape.faces = upload(self.faces, wp.vec3i, device) if faces is None else faces
-        shape.spheres = upload(self.spheres, wp.vec4, device)
+        shape.vertices = upload(self.vertices, wp.vec3, device, read_only=True)
+        shape.faces = upload(self.faces, wp.vec3i, device, read_only=True) if faces is None else faces
+        shape.spheres = upload(self.spheres, wp.vec4, device, read_only=True)
         return shape
 
     def unshared(self) -> Geometry:

@@ -6,6 +6,7 @@ types of the arrays come from the structure's class. Indices are checked before 
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from wrt.core.checked_file import read_checked, write_checked
 from wrt.core.default_device import DEFAULT_DEVICE
 from wrt.core.device import row_type
 from wrt.core.errors import InputError
+from wrt.core.threads import thread_count, verifying
 from wrt.core.types import JsonObject, PathLike
 from wrt.core.version import VERSION
 from wrt.core.write_file import check_writable, replacing
@@ -68,20 +70,26 @@ def read(path: PathLike, geometry: Geometry, attributes: FlatScene | None = None
 
     Raises InputError if the file is missing, damaged, not a structure, of another version, or over another mesh.
     """
-    header, body = read_checked(path, MAGIC, "acceleration structure")
+    at_once = thread_count(threads)
     try:
-        cls = ACCELERATORS.get(header["accel"])
-        if cls is None:
-            raise InputError(f"holds a structure {header['accel']!r}, which this version of wrt does not have")
-        if header["geometry"] != geometry.digest():
-            raise InputError("was built over another mesh")
-        built = read_arrays(cls, header, body)
-        with np.errstate(over="ignore", invalid="ignore"):  # for values near the largest float32
-            return cls.restore(built, geometry, attributes, device, threads, units=Units(header["triangle"], header["box"]))
+        with read_checked(path, MAGIC, "acceleration structure", at_once) as (header, body):
+            cls = ACCELERATORS.get(header["accel"])
+            if cls is None:
+                raise InputError(f"holds a structure {header['accel']!r}, which this version of wrt does not have")
+            with verifying(partial(require_same_mesh, header, geometry), at_once):
+                built = read_arrays(cls, header, body)
+                with np.errstate(over="ignore", invalid="ignore"):  # for values near the largest float32
+                    return cls.restore(built, geometry, attributes, device, threads, units=Units(header["triangle"], header["box"]))
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         if isinstance(error, InputError):
             raise error.at(path) from error
         raise InputError(f"is not a structure of this version of wrt ({type(error).__name__}: {error})", path=path) from error
+
+
+def require_same_mesh(header: JsonObject, geometry: Geometry) -> None:
+    """Raise InputError unless the structure was built over a geometry with the same arrays."""
+    if header["geometry"] != geometry.digest():
+        raise InputError("was built over another mesh")
 
 
 def read_arrays(cls: type[Any], header: JsonObject, body: memoryview) -> Built:

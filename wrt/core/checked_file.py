@@ -6,7 +6,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from hashlib import sha256
 from typing import BinaryIO
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from wrt.core.errors import InputError
 from wrt.core.files import open_regular
+from wrt.core.threads import verifying
 from wrt.core.types import JsonObject
 
 DIGEST_BYTES = 32
@@ -30,8 +32,11 @@ def write_checked(file: BinaryIO, magic: bytes, header: JsonObject, parts: Itera
     file.write(digest.digest())
 
 
-def read_checked(path: str | os.PathLike[str], magic: bytes, what: str) -> tuple[JsonObject, memoryview]:
-    """Return the header and the bytes of the arrays. Raises InputError if the file is missing, damaged, or not of the kind `what`."""
+@contextmanager
+def read_checked(path: str | os.PathLike[str], magic: bytes, what: str, threads: int = 1) -> Iterator[tuple[JsonObject, memoryview]]:
+    """Yield the header and the bytes of the arrays. With two threads or more, the checksum is verified while the block runs.
+
+    Raises InputError if the file is missing, damaged, or not of the kind `what`: if it is damaged, in place of any error of the block."""
     try:
         with open_regular(path) as file:
             if file.read(len(magic)) != magic:
@@ -43,12 +48,16 @@ def read_checked(path: str | os.PathLike[str], magic: bytes, what: str) -> tuple
     except InputError as error:
         raise error.at(path) from error
     end = bytes(data[: len(magic) + MAX_HEADER]).find(b"\n", len(magic))
-    if end < 0 or sha256(data[:-DIGEST_BYTES]).digest() != data[-DIGEST_BYTES:]:
-        raise InputError("is damaged: its checksum does not match its content", path=path)
-    try:
-        header = json.loads(bytes(data[len(magic):end]))
-    except (ValueError, RecursionError):
-        header = None
-    if not isinstance(header, dict):
-        raise InputError(f"is no {what} of this version", path=path)
-    return header, data[end + 1:-DIGEST_BYTES]
+
+    def verify() -> None:
+        if end < 0 or sha256(data[:-DIGEST_BYTES]).digest() != data[-DIGEST_BYTES:]:
+            raise InputError("is damaged: its checksum does not match its content", path=path)
+
+    with verifying(verify, threads):
+        try:
+            header = json.loads(bytes(data[len(magic):end]))
+        except (ValueError, RecursionError):
+            header = None
+        if not isinstance(header, dict):
+            raise InputError(f"is no {what} of this version", path=path)
+        yield header, data[end + 1:-DIGEST_BYTES]

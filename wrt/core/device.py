@@ -226,9 +226,10 @@ def _require_room_to_compile(cache: Path) -> None:
         raise OSError(errno.ENOSPC, f"there is room for {disk.f_favail} files, but {FILES_TO_COMPILE} are needed")
 
 
-def upload(array: np.ndarray, dtype: WarpType, device: Device) -> WarpArray:
+def upload(array: np.ndarray, dtype: WarpType, device: Device, read_only: bool = False) -> WarpArray:
     """Return a Warp array of `dtype` with the rows of a NumPy array; on the CPU without a copy if type and layout allow it.
 
+    read_only: no kernel writes to the array, so that it may share the memory of an array that is not writeable, such as a scene's.
     Raises InputError for more rows than the int32 indices of kernels can reach."""
     if len(array) > MOST_ROWS:
         raise InputError(f"{len(array)} rows of {dtype.__name__ if isinstance(dtype, type) else dtype.key} are more than an array"
@@ -240,7 +241,8 @@ def upload(array: np.ndarray, dtype: WarpType, device: Device) -> WarpArray:
             return _array_at(rows.ctypes.data, dtype, rows.shape, device, rows)
         return _view_as(wp.array(rows.view(np.uint8), dtype=wp.uint8, device=device, copy=True), dtype, array.shape)
     array = np.ascontiguousarray(array, dtype=wp.dtype_to_numpy(warp_private.scalar_type(dtype)))
-    # Warp cannot share the memory of a read-only array, such as a scene's.
+    if read_only and device.is_cpu:
+        return _array_at(array.ctypes.data, dtype, array.shape[:1], device, array)
     return wp.array(array, dtype=dtype, device=device, copy=not array.flags.writeable)
 
 

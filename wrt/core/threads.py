@@ -128,6 +128,16 @@ def submit(task: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> Futur
     return _pool(os.getpid()).submit(task, *arguments, **named)
 
 
+@contextlib.contextmanager
+def verifying(check: Callable[[], object], threads: int) -> Iterator[None]:
+    """Run `check` on another thread while the block runs; if `threads` is 1, after it. Raise its error in place of the block's."""
+    end = submit(check).result if threads > 1 else check
+    try:
+        yield
+    finally:
+        end()
+
+
 def run_all(tasks: Iterable[Callable[[], None]], threads: int) -> None:
     """Run all tasks on `threads` threads, including this one. After an error no task starts; the error is raised in the end."""
     with_stack(partial(_run_all, list(tasks), threads))

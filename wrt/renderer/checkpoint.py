@@ -47,15 +47,15 @@ class Saved:
 
 def read(path: str | os.PathLike[str]) -> Saved:
     """Read a checkpoint. Raises InputError if the file is missing, damaged, of another version, or no checkpoint."""
-    header, body = read_checked(path, MAGIC, "checkpoint")
     try:
-        low, high = map(int, header["samples"])
-        if not 0 <= low <= high < 1 << 31:  # counts of the film are int32
-            raise ValueError("samples out of range")
-        seconds = float(header["seconds"])
-        if not 0.0 <= seconds < math.inf:
-            raise ValueError(f"{seconds} seconds")
-        return Saved((low, high), seconds, dict(header["identity"]), body)
+        with read_checked(path, MAGIC, "checkpoint") as (header, body):
+            low, high = map(int, header["samples"])
+            if not 0 <= low <= high < 1 << 31:  # counts of the film are int32
+                raise ValueError("samples out of range")
+            seconds = float(header["seconds"])
+            if not 0.0 <= seconds < math.inf:
+                raise ValueError(f"{seconds} seconds")
+            return Saved((low, high), seconds, dict(header["identity"]), body)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"is no checkpoint of this version ({type(error).__name__}: {error})", path=path) from error
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
+import pytest
 
 from tests.kernel_tools import DEVICE  # isort: skip (starts Warp)
 import warp as wp
 
 from wrt.accel.geometry import Geometry
-from wrt.core.device import launch_on
-from wrt.kernels.build.shape import bounds, write_corners
+from wrt.core.device import launch, launch_on
+from wrt.kernels.build.shape import bounds, write_corners, write_rows
 from wrt.kernels.structs import Primitive
 from wrt.kernels.traverse.common import Units
 from wrt.scene.clean import corners_have_area
@@ -65,3 +68,17 @@ def test_corners_have_the_hosts_bits_and_the_same_have_no_area() -> None:
     theirs, mine = geometry.primitives(Units(spheres=True), order), out.numpy()
     for name in ("v0", "v1", "v2", "prim_id"):
         np.testing.assert_array_equal(mine[name], theirs[name])
+
+
+@pytest.mark.parametrize("width", [4, 8])
+def test_rows_hold_the_hosts_records(width: int) -> None:
+    """In each row, a lane without a primitive repeats the lane before it."""
+    geometry, rng = geometry_of(hard_corners()), np.random.default_rng(1)
+    order = rng.integers(0, len(geometry), 5000).astype(np.int32)
+    starts = np.unique(np.append(np.arange(0, len(order) + 1, width), rng.integers(1, len(order), 2000))).astype(np.int32)
+    rows = np.zeros((len(starts) - 1, 10, width), np.float32)
+    launch(write_rows, len(rows), geometry.on(wp.get_device("cpu")), order, starts, width, rows.reshape(-1), None, step=700)
+    lanes = np.array([[min(begin + lane, end - 1) for lane in range(width)] for begin, end in pairwise(starts)])
+    records = geometry.primitives(Units(spheres=True), order).view(np.float32).reshape(-1, 10)
+    np.testing.assert_array_equal(rows.view(np.int32)[:, 9], order[lanes])
+    np.testing.assert_array_equal(rows[:, :9].transpose(0, 2, 1), records[lanes, :9])

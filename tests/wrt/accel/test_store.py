@@ -114,9 +114,15 @@ def test_public_names_take_paths(saved: Path, tmp_path: Path) -> None:
         wrt.load_accel(saved, 7)  # type: ignore[arg-type]
 
 
-def test_another_mesh_is_refused(saved: Path) -> None:
-    with refused(what="built over another mesh", path="ball.accel"):
-        load_accel(saved, icosphere(3))
+@pytest.mark.parametrize("threads", [1, 2])
+def test_another_mesh_is_refused(saved: Path, threads: int) -> None:
+    """Also a smaller one, which the indices of the file lead out of. A damaged file is said to be damaged first."""
+    for mesh in (icosphere(3), icosphere(1)):
+        with refused(what="built over another mesh", path="ball.accel"):
+            load_accel(saved, mesh, threads=threads)
+    saved.write_bytes(saved.read_bytes()[:-1] + b"x")
+    with refused(what="checksum", path="ball.accel"):
+        load_accel(saved, icosphere(1), threads=threads)
 
 
 @pytest.mark.parametrize(("spoil", "message"), [

@@ -14,7 +14,7 @@ import pytest
 
 from tests.data import ROOT
 from tests.refused import refused
-from wrt.core.threads import run_all, run_growing, thread_count
+from wrt.core.threads import run_all, run_growing, thread_count, verifying
 
 
 def test_threads() -> None:
@@ -133,3 +133,17 @@ def test_run_growing_also_runs_what_tasks_give(threads: int) -> None:
     assert sorted(done) == sorted([16] + 2 * [8] + 5 * [4] + 10 * [2] + 20 * [1])
     with pytest.raises(ValueError, match="three"):
         run_growing(begin, [5], threads)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_check_that_fails_replaces_the_error_of_the_block(threads: int) -> None:
+    done = []
+    with verifying(lambda: done.append("check"), threads):
+        done.append("block")
+    assert sorted(done) == ["block", "check"]
+    for fails in (False, True):
+        with pytest.raises(ZeroDivisionError), verifying(lambda: 1 // 0, threads):
+            if fails:
+                raise KeyError
+    with pytest.raises(KeyError), verifying(lambda: None, threads):
+        raise KeyError

@@ -256,8 +256,7 @@ def test_any_damage_is_noticed(path: Path) -> None:
 
 def forged(path: Path, body_change: Callable[[bytes], bytes] = bytes, **changes: Any) -> None:
     """Change the contents of a checkpoint, and write it with a valid checksum."""
-    header, body = read_checked(path, MAGIC, "checkpoint")
-    with open(path.with_suffix(".new"), "wb") as file:
+    with read_checked(path, MAGIC, "checkpoint") as (header, body), open(path.with_suffix(".new"), "wb") as file:
         write_checked(file, MAGIC, header | changes, [body_change(bytes(body))])
     os.replace(path.with_suffix(".new"), path)
 

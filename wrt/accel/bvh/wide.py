@@ -13,17 +13,20 @@ from wrt.accel.built import Built
 from wrt.accel.bvh.builders import BinaryOptions, BvhOptions, build_binary
 from wrt.accel.bvh.compress import compress, decompress, existing_children
 from wrt.accel.bvh.small import SMALL, small_tree
-from wrt.accel.bvh.wide_tree import COLLAPSE, WideTree, check_wide, collapse, lanes_of, packed, refit
-from wrt.core.device import empty_aligned, preloading, record_dtype
+from wrt.accel.bvh.wide_tree import COLLAPSE, WideTree, check_wide, collapse, lanes_of, packed, refit, row_starts
+from wrt.accel.geometry import Geometry
+from wrt.core.device import empty_aligned, launch, preloading, record_dtype, start
 from wrt.core.errors import InputError
 from wrt.core.threads import run_all
 from wrt.core.types import WarpStruct
+from wrt.kernels.build.shape import write_rows
 from wrt.kernels.wide.batch import BatchTraversal
 from wrt.kernels.wide.layout import PLANES, STACK_SIZE, first_reference, node_size
 from wrt.kernels.wide.references import EMPTY, MAX_FIRST, leaf_count, leaf_first
 from wrt.kernels.wide.traverse import WideTraversal
 
 ROWS_PER_JOB = 4096
+ROWS_BY_KERNEL = 1 << 15  # triangles
 
 
 @dataclass(frozen=True)
@@ -63,7 +66,7 @@ class WideBvh(OneMesh):
         """Build a binary tree and collapse it."""
         # Two leaves count as cheaper than one if they have less area, because the cost of inner nodes depends on the collapse.
         of_binary = replace(options, max_leaf=min(options.max_leaf, self.width), cost_traversal=0.0, cost_intersection=1.0)
-        with preloading(*(COLLAPSE if len(self.geometry) > 1 else ())):
+        with preloading(*(COLLAPSE if len(self.geometry) > 1 else ()), *([write_rows] if self._rows_by_kernel() else [])):
             binary = build_binary(self.geometry, of_binary, self.threads)
             if len(binary.order) < 2:
                 return small_tree(*self.geometry.bounds(), options)
@@ -107,21 +110,29 @@ class WideBvh(OneMesh):
 
     def _primitives(self, built: Built) -> np.ndarray:
         """Return the records of the triangle test in rows of `width` lanes; an unused lane repeats the primitive before it."""
-        order = (built.order if self.compressed
-                 else lanes_of(self._references(built), built.order, self.width).reshape(-1))
-        units, width = self.structure.units, self.width
-        order = np.append(order, np.full(-len(order) % width, -1, np.int32))
+        units, width, order = self.structure.units, self.width, built.order
+        starts = (np.minimum(np.arange(0, len(order) + width, width, dtype=np.int32), len(order)) if self.compressed
+                  else row_starts(self._references(built), width))
         floats = record_dtype(units.triangle_test.record).itemsize // 4
-        rows = empty_aligned((len(order) // width, floats, width), np.float32)
+        rows = empty_aligned((len(starts) - 1, floats, width), np.float32)
+        if self._rows_by_kernel():
+            launch(write_rows, len(rows), self.geometry.on(start("cpu")), order, starts, width, rows.reshape(-1), None,
+                   threads=self.threads, step=ROWS_PER_JOB)
+            return rows.reshape(-1)
 
         def fill(first: int) -> None:
-            lanes = order[first * width : (first + ROWS_PER_JOB) * width]
-            records = self.geometry.primitives(units, lanes[lanes >= 0]).view(np.float32).reshape(-1, floats)
-            index = np.cumsum(lanes >= 0) - 1
-            rows[first : first + ROWS_PER_JOB] = records.take(index, axis=0).reshape(-1, width, floats).transpose(0, 2, 1)
+            begin = starts[first : first + ROWS_PER_JOB + 1, None]
+            lanes = order[np.minimum(begin[:-1] + np.arange(width, dtype=np.int32), begin[1:] - 1)]
+            records = self.geometry.primitives(units, lanes.reshape(-1)).view(np.float32).reshape(*lanes.shape, floats)
+            rows[first : first + ROWS_PER_JOB] = records.transpose(0, 2, 1)
 
         run_all([partial(fill, first) for first in range(0, len(rows), ROWS_PER_JOB)], self.threads)
         return rows.reshape(-1)
+
+    def _rows_by_kernel(self) -> bool:
+        """Return True if a kernel writes the rows: from so many triangles on that this saves more time than loading the kernel takes."""
+        return (self.structure.units.triangle_test.layout == "corners" and type(self.geometry) is Geometry
+                and self.geometry.n_triangles >= ROWS_BY_KERNEL)
 
     def _upload(self, built: Built) -> WarpStruct:
         nodes = empty_aligned(built.arrays["nodes"].shape, np.float32)
@@ -136,9 +147,9 @@ class WideBvh(OneMesh):
         if self.compressed and (existing_children(self._nodes(built), self.width) != (references != EMPTY)).any():
             raise InputError("is damaged: a node's mask of children differs from its references")
         if not self.compressed:
-            planes = self._nodes(built)[:, : first_reference(self.width, False)].reshape(-1, 3, 2, self.width)
-            empty = ((planes[:, :, 0] == np.inf) & (planes[:, :, 1] == -np.inf)).all(axis=1)
-            if not empty[references == EMPTY].all():
+            node, child = np.nonzero(references == EMPTY)
+            boxes = self._nodes(built)[:, : first_reference(self.width, False)].reshape(-1, 3, 2, self.width)[node, :, :, child]
+            if (boxes != np.array([np.inf, -np.inf], np.float32)).any():
                 raise InputError("is damaged: a child that does not exist has a box")
 
     def _refit(self, built: Built) -> Built:

@@ -106,20 +106,28 @@ def packed(children: np.ndarray, unit: int) -> np.ndarray:
     return out
 
 
+def row_starts(children: np.ndarray, width: int) -> np.ndarray:
+    """Return the index, in the order of the primitives, of each row's first primitive and, last, their number, (rows + 1,) int32.
+
+    children: references in units of rows."""
+    leaves = children[children < 0]
+    row, count = leaf_first.func(leaves), leaf_count.func(leaves)
+    starts = np.zeros(int((row - (-count // width)).max(initial=0)) + 1, np.int32)
+    while len(row):  # once for each row of the largest leaf
+        starts[row + 1] = np.minimum(count, width)
+        longer = count > width
+        row, count = row[longer] + 1, count[longer] - width
+    return np.cumsum(starts, out=starts)
+
+
 def lanes_of(children: np.ndarray, order: np.ndarray, width: int) -> np.ndarray:
     """Return the prim_id in each lane of the leaves' rows, (rows, width); -1 in an unused lane.
 
     children: references in units of rows. order: (R,) prim_ids of the leaves, one leaf after another.
     """
-    leaves = children[children < 0]
-    row, count = leaf_first.func(leaves), leaf_count.func(leaves)
-    rows = int((row - (-count // width)).max(initial=0))
-    at = np.zeros(rows, np.int64)
-    at[row] = count
-    row, count = np.flatnonzero(at), at[at > 0]
-    out = np.full(rows * width, -1, np.int32)
-    out[np.repeat(row * width - (np.cumsum(count) - count), count) + np.arange(int(count.sum()))] = order
-    return out.reshape(rows, width)
+    starts = row_starts(children, width)[:, None]
+    lanes = starts[:-1] + np.arange(width, dtype=np.int32)
+    return np.where(lanes < starts[1:], order.take(lanes, mode="clip"), np.int32(-1))
 
 
 def check_wide(children: np.ndarray, n_primitives: int, unit: int) -> None:

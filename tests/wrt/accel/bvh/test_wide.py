@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.refused import Refusal, refused
+from wrt.accel.bvh import wide
 from wrt.accel.bvh.compress import compress, decompress
 from wrt.accel.bvh.wide_tree import check_wide, lanes_of, packed
 from wrt.accel.geometry import Geometry
@@ -185,3 +186,10 @@ def test_a_node_that_tells_of_other_children_is_refused() -> None:
     nodes[3, 3:4].view(np.uint32)[0] ^= np.uint32(1 << 31)
     with refused(what="children"):
         accel._check(accel.built)
+
+
+@pytest.mark.parametrize("name", ["bvh4", "bvh8", "bvh8c"])
+def test_large_meshes_get_the_same_rows_from_a_kernel(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    host = build(BALL, name, max_leaf=12).data.primitives.numpy()
+    monkeypatch.setattr(wide, "ROWS_BY_KERNEL", 0)
+    assert build(BALL, name, max_leaf=12).data.primitives.numpy().tobytes() == host.tobytes()
