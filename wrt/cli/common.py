@@ -240,13 +240,19 @@ def client_of(cluster: str | None) -> Client | None:
 CLUSTER = click.option("--cluster", metavar="ADDRESS",
                        help="Share the work among the workers of a Dask scheduler, tcp://host:8786 (docs/cluster.md)")
 
+STAGING = option_group("staging", dict, ("up", "studio", "floor"), (
+    click.option("--up", type=OneOf("wrt.scene.defaults:UP"), default="y", show_default=True, help="Axis of a mesh file that points up"),
+    click.option("--studio/--no-studio", default=True, show_default=True,
+                 help="Light a file without lights by a studio, which glass and smooth surfaces reflect, or by a pale sky"),
+    click.option("--floor", is_flag=True, help="Put a mesh file on a grey floor")))
 
-def load(path: Path, quiet: bool) -> Scene:
-    """Read a scene, and write the loader's warnings to stderr."""
+
+def load(path: Path, quiet: bool, staging: dict[str, Parsed] | None = None) -> Scene:
+    """Read a scene, and write the loader's warnings to stderr. staging: keywords of load_scene, the values of STAGING's options."""
     from wrt.io.load import load_scene
 
     with warnings_reported(quiet):
-        return load_scene(path)
+        return load_scene(path, **staging or {})
 
 
 @contextlib.contextmanager

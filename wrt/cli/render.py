@@ -13,6 +13,7 @@ import click
 from wrt.cli.common import (
     CLUSTER,
     DURATION,
+    STAGING,
     Assignments,
     Names,
     OneOf,
@@ -53,6 +54,7 @@ if TYPE_CHECKING:
 @click.option("--fresnel", type=OneOf("wrt.scene.settings:FRESNELS"), help="Fresnel reflectance: exact, or schlick (cheaper, approximate)")
 @click.option("--sampler", type=OneOf("wrt.scene.settings:SAMPLERS"), help="Sample points: sobol (evenly spread), or independent (random)")
 @shared("assignments", "accel")
+@STAGING
 @click.option("--instancing", type=OneOf("wrt.accel.scenes.instancing:INSTANCING"), default="auto", show_default=True,
               help="Store a mesh that several objects share once: auto (large meshes), always or never")
 @click.option("--aov", type=Names(), default=(), help="Layers to write as well: depth, normal, albedo, prim_id, material_id")
@@ -67,7 +69,7 @@ if TYPE_CHECKING:
 @click.option("--checkpoint-file", type=click.Path(path_type=Path), help="Checkpoint  [default: the picture's name + .checkpoint]")
 @click.option("--resume", is_flag=True, help="Continue from the checkpoint; if there is none, start from the beginning")
 @shared("quiet", "as_json")
-def render(scene: Path, output: Path | None, assignments: Assignments, quiet: bool, as_json: bool,
+def render(scene: Path, output: Path | None, assignments: Assignments, staging: dict[str, Parsed], quiet: bool, as_json: bool,
            **options: Parsed) -> None:
     begin = time.perf_counter()
     from wrt.picture.film import aov_path
@@ -84,7 +86,7 @@ def render(scene: Path, output: Path | None, assignments: Assignments, quiet: bo
     for name in layers or ():
         check_writable(aov_path(output, name))
     clock, begin = {"import": time.perf_counter() - begin}, time.perf_counter()
-    loaded = load(scene, quiet).with_settings(**settings)
+    loaded = load(scene, quiet, staging).with_settings(**settings)
     clock["load"] = time.perf_counter() - begin
     checkpoint = options.get("checkpoint")
     if checkpoint is not None and options["resume"] and not (os.path.lexists(checkpoint) or quiet):

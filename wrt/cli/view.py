@@ -12,7 +12,7 @@ from pathlib import Path
 
 import click
 
-from wrt.cli.common import Assignments, Parsed, load, names_of, naming, option_group, say, settings_of, shared
+from wrt.cli.common import STAGING, Assignments, Parsed, load, names_of, naming, option_group, say, settings_of, shared
 from wrt.viewer.access import Place
 
 PLACE_OPTIONS = (
@@ -30,8 +30,9 @@ PLACE_OPTIONS = (
 @option_group("place", Place, names_of(Place), PLACE_OPTIONS)
 @click.option("--open/--no-open", "open_browser", default=True, help="Open a browser  [default: on a desktop]")
 @click.option("--spp", type=click.IntRange(1, 1 << 24), default=1024, show_default=True, help="Samples per pixel of the finished picture")
+@STAGING
 @shared("device", "threads", "camera", "accel", "assignments", "quiet")
-def view(scene: Path, place: Place, open_browser: bool, spp: int, assignments: Assignments, quiet: bool,
+def view(scene: Path, place: Place, open_browser: bool, spp: int, assignments: Assignments, staging: dict[str, Parsed], quiet: bool,
          **options: Parsed) -> None:
     """Show SCENE in a browser with an orbit camera; the picture gets finer while the camera rests.
 
@@ -47,7 +48,7 @@ def view(scene: Path, place: Place, open_browser: bool, spp: int, assignments: A
 
     rendering = Options(**options)
     settings = settings_of(assignments, size="the browser's window", spp="--spp")
-    loaded = load(scene, quiet).with_settings(**settings)
+    loaded = load(scene, quiet, staging).with_settings(**settings)
     with naming(scene):
         loaded.camera(options["camera"])  # raises InputError with the file's name
     page = Page(loaded, rendering, place, spp, counter_of=CostCounter.beside, warn=(lambda text: None) if quiet else say)

@@ -17,13 +17,13 @@ from wrt.core.packages import needed_by
 from wrt.core.registry import Registry
 from wrt.core.types import JsonObject, PathLike
 from wrt.io.mesh_file import MESH_FORMATS, load_mesh
-from wrt.scene.defaults import stage
+from wrt.scene.defaults import UP, Staging, put_on_floor, stage
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene
 
 
-def load_scene(path: PathLike) -> Scene:
+def load_scene(path: PathLike, *, up: str = "y", studio: bool = True, floor: bool = False) -> Scene:
     """Read a scene file: TOML (.toml), glTF 2.0 (.gltf, .glb), or a mesh in light grey.
 
     A scene without a camera gets one that frames it, and a scene without a light gets lights; a SceneWarning names the additions.
@@ -32,12 +32,20 @@ def load_scene(path: PathLike) -> Scene:
     ----------
     path
         The file. Its suffix gives the format: .toml, .gltf, .glb or one of wrt.MESH_FORMATS.
+    up
+        Axis of a mesh file that points up in the picture: "x", "y" or "z". Scene files have +y up.
+    studio
+        Light glass and smooth surfaces in a scene without lights by a studio, which they reflect. False: by a pale sky.
+    floor
+        Put the mesh of a mesh file on a grey floor.
 
     Raises
     ------
     InputError
         If the file cannot be used; it names the file and the place. For TOML it lists all mistakes, each with key, value and expectation.
+        If `up` or `floor` is given for a scene file.
     """
+    staging = Staging(up, studio, floor)
     path = as_path(path, "path")
     known = ", ".join([*LOADERS, *MESH_FORMATS])
     require_file(path, f" (a scene is one of {known})")
@@ -46,8 +54,11 @@ def load_scene(path: PathLike) -> Scene:
     load = LOADERS.get(path.suffix.lower(), _load_bare_mesh if path.suffix.lower() in MESH_FORMATS else None)
     if load is None:
         raise InputError(f"is no scene file: its suffix must be one of {known}", path=path)
+    if load is not _load_bare_mesh and (up != "y" or floor):
+        raise InputError("is for mesh files alone: a scene file says what is up and what is below", argument="up" if up != "y" else "floor",
+                         path=path)
     with np.errstate(over="ignore", invalid="ignore"):  # the scene refuses infinite values
-        return load(path)
+        return load(path, staging)
 
 
 def as_scene(value: Scene | Mesh | PathLike) -> Scene:
@@ -55,7 +66,7 @@ def as_scene(value: Scene | Mesh | PathLike) -> Scene:
     if isinstance(value, Scene):
         return value
     if isinstance(value, Mesh):
-        return _bare(value, value.name or "mesh", value.name or "mesh")
+        return _bare(value, value.name or "mesh", value.name or "mesh", Staging())
     if isinstance(value, str | os.PathLike):
         return load_scene(value)
     raise InputError(f"must be a Scene, a Mesh, or the path of a scene or mesh file, got {shown(value)}", argument="scene")
@@ -70,28 +81,31 @@ def schema() -> JsonObject:
     return {"$schema": dialect, **scene_table().model_json_schema(), "title": "wrt scene"}
 
 
-def _load_toml(path: Path) -> Scene:
+def _load_toml(path: Path, staging: Staging) -> Scene:
     with needed_by("a TOML scene"):
         from wrt.io.toml.build import build
         from wrt.io.toml.report import check
 
-    return _staged(build(check(_parse(path), path), path), path)
+    return _staged(build(check(_parse(path), path), path), path, staging)
 
 
-def _load_bare_mesh(path: Path) -> Scene:
-    return _bare(load_mesh(path), path.stem, path)
+def _load_bare_mesh(path: Path, staging: Staging) -> Scene:
+    return _bare(load_mesh(path), path.stem, path, staging)
 
 
-def _bare(mesh: Mesh, name: str, path: PathLike) -> Scene:
+def _bare(mesh: Mesh, name: str, path: PathLike, staging: Staging) -> Scene:
     """Return a scene of one mesh in light grey."""
     grey = Material(name="light grey", albedo=(0.75, 0.75, 0.75))
     unread = " (.mtl files are not read)" if os.fspath(path).lower().endswith(".obj") else ""
     parts = f"its {len(mesh.groups)} parts are all light grey{unread}: a TOML scene can give each a material"
     notes = [parts] if len(mesh.groups) > 1 else []
-    return _staged(Scene(objects=(Object(mesh, (grey,), name=name),), name=name), path, notes)
+    notes += ["a camera that frames it, and a grey floor, were added"] if staging.floor else []
+    scene = Scene(objects=(Object(mesh, (grey,), UP[staging.up], name=name),), name=name)
+    with at(path=path):
+        return _staged(put_on_floor(scene) if staging.floor else scene, path, staging, notes)
 
 
-LOADERS: Registry[Callable[[Path], Scene]] = Registry("scene format", {
+LOADERS: Registry[Callable[[Path, Staging], Scene]] = Registry("scene format", {
     ".toml": _load_toml, ".gltf": "wrt.io.gltf.reader:load_gltf", ".glb": "wrt.io.gltf.reader:load_gltf"})
 
 
@@ -123,10 +137,10 @@ def _require_64_bits(value: object) -> None:
         raise InputError("holds an integer of more than 64 bits")
 
 
-def _staged(scene: Scene, path: PathLike, notes: Sequence[str] = ()) -> Scene:
+def _staged(scene: Scene, path: PathLike, staging: Staging, notes: Sequence[str] = ()) -> Scene:
     """Add a camera and lights to a scene without them, and issue one SceneWarning with `notes` and the additions."""
     with at(path=path):
-        scene, added = stage(scene)
+        scene, added = stage(scene, staging)
     if notes or added:
         warn(f"{os.fspath(path)}: {'; '.join([*notes, *added])}")
     return scene

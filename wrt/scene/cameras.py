@@ -109,6 +109,8 @@ class Camera(CameraKind):
         Radius of the lens (0: a pinhole), and distance along the axis to the plane in focus, in scene units.
     blades, blade_rotation
         Number of straight sides of the aperture, 3 or more (0: round), and its rotation in radians.
+    least_fov_x
+        Least horizontal angle of view in radians. In a picture that is too narrow for it, the vertical angle is larger than fov_y.
     """
 
     kind = "perspective"
@@ -120,6 +122,8 @@ class Camera(CameraKind):
         "number", "distance along the axis to the plane in focus (default: the target's distance, else 1)", "length", ge=SMALLEST))
     blades: int = field(default=0, metadata=given("whole", "sides of the aperture, 3 or more; 0: round", ge=0, le=64))
     blade_rotation: float = field(default=0.0, metadata=given("angle", "rotation of the aperture"))
+    least_fov_x: float = field(default=0.0, metadata=given(
+        "angle", "least horizontal angle of view: a picture too narrow for it widens fov_y", ge=0.0, le=179.94))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -127,7 +131,7 @@ class Camera(CameraKind):
             raise wrong(at_thing("camera", self.name) + "blades", f"must be 0 (round) or 3 to 64, got {self.blades}")
 
     def record(self, size: tuple[int, int]) -> Record:
-        tan_y = float(np.tan(0.5 * self.fov_y))
+        tan_y = max(float(np.tan(0.5 * self.fov_y)), float(np.tan(0.5 * self.least_fov_x)) * size[1] / size[0])
         return {"tan_y": tan_y, "tan_x": tan_y * size[0] / size[1], "focus_distance": self.focus_distance,
                 "aperture_radius": self.aperture_radius, "blades": self.blades, "blade_rotation": self.blade_rotation}
 

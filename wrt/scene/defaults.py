@@ -3,27 +3,63 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from wrt.core.checks import listed
+from wrt.core.checks import as_choice, as_one, listed
 from wrt.scene.backgrounds import ConstantBackground, GradientBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.lights import DirectionalLight
-from wrt.scene.materials import Material
-from wrt.scene.model import Scene
+from wrt.scene.materials import MATERIALS, Material
+from wrt.scene.model import Object, Scene
+from wrt.scene.shapes import quad
 from wrt.scene.size import require_size
+from wrt.scene.studio import studio
 from wrt.scene.values import BLACK, LUMINANCE, SMALLEST
 
-FOV_Y = math.radians(40.0)
 _THREE_QUARTER = np.array([0.62, 0.42, 1.0])  # direction from the scene to the camera; the front of glTF is +z, up is +y
-_MARGIN = 1.05  # radius of the sphere in view, in radii of the scene's bounding sphere
+FLAT = (0.2, 0.02, 0.2)  # A subject this thin along x, y or z, relative to its next longer side, is seen face on.
+FILL = 0.85  # of the picture's tighter side, by the subject
+NARROWEST = math.radians(0.001)  # angle of view
 
-# A white surface that faces the key light and the sky has a radiance near 1.
-_KEY_IRRADIANCE = 1.7
+# A white surface that faces the key light, and the sky or the studio, has a radiance near 1.
+_KEY_IRRADIANCE = {"sky": 1.7, "studio": 1.2}
 DARK = 0.01  # a lower radiance counts as unlit; a display shows it as code 25 of 255
 _SKY = GradientBackground(bottom=(0.22, 0.21, 0.20), top=(0.50, 0.60, 0.75))
+
+MATTE = 0.4  # A surface this rough shows no soft boxes, and reflects a pale sky with less noise.
+UP = {"x": np.array([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]), "y": np.eye(4),
+      "z": np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])}  # rotations that turn an axis to +y
+
+
+@dataclass(frozen=True)
+class Staging:
+    """What is added to a scene that lacks it.
+
+    Parameters
+    ----------
+    up
+        Axis of a bare mesh that points up in its picture: "x", "y" or "z". Scene files have +y up.
+    studio
+        Light a scene without lights by a studio if it has glass or smooth surfaces, which reflect its soft boxes. False: by a pale sky.
+    floor
+        Put a bare mesh on a grey floor.
+
+    Raises
+    ------
+    InputError
+        If `up` is another text.
+    """
+
+    up: str = "y"
+    studio: bool = True
+    floor: bool = False
+
+    def __post_init__(self) -> None:
+        as_choice(self.up, tuple(UP), "up")
+        as_one(self.studio, bool, "studio")
+        as_one(self.floor, bool, "floor")
 
 
 def bounding_sphere(scene: Scene) -> tuple[np.ndarray, float]:
@@ -39,17 +75,51 @@ def bounding_sphere(scene: Scene) -> tuple[np.ndarray, float]:
     return center, radius
 
 
-def frame_camera(scene: Scene, aspect: float = 16.0 / 9.0) -> Camera:
-    """Return a pinhole camera in three-quarter view that sees the whole bounding sphere of the scene.
+def frame_camera(scene: Scene) -> Camera:
+    """Return a pinhole camera that sees all shapes; in a picture of any aspect ratio they fill FILL of the tighter side.
 
-    aspect: width / height of the picture. The vertical angle of view is 40 degrees. The camera is so far away that the sphere
-    fits into the narrower of the vertical and the horizontal angle. Raises InputError if the scene has no shapes."""
+    The view is three-quarter from above; a flat subject is seen face on (`_view`). The camera stands where the scene's bounding sphere
+    subtends 38 degrees, and its angle of view follows from the projected shapes. Raises InputError if the scene has no shapes."""
     center, radius = bounding_sphere(scene)
-    half_angle = math.atan(math.tan(0.5 * FOV_Y) * min(aspect, 1.0))
     radius = max(radius, 1e-9 * float(np.abs(center).max()), SMALLEST)  # a single point has none
-    distance = _MARGIN * radius / math.sin(half_angle)
-    position = center + distance * _THREE_QUARTER / np.linalg.norm(_THREE_QUARTER)
-    return Camera.look_at(position, center, fov_y=FOV_Y, focus_distance=distance, name="framing")
+    back, up = _view(scene)
+    distance = 3.0 * radius
+    for _ in range(3):  # each step centres the projected shapes better
+        camera = Camera.look_at(center + distance * back, center, up, focus_distance=distance, name="framing")
+        low, high = _projected(scene, camera.camera_to_world)
+        center = center + camera.camera_to_world[:3, :2] @ (0.5 * distance * (low + high))
+    fov_x, fov_y = (max(2.0 * math.atan(half / FILL), NARROWEST) for half in np.maximum(-low, high))
+    return replace(camera, fov_y=fov_y, least_fov_x=fov_x)
+
+
+def _view(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Return the unit direction (3,) from the scene to its camera, and the vector (3,) that appears upright."""
+    low, high = scene.bounds()
+    thin, middle, _ = order = np.argsort(high - low, kind="stable")
+    direction, up = _THREE_QUARTER, np.eye(3)[1]
+    if (high - low)[thin] <= FLAT[thin] * (high - low)[middle] and (high - low)[order[1]] > 0.0:
+        direction, up = np.eye(3)[thin], -np.eye(3)[2] if thin == 1 else up
+    return direction / np.linalg.norm(direction), up
+
+
+def _projected(scene: Scene, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the smallest and the largest tangent (2,), to the right and up, of the directions from a camera to the shapes.
+
+    pose: camera_to_world. All shapes must be in front of the camera."""
+    view = np.linalg.inv(pose)
+    tangents: list[np.ndarray] = []
+    for points, transform in scene.outlines():
+        matrix = view @ transform
+        x, y, z = matrix[:3, :3] @ points.T + matrix[:3, 3:]
+        tangents += [np.array([each.min(), each.max()]) for each in (x / -z, y / -z)]
+    for sphere in scene.spheres:
+        center = view[:3, :3] @ sphere.center + view[:3, 3]
+        for axis in (0, 1):  # the two tangent lines from the camera to the sphere's shadow on a plane through the camera's axis
+            middle = math.atan2(center[axis], -center[2])
+            half = math.asin(min(1.0, sphere.radius / math.hypot(center[axis], center[2])))
+            tangents.append(np.tan([middle - half, middle + half]))
+    both = np.array(tangents).reshape(-1, 2, 2)
+    return both[:, :, 0].min(axis=0), both[:, :, 1].max(axis=0)
 
 
 def is_lit(scene: Scene) -> bool:
@@ -84,22 +154,43 @@ def emission_named(scene: Scene) -> str:
     return f"the emission of {listed(names)}" if names else ""
 
 
-def stage(scene: Scene) -> tuple[Scene, list[str]]:
+def shines(material: Material) -> bool:
+    """Return True for glass, and for surfaces so smooth that they show what they reflect."""
+    return material.is_clear or (MATERIALS[material.kind].reflects and (
+        material.roughness < MATTE or material.metallic_roughness_texture is not None))
+
+
+def put_on_floor(scene: Scene) -> Scene:
+    """Return the scene with a camera that frames its shapes, and with a grey floor below them. Raises InputError if it has no shapes."""
+    center, radius = bounding_sphere(scene)
+    low, side = scene.bounds()[0], 100.0 * max(radius, SMALLEST)
+    corner = (center[0] - side, low[1] - 1e-4 * radius, center[2] + side)  # a little below flat lower sides
+    mesh, grey = quad(corner, (2.0 * side, 0.0, 0.0), (0.0, 0.0, -2.0 * side)), Material(name="floor", albedo=(0.5,) * 3)
+    floor = Object(mesh, (grey,), name="floor")
+    return replace(scene, cameras=scene.cameras or (frame_camera(scene),), objects=(*scene.objects, floor))
+
+
+def stage(scene: Scene, staging: Staging | None = None) -> tuple[Scene, list[str]]:
     """Return the scene with a camera and lights, and a sentence on each addition.
 
     A scene without a camera gets one that frames it. A scene that is not lit (`is_lit`) gets a key light from above the first camera's
-    right shoulder and a pale sky. Raises InputError for a scene without cameras and shapes, and for a scene that is too small."""
+    right shoulder, and a studio if it has surfaces that reflect one (`shines`), else a pale sky. Raises InputError for a scene without
+    cameras and shapes, and for a scene that is too small."""
     require_size(scene)
+    staging = staging or Staging()
     added = []
     if not scene.cameras:
         scene = replace(scene, cameras=(frame_camera(scene),))
         added.append("it has no camera: a camera that frames the scene was added")
     if not is_lit(scene):
         right, up, back = scene.cameras[0].camera_to_world[:3, :3].T
-        direction = -(back + 0.6 * up + 0.4 * right)
-        key = DirectionalLight(tuple(direction), (_KEY_IRRADIANCE,) * 3, name="key light")
-        scene = replace(scene, lights=(key,), background=_SKY)
+        shining = any(map(shines, scene.materials))
+        around = "studio" if staging.studio and shining else "sky"
+        key = DirectionalLight(tuple(-(back + 0.6 * up + 0.4 * right)), (_KEY_IRRADIANCE[around],) * 3, name="key light")
         weak = emission_named(scene)
         lacks = f"no lights but {weak}, which is too weak to light it" if weak else "no lights"
-        added.append(f"it has {lacks}: a key light from above the camera's shoulder and a pale sky were added")
+        skies = {"sky": "a pale sky", "studio": "a studio, for its smooth surfaces to reflect (studio=False or --no-studio: a pale sky),"}
+        background = studio(math.atan2(back[0], back[2])) if around == "studio" else _SKY
+        scene = replace(scene, lights=(key,), background=background)
+        added.append(f"it has {lacks}: a key light from above the camera's shoulder and {skies[around]} were added")
     return scene, added

@@ -57,7 +57,7 @@ def from_viewport(camera: CameraKind, viewport: viser.CameraHandle, unit: float)
     with np.errstate(over="ignore"):  # the camera's constructor refuses infinite values
         pose[:3, 3] = np.asarray(viewport.position, np.float64) * unit
     if isinstance(camera, Camera):
-        camera = replace(camera, fov_y=float(viewport.fov))
+        camera = replace(camera, fov_y=float(viewport.fov), least_fov_x=0.0)
     return replace(camera, camera_to_world=pose)
 
 

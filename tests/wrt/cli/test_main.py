@@ -394,7 +394,7 @@ def test_ctrl_c_while_saving_waits_for_the_file(name: str, monkeypatch: pytest.M
                                    "wrt.renderer.schedule.Run._trace_aovs"])
 def test_ctrl_c_before_the_first_sample_leaves_everything_as_it_was(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
     Path("box.png").write_bytes(b"old")
-    monkeypatch.setattr(where, lambda *arguments: signal.raise_signal(signal.SIGINT) or {})
+    monkeypatch.setattr(where, lambda *arguments, **options: signal.raise_signal(signal.SIGINT) or {})
     result = run("render", "box.obj", *SMALL, "--aov", "depth")
     assert result.code == 130 and result.out == "" and result.err.split("\n")[-2] == "interrupted"
     assert "Traceback" not in result.err and Path("box.png").read_bytes() == b"old" and new_files() == {"box.png"}
@@ -581,9 +581,9 @@ def test_an_ignored_signal_stays_ignored() -> None:
 
 LOADING = """
 import sys, wrt.io.load
-def slow(path, load=wrt.io.load.load_scene):
+def slow(path, load=wrt.io.load.load_scene, **staging):
     print("now", file=sys.stderr, flush=True)
-    while True: load(path)
+    while True: load(path, **staging)
 wrt.io.load.load_scene = slow
 """
 COMPILING = """

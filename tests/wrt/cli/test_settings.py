@@ -211,7 +211,7 @@ def test_a_wrong_name_is_answered_with_the_nearest(arguments: list[str], message
 
 
 @pytest.mark.parametrize(("wrong", "meant"), [
-    ("--width", "--size"), ("--height", "--size"), ("--sizes", "--size"), ("--max-dept", "--max-depth"), ("--up", None),
+    ("--width", "--size"), ("--height", "--size"), ("--sizes", "--size"), ("--max-dept", "--max-depth"), ("--north", None),
     ("--bit", "--bits"),
 ])
 def test_an_unknown_option_suggests_what_is_meant_or_nothing(wrong: str, meant: str | None) -> None:

@@ -523,6 +523,29 @@ def test_scene_without_camera_or_light_is_staged(tmp_path: Path) -> None:
     assert errors(tmp_path, "") == ["the scene has no shapes"]
 
 
+@pytest.mark.parametrize("up, top", [("x", 0), ("y", 1), ("z", 2)])
+def test_the_up_axis_of_a_bare_mesh_appears_upright_and_its_floor_is_below(tmp_path: Path, up: str, top: int) -> None:
+    corners = np.array([(1, 2, 4), (3, 5, 9), (2, 7, 5)])
+    (tmp_path / "m.obj").write_text("".join(f"v {x} {y} {z}\n" for x, y, z in corners) + "f 1 2 3\n")
+    with pytest.warns(SceneWarning, match="grey floor"):
+        scene = load_scene(tmp_path / "m.obj", up=up, floor=True)
+    thing, floor = scene.objects
+    axes = thing.transform[:3, :3]
+    assert np.array_equal(axes @ np.eye(3)[top], (0, 1, 0)) and np.linalg.det(axes) == 1.0
+    height = floor.mesh.vertices[:, 1]
+    assert np.ptp(height) == 0.0 and height[0] == pytest.approx(corners[:, top].min(), abs=1e-3)
+    assert height[0] < corners[:, top].min()
+
+
+def test_up_and_floor_are_refused_for_scene_files_and_wrong_values(tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_text("")
+    for wrong in ({"up": "z"}, {"floor": True}):
+        with refused(*wrong, "mesh files alone"):
+            load_scene(tmp_path / "a.toml", **wrong)
+    with refused("up", "one of x, y, z"):
+        load_scene(tmp_path / "a.toml", up="w")
+
+
 def test_bare_mesh(tmp_path: Path) -> None:
     path = tmp_path / "m.obj"
     path.write_text(TRIANGLES + "f 1 2 3\n")

@@ -97,5 +97,6 @@ def test_the_camera_that_is_added_sees_the_whole_scene(name: str) -> None:
     points = np.concatenate([thing.mesh.vertices @ thing.transform[:3, :3].T + thing.transform[:3, 3]
                              for thing in scene.objects])
     seen = np.c_[points, np.ones(len(points))] @ np.linalg.inv(scene.cameras[0].camera_to_world).T
-    half = np.tan(0.5 * scene.cameras[0].fov_y) * -seen[:, 2]
-    assert (seen[:, 2] < 0).all() and (np.abs(seen[:, 1]) <= half).all() and (np.abs(seen[:, 0]) <= half * 16 / 9).all()
+    for size in ((16, 9), (1, 2)):
+        lens = scene.cameras[0].record(size)
+        assert (seen[:, 2] < 0).all() and (np.abs(seen[:, :2]) <= np.outer(-seen[:, 2], (lens["tan_x"], lens["tan_y"]))).all()

@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import wrt
 from tests.refused import refused
-from wrt.scene.backgrounds import ConstantBackground, GradientBackground
+from wrt.scene.backgrounds import ConstantBackground, EnvironmentBackground, GradientBackground
 from wrt.scene.cameras import Camera
-from wrt.scene.defaults import DARK, bounding_sphere, frame_camera, is_lit, stage
+from wrt.scene.defaults import DARK, FILL, Staging, frame_camera, is_lit, stage
 from wrt.scene.lights import DirectionalLight, PointLight
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
@@ -35,24 +36,50 @@ def world_points(scene: Scene) -> np.ndarray:
     return np.vstack([points[:, :3], sphere.center + sphere.radius * direction])
 
 
-@pytest.mark.parametrize("aspect", [16 / 9, 1.0, 0.5])
-@pytest.mark.parametrize("offset, scale", [((0, 0, 0), 1.0), ((1000, -200, 30), 1e-3), ((0, 1e6, 0), 1e4)])
-def test_whole_sphere_is_in_view_and_fills_it(aspect, offset, scale):
-    scene = cloud(1, offset, scale)
-    camera = frame_camera(scene, aspect)
-    center, radius = bounding_sphere(scene)
-    points = world_points(scene)
-    assert np.linalg.norm(points - center, axis=1).max() == pytest.approx(radius, rel=1e-3)
+def filled(scene: Scene, points: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Where the points are in a picture of frame_camera: lowest and highest (x, y), with the edges of the picture at -1 and 1."""
+    camera = frame_camera(scene)
+    x, y, z = (np.linalg.inv(camera.camera_to_world) @ np.c_[points, np.ones(len(points))].T)[:3]
+    lens = camera.record(size)
+    places = np.array([x / -z / lens["tan_x"], y / -z / lens["tan_y"]])
+    assert (z < 0.0).all()
+    return places.min(axis=1), places.max(axis=1)
 
-    # Directions that graze the sphere must lie within the picture; the tightest of them close to its edge.
-    view = np.linalg.inv(camera.camera_to_world)
-    distance = np.linalg.norm(camera.camera_to_world[:3, 3] - center)
-    to_center = view @ np.append(center, 1.0)
-    assert to_center[:2] == pytest.approx([0, 0], abs=1e-6 * distance) and to_center[2] == pytest.approx(-distance)
-    tangent = np.tan(np.arcsin(radius / distance))
-    edge = np.tan(camera.fov_y / 2) * min(aspect, 1.0)
-    assert 0.9 * edge < tangent < edge
-    assert camera.fov_y == pytest.approx(np.radians(40))
+
+@pytest.mark.parametrize("size", [(160, 90), (64, 64), (50, 100)])
+@pytest.mark.parametrize("offset, scale", [((0, 0, 0), 1.0), ((1000, -200, 30), 1e-3), ((0, 1e6, 0), 1e4)])
+def test_shapes_fill_the_tighter_side_of_any_picture_and_are_centred(size, offset, scale):
+    for seed in range(4):
+        scene = cloud(seed, offset, scale)
+        low, high = filled(scene, world_points(scene), size)
+        assert max(high.max(), -low.min()) == pytest.approx(FILL, rel=1e-3)
+        assert low == pytest.approx(-high, abs=0.01)
+
+
+@pytest.mark.parametrize("size", [(160, 90), (50, 100)])
+def test_a_sphere_touches_the_same_margin(size):
+    center, radius = np.array([3.0, -2.0, 7.0]), 2.5
+    scene = Scene(spheres=(Sphere(tuple(center), radius, Material()),))
+    direction = np.random.default_rng(0).normal(size=(200_000, 3))
+    points = center + radius * direction / np.linalg.norm(direction, axis=1)[:, None]
+    low, high = filled(scene, points, size)
+    assert max(high.max(), -low.min()) == pytest.approx(FILL, abs=1e-3)
+
+
+@pytest.mark.parametrize("thin, back", [(0, (1, 0, 0)), (1, (0, 1, 0)), (2, (0, 0, 1))])
+def test_a_flat_subject_is_seen_face_on(thin, back):
+    sides = [(0, 2, 0), (0, 0, 3)], [(0, 0, -3), (2, 0, 0)], [(2, 0, 0), (0, 3, 0)]
+    scene = Scene(objects=(Object(quad((5, 6, 7), *sides[thin]), (Material(),)),))
+    camera = frame_camera(scene)
+    assert camera.camera_to_world[:3, 2] == pytest.approx(np.array(back))
+    assert camera.camera_to_world[:3, 1] == pytest.approx(np.array((0, 0, -1) if thin == 1 else (0, 1, 0)))
+
+
+@pytest.mark.parametrize("edge", [(1, 0, 0), (0, 1, 0), (1, 1, 1), (0, 0, 0)])
+def test_a_line_or_a_point_has_a_camera(edge):
+    mesh = Mesh(np.array([(2, 2, 2), np.add((2, 2, 2), edge), (2, 2, 2)], np.float32), np.array([[0, 1, 2]]))
+    camera = frame_camera(Scene(objects=(Object(mesh, (Material(),)),)))
+    assert camera.fov_y > 0.0 and camera.least_fov_x > 0.0
 
 
 def test_view_is_three_quarter_from_above():
@@ -75,6 +102,31 @@ def test_what_is_missing_is_added_and_said():
     along, up, right = (float(np.dot(light.direction, axis)) for axis in (-pose[:3, 2], pose[:3, 1], pose[:3, 0]))
     assert along > 0.7 and up < 0 and right < 0  # it travels into the picture, downwards, from the right
     assert stage(staged)[1] == []
+
+
+@pytest.mark.parametrize("material, shining", [
+    (Material(), False), (Material(kind="mirror"), True), (Material(kind="glass"), True),
+    (Material(kind="metallic_roughness", metallic=1.0, roughness=0.1), True),
+    (Material(kind="metallic_roughness", metallic=1.0, roughness=1.0), False),
+    (Material(kind="metallic_roughness", transmission=1.0, roughness=1.0), True)])
+def test_smooth_surfaces_and_glass_get_a_studio_that_can_be_switched_off(material, shining):
+    scene = Scene(spheres=(Sphere((0, 0, 0), 1.0, material),))
+    staged, added = stage(scene)
+    assert isinstance(staged.background, EnvironmentBackground if shining else GradientBackground)
+    assert ("studio=False" in added[1]) is shining
+    assert isinstance(stage(scene, Staging(studio=False))[0].background, GradientBackground)
+
+
+def test_the_studio_turns_with_the_camera():
+    """A mirror ball looks the same from all around, and reflects the key box in its upper right quarter."""
+    pictures = []
+    for angle in (0.0, 2.0, -1.3):
+        camera = Camera.look_at((4 * np.sin(angle), 1, 4 * np.cos(angle)), (0, 0, 0), fov_y=0.5)
+        scene, _ = stage(Scene(spheres=(Sphere((0, 0, 0), 1.0, Material(kind="mirror", albedo=(1, 1, 1))),), cameras=(camera,)))
+        pictures.append(wrt.render(scene, size=(20, 20), spp=64).pixels[..., 0])
+    assert pictures[1] == pytest.approx(pictures[0], abs=0.15) and pictures[2] == pytest.approx(pictures[0], abs=0.15)
+    row, column = np.unravel_index(np.argmax(pictures[0]), (20, 20))
+    assert row < 10 <= column and pictures[0].max() > 3.0 * np.median(pictures[0])
 
 
 @pytest.mark.parametrize("material, lit", [

@@ -23,7 +23,7 @@ from wrt.io.gltf.meshes import Meshes
 from wrt.io.gltf.nodes import walk
 from wrt.io.gltf.schema import PunctualLightOfNode, PunctualLights, SpotCone, exactly
 from wrt.scene.cameras import Camera, CameraKind, OrthographicCamera
-from wrt.scene.defaults import emission_named, stage
+from wrt.scene.defaults import Staging, emission_named, stage
 from wrt.scene.lights import DirectionalLight, Light, PointLight, SpotLight
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
@@ -32,10 +32,10 @@ from wrt.scene.settings import Settings
 from wrt.scene.values import require_count
 
 
-def load_gltf(path: PathLike, *, staged: bool = True) -> Scene:
+def load_gltf(path: PathLike, staging: Staging | None = None, *, staged: bool = True) -> Scene:
     """Read a glTF 2.0 file. The scene shares the meshes, materials and textures that the file shares.
 
-    staged: add a camera or lights to a file without them (wrt.scene.defaults), and refuse a file without triangles. It is False for a
+    staged: add a camera or lights to a file without them, as `staging` says, and refuse a file without triangles. It is False for a
     file that a scene file includes. One SceneWarning names everything left out or added. Settings are the defaults, except that
     glass_shadows is "tinted" if there is solid glass (KHR_materials_volume). Raises InputError with the file and the place in its JSON."""
     with at(path=path):
@@ -44,7 +44,7 @@ def load_gltf(path: PathLike, *, staged: bool = True) -> Scene:
         left_out = [f"not supported and left out: {features}" for features in [document.left_out.sentence()] if features]
         if not scene.objects and (staged or not (scene.lights or scene.cameras)):
             raise InputError("; ".join(["the scene has no triangles", *left_out]))
-        scene, added = stage(scene) if staged else (scene, [])
+        scene, added = stage(scene, staging) if staged else (scene, [])
         if staged and not scene.lights:
             added.append(f"it has no lights but {emission_named(scene)}: surfaces that it does not reach are black")
     if left_out or added:

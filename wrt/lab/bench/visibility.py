@@ -103,7 +103,7 @@ def surfaces(plan: Plan) -> Iterator[Surface]:
 
 
 def framing(mesh: Mesh) -> Camera:
-    return frame_camera(Scene(objects=(Object(mesh, (Material(),)),)), 1.0)
+    return frame_camera(Scene(objects=(Object(mesh, (Material(),)),)))
 
 
 def rows(plan: Plan) -> Iterator[Row]:

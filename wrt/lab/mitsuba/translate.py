@@ -150,7 +150,7 @@ def _sensor(mi: ModuleType, scene: Scene, camera: CameraKind) -> Plugin:
         pose = pose @ np.diag([half_width, half_width, 1.0, 1.0])
         sensor |= {"type": "orthographic"}
     elif isinstance(camera, Camera):
-        sensor |= {"type": "perspective", "fov_axis": "y", "fov": math.degrees(camera.fov_y)}
+        sensor |= {"type": "perspective", "fov_axis": "y", "fov": math.degrees(2.0 * math.atan(camera.record((width, height))["tan_y"]))}
         if camera.aperture_radius > 0.0:
             sensor |= {"type": "thinlens", "aperture_radius": camera.aperture_radius, "focus_distance": camera.focus_distance}
             if camera.blades:
