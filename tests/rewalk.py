@@ -209,10 +209,40 @@ def visit_order(walk: Walk, stack: list[tuple[np.float32, int]], entered: list[t
     return nearest[1]
 
 
+def bvh6(accel, ray: WalkRay) -> Walk:
+    """Traverse a bvh6: the nearest child next, the others sorted on the stack. A leaf's reference is -64 * primitive - 1."""
+    walk, tree = Walk(), accel._tree(accel.built)
+    stack, current = [], 0
+    while current is not None:
+        if current < 0:
+            walk.leaves += 1
+            ray.test(walk, accel, -1 - current >> 6)
+        else:
+            children = tree.children[current]
+            walk.node(current, 64, int((children != 0).sum()))
+            # Entries sort by t, then by unsigned reference, where the kernel's reference of a leaf is -1 - primitive.
+            entered = sorted((t, (r if r > 0 else -1 - (-1 - r >> 6)) % (1 << 32), r) for k in range(6)
+                             if (r := int(children[k])) and (t := ray.enter(tree.lo[current, k], tree.hi[current, k])) < INF)
+            if entered:
+                for t, _, r in entered[:0:-1]:
+                    stack.append((t, r))
+                    walk.push(len(stack))
+                current = entered[0][2]
+                continue
+        current = None
+        while stack and current is None:
+            t, r = stack.pop()
+            walk.pops += 1
+            if t <= ray.best[0]:
+                current = r
+    return walk
+
+
 REWALK: dict[str, Callable[..., Walk]] = {
     "brute_force": brute_force,
     "bvh2": bvh2,
     "bvh4": wide,
+    "bvh6": bvh6,
     "bvh8": wide,
     "bvh8c": wide,
 }

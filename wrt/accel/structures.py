@@ -26,6 +26,7 @@ ACCELERATORS = Structures("structure", {
     "bvh": "wrt.accel.bvh.wide:Bvh8",  # the default
     "bvh2": "wrt.accel.bvh.binary:Bvh2",
     "bvh4": "wrt.accel.bvh.wide:Bvh4",
+    "bvh6": "wrt.accel.bvh.six:Bvh6",
     "bvh8": "wrt.accel.bvh.wide:Bvh8",
     "bvh2_sphere": "wrt.accel.bvh.volumes:Bvh2Sphere",
     "bvh2_kdop": "wrt.accel.bvh.volumes:Bvh2Kdop",

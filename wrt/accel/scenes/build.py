@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from wrt.accel.brute_force import BruteForce
     from wrt.accel.bvh.binary import Bvh2
     from wrt.accel.bvh.volumes import Bvh2Kdop, Bvh2Sphere
+    from wrt.accel.bvh.six import Bvh6
     from wrt.accel.bvh.wide import Bvh4, Bvh8, Bvh8c
     from wrt.accel.cells.bsp import Bsp
     from wrt.accel.cells.grid import Grid
@@ -88,6 +89,9 @@ def build(mesh: OneMeshLike, accel: Literal["bvh", "bvh8"] = ..., device: str = 
 @overload
 def build(mesh: OneMeshLike, accel: Literal["bvh4"], device: str = ..., threads: int | None = ...,
           **options: Unpack[BuildOptions]) -> Bvh4: ...
+@overload
+def build(mesh: OneMeshLike, accel: Literal["bvh6"], device: str = ..., threads: int | None = ...,
+          **options: Unpack[BuildOptions]) -> Bvh6: ...
 @overload
 def build(mesh: OneMeshLike, accel: Literal["bvh8c"], device: str = ..., threads: int | None = ...,
           **options: Unpack[BuildOptions]) -> Bvh8c: ...

@@ -1,0 +1,125 @@
+"""bvh6: a wide BVH as in ray tracing units: six children in a node of 64 bytes, one primitive per leaf."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+
+from wrt.accel.base import OneMesh
+from wrt.accel.built import Built
+from wrt.accel.bvh.builders import BvhOptions
+from wrt.accel.bvh.compress import compress, decompress
+from wrt.accel.bvh.wide import WideBvh
+from wrt.accel.bvh.wide_tree import WideTree, check_wide
+from wrt.core.device import records
+from wrt.core.errors import InputError
+from wrt.kernels.traverse import bvh6 as kernels
+from wrt.kernels.traverse.bvh6 import LEAVES_SHIFT, WIDTH, Bvh6Node
+from wrt.kernels.wide.layout import EXIST_SHIFT, FIRST_BYTES, WORD
+from wrt.kernels.wide.references import EMPTY, leaf_first, leaf_reference
+
+
+@dataclass(frozen=True)
+class Bvh6Options:
+    """Options of bvh6: those of BinaryOptions. A leaf has one primitive, so there is no max_leaf."""
+
+    builder: str = "binned"
+    cost_traversal: float = 1.0
+    cost_intersection: float = 1.0
+    split_alpha: float = 4e-5
+    split_budget: float = 0.5
+
+
+class Bvh6(WideBvh):
+    """A BVH of up to six children per node of 64 bytes, with 8 bits per plane, rounded outwards, and one primitive per leaf.
+
+    Intel's GPUs and the simulator Vulkan-Sim have such nodes. Options: Bvh6Options.
+    """
+
+    name = "bvh6"
+    options = Bvh6Options
+    width = WIDTH
+    kernels = kernels
+    _upload = OneMesh._upload
+    _primitives = OneMesh._primitives
+
+    def _build(self, options: Bvh6Options) -> Built:  # type: ignore[override]
+        tree = grouped(self._collapsed(BvhOptions(**asdict(options), max_leaf=1, row=WIDTH)))
+        built = Built(self._arrays(tree), tree.order[:, 0].copy(), len(tree.children), tree.leaves, tree.depth)
+        return replace(built, sah_cost=self._tree(built).sah_cost(tree.root_area))
+
+    def _arrays(self, tree: WideTree) -> dict[str, np.ndarray]:
+        """Return the nodes of a tree that `grouped` made."""
+        nodes, exists, inner = records(Bvh6Node, len(tree.children)), tree.children != EMPTY, tree.children > 0
+        head = compress(tree.lo, tree.hi, exists)
+        nodes["origin"] = head[:, :WORD]
+        nodes["exponents"] = np.ascontiguousarray(head[:, WORD]).view(np.int32) & ((1 << EXIST_SHIFT) - 1)
+        nodes["planes"] = np.ascontiguousarray(head[:, FIRST_BYTES:]).view(np.int32)
+        leaves = exists.sum(axis=1) - inner.sum(axis=1)
+        nodes["counts"] = inner.sum(axis=1) + (leaves << LEAVES_SHIFT)
+        nodes["node"] = np.where(inner.any(axis=1), tree.children[:, 0], 0)
+        first = np.take_along_axis(tree.children, np.minimum(inner.sum(axis=1), WIDTH - 1)[:, None], axis=1)[:, 0].astype(np.int64)
+        nodes["primitive"] = np.where(leaves > 0, leaf_first.func(first), 0)
+        return {"nodes": nodes}
+
+    def _references(self, built: Built) -> np.ndarray:
+        nodes, slot = built.arrays["nodes"], np.arange(WIDTH)
+        inner, leaves = (count[:, None] for count in _counts(nodes))
+        leaf = leaf_reference.func(nodes["primitive"].astype(np.int64)[:, None] + slot - inner, 1)
+        out = np.where(slot < inner, nodes["node"][:, None] + slot, np.where(slot < inner + leaves, leaf, EMPTY))
+        return out.astype(np.int32)
+
+    def _tree(self, built: Built) -> WideTree:
+        nodes, children = built.arrays["nodes"], self._references(built)
+        head = np.empty((len(nodes), FIRST_BYTES + nodes["planes"].shape[1]), np.float32)
+        mask = ((children != EMPTY) << np.arange(EXIST_SHIFT, EXIST_SHIFT + WIDTH)).sum(axis=1)
+        head[:, :WORD] = nodes["origin"]
+        head[:, WORD] = (nodes["exponents"] | mask).astype(np.int32).view(np.float32)
+        head[:, FIRST_BYTES:] = np.ascontiguousarray(nodes["planes"]).view(np.float32)
+        lanes = np.full((len(built.order), WIDTH), -1, np.int32)
+        lanes[:, 0] = built.order
+        return WideTree(*decompress(head, WIDTH), children, lanes, built.leaves, built.depth, 0)
+
+    def _check(self, built: Built) -> None:
+        nodes = built.arrays["nodes"]
+        inner, leaves = _counts(nodes)
+        if ((nodes["counts"] < 0) | (inner + leaves > WIDTH)).any() or (nodes["primitive"] < 0).any() or (nodes["node"] < 0).any():
+            raise InputError("is damaged: a node has an impossible number of children")
+        if (nodes["primitive"] > len(built.order)).any():
+            raise InputError("is damaged: a leaf leads to other primitives")
+        check_wide(self._references(built), len(built.order), 1)
+
+
+def _counts(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the number of inner children and of leaves of each node, (N,) each."""
+    return nodes["counts"] & ((1 << LEAVES_SHIFT) - 1), nodes["counts"] >> LEAVES_SHIFT
+
+
+def grouped(tree: WideTree) -> WideTree:
+    """Return a tree of one-primitive leaves with inner nodes first in each node; its inner nodes and its leaves have successive indices."""
+    children = tree.children.astype(np.int64)
+    # Sort the slots: inner nodes by index, leaves by index, then empty slots.
+    none = np.int64(1) << 40
+    key = np.where(children > 0, children, np.where(children < 0, (none >> 1) + leaf_first.func(children), none))
+    slots = np.argsort(key, axis=1, kind="stable")
+    children = np.take_along_axis(children, slots, axis=1)
+    lo, hi = (np.take_along_axis(box, slots[..., None], axis=1) for box in (tree.lo, tree.hi))
+    index, row = np.zeros(len(children), np.int64), np.zeros(len(tree.order), np.int64)
+    inner, leaf = children > 0, children < 0
+    # Groups of siblings keep the order of their first members, which is the order of the builder.
+    index[children[inner]] = 1 + _ranks(np.where(inner, children, none).min(axis=1), inner)
+    row[leaf_first.func(children[leaf])] = _ranks(np.where(leaf, leaf_first.func(children), none).min(axis=1), leaf)
+    renumbered = np.where(inner, index[np.where(inner, children, 0)], EMPTY)
+    renumbered[leaf] = leaf_reference.func(row[leaf_first.func(children[leaf])], 1)
+    node_at, row_at = np.argsort(index, kind="stable"), np.argsort(row, kind="stable")
+    return replace(tree, lo=lo[node_at], hi=hi[node_at], children=renumbered[node_at].astype(np.int32), order=tree.order[row_at])
+
+
+def _ranks(first: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Return the rank of each chosen slot: nodes sorted by `first` (N,), then by slot. chosen: (N, W) bool; result: (chosen.sum(),)."""
+    count = chosen.sum(axis=1)
+    at = np.argsort(first, kind="stable")
+    begin = np.empty(len(count), np.int64)
+    begin[at] = np.cumsum(count[at]) - count[at]
+    return np.repeat(begin, count) + np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
