@@ -226,8 +226,8 @@ def damaged_checked(seed: Seed, other: Seed, rng: Random) -> Seed:
     magic, header, body = seed.data.split(b"\n", 2)
     body = body[:-32]
     if rng.random() < 0.3:
-        tree = mutate_tree(json.loads(header), rng, ("bvh2", "bvh4", "bvh8", "bvh8c", "grid", "kdtree", "octree", "brute_force",
-                                                     "fast", "order"))
+        tree = mutate_tree(json.loads(header), rng, ("bvh2", "bvh4", "bvh6", "bvh8", "bvh8c", "grid", "kdtree", "octree",
+                                                     "brute_force", "fast", "order"))
         header = json.dumps(tree).encode() if rng.random() < 0.9 else mutate(header, rng, TEXT)
     else:
         body = damaged_numbers(body, rng) if rng.random() < 0.8 else mutate(body, rng, BYTES)

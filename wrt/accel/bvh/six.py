@@ -6,11 +6,10 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from wrt.accel.base import OneMesh
 from wrt.accel.built import Built
 from wrt.accel.bvh.builders import BvhOptions
 from wrt.accel.bvh.compress import compress, decompress
-from wrt.accel.bvh.wide import WideBvh
+from wrt.accel.bvh.wide import CollapsedBvh
 from wrt.accel.bvh.wide_tree import WideTree, check_wide
 from wrt.core.device import records
 from wrt.core.errors import InputError
@@ -31,7 +30,7 @@ class Bvh6Options:
     split_budget: float = 0.5
 
 
-class Bvh6(WideBvh):
+class Bvh6(CollapsedBvh):
     """A BVH of up to six children per node of 64 bytes, with 8 bits per plane, rounded outwards, and one primitive per leaf.
 
     Intel's GPUs and the simulator Vulkan-Sim have such nodes. Options: Bvh6Options.
@@ -41,10 +40,8 @@ class Bvh6(WideBvh):
     options = Bvh6Options
     width = WIDTH
     kernels = kernels
-    _upload = OneMesh._upload
-    _primitives = OneMesh._primitives
 
-    def _build(self, options: Bvh6Options) -> Built:  # type: ignore[override]
+    def _build(self, options: Bvh6Options) -> Built:
         tree = grouped(self._collapsed(BvhOptions(**asdict(options), max_leaf=1, row=WIDTH)))
         built = Built(self._arrays(tree), tree.order[:, 0].copy(), len(tree.children), tree.leaves, tree.depth)
         return replace(built, sah_cost=self._tree(built).sah_cost(tree.root_area))
@@ -80,6 +77,10 @@ class Bvh6(WideBvh):
         lanes = np.full((len(built.order), WIDTH), -1, np.int32)
         lanes[:, 0] = built.order
         return WideTree(*decompress(head, WIDTH), children, lanes, built.leaves, built.depth, 0)
+
+    def decoded(self) -> WideTree:
+        """Return the tree with the boxes that rays are tested against; each leaf is a row with one primitive."""
+        return self._tree(self.built)
 
     def _check(self, built: Built) -> None:
         nodes = built.arrays["nodes"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import ClassVar
@@ -46,21 +47,20 @@ class Bvh8Options(Bvh4Options):
     max_leaf: int = 8
 
 
-class WideBvh(OneMesh):
-    """A binary tree collapsed into nodes of `width` children. Options: Bvh4Options and Bvh8Options."""
+class CollapsedBvh(OneMesh):
+    """A binary tree collapsed into nodes of `width` children. Subclasses convert the tree to the arrays of their nodes, and back."""
 
     width: ClassVar[int]
     compressed: ClassVar[bool] = False
     can_refit = True
 
-    def _build(self, options: BinaryOptions) -> Built:
-        options = BvhOptions(**asdict(options), row=self.width)
-        few = options.builder == "refined" and len(self.geometry) <= SMALL
-        tree = small_tree(*self.geometry.bounds(), options) if few else self._collapsed(options)
-        if tree.stack > STACK_SIZE:
-            tree = self._collapsed(options)
-        built = Built(self._arrays(tree), tree.order[tree.order >= 0], len(tree.children), tree.leaves, tree.depth)
-        return replace(built, sah_cost=(self._tree(built) if self.compressed else tree).sah_cost(tree.root_area))
+    @abstractmethod
+    def _arrays(self, tree: WideTree) -> dict[str, np.ndarray]:
+        """Return the nodes of a tree, as arrays of the structure's Warp struct."""
+
+    @abstractmethod
+    def _tree(self, built: Built) -> WideTree:
+        """Convert arrays from `_arrays` back to a tree, and decode compressed boxes."""
 
     def _collapsed(self, options: BvhOptions) -> WideTree:
         """Build a binary tree and collapse it."""
@@ -75,6 +75,33 @@ class WideBvh(OneMesh):
             raise InputError(f"a {self.name} holds at most {MAX_FIRST} primitives, and there are {len(binary.order)}",
                              hint="use bvh8")
         return tree
+
+    def _refit(self, built: Built) -> Built:
+        tree = refit(self._tree(built), self.geometry)
+        built = replace(built, arrays=self._arrays(tree))
+        return replace(built, sah_cost=self._tree(built).sah_cost(tree.root_area))
+
+    def _children(self, built: Built) -> WarpStruct:
+        from wrt.accel.epo import children
+
+        tree = self._tree(built)
+        leaf = tree.children < 0
+        first = np.where(leaf, leaf_first.func(tree.children.astype(np.int64)) * self.width, tree.children)
+        count = np.where(leaf, leaf_count.func(tree.children), np.where(tree.children == EMPTY, -1, 0))
+        return children(tree.lo, tree.hi, first, count, tree.order)
+
+
+class WideBvh(CollapsedBvh):
+    """A binary tree collapsed into nodes of `width` children. Options: Bvh4Options and Bvh8Options."""
+
+    def _build(self, options: BinaryOptions) -> Built:
+        options = BvhOptions(**asdict(options), row=self.width)
+        few = options.builder == "refined" and len(self.geometry) <= SMALL
+        tree = small_tree(*self.geometry.bounds(), options) if few else self._collapsed(options)
+        if tree.stack > STACK_SIZE:
+            tree = self._collapsed(options)
+        built = Built(self._arrays(tree), tree.order[tree.order >= 0], len(tree.children), tree.leaves, tree.depth)
+        return replace(built, sah_cost=(self._tree(built) if self.compressed else tree).sah_cost(tree.root_area))
 
     def _nodes(self, built: Built) -> np.ndarray:
         return built.arrays["nodes"].reshape(-1, node_size(self.width, self.compressed))
@@ -98,7 +125,6 @@ class WideBvh(OneMesh):
         return {"nodes": nodes.reshape(-1)}
 
     def _tree(self, built: Built) -> WideTree:
-        """Convert arrays from `_arrays` back to a tree, and decode compressed boxes."""
         head = self._nodes(built)[:, : first_reference(self.width, self.compressed)]
         if self.compressed:
             lo, hi = decompress(head, self.width)
@@ -151,20 +177,6 @@ class WideBvh(OneMesh):
             boxes = self._nodes(built)[:, : first_reference(self.width, False)].reshape(-1, 3, 2, self.width)[node, :, :, child]
             if (boxes != np.array([np.inf, -np.inf], np.float32)).any():
                 raise InputError("is damaged: a child that does not exist has a box")
-
-    def _refit(self, built: Built) -> Built:
-        tree = refit(self._tree(built), self.geometry)
-        built = replace(built, arrays=self._arrays(tree))
-        return replace(built, sah_cost=self._tree(built).sah_cost(tree.root_area))
-
-    def _children(self, built: Built) -> WarpStruct:
-        from wrt.accel.epo import children
-
-        tree = self._tree(built)
-        leaf = tree.children < 0
-        first = np.where(leaf, leaf_first.func(tree.children.astype(np.int64)) * self.width, tree.children)
-        count = np.where(leaf, leaf_count.func(tree.children), np.where(tree.children == EMPTY, -1, 0))
-        return children(tree.lo, tree.hi, first, count, tree.order)
 
 
 class Bvh4(WideBvh):

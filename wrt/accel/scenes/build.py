@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 
     from wrt.accel.brute_force import BruteForce
     from wrt.accel.bvh.binary import Bvh2
-    from wrt.accel.bvh.volumes import Bvh2Kdop, Bvh2Sphere
     from wrt.accel.bvh.six import Bvh6
+    from wrt.accel.bvh.volumes import Bvh2Kdop, Bvh2Sphere
     from wrt.accel.bvh.wide import Bvh4, Bvh8, Bvh8c
     from wrt.accel.cells.bsp import Bsp
     from wrt.accel.cells.grid import Grid

@@ -8,7 +8,7 @@ import numpy as np
 
 from wrt.accel.base import Accelerator
 from wrt.accel.bvh.binary import Bvh2
-from wrt.accel.bvh.wide import WideBvh
+from wrt.accel.bvh.wide import CollapsedBvh
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
 from wrt.accel.structures import ACCELERATORS
@@ -24,7 +24,7 @@ from wrt.lab.rtcore.warps import WARP, blocks
 
 def bvhs() -> list[str]:
     """Return the names of the registry's BVHs, without aliases: all structures that are built from a binary tree."""
-    return [name for name, cls in ACCELERATORS.items() if name == cls.name and issubclass(cls, Bvh2 | WideBvh)]
+    return [name for name, cls in ACCELERATORS.items() if name == cls.name and issubclass(cls, Bvh2 | CollapsedBvh)]
 
 
 def in_warps(accel: Accelerator, sets: dict[str, RaySet]) -> dict[str, RaySet]:
