@@ -19,7 +19,7 @@ from wrt.accel.geometry import Geometry
 from wrt.core.device import empty_aligned, launch, preloading, record_dtype, start
 from wrt.core.errors import InputError
 from wrt.core.threads import run_all
-from wrt.core.types import WarpStruct
+from wrt.core.types import Kernel, WarpStruct
 from wrt.kernels.build.shape import write_rows
 from wrt.kernels.wide.batch import BatchTraversal
 from wrt.kernels.wide.layout import PLANES, STACK_SIZE, first_reference, node_size
@@ -62,11 +62,11 @@ class CollapsedBvh(OneMesh):
     def _tree(self, built: Built) -> WideTree:
         """Convert arrays from `_arrays` back to a tree, and decode compressed boxes."""
 
-    def _collapsed(self, options: BvhOptions) -> WideTree:
-        """Build a binary tree and collapse it."""
+    def _collapsed(self, options: BvhOptions, *kernels: Kernel) -> WideTree:
+        """Build a binary tree and collapse it; load `kernels`, which the structure needs afterwards, at the same time."""
         # Two leaves count as cheaper than one if they have less area, because the cost of inner nodes depends on the collapse.
         of_binary = replace(options, max_leaf=min(options.max_leaf, self.width), cost_traversal=0.0, cost_intersection=1.0)
-        with preloading(*(COLLAPSE if len(self.geometry) > 1 else ()), *([write_rows] if self._rows_by_kernel() else [])):
+        with preloading(*(COLLAPSE if len(self.geometry) > 1 else ()), *kernels):
             binary = build_binary(self.geometry, of_binary, self.threads)
             if len(binary.order) < 2:
                 return small_tree(*self.geometry.bounds(), options)
@@ -96,10 +96,11 @@ class WideBvh(CollapsedBvh):
 
     def _build(self, options: BinaryOptions) -> Built:
         options = BvhOptions(**asdict(options), row=self.width)
+        kernels = [write_rows] if self._rows_by_kernel() else []
         few = options.builder == "refined" and len(self.geometry) <= SMALL
-        tree = small_tree(*self.geometry.bounds(), options) if few else self._collapsed(options)
+        tree = small_tree(*self.geometry.bounds(), options) if few else self._collapsed(options, *kernels)
         if tree.stack > STACK_SIZE:
-            tree = self._collapsed(options)
+            tree = self._collapsed(options, *kernels)
         built = Built(self._arrays(tree), tree.order[tree.order >= 0], len(tree.children), tree.leaves, tree.depth)
         return replace(built, sah_cost=(self._tree(built) if self.compressed else tree).sah_cost(tree.root_area))
 
