@@ -283,6 +283,7 @@ class Lighting:
     emitter_cdf: wp.array(dtype=wp.float32)  # Entry i: share of a light's power in its emitters up to and including emitter i.
     background: Background
     ambient: wp.vec3
+    ambient_radius: float  # Surfaces farther away do not occlude the ambient term. Unread unless Features.ambient_occlusion.
 
 
 @wp.struct

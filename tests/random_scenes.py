@@ -174,7 +174,7 @@ def plan_of_scene(number: int, seed: int) -> Plan:
     pose = type(camera).look_at(*(size * each + world[:3, 3] for each in (position, rng.normal(0.0, 0.3, 3)))).camera_to_world
     scene = Scene(objects, spheres, tuple(draw(rng).moved(world) for draw in group.lights),
                   (replace(camera, camera_to_world=pose),), group.background(rng),
-                  rng.uniform(0.1, 1.0, 3) if group.ambient else (0.0, 0.0, 0.0), group.settings)
+                  rng.uniform(0.1, 1.0, 3) if group.ambient else (0.0, 0.0, 0.0), 1.5 * size * (number % 2), group.settings)
     scene = scene_at(scene.with_settings(size=(int(rng.integers(1, 20)), int(rng.integers(1, 12)))), rng.random())
     plan = plan_of(scene, Options(device="cpu", threads=1, **group.options))
     depth = int(rng.integers(0, group.settings.max_depth + 1, 2).max())

@@ -36,7 +36,7 @@ class Tile:
 
 
 def make_direct_light(features: Features, accel_struct: Any, transmittance: Any, step: Step) -> Any:
-    """Return direct_light, which traces one shadow ray to each light, and one to the background if Features.sky_light is set."""
+    """Return direct_light, which traces one shadow ray to each light, and to each of Features.extra_lights."""
     Shaded = make_shaded(features.counting)
     light_point = make_light_points(features).point
 

@@ -8,9 +8,11 @@ from wrt.kernels.shade.backgrounds import make_sky_point, make_sky_sample
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.lights import LIGHTS, WITHOUT_AREA, LightSample, make_light_sample
 from wrt.kernels.shade.materials import Scatter, blinn_phong
-from wrt.kernels.shade.sampling import PI, hash_pair, make_sample_2d
+from wrt.kernels.shade.sampling import PI, cosine_point, hash_pair, make_sample_2d, rotated_to
 from wrt.kernels.shade.surface import Surface, spawn_point
 from wrt.kernels.structs import Lighting, Ray, Surfaces, any_positive, gamma, make_ray
+
+AMBIENT = wp.constant(2)  # LightSample.area of the ambient term, which has no highlight.
 
 
 @wp.func
@@ -27,15 +29,28 @@ def shadow_ray(s: Surface, sample: LightSample) -> Ray:
     return ray
 
 
+@wp.func
+def ambient_sample(lighting: Lighting, s: Surface, point: wp.vec3) -> LightSample:
+    """Sample the ambient term: a direction by the cosine, whose shadow ray ends at lighting.ambient_radius. point: a cosine_point.
+
+    The mean is the ambient occlusion of Zhukov, Iones, Kronin 1998, "An Ambient Light Illumination Model", with visibility 0 or 1."""
+    sample = LightSample()
+    sample.wi = rotated_to(point, s.shading)
+    sample.weight = lighting.ambient * (PI / wp.max(wp.dot(sample.wi, s.shading), 1.0e-9))
+    sample.end = s.point + lighting.ambient_radius * sample.wi
+    sample.area = AMBIENT
+    return sample
+
+
 def make_reflected_light(features: Features) -> Any:
     """Return sample_light, and reflected_light, the radiance that a surface reflects from an unoccluded light sample towards wo."""
     light_sample = make_light_sample(features)
     sky_sample = make_sky_sample(features)
-    lights = bool(features.lights)
+    lights, ambient = bool(features.lights), features.extra_lights - 1
 
     @wp.func
     def sample_light(lighting: Lighting, surfaces: Surfaces, i: int, s: Surface, point: wp.vec3) -> LightSample:
-        """Sample light i, or the background if i = lighting.count. `point` comes from LightPoints.point."""
+        """Sample light i, the background or the ambient term (Features.extra_lights). `point` comes from LightPoints.point."""
         sample = LightSample()
         if wp.static(lights):
             if i < lighting.count:
@@ -43,6 +58,9 @@ def make_reflected_light(features: Features) -> Any:
         if wp.static(features.sky_light):
             if i == lighting.count:
                 sample = sky_sample(lighting.background, s.shading, point)
+        if wp.static(features.ambient_occlusion):
+            if i == lighting.count + wp.static(ambient):
+                sample = ambient_sample(lighting, s, point)
         return sample
 
     @wp.func
@@ -53,7 +71,7 @@ def make_reflected_light(features: Features) -> Any:
         value = scatter.diffuse / PI
         if wp.static(features.highlight):
             # A traced reflection finds area lights by itself. The background has no highlight: it is no small light.
-            if sample.area == 0 or (scatter.traced == 0 and sample.distant == 0):
+            if sample.area == 0 or (scatter.traced == 0 and sample.distant == 0 and sample.area != AMBIENT):
                 if any_positive(scatter.highlight):
                     value = value + scatter.highlight * blinn_phong(s.shading, sample.wi, wo, scatter.exponent)
         return cosine * wp.cw_mul(value, sample.weight)
@@ -65,13 +83,14 @@ class LightPoints(NamedTuple):
     """The functions for random points on light i. key: seed of the hit that the light illuminates. index: index of the sample."""
 
     xi: Any  # (key, index, i) -> vec2 in [0, 1)^2, which places a sample on light i.
-    point: Any  # (lighting, key, index, i) -> vec3: sky_point(xi) for the background, else (xi[0], xi[1], 0).
+    # (lighting, key, index, i) -> vec3: sky_point(xi) for the background, cosine_point(xi) for the ambient term, else (xi[0], xi[1], 0).
+    point: Any
 
 
 def make_light_points(features: Features) -> LightPoints:
     """Return the LightPoints of a scene."""
     sample_2d = make_sample_2d(features)
-    sky_point = make_sky_point(features)
+    sky_point, ambient = make_sky_point(features), features.extra_lights - 1
     single = {kind for kind, name in enumerate(LIGHTS) if name in features.lights and name in WITHOUT_AREA}
     is_single = wp.types.vector(len(LIGHTS), int)(*(int(kind in single) for kind in range(len(LIGHTS))))
 
@@ -89,6 +108,9 @@ def make_light_points(features: Features) -> LightPoints:
         if wp.static(features.sky_light):
             if i == lighting.count:
                 return sky_point(xi)
+        if wp.static(features.ambient_occlusion):
+            if i == lighting.count + wp.static(ambient):
+                return cosine_point(xi)
         return wp.vec3(xi[0], xi[1], 0.0)
 
     return LightPoints(light_xi, light_point)

@@ -32,7 +32,8 @@ class Features:
     lights: tuple[str, ...] = ()  # The kinds of lights that the scene has.
     background: str = "constant"  # The kind of the background.
     sky_light: bool = False  # The background is sampled as a light.
-    ambient: bool = False  # The ambient term is not 0.
+    ambient: bool = False  # The ambient term is not 0, and is not occluded.
+    ambient_occlusion: bool = False  # Shadow rays sample how much of the ambient term nearby surfaces occlude.
     tinted_shadows: bool = False  # Shadow rays pass solid glass straight.
     transparent_shadows: bool = False  # Shadow rays pass transparent surfaces.
     reflection: bool = False  # Surfaces make reflected paths.
@@ -42,5 +43,10 @@ class Features:
 
     @property
     def direct_light(self) -> bool:
-        """True if lights or the background are sampled at a hit."""
-        return bool(self.lights) or self.sky_light
+        """True if lights, the background or the ambient term are sampled at a hit."""
+        return bool(self.lights) or self.extra_lights > 0
+
+    @property
+    def extra_lights(self) -> int:
+        """Number of lights after the scene's: light Lighting.count is the background, if sampled; the last one is the ambient term."""
+        return int(self.sky_light) + int(self.ambient_occlusion)

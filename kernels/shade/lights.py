@@ -29,7 +29,7 @@ class LightSample:
     end: wp.vec3  # Point where the shadow ray ends. Unread if `distant`.
     distant: int  # 1 if the light is at infinity, else 0.
     weight: wp.vec3  # Radiance over density per steradian. For a light without area: irradiance at normal incidence.
-    area: int  # 1 if a ray can hit this light, else 0.
+    area: int  # 1 if a ray can hit this light, 2 for the ambient term (direct.AMBIENT), else 0.
 
 
 # --- the kinds --------------------------------------------------------------------------------------------------------

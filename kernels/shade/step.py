@@ -32,7 +32,7 @@ def make_shaded(counting: bool) -> Any:
     class Shaded:
         """The result of shading a path's hit. A path of throughput 0 means no path."""
 
-        light: wp.vec3  # Emission and the ambient term.
+        light: wp.vec3  # Emission and the ambient term, unless it is occluded.
         throughput: wp.vec3  # Weight of this surface's light in the sample.
         surface: Surface  # The surface at the hit, where shadow rays start.
         scatter: Scatter
@@ -236,7 +236,7 @@ class Step(NamedTuple):
 
     choose_facet: Any  # (key, index) -> vec3, a cap_point: the facet for `shade`, in sample `index` at the path with this key.
     shade: Any  # (surfaces, lighting, path, surface, texels, t, facet) -> Shaded.
-    extra_lights: int  # 1 if the background is sampled: it is light number lighting.count. Else 0.
+    extra_lights: int  # Features.extra_lights: lights lighting.count and following are the background and the ambient term.
     sample_light: Any  # (lighting, surfaces, i, surface, point) -> LightSample of light i; `point` comes from LightPoints.
     shadow_request: Any  # (shaded, sample) -> ShadowRequest.
 
@@ -262,4 +262,4 @@ def make_step(features: Features, shading: Shading) -> Step:
             out.end = sample.end
         return out
 
-    return Step(choose_facet, make_shade(features, shading), 1 if features.sky_light else 0, sample_light, shadow_request)
+    return Step(choose_facet, make_shade(features, shading), features.extra_lights, sample_light, shadow_request)

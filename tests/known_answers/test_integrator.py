@@ -3,6 +3,8 @@
 A kernel is compiled for a scene's features. Scenes here have distant hidden objects with more features, so that they share kernels.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -238,6 +240,31 @@ def test_shadows_and_the_ambient_term():
     assert np.allclose(under.pixels.mean(axis=(0, 1)), expected, atol=5e-3)
     outside = render(scene, camera=toward((6.0, 0.0, 0.0), (9.0, 5.0, 0.0), fov=1e-3))
     assert outside.pixels.mean() > 0.5  # Outside, the point light is visible past the lid's edge.
+
+
+@pytest.mark.parametrize("radius", [0.5, 1.5, 4.0, 50.0])
+def test_a_wall_occludes_the_ambient_term_as_far_as_the_radius(radius):
+    """Nusselt's analog: the directions that meet a wall at distance 1 within the radius are a segment of the unit disk."""
+    wall = Object(moved(quad((1.0, -500.0, -500.0), (0.0, 0.0, 1000.0), (0.0, 1000.0, 0.0))), (Material(albedo=(0.0,) * 3),))
+    scene = lit_scene(floor(), wall, background=ConstantBackground(), ambient=(0.4, 0.2, 0.1))
+    scene = replace(scene, ambient_occlusion=radius)
+    film = render(scene, camera=toward((0.0, 0.0, 0.0), (-3.0, 5.0, 0.0), fov=1e-3), spp=1024)
+    near = min(1.0, 1.0 / radius)
+    occluded = (np.arccos(near) - near * np.sqrt(1.0 - near * near)) / np.pi
+    assert film.pixels.mean(axis=(0, 1)) == pytest.approx(0.5 * np.array([0.4, 0.2, 0.1]) * (1.0 - occluded), rel=2e-3)
+
+
+@pytest.mark.parametrize("radius", [0.1, 1.0, 1.7, 1.9])
+def test_inside_a_ball_chords_occlude_the_ambient_term(radius):
+    """A chord at angle a from the normal has length 2 cos a. By the cosine, the share of longer chords is 1 - (radius / 2)^2."""
+    ball = Sphere((0.0, 0.0, 0.0), 1.0, Material(albedo=(0.5,) * 3, specular=(0.3,) * 3))
+    scene = replace(lit_scene(spheres=(ball,), background=ConstantBackground(), ambient=(0.6,) * 3), ambient_occlusion=radius)
+    for mesh in (False, True):
+        if mesh:
+            walls = Object(moved(replace(icosphere(5), normals=None)), (ball.material,))
+            scene = replace(scene, objects=(walls,), spheres=())
+        film = render(scene, camera=toward((0.9, 0.1, 0.2), (0.1, 0.0, 0.0), fov=0.5), spp=256)
+        assert film.pixels.mean() == pytest.approx(0.3 * max(0.0, 1.0 - (radius / 2.0) ** 2), rel=5e-3, abs=1e-4)
 
 
 # --- mixtures ---------------------------------------------------------------------------------------------------------

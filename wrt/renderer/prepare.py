@@ -126,7 +126,7 @@ def prepare(plan: Plan, device: Device, built: Prepared | None = None) -> Prepar
     work = _Preparation(plan, device)
     work.run(([work.build] if built is None else []) + [partial(work.compile, kernel) for kernel in work.kernels])
     arrays, accel = (work.arrays, work.accel) if built is None else (built.arrays, built.accel)
-    lights = arrays.lighting.count + (1 if plan.features.sky_light else 0)
+    lights = arrays.lighting.count + plan.features.extra_lights
     waves = Waves(plan.wave_kernels, plan.features, lights) if plan.by_waves else None
     camera = camera_struct(plan.camera, plan.scene.settings.size)
     return Prepared(plan, device, work.threads, work.kernels, arrays, accel, camera, waves, work.seconds)

@@ -255,6 +255,7 @@ def upload_scene(scene: Scene, device: Device, meshes: frozenset[int] = frozense
     lighting.emitter_cdf = upload(cdf, wp.float32, device)
     lighting.background = background_struct(scene.background, device)
     lighting.ambient = wp.vec3(*scene.ambient)
+    lighting.ambient_radius = scene.ambient_occlusion
     return DeviceScene(world, s, lighting)
 
 

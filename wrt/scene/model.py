@@ -109,6 +109,9 @@ class Scene:
         Radiance of rays that hit nothing; black by default.
     ambient
         Radiance that every diffuse surface receives from all directions, unshadowed (Whitted's ambient term).
+    ambient_occlusion
+        Radius in scene units. A shadow ray of this length, in a random direction, then decides whether a surface receives `ambient`, so
+        that corners are darker. 0: the ambient term is unshadowed.
     settings
         Size, samples and other defaults of `render`. Its keywords override the settings.
 
@@ -129,6 +132,7 @@ class Scene:
     cameras: tuple[CameraKind, ...] = ()
     background: Background = field(default_factory=ConstantBackground)
     ambient: Color = BLACK
+    ambient_occlusion: float = 0.0
     settings: Settings = field(default_factory=Settings)
     name: str = ""
 
@@ -144,6 +148,7 @@ class Scene:
             depth = GLASS_DEPTH if any(material.is_clear for material in self.materials) else DEPTH
             object.__setattr__(self, "settings", replace(self.settings, max_depth=depth))
         object.__setattr__(self, "ambient", as_vector(self.ambient, "ambient", low=0.0))
+        object.__setattr__(self, "ambient_occlusion", as_number(self.ambient_occlusion, "ambient_occlusion", low=0.0, high=MAX_REACH))
 
     def __repr__(self) -> str:
         counts = {"triangle": sum(len(thing.mesh.faces) for thing in self.objects), "object": len(self.objects),

@@ -122,6 +122,7 @@ class _Builder:
             cameras=(*cameras, *(camera for scene in included for camera in scene.cameras)),
             background=background,
             ambient=as_vector(table.ambient, "ambient"),
+            ambient_occlusion=table.ambient_occlusion,
             settings=settings(table.settings, included),
             name=table.title or self.path.stem,
         )

@@ -24,6 +24,7 @@ from wrt.scene.lights import LIGHTS
 from wrt.scene.materials import MATERIALS
 from wrt.scene.settings import Settings
 from wrt.scene.shapes import SHAPES
+from wrt.scene.values import MAX_REACH
 
 RADIANCE = unit("radiance")
 Profile = Annotated[list[Annotated[list[float], Field(min_length=2, max_length=2), LENGTH]], Field(min_length=2)]
@@ -212,6 +213,8 @@ class SceneTable(Table):
     background: Any = Field(None, description="radiance of rays that hit nothing (default: black)")
     ambient: Annotated[Radiance, RADIANCE] = Field(
         [0.0, 0.0, 0.0], description="radiance that every diffuse surface receives from all directions, unshadowed")
+    ambient_occlusion: Annotated[float, Field(ge=0.0, le=MAX_REACH), LENGTH] = Field(
+        0.0, description="surfaces within this radius occlude `ambient`; 0: nothing does")
     materials: dict[str, MaterialTable] = Field({}, description="materials by name")
     override: dict[str, MaterialTable] = Field({}, description="materials that replace included materials of the same name")
     spheres: list[SphereTable] = Field([], description="exact spheres")
