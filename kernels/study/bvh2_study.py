@@ -1,4 +1,4 @@
-"""Variants of the binary BVH's traversal, to count their steps: without order, without early stop, or with a short stack; same hits.
+"""Variants of the binary BVH's traversal, to count their steps: in any order, without early stop, or with a short stack; same hits.
 A short stack overwrites its oldest entries. When the stack is empty, the walk restarts at the root and follows a trail. The trail has one
 bit per level of the tree. The bit is set if only the last child of the level remains to be visited. Laine 2010, "Restart Trail for
 Stackless BVH Traversal"; Vaidyanathan et al. 2019, "Wide BVH Traversal with a Short Stack"."""
@@ -18,11 +18,17 @@ TOP = wp.constant(wp.uint64(1 << 63))
 NONE = wp.constant(wp.uint64(0))
 
 
+@wp.func
+def child_0_first(entry: wp.vec2) -> bool:
+    """Visit the children in the order of the node: an argument `choose` of make_binary_traversal."""
+    return False
+
+
 class Study(NamedTuple):
-    """A variant, in place of a structure's traversal module. With a short stack, `ordered` and `early` have no effect."""
+    """A variant, in place of a structure's traversal module. With a short stack, `choose` and `early` have no effect."""
 
     entries: int = STACK_SIZE  # Number of stack entries; STACK_SIZE: as many as needed.
-    ordered: bool = True  # Visit the nearer child first.
+    choose: Any = None  # Argument of make_binary_traversal: a function that orders the children. None: nearer child first.
     early: bool = True  # Drop boxes and stack entries behind the best hit.
 
     def make_struct(self, record: Any) -> Any:
@@ -32,7 +38,7 @@ class Study(NamedTuple):
         if self.entries < STACK_SIZE:
             return make_short_stack(units, self.entries, any_hit, accepts)
         volumes = box_volumes(units.triangle_test.record, units.box_test)
-        return make_binary_traversal(units, volumes, make_leaf(units, any_hit, accepts), any_hit, self.ordered, self.early)
+        return make_binary_traversal(units, volumes, make_leaf(units, any_hit, accepts), any_hit, self.choose, self.early)
 
 
 @wp.struct

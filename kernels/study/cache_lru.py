@@ -47,6 +47,9 @@ class Trace:
     first: wp.array(dtype=wp.int64)  # Ray i has the fetches first[i] .. first[i + 1] - 1.
     address: wp.array(dtype=wp.int64)  # First byte of each fetch.
     size: wp.array(dtype=wp.int64)  # Number of bytes of each fetch.
+    prefetch_first: wp.array(dtype=wp.int64)  # Fetch i starts the prefetches prefetch_first[i] .. [i + 1] - 1. Length 0: no prefetches.
+    prefetch_address: wp.array(dtype=wp.int64)
+    prefetch_size: wp.array(dtype=wp.int64)
 
 
 @wp.struct
@@ -68,10 +71,42 @@ class Missed:
 
 
 @wp.func
-def play_round(trace: Trace, caches: Caches, out: Missed, sm: int, warp: int, step: wp.int64, time: wp.int64) -> bool:
-    """Replay fetch `step` of each ray of a warp. Rays that fetch the same line share one access. Return whether more fetches follow."""
-    more = bool(False)
+def request(caches: Caches, out: Missed, sm: int, line: wp.int64, seen: int, time: wp.int64) -> int:
+    """Access a line unless the round has done so; return its entry in out.seen. seen: number of lines that the round has accessed."""
     begin = sm * out.seen_size
+    for j in range(seen):
+        if out.seen[begin + seen - 1 - j] == line:
+            return begin + seen - 1 - j
+    entry = begin + seen
+    out.seen[entry] = line
+    out.seen_at[entry] = wp.int64(-1)
+    if not access(caches, sm, line):
+        at = out.first[sm] + out.misses[sm]
+        out.line[at] = line
+        out.time[at] = time
+        out.lanes[at] = wp.int64(0)
+        out.seen_at[entry] = at
+        out.misses[sm] += wp.int64(1)
+    return entry
+
+
+@wp.func
+def prefetch_lines(trace: Trace, caches: Caches, out: Missed, sm: int, fetch: wp.int64, seen: int, time: wp.int64) -> int:
+    """Access the lines that a fetch prefetches; no lane waits for them. Return the number of lines that the round has accessed."""
+    for i in range(int(trace.prefetch_first[fetch]), int(trace.prefetch_first[fetch + wp.int64(1)])):
+        line = trace.prefetch_address[i] / LINE
+        last = (trace.prefetch_address[i] + trace.prefetch_size[i] - wp.int64(1)) / LINE
+        while line <= last:
+            seen = wp.max(seen, request(caches, out, sm, line, seen, time) - sm * out.seen_size + 1)
+            line = line + wp.int64(1)
+    return seen
+
+
+@wp.func
+def play_round(trace: Trace, caches: Caches, out: Missed, sm: int, warp: int, step: wp.int64, time: wp.int64) -> bool:
+    """Replay fetch `step` of each ray of a warp, then the prefetches that these fetches start. Rays that fetch the same line share one
+    access. Return whether more fetches follow."""
+    more = bool(False)
     seen = int(0)
     for ray in range(int(trace.warp_first[warp]), int(trace.warp_first[warp + 1])):
         fetch = trace.first[ray] + step
@@ -81,26 +116,16 @@ def play_round(trace: Trace, caches: Caches, out: Missed, sm: int, warp: int, st
             last = (trace.address[fetch] + trace.size[fetch] - wp.int64(1)) / LINE
             while line <= last:
                 out.wanted[sm] += wp.int64(1)
-                entry = int(-1)
-                for j in range(seen):
-                    if out.seen[begin + seen - 1 - j] == line:
-                        entry = begin + seen - 1 - j
-                        break
-                if entry < 0:
-                    entry = begin + seen
-                    seen = seen + 1
-                    out.seen[entry] = line
-                    out.seen_at[entry] = wp.int64(-1)
-                    if not access(caches, sm, line):
-                        at = out.first[sm] + out.misses[sm]
-                        out.line[at] = line
-                        out.time[at] = time
-                        out.lanes[at] = wp.int64(0)
-                        out.seen_at[entry] = at
-                        out.misses[sm] += wp.int64(1)
+                entry = request(caches, out, sm, line, seen, time)
+                seen = wp.max(seen, entry - sm * out.seen_size + 1)
                 if out.seen_at[entry] >= wp.int64(0):
                     out.lanes[out.seen_at[entry]] += wp.int64(1)
                 line = line + wp.int64(1)
+    if trace.prefetch_first.shape[0] > 0:
+        for ray in range(int(trace.warp_first[warp]), int(trace.warp_first[warp + 1])):
+            fetch = trace.first[ray] + step
+            if fetch < trace.first[ray + 1]:
+                seen = prefetch_lines(trace, caches, out, sm, fetch, seen, time)
     out.accesses[sm] += wp.int64(seen)
     return more
 

@@ -26,7 +26,7 @@ def make_struct(record: Any) -> Any:
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
     """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found; accepts: common.make_better."""
     probe_of = make_probe(units)
-    visit_leaf = make_leaf(units, any_hit, accepts)
+    visit_leaf = make_leaf(units, any_hit, accepts, is_leaf=False)
     _, _, _, finish = make_counters(units, 0)
     struct = make_struct(units.triangle_test.record)
 

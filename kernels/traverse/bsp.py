@@ -35,8 +35,10 @@ import warp as wp
 from wrt.kernels.structs import NO_HIT, Hit, Ray, largest, size_of
 from wrt.kernels.traverse.bvh2 import Child, child_of
 from wrt.kernels.traverse.common import Probe, Units, make_probe, no_hit
-from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
+from wrt.kernels.traverse.counters import Counts, Recorder, make_counters, write_step
 from wrt.kernels.traverse.leaf import make_leaf
+from wrt.kernels.traverse.recording import make_recording
+from wrt.kernels.traverse.steps import ENTERED, cell_step, part_step, plane_step
 from wrt.kernels.units.box import BoxRay, slab_interval
 
 # Stack entries. Builders keep a tree's depth at or below STACK_SIZE, because the walk pushes at most one child per level.
@@ -149,10 +151,30 @@ def cut_by_plane(node: BspNode, box: BoxRay, direction: wp.vec3, t_0: float, t_1
     return out
 
 
+@wp.func
+def record_sides(recorder: Recorder, ray: Ray, index: int, node: BspNode, sides: Sides, part: wp.vec2):
+    """Record the test of a node's plane, and its children. part: the part (t_0, t_1) of the ray in the node."""
+    normal = node.normal
+    if node.axis < wp.static(PLANE):
+        normal = wp.vec3()
+        normal[node.axis] = 1.0
+    t = -(wp.dot(normal, ray.origin) + node.offset) / wp.dot(normal, ray.direction)
+    plane = plane_step(index, normal, node.offset, t)
+    write_step(recorder, ray.slot, plane)
+    near_is_below = sides.near.first == node.first_0 and sides.near.count == node.count_0
+    near = part_step(plane, not near_is_below, sides.near.first, wp.vec2(part[0], sides.near_t_1), sides.meets_near)
+    near.count = sides.near.count
+    far = part_step(plane, near_is_below, sides.far.first, wp.vec2(sides.far_t_0, part[1]), sides.meets_far)
+    far.count = sides.far.count
+    write_step(recorder, ray.slot, near)
+    write_step(recorder, ray.slot, far)
+
+
 def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
     """Make walk(accel, surfaces, probe, reach) -> (best Hit, Counts), which visits the cells along the ray's part `reach`."""
     visit_leaf = make_leaf(units, any_hit, accepts)
     fetch_node, _, push, _ = make_counters(units, size_of(BspNode))
+    record_push, record_pop = make_recording(units)
 
     @wp.func
     def walk(accel: Any, surfaces: Any, probe: Probe, reach: Reach):
@@ -178,12 +200,15 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
             else:
                 counts = fetch_node(accel.recorder, probe.ray, counts, first, 0)
                 sides = cut_by_plane(accel.nodes[first], probe.box, probe.ray.direction, t_0, t_1, reach.drift)
+                if wp.static(units.steps):
+                    record_sides(accel.recorder, probe.ray, first, accel.nodes[first], sides, wp.vec2(t_0, t_1))
                 if sides.meets_near:
                     if sides.meets_far:
                         stack_first[size] = sides.far.first
                         stack_count[size] = sides.far.count
                         stack_t_0[size] = sides.far_t_0
                         stack_t_1[size] = t_1
+                        record_push(accel.recorder, probe.ray, sides.far.first, sides.far.count, sides.far_t_0, size)
                         size = size + 1
                         counts = push(counts, size)
                     first = sides.near.first
@@ -200,6 +225,8 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
             while size > 0 and not found:
                 size = size - 1
                 counts.pops += 1
+                taken = wp.where(stack_t_0[size] <= best.t + reach.beyond, ENTERED, 0)
+                record_pop(accel.recorder, probe.ray, stack_first[size], stack_count[size], stack_t_0[size], taken)
                 if stack_t_0[size] <= best.t + reach.beyond:
                     first = stack_first[size]
                     count = stack_count[size]
@@ -222,6 +249,8 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
     def traverse(accel: struct, surfaces: Any, ray: Ray) -> Hit:
         probe = probe_of(ray)
         reach = reach_of(probe.box, ray, no_hit(ray).t, accel.lo, accel.hi, accel.extent)
+        if wp.static(units.steps):
+            write_step(accel.recorder, ray.slot, cell_step(accel.first, accel.count, accel.lo, accel.hi, reach.t_0, reach.t_1))
         best, counts = walk(accel, surfaces, probe, reach)
         return finish(accel.recorder, ray, counts, best)
 

@@ -10,9 +10,11 @@ import warp as wp
 
 from wrt.kernels.structs import NO_HIT, Hit, Ray, size_of
 from wrt.kernels.traverse.common import Probe, Units, make_probe, no_hit
-from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
+from wrt.kernels.traverse.counters import Counts, Recorder, make_counters, write_step
 from wrt.kernels.traverse.leaf import make_leaf
+from wrt.kernels.traverse.recording import make_recording
 from wrt.kernels.traverse.stack import key_of, make_stack, reference_of, t_of
+from wrt.kernels.traverse.steps import ENTERED, INNER, Step, box_step
 from wrt.kernels.units.box import BoxRay
 
 # Stack entries. Builders keep a tree's depth at or below STACK_SIZE, because the walk pushes at most one node per level.
@@ -48,6 +50,12 @@ def make_struct(record: Any, node: Any = Bvh2Node) -> Any:
     return Bvh2
 
 
+@wp.func
+def box_of(node: Any, second: bool) -> Step:
+    """Make the step of a child with a box; the caller sets the other fields."""
+    return box_step(0, 0, wp.where(second, node.lo_1, node.lo_0), wp.where(second, node.hi_1, node.hi_0), 0.0)
+
+
 class Volumes(NamedTuple):
     """A kind of bounding volume: types and functions for make_binary_traversal."""
 
@@ -55,6 +63,7 @@ class Volumes(NamedTuple):
     node: Any  # Type of a node, with first_0, count_0, first_1, count_1 as in Bvh2Node.
     set_up: Any  # Function (accel, probe) -> the ray set up for `enter`.
     enter: Any  # Function (ray, node, t_max) -> vec2, t where the ray enters each child; inf on a miss, never behind a hit inside.
+    outline: Any = box_of  # Function (node, second) -> Step with the box around a child, and the radius if it is a sphere.
     root: Any = None  # Function (ray) -> index of the node where the walk begins; None: node 0.
 
 
@@ -90,19 +99,53 @@ def child_of(node: Any, second: bool) -> Child:
     return child
 
 
+@wp.func
+def step_count(count: int) -> int:
+    """Return Step.count of a child with `count` primitives."""
+    return wp.where(count > 0, count, INNER)
+
+
+def make_recorded(units: Units, volumes: Volumes) -> Any:
+    """Make record_children, for the tests of a node's children, and record_popped (kernels.traverse.steps)."""
+    outline = volumes.outline
+    _, record_pop = make_recording(units)
+
+    @wp.func
+    def record_children(recorder: Recorder, ray: Ray, node: Any, entry: wp.vec2):
+        if wp.static(units.steps):
+            for k in range(2):
+                child = child_of(node, k == 1)
+                step = outline(node, k == 1)
+                step.index = child.first
+                step.count = step_count(child.count)
+                step.result = wp.where(entry[k] < wp.inf, ENTERED, 0)
+                step.t = entry[k]
+                write_step(recorder, ray.slot, step)
+
+    @wp.func
+    def record_popped(recorder: Recorder, ray: Ray, key: wp.uint64, count: int, end: float):
+        if wp.static(units.steps):
+            record_pop(recorder, ray, reference_of(key), step_count(count), t_of(key), wp.where(t_of(key) <= end, ENTERED, 0))
+
+    return record_children, record_popped
+
+
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
     """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found; accepts: common.make_better."""
     volumes = box_volumes(units.triangle_test.record, units.box_test)
     return make_binary_traversal(units, volumes, make_leaf(units, any_hit, accepts), any_hit)
 
 
-def make_binary_traversal(units: Units, volumes: Volumes, visit_leaf: Any, any_hit: bool, ordered: bool = True,
+def make_binary_traversal(units: Units, volumes: Volumes, visit_leaf: Any, any_hit: bool, choose: Any = None,
                           early: bool = True) -> Any:
-    """Make the traversal of a tree with these volumes; visit_leaf: made by kernels.traverse.leaf.make_leaf. The laboratory switches off
-    `ordered` (visit the nearer child first) and `early` (drop nodes that begin behind the best hit)."""
+    """Make the traversal of a tree with these volumes; visit_leaf: made by kernels.traverse.leaf.make_leaf. Two arguments are for the
+    laboratory. choose: function (entry) -> True to visit child 1 first, where `entry` is the result of Volumes.enter; None: visit the
+    nearer child first. early: drop nodes that begin behind the best hit."""
     probe_of = make_probe(units)
     struct, set_up, enter, root = volumes.struct, volumes.set_up, volumes.enter, volumes.root
     fetch_node, _, push, finish = make_counters(units, size_of(volumes.node))
+    record_children, record_popped = make_recorded(units, volumes)
+    record_push, _ = make_recording(units)
     # A stack entry is a key (entry distance, and inner node or first primitive) and the child's `count`.
     new_keys, shared_keys, put_key, key_at = make_stack(units.stack, STACK_SIZE, wp.uint64, ENTRY)
     new_counts, shared_counts, put_count, count_at = make_stack(units.stack, STACK_SIZE, wp.int32, ENTRY)
@@ -136,16 +179,18 @@ def make_binary_traversal(units: Units, volumes: Volumes, visit_leaf: Any, any_h
                 node = accel.nodes[first]
                 counts = fetch_node(accel.recorder, ray, counts, first, 2)
                 entry = enter(prepared, node, end)
+                record_children(accel.recorder, ray, node, entry)
                 hit_0 = entry[0] < wp.inf
                 hit_1 = entry[1] < wp.inf
                 if hit_0 or hit_1:
-                    second = not hit_0  # child 1 is visited first
-                    if wp.static(ordered):
-                        second = entry[1] < entry[0]
+                    second = entry[1] < entry[0]  # child 1 is visited first
+                    if wp.static(choose is not None):
+                        second = (choose(entry) and hit_1) or not hit_0
                     if hit_0 and hit_1:
                         far = child_of(node, not second)
                         put_key(keys, first_keys, size, key_of(wp.where(second, entry[0], entry[1]), far.first))
                         put_count(sizes, first_sizes, size, far.count)
+                        record_push(accel.recorder, ray, far.first, step_count(far.count), wp.where(second, entry[0], entry[1]), size)
                         size = size + 1
                         counts = push(counts, size)
                     near = child_of(node, second)
@@ -158,6 +203,7 @@ def make_binary_traversal(units: Units, volumes: Volumes, visit_leaf: Any, any_h
                 size = size - 1
                 counts.pops += 1
                 key = key_at(keys, first_keys, size)
+                record_popped(accel.recorder, ray, key, count_at(sizes, first_sizes, size), end)
                 if t_of(key) <= end:
                     first = reference_of(key)
                     count = count_at(sizes, first_sizes, size)

@@ -9,6 +9,7 @@ from wrt.kernels.traverse import bvh2
 from wrt.kernels.traverse.bvh2 import STACK_SIZE, Volumes, make_binary_traversal  # noqa: F401 (STACK_SIZE: for the host)
 from wrt.kernels.traverse.common import Probe, Units
 from wrt.kernels.traverse.leaf import make_leaf
+from wrt.kernels.traverse.steps import Step, box_step
 from wrt.kernels.units.bounding_sphere import SphereRay, ray_bounding_sphere, sphere_ray
 
 
@@ -28,6 +29,17 @@ def make_struct(record: Any) -> Any:
     return bvh2.make_struct(record, SphereNode)
 
 
+@wp.func
+def outline_of(node: SphereNode, second: bool) -> Step:
+    """Make the step of a child, with the box around its sphere and the sphere's radius."""
+    sphere = wp.where(second, node.sphere_1, node.sphere_0)
+    center = wp.vec3(sphere[0], sphere[1], sphere[2])
+    reach = wp.vec3(sphere[3], sphere[3], sphere[3])
+    step = box_step(0, 0, center - reach, center + reach, 0.0)
+    step.edges = wp.vec3d(wp.float64(sphere[3]), wp.float64(0.0), wp.float64(0.0))
+    return step
+
+
 @cache
 def sphere_volumes(record: Any) -> Volumes:
     """Make the Volumes of bounding spheres."""
@@ -41,7 +53,7 @@ def sphere_volumes(record: Any) -> Volumes:
     def enter(ray: SphereRay, node: SphereNode, t_max: float) -> wp.vec2:
         return wp.vec2(ray_bounding_sphere(ray, node.sphere_0, t_max), ray_bounding_sphere(ray, node.sphere_1, t_max))
 
-    return Volumes(struct, SphereNode, set_up, enter)
+    return Volumes(struct, SphereNode, set_up, enter, outline_of)
 
 
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:

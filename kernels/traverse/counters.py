@@ -8,6 +8,7 @@ import warp as wp
 
 from wrt.kernels.structs import NO_HIT, Hit, Ray, size_of
 from wrt.kernels.traverse.common import Units
+from wrt.kernels.traverse.steps import NODE, Step, simple_step
 
 # An entry of a trace is address * SIZE_RANGE + size, both in bytes. Nodes have addresses from 0 on, primitives from PRIMITIVE_SPACE on.
 PRIMITIVE_SPACE = wp.constant(wp.int64(1 << 40))
@@ -36,8 +37,10 @@ class Recorder:
     """Arrays to which a traversal adds its counts and its traces."""
 
     counts: wp.array(dtype=Counts)  # Indexed by Ray.slot.
-    first: wp.array(dtype=wp.int64)  # The trace of slot i begins at fetches[first[i]]. Length 0: write no traces.
+    # The trace of slot i begins at fetches[first[i]]. Length 0: write no traces. With Units.steps: number of the next step of slot i.
+    first: wp.array(dtype=wp.int64)
     fetches: wp.array(dtype=wp.int64)
+    steps: wp.array(dtype=Step)  # With Units.steps. Length 0: count the steps in `first`, but do not store them.
     base: wp.int64  # Address at which this structure begins, if there are several; added to all addresses.
 
 
@@ -48,6 +51,15 @@ def write_fetch(recorder: Recorder, slot: int, counts: Counts, address: wp.int64
         before = recorder.counts[slot]  # counts of the structures that the ray has left
         place = recorder.first[slot] + wp.int64(before.nodes + before.primitives + counts.nodes + counts.primitives)
         recorder.fetches[place] = (recorder.base + address) * SIZE_RANGE + wp.int64(size)
+
+
+@wp.func
+def write_step(recorder: Recorder, slot: int, step: Step):
+    """Append a step to those of a slot."""
+    place = recorder.first[slot]
+    recorder.first[slot] = place + wp.int64(1)
+    if recorder.steps.shape[0] > 0:
+        recorder.steps[place] = step
 
 
 @wp.func
@@ -79,7 +91,10 @@ def make_counters(units: Units, node_bytes: int) -> Any:
         """Count the fetch of node `index`, and one operation of the box unit that tests `boxes` boxes."""
         if wp.static(on):
             size = wp.static(node_size)
-            write_fetch(recorder, ray.slot, counts, wp.int64(index) * wp.int64(wp.static(node_size)), size)
+            if wp.static(units.steps):
+                write_step(recorder, ray.slot, simple_step(NODE, index, 0))
+            else:
+                write_fetch(recorder, ray.slot, counts, wp.int64(index) * wp.int64(wp.static(node_size)), size)
             counts.nodes += 1
             counts.node_bytes += size
             counts.boxes += boxes
@@ -91,7 +106,8 @@ def make_counters(units: Units, node_bytes: int) -> Any:
         """Count the fetch of primitive `index`, which is then tested."""
         if wp.static(on):
             size = wp.static(primitive_size)
-            write_fetch(recorder, ray.slot, counts, PRIMITIVE_SPACE + wp.int64(index) * wp.int64(wp.static(primitive_size)), size)
+            if wp.static(not units.steps):  # recording.py writes the step, which needs the test's result
+                write_fetch(recorder, ray.slot, counts, PRIMITIVE_SPACE + wp.int64(index) * wp.int64(wp.static(primitive_size)), size)
             counts.primitives += 1
             counts.primitive_bytes += size
         return counts

@@ -11,8 +11,9 @@ import warp as wp
 from wrt.kernels.structs import NO_HIT, Hit, Ray, size_of
 from wrt.kernels.traverse.cell_ray import cell_slack, earlier, later, parallel
 from wrt.kernels.traverse.common import Units, make_probe, no_hit
-from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
+from wrt.kernels.traverse.counters import Counts, Recorder, make_counters, write_step
 from wrt.kernels.traverse.leaf import Mailbox, make_mailbox_leaf
+from wrt.kernels.traverse.steps import INNER, cell_step
 from wrt.kernels.units.box import BoxRay, slab_interval
 
 
@@ -124,11 +125,30 @@ def layout_of(accel: Any) -> GridLayout:
     return layout
 
 
+def make_record_cell(units: Units) -> Any:
+    """Make record_cell(recorder, ray, layout, index, t, t_end), for cell `index` or, if index = INNER, the whole grid."""
+
+    @wp.func
+    def record_cell(recorder: Recorder, ray: Ray, layout: GridLayout, index: int, t: float, t_end: float):
+        if wp.static(units.steps):
+            lo = layout.lo
+            hi = layout.hi
+            if index != INNER:
+                cell = wp.vec3i(index % layout.n[0], (index / layout.n[0]) % layout.n[1], index / (layout.n[0] * layout.n[1]))
+                for axis in range(3):
+                    lo[axis] = grid_plane(layout, axis, cell[axis])
+                    hi[axis] = grid_plane(layout, axis, cell[axis] + 1)
+            write_step(recorder, ray.slot, cell_step(index, INNER, lo, hi, t, t_end))
+
+    return record_cell
+
+
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
     """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found. Units.box has no effect."""
     probe_of = make_probe(units)
     visit_leaf = make_mailbox_leaf(units, any_hit, accepts)
     fetch_node, _, _, finish = make_counters(units, size_of(GridCell))
+    record_cell = make_record_cell(units)
     struct = make_struct(units.triangle_test.record)
 
     @wp.func
@@ -140,6 +160,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
         slack = cell_slack(probe.box, accel.pad, accel.extent)
         interval = slab_interval(probe.box, layout.lo, layout.hi)
         t_in = wp.max(interval[0], earlier(ray.t_min) - slack)
+        record_cell(accel.recorder, ray, layout, INNER, t_in, later(interval[1]))
         if not (t_in <= later(interval[1]) and t_in < wp.inf):
             return finish(accel.recorder, ray, counts, best)
         slab = wp.vec3i()
@@ -167,6 +188,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
                          + (k / (side_slabs + 1)) * step[other] * stride[other])
                 cell = accel.cells[index]
                 counts = fetch_node(accel.recorder, ray, counts, index, 0)
+                record_cell(accel.recorder, ray, layout, index, t_in, t_out)
                 if cell.count > 0:
                     counts.leaves += 1
                 mailbox, best, counts = visit_leaf(accel, surfaces, probe, cell, mailbox, best, counts)

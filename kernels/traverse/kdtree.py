@@ -17,8 +17,10 @@ import warp as wp
 from wrt.kernels.structs import NO_HIT, Hit, Ray, largest, size_of
 from wrt.kernels.traverse.cell_ray import earlier, later
 from wrt.kernels.traverse.common import Probe, Units, make_probe, no_hit
-from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
+from wrt.kernels.traverse.counters import Counts, Recorder, make_counters, write_step
 from wrt.kernels.traverse.leaf import make_leaf
+from wrt.kernels.traverse.recording import make_recording
+from wrt.kernels.traverse.steps import ENTERED, INNER, box_step, part_step, plane_step
 from wrt.kernels.units.box import slab_interval
 
 # Stack entries. Builders keep a tree's depth at or below STACK_SIZE, because the walk pushes at most one node per level.
@@ -75,10 +77,28 @@ def limit_of(t: float, slack: float) -> float:
     return t * CLAMP_RELATIVE + slack
 
 
+@wp.func
+def record_split(recorder: Recorder, ray: Ray, index: int, node: KdNode, t_split: float, part: wp.vec2):
+    """Record the test of a node's plane, and both children. part: (t_enter, t_exit) of the ray in the node."""
+    axis = node.word & 3
+    normal = wp.vec3()
+    normal[axis] = 1.0
+    plane = plane_step(index, normal, -node.split, t_split)
+    write_step(recorder, ray.slot, plane)
+    right_is_near = 1.0 / ray.direction[axis] < 0.0
+    near = wp.vec2(part[0], wp.where(later(t_split) < part[1], later(t_split), part[1]))
+    far = wp.vec2(wp.where(earlier(t_split) > part[0], earlier(t_split), part[0]), part[1])
+    for side in range(2):
+        is_near = right_is_near == (side == 1)
+        met = wp.where(is_near, not part[0] > later(t_split), part[0] > later(t_split) or not part[1] < earlier(t_split))
+        write_step(recorder, ray.slot, part_step(plane, side == 1, (node.word >> 2) + side, wp.where(is_near, near, far), met))
+
+
 def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
     """Make walk(accel, surfaces, probe, part, slack, counts) -> (best Hit, Counts). part: (t_enter, t_exit) of the root's cell."""
     visit_leaf = make_leaf(units, any_hit, accepts)
     fetch_node, _, push, _ = make_counters(units, size_of(KdNode))
+    record_push, record_pop = make_recording(units)
 
     @wp.func
     def walk(accel: Any, surfaces: Any, probe: Probe, part: wp.vec2, slack: float, counts: Counts):
@@ -102,6 +122,8 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
                 far = wp.where(inverse < 0.0, first, first + 1)
                 near_exit = later(t_split)
                 far_enter = wp.where(earlier(t_split) > t_enter, earlier(t_split), t_enter)
+                if wp.static(units.steps):
+                    record_split(accel.recorder, probe.ray, index, node, t_split, wp.vec2(t_enter, t_exit))
                 if t_enter > near_exit:
                     index = far
                     t_enter = far_enter
@@ -110,6 +132,7 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
                         stack_index[size] = far
                         stack_enter[size] = far_enter
                         stack_exit[size] = t_exit
+                        record_push(accel.recorder, probe.ray, far, INNER, far_enter, size)
                         size = size + 1
                         counts = push(counts, size)
                     index = wp.where(inverse < 0.0, first + 1, first)
@@ -132,6 +155,7 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
                 t_enter = stack_enter[size]
                 t_exit = wp.where(limit < stack_exit[size], limit, stack_exit[size])
                 found = t_enter <= t_exit
+                record_pop(accel.recorder, probe.ray, index, INNER, t_enter, wp.where(found, ENTERED, 0))
         return best, counts
 
     return walk
@@ -152,6 +176,9 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
         counts = Counts()
         counts.boxes += 1  # the box of the root's cell
         counts.box_operations += 1
+        if wp.static(units.steps):
+            enter = ray_aabb(probe.box, accel.lo, accel.hi, best.t)
+            write_step(accel.recorder, ray.slot, box_step(0, INNER, accel.lo, accel.hi, enter))
         if ray_aabb(probe.box, accel.lo, accel.hi, best.t) < wp.inf:
             slack = clamp_slack(ray.direction, probe.box.inv_dir, accel.reach)
             limit = limit_of(best.t, slack)

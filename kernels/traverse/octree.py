@@ -11,8 +11,10 @@ import warp as wp
 from wrt.kernels.structs import NO_HIT, Hit, Ray, size_of
 from wrt.kernels.traverse.cell_ray import cell_slack, earlier, later
 from wrt.kernels.traverse.common import Probe, Units, make_probe, no_hit
-from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
+from wrt.kernels.traverse.counters import Counts, Recorder, make_counters, write_step
 from wrt.kernels.traverse.leaf import Mailbox, make_mailbox_leaf
+from wrt.kernels.traverse.recording import make_recording
+from wrt.kernels.traverse.steps import ENTERED, INNER, STAYS, box_step
 from wrt.kernels.units.box import BoxRay, slab_interval
 
 MAX_LEVELS = 20  # levels, and stack entries: corners of cells, in units of the finest cell, are integers that are exact in float32
@@ -174,10 +176,33 @@ def enter_octants(ray: OctreeRay, occupied: int, corner: wp.vec3i, size: int, en
     return octants_met(in_order(occupied, ray.flip), enter, middle, wp.where(limit < leave, limit, leave))
 
 
+def make_record_octants(units: Units) -> Any:
+    """Make record_octants, which records the octants of a node (kernels.traverse.steps)."""
+
+    @wp.func
+    def record_octants(recorder: Recorder, slot: int, ray: OctreeRay, node: OctreeNode, corner: wp.vec3i, size: int, met: int):
+        """Record the octants of a node. corner, size: of its cell; met: the mask of `enter_octants`."""
+        if wp.static(units.steps):
+            half = size >> 1
+            for octant in range(8):
+                if ((-node.count) >> octant) & 1 != 0:
+                    index = node.first + wp.bit_count(-node.count & ((1 << octant) - 1))
+                    low = corner + octant_corner(octant, half)
+                    lo = octree_planes(ray.layout, low)
+                    hi = octree_planes(ray.layout, low + wp.vec3i(half, half, half))
+                    entered = (met >> (octant ^ ray.flip)) & 1 != 0
+                    t = wp.where(entered, distance_to_cell(ray, low, half), float(wp.inf))
+                    write_step(recorder, slot, box_step(index, INNER, lo, hi, t))
+
+    return record_octants
+
+
 def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
     """Make walk(accel, surfaces, probe, set_up, enter, counts) -> (best Hit, Counts); set_up: OctreeRay; enter: t at the root's cell."""
     visit_leaf = make_mailbox_leaf(units, any_hit, accepts)
     fetch_node, _, push, _ = make_counters(units, size_of(OctreeNode))
+    record_push, record_pop = make_recording(units)
+    record_octants = make_record_octants(units)
 
     @wp.func
     def walk(accel: Any, surfaces: Any, probe: Probe, set_up: OctreeRay, enter: float, counts: Counts):
@@ -199,12 +224,14 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
             if node.count < 0:
                 counts.boxes += wp.bit_count(-node.count)
                 left = enter_octants(set_up, -node.count, corner, size, enter, later(best.t) + set_up.slack)
+                record_octants(accel.recorder, probe.ray.slot, set_up, node, corner, size, left)
                 if left != 0:
                     stack_first[level] = node.first
                     stack_occupied[level] = -node.count
                     stack_left[level] = left
                     level += 1
                     if (left & (left - 1)) != 0:
+                        record_push(accel.recorder, probe.ray, index, INNER, enter, entries)
                         entries += 1
                         counts = push(counts, entries)
             else:
@@ -228,13 +255,13 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
                     size = (1 << accel.levels) >> level
                     mask = -2 * size
                     corner = wp.vec3i(corner[0] & mask, corner[1] & mask, corner[2] & mask) + octant_corner(octant, size)
-                    if not fresh:
-                        counts.pops += 1
-                        if left == 0:
-                            entries -= 1
                     enter = distance_to_cell(set_up, corner, size)
                     found = fresh or enter <= later(best.t) + set_up.slack
                     index = stack_first[level - 1] + wp.bit_count(stack_occupied[level - 1] & ((1 << octant) - 1))
+                    if not fresh:
+                        counts.pops += 1
+                        entries -= wp.where(left == 0, 1, 0)
+                        record_pop(accel.recorder, probe.ray, index, INNER, enter, int(found) * ENTERED + int(left != 0) * STAYS)
                     fresh = False
         return best, counts
 
@@ -258,6 +285,9 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
         set_up = octree_ray(accel, probe.box, ray.t_min)
         interval = slab_interval(probe.box, accel.lo, accel.hi)
         enter = wp.max(interval[0], set_up.begin)
+        if wp.static(units.steps):
+            met = enter <= later(interval[1]) and enter <= later(best.t) + set_up.slack and enter < wp.inf
+            write_step(accel.recorder, ray.slot, box_step(0, INNER, accel.lo, accel.hi, wp.where(met, enter, float(wp.inf))))
         if enter <= later(interval[1]) and enter <= later(best.t) + set_up.slack and enter < wp.inf:
             best, counts = walk(accel, surfaces, probe, set_up, enter, counts)
         return finish(accel.recorder, ray, counts, best)

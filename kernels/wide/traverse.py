@@ -15,12 +15,14 @@ import warp as wp
 from wrt.kernels.query import LARGEST
 from wrt.kernels.structs import NO_HIT, Hit, Ray, size_of
 from wrt.kernels.traverse.common import Probe, Units, make_intersect, make_probe, no_hit
-from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
+from wrt.kernels.traverse.counters import Counts, Recorder, make_counters, write_step
+from wrt.kernels.traverse.recording import make_recorded_test, make_recording
 from wrt.kernels.traverse.stack import key_of, make_stack, reference_of, t_of
+from wrt.kernels.traverse.steps import ENTERED, INNER, LEAF, Step, box_step, simple_step
 from wrt.kernels.units.triangle import component
 from wrt.kernels.wide.lanes import LaneRay, bits, lowest, make_cull, prefetch
 from wrt.kernels.wide.layout import HI_X, HI_Y, HI_Z, LO_X, LO_Y, LO_Z, STACK_SIZE, NodeLayout
-from wrt.kernels.wide.nodes import far_pad, make_children
+from wrt.kernels.wide.nodes import far_pad, make_children, make_plane
 from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
 
 
@@ -186,6 +188,55 @@ def make_counting(units: Units, layout: NodeLayout) -> Any:
     return count_node, count_leaf, count_pop, push, finish
 
 
+def make_recorded(units: Units, accepts: Any, layout: NodeLayout) -> Any:
+    """Return record_children, record_push, record_pop and recorded_leaf, which write the steps of kernels.traverse.steps."""
+    record, width = units.triangle_test.record, layout.width
+    struct = make_struct(record)
+    plane, _ = make_plane(width, layout.compressed)
+    record_pushed, record_popped = make_recording(units)
+    gather, recorded_test = make_gather(record, width), make_recorded_test(units, accepts)
+
+    @wp.func
+    def child_of(reference: int) -> Step:
+        if reference < 0:
+            return simple_step(LEAF, leaf_first(reference) * wp.static(layout.unit), leaf_count(reference))
+        return simple_step(LEAF, reference, INNER)
+
+    @wp.func
+    def record_children(accel: struct, slot: int, first: int, t: Any, mask: int):
+        for j in range(width):
+            reference = bits(accel.nodes, first + wp.static(layout.references) + j)
+            if reference != EMPTY:
+                lo = wp.vec3(plane(accel.nodes, first, LO_X, j), plane(accel.nodes, first, LO_Y, j), plane(accel.nodes, first, LO_Z, j))
+                hi = wp.vec3(plane(accel.nodes, first, HI_X, j), plane(accel.nodes, first, HI_Y, j), plane(accel.nodes, first, HI_Z, j))
+                entry = wp.where((mask >> j) & 1 != 0, t[j], float(wp.inf))
+                child = child_of(reference)
+                write_step(accel.recorder, slot, box_step(child.index, child.count, lo, hi, entry))
+
+    @wp.func
+    def record_push(recorder: Recorder, ray: Ray, key: wp.uint64, below: int):
+        child = child_of(reference_of(key))
+        record_pushed(recorder, ray, child.index, child.count, t_of(key), below)
+
+    @wp.func
+    def record_pop(recorder: Recorder, ray: Ray, key: wp.uint64, best: Hit):
+        child = child_of(reference_of(key))
+        record_popped(recorder, ray, child.index, child.count, t_of(key), wp.where(t_of(key) <= best.t, ENTERED, 0))
+
+    @wp.func
+    def recorded_leaf(accel: struct, surfaces: Any, reference: int, probe: Probe, best: Hit) -> Hit:
+        """Test all primitives of a leaf one by one, also those that the test of a row rejects."""
+        leaf = child_of(reference)
+        write_step(accel.recorder, probe.ray.slot, leaf)
+        for i in range(leaf.index, leaf.index + leaf.count):
+            row = i / width
+            primitive = gather(accel.primitives, row * wp.static(row_size(record, width)) + i - row * width)
+            best = recorded_test(accel.recorder, probe, surfaces, primitive, i, best)
+        return best
+
+    return record_children, record_push, record_pop, recorded_leaf
+
+
 def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout) -> Any:
     """Return traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found."""
     struct = make_struct(units.triangle_test.record)
@@ -194,6 +245,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
     test_leaf = make_leaf_test(units, any_hit, accepts, layout)
     prefetch_next = make_prefetch(units.triangle_test.record, layout)
     count_node, count_leaf, count_pop, count_push, finish = make_counting(units, layout)
+    record_children, record_push, record_pop, recorded_leaf = make_recorded(units, accepts, layout)
     new_stack, shared_stack, put, get = make_stack(units.stack, STACK_SIZE, wp.uint64, 8)
 
     @wp.func
@@ -216,7 +268,10 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
         reference = int(0)
         while True:
             if reference < 0:
-                best = test_leaf(accel, surfaces, reference, probe, rows, best)
+                if wp.static(units.steps):
+                    best = recorded_leaf(accel, surfaces, reference, probe, best)
+                else:
+                    best = test_leaf(accel, surfaces, reference, probe, rows, best)
                 counts = count_leaf(accel, ray, counts, reference)
                 if wp.static(any_hit):
                     if best.prim_id != NO_HIT:
@@ -225,6 +280,8 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
                 first = reference * wp.static(layout.size)
                 counts = count_node(accel, ray, counts, reference)
                 t, mask = children(accel.nodes, first, rows, best.t)
+                if wp.static(units.steps):
+                    record_children(accel, ray.slot, first, t, mask)
                 if mask != 0:
                     first = first + wp.static(layout.references)
                     lane = lowest(mask)
@@ -236,6 +293,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
                         mask = mask & (mask - 1)
                         key = key_of(t[lane], child(accel, first + lane))
                         if wp.static(any_hit):
+                            record_push(accel.recorder, ray, near, size)
                             put(stack, shared, size, near)
                             near = key
                         else:
@@ -244,9 +302,11 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
                             # Most nodes push two or three entries, so this does not sort them fully: the nearest pushed so far is on top.
                             if size > begin:
                                 under = get(stack, shared, size - 1)
+                                record_push(accel.recorder, ray, far, wp.where(far < under, size, size - 1))
                                 put(stack, shared, size, wp.min(far, under))
                                 put(stack, shared, size - 1, wp.max(far, under))
                             else:
+                                record_push(accel.recorder, ray, far, size)
                                 put(stack, shared, size, far)
                         size = size + 1
                         counts = count_push(counts, size)
@@ -258,6 +318,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
                 size = size - 1
                 counts = count_pop(counts)
                 key = get(stack, shared, size)
+                record_pop(accel.recorder, ray, key, best)
                 if t_of(key) <= best.t:
                     reference = reference_of(key)
                     found = True

@@ -54,9 +54,9 @@ class Snapshot:
         assert self.built is not None
         return self.built
 
-    def counting(self, data: WarpStruct) -> Snapshot:
-        """Return the snapshot with `data` in place of its own data, for kernels that count."""
-        units = self.structure.units._replace(counters=True)
+    def counting(self, data: WarpStruct, steps: bool = False) -> Snapshot:
+        """Return the snapshot with `data` in place of its own data, for kernels that count, and that record each step if `steps`."""
+        units = self.structure.units._replace(counters=True, steps=steps)
         return replace(self, structure=self.structure._replace(units=units), data=data)
 
 

@@ -197,7 +197,9 @@ class Bvh(Plan):
 
 @dataclass(frozen=True)
 class RtCore(Plan):
-    """Model the RT core on MESHES: what limits it, a range of rays a second, and which assumption changes that range most."""
+    """Model the RT core on MESHES: what limits it, a range of rays a second, and which assumption changes that range most.
+
+    A trace that --trace or wrt.trace wrote (.npz) can stand in place of a mesh."""
 
     COMMAND, STUDY, QUICK = "bench rtcore", "wrt.lab.rtcore.meshes", {"rays": 1 << 12}
     meshes: Sequence[Any] = the_meshes(MISSING)
@@ -207,6 +209,7 @@ class RtCore(Plan):
     gpu: str = option("rtx2080ti", MODELLED, of=GPUS)
     seed: int = option(0, RAY_SEED)
     inside: bool = option(False, INSIDE)
+    trace: str = option("", "Write the trace of one mesh, structure and kind of ray to a .npz file  [default: none]")
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,15 @@ class Cache:
 
 
 @dataclass(frozen=True, eq=False)
+class Prefetches:
+    """Prefetches, (P,) int64 arrays. after: index of the fetch that starts each one, ascending; address, size: in bytes."""
+
+    after: np.ndarray
+    address: np.ndarray
+    size: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class Level1:
     """Result of `first_level`. accesses: number of L1 accesses; wanted: sum over the accesses of the lanes that need the line.
     The arrays are (M,) int64 over the misses. line: the cache line; time: the miss's round; lanes: number of lanes that wait for it."""
@@ -91,22 +100,31 @@ def caches_of(cache: Cache, count: int) -> Caches:
     return out
 
 
-def first_level(warp: np.ndarray, fetches: Counters, sms: int, slots: int, l1: Cache) -> Level1:
+def first_level(warp: np.ndarray, fetches: Counters, sms: int, slots: int, l1: Cache, prefetches: Prefetches | None = None) -> Level1:
     """Simulate the L1 of each SM. warp: (N,) warp of each ray, ascending, at most 32 rays a warp; fetches: Counters of these rays.
     SM i runs the warps i, i + sms, i + 2 sms ..., at most `slots` at a time. In each round every lane of a warp makes its next fetch, and
     each cache line that the lanes touch is accessed once. Rounds do not wait for memory: a warp holds its slot for as many rounds as its
-    longest ray has fetches."""
+    longest ray has fetches. Prefetches access the L1 in the round of their fetch, after all fetches, and no lane waits for them."""
     cpu = start("cpu")
     # Place the primitives behind the nodes, as in one memory.
     space, node = int(PRIMITIVE_SPACE), fetches.address < int(PRIMITIVE_SPACE)
     behind = LINE * -(-int((fetches.address + fetches.size)[node].max(initial=0)) // LINE)
-    address = np.where(node, fetches.address, fetches.address - space + behind)
+
+    def placed(address: np.ndarray) -> np.ndarray:
+        return np.where(address < space, address, address - space + behind)
+
+    address = placed(fetches.address)
     touched = (address + fetches.size - 1) // LINE - address // LINE + 1
+    trace = Trace()
+    if prefetches is not None and len(prefetches.after):
+        begin = placed(prefetches.address)
+        np.add.at(touched, prefetches.after, (begin + prefetches.size - 1) // LINE - begin // LINE + 1)
+        trace.prefetch_first = upload(np.searchsorted(prefetches.after, np.arange(len(address) + 1)), wp.int64, cpu)
+        trace.prefetch_address, trace.prefetch_size = upload(begin, wp.int64, cpu), upload(prefetches.size, wp.int64, cpu)
     count = int(warp[-1]) + 1 if len(warp) else 0
     warp_first = np.searchsorted(warp, np.arange(count + 1))
     most = np.diff(np.concatenate([[0], np.cumsum(touched)])[fetches.first[warp_first]])  # most misses of each warp
     begin = np.concatenate([[0], np.cumsum([int(most[sm::sms].sum()) for sm in range(sms)])])
-    trace = Trace()
     trace.sms, trace.slots = sms, slots
     trace.warp_first, trace.first = upload(warp_first, wp.int64, cpu), upload(fetches.first, wp.int64, cpu)
     trace.address, trace.size = upload(address, wp.int64, cpu), upload(fetches.size, wp.int64, cpu)

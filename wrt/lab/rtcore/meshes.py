@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -12,6 +13,8 @@ from wrt.accel.bvh.wide import CollapsedBvh
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
 from wrt.accel.structures import ACCELERATORS
+from wrt.core.errors import InputError
+from wrt.core.write_file import check_writable
 from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench.rays import RaySet, ray_sets
 from wrt.lab.bench.report import Columns, Part, Row, grouped, mesh_name, tabled
@@ -19,6 +22,8 @@ from wrt.lab.plans import RtCore as Plan
 from wrt.lab.rtcore.model import LEGEND as LEGEND
 from wrt.lab.rtcore.model import MODEL_COLUMNS, model_row, parameters, simt, trace_rays
 from wrt.lab.rtcore.parameters import GPUS
+from wrt.lab.rtcore.trace import Trace
+from wrt.lab.rtcore.trace import trace as record
 from wrt.lab.rtcore.warps import WARP, blocks
 
 
@@ -43,19 +48,47 @@ def in_warps(accel: Accelerator, sets: dict[str, RaySet]) -> dict[str, RaySet]:
 
 TITLE = "The model of the RT core on meshes"
 COLUMNS: Columns = {
-    "structure": "{structure}", "rays": "{name}", "B/triangle": lambda row: f"{row.bytes / row.mesh_triangles:.0f}",
+    "structure": "{structure}", "rays": "{name}",
+    "B/triangle": lambda row: f"{row.bytes / row.mesh_triangles:.0f}" if row.mesh_triangles else "",
     **{head: column for head, column in MODEL_COLUMNS.items() if head != "rays"},
     "SIMT efficiency": "{simt_efficiency[as they come]:.0%}", "if sorted": "{simt_efficiency[sorted]:.0%}"}
 
 
+def check_trace(plan: Plan) -> None:
+    """Raise InputError unless plan.trace is empty, or a file that can be written, for one mesh, structure and kind of ray."""
+    if not plan.trace:
+        return
+    if len(plan.meshes) != 1 or len(plan.structures) != 1 or len(plan.kinds) != 1:
+        raise InputError("a file has one trace: give one mesh, one structure and one kind of ray", argument="trace")
+    if Path(plan.trace).suffix.lower() != ".npz":
+        raise InputError("the file of a trace must have the suffix .npz", path=plan.trace)
+    check_writable(plan.trace)
+
+
+def row_of_trace(trace: Trace, name: str, plan: Plan) -> Row:
+    work = trace.work("trace")
+    return model_row(work, GPUS[plan.gpu], simt(work.counters.counts, work.warp, trace.origin, trace.direction), mesh=name,
+                     mesh_triangles=0, structure=trace.structure, bytes=0)
+
+
 def rows(plan: Plan) -> Iterator[Row]:
-    for mesh in map(as_mesh, plan.meshes):
+    check_trace(plan)
+    for path in plan.meshes:
+        if isinstance(path, str | Path) and Path(path).suffix.lower() == ".npz":
+            yield row_of_trace(Trace.load(path), mesh_name(path), plan)
+            continue
+        mesh = as_mesh(path)
         geometry, sets = Geometry.of(mesh), None
         for name in dict.fromkeys(plan.structures) or bvhs():
             accel = build(geometry, name)
             sets = sets or in_warps(accel, ray_sets(accel, plan.rays, plan.seed, plan.inside))
             for rays in (sets[kind] for kind in plan.kinds):
-                work = trace_rays(accel, rays.kind, rays.origins, rays.directions, rays.t_max)  # shadow rays also search the closest hit
+                if plan.trace:
+                    recorded = record(accel, rays.origins, rays.directions, t_max=rays.t_max)
+                    recorded.save(plan.trace)
+                    work = recorded.work(rays.kind)
+                else:  # shadow rays also search the closest hit
+                    work = trace_rays(accel, rays.kind, rays.origins, rays.directions, rays.t_max)
                 efficiencies = simt(work.counters.counts, work.warp, rays.origins, rays.directions)
                 yield model_row(work, GPUS[plan.gpu], efficiencies, mesh=mesh_name(mesh),
                                 mesh_triangles=len(geometry), structure=name, bytes=accel.stats.bytes)
@@ -63,6 +96,6 @@ def rows(plan: Plan) -> Iterator[Row]:
 
 def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
     """Return a table for each mesh, and the table of the model's parameters."""
-    tables = [tabled(COLUMNS, group, f"{mesh}, {triangles} triangles")
+    tables = [tabled(COLUMNS, group, f"{mesh}, {triangles} triangles" if triangles else f"Trace {mesh}")
               for (mesh, triangles), group in grouped(rows, "mesh", "mesh_triangles").items()]
     return [*tables, parameters()]

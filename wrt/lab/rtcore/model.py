@@ -18,7 +18,7 @@ from wrt.accel.base import Accelerator
 from wrt.accel.queries.answers import Counters
 from wrt.core.types import ArrayLike
 from wrt.lab.bench.report import Columns, Part, Row, tabled, tables_page
-from wrt.lab.rtcore.caches import LINE, Misses, first_level, second_level
+from wrt.lab.rtcore.caches import LINE, Misses, Prefetches, first_level, second_level
 from wrt.lab.rtcore.parameters import BASE, PARAMETERS, SWEEPS, Core, Gpu
 from wrt.lab.rtcore.warps import by_coherence, efficiency, longest_of, packed
 
@@ -32,6 +32,7 @@ class Work:
     name: str
     counters: Counters
     warp: np.ndarray
+    prefetches: Prefetches | None = None
 
     def __len__(self) -> int:
         return len(self.warp)
@@ -48,7 +49,7 @@ class Work:
         """Simulate the caches of a GPU. Reuse the result of a call with equal caches, SMs, warps at a time and `warm`."""
         first_key = (gpu.sms, core.warps, gpu.l1)
         if first_key not in self._simulated:
-            self._simulated[first_key] = first_level(self.warp, self.counters, *first_key)
+            self._simulated[first_key] = first_level(self.warp, self.counters, *first_key, self.prefetches)
         key = (*first_key, gpu.l2, core.warm)
         if key not in self._simulated:
             self._simulated[key] = second_level(self._simulated[first_key], gpu.l2, core.warm)

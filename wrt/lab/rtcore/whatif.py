@@ -19,7 +19,7 @@ from wrt.accel.queries.answers import Counters
 from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.io.mesh_file import as_mesh
-from wrt.kernels.study.bvh2_study import LEVELS, STACK_SIZE, Study
+from wrt.kernels.study.bvh2_study import LEVELS, STACK_SIZE, Study, child_0_first
 from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
 from wrt.lab.bench.rays import RaySet, ray_sets
 from wrt.lab.bench.report import Columns, Part, Row, cells, mesh_name, tabled
@@ -165,8 +165,8 @@ def planes(tree: Bvh2, rays: RaySet) -> Iterator[Variant]:
 
 def order(tree: Bvh2, rays: RaySet) -> Iterator[Variant]:
     """Yield variants of the traversal: with and without visiting the nearer child first, with and without early stop."""
-    for name, study in (("both", Study()), ("early stop alone", Study(ordered=False)), ("order alone", Study(early=False)),
-                        ("neither", Study(ordered=False, early=False))):
+    for name, study in (("both", Study()), ("early stop alone", Study(choose=child_0_first)), ("order alone", Study(early=False)),
+                        ("neither", Study(choose=child_0_first, early=False))):
         yield traced(name, with_traversal(tree, study), rays)
 
 

@@ -10,7 +10,7 @@ import pytest
 from wrt.accel.queries.answers import Counters
 from wrt.accel.scenes.build import build
 from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
-from wrt.lab.rtcore.caches import LINE, Cache, Misses, distinct_lines, first_level, lines_of, replay, second_level
+from wrt.lab.rtcore.caches import LINE, Cache, Misses, Prefetches, distinct_lines, first_level, lines_of, replay, second_level
 from wrt.scene.shapes import icosphere
 
 
@@ -143,3 +143,35 @@ def test_a_recorded_trace_in_the_order_of_warps() -> None:
     ordered = [event for event, hit in sorted(below, key=lambda each: each[0][:2]) if not hit]
     dram = {(e[0], e[1], e[2], e[4]) for e, hit in zip(ordered, deep, strict=True) if not hit}
     assert found.wait_dram == sum(key in dram for key, _ in lanes)
+
+
+def test_prefetches_are_those_of_lists_in_python() -> None:
+    """Two warps on one SM with one slot: a round accesses the lines of all fetches, then those of their prefetches, which cost no wait."""
+    rng = np.random.default_rng(4)
+    length = rng.integers(1, 30, 40)
+    first = np.concatenate([[0], np.cumsum(length)])
+    total = int(first[-1])
+    address, size = rng.integers(0, 60, total) * 64, rng.integers(1, 200, total)
+    after = np.sort(rng.integers(0, total, 300))
+    more = Prefetches(after, rng.integers(0, 60, 300) * 64, rng.integers(1, 200, 300))
+    warp, l1 = np.arange(40) // 32, Cache(16 * LINE, 4)
+    missed = first_level(*made(warp, first, address, size), 1, 1, l1, more)
+
+    def lines(of: tuple[np.ndarray, np.ndarray], i: int) -> range:
+        return range(int(of[0][i]) // LINE, int(of[0][i] + of[1][i] - 1) // LINE + 1)
+
+    order, waiting, wanted = [], [], 0
+    for rays in (range(32), range(32, 40)):
+        for k in range(int(length[rays].max())):
+            now = [int(first[ray]) + k for ray in rays if k < length[ray]]
+            asked = [line for j in now for line in lines((address, size), j)]
+            ahead = [line for j in now for i in np.flatnonzero(after == j) for line in lines((more.address, more.size), int(i))]
+            wanted += len(asked)
+            for line in dict.fromkeys([*asked, *ahead]):
+                order.append(line)
+                waiting.append(asked.count(line))
+    hits = plain_replay(order, l1)
+    assert missed.accesses == len(order) and missed.wanted == wanted
+    assert missed.line.tolist() == [line for line, hit in zip(order, hits, strict=True) if not hit]
+    assert missed.lanes.tolist() == [lanes for lanes, hit in zip(waiting, hits, strict=True) if not hit]
+    assert 0 in missed.lanes

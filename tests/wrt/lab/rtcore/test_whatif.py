@@ -15,7 +15,7 @@ from tests.refused import refused
 from wrt.accel.bvh.binary import Bvh2
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
-from wrt.kernels.study.bvh2_study import STACK_SIZE, Study
+from wrt.kernels.study.bvh2_study import STACK_SIZE, Study, child_0_first
 from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
 from wrt.lab.bench.report import text
 from wrt.lab.rtcore.parameters import SWEEPS
@@ -62,7 +62,7 @@ def test_a_short_stack_finds_the_same_with_more_nodes(entries: int, soup: Geomet
 def test_order_and_early_stop_save_work_and_change_nothing(soup: Geometry, rays: tuple[np.ndarray, np.ndarray]) -> None:
     tree = Bvh2(soup)
     found = {study: with_traversal(tree, study).closest_hit(*rays, counters=True)
-             for study in (Study(), Study(ordered=False), Study(early=False), Study(ordered=False, early=False))}
+             for study in (Study(), Study(choose=child_0_first), Study(early=False), Study(choose=child_0_first, early=False))}
     plain = tree.closest_hit(*rays, counters=True)
     nodes = []
     for hits in found.values():
