@@ -27,13 +27,16 @@ class Placement:
 
 @wp.struct
 class PlacedRays:
-    """Rays of a caller, and the same rays for a structure, by ray."""
+    """Rays of a caller, and the same rays for a structure, by ray.
+
+    A ray that is not finite, too far away, or without direction is placed at 0, with t_max = -inf: it hits nothing.
+    """
 
     origins: wp.array(dtype=wp.vec3d)
     directions: wp.array(dtype=wp.vec3d)
     placed_origins: wp.array(dtype=wp.vec3)
     placed_directions: wp.array(dtype=wp.vec3)
-    valid: wp.array(dtype=wp.bool)  # False: not finite, too far away, or without direction
+    t_max: wp.array(dtype=wp.float32)  # inf, or -inf for rays that hit nothing
 
 
 @wp.struct
@@ -51,17 +54,17 @@ class HitPoints64:
     point: wp.array(dtype=wp.vec3d)
 
 
-SPLIT_MISS, SPLIT_VALID, SPLIT_FAR = wp.constant(0), wp.constant(1), wp.constant(2)
+FAR = wp.constant(wp.float32(-1.0))  # a value of SplitRays.t_max
 
 
 @wp.struct
 class SplitRays:
-    """Rays in rows of origin and direction, and the same in two arrays, by ray."""
+    """Rays in rows of origin and direction, and the same in two arrays, by ray. Rays that hit nothing as in PlacedRays."""
 
     rays: wp.array(dtype=wp.spatial_vector)
     origins: wp.array(dtype=wp.vec3)
     directions: wp.array(dtype=wp.vec3)
-    kind: wp.array(dtype=wp.int8)  # SPLIT_MISS: not finite, or without direction; SPLIT_FAR: beyond FARTHEST; else SPLIT_VALID
+    t_max: wp.array(dtype=wp.float32)  # inf, -inf for rays that hit nothing, or FAR for origins beyond FARTHEST
 
 
 @wp.func
@@ -101,10 +104,13 @@ def place_rays(placement: Placement, rays: PlacedRays, first: int):
             origin += unit * ahead
     longest = longest_component(direction)
     finite = wp.dot(direction, direction) == wp.dot(direction, direction) and wp.dot(origin, origin) == wp.dot(origin, origin)
-    rays.valid[i] = (finite and longest > wp.float64(0.0) and longest < wp.float64(wp.inf)
-                     and longest_component(origin) <= wp.float64(FARTHEST))
-    rays.placed_origins[i] = wp.vec3(origin)
-    rays.placed_directions[i] = wp.vec3(direction)
+    rays.placed_origins[i] = wp.vec3(0.0)
+    rays.placed_directions[i] = wp.vec3(1.0)
+    rays.t_max[i] = -wp.inf
+    if finite and longest > wp.float64(0.0) and longest < wp.float64(wp.inf) and longest_component(origin) <= wp.float64(FARTHEST):
+        rays.placed_origins[i] = wp.vec3(origin)
+        rays.placed_directions[i] = wp.vec3(direction)
+        rays.t_max[i] = wp.inf
 
 
 @kernel
@@ -114,15 +120,16 @@ def split_rays(rays: SplitRays, first: int):
     row = rays.rays[i]
     origin = wp.vec3(row[0], row[1], row[2])
     direction = wp.vec3(row[3], row[4], row[5])
-    rays.origins[i] = origin
-    rays.directions[i] = direction
-    kind = SPLIT_MISS
+    rays.origins[i] = wp.vec3(0.0)
+    rays.directions[i] = wp.vec3(1.0)
+    rays.t_max[i] = -wp.inf
     if wp.isfinite(origin) and wp.isfinite(direction):
         if largest(origin) > FARTHEST:
-            kind = SPLIT_FAR
+            rays.t_max[i] = FAR
         elif largest(direction) > 0.0:
-            kind = SPLIT_VALID
-    rays.kind[i] = wp.int8(kind)
+            rays.origins[i] = origin
+            rays.directions[i] = direction
+            rays.t_max[i] = wp.inf
 
 
 @kernel

@@ -7,11 +7,10 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.queries.raw_kernel import RawKernel
+from wrt.compat.surfaces import empty_rays
 from wrt.core.warp_private import record_of, struct_record
 from wrt.kernels.placed_rays import (
-    SPLIT_FAR,
-    SPLIT_MISS,
-    SPLIT_VALID,
+    FAR,
     HitPoints64,
     PlacedRays,
     Placement,
@@ -32,9 +31,11 @@ def placed(origins, directions, *, shift=(0.0, 0.0, 0.0), exponent=0, center=(0.
     place.shift, place.center, place.radius, place.near = wp.vec3d(*shift), wp.vec3d(*center), radius, 4.0 * radius
     place.scale, place.scale_again = 2.0 ** (exponent // 2), 2.0 ** (exponent - exponent // 2)
     n = len(origins)
-    arrays = origins, directions, np.empty((n, 3), np.float32), np.empty((n, 3), np.float32), np.empty(n, bool)
-    PLACE.launch(n, record_of(place), struct_record(PlacedRays, arrays), threads=threads)
-    return arrays[2:]
+    rays = empty_rays(n)
+    PLACE.launch(n, record_of(place), struct_record(PlacedRays, (origins, directions, *rays)), threads=threads)
+    valid = rays.t_max == np.inf
+    assert (rays.t_max[~valid] == -np.inf).all()
+    return rays.origins, rays.directions, valid
 
 
 def random_rays(n, seed):
@@ -124,15 +125,16 @@ def test_points_are_where_the_lines_meet_the_planes():
     np.testing.assert_allclose(beside[-1], targets, rtol=0.0, atol=1e-6)
 
 
-def test_rows_of_six_are_split_and_sorted_into_kinds():
+def test_rows_of_six_are_split_and_checked():
     odd = np.array([0.0, np.nan, np.inf, 1e37, 1.1e37, -3e38, 1.0], np.float32)
     rows = np.array(np.meshgrid(*[odd] * 2, [0.0, 1.0, np.nan, -1e-45], [0.0, -np.inf], [0.0], [2.0, 0.0], indexing="ij"), np.float32)
     rows = np.ascontiguousarray(rows.reshape(6, -1).T)
     n = len(rows)
-    origins, directions, kind = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32), np.empty(n, np.int8)
-    SPLIT.launch(n, struct_record(SplitRays, (rows, origins, directions, kind)))
-    np.testing.assert_array_equal(np.concatenate([origins, directions], axis=1), rows)
+    rays = empty_rays(n)
+    SPLIT.launch(n, struct_record(SplitRays, (rows, *rays)))
     finite = np.isfinite(rows).all(axis=1)
     far = finite & (np.abs(np.where(finite[:, None], rows[:, :3], 0.0)) > np.float32(1e37)).any(axis=1)
-    expected = np.where(far, SPLIT_FAR, np.where(finite & rows[:, 3:].any(axis=1), SPLIT_VALID, SPLIT_MISS))
-    np.testing.assert_array_equal(kind, expected)
+    valid = finite & ~far & rows[:, 3:].any(axis=1)
+    np.testing.assert_array_equal(rays.t_max, np.where(far, FAR, np.where(valid, np.inf, -np.inf)))
+    np.testing.assert_array_equal(np.concatenate([rays.origins, rays.directions], axis=1)[valid], rows[valid])
+    assert np.isfinite(rays.origins).all() and rays.directions.any(axis=1).all()  # a query accepts all rays

@@ -20,14 +20,14 @@ from wrt.accel.queries.all_hits import ListQuery
 from wrt.accel.queries.raw_kernel import RawKernel
 from wrt.accel.queries.rays import vectors
 from wrt.accel.scenes.build import build
-from wrt.compat.surfaces import every_hit, given_rays, scatter
+from wrt.compat.surfaces import GivenRays, any_hits, closest_hits, empty_rays, every_hit, scatter
 from wrt.core.arrays import float32, real_numbers
 from wrt.core.checks import as_integer, shown
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike
 from wrt.core.warp_private import struct_record
-from wrt.kernels.placed_rays import SPLIT_FAR, SPLIT_VALID, SplitRays, split_rays
+from wrt.kernels.placed_rays import FAR, SplitRays, split_rays
 from wrt.kernels.query import FARTHEST
 from wrt.scene.values import LARGEST, as_number
 
@@ -119,12 +119,13 @@ class RaycastingScene:
             and primitive_normals (..., 3), 0 on a miss.
         """
         accel, _, normals = self._scene()
-        shape, valid, origins, directions = _valid_rays(rays, nthreads)
-        hits = accel.closest_hit(origins, directions, threads=_threads(nthreads))
-        geometry_ids, primitive_ids = self._ids(hits.prim_id)
-        found = {"t_hit": hits.t, "geometry_ids": geometry_ids, "primitive_ids": primitive_ids,
-                 "primitive_uvs": np.stack([hits.u, hits.v], axis=1), "primitive_normals": normals[hits.prim_id]}
-        return _answers(found, valid, shape)
+        threads = _threads(nthreads)
+        shape, given = _given_rays(rays, threads)
+        t, u, v, prim_id = closest_hits(accel, given, threads)
+        geometry_ids, primitive_ids = self._ids(prim_id)
+        found = {"t_hit": t, "geometry_ids": geometry_ids, "primitive_ids": primitive_ids,
+                 "primitive_uvs": np.stack([u, v], axis=1), "primitive_normals": normals[prim_id]}
+        return {name: _answer(array, shape) for name, array in found.items()}
 
     def test_occlusions(self, rays: ArrayLike, tnear: float = 0.0, tfar: float = math.inf, nthreads: int = 0) -> Answer:
         """Test whether each ray hits anything: (...) bool.
@@ -135,15 +136,17 @@ class RaycastingScene:
             Ends of the segment in units of the direction's length.
         """
         accel = self._scene()[0]
-        shape, valid, origins, directions = _valid_rays(rays, nthreads)
-        found = accel.any_hit(origins, directions, tnear, tfar, threads=_threads(nthreads))
-        return _answer(scatter(found, valid, False), shape)
+        threads = _threads(nthreads)
+        shape, given = _given_rays(rays, threads)
+        ends = np.where(given.t_max > 0.0, tfar, given.t_max)
+        return _answer(accel.any_hit(given.origins, given.directions, tnear, ends, threads=threads), shape)
 
     def count_intersections(self, rays: ArrayLike, nthreads: int = 0) -> Answer:
         """Count the intersections of each ray with surfaces, (...) int32. An intersection at an edge or a corner counts once."""
-        shape, valid, origins, directions = _valid_rays(rays, nthreads)
-        ray, *_ = every_hit(self._scene()[0], origins, directions, _threads(nthreads))
-        return _answer(scatter(np.bincount(ray, minlength=len(origins)).astype(np.int32), valid, 0), shape)
+        threads = _threads(nthreads)
+        shape, given = _given_rays(rays, threads)
+        ray, *_ = every_hit(self._scene()[0], given, threads)
+        return _answer(np.bincount(ray, minlength=len(given.t_max)).astype(np.int32), shape)
 
     def list_intersections(self, rays: ArrayLike, nthreads: int = 0) -> dict[str, Answer]:
         """List the M intersections that `count_intersections` counts, ray by ray in order of distance.
@@ -154,12 +157,12 @@ class RaycastingScene:
             ray_splits (N + 1,): rows ray_splits[i] .. ray_splits[i + 1] - 1 are of ray i; ray_ids, geometry_ids, primitive_ids (M,),
             all uint32; t_hit (M,); primitive_uvs (M, 2).
         """
-        shape, valid, origins, directions = _valid_rays(rays, nthreads)
-        ray, face, t, u, v = every_hit(self._scene()[0], origins, directions, _threads(nthreads))
-        rows = given_rays(ray, valid)
-        splits = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=math.prod(shape)))])
+        threads = _threads(nthreads)
+        shape, given = _given_rays(rays, threads)
+        ray, face, t, u, v = every_hit(self._scene()[0], given, threads)
+        splits = np.concatenate([[0], np.cumsum(np.bincount(ray, minlength=math.prod(shape)))])
         geometry_ids, primitive_ids = self._ids(face)
-        found = {"ray_splits": splits.astype(np.uint32), "ray_ids": rows.astype(np.uint32), "t_hit": t,
+        found = {"ray_splits": splits.astype(np.uint32), "ray_ids": ray.astype(np.uint32), "t_hit": t,
                  "geometry_ids": geometry_ids, "primitive_ids": primitive_ids, "primitive_uvs": np.stack([u, v], axis=1)}
         return {name: _answer(array, array.shape[:1]) for name, array in found.items()}
 
@@ -249,8 +252,8 @@ class RaycastingScene:
         return np.asarray(2 * votes > nsamples)
 
 
-def _threads(nthreads: int) -> int | None:
-    return as_integer(nthreads, "nthreads", 0, (1 << 31) - 1) or None
+def _threads(nthreads: int) -> int:
+    return thread_count(as_integer(nthreads, "nthreads", 0, (1 << 31) - 1) or None)
 
 
 def _numbers(value: Any, name: str, shape: str) -> np.ndarray:
@@ -291,18 +294,14 @@ def _normals(mesh: Geometry) -> np.ndarray:
     return np.concatenate([unit, np.zeros((1, 3))]).astype(np.float32)
 
 
-def _valid_rays(value: Any, nthreads: int) -> tuple[tuple[int, ...], np.ndarray | None, np.ndarray, np.ndarray]:
-    """Return the leading shape, the mask of finite rays with nonzero directions (None: all), and the origins and directions of these."""
-    shape, rays = _rows(value, "rays", 6)
-    origins, directions = np.empty((2, len(rays), 3), np.float32)
-    kind = np.empty(len(rays), np.int8)
-    SPLIT_RAYS.launch(len(rays), struct_record(SplitRays, (rays, origins, directions, kind)), threads=thread_count(_threads(nthreads)))
-    if kind.max(initial=0) == SPLIT_FAR:
-        _finite(rays, "rays")
-    if kind.min(initial=1) == SPLIT_VALID:
-        return shape, None, origins, directions
-    valid = kind == SPLIT_VALID
-    return shape, valid, origins[valid], directions[valid]
+def _given_rays(value: Any, threads: int) -> tuple[tuple[int, ...], GivenRays]:
+    """Return the leading shape of the caller's rays, and the rays."""
+    shape, rows = _rows(value, "rays", 6)
+    rays = empty_rays(len(rows))
+    SPLIT_RAYS.launch(len(rows), struct_record(SplitRays, (rows, *rays)), threads=threads)
+    if (rays.t_max == FAR).any():
+        _finite(rows, "rays")
+    return shape, rays
 
 
 def _valid_points(value: Any) -> tuple[tuple[int, ...], np.ndarray | None, np.ndarray]:
@@ -321,12 +320,12 @@ def _finite(array: np.ndarray, name: str) -> np.ndarray:
 
 
 def _answers(found: dict[str, np.ndarray], valid: np.ndarray | None, shape: tuple[int, ...]) -> dict[str, Any]:
-    """Return results for all rays or points of the caller, as arrays or tensors.
+    """Return results for all points of the caller, as arrays or tensors.
 
-    found: results by name, one row for each valid ray or point. All other rays or points get the values of a miss. shape: leading
-    shape of the caller's rays or points.
+    found: results by name, one row for each valid point. All other points get the values for a structure without faces. shape:
+    leading shape of the caller's points.
     """
-    missed = {"t_hit": np.inf, "geometry_ids": RaycastingScene.INVALID_ID, "primitive_ids": RaycastingScene.INVALID_ID}
+    missed = {"geometry_ids": RaycastingScene.INVALID_ID, "primitive_ids": RaycastingScene.INVALID_ID}
     return {name: _answer(scatter(array, valid, missed.get(name, 0.0)), shape) for name, array in found.items()}
 
 

@@ -14,10 +14,9 @@ from trimesh.caching import Cache, cache_decorator
 from trimesh.ray.ray_util import contains_points
 
 from wrt.accel.points.contains import contains, open_edges_of
-from wrt.accel.queries.answers import Hits
 from wrt.accel.queries.raw_kernel import RawKernel
 from wrt.accel.scenes.build import build
-from wrt.compat.surfaces import every_hit, given_rays, scatter
+from wrt.compat.surfaces import GivenRays, any_hits, closest_hits, empty_rays, every_hit
 from wrt.core.arrays import real_numbers
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
@@ -82,7 +81,8 @@ class RayMeshIntersector:
         """
         origins, directions = _rays(ray_origins, ray_directions)
         scaled, most = self._scaled, max_hits if multiple_hits else min(max_hits, 1)
-        ray, face, u, v = scaled.every_hit(origins, directions, most) if most > 1 else scaled.first_hit(origins, directions)
+        rays = scaled.placed(origins, directions)
+        ray, face, u, v = scaled.every_hit(rays, most) if most > 1 else scaled.first_hit(rays)
         if most != 1:
             order = _first_hits_first(ray) if most > 1 else np.zeros(0, np.int64)
             ray, face, u, v = (array[order] for array in (ray, face, u, v))
@@ -102,12 +102,13 @@ class RayMeshIntersector:
 
     def intersects_first(self, ray_origins: ArrayLike, ray_directions: ArrayLike) -> np.ndarray:
         """Find the face that each ray hits first, (N,) int32, -1 on a miss. At equal distance, the lowest index wins."""
-        origins, directions = _rays(ray_origins, ray_directions)
-        return self._scaled.first_face(origins, directions)
+        scaled = self._scaled
+        return closest_hits(scaled.accel, scaled.placed(*_rays(ray_origins, ray_directions)), scaled.threads)[3]
 
     def intersects_any(self, ray_origins: ArrayLike, ray_directions: ArrayLike) -> np.ndarray:
         """Test whether each ray hits anything: (N,) bool."""
-        return self._scaled.any_hit(*_rays(ray_origins, ray_directions))
+        scaled = self._scaled
+        return any_hits(scaled.accel, scaled.placed(*_rays(ray_origins, ray_directions)), scaled.threads)
 
     def contains_points(self, points: Any) -> np.ndarray:
         """Test whether points (N, 3) are inside, by wrt.contains: (N,) bool.
@@ -153,7 +154,7 @@ class _ScaledStructure:
         self.exponent = -int(np.frexp(half)[1]) if scale_to_box else 0
         vertices[unused] = self.low
         self.accel = build(Mesh(self.to_local(vertices), faces), device=device, threads=threads)
-        self.threads, self.vertices, self.faces = threads, vertices, faces
+        self.threads, self.vertices, self.faces = thread_count(threads), vertices, faces
         box = self.to_local(np.stack([self.low, self.high]))
         center, radius = box.mean(axis=0), float(np.linalg.norm(box[1] - box[0])) / 2
         self.placement: WarpStruct = Placement()
@@ -169,43 +170,29 @@ class _ScaledStructure:
     def to_local(self, points: np.ndarray) -> np.ndarray:
         return np.ldexp(points - self.shift, self.exponent)
 
-    def local_rays(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray | None, np.ndarray, np.ndarray]:
-        """Return the mask of the valid rays (None: all rays), and these rays in the structure's coordinates, float32."""
-        placed_origins, placed_directions = np.empty((2, *origins.shape), np.float32)
-        valid = np.empty(len(origins), bool)
-        arrays = origins, directions, placed_origins, placed_directions, valid
-        PLACE_RAYS.launch(len(origins), record_of(self.placement), struct_record(PlacedRays, arrays), threads=thread_count(self.threads))
-        if valid.all():
-            return None, placed_origins, placed_directions
-        return valid, placed_origins[valid], placed_directions[valid]
+    def placed(self, origins: np.ndarray, directions: np.ndarray) -> GivenRays:
+        """Return the rays in the structure's coordinates."""
+        rays = empty_rays(len(origins))
+        record = struct_record(PlacedRays, (origins, directions, *rays))
+        PLACE_RAYS.launch(len(origins), record_of(self.placement), record, threads=self.threads)
+        return rays
 
-    def first_hit(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
+    def first_hit(self, rays: GivenRays) -> tuple[np.ndarray, ...]:
         """Return ray, face, u and v of each ray's first hit."""
-        valid, origins, directions = self.local_rays(origins, directions)
-        hits: Hits = self.accel.closest_hit(origins, directions, threads=self.threads)
-        hit = np.flatnonzero(hits.prim_id >= 0)
-        return given_rays(hit, valid), hits.prim_id[hit].astype(np.int64), hits.u[hit], hits.v[hit]
+        _, u, v, prim_id = closest_hits(self.accel, rays, self.threads)
+        hit = np.flatnonzero(prim_id >= 0)
+        return hit, prim_id[hit].astype(np.int64), u[hit], v[hit]
 
-    def first_face(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Return the face of each ray's first hit, (N,) int32; -1 on a miss."""
-        valid, origins, directions = self.local_rays(origins, directions)
-        return scatter(self.accel.closest_hit(origins, directions, threads=self.threads).prim_id, valid, -1)
-
-    def every_hit(self, origins: np.ndarray, directions: np.ndarray, limit: int) -> tuple[np.ndarray, ...]:
+    def every_hit(self, rays: GivenRays, limit: int) -> tuple[np.ndarray, ...]:
         """Return ray, face, u and v of all hits, at most `limit` per ray, ray by ray in order of distance."""
-        valid, origins, directions = self.local_rays(origins, directions)
-        ray, face, _, u, v = every_hit(self.accel, origins, directions, self.threads, limit)
-        return given_rays(ray, valid), face.astype(np.int64), u, v
-
-    def any_hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        valid, origins, directions = self.local_rays(origins, directions)
-        return scatter(self.accel.any_hit(origins, directions, threads=self.threads), valid, False)
+        ray, face, _, u, v = every_hit(self.accel, rays, self.threads, limit)
+        return ray, face.astype(np.int64), u, v
 
     def located(self, origins: np.ndarray, directions: np.ndarray, *hits: np.ndarray) -> np.ndarray:
         """Return the points (M, 3) float64 of hits: ray and face (M,) int64, u and v (M,) float32."""
         points = np.empty((len(hits[0]), 3))
         arrays = origins, directions, self.vertices, self.faces, *map(np.ascontiguousarray, hits), points
-        LOCATE_HITS.launch(len(points), struct_record(HitPoints64, arrays), threads=thread_count(self.threads))
+        LOCATE_HITS.launch(len(points), struct_record(HitPoints64, arrays), threads=self.threads)
         return points
 
     def contains(self, points: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import os
 import re
 import threading
 from collections.abc import Iterable
-from functools import cache, wraps
+from functools import cache, partial, wraps
 from hashlib import sha256
 from inspect import signature
 from pathlib import Path
@@ -92,7 +92,7 @@ class Recorded(NamedTuple):
     bounds: int  # address of the launch's size
     args: int  # address of a C struct of all arguments
     last: int  # address of the last argument in the struct
-    owners: object  # objects that own the memory at these addresses
+    owners: tuple[Any, ...]  # the launch, its bounds, the struct of its arguments: they own the memory at these addresses
 
 
 def recorded(command: wp.Launch) -> Recorded:
@@ -105,6 +105,27 @@ def recorded(command: wp.Launch) -> Recorded:
     last = ctypes.addressof(args) + getattr(type(args), f"arg_{len(params) - 1}").offset
     entry = ctypes.cast(command.hooks.forward, ctypes.c_void_p).value or 0
     return Recorded(entry, ctypes.addressof(bounds), ctypes.addressof(args), last, (command, bounds, args))
+
+
+class RawLaunch:
+    """A recorded launch on the CPU that gets its arguments as records. Only one thread at a time may use it.
+
+    It calls the machine code as wp.Launch does, but keeps the C struct of all arguments, which wp.Launch makes anew: 0.4 us in place
+    of 2.3 us. The caller keeps the memory alive that the records point into."""
+
+    def __init__(self, command: wp.Launch) -> None:
+        self.recorded = recorded(command)
+        _, self._bounds, self._args, *_ = self.recorded.owners
+        self._names = [name for name, _ in self._args._fields_]
+        self.launch = partial(command.hooks.forward, ctypes.byref(self._bounds), ctypes.byref(self._args))
+
+    def set(self, i: int, record: object) -> None:
+        """Set argument i: a record or a number."""
+        setattr(self._args, self._names[i], record)
+
+    def set_dim(self, n: int) -> None:
+        """Set the number of threads."""
+        self._bounds.size = self._bounds.shape[0] = n
 
 
 @cache

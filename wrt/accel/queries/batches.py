@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES
-from wrt.accel.queries.raw_launches import check_raw_launches
+from wrt.accel.queries.raw_launches import raw_launch
 from wrt.accel.queries.rays import Rays, rays_on
 from wrt.accel.queries.world_ids import WorldIds
 from wrt.accel.snapshot import Snapshot
@@ -83,7 +83,7 @@ class Tracer:
     def trace(self, snapshot: Snapshot, query: Query) -> None:
         """Trace on the CPU, as trace_query does. The rays are checked before tracing, or by a kernel that traces many rays at a time."""
         load_kernel(self.kernel, cpu := wp.get_device("cpu"))
-        rays, threads = query.rays.on(cpu), query.threads
+        rays, threads = query.rays.on(cpu) if query.rays.as_warp else query.rays, query.threads
         if not self.stream:  # `self.stream` reports invalid rays itself
             rays = rays.checked()
         inputs, results = [np.asarray(array) for array in rays], [np.asarray(array) for array in query.out]
@@ -101,9 +101,7 @@ class Tracer:
             if packed:
                 worker.launch(snapshot, packed, first, end)
             else:
-                copy(inputs, slice(first, end), worker.rays, slice(end - first))
-                worker.launch(snapshot, worker.packed, 0, end - first)
-                copy(worker.results, slice(end - first), results, slice(first, end))
+                worker.trace(snapshot, [array[first:end] for array in inputs], [array[first:end] for array in results])
             refused.append(bool(worker.report[ANY_REFUSED]))
             self.free.append(worker)  # not after an exception, because a thread may still use it
 
@@ -143,18 +141,30 @@ class Worker:
         self.block, self.scratch = tracer.block, new_scratch(tracer.sizes)
         self.report = self.scratch.report.numpy() if tracer.stream else np.zeros(REPORT_SIZE, np.int32)
         own = [self.scratch, 0] if tracer.stream else []
-        check_raw_launches()
         self.threads = 1
-        self.command = wp.launch(tracer.kernel, dim=1, inputs=[*tracer.inputs, *own, 0], device="cpu", record_cmd=True)
+        self.command = raw_launch(tracer.kernel, *tracer.inputs, *own, 0)
         self.inputs: list[object] = [None] * (len(own) + 5)  # of the last launch
         self.own = [record_of(self.scratch)] if tracer.stream else []
+
+    def trace(self, snapshot: Snapshot, rays: list[np.ndarray], results: list[np.ndarray]) -> None:
+        """Trace at most FEWEST rays by means of the buffers. Values beyond float32 become infinite."""
+        n = len(rays[0])
+        for target, source in zip(self.rays, rays, strict=True):
+            if source.dtype == np.float32:
+                target[:n] = source
+            else:
+                with np.errstate(over="ignore"):
+                    target[:n] = source
+        self.launch(snapshot, self.packed, 0, n)
+        for result, found in zip(results, self.results, strict=True):
+            result[:] = found[:n]
 
     def launch(self, snapshot: Snapshot, packed: tuple[Any, Any], first: int, end: int) -> None:
         """Trace the rays [first, end) of `packed`, from `pack`. Afterwards report[ANY_REFUSED] tells whether one of them was invalid."""
         inputs = [record_of(snapshot.data), record_of(snapshot.surfaces), *packed, *self.own, first, end]
         for i, last in enumerate(self.inputs):  # a kernel that traces one ray at a time has no argument `end`
             if inputs[i] is not last:
-                self.command.set_param_at_index_from_ctype(i, inputs[i])
+                self.command.set(i, inputs[i])
                 self.inputs[i] = inputs[i]
         threads = end - first if self.block == 1 else 1
         if threads != self.threads:
@@ -171,16 +181,6 @@ def readable(array: np.ndarray) -> bool:
 def pack(rays: list[np.ndarray], results: list[np.ndarray]) -> tuple[Any, Any]:
     """Make kernel records of rays and results: RayArrays, and HitArrays or an array of bool. The caller must keep the arrays."""
     return struct_record(RayArrays, rays), struct_record(HitArrays, results) if len(results) > 1 else array_record(results[0])
-
-
-def copy(sources: list[np.ndarray], rows: slice, targets: list[np.ndarray], to: slice) -> None:
-    """Copy rows of arrays; values beyond float32 become infinite."""
-    for source, target in zip(sources, targets, strict=True):
-        if source.dtype == target.dtype:
-            target[to] = source[rows]
-        else:
-            with np.errstate(over="ignore"):
-                target[to] = source[rows]
 
 
 def rays_on_gpu(n: int, device: Device) -> int:

@@ -10,11 +10,11 @@ from functools import partial
 import numpy as np
 import warp as wp
 
-from wrt.accel.queries.raw_launches import check_raw_launches
+from wrt.accel.queries.raw_launches import raw_launch
 from wrt.core.device import launch_on, load_kernel, row_type, upload
 from wrt.core.threads import run_all
 from wrt.core.types import Device, Kernel, WarpArray, WarpType
-from wrt.core.warp_private import array_record, record_of, struct_record
+from wrt.core.warp_private import RawLaunch, array_record, record_of, struct_record
 from wrt.kernels.warp_private import fields_of
 
 STEP = 16384  # elements of a launch: some milliseconds of work, so that Ctrl-C is answered soon
@@ -33,7 +33,7 @@ class RawKernel:
 
     def __init__(self, kernel: Kernel, *inputs: object) -> None:
         self.kernel, self.inputs = kernel, inputs
-        self._free: list[wp.Launch] = []  # recorded launches that no thread uses now
+        self._free: list[RawLaunch] = []  # launches that no thread uses now
 
     def launch(self, n: int, *inputs: object, threads: int = 1) -> None:
         """Run the kernel on the CPU over n elements: contiguous NumPy arrays, records and Warp structs in.
@@ -49,10 +49,9 @@ class RawKernel:
         try:
             command = self._free.pop()
         except IndexError:
-            check_raw_launches()
-            command = wp.launch(self.kernel, dim=1, inputs=[*self.inputs, 0], device="cpu", record_cmd=True, record_tape=False)
+            command = raw_launch(self.kernel, *self.inputs, 0)
         for i, record in enumerate((*records, first)):
-            command.set_param_at_index_from_ctype(i, record)
+            command.set(i, record)
         command.set_dim(end - first)
         command.launch()
         self._free.append(command)  # not after an error

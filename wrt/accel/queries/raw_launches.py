@@ -10,7 +10,8 @@ import warp as wp
 
 from wrt.core import device, warp_private
 from wrt.core.device import load_kernel, made_once
-from wrt.core.types import WarpStruct
+from wrt.core.types import Kernel, WarpStruct
+from wrt.core.warp_private import RawLaunch, Recorded
 from wrt.kernels.launch_probe import PER_THREAD, Canary, probe
 from wrt.kernels.launches import Launch
 
@@ -27,16 +28,22 @@ class Launches:
     def recorded(self, command: wp.Launch, block: int = 1) -> WarpStruct:
         """Convert wp.launch(..., device="cpu", record_cmd=True) to a kernels.launches.Launch. Raises InputError if the self-test fails."""
         check_raw_launches()
-        return self.of(command, block)
+        return self.of(warp_private.recorded(command), block)
 
-    def of(self, command: wp.Launch, block: int) -> WarpStruct:
-        """Convert a launch without the self-test."""
-        launch = warp_private.recorded(command)
+    def of(self, launch: Recorded, block: int) -> WarpStruct:
+        """Convert a recorded launch without the self-test."""
         self.owners.append(launch.owners)
         record = Launch()
         record.entry, record.bounds, record.args, record.tail = launch.entry, launch.bounds, launch.args, launch.last
         record.block = block
         return record
+
+
+def raw_launch(kernel: Kernel, *inputs: object) -> RawLaunch:
+    """Record a launch of one thread with values of the arguments' types. Raises InputError if the self-test fails."""
+    check_raw_launches()
+    command = wp.launch(kernel, dim=1, inputs=list(inputs), device="cpu", record_cmd=True, record_tape=False)
+    return RawLaunch(command)
 
 
 def preload_headers() -> None:
@@ -77,11 +84,11 @@ def _has_records(memory: np.ndarray, source: np.ndarray) -> bool:
 def _has_arguments(memory: np.ndarray, source: np.ndarray) -> bool:
     """Return whether a launch receives hand-made arguments and the size that set_dim sets."""
     first, end = 3, 11
-    command = _command(memory, source, Launch())
-    command.set_param_at_index_from_ctype(3, first)
-    command.set_param_at_index_from_ctype(4, end)
-    command.set_dim((end - first) // PER_THREAD)
-    command.launch()
+    raw = _raw(memory, source, Launch())
+    raw.set(3, first)
+    raw.set(4, end)
+    raw.set_dim((end - first) // PER_THREAD)
+    raw.launch()
     return _wrote(memory, source, first, end)
 
 
@@ -89,19 +96,19 @@ def _launches_itself(memory: np.ndarray, source: np.ndarray) -> bool:
     """Return whether a kernel that launches another kernel sets the range: the last two arguments, and the size of the launch."""
     first, end = 20, 42
     launches = Launches()
-    command = _command(memory, source, launches.of(_command(memory, source, Launch()), PER_THREAD))
-    command.set_param_at_index_from_ctype(3, first)
-    command.set_param_at_index_from_ctype(4, end)
-    command.launch()
+    raw = _raw(memory, source, launches.of(_raw(memory, source, Launch()).recorded, PER_THREAD))
+    raw.set(3, first)
+    raw.set(4, end)
+    raw.launch()
     return _wrote(memory, source, first, end)
 
 
-def _command(memory: np.ndarray, source: np.ndarray, launch: WarpStruct) -> wp.Launch:
+def _raw(memory: np.ndarray, source: np.ndarray, launch: WarpStruct) -> RawLaunch:
     """Record a launch of `probe` with one thread and hand-made records of both arrays, without GUARDS words at either end."""
-    command = wp.launch(probe, dim=1, inputs=[Canary(), None, launch, 0, 0], device="cpu", record_cmd=True, record_tape=False)
-    command.set_param_at_index_from_ctype(0, warp_private.struct_record(Canary, [memory[GUARDS:-GUARDS]]))
-    command.set_param_at_index_from_ctype(1, warp_private.array_record(source[GUARDS:-GUARDS]))
-    return command
+    raw = RawLaunch(wp.launch(probe, dim=1, inputs=[Canary(), None, launch, 0, 0], device="cpu", record_cmd=True, record_tape=False))
+    raw.set(0, warp_private.struct_record(Canary, [memory[GUARDS:-GUARDS]]))
+    raw.set(1, warp_private.array_record(source[GUARDS:-GUARDS]))
+    return raw
 
 
 def _wrote(memory: np.ndarray, source: np.ndarray, first: int, end: int) -> bool:

@@ -118,9 +118,13 @@ def _segment_ends(value: ArrayLike, n: int, name: str) -> Array:
         if array.ndim == 1:
             return array
         value = float(float32(array))
-    number = c_float(value)
-    _check_ends(number.value, name)
-    return np.ndarray((n,), np.float32, number, strides=(0,))  # type: ignore[arg-type]
+    _check_ends(c_float(value).value, name)
+    return constant(value, n)
+
+
+def constant(value: float, n: int) -> np.ndarray:
+    """Return an array (n,) float32 of stride 0, all of whose elements are `value`. Values beyond float32 become infinite."""
+    return np.ndarray((n,), np.float32, c_float(value), strides=(0,))  # type: ignore[arg-type]
 
 
 def _checked_ends(array: Array, name: str) -> Array:
