@@ -7,21 +7,12 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.queries.raw_kernel import RawKernel
-from wrt.compat.surfaces import empty_rays
+from wrt.compat.given_rays import RayFormat
 from wrt.core.warp_private import record_of, struct_record
-from wrt.kernels.placed_rays import (
-    FAR,
-    HitPoints64,
-    PlacedRays,
-    Placement,
-    SplitRays,
-    locate_hits,
-    place_rays,
-    split_rays,
-)
+from wrt.kernels.placed_rays import FAR, HitPoints64, PlacedRays, Placement, SplitRays, locate_hits, place_rays, split_rays
 
-PLACE, LOCATE = RawKernel(place_rays, Placement(), PlacedRays()), RawKernel(locate_hits, HitPoints64())
-SPLIT = RawKernel(split_rays, SplitRays())
+PLACE, LOCATE = RayFormat(place_rays, PlacedRays, (3, 3), np.float64, Placement()), RawKernel(locate_hits, HitPoints64())
+SPLIT = RayFormat(split_rays, SplitRays, (6,), np.float32)
 ODD = [0.0, -0.0, np.nan, np.inf, -np.inf, 1e300, -1e-300, 5e-324, 1e37, 2e37, 1.0]
 
 
@@ -30,9 +21,7 @@ def placed(origins, directions, *, shift=(0.0, 0.0, 0.0), exponent=0, center=(0.
     place = Placement()
     place.shift, place.center, place.radius, place.near = wp.vec3d(*shift), wp.vec3d(*center), radius, 4.0 * radius
     place.scale, place.scale_again = 2.0 ** (exponent // 2), 2.0 ** (exponent - exponent // 2)
-    n = len(origins)
-    rays = empty_rays(n)
-    PLACE.launch(n, record_of(place), struct_record(PlacedRays, (origins, directions, *rays)), threads=threads)
+    rays = PLACE.converted((origins, directions), threads, record_of(place))
     valid = rays.t_max == np.inf
     assert (rays.t_max[~valid] == -np.inf).all()
     return rays.origins, rays.directions, valid
@@ -129,9 +118,7 @@ def test_rows_of_six_are_split_and_checked():
     odd = np.array([0.0, np.nan, np.inf, 1e37, 1.1e37, -3e38, 1.0], np.float32)
     rows = np.array(np.meshgrid(*[odd] * 2, [0.0, 1.0, np.nan, -1e-45], [0.0, -np.inf], [0.0], [2.0, 0.0], indexing="ij"), np.float32)
     rows = np.ascontiguousarray(rows.reshape(6, -1).T)
-    n = len(rows)
-    rays = empty_rays(n)
-    SPLIT.launch(n, struct_record(SplitRays, (rows, *rays)))
+    rays = SPLIT.converted((rows,), 1)
     finite = np.isfinite(rows).all(axis=1)
     far = finite & (np.abs(np.where(finite[:, None], rows[:, :3], 0.0)) > np.float32(1e37)).any(axis=1)
     valid = finite & ~far & rows[:, 3:].any(axis=1)

@@ -17,23 +17,22 @@ from wrt.accel.points.closest_points import closest_points
 from wrt.accel.points.contains import odd_crossings
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.all_hits import ListQuery
-from wrt.accel.queries.raw_kernel import RawKernel
 from wrt.accel.queries.rays import vectors
 from wrt.accel.scenes.build import build
-from wrt.compat.surfaces import GivenRays, any_hits, closest_hits, empty_rays, every_hit, scatter
+from wrt.compat.given_rays import GivenRays, RayFormat, closest_hits
+from wrt.compat.surfaces import every_hit, scatter
 from wrt.core.arrays import float32, real_numbers
 from wrt.core.checks import as_integer, shown
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike
-from wrt.core.warp_private import struct_record
 from wrt.kernels.placed_rays import FAR, SplitRays, split_rays
 from wrt.kernels.query import FARTHEST
 from wrt.scene.values import LARGEST, as_number
 
 MOST_SAMPLES = 1 << 16
 WIDEST = 1 << 15  # pixels
-SPLIT_RAYS = RawKernel(split_rays, SplitRays())
+SPLIT = RayFormat(split_rays, SplitRays, (6,), np.float32)
 
 
 class Array(np.ndarray):
@@ -297,8 +296,7 @@ def _normals(mesh: Geometry) -> np.ndarray:
 def _given_rays(value: Any, threads: int) -> tuple[tuple[int, ...], GivenRays]:
     """Return the leading shape of the caller's rays, and the rays."""
     shape, rows = _rows(value, "rays", 6)
-    rays = empty_rays(len(rows))
-    SPLIT_RAYS.launch(len(rows), struct_record(SplitRays, (rows, *rays)), threads=threads)
+    rays = SPLIT.converted((rows,), threads)
     if (rays.t_max == FAR).any():
         _finite(rows, "rays")
     return shape, rays

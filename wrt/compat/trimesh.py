@@ -16,7 +16,8 @@ from trimesh.ray.ray_util import contains_points
 from wrt.accel.points.contains import contains, open_edges_of
 from wrt.accel.queries.raw_kernel import RawKernel
 from wrt.accel.scenes.build import build
-from wrt.compat.surfaces import GivenRays, any_hits, closest_hits, empty_rays, every_hit
+from wrt.compat.given_rays import RayFormat
+from wrt.compat.surfaces import every_hit
 from wrt.core.arrays import real_numbers
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
@@ -29,7 +30,8 @@ if TYPE_CHECKING:
     import trimesh
 
 FAR = 4.0  # in radii of a mesh: an origin farther from the mesh is moved near it before it is rounded to float32
-PLACE_RAYS, LOCATE_HITS = RawKernel(place_rays, Placement(), PlacedRays()), RawKernel(locate_hits, HitPoints64())
+PLACED = RayFormat(place_rays, PlacedRays, (3, 3), np.float64, Placement())
+LOCATE_HITS = RawKernel(locate_hits, HitPoints64())
 
 
 class RayMeshIntersector:
@@ -81,9 +83,8 @@ class RayMeshIntersector:
         """
         origins, directions = _rays(ray_origins, ray_directions)
         scaled, most = self._scaled, max_hits if multiple_hits else min(max_hits, 1)
-        rays = scaled.placed(origins, directions)
-        ray, face, u, v = scaled.every_hit(rays, most) if most > 1 else scaled.first_hit(rays)
-        if most != 1:
+        ray, face, u, v = scaled.every_hit(origins, directions, most) if most > 1 else scaled.first_hit(origins, directions)
+        if most == 0 or (most > 1 and len(origins) > 1):  # the hits of one ray are in order
             order = _first_hits_first(ray) if most > 1 else np.zeros(0, np.int64)
             ray, face, u, v = (array[order] for array in (ray, face, u, v))
         return (face, ray, scaled.located(origins, directions, ray, face, u, v)) if return_locations else (face, ray)
@@ -102,13 +103,12 @@ class RayMeshIntersector:
 
     def intersects_first(self, ray_origins: ArrayLike, ray_directions: ArrayLike) -> np.ndarray:
         """Find the face that each ray hits first, (N,) int32, -1 on a miss. At equal distance, the lowest index wins."""
-        scaled = self._scaled
-        return closest_hits(scaled.accel, scaled.placed(*_rays(ray_origins, ray_directions)), scaled.threads)[3]
+        return self._scaled.closest_hits(*_rays(ray_origins, ray_directions))[3]
 
     def intersects_any(self, ray_origins: ArrayLike, ray_directions: ArrayLike) -> np.ndarray:
         """Test whether each ray hits anything: (N,) bool."""
         scaled = self._scaled
-        return any_hits(scaled.accel, scaled.placed(*_rays(ray_origins, ray_directions)), scaled.threads)
+        return PLACED.any_hits(scaled.accel, _rays(ray_origins, ray_directions), scaled.threads, scaled.placement)
 
     def contains_points(self, points: Any) -> np.ndarray:
         """Test whether points (N, 3) are inside, by wrt.contains: (N,) bool.
@@ -157,11 +157,12 @@ class _ScaledStructure:
         self.threads, self.vertices, self.faces = thread_count(threads), vertices, faces
         box = self.to_local(np.stack([self.low, self.high]))
         center, radius = box.mean(axis=0), float(np.linalg.norm(box[1] - box[0])) / 2
-        self.placement: WarpStruct = Placement()
-        self.placement.shift, self.placement.center = wp.vec3d(*self.shift), wp.vec3d(*center)
+        place: WarpStruct = Placement()
+        place.shift, place.center = wp.vec3d(*self.shift), wp.vec3d(*center)
         half_way = self.exponent // 2
-        self.placement.scale, self.placement.scale_again = 2.0**half_way, 2.0**(self.exponent - half_way)
-        self.placement.radius, self.placement.near = radius, FAR * radius
+        place.scale, place.scale_again = 2.0**half_way, 2.0**(self.exponent - half_way)
+        place.radius, place.near = radius, FAR * radius
+        self.placement = record_of(place)
 
     @property
     def closed(self) -> bool:
@@ -170,21 +171,19 @@ class _ScaledStructure:
     def to_local(self, points: np.ndarray) -> np.ndarray:
         return np.ldexp(points - self.shift, self.exponent)
 
-    def placed(self, origins: np.ndarray, directions: np.ndarray) -> GivenRays:
-        """Return the rays in the structure's coordinates."""
-        rays = empty_rays(len(origins))
-        record = struct_record(PlacedRays, (origins, directions, *rays))
-        PLACE_RAYS.launch(len(origins), record_of(self.placement), record, threads=self.threads)
-        return rays
+    def closest_hits(self, *rays: np.ndarray) -> list[np.ndarray]:
+        """Return t, u, v and prim_id of the closest hit of each ray. rays: origins and directions."""
+        return PLACED.closest_hits(self.accel, rays, self.threads, self.placement)
 
-    def first_hit(self, rays: GivenRays) -> tuple[np.ndarray, ...]:
+    def first_hit(self, *rays: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return ray, face, u and v of each ray's first hit."""
-        _, u, v, prim_id = closest_hits(self.accel, rays, self.threads)
+        _, u, v, prim_id = self.closest_hits(*rays)
         hit = np.flatnonzero(prim_id >= 0)
         return hit, prim_id[hit].astype(np.int64), u[hit], v[hit]
 
-    def every_hit(self, rays: GivenRays, limit: int) -> tuple[np.ndarray, ...]:
+    def every_hit(self, origins: np.ndarray, directions: np.ndarray, limit: int) -> tuple[np.ndarray, ...]:
         """Return ray, face, u and v of all hits, at most `limit` per ray, ray by ray in order of distance."""
+        rays = PLACED.converted((origins, directions), self.threads, self.placement)
         ray, face, _, u, v = every_hit(self.accel, rays, self.threads, limit)
         return ray, face.astype(np.int64), u, v
 

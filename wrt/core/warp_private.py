@@ -117,7 +117,7 @@ class RawLaunch:
         self.recorded = recorded(command)
         _, self._bounds, self._args, *_ = self.recorded.owners
         self._names = [name for name, _ in self._args._fields_]
-        self.launch = partial(command.hooks.forward, ctypes.byref(self._bounds), ctypes.byref(self._args))
+        self._run = partial(command.hooks.forward, ctypes.byref(self._bounds), ctypes.byref(self._args))
 
     def set(self, i: int, record: object) -> None:
         """Set argument i: a record or a number."""
@@ -126,6 +126,10 @@ class RawLaunch:
     def set_dim(self, n: int) -> None:
         """Set the number of threads."""
         self._bounds.size = self._bounds.shape[0] = n
+
+    def launch(self) -> None:
+        """Run the kernel."""
+        self._run()
 
 
 @cache

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Generic, NamedTuple, overload
 
 import numpy as np
@@ -12,6 +13,7 @@ import warp as wp
 
 from wrt.accel.queries.accelerator import Accelerator, snapshot_of
 from wrt.accel.queries.answers import Hits
+from wrt.accel.queries.few_lists import MOST, FewLists
 from wrt.accel.queries.hit_points import device_scene
 from wrt.accel.queries.raw_kernel import RawKernel, kernel_memory
 from wrt.accel.queries.rays import Rays, arrays_on, host_arrays, rays_of
@@ -20,7 +22,7 @@ from wrt.core.arrays import to_numpy, to_tensor_like, to_warp
 from wrt.core.checks import as_integer, as_one
 from wrt.core.device import MOST_ROWS, made_once, upload
 from wrt.core.errors import InputError
-from wrt.core.threads import thread_count
+from wrt.core.threads import thread_count, with_stack
 from wrt.core.types import Array, ArrayLike, ArrayT, NumpyLike, TensorT, WarpArray
 from wrt.kernels.hit_lists import FEW, HitLists, copy_hits, list_hit, make_list_hits_kernel
 from wrt.kernels.query import HitArrays, RayArrays
@@ -89,16 +91,23 @@ class ListQuery:
 
     n = 0
     rays: Rays
-    give: Any = to_numpy  # converts arrays to those of the caller's library
+    give: Any  # converts arrays to those of the caller's library
 
     def __init__(self, accel: Accelerator, threads: int | None, crossings: bool = False) -> None:
         self.snapshot = snapshot_of(accel)
         self.threads, self.device = thread_count(threads), self.snapshot.device
         self.memory: Any = kernel_memory(self.device)
-        self.crossings, self.mesh = as_one(crossings, bool, "crossings"), (None, None)
+        self.give = to_numpy
+        self.crossings = as_one(crossings, bool, "crossings")
+        self.mesh: tuple[WarpArray | None, WarpArray | None] = (None, None)
         if crossings:
             surfaces = device_scene(self.snapshot).surfaces
             self.mesh = surfaces.vertices, surfaces.faces
+
+    def of_valid(self, rays: Rays) -> ListQuery:
+        """Set rays that are valid: contiguous NumPy arrays of float32."""
+        self.n, self.rays = len(rays.origins), rays if self.device.is_cpu else arrays_on(self.device, rays)
+        return self
 
     def of(self, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf) -> ListQuery:
         """Set the rays. Raises InputError that names the argument."""
@@ -109,6 +118,8 @@ class ListQuery:
 
     def all(self, limit: int = ALL) -> AllHits[Any]:
         """Find the first `limit` hits of each ray."""
+        if self.n <= MOST and self.device.is_cpu and (few := with_stack(partial(self._few, min(limit, ALL)))) is not None:
+            return AllHits(self.converted(few[0]), *map(self.give, few[1:]))
         counts, parts = [np.zeros(0, np.int64)], []
         for rays, lists, of_each in self._listed(limit):
             first = _begins(of_each)
@@ -141,6 +152,17 @@ class ListQuery:
     def converted(self, values: np.ndarray) -> Array:
         """Convert int64 values to an array of the caller's library."""
         return values if self.give is to_numpy else self.give(upload(values, wp.int64, self.device))
+
+    def _few(self, limit: int) -> list[np.ndarray] | None:
+        """Return the fields of AllHits, or None if a ray has too many hits for FewLists."""
+        free = few_lists(self.snapshot.structure)
+        try:
+            lists = free.pop()
+        except IndexError:
+            lists = FewLists(list_hits(self.snapshot.structure), COPY_HITS)
+        found = lists.find(self.snapshot, self.rays, limit, self.mesh)
+        free.append(lists)  # not after an exception
+        return found
 
     def _listed(self, limit: int, counting: bool = False) -> Iterator[tuple[object, list[_Lists], np.ndarray]]:
         """Yield, for each batch of the rays: these rays, one or two HitLists, and the number of hits of each ray.
@@ -194,6 +216,12 @@ def list_hits(structure: Structure) -> RawKernel:
     listing = structure._replace(units=structure.units._replace(lists=True))
     kernel = make_list_hits_kernel(structure.struct, listing.traversal(any_hit=False, accepts=list_hit))
     return RawKernel(kernel, structure.struct(), RayArrays(), HitLists())
+
+
+@made_once
+def few_lists(structure: Structure) -> list[FewLists]:
+    """Return the FewLists of a structure that no thread uses now."""
+    return []
 
 
 @overload

@@ -82,8 +82,7 @@ class Tracer:
 
     def trace(self, snapshot: Snapshot, query: Query) -> None:
         """Trace on the CPU, as trace_query does. The rays are checked before tracing, or by a kernel that traces many rays at a time."""
-        load_kernel(self.kernel, cpu := wp.get_device("cpu"))
-        rays, threads = query.rays.on(cpu) if query.rays.as_warp else query.rays, query.threads
+        rays, threads = query.rays.on(wp.get_device("cpu")) if query.rays.as_warp else query.rays, query.threads
         if not self.stream:  # `self.stream` reports invalid rays itself
             rays = rays.checked()
         inputs, results = [np.asarray(array) for array in rays], [np.asarray(array) for array in query.out]
@@ -135,6 +134,7 @@ class Worker:
     """
 
     def __init__(self, tracer: Tracer) -> None:
+        load_kernel(tracer.kernel, wp.get_device("cpu"))
         self.rays = [np.empty((FEWEST, 3), np.float32), np.empty((FEWEST, 3), np.float32), *np.empty((2, FEWEST), np.float32)]
         self.results = [np.empty(FEWEST, dtype) for dtype in tracer.types.values()]
         self.packed = pack(self.rays, self.results)

@@ -16,6 +16,7 @@ from tests.refused import Refusal, refused
 from tests.structures import families_first
 from tests.wrt.accel.test_structures_agree import mixed_rays
 from wrt.accel.geometry import Geometry
+from wrt.accel.queries.few_lists import MOST
 from wrt.accel.scenes.build import build
 from wrt.kernels.query import RayArrays
 from wrt.kernels.traverse.common import Units
@@ -126,13 +127,30 @@ def test_counting_keeps_no_hits(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_more_rays_than_are_asked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(5)
     mesh = soup(rng)
-    asked, accel = rays(rng, mesh, 1000), wrt.build(mesh)
+    asked, accel = rays(rng, mesh, MOST + 300), wrt.build(mesh)
     expected = wrt.all_hits(accel, *asked), wrt.first_hits(accel, 5, *asked), wrt.count_hits(accel, *asked)
     monkeypatch.setattr("wrt.accel.queries.all_hits.RAYS_AT_ONCE", 300)
     found = wrt.all_hits(accel, *asked), wrt.first_hits(accel, 5, *asked), wrt.count_hits(accel, *asked)
     assert np.array_equal(found[2], expected[2]) and np.array_equal(found[0].first, expected[0].first)
     for field in ("t", "u", "v", "prim_id"):
         assert all(np.array_equal(getattr(found[i], field), getattr(expected[i], field)) for i in (0, 1))
+
+
+@pytest.mark.parametrize("mesh", [shapes.torus(1.0, 0.4, 32, 16), soup(np.random.default_rng(6))], ids=["torus", "soup"])
+@pytest.mark.parametrize("crossings", [False, True])
+def test_few_rays_hit_what_they_hit_among_many(mesh: wrt.Mesh, crossings: bool) -> None:
+    """A call with few rays uses buffers of earlier calls; rays of the soup can have more hits than these hold."""
+    accel = wrt.build(mesh)
+    asked = rays(np.random.default_rng(7), mesh, MOST + 1)
+    among = wrt.all_hits(accel, *asked, crossings=crossings)
+    begin = 0
+    for n in (1, 0, 3, 700, MOST - 704):
+        few = wrt.all_hits(accel, *(array[begin:begin + n] for array in asked), crossings=crossings)
+        rows = slice(among.first[begin], among.first[begin + n])
+        assert np.array_equal(few.first, among.first[begin:begin + n + 1] - rows.start)
+        for field in ("t", "u", "v", "prim_id"):
+            assert np.array_equal(getattr(few, field), getattr(among, field)[rows])
+        begin += n
 
 
 def test_all_hits_are_the_first_ones_without_the_misses() -> None:

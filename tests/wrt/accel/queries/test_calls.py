@@ -21,6 +21,7 @@ from wrt.accel.queries.answers import Hits
 from wrt.accel.queries.batches import FEWEST
 from wrt.accel.scenes.build import build
 from wrt.core.arrays import to_numpy, to_warp
+from wrt.core.warp_private import RawLaunch
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 
@@ -315,8 +316,8 @@ def test_a_small_call_wakes_no_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     accel = build(icosphere(1), "bvh8", device="cpu")
     rays = some_rays(FEWEST)
     seen: set[int] = set()
-    launch = wp.Launch.launch
-    monkeypatch.setattr(wp.Launch, "launch", lambda self, *a: (seen.add(threading.get_ident()), launch(self, *a))[1])
+    launch = RawLaunch.launch
+    monkeypatch.setattr(RawLaunch, "launch", lambda self, *a: (seen.add(threading.get_ident()), launch(self, *a))[1])
     for form in (np.asarray, np.float64):
         accel.closest_hit(form(rays[0]), rays[1], threads=8)  # type: ignore[operator]
         accel.any_hit(form(rays[0]), rays[1])  # type: ignore[operator]

@@ -1,0 +1,70 @@
+"""Lists of all hits of a few rays: buffers and launches that later calls reuse. Records for new arrays take longer than a ray."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from wrt.accel.queries.answers import HIT_TYPES
+from wrt.accel.queries.raw_kernel import HostMemory, RawKernel
+from wrt.accel.queries.raw_launches import raw_launch
+from wrt.accel.queries.rays import Rays
+from wrt.accel.snapshot import Snapshot
+from wrt.core.device import load_kernel, start
+from wrt.core.types import WarpArray
+from wrt.core.warp_private import array_record, record_of, struct_record
+from wrt.kernels.hit_lists import FEW, HitLists
+from wrt.kernels.query import HitArrays, RayArrays
+from wrt.kernels.structs import Hit
+
+MOST = 1024  # rays
+
+
+class FewLists:
+    """Lists of FEW hits for each of MOST rays. One thread uses it at a time.
+
+    Parameters
+    ----------
+    fill, copy : RawKernel
+        Kernels of kernels.hit_lists: one that fills the lists, and copy_hits.
+    """
+
+    def __init__(self, fill: RawKernel, copy: RawKernel) -> None:
+        for each in (fill, copy):
+            load_kernel(each.kernel, start("cpu"))
+        self.rays = [np.empty((MOST, 3), np.float32), np.empty((MOST, 3), np.float32), *np.empty((2, MOST), np.float32)]
+        self.first = np.arange(0, FEW * MOST + 1, FEW, dtype=np.int32)
+        self.counts, self.begin = np.empty((2, MOST), np.int32)
+        self.rows = HostMemory().empty(FEW * MOST, Hit)
+        self.hits = [np.empty(FEW * MOST, dtype) for dtype in HIT_TYPES.values()]
+        self.lists = struct_record(HitLists, [0, False, None, None, self.first, self.counts, self.rows])
+        rays = struct_record(RayArrays, self.rays)
+        self.fill, self.copy = raw_launch(fill.kernel, *fill.inputs, 0), raw_launch(copy.kernel, *copy.inputs, 0)
+        self.fill.set(1, rays)
+        for i, record in enumerate((rays, self.lists, array_record(self.begin), struct_record(HitArrays, self.hits))):
+            self.copy.set(i, record)
+
+    def find(self, snapshot: Snapshot, rays: Rays, limit: int, mesh: tuple[WarpArray | None, WarpArray | None]) -> list[np.ndarray] | None:
+        """Return the first row of each ray's list, and t, u, v and prim_id of the hits; None if a ray has more than FEW hits.
+
+        mesh: vertices and faces, to list crossings only; else two times None.
+        """
+        n = len(rays.t_min)
+        for buffer, array in zip(self.rays, rays, strict=True):
+            buffer[:n] = array
+        self.counts[:n] = 0
+        vertices, faces = mesh
+        self.lists.limit, self.lists.crossings = limit, vertices is not None
+        if vertices is not None and faces is not None:
+            self.lists.vertices, self.lists.faces = record_of(vertices), record_of(faces)
+        self.fill.set(0, record_of(snapshot.data))
+        self.fill.set(2, self.lists)
+        self.fill.set_dim(n)
+        self.fill.launch()
+        if self.counts[:n].max(initial=0) > FEW:
+            return None
+        first = np.zeros(n + 1, np.int64)
+        np.cumsum(self.counts[:n], out=first[1:])
+        self.begin[:n] = first[:-1]
+        self.copy.set_dim(n)
+        self.copy.launch()
+        return [first, *(array[:first[-1]].copy() for array in self.hits)]

@@ -1,0 +1,136 @@
+"""Rays as a caller of an adapter gives them: a kernel of kernels.placed_rays converts them for the structure, and they are traced.
+
+A ray that is not finite, or has direction 0, hits nothing. The queries leave out the checks of `closest_hit` and `any_hit`, which
+take longer than a ray.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from wrt.accel.queries.accelerator import Accelerator
+from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES
+from wrt.accel.queries.batches import SMALL, Query, Tracer, Worker, trace_query, tracer
+from wrt.accel.queries.raw_kernel import RawKernel
+from wrt.accel.queries.raw_launches import raw_launch
+from wrt.accel.queries.rays import Rays, constant
+from wrt.accel.snapshot import Snapshot
+from wrt.core.threads import with_stack
+from wrt.core.types import Kernel, WarpType
+from wrt.core.warp_private import struct_record
+
+
+class GivenRays(NamedTuple):
+    """Valid rays: origins and directions (N, 3), t_max (N,), float32. A ray with t_max = -inf hits nothing."""
+
+    origins: np.ndarray
+    directions: np.ndarray
+    t_max: np.ndarray
+
+    @property
+    def rays(self) -> Rays:
+        """Rays of a query."""
+        return Rays(self.origins, self.directions, constant(0.0, len(self.t_max)), self.t_max)
+
+    def of(self, rows: np.ndarray) -> GivenRays:
+        """Return some of the rays. rows: indices (M,)."""
+        return GivenRays(*(array[rows] for array in self))
+
+
+def closest_hits(accel: Accelerator, rays: GivenRays, threads: int) -> list[np.ndarray]:
+    """Return t, u, v and prim_id of each ray's closest hit."""
+    return _traced(accel, rays, threads, HIT_TYPES)
+
+
+def any_hits(accel: Accelerator, rays: GivenRays, threads: int) -> np.ndarray:
+    """Return whether each ray hits anything, (N,) bool."""
+    return _traced(accel, rays, threads, ANY_HIT_TYPES)[0]
+
+
+def _traced(accel: Accelerator, rays: GivenRays, threads: int, types: Mapping[str, type]) -> list[np.ndarray]:
+    out: list[Any] = [np.empty(len(rays.t_max), dtype) for dtype in types.values()]
+    trace_query(accel.snapshot, Query(rays.rays, out, threads))
+    return out
+
+
+class RayFormat:
+    """A form of rays, and the kernel that converts them.
+
+    Parameters
+    ----------
+    kernel : Kernel
+        Kernel of kernels.placed_rays. Arguments: `inputs`, `struct`, first.
+    struct : WarpType
+        Struct of the caller's arrays, and of those of GivenRays.
+    columns, dtype : int
+        Number of columns of each of the caller's arrays, and their type.
+    *inputs
+        A value of the type of each argument before `struct`.
+    """
+
+    def __init__(self, kernel: Kernel, struct: WarpType, columns: tuple[int, ...], dtype: type, *inputs: object) -> None:
+        self.kernel, self.struct, self.columns, self.dtype, self.inputs = kernel, struct, columns, dtype, inputs
+        self._convert = RawKernel(kernel, *inputs, struct())
+        self._free: dict[Tracer, list[_FewRays]] = {}
+
+    def converted(self, arrays: tuple[np.ndarray, ...], threads: int, *inputs: object) -> GivenRays:
+        """Convert the caller's arrays. inputs: records of the kernel's arguments before the struct."""
+        n = len(arrays[0])
+        rays = GivenRays(np.empty((n, 3), np.float32), np.empty((n, 3), np.float32), np.empty(n, np.float32))
+        self._convert.launch(n, *inputs, struct_record(self.struct, (*arrays, *rays)), threads=threads)
+        return rays
+
+    def closest_hits(self, accel: Accelerator, arrays: tuple[np.ndarray, ...], threads: int, *inputs: object) -> list[np.ndarray]:
+        """Convert rays and return their hits as `closest_hits`."""
+        if len(arrays[0]) <= SMALL and accel.device.is_cpu:
+            return self._few(accel.snapshot, False, arrays, inputs)
+        return closest_hits(accel, self.converted(arrays, threads, *inputs), threads)
+
+    def any_hits(self, accel: Accelerator, arrays: tuple[np.ndarray, ...], threads: int, *inputs: object) -> np.ndarray:
+        """Convert rays and return whether they hit anything, as `any_hits`."""
+        if len(arrays[0]) <= SMALL and accel.device.is_cpu:
+            return self._few(accel.snapshot, True, arrays, inputs)[0]
+        return any_hits(accel, self.converted(arrays, threads, *inputs), threads)
+
+    def _few(self, snapshot: Snapshot, any_hit: bool, arrays: tuple[np.ndarray, ...], inputs: tuple[object, ...]) -> list[np.ndarray]:
+        free = self._free.setdefault(tracer(snapshot.structure, any_hit), [])
+        try:
+            few = free.pop()
+        except IndexError:
+            few = _FewRays(self, tracer(snapshot.structure, any_hit))
+        found = with_stack(partial(few.trace, snapshot, arrays, inputs))
+        free.append(few)  # not after an exception
+        return found
+
+
+class _FewRays:
+    """Buffers for SMALL rays, and recorded launches that convert and trace them: a tenth of the time of records for new arrays.
+
+    One thread uses it at a time.
+    """
+
+    def __init__(self, form: RayFormat, tracer: Tracer) -> None:
+        self.worker = Worker(tracer)
+        self.arrays: list[np.ndarray] = [np.empty((SMALL, columns), form.dtype) for columns in form.columns]
+        origins, directions, t_min, t_max = self.worker.rays
+        t_min[:] = 0.0
+        self.inputs: list[object] = [None] * len(form.inputs)  # of the last launch
+        self.convert = raw_launch(form.kernel, *form.inputs, form.struct(), 0)
+        self.convert.set(len(self.inputs), struct_record(form.struct, (*self.arrays, origins, directions, t_max)))
+
+    def trace(self, snapshot: Snapshot, arrays: tuple[np.ndarray, ...], inputs: tuple[object, ...]) -> list[np.ndarray]:
+        n = len(arrays[0])
+        for buffer, array in zip(self.arrays, arrays, strict=True):
+            buffer[:n] = array
+        for i, record in enumerate(inputs):
+            if record is not self.inputs[i]:
+                self.convert.set(i, record)
+                self.inputs[i] = record
+        self.convert.set_dim(n)
+        self.convert.launch()
+        self.worker.launch(snapshot, self.worker.packed, 0, n)
+        return [found[:n].copy() for found in self.worker.results]
