@@ -24,6 +24,17 @@ class RayArrays:
 
 
 @wp.struct
+class WorldRays:
+    """Rays of a query, as in RayArrays, and the index of each ray's world; `world` may have stride 0, too."""
+
+    origin: wp.array(dtype=wp.vec3)
+    direction: wp.array(dtype=wp.vec3)
+    t_min: wp.array(dtype=wp.float32)
+    t_max: wp.array(dtype=wp.float32)
+    world: wp.array(dtype=wp.int32)
+
+
+@wp.struct
 class RenderRays:
     """Rays of a picture, in world space. The traversal uses their directions as they are, without direction_scale."""
 

@@ -33,6 +33,8 @@ def make_struct(bottom: Any) -> Any:
     @wp.struct
     class Instances:
         nodes: wp.array(dtype=Bvh2Node)  # One tree per world (separate scene); leaves are ranges of placements.
+        wide: wp.array(dtype=wp.float32)  # The same trees in plain nodes with 8 children (wide/layout.py), if `bottom` is WideBvh.
+        roots: wp.array(dtype=wp.int32)  # Index in `wide` of each world's root.
         placements: wp.array(dtype=Placement)
         bottoms: wp.array(dtype=bottom)
         bases: wp.array(dtype=wp.int64)  # Address at which each structure begins in traces (Recorder.base).

@@ -28,15 +28,13 @@ from wrt.kernels.wide.layout import (
     ROW_SIZE,
     SLOT,
     SLOT_SIZE,
-    STACK_WORDS,
     WIDTH,
 )
-from wrt.kernels.wide.nodes import ROW_PADS, far_pad
+from wrt.kernels.wide.nodes import far_pad
 from wrt.kernels.wide.packets import (
     ANY_REFUSED,
     FAILED,
     PAUSED,
-    REPORT_SIZE,
     Scratch,
     WideBvh,
     count_of,
@@ -59,7 +57,6 @@ from wrt.kernels.wide.packets import (
     write_occluded,
 )
 from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
-from wrt.kernels.wide.traverse import WideTraversal
 
 PRIM_ID = WIDTH * PRIM_ID_ROW  # Index of the first prim_id in a row of primitives.
 PACKETS = 4  # Number of packets that are set up together.
@@ -346,19 +343,3 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
                 write(out, block + LANES * p, wp.min(end - block - LANES * p, LANES), scratch, PACKET_SIZE * p)
 
     return trace
-
-
-class BatchTraversal(WideTraversal):
-    """The traversal for plain nodes (not compressed) with 8 children (bvh8). It also has a kernel for many rays."""
-
-    stream_block = PACKETS * LANES
-    stream_sizes = PACKETS * PACKET_SIZE, STACK_WORDS * SLOTS, SLOT_SIZE * SLOTS, REPORT_SIZE  # Lengths of the arrays in Scratch.
-
-    def __init__(self) -> None:
-        super().__init__(WIDTH)
-
-    def make_stream(self, units: Units, any_hit: bool, rays_struct: Any = RayArrays, accepts: Any = None) -> Any:
-        """Return the kernel of `make_kernel`, or None if the units have no vectorised form."""
-        if units.triangle != "watertight" or units.box not in ROW_PADS or units.counters or units.instances or units.resumes:
-            return None
-        return make_kernel(units, any_hit, rays_struct, accepts)

@@ -10,20 +10,21 @@ template <class T> struct BoxRay { Vec3<T> origin, inv_dir; };
 template <class T> struct Interval { T enter, leave; };
 
 // Narrow the interval t to the part of a line between the near and far planes of a box. A distance NaN (0 * inf) changes nothing, because
-// it compares as false. far_inv_dir is inv_dir times a factor that covers the rounding of far distances.
+// it compares as false. far_inv_dir is inv_dir times a factor that covers the rounding of far distances. The ray has an origin for near
+// planes and one for far planes: the same, but for instances.h.
 template <class T, class Plane, class Number>
-WRT_INLINE void narrow(Interval<T>& t, const Vec3<Plane>& near, const Vec3<Plane>& far, const Vec3<Number>& origin,
-                       const Vec3<Number>& inv_dir, const Vec3<Number>& far_inv_dir) {
-    const T enter_x = (near[0] - origin[0]) * inv_dir[0];
-    const T enter_y = (near[1] - origin[1]) * inv_dir[1];
-    const T enter_z = (near[2] - origin[2]) * inv_dir[2];
+WRT_INLINE void narrow(Interval<T>& t, const Vec3<Plane>& near, const Vec3<Plane>& far, const Vec3<Number>& near_origin,
+                       const Vec3<Number>& far_origin, const Vec3<Number>& inv_dir, const Vec3<Number>& far_inv_dir) {
+    const T enter_x = (near[0] - near_origin[0]) * inv_dir[0];
+    const T enter_y = (near[1] - near_origin[1]) * inv_dir[1];
+    const T enter_z = (near[2] - near_origin[2]) * inv_dir[2];
     t.enter = enter_x > t.enter ? enter_x : t.enter;
     t.enter = enter_y > t.enter ? enter_y : t.enter;
     t.enter = enter_z > t.enter ? enter_z : t.enter;
 
-    const T leave_x = (far[0] - origin[0]) * far_inv_dir[0];
-    const T leave_y = (far[1] - origin[1]) * far_inv_dir[1];
-    const T leave_z = (far[2] - origin[2]) * far_inv_dir[2];
+    const T leave_x = (far[0] - far_origin[0]) * far_inv_dir[0];
+    const T leave_y = (far[1] - far_origin[1]) * far_inv_dir[1];
+    const T leave_z = (far[2] - far_origin[2]) * far_inv_dir[2];
     t.leave = leave_x < t.leave ? leave_x : t.leave;
     t.leave = leave_y < t.leave ? leave_y : t.leave;
     t.leave = leave_z < t.leave ? leave_z : t.leave;
@@ -36,7 +37,7 @@ template <class T> WRT_INLINE Vec3<T> near_planes(const BoxRay<T>& ray, const Ve
 
 template <class T> WRT_INLINE Interval<T> slab_interval(const BoxRay<T>& ray, const Vec3<T>& lo, const Vec3<T>& hi) {
     Interval<T> t = {all<T>(-__builtin_inff()), all<T>(__builtin_inff())};
-    narrow(t, near_planes(ray, lo, hi), near_planes(ray, hi, lo), ray.origin, ray.inv_dir, ray.inv_dir);
+    narrow(t, near_planes(ray, lo, hi), near_planes(ray, hi, lo), ray.origin, ray.origin, ray.inv_dir, ray.inv_dir);
     return t;
 }
 
@@ -81,7 +82,7 @@ template <int N, class Layout> struct Node {
         Interval<Row> t = {all<Row>(ray.t_min), all<Row>(t_max)};
         const Vec3<Row> near = {{plane(ray.near[0], 0), plane(ray.near[1], 1), plane(ray.near[2], 2)}};
         const Vec3<Row> far = {{plane(ray.near[0] ^ 1, 0), plane(ray.near[1] ^ 1, 1), plane(ray.near[2] ^ 1, 2)}};
-        narrow(t, near, far, ray.origin, ray.inv_dir, ray.far_inv_dir);
+        narrow(t, near, far, ray.origin, ray.origin, ray.inv_dir, ray.far_inv_dir);
         return t;
     }
 

@@ -55,31 +55,40 @@ WRT_INLINE int push_and_take(const float* nodes, int first, const Interval<Lanes
     return take<ANY_HIT>(nodes, reach, stacks, bottom, WRT_UNPREDICTABLE(left != 0) ? place + LEVEL : place, slot);
 }
 
-// Put a ray into a slot, and take the first of the root's children. rays_meeting_root has stored their ROOT_ENTRIES.
-template <bool ANY_HIT> WRT_INLINE int begin(const float* nodes, float* packets, int ray, unsigned* stacks, int bottom, int* slot) {
+// Put a ray into a slot, and take the first of the children of node `root`. rays_meeting has stored their ROOT_ENTRIES.
+template <bool ANY_HIT>
+WRT_INLINE int begin(const float* nodes, int root, float* packets, int ray, unsigned* stacks, int bottom, int* slot) {
     typedef Lanes<WIDTH>::Floats Children;
     Children enter;
     for (int child = 0; child < WIDTH; ++child) enter[child] = packets[ray + ROOT_ENTRIES + LANES * child];
     slot[SLOT_RAY] = ray;
     slot[SLOT_PLACE] = bottom;
     const float reach = __builtin_inff();
-    return push_and_take<ANY_HIT>(nodes, 0, {enter, all<Children>(LARGEST)}, reach, stacks, bottom, slot);
+    return push_and_take<ANY_HIT>(nodes, root * NODE_SIZE, {enter, all<Children>(LARGEST)}, reach, stacks, bottom, slot);
 }
 
-// Visit a node, and take the next child: of this node or, if the ray enters none, from the stack.
-template <bool ANY_HIT> WRT_INLINE int step(const float* nodes, float* packets, unsigned* stacks, int bottom, int* slot) {
+// Visit the node `node` = nodes + first, and take the next child: of this node or, if the ray enters none, from the stack. The ray has one
+// origin for near planes and one for far planes (box.h: narrow).
+template <bool ANY_HIT>
+WRT_INLINE int step_at(const float* nodes, const float* node, int first, const Vec3<float>& near_origin, const Vec3<float>& far_origin,
+                       float* packets, unsigned* stacks, int bottom, int* slot) {
     typedef Lanes<WIDTH>::Floats Children;
-    const int first = slot[SLOT_NEXT] * NODE_SIZE;
     const OneRay ray = {packets + slot[SLOT_RAY]};
-    const float* const node = nodes + (long long)first;
     const int near_x = ray.bits(NEAR_X), near_y = ray.bits(NEAR_Y), near_z = ray.bits(NEAR_Z);
     const Vec3<Children> near = {{load<Children>(node + near_x), load<Children>(node + near_y), load<Children>(node + near_z)}};
     const Vec3<Children> far = {{load<Children>(node + (near_x ^ WIDTH)), load<Children>(node + (near_y ^ WIDTH)),
                                  load<Children>(node + (near_z ^ WIDTH))}};
     const float reach = ray[T];
     Interval<Children> t = {all<Children>(ray[T_MIN]), all<Children>(reach)};
-    narrow(t, near, far, vector<float>(ray, ORIGIN_X), vector<float>(ray, INVERSE_X), vector<float>(ray, FAR_X));
+    narrow(t, near, far, near_origin, far_origin, vector<float>(ray, INVERSE_X), vector<float>(ray, FAR_X));
     return push_and_take<ANY_HIT>(nodes, first, t, reach, stacks, bottom, slot);
+}
+
+// Call step_at for the ray's next node.
+template <bool ANY_HIT> WRT_INLINE int step(const float* nodes, float* packets, unsigned* stacks, int bottom, int* slot) {
+    const int first = slot[SLOT_NEXT] * NODE_SIZE;
+    const Vec3<float> origin = vector<float>(OneRay{packets + slot[SLOT_RAY]}, ORIGIN_X);
+    return step_at<ANY_HIT>(nodes, nodes + (long long)first, first, origin, origin, packets, stacks, bottom, slot);
 }
 
 // After a leaf, take a child from the stack that begins at or before `reach`, the ray's t.

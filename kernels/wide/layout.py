@@ -68,9 +68,10 @@ LINES = 5  # Number of cache lines to prefetch: a row of triangles has 5, a node
 
 # A packet is a block of floats. It begins with a vector of sixteen lanes for each field of a ray. The fields `turned` are the origin in
 # the axis order kx, ky, kz. The field `axes` has kx, ky, kz, with AXIS_BITS each. The fields `near` are indices of near planes in a node.
+# The field `root` is only for rays of several worlds (wide/instances.py).
 FIELDS = ("origin_x", "origin_y", "origin_z", "inverse_x", "inverse_y", "inverse_z", "far_x", "far_y", "far_z", "t_min", "t",
           "direction_x", "direction_y", "direction_z", "turned_x", "turned_y", "turned_z", "shear_x", "shear_y", "shear_z",
-          "axes", "u", "v", "prim_id", "scale", "near_x", "near_y", "near_z", "exclude")
+          "axes", "u", "v", "prim_id", "scale", "near_x", "near_y", "near_z", "exclude", "root")
 FIELD = {name: LANES * i for i, name in enumerate(FIELDS)}  # Index in a packet of each field's first lane.
 AXIS_BITS = 2
 
@@ -104,8 +105,9 @@ KEY_MASK = 2 * WIDTH - 1
 # A level remains on the stack only for a node with two or more entered children. The traversal for one ray pushes an entry there, too.
 STACK_WORDS = LEVEL * (STACK_SIZE + 2)
 
-# A slot describes an interleaved ray: its column in `packets`, the next reference, and the index of the last level of its stack.
-SLOT_WORDS = ("ray", "next", "place")
+# A slot describes an interleaved ray: its column in `packets`, the next reference, the index of the last level of its stack, and the
+# placement whose structure it walks (wide/instances.py).
+SLOT_WORDS = ("ray", "next", "place", "placement")
 SLOT = {name: i for i, name in enumerate(SLOT_WORDS)}
 SLOT_SIZE = 4
 

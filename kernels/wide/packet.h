@@ -113,7 +113,7 @@ WRT_INLINE PacketRay packet_ray(const AllRays& packet) {
 
 WRT_INLINE Interval<Rays> interval_in(const PacketRay& ray, const Vec3<Rays>& near, const Vec3<Rays>& far) {
     Interval<Rays> t = {ray.t_min, ray.t_max};
-    narrow(t, near, far, ray.origin, ray.inv_dir, ray.far_inv_dir);
+    narrow(t, near, far, ray.origin, ray.origin, ray.inv_dir, ray.far_inv_dir);
     return t;
 }
 
@@ -153,10 +153,10 @@ template <bool ANY_HIT> WRT_INLINE void push(unsigned* stack, int begin, int siz
     at[ENTRY_RAYS] = rays;
 }
 
-// Push the children of a node that rays of the mask enter onto a stack of `size` entries; return the new size. The packet must have a beam.
+// Push the children of the node at `p` that rays of the mask enter onto a stack of `size` entries; return the new size. The packet must
+// have a beam. What the children's references lead to, in `nodes` or `primitives`, is prefetched.
 template <bool ANY_HIT>
-WRT_CALLED int children(const float* nodes, const float* primitives, float* packet, int node, int mask, unsigned* stack, int size) {
-    const float* const p = nodes + (long long)node * NODE_SIZE;
+WRT_INLINE int children_at(const float* p, const float* nodes, const float* primitives, float* packet, int mask, unsigned* stack, int size) {
     const int near[3] = {(int)packet[BEAM_NEAR_ROW], (int)packet[BEAM_NEAR_ROW + 1], (int)packet[BEAM_NEAR_ROW + 2]};
     const Interval<Children> beam = beam_interval(packet, p, near);
     const float *near_x = p + WIDTH * near[0], *near_y = p + WIDTH * near[1], *near_z = p + WIDTH * near[2];
@@ -178,9 +178,16 @@ WRT_CALLED int children(const float* nodes, const float* primitives, float* pack
     return top;
 }
 
-// Return the mask of the rays in `mask` that enter a child of the root, and store their entry distances in ROOT_ENTRIES.
-WRT_INLINE int rays_meeting_root(const float* root, int mask, float* packet) {
-    const PacketRay ray = packet_ray({packet});
+// Call children_at, without inlining, for the node with index `node`.
+template <bool ANY_HIT>
+WRT_CALLED int children(const float* nodes, const float* primitives, float* packet, int node, int mask, unsigned* stack, int size) {
+    return children_at<ANY_HIT>(nodes + (long long)node * NODE_SIZE, nodes, primitives, packet, mask, stack, size);
+}
+
+// Return the mask of the rays in `mask` that enter a child of the root, and store their entry distances in ROOT_ENTRIES. The rays have one
+// origin for near planes and one for far planes (box.h: narrow).
+WRT_INLINE int rays_meeting(const float* root, const PacketRay& ray, const Vec3<Rays>& near_origin, const Vec3<Rays>& far_origin, int mask,
+                            float* packet) {
     const BoxRay<Rays> box = {ray.origin, ray.inv_dir};
     const Rays never = all<Rays>(__builtin_inff());
     int out = 0;
@@ -188,11 +195,17 @@ WRT_INLINE int rays_meeting_root(const float* root, int mask, float* packet) {
         const float* const p = root + child;
         const auto lo = in_lanes<Rays>(Vec3<float>{{p[WIDTH * LO_X], p[WIDTH * LO_Y], p[WIDTH * LO_Z]}});
         const auto hi = in_lanes<Rays>(Vec3<float>{{p[WIDTH * HI_X], p[WIDTH * HI_Y], p[WIDTH * HI_Z]}});
-        const Interval<Rays> t = interval_in(ray, near_planes(box, lo, hi), near_planes(box, hi, lo));
+        Interval<Rays> t = {ray.t_min, ray.t_max};
+        narrow(t, near_planes(box, lo, hi), near_planes(box, hi, lo), near_origin, far_origin, ray.inv_dir, ray.far_inv_dir);
         store(packet + ROOT_ENTRIES + LANES * child, t.enter <= t.leave ? t.enter : never);
         out |= mask_of(t.enter <= t.leave);
     }
     return out & mask;
+}
+
+WRT_INLINE int rays_meeting_root(const float* root, int mask, float* packet) {
+    const PacketRay ray = packet_ray({packet});
+    return rays_meeting(root, ray, ray.origin, ray.origin, mask, packet);
 }
 
 // Return the mask of the rays whose t is at least t_entry.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import warp as wp
 
 from wrt.kernels.headers import with_headers
-from wrt.kernels.query import HitArrays, RayArrays
+from wrt.kernels.query import HitArrays, RenderRays
 from wrt.kernels.structs import Primitive, kernel
 from wrt.kernels.wide.layout import ENTRY, ENTRY_RAYS, LAYOUT_H, SLOT_SIZE, STACK_WORDS
 from wrt.kernels.wide.traverse import make_struct
@@ -51,8 +51,8 @@ def flag(value: bool) -> str:
 
 @cache
 def make_set_up(rays_struct: Any) -> Any:
-    """Return set_up for rays_struct: RayArrays, or RenderRays, whose directions it does not scale."""
-    plain = rays_struct is RayArrays
+    """Return set_up for rays_struct: RayArrays, WorldRays, or RenderRays, whose directions it does not scale."""
+    plain = rays_struct is not RenderRays
     excludes = "nullptr" if plain else "rays.exclude.data + first"
 
     @wp.func_native(f"""
@@ -138,7 +138,7 @@ class Steps(NamedTuple):
 def make_steps(any_hit: bool) -> Steps:
     slot = f"scratch.stacks.data, {STACK_WORDS} * slot, scratch.slots.data + {SLOT_SIZE} * slot"
 
-    @wp.func_native(f"return wrt::begin<{flag(any_hit)}>(accel.nodes.data, scratch.packets.data, ray, {slot});")
+    @wp.func_native(f"return wrt::begin<{flag(any_hit)}>(accel.nodes.data, 0, scratch.packets.data, ray, {slot});")
     def begin(accel: WideBvh, scratch: Scratch, slot: int, ray: int) -> int: ...
 
     @wp.func_native(f"return wrt::step<{flag(any_hit)}>(accel.nodes.data, scratch.packets.data, {slot});")

@@ -19,11 +19,14 @@ template <class RayArrays> WRT_INLINE RayPointers pointers_to(const RayArrays& r
             excludes, one_t_min, one_t_max};
 }
 
-struct SixteenRays {
-    Vec3<Rays> origin, direction;
-    Rays t_min, t_max;
-    RayInts exclude;
+// N rays in the units of a query.
+template <int N> struct RayBlock {
+    Vec3<typename Lanes<N>::Floats> origin, direction;
+    typename Lanes<N>::Floats t_min, t_max;
+    typename Lanes<N>::Ints exclude;
 };
+
+typedef RayBlock<LANES> SixteenRays;
 
 // Return component K of sixteen vectors of three, which are 48 consecutive floats: three vectors of lanes. The first two vectors have 11 or
 // 10 values of the component, the third has the others.
@@ -93,36 +96,62 @@ template <bool SCALED> WRT_INLINE Rays scale_rays(SixteenRays& rays) {
 }
 
 // Return t of the best hit before the traversal, as no_hit in traverse/common.py. A ray that is not finite gets an empty segment.
-WRT_INLINE Rays no_hit(const SixteenRays& rays) {
-    const Rays zero_x = 0.0f * rays.origin[0] + 0.0f * rays.direction[0], zero_y = 0.0f * rays.origin[1] + 0.0f * rays.direction[1];
-    const Rays zero_z = 0.0f * rays.origin[2] + 0.0f * rays.direction[2], largest = all<Rays>(LARGEST);
-    const Rays t = zero_x + zero_y + zero_z == 0.0f ? rays.t_max : all<Rays>(-__builtin_inff());
+template <int N> WRT_INLINE auto no_hit(const RayBlock<N>& rays) {
+    typedef typename Lanes<N>::Floats Floats;
+    const Floats zero_x = 0.0f * rays.origin[0] + 0.0f * rays.direction[0], zero_y = 0.0f * rays.origin[1] + 0.0f * rays.direction[1];
+    const Floats zero_z = 0.0f * rays.origin[2] + 0.0f * rays.direction[2], largest = all<Floats>(LARGEST);
+    const Floats t = zero_x + zero_y + zero_z == 0.0f ? rays.t_max : all<Floats>(-__builtin_inff());
     return t < largest ? t : largest;
 }
 
-WRT_INLINE Rays component(const Vec3<Rays>& v, RayInts k) { return k == 0 ? v[0] : (k == 1 ? v[1] : v[2]); }
+template <class T, class Int> WRT_INLINE T component(const Vec3<T>& v, Int k) { return k == 0 ? v[0] : (k == 1 ? v[1] : v[2]); }
 
-template <class Ray> WRT_INLINE void store_vector(const Ray& ray, int first, const Vec3<Rays>& v) {
+template <class Ray, class T> WRT_INLINE void store_vector(const Ray& ray, int first, const Vec3<T>& v) {
     for (int k = 0; k < 3; ++k) ray.put(first + LANES * k, v[k]);
 }
 
 // Store the rays' set-up for the triangle unit, as triangle_ray in units/triangle.py computes it.
-WRT_INLINE void store_triangle_ray(const AllRays& packet, const Vec3<Rays>& o, const Vec3<Rays>& d) {
-    const RayInts zero = {}, one = all<RayInts>(1), two = all<RayInts>(2);
-    const Rays size_x = absolute(d[0]), size_y = absolute(d[1]), size_z = absolute(d[2]);
-    RayInts kz = size_y > size_x ? one : zero;
+template <int N, class T> WRT_INLINE void store_triangle_ray(const SomeRays<N>& packet, const Vec3<T>& o, const Vec3<T>& d) {
+    typedef typename Lanes<N>::Ints Ints;
+    const Ints zero = {}, one = all<Ints>(1), two = all<Ints>(2);
+    const T size_x = absolute(d[0]), size_y = absolute(d[1]), size_z = absolute(d[2]);
+    Ints kz = size_y > size_x ? one : zero;
     kz = size_z > (kz == 0 ? size_x : size_y) ? two : kz;
-    const RayInts next = kz == 2 ? zero : kz + 1, after = next == 2 ? zero : next + 1;
-    const Rays d_z = component(d, kz);
-    const RayInts kx = d_z < 0.0f ? after : next, ky = d_z < 0.0f ? next : after;
+    const Ints next = kz == 2 ? zero : kz + 1, after = next == 2 ? zero : next + 1;
+    const T d_z = component(d, kz);
+    const Ints kx = d_z < 0.0f ? after : next, ky = d_z < 0.0f ? next : after;
     packet.put_bits(AXES, kx | ky << AXIS_BITS | kz << 2 * AXIS_BITS);
-    store_vector(packet, TURNED_X, {{component(o, kx), component(o, ky), component(o, kz)}});
-    store_vector(packet, SHEAR_X, {{component(d, kx) / d_z, component(d, ky) / d_z, 1.0f / d_z}});
+    store_vector(packet, TURNED_X, Vec3<T>{{component(o, kx), component(o, ky), component(o, kz)}});
+    store_vector(packet, SHEAR_X, Vec3<T>{{component(d, kx) / d_z, component(d, ky) / d_z, 1.0f / d_z}});
 }
 
 // Return the index of an axis's near planes in a node.
-WRT_INLINE RayInts near_row(Rays inv_dir, int lo, int hi) {
-    return inv_dir < 0.0f ? all<RayInts>(WIDTH * hi) : all<RayInts>(WIDTH * lo);
+template <int N> WRT_INLINE auto near_row(typename Lanes<N>::Floats inv_dir, int lo, int hi) {
+    typedef typename Lanes<N>::Ints Ints;
+    return inv_dir < 0.0f ? all<Ints>(WIDTH * hi) : all<Ints>(WIDTH * lo);
+}
+
+// Store the fields of N rays that have no hit yet, except SCALE; return their reciprocal directions.
+template <int N> WRT_INLINE auto store_rays(const SomeRays<N>& packet, const RayBlock<N>& rays, float far_pad) {
+    typedef typename Lanes<N>::Floats Floats;
+    typedef Vec3<Floats> Vector;
+    const Vector &o = rays.origin, &d = rays.direction;
+    const Vector i = {{1.0f / d[0], 1.0f / d[1], 1.0f / d[2]}};
+    store_vector(packet, ORIGIN_X, o);
+    store_vector(packet, DIRECTION_X, d);
+    store_vector(packet, INVERSE_X, i);
+    store_vector(packet, FAR_X, Vector{{far_pad * i[0], far_pad * i[1], far_pad * i[2]}});
+    packet.put_bits(NEAR_X, near_row<N>(i[0], LO_X, HI_X));
+    packet.put_bits(NEAR_Y, near_row<N>(i[1], LO_Y, HI_Y));
+    packet.put_bits(NEAR_Z, near_row<N>(i[2], LO_Z, HI_Z));
+    store_triangle_ray<N>(packet, o, d);
+    packet.put(T_MIN, rays.t_min);
+    packet.put_bits(EXCLUDE, rays.exclude);
+    packet.put(T, rays.t_max);
+    packet.put(U, Floats{});
+    packet.put(V, Floats{});
+    packet.put_bits(PRIM_ID, all<typename Lanes<N>::Ints>(NO_HIT));
+    return i;
 }
 
 // Return the minimum of each two neighbouring lanes: of a in the lower half of the result, of b in the upper half. Four layers of calls
@@ -177,21 +206,7 @@ template <bool SCALED> WRT_CALLED int set_up(const RayPointers& from, int count,
     store(numbers + REFUSED, refused(rays));
     packet.put(SCALE, scale_rays<SCALED>(rays));
     rays.t_max = no_hit(rays);
-    const Vec3<Rays>&o = rays.origin, &d = rays.direction, i = {{1.0f / d[0], 1.0f / d[1], 1.0f / d[2]}};
-    store_vector(packet, ORIGIN_X, o);
-    store_vector(packet, DIRECTION_X, d);
-    store_vector(packet, INVERSE_X, i);
-    store_vector(packet, FAR_X, {{far_pad * i[0], far_pad * i[1], far_pad * i[2]}});
-    packet.put_bits(NEAR_X, near_row(i[0], LO_X, HI_X));
-    packet.put_bits(NEAR_Y, near_row(i[1], LO_Y, HI_Y));
-    packet.put_bits(NEAR_Z, near_row(i[2], LO_Z, HI_Z));
-    store_triangle_ray(packet, o, d);
-    packet.put(T_MIN, rays.t_min);
-    packet.put_bits(EXCLUDE, rays.exclude);
-    packet.put(T, rays.t_max);
-    packet.put(U, Rays{});
-    packet.put(V, Rays{});
-    packet.put_bits(PRIM_ID, all<RayInts>(NO_HIT));
+    const Vec3<Rays> i = store_rays<LANES>(packet, rays, far_pad);
     const int active = mask_of(rays.t_max >= rays.t_min) & ((1 << count) - 1);
     return store_beam(numbers, rays, i, active, far_pad) ? active | COHERENT : active;
 }

@@ -14,7 +14,8 @@ from wrt.accel.instanced_geometry import MAX_SPREAD, InstancedGeometry, inverse_
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.structure import Structure
 from wrt.accel.top_level import BOXES, MOVED_BOXES, Boxes, build_top, part_boxes, refit_top, spread_of, world_boxes
-from wrt.core.arrays import real_numbers
+from wrt.accel.wide_top import widen
+from wrt.core.arrays import real_numbers, to_warp
 from wrt.core.checks import shown
 from wrt.core.default_device import DEFAULT_DEVICE
 from wrt.core.device import upload
@@ -48,6 +49,7 @@ class Instances(Accelerator):
         self._bottom_snapshots = [bottom.snapshot for bottom in self.bottoms]
         self._bottoms = wp.array([each.data for each in self._bottom_snapshots], dtype=self.structure.bottom, device=self.device)
         self._top = build_top(geometry, *world_boxes(geometry, np.arange(len(geometry.part)), self._boxes(geometry, BOXES)))
+        self._wide = widen(self._top.nodes, self._top.roots)
         self._roots = upload(self._top.roots, wp.int32, self.device)
         self._install_top(geometry, begin, self._top.cost)
 
@@ -59,6 +61,8 @@ class Instances(Accelerator):
         top, data = self._top, self.structure.struct()
         sizes = np.array([top.nodes.nbytes, *(each.stats.bytes for each in self._bottom_snapshots)], np.int64)
         data.nodes = upload(top.nodes, fields_of(data)["nodes"].dtype, self.device)
+        if self.structure.accel.stream is not None and self.device.is_cpu:
+            data.wide, data.roots = to_warp(self._wide.nodes(top.nodes)), to_warp(self._wide.roots)
         data.placements = upload(top.placements, Placement, self.device)
         data.bottoms, data.slack = self._bottoms, top.slack
         data.bases = upload(np.cumsum((sizes + ALIGNMENT - 1) // ALIGNMENT * ALIGNMENT)[:-1], wp.int64, self.device)
@@ -111,7 +115,7 @@ class Instances(Accelerator):
             growth = top.cost / cost if cost > 0.0 else 1.0
             if rebuilt := growth > rebuild_at:
                 top = build_top(geometry, top.low, top.high)
-                cost = top.cost
+                self._wide, cost = widen(top.nodes, top.roots), top.cost
             self._top = top
             self._install_top(geometry, begin, cost)
             return Refit(self.stats.build_seconds, growth, rebuilt)

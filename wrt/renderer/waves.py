@@ -26,7 +26,7 @@ from wrt.kernels.shade.sampling import LANES
 from wrt.kernels.shade.shading import make_cutout
 from wrt.kernels.shade.shadows import ShadowWalk
 from wrt.kernels.shade.step import PendingLight, Sample
-from wrt.kernels.wide.batch import BatchTraversal
+from wrt.kernels.wide.stream import BatchTraversal
 from wrt.renderer.film_arrays import AovFilm, DeviceFilm
 from wrt.renderer.tiles import Work
 

@@ -20,10 +20,11 @@ from wrt.io.mesh_file import load_mesh
 from wrt.kernels.query import HitArrays, RenderRays, make_render_rays_kernel
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.traverse.common import Units
-from wrt.kernels.wide.batch import MAX_FAILED, PACKETS, BatchTraversal
+from wrt.kernels.wide.batch import MAX_FAILED, PACKETS
 from wrt.kernels.wide.layout import LANES, STACK_SIZE
 from wrt.kernels.wide.packets import FAILED, PAUSED
 from wrt.kernels.wide.references import EMPTY, leaf_reference
+from wrt.kernels.wide.stream import BatchTraversal
 from wrt.lab.bench.rays import ray_sets
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
@@ -228,8 +229,7 @@ def test_packets_are_given_up_where_they_fall_apart():
 
 def test_units_without_lanes_have_no_stream():
     bvh8 = ACCELERATORS["bvh8"]
-    for units in (Units(triangle="moeller_trumbore"), Units(box="plain"), Units(counters=True), Units(instances=True),
-                  Units(resumes=True)):
+    for units in (Units(triangle="moeller_trumbore"), Units(box="plain"), Units(counters=True), Units(resumes=True)):
         assert tracer(Structure(bvh8, units), False).stream is None
     assert tracer(Structure(ACCELERATORS["bvh2"]), False).stream is None
     assert tracer(Structure(bvh8, Units(box="minmax")), True).stream is not None

@@ -18,9 +18,9 @@ from wrt.accel.structures import stack_on
 from wrt.core.arrays import to_warp
 from wrt.core.device import empty_aligned, launch_on, load_kernel, made_once, memory_of
 from wrt.core.threads import run_all
-from wrt.core.types import Array, Device, Kernel, KernelModule, WarpStruct
+from wrt.core.types import Array, Device, Kernel, KernelModule, WarpStruct, WarpType
 from wrt.core.warp_private import array_record, record_of, struct_record
-from wrt.kernels.query import HitArrays, RayArrays
+from wrt.kernels.query import HitArrays, RayArrays, WorldRays
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.warp_private import fields_of
 from wrt.kernels.wide.packets import ANY_REFUSED, REPORT_SIZE, Scratch
@@ -47,12 +47,15 @@ class Query(NamedTuple):
 
 def trace_query(snapshot: Snapshot, query: Query) -> None:
     """Trace the rays and write the results to query.out. Raises InputError for invalid rays, after some results are written."""
-    if query.worlds is not None:
-        trace_worlds(snapshot, query, query.worlds)
-    elif snapshot.device.is_cuda:
+    any_hit = len(query.out) == 1
+    if snapshot.device.is_cuda and query.worlds is None:
         trace_on_gpu(snapshot, query)
+    elif query.worlds is None:
+        tracer(snapshot.structure, any_hit).trace(snapshot, query)
+    elif snapshot.device.is_cuda or not has_stream(snapshot.structure):
+        trace_worlds(snapshot, query, query.worlds)
     else:
-        tracer(snapshot.structure, len(query.out) == 1).trace(snapshot, query)
+        world_tracer(snapshot.structure, any_hit).trace(snapshot, query)
 
 
 def parts(n: int, threads: int, block: int) -> list[tuple[int, int]]:
@@ -67,17 +70,21 @@ def parts(n: int, threads: int, block: int) -> list[tuple[int, int]]:
 
 
 class Tracer:
-    """Tracer of queries on the CPU. It holds the kernel for a structure, and workers that later calls reuse."""
+    """Tracer of queries on the CPU. It holds the kernel for a structure, and workers that later calls reuse.
 
-    def __init__(self, structure: Structure, any_hit: bool) -> None:
+    rays: RayArrays, or WorldRays if each ray has its own world, which only a structure with a `stream` supports.
+    """
+
+    def __init__(self, structure: Structure, any_hit: bool, rays: WarpType = RayArrays) -> None:
         stream: KernelModule = structure.accel.stream
         # Kernel that traces many rays at a time, or None if the structure has no such kernel.
-        self.stream = stream and stream.make_stream(structure.units, any_hit)
+        self.rays = rays
+        self.stream = stream and stream.make_stream(structure.units, any_hit, self.rays)
         self.kernel = self.stream or (any_hit_kernel if any_hit else closest_hit_kernel)(structure)
         self.block = stream.stream_block if self.stream else 1
         self.sizes = stream.stream_sizes if self.stream else ()
         self.types = ANY_HIT_TYPES if any_hit else HIT_TYPES
-        self.inputs = structure.struct(), Surfaces(), RayArrays(), None if any_hit else HitArrays()
+        self.inputs = structure.struct(), Surfaces(), self.rays(), None if any_hit else HitArrays()
         self.free: list[Worker] = []
 
     def trace(self, snapshot: Snapshot, query: Query) -> None:
@@ -87,7 +94,10 @@ class Tracer:
             rays = rays.checked()
         inputs, results = [np.asarray(array) for array in rays], [np.asarray(array) for array in query.out]
         n = len(inputs[0])
-        packed = pack(inputs, results) if SMALL < n <= MOST_PACKED and all(map(readable, inputs)) else None
+        in_place = SMALL < n <= MOST_PACKED and all(map(readable, inputs))
+        if query.worlds is not None:
+            inputs.append(query.worlds.arrays.id.numpy())
+        packed = pack(self.rays, inputs, results) if in_place else None
         if packed and self.stream:
             ranges = parts(n, threads, self.block) if n > FEWEST else [(0, n)]
         else:
@@ -116,7 +126,13 @@ class Tracer:
             return Worker(self)
 
 
-tracer = made_once(Tracer)
+tracer, world_tracer = made_once(Tracer), made_once(partial(Tracer, rays=WorldRays))
+
+
+@made_once
+def has_stream(structure: Structure) -> bool:
+    """Return whether the structure has a CPU kernel that traces many rays at a time."""
+    return tracer(structure, False).stream is not None
 
 
 def new_scratch(sizes: tuple[int, ...]) -> WarpStruct:
@@ -137,7 +153,9 @@ class Worker:
         load_kernel(tracer.kernel, wp.get_device("cpu"))
         self.rays = [np.empty((FEWEST, 3), np.float32), np.empty((FEWEST, 3), np.float32), *np.empty((2, FEWEST), np.float32)]
         self.results = [np.empty(FEWEST, dtype) for dtype in tracer.types.values()]
-        self.packed = pack(self.rays, self.results)
+        if tracer.rays is WorldRays:
+            self.rays.append(np.empty(FEWEST, np.int32))
+        self.packed = pack(tracer.rays, self.rays, self.results)
         self.block, self.scratch = tracer.block, new_scratch(tracer.sizes)
         self.report = self.scratch.report.numpy() if tracer.stream else np.zeros(REPORT_SIZE, np.int32)
         own = [self.scratch, 0] if tracer.stream else []
@@ -178,9 +196,9 @@ def readable(array: np.ndarray) -> bool:
     return array.dtype == np.float32 and array.flags.aligned and (array.flags.c_contiguous or array.strides == (0,))
 
 
-def pack(rays: list[np.ndarray], results: list[np.ndarray]) -> tuple[Any, Any]:
-    """Make kernel records of rays and results: RayArrays, and HitArrays or an array of bool. The caller must keep the arrays."""
-    return struct_record(RayArrays, rays), struct_record(HitArrays, results) if len(results) > 1 else array_record(results[0])
+def pack(kind: WarpType, rays: list[np.ndarray], results: list[np.ndarray]) -> tuple[Any, Any]:
+    """Make kernel records of rays (`kind`) and results (HitArrays or an array of bool). The caller must keep the arrays."""
+    return struct_record(kind, rays), struct_record(HitArrays, results) if len(results) > 1 else array_record(results[0])
 
 
 def rays_on_gpu(n: int, device: Device) -> int:

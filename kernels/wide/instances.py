@@ -1,0 +1,320 @@
+"""Traversal of instances for many rays on the CPU. The hits have the bits of traverse/instances.py, which walks with one ray at a time.
+
+The upper level is a wide BVH whose leaves are single placements. Packets and interleaved rays walk it as they walk a structure over one
+mesh (wide/batch.py). At a placement, the rays of a packet that enter its box change to its space together, and walk its structure as a
+packet of their own. An interleaved ray changes to its space alone, and its slot continues with the steps of the placed structure."""
+
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from wrt.kernels.headers import with_headers
+from wrt.kernels.memory import put_int
+from wrt.kernels.query import HitArrays, RayArrays, WorldRays
+from wrt.kernels.structs import Surfaces, kernel
+from wrt.kernels.traverse.common import Units
+from wrt.kernels.traverse.instances import make_struct
+from wrt.kernels.traverse.stack import reference_of, t_of
+from wrt.kernels.wide.batch import (
+    MAX_FAILED,
+    MIN_VISITS,
+    PACKETS,
+    PAUSE,
+    SLOTS,
+    make_interleaved,
+    make_packet_walk,
+    make_row_test,
+)
+from wrt.kernels.wide.lanes import bits, lowest
+from wrt.kernels.wide.lanes import value as number
+from wrt.kernels.wide.layout import (
+    ACTIVE,
+    COHERENT,
+    ENTRY,
+    FIELD,
+    LANES,
+    LAYOUT_H,
+    PACKET_SIZE,
+    REFUSED,
+    ROW_SIZE,
+    SLOT,
+    SLOT_SIZE,
+    STACK_WORDS,
+    WIDTH,
+)
+from wrt.kernels.wide.nodes import far_pad
+from wrt.kernels.wide.packets import (
+    ANY_REFUSED,
+    FAILED,
+    PAUSED,
+    REPORT_SIZE,
+    Scratch,
+    WideBvh,
+    count_of,
+    flag,
+    key_at,
+    lowest_of_all,
+    make_set_up,
+    make_steps,
+    prefetch_next,
+    rays_at,
+    rays_meeting_root,
+    rays_reaching,
+    slot_at,
+    store_bits,
+    write_hits,
+    write_occluded,
+)
+from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
+
+Instances = make_struct(WideBvh)
+HEADERS = with_headers("wide/instances.h", layout=LAYOUT_H)
+
+# The first packets of Scratch are in the spaces of placements: of a packet that walks, and of the ray in each slot. Scratch has two stacks
+# and two slots for each interleaved ray. The second, at an index higher by SLOTS, is for the upper level. Packets use its stacks, too.
+PLACED = (SLOTS + LANES - 1) // LANES
+TOP_STACK = STACK_WORDS * SLOTS // ENTRY  # First entry of a packet's stack in the upper level.
+FEW_PLACED = 3  # If at most so many rays of a packet enter a placement, they are interleaved.
+
+
+def make_instance_steps(any_hit: bool, pad: float) -> Any:
+    """Return functions for walks of the upper level, and for the change between levels. Each calls C++ (instances.h)."""
+    stack = f"scratch.stacks.data, {STACK_WORDS} * slot, scratch.slots.data + {SLOT_SIZE} * slot"
+    hits = flag(any_hit)
+
+    @wp.func_native(f"""
+    return wrt::top_children<{hits}>(accel.wide.data, accel.slack, scratch.packets.data + base, reference, mask, scratch.stacks.data, size);
+    """)
+    def children(accel: Instances, scratch: Scratch, base: int, reference: int, mask: int, size: int) -> int:
+        """As packets.make_children."""
+
+    @wp.func_native("""
+    return wrt::rays_meeting_top(accel.wide.data, root, accel.slack, mask, scratch.packets.data + base);
+    """)
+    def rays_meeting(accel: Instances, scratch: Scratch, base: int, root: int, mask: int) -> int:
+        """As rays_meeting_root."""
+
+    @wp.func_native(f"return wrt::begin<{hits}>(accel.wide.data, root, scratch.packets.data, ray, {stack});")
+    def begin(accel: Instances, scratch: Scratch, slot: int, root: int, ray: int) -> int:
+        """As Steps.begin."""
+
+    @wp.func_native(f"return wrt::top_step<{hits}>(accel.wide.data, accel.slack, scratch.packets.data, {stack});")
+    def step(accel: Instances, scratch: Scratch, slot: int) -> int:
+        """As Steps.step."""
+
+    @wp.func_native(f"return wrt::pop<{hits}>(accel.wide.data, reach, {stack});")
+    def pop(accel: Instances, scratch: Scratch, slot: int, reach: float) -> int:
+        """As Steps.pop."""
+
+    @wp.func_native(f"""
+    return wrt::place_packet(scratch.packets.data + base, accel.placements.data[placement], mask, {pad!r}, scratch.packets.data);
+    """)
+    def place_packet(accel: Instances, placement: int, scratch: Scratch, base: int, mask: int) -> int:
+        """Set up the rays of the mask in a placement's space, as packet 0. Return as set_up."""
+
+    @wp.func_native(f"wrt::take_hits<{LANES}, {hits}>({{scratch.packets.data + base}}, accel.placements.data[placement], {{scratch.packets.data}});")
+    def take_packet(accel: Instances, placement: int, scratch: Scratch, base: int) -> None:
+        """Store the hits of packet 0 that are better than those of the packet at `base`, whose rays it has."""
+
+    @wp.func_native(f"wrt::place_ray(scratch.packets.data + ray, accel.placements.data[placement], {pad!r}, scratch.packets.data + local);")
+    def place_ray(accel: Instances, placement: int, scratch: Scratch, ray: int, local: int) -> None:
+        """Set up a ray in a placement's space. ray, local: indices of its columns."""
+
+    @wp.func_native(f"wrt::take_hits<1, {hits}>({{scratch.packets.data + ray}}, accel.placements.data[placement], {{scratch.packets.data + local}});")
+    def take_hit(accel: Instances, placement: int, scratch: Scratch, ray: int, local: int) -> None:
+        """As take_packet, for one ray."""
+
+    return children, rays_meeting, begin, step, pop, place_packet, take_packet, place_ray, take_hit
+
+
+@wp.func_native(f"int* const s = slots.data + {SLOT_SIZE} * slot; s[{SLOT['ray']}] = ray; s[{SLOT['next']}] = next; s[{SLOT['place']}] = {STACK_WORDS} * slot; s[{SLOT['placement']}] = placement;")
+def fill_slot(slots: wp.array(dtype=wp.int32), slot: int, ray: int, next: int, placement: int) -> None: ...
+
+
+@wp.func_native("""
+    return wrt::store_roots(rays.world.data + (rays.world.strides[0] == 0 ? 0 : first), rays.world.strides[0] != 0, accel.roots.data,
+                            accel.roots.shape[0], count, active, scratch.packets.data + base);
+""")
+def store_roots(accel: Instances, rays: WorldRays, first: int, count: int, active: int, scratch: Scratch, base: int) -> int: ...
+
+
+def make_top_walk(units: Units, any_hit: bool) -> Any:
+    """Return walk, which traces a packet of rays through the instances. The packet must have a beam."""
+    children, _, _, _, _, place_packet, take_packet, _, _ = make_instance_steps(any_hit, far_pad(units.box))
+    walk_packet = make_packet_walk(units, any_hit, None)
+    interleaved = make_interleaved(units, any_hit, None)
+
+    @wp.func
+    def visit(accel: Instances, surfaces: Surfaces, placement: int, mask: int, scratch: Scratch, base: int):
+        """Trace the rays of the mask through a placement's structure."""
+        bottom = accel.bottoms[accel.placements[placement].bottom]
+        active = place_packet(accel, placement, scratch, base, mask)
+        if active >= COHERENT and count_of(mask) > FEW_PLACED:
+            walk_packet(bottom, surfaces, scratch, 0, active - COHERENT)
+        else:
+            active = rays_meeting_root(bottom, scratch, 0, active & wp.static(COHERENT - 1))
+            interleaved(bottom, surfaces, scratch, wp.uint64(active))
+        take_packet(accel, placement, scratch, base)
+
+    @wp.func
+    def walk(accel: Instances, surfaces: Surfaces, scratch: Scratch, base: int, root: int, active: int) -> bool:
+        """Trace the rays in the mask `active` from the node `root`. Return whether on average at least MIN_VISITS of them entered each placement."""
+        visits = int(0)
+        rays = int(0)
+        size = int(TOP_STACK)
+        reference = int(root)
+        mask = int(active)
+        while True:
+            if reference < 0:
+                visits += 1
+                rays += count_of(mask)
+                visit(accel, surfaces, leaf_first(reference), mask, scratch, base)
+            else:
+                size = children(accel, scratch, base, reference, mask, size)
+            mask = int(0)
+            while size > TOP_STACK and mask == 0:
+                size = size - 1
+                mask = rays_at(scratch.stacks, size) & rays_reaching(t_of(key_at(scratch.stacks, size)), scratch, base)
+            if mask == 0:
+                break
+            reference = reference_of(key_at(scratch.stacks, size))
+        return rays >= MIN_VISITS * visits
+
+    return walk
+
+
+def make_top_interleaved(units: Units, any_hit: bool, worlds: bool) -> Any:
+    """Return interleaved, which traces rays of PACKETS packets through the instances, one step of each ray in turn.
+
+    The mask `waiting` has a bit for each ray to trace: bit LANES * packet + lane, of the packets behind the first PLACED ones."""
+    _, _, top_begin, top_step, top_pop, _, _, place_ray, take_hit = make_instance_steps(any_hit, far_pad(units.box))
+    test_row = make_row_test(units, any_hit, None, True)
+    _, step, pop = make_steps(any_hit)
+
+    @wp.func
+    def descend(accel: Instances, scratch: Scratch, slot: int, next: int) -> bool:
+        """Walk the upper level to the ray's next placement, and change to its space. Return False if there is none."""
+        top = SLOT_SIZE * (SLOTS + slot)
+        while next > 0:
+            next = top_step(accel, scratch, SLOTS + slot)
+        if next == EMPTY:
+            return False
+        local = slot / LANES * PACKET_SIZE + slot % LANES
+        placement = leaf_first(next)
+        place_ray(accel, placement, scratch, slot_at(scratch.slots, top + wp.static(SLOT["ray"])), local)
+        fill_slot(scratch.slots, slot, local, 0, placement)
+        return True
+
+    @wp.func
+    def start(accel: Instances, scratch: Scratch, slot: int, ray: int) -> bool:
+        """Put ray `ray` = LANES * packet + lane into a slot. Return False if it enters no placement."""
+        column = (PLACED + ray / LANES) * PACKET_SIZE + ray % LANES
+        root = int(0)
+        if wp.static(worlds):
+            root = bits(scratch.packets, column + wp.static(FIELD["root"]))
+            if root < 0:
+                fill_slot(scratch.slots, SLOTS + slot, column, ~root, 0)
+                return descend(accel, scratch, slot, top_step(accel, scratch, SLOTS + slot))
+        return descend(accel, scratch, slot, top_begin(accel, scratch, SLOTS + slot, root, column))
+
+    @wp.func
+    def turn(accel: Instances, surfaces: Surfaces, scratch: Scratch, slot: int) -> bool:
+        """Visit the node or leaf of a slot's ray, and choose the next one. Return False if the ray is finished."""
+        words = slot * SLOT_SIZE
+        placement = slot_at(scratch.slots, words + wp.static(SLOT["placement"]))
+        bottom = accel.bottoms[accel.placements[placement].bottom]
+        reference = slot_at(scratch.slots, words + wp.static(SLOT["next"]))
+        finished = bool(False)
+        if reference < 0:
+            ray = slot_at(scratch.slots, words + wp.static(SLOT["ray"]))
+            left = leaf_count(reference)
+            first = leaf_first(reference) * ROW_SIZE
+            while left > 0 and not finished:
+                finished = test_row(bottom, first, wp.min(left, WIDTH), surfaces, scratch, ray)
+                left = left - WIDTH
+                first = first + ROW_SIZE
+            next = int(EMPTY)
+            if not finished:
+                next = pop(bottom, scratch, slot, number(scratch.packets, ray + wp.static(FIELD["t"])))
+        else:
+            next = step(bottom, scratch, slot)
+        if next != EMPTY:
+            prefetch_next(bottom, next)
+            return True
+        ray = slot_at(scratch.slots, words + SLOT_SIZE * SLOTS + wp.static(SLOT["ray"]))
+        take_hit(accel, placement, scratch, ray, slot_at(scratch.slots, words + wp.static(SLOT["ray"])))
+        if finished:
+            return False
+        return descend(accel, scratch, slot, top_pop(accel, scratch, SLOTS + slot, number(scratch.packets, ray + wp.static(FIELD["t"]))))
+
+    @wp.func
+    def interleaved(accel: Instances, surfaces: Surfaces, scratch: Scratch, waiting: wp.uint64):
+        live = int(0)
+        todo = int(wp.static((1 << SLOTS) - 1))  # Slots that are free, or whose ray takes its next step.
+        while todo != 0:
+            while todo != 0:
+                slot = lowest(todo)
+                todo = todo & (todo - 1)
+                goes_on = bool(False)
+                if (live >> slot) & 1 != 0:
+                    goes_on = turn(accel, surfaces, scratch, slot)
+                while waiting != wp.uint64(0) and not goes_on:
+                    goes_on = start(accel, scratch, slot, lowest_of_all(waiting))
+                    waiting = waiting & (waiting - wp.uint64(1))
+                live = wp.where(goes_on, live | (1 << slot), live & ~(1 << slot))
+            todo = int(live)
+
+    return interleaved
+
+
+@cache
+def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays) -> Any:
+    """Return the kernel of batch.make_kernel for instances."""
+    worlds = rays_struct is WorldRays
+    walk, interleaved = make_top_walk(units, any_hit), make_top_interleaved(units, any_hit, worlds)
+    set_up, rays_meeting = make_set_up(rays_struct), make_instance_steps(any_hit, far_pad(units.box))[1]
+    write = write_occluded if any_hit else write_hits
+    out_type = wp.array(dtype=wp.bool) if any_hit else HitArrays
+
+    def trace(accel: Instances, surfaces: Surfaces, rays: rays_struct, out: out_type, scratch: Scratch, first: int, end: int):
+        put_int(scratch.report, FAILED, 0)
+        put_int(scratch.report, PAUSED, 0)
+        put_int(scratch.report, ANY_REFUSED, 0)
+        for block in range(first, end, wp.static(PACKETS * LANES)):
+            single_rays = wp.uint64(0)
+            packets = wp.min((end - block + LANES - 1) / LANES, PACKETS)
+            for p in range(packets):
+                base = PACKET_SIZE * (PLACED + p)
+                count = wp.min(end - block - LANES * p, LANES)
+                active = set_up(rays, block + LANES * p, count, wp.static(far_pad(units.box)), scratch, base)
+                if wp.static(worlds):
+                    active = store_roots(accel, rays, block + LANES * p, count, active, scratch, base)
+                store_bits(scratch.packets, base + ACTIVE, active)
+                if bits(scratch.packets, base + REFUSED) != 0:
+                    put_int(scratch.report, ANY_REFUSED, 1)
+            for p in range(packets):
+                base = PACKET_SIZE * (PLACED + p)
+                active = bits(scratch.packets, base + ACTIVE)
+                paused = slot_at(scratch.report, PAUSED)
+                root = int(0)
+                if wp.static(worlds) and active != 0:
+                    root = bits(scratch.packets, base + wp.static(FIELD["root"]) + lowest(active))
+                if active >= COHERENT and paused == 0:
+                    coherent = walk(accel, surfaces, scratch, base, root, active - COHERENT)
+                    failed = wp.where(coherent, 0, slot_at(scratch.report, FAILED) + 1)
+                    if failed == MAX_FAILED:
+                        failed = failed - 1
+                        put_int(scratch.report, PAUSED, PAUSE)
+                    put_int(scratch.report, FAILED, failed)
+                else:
+                    put_int(scratch.report, PAUSED, wp.max(paused - 1, 0))
+                    active = active & wp.static(COHERENT - 1)
+                    if root >= 0:
+                        active = rays_meeting(accel, scratch, base, root, active)
+                    single_rays = single_rays | (wp.uint64(active) << wp.uint64(LANES * p))
+            interleaved(accel, surfaces, scratch, single_rays)
+            for p in range(packets):
+                write(out, block + LANES * p, wp.min(end - block - LANES * p, LANES), scratch, PACKET_SIZE * (PLACED + p))
+
+    return kernel(trace, extra_build_options=HEADERS)

@@ -1,0 +1,143 @@
+"""Batches through instances and worlds: the hits have the bits of the kernel for one ray, for any mixture of rays."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests.kernel_tools import cpu_only, launch, zeros
+from tests.kernels.wide.test_batch import assert_same, mixed_rays, new_hits
+
+import wrt  # isort: skip (after Warp is started)
+import warp as wp
+
+from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES, answer_arrays
+from wrt.accel.queries.batches import Query, new_scratch, trace_worlds, tracer, world_tracer
+from wrt.accel.queries.rays import rays_of
+from wrt.accel.queries.world_ids import check_world
+from wrt.accel.scenes.flatten import flatten
+from wrt.accel.scenes.instancing import instanced_meshes
+from wrt.accel.structure import Structure
+from wrt.accel.structures import ACCELERATORS
+from wrt.kernels.query import RenderRays, make_render_rays_kernel
+from wrt.kernels.traverse.common import Units
+from wrt.kernels.wide.stream import BatchTraversal
+from wrt.scene.shapes import icosphere
+
+pytestmark = cpu_only
+
+
+def placed(rng, scale):
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.random(random_state=rng.integers(1 << 30)).as_matrix() @ np.diag(scale * rng.choice([-1.0, 1.0], 3))
+    matrix[:3, 3] = rng.normal(size=3)
+    return matrix
+
+
+def scene(count, seed, spheres=0):
+    """Return balls of two meshes, some of them sheared, mirrored or twice at the same place, and a mesh that fits no other."""
+    rng = np.random.default_rng(seed)
+    meshes = [icosphere(3), icosphere(2), wrt.Mesh([[-3, -3, -2], [3, -3, -2], [0, 3, -2]], [[0, 1, 2]])]
+    objects = [wrt.Object(meshes[i % 2], wrt.Material(), transform=placed(rng, rng.uniform(0.1, 0.4, 3))) for i in range(count)]
+    objects += [wrt.Object(each.mesh, wrt.Material(), transform=each.transform) for each in objects[:3]]
+    balls = [wrt.Sphere(tuple(rng.normal(size=3)), 0.3, wrt.Material()) for _ in range(spheres)]
+    return wrt.Scene([*objects, wrt.Object(meshes[2], wrt.Material())], spheres=balls)
+
+
+@cache
+def one_world(count):
+    return wrt.build([scene(count, count)], threads=1)
+
+
+@pytest.mark.parametrize("count", [1, 7, 60])
+@pytest.mark.parametrize("n", [1, 63, 4000])
+def test_hits_have_the_bits_of_one_ray(count, n):
+    accel = one_world(count)
+    o, d, t_min, t_max = mixed_rays(n, n)
+    prim_id = assert_same(accel, o, d)
+    assert_same(accel, o, d, t_min, np.maximum(t_max, t_min))
+    assert n < 1000 or (prim_id >= 0).mean() > 0.1
+
+
+def test_axis_parallel_rays_and_far_origins():
+    accel, (o, d, _, _) = one_world(60), mixed_rays(3000, 5)
+    along = np.eye(3, dtype=np.float32)[np.arange(len(o)) % 3] * np.where(np.arange(len(o)) % 2, 1, -1)[:, None]
+    assert_same(accel, o, along)
+    assert_same(accel, o, np.where(np.arange(len(o))[:, None] % 40 < 20, along * np.float32(-0.0) + d, along))
+    assert_same(accel, -4e5 * d, d)
+    assert_same(accel, o * np.float32(1e20), -o)
+
+
+@pytest.mark.parametrize("size", [1e-30, 1e-12, 1e12, 1e24])
+def test_directions_are_scaled_between_spaces_of_different_size(size):
+    rng = np.random.default_rng(3)
+    mesh = wrt.Mesh(icosphere(2).vertices * np.float32(size), icosphere(2).faces)
+    objects = [wrt.Object(mesh, wrt.Material(), transform=placed(rng, 0.5 / size)) for _ in range(5)]
+    accel = wrt.build([wrt.Scene(objects)])
+    o, d, t_min, t_max = mixed_rays(1000, 6)
+    assert (assert_same(accel, o, d, t_min, np.maximum(t_max, t_min)) >= 0).any()
+    assert_same(accel, o, d * np.float32(1e-30))
+
+
+def test_moved_instances():
+    accel, rng = wrt.build([scene(30, 1)], threads=1), np.random.default_rng(8)
+    o, d, _, _ = mixed_rays(1000, 7)
+    for rebuild_at in (np.inf, 0.0):
+        accel.move(np.arange(20), np.stack([placed(rng, [0.3, 0.2, 0.1]) for _ in range(20)]), rebuild_at)
+        assert_same(accel, o, d)
+
+
+@pytest.mark.parametrize("together", [1, 16, 50, 4000])
+def test_rays_of_several_worlds(together):
+    accel = wrt.build([scene(5, 0), icosphere(1), scene(1, 3), scene(20, 4)], threads=1)
+    o, d, t_min, t_max = mixed_rays(4000, 9)
+    ids = wp.array(np.random.default_rng(0).integers(-1, 6, 4000).repeat(together)[:4000].astype(np.int32), device="cpu")
+    rays, worlds = rays_of(o, d, t_min, np.maximum(t_max, t_min)), check_world(accel.snapshot, ids, 4000)
+    for types, query in ((HIT_TYPES, accel.closest_hit), (ANY_HIT_TYPES, accel.any_hit)):
+        assert world_tracer(accel.structure, types is ANY_HIT_TYPES).stream is not None
+        expected = answer_arrays(types, None, 4000, None, False)
+        trace_worlds(accel.snapshot, Query(rays, expected, 1, worlds), worlds)
+        for threads, some in ((1, slice(None)), (2, slice(None)), (1, slice(700))):
+            found = query(o[some], d[some], t_min[some], np.maximum(t_max, t_min)[some], threads, world=ids[some])
+            found = [found.t, found.u, found.v, found.prim_id] if types is HIT_TYPES else [found]
+            for mine, theirs in zip(found, expected, strict=True):
+                np.testing.assert_array_equal(mine, np.asarray(theirs)[some])
+    np.testing.assert_array_equal(accel.any_hit(o, d, world=3), accel.any_hit(o, d, world=np.full(4000, 3)))
+
+
+def test_an_empty_world_is_missed():
+    accel = wrt.build([scene(3, 0), wrt.Scene([])])
+    o, d, _, _ = mixed_rays(200, 2)
+    assert not accel.any_hit(o, d, world=1).any() and accel.any_hit(o, d, world=0).any()
+
+
+@pytest.mark.parametrize("any_hit", [False, True])
+def test_rays_of_pictures(any_hit):
+    objects = scene(40, 2, spheres=3)
+    accel = wrt.build(flatten(objects, instanced_meshes(objects, "always")).geometry)
+    assert accel.structure.units.instances and accel.structure.units.spheres
+    o, d, _, t_max = mixed_rays(3000, 4)
+    first = accel.closest_hit(o, d).prim_id
+    rays = RenderRays()
+    rays.origin, rays.direction = wp.array(o, dtype=wp.vec3, device="cpu"), wp.array(d, dtype=wp.vec3, device="cpu")
+    rays.t_min, rays.t_max = wp.zeros(3000, dtype=wp.float32, device="cpu"), wp.array(t_max, dtype=wp.float32, device="cpu")
+    rays.exclude = wp.array(first + 1, dtype=wp.int32, device="cpu")
+    structure, answers = accel.structure, []
+    one = make_render_rays_kernel(structure.struct, structure.traversal(any_hit=any_hit), any_hit)
+    many = structure.accel.stream.make_stream(structure.units, any_hit, RenderRays)
+    for kernel, threads, own in ((one, 3000, []), (many, 1, [new_scratch(BatchTraversal.stream_sizes)])):
+        out = zeros(3000, wp.bool) if any_hit else new_hits(3000)
+        launch(kernel, threads, accel.data, accel.snapshot.surfaces, rays, out, *own, 0, 3000)
+        answers.append([out.numpy()] if any_hit else [getattr(out, name).numpy() for name in ("t", "u", "v", "prim_id")])
+    for mine, theirs in zip(*answers, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    assert len({*answers[0][-1].tolist()}) > 1
+
+
+def test_without_a_vectorised_form_one_ray_is_traced_at_a_time():
+    units = Units(instances=True)
+    for each in (units._replace(counters=True), units._replace(triangle="moller_trumbore"), units._replace(box="minmax")):
+        assert BatchTraversal().make_stream(each, False) is None
+    assert BatchTraversal().make_stream(units, False, RenderRays, accepts=lambda *_: True) is None
+    assert tracer(Structure(ACCELERATORS["bvh2"], units), False).stream is None
