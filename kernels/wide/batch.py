@@ -17,19 +17,7 @@ from wrt.kernels.traverse.common import Probe, Units, make_better, sphere_hit
 from wrt.kernels.traverse.stack import reference_of, t_of
 from wrt.kernels.wide.lanes import bits, lowest
 from wrt.kernels.wide.lanes import value as number
-from wrt.kernels.wide.layout import (
-    ACTIVE,
-    COHERENT,
-    FIELD,
-    LANES,
-    PACKET_SIZE,
-    PRIM_ID_ROW,
-    REFUSED,
-    ROW_SIZE,
-    SLOT,
-    SLOT_SIZE,
-    WIDTH,
-)
+from wrt.kernels.wide.layout import ACTIVE, COHERENT, FIELD, LANES, PACKET_SIZE, PRIM_ID_ROW, REFUSED, ROW_SIZE, SLOT, SLOT_SIZE, WIDTH
 from wrt.kernels.wide.nodes import far_pad
 from wrt.kernels.wide.packets import (
     ANY_REFUSED,

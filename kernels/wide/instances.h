@@ -20,7 +20,8 @@ template <class T> WRT_INLINE T widening(const float* node, const Vec3<T>& origi
     return slack * farthest;
 }
 
-// The origins from which a ray meets the near and the far planes of boxes as it would meet those of wider boxes.
+// The origins from which a ray meets the near and the far planes of boxes as it would meet those of wider boxes. Their rounding is at most
+// u times the distance and a box's coordinates, which `enter` allows for.
 template <class T> struct Origins {
     Vec3<T> near, far;
 };
@@ -58,7 +59,7 @@ template <bool ANY_HIT> WRT_INLINE int top_step(const float* nodes, float slack,
 }
 
 // As rays_meeting_root, for the root of a world.
-WRT_CALLED int rays_meeting_top(const float* nodes, int node, float slack, int mask, float* packet) {
+WRT_CALLED int rays_meeting_top(const float* nodes, float slack, float* packet, int node, int mask) {
     const float* const root = nodes + (long long)node * NODE_SIZE;
     const PacketRay ray = packet_ray({packet});
     const BoxRay<Rays> box = {ray.origin, ray.inv_dir};
@@ -92,10 +93,9 @@ template <int N> WRT_INLINE typename Lanes<N>::Doubles power_of_two(typename Lan
 // Return the exponent of power_of_two in traverse/instances.py.
 WRT_CALLED int exponent_near_one(double x) {
     int out = 0;
-    for (int k = 0; k < 16 && (x > 0x1p64 || x < 0x1p-64); ++k) {
-        const int step = x > 0x1p64 ? -96 : 96;
-        x *= step < 0 ? 0x1p-96 : 0x1p96;
-        out += step;
+    for (int k = 0; k < 16 && (x > LONGEST || x < SHORTEST); ++k) {
+        out += x > LONGEST ? -LENGTHEN_EXPONENT : LENGTHEN_EXPONENT;
+        x *= x > LONGEST ? 1.0 / LENGTHEN : LENGTHEN;
     }
     return out;
 }
@@ -111,13 +111,13 @@ WRT_INLINE auto to_local(const Placement& place, const Vec3<typename Lanes<N>::D
     return out;
 }
 
-// Set up N rays in the space of a placed structure, as local_ray does; `local` gets the fields of store_rays and, in SCALE, the exponents of
-// local_scale. Return the rays and their reciprocal directions.
 template <int N> struct PlacedRays {
     RayBlock<N> rays;
     Vec3<typename Lanes<N>::Floats> inv_dir;
 };
 
+// Set up N rays in the space of a placed structure, as local_ray does; `local` gets the fields of store_rays and, in SCALE, the exponents of
+// local_scale.
 template <int N, class Placement>
 WRT_INLINE PlacedRays<N> place_rays(const SomeRays<N>& world, const Placement& place, float far_pad, const SomeRays<N>& local) {
     typedef typename Lanes<N>::Floats Floats;
@@ -129,7 +129,7 @@ WRT_INLINE PlacedRays<N> place_rays(const SomeRays<N>& world, const Placement& p
     const Doubles longer = y > x ? y : x, longest = z > longer ? z : longer;
     typename Lanes<N>::Ints exponent = {};
     Floats t_min = world[T_MIN], t_max = world[T];
-    if (int left = mask_of((longest > 0x1p64) | (longest < 0x1p-64))) {
+    if (int left = mask_of((longest > (double)LONGEST) | (longest < (double)SHORTEST))) {
         for (; left; left &= left - 1) exponent[lowest(left)] = exponent_near_one(longest[lowest(left)]);
         const Doubles scale = power_of_two<N>(exponent), inverse = power_of_two<N>(-exponent);
         for (int k = 0; k < 3; ++k) d[k] = scale * d[k];
@@ -156,6 +156,7 @@ template <class Placement> WRT_CALLED int place_packet(float* world, const Place
     return store_beam(local, placed.rays, placed.inv_dir, active, far_pad) ? active | COHERENT : active;
 }
 
+// As place_packet, for one ray.
 template <class Placement> WRT_CALLED void place_ray(float* world, const Placement& place, float far_pad, float* local) {
     place_rays<1>({world}, place, far_pad, {local});
 }

@@ -5,7 +5,7 @@ mesh (wide/batch.py). At a placement, the rays of a packet that enter its box ch
 packet of their own. An interleaved ray changes to its space alone, and its slot continues with the steps of the placed structure."""
 
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import warp as wp
 
@@ -16,16 +16,7 @@ from wrt.kernels.structs import Surfaces, kernel
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.traverse.instances import make_struct
 from wrt.kernels.traverse.stack import reference_of, t_of
-from wrt.kernels.wide.batch import (
-    MAX_FAILED,
-    MIN_VISITS,
-    PACKETS,
-    PAUSE,
-    SLOTS,
-    make_interleaved,
-    make_packet_walk,
-    make_row_test,
-)
+from wrt.kernels.wide.batch import MAX_FAILED, MIN_VISITS, PACKETS, PAUSE, SLOTS, make_interleaved, make_packet_walk, make_row_test
 from wrt.kernels.wide.lanes import bits, lowest
 from wrt.kernels.wide.lanes import value as number
 from wrt.kernels.wide.layout import (
@@ -48,7 +39,6 @@ from wrt.kernels.wide.packets import (
     ANY_REFUSED,
     FAILED,
     PAUSED,
-    REPORT_SIZE,
     Scratch,
     WideBvh,
     count_of,
@@ -71,6 +61,13 @@ from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
 Instances = make_struct(WideBvh)
 HEADERS = with_headers("wide/instances.h", layout=LAYOUT_H)
 
+if TYPE_CHECKING:  # type checkers skip device code (structs.py)
+    from typing import no_type_check as instances_kernel
+else:
+    def instances_kernel(function):
+        """Make a kernel that can call the functions of this file."""
+        return kernel(function, extra_build_options=HEADERS)
+
 # The first packets of Scratch are in the spaces of placements: of a packet that walks, and of the ray in each slot. Scratch has two stacks
 # and two slots for each interleaved ray. The second, at an index higher by SLOTS, is for the upper level. Packets use its stacks, too.
 PLACED = (SLOTS + LANES - 1) // LANES
@@ -78,70 +75,89 @@ TOP_STACK = STACK_WORDS * SLOTS // ENTRY  # First entry of a packet's stack in t
 FEW_PLACED = 3  # If at most so many rays of a packet enter a placement, they are interleaved.
 
 
-def make_instance_steps(any_hit: bool, pad: float) -> Any:
-    """Return functions for walks of the upper level, and for the change between levels. Each calls C++ (instances.h)."""
+class TopSteps(NamedTuple):
+    """Functions of packets.py for the upper level. Each calls C++ (instances.h)."""
+
+    children: Any  # As make_children.
+    rays_meeting: Any  # As rays_meeting_root, for the root of a world.
+    begin: Any  # begin, step, pop: as in Steps.
+    step: Any
+    pop: Any
+
+
+@cache
+def make_top_steps(any_hit: bool) -> TopSteps:
+    hits, memory = flag(any_hit), "accel.wide.data, accel.slack, scratch.packets.data"
     stack = f"scratch.stacks.data, {STACK_WORDS} * slot, scratch.slots.data + {SLOT_SIZE} * slot"
-    hits = flag(any_hit)
 
-    @wp.func_native(f"""
-    return wrt::top_children<{hits}>(accel.wide.data, accel.slack, scratch.packets.data + base, reference, mask, scratch.stacks.data, size);
-    """)
-    def children(accel: Instances, scratch: Scratch, base: int, reference: int, mask: int, size: int) -> int:
-        """As packets.make_children."""
+    @wp.func_native(f"return wrt::top_children<{hits}>({memory} + base, reference, mask, scratch.stacks.data, size);")
+    def children(accel: Instances, scratch: Scratch, base: int, reference: int, mask: int, size: int) -> int: ...
 
-    @wp.func_native("""
-    return wrt::rays_meeting_top(accel.wide.data, root, accel.slack, mask, scratch.packets.data + base);
-    """)
-    def rays_meeting(accel: Instances, scratch: Scratch, base: int, root: int, mask: int) -> int:
-        """As rays_meeting_root."""
+    @wp.func_native(f"return wrt::rays_meeting_top({memory} + base, root, mask);")
+    def rays_meeting(accel: Instances, scratch: Scratch, base: int, root: int, mask: int) -> int: ...
 
     @wp.func_native(f"return wrt::begin<{hits}>(accel.wide.data, root, scratch.packets.data, ray, {stack});")
-    def begin(accel: Instances, scratch: Scratch, slot: int, root: int, ray: int) -> int:
-        """As Steps.begin."""
+    def begin(accel: Instances, scratch: Scratch, slot: int, root: int, ray: int) -> int: ...
 
-    @wp.func_native(f"return wrt::top_step<{hits}>(accel.wide.data, accel.slack, scratch.packets.data, {stack});")
-    def step(accel: Instances, scratch: Scratch, slot: int) -> int:
-        """As Steps.step."""
+    @wp.func_native(f"return wrt::top_step<{hits}>({memory}, {stack});")
+    def step(accel: Instances, scratch: Scratch, slot: int) -> int: ...
 
     @wp.func_native(f"return wrt::pop<{hits}>(accel.wide.data, reach, {stack});")
-    def pop(accel: Instances, scratch: Scratch, slot: int, reach: float) -> int:
-        """As Steps.pop."""
+    def pop(accel: Instances, scratch: Scratch, slot: int, reach: float) -> int: ...
 
-    @wp.func_native(f"""
-    return wrt::place_packet(scratch.packets.data + base, accel.placements.data[placement], mask, {pad!r}, scratch.packets.data);
-    """)
-    def place_packet(accel: Instances, placement: int, scratch: Scratch, base: int, mask: int) -> int:
-        """Set up the rays of the mask in a placement's space, as packet 0. Return as set_up."""
-
-    @wp.func_native(f"wrt::take_hits<{LANES}, {hits}>({{scratch.packets.data + base}}, accel.placements.data[placement], {{scratch.packets.data}});")
-    def take_packet(accel: Instances, placement: int, scratch: Scratch, base: int) -> None:
-        """Store the hits of packet 0 that are better than those of the packet at `base`, whose rays it has."""
-
-    @wp.func_native(f"wrt::place_ray(scratch.packets.data + ray, accel.placements.data[placement], {pad!r}, scratch.packets.data + local);")
-    def place_ray(accel: Instances, placement: int, scratch: Scratch, ray: int, local: int) -> None:
-        """Set up a ray in a placement's space. ray, local: indices of its columns."""
-
-    @wp.func_native(f"wrt::take_hits<1, {hits}>({{scratch.packets.data + ray}}, accel.placements.data[placement], {{scratch.packets.data + local}});")
-    def take_hit(accel: Instances, placement: int, scratch: Scratch, ray: int, local: int) -> None:
-        """As take_packet, for one ray."""
-
-    return children, rays_meeting, begin, step, pop, place_packet, take_packet, place_ray, take_hit
+    return TopSteps(children, rays_meeting, begin, step, pop)
 
 
-@wp.func_native(f"int* const s = slots.data + {SLOT_SIZE} * slot; s[{SLOT['ray']}] = ray; s[{SLOT['next']}] = next; s[{SLOT['place']}] = {STACK_WORDS} * slot; s[{SLOT['placement']}] = placement;")
-def fill_slot(slots: wp.array(dtype=wp.int32), slot: int, ray: int, next: int, placement: int) -> None: ...
+class Changes(NamedTuple):
+    """Functions for the change to the space of a placement and back. Each calls C++ (instances.h)."""
+
+    place_packet: Any  # Set up the rays of the mask in the packet at `base` as packet 0 in a placement's space. Return as set_up.
+    take_packet: Any  # Store the hits of packet 0 that are better than those of the packet at `base`.
+    place_ray: Any  # As place_packet, for one ray. The arguments `ray` and `local` are the indices of its columns.
+    take_hit: Any  # As take_packet, for one ray.
+
+
+@cache
+def make_changes(any_hit: bool, pad: float) -> Changes:
+    place, packets, hits = "accel.placements.data[placement]", "scratch.packets.data", flag(any_hit)
+
+    @wp.func_native(f"return wrt::place_packet({packets} + base, {place}, mask, {pad!r}, {packets});")
+    def place_packet(accel: Instances, placement: int, scratch: Scratch, base: int, mask: int) -> int: ...
+
+    @wp.func_native(f"wrt::take_hits<{LANES}, {hits}>({{{packets} + base}}, {place}, {{{packets}}});")
+    def take_packet(accel: Instances, placement: int, scratch: Scratch, base: int) -> None: ...
+
+    @wp.func_native(f"wrt::place_ray({packets} + ray, {place}, {pad!r}, {packets} + local);")
+    def place_ray(accel: Instances, placement: int, scratch: Scratch, ray: int, local: int) -> None: ...
+
+    @wp.func_native(f"wrt::take_hits<1, {hits}>({{{packets} + ray}}, {place}, {{{packets} + local}});")
+    def take_hit(accel: Instances, placement: int, scratch: Scratch, ray: int, local: int) -> None: ...
+
+    return Changes(place_packet, take_packet, place_ray, take_hit)
+
+
+@wp.func_native(f"""
+    int* const words = slots.data + {SLOT_SIZE} * slot;
+    words[{SLOT["ray"]}] = ray;
+    words[{SLOT["next"]}] = next;
+    words[{SLOT["place"]}] = {STACK_WORDS} * slot;
+    words[{SLOT["placement"]}] = placement;
+""")
+def fill_slot(slots: wp.array(dtype=wp.int32), slot: int, ray: int, next: int, placement: int) -> None:
+    """Put a ray with an empty stack into a slot."""
 
 
 @wp.func_native("""
     return wrt::store_roots(rays.world.data + (rays.world.strides[0] == 0 ? 0 : first), rays.world.strides[0] != 0, accel.roots.data,
                             accel.roots.shape[0], count, active, scratch.packets.data + base);
 """)
-def store_roots(accel: Instances, rays: WorldRays, first: int, count: int, active: int, scratch: Scratch, base: int) -> int: ...
+def store_roots(accel: Instances, rays: WorldRays, first: int, count: int, active: int, scratch: Scratch, base: int) -> int:
+    """Store the root of each ray's world. Return the mask `active` (see set_up) as instances.h describes."""
 
 
 def make_top_walk(units: Units, any_hit: bool) -> Any:
     """Return walk, which traces a packet of rays through the instances. The packet must have a beam."""
-    children, _, _, _, _, place_packet, take_packet, _, _ = make_instance_steps(any_hit, far_pad(units.box))
+    children, (place_packet, take_packet, _, _) = make_top_steps(any_hit).children, make_changes(any_hit, far_pad(units.box))
     walk_packet = make_packet_walk(units, any_hit, None)
     interleaved = make_interleaved(units, any_hit, None)
 
@@ -159,7 +175,7 @@ def make_top_walk(units: Units, any_hit: bool) -> Any:
 
     @wp.func
     def walk(accel: Instances, surfaces: Surfaces, scratch: Scratch, base: int, root: int, active: int) -> bool:
-        """Trace the rays in the mask `active` from the node `root`. Return whether on average at least MIN_VISITS of them entered each placement."""
+        """Trace the rays in the mask `active` from the node `root`. Return whether on average MIN_VISITS of them enter a placement."""
         visits = int(0)
         rays = int(0)
         size = int(TOP_STACK)
@@ -188,7 +204,8 @@ def make_top_interleaved(units: Units, any_hit: bool, worlds: bool) -> Any:
     """Return interleaved, which traces rays of PACKETS packets through the instances, one step of each ray in turn.
 
     The mask `waiting` has a bit for each ray to trace: bit LANES * packet + lane, of the packets behind the first PLACED ones."""
-    _, _, top_begin, top_step, top_pop, _, _, place_ray, take_hit = make_instance_steps(any_hit, far_pad(units.box))
+    top_begin, top_step, top_pop = make_top_steps(any_hit)[2:]
+    place_ray, take_hit = make_changes(any_hit, far_pad(units.box))[2:]
     test_row = make_row_test(units, any_hit, None, True)
     _, step, pop = make_steps(any_hit)
 
@@ -273,10 +290,11 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays) -> An
     """Return the kernel of batch.make_kernel for instances."""
     worlds = rays_struct is WorldRays
     walk, interleaved = make_top_walk(units, any_hit), make_top_interleaved(units, any_hit, worlds)
-    set_up, rays_meeting = make_set_up(rays_struct), make_instance_steps(any_hit, far_pad(units.box))[1]
+    set_up, rays_meeting = make_set_up(rays_struct), make_top_steps(any_hit).rays_meeting
     write = write_occluded if any_hit else write_hits
     out_type = wp.array(dtype=wp.bool) if any_hit else HitArrays
 
+    @instances_kernel
     def trace(accel: Instances, surfaces: Surfaces, rays: rays_struct, out: out_type, scratch: Scratch, first: int, end: int):
         put_int(scratch.report, FAILED, 0)
         put_int(scratch.report, PAUSED, 0)
@@ -317,4 +335,4 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays) -> An
             for p in range(packets):
                 write(out, block + LANES * p, wp.min(end - block - LANES * p, LANES), scratch, PACKET_SIZE * (PLACED + p))
 
-    return kernel(trace, extra_build_options=HEADERS)
+    return trace

@@ -1,5 +1,6 @@
 """Memory layouts of nodes, packets, stacks and slots, as constants for Python and C++; LAYOUT_H is the text of layout.h."""
 
+import math
 from typing import NamedTuple
 
 from wrt.kernels.headers import constants
@@ -119,6 +120,7 @@ _NUMBERS = {
     "NODE_SIZE": node_size(WIDTH, False), "REFERENCES": first_reference(WIDTH, False),
     "PRIM_ID_ROW": PRIM_ID_ROW, "ROW_SIZE": ROW_SIZE, "NO_HIT": NO_HIT,
     "LARGEST": LARGEST, "FARTHEST": FARTHEST, "SHORTEST": SHORTEST, "LONGEST": LONGEST, "LENGTHEN": LENGTHEN, "SHORTEN": SHORTEN,
+    "LENGTHEN_EXPONENT": math.frexp(LENGTHEN)[1] - 1,
     **{name.upper(): first for name, first in FIELD.items()},
     **{name.upper(): i for i, name in enumerate(PLANES)},
     **{f"BEAM_{name.upper()}": first for name, first in BEAM.items()},

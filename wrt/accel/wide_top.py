@@ -50,7 +50,7 @@ def sides(binary: np.ndarray, name: str) -> np.ndarray:
 def widen(binary: np.ndarray, roots: np.ndarray) -> WideTop:
     """Make wide trees: a node takes the place of its largest child, by area, until it has eight children or only leaves."""
     low, high, first, count = (sides(binary, name) for name in ("lo", "hi", "first", "count"))
-    exists, area = (low <= high).all(axis=1), half_areas(low, high)
+    exists, area = np.asarray((low <= high).all(axis=1)), half_areas(low, high)
     level, references, sources, made = roots.astype(np.int64), [], [], 0
     while len(level):
         code = np.full((len(level), WIDTH), NONE)

@@ -21,9 +21,9 @@ from wrt.core.errors import InputError
 from wrt.core.threads import run_all
 from wrt.core.types import Kernel, WarpStruct
 from wrt.kernels.build.shape import write_rows
-from wrt.kernels.wide.stream import BatchTraversal
 from wrt.kernels.wide.layout import PLANES, STACK_SIZE, first_reference, node_size
 from wrt.kernels.wide.references import EMPTY, MAX_FIRST, leaf_count, leaf_first
+from wrt.kernels.wide.stream import BatchTraversal
 from wrt.kernels.wide.traverse import WideTraversal
 
 ROWS_PER_JOB = 4096
