@@ -55,6 +55,10 @@ CROP = PatternType("X0,Y0,X1,Y1", ",".join([rf"\s*({DIGITS})\s*"] * 4),
 DURATION = PatternType("TIME", r"([0-9]+(?:\.[0-9]*)?)\s*([smh]?)", "a time; write 30s, 5m or 1h",
                        lambda number, unit: float(number) * {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0}[unit])
 
+EXPOSURE = PatternType("STOPS|auto", r"(auto|[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)",
+                       "an exposure; write stops such as -1.5, or auto",
+                       lambda stops: stops if stops == "auto" else float(stops))
+
 
 class Names(click.ParamType):
     """Comma-separated names."""
@@ -136,7 +140,7 @@ SHARED = {
     "assignments": click.option(
         "--set", "assignments", type=Setting(), multiple=True,
         help="Change a setting of the scene, such as glass_shadows=tinted; repeatable. The settings are size, spp, max_depth,"
-             " min_throughput, filter, fresnel, glass_shadows, sampler, exposure and tonemap (docs/scene_format.md)"),
+             " min_throughput, filter, fresnel, glass_shadows, sampler, exposure, tonemap and auto_exposure (docs/scene_format.md)"),
     "seed": click.option("--seed", type=int, default=0, show_default=True, help="Seed of the samples: another seed gives other noise"),
     "device": click.option("--device", default=DEFAULT_DEVICE, show_default=True, help="cpu, cuda:0 ... (`devices` lists them)"),
     "threads": click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]"),
@@ -240,11 +244,13 @@ def client_of(cluster: str | None) -> Client | None:
 CLUSTER = click.option("--cluster", metavar="ADDRESS",
                        help="Share the work among the workers of a Dask scheduler, tcp://host:8786 (docs/cluster.md)")
 
-STAGING = option_group("staging", dict, ("up", "studio", "floor"), (
+STAGING = option_group("staging", dict, ("up", "studio", "floor", "fill"), (
     click.option("--up", type=OneOf("wrt.scene.defaults:UP"), default="y", show_default=True, help="Axis of a mesh file that points up"),
     click.option("--studio/--no-studio", default=True, show_default=True,
                  help="Light a file without lights by a studio, which glass and smooth surfaces reflect, or by a pale sky"),
-    click.option("--floor", is_flag=True, help="Put a mesh file on a grey floor")))
+    click.option("--floor", is_flag=True, help="Put a mesh file on a grey floor"),
+    click.option("--fill", type=float,
+                 help="Radiance of a fill light beside a glTF file's own lights  [default: 0, or an estimate beside emissive surfaces]")))
 
 
 def load(path: Path, quiet: bool, staging: dict[str, Parsed] | None = None) -> Scene:

@@ -13,6 +13,7 @@ import click
 from wrt.cli.common import (
     CLUSTER,
     DURATION,
+    EXPOSURE,
     STAGING,
     Assignments,
     Names,
@@ -60,7 +61,8 @@ if TYPE_CHECKING:
 @click.option("--aov", type=Names(), default=(), help="Layers to write as well: depth, normal, albedo, prim_id, material_id")
 @click.option("--bits", type=int, help="Bits per channel. PNG: 8 or 16, EXR: 16 or 32  [default: 8 for PNG, 32 for EXR]")
 @click.option("--tonemap", type=OneOf("wrt.scene.settings:TONEMAPS"), help="Curve from linear to display values  [default: the scene's]")
-@click.option("--exposure", type=float, help="Exposure in stops  [default: the scene's, or 0]")
+@click.option("--exposure", type=EXPOSURE,
+              help="Exposure in stops, or auto: bright parts are shown just below white  [default: the scene's]")
 @click.option("--time-limit", type=DURATION, help="Stop tracing after this time (30s, 5m, 1h) and write the picture so far")
 @click.option("--target-error", type=float,
               help="Stop when the estimated noise is at most this: the root mean square, over pixels and channels, of the"
@@ -108,7 +110,7 @@ def render(scene: Path, output: Path | None, assignments: Assignments, staging: 
         for path in paths:
             say(path, err=False)
     if not quiet:
-        say(_summary(film))
+        say(_summary(film, loaded.settings.auto_exposure))
     if write_error:
         raise InputError(f"{write_error}; the picture was written to {paths[0]} instead")
     if film.stats["interrupted"]:
@@ -125,6 +127,8 @@ def check_options(output: Path, assignments: Assignments, options: dict[str, Par
     flags = {"filter": options.pop("filter_name")}
     flags |= {name: options.pop(name) for name in (
         "spp", "size", "max_depth", "min_throughput", "fresnel", "sampler", "tonemap", "exposure")}
+    if flags["exposure"] == "auto":
+        flags |= {"exposure": None, "auto_exposure": True}
     settings = settings_of(assignments, flags)
     options |= checkpoint_options(output, options.pop("every"), options.pop("checkpoint_file"), options.pop("resume"))
     Scene().with_settings(**settings)
@@ -147,7 +151,7 @@ def trace(loaded: Scene, path: Path, spp: int | None, options: dict[str, Parsed]
     return film
 
 
-def _summary(film: Film) -> str:
+def _summary(film: Film, auto_exposure: bool) -> str:
     """Return a text with samples, rays, cut rays, and the seconds of each stage ("compile" overlaps "upload" and "build")."""
     s = film.stats
     cut = f"cut: {s['cut_by_depth']} rays by depth, {s['cut_by_throughput']} by throughput"
@@ -166,5 +170,6 @@ def _summary(film: Film) -> str:
     saved = f"\n{s['checkpoint']}: --resume continues from this checkpoint" if s.get("checkpoint") else ""
     resumed = f" ({s['resumed']['seconds']:.2f} before the resume)" if s.get("resumed") else ""
     seconds = ", ".join(f"{name} {value:.2f}{resumed if name == 'trace' else ''}" for name, value in s["seconds"].items())
-    return (f"{film.metadata['spp']} spp{note}, {s['rays'] / 1e6:.2f} M rays, {s['rays_per_second'] / 1e6:.2f} Mray/s; "
+    exposed = f"exposure {film.exposure:+.2g}, chosen automatically (--exposure 0: none)\n" if auto_exposure else ""
+    return (f"{exposed}{film.metadata['spp']} spp{note}, {s['rays'] / 1e6:.2f} M rays, {s['rays_per_second'] / 1e6:.2f} Mray/s; "
             f"{cut}, lost throughput {s['lost_throughput_per_sample']:.2g} per sample{black}\nseconds: {seconds}{saved}{hint}")

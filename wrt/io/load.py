@@ -23,7 +23,8 @@ from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene
 
 
-def load_scene(path: PathLike, *, up: str = "y", studio: bool = True, floor: bool = False) -> Scene:
+def load_scene(path: PathLike, *, up: str = "y", studio: bool = True, floor: bool = False,
+               fill: float | None = None) -> Scene:
     """Read a scene file: TOML (.toml), glTF 2.0 (.gltf, .glb), or a mesh in light grey.
 
     A scene without a camera gets one that frames it, and a scene without a light gets lights; a SceneWarning names the additions.
@@ -38,14 +39,17 @@ def load_scene(path: PathLike, *, up: str = "y", studio: bool = True, floor: boo
         Light glass and smooth surfaces in a scene without lights by a studio, which they reflect. False: by a pale sky.
     floor
         Put the mesh of a mesh file on a grey floor.
+    fill
+        Radiance of an ambient term beside the lights of a glTF file. None: if its only lights are emissive surfaces, an estimate of
+        the light between surfaces, else 0.
 
     Raises
     ------
     InputError
         If the file cannot be used; it names the file and the place. For TOML it lists all mistakes, each with key, value and expectation.
-        If `up` or `floor` is given for a scene file.
+        If `up` or `floor` is given for a scene file, or `fill` for a file that is not glTF.
     """
-    staging = Staging(up, studio, floor)
+    staging = Staging(up, studio, floor, fill)
     path = as_path(path, "path")
     known = ", ".join([*LOADERS, *MESH_FORMATS])
     require_file(path, f" (a scene is one of {known})")
@@ -57,6 +61,8 @@ def load_scene(path: PathLike, *, up: str = "y", studio: bool = True, floor: boo
     if load is not _load_bare_mesh and (up != "y" or floor):
         raise InputError("is for mesh files alone: a scene file says what is up and what is below", argument="up" if up != "y" else "floor",
                          path=path)
+    if fill is not None and path.suffix.lower() not in (".gltf", ".glb"):
+        raise InputError("is for glTF files alone", argument="fill", path=path, hint="a TOML scene has `ambient`")
     with np.errstate(over="ignore", invalid="ignore"):  # the scene refuses infinite values
         return load(path, staging)
 

@@ -14,6 +14,7 @@ from wrt.core.checks import as_choice
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)  # weights of linear Rec. 709
 # Radiance that every curve shows as white; its square fits in a float32.
 BRIGHTEST = 1e9
+BRIGHT, BRIGHT_SHARE = 0.8, 0.95  # of auto_exposure
 
 
 def encode_srgb(linear: np.ndarray) -> np.ndarray:
@@ -124,6 +125,15 @@ def tone_map(pixels: np.ndarray, exposure: float = 0.0, tonemap: str = "none") -
         exposed = np.asarray(pixels, dtype=np.float32) * np.float32(2.0**exposure)
     linear = np.clip(np.nan_to_num(exposed, nan=0.0, posinf=BRIGHTEST, neginf=0.0), 0.0, BRIGHTEST)
     return np.clip(TONEMAPS[tonemap](linear), 0.0, 1.0).astype(np.float32, copy=False)
+
+
+def auto_exposure(pixels: np.ndarray) -> float:
+    """Return the exposure in stops that shows BRIGHT_SHARE of the lit pixels at a luminance of BRIGHT or less; 0 without a lit pixel.
+
+    pixels: (..., 3) linear. Black, NaN and infinite pixels do not count. The result is in [-60, 60]."""
+    bright = luminance(np.asarray(pixels, np.float64))
+    lit = bright[np.isfinite(bright) & (bright > 0.0)]
+    return float(np.clip(np.log2(BRIGHT / np.quantile(lit, BRIGHT_SHARE)), -60.0, 60.0)) if lit.size else 0.0
 
 
 def to_codes(pixels: np.ndarray, exposure: float = 0.0, tonemap: str = "none", bits: int = 8) -> np.ndarray:

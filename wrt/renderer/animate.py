@@ -17,7 +17,8 @@ from wrt.core.write_file import check_writable, replacing
 from wrt.picture.film import Film
 from wrt.renderer.options import Options
 from wrt.renderer.renderer import Renderer
-from wrt.scene.cameras import CameraKind
+from wrt.scene.cameras import Camera, CameraKind
+from wrt.scene.defaults import frame_turn
 from wrt.scene.model import Scene, moves, scene_at
 from wrt.scene.values import as_number
 
@@ -58,7 +59,10 @@ def animate(scene: Scene, animation: Animation, options: Options) -> Iterator[Fi
         options = replace(options, instancing="never")
     renderer = Renderer(scene_at(scene, 0.0), options)
     start, middle = renderer.prepared.plan.camera, np.mean(scene.bounds(), axis=0)
+    if isinstance(start, Camera) and start.least_fov_x > 0.0 and degrees:  # it frames the first view alone
+        start = frame_turn(start, scene)
     done = {"structure": "built", "seconds": renderer.accel.stats.build_seconds, "growth": 1.0}
+    exposure = 0.0
     for frame in range(animation.frames):
         time = frame / animation.frames
         if frame and moves(scene):
@@ -67,6 +71,8 @@ def animate(scene: Scene, animation: Animation, options: Options) -> Iterator[Fi
             done = {"structure": "kept", "seconds": 0.0, "growth": 1.0}
         renderer.aim(orbited(start, middle, degrees * time))
         film = renderer.run()
+        exposure = film.exposure if frame == 0 else exposure  # one for all frames: an automatic one would flicker
+        film = replace(film, exposure=exposure)
         film.stats["frame"] = {"number": frame, "time": time, **done}
         yield film
         if film.stats["interrupted"]:

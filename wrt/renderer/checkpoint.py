@@ -29,8 +29,8 @@ from wrt.scene.settings import SETTINGS
 
 MAGIC = b"wrt checkpoint 1\n"
 # Options and settings that may change on resume; and `camera` and `device`, since the digest and the kind are compared instead.
-NO_PIXEL = ("spp", "exposure", "tonemap", "threads", "aov", "time_limit", "target_error", "tile_size", "pass_size", "progress",
-            "checkpoint", "checkpoint_every", "resume", "camera", "device", "devices", "executor")
+NO_PIXEL = ("spp", "exposure", "tonemap", "auto_exposure", "threads", "aov", "time_limit", "target_error", "tile_size", "pass_size",
+            "progress", "checkpoint", "checkpoint_every", "resume", "camera", "device", "devices", "executor")
 # Messages for differing hashes. For other parts of the identity, the message shows both values.
 DIFFERENT = {"scene": "the scene differs", "camera": "the camera differs", "kernels": "the kernels have another version"}
 

@@ -26,7 +26,8 @@ from wrt.scene.cameras import CameraKind
 from wrt.scene.model import Scene
 from wrt.scene.settings import SettingChanges, Settings
 
-AIMED = ("size", "spp", "max_depth", "min_throughput", "exposure", "tonemap")  # settings that the kernels do not depend on
+# Settings that the kernels do not depend on.
+AIMED = ("size", "spp", "max_depth", "min_throughput", "exposure", "tonemap", "auto_exposure")
 
 
 @made_once

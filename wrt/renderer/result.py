@@ -9,6 +9,7 @@ import numpy as np
 
 from wrt.core.version import VERSION
 from wrt.picture.film import Film
+from wrt.picture.tonemap import auto_exposure
 from wrt.renderer.film_arrays import DeviceFilm
 from wrt.renderer.plan import Plan
 
@@ -46,7 +47,9 @@ def film_of(plan: Plan, arrays: DeviceFilm, seed: int, aov: dict[str, np.ndarray
 def bare_film(plan: Plan, arrays: DeviceFilm) -> Film:
     """Return a film with pixels, variance and samples only. arrays: result of DeviceFilm.snapshot."""
     settings = plan.scene.settings
-    return Film(*arrays.pixels_and_variance(), arrays.samples(), exposure=settings.exposure, tonemap=settings.tonemap)
+    pixels, variance = arrays.pixels_and_variance()
+    exposure = settings.exposure + (auto_exposure(pixels) if settings.auto_exposure else 0.0)
+    return Film(pixels, variance, arrays.samples(), exposure=exposure, tonemap=settings.tonemap)
 
 
 def plain_text(name: str) -> str:

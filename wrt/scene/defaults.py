@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from wrt.scene.model import Object, Scene
 from wrt.scene.shapes import quad
 from wrt.scene.size import require_size
 from wrt.scene.studio import studio
-from wrt.scene.values import BLACK, LUMINANCE, SMALLEST
+from wrt.scene.values import BLACK, LUMINANCE, SMALLEST, as_number
 
 _THREE_QUARTER = np.array([0.62, 0.42, 1.0])  # direction from the scene to the camera; the front of glTF is +z, up is +y
 FLAT = (0.2, 0.02, 0.2)  # A subject this thin along x, y or z, relative to its next longer side, is seen face on.
@@ -28,6 +29,7 @@ _KEY_IRRADIANCE = {"sky": 1.7, "studio": 1.2}
 DARK = 0.01  # a lower radiance counts as unlit; a display shows it as code 25 of 255
 _SKY = GradientBackground(bottom=(0.22, 0.21, 0.20), top=(0.50, 0.60, 0.75))
 
+FILL_REACH = 0.3  # radius within which surfaces occlude the fill light, in radii of the scene's bounding sphere
 MATTE = 0.4  # A surface this rough shows no soft boxes, and reflects a pale sky with less noise.
 UP = {"x": np.array([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]), "y": np.eye(4),
       "z": np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])}  # rotations that turn an axis to +y
@@ -45,21 +47,27 @@ class Staging:
         Light a scene without lights by a studio if it has glass or smooth surfaces, which reflect its soft boxes. False: by a pale sky.
     floor
         Put a bare mesh on a grey floor.
+    fill
+        Radiance of an ambient term beside a glTF file's own lights. None: an estimate of the light between surfaces if the file's
+        only lights are emissive surfaces, else 0.
 
     Raises
     ------
     InputError
-        If `up` is another text.
+        If `up` is another text, or `fill` is negative.
     """
 
     up: str = "y"
     studio: bool = True
     floor: bool = False
+    fill: float | None = None
 
     def __post_init__(self) -> None:
         as_choice(self.up, tuple(UP), "up")
         as_one(self.studio, bool, "studio")
         as_one(self.floor, bool, "floor")
+        if self.fill is not None:
+            as_number(self.fill, "fill", low=0.0)
 
 
 def bounding_sphere(scene: Scene) -> tuple[np.ndarray, float]:
@@ -138,20 +146,47 @@ def _emitted_power(scene: Scene) -> float:
     def radiance(material: Material) -> float:
         return float(LUMINANCE @ material.emission) * (1 + material.two_sided) * material.lights_others
 
-    power = sum(4.0 * math.pi * sphere.radius**2 * radiance(sphere.material) for sphere in scene.spheres)
+    return _integral(scene, radiance)
+
+
+def _integral(scene: Scene, value: Callable[[Material], float]) -> float:
+    """Return the integral over all surfaces of a value of their material."""
+    total = sum(4.0 * math.pi * sphere.radius**2 * value(sphere.material) for sphere in scene.spheres)
     for thing in scene.objects:
-        emitted = np.array([radiance(material) for material in thing.materials])
-        if emitted.any():
+        values = np.array([value(material) for material in thing.materials])
+        if values.any():
             a, b, c = np.moveaxis((thing.mesh.vertices @ thing.transform[:3, :3].T)[thing.mesh.faces], 1, 0)
-            of_face = emitted[0 if thing.face_material is None else thing.face_material]
-            power += float(np.sum(of_face * 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)))
-    return power
+            of_face = values[0 if thing.face_material is None else thing.face_material]
+            total += float(np.sum(of_face * 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)))
+    return total
 
 
 def emission_named(scene: Scene) -> str:
     """Return "the emission of ..." with the names of the materials whose emission lights other surfaces; "" without such materials."""
     names = [material.name for material in scene.materials if material.lights_others]
     return f"the emission of {listed(names)}" if names else ""
+
+
+def add_fill(scene: Scene, fill: float | None) -> tuple[Scene, str]:
+    """Return a glTF scene that is lit by its own lights with a fill light, and a sentence on it. fill: see Staging.
+
+    The fill light is an ambient term that surfaces nearby occlude. Where emission is the only light, the estimate is the radiosity
+    method's ambient term (Cohen, Chen, Wallace, Greenberg 1988, section 3.3) for a mean albedo of 1/2: emitted power over area."""
+    lamps = f"it has no lights but {emission_named(scene)}: " if not scene.lights else ""
+    if fill is None:
+        fill = _emitted_power(scene) / _integral(scene, lambda material: 1.0) if lamps else 0.0
+    if fill <= 0.0:
+        return scene, f"{lamps}surfaces that it does not reach are black" if lamps else ""
+    scene = replace(scene, ambient=(fill,) * 3, ambient_occlusion=FILL_REACH * bounding_sphere(scene)[1])
+    return scene, f"{lamps}a fill light of radiance {fill:.2g} was added for light between surfaces (fill=0 or --fill 0: none)"
+
+
+def frame_turn(camera: Camera, scene: Scene) -> Camera:
+    """Return a framing camera with an angle of view that holds the scene while the camera orbits it."""
+    center, radius = bounding_sphere(scene)
+    distance = max(float(np.linalg.norm(camera.camera_to_world[:3, 3] - center)), 2.0 * radius)
+    angle = 2.0 * math.atan(math.tan(math.asin(radius / distance)) / FILL)
+    return replace(camera, fov_y=max(angle, camera.fov_y), least_fov_x=max(angle, camera.least_fov_x))
 
 
 def shines(material: Material) -> bool:

@@ -220,13 +220,15 @@ class Scene:
                 yield vertices.astype(np.float64), thing.transform
 
     def with_settings(self, **changes: Unpack[SettingChanges]) -> Scene:
-        """Return a copy of the scene with changed settings. A setting of None keeps the scene's value.
+        """Return a copy of the scene with changed settings. A setting of None keeps the scene's value; an exposure ends auto_exposure.
 
         Raises InputError for an unknown setting and for a wrong value."""
         for name in changes:
             if name not in SETTINGS:
                 raise unknown(name, "setting", SETTINGS, argument=name)
         changed: dict[str, Any] = {name: value for name, value in changes.items() if value is not None}
+        if "exposure" in changed:
+            changed.setdefault("auto_exposure", False)
         return replace(self, settings=replace(self.settings, **changed))
 
 

@@ -39,6 +39,8 @@ class Settings:
         "sobol" (Owen-scrambled, evenly spread), or "independent" random numbers, whose noise falls more slowly.
     exposure, tonemap
         Exposure in stops, factors of 2 on radiance; then the curve from linear to display: "none", "reinhard", "aces" or "agx".
+    auto_exposure
+        Add to `exposure` the stops that show the picture's bright parts just below white (wrt.picture.tonemap.auto_exposure).
 
     Raises
     ------
@@ -61,6 +63,7 @@ class Settings:
         "choice", "samples of a pixel: evenly spread, or independent random numbers", among=SAMPLERS))
     exposure: float = field(default=0.0, metadata=given("number", "each stop doubles the displayed values", "stops", ge=-100.0, le=100.0))
     tonemap: str = field(default="none", metadata=given("choice", "curve from linear to display", among=TONEMAPS))
+    auto_exposure: bool = field(default=False, metadata=given("flag", "add the stops that show bright parts just below white"))
 
     def __post_init__(self) -> None:
         check_fields(self, "")
@@ -82,3 +85,4 @@ class SettingChanges(TypedDict, total=False):
     sampler: str | None
     exposure: float | None
     tonemap: str | None
+    auto_exposure: bool | None

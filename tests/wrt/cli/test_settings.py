@@ -72,7 +72,8 @@ def with_settings(text: str) -> None:
 
 def test_set_is_the_setting_of_a_file() -> None:
     values = {"size": [20, 12], "spp": 3, "max_depth": 3, "min_throughput": 0.01, "filter": "gaussian", "fresnel": "schlick",
-              "glass_shadows": "tinted", "sampler": "independent", "exposure": -1, "tonemap": "reinhard"}
+              "glass_shadows": "tinted", "sampler": "independent", "exposure": -1, "tonemap": "reinhard",
+              "auto_exposure": True}
     assert tuple(values) == SETTINGS
     with_settings("\n".join(f"{name} = {json.dumps(value)}" for name, value in values.items()))
     assert run("render", "scene.toml", "-o", "expected.png").code == 0

@@ -11,6 +11,8 @@ import pytest
 
 import wrt
 from tests.gltf_files import GltfFile
+from tests.refused import refused
+from wrt.picture.tonemap import luminance
 from wrt.scene.shapes import box
 
 
@@ -46,7 +48,35 @@ def test_weak_emission_does_not_switch_off_the_light_that_is_added(tmp_path: Pat
 def test_a_lamp_that_lights_the_scene_is_its_only_light_and_that_is_told(tmp_path: Path) -> None:
     pixels, told = rendered(gltf_box(tmp_path, -4, 4, emission=1.0, strength=2000.0, translation=[0, 0, 0]))
     assert 0.0 < np.median(pixels) and len(told) == 1
-    assert told[0].endswith("it has no lights but the emission of 'lamp': surfaces that it does not reach are black")
+    assert "it has no lights but the emission of 'lamp': a fill light of radiance" in told[0] and "--fill 0" in told[0]
+
+
+@pytest.mark.parametrize("strength", [200.0, 2000.0])
+def test_the_fill_light_is_emitted_power_over_area_and_can_be_set_or_switched_off(tmp_path: Path, strength: float) -> None:
+    path = gltf_box(tmp_path, -4, 4, emission=1.0, strength=strength, translation=[0, 0, 0])
+    lamp, walls = 6 * 0.2**2, 6 * 8.0**2
+    with pytest.warns(wrt.SceneWarning, match="fill light"):
+        scene = wrt.load_scene(path)
+    assert scene.ambient == pytest.approx((strength * lamp / (lamp + walls),) * 3, rel=1e-4) and 0.0 < scene.ambient_occlusion < 4.0
+    with pytest.warns(wrt.SceneWarning, match="does not reach are black"):
+        assert wrt.load_scene(path, fill=0).ambient == (0.0, 0.0, 0.0)
+    with pytest.warns(wrt.SceneWarning, match="fill light of radiance 0.5 "):
+        assert wrt.load_scene(path, fill=0.5).ambient == (0.5, 0.5, 0.5)
+    (tmp_path / "a.toml").write_text("")
+    with refused("fill", "glTF"):
+        wrt.load_scene(tmp_path / "a.toml", fill=0.5)
+
+
+@pytest.mark.parametrize("strength", [200.0, 2e6])
+def test_pictures_of_a_files_own_lights_are_exposed_and_an_exposure_ends_that(tmp_path: Path, strength: float) -> None:
+    path = gltf_box(tmp_path, -4, 4, emission=1.0, strength=strength, translation=[0, 0, 0])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        film = wrt.render(path, size="32x24", spp=4)
+        plain = wrt.render(path, size="32x24", spp=4, exposure=1.5)
+    assert np.array_equal(film.pixels, plain.pixels) and plain.exposure == 1.5
+    bright = np.quantile(luminance(film.pixels.astype(float)) * 2.0**film.exposure, 0.95)
+    assert bright == pytest.approx(0.8, rel=0.01)
 
 
 def test_a_camera_in_a_closed_box_sees_nothing_and_that_is_told(tmp_path: Path) -> None:

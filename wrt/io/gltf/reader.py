@@ -23,7 +23,7 @@ from wrt.io.gltf.meshes import Meshes
 from wrt.io.gltf.nodes import walk
 from wrt.io.gltf.schema import PunctualLightOfNode, PunctualLights, SpotCone, exactly
 from wrt.scene.cameras import Camera, CameraKind, OrthographicCamera
-from wrt.scene.defaults import Staging, emission_named, stage
+from wrt.scene.defaults import Staging, add_fill, is_lit, stage
 from wrt.scene.lights import DirectionalLight, Light, PointLight, SpotLight
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
@@ -44,9 +44,12 @@ def load_gltf(path: PathLike, staging: Staging | None = None, *, staged: bool = 
         left_out = [f"not supported and left out: {features}" for features in [document.left_out.sentence()] if features]
         if not scene.objects and (staged or not (scene.lights or scene.cameras)):
             raise InputError("; ".join(["the scene has no triangles", *left_out]))
+        own_lights = staged and is_lit(scene)
         scene, added = stage(scene, staging) if staged else (scene, [])
-        if staged and not scene.lights:
-            added.append(f"it has no lights but {emission_named(scene)}: surfaces that it does not reach are black")
+        if own_lights:
+            scene, told = add_fill(scene, staging.fill if staging else None)
+            scene = scene.with_settings(auto_exposure=True)  # the units of a file's lights are any
+            added += [told] if told else []
     if left_out or added:
         warn(f"{os.fspath(path)}: {'; '.join(left_out + added)}")
     return scene
