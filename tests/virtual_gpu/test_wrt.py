@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,10 @@ from tests.structures import STRUCTURES as ALL
 from tests.virtual_gpu import gpus
 from wrt.accel.scenes.build import build
 from wrt.core.arrays import to_numpy
+from wrt.lab.bench import peer_tiles
+from wrt.lab.bench.report import run
+from wrt.lab.hard_cases import contestants
+from wrt.lab.plans import Peers
 from wrt.scene import shapes
 
 pytestmark = pytest.mark.skipif(not device.IS_VIRTUAL, reason="run with --device cuda:0")
@@ -120,3 +125,16 @@ def test_lists_of_hits_in_several_parts_equal_those_of_the_cpu(monkeypatch: pyte
     for field in ("first", "t", "u", "v", "prim_id"):
         assert np.array_equal(to_numpy(getattr(there, field)), getattr(here, field))
     assert len(here.t) > 500
+
+
+def test_the_comparison_with_other_libraries_runs_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`bench peers --device cuda:0` runs there, also for many worlds. Virtual GPUs have no meshes of Warp, the only rival on a GPU."""
+    for module in (contestants, peer_tiles):
+        monkeypatch.setattr(module, "constructors", lambda device: ())
+    kinds = ("primary", "shadow", "points", "tiles")
+    plan = Peers((shapes.icosphere(2),), rays=400, runs=1, worlds=2, kinds=kinds, rivals=("warp",), threads="one")
+    there, here = (run(replace(plan, device=device)) for device in ("cuda:0", "cpu"))
+    assert [(row.kind, row.name, row.hit) for row in there] == [(row.kind, row.name, row.hit) for row in here]
+    assert {row.kind for row in there} == set(kinds) and {row.threads for row in there} == {1}
+    with refused("rivals", "embree runs on the CPU only, not on cuda:0"):
+        Peers(rivals=("embree",), device="cuda:0")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import Any
@@ -56,11 +56,17 @@ class Reporting:
 
     def check_markdown(self) -> None:
         """Raise InputError unless `output` is None or a Markdown file that can be written."""
+        self.check_report({})
+
+    def check_report(self, others: Collection[str]) -> str:
+        """Return the suffix of `output`, "" for None. Raise InputError unless it is .md or one of `others`, and can be written."""
         if self.output is None:
-            return
-        if self.output.suffix.lower() != ".md":
-            raise InputError("must be a .md file, the report", path=self.output)
+            return ""
+        suffix = self.output.suffix.lower()
+        if suffix not in (".md", *others):
+            raise InputError(f"must be a {' or '.join(('.md', *others))} file, the report", path=self.output)
         check_writable(self.output)
+        return suffix
 
     def write(self, text: str) -> None:
         if self.output is not None:
@@ -130,13 +136,16 @@ def measured(plan: type[Plan]) -> click.Command:
 
     @click.command(plan.COMMAND.split()[-1], help=plan.__doc__)
     @planned(plan)
-    @reporting(cluster="meshes" in plan.__annotations__)
+    @reporting(plan.OUTPUT, cluster="meshes" in plan.__annotations__)
     def command(how: Reporting, plan: Plan) -> None:
         from wrt.lab.bench import report
         from wrt.lab.bench.sweep import by_mesh
 
         study = report.study_of(plan)
-        how.check_markdown()
+        writers = getattr(study, "WRITERS", {})
+        suffix = how.check_report(writers)
+        if hasattr(study, "check_output"):
+            study.check_output(suffix)
         client = client_of(how.cluster)
         machine = study.machine(plan) if hasattr(study, "machine") else report.machine_line()
         if client is not None:
@@ -146,7 +155,10 @@ def measured(plan: type[Plan]) -> click.Command:
         with warnings_reported(how.quiet):
             rows = by_mesh(report.run, plan, lambda row: how.progress(report.line(plan, row)), client)
         text = report.text(rows, plan, machine)
-        how.write(text)
+        if how.output is not None and suffix in writers:
+            write_bytes(how.output, writers[suffix](rows, plan, machine, suffix))
+        else:
+            how.write(text)
         how.end(text, {"machine": machine, **report.data(rows, plan), "output": how.output})
 
     return command

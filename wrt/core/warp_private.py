@@ -282,6 +282,12 @@ def _compile_well() -> None:
     context.runtime.get_clang_pch_dir = lambda: None if _own() else own_headers()  # it makes a folder in each thread
 
 
+def processor_features() -> frozenset[str]:
+    """Return LLVM's names of this processor's instruction sets, for example "avx2"; empty if Warp cannot compile for the CPU."""
+    llvm = context.runtime.llvm
+    return frozenset() if llvm is None else frozenset(llvm.wp_get_host_cpu_features().decode().split(","))
+
+
 def _headers_key(options: dict[str, Any]) -> str:
     """Return a name for headers precompiled with these options.
 

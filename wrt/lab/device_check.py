@@ -30,7 +30,7 @@ from wrt.lab.bench.report import Columns, Row, machine_line, markdown, tabled
 from wrt.lab.bench.timing import alternate, spread
 from wrt.lab.bench.visibility import terrain
 from wrt.lab.hard_cases.cases import HARD_CASES, generate
-from wrt.lab.hard_cases.contestants import Own, WarpMesh
+from wrt.lab.hard_cases.contestants import CONSTRUCTORS, Own, WarpMesh
 from wrt.renderer.compile import compile_queries
 from wrt.renderer.options import Options
 from wrt.renderer.plan import plan_of
@@ -47,7 +47,6 @@ PICTURE: dict[str, Any] = {"size": (64, 36), "spp": 4, "seed": 3}
 MESHES: dict[str, Callable[[], Mesh]] = {
     "ball": partial(shapes.icosphere, 3), "torus": partial(shapes.torus, 1.0, 0.4, 64, 32), "terrain": partial(terrain, 48),
     "teapot": partial(shapes.teapot, 32), "teapot in a ring": lambda: shapes.merged([shapes.torus(500.0), shapes.teapot(16)], "")}
-CONSTRUCTORS = ("sah", "median", "lbvh", "cubql")  # builders of Warp's BVH
 FAST, SLOW, RUNS = 1 << 20, 1 << 15, 7  # number of timed rays on CUDA and on the CPU, and of timed runs
 TIMED_CELLS = 192  # cells a side of the timed terrain
 COLUMNS: Columns = {"results": "{part}", "of": "{what}", "compared": "{count}", "differ": "{differ}",

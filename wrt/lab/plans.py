@@ -14,6 +14,7 @@ STRUCTURES = ("structure", "wrt.accel.structures:ACCELERATORS")
 KINDS = ("kind of ray", "wrt.lab.bench.rays:RAY_KINDS")
 GPUS = ("GPU", "wrt.lab.rtcore.parameters:GPUS")
 THREAD_CHOICES = ("one", "all", "both")
+PEER_KINDS = ("primary", "shadow", "diffuse", "random", "points", "tiles")
 THREADS = "Number of CPU threads  [default: all cores]"
 RAY_SEED = "Seed of the random rays"
 INSIDE = "Put the camera at the centre of the mesh's bounding box, as in a room"
@@ -39,11 +40,13 @@ def the_kinds(*default: str) -> Sequence[str]:
 class Plan:
     """Options of a measurement. Raise InputError for a number out of its range and for an unknown name.
 
-    COMMAND: name of the command; STUDY: module that measures; QUICK: values that replace the defaults under --quick."""
+    COMMAND: name of the command; STUDY: module that measures; QUICK: values that replace the defaults under --quick;
+    OUTPUT: help of -o."""
 
     COMMAND: ClassVar[str] = ""
     STUDY: ClassVar[str] = ""
     QUICK: ClassVar[Mapping[str, Any]] = {}
+    OUTPUT: ClassVar[str] = "Write the tables as Markdown (.md)"
 
     def __post_init__(self) -> None:
         from wrt.core.checks import as_integer, require_known
@@ -105,32 +108,41 @@ class Units(Plan):
 
 @dataclass(frozen=True)
 class Peers(Plan):
-    """Compare wrt with Embree (robust, fast, in packets) and Warp's mesh_query_ray on the same rays: speeds, their ratios, and
-    the number of answers that differ.
+    """Compare wrt with Embree (robust, fast, in packets), Open3D, trimesh, Warp and tinybvh on the same rays and points: nanoseconds
+    a ray, ratios of the speeds, and the number of answers that differ.
 
     MESHES: mesh files; default: a sphere."""
 
     COMMAND, STUDY, QUICK = "bench peers", "wrt.lab.bench.peers", {"rays": 20_000, "runs": 5}
+    OUTPUT = "Write the tables as Markdown (.md), the figures as .csv, or a bar chart as .svg or .png"
     meshes: Sequence[Any] = the_meshes()
     structures: Sequence[str] = option(("bvh",), "Structures of wrt to measure; ratios relate to the first one", of=STRUCTURES)
-    rivals: Sequence[str] = option((), "Libraries to compare with: embree, embree_fast, embree16, embree16_incoherent, warp, open3d"
-                                           "  [default: all installed]",
-                                   of=("rival", "wrt.lab.hard_cases.contestants:PEERS"))
-    kinds: Sequence[str] = the_kinds()
-    rays: int = option(100_000, "Number of rays of each kind", (1, 2**28))
+    rivals: Sequence[str] = option((), "Libraries to compare with: embree, embree_fast, embree16, embree16_incoherent, warp, open3d,"
+                                           " trimesh  [default: all installed]", of=("rival", "wrt.lab.hard_cases.contestants:RIVALS"))
+    tinybvh: str | None = option(None, "Also compare with tinybvh: the folder with its header tiny_bvh.h, which a C++ compiler compiles")
+    kinds: Sequence[str] = option(PEER_KINDS[:-1], "Kinds: primary, shadow, diffuse, random rays; points: closest points;"
+                                                   " tiles: pictures of 64x64 pixels in many small worlds",
+                                  of=("kind of query", f"{__name__}:PEER_KINDS"))
+    rays: int = option(100_000, "Number of rays of each kind, and 50 times the number of points", (1, 2**28))
+    worlds: int = option(64, "Number of worlds for the kind tiles", (1, 2**20))
     runs: int = option(7, "Timed runs of each library, alternating", (1, 1000))
-    seed: int = option(0, RAY_SEED)
+    seed: int = option(0, "Seed of the random rays and worlds")
     threads: str = option("both", "CPU threads: one (measures CPU time), all (measures wall-clock time) or both",
                           of=("number of threads", f"{__name__}:THREAD_CHOICES"))
+    device: str = option("cpu", "Device to measure on: cpu, cuda:0, ... (`wrt devices` lists them)")
 
     def __post_init__(self) -> None:
         from wrt.core.errors import InputError
-        from wrt.lab.hard_cases.contestants import PEERS
+        from wrt.lab.hard_cases.contestants import RIVALS
 
         super().__post_init__()
         for name in self.rivals:
-            if not PEERS[name].is_installed():
+            if not RIVALS[name].is_installed():
                 raise InputError(f"{name} is not installed", hint='pip install "wrt[peers]"')
+            if self.device != "cpu" and not RIVALS[name].on_gpu:
+                raise InputError(f"{name} runs on the CPU only, not on {self.device}", argument="rivals")
+        if self.device != "cpu" and self.tinybvh is not None:
+            raise InputError(f"tinybvh runs on the CPU only, not on {self.device}", argument="tinybvh")
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,12 @@
-"""`python -m wrt bench peers`: compare wrt's structures with Embree and Warp's mesh_query_ray on the same rays."""
+"""`python -m wrt bench peers`: compare wrt with other libraries (Embree, Open3D, trimesh, Warp, tinybvh) on the same rays and points."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from pathlib import Path
 from time import perf_counter, thread_time
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -14,66 +15,146 @@ from wrt.accel.queries.answers import Hits
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.threads import run_all, thread_count
 from wrt.io.mesh_file import as_mesh
+from wrt.lab.bench import peer_points, peer_tiles
 from wrt.lab.bench.accel import timing, warm_up
+from wrt.lab.bench.instruction_sets import instruction_sets
+from wrt.lab.bench.peer_files import chart, figures
+from wrt.lab.bench.peer_files import check_output as check_output
 from wrt.lab.bench.rays import RaySet, ray_sets
 from wrt.lab.bench.report import Columns, Part, Row, grouped, machine_line, mesh_name, tabled, versions
 from wrt.lab.bench.timing import alternate, spread
-from wrt.lab.hard_cases.contestants import PEERS, Algorithm, Own
+from wrt.lab.hard_cases import tinybvh
+from wrt.lab.hard_cases.contestants import RIVALS, Algorithm, Own, Peer
 from wrt.lab.plans import Peers as Plan
+from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 
 SAME_T = 1e-4  # largest relative difference of t at which two triangles are a tie
 PARTS = 4  # parts of the rays for each thread, if a library uses one thread a call
 TITLE = "wrt and other libraries"
-COLUMNS: Columns = {"rays": "{kind}", "threads": "{threads}", "hit": "{hit:.0%}", "library": "{name}",
-                    "Mray/s": lambda row: spread(row.mrays), "wrt / library": "{first_over_it:.2f}", "differ": "{differ}"}
+COLUMNS: Columns = {"rays": "{kind}", "threads": "{threads}", "hit": "{hit:.0%}", "library": "{name}", "ns/ray": "{ns:.3g}",
+                    "Mray/s": lambda row: spread(row.mrays), "wrt / library": "{first_over_it:.2f}", "differ": "{differ} of {rays}"}
 LEGEND = """\
-Mray/s: rays over the thread's CPU seconds (over wall-clock seconds for several threads), median of alternating runs, quartiles in
-brackets. Rays and results are in each library's own arrays. If a library runs on one thread, each thread calls it with parts of the
-rays. wrt / library: speed of the table's first structure over the library's, median of the ratios run by run. differ: rays that hit in
-one library and miss in the other, or hit different primitives at t that differ by more than 1e-4 relative. Any-hit rays differ if one
-library says occluded and the other does not."""
+ns/ray, Mray/s: the thread's CPU seconds and the rays (wall-clock seconds for several threads and for a GPU), medians of alternating
+runs; quartiles in brackets. Rays and results are in each library's own arrays. If a library runs on one thread, each thread calls it
+with parts of the rays. wrt / library: speed of the table's first structure over the library's, median of the ratios run by run. differ:
+rays that hit in one library and miss in the other, or hit different primitives at t that differ by more than 1e-4 relative. Any-hit rays
+(shadow) differ if one library says occluded and the other does not. points: closest points; distances differ by more than 1e-4
+relative. tiles: 64x64 primary rays in each of many worlds of 3,202 triangles. best mode: the fastest of a library's modes for each mesh."""
+WRITERS = {".csv": figures, ".svg": chart, ".png": chart}
 
 
 def rows(plan: Plan) -> Iterator[Row]:
-    rivals = list(dict.fromkeys(plan.rivals)) or [name for name, peer in PEERS.items() if peer.is_installed()]
     for mesh in map(as_mesh, plan.meshes or [icosphere(5)]):
-        geometry, algorithms, builds = Geometry.of(mesh), contestants(plan, rivals), []
-        for algorithm in algorithms:
-            begin = perf_counter()
-            algorithm.prepare(geometry)
-            builds.append(perf_counter() - begin)
-        for rays in ray_sets(cast(Own, algorithms[0]).accel, plan.rays, plan.seed).values():
-            for threads in thread_counts(plan) if rays.kind in plan.kinds else ():
-                for i, measured in enumerate(compared(algorithms, rays, threads, plan.runs)):
-                    yield Row(mesh=mesh_name(mesh), triangles=len(mesh.faces), kind=rays.kind, rays=len(rays),
-                              name=algorithms[i].name, build=builds[i], threads=threads, **measured)
+        geometry, facts = Geometry.of(mesh), {"mesh": mesh_name(mesh), "triangles": len(mesh.faces)}
+        if set(plan.kinds) - {"points", "tiles"}:
+            for row in ray_rows(plan, geometry):
+                yield Row(**facts, **row)
+        if "points" in plan.kinds:
+            for row in point_rows(plan, geometry):
+                yield Row(**facts, **row)
+    if "tiles" in plan.kinds:
+        worlds = peer_tiles.small_worlds(plan.worlds, plan.seed)
+        for row in tile_rows(plan, worlds):
+            yield Row(mesh=f"{len(worlds)} worlds", triangles=sum(len(world.faces) for world in worlds), **row)
 
 
-def contestants(plan: Plan, rivals: Sequence[str]) -> list[Algorithm]:
+def ray_rows(plan: Plan, geometry: Geometry) -> Iterator[dict[str, object]]:
+    algorithms, builds = contestants(plan), []
+    for algorithm in algorithms:
+        begin = perf_counter()
+        algorithm.prepare(geometry)
+        builds.append(perf_counter() - begin)
+    for rays in ray_sets(cast(Own, algorithms[0]).accel, plan.rays, plan.seed).values():
+        for threads in thread_counts(plan) if rays.kind in plan.kinds else ():
+            for i, measured in enumerate(compared(algorithms, rays, threads, plan.runs, plan.device)):
+                name = algorithms[i].name
+                yield {"kind": rays.kind, "rays": len(rays), "name": name, "library": getattr(algorithms[i], "family", "") or name,
+                       "build": builds[i], "threads": threads, **measured}
+
+
+def contestants(plan: Plan) -> list[Algorithm]:
     out: list[Algorithm] = []
     for structure in dict.fromkeys(plan.structures):
         warm_up(structure)
-        out.append(Own(structure=structure))
+        out.append(Own(structure=structure, device=plan.device))
         out[-1].name = f"wrt {ACCELERATORS[structure].name}"
-    return [*out, *(PEERS[rival]() for rival in rivals)]
+    rivals = list(dict.fromkeys(plan.rivals)) or [name for name, peer in RIVALS.items() if is_usable(peer, plan)]
+    return [*out, *(mode for rival in rivals for mode in RIVALS[rival].modes(plan.device)),
+            *(tinybvh.trees(Path(plan.tinybvh)) if plan.tinybvh is not None else [])]
+
+
+def is_usable(peer: type[Peer], plan: Plan) -> bool:
+    return peer.is_installed() and (peer.on_gpu or plan.device == "cpu")
 
 
 def thread_counts(plan: Plan) -> list[int]:
-    return sorted({"one": {1}, "all": {thread_count(None)}, "both": {1, thread_count(None)}}[plan.threads])
+    return sorted({"one": {1}, "all": {thread_count(None)}, "both": {1, thread_count(None)}}[plan.threads]) if plan.device == "cpu" else [1]
 
 
-def compared(algorithms: Sequence[Algorithm], rays: RaySet, threads: int, runs: int) -> Iterator[dict[str, object]]:
+def compared(algorithms: Sequence[Algorithm], rays: RaySet, threads: int, runs: int, device: str = "cpu") -> Iterator[dict[str, object]]:
     """Yield the figures of each library for the same rays.
-    - hit: share of rays that hit, by the first library; differ: number of rays whose answer is not the first library's.
-    - seconds: time of each run, CPU time for one thread and wall-clock time for several threads."""
+    - hit: share of rays that hit, by the first library; differ: number of rays whose answer is not the first library's."""
     searches = [searching(algorithm, rays, threads) for algorithm in algorithms]
     answers = [answer(algorithm, rays, search()) for algorithm, search in zip(algorithms, searches, strict=True)]
     hit = float(np.mean(answers[0].prim_id >= 0 if isinstance(answers[0], Hits) else answers[0]))
-    seconds = alternate(dict(enumerate(searches)), runs, thread_time if threads == 1 else perf_counter)
-    for i, found in enumerate(answers):
-        yield {"hit": hit, **timing(len(rays), seconds[i], seconds[0]),
-               "first_over_it": float(np.median(seconds[i] / seconds[0])), "differ": differing(found, answers[0])}
+    for i, measured in enumerate(timed(searches, len(rays), threads, runs, device)):
+        yield {"hit": hit, **measured, "differ": differing(answers[i], answers[0])}
+
+
+def timed(works: Sequence[Callable[[], object]], n: int, threads: int, runs: int, device: str) -> Iterator[dict[str, object]]:
+    """Run these functions, each of which answers n queries, by turns; yield the figures of each.
+    seconds: time of each run, CPU time for one thread, and wall-clock time for several threads or a GPU."""
+    jobs = dict(enumerate(works if device == "cpu" else [partial(completed, work, device) for work in works]))
+    seconds = alternate(jobs, runs, thread_time if threads == 1 and device == "cpu" else perf_counter)
+    for i in jobs:
+        yield {**timing(n, seconds[i], seconds[0]), "ns": 1e9 * float(np.median(seconds[i])) / n,
+               "first_over_it": float(np.median(seconds[i] / seconds[0]))}
+
+
+def completed(work: Callable[[], object], device: str) -> object:
+    """Do the work, and wait until the device has completed it."""
+    import warp as wp
+
+    out = work()
+    wp.synchronize_device(device)
+    return out
+
+
+def point_rows(plan: Plan, geometry: Geometry) -> Iterator[dict[str, object]]:
+    """Yield the figures of each library that finds closest points."""
+    points = peer_points.points_around(geometry, plan.rays, plan.seed)
+    chosen = [each for name, each in peer_points.LIBRARIES.items() if each.is_installed() and (each.on_gpu or plan.device == "cpu")
+              and (name == "wrt" or not plan.rivals or name in plan.rivals)]
+    for threads in thread_counts(plan):
+        libraries, queries, builds = [each for each in chosen if each.has_threads or threads == 1], [], []
+        for library in libraries:
+            begin = perf_counter()
+            queries.append(library.prepare(geometry, plan.device))
+            builds.append(perf_counter() - begin)
+        works = [partial(query, points, threads) for query in queries]
+        found = [work() for work in works]
+        for i, measured in enumerate(timed(works, len(points), threads, plan.runs, plan.device)):
+            name = libraries[i].name
+            yield {"kind": "points", "rays": len(points), "name": name, "library": name, "build": builds[i], "threads": threads,
+                   "hit": 1.0, **measured, "differ": different_lengths(found[i], found[0])}
+
+
+def tile_rows(plan: Plan, worlds: Sequence[Mesh]) -> Iterator[dict[str, object]]:
+    """Yield the figures of each library for a picture of each world."""
+    rays = peer_tiles.tiles(len(worlds))
+    for threads in thread_counts(plan):
+        libraries, builds = [], []
+        for make in peer_tiles.libraries(worlds, rays, plan.device, threads):
+            begin = perf_counter()
+            libraries.append(make())
+            builds.append(perf_counter() - begin)
+        found = [library.found(library.work()) for library in libraries]
+        for i, measured in enumerate(timed([library.work for library in libraries], len(rays.world), threads, plan.runs, plan.device)):
+            name = libraries[i].name
+            yield {"kind": "tiles", "rays": len(rays.world), "name": name, "library": name.split(",")[0], "build": builds[i],
+                   "threads": threads, "hit": float(np.isfinite(found[0]).mean()), **measured,
+                   "differ": different_lengths(found[i], found[0])}
 
 
 def searching(algorithm: Algorithm, rays: RaySet, threads: int) -> Callable[[], list[object]]:
@@ -110,9 +191,23 @@ def differing(found: Hits | np.ndarray, truth: Hits | np.ndarray) -> int:
     return int((np.asarray(found) != np.asarray(truth)).sum())
 
 
+def different_lengths(found: np.ndarray, truth: np.ndarray) -> int:
+    """Count the distances that differ by more than SAME_T relative; two infinite distances are equal."""
+    return int((~np.isclose(found, truth, rtol=SAME_T, atol=0.0)).sum())
+
+
 def machine(plan: Plan) -> str:
-    return machine_line(f"{' and '.join(map(str, thread_counts(plan)))} threads used", versions("warp-lang", "embreex", "open3d"),
-                        f"{plan.runs} alternating runs of {plan.rays} rays")
+    if plan.tinybvh is not None:
+        tinybvh.library(Path(plan.tinybvh))  # an error about it comes before the measurements
+    missing = [peer.name for peer in RIVALS.values() if not peer.is_installed()]
+    missing += [each.name for each in peer_points.LIBRARIES.values() if not each.is_installed()]
+    used = f"{' and '.join(map(str, thread_counts(plan)))} threads used" if plan.device == "cpu" else ""
+    found = versions("warp-lang", "embreex", "open3d", "open3d-cpu", "trimesh")
+    found += f", tinybvh {tinybvh.version(Path(plan.tinybvh))}" if plan.tinybvh is not None else ""
+    return machine_line(", ".join(filter(None, [instruction_sets() if plan.device == "cpu" else "", used])), found,
+                        f"{plan.runs} alternating runs of {plan.rays} rays",
+                        *([f"not installed: {', '.join(missing)}"] if missing and not plan.rivals and plan.device == "cpu" else []),
+                        device=plan.device)
 
 
 def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
@@ -121,20 +216,30 @@ def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
         built = ", ".join(dict.fromkeys(f"{row.name} {row.build:.2f} s" for row in group))
         out.append(tabled(COLUMNS, group, f"{mesh}, {triangles} triangles", f"Build time, wall clock: {built}."))
     kinds = list(dict.fromkeys(row.kind for row in rows))
-    lines = [(name, *(f"{by_kind[kind]:.2f}" for kind in kinds)) for name, by_kind in means(rows).items()]
+    lines = [(name, *(f"{by_kind[kind]:.2f}" if kind in by_kind else "" for kind in kinds)) for name, by_kind in means(rows).items()]
     title = f"Geometric means over {len(by_mesh)} meshes of wrt / library"
     return [*out, *([Part(title, "", ("library", *kinds), lines)] if lines else [])]
 
 
 def means(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     """Return library -> kind of ray -> geometric mean over the meshes of the first structure's speed over the library's speed."""
-    first = rows[0].name if rows else ""
     out: dict[str, dict[str, float]] = {}
-    for (name, threads, kind), group in grouped([row for row in rows if row.name != first], "name", "threads", "kind").items():
+    for (name, threads, kind), group in grouped(rivals_of(rows), "name", "threads", "kind").items():
         logs = np.log([row.first_over_it for row in group])
         out.setdefault(name if threads == 1 else f"{name}, {threads} threads", {})[kind] = float(np.exp(np.mean(logs)))
     return out
 
 
-def facts(rows: Sequence[Row], plan: Plan) -> dict[str, object]:
+def rivals_of(rows: Sequence[Row]) -> list[Row]:
+    """Return the rows of all but the first library of each comparison, and a further row for the best of a library's modes."""
+    out: list[Row] = []
+    for group in grouped(rows, "mesh", "triangles", "kind", "threads").values():
+        out += group[1:]
+        for (library,), modes in grouped(group[1:], "library").items():
+            if len(modes) > 1:
+                out.append(Row(**{**vars(min(modes, key=lambda row: row.first_over_it)), "name": f"{library}, best mode"}))
+    return out
+
+
+def facts(rows: Sequence[Row], plan: Plan) -> dict[str, Any]:
     return {"means": means(rows)}

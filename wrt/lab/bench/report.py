@@ -77,7 +77,8 @@ def study_of(plan: Plan) -> ModuleType:
     """Return the module that measures a plan.
 
     The module has TITLE, LEGEND, and rows(plan), which yields each Row once it is measured. COLUMNS or parts(rows, plan) make the tables.
-    Optional are machine(plan) for the report, line(row) for a line of progress, and facts(rows, plan) for more JSON fields."""
+    Optional are machine(plan) for the report, line(row) for a line of progress, facts(rows, plan) for more JSON fields, and for -o
+    WRITERS, suffix -> function(rows, plan, machine, suffix) to bytes, with check_output(suffix), which raises InputError."""
     return importlib.import_module(plan.STUDY)
 
 
@@ -139,7 +140,8 @@ def repeating(plan: Plan) -> str:
         elif isinstance(value, bool):
             words += [flag] if value else []
         elif value not in (None, ()) and (value != each.default or isinstance(value, int)):
-            words.append(f"{flag} {value if isinstance(value, str | int | float) else ','.join(value)}")
+            text = ",".join(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
+            words.append(f"{flag} {text.name if isinstance(text, Path) else text}")
     return " ".join(words)
 
 

@@ -20,6 +20,8 @@ from wrt.core.registry import Registry
 from wrt.core.types import ArrayLike
 from wrt.lab.bench.rays import RaySet
 
+CONSTRUCTORS = ("sah", "median", "lbvh", "cubql")  # builders of Warp's BVH
+
 
 class Algorithm(ABC):
     """An algorithm that finds closest hits: call prepare() for each geometry, then closest(), which uses one thread."""
@@ -84,6 +86,13 @@ class Peer(Algorithm):
 
     is_peer = True
     has_threads = False
+    on_gpu: ClassVar[bool] = False  # it can trace on the device that the constructor names
+    family: ClassVar[str] = ""  # of peers that are modes of one library: the reports also show the fastest of them
+
+    @classmethod
+    def modes(cls, device: str) -> list[Peer]:
+        """Return the peers to compare on this device."""
+        return [cls()]
 
     def prepare(self, geometry: Geometry) -> bool:
         if len(geometry.spheres) or not len(geometry.faces):
@@ -101,6 +110,7 @@ class Embree(Peer):
 
     name = "Embree robust"
     package = "embreex"
+    family = "Embree robust"
     robust: ClassVar[bool] = True
 
     def load(self, geometry: Geometry) -> None:
@@ -133,13 +143,26 @@ class EmbreeFast(Embree):
     """Embree 4 through embreex without the robust flag, which is Embree's own default: faster, but it loses rays at edges."""
 
     name = "Embree fast"
+    family = ""
     robust = False
+
+
+def constructors(device: str) -> tuple[str, ...]:
+    """Return the builders of Warp's BVH to compare on this device: on the CPU the one with the fastest queries, on a GPU all."""
+    return CONSTRUCTORS if device.startswith("cuda") else CONSTRUCTORS[:1]
 
 
 class WarpMesh(Peer):
     """Warp's mesh_query_ray, which has no t_min, on a wp.Mesh built by one of Warp's constructors."""
 
     name = "Warp mesh_query_ray"
+    family = "Warp mesh_query_ray"
+    on_gpu = True
+
+    @classmethod
+    def modes(cls, device: str) -> list[Peer]:
+        """Return one with each constructor."""
+        return [cls(device, each) for each in constructors(device)]
 
     def __init__(self, device: str = DEFAULT_DEVICE, constructor: str = "sah") -> None:
         self.place, self.constructor = device, constructor
@@ -219,6 +242,39 @@ class Open3D(Peer):
         return lambda: self.scene.cast_rays(bundle, nthreads=threads)
 
 
+class Trimesh(Peer):
+    """trimesh.ray with Embree. It has no t_max, so segments need the hits' locations."""
+
+    name = "trimesh.ray with embreex"
+    package = "embreex"
+
+    def load(self, geometry: Geometry) -> None:
+        with needed_by(self.name):
+            import trimesh
+            from trimesh.ray.ray_pyembree import RayMeshIntersector
+
+        self.mesh = RayMeshIntersector(trimesh.Trimesh(geometry.vertices, geometry.faces, process=False))
+        self.mesh.intersects_first(np.zeros((1, 3)), np.ones((1, 3)))  # Embree builds at the first query
+
+    def closest(self, origins: np.ndarray, directions: np.ndarray, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf) -> Hits:
+        face, ray, where = self.mesh.intersects_id(origins, directions, multiple_hits=False, return_locations=True)
+        t, prim_id = np.full(len(origins), np.inf), np.full(len(origins), -1, np.int32)
+        o, d = origins[ray].astype(np.float64), directions[ray].astype(np.float64)
+        t[ray], prim_id[ray] = ((where - o) * d).sum(axis=1) / (d**2).sum(axis=1), face
+        return cut(t.astype(np.float32), prim_id, np.zeros(len(t)), np.zeros(len(t)), t_min, t_max)
+
+    def search(self, rays: RaySet, threads: int) -> Callable[[], object]:
+        o, d = rays.origins.astype(np.float64), rays.directions.astype(np.float64)
+        if not rays.any_hit:
+            return lambda: self.mesh.intersects_first(o, d)
+        if np.isinf(rays.t_max).all():
+            return lambda: self.mesh.intersects_any(o, d)
+        return lambda: self.closest(o, d, 0.0, rays.t_max).prim_id >= 0
+
+    def occluded(self, out: np.ndarray) -> np.ndarray:
+        return out
+
+
 def cut(t: np.ndarray, prim_id: np.ndarray, u: np.ndarray, v: np.ndarray, t_min: ArrayLike, t_max: ArrayLike) -> Hits:
     """Return Hits in which hits outside [t_min, t_max] are misses."""
     outside = (prim_id < 0) | ~((t >= np.asarray(t_min)) & (t <= np.asarray(t_max)))
@@ -242,3 +298,5 @@ PEERS: Registry[type[Peer]] = Registry("rival", {
     "warp": f"{__name__}:WarpMesh",
     "open3d": f"{__name__}:Open3D",
 })
+# Of `bench peers`: also those whose hits have no u and v.
+RIVALS: Registry[type[Peer]] = Registry("rival", {**PEERS.data, "trimesh": f"{__name__}:Trimesh"})

@@ -45,6 +45,7 @@ class EmbreePackets(Peer):
 
     name = "Embree robust, 16 coherent"
     package = "embreex"
+    family = "Embree robust"
     coherent: ClassVar[bool] = True
 
     def load(self, geometry: Geometry) -> None:
