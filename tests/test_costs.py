@@ -17,12 +17,13 @@ from tests.structures import STRUCTURES
 OTHERS = [name for name in STRUCTURES if name != "brute_force"]
 
 
-def test_every_structure_has_its_lines() -> None:
-    names = [f"{structure} {mesh} {kind}" for structure in [costs.DEFAULT, *OTHERS] for mesh, kind in costs.kinds_of(structure)]
-    assert set(costs.stored()) == set(names)
+def test_the_file_has_every_line_of_the_default_structure_and_no_unknown_line() -> None:
+    names = {structure: {f"{structure} {mesh} {kind}" for mesh, kind in costs.kinds_of(structure)} for structure in OTHERS}
+    assert names[costs.DEFAULT] <= costs.stored().keys() <= set().union(*names.values())
 
 
-@pytest.mark.parametrize("structure", [name if name in ("bvh8", "bvh2") else pytest.param(name, marks=pytest.mark.slow) for name in OTHERS])
+@pytest.mark.parametrize("structure", [name if name in ("bvh8", "bvh2") else pytest.param(name, marks=pytest.mark.slow)
+                                       for name in sorted({line.split()[0] for line in costs.stored()})])
 def test_counters_are_those_of_the_file(structure: str) -> None:
     stored = costs.stored()
     for name, counters in costs.counted(structure).items():
