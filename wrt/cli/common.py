@@ -49,13 +49,14 @@ class PatternType(click.ParamType):
         return self.value(*match.groups())
 
 
-SIZE = PatternType("WxH", f"({DIGITS})[xX]({DIGITS})", "a size; write 640x360", lambda *sides: tuple(map(int, sides)))
+SIZE = PatternType("W[xH]", f"({DIGITS})(?:[xX]({DIGITS}))?", "a size; write 640x360, or 640 for a width",
+                   lambda width, height: (int(width), int(height)) if height else int(width))
 CROP = PatternType("X0,Y0,X1,Y1", ",".join([rf"\s*({DIGITS})\s*"] * 4),
                    "a rectangle; write X0,Y0,X1,Y1 in pixels from the top left", lambda *ends: tuple(map(int, ends)))
 DURATION = PatternType("TIME", r"([0-9]+(?:\.[0-9]*)?)\s*([smh]?)", "a time; write 30s, 5m or 1h",
                        lambda number, unit: float(number) * {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0}[unit])
 
-EXPOSURE = PatternType("STOPS|auto", r"(auto|[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)",
+EXPOSURE = PatternType("STOPS|auto", r"(auto|[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|nan|[-+]?inf)",
                        "an exposure; write stops such as -1.5, or auto",
                        lambda stops: stops if stops == "auto" else float(stops))
 
@@ -133,7 +134,8 @@ class Setting(click.ParamType):
 SHARED = {
     "scene": click.argument("scene", type=click.Path(path_type=Path)),
     "spp": click.option("--spp", type=int, help="Samples per pixel  [default: the scene's]"),
-    "size": click.option("--size", type=SIZE, help="Width and height in pixels  [default: the scene's, or 640x360]"),
+    "size": click.option("--size", type=SIZE, help="Width and height in pixels, or a width, which keeps the scene's aspect ratio"
+                         "  [default: the scene's, or 640x360]"),
     "max_depth": click.option("--max-depth", type=int, help="Bounces after the first hit  [default: the scene's, or 8; 64 with glass]"),
     "crop": click.option("--crop", type=CROP, help="Render only this rectangle, in pixels from the top left"),
     "camera": click.option("--camera", help="Name or index of a camera in the scene  [default: the first]"),

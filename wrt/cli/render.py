@@ -29,7 +29,7 @@ from wrt.cli.common import (
     shared,
     warnings_reported,
 )
-from wrt.cli.save import checkpoint_options, remove_checkpoint, save_film
+from wrt.cli.save import checkpoint_options, remove_checkpoint, save_film, write_to_stdout
 from wrt.core.default_device import DEFAULT_DEVICE
 from wrt.core.errors import InputError
 from wrt.core.interrupts import Interrupted, exit_code
@@ -40,11 +40,13 @@ if TYPE_CHECKING:
     from wrt.scene.model import Scene
     from wrt.scene.settings import SettingChanges
 
+STDOUT = Path("-")
+
 
 @click.command(help=f"Render SCENE (.toml, .gltf, .glb, or a mesh: {SUFFIXES}) to a picture.")
 @shared("scene")
 @click.option("-o", "--output", type=click.Path(path_type=Path),
-              help="Picture to write: .png, .exr or .hdr  [default: the scene's file name with .png]")
+              help="Picture to write: .png, .exr, .hdr, .jpg or .webp; - is a PNG on stdout  [default: the scene's file name with .png]")
 @shared("spp", "size", "seed")
 @click.option("--device", default=DEFAULT_DEVICE, show_default=True,
               help="cpu, cuda:0 ... (`devices` lists them). Several of one kind share the work: cuda:0,cuda:1")
@@ -75,10 +77,14 @@ def render(scene: Path, output: Path | None, assignments: Assignments, staging: 
            **options: Parsed) -> None:
     begin = time.perf_counter()
     from wrt.picture.film import aov_path
-    from wrt.picture.image import check_writable
+    from wrt.picture.image import check_writable, output_format
 
     output, bits = output or Path(f"{scene.stem or 'picture'}.png"), options.pop("bits")
-    check_writable(output, bits)
+    if output == STDOUT:
+        require_alone(as_json, options)
+        output_format("-.png", bits)
+    else:
+        check_writable(output, bits)
     if scene.exists():
         from wrt.accel.queries.raw_launches import preload_headers
 
@@ -97,7 +103,7 @@ def render(scene: Path, output: Path | None, assignments: Assignments, staging: 
     with warnings_reported(quiet):
         film = trace(loaded, scene, settings.get("spp"), options, quiet)
         begin = time.perf_counter()
-        paths, signals, write_error = save_film(film, output, bits, layers)
+        paths, signals, write_error = write_to_stdout(film, bits) if output == STDOUT else save_film(film, output, bits, layers)
     if checkpoint is not None and not (write_error or film.stats["interrupted"] or film.stats["timed_out"]):
         remove_checkpoint(checkpoint)  # the picture is complete
         film.stats["checkpoint"] = None
@@ -115,6 +121,13 @@ def render(scene: Path, output: Path | None, assignments: Assignments, staging: 
         raise InputError(f"{write_error}; the picture was written to {paths[0]} instead")
     if film.stats["interrupted"]:
         raise SystemExit(exit_code(film.stats["signal"]))
+
+
+def require_alone(as_json: bool, options: dict[str, Parsed]) -> None:
+    """Raise InputError for an option that writes beside a picture on stdout."""
+    for name, given in (("json", as_json), ("aov", options["aov"]), ("checkpoint", options["every"] or options["resume"])):
+        if given and not (name == "checkpoint" and options["checkpoint_file"]):
+            raise InputError("has no place if the picture goes to stdout", argument=f"--{name}", hint="give -o a file name")
 
 
 def check_options(output: Path, assignments: Assignments, options: dict[str, Parsed]) -> SettingChanges:

@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import click
+
 from wrt.core.errors import InputError
 from wrt.core.interrupts import held_interrupts
 
@@ -46,6 +48,17 @@ def save_film(film: Film, output: Path, bits: int | None, layers: Sequence[str] 
                 except InputError:
                     shutil.rmtree(folder, ignore_errors=True)
             raise
+
+
+def write_to_stdout(film: Film, bits: int | None) -> tuple[list[Path], list[int], InputError | None]:
+    """Write the picture to stdout as a PNG file. The result is that of save_film, without paths."""
+    from wrt.picture.image import encode_png
+    from wrt.picture.tonemap import to_codes
+
+    codes = to_codes(film.pixels, film.exposure, film.tonemap, bits or 8)
+    with held_interrupts() as signals:
+        click.echo(encode_png(codes, film.metadata), nl=False)
+    return [], signals, None
 
 
 def remove_checkpoint(path: Path) -> None:

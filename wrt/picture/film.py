@@ -122,7 +122,7 @@ class Film:
         Parameters
         ----------
         path
-            Path of the picture. A .png file is exposed and tone-mapped; .exr and .hdr files are linear.
+            Path of the picture. A .png, .jpg or .webp file is exposed and tone-mapped; .exr and .hdr files are linear.
         bits
             Bits of a channel: 8 or 16 for PNG (default 8), 32 or 16 for EXR (default 32).
         aov

@@ -1,13 +1,14 @@
-"""Image files: PNG (8 and 16 bit), OpenEXR and Radiance HDR. Each file is written completely or not at all.
+"""Image files: PNG (8 and 16 bit), JPEG, WebP, OpenEXR and Radiance HDR. Each file is written completely or not at all.
 
-Row 0 is on top. Colours in memory are linear Rec. 709; a PNG or JPEG file holds sRGB codes. OpenImageIO reads and writes EXR and HDR,
-Pillow reads the rest (wrt.picture.decode). PNG is encoded here: Pillow writes no 16-bit RGB, and OpenImageIO's PNG writer damages text
-outside ASCII and reports success on a full disk.
+Row 0 is on top. Colours in memory are linear Rec. 709; PNG, JPEG and WebP files hold sRGB codes. OpenImageIO reads and writes EXR and
+HDR; Pillow reads the rest (wrt.picture.decode), and writes JPEG and WebP. PNG is encoded here: Pillow writes no 16-bit RGB, and
+OpenImageIO's PNG writer damages text outside ASCII and reports success on a full disk.
 """
 
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import struct
 import zlib
@@ -30,7 +31,10 @@ from wrt.picture.tonemap import decode_srgb, to_codes
 Metadata = Mapping[str, object]
 
 # Bits per channel in which a format is written; the first is the default.
-FORMATS: dict[str, tuple[int, ...]] = {".png": (8, 16), ".exr": (32, 16), ".hdr": (32,)}
+FORMATS: dict[str, tuple[int, ...]] = {".png": (8, 16), ".exr": (32, 16), ".hdr": (32,), ".jpg": (8,), ".jpeg": (8,), ".webp": (8,)}
+# Options of Pillow for files with losses: nearly invisible ones.
+LOSSY: dict[str, dict[str, Any]] = {"JPEG": {"quality": 95, "subsampling": 0}, "WEBP": {"quality": 95}}
+MOST_LOSSY = {"JPEG": 65535, "WEBP": 16383}  # pixels of a side
 DISPLAY_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tga")  # read as sRGB codes
 LINEAR_SUFFIXES = (".exr", ".hdr")
 METADATA_PREFIX = "wrt:"  # begins the names of text entries
@@ -68,16 +72,16 @@ def write_image(path: PathLike, pixels: np.ndarray, *, bits: int | None = None, 
     """Write one picture in the format of the suffix.
 
     - pixels: (H, W, 3) linear. bits: per channel, of FORMATS (default 8 for PNG, 32 for EXR and HDR; 16 in EXR is half).
-    - exposure, tonemap: for PNG alone; metadata: text entries, written as `wrt:key`.
+    - exposure, tonemap: for PNG, JPEG and WebP alone; metadata: text entries, written as `wrt:key`.
 
-    EXR keeps NaN and infinite values. In PNG, NaN and -inf are black, +inf is white. HDR has 0 for NaN and negative values, and its
-    largest value for +inf. A SceneWarning counts replaced pixels. Raises InputError if the file cannot be written; an existing file
-    then stays unchanged."""
+    EXR keeps NaN and infinite values. In PNG, JPEG and WebP, NaN and -inf are black, +inf is white. HDR has 0 for NaN and negative
+    values, and its largest value for +inf. A SceneWarning counts replaced pixels. Raises InputError if the file cannot be written; an
+    existing file then stays unchanged."""
     pixels = np.asarray(pixels, dtype=np.float32)
     if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.size == 0:
         raise InputError(f"must be (H, W, 3), got {pixels.shape}", argument="pixels", path=path)
     suffix, bits = output_format(path, bits)
-    if suffix == ".png":
+    if suffix not in LINEAR_SUFFIXES:
         _warn_replaced(path, ~np.isfinite(pixels), "NaN or infinite, written as black or white")
         write_codes(path, to_codes(pixels, exposure, tonemap, bits), metadata)
     elif suffix == ".exr":
@@ -87,8 +91,24 @@ def write_image(path: PathLike, pixels: np.ndarray, *, bits: int | None = None, 
 
 
 def write_codes(path: PathLike, codes: np.ndarray, metadata: Metadata | None = None) -> None:
-    """Write display codes, (H, W, 3) uint8 or uint16, to a PNG file. Raises InputError as write_image does."""
-    write_file.write_bytes(path, encode_png(codes, metadata))
+    """Write display codes, (H, W, 3) uint8 or (PNG alone) uint16, in the format of the suffix. Raises InputError as write_image does."""
+    kind = {".webp": "WEBP", ".png": "PNG"}.get(Path(path).suffix.lower(), "JPEG")
+    with at(path=path):
+        data = encode_png(codes, metadata) if kind == "PNG" else _encode_lossy(codes, kind, metadata or {})
+    write_file.write_bytes(path, data)
+
+
+def _encode_lossy(codes: np.ndarray, kind: str, metadata: Metadata) -> bytes:
+    """Encode (H, W, 3) uint8 sRGB codes as a JPEG or WebP file, with the metadata in EXIF's ImageDescription (tag 0x010E)."""
+    with needed_by("a JPEG or WebP picture"):
+        from PIL import Image
+
+    if max(codes.shape) > MOST_LOSSY[kind]:
+        raise InputError(f"a side of a {kind} picture has at most {MOST_LOSSY[kind]} pixels, not {max(codes.shape)}", hint="write a .png")
+    out, exif = io.BytesIO(), Image.Exif()
+    exif[0x010E] = "; ".join(f"{METADATA_PREFIX}{key}={value}" for key, value in metadata.items()).encode("ascii", "replace").decode()
+    Image.fromarray(codes).save(out, kind, exif=exif, **LOSSY[kind])
+    return out.getvalue()
 
 
 def write_exr(path: PathLike, channels: Mapping[str, np.ndarray], metadata: Metadata | None = None) -> None:

@@ -220,13 +220,17 @@ class Scene:
                 yield vertices.astype(np.float64), thing.transform
 
     def with_settings(self, **changes: Unpack[SettingChanges]) -> Scene:
-        """Return a copy of the scene with changed settings. A setting of None keeps the scene's value; an exposure ends auto_exposure.
+        """Return a copy of the scene with changed settings. A setting of None keeps the scene's value; an exposure ends
+        auto_exposure; a size that is one number is a width, and the aspect ratio stays.
 
         Raises InputError for an unknown setting and for a wrong value."""
         for name in changes:
             if name not in SETTINGS:
                 raise unknown(name, "setting", SETTINGS, argument=name)
         changed: dict[str, Any] = {name: value for name, value in changes.items() if value is not None}
+        if isinstance(changed.get("size"), int):
+            width, height = self.settings.size
+            changed["size"] = (changed["size"], max(1, round(changed["size"] * height / width)))
         if "exposure" in changed:
             changed.setdefault("auto_exposure", False)
         return replace(self, settings=replace(self.settings, **changed))

@@ -75,7 +75,7 @@ SETTINGS = tuple(each.name for each in fields(Settings))
 class SettingChanges(TypedDict, total=False):
     """The fields of Settings as keywords; None keeps the scene's value."""
 
-    size: tuple[int, int] | str | None
+    size: tuple[int, int] | str | int | None
     spp: int | None
     max_depth: int | None
     min_throughput: float | None

@@ -192,7 +192,9 @@ def test_names_that_cannot_be_encoded_are_no_reason_to_fail() -> None:
 HUGE = "9" * 5000  # more digits than Python converts to an integer
 WRONG = [
     (["--size", "0x0"], "size must be 1x1 to 32768x32768"), (["--size", "100000x100000"], "size must be"),
-    (["--size", "640"], "write 640x360"), (["--size", "-1x3"], "write 640x360"), (["--size", HUGE + "x1"], "write 640x360"),
+    (["--size", "640x"], "write 640x360"), (["--size", "0"], "size must be"), (["-o", "-", "--json"], "--json"),
+    (["-o", "-", "--aov", "depth"], "--aov"), (["-o", "-", "--bits", "32"], "bits"), (["--size", "-1x3"], "write 640x360"),
+    (["--size", HUGE + "x1"], "write 640x360"),
     (["--spp", "0"], "spp must be 1 to"), (["--spp", "-1"], "spp must be"), (["--spp", "1000000000"], "spp must be"),
     (["--spp", "1.5"], "'--spp'"), (["--spp", "many"], "'--spp'"),
     (["--seed", "-1"], "seed must be 0 to"), (["--seed", str(2**32)], "seed must be 0 to"),
@@ -233,7 +235,7 @@ def test_a_crop_outside_the_picture(crop: str) -> None:
 
 @pytest.mark.parametrize(("output", "message"), [
     ("nowhere/a.png", "nowhere/a.png: its folder does not exist"), ("folder.png", "folder.png: is a folder"),
-    ("a.jpg", "a.jpg: cannot write .jpg; use .png, .exr, .hdr"), ("a", "a: cannot write a file without a suffix"),
+    ("a.gif", "a.gif: cannot write .gif; use .png, .exr, .hdr"), ("a", "a: cannot write a file without a suffix"),
     ("", "cannot write a file without a suffix"), ("box.obj/a.png", "its folder does not exist"),
     ("a" * 300 + ".png", "too long"),
 ])
@@ -398,6 +400,21 @@ def test_ctrl_c_before_the_first_sample_leaves_everything_as_it_was(where: str, 
     result = run("render", "box.obj", *SMALL, "--aov", "depth")
     assert result.code == 130 and result.out == "" and result.err.split("\n")[-2] == "interrupted"
     assert "Traceback" not in result.err and Path("box.png").read_bytes() == b"old" and new_files() == {"box.png"}
+
+
+def test_a_width_alone_keeps_the_scenes_aspect_ratio() -> None:
+    Path("scene.toml").write_text(TWO_CAMERAS + "[settings]\nsize = [60, 20]\nspp = 1\n")
+    assert run("render", "scene.toml", "--size", 31, "-o", "a.jpg").code == 0
+    with Image.open("a.jpg") as image:
+        assert image.size == (31, 10) and image.format == "JPEG" and "wrt:spp=1" in image.getexif()[0x010E]
+
+
+def test_a_picture_on_stdout_is_the_file_and_nothing_else() -> None:
+    assert run("render", "box.obj", *SMALL, "-o", "a.png").code == 0
+    piped = subprocess.run([sys.executable, "-m", "wrt", "render", "box.obj", *map(str, SMALL), "-o", "-"], capture_output=True, check=True)
+    Path("piped.png").write_bytes(piped.stdout)
+    assert piped.stdout.startswith(b"\x89PNG") and piped.stdout.endswith(b"IEND\xaeB`\x82")
+    assert np.array_equal(read_image("piped.png"), read_image("a.png")) and not Path("-").exists()
 
 
 # --- the other commands -----------------------------------------------------------------------------------------------

@@ -86,7 +86,7 @@ def test_wrong_names_write_nothing(film: Film, tmp_path: Path) -> None:
     with refused("aov", "no AOV 'dept'", hint="depth, normal"):
         film.save(tmp_path / "a.png", aov=["depth", "dept"])
     with refused(hint="use .png, .exr, .hdr"):
-        film.save(tmp_path / "a.jpg")
+        film.save(tmp_path / "a.gif")
     (tmp_path / "a.depth.png").mkdir()
     with refused(what="folder", path="a.depth.png"):
         film.save(tmp_path / "a.png", aov=["normal", "depth"])

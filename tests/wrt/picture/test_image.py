@@ -193,6 +193,23 @@ def test_metadata_cannot_break_the_hdr_header(pixels: np.ndarray, tmp_path: Path
     assert read_metadata(tmp_path / "a.hdr") == {"scene": "two lines"}
 
 
+@pytest.mark.parametrize(("suffix", "kind"), [(".jpg", "JPEG"), (".JPEG", "JPEG"), (".webp", "WEBP")])
+def test_pictures_with_losses_are_close_to_the_png_and_say_what_they_are(suffix: str, kind: str, tmp_path: Path) -> None:
+    y, x = np.mgrid[0:48, 0:64] / 64
+    smooth = np.stack([x, y, 1 - x], axis=-1).astype(np.float32) * 2.0
+    write_image(tmp_path / "a.png", smooth, exposure=-1, tonemap="aces")
+    write_image(tmp_path / f"a{suffix}", smooth, exposure=-1, tonemap="aces", metadata={"scene": "ä b"})
+    with Image.open(tmp_path / f"a{suffix}") as image, Image.open(tmp_path / "a.png") as exact:
+        assert image.format == kind and image.getexif()[0x010E] == "wrt:scene=? b"
+        assert np.abs(np.asarray(image.convert("RGB"), int) - np.asarray(exact, int)).max() <= 12
+
+
+def test_a_side_that_the_format_cannot_hold_is_refused(tmp_path: Path) -> None:
+    with refused(None, "at most 16383 pixels", hint="png"):
+        write_image(tmp_path / "a.webp", np.zeros((1, 16384, 3), np.float32))
+    assert not list(tmp_path.iterdir())
+
+
 # --- whole or not at all ----------------------------------------------------------------------------------------------
 
 
@@ -246,7 +263,7 @@ def test_check_writable_leaves_no_trace(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "bits", "message"),
     [
-        ("a.jpg", None, (None, "cannot write .jpg", None, "a.jpg", "use .png, .exr, .hdr")),
+        ("a.gif", None, (None, "cannot write .gif", None, "a.gif", "use .png, .exr, .hdr, .jpg")),
         ("a", None, (None, "file without a suffix", None, "a")),
         ("a.png", 32, ("bits", "png is written")),
         ("a.hdr", 16, ("bits", "hdr is written")),
