@@ -2,7 +2,7 @@
 The functions scale very short and long directions (query.direction_scale) and traverse the structure for one ray. In a kernel without fused
 multiply-add (structs.kernel), their hits equal those of Accelerator.closest_hit to the last bit."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import warp as wp
 
@@ -18,6 +18,7 @@ class QueryRay:
     direction: wp.vec3  # Any length but 0.
     t_min: float  # At least 0, in units of |direction|.
     t_max: float  # In units of |direction|; may be inf.
+    world: int  # Index of the world that the ray sees, in a structure over worlds; in a world that does not exist, it hits nothing.
 
 
 @wp.struct
@@ -88,27 +89,50 @@ def make_query_hit(hit: Hit, direction: wp.vec3) -> QueryHit:
     return out
 
 
-def make_ray_query(accel_struct: Any, closest: Any, any_of: Any, resuming: Any, kind: int) -> tuple[Any, Any, Any, Any]:
-    """Make World, closest_hit, any_hit and next_hit from three traversals; `resuming` is made with Units.resumes.
-    The integer `kind` identifies these traversals: a World with another `kind` is rejected at run time."""
+class Traversals(NamedTuple):
+    """The traversals of one kind of structure, for queries in a user's kernel."""
+
+    struct: Any  # Type of the structure.
+    closest: Any
+    any_of: Any
+    resuming: Any  # Made with Units.resumes.
+    instances: bool  # True for structures with instances, whose World has the roots of its worlds.
+    kind: int  # Identifies these traversals: a World with another `kind` is rejected at run time.
+
+
+def make_ray_query(traversals: Traversals) -> tuple[Any, Any, Any, Any]:
+    """Make World, closest_hit, any_hit and next_hit."""
+    struct, closest, any_of, resuming, instances, kind = traversals
 
     @wp.struct
     class World:
         """A structure and its surfaces, as one argument of a kernel."""
 
         kind: int  # The query functions compare it with their own `kind`, because Warp does not compare struct types.
-        accel: accel_struct
+        accel: struct
         surfaces: Surfaces
+        roots: wp.array(dtype=wp.int32)  # Index of each world's root; only with instances.
+
+    @wp.func
+    def prepared(world: World, ray: QueryRay) -> Ray:
+        """Make the ray for the traversal."""
+        out = traversal_ray(ray, world.kind != kind)
+        if wp.static(instances):
+            if ray.world >= 0 and ray.world < world.roots.shape[0]:
+                out.first_prim = world.roots[ray.world]
+            else:
+                out.direction = wp.vec3(wp.nan, wp.nan, wp.nan)
+        return out
 
     @wp.func
     def closest_hit(world: World, ray: QueryRay) -> QueryHit:
         """Return the closest hit in the ray's segment; of hits at equal t, the one with the lowest prim_id."""
-        return make_query_hit(closest(world.accel, world.surfaces, traversal_ray(ray, world.kind != kind)), ray.direction)
+        return make_query_hit(closest(world.accel, world.surfaces, prepared(world, ray)), ray.direction)
 
     @wp.func
     def any_hit(world: World, ray: QueryRay) -> bool:
         """Return True if the ray hits anything in its segment."""
-        hit = any_of(world.accel, world.surfaces, traversal_ray(ray, world.kind != kind))
+        hit = any_of(world.accel, world.surfaces, prepared(world, ray))
         return hit.prim_id >= 0
 
     @wp.func
@@ -116,7 +140,7 @@ def make_ray_query(accel_struct: Any, closest: Any, any_of: Any, resuming: Any, 
         """Return the next hit of this ray after `hit`, in the order of t and, at equal t, of prim_id. Start with the closest hit, and
         repeated calls return each hit of the segment once. Each call starts at the root and repeats the tests at the same t, so k hits at
         one t take k^2 tests. The function `wrt.all_hits` stores the hits, and takes k log k steps."""
-        going = traversal_ray(ray, world.kind != kind)
+        going = prepared(world, ray)
         going.t_min = hit.scaled_t
         going.slot = hit.prim_id + 1
         return make_query_hit(resuming(world.accel, world.surfaces, going), ray.direction)

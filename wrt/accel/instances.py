@@ -12,6 +12,7 @@ from wrt.accel.built import AccelStats, Refit
 from wrt.accel.flat_scene import FlatScene
 from wrt.accel.instanced_geometry import MAX_SPREAD, InstancedGeometry, inverse_of
 from wrt.accel.queries.accelerator import Accelerator
+from wrt.accel.queries.ray_query import kernel_argument
 from wrt.accel.structure import Structure
 from wrt.accel.top_level import BOXES, MOVED_BOXES, Boxes, build_top, part_boxes, refit_top, spread_of, world_boxes
 from wrt.accel.wide_top import widen
@@ -21,7 +22,7 @@ from wrt.core.default_device import DEFAULT_DEVICE
 from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.core.seconds import build_clock
-from wrt.core.types import ArrayLike
+from wrt.core.types import ArrayLike, WarpStruct
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.traverse.instances import Placement
 from wrt.kernels.warp_private import fields_of
@@ -52,6 +53,11 @@ class Instances(Accelerator):
         self._wide = widen(self._top.nodes, self._top.roots)
         self._roots = upload(self._top.roots, wp.int32, self.device)
         self._install_top(geometry, begin, self._top.cost)
+
+    @property
+    def world(self) -> WarpStruct:
+        """The structure, as of the last move, as an argument of the user's kernels (`wrt.ray_query`)."""
+        return kernel_argument(self._snapshot)
 
     def _boxes(self, geometry: InstancedGeometry, most: int) -> list[Boxes]:
         return part_boxes(geometry, [bottom.built.order for bottom in self.bottoms], most)

@@ -13,7 +13,7 @@ from wrt.core.checks import as_one
 from wrt.core.device import made_once
 from wrt.core.errors import InputError
 from wrt.core.types import DeviceFunction, WarpStruct, WarpType
-from wrt.kernels.ray_query import QueryHit, QueryRay, make_ray_query, query_ray
+from wrt.kernels.ray_query import QueryHit, QueryRay, Traversals, make_ray_query, query_ray
 from wrt.kernels.traverse.common import Units
 
 
@@ -25,7 +25,8 @@ class RayQuery(NamedTuple):
     World : type
         Type of the kernel argument `accel.world`.
     Ray, Hit : type
-        Structs. A Ray has `t_min` and `t_max`; a Hit has `t`, `u`, `v` and `prim_id` (-1 on a miss).
+        Structs. A Ray has `t_min`, `t_max` and `world`, the index of the world that it sees, at first 0. A Hit has `t`, `u`, `v`
+        and `prim_id` (-1 on a miss).
     ray : (origin, direction) -> Ray
         Ray from the origin to infinity.
     closest_hit : (world, ray) -> Hit
@@ -54,7 +55,7 @@ def ray_query(accel: Accelerator | str, *, triangle: str | None = None, box: str
     Parameters
     ----------
     accel : Accelerator or str
-        A structure over one mesh; or a name in `wrt.ACCELERATORS`, for all structures of that kind.
+        A structure over meshes, instances or worlds; or a name in `wrt.ACCELERATORS`, for structures of that kind over one mesh.
     triangle, box : str, optional
         Intersection tests of the structures; only if `accel` is a name.
 
@@ -66,9 +67,9 @@ def ray_query(accel: Accelerator | str, *, triangle: str | None = None, box: str
     Raises
     ------
     InputError
-        For unknown names, and for structures over several meshes.
+        For unknown names, and for structures over spheres.
     """
-    message = "accel must be a structure over one mesh without spheres, or a name in wrt.ACCELERATORS"
+    message = "accel must be a structure without spheres, or a name in wrt.ACCELERATORS"
     if isinstance(accel, str):
         units = Units(as_one(triangle or Units().triangle, str, "triangle"), as_one(box or Units().box, str, "box"))
         ACCELERATORS.check(accel, "accel")
@@ -81,7 +82,7 @@ def ray_query(accel: Accelerator | str, *, triangle: str | None = None, box: str
         structure = accel.structure
     else:
         raise InputError(message, argument="accel")
-    structure.require_one_mesh(message)
+    require_no_spheres(structure, message)
     world, closest_hit, any_hit, next_hit = query_of(structure)
     return RayQuery(world, QueryRay, QueryHit, query_ray, closest_hit, any_hit, next_hit)
 
@@ -90,20 +91,29 @@ def ray_query(accel: Accelerator | str, *, triangle: str | None = None, box: str
 def query_of(structure: Structure) -> tuple[WarpType, DeviceFunction, DeviceFunction, DeviceFunction]:
     """Make the fields World, closest_hit, any_hit and next_hit of RayQuery for a kind of structure."""
     resuming = structure._replace(units=structure.units._replace(resumes=True))
-    return make_ray_query(structure.struct, structure.traversal(any_hit=False), structure.traversal(any_hit=True),
-                          resuming.traversal(any_hit=False), kind_of(structure))
+    return make_ray_query(Traversals(structure.struct, structure.traversal(any_hit=False), structure.traversal(any_hit=True),
+                                     resuming.traversal(any_hit=False), structure.units.instances, kind_of(structure)))
+
+
+def require_no_spheres(structure: Structure, message: str) -> None:
+    """Raise InputError with `message` if the structure has spheres."""
+    if structure.units.spheres:
+        raise InputError(message, argument="accel")
 
 
 def kind_of(structure: Structure) -> int:
-    """Return a hash of the structure's name and triangle test, with which kernels recognise a structure of another kind."""
-    return zlib.crc32(f"{structure.accel.name} {structure.units.triangle}".encode()) & 0x7FFFFFFF
+    """Return a hash of the structure's name, triangle test and levels, with which kernels recognise a structure of another kind."""
+    name = f"{structure.accel.name} {structure.units.triangle} {structure.units.instances}"
+    return zlib.crc32(name.encode()) & 0x7FFFFFFF
 
 
 def kernel_argument(snapshot: Snapshot) -> WarpStruct:
-    """Return the structure as one kernel argument, RayQuery.World. Raises InputError unless it is over one mesh without spheres."""
+    """Return the structure as one kernel argument, RayQuery.World. Raises InputError if it has spheres."""
     structure = snapshot.structure
-    structure.require_one_mesh("a kernel can only query a structure over one mesh without spheres")
+    require_no_spheres(structure, "a kernel can only query a structure without spheres")
     world = query_of(structure)[0]()
     world.kind = kind_of(structure)
     world.accel, world.surfaces = snapshot.data, snapshot.surfaces
+    if snapshot.roots is not None:
+        world.roots = snapshot.roots
     return world

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 import wrt
-from tests.kernel_tools import cpu_only, floats, launch, vec3s, zeros
+from tests.kernel_tools import DEVICE, cpu_only, floats, launch, vec3s, zeros
 from tests.refused import Refusal, refused
 from tests.wrt.accel.queries.test_all_hits import rays, soup
 from wrt.scene import shapes
@@ -59,6 +59,47 @@ def test_one_query_is_for_all_structures_of_a_kind_and_follows_a_refit() -> None
     assert np.isclose(answers(kernel, accel, asked)[0][0], 2.0 * before)
 
 
+def by_world(query):
+    """Make a kernel that finds the closest hit and all further hits of each ray in its world."""
+
+    @wrt.kernel
+    def each_world(world: query.World, origins: wp.array(dtype=wp.vec3), directions: wp.array(dtype=wp.vec3),
+                   ids: wp.array(dtype=int), t: wp.array(dtype=float), prim_id: wp.array(dtype=int),
+                   occluded: wp.array(dtype=wp.bool), count: wp.array(dtype=int)):
+        i = wp.tid()
+        ray = query.ray(origins[i], directions[i])
+        ray.world = ids[i]
+        hit = query.closest_hit(world, ray)
+        t[i] = hit.t
+        prim_id[i] = hit.prim_id
+        occluded[i] = query.any_hit(world, ray)
+        while hit.prim_id >= 0:
+            count[i] += 1
+            hit = query.next_hit(world, ray, hit)
+
+    return each_world
+
+
+@pytest.mark.parametrize("name", ["bvh", "bvh2"])
+def test_rays_of_a_kernel_see_worlds_and_instances(name: str) -> None:
+    rng = np.random.default_rng(5)
+    mesh, moved = soup(rng), np.eye(4)
+    moved[:3] = rng.normal(size=(3, 4))
+    scene = wrt.Scene([wrt.Object(mesh, wrt.Material()), wrt.Object(mesh, wrt.Material(), transform=moved)])
+    accel, n = wrt.build([shapes.icosphere(2), scene], name), 5000
+    o, d, *_ = rays(rng, mesh, n)
+    ids = rng.integers(-1, 3, n).astype(np.int32)
+    t, prim_id, occluded, count = zeros(n), zeros(n, wp.int32), zeros(n, wp.bool), zeros(n, wp.int32)
+    ints = wp.array(ids, dtype=wp.int32, device=DEVICE)
+    launch(by_world(wrt.ray_query(accel)), n, accel.world, vec3s(o), vec3s(d), ints, t, prim_id, occluded, count)
+    hits = accel.closest_hit(o, d, world=ints)
+    assert np.array_equal(t.numpy().view(np.int32), hits.t.view(np.int32)) and np.array_equal(prim_id.numpy(), hits.prim_id)
+    assert np.array_equal(occluded.numpy(), accel.any_hit(o, d, world=ints)) and 0.2 < occluded.numpy().mean() < 0.9
+    expected = wrt.count_hits(wrt.build(shapes.icosphere(2), name), o[ids == 0], d[ids == 0])
+    assert np.array_equal(count.numpy()[ids == 0], expected)
+    assert not count.numpy()[(ids < 0) | (ids > 1)].any() and (count.numpy()[ids == 1] > 2).any()
+
+
 @cpu_only
 def test_a_kernel_that_fuses_says_so_and_hits_nothing(capfd: pytest.CaptureFixture[str]) -> None:
     accel = wrt.build(shapes.icosphere(1), "bvh2")
@@ -93,7 +134,7 @@ def test_tests_that_there_are_not(arguments: dict, said: Refusal) -> None:
         wrt.ray_query(wrt.build(shapes.icosphere(1)), **arguments)
 
 
-@pytest.mark.parametrize("accel, said", [("bvg", ("accel", "no structure 'bvg'")), (3, ("accel", "structure over one mesh"))])
+@pytest.mark.parametrize("accel, said", [("bvg", ("accel", "no structure 'bvg'")), (3, ("accel", "structure without spheres"))])
 def test_what_is_refused(accel: object, said: Refusal) -> None:
     with refused(*said):
         wrt.ray_query(accel)
