@@ -37,7 +37,7 @@ STANDS_FOR = {"MESH...": "model.ply", "MESH": "model.ply", "SCENE": "scenes/whit
 # Options to append to a command so that it takes little time. Commands in neither CHEAP nor SLOW are parsed, but not run.
 CHEAP = {
     "render": ("--size", "32x18", "--spp", "4"), "info": (), "compile": (), "compare": (), "validate": (), "schema": (),
-    "devices": (),
+    "devices": (), "walk": (),
     "profile": ("--size", "24x14"), "animate": ("--frames", "2", "--size", "32x18", "--spp", "1"), "build": (),
     "bench accel": ("--structures", "bvh", "--kinds", "primary", "--rays", "200", "--runs", "1", "--max-triangles", "2000"),
 }

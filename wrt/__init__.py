@@ -7,7 +7,8 @@ Pictures: load_scene, render, Film, Options, Progress, LiveView, side_by_side.
 Scenes in Python: Scene, Settings, Object, Sphere, Material, Texture, Checkerboard, Motion; Camera, OrthographicCamera,
 FisheyeCamera, PanoramaCamera; PointLight, DirectionalLight, SpotLight; ConstantBackground, GradientBackground,
 EnvironmentBackground.
-Costs of a picture: profile. Steps of rays: trace. The fastest structure on a device: tune. Errors and warnings: InputError, SceneWarning.
+Costs of a picture: profile. Steps of rays through a structure: walk, trace. The fastest structure on a device: tune.
+Errors and warnings: InputError, SceneWarning.
 Further modules: sensors, compat (trimesh, open3d), testing.
 """
 
@@ -53,6 +54,7 @@ if TYPE_CHECKING:
     from wrt.lab.rtcore.profiler import profile as profile
     from wrt.lab.rtcore.trace import trace as trace
     from wrt.lab.tune import tune as tune
+    from wrt.lab.walk.walk import walk as walk
     from wrt.picture.film import Film as Film
     from wrt.renderer.options import Options as Options
     from wrt.renderer.options import Progress as Progress

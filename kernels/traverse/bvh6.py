@@ -9,10 +9,12 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.structs import NO_HIT, Hit, Ray, size_of
-from wrt.kernels.traverse.common import Units, make_probe, no_hit
-from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
+from wrt.kernels.traverse.common import Probe, Units, make_probe, no_hit
+from wrt.kernels.traverse.counters import Counts, Recorder, make_counters, write_step
 from wrt.kernels.traverse.leaf import make_leaf
+from wrt.kernels.traverse.recording import make_recording
 from wrt.kernels.traverse.stack import key_of, make_stack, reference_of, t_of
+from wrt.kernels.traverse.steps import ENTERED, INNER, box_step
 
 WIDTH = 6
 STACK_SIZE = 64
@@ -65,12 +67,63 @@ def reference(node: Bvh6Node, slot: int) -> int:
     return wp.where(slot < inner, node.node + slot, -1 - (node.primitive + slot - inner))
 
 
+def make_recorded(units: Units) -> Any:
+    """Make record_box, record_push and record_pop (kernels.traverse.steps)."""
+    record_pushed, record_popped = make_recording(units)
+
+    @wp.func
+    def record_box(recorder: Recorder, ray: Ray, child: int, lo: wp.vec3, hi: wp.vec3, t: float):
+        if wp.static(units.steps):
+            write_step(recorder, ray.slot, box_step(wp.max(child, -1 - child), wp.where(child < 0, 1, INNER), lo, hi, t))
+
+    @wp.func
+    def record_push(recorder: Recorder, ray: Ray, key: wp.uint64, below: int):
+        child = reference_of(key)
+        record_pushed(recorder, ray, wp.max(child, -1 - child), wp.where(child < 0, 1, INNER), t_of(key), below)
+
+    @wp.func
+    def record_pop(recorder: Recorder, ray: Ray, key: wp.uint64, end: float):
+        child = reference_of(key)
+        taken = wp.where(t_of(key) <= end, ENTERED, 0)
+        record_popped(recorder, ray, wp.max(child, -1 - child), wp.where(child < 0, 1, INNER), t_of(key), taken)
+
+    return record_box, record_push, record_pop
+
+
+def make_enter_children(units: Units, record_box: Any) -> Any:
+    """Make enter_children(recorder, probe, node, children, t_max) -> (Entries, n): keys of the n entered children, the nearest last."""
+    ray_aabb = units.box_test
+
+    @wp.func
+    def enter_children(recorder: Recorder, probe: Probe, node: Bvh6Node, children: int, t_max: float):
+        entered = Entries()
+        n = int(0)
+        for slot in range(children):
+            lo = wp.vec3(plane(node, 0, slot), plane(node, 2, slot), plane(node, 4, slot))
+            hi = wp.vec3(plane(node, 1, slot), plane(node, 3, slot), plane(node, 5, slot))
+            t = ray_aabb(probe.box, lo, hi, t_max)
+            record_box(recorder, probe.ray, reference(node, slot), lo, hi, t)
+            if t < wp.inf:
+                key = key_of(t + 0.0, reference(node, slot))  # t + 0.0: never -0
+                j = int(n)
+                while j > 0 and entered[j - 1] < key:
+                    entered[j] = entered[j - 1]
+                    j = j - 1
+                entered[j] = key
+                n = n + 1
+        return entered, n
+
+    return enter_children
+
+
 def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
     """Make traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found; accepts: common.make_better."""
     struct = make_struct(units.triangle_test.record)
-    probe_of, ray_aabb = make_probe(units), units.box_test
+    probe_of = make_probe(units)
     visit_leaf = make_leaf(units, any_hit, accepts)
     fetch_node, _, push, finish = make_counters(units, size_of(Bvh6Node))
+    record_box, record_push, record_pop = make_recorded(units)
+    enter_children = make_enter_children(units, record_box)
     new_stack, shared_stack, put, get = make_stack(units.stack, STACK_SIZE, wp.uint64, 8)
 
     @wp.func
@@ -93,22 +146,10 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
                 node = accel.nodes[current]
                 children = (node.counts & wp.static((1 << LEAVES_SHIFT) - 1)) + (node.counts >> LEAVES_SHIFT)
                 counts = fetch_node(accel.recorder, ray, counts, current, children)
-                entered = Entries()  # Sorted: the nearest child is the last.
-                n = int(0)
-                for slot in range(children):
-                    lo = wp.vec3(plane(node, 0, slot), plane(node, 2, slot), plane(node, 4, slot))
-                    hi = wp.vec3(plane(node, 1, slot), plane(node, 3, slot), plane(node, 5, slot))
-                    t = ray_aabb(probe.box, lo, hi, best.t)
-                    if t < wp.inf:
-                        key = key_of(t + 0.0, reference(node, slot))  # t + 0.0: never -0
-                        j = int(n)
-                        while j > 0 and entered[j - 1] < key:
-                            entered[j] = entered[j - 1]
-                            j = j - 1
-                        entered[j] = key
-                        n = n + 1
+                entered, n = enter_children(accel.recorder, probe, node, children, best.t)
                 if n > 0:
                     for j in range(n - 1):
+                        record_push(accel.recorder, ray, entered[j], size)
                         put(stack, shared, size, entered[j])
                         size = size + 1
                         counts = push(counts, size)
@@ -120,6 +161,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any = None) -> Any:
                 size = size - 1
                 counts.pops += 1
                 key = get(stack, shared, size)
+                record_pop(accel.recorder, ray, key, best.t)
                 if t_of(key) <= best.t:
                     current = reference_of(key)
                     found = True

@@ -20,5 +20,6 @@ COMMANDS: Registry[click.Command] = Registry("command", {
     "stability": "wrt.cli.measure:stability",
     "validate": "wrt.cli.scene_files:validate",
     "view": "wrt.cli.view:view",
+    "walk": "wrt.cli.walk:walk",
     "whatif": "wrt.cli.measure:whatif",
 }, "wrt.commands")
