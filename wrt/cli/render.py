@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -41,6 +43,7 @@ if TYPE_CHECKING:
     from wrt.scene.settings import SettingChanges
 
 STDOUT = Path("-")
+WATCH_EVERY = 0.2  # seconds between two looks at a watched file
 
 
 @click.command(help=f"Render SCENE (.toml, .gltf, .glb, or a mesh: {SUFFIXES}) to a picture.")
@@ -72,11 +75,47 @@ STDOUT = Path("-")
 @click.option("--checkpoint", "every", type=DURATION, help="Save the samples so far at this interval (30s, 5m, 1h), for --resume")
 @click.option("--checkpoint-file", type=click.Path(path_type=Path), help="Checkpoint  [default: the picture's name + .checkpoint]")
 @click.option("--resume", is_flag=True, help="Continue from the checkpoint; if there is none, start from the beginning")
+@click.option("--watch", is_flag=True, help="Render again whenever the file SCENE changes, until Ctrl-C")
 @shared("quiet", "as_json")
-def render(scene: Path, output: Path | None, assignments: Assignments, staging: dict[str, Parsed], quiet: bool, as_json: bool,
-           **options: Parsed) -> None:
+def render(scene: Path, output: Path | None, watch: bool, quiet: bool, **options: Parsed) -> None:
+    if not watch:
+        render_once(scene, output, quiet=quiet, **options)
+        return
+    if output == STDOUT or options["resume"]:
+        raise InputError("makes a picture after each change, which needs a file and a new start", argument="--watch",
+                         hint="give -o a file name, and no --resume")
+    watched(scene, lambda: render_once(scene, output, quiet=quiet, **options), quiet)
+
+
+def watched(scene: Path, make: Callable[[], None], quiet: bool) -> None:
+    """Call `make` now and after each change of the file `scene`, until Ctrl-C. An InputError is reported: the file may be half edited."""
+    with contextlib.suppress(KeyboardInterrupt):
+        while True:
+            seen = stamp(scene)
+            try:
+                make()
+            except InputError as error:
+                say(f"error: {error}")
+            if not quiet:
+                say(f"{scene}: waiting for a change (Ctrl-C ends)")
+            while stamp(scene) in (seen, None):
+                time.sleep(WATCH_EVERY)
+
+
+def stamp(path: Path) -> tuple[int, int, int] | None:
+    """Return values that change when a file is written or replaced; None while it does not exist."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_mtime_ns, status.st_size, status.st_ino
+
+
+def render_once(scene: Path, output: Path | None, *, assignments: Assignments, staging: dict[str, Parsed], quiet: bool,
+                as_json: bool, **options: Parsed) -> None:
+    """Render SCENE and write its picture. The arguments are those of the command."""
     begin = time.perf_counter()
-    from wrt.picture.film import aov_path
+    from wrt.picture.film import aov_path, depth_range
     from wrt.picture.image import check_writable, output_format
 
     output, bits = output or Path(f"{scene.stem or 'picture'}.png"), options.pop("bits")
@@ -115,6 +154,8 @@ def render(scene: Path, output: Path | None, assignments: Assignments, staging: 
     else:
         for path in paths:
             say(path, err=False)
+    if not quiet and "depth" in (layers or ()) and (ends := depth_range(film.aov["depth"])):
+        say(f"depth picture: white is {ends['white']:.4g}, the darkest grey {ends['darkest']:.4g}, linear between, in scene units")
     if not quiet:
         say(_summary(film, loaded.settings.auto_exposure))
     if write_error:

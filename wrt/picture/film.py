@@ -153,7 +153,7 @@ class Film:
             check_writable(view_path)
         write_image(path, self.pixels, bits=bits, exposure=self.exposure, tonemap=self.tonemap, metadata=self.metadata)
         for name, (view_path, array) in zip(names, views.items(), strict=True):
-            write_codes(view_path, aov_to_srgb8(name, array), self.metadata)
+            write_codes(view_path, aov_to_srgb8(name, array), self.metadata | (depth_range(array) if name == "depth" else {}))
         return [Path(path), *views]
 
     def _layer_names(self, aov: str | Iterable[str] | None, suffix: str) -> list[str]:
@@ -178,6 +178,12 @@ def layer_channels(name: str, array: np.ndarray) -> dict[str, np.ndarray]:
 
 
 # --- layers to look at ------------------------------------------------------------------------------------------------
+
+
+def depth_range(depth: np.ndarray) -> dict[str, float]:
+    """Return the depths, in scene units, that `_view_depth` shows as white and as the darkest grey; empty without a hit."""
+    hit = depth[np.isfinite(depth)]
+    return {"white": float(hit.min()), "darkest": float(hit.max())} if hit.size else {}
 
 
 def _view_depth(depth: np.ndarray) -> np.ndarray:

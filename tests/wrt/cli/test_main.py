@@ -23,6 +23,8 @@ from tests.data import ROOT
 from tests.picture_metadata import read_metadata
 from wrt import __version__
 from wrt.cli import common as cli_common
+from wrt.cli.render import watched
+from wrt.core.errors import InputError
 from wrt.io.load import load_scene, schema
 from wrt.picture import film as film_module
 from wrt.picture.image import read_channels, read_image, write_image
@@ -415,6 +417,24 @@ def test_a_picture_on_stdout_is_the_file_and_nothing_else() -> None:
     Path("piped.png").write_bytes(piped.stdout)
     assert piped.stdout.startswith(b"\x89PNG") and piped.stdout.endswith(b"IEND\xaeB`\x82")
     assert np.array_equal(read_image("piped.png"), read_image("a.png")) and not Path("-").exists()
+
+
+def test_a_watched_scene_is_rendered_after_each_change_and_mistakes_are_reported(capsys: pytest.CaptureFixture[str]) -> None:
+    path, seen = Path("scene.toml"), []
+    path.write_text("1")
+
+    def make() -> None:
+        seen.append(path.read_text())
+        if len(seen) == 3:
+            raise KeyboardInterrupt
+        path.write_text(f"{seen[-1]} and a change")
+        if len(seen) == 1:
+            raise InputError("is half edited", path=path)
+
+    watched(path, make, quiet=False)
+    assert seen == ["1", "1 and a change", "1 and a change and a change"]
+    assert "error: scene.toml: is half edited" in capsys.readouterr().err
+    refused(run("render", "box.obj", "--watch", "-o", "-"), "--watch")
 
 
 # --- the other commands -----------------------------------------------------------------------------------------------

@@ -73,6 +73,9 @@ def test_png_is_shown_as_the_film_says_and_layers_go_beside_it(film: Film, tmp_p
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(path.name for path in written)
     assert np.array_equal(decode_rgba8(written[0].read_bytes())[..., :3], to_codes(film.pixels, -1.0, "agx"))
     assert np.array_equal(decode_rgba8(written[1].read_bytes())[..., :3], aov_to_srgb8("depth", film.aov["depth"]))
+    hit = film.aov["depth"][np.isfinite(film.aov["depth"])]
+    told = read_metadata(written[1])
+    assert (float(told["white"]), float(told["darkest"])) == (hit.min(), hit.max()) and "white" not in read_metadata(written[2])
     assert read_metadata(written[0]) == {key: str(value) for key, value in film.metadata.items()}
 
 
