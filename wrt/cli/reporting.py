@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import signal
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import MISSING, dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import click
 from click.core import ParameterSource
@@ -21,6 +23,7 @@ from wrt.cli.common import (
     OneOf,
     Parsed,
     client_of,
+    json_text,
     names_of,
     option_group,
     progress_writer,
@@ -32,7 +35,9 @@ from wrt.core.errors import InputError
 from wrt.core.interrupts import exit_code
 from wrt.core.write_file import check_writable, write_bytes
 from wrt.lab.plans import STRUCTURES, Plan
+from wrt.renderer.progress import TimeLeft
 
+T = TypeVar("T")
 # The type of an option, by the annotation of the plan's field. Any other annotation means a path.
 TYPES: dict[str, Any] = {"int": int, "int | None": int, "bool": bool, "str": str, "Sequence[str]": Names(), "float": DURATION}
 
@@ -67,6 +72,26 @@ class Reporting:
             raise InputError(f"must be a {' or '.join(('.md', *others))} file, the report", path=self.output)
         check_writable(self.output)
         return suffix
+
+    def rows_of(self, measure: Callable[[Callable[[T], None]], list[T]], line: Callable[[T], str],
+                total: int | None) -> tuple[list[T], int | None]:
+        """Measure, and show each finished row with the time left. Return the rows, and the number of the signal that ended the work.
+
+        measure: function that takes a callback for finished rows. total: expected number of rows, None if unknown. After Ctrl-C the
+        finished rows are returned; without any, KeyboardInterrupt is raised."""
+        left, kept = TimeLeft(total or 0), list[T]()
+
+        def done(row: T) -> None:
+            kept.append(row)
+            left.done = len(kept)
+            self.progress(f"{line(row)}{f'  ({len(kept)} of {total}{left})' if total and len(kept) < total else ''}")
+
+        try:
+            return measure(done), None
+        except KeyboardInterrupt as stop:
+            if not kept:
+                raise
+            return kept, int(getattr(stop, "number", signal.SIGINT))
 
     def write(self, text: str) -> None:
         if self.output is not None:
@@ -142,10 +167,11 @@ def measured(plan: type[Plan]) -> click.Command:
         from wrt.lab.bench.sweep import by_mesh
 
         study = report.study_of(plan)
-        writers = getattr(study, "WRITERS", {})
-        suffix = how.check_report(writers)
+        writers = report.WRITERS | getattr(study, "WRITERS", {})
+        suffix = how.check_report((".json", *writers))
         if hasattr(study, "check_output"):
             study.check_output(suffix)
+        total = study.total(plan) if hasattr(study, "total") else None
         client = client_of(how.cluster)
         machine = study.machine(plan) if hasattr(study, "machine") else report.machine_line()
         if client is not None:
@@ -153,12 +179,14 @@ def measured(plan: type[Plan]) -> click.Command:
 
             machine = f"a cluster, each mesh on one worker: {machines(client)}; started from {machine}"
         with warnings_reported(how.quiet):
-            rows = by_mesh(report.run, plan, lambda row: how.progress(report.line(plan, row)), client)
-        text = report.text(rows, plan, machine)
+            rows, interrupted = how.rows_of(lambda done: by_mesh(report.run, plan, done, client), partial(report.line, plan), total)
+        if interrupted is not None:
+            machine = f"{machine}; interrupted after {len(rows)} row{'s' if len(rows) > 1 else ''}"
+        text, data = report.text(rows, plan, machine), {"machine": machine, **report.data(rows, plan)}
         if how.output is not None and suffix in writers:
             write_bytes(how.output, writers[suffix](rows, plan, machine, suffix))
         else:
-            how.write(text)
-        how.end(text, {"machine": machine, **report.data(rows, plan), "output": how.output})
+            how.write(json_text(data) if suffix == ".json" else text)
+        how.end(text, {**data, "output": how.output}, interrupted=interrupted)
 
     return command

@@ -46,7 +46,7 @@ class Plan:
     COMMAND: ClassVar[str] = ""
     STUDY: ClassVar[str] = ""
     QUICK: ClassVar[Mapping[str, Any]] = {}
-    OUTPUT: ClassVar[str] = "Write the tables as Markdown (.md)"
+    OUTPUT: ClassVar[str] = "Write the tables as Markdown (.md), or the rows as .csv or .json"
 
     def __post_init__(self) -> None:
         from wrt.core.checks import as_integer, require_known
@@ -114,7 +114,7 @@ class Peers(Plan):
     MESHES: mesh files; default: a sphere."""
 
     COMMAND, STUDY, QUICK = "bench peers", "wrt.lab.bench.peers", {"rays": 20_000, "runs": 5}
-    OUTPUT = "Write the tables as Markdown (.md), the figures as .csv, or a bar chart as .svg or .png"
+    OUTPUT = "Write the tables as Markdown (.md), the figures as .csv or .json, or a bar chart as .svg or .png"
     meshes: Sequence[Any] = the_meshes()
     structures: Sequence[str] = option(("bvh",), "Structures of wrt to measure; ratios relate to the first one", of=STRUCTURES)
     rivals: Sequence[str] = option((), "Libraries to compare with: embree, embree_fast, embree16, embree16_incoherent, warp, open3d,"

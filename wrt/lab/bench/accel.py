@@ -59,6 +59,12 @@ def meshes(plan: Plan) -> Iterator[Mesh]:
     yield from map(as_mesh, plan.meshes) if plan.meshes else map(terrain, takewhile(lambda n: 2 * n * n <= plan.max_triangles, cells))
 
 
+def total(plan: Plan) -> int:
+    """Return the number of rows if no structure refuses a mesh."""
+    return (len(plan.meshes) or sum(1 for _ in meshes(plan))) * len(names(plan)) * len(set(plan.kinds))
+
+
+
 def rows(plan: Plan) -> Iterator[Row]:
     return (row for mesh in meshes(plan) for row in mesh_rows(plan, mesh))
 

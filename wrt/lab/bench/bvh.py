@@ -52,6 +52,11 @@ over the surface of their boxes. ns/test: time to test one volume on one thread,
 run. Mray/s: on one thread. differ: rays whose prim_id or t, bit for bit, is not that of bvh2."""
 
 
+def total(plan: Plan) -> int:
+    return len(plan.meshes) * (len(plan.builders or BVH_BUILDERS) + len(VOLUMES))
+
+
+
 def rows(plan: Plan) -> Iterator[Row]:
     for mesh in map(as_mesh, plan.meshes):
         geometry, name = Geometry.of(mesh), mesh_name(mesh)

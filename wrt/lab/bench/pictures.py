@@ -34,6 +34,11 @@ quartiles in brackets; loop / waves is a ratio run by run. rays/sample includes 
 0)."""
 
 
+def total(plan: Plan) -> int:
+    return len(plan.scenes)
+
+
+
 def rows(plan: Plan) -> Iterator[Row]:
     for path in plan.scenes:
         scene = load_scene(path).with_settings(size=as_size(plan.size), spp=plan.spp)

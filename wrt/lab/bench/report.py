@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import importlib
+import io
+import json
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -77,8 +80,8 @@ def study_of(plan: Plan) -> ModuleType:
     """Return the module that measures a plan.
 
     The module has TITLE, LEGEND, and rows(plan), which yields each Row once it is measured. COLUMNS or parts(rows, plan) make the tables.
-    Optional are machine(plan) for the report, line(row) for a line of progress, facts(rows, plan) for more JSON fields, and for -o
-    WRITERS, suffix -> function(rows, plan, machine, suffix) to bytes, with check_output(suffix), which raises InputError."""
+    Optional are machine(plan) for the report, line(row) for a line of progress, facts(rows, plan) for more JSON fields, total(plan) for
+    the expected number of rows, and for -o WRITERS (see below), with check_output(suffix), which raises InputError."""
     return importlib.import_module(plan.STUDY)
 
 
@@ -120,6 +123,35 @@ def data(rows: Sequence[Row], plan: Plan) -> JsonObject:
     """Return the rows and further fields of a study for JSON."""
     facts: Any = getattr(study_of(plan), "facts", lambda rows, plan: {})
     return {"rows": [row.as_dict() for row in rows], **facts(rows, plan)}
+
+
+def csv_file(rows: Sequence[Row], plan: Plan, machine: str, suffix: str) -> bytes:
+    """Return the rows as CSV, with lines that begin with # for the command and the machine. Columns are the fields in JSON.
+
+    A field of a dictionary has the column "name.field". A list is a JSON text in one cell. A field that a row lacks is empty."""
+    lines = [flat(row.as_dict()) for row in rows]
+    columns = list(dict.fromkeys(name for line in lines for name in line))
+    text = io.StringIO(f"# command: {repeating(plan)}\n# machine: {machine}\n")
+    text.seek(0, io.SEEK_END)
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(lines)
+    return text.getvalue().encode()
+
+
+def flat(fields: Mapping[str, object], prefix: str = "") -> dict[str, object]:
+    """Return the fields of a JSON object as cells of one line of CSV."""
+    out: dict[str, object] = {}
+    for name, value in fields.items():
+        if isinstance(value, Mapping):
+            out |= flat(value, f"{prefix}{name}.")
+        else:
+            out[prefix + name] = json.dumps(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
+    return out
+
+
+# Formats of -o besides Markdown and JSON, by suffix: function(rows, plan, machine, suffix) -> contents of the file.
+WRITERS = {".csv": csv_file}
 
 
 def text(rows: Sequence[Row], plan: Plan, machine: str) -> str:

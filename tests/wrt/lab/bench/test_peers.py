@@ -225,6 +225,6 @@ def test_the_command_prints_and_writes(box, tmp_path) -> None:
     assert all(float(row["ns"]) > 0.0 for row in table)
     assert (tmp_path / "out.svg").read_text().lstrip().startswith("<?xml") and Image.open(tmp_path / "out.png").width > 400
     done = command("bench", "peers", box, "-o", tmp_path / "out.txt")
-    assert done.code == 2 and "must be a .md or .csv or .svg or .png file" in done.err
+    assert done.code == 2 and "must be a .md or .json or .csv or .svg or .png file" in done.err
     done = command("bench", "peers", box, "-o", tmp_path / "no" / "out.md")
     assert done.code == 2 and "no/out.md: its folder does not exist" in done.err
