@@ -7,8 +7,8 @@ Pictures: load_scene, render, Film, Options, Progress, LiveView, side_by_side.
 Scenes in Python: Scene, Settings, Object, Sphere, Material, Texture, Checkerboard, Motion; Camera, OrthographicCamera,
 FisheyeCamera, PanoramaCamera; PointLight, DirectionalLight, SpotLight; ConstantBackground, GradientBackground,
 EnvironmentBackground.
-Costs of a picture: profile. Steps of rays through a structure: walk, trace. The fastest structure on a device: tune.
-Errors and warnings: InputError, SceneWarning.
+Costs of a picture: profile. All rays of a pixel: inspect. Steps of rays through a structure: walk, trace.
+The fastest structure on a device: tune. Errors and warnings: InputError, SceneWarning.
 Further modules: sensors, compat (trimesh, open3d), testing.
 """
 
@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from wrt.picture.film import Film as Film
     from wrt.renderer.options import Options as Options
     from wrt.renderer.options import Progress as Progress
+    from wrt.renderer.inspector.inspect import inspect as inspect
     from wrt.renderer.pixel_rays import camera_rays as camera_rays
     from wrt.renderer.render import render as render
     from wrt.scene.backgrounds import ConstantBackground as ConstantBackground

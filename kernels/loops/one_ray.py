@@ -1,4 +1,4 @@
-"""One ray at a time: the render loop on CUDA, and on a CPU if rays are counted or logged.
+"""One ray at a time: the render loop on CUDA, and on a CPU if rays are counted, logged or recorded.
 
 A thread follows a camera ray and all rays that it causes. It traces a ray, shades the hit (shade/step.py), and pushes the new paths
 on a small stack. A GPU hides the latency of one thread behind thousands of other threads. A CPU cannot, so wave.py traces and shades the
@@ -9,6 +9,7 @@ from typing import Any
 
 import warp as wp
 
+from wrt.kernels.loops.record import begin_light, end_light, last_ray, make_recorder
 from wrt.kernels.shade.backgrounds import BACKGROUNDS
 from wrt.kernels.shade.direct import make_light_points
 from wrt.kernels.shade.features import Features
@@ -47,8 +48,13 @@ def make_direct_light(features: Features, accel_struct: Any, transmittance: Any,
         for i in range(lighting.count + wp.static(step.extra_lights)):
             point = light_point(lighting, shaded.key, index, i)
             request = step.shadow_request(shaded, step.sample_light(lighting, surfaces, i, shaded.surface, point))
+            if wp.static(features.recording):
+                begin_light(accel.record, i, request)
             if any_positive(request.value):
-                out = add_light(out, request.value, shaded.scatter, transmittance(accel, surfaces, request.ray, request.end))
+                shadow = transmittance(accel, surfaces, request.ray, request.end)
+                if wp.static(features.recording):
+                    end_light(accel.record, shadow)
+                out = add_light(out, request.value, shaded.scatter, shadow)
         return out
 
     return direct_light
@@ -62,6 +68,7 @@ def make_radiance(features: Features, accel_struct: Any, closest_hit: Any, any_h
     background_radiance = BACKGROUNDS[features.background].radiance
     transmittance = make_transmittance(features, shading, accel_struct, closest_hit, any_hit)
     direct_light = make_direct_light(features, accel_struct, transmittance, step)
+    recorder = make_recorder(features)
 
     @wp.func
     def radiance(
@@ -80,7 +87,11 @@ def make_radiance(features: Features, accel_struct: Any, closest_hit: Any, any_h
             out.rays += 1
             traced += 1
             hit = closest_hit(accel, surfaces, ray)
+            if wp.static(features.recording):
+                ray_index = last_ray(accel.record)
             if hit.prim_id < 0:
+                if wp.static(features.recording):
+                    recorder.miss(accel.record, ray_index, path, background_radiance(lighting.background, path.direction))
                 out.radiance += wp.cw_mul(path.throughput, background_radiance(lighting.background, path.direction))
                 continue
             surface = shading.surface_at(surfaces, ray, hit)
@@ -101,6 +112,8 @@ def make_radiance(features: Features, accel_struct: Any, closest_hit: Any, any_h
             if wp.static(features.direct_light):
                 if receives_light(shaded.scatter):
                     direct = direct_light(accel, surfaces, lighting, shaded, index)
+            if wp.static(features.recording):
+                recorder.surface(accel.record, ray_index, path, surface, shaded, next, direct)
             out = add_surface_light(add_cuts(out, next), next.pending_light, direct)
         return out
 
@@ -135,7 +148,7 @@ def make_render_kernel(features: Features, structure: Any, camera_kind: Any) -> 
     """Return the kernel that renders a tile with one thread for each pixel, or one for each sample if Tile.threads > 1 (see add_samples).
 
     kernels/shade/cameras describes the module `camera_kind`. With features.counting, every ray is logged, and `structure` must come
-    from kernels.study.ray_log."""
+    from kernels.study.ray_log. With features.recording, `structure` must come from record.py."""
     accel_struct = structure.struct
     closest_hit, any_hit = make_traversals(features, structure)
     camera_struct = camera_kind.Camera

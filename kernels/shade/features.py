@@ -40,6 +40,7 @@ class Features:
     refraction: bool = False  # Surfaces make refracted paths.
     stack_size: int = 1  # Number of a sample's paths that can wait, rounded up so that similar max_depths share a kernel.
     counting: bool = False  # Rays carry a label for the ray log (wrt.kernels.study.ray_log).
+    recording: bool = False  # Everything that happens to a pixel's rays is recorded (wrt.kernels.loops.record).
 
     @property
     def direct_light(self) -> bool:

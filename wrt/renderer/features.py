@@ -17,13 +17,14 @@ from wrt.scene.materials import MATERIALS, SLOTS, Checkerboard, Texture
 from wrt.scene.model import Scene
 
 STACK_STEP = 16  # Stack sizes are multiples of this, so that scenes share kernels.
+TOOLS = {"counting", "recording"}  # features for measurements and the inspector, which no scene asks for
 # Textures that do not need the feature `parameter_textures`.
 COMMON = {"albedo_texture", "emission_texture", "normal_texture"}
 
 
 def switches(features: Features) -> dict[str, bool]:
     """Return each on/off feature by name. Each kind of light, material and background counts as a feature, too."""
-    on_off = {name: value for name, value in vars(features).items() if isinstance(value, bool) and name != "counting"}
+    on_off = {name: value for name, value in vars(features).items() if isinstance(value, bool) and name not in TOOLS}
     return on_off | {f"{name}_lights": name in features.lights for name in (*LIGHTS, *EMISSIVE)} | {
         name: name in features.materials for name in MATERIALS} | {
         name: name == features.background for name in BACKGROUNDS if name != Features.background}

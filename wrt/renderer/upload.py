@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -120,24 +120,30 @@ def light_records(scene: Scene, world: FlatScene) -> tuple[np.ndarray, np.ndarra
         if sphere.material.lights_others:
             rows.append({"kind": index_of("sphere", lights.LIGHTS, "light kind"), "position": sphere.center, "radius": sphere.radius,
                          "color": sphere.material.emission, "two_sided": sphere.material.two_sided})
-    groups = _emissive_groups(scene, world)
-    if len(groups) > MAX_MESH_LIGHTS:
-        groups = [np.concatenate(groups)]
     parts = [records(structs.Emitter, 1)[:0]]
     cdfs = [np.zeros(0, np.float32)]
     first = 0
-    for prim_id in groups:
-        part, cdf = _emitters(scene, world, prim_id)
-        if len(part):
-            rows.append({"kind": index_of("mesh", lights.LIGHTS, "light kind"), "first": first, "count": len(part)})
-            parts.append(part)
-            cdfs.append(cdf)
-            first += len(part)
+    for _, part, cdf in mesh_lights(scene, world):
+        rows.append({"kind": index_of("mesh", lights.LIGHTS, "light kind"), "first": first, "count": len(part)})
+        parts.append(part)
+        cdfs.append(cdf)
+        first += len(part)
     out = records(structs.Light, max(len(rows), 1))
     for i, values in enumerate(rows):
         for name, value in values.items():
             out[i][name] = value
     return out[: len(rows)], np.concatenate(parts), np.concatenate(cdfs)
+
+
+def mesh_lights(scene: Scene, world: FlatScene) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield, for each light made of emissive faces, the prim_ids of these faces, the array of struct Emitter, and its cdf."""
+    groups = _emissive_groups(scene, world)
+    if len(groups) > MAX_MESH_LIGHTS:
+        groups = [np.concatenate(groups)]
+    for prim_id in groups:
+        part, cdf = _emitters(scene, world, prim_id)
+        if len(part):
+            yield prim_id, part, cdf
 
 
 def _emissive_groups(scene: Scene, world: FlatScene) -> list[np.ndarray]:

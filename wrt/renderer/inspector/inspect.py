@@ -1,0 +1,117 @@
+"""`wrt.inspect`: every ray of one pixel, as the renderer traces it."""
+
+from __future__ import annotations
+
+import os
+from typing import Any, Unpack
+
+import numpy as np
+
+from wrt.core.checks import as_integer, as_tuple, unknown
+from wrt.core.device import start
+from wrt.core.errors import InputError
+from wrt.io.load import as_scene
+from wrt.renderer.inspector.assemble import Assembler
+from wrt.renderer.inspector.recorder import Recorder
+from wrt.renderer.inspector.tree import Inspection, Sample
+from wrt.renderer.options import Options
+from wrt.renderer.plan import plan_of
+from wrt.scene.cameras import CameraKind
+from wrt.scene.mesh import Mesh
+from wrt.scene.model import Scene
+from wrt.scene.settings import SETTINGS, SettingChanges
+
+# The options of `render` that choose a pixel's bits, or how they are computed.
+OPTIONS = ("seed", "device", "threads", "accel", "accel_options", "triangle", "box", "instancing", "camera")
+
+
+class InspectOptions(SettingChanges, total=False):
+    """The keywords of `inspect`: the scene's settings, and some of the fields of Options."""
+
+    seed: int
+    device: str
+    threads: int | None
+    accel: str
+    accel_options: dict[str, object]
+    triangle: str
+    box: str
+    instancing: str
+    camera: str | int | CameraKind | None
+
+
+def inspect(scene: Scene | Mesh | str | os.PathLike[str], pixel: tuple[int, int], sample: int | None = None,
+            **options: Unpack[InspectOptions]) -> Inspection:
+    """Trace one pixel as `render` does, and return all of its rays.
+
+    The kernel that renders also records. So the sum over the tree is the pixel of `render` with the same options, bit for bit.
+
+    Parameters
+    ----------
+    scene
+        As for `render`.
+    pixel
+        x and y in pixels from the top left.
+    sample
+        Index of the only sample to trace. None: all samples of the pixel.
+    **options
+        The settings size, spp, max_depth, min_throughput, filter, fresnel, glass_shadows, sampler, exposure and tonemap, and seed,
+        device, threads, accel, accel_options, triangle, box, instancing and camera, as for `render`.
+
+    Returns
+    -------
+    Inspection
+        The tree of rays of each sample.
+
+    Raises
+    ------
+    InputError
+        If the scene cannot be rendered, an option is unknown or wrong, or there is no such pixel or sample.
+
+    Examples
+    --------
+    >>> tree = wrt.inspect("scenes/whitted.toml", (320, 180), sample=0)
+    >>> print(tree)
+    >>> tree.save("rays.svg")
+    """
+    return Inspector(scene, **options).pixel(pixel, sample)
+
+
+class Inspector:
+    """A prepared scene whose pixels are inspected one after another. The arguments are those of `inspect`."""
+
+    def __init__(self, scene: Scene | Mesh | str | os.PathLike[str], **options: Unpack[InspectOptions]) -> None:
+        keywords: dict[str, Any] = {**options}
+        changes = {name: keywords.pop(name) for name in SETTINGS if name in keywords}
+        for name in keywords:
+            if name not in OPTIONS:
+                raise unknown(name, "argument of inspect", (*SETTINGS, *OPTIONS), argument=name)
+        resolved = Options(**keywords)
+        self.scene = as_scene(scene).with_settings(**changes)
+        plan = plan_of(self.scene, resolved)
+        self.camera, self.seed = plan.camera, resolved.seed
+        self._recorder = Recorder(plan, start(resolved.device))
+        self._assembler = Assembler(self.scene, self._recorder.prepared.arrays.world)
+
+    def pixel(self, pixel: tuple[int, int], sample: int | None = None) -> Inspection:
+        """Return the rays of a pixel. pixel, sample: as for `inspect`. Raises InputError if there is no such pixel or sample."""
+        settings = self.scene.settings
+        x, y = as_pixel(pixel, settings.size)
+        if sample is None:
+            indices = range(settings.spp)
+        else:
+            index = as_integer(sample, "sample", 0, settings.spp - 1)
+            indices = range(index, index + 1)
+        samples = tuple(Sample(i, self._assembler.tree(self._recorder.sample(x, y, i))) for i in indices)
+        return Inspection(self.scene, self.camera, (x, y), settings.size, self.seed, samples)
+
+
+def as_pixel(pixel: tuple[int, int], size: tuple[int, int]) -> tuple[int, int]:
+    """Return x and y of a pixel. Raises InputError if it is outside the picture of this size."""
+    numbers = as_tuple(pixel, (int, np.integer), "pixel")
+    if len(numbers) != 2:
+        raise InputError(f"must be x, y from the top left, got {pixel!r}", argument="pixel")
+    (x, y), (width, height) = (as_integer(each, "pixel", -2**31, 2**31) for each in numbers), size
+    if not (0 <= x < width and 0 <= y < height):
+        raise InputError(f"must be within the picture of {width}x{height}, x 0 to {width - 1} and y 0 to {height - 1}, got {x},{y}",
+                         argument="pixel")
+    return x, y
