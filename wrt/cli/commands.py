@@ -14,6 +14,7 @@ COMMANDS: Registry[click.Command] = Registry("command", {
     "compile": "wrt.cli.compile:compile_kernels",
     "devices": "wrt.cli.devices:devices",
     "info": "wrt.cli.scene_files:info",
+    "inspect": "wrt.cli.inspect:inspect",
     "profile": "wrt.cli.measure:profile",
     "render": "wrt.cli.render:render",
     "schema": "wrt.cli.scene_files:schema",

@@ -12,8 +12,9 @@ from wrt.core.device import start
 from wrt.core.errors import InputError
 from wrt.io.load import as_scene
 from wrt.renderer.inspector.assemble import Assembler
+from wrt.renderer.inspector.inspection import Inspection
 from wrt.renderer.inspector.recorder import Recorder
-from wrt.renderer.inspector.tree import Inspection, Sample
+from wrt.renderer.inspector.tree import Sample
 from wrt.renderer.options import Options
 from wrt.renderer.plan import plan_of
 from wrt.scene.cameras import CameraKind

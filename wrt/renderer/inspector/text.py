@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from wrt.renderer.inspector.tree import Inspection, Light, Place, Ray
+from wrt.renderer.inspector.tree import InspectedPixel, Light, Place, Ray
 
 MOST = 4  # samples that are printed
 
 
-def tree_text(inspection: Inspection) -> str:
+def tree_text(inspection: InspectedPixel) -> str:
     """Return the trees of the first MOST samples, below a line with the pixel's radiance."""
     (x, y), (width, height), samples = inspection.pixel, inspection.size, inspection.samples
     of = f"sample {samples[0].index}" if len(samples) == 1 else f"the mean of {len(samples)} samples"
@@ -30,12 +28,11 @@ def tree_text(inspection: Inspection) -> str:
 
 def ray_lines(ray: Ray, first: str, below: str) -> Iterator[str]:
     """Yield the lines of a ray and of everything that begins at its hit. first, below: indents of the first line and of the others."""
-    # A deep path of glass would indent more and more: the stack of these generators is as deep as the tree (max_depth is at most 1000).
     waiting: list[tuple[Ray | Light, str, str]] = [(ray, first, below)]
     while waiting:
         item, first, below = waiting.pop()
-        yield first + (describe_ray(item) if hasattr(item, "children") else describe_light(item))
-        items = (*item.lights, *item.children) if hasattr(item, "children") else ()
+        yield first + (describe_ray(item) if isinstance(item, Ray) else describe_light(item))
+        items = (*item.lights, *item.children) if isinstance(item, Ray) else ()
         waiting += [(each, below + ("└─ " if last else "├─ "), below + ("   " if last else "│  "))
                     for each, last in zip(items[::-1], [True] + [False] * (len(items) - 1), strict=False)]
 

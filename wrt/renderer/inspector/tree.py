@@ -1,4 +1,4 @@
-"""The tree of rays of a pixel: Inspection, Sample, Ray, Light and ShadowPart. A pixel is a mean of samples, a sample a sum over rays."""
+"""The tree of rays of a pixel: InspectedPixel, Sample, Ray, Light and Place. A pixel is a mean of samples, a sample a sum over rays."""
 
 from __future__ import annotations
 
@@ -8,11 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from wrt.core.types import JsonObject, PathLike
+from wrt.core.types import JsonObject
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from wrt.scene.cameras import CameraKind
     from wrt.scene.model import Scene
 
@@ -121,22 +119,8 @@ class Sample:
 
 
 @dataclass(frozen=True, eq=False)
-class Inspection:
-    """The rays of a pixel. `print` shows them as a tree; `radiance` is the sum over the tree.
-
-    Parameters
-    ----------
-    scene
-        The inspected scene, with the settings of the inspection.
-    camera
-        The camera of the picture.
-    pixel, size
-        x and y from the top left; width and height of the picture.
-    seed
-        Seed of the samples.
-    samples
-        The inspected samples: all samples of the pixel, or one.
-    """
+class InspectedPixel:
+    """The data of an Inspection, which documents the fields."""
 
     scene: Scene = field(repr=False)
     camera: CameraKind = field(repr=False)
@@ -166,42 +150,6 @@ class Inspection:
         head = {"scene": self.scene.name, "camera": self.camera.name, "pixel": list(self.pixel), "size": list(self.size), "seed": self.seed}
         samples = [{"index": each.index, "radiance": each.radiance.tolist(), "rays": _table(each.rays)} for each in self.samples]
         return head | {"radiance": self.radiance.tolist(), "samples": samples}
-
-    def figure(self, view: str = "both", sample: int | None = None) -> Figure:
-        """Draw the rays of one sample.
-
-        Parameters
-        ----------
-        view
-            "section": the plane that holds most of the rays, with the outlines of the shapes that it cuts. "picture": the scene from
-            the side, with the rays in it. "both": one beside the other.
-        sample
-            Index of the sample to draw. None: the first.
-
-        Returns
-        -------
-        Figure
-            A figure of matplotlib, which a notebook shows, and `save` writes.
-
-        Raises
-        ------
-        InputError
-            If matplotlib is missing, the view is unknown, the sample was not inspected, or it has no ray.
-        """
-        from wrt.renderer.inspector.drawing import figure
-
-        return figure(self, view, sample)
-
-    def save(self, path: PathLike, view: str = "both", sample: int | None = None) -> None:
-        """Write `figure(view, sample)` to a file: .png, .svg or .pdf. Raises InputError as `figure`, and if the file cannot be written."""
-        from wrt.renderer.inspector.drawing import save
-
-        save(self, path, view, sample)
-
-    def __str__(self) -> str:
-        from wrt.renderer.inspector.text import tree_text
-
-        return tree_text(self)
 
 
 def _table(rays: tuple[Ray, ...]) -> list[JsonObject]:
