@@ -34,8 +34,7 @@ def differing_pixels(path: Path, camera: int, pixels: int, spp: int, seed: int =
 
 
 def main() -> None:
-    pixels, spp = (int(text) for text in (*sys.argv[1:], "1000", "2")[:2]) if len(sys.argv) < 2 else (
-        int(sys.argv[1]), int((*sys.argv[2:], "2")[0]))
+    pixels, spp = int((*sys.argv[1:2], 1000)[0]), int((*sys.argv[2:3], 2)[0])
     failed = total = 0
     for path in SCENES:
         for camera in range(len(wrt.load_scene(path).cameras)):

@@ -30,14 +30,14 @@ PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "kernels" / "README.m
 NOTES = sorted((ROOT / "docs" / "lab_notes").glob("*.md"))  # dated: their commands and Python are not run
 # Commands of other programs, and commands of wrt that have their own tests or that .ci/run runs.
 OTHERS = ("pip install ", "pytest", "python -m pdoc ", "dask ", "python -m tests.fuzz ", "python -m tests.virtual_gpu ",
-          "openssl req ", "export DASK_", "ulimit -v ", "timeout -k ", "prlimit ")
+          "openssl req ", "python -m tests.inspect_all", "export DASK_", "ulimit -v ", "timeout -k ", "prlimit ")
 # Placeholders in command lines, and the files of the fixture `folder` that replace them.
 STANDS_FOR = {"MESH...": "model.ply", "MESH": "model.ply", "SCENE": "scenes/whitted.toml", "FILE.gif": "file.gif", "STUDY": "order",
               "bunny.ply": "model.ply", "FOLDER|FILE.gif|.png": "frames", "FOLDER": "folder"}
 # Options to append to a command so that it takes little time. Commands in neither CHEAP nor SLOW are parsed, but not run.
 CHEAP = {
     "render": ("--size", "32x18", "--spp", "4"), "info": (), "compile": (), "compare": (), "validate": (), "schema": (),
-    "devices": (), "walk": (),
+    "devices": (), "walk": (), "inspect": ("--spp", "1"),
     "profile": ("--size", "24x14"), "animate": ("--frames", "2", "--size", "32x18", "--spp", "1"), "build": (),
     "bench accel": ("--structures", "bvh", "--kinds", "primary", "--rays", "200", "--runs", "1", "--max-triangles", "2000"),
 }

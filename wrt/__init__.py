@@ -56,9 +56,9 @@ if TYPE_CHECKING:
     from wrt.lab.tune import tune as tune
     from wrt.lab.walk.walk import walk as walk
     from wrt.picture.film import Film as Film
+    from wrt.renderer.inspector.inspect import inspect as inspect
     from wrt.renderer.options import Options as Options
     from wrt.renderer.options import Progress as Progress
-    from wrt.renderer.inspector.inspect import inspect as inspect
     from wrt.renderer.pixel_rays import camera_rays as camera_rays
     from wrt.renderer.render import render as render
     from wrt.scene.backgrounds import ConstantBackground as ConstantBackground

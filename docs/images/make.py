@@ -1,9 +1,11 @@
-"""Render the three pictures of README.md: `PYTHONPATH=. python docs/images/make.py`."""
+"""Make the four pictures of README.md: `PYTHONPATH=. python docs/images/make.py`."""
 
+import io
 import tempfile
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 import wrt
 from tests.gltf_files import GltfFile
@@ -71,11 +73,22 @@ def glass(folder: Path) -> Path:
     return room
 
 
+def rays() -> None:
+    """Draw the rays of a pixel that shows a prism: refraction, inner reflections, and the shadow rays of a point behind it."""
+    tree = wrt.inspect(HERE.parents[1] / "scenes" / "glass_slab.toml", (440, 215), 0, min_throughput=0.01, spp=64)
+    file = io.BytesIO()
+    tree.figure("picture").savefig(file)
+    picture = Image.open(file).convert("RGB")
+    picture = picture.resize((1000, round(picture.height * 1000 / picture.width)), Image.Resampling.LANCZOS)
+    picture.save(HERE / "rays.jpg", quality=88, optimize=True)
+
+
 def main() -> None:
     stadium = HERE.parents[1] / "scenes" / "stadium.toml"
     wrt.render(stadium, spp=64, size=SIZE).save(HERE / "mesh.png")
     with tempfile.TemporaryDirectory() as folder:
         wrt.render(glass(Path(folder)), spp=256, size=SIZE).save(HERE / "glass.png")
+    rays()
     wrt.profile(stadium, spp=4, size=(320, 240)).heatmap("nodes").save(HERE / "nodes.png", optimize=True)
 
 

@@ -59,7 +59,7 @@ class AskedLight:
     """A light at a surface. Its shadow ray is traced in the parts rays[first_ray] .. rays[first_ray + n_rays - 1]."""
 
     end: int  # Index of the surface in Record.ends.
-    light: int  # Index of the light; the number of lights stands for the background.
+    light: int  # Index of the light, or of one of Features.extra_lights behind the scene's lights.
     value: wp.vec3  # ShadowRequest.value: reflected radiance if nothing occludes the light; 0 if no ray is traced.
     transmittance: wp.vec3
     first_ray: int
@@ -168,6 +168,13 @@ def end_light(record: Record, shadow: Shadow):
         record.lights[i] = entry
 
 
+@wp.func
+def store_end(record: Record, entry: PathEnd):
+    i = next_index(record, ENDS)
+    if i < record.ends.shape[0]:
+        record.ends[i] = entry
+
+
 class Recorder(NamedTuple):
     """The device functions that record the end of a path."""
 
@@ -187,12 +194,6 @@ def make_recorder(features: Features) -> Recorder:
         entry.throughput = path.throughput
         entry.medium = path.medium
         return entry
-
-    @wp.func
-    def store_end(record: Record, entry: PathEnd):
-        i = next_index(record, ENDS)
-        if i < record.ends.shape[0]:
-            record.ends[i] = entry
 
     @wp.func
     def miss(record: Record, ray: int, path: Path, background: wp.vec3):

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from wrt.accel.flat_scene import FlatScene
+from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.follow_up import CUT_BY_DEPTH, FOLLOWED
 from wrt.kernels.shade.paths import ONWARD, REFLECTED
-from wrt.renderer.inspector.tree import Light, Place, Ray
+from wrt.renderer.inspector.tree import AMBIENT, Light, Place, Ray
 from wrt.renderer.upload import mesh_lights
 from wrt.scene.model import Scene
 
@@ -23,17 +24,18 @@ BLACK = np.zeros(3, np.float32)
 class Assembler:
     """Makes trees, with the names of a scene's shapes, materials and lights. world: the scene as arrays."""
 
-    def __init__(self, scene: Scene, world: FlatScene) -> None:
+    def __init__(self, scene: Scene, world: FlatScene, features: Features) -> None:
         self.first_prims = np.zeros(0, np.int64) if world.objects is None else world.objects
         self.shapes = [*_names(scene.objects, "object"), *_names(scene.spheres, "sphere")]
         self.materials = _names(scene.materials, "material")
         self.emissive = [material.is_emissive for material in scene.materials]
         self.lights = _names(scene.lights, "light")
-        self.lights += [name for name, each in zip(_names(scene.spheres, "sphere"), scene.spheres, strict=True) if each.material.lights_others]
+        spheres = zip(_names(scene.spheres, "sphere"), scene.spheres, strict=True)
+        self.lights += [name for name, sphere in spheres if sphere.material.lights_others]
         for prim_id, _, _ in mesh_lights(scene, world):
             first, last = (self.shape_of(int(each)) for each in (prim_id[0], prim_id[-1]))
             self.lights.append(self.shapes[first] if first == last else "all emissive objects")
-        self.lights.append("background")
+        self.lights += ["background"] * features.sky_light + [AMBIENT] * features.ambient_occlusion
         self.material_of = world.materials
 
     def shape_of(self, prim_id: int) -> int:
@@ -67,9 +69,10 @@ class Assembler:
         hit = end["material"] >= 0
         here = hit and self.emissive[end["material"]] and bool(end["own"].any())
         ended = "missed" if not hit else "continued" if children else "emission" if here else "absorbed"
-        places = (end[name].copy() if hit else NOWHERE for name in ("point", "geometric", "shading"))
-        return Ray(*self._place(traced), kind, int(end["depth"]), end["throughput"].copy(), ended, *places, bool(end["front"]),
-                   *(end[name].copy() for name in ("weight", "own", "direct", "radiance")), lights, children)
+        point, normal, shading_normal = (end[name].copy() if hit else NOWHERE for name in ("point", "geometric", "shading"))
+        throughput, weight, own, direct, radiance = (end[name].copy() for name in ("throughput", "weight", "own", "direct", "radiance"))
+        return Ray(*self._place(traced), kind, int(end["depth"]), throughput, ended, point, normal, shading_normal, bool(end["front"]),
+                   weight, own, direct, radiance, lights, children)
 
     def _cut(self, path: Row) -> Ray:
         """Return a ray that was not traced: it adds nothing."""
@@ -90,7 +93,8 @@ class Assembler:
         shape = self.shapes[self.shape_of(prim_id)] if prim_id >= 0 else ""
         material = self.materials[self.material_of(np.array([prim_id]))[0]] if prim_id >= 0 else ""
         t = float(ray["t"]) if prim_id >= 0 else math.inf
-        return (ray["origin"].copy(), ray["direction"].copy(), float(ray["t_min"]), float(ray["t_max"]), exclude, t, prim_id, shape, material)
+        segment = float(ray["t_min"]), float(ray["t_max"])
+        return ray["origin"].copy(), ray["direction"].copy(), *segment, exclude, t, prim_id, shape, material
 
 
 def _names(things: Any, noun: str) -> list[str]:

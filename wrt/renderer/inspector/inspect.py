@@ -91,7 +91,7 @@ class Inspector:
         plan = plan_of(self.scene, resolved)
         self.camera, self.seed = plan.camera, resolved.seed
         self._recorder = Recorder(plan, start(resolved.device))
-        self._assembler = Assembler(self.scene, self._recorder.prepared.arrays.world)
+        self._assembler = Assembler(self.scene, self._recorder.prepared.arrays.world, plan.features)
 
     def pixel(self, pixel: tuple[int, int], sample: int | None = None) -> Inspection:
         """Return the rays of a pixel. pixel, sample: as for `inspect`. Raises InputError if there is no such pixel or sample."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -52,14 +53,15 @@ def draw_stroke(axes: Axes, stroke: Stroke, points: np.ndarray, hidden: np.ndarr
         axes.plot(*points[-1], marker=ENDS[stroke.mark][0], color=shade, ms=6.0, mec=shade if crossed else "white",
                   mew=1.6 if crossed else 0.8, zorder=6, alpha=alpha)
     for head in heads:
-        axes.annotate("", head + 0.02 * along, head, zorder=order, annotation_clip=True, arrowprops={
-            "arrowstyle": "-|>", "lw": 0.0, "mutation_scale": 8.0 + 3.0 * width, "color": shade, "alpha": alpha, "shrinkA": 0.0, "shrinkB": 0.0})
+        arrow = {"arrowstyle": "-|>", "lw": 0.0, "mutation_scale": 8.0 + 3.0 * width, "color": shade, "alpha": alpha}
+        arrow |= {"shrinkA": 0.0, "shrinkB": 0.0}
+        axes.annotate("", head + 0.02 * along, head, zorder=order, annotation_clip=True, arrowprops=arrow)
 
 
 def runs(flags: np.ndarray) -> list[tuple[int, int, bool]]:
     """Return (first, end, flag) of each run of equal flags."""
     edges = [0, *(np.flatnonzero(np.diff(flags)) + 1).tolist(), len(flags)]
-    return [(first, end, bool(flags[first])) for first, end in zip(edges[:-1], edges[1:], strict=True)]
+    return [(first, end, bool(flags[first])) for first, end in pairwise(edges)]
 
 
 def label_points(axes: Axes, sample: Sample, strokes: list[Stroke], project: Callable[[np.ndarray], np.ndarray]) -> None:
@@ -79,8 +81,9 @@ def label_points(axes: Axes, sample: Sample, strokes: list[Stroke], project: Cal
         star = marker == "*"
         axes.plot([x], [y], marker=marker, ms=13 if star else 8, color=shade, mec="#8a6500" if star else "white", mew=0.9, zorder=6)
         right, high = share[0] > 0.85, share[1] > 0.93
-        text = axes.annotate(name, (x, y), (-8 if right else 8, -13 if high else 7), textcoords="offset points", fontsize=8, color="#202020",
-                             ha="right" if right else "left", zorder=7, path_effects=[withStroke(linewidth=2.2, foreground="white")])
+        text = axes.annotate(name, (x, y), (-8 if right else 8, -13 if high else 7), textcoords="offset points", fontsize=8,
+                             color="#202020", ha="right" if right else "left", zorder=7,
+                             path_effects=[withStroke(linewidth=2.2, foreground="white")])
         text.set_in_layout(False)
 
 
@@ -105,6 +108,6 @@ def label_shapes(axes: Axes, shapes: list[Outline], corners: np.ndarray, lines: 
         free = [place for place in places if all((np.abs(place - other) > half + size_of).any() for other, size_of in taken)]
         if free:
             place = min(free, key=lambda place: int((np.abs(points_of_lines - place) < half).all(axis=1).sum()))
-            axes.text(*place, shape.name, fontsize=7.5, ha="center", va="center", color="#4a443a", zorder=7,
+            axes.text(place[0], place[1], shape.name, fontsize=7.5, ha="center", va="center", color="#4a443a", zorder=7,
                       bbox={"facecolor": "white", "alpha": 0.6, "pad": 0.8, "linewidth": 0})
             taken.append((place, half))

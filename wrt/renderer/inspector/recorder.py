@@ -19,7 +19,8 @@ from wrt.renderer.prepare import prepare
 from wrt.renderer.tiles import Work
 
 # The arrays of a Record in the order of Record.used, with the number of entries of the first attempt.
-ARRAYS = {"rays": (record.TracedRay, 256), "ends": (record.PathEnd, 128), "lights": (record.AskedLight, 256), "paths": (record.NewPath, 256)}
+ARRAYS = {"rays": (record.TracedRay, 256), "ends": (record.PathEnd, 128),
+          "lights": (record.AskedLight, 256), "paths": (record.NewPath, 256)}
 
 
 class RecordedStructure(NamedTuple):

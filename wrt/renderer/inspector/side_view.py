@@ -25,7 +25,7 @@ FOV = math.radians(34.0)
 FILLED = 0.84  # share of the picture's width or height that the rays may fill
 # Candidates for the side camera: angles around the camera's up and above its horizon, in degrees.
 AROUND, ABOVE = (-120, -90, -60, -40, 40, 60, 90, 120), (10, 30, 50)
-STEPS = 48  # parts of a line that are drawn as hidden or not
+STEPS = 96  # parts of a line that are drawn as hidden or not
 
 
 class SideView:
@@ -67,7 +67,7 @@ def side_camera(inspection: InspectedPixel, sample: Sample, strokes: list[Stroke
     pose, points = inspection.camera.camera_to_world, frame_points(sample)
     view = SideView(inspection.scene, Camera(fov_y=FOV))
     paths = [stroke for stroke in strokes if not stroke.is_shadow]
-    lines = np.array([np.linspace(stroke.start, stroke.end, 9) for stroke in paths])
+    lines = np.array([np.linspace(stroke.start, stroke.end, 17) for stroke in paths])
     weights = np.sqrt([stroke.weight for stroke in paths])[:, None]
     best, found = -1.0, view
     back = -sample.rays[0].direction.astype(np.float64)
@@ -81,10 +81,16 @@ def side_camera(inspection: InspectedPixel, sample: Sample, strokes: list[Stroke
             candidate = view.aimed(framed(points, math.cos(rise) * level + math.sin(rise) * up, up))
             seen = ~candidate.hidden(lines[:, 1:].reshape(-1, 3)).reshape(len(lines), -1)
             flat = candidate.project(lines.reshape(-1, 3)).reshape(*lines.shape[:2], 2)
-            score = float(np.nansum(weights * seen * np.linalg.norm(np.diff(flat, axis=1), axis=2)))
+            seen &= in_picture(flat[:, 1:]) & in_picture(flat[:, :-1])
+            score = float((weights * np.where(seen, np.linalg.norm(np.diff(flat, axis=1), axis=2), 0.0)).sum())
             if score > best:
                 best, found = score, candidate
     return found
+
+
+def in_picture(flat: np.ndarray, beyond: float = 0.0) -> np.ndarray:
+    """Return whether points (..., 2) are in the picture, or beyond its edges by at most that share of its size; NaN is not."""
+    return np.asarray((np.abs(flat / SIZE - 0.5) <= 0.5 + beyond).all(axis=-1))
 
 
 def framed(points: np.ndarray, towards_eye: np.ndarray, up: np.ndarray) -> Camera:
@@ -110,6 +116,9 @@ def draw_picture(axes: Axes, inspection: InspectedPixel, sample: Sample) -> None
     for stroke in strokes:
         points = np.linspace(stroke.start, stroke.end, STEPS + 1)
         flat = view.project(points)
-        if np.isfinite(flat).all():
-            draw_stroke(axes, stroke, flat, view.hidden(0.5 * (points[1:] + points[:-1])))
+        kept = np.flatnonzero(in_picture(flat, 0.2))  # a line may leave the picture, even behind the camera
+        if len(kept) > 1:
+            part = stroke if kept[-1] == STEPS else stroke._replace(mark="", goes_on=False)
+            points, flat = points[kept], flat[kept]
+            draw_stroke(axes, part, flat, view.hidden(0.5 * (points[1:] + points[:-1])))
     label_points(axes, sample, strokes, view.project)

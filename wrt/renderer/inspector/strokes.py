@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wrt.renderer.inspector.tree import Light, Ray, Sample
+from wrt.renderer.inspector.tree import AMBIENT, Light, Ray, Sample
 
 COLORS = {"camera": "#202020", "reflected": "#1668c4", "refracted": "#d1342b", "transmitted": "#c2378f", "onward": "#2b8a3e",
           "shadow ray": "#e59a00", "blocked": "#8a7f70"}
@@ -77,7 +77,7 @@ def _shadow(ray: Ray, light: Light, weight: float, extent: float) -> Stroke:
     if goes_on:  # the background, or a directional light
         end = last.origin + LEAVES * extent * _unit(last.direction)
     return Stroke("blocked" if blocked else "shadow ray", start, end, weight * (1.0 if light.radiance.any() else 0.3),
-                  "blocked" if blocked else "", goes_on, "" if blocked or goes_on else light.light)
+                  "blocked" if blocked else "", goes_on, "" if blocked or goes_on or light.light == AMBIENT else light.light)
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

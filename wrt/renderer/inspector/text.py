@@ -32,7 +32,7 @@ def ray_lines(ray: Ray, first: str, below: str) -> Iterator[str]:
     while waiting:
         item, first, below = waiting.pop()
         yield first + (describe_ray(item) if isinstance(item, Ray) else describe_light(item))
-        items = (*item.lights, *item.children) if isinstance(item, Ray) else ()
+        items: tuple[Ray | Light, ...] = (*item.lights, *item.children) if isinstance(item, Ray) else ()
         waiting += [(each, below + ("└─ " if last else "├─ "), below + ("   " if last else "│  "))
                     for each, last in zip(items[::-1], [True] + [False] * (len(items) - 1), strict=False)]
 

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from wrt.scene.cameras import CameraKind
     from wrt.scene.model import Scene
 
+AMBIENT = "ambient term"  # name of the light that stands for the ambient term, with ambient occlusion
+
 
 @dataclass(frozen=True, eq=False)
 class Place:
@@ -44,7 +46,7 @@ class Place:
 class Light:
     """A light that a surface asks, or would ask.
 
-    - light: the light's name. value: radiance that the surface reflects if nothing occludes the light.
+    - light: the light's name, "background" or AMBIENT. value: radiance that the surface reflects if nothing occludes the light.
     - transmittance: share of the light that arrives. radiance: value times transmittance. All (3,) float32.
     - state: "seen", "dimmed" (by surfaces that let a part through), "blocked", "cut" (too many such surfaces), or "dark": it cannot
       light this point, because it is behind the surface or shines elsewhere, so that no ray is traced.

@@ -145,8 +145,11 @@ def test_what_a_profile_cannot_do_is_refused(scene: Scene, monkeypatch: pytest.M
         profile(scene)
 
 
+GUARDS = ("if counting:", "if wp.static(counting):", "if wp.static(features.counting):", "if wp.static(features.recording):")
+
+
 def test_nothing_of_the_log_is_in_a_render(scene: Scene, tmp_path: Path) -> None:
-    """A source without counting compiles to the same machine code for Turing, to the last byte."""
+    """A source without counting and recording compiles to the same machine code for Turing, to the last byte."""
     features, structure = features_of(scene, scene.camera(None)), Structure(ACCELERATORS["bvh"], Units())
     folder = Path(wrt.__file__).parent.parent / "kernels"
     modules, names = {}, ("paths", "step", "follow_up", "film", "one_ray")
@@ -156,7 +159,7 @@ def test_nothing_of_the_log_is_in_a_render(scene: Scene, tmp_path: Path) -> None
             text = text.replace(f"wrt.kernels.shade.{other} ", f"wrt.kernels.bare_{other} ")
         (tmp_path / f"{name}.py").write_text(text)
         spec = importlib.util.spec_from_file_location(f"wrt.kernels.bare_{name}", tmp_path / f"{name}.py")
-        assert spec is not None and spec.loader is not None and "counting" not in text
+        assert spec is not None and spec.loader is not None and "counting" not in text and "features.recording" not in text
         modules[name] = importlib.util.module_from_spec(spec)
         sys.modules[spec.name] = modules[name]
         spec.loader.exec_module(modules[name])
@@ -169,7 +172,7 @@ def test_nothing_of_the_log_is_in_a_render(scene: Scene, tmp_path: Path) -> None
 
 
 def without_counting(text: str) -> str:
-    """The source without docstrings, without the blocks that `counting` guards, and without that argument."""
+    """The source without docstrings, without the blocks that `counting` or `recording` guards, and without the argument `counting`."""
     tree = ast.parse(text)
     for node in ast.walk(tree):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
@@ -179,7 +182,7 @@ def without_counting(text: str) -> str:
         indent = len(line) - len(line.lstrip())
         if depth is not None and indent > depth:
             continue
-        depth = indent if line.strip() in ("if counting:", "if wp.static(counting):", "if wp.static(features.counting):") else None
+        depth = indent if line.strip() in GUARDS else None
         if depth is None:
             out.append(line)
     bare = "\n".join(out) + "\n"
