@@ -55,8 +55,8 @@ def inspect(scene: Scene | Mesh | str | os.PathLike[str], pixel: tuple[int, int]
     sample
         Index of the only sample to trace. None: all samples of the pixel.
     **options
-        The settings size, spp, max_depth, min_throughput, filter, fresnel, glass_shadows, sampler, exposure and tonemap, and seed,
-        device, threads, accel, accel_options, triangle, box, instancing and camera, as for `render`.
+        The scene's settings, such as spp, and seed, device, threads, accel, accel_options, triangle, box, instancing and camera, as for
+        `render`.
 
     Returns
     -------
