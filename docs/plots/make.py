@@ -134,6 +134,34 @@ def peers() -> str:
                 low=0.9, log=True, mean=True, one=True)
 
 
+def queries() -> str:
+    """Draw a bar for each kind of ray and each library in its best mode; the time is a geometric mean over the meshes."""
+    names = {"wrt bvh8": "wrt", "tinybvh": "tinybvh", "Embree robust": "Embree robust", "Embree fast": "Embree fast",
+             "Open3D RaycastingScene": "Open3D", "trimesh.ray with embreex": "trimesh", "Warp mesh_query_ray": "Warp"}
+    best: dict[tuple[str, str], dict[str, float]] = {}
+    for row in read("queries"):
+        modes = best.setdefault((row["kind"], row["library"]), {})
+        modes[row["mesh"]] = min(float(row["ns"]), modes.get(row["mesh"], math.inf))
+    kinds = {"primary": "primary rays", "shadow": "any hit: shadow rays", "diffuse": "bounce: diffuse rays", "random": "random rays"}
+    times = {key: geometric_mean(modes.values()) for key, modes in best.items() if key[0] in kinds}
+    drawing, y, left = Drawing("Nanoseconds a ray, one thread", 0), 48.0, 180
+    drawing.text(12, 30, "Nanoseconds a ray, one thread: less is better", bold=True)
+    scale = Scale(0, max(times.values()), left, WIDTH - 70)
+    for kind, title in kinds.items():
+        drawing.text(left, y + 22, title, bold=True)
+        y += 30
+        for library, name in names.items():
+            if (kind, library) in times:
+                time = times[kind, library]
+                drawing.text(left - 10, y + 20, name, anchor="end", size=19)
+                drawing.box(left, y + 3, scale(time) - left, 20, COLORS[0] if name == "wrt" else "#aaa")
+                drawing.text(scale(time) + 8, y + 20, f"{time:.0f}", size=19, bold=name == "wrt")
+                y += 26
+        y += 8
+    drawing.height = y + 4
+    return drawing.svg()
+
+
 def speed_and_error() -> str:
     speeds, errors = read("peers"), read("hard_cases")
 
@@ -282,7 +310,7 @@ def refit() -> str:
     return drawing.svg()
 
 
-PLOTS = (speed_and_error, peers, hard_cases, libraries, default_cost, mitsuba, pictures, structures, builders, refit)
+PLOTS = (speed_and_error, peers, queries, hard_cases, libraries, default_cost, mitsuba, pictures, structures, builders, refit)
 
 
 def main() -> None:

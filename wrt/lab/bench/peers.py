@@ -217,7 +217,7 @@ def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
         out.append(tabled(COLUMNS, group, f"{mesh}, {triangles} triangles", f"Build time, wall clock: {built}."))
     kinds = list(dict.fromkeys(row.kind for row in rows))
     lines = [(name, *(f"{by_kind[kind]:.2f}" if kind in by_kind else "" for kind in kinds)) for name, by_kind in means(rows).items()]
-    title = f"Geometric means over {len(by_mesh)} meshes of wrt / library"
+    title = f"Geometric means over {len({row.mesh for row in rows if row.kind != 'tiles'})} meshes of wrt / library"
     return [*out, *([Part(title, "", ("library", *kinds), lines)] if lines else [])]
 
 
