@@ -1,6 +1,6 @@
 """wrt: a Whitted ray tracer on NVIDIA Warp, a software model of RT cores, and tools to measure both.
 
-Ray queries without a picture: load_mesh, Mesh, DeviceGeometry, build, ACCELERATORS, load_accel, camera_rays; all_hits,
+Ray queries without a picture: load_mesh, Mesh, DeviceGeometry, build, ACCELERATORS, load_accel, accel_from_tree, camera_rays; all_hits,
 count_hits, first_hits, contains, winding_number, visible; closest_points, signed_distance.
 Ray queries from your own Warp kernels: kernel, ray_query. Gradients: Hits.gradients, and the modules torch, jax.
 Pictures: load_scene, render, Film, Options, Progress, LiveView, side_by_side.
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from wrt.accel.queries.all_hits import first_hits as first_hits
     from wrt.accel.queries.ray_query import ray_query as ray_query
     from wrt.accel.queries.visible import visible as visible
+    from wrt.accel.scenes.build import accel_from_tree as accel_from_tree
     from wrt.accel.scenes.build import build as build
     from wrt.accel.scenes.build import load_accel as load_accel
     from wrt.accel.structures import ACCELERATORS as ACCELERATORS

@@ -20,6 +20,7 @@ from wrt.accel.queries.rays import vectors
 from wrt.accel.snapshot import Snapshot
 from wrt.accel.store import check_order, save
 from wrt.accel.structure import Structure, options_of
+from wrt.accel.tree_exchange import TreeExchange
 from wrt.core.arrays import check_no_gradients, from_tensor
 from wrt.core.default_device import DEFAULT_DEVICE
 from wrt.core.device import upload
@@ -30,7 +31,7 @@ from wrt.kernels.traverse.common import Units
 from wrt.kernels.warp_private import fields_of
 
 
-class OneMesh(Accelerator, ABC):
+class OneMesh(TreeExchange, ABC):
     """An acceleration structure over one mesh. Subclasses set `name`, `kernels` and `options`, and implement `_build`.
 
     record: Warp struct of a primitive. units: kernels.traverse.common.Units. accepts: Warp function that can reject hits. A module

@@ -11,10 +11,12 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.base import OneMesh
+from wrt.accel.box_tree import ABSENT, BoxTree
 from wrt.accel.built import Built
 from wrt.accel.bvh.builders import BinaryOptions, BvhOptions, build_binary, sah_cost
 from wrt.accel.bvh.lbvh import build_on
 from wrt.accel.bvh.refit import Fitting, parents_of, tree_of
+from wrt.accel.bvh.tree import binary_tree_of
 from wrt.accel.device_geometry import DeviceGeometry
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import NumberedGeometry
@@ -55,8 +57,25 @@ class BinaryBvh(OneMesh):
     def _around(self, nodes: np.ndarray, order: np.ndarray, leaves: int, depth: int) -> Built:
         """Make the builder's result from a binary tree. nodes: Bvh2Node records; other arguments as in Built."""
 
+    def _box_tree(self, built: Built) -> BoxTree:
+        return box_tree(self._boxes(built), built.order)
+
+    def _boxes(self, built: Built) -> np.ndarray:
+        """Return Bvh2Node records with the structure's links and boxes around its volumes."""
+        return built.arrays["nodes"]
+
+    def _built_of(self, tree: BoxTree) -> Built:
+        binary = binary_tree_of(tree)
+        return self._around(binary.nodes, binary.order, binary.leaves, binary.depth)
+
     def _check(self, built: Built) -> None:
         check_binary(built.arrays["nodes"], len(built.order), kernels.STACK_SIZE)
+
+
+def box_tree(nodes: np.ndarray, order: np.ndarray) -> BoxTree:
+    """Convert Bvh2Node records to a BoxTree."""
+    lo, hi, first, count = (np.stack([nodes[part + "_0"], nodes[part + "_1"]], axis=1) for part in ("lo", "hi", "first", "count"))
+    return BoxTree(lo, hi, first.astype(np.int32), np.where(lo[..., 0] > hi[..., 0], ABSENT, count).astype(np.int32), order)
 
 
 class Bvh2(BinaryBvh):

@@ -16,7 +16,7 @@ from wrt.core.errors import InputError
 from wrt.kernels.traverse import bvh6 as kernels
 from wrt.kernels.traverse.bvh6 import LEAVES_SHIFT, WIDTH, Bvh6Node
 from wrt.kernels.wide.layout import EXIST_SHIFT, FIRST_BYTES, WORD
-from wrt.kernels.wide.references import EMPTY, leaf_first, leaf_reference
+from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first, leaf_reference
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,11 @@ class Bvh6(CollapsedBvh):
         tree = grouped(self._collapsed(BvhOptions(**asdict(options), max_leaf=1, row=WIDTH)))
         built = Built(self._arrays(tree), tree.order[:, 0].copy(), len(tree.children), tree.leaves, tree.depth)
         return replace(built, sah_cost=self._tree(built).sah_cost(tree.root_area))
+
+    def _arranged(self, tree: WideTree) -> WideTree:
+        if (leaf_count.func(tree.children[tree.children < 0]) > 1).any():
+            raise InputError("bvh6 holds one primitive per leaf, and the tree has leaves with more", argument="accel", hint="use bvh8")
+        return grouped(tree)
 
     def _arrays(self, tree: WideTree) -> dict[str, np.ndarray]:
         """Return the nodes of a tree that `grouped` made."""

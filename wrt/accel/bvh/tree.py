@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from wrt.accel.box_tree import BoxTree
 from wrt.core.device import records
 from wrt.core.errors import InputError
 from wrt.kernels.build.shape import half_area
@@ -83,6 +84,21 @@ def squeeze(nodes: np.ndarray, used: np.ndarray) -> np.ndarray:
         inner = out["count_" + side] == 0
         out["first_" + side] = np.where(inner, index[np.minimum(out["first_" + side], len(index) - 1)], out["first_" + side])
     return out
+
+
+def binary_tree_of(tree: BoxTree) -> BinaryTree:
+    """Convert a BoxTree of at most two children per node, in depth-first order."""
+    if tree.width > 2:
+        raise InputError(f"must have at most 2 children per node, got {tree.width}", place="tree: child", hint="use bvh4 or bvh8")
+    tree = tree.preorder()
+    nodes = records(Bvh2Node, len(tree.child))
+    for side in range(2):
+        absent = tree.count[:, side] < 0 if side < tree.width else np.ones(len(nodes), bool)
+        k = min(side, tree.width - 1)
+        nodes[f"lo_{side}"] = np.where(absent[:, None], np.float32(np.inf), tree.lo[:, k])
+        nodes[f"hi_{side}"] = np.where(absent[:, None], np.float32(-np.inf), tree.hi[:, k])
+        nodes[f"first_{side}"], nodes[f"count_{side}"] = np.where(absent, 0, tree.child[:, k]), np.where(absent, 0, tree.count[:, k])
+    return BinaryTree(nodes, tree.primitives.astype(np.int32), len(tree.levels()))
 
 
 def half_areas(lo: np.ndarray, hi: np.ndarray) -> np.ndarray:

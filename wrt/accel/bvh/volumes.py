@@ -41,6 +41,9 @@ class Bvh2Sphere(BinaryBvh):
         empty = [nodes[f"sphere_{side}"][:, 3] < 0.0 for side in "01"]
         check_links(nodes, empty, len(built.order), self.kernels.STACK_SIZE)
 
+    def _boxes(self, built: Built) -> np.ndarray:
+        return boxes_around(built, self.geometry)
+
     def _refit(self, built: Built) -> Built:
         return self._around(boxes_around(built, self.geometry), built.order, built.leaves, built.depth)
 
@@ -60,6 +63,9 @@ class Bvh2Kdop(BinaryBvh):
         kdops = fit_kdops(nodes, order, self.geometry, middle)
         return Built({"nodes": kdops, "middle": middle}, order, len(nodes), leaves, depth,
                      cost_of(nodes, kdop_areas(kdops, middle)))
+
+    def _boxes(self, built: Built) -> np.ndarray:
+        return boxes_around(built, self.geometry)
 
     def _refit(self, built: Built) -> Built:
         return self._around(boxes_around(built, self.geometry), built.order, built.leaves, built.depth)

@@ -10,11 +10,13 @@ from typing import ClassVar
 import numpy as np
 
 from wrt.accel.base import OneMesh
+from wrt.accel.box_tree import ABSENT, INNER, BoxTree
 from wrt.accel.built import Built
 from wrt.accel.bvh.builders import BinaryOptions, BvhOptions, build_binary
 from wrt.accel.bvh.compress import compress, decompress, existing_children
 from wrt.accel.bvh.small import SMALL, small_tree
-from wrt.accel.bvh.wide_tree import COLLAPSE, WideTree, check_wide, collapse, lanes_of, packed, refit, row_starts
+from wrt.accel.bvh.tree import binary_tree_of
+from wrt.accel.bvh.wide_tree import COLLAPSE, WideTree, check_wide, collapse, lanes_of, packed, refit, row_starts, wide_tree_of
 from wrt.accel.geometry import Geometry
 from wrt.core.device import empty_aligned, launch, preloading, record_dtype, start
 from wrt.core.errors import InputError
@@ -75,6 +77,29 @@ class CollapsedBvh(OneMesh):
             raise InputError(f"a {self.name} holds at most {MAX_FIRST} primitives, and there are {len(binary.order)}",
                              hint="use bvh8")
         return tree
+
+    def _box_tree(self, built: Built) -> BoxTree:
+        tree = self._tree(built)
+        children = packed(tree.children, 1).astype(np.int64)
+        leaf = children < 0
+        count = np.where(leaf, leaf_count.func(children), np.where(children == EMPTY, ABSENT, INNER))
+        return BoxTree(tree.lo, tree.hi, np.where(leaf, leaf_first.func(children), children).astype(np.int32), count.astype(np.int32),
+                       built.order)
+
+    def _arranged(self, tree: WideTree) -> WideTree:
+        """Order a tree as `_arrays` needs it, or raise InputError if the nodes cannot hold it."""
+        return tree
+
+    def _built_of(self, tree: BoxTree) -> Built:
+        """Convert a tree. Binary trees are collapsed into nodes of more children."""
+        if tree.width == 2 and len(tree.primitives) > 1:
+            options = BvhOptions(**{"max_leaf": 1} | asdict(self.options()) | {"row": self.width})
+            wide = collapse(binary_tree_of(tree), self.width, options.max_leaf, options.cost_traversal, options.cost_intersection)
+        else:
+            wide = wide_tree_of(tree, self.width)
+        wide = self._arranged(wide)
+        built = Built(self._arrays(wide), wide.order[wide.order >= 0], len(wide.children), wide.leaves, wide.depth)
+        return replace(built, sah_cost=self._tree(built).sah_cost(wide.root_area))
 
     def _refit(self, built: Built) -> Built:
         tree = refit(self._tree(built), self.geometry)

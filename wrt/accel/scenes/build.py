@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict, TypeVar, Unpack, overload
 
 import numpy as np
 
 from wrt.accel.base import OneMesh
+from wrt.accel.box_tree import BoxTree
 from wrt.accel.flat_scene import FlatScene, flat_scene_of
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry
@@ -190,6 +191,46 @@ def load_accel(path: PathLike, mesh: MeshLike, device: str = DEFAULT_DEVICE, thr
     if not isinstance(flat.geometry, Geometry):
         raise InputError("must not be a scene with instances, because no file holds a structure over it", argument="mesh")
     return read(path, flat.geometry, flat, as_one(device, str, "device"), threads)
+
+
+def accel_from_tree(mesh: MeshLike, tree: BoxTree | Mapping[str, Any] | PathLike, accel: str | None = None, device: str = DEFAULT_DEVICE,
+                    threads: int | None = None, *, spatial_splits: bool = False) -> OneMesh:
+    """Make a BVH from the tree of another builder, so that wrt's queries, counters and models measure it.
+
+    The tree is checked first. Boxes grow by the padding that wrt's intersection tests need, so that no ray is lost; a tree from
+    `OneMesh.tree` keeps its boxes.
+
+    Parameters
+    ----------
+    mesh
+        See `build`; the surfaces that the tree was built over.
+    tree : BoxTree, mapping of its arrays, or path of a .npz file
+        `lo`, `hi`, `child`, `count` and `primitives`, as `OneMesh.tree` returns and `BoxTree` describes.
+    accel : str, optional
+        BVH in `wrt.ACCELERATORS`; by default bvh2, bvh4 or bvh8 after the tree's width. Wide BVHs collapse a binary tree.
+    device, threads
+        See `build`.
+    spatial_splits : bool
+        Allow several leaves to list the same primitive. Their boxes must contain the padded parts of the primitive; this is not checked.
+
+    Returns
+    -------
+    OneMesh
+        Structure of the class `accel`.
+
+    Raises
+    ------
+    InputError
+        Says what is wrong and names the node and child, if the arrays are not a tree over the mesh.
+    """
+    read, flat = BoxTree.of(tree), to_flat_scene(mesh)
+    if not isinstance(flat.geometry, Geometry):
+        raise InputError("must not be a scene with instances", argument="mesh")
+    name = accel or ("bvh2" if read.width <= 2 else "bvh4" if read.width <= 4 else "bvh8")
+    ACCELERATORS.check(as_one(name, str, "accel"), "accel")
+    out: OneMesh = ACCELERATORS[name].from_tree(read, flat.geometry, flat, as_one(device, str, "device"), threads,
+                                                spatial_splits=spatial_splits)
+    return out
 
 
 def to_flat_scene(mesh: MeshLike) -> FlatScene:
