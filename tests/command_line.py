@@ -11,7 +11,7 @@ from typing import NamedTuple
 from unittest import mock
 
 from wrt.cli import main as cli
-from wrt.renderer.progress import COMPILING
+from wrt.core.compiling import COMPILING
 
 BOX_OBJ = """\
 v -1 -1 -1

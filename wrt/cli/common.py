@@ -130,8 +130,21 @@ class Setting(click.ParamType):
         return name, parsed if isinstance(parsed, bool | int | float | str) and name != "size" else text  # "0x360" is a size
 
 
+def quiet_option(text: str) -> Decorator:
+    """Return the option -q. A quiet command does not report that kernels are compiled. text: the option's help."""
+
+    def silence(context: click.Context, option: click.Parameter, quiet: bool) -> bool:
+        if quiet:
+            from wrt.core.compiling import WATCH
+
+            context.with_resource(WATCH.reported_by_caller())
+        return quiet
+
+    return click.option("-q", "--quiet", is_flag=True, help=text, callback=silence)
+
+
 # Options and arguments that several commands share, by the name of the command function's parameter.
-SHARED = {
+SHARED: dict[str, Decorator] = {
     "scene": click.argument("scene", type=click.Path(path_type=Path)),
     "spp": click.option("--spp", type=int, help="Samples per pixel  [default: the scene's]"),
     "size": click.option("--size", type=SIZE, help="Width and height in pixels, or a width, which keeps the scene's aspect ratio"
@@ -147,7 +160,7 @@ SHARED = {
     "device": click.option("--device", default=DEFAULT_DEVICE, show_default=True, help="cpu, cuda:0 ... (`devices` lists them)"),
     "threads": click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]"),
     "accel": click.option("--accel", type=ACCEL, default="bvh", show_default=True, help="Acceleration structure"),
-    "quiet": click.option("-q", "--quiet", is_flag=True, help="Print no progress and no warnings"),
+    "quiet": quiet_option("Print no progress and no warnings"),
     "as_json": click.option("--json", "as_json", is_flag=True, help="Print the result as JSON"),
 }
 

@@ -126,7 +126,9 @@ def render_once(scene: Path, output: Path | None, *, assignments: Assignments, s
         check_writable(output, bits)
     if scene.exists():
         from wrt.accel.queries.raw_launches import preload_headers
+        from wrt.core.compiling import WATCH
 
+        click.get_current_context().with_resource(WATCH.reported_by_caller())  # `trace` reports it
         preload_headers()  # in the background, while the next modules are imported
     settings = check_options(output, assignments, options)
     layers = options["aov"] if output.suffix.lower() != ".exr" else None  # an EXR file holds the layers as channels

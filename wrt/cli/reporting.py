@@ -27,6 +27,7 @@ from wrt.cli.common import (
     names_of,
     option_group,
     progress_writer,
+    quiet_option,
     say,
     say_json,
     warnings_reported,
@@ -114,9 +115,8 @@ class Reporting:
 def reporting(report: str = "Write the tables as Markdown (.md)", *, cluster: bool = False,
               quiet: str = "Print no progress and no warnings") -> Decorator:
     """Return a decorator that adds the options of Reporting. The command receives the object as `how`. report, quiet: help of -o and -q."""
-    options = [SHARED["as_json"],
-               click.option("-q", "--quiet", is_flag=True, help=quiet),
-               click.option("-o", "--output", type=click.Path(path_type=Path), help=report)]
+    file = click.option("-o", "--output", type=click.Path(path_type=Path), help=report)
+    options: list[Decorator] = [SHARED["as_json"], quiet_option(quiet), file]
     return option_group("how", Reporting, names_of(Reporting), [*options, CLUSTER] if cluster else options)
 
 

@@ -23,6 +23,7 @@ import numpy.typing as npt
 import warp as wp
 
 from wrt.core import cuda, warp_private
+from wrt.core.compiling import WATCH
 from wrt.core.errors import InputError
 from wrt.core.kernel_cache import is_intact, remove
 from wrt.core.seconds import loading
@@ -196,7 +197,8 @@ def _load(kernel: Kernel, device: Device, block_dim: int) -> None:
             remove(path)
         folder.parent.mkdir(parents=True, exist_ok=True)
         _require_room_to_compile(folder.parent)
-        warp_private.load(kernel, device, block_dim)
+        with WATCH.compiling():
+            warp_private.load(kernel, device, block_dim)
 
 
 @contextmanager

@@ -40,7 +40,8 @@ class Progress:
     rays, seconds
         Number of rays traced so far, and seconds of tracing. Before the stage "trace": 0, and seconds since preparing began.
     stage
-        "trace" while rays are traced. If preparing takes over a second, "compile" (reported once) and "build" come before.
+        "trace" while rays are traced. Before: "compile", once, if kernels are compiled for over half a second (otherwise the logger
+        "wrt" reports that); "build", if building takes over a second.
     note
         Text about a problem that does not end the render, or "".
     picture

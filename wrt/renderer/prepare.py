@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_EXCEPTION, wait
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any, Unpack
@@ -14,6 +15,7 @@ import numpy as np
 
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.scenes.build import build, reports_progress
+from wrt.core.compiling import WATCH
 from wrt.core.device import load_kernel
 from wrt.core.threads import Pool, thread_count
 from wrt.core.types import Device, Kernel, WarpStruct
@@ -30,7 +32,7 @@ from wrt.scene.settings import SettingChanges
 TILE_SIZE = 32  # Smallest side of a tile on the CPU, in pixels.
 TILES_EACH = 8  # Tiles of a pass for each thread, or more.
 PREPARING = "wrt prepares"  # Name of the threads that compile and build.
-PREPARING_REPORTED = 1.0  # Seconds of compiling and building after which `progress` is called.
+PREPARING_REPORTED = 1.0  # Seconds after which building is reported.
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,10 +144,14 @@ class _Preparation:
         self.plan, self.device, self.kernels = plan, device, plan.kernels
         self.threads = thread_count(plan.options.threads)
         self.begin, self.seconds = time.perf_counter(), {"compile": 0.0}
-        self.compiled, self.fraction_built, self.reported = list[Kernel](), 0.0, ("", 0)
+        self.fraction_built, self.reported = 0.0, ("", 0)
 
     def run(self, jobs: list[Callable[[], None]]) -> None:
         """Run the jobs. After Ctrl-C or an error, return without waiting for the compiler. Python handles Ctrl-C between short waits."""
+        with nullcontext() if self.plan.options.progress is None else WATCH.reported_by_caller():
+            self._run(jobs)
+
+    def _run(self, jobs: list[Callable[[], None]]) -> None:
         pool = Pool(1 + min(self.threads, len(self.kernels)), PREPARING)
         pending = {pool.submit(job) for job in jobs}
         try:
@@ -153,23 +159,20 @@ class _Preparation:
                 finished, pending = wait(pending, timeout=0.1, return_when=FIRST_EXCEPTION)
                 for job in finished:
                     job.result()
-                seconds = time.perf_counter() - self.begin
-                if pending and seconds >= PREPARING_REPORTED:
-                    self._report(seconds)
+                if pending and self.plan.options.progress is not None:
+                    self._report(self.plan.options.progress, time.perf_counter() - self.begin)
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
 
-    def _report(self, seconds: float) -> None:
-        """Call `progress` if the stage or its percentage has changed."""
+    def _report(self, progress: Callable[[Progress], None], seconds: float) -> None:
+        """Call `progress` if the stage or its percentage has changed, and the stage takes long."""
         stage, done = ("build", int(100.0 * self.fraction_built)) if self.fraction_built > 0.0 else ("compile", 0)
-        progress, compiling = self.plan.options.progress, len(self.compiled) < len(self.kernels)
-        if progress is not None and (stage, done) != self.reported and (compiling or stage == "build"):
+        if (stage, done) != self.reported and (seconds >= PREPARING_REPORTED if stage == "build" else WATCH.is_slow()):
             self.reported = stage, done
             progress(Progress(done, 100, 0, seconds, stage=stage))
 
     def compile(self, kernel: Kernel) -> None:
         load_kernel(kernel, self.device)
-        self.compiled.append(kernel)
         self.seconds["compile"] = time.perf_counter() - self.begin
 
     def build(self) -> None:

@@ -8,12 +8,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from typing import TYPE_CHECKING
 
+from wrt.core.compiling import COMPILING
 from wrt.core.packages import needed_by
 
 if TYPE_CHECKING:
     from wrt.renderer.options import Progress
 
-COMPILING = "compiling kernels (first time for this kind of scene) ..."
 BUILDING = "building the structure"
 LINE_EVERY = 10.0  # seconds between lines, if stderr is no terminal
 

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from wrt.core.compiling import COMPILING
 from wrt.core.errors import InputError
 from wrt.core.packages import needed_by
 from wrt.picture.film import Film
 from wrt.renderer.options import Progress
-from wrt.renderer.progress import COMPILING, describe
+from wrt.renderer.progress import describe
 
 if TYPE_CHECKING:
     from IPython.display import DisplayHandle

@@ -15,12 +15,12 @@ import numpy as np
 
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.checks import require_known
+from wrt.core.compiling import COMPILING
 from wrt.core.errors import InputError
 from wrt.picture.film import Film
 from wrt.picture.heatmap import colored, top_of
 from wrt.picture.tonemap import to_codes
 from wrt.renderer.options import Options, Progress
-from wrt.renderer.progress import COMPILING
 from wrt.scene.cameras import CameraKind
 from wrt.scene.model import Scene
 from wrt.viewer.renderers import CounterOf, Renderers, Shown, View

@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 
 from tests.command_line import BOX_OBJ, wrt
+from wrt.core.compiling import COMPILING
 from wrt.renderer.options import Progress
-from wrt.renderer.progress import BUILDING, COMPILING, LINE_EVERY, TimeLeft, describe, progress_reporter
+from wrt.renderer.progress import BUILDING, LINE_EVERY, TimeLeft, describe, progress_reporter
 
 
 def at(seconds: float, done: int = 50) -> Progress:

@@ -17,6 +17,7 @@ import pytest
 import wrt
 from tests.command_line import BOX_OBJ
 from tests.refused import Refusal, refused
+from wrt.core.compiling import COMPILING, Watch
 from wrt.core.errors import SceneWarning
 from wrt.io.load import load_scene
 from wrt.io.mesh_file import load_mesh
@@ -498,21 +499,30 @@ def test_depth_is_the_distance_along_the_ray_and_normals_face_it() -> None:
         assert np.array_equal(film.aov["normal"], np.broadcast_to(np.float32((0, 0, side)), (16, 16, 3)))
 
 
-def test_slow_compiling_is_reported_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slow_compiling_is_reported_once(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    """To `progress` if the caller passes it, else to the log. Kernels that are loaded already are not reported."""
     def slow(kernel: Any, device: Any) -> None:
-        wait_until(lambda: len([each for each in seen if each.stage == "compile"]) > quick)
-        time.sleep(0.3)  # long enough for a second report
+        with watch.compiling():
+            wait_until(lambda: len(reported()) + len(caplog.records) > 0)
+            time.sleep(0.3)  # long enough for a second report
         load(kernel, device)
 
-    load = prepare.load_kernel
-    monkeypatch.setattr(prepare, "PREPARING_REPORTED", 0.2)
-    seen: list[Progress] = []
+    def reported() -> list[Progress]:
+        return [each for each in seen if each.stage == "compile"]
+
+    watch, load, seen = Watch(delay=0.2), prepare.load_kernel, list[Progress]()
+    render(SCENE, spp=2)
+    monkeypatch.setattr(prepare, "WATCH", watch)
     render(SCENE, spp=2, progress=seen.append)
-    quick = len([each for each in seen if each.stage == "compile"])
+    assert not reported()
     monkeypatch.setattr(prepare, "load_kernel", slow)
     render(SCENE, spp=2, progress=seen.append)
-    reported = [each for each in seen if each.stage == "compile"]
-    assert len(reported) == quick + 1 and (reported[-1].done, reported[-1].rays) == (0, 0) and seen[-1].stage == "trace"
+    assert len(reported()) == 1 and (reported()[0].done, reported()[0].rays) == (0, 0) and seen[-1].stage == "trace"
+    assert not caplog.records
+    seen.clear()
+    watch.pause = 0.0  # the next kernels are a series of their own
+    render(SCENE, spp=2)
+    assert [each.getMessage() for each in caplog.records] == [COMPILING]
 
 
 def test_slow_building_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:

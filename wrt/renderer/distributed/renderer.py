@@ -8,10 +8,11 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import replace
 from typing import Any
 
+from wrt.core.compiling import WATCH
 from wrt.core.device import start
 from wrt.core.errors import InputError
 from wrt.picture.film import Film
@@ -20,7 +21,6 @@ from wrt.renderer.distributed.workers import DeviceWorkers, ExecutorWorkers, Job
 from wrt.renderer.film_arrays import AovFilm, DeviceFilm
 from wrt.renderer.options import Options, Progress
 from wrt.renderer.plan import Plan, plan_of
-from wrt.renderer.prepare import PREPARING_REPORTED
 from wrt.renderer.result import Facts
 from wrt.renderer.schedule import STEP_SECONDS, Run, Steps
 from wrt.renderer.tiles import Rectangle, Work, tiles
@@ -51,15 +51,15 @@ class DistributedRenderer:
 
     def _prepare_workers(self) -> tuple[str, dict[str, float], dict[str, Any]]:
         """Let the workers prepare the scene. Return the kind of their devices, the seconds by stage, and Prepared.facts()."""
-        begin, reported, replies = time.perf_counter(), self.plan.options.progress is None, []
-        for done in self.workers.run([("ready",)] * self.workers.slots()):
-            seconds = time.perf_counter() - begin
-            if done is not None:
-                replies.append(done[1])
-            elif not reported and seconds >= PREPARING_REPORTED:
-                assert self.plan.options.progress is not None
-                self.plan.options.progress(Progress(0, 100, 0, seconds, stage="compile"))
-                reported = True
+        progress, begin, replies = self.plan.options.progress, time.perf_counter(), []
+        with nullcontext() if progress is None else WATCH.reported_by_caller():
+            for done in self.workers.run([("ready",)] * self.workers.slots()):
+                seconds = time.perf_counter() - begin
+                if done is not None:
+                    replies.append(done[1])
+                elif progress is not None and seconds >= WATCH.delay:
+                    progress(Progress(0, 100, 0, seconds, stage="compile"))
+                    progress = None
         kind = replies[0][1]
         for reply in replies:
             _check_kind(reply, kind)
