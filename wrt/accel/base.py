@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import partial
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 import warp as wp
@@ -30,6 +31,8 @@ from wrt.core.types import ArrayLike, KernelModule, PathLike, WarpArray, WarpStr
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.warp_private import fields_of
 
+MeshT = TypeVar("MeshT", bound="OneMesh")
+
 
 class OneMesh(TreeExchange, ABC):
     """An acceleration structure over one mesh. Subclasses set `name`, `kernels` and `options`, and implement `_build`.
@@ -43,6 +46,7 @@ class OneMesh(TreeExchange, ABC):
     kernels: KernelModule  # with make_struct(record) -> Warp struct of the arrays, and make_traversal(units, any_hit, accepts)
     stream: ClassVar[KernelModule | None] = None  # module of a CPU kernel that traces many rays at a time, if there is one
     options: ClassVar[type[Any]]  # a frozen dataclass, which raises InputError for values out of range
+    build_all: ClassVar[Callable[..., list[Built]] | None] = None  # (structures, options), if it is faster than `_build` of each
     can_refit: ClassVar[bool] = False  # whether `_refit` is implemented
 
     def __init__(self, geometry: Geometry, attributes: FlatScene | None = None, /, device: str = DEFAULT_DEVICE,
@@ -236,3 +240,17 @@ def array_bytes(data: WarpStruct) -> int:
     """Return the size of all arrays in a Warp struct, in bytes."""
     arrays = (getattr(data, name) for name in fields_of(data))
     return sum(array.capacity for array in arrays if isinstance(array, wp.array))
+
+
+def build_each(kind: type[MeshT], geometries: Sequence[Geometry], device: str, threads: int | None, units: Units,
+               options: dict[str, object]) -> list[MeshT]:
+    """Build a structure over each geometry, all with the same options. AccelStats.build_seconds is the time of all of them."""
+    begin, built_with = build_clock(), options_of(kind.name, kind.options, options)
+    structures = [kind.__new__(kind) for _ in geometries]
+    for each, geometry in zip(structures, geometries, strict=True):
+        Accelerator.__init__(each, Structure(kind, units), geometry.unshared(), None, device, threads)
+        each.__dict__.update(built_with=built_with)
+    built = kind.build_all(structures, built_with) if kind.build_all else [each._build(built_with) for each in structures]
+    for each, arrays in zip(structures, built, strict=True):
+        each._install(arrays, begin, arrays.sah_cost)
+    return structures

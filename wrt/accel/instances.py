@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import warp as wp
 
-from wrt.accel.base import OneMesh, array_bytes
+from wrt.accel.base import OneMesh, array_bytes, build_each
 from wrt.accel.built import AccelStats, Refit
 from wrt.accel.flat_scene import FlatScene
 from wrt.accel.instanced_geometry import MAX_SPREAD, InstancedGeometry, inverse_of
@@ -44,8 +44,7 @@ class Instances(Accelerator):
                  box: str = "conservative", **options: object) -> None:
         begin = build_clock()
         super().__init__(Structure(kind, Units(triangle, box, instances=True)), geometry, attributes, device, threads)
-        self.bottoms = [kind(part, device=device, threads=threads, triangle=triangle, box=box, **options)
-                        for part in geometry.parts]
+        self.bottoms = build_each(kind, geometry.parts, device, threads, Units(triangle, box), options)
         # The snapshots keep the arrays alive: the Warp array of structs holds only their addresses.
         self._bottom_snapshots = [bottom.snapshot for bottom in self.bottoms]
         self._bottoms = wp.array([each.data for each in self._bottom_snapshots], dtype=self.structure.bottom, device=self.device)

@@ -28,38 +28,19 @@ class _Choice(NamedTuple):
 class _Subtree:
     """Subtree of a binary tree: primitives `items` (n,), their boxes lo, hi (n, 3), and half the area of the box around them.
 
-    `split` sets parts: two halves, or none for a single primitive. `choose` sets choices[k], the best choice of at most k + 1
-    children, and opened, the best choice of two or more children.
+    Function `split` fills parts: two halves, or none for a single primitive. Method `choose` sets choices[k], the best choice of at most
+    k + 1 children, and opened, the best choice of two or more children.
     """
 
-    parts: list[_Subtree]
     choices: list[_Choice]
     opened: _Choice
 
     def __init__(self, items: np.ndarray, lo: np.ndarray, hi: np.ndarray, area: float, options: BvhOptions) -> None:
         self.items, self.lo, self.hi, self.area, self.options = items, lo, hi, area, options
+        self.parts: list[_Subtree] = []
         # Mean of two costs: a single ray tests a row of primitives at once; a packet of rays tests primitives one by one.
         rows = 0.5 * -(-len(items) // options.row) + 0.5 * len(items) / options.row
         self.leaf_cost = options.cost_intersection * rows * area if len(items) <= options.max_leaf else np.inf
-
-    def split(self) -> None:
-        """Split at the least SAH cost of a sweep along all axes. At equal cost, prefer parts of equal size."""
-        n, self.parts = len(self.items), []
-        if n == 1:
-            return
-        with np.errstate(invalid="ignore"):  # a box may be all of space
-            centers = 0.5 * self.lo + 0.5 * self.hi
-        order = centers.argsort(axis=0, kind="stable")  # (n, axis)
-        lo, hi = self.lo[order], self.hi[order]  # (n, axis, 3)
-        # Areas around the first 1, 2, .. and around the last 1, 2, .. items along each axis.
-        below, above = half_areas(
-            np.minimum.accumulate(np.stack([lo, lo[::-1]]), axis=1), np.maximum.accumulate(np.stack([hi, hi[::-1]]), axis=1))
-        below, above = below[:-1], above[-2::-1]
-        count = np.arange(1, n)[:, None]
-        cost = below * count + above * (n - count)
-        k, axis = divmod(int(np.where(cost == cost.min(), abs(2 * count - n), n).argmin()), 3)
-        self.parts = [_Subtree(self.items[part], self.lo[part], self.hi[part], float(area[k, axis]), self.options)
-                      for part, area in ((order[: k + 1, axis], below), (order[k + 1 :, axis], above))]
 
     def choose(self) -> None:
         """Set `choices` and `opened` by dynamic programming, as kernels.build.wide does. Call it for the parts first."""
@@ -69,8 +50,9 @@ class _Subtree:
             first, second = ([choice.cost for choice in part.choices] for part in self.parts)
             several = []
             for k in range(2, min(self.options.row, len(self.items)) + 1):
-                cost, a = min((first[a - 1] + second[k - a - 1], a) for a in range(1, k))
-                several.append(_Choice(cost, k, a))
+                costs = [first[a - 1] + second[k - a - 1] for a in range(1, k)]
+                cost = min(costs)
+                several.append(_Choice(cost, k, 1 + costs.index(cost)))
             self.opened = min(several)
             self.choices = [min(self.choices[0], _Choice(self.options.cost_traversal * self.area + self.opened.cost, 1, 0))]
             for choice in several:
@@ -98,22 +80,63 @@ class _Subtree:
         return sorted(self.roots(self.opened), key=lambda child: (child.is_leaf, child.area))
 
 
-def small_tree(lo: np.ndarray, hi: np.ndarray, options: BvhOptions) -> WideTree:
-    """Build the wide tree over boxes lo, hi (n, 3) float32, with up to options.row children per node.
+def split(subtrees: list[_Subtree]) -> None:
+    """Append two halves to `parts` of subtrees with equally many primitives, unless each has only one.
+
+    Split at the least SAH cost of a sweep along all axes. At equal cost, prefer parts of equal size.
+    """
+    n = len(subtrees[0].items)
+    if n == 1:
+        return
+    items, los, his = (np.stack([getattr(subtree, name) for subtree in subtrees]) for name in ("items", "lo", "hi"))
+    with np.errstate(invalid="ignore"):  # a box may be all of space
+        orders = (0.5 * los + 0.5 * his).argsort(axis=1, kind="stable")  # (subtree, n, axis)
+    lo, hi = (np.take_along_axis(box[:, :, None], orders[..., None], axis=1) for box in (los, his))  # (subtree, n, axis, 3)
+    # Areas around the first 1, 2, .. and around the last 1, 2, .. items along each axis.
+    below, above = half_areas(np.minimum.accumulate(np.stack([lo, lo[:, ::-1]]), axis=2),
+                              np.maximum.accumulate(np.stack([hi, hi[:, ::-1]]), axis=2))
+    below, above = below[:, :-1], above[:, -2::-1]
+    count = np.arange(1, n)[:, None]
+    cost = below * count + above * (n - count)
+    places = np.where(cost == cost.min(axis=(1, 2), keepdims=True), abs(2 * count - n), n).reshape(len(cost), -1).argmin(axis=1)
+    every, (ks, axes) = np.arange(len(subtrees)), np.divmod(places, 3)
+    items, lo, hi = np.take_along_axis(items, orders[every, :, axes], axis=1), lo[every, :, axes], hi[every, :, axes]
+    areas = zip(below[every, ks, axes].tolist(), above[every, ks, axes].tolist(), strict=True)
+    for i, (subtree, k, (first, second)) in enumerate(zip(subtrees, (ks + 1).tolist(), areas, strict=True)):
+        subtree.parts.append(_Subtree(items[i, :k], lo[i, :k], hi[i, :k], first, subtree.options))
+        subtree.parts.append(_Subtree(items[i, k:], lo[i, k:], hi[i, k:], second, subtree.options))
+
+
+def small_trees(boxes: list[tuple[np.ndarray, np.ndarray]], options: BvhOptions) -> list[WideTree]:
+    """Build a wide tree over each pair of boxes lo, hi (n, 3) float32, with up to options.row children per node.
 
     Build a binary tree of single boxes by the surface area heuristic (MacDonald and Booth 1990), and collapse it at the least cost.
+    Subtrees of all trees are split together, because NumPy takes longer for a call than for a few boxes.
     """
-    width = options.row
-    subtrees = []
-    if len(lo):
-        area = float(half_areas(lo.min(axis=0), hi.max(axis=0)))
-        subtrees = [_Subtree(np.arange(len(lo), dtype=np.int32), lo, hi, area, options)]
-    for subtree in subtrees:  # the loop appends to the list
-        subtree.split()
-        subtrees += subtree.parts
+    roots = [_Subtree(np.arange(len(lo), dtype=np.int32), lo, hi, float(half_areas(lo.min(axis=0), hi.max(axis=0))), options)
+             if len(lo) else None for lo, hi in boxes]
+    subtrees = level = [root for root in roots if root]
+    while level:
+        groups: dict[int, list[_Subtree]] = {}
+        for subtree in level:
+            groups.setdefault(len(subtree.items), []).append(subtree)
+        for group in groups.values():
+            split(group)
+        level = [part for subtree in level for part in subtree.parts]
+        subtrees = subtrees + level
     for subtree in reversed(subtrees):
         subtree.choose()
-    nodes, children_of = subtrees[:1], []
+    return [wide_tree(root, options.row) for root in roots]
+
+
+def small_tree(lo: np.ndarray, hi: np.ndarray, options: BvhOptions) -> WideTree:
+    """Call `small_trees` for a single tree."""
+    return small_trees([(lo, hi)], options)[0]
+
+
+def wide_tree(root: _Subtree | None, width: int) -> WideTree:
+    """Return the wide tree of a root that `choose` was called for; None: over no primitives."""
+    nodes, children_of = [root] if root else [], []
     for node in nodes:  # the loop appends to the list
         children_of.append(node.children())
         nodes += [child for child in children_of[-1] if not child.is_leaf]

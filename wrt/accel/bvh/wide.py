@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from wrt.accel.box_tree import ABSENT, INNER, BoxTree
 from wrt.accel.built import Built
 from wrt.accel.bvh.builders import BinaryOptions, BvhOptions, build_binary
 from wrt.accel.bvh.compress import compress, decompress, existing_children
-from wrt.accel.bvh.small import SMALL, small_tree
+from wrt.accel.bvh.small import SMALL, small_tree, small_trees
 from wrt.accel.bvh.tree import binary_tree_of
 from wrt.accel.bvh.wide_tree import COLLAPSE, WideTree, check_wide, collapse, lanes_of, packed, refit, row_starts, wide_tree_of
 from wrt.accel.geometry import Geometry
@@ -120,11 +121,19 @@ class WideBvh(CollapsedBvh):
     """A binary tree collapsed into nodes of `width` children. Options: Bvh4Options and Bvh8Options."""
 
     def _build(self, options: BinaryOptions) -> Built:
-        options = BvhOptions(**asdict(options), row=self.width)
+        return self.build_all([self], options)[0]
+
+    @classmethod
+    def build_all(cls, structures: Sequence[Self], options: BinaryOptions) -> list[Built]:
+        options = BvhOptions(**asdict(options), row=cls.width)
+        few = [each for each in structures if options.builder == "refined" and len(each.geometry) <= SMALL]
+        trees = dict(zip(map(id, few), small_trees([each.geometry.bounds() for each in few], options), strict=True))
+        return [each._built(trees.get(id(each)), options) for each in structures]
+
+    def _built(self, tree: WideTree | None, options: BvhOptions) -> Built:
+        """Return the arrays of a tree. Build the tree if it is None, or too deep."""
         kernels = [write_rows] if self._rows_by_kernel() else []
-        few = options.builder == "refined" and len(self.geometry) <= SMALL
-        tree = small_tree(*self.geometry.bounds(), options) if few else self._collapsed(options, *kernels)
-        if tree.stack > STACK_SIZE:
+        if tree is None or tree.stack > STACK_SIZE:
             tree = self._collapsed(options, *kernels)
         built = Built(self._arrays(tree), tree.order[tree.order >= 0], len(tree.children), tree.leaves, tree.depth)
         return replace(built, sah_cost=(self._tree(built) if self.compressed else tree).sah_cost(tree.root_area))

@@ -8,6 +8,7 @@ import pytest
 from tests.refused import refused
 
 from tests.kernel_tools import cpu_only  # isort: skip
+import wrt
 from wrt.accel.bvh import wide
 from wrt.accel.bvh.small import SMALL, small_tree
 from wrt.accel.bvh.tree import BvhOptions
@@ -158,3 +159,16 @@ def test_a_chain_that_no_stack_holds_is_left_to_the_builder() -> None:
     hits, expected = accel.closest_hit(origins, directions), truth.closest_hit(origins, directions)
     assert (expected.prim_id >= 0).any()
     assert np.array_equal(hits.prim_id, expected.prim_id) and np.array_equal(hits.t, expected.t)
+
+
+@pytest.mark.parametrize("name", ["bvh8", "bvh8c", "bvh2"])
+def test_a_list_of_meshes_gets_the_trees_of_single_builds(name: str) -> None:
+    rng = np.random.default_rng(4)
+    meshes = [wrt.Mesh(rng.normal(size=(3 * n, 3)), np.arange(3 * n).reshape(-1, 3)) for n in (1, 2, 20, 20, SMALL, SMALL + 1)]
+    worlds = wrt.build(meshes, name)
+    for part, mesh in zip(worlds.geometry.part, meshes, strict=True):
+        one = worlds.bottoms[part]
+        alone = wrt.build(mesh, name).built
+        assert np.array_equal(one.built.order, alone.order) and one.built.sah_cost == alone.sah_cost
+        for key, values in alone.arrays.items():
+            assert np.asarray(one.built.arrays[key]).tobytes() == np.asarray(values).tobytes()
