@@ -39,7 +39,7 @@ def bench(context: click.Context, quick: bool) -> None:
 
 
 for plan in (plans.Visibility, plans.Units, plans.Peers, plans.HardCases, plans.Accel, plans.Bvh, plans.RtCore, plans.Float64,
-             plans.Pictures, plans.Closed):
+             plans.Pictures, plans.Closed, plans.Claims):
     bench.add_command(measured(plan))
 whatif = measured(plans.WhatIf)
 

@@ -18,7 +18,7 @@ PEER_KINDS = ("primary", "shadow", "diffuse", "random", "points", "tiles")
 THREADS = "Number of CPU threads  [default: all cores]"
 RAY_SEED = "Seed of the random rays"
 INSIDE = "Put the camera at the centre of the mesh's bounding box, as in a room"
-MODELLED = "GPU to model: rtx2080ti or rtx2060"
+MODELLED = "GPU to model: rtx2080ti, rtx2060, arcb580 or rx9070"
 
 
 def option(default: Any, text: str = "", between: tuple[int, int] | None = None, of: tuple[str, str] | None = None) -> Any:
@@ -222,6 +222,26 @@ class RtCore(Plan):
     seed: int = option(0, RAY_SEED)
     inside: bool = option(False, INSIDE)
     trace: str = option("", "Write the trace of one mesh, structure and kind of ray to a .npz file  [default: none]")
+
+
+@dataclass(frozen=True)
+class Claims(Plan):
+    """Repeat published claims about ray tracing hardware with exact counts: the published number, wrt's, their ratio, and what differs.
+
+    NAMES: claims; default: all. Without files, generated scenes stand in for the published ones."""
+
+    COMMAND, STUDY = "bench claims", "wrt.lab.bench.claims"
+    QUICK = {"side": 48, "names": ("ttp-nodes", "rules", "coop-rt", "cwbvh", "short-stack")}
+    OUTPUT = "Write the tables as Markdown (.md), the figures as .csv, or charts as .svg or .png"
+    names: Sequence[str] = option((), of=("claim", "wrt.lab.claims.claim:CLAIMS"))
+    scene: Sequence[str] = option((), "Published scenes that you have, as bunny=FILE,sponza=FILE,conference=FILE")
+    side: int = option(128, "Side of the square pictures, in pixels", (8, 1024))
+
+    def __post_init__(self) -> None:
+        from wrt.lab.claims.scene_files import scene_files
+
+        super().__post_init__()
+        scene_files(self.scene)
 
 
 @dataclass(frozen=True)

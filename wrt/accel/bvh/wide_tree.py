@@ -38,6 +38,11 @@ class WideTree:
     stack: int
 
     @property
+    def exists(self) -> np.ndarray:
+        """Whether each child exists, (N, W) bool."""
+        return self.children != EMPTY
+
+    @property
     def areas(self) -> np.ndarray:
         """Half the surface area of each child's box, (N, W) float64; 0 for empty boxes."""
         return half_areas(self.lo, self.hi)
@@ -50,6 +55,11 @@ class WideTree:
     def sah_cost(self, root: float) -> float:
         """Return the SAH cost. root: half the surface area of the root's box."""
         return expected_cost(root, self.areas, np.where(self.children < 0, leaf_count.func(self.children), 0))
+
+
+def leaf_rows(references: np.ndarray) -> np.ndarray:
+    """Return the first row of each of the leaves' references, int64."""
+    return np.asarray(leaf_first.func(references.astype(np.int64)))
 
 
 def collapse(tree: BinaryTree, width: int, max_leaf: int, cost_traversal: float, cost_intersection: float) -> WideTree:

@@ -143,21 +143,21 @@ SIMT_COLUMNS: Columns = {"rays": "{name}", **{name: f"{{simt_efficiency[{name}]:
 LEGEND = f"""\
 nodes, boxes, triangles: fetched or tested; lines: cache lines that the warps access. {", ".join(TERMS)}: clocks of an RT core per ray that
 this part alone needs; in brackets its use while the slowest part (limit) is fully used. Grays/s: under the assumptions in the table of
-parameters (4 boxes or 1 triangle a clock, 4 warps at a time, L2 empty at first). range: over {", ".join(RANGE)} =
+parameters (Turing: 4 boxes or 1 triangle a clock; 4 warps at a time, L2 empty at first). range: over {", ".join(RANGE)} =
 {"; ".join(", ".join(f"{value:g}" for value in SWEEPS[name]) for name in RANGE)}. moved most by: the assumptions that change Grays/s most
 if each varies alone, with the factor from lowest to highest. Nothing here is measured: NVIDIA has not published Turing's rates and node
 format."""
 
 
 def model_row(work: Work, gpu: Gpu, simt: dict[str, float], **facts: object) -> Row:
-    """Return the row of a Work: the prediction under the assumptions BASE, and means over the rays.
+    """Return the row of a Work: the prediction under the assumptions gpu.core, and means over the rays.
     - low, high: lowest and highest rays a second as the fields RANGE of Core vary; factors: result of `sensitivity`.
     - simt: result of the function `simt`; facts: further fields of the row."""
-    prediction = vars(predict(work, gpu))
-    low, high = span(sweep(work, gpu, names=RANGE))
+    prediction = vars(predict(work, gpu, gpu.core))
+    low, high = span(sweep(work, gpu, gpu.core, RANGE))
     return Row(**facts, **{name: value for name, value in prediction.items() if name != "work"}, name=work.name, rays=len(work),
                nodes=work.mean("nodes"), boxes=work.mean("boxes"), triangles=work.mean("primitives"),
-               lines=work.misses(gpu, BASE).accesses / len(work), low=low, high=high, factors=sensitivity(work, gpu),
+               lines=work.misses(gpu, gpu.core).accesses / len(work), low=low, high=high, factors=sensitivity(work, gpu, gpu.core),
                simt_efficiency=simt)
 
 

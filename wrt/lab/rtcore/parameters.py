@@ -9,6 +9,8 @@ from wrt.lab.rtcore.caches import Cache
 PUBLISHED, DERIVED, ASSUMED = "published", "derived", "assumed"
 TURING = "NVIDIA Turing GPU Architecture, WP-09183-001 (2018)"
 PASCAL = "NVIDIA GeForce GTX 1080 Ti, product data (2017)"
+ARC = "Intel Arc B580, product data (2024)"
+RDNA = "AMD Radeon RX 9070, product data (2025)"
 VULKAN_SIM = "Vulkan-Sim, configs/tested-cfgs/SM75_RTX2060/gpgpusim.config (Saed et al., MICRO 2022)"
 
 
@@ -26,6 +28,12 @@ PARAMETERS = (
     ("GTX 1080 Ti: instructions of a lane a ray", "5154", DERIVED, "", "28 x 128 x 1.582 GHz / 1.1 Grays/s"),
     ("RTX 2060: SMs, clock", "30, 1.365 GHz (base)", PUBLISHED, "", VULKAN_SIM),
     ("RTX 2060: DRAM, L2", "336 GB/s, 3 MB", PUBLISHED, "", "NVIDIA GeForce RTX 2060, product data (2019)"),
+    ("Arc B580: Xe cores, clock, DRAM", "20, 2.67 GHz, 456 GB/s", PUBLISHED, "", ARC),
+    ("Arc B580: L2, L1", "18 MB, 256 KB in each Xe core", PUBLISHED, "", ARC),
+    ("Arc B580: tests a clock and unit", "18 boxes, 2 triangles", PUBLISHED, "", "Chips and Cheese, Arc B580 (2025)"),
+    ("RX 9070: compute units, clock, DRAM", "56, 2.52 GHz, 640 GB/s", PUBLISHED, "", RDNA),
+    ("RX 9070: L2, L1", "8 MB (the Infinity Cache is left out), 32 KB in each compute unit", PUBLISHED, "", RDNA),
+    ("RX 9070: tests a clock and unit", "8 boxes, 2 triangles", PUBLISHED, "", "Chips and Cheese, RX 9070 (2025)"),
     ("cache line", "128 bytes", PUBLISHED, "", VULKAN_SIM),
     ("L2: ways", "16", ASSUMED, "", VULKAN_SIM),
     ("L1: ways", "4", ASSUMED, "", "no source; Vulkan-Sim has a fully associative L1"),
@@ -42,24 +50,6 @@ PARAMETERS = (
     ("latency of DRAM, beyond the L2's", "100 clocks", ASSUMED, "", VULKAN_SIM),
     ("L2 at the beginning", "empty", ASSUMED, "empty, warm", "warm: the L2 has seen the same rays once before"),
 )
-
-
-@dataclass(frozen=True)
-class Gpu:
-    """A GPU. sms: number of SMs; clock: Hz (RTX 2080 Ti: boost, RTX 2060: base); dram: bytes a second; l1: cache of each SM."""
-
-    name: str
-    sms: int
-    clock: float
-    dram: float
-    l1: Cache
-    l2: Cache
-
-
-GPUS = {
-    "rtx2080ti": Gpu("RTX 2080 Ti", 68, 1.545e9, 616e9, Cache(96 << 10, 4), Cache(5632 << 10, 16)),
-    "rtx2060": Gpu("RTX 2060", 30, 1.365e9, 336e9, Cache(96 << 10, 4), Cache(3 << 20, 16)),
-}
 
 
 @dataclass(frozen=True)
@@ -82,6 +72,28 @@ class Core:
 
 
 BASE = Core()
+
+@dataclass(frozen=True)
+class Gpu:
+    """A GPU. sms: number of SMs; clock: Hz (RTX 2060: base, others: boost); dram: bytes a second; l1: cache of each SM; core: of each SM.
+    An SM stands for a part with one ray tracing unit: a Xe core by Intel, a compute unit by AMD."""
+
+    name: str
+    sms: int
+    clock: float
+    dram: float
+    l1: Cache
+    l2: Cache
+    core: Core = BASE
+
+
+GPUS = {
+    "rtx2080ti": Gpu("RTX 2080 Ti", 68, 1.545e9, 616e9, Cache(96 << 10, 4), Cache(5632 << 10, 16)),
+    "rtx2060": Gpu("RTX 2060", 30, 1.365e9, 336e9, Cache(96 << 10, 4), Cache(3 << 20, 16)),
+    "arcb580": Gpu("Arc B580", 20, 2.67e9, 456e9, Cache(256 << 10, 4), Cache(18 << 20, 16), Core(boxes=18.0, triangles=2.0)),
+    "rx9070": Gpu("RX 9070", 56, 2.52e9, 640e9, Cache(32 << 10, 4), Cache(8 << 20, 16), Core(boxes=8.0, triangles=2.0)),
+}
+
 
 # Field of Core -> its values in sweeps. Fields vary one at a time for the sensitivity, those of model.RANGE together for the range.
 SWEEPS: dict[str, tuple[float, ...]] = {

@@ -1,0 +1,138 @@
+"""What a claim is: a published number, its source and set-up, and the function that repeats it. CLAIMS is the registry."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from wrt.core.registry import Registry
+from wrt.core.types import PathLike
+from wrt.lab.claims.scenes import PATH, Scene, open_scene
+from wrt.lab.claims.walks import Rays, Rules, Tree, Walk, build_tree, tree_of, walk
+from wrt.scene.mesh import Mesh
+
+SAME_SCENE, OTHER_CAMERA = 1.25, 1.5  # factors within which a repeated number agrees
+TTP_RULES = Rules(ordered=False, culled=False)  # the walk of Vulkan-Sim: children unsorted, popped entries not culled
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One repeated number of a claim.
+
+    what: what is counted, with its scene; unit: of both numbers, "ratio" where 1 means no change. published: a number or the two ends of a
+    range; None for a finding of wrt's own. differences: of set-up. reason: what a measurement says about the difference. factor: largest
+    ratio, either way, that counts as agreement."""
+
+    what: str
+    ours: float
+    published: float | tuple[float, float] | None = None
+    unit: str = ""
+    differences: str = ""
+    reason: str = ""
+    factor: float = OTHER_CAMERA
+
+    @property
+    def ratio(self) -> float | None:
+        """Ours over the published number, or over the nearer end of a range; 1 within the range."""
+        if self.published is None:
+            return None
+        low, high = self.published if isinstance(self.published, tuple) else (self.published, self.published)
+        nearer = float(np.clip(self.ours, low, high))
+        return 1.0 if self.ours == nearer else self.ours / nearer if nearer != 0.0 else np.inf
+
+    @property
+    def verdict(self) -> str:
+        """Return "own finding", "differs" or "agrees": within the factor, and for the unit "ratio" on the same side of 1."""
+        if self.published is None or self.ratio is None:
+            return "own finding"
+        low = self.published[0] if isinstance(self.published, tuple) else self.published
+        opposite = self.unit == "ratio" and (self.ours - 1.0) * (low - 1.0) < 0.0
+        return "agrees" if 1.0 / self.factor <= self.ratio <= self.factor and not opposite else "differs"
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A published claim. source: authors, venue, and the figure or table; setup: of the paper.
+    sure: "read" in the original, "quoted" by others, "abstract" read alone, or "memory". measure: yields the repeated numbers."""
+
+    source: str
+    setup: str
+    sure: str
+    measure: Callable[[Study], Iterator[Figure]]
+
+
+@dataclass(eq=False)
+class Study:
+    """What the claims share: scenes, trees and walks, each made once. files: name of a published scene -> the caller's mesh file."""
+
+    files: Mapping[str, Mesh | PathLike] = field(default_factory=dict)
+    side: int = 128
+    _kept: dict[tuple[object, ...], object] = field(default_factory=dict)
+
+    def keep(self, key: tuple[object, ...], make: Callable[[], object]) -> object:
+        if key not in self._kept:
+            self._kept[key] = make()
+        return self._kept[key]
+
+    def scene(self, name: str) -> Scene:
+        found = self.keep(("scene", name), lambda: open_scene(name, self.files.get(name), self.side))
+        assert isinstance(found, Scene)
+        return found
+
+    def tree(self, name: str, width: int, max_leaf: int = 1, bits: bool = False) -> Tree:
+        found = self.keep(("tree", name, width, max_leaf, bits), lambda: build_tree(self.scene(name).geometry, width, max_leaf, bits))
+        assert isinstance(found, Tree)
+        return found
+
+    def six(self, name: str) -> Tree:
+        """Return the tree of bvh6."""
+        from wrt.accel.bvh.six import Bvh6
+
+        scene = self.scene(name)
+        found = self.keep(("six", name), lambda: tree_of(scene.geometry, Bvh6(scene.geometry).decoded()))
+        assert isinstance(found, Tree)
+        return found
+
+    def ttp(self, name: str, workload: str = PATH, rules: Rules = TTP_RULES) -> Walk:
+        """Return the logged walk of bvh6 by the rays of a workload."""
+        found = self.keep(("ttp", name, workload, rules), lambda: walk(self.six(name), self.rays(name, workload), rules, log=True))
+        assert isinstance(found, Walk)
+        return found
+
+    def rays(self, name: str, workload: str = PATH) -> Rays:
+        return self.scene(name).workloads[workload]
+
+    def differences(self, name: str, theirs: str) -> str:
+        """Say in words what differs between a published scene and ours. theirs: the published scene."""
+        scene = self.scene(name)
+        kind = "a generated scene in its place" if not scene.given else "another version" if name == "sponza" else "the caller's file"
+        return (f"scene {scene.shown}: {len(scene.geometry)} triangles, {kind} (theirs: {theirs}); own camera, "
+                f"{scene.side} x {scene.side} pixels")
+
+
+CLAIMS: Registry[Claim] = Registry("claim", {
+    "ttp-nodes": "wrt.lab.claims.nodes:TTP_NODES",
+    "ttp-breadth": "wrt.lab.claims.nodes:TTP_BREADTH",
+    "ttp-prefetch": "wrt.lab.claims.prefetch:TTP_PREFETCH",
+    "ttp-queue": "wrt.lab.claims.nodes:TTP_QUEUE",
+    "rules": "wrt.lab.claims.nodes:RULES",
+    "coop-rt": "wrt.lab.claims.warps:COOP_RT",
+    "repacking": "wrt.lab.claims.warps:REPACKING",
+    "loops": "wrt.lab.claims.warps:LOOPS",
+    "treelets": "wrt.lab.claims.memory:TREELETS",
+    "treelet-prefetch": "wrt.lab.claims.memory:TREELET_PREFETCH",
+    "cwbvh": "wrt.lab.claims.memory:CWBVH",
+    "eight-bits": "wrt.lab.claims.memory:EIGHT_BITS",
+    "short-stack": "wrt.lab.claims.stacks:SHORT_STACK",
+    "stackless": "wrt.lab.claims.stacks:STACKLESS",
+    "prediction": "wrt.lab.claims.stacks:PREDICTION",
+    "k-hits": "wrt.lab.claims.stacks:K_HITS",
+    "machines": "wrt.lab.claims.machines:MACHINES",
+    "turing": "wrt.lab.claims.machines:TURING",
+    "predictors": "wrt.lab.claims.classics:PREDICTORS",
+    "cells": "wrt.lab.claims.classics:CELLS",
+    "reordering": "wrt.lab.claims.classics:REORDERING",
+    "watertight": "wrt.lab.claims.classics:WATERTIGHT",
+}, "wrt.claims")

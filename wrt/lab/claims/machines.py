@@ -1,0 +1,68 @@
+"""Claims about whole GPUs: ratios of tests and of units in use, and NVIDIA's 10 Grays/s."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from wrt.accel.queries.answers import Counters
+from wrt.accel.scenes.build import build
+from wrt.lab.bench.rays import ray_sets
+from wrt.lab.claims.claim import Claim, Figure, Study
+from wrt.lab.claims.walks import Rays, Rules, walk
+from wrt.lab.rtcore.meshes import in_warps
+from wrt.lab.rtcore.model import RANGE, predict, sensitivity, span, sweep, trace_rays
+from wrt.lab.rtcore.parameters import GPUS
+
+
+def counters_of(study: Study, name: str, structure: str, rays: Rays) -> Counters:
+    accel = build(study.scene(name).geometry, structure)
+    counters = accel.closest_hit(rays.origins, rays.directions, 0.0, rays.t_max, counters=True).counters
+    assert counters is not None
+    return counters
+
+
+def machines(study: Study) -> Iterator[Figure]:
+    """Compare steps a ray, the use of the test units, and boxes for each triangle with counts on two GPUs by other makers."""
+    name = "sponza"
+    rays = study.rays(name)
+    part, core = rays.part(rays.kind == 0), GPUS["arcb580"].core
+    arc = counters_of(study, name, "bvh6", part)
+    boxes, triangles = float(arc.boxes.mean()), float(arc.primitives.mean())
+    said = f"{study.differences(name, 'a frame of a game, not shared')}; camera and bounce rays, sorted and culled"
+    steps = float((arc.nodes + arc.leaves).mean())
+    numbers = f"bvh6: {arc.nodes.mean():.1f} nodes, {boxes:.1f} boxes and {triangles:.2f} triangles a ray"
+    yield Figure("steps a ray, bvh6", steps, 39.5, "nodes", said, f"{numbers}; without order and culling"
+                                                                  f" {study.ttp(name).fetches[rays.kind == 0].mean():.1f}")
+    yield Figure("use of the box unit over use of the triangle unit, bvh6", boxes / core.boxes / (triangles / core.triangles), 1.55 / 1.04,
+                 "factor", f"{said}; {core.boxes:g} boxes and {core.triangles:g} triangles a clock", numbers)
+    loose = walk(study.tree(name, 4, 4), part, Rules(False, False)).counts
+    for structure, published, gpu in (("bvh8c", 111.76 / 19.61, "RX 9070"), ("bvh4", 38.8 / 10.76, "RX 6900 XT")):
+        found = counters_of(study, name, structure, part)
+        nodes, wide = float(found.nodes.mean()), float(found.boxes.mean())
+        few = float(found.primitives.mean())
+        yield Figure(f"boxes for each triangle, {structure} as {gpu}", wide / few, published, "factor",
+                     f"{study.differences(name, '3DMark DXR feature test')}; own leaves of up to {structure[3]} triangles; planes of"
+                     f" {8 if structure == 'bvh8c' else 32} bits, no rotated boxes", f"{nodes:.1f} nodes, {wide:.1f} boxes, {few:.2f}"
+                                                                                     " triangles a ray; without order and culling, width"
+                                                                                     " 4, binned tree:"
+                     f" {loose['boxes'].sum() / loose['tests'].sum():.1f}")
+
+
+def turing(study: Study) -> Iterator[Figure]:
+    """Predict rays a second of an RTX 2080 Ti for primary rays, and rank the assumptions by their weight."""
+    scene = study.scene("bunny")
+    accel = build(scene.geometry, "bvh2")
+    rays = in_warps(accel, ray_sets(accel, 4 * scene.side**2))["primary"]
+    work, gpu = trace_rays(accel, "primary", rays.origins, rays.directions), GPUS["rtx2080ti"]
+    low, high = span(sweep(work, gpu, gpu.core, RANGE))
+    weights = ", ".join(f"{name} {factor:.2f}x" for name, factor in sensitivity(work, gpu, gpu.core).items())
+    yield Figure("primary rays of an RTX 2080 Ti, bvh2", predict(work, gpu, gpu.core).rays_per_second / 1e9, 10.0, "Grays/s",
+                 f"scene {scene.shown}: {len(scene.geometry)} triangles; the rates of the tests are assumed (docs/rt_core.md)",
+                 f"range {low / 1e9:.2f} to {high / 1e9:.2f} over {', '.join(RANGE)}; factor of each assumption alone: {weights}")
+
+
+MACHINES = Claim("Chips and Cheese: Intel Arc B580 (2025-03), AMD RX 9070 (2025-04)",
+                 "hardware counters: Arc 39.5 steps a ray, box and triangle units in use 1.55 and 1.04 %; RX 9070 111.76 to 19.61 and RX"
+                 " 6900 XT"
+                 " 38.8 to 10.76 box and triangle tests", "read", machines)
+TURING = Claim("NVIDIA Turing GPU Architecture, WP-09183-001 (2018)", "10 Grays/s, primary rays of simple scenes", "read", turing)

@@ -1,0 +1,172 @@
+"""Walks of wide trees by other rules than wrt's own: counts and logs of each ray (kernel: kernels/study/tree_walk.py)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from wrt.accel.bvh.builders import BvhOptions, build_binary
+from wrt.accel.bvh.compress import compress, decompress
+from wrt.accel.bvh.wide_tree import WideTree, collapse, leaf_rows
+from wrt.accel.geometry import Geometry
+from wrt.core.device import load_kernel, on_host, start, upload
+from wrt.core.errors import InputError
+from wrt.core.types import WarpStruct
+from wrt.kernels.structs import Primitive, Surfaces
+from wrt.kernels.study import tree_walk as kernels
+from wrt.kernels.study.tree_walk import QUEUE
+from wrt.kernels.traverse.common import Units
+
+RAYS_PER_LAUNCH = 2048
+NODE_BYTES = 64  # of an inner node and of a leaf
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Rays of a workload, arrays (N,), sorted by depth, kind and pixel.
+
+    origins, directions: (N, 3) float32. kind: 0 camera or bounce, 1 shadow or ambient occlusion; these end at their first hit. depth:
+    bounces
+    before the ray; pixel: index of its pixel. warp: (N,) int64, warp of 32 rays in which the ray runs, ascending; gaps are idle lanes."""
+
+    origins: np.ndarray
+    directions: np.ndarray
+    t_max: np.ndarray
+    kind: np.ndarray
+    depth: np.ndarray
+    pixel: np.ndarray
+    warp: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.origins)
+
+    def part(self, rows: np.ndarray) -> Rays:
+        return Rays(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+
+
+class Tree(NamedTuple):
+    """A wide tree with its primitives on the device. bytes: size of the nodes of a structure with this tree."""
+
+    wide: WideTree
+    data: WarpStruct
+
+    @property
+    def width(self) -> int:
+        return int(self.wide.children.shape[1])
+
+    @property
+    def nodes(self) -> int:
+        return len(self.wide.children)
+
+
+class Rules(NamedTuple):
+    """Rules of a walk, see kernels.study.tree_walk.Rules. The default is wrt's own walk."""
+
+    ordered: bool = True
+    culled: bool = True
+    queue: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Walk:
+    """Result of `walk`. counts: (N,) records of kernels.study.tree_walk.Work. The log has M fetches and P pushes of all rays.
+
+    first: (N + 1,) int64, ray i has the fetches first[i] .. first[i + 1] - 1. fetch: (M,) int32 references. entered: (M,) int64, entries
+    that
+    each fetch pushed. push_first: (N + 1,) int64; push: (P,) int32 references."""
+
+    counts: np.ndarray
+    first: np.ndarray
+    fetch: np.ndarray
+    entered: np.ndarray
+    push_first: np.ndarray
+    push: np.ndarray
+    nodes: int  # of the tree
+
+    @cached_property
+    def fetches(self) -> np.ndarray:
+        """Number of nodes and leaves that each ray fetches, (N,) int64."""
+        return self.counts["inner"].astype(np.int64) + self.counts["leaves"]
+
+    @cached_property
+    def address(self) -> np.ndarray:
+        """Address of each fetch in bytes, (M,) int64: nodes of NODE_BYTES, then leaves, one row of primitives each."""
+        return self.addresses(self.fetch)
+
+    def addresses(self, reference: np.ndarray) -> np.ndarray:
+        return NODE_BYTES * np.where(reference < 0, self.nodes + leaf_rows(reference), reference)
+
+    @cached_property
+    def owner(self) -> np.ndarray:
+        """Ray of each fetch, (M,) int64."""
+        return np.repeat(np.arange(len(self.counts)), np.diff(self.first))
+
+
+def tree_of(geometry: Geometry, wide: WideTree) -> Tree:
+    """Upload a tree and its primitives."""
+    cpu, data = start("cpu"), kernels.StudyTree()
+    data.width = wide.children.shape[1]
+    data.children = upload(np.ascontiguousarray(wide.children).reshape(-1), wp.int32, cpu)
+    data.lo, data.hi = (upload(np.ascontiguousarray(box).reshape(-1, 3), wp.vec3, cpu) for box in (wide.lo, wide.hi))
+    order = np.maximum(wide.order.reshape(-1), 0).astype(np.int32)
+    data.primitives = upload(geometry.primitives(Units(), order), Primitive, cpu)
+    return Tree(wide, data)
+
+
+def build_tree(geometry: Geometry, width: int, max_leaf: int = 1, bits: bool = False, builder: str = "binned") -> Tree:
+    """Build a tree of nodes with `width` children, as wrt's wide BVHs are built. bits: round boxes outwards to 8 bits per plane (width 2
+    to 8, even)."""
+    options = BvhOptions(builder=builder, max_leaf=max_leaf, cost_traversal=0.0, row=width)
+    wide = collapse(build_binary(geometry, options, 1), width, max_leaf, 1.0, 1.0)
+    if bits:
+        lo, hi = decompress(compress(wide.lo, wide.hi, wide.exists), width)
+        wide = WideTree(np.ascontiguousarray(lo), np.ascontiguousarray(hi), wide.children, wide.order, wide.leaves, wide.depth, wide.stack)
+    return tree_of(geometry, wide)
+
+
+def upload_rays(rays: Rays, starts: np.ndarray | None = None) -> WarpStruct:
+    """Upload rays. starts: (N,) int32 references at which the walks begin; None: the root."""
+    cpu, out = start("cpu"), kernels.StudyRays()
+    out.origin, out.direction = (upload(np.ascontiguousarray(each), wp.vec3, cpu) for each in (rays.origins, rays.directions))
+    out.t_max = upload(rays.t_max.astype(np.float32), wp.float32, cpu)
+    out.any_hit = upload((rays.kind == 1).astype(np.int8), wp.int8, cpu)
+    out.start = upload(np.zeros(len(rays), np.int32) if starts is None else starts.astype(np.int32), wp.int32, cpu)
+    return out
+
+
+def walk(tree: Tree, rays: Rays, rules: Rules, log: bool = False, starts: np.ndarray | None = None) -> Walk:
+    """Trace rays by `rules`, with a log if asked. starts: see `upload_rays`. Raise InputError if a queue needs more than QUEUE entries."""
+    cpu, n = start("cpu"), len(rays)
+    given, device_rules, out = upload_rays(rays, starts), kernels.Rules(), wp.zeros(n, dtype=kernels.Work, device=cpu)
+    device_rules.ordered, device_rules.culled, device_rules.queue = map(int, rules)
+    scratch = wp.empty(RAYS_PER_LAUNCH * int(QUEUE), dtype=wp.uint64, device=cpu)
+    load_kernel(kernels.walk, cpu)
+
+    def trace(record: WarpStruct) -> np.ndarray:
+        record.work = out
+        for first in range(0, n, RAYS_PER_LAUNCH):
+            wp.launch(kernels.walk, dim=min(RAYS_PER_LAUNCH, n - first), device=cpu,
+                      inputs=[tree.data, Surfaces(), given, device_rules, first, scratch, record])
+        return on_host(out).copy()
+
+    counts = trace(kernels.WalkLog())
+    if (counts["waiting"] > int(QUEUE)).any():
+        raise InputError(f"a ray needs more than {int(QUEUE)} entries in its queue")
+    none = np.zeros(0, np.int64)
+    if not log:
+        return Walk(counts, none, none, none, none, none, tree.nodes)
+    first, push_first = (np.concatenate([[0], np.cumsum(each, dtype=np.int64)]) for each in
+                         (counts["inner"].astype(np.int64) + counts["leaves"], counts["pushes"]))
+    record = kernels.WalkLog()
+    record.fetch_first, record.push_first = upload(first, wp.int64, cpu), upload(push_first, wp.int64, cpu)
+    record.fetch, record.push = (wp.zeros(int(each[-1]), dtype=wp.int32, device=cpu) for each in (first, push_first))
+    record.entered = wp.zeros(int(first[-1]), dtype=wp.int8, device=cpu)
+    trace(record)
+    return Walk(counts, first, record.fetch.numpy().copy(), record.entered.numpy().astype(np.int64), push_first,
+                record.push.numpy().copy(), tree.nodes)
+
+
