@@ -161,6 +161,12 @@ def text(rows: Sequence[Row], plan: Plan, machine: str) -> str:
     return f"{head}{markdown(parts_of(rows, plan))}\n{study.LEGEND}"
 
 
+def without_folder(text: str) -> str:
+    """Return "name=file" without the file's folder, and other texts unchanged."""
+    name, given, path = text.partition("=")
+    return f"{name}={Path(path).name}" if given else text
+
+
 def repeating(plan: Plan) -> str:
     """Return the command line that repeats the measurement; names of files have no folders."""
     words = [f"python -m wrt {plan.COMMAND}"]
@@ -172,7 +178,7 @@ def repeating(plan: Plan) -> str:
         elif isinstance(value, bool):
             words += [flag] if value else []
         elif value not in (None, ()) and (value != each.default or isinstance(value, int)):
-            text = ",".join(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
+            text = ",".join(map(without_folder, value)) if isinstance(value, Sequence) and not isinstance(value, str) else value
             words.append(f"{flag} {text.name if isinstance(text, Path) else text}")
     return " ".join(words)
 
