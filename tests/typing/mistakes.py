@@ -16,9 +16,9 @@ wrt.build(mesh, 8)  # Error: a name.
 wrt.build(3.0)  # Error: a mesh.
 wrt.build(mesh).move(0, np.eye(4))  # Error: only Instances can be moved.
 accel = wrt.build(mesh)
-accel.closest_hit(rays)  # Error: origins and directions.
+accel.closest_hit()  # Error: rays.
 accel.closest_hit(rays, rays, tmax=1.0)  # Error: t_max.
-accel.closest_hit(rays, rays).distance  # Error: t.
+accel.closest_hit(rays, rays).normls  # Error: normals.
 accel.closest_hit(rays, rays, threads="all")  # Error: a number.
 accel.any_hit(rays, rays, counters=True)  # Error: only closest_hit has counters.
 accel.any_hit(rays, rays).point  # Error: the result is an array of bool.

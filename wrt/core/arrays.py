@@ -105,6 +105,16 @@ def to_tensor_like(*arguments: object) -> Callable[[Array], Tensor] | None:
     return None
 
 
+def given_like(like: Any, values: np.ndarray) -> Any:
+    """Return NumPy values as an array of the library of `like`, and on its device."""
+    give, values = to_tensor_like(like), np.asarray(values)
+    if isinstance(like, wp.array):
+        return wp.array(values, device=like.device)
+    if give is None:
+        return values
+    return give(values if on_cpu(like) else wp.array(values, device=to_warp(like).device))
+
+
 def _to_tensor(from_dlpack: Callable[[Array], Tensor], to_cpu: bool, array: Array) -> Tensor:
     """Convert an array by `from_dlpack`. On the CPU a NumPy array is passed, because NumPy supports all versions of DLPack."""
     return from_dlpack(to_numpy(array) if to_cpu or not isinstance(array, wp.array) or array.device.is_cpu else array)

@@ -7,15 +7,16 @@ linear Rec. 709, (3,) floats; angles are radians. A camera looks along its -z ax
 from __future__ import annotations
 
 import contextlib
+import os
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import Any, Unpack
+from typing import Any, Self, Unpack
 
 import numpy as np
 
-from wrt.core.checks import as_array, as_one, as_tuple, at_thing, unknown
+from wrt.core.checks import as_array, as_one, as_tuple, at_thing, shown, unknown
 from wrt.core.errors import InputError, wrong
 from wrt.scene.backgrounds import BACKGROUNDS, Background, ConstantBackground
 from wrt.scene.cameras import CameraKind
@@ -149,6 +150,40 @@ class Scene:
             object.__setattr__(self, "settings", replace(self.settings, max_depth=depth))
         object.__setattr__(self, "ambient", as_vector(self.ambient, "ambient", low=0.0))
         object.__setattr__(self, "ambient_occlusion", as_number(self.ambient_occlusion, "ambient_occlusion", low=0.0, high=MAX_REACH))
+
+    @classmethod
+    def of(cls, meshes: Iterable[object], **fields: Any) -> Self:
+        """Make one scene of several meshes.
+
+        Parameters
+        ----------
+        meshes
+            Meshes, objects and spheres; a mesh becomes an object at its place, in a grey material. Also trimesh meshes and pairs
+            (vertices, faces).
+        **fields
+            Further fields of the scene, such as `lights`.
+
+        Raises
+        ------
+        InputError
+            If an entry is none of these.
+
+        Examples
+        --------
+        >>> accel = wrt.build(wrt.Scene.of([floor, robot]))    # wrt.build([floor, robot]): two worlds, of one mesh each
+        """
+        grey, things = Material(), []
+        for i, thing in enumerate([meshes] if isinstance(meshes, Mesh) else meshes):
+            at = f"meshes[{i}]"
+            if isinstance(thing, tuple) and len(thing) == 2:
+                thing = Mesh(*thing)
+            elif type(thing).__module__.split(".")[0] == "trimesh":
+                thing = Mesh.from_trimesh(thing)  # type: ignore[arg-type]
+            if isinstance(thing, str | os.PathLike):
+                raise InputError(f"must be a mesh, got {shown(thing)}", argument=at, hint="wrt.load_mesh reads a file")
+            things.append(Object(thing, (grey,), name=thing.name) if isinstance(thing, Mesh) else as_one(thing, (Object, Sphere), at))
+        spheres = tuple(thing for thing in things if isinstance(thing, Sphere))
+        return cls(tuple(thing for thing in things if isinstance(thing, Object)), spheres, **fields)
 
     def __repr__(self) -> str:
         counts = {"triangle": sum(len(thing.mesh.faces) for thing in self.objects), "object": len(self.objects),

@@ -157,9 +157,10 @@ def test_warp_arrays_come_back_as_warp_arrays(name: str) -> None:
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
-    (([[0, 0]], [[1, 0, 0]]), ("origins", "(N, 3)")),
-    (([0, 0, 0], [[1, 0, 0]]), ("origins", "(N, 3)")),
-    (([[0, 0, 0]], [[1, 0, 0], [0, 1, 0]]), ("directions", "as many rows")),
+    (([[0, 0]], [[1, 0, 0]]), ("origins", "(..., 3)")),
+    (([0, 0], [[1, 0, 0]]), ("origins", "(..., 3)")),
+    ((0.0, [[1, 0, 0]]), ("origins", "(..., 3)")),
+    (([[0, 0, 0]] * 3, [[1, 0, 0], [0, 1, 0]]), ("directions", "broadcasts")),
     (([[0, 0, 0]], [[0, 0, 0]]), ("directions", "row 0")),
     (([[0, 0, 0], [0, 0, 0]], [[1, 0, 0], [-0.0, 0, 0]]), ("directions", "row 1")),
     (([[0, np.nan, 0]], [[1, 0, 0]]), ("origins", "row 0")),
@@ -173,12 +174,12 @@ def test_warp_arrays_come_back_as_warp_arrays(name: str) -> None:
     (([[0, 0, 0], [1e38, 0, 0]], [[1, 0, 0]] * 2), ("origins", "row 1")),
     (([[0, 0, -1.1e37]], [[1, 0, 0]]), ("origins", "row 0")),
     (([[0, 0, 1e300]], [[1, 0, 0]]), ("origins", "row 0")),
-    (([[0, 0, 10**400]], [[1, 0, 0]]), ("origins", "(N, 3)")),
-    ((np.zeros((1, 3), complex), [[1, 0, 0]]), ("origins", "(N, 3)")),
-    (([[0, 0, 0]], [[1j, 0, 0]]), ("directions", "(N, 3)")),
-    ((np.zeros((1, 3), bool), [[1, 0, 0]]), ("origins", "(N, 3)")),
-    (([[0, 0, 0]], [["1", "0", "0"]]), ("directions", "(N, 3)")),
-    ((np.zeros((1, 3), "datetime64[s]"), [[1, 0, 0]]), ("origins", "(N, 3)")),
+    (([[0, 0, 10**400]], [[1, 0, 0]]), ("origins", "(..., 3)")),
+    ((np.zeros((1, 3), complex), [[1, 0, 0]]), ("origins", "(..., 3)")),
+    (([[0, 0, 0]], [[1j, 0, 0]]), ("directions", "(..., 3)")),
+    ((np.zeros((1, 3), bool), [[1, 0, 0]]), ("origins", "(..., 3)")),
+    (([[0, 0, 0]], [["1", "0", "0"]]), ("directions", "(..., 3)")),
+    ((np.zeros((1, 3), "datetime64[s]"), [[1, 0, 0]]), ("origins", "(..., 3)")),
     ((np.ma.zeros((1, 3)), [[1, 0, 0]]), ("origins", "masked array")),
     (([[0, 0, 0]], np.ma.masked_less([[1.0, 0, 0]], 0.5)), ("directions", "masked array")),
     (([[0, 0, 0]], [[1, 0, 0]], 1j), ("t_min", "number or (1,)")),
@@ -262,10 +263,10 @@ def test_bad_warp_arrays_are_named() -> None:
         structure.closest_hit(good, np.ones((1, 3)))
     with refused("origins", "both be Warp arrays"):
         structure.closest_hit(np.ones((1, 3)), good)
-    with refused("origins", "both be Warp arrays"):
+    with refused("origins", "of vec3, or (..., 3)"):
         structure.closest_hit(wp.zeros(1, dtype=wp.vec2, device=DEVICE), good)
-    with refused("directions", "as many rows"):
-        structure.closest_hit(good, vec3s(np.ones((2, 3))))
+    with refused("directions", "broadcasts"):
+        structure.closest_hit(vec3s(np.ones((3, 3))), vec3s(np.ones((2, 3))))
     with refused("t_max"):
         structure.closest_hit(good, good, t_max=wp.zeros(3, dtype=wp.float32, device=DEVICE))
     for name, value, message in (("t_min", -0.5, ("t_min", "NaN or below 0")), ("t_min", np.nan, ("t_min", "NaN")),

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from typing import Any, Self, overload
+from inspect import signature
+from typing import Any, Self, TypedDict, Unpack, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -13,22 +14,30 @@ from wrt.accel.built import AccelStats
 from wrt.accel.flat_scene import FlatScene
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry
-from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES, Hits, answer_arrays
+from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES, Hits, answer_arrays, arrays_of
 from wrt.accel.queries.batches import Query, trace_query
 from wrt.accel.queries.counting import counted
 from wrt.accel.queries.gradients import record
-from wrt.accel.queries.rays import rays_of
+from wrt.accel.queries.rays import are_rows, rays_of
+from wrt.accel.queries.shapes import flat_arrays, in_shape, shaped_rays, worlds_of_each
 from wrt.accel.queries.world_ids import check_world
 from wrt.accel.snapshot import Snapshot
 from wrt.accel.structure import Structure, check_units
 from wrt.core.arrays import to_tensor_like
-from wrt.core.checks import shown
+from wrt.core.checks import did_you_mean, shown
 from wrt.core.device import start, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike, NumpyLike, TensorT, WarpArray, WarpStruct
 from wrt.core.warp_private import recording_tape
 from wrt.kernels.structs import Surfaces
+
+
+class CostOptions(TypedDict, total=False):
+    """Options of `closest_hit` about costs."""
+
+    counters: bool
+    trace: bool
 
 
 class Accelerator:
@@ -89,20 +98,20 @@ class Accelerator:
         return self._snapshot.stats
 
     @overload
-    def closest_hit(self, origins: WarpArray, directions: WarpArray, t_min: ArrayLike = ..., t_max: ArrayLike = ...,
-                    threads: int | None = ..., *, counters: bool = ..., trace: bool = ..., out: Hits[WarpArray] | None = ...,
-                    world: ArrayLike | None = ...) -> Hits[WarpArray]: ...
+    def closest_hit(self, origins: WarpArray, directions: WarpArray | None = ..., t_min: ArrayLike = ..., t_max: ArrayLike = ...,
+                    threads: int | None = ..., *, out: Hits[WarpArray] | None = ...,
+                    world: ArrayLike | None = ..., invalid: str = ..., **costs: Unpack[CostOptions]) -> Hits[WarpArray]: ...
     @overload
-    def closest_hit(self, origins: NumpyLike, directions: NumpyLike, t_min: ArrayLike = ..., t_max: ArrayLike = ...,
-                    threads: int | None = ..., *, counters: bool = ..., trace: bool = ..., out: Hits | None = ...,
-                    world: ArrayLike | None = ...) -> Hits: ...
+    def closest_hit(self, origins: NumpyLike, directions: NumpyLike | None = ..., t_min: ArrayLike = ..., t_max: ArrayLike = ...,
+                    threads: int | None = ..., *, out: Hits | None = ...,
+                    world: ArrayLike | None = ..., invalid: str = ..., **costs: Unpack[CostOptions]) -> Hits: ...
     @overload
-    def closest_hit(self, origins: TensorT, directions: TensorT, t_min: ArrayLike = ..., t_max: ArrayLike = ...,
-                    threads: int | None = ..., *, counters: bool = ..., trace: bool = ..., out: Hits[TensorT] | None = ...,
-                    world: ArrayLike | None = ...) -> Hits[TensorT]: ...
-    def closest_hit(self, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
-                    threads: int | None = None, *, counters: bool = False, trace: bool = False, out: Hits[Any] | None = None,
-                    world: ArrayLike | None = None) -> Hits[Any]:
+    def closest_hit(self, origins: TensorT, directions: TensorT | None = ..., t_min: ArrayLike = ..., t_max: ArrayLike = ...,
+                    threads: int | None = ..., *, out: Hits[TensorT] | None = ...,
+                    world: ArrayLike | None = ..., invalid: str = ..., **costs: Unpack[CostOptions]) -> Hits[TensorT]: ...
+    def closest_hit(self, origins: ArrayLike, directions: ArrayLike | None = None, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
+                    threads: int | None = None, *, out: Hits[Any] | None = None, world: ArrayLike | None = None,
+                    invalid: str = "raise", **costs: Unpack[CostOptions]) -> Hits[Any]:
         """Find the closest hit of each ray in the closed segment [t_min, t_max]; at equal t, the hit with the lowest prim_id.
 
         With t_min = 0 a ray hits a surface through its origin; a t_min above 0 excludes that surface. While a `wp.Tape` records,
@@ -111,86 +120,110 @@ class Accelerator:
 
         Parameters
         ----------
-        origins, directions : (N, 3) array_like, or Warp arrays (N,) of vec3
-            Real numbers, converted to float32; contiguous float32 arrays are read in place. Coordinates of origins are at most 1e37;
-            directions have any length but 0. The values of Warp arrays are not checked.
-        t_min, t_max : float or (N,) array_like
+        origins, directions : (..., 3) array_like, or Warp arrays (...) of vec3
+            Real numbers, converted to float32; contiguous float32 arrays (N, 3) are read in place. They broadcast: one origin (3,) with
+            directions (H, W, 3) is H W rays. Coordinates of origins are at most 1e37; directions have any length but 0. The values of
+            Warp arrays are not checked. Without directions, `origins` is (..., 6) and holds both, as in Open3D.
+        t_min, t_max : float or array_like of the rays' shape (...)
             Ends of the segment in units of the direction's length, t_min >= 0. The values of Warp arrays on a GPU are not checked.
         threads : int, optional
             Threads on the CPU; one per core by default.
-        counters, trace : bool
-            Count the nodes and primitives that each ray visits (`hits.counters`); `trace` also records every fetch, in a second run.
         out : Hits, optional
-            Hits of N rays whose arrays receive the results. These must not overlap with the arrays of the rays.
-        world : int or (N,) array_like of int, optional
+            Hits of the rays' shape whose arrays receive the results. These must not overlap with the arrays of the rays.
+        world : int or array_like of int of the rays' shape, optional
             Index of the world that each ray sees; required over several worlds. Warp arrays are not checked: in a world that does
             not exist, a ray misses.
+        invalid : {"raise", "miss"}
+            "miss": a ray with NaN, another value that is not valid, or direction 0 misses. This reads Warp arrays on the host.
+        **costs
+            `counters=True` counts the nodes and primitives that each ray visits (`hits.counters`); `trace=True` also records every fetch.
 
         Returns
         -------
         Hits
-            Arrays of NumPy, or of the library of `origins`: Warp, PyTorch, JAX.
+            Arrays of the rays' shape (...), of NumPy or of the library of `origins`: Warp, PyTorch, JAX.
 
         Raises
         ------
         InputError
             Names the argument and what was expected. The arrays of `out` may have been overwritten.
         """
-        threads, rays, give = thread_count(threads), rays_of(origins, directions, t_min, t_max, True), to_tensor_like(origins, directions)
-        if not (out is None or isinstance(out, Hits)):
-            raise InputError(f"must be Hits, got {shown(out)}", argument="out")
-        callers = None if out is None else [out.t, out.u, out.v, out.prim_id]
+        threads, give, shape = thread_count(threads), to_tensor_like(origins, directions), None
+        callers = None if out is None else arrays_of(out)
+        if are_rows(origins, directions) and invalid == "raise":  # the usual case, whose arrays need no other shape
+            rays = rays_of(origins, directions, t_min, t_max, True)  # type: ignore[arg-type]
+        else:
+            rays, shape = shaped_rays(origins, directions, t_min, t_max, True, invalid)
+            callers, world = callers and flat_arrays(callers, shape, HIT_TYPES), worlds_of_each(world, shape)
         t, u, v, prim_id = arrays = answer_arrays(HIT_TYPES, callers, len(rays.origins), self.device if rays.as_warp else None,
                                              give is not None)
         snapshot = self._snapshot  # read once, because a refit may replace it during the query
         worlds = check_world(snapshot, world, len(t))
-        query, costs = Query(rays, arrays, threads, worlds), None
-        if counters or trace:
-            costs = counted(snapshot, query, fetches_too=trace)
+        query, counters = Query(rays, arrays, threads, worlds), None
+        if costs and asks_for_counters(costs):
+            counters = counted(snapshot, query, fetches_too=costs.get("trace", False))
         else:
             trace_query(snapshot, query)
-        hits = Hits(t, u, v, prim_id, costs, (snapshot, rays, worlds))
+        hits = Hits(t, u, v, prim_id, counters, (snapshot, rays, worlds))
         if recording_tape() is not None:
             record(hits, t=t, u=u, v=v)
+        hits = hits if shape is None else hits.in_shape(shape)
         return hits if give is None else hits.each(give)
 
     @overload
-    def any_hit(self, origins: WarpArray, directions: WarpArray, t_min: ArrayLike = ..., t_max: ArrayLike = ...,
-                threads: int | None = ..., *, out: WarpArray | None = ..., world: ArrayLike | None = ...) -> WarpArray: ...
+    def any_hit(self, origins: WarpArray, directions: WarpArray | None = ..., t_min: ArrayLike = ..., t_max: ArrayLike = ...,
+                threads: int | None = ..., *, out: WarpArray | None = ..., world: ArrayLike | None = ...,
+                invalid: str = ...) -> WarpArray: ...
     @overload
-    def any_hit(self, origins: NumpyLike, directions: NumpyLike, t_min: ArrayLike = ..., t_max: ArrayLike = ...,
+    def any_hit(self, origins: NumpyLike, directions: NumpyLike | None = ..., t_min: ArrayLike = ..., t_max: ArrayLike = ...,
                 threads: int | None = ..., *, out: npt.NDArray[np.bool_] | None = ...,
-                world: ArrayLike | None = ...) -> npt.NDArray[np.bool_]: ...
+                world: ArrayLike | None = ..., invalid: str = ...) -> npt.NDArray[np.bool_]: ...
     @overload
-    def any_hit(self, origins: TensorT, directions: TensorT, t_min: ArrayLike = ..., t_max: ArrayLike = ...,
-                threads: int | None = ..., *, out: TensorT | None = ..., world: ArrayLike | None = ...) -> TensorT: ...
-    def any_hit(self, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
-                threads: int | None = None, *, out: object = None, world: ArrayLike | None = None) -> object:
+    def any_hit(self, origins: TensorT, directions: TensorT | None = ..., t_min: ArrayLike = ..., t_max: ArrayLike = ...,
+                threads: int | None = ..., *, out: TensorT | None = ..., world: ArrayLike | None = ..., invalid: str = ...) -> TensorT: ...
+    def any_hit(self, origins: ArrayLike, directions: ArrayLike | None = None, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
+                threads: int | None = None, *, out: object = None, world: ArrayLike | None = None,
+                invalid: str = "raise") -> object:
         """Test whether each ray hits anything in its segment: True exactly where `closest_hit` finds a hit.
 
         Parameters
         ----------
-        origins, directions, t_min, t_max, threads, world
+        origins, directions, t_min, t_max, threads, world, invalid
             See `closest_hit`.
-        out : (N,) bool, optional
-            Array that receives the results.
+        out : (...) bool, optional
+            Array of the rays' shape that receives the results.
 
         Returns
         -------
-        (N,) bool
-            Array of NumPy, or of the library of `origins`.
+        (...) bool
+            Array of the rays' shape, of NumPy or of the library of `origins`.
 
         Raises
         ------
         InputError
             Names the argument and what was expected.
         """
-        threads, rays, give = thread_count(threads), rays_of(origins, directions, t_min, t_max), to_tensor_like(origins, directions)
-        callers, device = None if out is None else [out], self.device if rays.as_warp else None
-        arrays = answer_arrays(ANY_HIT_TYPES, callers, len(rays.origins), device, give is not None)
+        threads, give, shape = thread_count(threads), to_tensor_like(origins, directions), None
+        callers = None if out is None else [out]
+        if are_rows(origins, directions) and invalid == "raise":
+            rays = rays_of(origins, directions, t_min, t_max)  # type: ignore[arg-type]
+        else:
+            rays, shape = shaped_rays(origins, directions, t_min, t_max, invalid=invalid)
+            callers, world = callers and flat_arrays(callers, shape, ANY_HIT_TYPES), worlds_of_each(world, shape)
+        arrays = answer_arrays(ANY_HIT_TYPES, callers, len(rays.origins), self.device if rays.as_warp else None, give is not None)
         snapshot = self._snapshot
         trace_query(snapshot, Query(rays, arrays, threads, check_world(snapshot, world, len(arrays[0]))))
-        return arrays[0] if give is None else give(arrays[0])
+        found = arrays[0] if shape is None else in_shape(arrays[0], shape)
+        return found if give is None else give(found)
+
+
+def asks_for_counters(costs: CostOptions) -> bool:
+    """Return whether any of the options is set. Raises TypeError if `closest_hit` has no option of this name."""
+    for name in costs:
+        if name not in CostOptions.__annotations__:
+            near = did_you_mean(name, [*signature(Accelerator.closest_hit).parameters, *CostOptions.__annotations__])
+            raise TypeError(f"closest_hit() got an unexpected keyword argument {name!r}{near and '; ' + near.rstrip()}")
+    return any(costs.values())
 
 
 def snapshot_of(accel: Accelerator) -> Snapshot:

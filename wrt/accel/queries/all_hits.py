@@ -16,9 +16,10 @@ from wrt.accel.queries.answers import Hits
 from wrt.accel.queries.few_lists import MOST, FewLists
 from wrt.accel.queries.hit_points import device_scene
 from wrt.accel.queries.raw_kernel import RawKernel, kernel_memory
-from wrt.accel.queries.rays import Rays, arrays_on, host_arrays, rays_of
+from wrt.accel.queries.rays import Rays, are_rows, arrays_on, host_arrays, rays_of
+from wrt.accel.queries.shapes import Shape, shaped_rays
 from wrt.accel.structure import Structure
-from wrt.core.arrays import to_numpy, to_tensor_like, to_warp
+from wrt.core.arrays import given_like, to_numpy, to_tensor_like
 from wrt.core.checks import as_integer, as_one
 from wrt.core.device import MOST_ROWS, made_once, upload
 from wrt.core.errors import InputError
@@ -36,7 +37,7 @@ COPY_HITS = RawKernel(copy_hits, RayArrays(), HitLists(), None, HitArrays())
 
 @dataclass(frozen=True, eq=False)
 class AllHits(Generic[ArrayT]):
-    """M hits of N rays, ray by ray, in order of t and, at equal t, of prim_id. Arrays of NumPy, PyTorch or JAX.
+    """M hits of N rays, ray by ray (in C order), in order of t and, at equal t, of prim_id. Arrays of NumPy, PyTorch or JAX.
 
     Attributes
     ----------
@@ -66,9 +67,8 @@ class AllHits(Generic[ArrayT]):
     @property
     def ray_id(self) -> ArrayT:
         """Index of the ray of each hit, (M,) int64."""
-        ray_id: Any = np.repeat(np.arange(len(self)), to_numpy(self.counts))
-        give: Any = to_tensor_like(self.first)
-        return ray_id if give is None else give(wp.array(ray_id, dtype=wp.int64, device=to_warp(self.first).device))
+        ray: ArrayT = given_like(self.first, np.repeat(np.arange(len(self)), to_numpy(self.counts)))
+        return ray
 
     def __repr__(self) -> str:
         return f"AllHits({len(self)} rays, {int(self.first[-1])} hits)"
@@ -90,6 +90,7 @@ class ListQuery:
     """A query for all hits of rays, on a snapshot of a structure. `of` sets the rays; `all`, `first` and `counts` return results."""
 
     n = 0
+    shape: Shape | None = None  # of the rays; None: (n,)
     rays: Rays
     give: Any  # converts arrays to those of the caller's library
 
@@ -109,9 +110,12 @@ class ListQuery:
         self.n, self.rays = len(rays.origins), rays if self.device.is_cpu else arrays_on(self.device, rays)
         return self
 
-    def of(self, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf) -> ListQuery:
+    def of(self, origins: ArrayLike, directions: ArrayLike | None, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf) -> ListQuery:
         """Set the rays. Raises InputError that names the argument."""
-        rays = rays_of(origins, directions, t_min, t_max)
+        if are_rows(origins, directions):
+            rays = rays_of(origins, directions, t_min, t_max)  # type: ignore[arg-type]
+        else:
+            rays, self.shape = shaped_rays(origins, directions, t_min, t_max)
         self.n, self.rays = len(rays.origins), host_arrays(rays) if self.device.is_cpu else arrays_on(self.device, rays)
         self.give = to_tensor_like(origins, directions) or to_numpy
         return self
@@ -142,7 +146,8 @@ class ListQuery:
         for rays, lists, of_each in self._listed(k):
             self._copy(rays, lists, begin[:len(of_each)], hits)
             begin = begin[len(of_each):]
-        return Hits(*(self.give(array.reshape((self.n, k))) for array in hits))
+        shape = (self.n,) if self.shape is None else self.shape
+        return Hits(*(self.give(array.reshape((*shape, k))) for array in hits))
 
     def counts(self) -> np.ndarray:
         """Count the hits of each ray, (N,) int64. If no triangle is in several leaves, the first traversal is enough."""
@@ -225,12 +230,12 @@ def few_lists(structure: Structure) -> list[FewLists]:
 
 
 @overload
-def all_hits(accel: Accelerator, origins: NumpyLike | WarpArray, directions: NumpyLike | WarpArray, t_min: ArrayLike = ...,
+def all_hits(accel: Accelerator, origins: NumpyLike | WarpArray, directions: NumpyLike | WarpArray | None = ..., t_min: ArrayLike = ...,
              t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ...) -> AllHits: ...
 @overload
-def all_hits(accel: Accelerator, origins: TensorT, directions: TensorT, t_min: ArrayLike = ..., t_max: ArrayLike = ...,
+def all_hits(accel: Accelerator, origins: TensorT, directions: TensorT | None = ..., t_min: ArrayLike = ..., t_max: ArrayLike = ...,
              threads: int | None = ..., crossings: bool = ...) -> AllHits[TensorT]: ...
-def all_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
+def all_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike | None = None, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
              threads: int | None = None, crossings: bool = False) -> AllHits[Any]:
     """Find every hit of each ray in its segment, in order of distance. A ray hits each triangle at most once.
 
@@ -262,13 +267,13 @@ def all_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike, t_mi
 
 
 @overload
-def count_hits(accel: Accelerator, origins: NumpyLike | WarpArray, directions: NumpyLike | WarpArray, t_min: ArrayLike = ...,
+def count_hits(accel: Accelerator, origins: NumpyLike | WarpArray, directions: NumpyLike | WarpArray | None = ..., t_min: ArrayLike = ...,
                t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ...) -> npt.NDArray[np.int64]: ...
 @overload
-def count_hits(accel: Accelerator, origins: TensorT, directions: TensorT, t_min: ArrayLike = ..., t_max: ArrayLike = ...,
+def count_hits(accel: Accelerator, origins: TensorT, directions: TensorT | None = ..., t_min: ArrayLike = ..., t_max: ArrayLike = ...,
                threads: int | None = ..., crossings: bool = ...) -> TensorT: ...
-def count_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
-               threads: int | None = None, crossings: bool = False) -> object:
+def count_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike | None = None, t_min: ArrayLike = 0.0,
+               t_max: ArrayLike = np.inf,  threads: int | None = None, crossings: bool = False) -> object:
     """Count the hits of each ray in its segment. The hits take no memory unless the structure has triangles in several leaves.
 
     Parameters
@@ -278,8 +283,8 @@ def count_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike, t_
 
     Returns
     -------
-    (N,) int64
-        Array of NumPy, or of the library of `origins`: PyTorch, JAX.
+    (...) int64
+        Array of the rays' shape, of NumPy or of the library of `origins`: PyTorch, JAX.
 
     Raises
     ------
@@ -287,16 +292,19 @@ def count_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike, t_
         Names the argument and what was expected.
     """
     query = ListQuery(accel, threads, crossings).of(origins, directions, t_min, t_max)
-    return query.converted(query.counts())
+    counts = query.counts()
+    return query.converted(counts if query.shape is None else counts.reshape(query.shape))
 
 
 @overload
-def first_hits(accel: Accelerator, k: int, origins: NumpyLike | WarpArray, directions: NumpyLike | WarpArray, t_min: ArrayLike = ...,
+def first_hits(accel: Accelerator, k: int, origins: NumpyLike | WarpArray, directions: NumpyLike | WarpArray | None = ...,
+               t_min: ArrayLike = ...,
                t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ...) -> Hits: ...
 @overload
-def first_hits(accel: Accelerator, k: int, origins: TensorT, directions: TensorT, t_min: ArrayLike = ..., t_max: ArrayLike = ...,
+def first_hits(accel: Accelerator, k: int, origins: TensorT, directions: TensorT | None = ...,
+               t_min: ArrayLike = ..., t_max: ArrayLike = ...,
                threads: int | None = ..., crossings: bool = ...) -> Hits[TensorT]: ...
-def first_hits(accel: Accelerator, k: int, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0,
+def first_hits(accel: Accelerator, k: int, origins: ArrayLike, directions: ArrayLike | None = None, t_min: ArrayLike = 0.0,
                t_max: ArrayLike = np.inf, threads: int | None = None, crossings: bool = False) -> Hits[Any]:
     """Find the first k hits of each ray in order of distance. The traversal ends at the k-th hit.
 
@@ -310,7 +318,7 @@ def first_hits(accel: Accelerator, k: int, origins: ArrayLike, directions: Array
     Returns
     -------
     Hits
-        Arrays (N, k); a ray with fewer hits has misses at the end. These Hits have no points and normals.
+        Arrays (..., k); a ray with fewer hits has misses at the end. These Hits have no points and normals.
 
     Raises
     ------

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, fields, replace
 from itertools import combinations
-from typing import Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
 from wrt.accel.queries.hit_points import HitPoints, Source
-from wrt.core.arrays import from_tensor, to_numpy, to_warp
-from wrt.core.checks import shown
+from wrt.accel.queries.shapes import in_shape
+from wrt.core.arrays import check_no_gradients, from_tensor, is_tensor, to_numpy, to_warp
+from wrt.core.checks import did_you_mean, shown
 from wrt.core.device import empty_aligned
 from wrt.core.errors import InputError
 from wrt.core.html import html_table
@@ -25,14 +26,14 @@ ANY_HIT_TYPES = {"out": np.bool_}
 
 @dataclass(frozen=True, eq=False)
 class Counters:
-    """Costs of each ray of a query. `counters.nodes`, `counters.primitives` and the other fields of `counts` are (N,) arrays.
+    """Costs of each ray of a query. `counters.nodes`, `counters.primitives` and the other fields of `counts` have the rays' shape.
 
     Attributes
     ----------
-    counts : (N,) structured array
+    counts : (...) structured array
         Records of `kernels.traverse.counters.Counts`.
     first : (N + 1,) int64
-        Rows first[i] .. first[i + 1] - 1 of `address` and `size` are the fetches of ray i; all 0 without `trace=True`.
+        Rows first[i] .. first[i + 1] - 1 of `address` and `size` are the fetches of ray i of N, in C order; all 0 without `trace=True`.
     address, size : (M,) int64
         Address and size of each fetch in bytes. Addresses of primitives begin at kernels.traverse.counters.PRIMITIVE_SPACE.
     """
@@ -44,31 +45,41 @@ class Counters:
 
     def __getattr__(self, name: str) -> np.ndarray:
         if name.startswith("_") or name not in (self.counts.dtype.names or ()):
-            raise AttributeError(name)
+            raise no_attribute(self, name, self.__dict__.get("counts", np.empty(0)).dtype.names or ())
         return self.counts[name]
+
+    def of(self, rays: np.ndarray) -> Counters:
+        """Return the costs of some of the rays, given by their indices, in the shape of the indices."""
+        flat = rays.reshape(-1)
+        lengths, first = np.diff(self.first)[flat], np.zeros(len(flat) + 1, np.int64)
+        np.cumsum(lengths, out=first[1:])
+        fetches = np.arange(first[-1]) + np.repeat(self.first[:-1][flat] - first[:-1], lengths)
+        return Counters(self.counts.reshape(-1)[rays], first, self.address[fetches], self.size[fetches])
 
     def __repr__(self) -> str:
         means = ", ".join(f"{name} {self.counts[name].mean():.2f}" for name in self.counts.dtype.names or ())
-        return f"Counters({len(self.counts)} rays; mean per ray: {means})" if len(self.counts) else "Counters(0 rays)"
+        return f"Counters({self.counts.size} rays; mean per ray: {means})" if self.counts.size else "Counters(0 rays)"
 
     def _repr_html_(self) -> str:
-        names = (self.counts.dtype.names or ()) if len(self.counts) else ()
+        names = (self.counts.dtype.names or ()) if self.counts.size else ()
         rows = [(name, float(self.counts[name].mean()), int(self.counts[name].max()), int(self.counts[name].sum(dtype=np.int64)))
                 for name in names]
-        return html_table(f"Counters of {len(self.counts)} rays", ("", "mean per ray", "largest", "sum"), rows)
+        return html_table(f"Counters of {self.counts.size} rays", ("", "mean per ray", "largest", "sum"), rows)
 
 
 @dataclass(frozen=True, eq=False)
 class Hits(HitPoints[ArrayT]):
-    """Hits of N rays. The arrays are NumPy's, or those of the rays' library: Warp, PyTorch or JAX.
+    """Hits of rays, in arrays of the rays' shape (...). The arrays are NumPy's, or those of the rays' library: Warp, PyTorch or JAX.
+
+    `hits[mask]`, `hits[10:20]` and `hits[i, j]` are the hits of some rays, in copied arrays, as NumPy indexes `t`.
 
     Attributes
     ----------
-    t : (N,) float32
+    t : (...) float32
         Distance in units of the direction's length; inf on a miss.
-    u, v : (N,) float32
+    u, v : (...) float32
         Barycentric coordinates: the point is (1 - u - v) v0 + u v1 + v v2. Both are 0 on a miss and on a sphere.
-    prim_id : (N,) int32
+    prim_id : (...) int32
         Index of the face, or number of faces plus index of the sphere; -1 on a miss.
     counters : Counters or None
         Costs of each ray, if the query had `counters=True` or `trace=True`.
@@ -90,12 +101,30 @@ class Hits(HitPoints[ArrayT]):
         return len(self.t)
 
     def __repr__(self) -> str:
-        return f"Hits({len(self)} rays)"
+        return f"Hits({' x '.join(map(str, self.shape)) or 1} rays)"
+
+    def __getitem__(self, index: object) -> Hits[ArrayT]:
+        """Return the hits of some rays. index: mask, slice, integers, or a tuple of these. Raises InputError under a recording tape."""
+        check_no_gradients("hits[...]", t=self.t)
+        keys = tuple(to_numpy(key) if is_tensor(key) or isinstance(key, wp.array) else key
+                     for key in (index if isinstance(index, tuple) else (index,)))
+        rays = np.asarray(np.arange(int(np.prod(self.shape))).reshape(self.shape)[keys])
+        some: Hits[ArrayT] = self.each(lambda array: self._given(to_numpy(array).reshape(-1)[rays]))
+        if self.source is None:
+            return replace(some, counters=self.counters and self.counters.of(rays))
+        snapshot, own, worlds = self.source
+        flat = rays.reshape(-1)
+        return replace(some, counters=self.counters and self.counters.of(rays), source=(snapshot, own.of(flat), worlds and worlds.of(flat)))
+
+    if not TYPE_CHECKING:  # type checkers report unknown names themselves
+
+        def __getattr__(self, name: str) -> NoReturn:
+            raise no_attribute(self, name, dir(type(self)) + [each.name for each in fields(self)])
 
     def _repr_html_(self) -> str:
         hits = self.numpy()
         t = hits.t[hits.prim_id >= 0]
-        facts: dict[str, float] = {"rays": len(self), "hits": len(t), "misses": len(self) - len(t)}
+        facts: dict[str, float] = {"rays": hits.t.size, "hits": len(t), "misses": hits.t.size - len(t)}
         if len(t):
             facts |= {"nearest t": float(t.min()), "farthest t": float(t.max())}
         return html_table("Hits", (), facts.items()) + (self.counters._repr_html_() if self.counters else "")
@@ -111,6 +140,27 @@ class Hits(HitPoints[ArrayT]):
     def each(self, convert: Callable[[ArrayT], TensorT]) -> Hits[TensorT]:
         """Return the hits with t, u, v and prim_id passed through `convert`."""
         return Hits(convert(self.t), convert(self.u), convert(self.v), convert(self.prim_id), self.counters, self.source)
+
+    def _flat(self) -> Hits[ArrayT]:
+        return self.in_shape((int(np.prod(self.shape)),))
+
+    def in_shape(self, shape: tuple[int, ...]) -> Hits[ArrayT]:
+        """Return hits of N rays, views of the same arrays, in another shape."""
+        costs = self.counters and replace(self.counters, counts=self.counters.counts.reshape(shape))
+        return replace(self.each(lambda array: in_shape(array, shape)), counters=costs)
+
+
+def no_attribute(thing: object, name: str, known: Iterable[str]) -> AttributeError:
+    """Return the error about an unknown attribute, with the most similar public one."""
+    near = did_you_mean(name, [each for each in known if not each.startswith("_")]) if not name.startswith("_") else ""
+    return AttributeError(f"{type(thing).__name__} has no attribute {name!r}{near and '; ' + near.rstrip()}")
+
+
+def arrays_of(out: object) -> list[Any]:
+    """Return the arrays of the argument `out` of closest_hit in the order of HIT_TYPES. Raises InputError unless it is Hits."""
+    if not isinstance(out, Hits):
+        raise InputError(f"must be Hits, got {shown(out)}", argument="out")
+    return [out.t, out.u, out.v, out.prim_id]
 
 
 def answer_arrays(types: Mapping[str, type], out: list[Any] | None, n: int, device: Device | None,

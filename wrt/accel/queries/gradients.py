@@ -44,13 +44,15 @@ class Cotangents(NamedTuple):
     v: ArrayLike | None = None
     point: ArrayLike | None = None
 
-    def checked(self, n: int) -> Cotangents:
-        """Convert the fields to NumPy arrays. Raises InputError for other shapes."""
+    def checked(self, shape: tuple[int, ...]) -> Cotangents:
+        """Convert the fields, of the rays' shape, to NumPy arrays (N,) and (N, 3). Raises InputError for other shapes."""
         arrays = [field if field is None else to_numpy(field) for field in self]
-        for name, array in zip(self._fields, arrays, strict=True):
-            shape = (n, 3) if name == "point" else (n,)
-            if array is not None and (array.shape != shape or array.dtype.kind not in "iuf"):
-                raise InputError(f"must be {shape} of real numbers, got {shown(array)}", argument=name)
+        for i, (name, array) in enumerate(zip(self._fields, arrays, strict=True)):
+            rest = (3,) if name == "point" else ()
+            if array is not None:
+                if array.shape != shape + rest or array.dtype.kind not in "iuf":
+                    raise InputError(f"must be {shape + rest} of real numbers, got {shown(array)}", argument=name)
+                arrays[i] = array.reshape(-1, *rest) if array.ndim != len(rest) + 1 else array
         return Cotangents(*arrays)
 
     def at(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -76,7 +78,7 @@ def adjoint(geometry: Geometry, origins: Array, directions: Array, prim_id: Arra
     prim_id, o, d = to_numpy(prim_id), float32(to_numpy(origins)), float32(to_numpy(directions))  # float32, as in the query
     vertices, faces = geometry.vertices, geometry.faces
     n = len(prim_id)
-    by_hits = cotangents.checked(n)
+    by_hits = cotangents.checked((n,))
     out = Gradients(np.zeros((len(vertices), 3)), np.zeros((n, 3)), np.zeros((n, 3)))
     rows = np.flatnonzero((prim_id >= 0) & (prim_id < len(faces)))
     corners = faces[prim_id[rows]]

@@ -12,9 +12,10 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.queries.gradients import ONE_MESH, Cotangents, Gradients, adjoint, check_recorded, record
 from wrt.accel.queries.rays import Rays, rays_on
+from wrt.accel.queries.shapes import in_shape
 from wrt.accel.queries.world_ids import WorldIds, over_worlds
 from wrt.accel.snapshot import Snapshot, once
-from wrt.core.arrays import to_tensor_like, to_warp
+from wrt.core.arrays import from_tensor, given_like, to_numpy, to_tensor_like, to_warp
 from wrt.core.device import launch_on, records, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
@@ -37,7 +38,7 @@ class DeviceScene(NamedTuple):
 
 
 class HitPoints(Generic[ArrayT]):
-    """Properties of hits that `closest_hit` found, as arrays of the same library as the hits.
+    """Properties of hits that `closest_hit` found, as arrays of the same library and leading shape (...) as the hits.
 
     Each access computes the property again from the arrays of hits and rays. These arrays are not copied: do not modify them.
     A property raises InputError if the hits have no `source`, or the structure lacks the data for the property.
@@ -50,8 +51,36 @@ class HitPoints(Generic[ArrayT]):
     source: Source | None
 
     @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of `t`: of the rays."""
+        return tuple(from_tensor(self.t, "t", None).shape)
+
+    @property
+    def hit(self) -> ArrayT:
+        """Whether each ray hits something: (...) bool."""
+        return self._given(to_numpy(self.prim_id) >= 0)
+
+    @property
+    def distance(self) -> ArrayT:
+        """Distance of each hit from the ray's origin in scene units, t times the direction's length: (...) float32, inf on a miss."""
+        check_recorded(self, "distance")
+        length = np.linalg.norm(to_numpy(self._source()[1].directions).astype(np.float64), axis=1).reshape(self.shape)
+        t = to_numpy(self.t)
+        return self._given(np.multiply(t, length, out=np.full(t.shape, np.inf), where=np.isfinite(t)).astype(np.float32))
+
+    @property
+    def points(self) -> ArrayT:
+        """The same as `point`."""
+        return self.point
+
+    @property
+    def normals(self) -> ArrayT:
+        """The same as `normal`."""
+        return self.normal
+
+    @property
     def point(self) -> ArrayT:
-        """Point where each ray meets its primitive, in world space, to within `point_error`: (N, 3) float32, NaN on a miss.
+        """Point where each ray meets its primitive, in world space, to within `point_error`: (..., 3) float32, NaN on a miss.
 
         It is computed from the ray in float64 and rounded once, because u and v are inaccurate on needle-shaped triangles. If the
         exact ray misses the triangle by a rounding error, the point is moved onto the triangle, and `point_error` includes the
@@ -61,17 +90,17 @@ class HitPoints(Generic[ArrayT]):
 
     @property
     def point_error(self) -> ArrayT:
-        """Error bound of each coordinate of `point`, usually half a float32 rounding step: (N, 3) float32, NaN on a miss."""
+        """Error bound of each coordinate of `point`, usually half a float32 rounding step: (..., 3) float32, NaN on a miss."""
         return self._filled("error")
 
     @property
     def normal(self) -> ArrayT:
-        """Unit geometric normal, on a triangle's counter-clockwise side or outwards of a sphere: (N, 3) float32, NaN on a miss."""
+        """Unit geometric normal, on a triangle's counter-clockwise side or outwards of a sphere: (..., 3) float32, NaN on a miss."""
         return self._filled("normal")
 
     @property
     def shading_normal(self) -> ArrayT:
-        """Unit normal interpolated from vertex normals, on the side of `normal`: (N, 3) float32, NaN on a miss.
+        """Unit normal interpolated from vertex normals, on the side of `normal`: (..., 3) float32, NaN on a miss.
 
         Without vertex normals it equals `normal`. A refit does not change the vertex normals.
         """
@@ -79,7 +108,7 @@ class HitPoints(Generic[ArrayT]):
 
     @property
     def uv(self) -> ArrayT:
-        """Interpolated texture coordinates, with (0, 0) at the top left of the texture: (N, 2) float32, NaN on a miss.
+        """Interpolated texture coordinates, with (0, 0) at the top left of the texture: (..., 2) float32, NaN on a miss.
 
         In a scene they are (0, 0) on objects without texture coordinates.
         """
@@ -87,17 +116,17 @@ class HitPoints(Generic[ArrayT]):
 
     @property
     def object(self) -> ArrayT:
-        """Index into `scene.objects`, or len(scene.objects) plus the index into `scene.spheres`: (N,) int32, -1 on a miss."""
+        """Index into `scene.objects`, or len(scene.objects) plus the index into `scene.spheres`: (...) int32, -1 on a miss."""
         return self._filled("object")
 
     @property
     def instance(self) -> ArrayT:
-        """Index for `Instances.move`: `object` over a scene, else the row of `accel.geometry.to_world`. (N,) int32, -1 on a miss."""
+        """Index for `Instances.move`: `object` over a scene, else the row of `accel.geometry.to_world`. (...) int32, -1 on a miss."""
         return self._filled("instance")
 
     @property
     def material(self) -> ArrayT:
-        """Index into `scene.materials`: (N,) int32, -1 on a miss."""
+        """Index into `scene.materials`: (...) int32, -1 on a miss."""
         return self._filled("material")
 
     def gradients(self, t: ArrayLike | None = None, u: ArrayLike | None = None, v: ArrayLike | None = None,
@@ -108,9 +137,9 @@ class HitPoints(Generic[ArrayT]):
 
         Parameters
         ----------
-        t, u, v : (N,) array_like, optional
+        t, u, v : (...) array_like, optional
             Gradient of the loss with respect to `t`, `u` and `v`; zero by default. Values of misses are ignored.
-        point : (N, 3) array_like, optional
+        point : (..., 3) array_like, optional
             Gradient of the loss with respect to `point`; zero by default.
 
         Returns
@@ -125,18 +154,32 @@ class HitPoints(Generic[ArrayT]):
         """
         snapshot, rays, _ = self._source()
         snapshot.structure.require_one_mesh(ONE_MESH)
-        prim_id: Any = self.prim_id
-        found: Gradients[Any] = adjoint(snapshot.mesh, rays.origins, rays.directions, prim_id, Cotangents(t, u, v, point))
+        shape = self.shape
         give: Any = to_tensor_like(self.t)
-        return found if give is None else Gradients(*map(give, found))
+        cotangents = Cotangents(t, u, v, point).checked(shape)
+        found: Gradients[Any] = adjoint(snapshot.mesh, rays.origins, rays.directions, to_numpy(self.prim_id).reshape(-1), cotangents)
+        found = Gradients(found.vertices, *(each.reshape(*shape, 3) for each in found[1:]))
+        if give is not None:
+            found = Gradients(*map(give, found))
+        return found
+
+    def _flat(self) -> HitPoints[ArrayT]:
+        """Return the hits (N,)."""
+        return self
 
     def _source(self) -> Source:
         if self.source is None:
             raise InputError("these hits have no rays, from which points, normals and ids are computed: use the result of closest_hit")
         return self.source
 
+    def _given(self, values: np.ndarray) -> ArrayT:
+        """Return NumPy values as an array of the hits' library."""
+        given: ArrayT = given_like(self.t, values)
+        return given
+
     def _filled(self, name: str) -> ArrayT:
         snapshot, rays, worlds = self._source()
+        n, device, shape = len(rays.origins), snapshot.device, self.shape
         if name in ("error", "normal", "shading", "uv"):
             check_recorded(self, name)
         scene, surfaces, object_ids = device_scene(snapshot)
@@ -145,22 +188,21 @@ class HitPoints(Generic[ArrayT]):
         _require(scene, name)
         if name == "instance" and scene.objects is not None:
             name = "object"
-        n, device = len(self.t), snapshot.device
         out: Any = HitPlaces()
         setattr(out, name, array := wp.empty(n, dtype=fields_of(HitPlaces)[name].dtype, device=device))
         hits: Any = HitArrays()
         for each in fields_of(HitArrays):
-            setattr(hits, each, to_warp(getattr(self, each)).to(device))
+            setattr(hits, each, in_shape(to_warp(getattr(self, each)).to(device), (n,)))
         if worlds is not None:
-            hits.prim_id = upload(worlds.over_all(self.prim_id), wp.int32, device)
+            hits.prim_id = upload(worlds.over_all(hits.prim_id), wp.int32, device)
         inputs = [surfaces, object_ids, rays_on(device, rays), hits, out]
         launch_on(device, hit_places, n, *inputs, None, threads=thread_count(None), step=HITS_PER_LAUNCH)
         if isinstance(self.t, wp.array):
             if name == "point":
-                record(self, point=array)
-            return array
+                record(self._flat(), point=array)
+            return in_shape(array, shape)
         give: Any = to_tensor_like(self.t)
-        return array.numpy() if give is None else give(array)
+        return in_shape(array.numpy(), shape) if give is None else give(in_shape(array if device.is_cuda else array.numpy(), shape))
 
 
 def _require(scene: FlatScene, name: str) -> None:

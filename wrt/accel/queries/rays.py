@@ -16,6 +16,7 @@ from wrt.core.warp_private import keep
 from wrt.kernels.query import FARTHEST, RayArrays
 from wrt.kernels.warp_private import fields_of
 
+MISS = 'with invalid="miss", closest_hit and any_hit let such rays miss'
 LOWEST = {"t_min": 0.0, "t_max": -np.inf}
 
 
@@ -39,6 +40,11 @@ class Rays(NamedTuple):
         """Copy Warp arrays of other devices to `device`."""
         return Rays(*[array.to(device) if isinstance(array, wp.array) else array for array in self])
 
+    def of(self, rows: np.ndarray) -> Rays:
+        """Return some of the rays. rows: indices (M,)."""
+        return Rays(*(wp.array(array.numpy()[rows], dtype=array.dtype, device=array.device) if isinstance(array, wp.array)
+                      else constant(array[0], len(rows)) if array.strides == (0,) and len(array) else array[rows] for array in self))
+
     def checked(self) -> Rays:
         """Convert the rays to contiguous float32. Raises InputError for the first value that is not valid.
 
@@ -48,7 +54,8 @@ class Rays(NamedTuple):
             rays: Any = self[:2]
             origins, directions = (a if a.is_contiguous else a.contiguous() for a in rays)
         else:
-            origins, directions = vectors(self.origins, "origins", FARTHEST), vectors(self.directions, "directions")
+            origins = vectors(self.origins, "origins", FARTHEST, MISS)
+            directions = vectors(self.directions, "directions", hint=MISS)
             _check_not_zero(directions)
         return Rays(origins, directions, _checked_ends(self.t_min, "t_min"), _checked_ends(self.t_max, "t_max"))
 
@@ -70,6 +77,24 @@ def rays_of(origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike, t_max: 
     if len(rays[1]) != n:
         raise InputError(f"must have as many rows as origins ({n}), got {len(rays[1])}", argument="directions")
     return Rays(rays[0], rays[1], _segment_ends(t_min, n, "t_min"), _segment_ends(t_max, n, "t_max"))
+
+
+def are_rows(origins: Any, directions: Any) -> bool:
+    """Return whether `rays_of` takes both arguments as they are: NumPy arrays (N, 3), the usual case, or Warp arrays (N,)."""
+    if type(origins) is np.ndarray and type(directions) is np.ndarray:
+        return origins.ndim == 2 and origins.shape == directions.shape
+    if isinstance(origins, wp.array):
+        return isinstance(directions, wp.array) and origins.dtype == directions.dtype == wp.vec3 and origins.shape == directions.shape \
+            and origins.ndim == 1
+    mine, other = (getattr(array, "shape", ()) for array in (origins, directions))
+    return len(mine) == 2 and mine == other and not isinstance(directions, wp.array)
+
+
+def is_valid(origins: np.ndarray, directions: np.ndarray, t_min: np.ndarray, t_max: np.ndarray) -> np.ndarray:
+    """Return whether each of some rays is valid, (N,) bool."""
+    origins, directions = float32(origins), float32(directions)
+    near, finite = (np.abs(origins) <= FARTHEST).all(axis=1), np.isfinite(directions).all(axis=1)
+    return near & finite & directions.any(axis=1) & (t_min >= LOWEST["t_min"]) & (t_max >= LOWEST["t_max"])
 
 
 def rays_on(device: Device, rays: Rays) -> RayArrays:
@@ -151,7 +176,7 @@ def _rows(value: ArrayLike, name: str) -> np.ndarray:
     return array
 
 
-def vectors(value: ArrayLike, name: str, most: float = float(np.finfo(np.float32).max)) -> np.ndarray:
+def vectors(value: ArrayLike, name: str, most: float = float(np.finfo(np.float32).max), hint: str | None = None) -> np.ndarray:
     """Convert to (N, 3) float32. Raises InputError for other shapes, and for components that are NaN or beyond +-`most`."""
     array = float32(_rows(value, name))
     numbers = array.reshape(-1)
@@ -159,7 +184,7 @@ def vectors(value: ArrayLike, name: str, most: float = float(np.finfo(np.float32
         for good, what in ((np.isfinite(array), "finite"), (np.abs(array) <= most, f"within {most:g}")):
             if not good.all():
                 row = int(np.argmin(good.all(axis=1)))
-                raise InputError(f"must be {what}; row {row} is [{', '.join(map(str, array[row]))}]", argument=name)
+                raise InputError(f"must be {what}; row {row} is [{', '.join(map(str, array[row]))}]", argument=name, hint=hint)
     return array
 
 
@@ -169,4 +194,4 @@ def _check_not_zero(directions: np.ndarray) -> None:
         zero &= directions[:, 1] == 0.0
         zero &= directions[:, 2] == 0.0
         if zero.any():
-            raise InputError(f"must not be zero; row {int(np.argmax(zero))} is", argument="directions")
+            raise InputError(f"must not be zero; row {int(np.argmax(zero))} is", argument="directions", hint=MISS)

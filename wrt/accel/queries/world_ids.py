@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from typing import TypeGuard
 
 import numpy as np
@@ -38,6 +39,15 @@ class WorldIds:
             raise InputError(f"must be 0 to {count - 1}, got {ids.min() if ids.min() < 0 else ids.max()}", argument="world")
         return upload(np.broadcast_to(ids, (n,)).astype(np.int32), wp.int32, device)
 
+    def of(self, rays: np.ndarray) -> WorldIds:
+        """Return the worlds of some of the rays, given by their indices."""
+        some = copy(self)
+        arrays: WarpStruct = Worlds()
+        arrays.id = wp.array(self.arrays.id.numpy()[rays], dtype=wp.int32, device=self.arrays.id.device)
+        arrays.root = self.arrays.root
+        vars(some).update(arrays=arrays)
+        return some
+
     def over_all(self, prim_id: ArrayLike) -> np.ndarray:
         """Convert prim_ids, which count within a ray's world, to indices among the primitives of all worlds, (N,) int32; -1 stays."""
         own, world = to_numpy(prim_id), self.arrays.id.numpy()
@@ -54,7 +64,9 @@ def check_world(snapshot: Snapshot, world: ArrayLike | None, n: int) -> WorldIds
     geometry = snapshot.geometry
     if world is None:
         if over_worlds(geometry) and geometry.n_worlds > 1:
-            raise InputError(f"must not be None: the structure is over {geometry.n_worlds} worlds", argument="world")
+            raise InputError(f"must not be None: the structure is over {geometry.n_worlds} worlds, because wrt.build makes a world of"
+                             " each entry of a list, and a ray sees one of them", argument="world",
+                             hint="for one scene of these meshes: wrt.build(wrt.Scene.of(meshes))")
         return None
     if not over_worlds(geometry):
         raise InputError("is for structures over worlds, which wrt.build makes from a list of meshes or scenes", argument="world")

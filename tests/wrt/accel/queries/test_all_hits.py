@@ -251,7 +251,7 @@ def test_no_rays_and_no_triangles() -> None:
     (lambda accel, o: wrt.first_hits(accel, 2**31 - 1, np.ones((9, 3)), np.ones((9, 3))), (None, "hits do not fit")),
     (lambda accel, o: wrt.first_hits(accel, 1.5, o, o), ("k", "whole number")),  # type: ignore[arg-type]
     (lambda accel, o: wrt.all_hits(accel, o, o * np.nan), ("directions", "finite")),
-    (lambda accel, o: wrt.count_hits(accel, o, o[:1]), ("directions", "as many rows")),
+    (lambda accel, o: wrt.count_hits(accel, np.ones((3, 3)), np.ones((2, 3))), ("directions", "broadcasts")),
     (lambda accel, o: wrt.count_hits(accel, o, o, t_min=-1.0), ("t_min", "NaN or below 0")),
 ])
 def test_what_is_refused(call: Any, said: Refusal) -> None:

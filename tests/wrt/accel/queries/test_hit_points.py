@@ -26,7 +26,7 @@ from wrt.scene.materials import Material
 from wrt.scene.model import Object, Scene, Sphere
 
 N = 700
-PROPERTIES = [name for name, value in vars(HitPoints).items() if isinstance(value, property)]
+PROPERTIES = [name for name, value in vars(HitPoints).items() if isinstance(value, property) and name != "shape"]
 
 
 def triangles(rng: np.random.Generator, kind: str) -> np.ndarray:
