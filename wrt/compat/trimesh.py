@@ -196,7 +196,8 @@ class _ScaledStructure:
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         out = ((points >= self.low) & (points <= self.high)).all(axis=1)
-        out[out] = contains(self.accel, self.to_local(points[out]), threads=self.threads)
+        if out.any():
+            out[out] = contains(self.accel, self.to_local(points[out]), threads=self.threads)
         return out
 
 

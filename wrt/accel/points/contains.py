@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import overload
 
 import numpy as np
@@ -92,7 +93,13 @@ def odd_crossings(query: ListQuery, rows: np.ndarray, seed: int = 0) -> np.ndarr
     inside = np.zeros(len(rows), bool)
     low, high = used_bounds(query.snapshot)
     within = np.nonzero(((rows >= low) & (rows <= high)).all(axis=1))[0]
-    direction = np.random.default_rng(seed).normal(size=3).astype(np.float32)
-    counts = query.of(rows[within], np.broadcast_to(direction, (len(within), 3))).counts()
-    inside[within] = counts % 2 == 1
+    if len(within):
+        counts = query.of(rows[within], np.broadcast_to(direction_of(seed), (len(within), 3))).counts()
+        inside[within] = counts % 2 == 1
     return inside
+
+
+@cache
+def direction_of(seed: int) -> np.ndarray:
+    """Return a random direction, (3,) float32."""
+    return np.random.default_rng(seed).normal(size=3).astype(np.float32)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Generic, NamedTuple, overload
+from typing import Any, Generic, NamedTuple, TypeVar, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +32,7 @@ from wrt.kernels.structs import Hit
 ALL = (1 << 30) - 1
 RAYS_AT_ONCE = 1 << 18  # rays per batch; their hit lists take 32 MiB in the first traversal
 HIT_KINDS = wp.float32, wp.float32, wp.float32, wp.int32  # of HitArrays
+T = TypeVar("T")
 COPY_HITS = RawKernel(copy_hits, RayArrays(), HitLists(), None, HitArrays())
 
 
@@ -122,7 +123,7 @@ class ListQuery:
 
     def all(self, limit: int = ALL) -> AllHits[Any]:
         """Find the first `limit` hits of each ray."""
-        if self.n <= MOST and self.device.is_cpu and (few := with_stack(partial(self._few, min(limit, ALL)))) is not None:
+        if (few := self._few(min(limit, ALL), lambda lists, counts: lists.hits_of(counts))) is not None:
             return AllHits(self.converted(few[0]), *map(self.give, few[1:]))
         counts, parts = [np.zeros(0, np.int64)], []
         for rays, lists, of_each in self._listed(limit):
@@ -151,6 +152,8 @@ class ListQuery:
 
     def counts(self) -> np.ndarray:
         """Count the hits of each ray, (N,) int64. If no triangle is in several leaves, the first traversal is enough."""
+        if (few := self._few(ALL, lambda lists, counts: counts)) is not None:
+            return few
         counting = self.snapshot.stats.references == len(self.snapshot.geometry)
         return np.concatenate([np.zeros(0, np.int64), *(of_each for _, _, of_each in self._listed(ALL, counting))])
 
@@ -158,16 +161,20 @@ class ListQuery:
         """Convert int64 values to an array of the caller's library."""
         return values if self.give is to_numpy else self.give(upload(values, wp.int64, self.device))
 
-    def _few(self, limit: int) -> list[np.ndarray] | None:
-        """Return the fields of AllHits, or None if a ray has too many hits for FewLists."""
+    def _few(self, limit: int, take: Callable[[FewLists, np.ndarray], T]) -> T | None:
+        """Return `take` of the lists of few rays and their numbers of hits; None on a GPU, and for many rays or hits."""
+        return with_stack(partial(self._take_few, limit, take)) if self.n <= MOST and self.device.is_cpu else None
+
+    def _take_few(self, limit: int, take: Callable[[FewLists, np.ndarray], T]) -> T | None:
         free = few_lists(self.snapshot.structure)
         try:
             lists = free.pop()
         except IndexError:
             lists = FewLists(list_hits(self.snapshot.structure), COPY_HITS)
-        found = lists.find(self.snapshot, self.rays, limit, self.mesh)
+        counts = lists.find(self.snapshot, self.rays, limit, self.mesh)
+        taken = None if counts is None else take(lists, counts)
         free.append(lists)  # not after an exception
-        return found
+        return taken
 
     def _listed(self, limit: int, counting: bool = False) -> Iterator[tuple[object, list[_Lists], np.ndarray]]:
         """Yield, for each batch of the rays: these rays, one or two HitLists, and the number of hits of each ray.

@@ -35,16 +35,16 @@ class FewLists:
         self.first = np.arange(0, FEW * MOST + 1, FEW, dtype=np.int32)
         self.counts, self.begin = np.empty((2, MOST), np.int32)
         self.rows = HostMemory().empty(FEW * MOST, Hit)
-        self.hits = [np.empty(FEW * MOST, dtype) for dtype in HIT_TYPES.values()]
+        self.out = [np.empty(FEW * MOST, dtype) for dtype in HIT_TYPES.values()]
         self.lists = struct_record(HitLists, [0, False, None, None, self.first, self.counts, self.rows])
         rays = struct_record(RayArrays, self.rays)
         self.fill, self.copy = raw_launch(fill.kernel, *fill.inputs, 0), raw_launch(copy.kernel, *copy.inputs, 0)
         self.fill.set(1, rays)
-        for i, record in enumerate((rays, self.lists, array_record(self.begin), struct_record(HitArrays, self.hits))):
+        for i, record in enumerate((rays, self.lists, array_record(self.begin), struct_record(HitArrays, self.out))):
             self.copy.set(i, record)
 
-    def find(self, snapshot: Snapshot, rays: Rays, limit: int, mesh: tuple[WarpArray | None, WarpArray | None]) -> list[np.ndarray] | None:
-        """Return the first row of each ray's list, and t, u, v and prim_id of the hits; None if a ray has more than FEW hits.
+    def find(self, snapshot: Snapshot, rays: Rays, limit: int, mesh: tuple[WarpArray | None, WarpArray | None]) -> np.ndarray | None:
+        """Fill the lists. Return the number of hits of each ray, (N,) int64; None if a ray has more than FEW hits.
 
         mesh: vertices and faces, to list crossings only; else two times None.
         """
@@ -60,11 +60,15 @@ class FewLists:
         self.fill.set(2, self.lists)
         self.fill.set_dim(n)
         self.fill.launch()
-        if self.counts[:n].max(initial=0) > FEW:
-            return None
+        counts = self.counts[:n].astype(np.int64)
+        return counts if counts.max(initial=0) <= FEW else None
+
+    def hits_of(self, counts: np.ndarray) -> list[np.ndarray]:
+        """Return the first row of each ray's hits, (N + 1,) int64, and t, u, v and prim_id of the hits. counts: from `find`."""
+        n = len(counts)
         first = np.zeros(n + 1, np.int64)
-        np.cumsum(self.counts[:n], out=first[1:])
+        np.cumsum(counts, out=first[1:])
         self.begin[:n] = first[:-1]
         self.copy.set_dim(n)
         self.copy.launch()
-        return [first, *(array[:first[-1]].copy() for array in self.hits)]
+        return [first, *(array[:first[-1]].copy() for array in self.out)]
