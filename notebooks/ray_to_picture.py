@@ -128,6 +128,79 @@ film = wrt.render(night, camera=lens, size=SIZE, spp=2 * SPP)
 wrt.side_by_side({"pinhole": wrt.render(night, camera=pinhole, size=SIZE, spp=SPP), "lens, f / 2.25, focused at 6": film})
 
 # %% [markdown]
+# ### Three rays that find the image
+# A thin lens changes the slope of a ray by $-h/f$, where $h$ is the height at which the ray crosses the lens. Three rays of a point are
+# easy to draw:
+# - The **chief ray** crosses the middle of the lens, $h = 0$, and goes straight on.
+# - The **parallel ray** arrives parallel to the axis, and leaves through the focal point behind the lens.
+# - The **focal ray** comes through the focal point in front of the lens, and leaves parallel to the axis.
+#
+# They meet at the image of the point; so do all other rays of the point, as the cell checks.
+
+# %%
+f, s, y = 1.0, 3.0, 0.6
+image = 1 / (1 / f - 1 / s)  # s'
+fig, axes = plt.subplots(1, 2, figsize=(11.0, 3.2), dpi=80, layout="constrained")
+for ax in axes:
+    ax.annotate("", (0, 1.0), (0, -1.0), arrowprops={"arrowstyle": "<->", "color": "C0", "lw": 1.6})
+    ax.axhline(0, color="0.8", linewidth=0.8)
+    ax.plot([-f, f], [0, 0], "k|")
+for name, h, color in (("chief ray", 0.0, "C3"), ("parallel ray", y, "C2"), ("focal ray", -y * image / s, "C1"),
+                       ("another ray", -0.75, "0.6"), ("another ray", 0.3, "0.6")):
+    slope = (h - y) / s
+    behind = slope - h / f
+    assert np.isclose(h + image * behind, -y * image / s)  # the image is upside down, s'/s times as large
+    axes[0].plot([-s, 0, 1.4 * image], [y, h, h + 1.4 * image * behind], color=color, label=None if h == 0.3 else name)
+axes[0].plot([-s, image], [y, -y * image / s], "ko", markersize=4)
+axes[0].text(-f, 0.06, "f"), axes[0].text(f, 0.06, "f"), axes[0].text(image + 0.08, -0.3, "image")
+axes[0].legend(fontsize=8, loc="upper right")
+axes[0].set(title=f"a point at s = {s:g} and its image at s' = {image:g}", xlabel="along the axis, units", ylabel="height, units",
+            ylim=(-1.1, 1.1))
+
+S = np.array([-image, 0.25])  # the camera traces from the sensor, which stands at s'
+P = np.array([s, -S[1] * s / image])
+for h in np.linspace(-0.8, 0.8, 5):
+    slope = (h - S[1]) / image - h / f
+    assert np.isclose(h + s * slope, P[1])  # through the lens, every ray from S goes to P
+    axes[1].plot([S[0], 0, 1.5 * s], [S[1], h, h + 1.5 * s * slope], color="C3" if h == 0 else "C4", linewidth=1.6 if h == 0 else 1.0)
+axes[1].axvline(-image, color="0.3"), axes[1].axvline(s, color="0.6", linestyle=":")
+for name, x, height in (("S", S[0] - 0.3, S[1]), ("L", 0.08, 0.85), ("P", P[0] + 0.06, P[1] - 0.3), ("sensor", -image + 0.06, -1.0),
+                        ("in focus", s + 0.06, 0.85)):
+    axes[1].text(x, height, name)
+axes[1].set(title="from S on the sensor by L on the lens to P", xlabel="along the axis, units", xlim=(-2.1, 4.6), ylim=(-1.1, 1.1))
+plt.show()
+
+# %% [markdown]
+# The right picture is what a camera of wrt does, from left to right. The chief ray (red) from the point $S$ of the sensor gives the point
+# $P$ in the plane in focus. The ray of a sample starts at a random point $L$ of the lens, and goes to $P$. So the sensor itself is never
+# needed. The next cell inspects the rays that wrt traces for one pixel (`wrt.inspect`), in the camera's coordinates. Their origins are
+# points $L$; their distances from the chief ray follow $r\,|z - s| / s$, apart from the width of the pixel.
+
+# %%
+samples = wrt.inspect(night, (240, 60), camera=lens, spp=32, size=(480, 270), max_depth=0).samples
+rotation, eye = lens.camera_to_world[:3, :3], lens.camera_to_world[:3, 3]
+starts = np.array([(sample.root.origin - eye) @ rotation for sample in samples])
+toward = np.array([sample.root.direction @ rotation for sample in samples])
+toward /= -toward[:, 2:]  # one unit along the axis
+assert np.abs(starts[:, 2]).max() < 1e-5 and np.hypot(starts[:, 0], starts[:, 1]).max() <= lens.aperture_radius * (1 + 1e-5)
+fig, ax = plt.subplots(figsize=(7.2, 2.8), dpi=80, layout="constrained")
+z = np.linspace(0, 14, 57)
+across = starts[:, :1] + toward[:, :1] * z
+ax.plot(z, across.T, color="C4", linewidth=0.6)
+center, r = across.mean(axis=0), lens.aperture_radius
+for sign in (-1, 1):
+    ax.plot(z, center + sign * r * np.abs(z - lens.focus_distance) / lens.focus_distance, "k--", linewidth=1,
+            label="$r\\,|z - s|\\,/\\,s$" if sign == 1 else None)
+ax.axvline(lens.focus_distance, color="0.6", linestyle=":")
+ax.set(xlabel="distance along the axis, units (in focus: 6)", ylabel="x, units")
+ax.legend(fontsize=8)
+plt.show()
+footprint = 2 * lens.focus_distance * np.tan(0.5 * lens.fov_y) / 270  # of a pixel, in the plane in focus
+in_focus = np.ptp(across[:, np.argmin(np.abs(z - lens.focus_distance))])
+print(f"in focus, the rays of a pixel are {in_focus / footprint:.1f} pixels wide (the pixel filter), at the lens {2 * r / footprint:.0f}")
+assert in_focus < 5 * footprint
+
+# %% [markdown]
 # ## How large is the blur?
 # Light from a point at distance $z$ reaches a lens of radius $r$ in a cone. In the plane in focus, at distance $s$, this cone has the
 # diameter $2 r\,|z - s| / z$ (similar triangles). The picture's height $H$, in pixels, covers the length $2 s \tan(\mathrm{fov}_y/2)$ of
@@ -210,8 +283,32 @@ wrt.side_by_side({"round": lamps(4 * SPP), "three blades": lamps(4 * SPP, blades
 
 # %% [markdown]
 # ## Exercises
-# 1. In "Light by hand", remove the offset of $10^{-4}$. Which pixels change, and why not all of them?
-# 2. Use varying normals in the picture that is shaded by hand. `mesh.normals` is None for `pot on a floor`, but `teapot().normals` is
-#    not. The normal at a hit is the mean of the normals at the three corners, with the weights $1-u-v$, $u$ and $v$.
-# 3. At which f-number is the lamp at distance 24 blurred by one pixel? Predict it, then measure it.
-# 4. `Camera.lens` lets `fov_y` depend on `focus_distance` ("focus breathing"). By how much does it change from 4.8 to 10.4?
+# **1.** In "Light by hand", remove the offset of $10^{-4}$. Which pixels change, and why not all of them?
+# <details><summary>Solution</summary>
+#
+# Lit points become dark in a pattern: those whose rounded hit point lies below its triangle, so that the shadow ray hits this triangle
+# at once. A point that was rounded upwards starts above it. [whitted](whitted.ipynb) measures how large the offset may be.
+# </details>
+#
+# **2.** Use varying normals in the picture that is shaded by hand. `mesh.normals` is None for `pot on a floor`, but `teapot().normals` is
+# not. The normal at a hit is the mean of the normals at the three corners, with the weights $1-u-v$, $u$ and $v$.
+# <details><summary>Solution</summary>
+#
+# The pot's faces follow the two of the floor: `n = teapot(64).normals[teapot(64).faces[prim_id - 2]]` has the shape (N, 3, 3).
+# `smooth = (weights[:, :, None] * n).sum(axis=1)`, with the three weights of each hit, then divided by its length. Use `smooth` for the
+# cosine, and the normal of the triangle for the offset.
+# </details>
+#
+# **3.** At which f-number is the lamp at distance 24 blurred by one pixel? Predict it, then measure it.
+# <details><summary>Solution</summary>
+#
+# The diameter is proportional to $r = f/(2N)$. So $N = 2.25\,$`blur(24.0)`, about 80. To measure it, use
+# `replace(lens, aperture_radius=0.9 / (2 * N))` in `spread`.
+# </details>
+#
+# **4.** `Camera.lens` lets `fov_y` depend on `focus_distance` ("focus breathing"). By how much does it change from 4.8 to 10.4?
+# <details><summary>Solution</summary>
+#
+# The sensor stands at $s' = fs/(s-f)$: 1.108 for 4.8, and 0.985 for 10.4. $\mathrm{fov}_y = 2\arctan(0.40/(2s'))$ is 20.5 and 23.0
+# degrees: 2.5 degrees more.
+# </details>
