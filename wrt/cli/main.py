@@ -22,6 +22,7 @@ from wrt.cli.commands import COMMANDS
 from wrt.cli.common import Commands, say
 from wrt.core.errors import InputError
 from wrt.core.interrupts import Interrupted, exit_code, raise_on_termination
+from wrt.core.packages import needed_by
 
 GC_THRESHOLD = 500_000  # New objects between two garbage collections. Starting wrt makes 300,000 objects, which stay.
 # Parts of error messages that mean lack of memory: for a thread, for an array of Warp, for a shared library.
@@ -41,7 +42,8 @@ def main() -> None:
         sys.stdout.reconfigure(errors="backslashreplace")  # a name that stdout cannot encode is no error
     raise_on_termination()
     try:
-        code = cli(standalone_mode=False)
+        with needed_by("this command"):
+            code = cli(standalone_mode=False)
     except InputError as error:
         say(f"error: {error}")
         code = 2

@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
-from trimesh.caching import Cache, cache_decorator
-from trimesh.ray.ray_util import contains_points
 
 from wrt.accel.points.contains import contains, open_edges_of
 from wrt.accel.queries.raw_kernel import RawKernel
@@ -20,11 +18,16 @@ from wrt.compat.given_rays import RayFormat
 from wrt.compat.surfaces import every_hit
 from wrt.core.arrays import real_numbers
 from wrt.core.errors import InputError
+from wrt.core.packages import needed_by
 from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike, WarpStruct
 from wrt.core.warp_private import record_of, struct_record
 from wrt.kernels.placed_rays import HitPoints64, PlacedRays, Placement, locate_hits, place_rays
 from wrt.scene.mesh import Mesh
+
+with needed_by("wrt.compat.trimesh"):
+    from trimesh.caching import Cache, cache_decorator
+    from trimesh.ray.ray_util import contains_points
 
 if TYPE_CHECKING:
     import trimesh

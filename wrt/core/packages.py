@@ -8,7 +8,10 @@ from contextlib import contextmanager
 from wrt.core.errors import InputError
 
 # Names of packages that differ from the names of their modules.
-INSTALLED_AS = {"OpenImageIO": "openimageio", "PIL": "pillow", "elftools": "pyelftools"}
+INSTALLED_AS = {"OpenImageIO": "openimageio", "PIL": "pillow", "mapbox_earcut": "mapbox-earcut"}
+# Modules that only an extra of wrt installs, and the extra; tests/wrt/core/test_packages.py compares with pyproject.toml.
+EXTRAS = {"distributed": "cluster", "elftools": "instructions", "embreex": "peers", "jax": "jax", "matplotlib": "plots",
+          "mitsuba": "peers", "torch": "torch", "viser": "viewer"}
 
 
 @contextmanager
@@ -17,5 +20,8 @@ def needed_by(what: str) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        package = (error.name or str(error)).split(".")[0]
-        raise InputError(f"{what} needs {package}", hint=f"pip install {INSTALLED_AS.get(package, package)}") from error
+        module = (error.name or str(error)).split(".")[0]
+        if module == "wrt":
+            raise  # a defect of wrt, not a missing package
+        extra, package = EXTRAS.get(module), INSTALLED_AS.get(module, module)
+        raise InputError(f"{what} needs {module}", hint=f'pip install "wrt[{extra}]"' if extra else f"pip install {package}") from error

@@ -15,6 +15,7 @@ import warp as wp
 from wrt.core.device import memory_of, start, upload
 from wrt.core.errors import InputError
 from wrt.core.html import html_table
+from wrt.core.packages import needed_by
 from wrt.core.types import PathLike
 from wrt.io.load import as_scene
 from wrt.kernels.shade.paths import BRANCHES
@@ -106,7 +107,8 @@ class Profile:
 
     def heatmap(self, name: str) -> Image.Image:
         """Return a map of `maps` as a PIL image with a colour scale. Raise InputError for an unknown name."""
-        from PIL import Image
+        with needed_by("a heat map"):
+            from PIL import Image
 
         from wrt.picture.heatmap import heatmap
 
