@@ -318,6 +318,17 @@ def test_the_device_code_names_files_that_exist(file: str) -> None:
         assert any(any(folder.glob(name)) for folder in places), name
 
 
+def test_the_lecture_names_headings_and_files_that_exist() -> None:
+    lines = (ROOT / "docs" / "lecture.md").read_text(encoding="utf-8").splitlines()
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("| ")][1:]
+    assert len(rows) > 20
+    for topic, place, file, _ in rows:
+        notebook, heading = re.sub(r"\[(\w+)\]\([^)]*\)", r"\1", place).split(": ")
+        source = (ROOT / "notebooks" / f"{notebook}.py").read_text(encoding="utf-8")
+        assert re.search(rf"^# ##+ {re.escape(heading)}", source, re.MULTILINE), topic
+        assert not file or (ROOT / "kernels" / file.strip("`")).exists(), topic
+
+
 def test_every_page_is_reached_from_the_readme() -> None:
     reached, new = set(), [ROOT / "README.md"]
     while new:
