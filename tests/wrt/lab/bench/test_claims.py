@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import json
 from pathlib import Path
 
@@ -14,10 +15,10 @@ from PIL import Image
 from tests.command_line import wrt
 from tests.refused import refused
 from wrt.lab.bench import claims as bench
-from wrt.lab.bench.report import markdown
+from wrt.lab.bench.report import Row, markdown
 from wrt.lab.bench.visibility import terrain
 from wrt.lab.claims import scenes
-from wrt.lab.claims.claim import CLAIMS, Figure, Study
+from wrt.lab.claims.claim import CLAIMS, Claim, Figure, Study
 from wrt.lab.claims.scene_files import scene_files
 from wrt.lab.claims.scenes import PATH, open_scene
 from wrt.lab.plans import Claims as Plan
@@ -68,7 +69,48 @@ def test_the_report_has_the_numbers_the_sources_and_the_table_of_rules() -> None
     lines = list(csv.DictReader(io.StringIO(bench.as_csv(rows, plan, "", ".csv").decode())))
     assert [float(line["ours"]) for line in lines] == [row.ours for row in rows]
     picture = bench.as_picture(rows, plan, "", ".png")
-    assert Image.open(io.BytesIO(picture)).size[0] == 1200 and picture == bench.as_picture(rows, plan, "", ".png")
+    assert picture == bench.as_picture(rows, plan, "", ".png")
+
+def test_each_table_of_rules_names_its_own_scene() -> None:
+    plan = Plan(names=("rules",), side=8)
+    tables = {part.title: part.text for part in bench.parts(list(bench.rows(plan)), plan) if part.title.startswith("Nodes a ray")}
+    assert [text.split(":")[0] for text in tables.values()] == ["scene ball", "scene terrain"]
+    assert [title.split(", ")[-1] for title in tables] == ["bunny", "sponza"]
+
+
+def test_rules_that_ctrl_c_cut_off_are_empty_cells() -> None:
+    plan = Plan(names=("rules",), side=8)
+    rows = list(itertools.islice(bench.rows(plan), 5))
+    (table,) = (part for part in bench.parts(rows, plan) if part.lines and part.title.startswith("Nodes a ray"))
+    assert [[cell == "" for cell in line[1:]] for line in table.lines] == [[False, False, True, True]] + [[False, True, True, True]] * 3
+    assert bench.as_picture(rows, plan, "", ".png")
+
+
+def claims_rows(count: int) -> list[Row]:
+    """Return rows of `count` claims with two numbers each, one of which differs."""
+    figures = (Figure("first", 2.0, 3.0, "nodes", "scene a; own camera; half of it", "10 of 20"),
+               Figure("second", 2.0, 9.0, "nodes", "scene b; own camera", ""))
+    claim = Claim("authors, Figure 1", "their scene", "read", lambda study: iter(figures))
+    return [Row(claim=f"c{i}", **vars(each), ratio=each.ratio, verdict=each.verdict, **{name: getattr(claim, name) for name in
+                ("source", "setup", "sure")}) for i in range(count) for each in figures]
+
+
+def test_the_report_has_a_list_item_for_each_claim_and_says_what_is_common_once() -> None:
+    text = bench.parts(claims_rows(2), Plan())[-1].text
+    first = "- **c0**: authors, Figure 1 (read). Published set-up: their scene. Here: scene a; own camera; scene b."
+    second = "  - *first*: half of it; measured: 10 of 20"
+    assert text.split("\n") == [first, second, first.replace("c0", "c1"), second]
+
+
+@pytest.mark.parametrize(("count", "columns"), [(1, 1), (2, 1), (6, 2), (12, 3)])
+def test_the_panels_of_a_picture_are_a_grid(count: int, columns: int) -> None:
+    rows = claims_rows(count)
+    found = bench.in_columns([bench.Panel(i % 4 + 1, print) for i in range(count)])
+    assert [panel.height for column in found for panel in column] == [i % 4 + 1 for i in range(count)] and len(found) == columns
+    heights = [sum(panel.height + 3 for panel in column) for column in found]
+    assert max(heights) - min(heights) <= 14  # two panels
+    width, height = Image.open(io.BytesIO(bench.as_picture(rows, Plan(), "", ".png"))).size
+    assert width == 700 * columns and height < 100 + 28 * 5 * (count / columns + 1)
 
 
 def test_the_command_takes_a_file_for_a_published_scene(tmp_path: Path) -> None:
