@@ -1,5 +1,6 @@
 """All hits of rays: the traversal fills one list per ray, then each list is sorted."""
 
+from functools import cache
 from typing import Any
 
 import warp as wp
@@ -22,6 +23,13 @@ class HitLists:
     first: wp.array(dtype=wp.int32)  # Ray i has room for the hits rows[first[i]] .. rows[first[i + 1] - 1].
     count: wp.array(dtype=wp.int32)  # Number of hits of ray i; above the list's length, the list is incomplete (list_hit).
     rows: wp.array(dtype=Hit)
+    # The other arrays are for instances only.
+    root: wp.array(dtype=wp.int32)  # Root node of the world of ray i; below 0, the ray hits nothing.
+    first_face: wp.array(dtype=wp.int32)  # Index in `faces` of the face with prim_id 0 of each structure of the lower level.
+    # Of the placement that ray i is in now (kernels.traverse.instances): the results of local_scale, and face index minus prim_id.
+    scale: wp.array(dtype=wp.float64)
+    to_face: wp.array(dtype=wp.int32)
+    end: wp.array(dtype=wp.float32)  # t, in world space, behind which the walk of ray i needs no hits.
 
 
 @wp.func
@@ -72,44 +80,66 @@ def sort_and_trim(rows: wp.array(dtype=Hit), first: int, count: int, limit: int)
     return kept
 
 
-@wp.func
-def list_hit(lists: HitLists, ray: Ray, hit: Hit, best: Hit) -> Hit:
-    """Append a hit to the list of its ray. The returned `best` stays a miss, but the walk may stop beyond best.t.
-    If the list is too short, count[i] exceeds the list's length. Then a list for count[i] or 2 limit hits suffices, whichever is less."""
-    if lists.crossings:
-        shear = triangle_ray(ray)
-        face = lists.faces[hit.prim_id]
-        if not is_crossed(to_ray_space(lists.vertices[face[0]] - ray.origin, shear),
-                          to_ray_space(lists.vertices[face[1]] - ray.origin, shear),
-                          to_ray_space(lists.vertices[face[2]] - ray.origin, shear)):
-            return best
-    first = lists.first[ray.slot]
-    capacity = lists.first[ray.slot + 1] - first
-    n = lists.count[ray.slot]
-    if n < capacity:
-        lists.rows[first + n] = hit
-    n += 1
-    if capacity > lists.limit:
-        if n == capacity or (n == lists.limit and n <= FEW):
-            n = sort_and_trim(lists.rows, first, n, lists.limit)
-            if n == lists.limit:
-                best.t = lists.rows[first + n - 1].t
-    elif n >= 2 * lists.limit:  # stop the walk: a list of 2 limit hits is long enough, so the exact count does not matter
-        best.t = float(-wp.inf)
-    lists.count[ray.slot] = n
-    return best
+@cache
+def make_list_hit(instances: bool) -> Any:
+    """Make list_hit, which stores the hits of a traversal in its lists (common.make_better)."""
+
+    @wp.func
+    def list_hit(lists: HitLists, ray: Ray, hit: Hit, best: Hit) -> Hit:
+        """Append a hit to the list of its ray. The returned `best` stays a miss, but the walk may stop beyond best.t.
+        If the list is too short, count[i] exceeds the list's length. Then a list for count[i] or 2 limit hits suffices, whichever is
+        less."""
+        if lists.crossings:
+            shear = triangle_ray(ray)
+            index = hit.prim_id
+            if wp.static(instances):
+                index += lists.to_face[ray.slot]
+            face = lists.faces[index]
+            if not is_crossed(to_ray_space(lists.vertices[face[0]] - ray.origin, shear),
+                              to_ray_space(lists.vertices[face[1]] - ray.origin, shear),
+                              to_ray_space(lists.vertices[face[2]] - ray.origin, shear)):
+                return best
+        if wp.static(instances):
+            hit.t = float(wp.float64(hit.t) * lists.scale[ray.slot])
+        first = lists.first[ray.slot]
+        capacity = lists.first[ray.slot + 1] - first
+        n = lists.count[ray.slot]
+        if n < capacity:
+            lists.rows[first + n] = hit
+        n += 1
+        end = float(wp.inf)
+        if capacity > lists.limit:
+            if n == capacity or (n == lists.limit and n <= FEW):
+                n = sort_and_trim(lists.rows, first, n, lists.limit)
+                if n == lists.limit:
+                    end = lists.rows[first + n - 1].t
+        elif n >= 2 * lists.limit:  # stop the walk: a list of 2 limit hits is long enough, so the exact count does not matter
+            end = float(-wp.inf)
+        if end < wp.inf:
+            best.t = end
+            if wp.static(instances):
+                lists.end[ray.slot] = end
+                best.t = float(wp.float64(end) / lists.scale[ray.slot])
+        lists.count[ray.slot] = n
+        return best
+
+    return list_hit
 
 
-def make_list_hits_kernel(accel_struct: Any, traverse: Any) -> Any:
-    """Make the kernel that fills the list of each ray; `traverse` is made with Units.lists and accepts=list_hit."""
+def make_list_hits_kernel(accel_struct: Any, traverse: Any, instances: bool) -> Any:
+    """Make the kernel that fills the list of each ray; `traverse` is made with Units.lists and accepts=make_list_hit(instances)."""
 
     @kernel
     def list_hits(accel: accel_struct, rays: RayArrays, lists: HitLists, start: int):
         i = start + wp.tid()
         first = lists.first[i]
         capacity = lists.first[i + 1] - first
-        if capacity > 0:
-            traverse(accel, lists, load_ray(rays, i))
+        ray = load_ray(rays, i)
+        if wp.static(instances):
+            ray.first_prim = lists.root[i]
+            lists.end[i] = float(wp.inf)
+        if capacity > 0 and ray.first_prim >= 0:
+            traverse(accel, lists, ray)
             if lists.count[i] <= capacity:
                 lists.count[i] = sort_and_trim(lists.rows, first, lists.count[i], lists.limit)
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
+from wrt.kernels.structs import NO_HIT, Hit, Ray
 from wrt.kernels.traverse.bvh2 import Bvh2Node, Volumes, make_binary_traversal
 from wrt.kernels.traverse.common import Probe, Units
 from wrt.kernels.traverse.counters import Counts, Recorder, add_counts
@@ -121,8 +121,9 @@ def make_placed_leaf(units: Units, any_hit: bool, bottom: Any, struct: Any) -> A
     """Make visit_leaf (kernels.traverse.leaf) for the upper level; bottom: the traversal of the placed structures."""
 
     @wp.func
-    def visit(accel: struct, surfaces: Surfaces, ray: Ray, index: int, best: Hit) -> Hit:
-        """Return the closer of `best` and the hit in placement `index`; at equal t, the hit with the lower prim_id."""
+    def visit(accel: struct, surfaces: Any, ray: Ray, index: int, best: Hit) -> Hit:
+        """Return the closer of `best` and the hit in placement `index`; at equal t, the hit with the lower prim_id.
+        With Units.lists, `surfaces` is HitLists, which receives the hits; the result is a miss."""
         place = accel.placements[index]
         structure = accel.bottoms[place.bottom]
         if wp.static(units.counters):
@@ -131,6 +132,12 @@ def make_placed_leaf(units: Units, any_hit: bool, bottom: Any, struct: Any) -> A
         scale = local_scale(place, ray.direction)
         near = ray
         near.t_max = best.t
+        if wp.static(units.lists):
+            surfaces.scale[ray.slot] = scale
+            surfaces.to_face[ray.slot] = surfaces.first_face[place.bottom] - place.first_prim
+            bottom(structure, surfaces, local_ray(place, near, scale))
+            best.t = wp.min(best.t, surfaces.end[ray.slot])
+            return best
         hit = bottom(structure, surfaces, local_ray(place, near, scale))
         hit.t = float(wp.float64(hit.t) * scale)
         if hit.prim_id < 0 or hit.t > best.t or (hit.t == best.t and hit.prim_id > best.prim_id):
@@ -138,7 +145,7 @@ def make_placed_leaf(units: Units, any_hit: bool, bottom: Any, struct: Any) -> A
         return hit
 
     @wp.func
-    def visit_leaf(accel: struct, surfaces: Surfaces, probe: Probe, first: int, count: int, best: Hit, counts: Counts):
+    def visit_leaf(accel: struct, surfaces: Any, probe: Probe, first: int, count: int, best: Hit, counts: Counts):
         if wp.static(units.counters):  # the lower level adds its own counts to the recorder, so these must be there first
             add_counts(accel.recorder, probe.ray.slot, counts)
             counts = Counts()

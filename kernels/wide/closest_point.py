@@ -8,7 +8,7 @@ the distance to the triangle's padded box. Rounding is monotone, so no box of a 
 Therefore the nearest triangle does not depend on the tree."""
 
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import warp as wp
 
@@ -49,7 +49,7 @@ class PointArrays:
 
 
 @wp.func
-def squared_distance(p: wp.vec3, lo: wp.vec3, hi: wp.vec3) -> wp.float64:
+def squared_distance(p: Any, lo: wp.vec3, hi: wp.vec3) -> wp.float64:
     """Return the squared distance from a point to a box; 0 for a point inside."""
     out = wp.float64(0.0)
     for axis in range(3):
@@ -170,8 +170,26 @@ def nearer_flat(p: wp.vec3, surfaces: Surfaces, prim_id: int, best: Nearest) -> 
     return nearer_of(p, triangle, on, best)
 
 
-def make_leaf_search(layout: NodeLayout) -> Any:
-    """Return nearest_in_leaf(accel, surfaces, reference, p, best): the closer to p of `best` and the points on the leaf's triangles."""
+class PointSearch(NamedTuple):
+    """Functions of a walk over one BVH. `place` is the query point, or the record that kernels.wide.closest_placed has of it."""
+
+    nearest_in_leaf: Any  # (accel, surfaces, reference, place, best) -> the closer of `best` and the points on the leaf's triangles.
+    point: Any  # (place) -> point in the space of the boxes.
+    reach: Any  # (place, best) -> largest squared distance of a box that may contain a point as close as `best`.
+
+
+@wp.func
+def itself(p: wp.vec3) -> wp.vec3:
+    return p
+
+
+@wp.func
+def best_d2(p: wp.vec3, best: Nearest) -> wp.float64:
+    return best.d2
+
+
+def make_search(layout: NodeLayout) -> PointSearch:
+    """Make the functions of a walk over one mesh in world space."""
     struct, gather = make_struct(Primitive), make_gather(Primitive, layout.width)
     width, size_of_row = layout.width, row_size(Primitive, layout.width)
 
@@ -188,39 +206,45 @@ def make_leaf_search(layout: NodeLayout) -> Any:
                 best = nearer_flat(p, surfaces, record.prim_id, best)
         return best
 
-    return nearest_in_leaf
+    return PointSearch(nearest_in_leaf, itself, best_d2)
 
 
-def make_closest_point(layout: NodeLayout) -> Any:
-    """Return closest_point(accel, surfaces, p) -> Nearest: the point closest to p on any triangle."""
-    struct, nearest_in_leaf = make_struct(Primitive), make_leaf_search(layout)
+@wp.func
+def nothing_near() -> Nearest:
+    best = Nearest()
+    best.d2 = wp.float64(wp.inf)
+    best.prim_id = -1
+    return best
+
+
+def make_closest_point(layout: NodeLayout, search: PointSearch) -> Any:
+    """Return closest_point(accel, surfaces, place, best) -> Nearest: the closer of `best` and the closest point on any triangle."""
+    struct, (nearest_in_leaf, point, reach) = make_struct(Primitive), search
     plane, exists = make_plane(layout.width, layout.compressed)
 
     @wp.func
-    def distance_to_child(accel: struct, first: int, j: int, p: wp.vec3) -> wp.float64:
+    def distance_to_child(accel: struct, first: int, j: int, p: Any) -> wp.float64:
         lo = wp.vec3(plane(accel.nodes, first, LO_X, j), plane(accel.nodes, first, LO_Y, j), plane(accel.nodes, first, LO_Z, j))
         hi = wp.vec3(plane(accel.nodes, first, HI_X, j), plane(accel.nodes, first, HI_Y, j), plane(accel.nodes, first, HI_Z, j))
         return squared_distance(p, lo, hi)
 
     @wp.func
-    def closest_point(accel: struct, surfaces: Surfaces, p: wp.vec3) -> Nearest:
-        best = Nearest()
-        best.d2 = wp.float64(wp.inf)
-        best.prim_id = -1
+    def closest_point(accel: struct, surfaces: Any, place: Any, best: Nearest) -> Nearest:
+        p = point(place)
         stack = empty_stack()
         size = int(0)
         reference = int(0)
         while True:
             near = wp.uint64(NOTHING)
             if reference < 0:
-                best = nearest_in_leaf(accel, surfaces, reference, p, best)
+                best = nearest_in_leaf(accel, surfaces, reference, place, best)
             else:
                 first = reference * wp.static(layout.size)
                 for j in range(wp.static(layout.width)):
                     child = bits(accel.nodes, first + wp.static(layout.references) + j)
                     if child != EMPTY and exists(accel.nodes, first, j):
                         d2 = distance_to_child(accel, first, j, p)
-                        if d2 <= best.d2:
+                        if d2 <= reach(place, best):
                             key = key_of(float(d2), child)
                             far = wp.max(near, key)
                             near = wp.min(near, key)
@@ -231,7 +255,7 @@ def make_closest_point(layout: NodeLayout) -> Any:
             # at the same distance: they may have a lower prim_id.
             while near == NOTHING and size > 0:
                 size = size - 1
-                if t_of(stack[size]) <= float(best.d2):
+                if t_of(stack[size]) <= float(reach(place, best)):
                     near = stack[size]
             if near == NOTHING:
                 break
@@ -241,19 +265,23 @@ def make_closest_point(layout: NodeLayout) -> Any:
     return closest_point
 
 
+@wp.func
+def store_nearest(out: PointArrays, i: int, found: Nearest):
+    out.distance[i] = float(wp.sqrt(found.d2))
+    out.point[i] = wp.vec3(found.point)
+    out.u[i] = float(found.u)
+    out.v[i] = float(found.v)
+    out.prim_id[i] = found.prim_id
+
+
 @cache
 def make_closest_point_kernel(layout: NodeLayout) -> Any:
     """Return the kernel for points first .. first + dim - 1 (dim: launch size). The tree's primitives have the layout "corners"."""
-    struct, closest_point = make_struct(Primitive), make_closest_point(layout)
+    struct, closest_point = make_struct(Primitive), make_closest_point(layout, make_search(layout))
 
     @kernel
     def closest_points(accel: struct, surfaces: Surfaces, points: wp.array(dtype=wp.vec3), out: PointArrays, first: int):
         i = first + wp.tid()
-        found = closest_point(accel, surfaces, points[i])
-        out.distance[i] = float(wp.sqrt(found.d2))
-        out.point[i] = wp.vec3(found.point)
-        out.u[i] = float(found.u)
-        out.v[i] = float(found.v)
-        out.prim_id[i] = found.prim_id
+        store_nearest(out, i, closest_point(accel, surfaces, points[i], nothing_near()))
 
     return closest_points

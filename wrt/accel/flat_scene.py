@@ -31,7 +31,9 @@ class FlatScene:
 
     vertices: (V, 3); faces: (F, 3); normals: (V, 3) or None; uvs: (V, 2). Objects without normals or uvs have zeros; a mesh without
     uvs has (0, 2). prim_material: index in the scene's materials. Without `placed`, arrays are in world space, in the order of prim_id.
-    With `placed`, instanced meshes are stored once, in their own spaces. objects: first prim_id of each object, then of each sphere.
+    With `placed`, instanced meshes are stored once, in their own spaces. objects: first prim_id of each object, then of each sphere; None
+    over worlds, whose objects are the instances. own_materials: over worlds, (K, 3) int: a world, an index in prim_material's scene, and
+    the index of this material in the world's own scene; sorted.
     """
 
     geometry: Geometry | InstancedGeometry
@@ -42,6 +44,7 @@ class FlatScene:
     prim_material: np.ndarray
     placed: Placed | None = None
     objects: np.ndarray | None = None
+    own_materials: np.ndarray | None = None
 
     def places(self, prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the index of each triangle in `faces`, and the index of its run in `placed` (0 without `placed`), (N,) each."""

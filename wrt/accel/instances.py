@@ -76,7 +76,8 @@ class Instances(Accelerator):
             build_clock() - begin, len(top.nodes) + sum(s.nodes for s in stats), len(top.order) + sum(s.leaves for s in stats),
             top.depth + max((s.depth for s in stats), default=0), sum(s.references for s in stats),
             array_bytes(data) + sum(s.bytes for s in stats), float("nan"))
-        self._snapshot = replace(self._snapshot, geometry=geometry, data=data, stats=total, built_cost=built_cost, roots=self._roots)
+        self._snapshot = replace(self._snapshot, geometry=geometry, data=data, stats=total, built_cost=built_cost, roots=self._roots,
+                                 order=top.order)
 
     def move(self, instance: ArrayLike, matrix: ArrayLike, rebuild_at: float = np.inf) -> Refit:
         """Move instances to new matrices and fit the boxes of the upper level. Hits are bit for bit those of a new structure.

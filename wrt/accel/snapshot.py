@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Concatenate, ParamSpec, TypeVar
 from weakref import WeakKeyDictionary
 
+import numpy as np
+
 from wrt.accel.built import AccelStats, Built
 from wrt.accel.flat_scene import FlatScene
 from wrt.accel.geometry import Geometry
@@ -25,7 +27,8 @@ class Snapshot:
 
     surfaces: kernels.structs.Surfaces, of which only n_triangles and spheres are set. attributes: normals, materials and the like;
     None if the structure was built from a geometry. data: Warp struct of the arrays. built: None for instances. built_cost: SAH cost
-    at the last build. roots: for instances, (W,) index of each world's root node. followed: vertices of the last refit, if they
+    at the last build. roots: for instances, (W,) index of each world's root node; order: (I,) row of
+    geometry.to_world of each placement. followed: vertices of the last refit, if they
     require gradients. changes: True if refits in place modify the arrays.
     """
 
@@ -39,6 +42,7 @@ class Snapshot:
     built: Built | None = None
     built_cost: float = float("nan")
     roots: WarpArray | None = None
+    order: np.ndarray | None = None
     followed: WarpArray | None = None
     changes: bool = False
 

@@ -8,18 +8,23 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.points.contains import contains
 from wrt.accel.points.winding import winding_number
 from wrt.accel.queries.accelerator import Accelerator, snapshot_of
 from wrt.accel.queries.hit_points import device_scene
+from wrt.accel.queries.part_faces import part_faces
 from wrt.accel.queries.rays import vectors
+from wrt.accel.queries.world_ids import roots_of
+from wrt.accel.snapshot import Snapshot, once
 from wrt.core.checks import require_known
 from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
-from wrt.core.types import ArrayLike, KernelModule
+from wrt.core.types import ArrayLike, KernelModule, WarpStruct
 from wrt.kernels.query import FARTHEST
 from wrt.kernels.warp_private import fields_of
+from wrt.kernels.wide.closest_placed import PointPlaces, make_placed_points_kernel
 from wrt.kernels.wide.closest_point import PointArrays, make_closest_point_kernel
 from wrt.kernels.wide.traverse import WideTraversal
 
@@ -56,22 +61,26 @@ class ClosestPoints:
         return f"ClosestPoints({len(self)} points)"
 
 
-def closest_points(accel: Accelerator, points: ArrayLike, threads: int | None = None) -> ClosestPoints:
-    """Find the point on a mesh that is closest to each query point. Among faces at equal distance, the lowest prim_id wins.
+def closest_points(accel: Accelerator, points: ArrayLike, threads: int | None = None, *,
+                   world: ArrayLike | None = None) -> ClosestPoints:
+    """Find the point on the surfaces that is closest to each query point. Among faces at equal distance, the lowest prim_id wins.
 
     The result does not depend on the tree. It is computed in float64 and rounded once. The error of a distance has two parts: 2^-23
     of the distance, and 1e-15 times the mesh's largest coordinate times the ratio of a triangle's length to its height. Faces whose
     distances differ by less than the error may be confused. A face without area counts as a segment or point, though no ray hits
-    it. A face with a corner that is not finite is ignored.
+    it. A face with a corner that is not finite is ignored. Over instances, corners in world space are rounded to float32, as in a joined
+    mesh.
 
     Parameters
     ----------
     accel : Accelerator
-        A bvh4, bvh8 or bvh8c over one mesh without spheres, with the watertight triangle test.
+        A bvh4, bvh8 or bvh8c without spheres, or instances of such, with the watertight triangle test.
     points : (N, 3) array_like
         Query points, converted to float32.
     threads : int, optional
         Threads on the CPU; one per core by default.
+    world : int or (N,) array_like of int, optional
+        Index of the world of each point; required over several worlds.
 
     Returns
     -------
@@ -83,7 +92,7 @@ def closest_points(accel: Accelerator, points: ArrayLike, threads: int | None = 
     InputError
         For other structures, and for points that are not finite.
     """
-    snapshot = snapshot_of(accel)
+    snapshot = snapshot_of(accel, instances=True)
     structure = snapshot.structure
     kernels: KernelModule = structure.accel.kernels
     if not isinstance(kernels, WideTraversal) or structure.units.triangle != "watertight":
@@ -93,22 +102,43 @@ def closest_points(accel: Accelerator, points: ArrayLike, threads: int | None = 
     n, out = len(rows), PointArrays()
     for name, field in fields_of(PointArrays).items():
         setattr(out, name, wp.empty(n, dtype=field.dtype, device=device))
-    kernel, queries = make_closest_point_kernel(kernels.layout), upload(rows, wp.vec3, device)
-    surfaces = device_scene(snapshot).surfaces
-    launch_on(device, kernel, n, snapshot.data, surfaces, queries, out, None, threads=thread_count(threads), step=POINTS_PER_LAUNCH)
+    inputs, roots = [snapshot.data, None, upload(rows, wp.vec3, device)], roots_of(snapshot, world, n)
+    if roots is None:
+        kernel, inputs[1] = make_closest_point_kernel(kernels.layout), device_scene(snapshot).surfaces
+    else:
+        kernel, inputs[1] = make_placed_points_kernel(kernels.layout), point_places(snapshot)
+        inputs.append(upload(roots, wp.int32, device))
+    launch_on(device, kernel, n, *inputs, out, None, threads=thread_count(threads), step=POINTS_PER_LAUNCH)
     return ClosestPoints(*(getattr(out, name).numpy() for name in fields_of(PointArrays)))
 
 
-def signed_distance(accel: Accelerator, points: ArrayLike, threads: int | None = None, *, sign: str = "crossings") -> np.ndarray:
-    """Compute the distance of each point to a mesh, negative inside.
+@once
+def point_places(snapshot: Snapshot) -> WarpStruct:
+    """Upload what closest points need of placements: kernels.wide.closest_placed.PointPlaces."""
+    geometry, device, places = snapshot.geometry, snapshot.device, PointPlaces()
+    assert isinstance(geometry, InstancedGeometry)
+    reach = np.array([np.abs(part.vertices[np.isfinite(part.vertices)]).max(initial=0.0) for part in geometry.parts])
+    to_world, part = geometry.to_world[snapshot.order], geometry.part[snapshot.order]
+    for row, axis in enumerate("xyz"):
+        setattr(places, f"world_{axis}", upload(to_world[:, row], wp.vec4d, device))
+    least = np.linalg.svd(to_world[:, :, :3], compute_uv=False)[:, -1]
+    corners = np.abs(to_world[:, :, :3]).sum(axis=2).max(axis=1) * reach[part] + np.abs(to_world[:, :, 3]).max(axis=1)
+    places.least, places.margin = upload(least, wp.float64, device), upload(2.0**-22 * corners, wp.float64, device)
+    places.vertices, places.faces, places.first_face = part_faces(snapshot)
+    return places
+
+
+def signed_distance(accel: Accelerator, points: ArrayLike, threads: int | None = None, *, sign: str = "crossings",
+                    world: ArrayLike | None = None) -> np.ndarray:
+    """Compute the distance of each point to the surfaces, negative inside.
 
     Parameters
     ----------
-    accel, points, threads
+    accel, points, threads, world
         See `closest_points`.
     sign : str
         What decides on inside: "crossings" is `contains`, for closed meshes; "winding" is a `winding_number` above 0.5, for open
-        meshes and loose triangles, too.
+        meshes and loose triangles, too, but not for instances.
 
     Returns
     -------
@@ -123,6 +153,6 @@ def signed_distance(accel: Accelerator, points: ArrayLike, threads: int | None =
     require_known(sign, SIGNS, "rule of signs", "sign")
     accel = copy(accel)  # a refit by another thread does not change the copy
     points = vectors(points, "points", FARTHEST)  # queries return tensors for tensors
-    inside = contains(accel, points, threads) if sign == "crossings" else winding_number(accel, points, threads) > 0.5
-    distance = closest_points(accel, points, threads).distance
+    inside = contains(accel, points, threads, world=world) if sign == "crossings" else winding_number(accel, points, threads) > 0.5
+    distance = closest_points(accel, points, threads, world=world).distance
     return np.where(inside, -distance, distance)

@@ -10,6 +10,7 @@ import numpy.typing as npt
 import warp as wp
 
 from wrt.accel.geometry import Geometry
+from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.all_hits import ListQuery
 from wrt.accel.queries.rays import vectors
@@ -38,23 +39,28 @@ def open_edges(geometry: Geometry) -> int:
 
 @once
 def open_edges_of(snapshot: Snapshot) -> int:
-    """Count the open edges of a structure's mesh."""
-    return open_edges(snapshot.mesh)
+    """Count the open edges of a structure's mesh, or of all meshes below its instances."""
+    geometry = snapshot.geometry
+    parts = [geometry.parts[i] for i in np.unique(geometry.part)] if isinstance(geometry, InstancedGeometry) else [geometry]
+    return sum(map(open_edges, parts))
 
 
 @once
 def used_bounds(snapshot: Snapshot) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bounding box of all finite faces: low and high, (3,) each; inf and -inf without faces."""
-    geometry = snapshot.mesh
+    """Return the bounding box of all finite faces: low and high, (3,) each; inf and -inf without faces. All of space for instances."""
+    geometry = snapshot.geometry
+    if isinstance(geometry, InstancedGeometry):
+        return np.full(3, -np.inf), np.full(3, np.inf)
     used = geometry.vertices[geometry.faces[finite_faces(geometry)]].reshape(-1, 3)
     return used.min(axis=0, initial=np.inf), used.max(axis=0, initial=-np.inf)
 
 
 @overload
-def contains(accel: Accelerator, points: NumpyLike | WarpArray, threads: int | None = None) -> npt.NDArray[np.bool_]: ...
+def contains(accel: Accelerator, points: NumpyLike | WarpArray, threads: int | None = ..., *,
+             world: ArrayLike | None = ...) -> npt.NDArray[np.bool_]: ...
 @overload
-def contains(accel: Accelerator, points: TensorT, threads: int | None = None) -> TensorT: ...
-def contains(accel: Accelerator, points: ArrayLike, threads: int | None = None) -> object:
+def contains(accel: Accelerator, points: TensorT, threads: int | None = ..., *, world: ArrayLike | None = ...) -> TensorT: ...
+def contains(accel: Accelerator, points: ArrayLike, threads: int | None = None, *, world: ArrayLike | None = None) -> object:
     """Test whether points are inside a closed mesh: a ray from an inside point crosses the surface an odd number of times.
 
     By this rule a point inside two overlapping parts is outside. With the watertight test the result does not depend on the ray's
@@ -63,11 +69,13 @@ def contains(accel: Accelerator, points: ArrayLike, threads: int | None = None) 
     Parameters
     ----------
     accel : Accelerator
-        Structure over one closed mesh without spheres.
+        Structure over a closed mesh, or over instances of closed meshes, without spheres.
     points : (N, 3) array_like
         Points, converted to float32.
     threads : int, optional
         Threads on the CPU; one per core by default.
+    world : int or (N,) array_like of int, optional
+        Index of the world of each point; required over several worlds.
 
     Returns
     -------
@@ -84,17 +92,17 @@ def contains(accel: Accelerator, points: ArrayLike, threads: int | None = None) 
     if count := open_edges_of(query.snapshot):
         raise InputError(f"the mesh is not closed: {count} edges have an odd number of faces"
                          "; wrt.winding_number is above 0.5 mostly inside")
-    inside = odd_crossings(query, rows)
+    inside = odd_crossings(query, rows, world=world)
     return inside if give is None else give(upload(inside, wp.bool, query.device))
 
 
-def odd_crossings(query: ListQuery, rows: np.ndarray, seed: int = 0) -> np.ndarray:
+def odd_crossings(query: ListQuery, rows: np.ndarray, seed: int = 0, world: ArrayLike | None = None) -> np.ndarray:
     """Return whether a ray from each point in `rows`, (N, 3), crosses the surface an odd number of times. seed: of its direction."""
     inside = np.zeros(len(rows), bool)
     low, high = used_bounds(query.snapshot)
     within = np.nonzero(((rows >= low) & (rows <= high)).all(axis=1))[0]
     if len(within):
-        counts = query.of(rows[within], np.broadcast_to(direction_of(seed), (len(within), 3))).counts()
+        counts = query.of(rows[within], np.broadcast_to(direction_of(seed), (len(within), 3)), world=world).counts()
         inside[within] = counts % 2 == 1
     return inside
 

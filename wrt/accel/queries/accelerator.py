@@ -226,10 +226,13 @@ def asks_for_counters(costs: CostOptions) -> bool:
     return any(costs.values())
 
 
-def snapshot_of(accel: Accelerator) -> Snapshot:
-    """Return the snapshot of a structure over one mesh without spheres. Raises InputError for any other structure."""
-    message = f"accel must be a structure over one mesh without spheres (wrt.build), got {shown(accel)}"
+def snapshot_of(accel: Accelerator, instances: bool = False) -> Snapshot:
+    """Return the snapshot of a structure over one mesh without spheres, or, if `instances`, over instances or worlds.
+    Raises InputError for any other structure."""
+    what = "" if instances else " over one mesh"
+    message = f"must be a structure{what} without spheres (wrt.build), got {shown(accel)}"
     if not isinstance(accel, Accelerator):
         raise InputError(message, argument="accel")
-    accel.structure.require_one_mesh(message)
+    if accel.structure.units.spheres or (accel.structure.units.instances and not instances):
+        raise InputError(message, argument="accel")
     return accel.snapshot

@@ -11,13 +11,16 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.queries.accelerator import Accelerator, snapshot_of
 from wrt.accel.queries.answers import Hits
 from wrt.accel.queries.few_lists import MOST, FewLists
 from wrt.accel.queries.hit_points import device_scene
+from wrt.accel.queries.part_faces import part_faces
 from wrt.accel.queries.raw_kernel import RawKernel, kernel_memory
 from wrt.accel.queries.rays import Rays, are_rows, arrays_on, host_arrays, rays_of
-from wrt.accel.queries.shapes import Shape, shaped_rays
+from wrt.accel.queries.shapes import Shape, shaped_rays, worlds_of_each
+from wrt.accel.queries.world_ids import roots_of
 from wrt.accel.structure import Structure
 from wrt.core.arrays import given_like, to_numpy, to_tensor_like
 from wrt.core.checks import as_integer, as_one
@@ -25,7 +28,7 @@ from wrt.core.device import MOST_ROWS, made_once, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count, with_stack
 from wrt.core.types import Array, ArrayLike, ArrayT, NumpyLike, TensorT, WarpArray
-from wrt.kernels.hit_lists import FEW, HitLists, copy_hits, list_hit, make_list_hits_kernel
+from wrt.kernels.hit_lists import FEW, HitLists, copy_hits, make_list_hit, make_list_hits_kernel
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import Hit
 
@@ -85,6 +88,11 @@ class _Lists(NamedTuple):
     first: Array
     counts: Array
     rows: Array
+    root: Array | None = None
+    first_face: WarpArray | None = None
+    scale: Array | None = None
+    to_face: Array | None = None
+    end: Array | None = None
 
 
 class ListQuery:
@@ -93,31 +101,36 @@ class ListQuery:
     n = 0
     shape: Shape | None = None  # of the rays; None: (n,)
     rays: Rays
+    roots: np.ndarray | None = None  # (N,) int32, root node of each ray's world, or -1; None without instances
     give: Any  # converts arrays to those of the caller's library
 
     def __init__(self, accel: Accelerator, threads: int | None, crossings: bool = False) -> None:
-        self.snapshot = snapshot_of(accel)
+        self.snapshot = snapshot_of(accel, instances=True)
         self.threads, self.device = thread_count(threads), self.snapshot.device
         self.memory: Any = kernel_memory(self.device)
         self.give = to_numpy
         self.crossings = as_one(crossings, bool, "crossings")
         self.mesh: tuple[WarpArray | None, WarpArray | None] = (None, None)
         if crossings:
-            surfaces = device_scene(self.snapshot).surfaces
+            surfaces = part_faces(self.snapshot) if self.snapshot.roots is not None else device_scene(self.snapshot).surfaces
             self.mesh = surfaces.vertices, surfaces.faces
 
     def of_valid(self, rays: Rays) -> ListQuery:
-        """Set rays that are valid: contiguous NumPy arrays of float32."""
+        """Set rays that are valid: contiguous NumPy arrays of float32. Not over several worlds."""
         self.n, self.rays = len(rays.origins), rays if self.device.is_cpu else arrays_on(self.device, rays)
+        self.roots = roots_of(self.snapshot, None, self.n)
         return self
 
-    def of(self, origins: ArrayLike, directions: ArrayLike | None, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf) -> ListQuery:
+    def of(self, origins: ArrayLike, directions: ArrayLike | None, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
+           world: ArrayLike | None = None) -> ListQuery:
         """Set the rays. Raises InputError that names the argument."""
         if are_rows(origins, directions):
             rays = rays_of(origins, directions, t_min, t_max)  # type: ignore[arg-type]
         else:
             rays, self.shape = shaped_rays(origins, directions, t_min, t_max)
+            world = worlds_of_each(world, self.shape)
         self.n, self.rays = len(rays.origins), host_arrays(rays) if self.device.is_cpu else arrays_on(self.device, rays)
+        self.roots = roots_of(self.snapshot, world, self.n)
         self.give = to_tensor_like(origins, directions) or to_numpy
         return self
 
@@ -154,7 +167,9 @@ class ListQuery:
         """Count the hits of each ray, (N,) int64. If no triangle is in several leaves, the first traversal is enough."""
         if (few := self._few(ALL, lambda lists, counts: counts)) is not None:
             return few
-        counting = self.snapshot.stats.references == len(self.snapshot.geometry)
+        geometry = self.snapshot.geometry
+        stored = sum(map(len, geometry.parts)) if isinstance(geometry, InstancedGeometry) else len(geometry)
+        counting = self.snapshot.stats.references == stored
         return np.concatenate([np.zeros(0, np.int64), *(of_each for _, _, of_each in self._listed(ALL, counting))])
 
     def converted(self, values: np.ndarray) -> Array:
@@ -162,8 +177,9 @@ class ListQuery:
         return values if self.give is to_numpy else self.give(upload(values, wp.int64, self.device))
 
     def _few(self, limit: int, take: Callable[[FewLists, np.ndarray], T]) -> T | None:
-        """Return `take` of the lists of few rays and their numbers of hits; None on a GPU, and for many rays or hits."""
-        return with_stack(partial(self._take_few, limit, take)) if self.n <= MOST and self.device.is_cpu else None
+        """Return `take` of the lists of few rays and their numbers of hits; None on a GPU, over instances, and for many rays or hits."""
+        is_few = self.n <= MOST and self.device.is_cpu and self.roots is None
+        return with_stack(partial(self._take_few, limit, take)) if is_few else None
 
     def _take_few(self, limit: int, take: Callable[[FewLists, np.ndarray], T]) -> T | None:
         free = few_lists(self.snapshot.structure)
@@ -185,20 +201,24 @@ class ListQuery:
         for begin in range(0, self.n, RAYS_AT_ONCE):
             n = min(RAYS_AT_ONCE, self.n - begin)
             rays = self.memory.struct(RayArrays, *(array[begin:begin + n] for array in self.rays))
-            few = self._filled(rays, FEW * np.arange(n + 1), limit)
+            roots = None if self.roots is None else self.memory.array(self.roots[begin:begin + n], wp.int32)
+            few = self._filled(rays, roots, FEW * np.arange(n + 1), limit)
             lists, counts = [few], self.memory.numpy(few.counts).astype(np.int64)
             if counts.max() > FEW and not counting:
                 many = counts > FEW
                 lists[0] = few._replace(counts=self.memory.array(np.where(many, 0, counts), wp.int32))
-                lists.append(self._filled(rays, _begins(np.where(many, np.minimum(counts, 2 * limit), 0)), limit))
+                lists.append(self._filled(rays, roots, _begins(np.where(many, np.minimum(counts, 2 * limit), 0)), limit))
                 counts = np.where(many, self.memory.numpy(lists[1].counts), counts)
             yield rays, lists, counts
 
-    def _filled(self, rays: object, first: np.ndarray, limit: int) -> _Lists:
+    def _filled(self, rays: object, roots: Array | None, first: np.ndarray, limit: int) -> _Lists:
         """Traverse the structure and return lists of hits. The list of ray i has the rows first[i] .. first[i + 1] - 1."""
         rows, n = rows_of(first[-1]), len(first) - 1
         lists = _Lists(limit, self.crossings, *self.mesh, self.memory.array(first, wp.int32),
                        self.memory.array(np.zeros(n, np.int32), wp.int32), self.memory.empty(rows, Hit))
+        if roots is not None:
+            walk = (self.memory.empty(n, kind) for kind in (wp.float64, wp.int32, wp.float32))
+            lists = _Lists(*lists[:7], roots, part_faces(self.snapshot).first_face, *walk)
         self.memory.launch(list_hits(self.snapshot.structure), n, self.snapshot.data, rays, self.memory.struct(HitLists, *lists),
                            threads=self.threads)
         return lists
@@ -225,8 +245,9 @@ def rows_of(hits: int) -> int:
 
 @made_once
 def list_hits(structure: Structure) -> RawKernel:
-    listing = structure._replace(units=structure.units._replace(lists=True))
-    kernel = make_list_hits_kernel(structure.struct, listing.traversal(any_hit=False, accepts=list_hit))
+    listing, instances = structure._replace(units=structure.units._replace(lists=True)), structure.units.instances
+    traverse = listing.traversal(any_hit=False, accepts=make_list_hit(instances))
+    kernel = make_list_hits_kernel(structure.struct, traverse, instances)
     return RawKernel(kernel, structure.struct(), RayArrays(), HitLists())
 
 
@@ -238,12 +259,12 @@ def few_lists(structure: Structure) -> list[FewLists]:
 
 @overload
 def all_hits(accel: Accelerator, origins: NumpyLike | WarpArray, directions: NumpyLike | WarpArray | None = ..., t_min: ArrayLike = ...,
-             t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ...) -> AllHits: ...
+             t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ..., world: ArrayLike | None = ...) -> AllHits: ...
 @overload
 def all_hits(accel: Accelerator, origins: TensorT, directions: TensorT | None = ..., t_min: ArrayLike = ..., t_max: ArrayLike = ...,
-             threads: int | None = ..., crossings: bool = ...) -> AllHits[TensorT]: ...
+             threads: int | None = ..., crossings: bool = ..., world: ArrayLike | None = ...) -> AllHits[TensorT]: ...
 def all_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike | None = None, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
-             threads: int | None = None, crossings: bool = False) -> AllHits[Any]:
+             threads: int | None = None, crossings: bool = False, world: ArrayLike | None = None) -> AllHits[Any]:
     """Find every hit of each ray in its segment, in order of distance. A ray hits each triangle at most once.
 
     No ray passes between two adjacent triangles: through their common edge it hits one or both, depending on rounding. The time
@@ -252,8 +273,8 @@ def all_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike | Non
     Parameters
     ----------
     accel : Accelerator
-        Structure over one mesh without spheres.
-    origins, directions, t_min, t_max, threads
+        Structure without spheres.
+    origins, directions, t_min, t_max, threads, world
         See `Accelerator.closest_hit`.
     crossings : bool
         Find crossings of the surface instead. At a shared edge or corner, the ray counts as shifted by an infinitesimal distance:
@@ -270,22 +291,23 @@ def all_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike | Non
     InputError
         Names the argument and what was expected.
     """
-    return ListQuery(accel, threads, crossings).of(origins, directions, t_min, t_max).all()
+    return ListQuery(accel, threads, crossings).of(origins, directions, t_min, t_max, world).all()
 
 
 @overload
 def count_hits(accel: Accelerator, origins: NumpyLike | WarpArray, directions: NumpyLike | WarpArray | None = ..., t_min: ArrayLike = ...,
-               t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ...) -> npt.NDArray[np.int64]: ...
+               t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ...,
+               world: ArrayLike | None = ...) -> npt.NDArray[np.int64]: ...
 @overload
 def count_hits(accel: Accelerator, origins: TensorT, directions: TensorT | None = ..., t_min: ArrayLike = ..., t_max: ArrayLike = ...,
-               threads: int | None = ..., crossings: bool = ...) -> TensorT: ...
+               threads: int | None = ..., crossings: bool = ..., world: ArrayLike | None = ...) -> TensorT: ...
 def count_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike | None = None, t_min: ArrayLike = 0.0,
-               t_max: ArrayLike = np.inf,  threads: int | None = None, crossings: bool = False) -> object:
+               t_max: ArrayLike = np.inf, threads: int | None = None, crossings: bool = False, world: ArrayLike | None = None) -> object:
     """Count the hits of each ray in its segment. The hits take no memory unless the structure has triangles in several leaves.
 
     Parameters
     ----------
-    accel, origins, directions, t_min, t_max, threads, crossings
+    accel, origins, directions, t_min, t_max, threads, crossings, world
         See `all_hits`.
 
     Returns
@@ -298,26 +320,26 @@ def count_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike | N
     InputError
         Names the argument and what was expected.
     """
-    query = ListQuery(accel, threads, crossings).of(origins, directions, t_min, t_max)
+    query = ListQuery(accel, threads, crossings).of(origins, directions, t_min, t_max, world)
     counts = query.counts()
     return query.converted(counts if query.shape is None else counts.reshape(query.shape))
 
 
 @overload
 def first_hits(accel: Accelerator, k: int, origins: NumpyLike | WarpArray, directions: NumpyLike | WarpArray | None = ...,
-               t_min: ArrayLike = ...,
-               t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ...) -> Hits: ...
+               t_min: ArrayLike = ..., t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ...,
+               world: ArrayLike | None = ...) -> Hits: ...
 @overload
 def first_hits(accel: Accelerator, k: int, origins: TensorT, directions: TensorT | None = ...,
                t_min: ArrayLike = ..., t_max: ArrayLike = ...,
-               threads: int | None = ..., crossings: bool = ...) -> Hits[TensorT]: ...
+               threads: int | None = ..., crossings: bool = ..., world: ArrayLike | None = ...) -> Hits[TensorT]: ...
 def first_hits(accel: Accelerator, k: int, origins: ArrayLike, directions: ArrayLike | None = None, t_min: ArrayLike = 0.0,
-               t_max: ArrayLike = np.inf, threads: int | None = None, crossings: bool = False) -> Hits[Any]:
+               t_max: ArrayLike = np.inf, threads: int | None = None, crossings: bool = False, world: ArrayLike | None = None) -> Hits[Any]:
     """Find the first k hits of each ray in order of distance. The traversal ends at the k-th hit.
 
     Parameters
     ----------
-    accel, origins, directions, t_min, t_max, threads, crossings
+    accel, origins, directions, t_min, t_max, threads, crossings, world
         See `all_hits`.
     k : int
         Number of hits, at least 1.
@@ -333,4 +355,4 @@ def first_hits(accel: Accelerator, k: int, origins: ArrayLike, directions: Array
         Names the argument and what was expected.
     """
     k = as_integer(k, "k", 1, (1 << 31) - 1)
-    return ListQuery(accel, threads, crossings).of(origins, directions, t_min, t_max).first(k)
+    return ListQuery(accel, threads, crossings).of(origins, directions, t_min, t_max, world).first(k)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Generic, NamedTuple, TypeAlias
 
 import numpy as np
@@ -116,7 +117,10 @@ class HitPoints(Generic[ArrayT]):
 
     @property
     def object(self) -> ArrayT:
-        """Index into `scene.objects`, or len(scene.objects) plus the index into `scene.spheres`: (...) int32, -1 on a miss."""
+        """Index into `scene.objects`, or len(scene.objects) plus the index into `scene.spheres`: (...) int32, -1 on a miss.
+
+        Over worlds, `scene` is that of the ray's world; a mesh is its only object.
+        """
         return self._filled("object")
 
     @property
@@ -126,7 +130,7 @@ class HitPoints(Generic[ArrayT]):
 
     @property
     def material(self) -> ArrayT:
-        """Index into `scene.materials`: (...) int32, -1 on a miss."""
+        """Index into `scene.materials`, over worlds those of the ray's world: (...) int32, -1 on a miss."""
         return self._filled("material")
 
     def gradients(self, t: ArrayLike | None = None, u: ArrayLike | None = None, v: ArrayLike | None = None,
@@ -186,8 +190,9 @@ class HitPoints(Generic[ArrayT]):
         if name == "shading" and scene.normals is None:
             name = "normal"
         _require(scene, name)
-        if name == "instance" and scene.objects is not None:
-            name = "object"
+        to_own = own_ids(name, scene, worlds)
+        if name in ("instance", "object") and isinstance(scene.geometry, InstancedGeometry):
+            name = "instance" if scene.objects is None else "object"
         out: Any = HitPlaces()
         setattr(out, name, array := wp.empty(n, dtype=fields_of(HitPlaces)[name].dtype, device=device))
         hits: Any = HitArrays()
@@ -197,6 +202,8 @@ class HitPoints(Generic[ArrayT]):
             hits.prim_id = upload(worlds.over_all(hits.prim_id), wp.int32, device)
         inputs = [surfaces, object_ids, rays_on(device, rays), hits, out]
         launch_on(device, hit_places, n, *inputs, None, threads=thread_count(None), step=HITS_PER_LAUNCH)
+        if to_own is not None:
+            array = upload(to_own(array.numpy()), wp.int32, device)
         if isinstance(self.t, wp.array):
             if name == "point":
                 record(self._flat(), point=array)
@@ -211,10 +218,29 @@ def _require(scene: FlatScene, name: str) -> None:
         raise InputError("the mesh has no texture coordinates (uvs)")
     if name == "instance" and not isinstance(scene.geometry, InstancedGeometry):
         raise InputError("the structure has no instances")
-    if name in ("object", "material") and scene.objects is None:
-        if over_worlds(scene.geometry):
-            raise InputError(f"hits in a structure over worlds have no {name} yet: use hits.instance")
+    if name in ("object", "material") and scene.objects is None and scene.own_materials is None:
         raise InputError(f"hits have no {name}, because the structure is not over a scene")
+
+
+def own_ids(name: str, scene: FlatScene, worlds: WorldIds | None) -> Callable[[np.ndarray], np.ndarray] | None:
+    """Return the function that converts ids among all worlds, (N,) int32, to those of each ray's world, or None."""
+    geometry, own = scene.geometry, scene.own_materials
+    if own is None or name not in ("object", "material") or not over_worlds(geometry):
+        return None
+
+    def convert(ids: np.ndarray) -> np.ndarray:
+        world = np.zeros(len(ids), np.int64) if worlds is None else worlds.arrays.id.numpy()
+        hit = ids >= 0
+        if name == "object":
+            first = geometry.first_instance[np.where(hit, world, 0)]
+            return np.where(hit, ids - first, -1).astype(np.int32)
+        step = int(own[:, 1].max(initial=0)) + 1
+        row = np.searchsorted(own[:, 0] * step + own[:, 1], world[hit] * step + ids[hit])
+        out = np.full(len(ids), -1, np.int32)
+        out[hit] = own[row, 2]
+        return out
+
+    return convert
 
 
 @once

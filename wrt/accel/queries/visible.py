@@ -17,6 +17,7 @@ from wrt.accel.queries.all_hits import first_hits
 from wrt.accel.queries.answers import ANY_HIT_TYPES, answer_arrays
 from wrt.accel.queries.hit_points import device_scene
 from wrt.accel.queries.rays import vectors
+from wrt.accel.queries.world_ids import check_world
 from wrt.core.arrays import check_no_gradients, from_tensor, real_numbers, to_numpy, to_tensor_like
 from wrt.core.checks import shown
 from wrt.core.device import launch_on, upload
@@ -33,15 +34,16 @@ _cached_extents: WeakKeyDictionary[Geometry, tuple[float, float]] = WeakKeyDicti
 
 @overload
 def visible(accel: Accelerator, a: WarpArray, b: WarpArray, on_a: ArrayLike | None = ..., on_b: ArrayLike | None = ...,
-            threads: int | None = ..., *, out: WarpArray | None = ...) -> WarpArray: ...
+            threads: int | None = ..., *, out: WarpArray | None = ..., world: ArrayLike | None = ...) -> WarpArray: ...
 @overload
 def visible(accel: Accelerator, a: NumpyLike, b: NumpyLike, on_a: ArrayLike | None = ..., on_b: ArrayLike | None = ...,
-            threads: int | None = ..., *, out: npt.NDArray[np.bool_] | None = ...) -> npt.NDArray[np.bool_]: ...
+            threads: int | None = ..., *, out: npt.NDArray[np.bool_] | None = ...,
+            world: ArrayLike | None = ...) -> npt.NDArray[np.bool_]: ...
 @overload
 def visible(accel: Accelerator, a: TensorT, b: TensorT, on_a: ArrayLike | None = ..., on_b: ArrayLike | None = ...,
-            threads: int | None = ..., *, out: TensorT | None = ...) -> TensorT: ...
+            threads: int | None = ..., *, out: TensorT | None = ..., world: ArrayLike | None = ...) -> TensorT: ...
 def visible(accel: Accelerator, a: ArrayLike, b: ArrayLike, on_a: ArrayLike | None = None, on_b: ArrayLike | None = None,
-            threads: int | None = None, *, out: object = None) -> object:
+            threads: int | None = None, *, out: object = None, world: ArrayLike | None = None) -> object:
     """Test whether each point of `a` sees the point of `b` in the same row: no surface meets the open segment between them.
 
     Exchanging `a` and `b` does not change the result. Surfaces within a margin of an end point are ignored, so that a surface does
@@ -53,7 +55,7 @@ def visible(accel: Accelerator, a: ArrayLike, b: ArrayLike, on_a: ArrayLike | No
     Parameters
     ----------
     accel : Accelerator
-        Structure over a mesh or a scene, not over several worlds.
+        Any structure.
     a, b : (N, 3) array_like, or Warp arrays (N,) of vec3
         Points, converted to float32. Values of Warp arrays on a GPU are not checked; a point that is not finite sees nothing.
     on_a, on_b : (N,) array_like of int, optional
@@ -63,6 +65,8 @@ def visible(accel: Accelerator, a: ArrayLike, b: ArrayLike, on_a: ArrayLike | No
         Threads on the CPU; one per core by default.
     out : (N,) bool, optional
         Array that receives the results.
+    world : int or (N,) array_like of int, optional
+        Index of the world of each pair; required over several worlds.
 
     Returns
     -------
@@ -85,8 +89,7 @@ def visible(accel: Accelerator, a: ArrayLike, b: ArrayLike, on_a: ArrayLike | No
         raise InputError(f"must have as many rows as a ({n}), got {len(q)}", argument="b")
     array: Any = answer_arrays(ANY_HIT_TYPES, None if out is None else [out], n, device if as_warp else None, give is not None)[0]
     snapshot, has_ids, surfaces = accel.snapshot, on_a is not None or on_b is not None, Surfaces()
-    if isinstance(snapshot.geometry, InstancedGeometry) and snapshot.geometry.n_worlds > 1:
-        raise InputError("must not be over several worlds: visible does not support worlds yet", argument="accel")
+    check_world(snapshot, world, n)
     if has_ids:
         if accel.structure.units.instances:
             raise InputError("is for structures without instances", argument="on_a" if on_a is not None else "on_b")
@@ -105,7 +108,7 @@ def visible(accel: Accelerator, a: ArrayLike, b: ArrayLike, on_a: ArrayLike | No
     pairs.a, pairs.b, pairs.on_a, pairs.on_b = p, q, *(upload(each, wp.int32, device) for each in ids)
     run(segments, surfaces, pairs, size, rays)
     arrays = rays.origin, rays.direction, rays.t_min, rays.t_max
-    seen = accel.any_hit(*arrays, threads=threads)
+    seen = accel.any_hit(*arrays, threads=threads, world=world)
     run(to_visible, p, q, seen)
     result = np.array(to_numpy(seen)) if has_ids else seen
     if has_ids and not accel.structure.units.spheres:

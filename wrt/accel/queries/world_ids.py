@@ -54,6 +54,21 @@ class WorldIds:
         return np.where(own >= 0, own + self.first_prim[np.where(own >= 0, world, 0)], -1).astype(np.int32)
 
 
+def roots_of(snapshot: Snapshot, world: ArrayLike | None, n: int) -> np.ndarray | None:
+    """Return the root node of each ray's world, (n,) int32; -1 in a world that does not exist; None for a structure over one mesh.
+
+    Raises InputError that names `world`.
+    """
+    worlds = check_world(snapshot, world, n)
+    if snapshot.roots is None:
+        return None
+    roots = np.append(snapshot.roots.numpy(), np.int32(-1))
+    if worlds is None:
+        return np.full(n, roots[0], np.int32)
+    ids = worlds.arrays.id.numpy()
+    return np.asarray(roots[np.where((ids >= 0) & (ids < len(roots) - 1), ids, -1)])
+
+
 def over_worlds(geometry: object) -> TypeGuard[InstancedGeometry]:
     """Return whether a structure was built from a list of worlds."""
     return isinstance(geometry, InstancedGeometry) and geometry.worlds is not None

@@ -31,7 +31,12 @@ def worlds_over(worlds: Sequence[Mesh | Scene]) -> FlatScene:
     together = tuple(thing for each in objects for thing in each)
     if not together:
         raise InputError("must have at least one object in all its worlds together", argument="mesh")
-    flat = flatten(Scene(together), frozenset(id(thing.mesh) for thing in together))
+    joined = Scene(together)
+    flat = flatten(joined, frozenset(id(thing.mesh) for thing in together))
     geometry = flat.geometry
     assert isinstance(geometry, InstancedGeometry)
-    return replace(flat, geometry=replace(geometry, worlds=np.cumsum([0, *map(len, objects)])), objects=None)
+    index = {id(material): i for i, material in enumerate(joined.materials)}
+    own = [(world, index[id(material)], i) for world, scene in enumerate(worlds)
+           for i, material in enumerate(scene.materials if isinstance(scene, Scene) else grey)]
+    return replace(flat, geometry=replace(geometry, worlds=np.cumsum([0, *map(len, objects)])), objects=None,
+                   own_materials=np.array(sorted(own), np.int64).reshape(-1, 3))

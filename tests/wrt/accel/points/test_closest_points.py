@@ -203,8 +203,8 @@ def test_a_signed_distance_is_of_one_shape_whatever_is_refitted_meanwhile(monkey
     accel = wrt.build(ball, "bvh8")
     expected = wrt.signed_distance(accel, np.zeros((1, 3)))
 
-    def contains(*asked: Any) -> Any:
-        inside = wrt.contains(*asked)
+    def contains(*asked: Any, **more: Any) -> Any:
+        inside = wrt.contains(*asked, **more)
         accel.refit(3.0 * ball.vertices)
         return inside
 
@@ -251,7 +251,7 @@ def test_what_is_refused() -> None:
     for accel, points, told in (
             (wrt.build(ball, "kdtree"), np.zeros((1, 3)), (None, "bvh4, bvh8")),
             (wrt.build(ball, "bvh8", triangle="plane"), np.zeros((1, 3)), (None, "bvh8 with 'plane'")),
-            (wrt.build([ball]), np.zeros((1, 3)), ("accel", "structure over one mesh")), (5, np.zeros((1, 3)), ("accel", "got 5")),
+            (wrt.build([ball, ball]), np.zeros((1, 3)), ("world", "2 worlds")), (5, np.zeros((1, 3)), ("accel", "got 5")),
             (wrt.build(ball), np.zeros((1, 2)), ("points", "(N, 3)")),
             (wrt.build(ball), [[np.nan, 0, 0]], ("points", "finite"))):
         with refused(*told):

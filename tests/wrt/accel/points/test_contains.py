@@ -131,6 +131,6 @@ def test_what_is_refused_and_what_is_empty() -> None:
                                 (ball, [0.0, 1.0], ("points", "(N, 3)")),
                                 (ball, [[0.0, 1.0, 2.0], [0.0]], ("points", "(N, 3)")),
                                 (ball, np.ma.zeros((1, 3)), ("points", "masked array")),
-                                ("bvh", [[0.0, 0.0, 0.0]], ("accel", "structure over one mesh"))):
+                                ("bvh", [[0.0, 0.0, 0.0]], ("accel", "structure"))):
         with refused(*said):
             wrt.contains(accel, points)  # type: ignore[arg-type]

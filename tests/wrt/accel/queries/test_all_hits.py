@@ -245,7 +245,7 @@ def test_no_rays_and_no_triangles() -> None:
 
 
 @pytest.mark.parametrize("call, said", [
-    (lambda accel, o: wrt.all_hits("bvh", o, o), ("accel", "structure over one mesh")),  # type: ignore[arg-type]
+    (lambda accel, o: wrt.all_hits("bvh", o, o), ("accel", "structure")),  # type: ignore[arg-type]
     (lambda accel, o: wrt.first_hits(accel, 0, o, o), ("k", "1 to 2147483647")),
     (lambda accel, o: wrt.first_hits(accel, 2**60, o, o), ("k", "1 to 2147483647")),
     (lambda accel, o: wrt.first_hits(accel, 2**31 - 1, np.ones((9, 3)), np.ones((9, 3))), (None, "hits do not fit")),

@@ -239,6 +239,6 @@ def test_what_takes_no_prim_ids() -> None:
         wrt.visible("bvh", points, points)  # type: ignore[arg-type]
     with refused("on_a", "structures without instances"):
         wrt.visible(wrt.build(place((Geometry.of(shapes.box()), np.eye(4)))), points, points, [0])
-    with refused("accel", "over several worlds"):
+    with refused("world", "2 worlds"):
         wrt.visible(wrt.build([shapes.box(), shapes.box()]), points, points)
     assert wrt.visible(wrt.build([shapes.box()]), points, points + 3.0).tolist() == [False]
