@@ -35,8 +35,8 @@ def worlds_over(worlds: Sequence[Mesh | Scene]) -> FlatScene:
     flat = flatten(joined, frozenset(id(thing.mesh) for thing in together))
     geometry = flat.geometry
     assert isinstance(geometry, InstancedGeometry)
-    index = {id(material): i for i, material in enumerate(joined.materials)}
-    own = [(world, index[id(material)], i) for world, scene in enumerate(worlds)
+    places = {id(material): i for i, material in enumerate(joined.materials)}
+    own = [(world, places[id(material)], i) for world, scene in enumerate(worlds)
            for i, material in enumerate(scene.materials if isinstance(scene, Scene) else grey)]
     return replace(flat, geometry=replace(geometry, worlds=np.cumsum([0, *map(len, objects)])), objects=None,
                    own_materials=np.array(sorted(own), np.int64).reshape(-1, 3))
