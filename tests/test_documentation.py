@@ -47,6 +47,7 @@ SLOW = {  # run by `pytest -m slow`
     "bench rtcore": ("--rays", "500",), "bench units": ("--rays", "500", "--runs", "1"),
     "bench error": ("--size", "16x9", "--max-spp", "2", "--repeats", "3", "--reference-spp", "4", "--knobs", "max_depth"),
     "bench bvh": ("--rays", "500", "--builds", "1", "--runs", "1", "--builders", "sweep"), "bench instructions": (),
+    "bench visibility": ("--size", "64", "--max-size", "64", "--max-triangles", "2000", "--runs", "1"),
     "bench claims": ("--side", "16", "repacking"), "bench float64": ("--rays", "500"), "bench hard-cases": ("--rays", "5"),
     "bench closed": ("--points", "500", "--rays", "500", "--others", "100"),
     "bench pictures": ("--size", "16x9", "--spp", "1", "--runs", "1"),
