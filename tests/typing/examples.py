@@ -52,6 +52,10 @@ def worlds(origins: Array, directions: Array) -> None:
     hits = accel.closest_hit(origins, directions, world=np.arange(len(origins)) % 3)
     assert_type(hits, Hits)
     assert_type(accel.move(0, np.diag([2.0, 2.0, 2.0, 1.0])), Refit)
+    assert_type(accel.move(object=0, world=2, matrix=np.eye(4)), Refit)
+    robot = wrt.build(wrt.Scene.of([box(), icosphere(2)]), movable=True)
+    assert_type(robot, Instances)
+    assert_type(robot.move(object="arm", matrix=np.eye(4), rebuild_at=2.0), Refit)
 
 
 def queries(accel: OneMesh, origins: Array, directions: Array) -> None:

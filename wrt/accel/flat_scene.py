@@ -33,7 +33,7 @@ class FlatScene:
     uvs has (0, 2). prim_material: index in the scene's materials. Without `placed`, arrays are in world space, in the order of prim_id.
     With `placed`, instanced meshes are stored once, in their own spaces. objects: first prim_id of each object, then of each sphere; None
     over worlds, whose objects are the instances. own_materials: over worlds, (K, 3) int: a world, an index in prim_material's scene, and
-    the index of this material in the world's own scene; sorted.
+    the index of this material in the world's own scene; sorted. names: of all objects, if there are instances.
     """
 
     geometry: Geometry | InstancedGeometry
@@ -45,6 +45,7 @@ class FlatScene:
     placed: Placed | None = None
     objects: np.ndarray | None = None
     own_materials: np.ndarray | None = None
+    names: tuple[str, ...] = ()
 
     def places(self, prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the index of each triangle in `faces`, and the index of its run in `placed` (0 without `placed`), (N,) each."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import overload
 
 import numpy as np
 import warp as wp
@@ -10,6 +12,7 @@ import warp as wp
 from wrt.accel.base import OneMesh, array_bytes, build_each
 from wrt.accel.built import AccelStats, Refit
 from wrt.accel.flat_scene import FlatScene
+from wrt.accel.instance_names import InstanceNames, ObjectId
 from wrt.accel.instanced_geometry import MAX_SPREAD, InstancedGeometry, inverse_of
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.ray_query import kernel_argument
@@ -79,7 +82,13 @@ class Instances(Accelerator):
         self._snapshot = replace(self._snapshot, geometry=geometry, data=data, stats=total, built_cost=built_cost, roots=self._roots,
                                  order=top.order)
 
-    def move(self, instance: ArrayLike, matrix: ArrayLike, rebuild_at: float = np.inf) -> Refit:
+    @overload
+    def move(self, instance: ArrayLike, matrix: ArrayLike, rebuild_at: float = ...) -> Refit: ...
+    @overload
+    def move(self, *, object: ObjectId | Sequence[ObjectId], matrix: ArrayLike, world: ArrayLike | None = ...,
+             rebuild_at: float = ...) -> Refit: ...
+    def move(self, instance: ArrayLike | None = None, matrix: ArrayLike | None = None, rebuild_at: float = np.inf, *,
+             object: ObjectId | Sequence[ObjectId] | None = None, world: ArrayLike | None = None) -> Refit:
         """Move instances to new matrices and fit the boxes of the upper level. Hits are bit for bit those of a new structure.
 
         Other threads may query at the same time, as during `OneMesh.refit`.
@@ -93,6 +102,10 @@ class Instances(Accelerator):
             Affine maps from object to world space.
         rebuild_at : float
             Build the upper level anew if its SAH cost exceeds this multiple of its value at the last build.
+        object : str, int or sequence of these
+            In place of `instance`: names of objects, or their indices in their scene.
+        world : int or (R,) array_like of int, optional
+            Worlds of these objects; required over several worlds.
 
         Returns
         -------
@@ -102,12 +115,19 @@ class Instances(Accelerator):
         Raises
         ------
         InputError
-            For other shapes and indices, for objects that are not instances, and for matrices that flatten or shear too much.
+            For other shapes, names and indices, for objects that are not instances, and for matrices that flatten or shear too much.
         """
         with self._refitting:
             begin, before = build_clock(), self._snapshot
             geometry = before.geometry
             assert isinstance(geometry, InstancedGeometry)
+            if (instance is None) == (object is None) or matrix is None or (object is None and world is not None):
+                raise InputError("takes instance and matrix, or object, world and matrix", place="move")
+            if object is not None:
+                if "names" not in self._cache:
+                    self._cache["names"] = InstanceNames(geometry, before.attributes)
+                instance = self._cache["names"].find(object, world)
+            assert instance is not None
             rows, matrices = checked_moves(rows_of(geometry, before.attributes), instance, matrix)
             to_world = geometry.to_world.copy()
             to_world[rows] = matrices

@@ -199,3 +199,27 @@ def shifted(x: float) -> np.ndarray:
     matrix = np.eye(4)
     matrix[0, 3] = x
     return matrix
+
+
+def test_move_by_name() -> None:
+    floor, robot = (Object(mesh, (Material(),), name=name) for mesh, name in ((torus(), "floor"), (icosphere(1), "robot")))
+    scene, matrix = Scene((floor, robot, robot)), np.diag([2.0, 2.0, 2.0, 1.0])
+    accel = build(Scene((floor, robot)), movable=True)
+    assert isinstance(accel, Instances)
+    accel.move(object="robot", matrix=matrix)
+    assert np.array_equal(accel.geometry.to_world[1], matrix[:3])
+    worlds = build([Scene((robot, floor)), scene, Scene((floor, robot))])
+    worlds.move(object="floor", world=[0, 2], matrix=np.stack([matrix, 2.0 * matrix - np.diag([0.0, 0.0, 0.0, 1.0])]))
+    worlds.move(object=2, world=1, matrix=matrix)
+    scales = worlds.geometry.to_world[:, 0, 0].tolist()
+    assert scales == [1.0, 2.0, 1.0, 1.0, 2.0, 4.0, 1.0]
+    for more, told in (
+            ({"object": "robt", "world": 0}, ("object", "unknown object 'robt'")), ({"object": "robot"}, ("world", "3 worlds")),
+            ({"object": "robot", "world": 1}, ("object", "2 objects are called")), ({"object": 2, "world": 0}, ("object", "0 to 1")),
+            ({"object": 1.5, "world": 0}, ("object", "0 to 1")), ({"object": "robot", "world": 3}, ("world", "0 to 2")),
+            ({"object": ["robot"] * 3, "world": [0, 2]}, ("world", "3 worlds")),
+            ({"instance": 0, "object": 0}, (None, "instance and matrix")), ({"instance": 0, "world": 0}, (None, "instance and matrix"))):
+        with refused(*told):
+            worlds.move(matrix=matrix, **more)  # type: ignore[call-overload]
+    with refused("object", hint="did you mean 'robot'?"):
+        worlds.move(object="robt", world=0, matrix=matrix)

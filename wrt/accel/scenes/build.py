@@ -82,7 +82,10 @@ def reports_progress(accel: str) -> bool:
 
 
 @overload
-def build(mesh: list[WorldT], accel: str = ..., device: str = ..., threads: int | None = ...,
+def build(mesh: list[WorldT], accel: str = ..., device: str = ..., threads: int | None = ..., *, movable: bool = ...,
+          **options: Unpack[BuildOptions]) -> Instances: ...
+@overload
+def build(mesh: MeshLike, accel: str = ..., device: str = ..., threads: int | None = ..., *, movable: Literal[True],
           **options: Unpack[BuildOptions]) -> Instances: ...
 @overload
 def build(mesh: OneMeshLike, accel: Literal["bvh", "bvh8"] = ..., device: str = ..., threads: int | None = ...,
@@ -124,10 +127,10 @@ def build(mesh: OneMeshLike, accel: Literal["octree"], device: str = ..., thread
 def build(mesh: OneMeshLike, accel: str, device: str = ..., threads: int | None = ...,
           **options: Unpack[BuildOptions]) -> OneMesh: ...
 @overload
-def build(mesh: SceneLike, accel: str = ..., device: str = ..., threads: int | None = ...,
+def build(mesh: SceneLike, accel: str = ..., device: str = ..., threads: int | None = ..., *, movable: bool = ...,
           **options: Unpack[BuildOptions]) -> OneMesh | Instances: ...
-def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = DEFAULT_DEVICE, threads: int | None = None,
-          **options: Unpack[BuildOptions]) -> OneMesh | Instances:
+def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = DEFAULT_DEVICE, threads: int | None = None, *,
+          movable: bool = False, **options: Unpack[BuildOptions]) -> OneMesh | Instances:
     """Build an acceleration structure over a mesh, a scene or several worlds.
 
     In a scene, prim_ids number the faces of all objects in order, then the spheres. A mesh that several objects share is stored once
@@ -144,13 +147,16 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = DEFAULT_
         Device of the structure: "cpu" or "cuda:0".
     threads : int, optional
         Threads that build and refit; one per core by default.
+    movable : bool
+        Make each object of the scene, or the mesh, an instance that `Instances.move` moves. Not for scenes with spheres.
     **options
         Intersection tests `triangle` and `box`, and the options of the structure (`BuildOptions`).
 
     Returns
     -------
     OneMesh or Instances
-        An object of the structure's class, such as `Bvh8`; `Instances` for a list, and for a scene whose shared meshes are stored once.
+        An object of the structure's class, such as `Bvh8`; `Instances` for a list, if `movable`, and for a scene whose shared meshes are
+        stored once.
 
     Raises
     ------
@@ -159,6 +165,8 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = DEFAULT_
     """
     ACCELERATORS.check(as_one(accel, str, "accel"), "accel")
     kind, device = ACCELERATORS[accel], as_one(device, str, "device")
+    if as_one(movable, bool, "movable") and not isinstance(mesh, list):
+        mesh = [mesh]
     flat = (worlds_over([to_mesh_or_scene(each) for each in mesh]) if isinstance(mesh, list)
              else None if isinstance(mesh, Geometry | InstancedGeometry) else to_flat_scene(mesh))  # a geometry has no attributes
     geometry = mesh if flat is None else flat.geometry

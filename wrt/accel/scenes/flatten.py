@@ -95,7 +95,7 @@ def _placed_scene(scene: Scene, index: dict[int, int], parts: dict[int, _Joined]
                  np.concatenate([part.normals for part in joined]) if _is_smooth(scene) else None,
                  np.concatenate([part.uvs for part in joined]), prim_material,
                  Placed(columns[0], columns[1], columns[2], columns[3], np.array([run[4] for run in runs], np.float64)),
-                 _first_prims(scene))
+                 _first_prims(scene), names=tuple(thing.name for thing in scene.objects))
 
 
 def _is_smooth(scene: Scene) -> bool:

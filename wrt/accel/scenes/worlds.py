@@ -27,7 +27,7 @@ def worlds_over(worlds: Sequence[Mesh | Scene]) -> FlatScene:
         if isinstance(scene, Scene) and scene.spheres:
             raise InputError("has spheres, but worlds must consist of meshes", place=f"world {index}")
     grey = (Material(),)
-    objects = [scene.objects if isinstance(scene, Scene) else (Object(scene, grey),) for scene in worlds]
+    objects = [scene.objects if isinstance(scene, Scene) else (Object(scene, grey, name=scene.name),) for scene in worlds]
     together = tuple(thing for each in objects for thing in each)
     if not together:
         raise InputError("must have at least one object in all its worlds together", argument="mesh")
