@@ -89,7 +89,6 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         wrt.render(glass(Path(folder)), spp=256, size=SIZE).save(HERE / "glass.png")
     rays()
-    wrt.profile(stadium, spp=4, size=(320, 240)).heatmap("nodes").save(HERE / "nodes.png", optimize=True)
 
 
 if __name__ == "__main__":
