@@ -1,4 +1,4 @@
-"""Make the four pictures of README.md: `PYTHONPATH=. python docs/images/make.py`."""
+"""Make the three pictures of README.md: `PYTHONPATH=. python docs/images/make.py`."""
 
 import io
 import tempfile
