@@ -124,8 +124,8 @@ class Sides:
 
 
 @wp.func
-def cut_by_plane(node: BspNode, box: BoxRay, direction: wp.vec3, t_0: float, t_1: float, drift: float) -> Sides:
-    """Order a node's children along a ray, and cut the ray's part [t_0, t_1] at the node's plane; drift: Reach.drift."""
+def cut_by_plane(node: BspNode, box: BoxRay, direction: wp.vec3, part: wp.vec2, drift: float) -> Sides:
+    """Order a node's children along a ray, and cut the ray's part (t_0, t_1) at the node's plane; drift: Reach.drift."""
     # `height` is the origin's distance below the plane, `inv` 1 / (normal . direction).
     height = float(0.0)
     inv = float(0.0)
@@ -135,7 +135,7 @@ def cut_by_plane(node: BspNode, box: BoxRay, direction: wp.vec3, t_0: float, t_1
     else:
         height = -(wp.dot(node.normal, box.origin) + node.offset)
         inv = 1.0 / wp.dot(node.normal, direction)
-    thick = node.tolerance + drift * wp.max(-t_0, t_1)
+    thick = node.tolerance + drift * wp.max(-part[0], part[1])
     up = not inv < 0.0
     slab = wp.where(up, thick, -thick)
     near_end = (height + slab) * inv
@@ -144,10 +144,10 @@ def cut_by_plane(node: BspNode, box: BoxRay, direction: wp.vec3, t_0: float, t_1
     out.near = child_of(node, not up)
     out.far = child_of(node, up)
     # Comparisons with NaN are false: the child is visited.
-    out.meets_near = out.near.count != 0 and not (t_0 > near_end)
-    out.meets_far = out.far.count != 0 and not (far_begin > t_1)
-    out.near_t_1 = wp.where(near_end < t_1, near_end, t_1)
-    out.far_t_0 = wp.where(far_begin > t_0, far_begin, t_0)
+    out.meets_near = out.near.count != 0 and not (part[0] > near_end)
+    out.meets_far = out.far.count != 0 and not (far_begin > part[1])
+    out.near_t_1 = wp.where(near_end < part[1], near_end, part[1])
+    out.far_t_0 = wp.where(far_begin > part[0], far_begin, part[0])
     return out
 
 
@@ -182,14 +182,12 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
         counts = Counts()
         stack_first = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
         stack_count = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
-        stack_t_0 = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.float32)
-        stack_t_1 = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.float32)
+        stack_part = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.vec2)
         size = int(0)
         first = int(accel.first)
         count = int(accel.count)
-        t_0 = float(reach.t_0)
-        t_1 = float(reach.t_1)
-        found = t_0 <= t_1
+        part = wp.vec2(reach.t_0, reach.t_1)
+        found = part[0] <= part[1]
         while found:
             if count >= 0:
                 counts.leaves += wp.where(count > 0, 1, 0)
@@ -199,40 +197,36 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
                         break
             else:
                 counts = fetch_node(accel.recorder, probe.ray, counts, first, 0)
-                sides = cut_by_plane(accel.nodes[first], probe.box, probe.ray.direction, t_0, t_1, reach.drift)
+                sides = cut_by_plane(accel.nodes[first], probe.box, probe.ray.direction, part, reach.drift)
                 if wp.static(units.steps):
-                    record_sides(accel.recorder, probe.ray, first, accel.nodes[first], sides, wp.vec2(t_0, t_1))
+                    record_sides(accel.recorder, probe.ray, first, accel.nodes[first], sides, part)
                 if sides.meets_near:
                     if sides.meets_far:
                         stack_first[size] = sides.far.first
                         stack_count[size] = sides.far.count
-                        stack_t_0[size] = sides.far_t_0
-                        stack_t_1[size] = t_1
+                        stack_part[size] = wp.vec2(sides.far_t_0, part[1])
                         record_push(accel.recorder, probe.ray, sides.far.first, sides.far.count, sides.far_t_0, size)
                         size = size + 1
                         counts = push(counts, size)
                     first = sides.near.first
                     count = sides.near.count
-                    t_1 = sides.near_t_1
+                    part = wp.vec2(part[0], sides.near_t_1)
                     continue
                 if sides.meets_far:
                     first = sides.far.first
                     count = sides.far.count
-                    t_0 = sides.far_t_0
+                    part = wp.vec2(sides.far_t_0, part[1])
                     continue
             # Pop the next child that begins at most reach.beyond behind the best hit.
             found = bool(False)
             while size > 0 and not found:
                 size = size - 1
                 counts.pops += 1
-                taken = wp.where(stack_t_0[size] <= best.t + reach.beyond, ENTERED, 0)
-                record_pop(accel.recorder, probe.ray, stack_first[size], stack_count[size], stack_t_0[size], taken)
-                if stack_t_0[size] <= best.t + reach.beyond:
-                    first = stack_first[size]
-                    count = stack_count[size]
-                    t_0 = stack_t_0[size]
-                    t_1 = wp.min(stack_t_1[size], best.t + reach.beyond)
-                    found = bool(True)
+                first = stack_first[size]
+                count = stack_count[size]
+                part = wp.vec2(stack_part[size][0], wp.min(stack_part[size][1], best.t + reach.beyond))
+                found = part[0] <= best.t + reach.beyond
+                record_pop(accel.recorder, probe.ray, first, count, part[0], wp.where(found, ENTERED, 0))
         return best, counts
 
     return walk

@@ -95,19 +95,17 @@ def record_split(recorder: Recorder, ray: Ray, index: int, node: KdNode, t_split
 
 
 def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
-    """Make walk(accel, surfaces, probe, part, slack, counts) -> (best Hit, Counts). part: (t_enter, t_exit) of the root's cell."""
+    """Make walk(accel, surfaces, probe, root_part, slack, counts) -> (best Hit, Counts). root_part: (t_enter, t_exit) at the root."""
     visit_leaf = make_leaf(units, any_hit, accepts)
     fetch_node, _, push, _ = make_counters(units, size_of(KdNode))
     record_push, record_pop = make_recording(units)
 
     @wp.func
-    def walk(accel: Any, surfaces: Any, probe: Probe, part: wp.vec2, slack: float, counts: Counts):
+    def walk(accel: Any, surfaces: Any, probe: Probe, root_part: wp.vec2, slack: float, counts: Counts):
         best = no_hit(probe.ray)
-        t_enter = part[0]
-        t_exit = part[1]
+        part = wp.vec2(root_part)
         stack_index = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.int32)
-        stack_enter = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.float32)
-        stack_exit = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.float32)
+        stack_part = wp.zeros(shape=wp.static(STACK_SIZE), dtype=wp.vec2)
         size = int(0)
         index = int(0)
         found = bool(True)
@@ -121,24 +119,22 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
                 t_split = (node.split - probe.box.origin[axis]) * inverse
                 far = wp.where(inverse < 0.0, first, first + 1)
                 near_exit = later(t_split)
-                far_enter = wp.where(earlier(t_split) > t_enter, earlier(t_split), t_enter)
+                far_enter = wp.where(earlier(t_split) > part[0], earlier(t_split), part[0])
                 if wp.static(units.steps):
-                    record_split(accel.recorder, probe.ray, index, node, t_split, wp.vec2(t_enter, t_exit))
-                if t_enter > near_exit:
+                    record_split(accel.recorder, probe.ray, index, node, t_split, part)
+                if part[0] > near_exit:
                     index = far
-                    t_enter = far_enter
+                    part = wp.vec2(far_enter, part[1])
                 else:
-                    if not t_exit < earlier(t_split):
+                    if not part[1] < earlier(t_split):
                         stack_index[size] = far
-                        stack_enter[size] = far_enter
-                        stack_exit[size] = t_exit
+                        stack_part[size] = wp.vec2(far_enter, part[1])
                         record_push(accel.recorder, probe.ray, far, INNER, far_enter, size)
                         size = size + 1
                         counts = push(counts, size)
                     index = wp.where(inverse < 0.0, first + 1, first)
-                    t_exit = wp.where(near_exit < t_exit, near_exit, t_exit)
+                    part = wp.vec2(part[0], wp.where(near_exit < part[1], near_exit, part[1]))
                 continue
-
             counts.leaves += 1
             counts.box_operations -= 1  # a leaf has no plane to test
             best, counts = visit_leaf(accel, surfaces, probe, first, int(node.split), best, counts)
@@ -152,10 +148,9 @@ def make_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
                 size = size - 1
                 counts.pops += 1
                 index = stack_index[size]
-                t_enter = stack_enter[size]
-                t_exit = wp.where(limit < stack_exit[size], limit, stack_exit[size])
-                found = t_enter <= t_exit
-                record_pop(accel.recorder, probe.ray, index, INNER, t_enter, wp.where(found, ENTERED, 0))
+                part = wp.vec2(stack_part[size][0], wp.where(limit < stack_part[size][1], limit, stack_part[size][1]))
+                found = part[0] <= part[1]
+                record_pop(accel.recorder, probe.ray, index, INNER, part[0], wp.where(found, ENTERED, 0))
         return best, counts
 
     return walk

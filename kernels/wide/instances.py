@@ -200,18 +200,13 @@ def make_top_walk(units: Units, any_hit: bool) -> Any:
     return walk
 
 
-def make_top_interleaved(units: Units, any_hit: bool, worlds: bool) -> Any:
-    """Return interleaved, which traces rays of PACKETS packets through the instances, one step of each ray in turn.
-
-    The mask `waiting` has a bit for each ray to trace: bit LANES * packet + lane, of the packets behind the first PLACED ones."""
-    top_begin, top_step, top_pop = make_top_steps(any_hit)[2:]
-    place_ray, take_hit = make_changes(any_hit, far_pad(units.box))[2:]
-    test_row = make_row_test(units, any_hit, None, True)
-    _, step, pop = make_steps(any_hit)
+def make_start(any_hit: bool, place_ray: Any, worlds: bool) -> Any:
+    """Return descend and start, which bring a slot's ray to its next placement. Both return False if there is none."""
+    top_begin, top_step = make_top_steps(any_hit)[2:4]
 
     @wp.func
     def descend(accel: Instances, scratch: Scratch, slot: int, next: int) -> bool:
-        """Walk the upper level to the ray's next placement, and change to its space. Return False if there is none."""
+        """Walk the upper level to the ray's next placement, and change to its space."""
         top = SLOT_SIZE * (SLOTS + slot)
         while next > 0:
             next = top_step(accel, scratch, SLOTS + slot)
@@ -225,7 +220,7 @@ def make_top_interleaved(units: Units, any_hit: bool, worlds: bool) -> Any:
 
     @wp.func
     def start(accel: Instances, scratch: Scratch, slot: int, ray: int) -> bool:
-        """Put ray `ray` = LANES * packet + lane into a slot. Return False if it enters no placement."""
+        """Put ray `ray` = LANES * packet + lane into a slot."""
         column = (PLACED + ray / LANES) * PACKET_SIZE + ray % LANES
         root = int(0)
         if wp.static(worlds):
@@ -235,9 +230,17 @@ def make_top_interleaved(units: Units, any_hit: bool, worlds: bool) -> Any:
                 return descend(accel, scratch, slot, top_step(accel, scratch, SLOTS + slot))
         return descend(accel, scratch, slot, top_begin(accel, scratch, SLOTS + slot, root, column))
 
+    return descend, start
+
+
+def make_turn(units: Units, any_hit: bool, take_hit: Any, descend: Any) -> Any:
+    """Return turn, which visits the node or leaf of a slot's ray, and chooses the next one. It returns False if the ray is finished."""
+    test_row = make_row_test(units, any_hit, None, True)
+    _, step, pop = make_steps(any_hit)
+    top_pop = make_top_steps(any_hit).pop
+
     @wp.func
     def turn(accel: Instances, surfaces: Surfaces, scratch: Scratch, slot: int) -> bool:
-        """Visit the node or leaf of a slot's ray, and choose the next one. Return False if the ray is finished."""
         words = slot * SLOT_SIZE
         placement = slot_at(scratch.slots, words + wp.static(SLOT["placement"]))
         bottom = accel.bottoms[accel.placements[placement].bottom]
@@ -264,6 +267,17 @@ def make_top_interleaved(units: Units, any_hit: bool, worlds: bool) -> Any:
         if finished:
             return False
         return descend(accel, scratch, slot, top_pop(accel, scratch, SLOTS + slot, number(scratch.packets, ray + wp.static(FIELD["t"]))))
+
+    return turn
+
+
+def make_top_interleaved(units: Units, any_hit: bool, worlds: bool) -> Any:
+    """Return interleaved, which traces rays of PACKETS packets through the instances, one step of each ray in turn.
+
+    The mask `waiting` has a bit for each ray to trace: bit LANES * packet + lane, of the packets behind the first PLACED ones."""
+    place_ray, take_hit = make_changes(any_hit, far_pad(units.box))[2:]
+    descend, start = make_start(any_hit, place_ray, worlds)
+    turn = make_turn(units, any_hit, take_hit, descend)
 
     @wp.func
     def interleaved(accel: Instances, surfaces: Surfaces, scratch: Scratch, waiting: wp.uint64):

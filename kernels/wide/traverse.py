@@ -204,14 +204,16 @@ def make_recorded(units: Units, accepts: Any, layout: NodeLayout) -> Any:
 
     @wp.func
     def record_children(accel: struct, slot: int, first: int, t: Any, mask: int):
-        for j in range(width):
-            reference = bits(accel.nodes, first + wp.static(layout.references) + j)
-            if reference != EMPTY:
-                lo = wp.vec3(plane(accel.nodes, first, LO_X, j), plane(accel.nodes, first, LO_Y, j), plane(accel.nodes, first, LO_Z, j))
-                hi = wp.vec3(plane(accel.nodes, first, HI_X, j), plane(accel.nodes, first, HI_Y, j), plane(accel.nodes, first, HI_Z, j))
-                entry = wp.where((mask >> j) & 1 != 0, t[j], float(wp.inf))
-                child = child_of(reference)
-                write_step(accel.recorder, slot, box_step(child.index, child.count, lo, hi, entry))
+        if wp.static(units.steps):
+            nodes = accel.nodes
+            for j in range(width):
+                reference = bits(nodes, first + wp.static(layout.references) + j)
+                if reference != EMPTY:
+                    lo = wp.vec3(plane(nodes, first, LO_X, j), plane(nodes, first, LO_Y, j), plane(nodes, first, LO_Z, j))
+                    hi = wp.vec3(plane(nodes, first, HI_X, j), plane(nodes, first, HI_Y, j), plane(nodes, first, HI_Z, j))
+                    entry = wp.where((mask >> j) & 1 != 0, t[j], float(wp.inf))
+                    child = child_of(reference)
+                    write_step(accel.recorder, slot, box_step(child.index, child.count, lo, hi, entry))
 
     @wp.func
     def record_push(recorder: Recorder, ray: Ray, key: wp.uint64, below: int):
@@ -224,7 +226,7 @@ def make_recorded(units: Units, accepts: Any, layout: NodeLayout) -> Any:
         record_popped(recorder, ray, child.index, child.count, t_of(key), wp.where(t_of(key) <= best.t, ENTERED, 0))
 
     @wp.func
-    def recorded_leaf(accel: struct, surfaces: Any, reference: int, probe: Probe, best: Hit) -> Hit:
+    def recorded_leaf(accel: struct, surfaces: Any, reference: int, probe: Probe, rows: LaneRay, best: Hit) -> Hit:
         """Test all primitives of a leaf one by one, also those that the test of a row rejects."""
         leaf = child_of(reference)
         write_step(accel.recorder, probe.ray.slot, leaf)
@@ -242,16 +244,16 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
     struct = make_struct(units.triangle_test.record)
     children = make_children(layout.width, layout.compressed, units.box)
     probe_of = make_probe(units)
-    test_leaf = make_leaf_test(units, any_hit, accepts, layout)
     prefetch_next = make_prefetch(units.triangle_test.record, layout)
     count_node, count_leaf, count_pop, count_push, finish = make_counting(units, layout)
     record_children, record_push, record_pop, recorded_leaf = make_recorded(units, accepts, layout)
+    visit_leaf = recorded_leaf if units.steps else make_leaf_test(units, any_hit, accepts, layout)
     new_stack, shared_stack, put, get = make_stack(units.stack, STACK_SIZE, wp.uint64, 8)
 
     @wp.func
-    def child(accel: struct, at: int) -> int:
-        """Load the reference at accel.nodes[at], and prefetch its node or leaf."""
-        reference = bits(accel.nodes, at)
+    def child(accel: struct, first: int, lane: int) -> int:
+        """Load a reference of the node at accel.nodes[first], and prefetch its node or leaf."""
+        reference = bits(accel.nodes, first + wp.static(layout.references) + lane)
         prefetch_next(accel, reference)
         return reference
 
@@ -266,32 +268,26 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
         shared = shared_stack()
         size = int(0)
         reference = int(0)
-        while True:
+        found = bool(True)
+        while found:
             if reference < 0:
-                if wp.static(units.steps):
-                    best = recorded_leaf(accel, surfaces, reference, probe, best)
-                else:
-                    best = test_leaf(accel, surfaces, reference, probe, rows, best)
+                best = visit_leaf(accel, surfaces, reference, probe, rows, best)
                 counts = count_leaf(accel, ray, counts, reference)
                 if wp.static(any_hit):
                     if best.prim_id != NO_HIT:
-                        return finish(accel.recorder, ray, counts, best)
+                        break
             else:
                 first = reference * wp.static(layout.size)
                 counts = count_node(accel, ray, counts, reference)
                 t, mask = children(accel.nodes, first, rows, best.t)
-                if wp.static(units.steps):
-                    record_children(accel, ray.slot, first, t, mask)
+                record_children(accel, ray.slot, first, t, mask)
                 if mask != 0:
-                    first = first + wp.static(layout.references)
-                    lane = lowest(mask)
-                    mask = mask & (mask - 1)
-                    near = key_of(t[lane], child(accel, first + lane))
+                    lane, mask = lowest(mask), mask & (mask - 1)
+                    near = key_of(t[lane], child(accel, first, lane))
                     begin = size
                     while mask != 0:
-                        lane = lowest(mask)
-                        mask = mask & (mask - 1)
-                        key = key_of(t[lane], child(accel, first + lane))
+                        lane, mask = lowest(mask), mask & (mask - 1)
+                        key = key_of(t[lane], child(accel, first, lane))
                         if wp.static(any_hit):
                             record_push(accel.recorder, ray, near, size)
                             put(stack, shared, size, near)
@@ -319,11 +315,8 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
                 counts = count_pop(counts)
                 key = get(stack, shared, size)
                 record_pop(accel.recorder, ray, key, best)
-                if t_of(key) <= best.t:
-                    reference = reference_of(key)
-                    found = True
-            if not found:
-                break
+                reference = reference_of(key)
+                found = t_of(key) <= best.t
         return finish(accel.recorder, ray, counts, best)
 
     return traverse
