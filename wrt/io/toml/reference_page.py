@@ -12,19 +12,18 @@ from wrt.io.load import schema
 Schema = dict[str, Any]
 TOP = "SceneTable"
 SHARED_KEYS = 4  # if two tables share so many equal keys or more, the page describes these keys once
+TABLE = "| key | type | default | meaning |\n|---|---|---|---|"
 WORDS = {"string": "text", "boolean": "true or false", "integer": "whole number"}
 HEAD = """\
 # Scene files
 
-A scene is a [TOML](https://toml.io) file: `python -m wrt render scene.toml`, `wrt.load_scene("scene.toml")`. The command `python -m wrt
-validate scene.toml` reports every mistake with its place. `python -m wrt schema` prints the JSON Schema for editors, and this page with
-`--markdown`.
+A scene is a [TOML](https://toml.io) file. `python -m wrt validate scene.toml` reports every mistake with its place. `python -m wrt schema`
+prints the JSON Schema for editors, and this page with `--markdown`.
 
 - [Concepts](concepts.md#spaces-and-units) describes spaces and units. Angles are in degrees here, and in radians in Python.
 - Matrices are 16 numbers, row by row, and act on column vectors. One number for a colour is a grey.
-- [Known limits](accuracy.md#known-limits) has the smallest and the largest size of a scene.
 - File names are relative to the scene file.
-- A scene without a camera, or without any light, gets a default one; a message says so.
+- Objects and lights may have a `name`, for messages.
 
 ## Example
 """
@@ -42,7 +41,10 @@ def scene_format() -> str:
         sentence = " ".join(tables[name]["description"].split())
         known, before = _described_before(tables, name, list(places)[:i])
         more = f" {', '.join(f'`{key}`' for key in known)}: as in {_link(before)}." if known else ""
-        parts.append(f"### {_title(name)}\n{where} {sentence}{more}\n\n{_table(tables[name], known)}\n")
+        fixed = {key: value["const"] for key, value in tables[name]["properties"].items() if "const" in value and "default" not in value}
+        where = f"{where[:-1]}, with {', '.join(f'`{key} = {json.dumps(value)}`' for key, value in fixed.items())}." if fixed else where
+        rows = _rows(tables[name], {"name", *known, *fixed})
+        parts.append("\n".join([f"### {_title(name)}\n{where} {sentence}{more}\n", *([TABLE, *rows, ""] if rows else [])]))
     return "\n".join(parts)
 
 
@@ -92,14 +94,14 @@ def _references(value: Any, place: str) -> list[tuple[str, str]]:
     return [found for each, at in parts for found in _references(each, at)]
 
 
-def _table(table: Schema, left_out: list[str]) -> str:
-    rows = ["| key | type | default | meaning |", "|---|---|---|---|"]
+def _rows(table: Schema, left_out: set[str]) -> list[str]:
+    rows = []
     for key, value in [each for each in table["properties"].items() if each[0] not in left_out]:
-        default = "required" if key in table.get("required", ()) and "const" not in value else _default(value)
+        default = "required" if key in table.get("required", ()) else _default(value)
         notes = ", ".join(each for each in (_find(value, "unit"), _limits(value)) if each)
         cells = (f"`{key}`", f"{_type(value)} ({notes})" if notes else _type(value), default, value.get("description", ""))
         rows.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")
-    return "\n".join(rows)
+    return rows
 
 
 def _type(value: Schema) -> str:
