@@ -163,14 +163,14 @@ def measured(plan: type[Plan]) -> click.Command:
     @planned(plan)
     @reporting(plan.OUTPUT, cluster="meshes" in plan.__annotations__)
     def command(how: Reporting, plan: Plan) -> None:
-        from wrt.lab.bench import report
+        from wrt.lab.bench import plot, report
         from wrt.lab.bench.sweep import by_mesh
 
         study = report.study_of(plan)
         writers = report.WRITERS | getattr(study, "WRITERS", {})
         suffix = how.check_report((".json", *writers))
-        if hasattr(study, "check_output"):
-            study.check_output(suffix)
+        if suffix in (".png", ".svg"):
+            plot.new_figure(1.0, 1.0)  # raises InputError if matplotlib is missing
         total = study.total(plan) if hasattr(study, "total") else None
         client = client_of(how.cluster)
         machine = study.machine(plan) if hasattr(study, "machine") else report.machine_line()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -11,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from wrt.lab.bench.plot import new_figure
+from wrt.lab.bench.plot import new_figure, picture_file
 from wrt.lab.bench.report import Columns, Part, Row, grouped, tabled
 from wrt.lab.claims.claim import CLAIMS, SAME_SCENE, Figure, Study
 from wrt.lab.claims.nodes import NAMES, WIDTHS
@@ -32,8 +30,6 @@ published: a number, or the two ends of a range; ratio: ours over it, 1 within a
 where said), and on the same side of 1 for a unit of ratio. differs: the list of sources says what a measurement shows about it. own
 finding: no number to compare with. In brackets after a source: read in the original, quoted by others, the abstract alone, or memory.
 Generated scenes stand in for scenes without a file. Nothing is timed: equal options give equal rows."""
-FIELDS = ("claim", "what", "unit", "published_low", "published_high", "ours", "ratio", "verdict", "source", "setup", "sure", "differences",
-          "reason")
 
 
 def said(published: float | tuple[float, float] | None) -> str:
@@ -53,7 +49,7 @@ def rows(plan: Plan) -> Iterator[Row]:
 def row_of(name: str, figure: Figure) -> Row:
     claim = CLAIMS[name]
     return Row(claim=name, **vars(figure), ratio=figure.ratio, verdict=figure.verdict, source=claim.source, setup=claim.setup,
-    sure=claim.sure)
+               sure=claim.sure)
 
 
 def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
@@ -118,20 +114,8 @@ def facts(rows: Sequence[Row], plan: Plan) -> dict[str, object]:
     return {"compared": len(compared), "agree": sum(row.verdict == "agrees" for row in compared)}
 
 
-def as_csv(rows: Sequence[Row], plan: Plan, machine: str, suffix: str) -> bytes:
-    """Return one line per number; a published range has two ends."""
-    out = io.StringIO()
-    writer = csv.DictWriter(out, FIELDS, extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    for row in rows:
-        low, high = row.published if isinstance(row.published, tuple) else (row.published, row.published)
-        writer.writerow({**vars(row), "published_low": low, "published_high": high})
-    return out.getvalue().encode()
-
-
 def as_picture(rows: Sequence[Row], plan: Plan, machine: str, suffix: str) -> bytes:
     """Draw a panel for each claim and unit: bars for wrt's numbers, and the published number or range over each bar."""
-    from matplotlib import rc_context
     from matplotlib.patches import Patch
 
     panels = [Panel(len(group), partial(bars, rows=group))
@@ -150,10 +134,7 @@ def as_picture(rows: Sequence[Row], plan: Plan, machine: str, suffix: str) -> by
     figure.legend(handles=[Patch(color="C0", label="wrt: agrees, or nothing to compare with"), Patch(color="C1", label="wrt: differs"),
                            Patch(color="k", label="published value or range, by the source in the title")],
                   loc="outside upper center", ncols=3 if len(columns) > 1 else 1, frameon=False, fontsize="small")
-    out = io.BytesIO()
-    with rc_context({"svg.hashsalt": "wrt"}):
-        figure.savefig(out, format=suffix[1:], metadata={"Date": None} if suffix == ".svg" else {"Software": None})
-    return out.getvalue()
+    return picture_file(figure, suffix)
 
 
 class Panel(NamedTuple):
@@ -212,10 +193,4 @@ def curves(axes: Axes, scene: str, found: dict[tuple[int, str], float]) -> None:
     axes.legend(fontsize="x-small")
 
 
-def check_output(suffix: str) -> None:
-    """Raise InputError if matplotlib is missing for a picture."""
-    if suffix in (".png", ".svg"):
-        new_figure(1.0, 1.0)
-
-
-WRITERS = {".csv": as_csv, ".png": as_picture, ".svg": as_picture}
+WRITERS = {".png": as_picture, ".svg": as_picture}

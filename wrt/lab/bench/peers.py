@@ -18,8 +18,7 @@ from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench import peer_points, peer_tiles
 from wrt.lab.bench.accel import timing, warm_up
 from wrt.lab.bench.instruction_sets import instruction_sets
-from wrt.lab.bench.peer_files import chart, figures
-from wrt.lab.bench.peer_files import check_output as check_output
+from wrt.lab.bench.peer_chart import chart
 from wrt.lab.bench.rays import RaySet, ray_sets
 from wrt.lab.bench.report import Columns, Part, Row, grouped, machine_line, mesh_name, tabled, versions
 from wrt.lab.bench.timing import alternate, spread
@@ -41,7 +40,7 @@ with parts of the rays. wrt / library: speed of the table's first structure over
 rays that hit in one library and miss in the other, or hit different primitives at t that differ by more than 1e-4 relative. Any-hit rays
 (shadow) differ if one library says occluded and the other does not. points: closest points; distances differ by more than 1e-4
 relative. tiles: 64x64 primary rays in each of many worlds of 3,202 triangles. best mode: the fastest of a library's modes for each mesh."""
-WRITERS = {".csv": figures, ".svg": chart, ".png": chart}
+WRITERS = {".svg": chart, ".png": chart}
 
 
 def rows(plan: Plan) -> Iterator[Row]:

@@ -58,9 +58,9 @@ def new_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), dpi=DPI, layout="constrained")
 
 
-def bars(panels: Mapping[str, Mapping[str, float]], title: str, form: str) -> bytes:
+def bars(panels: Mapping[str, Mapping[str, float]], title: str, suffix: str) -> bytes:
     """Return a picture file: a panel for each kind, with a bar and its value for each name. The first bar of a panel is highlighted.
-    panels: kind -> name -> value > 0. form: "svg" or "png"."""
+    panels: kind -> name -> value > 0. suffix: .svg or .png."""
     rows = math.ceil(len(panels) / 2)
     figure = new_figure(9.0, 0.6 + rows * (0.5 + 0.24 * max(map(len, panels.values()))))
     figure.suptitle(title, fontsize="medium")
@@ -74,6 +74,14 @@ def bars(panels: Mapping[str, Mapping[str, float]], title: str, form: str) -> by
         each.set(xticks=[], xlim=(0, 1.25 * max(values.values())))
         each.spines[["top", "right", "bottom"]].set_visible(False)
         each.invert_yaxis()
+    return picture_file(figure, suffix)
+
+
+def picture_file(figure: Figure, suffix: str) -> bytes:
+    """Return the contents of a .svg or .png file; equal figures give equal bytes."""
+    from matplotlib import rc_context
+
     out = io.BytesIO()
-    figure.savefig(out, format=form)
+    with rc_context({"svg.hashsalt": "wrt"}):
+        figure.savefig(out, format=suffix[1:], metadata={"Date": None} if suffix == ".svg" else {"Software": None})
     return out.getvalue()

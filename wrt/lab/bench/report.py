@@ -81,7 +81,7 @@ def study_of(plan: Plan) -> ModuleType:
 
     The module has TITLE, LEGEND, and rows(plan), which yields each Row once it is measured. COLUMNS or parts(rows, plan) make the tables.
     Optional are machine(plan) for the report, line(row) for a line of progress, facts(rows, plan) for more JSON fields, total(plan) for
-    the expected number of rows, and for -o WRITERS (see below), with check_output(suffix), which raises InputError."""
+    the expected number of rows, and WRITERS for -o (see below)."""
     return importlib.import_module(plan.STUDY)
 
 

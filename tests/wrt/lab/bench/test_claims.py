@@ -66,8 +66,6 @@ def test_the_report_has_the_numbers_the_sources_and_the_table_of_rules() -> None
     rows = list(bench.rows(plan))
     text = markdown(bench.parts(rows, plan))
     assert "arXiv 2605.16253, Table I" in text and "of 6 compared numbers agree" in text and "width 8" in text
-    lines = list(csv.DictReader(io.StringIO(bench.as_csv(rows, plan, "", ".csv").decode())))
-    assert [float(line["ours"]) for line in lines] == [row.ours for row in rows]
     picture = bench.as_picture(rows, plan, "", ".png")
     assert picture == bench.as_picture(rows, plan, "", ".png")
 
@@ -122,7 +120,8 @@ def test_the_command_takes_a_file_for_a_published_scene(tmp_path: Path) -> None:
     data = json.loads(wrt(*arguments, "-q", "--json").out)
     assert data["compared"] == 2 and data["rows"][0]["differences"].startswith(f"scene bunny: {len(ball.faces)} triangles, the caller's")
     assert wrt(*arguments, "-o", tmp_path / "report.csv").code == 0
-    assert (tmp_path / "report.csv").read_text().startswith("claim,what,unit,published_low")
+    lines = list(csv.DictReader((tmp_path / "report.csv").read_text().splitlines()[2:]))
+    assert [float(line["ours"]) for line in lines] == [row["ours"] for row in data["rows"]]
     assert wrt("bench", "claims", "nonsense").code == 2
     assert wrt("bench", "claims", "rules", "-o", tmp_path / "x.pdf").code == 2
 

@@ -218,9 +218,9 @@ def test_the_command_prints_and_writes(box, tmp_path) -> None:
     for name in ("out.csv", "out.svg", "out.png"):
         assert command("bench", "peers", box, *few, "-o", tmp_path / name).code == 0
     lines = (tmp_path / "out.csv").read_text().splitlines()
-    assert f"# command: python -m wrt bench peers {box.name} --rivals warp --kinds random,points --rays 300" in lines[1]
+    assert f"# command: python -m wrt bench peers {box.name} --rivals warp --kinds random,points --rays 300" in lines[0]
     table = list(csv.DictReader(line for line in lines if not line.startswith("#")))
-    assert [(row["kind"], row["mode"]) for row in table] == [
+    assert [(row["kind"], row["name"]) for row in table] == [
         ("random", "wrt bvh8"), ("random", "Warp mesh_query_ray"), ("points", "wrt bvh8")]
     assert all(float(row["ns"]) > 0.0 for row in table)
     assert (tmp_path / "out.svg").read_text().lstrip().startswith("<?xml") and Image.open(tmp_path / "out.png").width > 400
