@@ -66,7 +66,7 @@ def test_axis_parallel_rays_and_far_origins():
     assert_same(accel, o, along)
     assert_same(accel, o, np.where(np.arange(len(o))[:, None] % 40 < 20, along * np.float32(-0.0) + d, along))
     assert_same(accel, -4e5 * d, d)
-    assert_same(accel, o * np.float32(1e20), -o)
+    assert_same(accel, o[:100] * np.float32(1e20), -o[:100])  # rays that test all triangles
 
 
 @pytest.mark.parametrize("size", [1e-30, 1e-12, 1e12, 1e24])
