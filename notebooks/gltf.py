@@ -258,8 +258,31 @@ except wrt.InputError as error:
 
 # %% [markdown]
 # ## Exercises
-# 1. Load a file of your own. Which warnings does it give? Which of them can you see in the picture?
-# 2. glTF has no depth of field. Add an aperture to `cameras.close` in the TOML file (in place of `fov_y`: `focal_length`,
-#    `sensor_height`, `f_number` and `focus_distance`, as in `scenes/lens.toml`), and focus on the spout.
-# 3. Make the glass ball hollow: put a second, smaller sphere into it, with the corners of its faces in reverse order.
-# 4. Use a checkerboard as the wood's roughness (`metallicRoughnessTexture`: green is roughness, blue is metallic).
+# **1.** Load a file of your own. Which warnings does it give? Which of them can you see in the picture?
+# <details><summary>Solution</summary>
+#
+# `docs/materials.md` lists all warnings, with what the picture shows instead of the part that is left out.
+# </details>
+#
+# **2.** glTF has no depth of field. Add an aperture to `cameras.close` in the TOML file (in place of `fov_y`: `focal_length`,
+# `sensor_height`, `f_number` and `focus_distance`, as in `scenes/lens.toml`), and focus on the spout.
+# <details><summary>Solution</summary>
+#
+# For the same angle of view, the sensor's height is $2 s' \tan(\mathrm{fov}_y/2)$, where $s'$ is $f s/(s - f)$. With `focal_length = 0.9`
+# and `focus_distance = 3.5` that is `sensor_height = 0.60`. `f_number = 2` makes a visible blur. The depth layer of a picture (`--aov
+# depth`) has the distance of the spout.
+# </details>
+#
+# **3.** Make the glass ball hollow: put a second, smaller sphere into it, with the corners of its faces in reverse order.
+# <details><summary>Solution</summary>
+#
+# `inner = icosphere(5, 0.36)`, then `replace(inner, faces=inner.faces[:, ::-1], normals=-inner.normals)`, with the material `glass` and
+# the same translation. The reversed faces say that the air is inside: a ray that meets them from the glass leaves the glass.
+# </details>
+#
+# **4.** Use a checkerboard as the wood's roughness (`metallicRoughnessTexture`: green is roughness, blue is metallic).
+# <details><summary>Solution</summary>
+#
+# `squares = 255 * ((x // 32 + y // 32) % 2)`. The texture is `np.stack([0 * x, squares, 0 * x], axis=-1).astype(np.uint8)`. The roughness
+# is the product of texture and `roughnessFactor`, so set the factor to 1: black squares reflect like a mirror.
+# </details>
