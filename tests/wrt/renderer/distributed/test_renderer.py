@@ -33,7 +33,7 @@ from wrt.renderer import upload
 from wrt.renderer.animate import Animation, animate
 from wrt.renderer.distributed import renderer as module
 from wrt.renderer.distributed import workers
-from wrt.renderer.distributed.installed import INSTALLED, difference
+from wrt.renderer.distributed.installed import CODE, INSTALLED, difference
 from wrt.renderer.options import Options, Progress
 from wrt.renderer.prepare import Prepared
 from wrt.renderer.render import render
@@ -262,7 +262,7 @@ def test_all_code_counts_wherever_the_kernels_stand(tmp_path: Path) -> None:
     wheel = json.loads(done.stdout)
     assert difference(INSTALLED, wheel) == "" and list(wheel["files"]) == list(INSTALLED["files"])
     assert {"accel/store.py", "lab/bench/timing.py", "kernels/loops/one_ray.py"} <= INSTALLED["files"].keys()
-    assert len(INSTALLED["files"]) == sum(path.suffix in (".py", ".h") for folder in ("wrt", "kernels")
+    assert len(INSTALLED["files"]) == sum(path.suffix in CODE for folder in ("wrt", "kernels")
                                           for path in (ROOT / folder).rglob("*"))
 
 
