@@ -18,6 +18,7 @@ from wrt.core.types import PathLike
 from wrt.core.write_file import check_writable, replacing
 from wrt.lab.walk.record import WalkRecord
 from wrt.lab.walk.regions import Region
+from wrt.renderer.inspector.section import Plane, cut
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,46 +29,25 @@ MOST_FACES = 100_000  # the sections of larger meshes are not drawn
 
 @dataclass(frozen=True, eq=False)
 class Section:
-    """A plane through a ray. origin, along, across: (3,) float64; `along` and `across` have unit length. window: (x0, x1, y0, y1)."""
+    """A plane through a ray's origin, and along the ray in the plane's direction `across`. window: (x0, x1, y0, y1)."""
 
-    origin: np.ndarray
-    along: np.ndarray
-    across: np.ndarray
+    plane: Plane
     length: float  # of the direction: x = t * length
-    window: tuple[float, float, float, float] = (0.0, 1.0, -1.0, 1.0)
-
-    def flat(self, points: np.ndarray) -> np.ndarray:
-        """Return x, y and the height above the plane of points (..., 3)."""
-        return (points - self.origin) @ np.stack([self.along, self.across, np.cross(self.along, self.across)], axis=1)
+    window: tuple[float, float, float, float]
 
     def outline(self, region: Region) -> np.ndarray:
         """Return the corners of a region's section within the window, (K, 2); (0, 2) if the plane misses it."""
         if region.radius != 0.0:
-            x, y, height = self.flat(region.center)
-            squared = region.radius**2 - height**2
+            squared = region.radius**2 - self.plane.distance(region.center) ** 2
             angle = np.linspace(0.0, 2.0 * np.pi, 73)
             circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-            return np.array([x, y]) + np.sqrt(squared) * circle if squared > 0.0 else empty()
+            return self.plane.project(region.center) + np.sqrt(squared) * circle if squared > 0.0 else empty()
         x0, x1, y0, y1 = self.window
         corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
         for normal, offset in zip(region.normals, region.offsets, strict=True):
-            corners = clipped(corners, np.array([normal @ self.along, normal @ self.across]), float(normal @ self.origin + offset))
+            flat = np.array([normal @ self.plane.across, normal @ self.plane.up])
+            corners = clipped(corners, flat, float(normal @ self.plane.origin + offset))
         return corners
-
-    def segments(self, corners: np.ndarray) -> np.ndarray:
-        """Return the section of triangles (F, 3, 3): end points (F, 2, 2), NaN where the plane misses the triangle."""
-        flat = self.flat(corners)
-        height = flat[..., 2]
-        out = np.full((len(corners), 2, 2), np.nan)
-        found = np.zeros(len(corners), int)
-        for i, j in ((0, 1), (1, 2), (2, 0)):
-            crosses = ((height[:, i] > 0.0) != (height[:, j] > 0.0)) & (found < 2)
-            rows = np.flatnonzero(crosses)
-            share = (height[rows, i] / (height[rows, i] - height[rows, j]))[:, None]
-            out[rows, found[rows]] = (1.0 - share) * flat[rows, i, :2] + share * flat[rows, j, :2]
-            found[rows] += 1
-        out[found < 2] = np.nan
-        return out
 
 
 def empty() -> np.ndarray:
@@ -96,16 +76,15 @@ def section_of(walk: WalkRecord) -> Section:
     along = direction / length
     axis = np.eye(3)[int(np.argmin(np.abs(along)))]
     across = axis - (axis @ along) * along
-    section = Section(walk.origin.astype(np.float64), along, across / np.linalg.norm(across), length)
+    plane = Plane(walk.origin.astype(np.float64), along, across / np.linalg.norm(across))
     points = walk.geometry.vertices.astype(np.float64)
     lo, hi = points.min(axis=0), points.max(axis=0)
     corners = np.array([[(lo, hi)[k >> a & 1][a] for a in range(3)] for k in range(8)])
-    flat = section.flat(corners)
+    flat = plane.project(corners)
     x0, x1, y0, y1 = flat[:, 0].min(), flat[:, 0].max(), min(flat[:, 1].min(), 0.0), max(flat[:, 1].max(), 0.0)
     size = max(x1 - x0, y1 - y0)
     x0 = min(x0, max(0.0, x0 - 0.3 * size))
-    return Section(section.origin, section.along, section.across, length,
-                   (x0 - 0.05 * size, x1 + 0.05 * size, y0 - 0.05 * size, y1 + 0.05 * size))
+    return Section(plane, length, (x0 - 0.05 * size, x1 + 0.05 * size, y0 - 0.05 * size, y1 + 0.05 * size))
 
 
 def draw(walk: WalkRecord, axes: Axes | None, step: int | None) -> Axes:
@@ -119,19 +98,19 @@ def draw(walk: WalkRecord, axes: Axes | None, step: int | None) -> Axes:
     x0, x1, y0, y1 = section.window
     corners = walk.geometry.vertices.astype(np.float64)[walk.geometry.faces]
     if len(corners) <= MOST_FACES:
-        axes.plot(*segments_of(section.segments(corners)), color="0.8", lw=0.8, zorder=1)
+        axes.plot(*segments_of(cut(corners, section.plane)), color="0.8", lw=0.8, zorder=1)
     steps = walk.steps[: last + 1]
     draw_regions(walk, axes, section, last)
     tested = np.array([each.prim_id for each in steps if 0 <= each.prim_id < len(corners)], int)
-    axes.plot(*segments_of(section.segments(corners[tested])), color="black", lw=1.4, zorder=4)
+    axes.plot(*segments_of(cut(corners[tested], section.plane)), color="black", lw=1.4, zorder=4)
     now = steps[-1] if steps else None
     end = min(now.best_t if now else walk.t_max, 1e30) * section.length
     axes.annotate("", (min(end, x1), 0.0), (max(walk.t_min * section.length, x0), 0.0), zorder=6,
                   arrowprops={"arrowstyle": "->", "color": "tab:orange", "lw": 1.6})
     if now is not None:
         if 0 <= now.prim_id < len(corners):
-            axes.plot(*segments_of(section.segments(corners[[now.prim_id]])), color=COLORS["entered" if now.result == "closest hit" else
-                                                                                         "missed"], lw=3.0, zorder=5)
+            color = COLORS["entered" if now.result == "closest hit" else "missed"]
+            axes.plot(*segments_of(cut(corners[[now.prim_id]], section.plane)), color=color, lw=3.0, zorder=5)
         if now.best_prim >= 0:
             axes.plot([now.best_t * section.length], [0.0], "o", color="tab:orange", zorder=7)
         axes.set_title(f"{walk.structure}, step {last} of {len(walk) - 1}: {now.text}", fontsize="small", loc="left", wrap=True)
