@@ -20,8 +20,7 @@ PIXEL = PatternType("X,Y", rf"\s*({DIGITS})\s*,\s*({DIGITS})\s*", "a pixel; writ
 @click.option("--view", default="both", show_default=True,
               help="What to draw: section (2D), picture (the rays in a picture from the side) or both")
 @shared("spp", "size", "seed", "threads", "camera", "max_depth", "assignments", "accel", "device", "quiet", "as_json")
-def inspect(scene: Path, pixel: tuple[int, int], sample: int | None, output: Path | None, view: str, assignments: Assignments,
-            quiet: bool, as_json: bool, **options: Parsed) -> None:
+def inspect(scene: Path, output: Path | None, view: str, assignments: Assignments, quiet: bool, as_json: bool, **options: Parsed) -> None:
     """Print the tree of rays of a pixel of SCENE: what each ray hits, why it ends, and what it adds to the pixel."""
     from wrt.core.checks import as_choice
     from wrt.core.write_file import check_writable
@@ -34,7 +33,7 @@ def inspect(scene: Path, pixel: tuple[int, int], sample: int | None, output: Pat
     settings = settings_of(assignments, {name: options.pop(name) for name in ("spp", "size", "max_depth")})
     loaded = load(scene, quiet)
     with warnings_reported(quiet), naming(scene):
-        found = inspect_pixel(loaded, pixel, sample, **settings, **options)
+        found = inspect_pixel(loaded, **settings, **options)
         if output is not None:
             found.save(output, view)
     if as_json:
