@@ -38,7 +38,7 @@ LAYERS_OF_ACCEL = (
     {"triangle_data", "geometry", "device_geometry", "instanced_geometry", "flat_scene"},  # geometry
     {"structures", "structure", "built", "snapshot"},  # kinds of structures, and the state of a structure
     {"queries"},
-    {"store", "base", "box_tree", "tree_exchange", "epo", "tensors"},
+    {"store", "scene_arrays", "base", "box_tree", "tree_exchange", "epo", "tensors"},
     {"bvh", "cells", "brute_force"},
     {"top_level", "instances"},
     {"scenes"},

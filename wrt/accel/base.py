@@ -52,8 +52,7 @@ class OneMesh(TreeExchange, ABC):
     def __init__(self, geometry: Geometry, attributes: FlatScene | None = None, /, device: str = DEFAULT_DEVICE,
                  threads: int | None = None, *, triangle: str = "watertight", box: str = "conservative", **options: object) -> None:
         super().__init__(Structure(type(self), Units(triangle, box)), geometry.unshared(), attributes, device, threads)
-        self.built_with = options_of(self.name, self.options, options)
-        begin = build_clock()
+        self.built_with, begin = options_of(self.name, self.options, options), build_clock()
         built = self._build(self.built_with)
         self._install(built, begin, built.sah_cost)
 
@@ -215,20 +214,21 @@ class OneMesh(TreeExchange, ABC):
         """Return the records that the triangle test reads, in the order of `built.order`."""
         return self.geometry.primitives(self.structure.units, built.order, self.threads)
 
-    def save(self, path: PathLike) -> None:
+    def save(self, path: PathLike, mesh: bool = False) -> None:
         """Write the structure to a file that `wrt.load_accel` reads.
 
         Parameters
         ----------
-        path : str or path
-            File with the suffix .accel.
+        path : str or path, with the suffix .accel
+        mesh : bool
+            Write the mesh, too, so that `wrt.load_accel(path)` needs none. Of materials, the file has only indices.
 
         Raises
         ------
         InputError
             If the suffix is not .accel, or the file cannot be written.
         """
-        save(self._snapshot, path)
+        save(self._snapshot, path, mesh)
 
     def __repr__(self) -> str:
         s = self.stats

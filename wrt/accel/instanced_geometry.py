@@ -85,3 +85,8 @@ def inverse_of(matrices: np.ndarray) -> np.ndarray:
     """Invert affine maps (I, 3, 4) in float64."""
     linear = np.linalg.inv(matrices[:, :, :3])
     return np.concatenate([linear, -(linear @ matrices[:, :, 3:])], axis=2)
+
+
+def spread_of(to_world: np.ndarray, to_local: np.ndarray) -> np.ndarray:
+    """Return the growth of rounding errors from a mesh's own space to world space: largest row sum of |A| |A^-1|, (I,)."""
+    return np.asarray((np.abs(to_world[:, :, :3]) @ np.abs(to_local[:, :, :3])).sum(axis=2).max(axis=1, initial=1.0))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import overload
+from typing import Self, overload
 
 import numpy as np
 import warp as wp
@@ -13,11 +13,12 @@ from wrt.accel.base import OneMesh, array_bytes, build_each
 from wrt.accel.built import AccelStats, Refit
 from wrt.accel.flat_scene import FlatScene
 from wrt.accel.instance_names import InstanceNames, ObjectId
-from wrt.accel.instanced_geometry import MAX_SPREAD, InstancedGeometry, inverse_of
+from wrt.accel.instanced_geometry import MAX_SPREAD, InstancedGeometry, inverse_of, spread_of
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.ray_query import kernel_argument
+from wrt.accel.store import save_instances
 from wrt.accel.structure import Structure
-from wrt.accel.top_level import BOXES, MOVED_BOXES, Boxes, build_top, part_boxes, refit_top, spread_of, world_boxes
+from wrt.accel.top_level import BOXES, MOVED_BOXES, Boxes, build_top, part_boxes, refit_top, world_boxes
 from wrt.accel.wide_top import widen
 from wrt.core.arrays import real_numbers, to_warp
 from wrt.core.checks import shown
@@ -25,7 +26,7 @@ from wrt.core.default_device import DEFAULT_DEVICE
 from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.core.seconds import build_clock
-from wrt.core.types import ArrayLike, WarpStruct
+from wrt.core.types import ArrayLike, PathLike, WarpStruct
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.traverse.instances import Placement
 from wrt.kernels.warp_private import fields_of
@@ -47,7 +48,20 @@ class Instances(Accelerator):
                  box: str = "conservative", **options: object) -> None:
         begin = build_clock()
         super().__init__(Structure(kind, Units(triangle, box, instances=True)), geometry, attributes, device, threads)
-        self.bottoms = build_each(kind, geometry.parts, device, threads, Units(triangle, box), options)
+        self._place(build_each(kind, geometry.parts, device, threads, Units(triangle, box), options), geometry, begin)
+
+    @classmethod
+    def restore(cls, bottoms: list[OneMesh], geometry: InstancedGeometry, attributes: FlatScene | None, device: str,
+                threads: int | None) -> Self:
+        """Make the structure over the structures of all parts of the geometry. The upper level is built."""
+        self, begin, units = cls.__new__(cls), build_clock(), bottoms[0].structure.units
+        Accelerator.__init__(self, Structure(type(bottoms[0]), units._replace(instances=True)), geometry, attributes, device, threads)
+        self._place(bottoms, geometry, begin)
+        return self
+
+    def _place(self, bottoms: list[OneMesh], geometry: InstancedGeometry, begin: float) -> None:
+        """Build the upper level, and set the snapshot."""
+        self.bottoms = bottoms
         # The snapshots keep the arrays alive: the Warp array of structs holds only their addresses.
         self._bottom_snapshots = [bottom.snapshot for bottom in self.bottoms]
         self._bottoms = wp.array([each.data for each in self._bottom_snapshots], dtype=self.structure.bottom, device=self.device)
@@ -147,7 +161,23 @@ class Instances(Accelerator):
             return Refit(self.stats.build_seconds, growth, rebuilt)
 
     def __reduce__(self) -> tuple[object, ...]:
-        raise TypeError("structures with instances cannot be pickled yet: pickle the scene, and build it again (wrt.build)")
+        """Pickle the structures of all parts and the scene. Unpickling builds the upper level."""
+        return Instances.restore, (self.bottoms, self.geometry, self._snapshot.attributes, str(self.device), self.threads)
+
+    def save(self, path: PathLike) -> None:
+        """Write the structure and its scene to a file that `wrt.load_accel(path)` reads. Of materials, the file has only indices.
+
+        Parameters
+        ----------
+        path : str or path
+            File with the suffix .accel.
+
+        Raises
+        ------
+        InputError
+            If the suffix is not .accel, or the file cannot be written.
+        """
+        save_instances(self._snapshot, [bottom.built for bottom in self.bottoms], path)
 
     def __repr__(self) -> str:
         s, geometry = self.stats, self.geometry

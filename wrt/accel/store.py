@@ -1,12 +1,15 @@
 """Files of structures, which `wrt build` writes and `wrt.load_accel` reads.
 
-A file has a checksum (wrt.core.checked_file). Its header describes the structure and the arrays, and has a hash of the geometry. The
-types of the arrays come from the structure's class. Indices are checked before a ray follows them.
+A file has a checksum (wrt.core.checked_file). Its header describes the structure and the arrays. It has a hash of the geometry, or the
+scene itself (wrt.accel.scene_arrays). The types of the arrays come from the structure's class. Indices are checked before a ray follows
+them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +19,13 @@ import warp as wp
 from wrt.accel.built import Built
 from wrt.accel.flat_scene import FlatScene
 from wrt.accel.geometry import Geometry
+from wrt.accel.instanced_geometry import InstancedGeometry
+from wrt.accel.scene_arrays import KINDS, arrays_of, scene_of
 from wrt.accel.snapshot import Snapshot
 from wrt.accel.structure import Structure
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.checked_file import read_checked, write_checked
+from wrt.core.checks import as_one
 from wrt.core.default_device import DEFAULT_DEVICE
 from wrt.core.device import row_type
 from wrt.core.errors import InputError
@@ -32,6 +38,7 @@ from wrt.kernels.warp_private import fields_of
 
 MAGIC = b"wrt acceleration structure 1\n"
 STATS = ("nodes", "leaves", "depth", "sah_cost")
+SIZES, OF_PARTS = "sizes of parts", "statistics of parts"  # arrays of files of instances: (P, n), and (P, 4) with STATS
 
 
 def array_types(accel: type[Any], triangle: str = "watertight") -> dict[str, np.dtype]:
@@ -48,25 +55,49 @@ def check_target(path: PathLike) -> None:
     check_writable(path)
 
 
-def save(snapshot: Snapshot, path: PathLike) -> None:
-    """Write a structure to a file atomically. Raises InputError if the file cannot be written."""
+def save(snapshot: Snapshot, path: PathLike, mesh: bool = False) -> None:
+    """Write a structure over one mesh to a file atomically; mesh: with the mesh. Raises InputError if the file cannot be written."""
     check_target(path)
     structure, built = snapshot.structure, snapshot.arrays.on_host()
-    units = structure.units
-    rows = {name: np.ascontiguousarray(np.atleast_1d(array)) for name, array in built.arrays.items()}
-    types = array_types(structure.accel, units.triangle)
-    body = [rows[name].astype(types[name].base, copy=False).tobytes() for name in types]
-    body.append(built.order.astype("<i4").tobytes())
-    header = {"accel": structure.accel.name, "triangle": units.triangle, "box": units.box, "wrt": VERSION,
-              "geometry": snapshot.mesh.digest(), "bytes": {name: len(part) for name, part in zip(types, body, strict=False)},
-              "order": len(built.order)} | {name: getattr(built, name) for name in STATS}
+    body = [each.tobytes() for each in built_rows(structure, built)]
+    sizes = {"bytes": dict(zip(array_types(structure.accel, structure.units.triangle), map(len, body), strict=False)),
+             "order": len(built.order)}
+    header = header_of(structure) | {"geometry": snapshot.mesh.digest()} | sizes | {name: getattr(built, name) for name in STATS}
+    scene = arrays_of(snapshot) if as_one(mesh, bool, "mesh") else {}
     with replacing(path) as file:
-        write_checked(file, MAGIC, header, body)
+        write_checked(file, MAGIC, header | listed(scene), [*scene.values(), *body])
 
 
-def read(path: PathLike, geometry: Geometry, attributes: FlatScene | None = None, device: str = DEFAULT_DEVICE,
-         threads: int | None = None) -> Any:
-    """Read a structure over `geometry`.
+def save_instances(snapshot: Snapshot, bottoms: Sequence[Built], path: PathLike) -> None:
+    """Write a structure over instances to a file atomically, with its scene; bottoms: of the structures of the lower level."""
+    check_target(path)
+    structure, scene = snapshot.structure, arrays_of(snapshot)
+    rows = [built_rows(structure, built) for built in bottoms]
+    scene[SIZES] = np.array([[each.nbytes for each in part] for part in rows], np.int64)
+    scene[OF_PARTS] = np.array([[getattr(built, name) for name in STATS] for built in bottoms], np.float64)
+    with replacing(path) as file:
+        write_checked(file, MAGIC, header_of(structure) | listed(scene), [*scene.values(), *(each for part in rows for each in part)])
+
+
+def header_of(structure: Structure) -> JsonObject:
+    return {"accel": structure.accel.name, "triangle": structure.units.triangle, "box": structure.units.box, "wrt": VERSION}
+
+
+def listed(arrays: Mapping[str, np.ndarray]) -> JsonObject:
+    """Return the part of a header that describes the arrays at the begin of the body."""
+    return {"arrays": {name: [each.dtype.str, *each.shape] for name, each in arrays.items()}} if arrays else {}
+
+
+def built_rows(structure: Structure, built: Built) -> list[np.ndarray]:
+    """Return the arrays of a builder's result and its order, as they stand in files."""
+    types = array_types(structure.accel, structure.units.triangle)
+    rows = {name: np.ascontiguousarray(np.atleast_1d(array)) for name, array in built.arrays.items()}
+    return [*(rows[name].astype(types[name].base, copy=False) for name in types), built.order.astype("<i4")]
+
+
+def read(path: PathLike, geometry: Geometry | None, attributes: FlatScene | None = None, device: str = DEFAULT_DEVICE,
+         threads: int | None = None, place: Callable[..., Any] | None = None) -> Any:
+    """Read a structure over `geometry`; None: over the scene in the file. place: `Instances.restore`, for files of instances.
 
     Raises InputError if the file is missing, damaged, not a structure, of another version, or over another mesh.
     """
@@ -76,14 +107,64 @@ def read(path: PathLike, geometry: Geometry, attributes: FlatScene | None = None
             cls = ACCELERATORS.get(header["accel"])
             if cls is None:
                 raise InputError(f"holds a structure {header['accel']!r}, which this version of wrt does not have")
+            arrays, body = read_scene(header, body)
+            units = Units(header["triangle"], header["box"])
+            if SIZES in arrays:
+                if geometry is not None or place is None:
+                    raise InputError("must not be given: the file holds instances with their scene", argument="mesh")
+                return place(*parts_of(cls, units, arrays, body, device, threads), device, threads)
+            if geometry is None:
+                if not arrays:
+                    raise InputError("must be given: the file does not hold it", argument="mesh", hint="accel.save(path, mesh=True)")
+                attributes = scene_of(arrays)
+                geometry = mesh_of(attributes)
             with verifying(partial(require_same_mesh, header, geometry), at_once):
                 built = read_arrays(cls, header, body)
                 with np.errstate(over="ignore", invalid="ignore"):  # for values near the largest float32
-                    return cls.restore(built, geometry, attributes, device, threads, units=Units(header["triangle"], header["box"]))
+                    return cls.restore(built, geometry, attributes, device, threads, units=units)
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         if isinstance(error, InputError):
             raise error.at(path) from error
         raise InputError(f"is not a structure of this version of wrt ({type(error).__name__}: {error})", path=path) from error
+
+
+def read_scene(header: JsonObject, body: memoryview) -> tuple[dict[str, np.ndarray], memoryview]:
+    """Return the arrays at the begin of the body, and the rest of the body. Raises InputError if they do not fit."""
+    arrays, at = {}, 0
+    for name, (kind, *shape) in header.get("arrays", {}).items():
+        dtype = np.dtype({SIZES: "<i8", OF_PARTS: "<f8"}.get(name) or KINDS[name][0])
+        size = dtype.itemsize * prod(shape)
+        if kind != dtype.str or not all(type(n) is int and n >= 0 for n in shape) or at + size > len(body):
+            raise InputError(f"is damaged: array {name!r} does not fit")
+        arrays[name] = np.frombuffer(body[at:at + size], dtype).reshape(shape).copy()
+        at += size
+    return arrays, body[at:]
+
+
+def mesh_of(scene: FlatScene) -> Geometry:
+    """Return the geometry of a scene without instances. Raises InputError for any other scene."""
+    if not isinstance(scene.geometry, Geometry):
+        raise InputError("is damaged: its scene has instances")
+    return scene.geometry
+
+
+def parts_of(cls: type[Any], units: Units, arrays: dict[str, np.ndarray], body: memoryview, device: str,
+             threads: int | None) -> tuple[list[Any], InstancedGeometry, FlatScene]:
+    """Return the structures of the lower level, the geometry and the scene from the arrays and the body of a file of instances."""
+    sizes, stats, at = arrays.pop(SIZES), arrays.pop(OF_PARTS), 0
+    scene = scene_of(arrays)
+    types, bottoms, geometry = array_types(cls, units.triangle), [], scene.geometry
+    if not isinstance(geometry, InstancedGeometry):
+        raise InputError("is damaged: its scene has no instances")
+    parts = geometry.parts
+    if not (len(parts) == len(sizes) == len(stats) > 0 and sizes.shape[1:] == (len(types) + 1,) and (sizes >= 0).all()):
+        raise InputError("is damaged: its instances do not fit")
+    for part, row, numbers in zip(parts, sizes.tolist(), stats.tolist(), strict=True):
+        header = {"triangle": units.triangle, "bytes": dict(zip(types, row, strict=False)), "order": row[-1] // 4}
+        built = read_arrays(cls, header | dict(zip(STATS, numbers, strict=True)), body[at:at + sum(row)])
+        at += sum(row)
+        bottoms.append(cls.restore(built, part, None, device, threads, units=units))
+    return bottoms, geometry, scene
 
 
 def require_same_mesh(header: JsonObject, geometry: Geometry) -> None:

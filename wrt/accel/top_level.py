@@ -11,7 +11,7 @@ from wrt.accel.bvh.refit import Fitting, parents_of, tree_of
 from wrt.accel.bvh.top_down import build_data, build_options, in_order
 from wrt.accel.bvh.tree import BvhOptions, half_areas, squeeze
 from wrt.accel.geometry import Geometry
-from wrt.accel.instanced_geometry import InstancedGeometry, inverse_of
+from wrt.accel.instanced_geometry import InstancedGeometry, inverse_of, spread_of
 from wrt.core.device import launch, on_host, records, start, upload
 from wrt.kernels.build import bvh2 as build_bvh2
 from wrt.kernels.build.records import BuildTask
@@ -108,11 +108,6 @@ def write_placements(top: TopLevel, geometry: InstancedGeometry, rows: np.ndarra
     out["local_x"], out["local_y"], out["local_z"] = to_local[:, 0], to_local[:, 1], to_local[:, 2]
     placements[place[rows]] = out
     return replace(top, placements=placements, spread=spread)
-
-
-def spread_of(to_world: np.ndarray, to_local: np.ndarray) -> np.ndarray:
-    """Return the growth of rounding errors from a mesh's own space to world space: largest row sum of |A| |A^-1|, (I,)."""
-    return np.asarray((np.abs(to_world[:, :, :3]) @ np.abs(to_local[:, :, :3])).sum(axis=2).max(axis=1, initial=1.0))
 
 
 def refit_top(top: TopLevel, geometry: InstancedGeometry, rows: np.ndarray, low: np.ndarray, high: np.ndarray) -> TopLevel:

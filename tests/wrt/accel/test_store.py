@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import multiprocessing
 import pickle
 from copy import deepcopy
 from hashlib import sha256
@@ -22,12 +23,17 @@ from tests.refused import Refusal, refused
 from tests.structures import STRUCTURES
 from wrt.accel.device_geometry import DeviceGeometry
 from wrt.accel.geometry import Geometry
+from wrt.accel.instances import Instances
+from wrt.accel.scene_arrays import arrays_of, scene_of
 from wrt.accel.scenes.build import build, load_accel
+from wrt.accel.scenes.flatten import flatten
+from wrt.accel.scenes.instancing import instanced_meshes
 from wrt.accel.store import MAGIC, check_binary
+from wrt.accel.structures import ACCELERATORS
 from wrt.core.checked_file import DIGEST_BYTES
 from wrt.core.errors import InputError
 from wrt.scene.mesh import Mesh
-from wrt.scene.shapes import icosphere
+from wrt.scene.shapes import icosphere, torus
 
 BALL = icosphere(2)
 
@@ -78,14 +84,79 @@ def test_a_structure_over_arrays_of_a_device_goes_through_pickle(saved: Path) ->
             same(after, build((2.0 * BALL.vertices, BALL.faces), "bvh2"))
 
 
-def test_a_scene_goes_through_pickle_and_instances_say_that_they_do_not() -> None:
+def test_a_scene_goes_through_pickle() -> None:
     material = wrt.Material()
     scene = wrt.Scene((wrt.Object(BALL, (material,)),), spheres=(wrt.Sphere((0.0, 0.0, 3.0), 1.0, material),))
     before = build(scene)
     hits = pickle.loads(pickle.dumps(before)).closest_hit(*rays())
     assert np.array_equal(hits.object, before.closest_hit(*rays()).object) and set(hits.object) == {-1, 0, 1}
-    with pytest.raises(TypeError, match="structures with instances cannot be pickled yet"):
-        pickle.dumps(build([BALL]))
+
+
+def crowd(spheres: bool) -> wrt.Scene:
+    """A joined object between instances of one mesh, two materials, and a sphere."""
+    red, grey, ring = wrt.Material(albedo=(1.0, 0.0, 0.0)), wrt.Material(), torus()
+    ball = Mesh(BALL.vertices, BALL.faces, normals=BALL.vertices)
+    places = [np.diag([s, s, s, 1.0]) for s in (0.5, 1.0, 0.25)]
+    objects = [wrt.Object(ball, (grey,), places[0], name="a"), wrt.Object(ring, (red,), name="ring"),
+               *(wrt.Object(ball, (red,), place, name="b") for place in places[1:])]
+    return wrt.Scene(tuple(objects), spheres=(wrt.Sphere((0.0, 0.0, 3.0), 1.0, grey),) if spheres else ())
+
+
+@pytest.mark.parametrize("accel", ["bvh", "bvh2", "kdtree"])
+@pytest.mark.parametrize("kind", ["scene", "worlds", "moved", "mesh", "flat"])
+def test_copies_with_their_scene(kind: str, accel: str, tmp_path: Path) -> None:
+    """Pickle, and a file with the scene: hits and their ids and normals are those of the structure."""
+    scene = crowd(spheres=kind == "flat")
+    before: wrt.accel.base.OneMesh | Instances
+    if kind == "scene":
+        flat = flatten(crowd(spheres=True), instanced_meshes(crowd(spheres=True), "always"))
+        before = Instances(ACCELERATORS[accel], flat.geometry, flat)
+    elif kind in ("worlds", "moved"):
+        before = build([BALL, scene] if kind == "worlds" else [scene], accel)
+    else:
+        before = build(BALL if kind == "mesh" else scene, accel)
+    if kind == "moved":
+        before.move(object="a", matrix=np.diag([2.0, 2.0, 2.0, 1.0]))
+    more = {} if isinstance(before, Instances) else {"mesh": True}
+    before.save(tmp_path / "x.accel", **more)
+    world = np.arange(500) % 2 if kind == "worlds" else None
+    hits = before.closest_hit(*rays(), world=world)
+    for after in (pickle.loads(pickle.dumps(before)), load_accel(tmp_path / "x.accel")):
+        again = after.closest_hit(*rays(), world=world)
+        assert after.structure == before.structure
+        for name in ("t", "u", "v", "prim_id", "normal", "shading_normal", *(("object", "material") if kind != "mesh" else ())):
+            assert getattr(hits, name).tobytes() == getattr(again, name).tobytes(), name
+    if kind == "moved":
+        after.move(object="ring", matrix=np.eye(4))
+    if isinstance(before, Instances):
+        with refused("mesh", path="x.accel"):
+            load_accel(tmp_path / "x.accel", BALL)
+
+
+def _hits_in_process(accel: object) -> bytes:
+    return accel.closest_hit(*rays()).t.tobytes()  # type: ignore[attr-defined]
+
+
+def test_structures_reach_spawned_processes() -> None:
+    accel = build([BALL])
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        assert pool.map(_hits_in_process, [accel]) == [_hits_in_process(accel)]
+
+
+@pytest.mark.parametrize(("name", "value"), [("faces", 10**6), ("part", 7), ("first_prim", -1), ("placed", 10**6), ("to_world", np.nan),
+                                            ("part_sizes", 3), ("worlds", 9)])
+def test_a_scene_in_a_file_leads_no_ray_out_of_bounds(name: str, value: float, tmp_path: Path) -> None:
+    arrays = arrays_of(build([crowd(spheres=False)]).snapshot)
+    scene_of(arrays)
+    arrays[name] = arrays[name].copy()
+    arrays[name].reshape(-1)[-1] = value
+    with refused(what="damaged"):
+        scene_of(arrays)
+
+
+def test_a_file_without_its_mesh(saved: Path) -> None:
+    with refused("mesh", path="ball.accel", hint="mesh=True"):
+        load_accel(saved)
 
 
 @pytest.fixture

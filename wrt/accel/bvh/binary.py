@@ -144,13 +144,13 @@ class Bvh2(BinaryBvh):
         cached.fitting.refit(cached.tree, cached.shape, self.threads)
         self._write_corners(cached.shape, cached.tree.order, self.data.primitives)
 
-    def save(self, path: PathLike) -> None:
+    def save(self, path: PathLike, mesh: bool = False) -> None:
         """Write the structure to a file, as OneMesh.save does. After a refit in place, first compute the SAH cost."""
         snapshot = self._snapshot
         built = snapshot.arrays
         if math.isnan(built.sah_cost):
             snapshot = replace(snapshot, built=replace(built, sah_cost=sah_cost(built.on_host().arrays["nodes"])))
-        save(snapshot, path)
+        save(snapshot, path, mesh)
 
     def _begin_in_place(self, points: WarpArray) -> InPlace:
         """Give the structure arrays that no snapshot shares; return the arrays that refits in place need."""

@@ -175,19 +175,24 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = DEFAULT_
     return kind(geometry, flat, device=device, threads=threads, **options)
 
 
-def load_accel(path: PathLike, mesh: MeshLike, device: str = DEFAULT_DEVICE, threads: int | None = None) -> OneMesh:
-    """Read a structure that `OneMesh.save` or `wrt build` wrote.
+@overload
+def load_accel(path: PathLike, mesh: MeshLike, device: str = ..., threads: int | None = ...) -> OneMesh: ...
+@overload
+def load_accel(path: PathLike, mesh: None = ..., device: str = ..., threads: int | None = ...) -> OneMesh | Instances: ...
+def load_accel(path: PathLike, mesh: MeshLike | None = None, device: str = DEFAULT_DEVICE,
+               threads: int | None = None) -> OneMesh | Instances:
+    """Read a structure that `OneMesh.save`, `Instances.save` or `wrt build` wrote.
 
     Parameters
     ----------
     path : str or path
         File with the suffix .accel.
     mesh, device, threads
-        See `build`; the mesh must equal the one that the structure was built over.
+        See `build`; the mesh must equal the one that the structure was built over. None: the file holds it.
 
     Returns
     -------
-    OneMesh
+    OneMesh or Instances
         Structure with the same intersection tests as the saved one.
 
     Raises
@@ -195,9 +200,12 @@ def load_accel(path: PathLike, mesh: MeshLike, device: str = DEFAULT_DEVICE, thr
     InputError
         If the file is missing, damaged, not a structure, of another version, or over another mesh.
     """
+    if mesh is None:
+        loaded: OneMesh | Instances = read(path, None, None, as_one(device, str, "device"), threads, Instances.restore)
+        return loaded
     flat = to_flat_scene(mesh)
     if not isinstance(flat.geometry, Geometry):
-        raise InputError("must not be a scene with instances, because no file holds a structure over it", argument="mesh")
+        raise InputError("must not be a scene with instances: the file of a structure over it holds the scene", argument="mesh")
     return read(path, flat.geometry, flat, as_one(device, str, "device"), threads)
 
 
