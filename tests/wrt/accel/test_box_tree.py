@@ -136,6 +136,27 @@ def test_another_builders_tree_gives_the_hits_of_wrts_own(name: str) -> None:
     assert found.counters is not None and found.counters.primitives.mean() < 40
 
 
+def chain(mesh: Mesh, ends: list[int]) -> dict[str, np.ndarray]:
+    """Return a tree of nodes with up to two children: node i has a leaf of the primitives ends[i] .. ends[i + 1] - 1, and node i + 1."""
+    n, corners = len(ends) - 1, mesh.vertices[mesh.faces]
+    last, first = np.arange(n) == n - 1, np.array(ends[:-1])
+    low, high = (np.broadcast_to(end(corners, axis=(0, 1)), (n, 2, 3)) for end in (np.min, np.max))
+    return {"lo": low, "hi": high, "child": np.stack([first, np.where(last, 0, np.arange(n) + 1)], axis=1),
+            "count": np.stack([np.where(np.diff(ends) > 0, np.diff(ends), -1), np.where(last, -1, 0)], axis=1),
+            "primitives": np.arange(ends[-1])}
+
+
+@pytest.mark.parametrize("name", BVHS[:-1])
+def test_binary_trees_with_missing_children_and_long_chains(name: str) -> None:
+    mesh, (origins, directions) = icosphere(1), aimed(500)
+    expected = wrt.build(mesh).closest_hit(origins, directions)
+    accel = wrt.accel_from_tree(mesh, chain(mesh, [0, 0, 1, 3, 3, 10, 40, 80]), name)
+    assert all(np.array_equal(getattr(accel.closest_hit(origins, directions), each), getattr(expected, each)) for each in BITS)
+    ball = icosphere(3)
+    with pytest.raises(wrt.InputError, match="levels|stack"):
+        wrt.accel_from_tree(ball, chain(ball, [*range(len(ball.faces) + 1)]), name)
+
+
 def test_spatial_splits_are_allowed_if_the_caller_says_so() -> None:
     rng = np.random.default_rng(2)
     corners = rng.uniform(-1, 1, (60, 3, 3)) * (1.0, 1.0, 0.1)

@@ -92,8 +92,9 @@ class CollapsedBvh(OneMesh):
         return tree
 
     def _built_of(self, tree: BoxTree) -> Built:
-        """Convert a tree. Binary trees are collapsed into nodes of more children."""
-        if tree.width == 2 and len(tree.primitives) > 1:
+        """Convert a tree. Binary trees as of a builder of wrt are collapsed into nodes of more children."""
+        whole = tree.width == 2 and len(tree.primitives) > 1 and (tree.count != ABSENT).all()
+        if whole and len(tree.levels()) <= STACK_SIZE:  # `collapse` has stacks for such trees
             options = BvhOptions(**{"max_leaf": 1} | asdict(self.options()) | {"row": self.width})
             wide = collapse(binary_tree_of(tree), self.width, options.max_leaf, options.cost_traversal, options.cost_intersection)
         else:
