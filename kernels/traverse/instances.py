@@ -14,6 +14,8 @@ from wrt.kernels.traverse.common import Probe, Units
 from wrt.kernels.traverse.counters import Counts, Recorder, add_counts
 from wrt.kernels.units.box import BoxRay, ray_aabb
 
+HALF_STEP = wp.constant(wp.float64(2.0**-150))  # Half the distance of the numbers in float32 that are below 2^-126.
+
 
 @wp.struct
 class Placement:
@@ -100,6 +102,25 @@ def local_scale(place: Placement, direction: wp.vec3) -> wp.float64:
 
 
 @wp.func
+def last_local(t: float, scale: wp.float64) -> float:
+    """Return the largest local t whose t in world space, rounded to float32, is at most t. Below 2^-126 many local t round to one."""
+    local = float((wp.float64(t) + HALF_STEP) / scale)
+    if local > 0.0 and float(wp.float64(local) * scale) > t:
+        local = wp.cast(wp.cast(local, wp.int32) - 1, wp.float32)
+    return local
+
+
+@wp.func
+def first_local(t: float, scale: wp.float64) -> float:
+    """Return the smallest local t >= 0 that is at least t in world space."""
+    local = float((wp.float64(t) - HALF_STEP) / scale)
+    local = wp.where(local <= 0.0, 0.0, local)  # also for -0
+    if float(wp.float64(local) * scale) < t:
+        local = wp.cast(wp.cast(local, wp.int32) + 1, wp.float32)
+    return local
+
+
+@wp.func
 def local_ray(place: Placement, ray: Ray, scale: wp.float64) -> Ray:
     """Transform a ray to the structure's space, in float64, rounded once; scale: the result of `local_scale`."""
     o = wp.vec4d(wp.float64(ray.origin[0]), wp.float64(ray.origin[1]), wp.float64(ray.origin[2]), wp.float64(1.0))
@@ -109,8 +130,8 @@ def local_ray(place: Placement, ray: Ray, scale: wp.float64) -> Ray:
     out.direction = wp.vec3(
         float(scale * wp.dot(place.local_x, d)), float(scale * wp.dot(place.local_y, d)), float(scale * wp.dot(place.local_z, d))
     )
-    out.t_min = float(wp.float64(ray.t_min) / scale)
-    out.t_max = float(wp.float64(ray.t_max) / scale)
+    out.t_min = first_local(ray.t_min, scale)
+    out.t_max = last_local(ray.t_max, scale)
     out.exclude_plus_one = ray.exclude_plus_one
     out.slot = ray.slot
     out.first_prim = place.first_prim
@@ -132,13 +153,16 @@ def make_placed_leaf(units: Units, any_hit: bool, bottom: Any, struct: Any) -> A
         scale = local_scale(place, ray.direction)
         near = ray
         near.t_max = best.t
+        local = local_ray(place, near, scale)
         if wp.static(units.lists):
             surfaces.scale[ray.slot] = scale
             surfaces.to_face[ray.slot] = surfaces.first_face[place.bottom] - place.first_prim
-            bottom(structure, surfaces, local_ray(place, near, scale))
+            bottom(structure, surfaces, local)
             best.t = wp.min(best.t, surfaces.end[ray.slot])
             return best
-        hit = bottom(structure, surfaces, local_ray(place, near, scale))
+        if wp.static(units.resumes):
+            local.t_min = last_local(near.t_min, scale)  # else a hit whose t rounds to t_min would be found again
+        hit = bottom(structure, surfaces, local)
         hit.t = float(wp.float64(hit.t) * scale)
         if hit.prim_id < 0 or hit.t > best.t or (hit.t == best.t and hit.prim_id > best.prim_id):
             return best

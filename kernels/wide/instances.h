@@ -100,6 +100,19 @@ WRT_CALLED int exponent_near_one(double x) {
     return out;
 }
 
+constexpr double HALF_STEP = 0x1p-150;
+
+// As last_local and first_local in traverse/instances.py.
+WRT_CALLED float last_local(float t, double scale) {
+    const float local = (float)((t + HALF_STEP) / scale);
+    return local > 0.0f && (float)(local * scale) > t ? __builtin_bit_cast(float, __builtin_bit_cast(int, local) - 1) : local;
+}
+
+WRT_CALLED float first_local(float t, double scale) {
+    const float near = (float)((t - HALF_STEP) / scale), local = near <= 0.0f ? 0.0f : near;
+    return (float)(local * scale) < t ? __builtin_bit_cast(float, __builtin_bit_cast(int, local) + 1) : local;
+}
+
 // Return the affine map of N vectors (x, y, z, w). The sums have the order of wp.dot, and never are -0.
 template <int N, class Placement>
 WRT_INLINE auto to_local(const Placement& place, const Vec3<typename Lanes<N>::Doubles>& v, double w) {
@@ -130,11 +143,14 @@ WRT_INLINE PlacedRays<N> place_rays(const SomeRays<N>& world, const Placement& p
     typename Lanes<N>::Ints exponent = {};
     Floats t_min = world[T_MIN], t_max = world[T];
     if (int left = mask_of((longest > (double)LONGEST) | (longest < (double)SHORTEST))) {
-        for (; left; left &= left - 1) exponent[lowest(left)] = exponent_near_one(longest[lowest(left)]);
-        const Doubles scale = power_of_two<N>(exponent), inverse = power_of_two<N>(-exponent);
+        for (int rest = left; rest; rest &= rest - 1) exponent[lowest(rest)] = exponent_near_one(longest[lowest(rest)]);
+        const Doubles scale = power_of_two<N>(exponent);
         for (int k = 0; k < 3; ++k) d[k] = scale * d[k];
-        t_min = narrowed<N>(wide<N>(t_min) * inverse);
-        t_max = narrowed<N>(wide<N>(t_max) * inverse);
+        for (; left; left &= left - 1) {
+            const int i = lowest(left);
+            t_min[i] = first_local(t_min[i], scale[i]);
+            t_max[i] = last_local(t_max[i], scale[i]);
+        }
     }
     for (int k = 0; k < 3; ++k) {
         out.rays.origin[k] = narrowed<N>(o[k]);

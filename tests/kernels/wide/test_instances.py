@@ -80,6 +80,44 @@ def test_directions_are_scaled_between_spaces_of_different_size(size):
     assert_same(accel, o, d * np.float32(1e-30))
 
 
+@pytest.mark.parametrize("kind", ["bvh2", "bvh8"])
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_a_scene_of_another_size_has_the_same_hits(kind, sign):
+    rng, mesh, size, length = np.random.default_rng(9), icosphere(2), 2.0 ** (56 * sign), 2.0 ** (-40 * sign)
+    matrices = [placed(rng, rng.uniform(0.1, 0.4, 3)) for _ in range(12)]
+    o, d, t_min, _ = mixed_rays(1000, 11)
+    worlds = [wrt.Scene([wrt.Object(mesh, wrt.Material(), transform=np.diag([s, s, s, 1.0]) @ matrix) for matrix in matrices])
+              for s in (1.0, size)]
+    accel = wrt.build(worlds, kind)
+    for low in (0.0, t_min):
+        ours = accel.closest_hit(o, d, low, world=0)
+        scaled = accel.closest_hit(o * np.float32(size), d * np.float32(length), low * np.float32(size / length), world=1)
+        np.testing.assert_array_equal(scaled.prim_id, ours.prim_id)
+        np.testing.assert_array_equal(scaled.t, ours.t * np.float32(size / length))
+        assert (ours.prim_id >= 0).mean() > 0.1
+
+
+@pytest.mark.parametrize("kind", ["bvh2", "bvh8"])
+def test_hits_whose_t_round_to_the_same_number_do_not_depend_on_the_order_of_visits(kind):
+    """At t below 2^-126, the hits of several instances have the same t in world space and different ones in their own spaces."""
+    rng = np.random.default_rng(5)
+    mesh, matrices = icosphere(1), [np.diag([*1e-30 * rng.uniform(0.5, 1.5, 3), 1.0]) for _ in range(8)]
+    worlds = [wrt.Scene([wrt.Object(mesh, wrt.Material(), transform=matrix) for matrix in some])
+              for some in (matrices, *([matrix] for matrix in matrices))]
+    accel, n = wrt.build(worlds, kind), 600
+    o = (rng.normal(size=(n, 3)) * 3e-30).astype(np.float32)
+    d = ((rng.normal(size=(n, 3)) * 1e-30 - o) * 10.0 ** rng.uniform(37.0, 48.0, (n, 1))).astype(np.float32)
+    t_max = np.where(np.arange(n) % 2, np.float32(np.inf), (10.0 ** rng.uniform(-45.0, -40.0, n)).astype(np.float32))
+    alone = [accel.closest_hit(o, d, 0.0, t_max, world=1 + i) for i in range(len(matrices))]
+    ids = np.stack([np.where(each.prim_id < 0, 1 << 30, each.prim_id + i * len(mesh.faces)) for i, each in enumerate(alone)])
+    first = np.lexsort((ids, np.stack([each.t for each in alone])), axis=0)[0]
+    found, rows = accel.closest_hit(o, d, 0.0, t_max, world=0), np.arange(n)
+    np.testing.assert_array_equal(found.prim_id, np.where(ids.min(axis=0) < 1 << 30, ids[first, rows], -1))
+    np.testing.assert_array_equal(found.t, np.stack([each.t for each in alone])[first, rows])
+    np.testing.assert_array_equal(accel.any_hit(o, d, 0.0, t_max, world=0), found.prim_id >= 0)
+    assert ((found.t > 0.0) & (found.t < 2.0**-126)).sum() > 50
+
+
 def test_moved_instances():
     accel, rng = wrt.build([scene(30, 1)], threads=1), np.random.default_rng(8)
     o, d, _, _ = mixed_rays(1000, 7)

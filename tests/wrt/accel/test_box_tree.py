@@ -153,7 +153,7 @@ def test_binary_trees_with_missing_children_and_long_chains(name: str) -> None:
     accel = wrt.accel_from_tree(mesh, chain(mesh, [0, 0, 1, 3, 3, 10, 40, 80]), name)
     assert all(np.array_equal(getattr(accel.closest_hit(origins, directions), each), getattr(expected, each)) for each in BITS)
     ball = icosphere(3)
-    with pytest.raises(wrt.InputError, match="levels|stack"):
+    with pytest.raises(wrt.InputError, match=r"levels|stack"):
         wrt.accel_from_tree(ball, chain(ball, [*range(len(ball.faces) + 1)]), name)
 
 
