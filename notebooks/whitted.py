@@ -490,9 +490,10 @@ assert not set.intersection(*map(set, best.values()))  # no epsilon of the list 
 # `film.stats["lost_throughput_per_sample"]` has the sum of the throughputs themselves.
 # </details>
 #
-# **5.** In the last test, let the sheet hover at 0.0001. Which epsilons are still right at each place, and is the error bound still right?
+# **5.** Predict which epsilons are right at size 1000, at 0, and at size 1, 300 away from 0. Then add both to `PLACES`.
 # <details><summary>Solution</summary>
 #
-# Set `HEIGHT = 1e-4`. Epsilons of $10^{-4}$ and more leak at size 1, while 3000 units away rounding alone needs more: none is right
-# there. float32 numbers near 3000 are 0.00024 apart, so that sheet and floor are no longer two surfaces. At 0 the bound stays right.
+# With the scene, all rounding errors and all gaps grow by the same factor: at size 1000 the range of size 1 begins and ends 1000 times
+# higher, at $10^{-3}$ and 3. At a distance of 300, coordinates have a tenth of the rounding error that they have at 3000: the range
+# begins at $3\cdot 10^{-5}$ and ends where it ends at 0. The error bound is right in both scenes.
 # </details>
