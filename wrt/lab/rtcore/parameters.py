@@ -9,8 +9,8 @@ from wrt.lab.rtcore.caches import Cache
 PUBLISHED, DERIVED, ASSUMED = "published", "derived", "assumed"
 TURING = "NVIDIA Turing GPU Architecture, WP-09183-001 (2018)"
 PASCAL = "NVIDIA GeForce GTX 1080 Ti, product data (2017)"
-ARC = "Intel Arc B580, product data (2024)"
-RDNA = "AMD Radeon RX 9070, product data (2025)"
+ARC = "Intel Arc B580, product data as printed in reviews (2024)"
+RDNA = "AMD Radeon RX 9070, product data as printed in reviews (2025)"
 VULKAN_SIM = "Vulkan-Sim, configs/tested-cfgs/SM75_RTX2060/gpgpusim.config (Saed et al., MICRO 2022)"
 
 
@@ -29,11 +29,16 @@ PARAMETERS = (
     ("RTX 2060: SMs, clock", "30, 1.365 GHz (base)", PUBLISHED, "", VULKAN_SIM),
     ("RTX 2060: DRAM, L2", "336 GB/s, 3 MB", PUBLISHED, "", "NVIDIA GeForce RTX 2060, product data (2019)"),
     ("Arc B580: Xe cores, clock, DRAM", "20, 2.67 GHz, 456 GB/s", PUBLISHED, "", ARC),
-    ("Arc B580: L2, L1", "18 MB, 256 KB in each Xe core", PUBLISHED, "", ARC),
-    ("Arc B580: tests a clock and unit", "18 boxes, 2 triangles", PUBLISHED, "", "Chips and Cheese, Arc B580 (2025)"),
-    ("RX 9070: compute units, clock, DRAM", "56, 2.52 GHz, 640 GB/s", PUBLISHED, "", RDNA),
-    ("RX 9070: L2, L1", "8 MB (the Infinity Cache is left out), 32 KB in each compute unit", PUBLISHED, "", RDNA),
-    ("RX 9070: tests a clock and unit", "8 boxes, 2 triangles", PUBLISHED, "", "Chips and Cheese, RX 9070 (2025)"),
+    ("Arc B580: L2", "18 MB", PUBLISHED, "", "Chips and Cheese, Intel's Battlemage Architecture (2025)"),
+    ("Arc B580: L1 with local memory", "256 KB in each Xe core", PUBLISHED, "", ARC),
+    ("Arc B580: what holds nodes", "all of the L1; the unit's own cache of 16 KB is left out", ASSUMED, "", "no source for the L1's share"),
+    ("Arc B580: tests a clock and unit", "18 boxes (3 pipelines of 6), 2 triangles", PUBLISHED, "", "Chips and Cheese, Arc B580 (2025)"),
+    ("RX 9070: compute units, clock, DRAM", "56, 2.52 GHz (boost), 640 GB/s", PUBLISHED, "", RDNA),
+    ("RX 9070: L2, L0", "8 MB, 32 KB in each compute unit; there is no L1", PUBLISHED, "", "AMD ROCm documentation, GPU specifications"),
+    ("RX 9070: Infinity Cache", "left out (it has 64 MB)", ASSUMED, "", "the model has two levels of caches"),
+    ("RX 9070: tests a clock and unit", "8 boxes or 2 triangles", PUBLISHED, "", "Chips and Cheese, RDNA 4's raytracing (2025)"),
+    ("RX 9070: boxes and triangles", "both in the same clock", ASSUMED, "", "the model's units are independent"),
+    ("Arc B580, RX 9070: all below", "as Turing", ASSUMED, "", "no source; the claims of nodes and tests do not use them"),
     ("cache line", "128 bytes", PUBLISHED, "", VULKAN_SIM),
     ("L2: ways", "16", ASSUMED, "", VULKAN_SIM),
     ("L1: ways", "4", ASSUMED, "", "no source; Vulkan-Sim has a fully associative L1"),

@@ -158,6 +158,19 @@ class Trace:
         order = np.argsort(both[0], kind="stable")
         return replace(self, prefetch_after=both[0][order], prefetch_address=both[1][order], prefetch_size=both[2][order])
 
+    def keep(self, mask: ArrayLike) -> Trace:
+        """Return the trace of only some fetches, with their children and prefetches. mask: (M,) bool."""
+        rows = np.asarray(mask)
+        if rows.shape != self.address.shape or rows.dtype != bool:
+            raise InputError(f"has shape {rows.shape} and type {rows.dtype}, and must have a bool for each of {len(self.address)} fetches",
+                             argument="mask")
+        children = np.repeat(rows, np.diff(self.child_first))
+        chosen = {PER_FETCH: rows, PER_CHILD: children, PER_PREFETCH: rows[self.prefetch_after]}
+        arrays = {name: getattr(self, name)[each] for names, each in chosen.items() for name in names}
+        before, child_before = (np.concatenate([[0], np.cumsum(each)]) for each in (rows, children))
+        arrays["prefetch_after"] = before[arrays["prefetch_after"]]
+        return replace(self, first=before[self.first], child_first=child_before[self.child_first[np.append(rows, True)]], **arrays)
+
     def save(self, path: PathLike) -> None:
         """Write the trace to a .npz file, which np.load reads without wrt. Raises InputError if it cannot be written."""
         if as_path(path, "path").suffix.lower() != ".npz":

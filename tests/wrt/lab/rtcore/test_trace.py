@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import re
+import shutil
 from contextlib import redirect_stdout
 from dataclasses import fields, replace
 from io import StringIO
@@ -13,7 +15,8 @@ import numpy as np
 import pytest
 
 import wrt
-from tests.data import ROOT
+from tests.command_line import wrt as command
+from tests.data import ROOT, data_path
 from tests.structures import families_first
 from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
 from wrt.lab.rtcore.model import trace_rays
@@ -113,12 +116,7 @@ def test_the_model_follows_a_changed_trace(recorded: Trace) -> None:
     assert small["DRAM"] < before["DRAM"] and small["box"] == before["box"]
     last = np.zeros(len(recorded.address), bool)
     last[recorded.first[1:] - 1] = True
-    kept = ~last
-    counts = np.diff(recorded.child_first)[kept]
-    dropped = replace(recorded, first=recorded.first - np.arange(len(recorded) + 1), child_first=np.concatenate([[0], np.cumsum(counts)]),
-                      **{name: getattr(recorded, name)[kept] for name in ("address", "size", "depth", "test", "tests", "result")},
-                      **{name: getattr(recorded, name)[np.repeat(kept, np.diff(recorded.child_first))]
-                         for name in ("child_address", "child_size", "child_t")})
+    dropped = recorded.keep(~last)
     assert len(dropped.address) == len(recorded.address) - len(recorded)
     assert dropped.counters.nodes.sum() + dropped.counters.primitives.sum() == len(dropped.address)
     # Each fetch prefetches the next one: nearly no lane waits for the L2, and no test is saved.
@@ -156,4 +154,43 @@ def test_the_page_can_be_followed(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     before, after = recorded.model().clocks, changed.model().clocks
     assert after["latency"] < before["latency"] and after["L1"] > before["L1"] and after["box"] == before["box"]
     assert "0 prefetches" in out["second_child.py"][0] and f"{two.sum()} prefetches" in out["second_child.py"][1]
-    assert out["left_first.py"][0].startswith("Trace(bvh2, 1 rays, ")
+    assert len(out["left_first.py"]) == 2 and all(line.startswith("Trace(bvh2, 1 rays, ") for line in out["left_first.py"])
+
+
+def test_kept_fetches_keep_their_children_and_prefetches(recorded: Trace) -> None:
+    """Fetches that `keep` leaves have the same children and prefetches as before; the others are gone."""
+    after = np.arange(0, len(recorded.address), 3)
+    trace = recorded.with_prefetches(after, 64 * after, np.full(len(after), 64))
+    mask = np.random.default_rng(0).random(len(trace.address)) < 0.6
+    kept = trace.keep(mask)
+    assert np.array_equal(kept.ray, trace.ray[mask]) and np.array_equal(kept.address, trace.address[mask])
+    rows = np.flatnonzero(mask)
+    for j in range(0, len(rows), 97):
+        mine, old = (slice(*each) for each in (kept.child_first[j : j + 2], trace.child_first[rows[j] : rows[j] + 2]))
+        assert np.array_equal(kept.child_t[mine], trace.child_t[old]) and np.array_equal(kept.child_address[mine], trace.child_address[old])
+    assert np.array_equal(rows[kept.prefetch_after], rows[rows % 3 == 0])
+    assert len(trace.keep(np.zeros(len(mask), bool)).address) == 0 and len(trace.keep(~np.zeros(len(mask), bool)).address) == len(mask)
+    for wrong in (mask[1:], rows):
+        with pytest.raises(wrt.InputError, match="must have a bool for each"):
+            trace.keep(wrong)
+
+
+def test_the_page_shows_the_numbers_of_the_bunny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clocks and fetches that docs/rt_core.md prints come from its command and its programs."""
+    shutil.copy(data_path("meshes/medium/stanford_bunny.ply"), tmp_path / "bunny.ply")
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs" / "rt_core.md").read_text()
+    (line,) = re.findall(r"^python -m wrt (bench rtcore .*--trace trace.npz)$", page, re.MULTILINE)
+    assert command(*line.split(), "-q").code == 0
+    scope: dict[str, Any] = {}
+    written = {}
+    for name, text in BLOCK.findall(page):
+        (tmp_path / name).write_text(text)
+        with redirect_stdout(StringIO()) as out:
+            exec(compile(text, str(tmp_path / name), "exec"), scope)
+        written[name] = out.getvalue().splitlines()
+    before, after = (ast.literal_eval(line[line.index("{"):]) for line in written["second_child.py"])
+    said = f"latency falls from {before['latency']:.1f} to {after['latency']:.1f}, then DRAM ({after['DRAM']:.1f}) is the limit"
+    assert said in " ".join(page.split()) and max(before.values()) == before["latency"] and max(after.values()) == after["DRAM"]
+    plain, changed = (re.search(r"(\d+) fetches", line) for line in written["left_first.py"])
+    assert plain and changed and f"costs {changed[1]} fetches instead of {plain[1]}" in page
