@@ -6,11 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import warp as wp
 
 import wrt
+from tests.kernel_tools import DEVICE
 from tests.refused import Refusal, refused
 from wrt.scene import shapes
-from wrt.sensors import pinhole, raster_lidar, rotating_lidar, with_range_noise
+from wrt.sensors import LIDARS, fisheye, lidar, pinhole, raster_lidar, rotating_lidar, with_range_noise
 
 K = np.array([[1100.0, 3.0, 511.2], [0.0, 1050.0, 390.7], [0.0, 0.0, 1.0]])
 
@@ -95,6 +97,136 @@ def test_a_raster_begins_at_the_top_left() -> None:
     assert np.allclose(raster_lidar((1.0, 1.0), "1x1").directions, [[1.0, 0.0, 0.0]])
 
 
+def poses(count: int) -> np.ndarray:
+    return np.stack([a_pose(seed) for seed in range(count)])
+
+
+SENSORS = {
+    "pinhole": lambda pose, **options: pinhole(np.diag([8.0, 9.0, 1.0]), (7, 5), pose, **options),
+    "distorted": lambda pose, **options: pinhole(np.diag([8.0, 9.0, 1.0]), (7, 5), pose, (0.05, 0.01, 0.002, 0.001), **options),
+    "fisheye": lambda pose, **options: fisheye(np.diag([8.0, 9.0, 1.0]), (7, 5), pose, **options),
+    "rotating": lambda pose, **options: rotating_lidar([-0.3, 0.0, 0.2, 0.4, 0.5], 7, pose, **options),
+    "raster": lambda pose, **options: raster_lidar((1.0, 0.5), (7, 5), pose, **options),
+    "vlp-16": lambda pose, **options: lidar("vlp-16", pose, 7, **options),
+}
+
+
+@pytest.mark.parametrize("kind", SENSORS)
+def test_a_batch_of_poses_is_one_sensor_after_another(kind: str) -> None:
+    make, many = SENSORS[kind], poses(4)
+    together, alone = make(many), [make(pose) for pose in many]
+    assert together.shape == (4, *alone[0].shape)
+    hits = wrt.build(shapes.icosphere(3, 12.0)).closest_hit(together.origins, together.directions)
+    for i, one in enumerate(alone):
+        assert np.array_equal(together.picture(together.origins)[i].reshape(-1, 3), one.origins)
+        assert np.array_equal(together.picture(together.directions)[i].reshape(-1, 3), one.directions)
+        own = hits[i * len(one.origins):(i + 1) * len(one.origins)]
+        np.testing.assert_allclose(together.depth(hits)[i], one.depth(own), rtol=1e-6)
+        assert np.array_equal(together.range(hits)[i], one.range(own))
+
+
+@pytest.mark.parametrize("kind", SENSORS)
+def test_rows_or_columns_have_poses_of_their_own(kind: str) -> None:
+    make = SENSORS[kind]
+    still = make(None)
+    axis = 1 if kind in ("rotating", "vlp-16") else 0
+    each = poses(still.shape[axis])
+    moving = make(each, rolling=True)
+    assert moving.shape == still.shape
+    for i, pose in enumerate(each):
+        one = make(pose)
+        for name in ("origins", "directions"):
+            np.testing.assert_allclose(moving.picture(getattr(moving, name)).take(i, axis), one.picture(getattr(one, name)).take(i, axis),
+                                       rtol=1e-6, atol=1e-6)
+    hits = wrt.build(shapes.icosphere(3, 12.0)).closest_hit(moving.origins, moving.directions)
+    alone = [make(pose) for pose in each]
+    depths = [one.depth(wrt.build(shapes.icosphere(3, 12.0)).closest_hit(one.origins, one.directions)).take(i, axis)
+              for i, one in enumerate(alone)]
+    np.testing.assert_allclose(moving.depth(hits), np.stack(depths, axis), rtol=1e-4, atol=1e-5)
+    assert np.array_equal(make(np.stack([each, each]), rolling=True).directions[:len(moving.directions)], moving.directions)
+
+
+def test_points_are_of_hits_or_of_measured_ranges() -> None:
+    sensor = lidar("os0-32", a_pose(2), columns=64)
+    floor = shapes.quad((-50.0, -50.0, -4.0), (100.0, 0.0, 0.0), (0.0, 100.0, 0.0))
+    hits = wrt.build(floor).closest_hit(sensor.origins, sensor.directions)
+    assert 0.2 < hits.hit.mean() < 0.8
+    points = sensor.points(hits)
+    assert points.shape == (32, 64, 3)
+    np.testing.assert_array_equal(points.reshape(-1, 3), hits.point)
+    for ranges in (sensor.range(hits), sensor.range(hits).ravel()):
+        np.testing.assert_allclose(sensor.points(ranges), points, atol=2e-5)
+    assert np.isnan(sensor.points(with_range_noise(sensor.range(hits), 0, dropout=1.0))).all()
+
+
+def test_named_lidars_have_the_angles_of_their_tables() -> None:
+    for name, elevations in (("vlp-16", np.arange(15.0, -16.0, -2.0)), ("os1-64", np.linspace(22.5, -22.5, 64)),
+                             ("hdl-32e", [10.67, 9.33, 8.0, 6.67, 5.33, 4.0, 2.67, 1.33, 0.0, -1.33, -2.67, -4.0, -5.33, -6.67, -8.0, -9.33,
+                                          -10.67, -12.0, -13.33, -14.67, -16.0, -17.33, -18.67, -20.0, -21.33, -22.67, -24.0, -25.33,
+                                          -26.67, -28.0, -29.33, -30.67])):
+        sensor = lidar(name)
+        rays = sensor.picture(sensor.directions)
+        assert sensor.shape == (len(elevations), LIDARS[name].columns) and LIDARS[name].source
+        np.testing.assert_allclose(np.degrees(np.arcsin(rays[:, 5, 2])), elevations, atol=0.006)
+        assert rays[0, 0, 1] == 0.0 and rays[0, 1, 1] < 0.0  # from straight ahead to the right
+
+
+class Library:
+    """A stand-in for a library with DLPack: its tensors share NumPy's memory."""
+
+    class Tensor:
+        def __init__(self, array: Any) -> None:
+            self.array = np.asarray(array)
+
+        def __dlpack__(self, **options: Any) -> Any:
+            return self.array.__dlpack__(**options)
+
+        def __dlpack_device__(self) -> Any:
+            return self.array.__dlpack_device__()
+
+        def __array_namespace__(self) -> Any:
+            return Library
+
+        @property
+        def shape(self) -> Any:
+            return self.array.shape
+
+    @staticmethod
+    def from_dlpack(array: Any) -> Any:
+        return Library.Tensor(np.from_dlpack(array))
+
+
+def test_tensors_stay_tensors_without_a_copy() -> None:
+    """By addresses: rays of the sensor, hits and pictures lie where the query and the sensor wrote them."""
+    sensor = pinhole(np.diag([8.0, 9.0, 1.0]), (7, 5), Library.Tensor(poses(3)))
+    assert isinstance(sensor.origins, Library.Tensor) and isinstance(sensor.directions, Library.Tensor)
+    hits = wrt.build(shapes.icosphere(3, 12.0)).closest_hit(sensor.origins, sensor.directions)
+    assert isinstance(hits.t, Library.Tensor)
+    ids = sensor.picture(hits.prim_id)
+    assert isinstance(ids, Library.Tensor) and ids.shape == (3, 5, 7) and ids.array.ctypes.data == hits.prim_id.array.ctypes.data
+    assert hits.source[1].origins.ctypes.data == sensor.origins.array.ctypes.data  # type: ignore[index]  # read in place
+    for picture in (sensor.depth(hits), sensor.range(hits), sensor.points(hits), with_range_noise(sensor.range(hits), 0)):
+        assert isinstance(picture, Library.Tensor) and picture.shape[:3] == (3, 5, 7)
+    on_warp = pinhole(np.diag([8.0, 9.0, 1.0]), (7, 5), poses(3), like=wp.zeros(1, dtype=float, device=DEVICE))
+    assert on_warp.origins.dtype == wp.vec3 and on_warp.origins.device == DEVICE
+    found = wrt.build(shapes.icosphere(3, 12.0)).closest_hit(on_warp.origins, on_warp.directions)
+    depth = on_warp.depth(found)
+    assert isinstance(depth, wp.array) and depth.shape == (3, 5, 7) and isinstance(on_warp.picture(found.t), wp.array)
+    np.testing.assert_array_equal(depth.numpy(), sensor.depth(hits).array)
+
+
+@pytest.mark.parametrize("name", ["torch", "jax"])
+def test_tensors_of_libraries(name: str) -> None:
+    library = pytest.importorskip("torch" if name == "torch" else "jax.numpy", reason=f"{name} is not installed: wrt does not need it")
+    sensor = pinhole(np.diag([8.0, 9.0, 1.0]), (7, 5), poses(3), like=library.zeros(1))
+    hits = wrt.build(shapes.icosphere(3, 12.0)).closest_hit(sensor.origins, sensor.directions)
+    address = (lambda tensor: tensor.data_ptr()) if name == "torch" else (lambda tensor: tensor.unsafe_buffer_pointer())
+    assert name == "jax" or address(sensor.picture(hits.t)) == address(hits.t)  # JAX copies to reshape
+    assert hits.source[1].origins.ctypes.data == address(sensor.origins)  # type: ignore[index]
+    for picture in (sensor.depth(hits), sensor.points(hits)):
+        assert type(picture) is type(sensor.origins) and tuple(picture.shape[:3]) == (3, 5, 7)
+
+
 def test_noise_has_the_deviation_that_is_asked_for() -> None:
     n = 100_000
     for r, constant, proportional in ((10.0, 0.02, 0.0), (10.0, 0.0, 0.003), (50.0, 0.03, 0.001)):
@@ -144,6 +276,15 @@ def test_noise_repeats_and_is_each_elements_own() -> None:
     (lambda: with_range_noise([1.0], -1), ("seed", "0")),
     (lambda: pinhole(np.diag([1e-40, 1.0, 1.0]), (4, 4)), (None, "range of float32")),
     (lambda: pinhole(K, (4, 4), [[1, 0, 0, 1e39], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), (None, "range of float32")),
+    (lambda: pinhole(K, (4, 4), np.zeros((2, 3, 4, 4)) + np.eye(4)), ("pose", "(4, 4) or (B, 4, 4)")),
+    (lambda: pinhole(K, (4, 5), np.zeros((4, 4, 4)) + np.eye(4), rolling=True), ("pose", "(5, 4, 4) or (B, 5, 4, 4)")),
+    (lambda: pinhole(K, (4, 4), np.stack([np.eye(4), np.diag([1.0, 1.0, 2.0, 1.0])])), ("pose", "translation; pose 1 is not")),
+    (lambda: pinhole(K, (4, 4), np.full((4, 4), np.nan)), ("pose", "finite")),
+    (lambda: pinhole(K, (4, 4), (np.eye(3), np.zeros(3))), ("pose", "got a pair (R, t)", None, None, "world to camera")),
+    (lambda: with_range_noise([1.0], 0, np.inf), ("constant", "finite")),
+    (lambda: with_range_noise([1.0], 0, dropout=np.nan), ("dropout", "finite")),
+    (lambda: lidar("vlp16"), ("name", "no LiDAR 'vlp16'", None, None, "'vlp-16'")),
+    (lambda: lidar("vlp-16").points(np.zeros(5)), ("values", "one row per ray")),
     (lambda: pinhole(K, (4, 4)).depth(np.zeros(16)), ("hits", "closest_hit returned")),
     (lambda: pinhole(K, (4, 4)).picture(np.zeros(3)), ("values", "one row per ray, (16")),
 ])

@@ -40,6 +40,12 @@ class CostOptions(TypedDict, total=False):
     trace: bool
 
 
+class RayOptions(TypedDict, total=False):
+    """Options of `any_hit` about rays."""
+
+    invalid: str
+
+
 class Accelerator:
     """An acceleration structure over one mesh (`OneMesh`) or over instances (`Instances`), with its queries.
 
@@ -160,7 +166,7 @@ class Accelerator:
         snapshot = self._snapshot  # read once, because a refit may replace it during the query
         worlds = check_world(snapshot, world, len(t))
         query, counters = Query(rays, arrays, threads, worlds), None
-        if costs and asks_for_counters(costs):
+        if costs and any(checked_names(costs, "closest_hit", CostOptions).values()):
             counters = counted(snapshot, query, fetches_too=costs.get("trace", False))
         else:
             trace_query(snapshot, query)
@@ -182,16 +188,17 @@ class Accelerator:
     def any_hit(self, origins: TensorT, directions: TensorT | None = ..., t_min: ArrayLike = ..., t_max: ArrayLike = ...,
                 threads: int | None = ..., *, out: TensorT | None = ..., world: ArrayLike | None = ..., invalid: str = ...) -> TensorT: ...
     def any_hit(self, origins: ArrayLike, directions: ArrayLike | None = None, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
-                threads: int | None = None, *, out: object = None, world: ArrayLike | None = None,
-                invalid: str = "raise") -> object:
+                threads: int | None = None, *, out: object = None, world: ArrayLike | None = None, **more: Unpack[RayOptions]) -> object:
         """Test whether each ray hits anything in its segment: True exactly where `closest_hit` finds a hit.
 
         Parameters
         ----------
-        origins, directions, t_min, t_max, threads, world, invalid
+        origins, directions, t_min, t_max, threads, world
             See `closest_hit`.
         out : (...) bool, optional
             Array of the rays' shape that receives the results.
+        **more
+            `invalid="raise"` or `"miss"`: see `closest_hit`.
 
         Returns
         -------
@@ -204,7 +211,9 @@ class Accelerator:
             Names the argument and what was expected.
         """
         threads, give, shape = thread_count(threads), to_tensor_like(origins, directions), None
-        callers = None if out is None else [out]
+        callers, invalid = None if out is None else [out], "raise"
+        if more:
+            invalid = checked_names(more, "any_hit", RayOptions).get("invalid", invalid)
         if are_rows(origins, directions) and invalid == "raise":
             rays = rays_of(origins, directions, t_min, t_max)  # type: ignore[arg-type]
         else:
@@ -217,13 +226,13 @@ class Accelerator:
         return found if give is None else give(found)
 
 
-def asks_for_counters(costs: CostOptions) -> bool:
-    """Return whether any of the options is set. Raises TypeError if `closest_hit` has no option of this name."""
-    for name in costs:
-        if name not in CostOptions.__annotations__:
-            near = did_you_mean(name, [*signature(Accelerator.closest_hit).parameters, *CostOptions.__annotations__])
-            raise TypeError(f"closest_hit() got an unexpected keyword argument {name!r}{near and '; ' + near.rstrip()}")
-    return any(costs.values())
+def checked_names(options: Any, method: str, kind: type) -> Any:
+    """Return the options of a method. Raises TypeError for a name that is none of a TypedDict's (`kind`)."""
+    for name in options:
+        if name not in kind.__annotations__:
+            near = did_you_mean(name, [*signature(getattr(Accelerator, method)).parameters, *kind.__annotations__])
+            raise TypeError(f"{method}() got an unexpected keyword argument {name!r}{near and '; ' + near.rstrip()}")
+    return options
 
 
 def snapshot_of(accel: Accelerator, instances: bool = False) -> Snapshot:

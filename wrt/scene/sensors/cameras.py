@@ -1,0 +1,195 @@
+"""Pinhole and fisheye cameras, with lens distortion, as arrays of rays."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from wrt.core.arrays import given_like
+from wrt.core.checks import as_size
+from wrt.core.errors import InputError
+from wrt.core.types import ArrayLike
+from wrt.scene.sensors.distortion import Fisheye, Radial
+from wrt.scene.sensors.sensor import Sensor, as_doubles, make_sensor
+
+FOLDS = "it folds over before this pixel"
+FOLDS_OR_TURNS = FOLDS + ", or the angle from the axis would exceed pi"
+
+
+def pinhole(intrinsics: ArrayLike, size: tuple[int, int] | str, pose: ArrayLike | None = None, distortion: ArrayLike = (),
+            rolling: bool = False, like: object = None) -> Sensor[Any]:
+    """Make one ray through the centre of each pixel of a pinhole camera.
+
+    Parameters
+    ----------
+    intrinsics
+        K, (3, 3) in pixels. The camera's frame is that of OpenCV: x right, y down, z forward. A point p in this frame projects to
+        K p / z, with (0, 0) at the centre of the top left pixel.
+    size
+        Width and height in pixels, or text such as "640x480".
+    pose
+        (4, 4), camera to world: a rotation and a translation. (B, 4, 4): B cameras. None: the identity.
+    distortion
+        OpenCV's coefficients in its order: k1 k2 p1 p2 (radial and tangential), k3, k4 k5 k6 (rational), s1 s2 s3 s4 (thin prism):
+        4, 5, 8 or 12 numbers.
+    rolling
+        Rolling shutter: `pose` is (rows, 4, 4) or (B, rows, 4, 4), the pose of each image row at the time of its exposure.
+    like
+        Warp array or tensor of PyTorch or JAX: the rays get its library and device. None: those of `pose`.
+
+    Returns
+    -------
+    Sensor
+        Directions have z = 1 in the camera's frame, so that t of a hit is its depth.
+
+    Raises
+    ------
+    InputError
+        If an argument does not have this form, the distortion folds over within the picture, or the rays exceed the range of float32.
+    """
+    k, (width, height) = _intrinsics(intrinsics), as_size(size)
+    x, y = _on_plane(k, np.arange(width)[None, :].astype(np.float64), np.arange(height)[:, None].astype(np.float64))
+    x, y = np.broadcast_arrays(x, y)
+    (x, y), exists = Radial(distortion).undistort_picture(x, y)
+    _require_rays(exists, FOLDS)
+    return make_sensor(_at_depth_1(x, y), pose, 2, 0 if rolling else None, like)
+
+
+def fisheye(intrinsics: ArrayLike, size: tuple[int, int] | str, pose: ArrayLike | None = None, distortion: ArrayLike = (),
+            rolling: bool = False, like: object = None) -> Sensor[Any]:
+    """Make one ray through the centre of each pixel of a fisheye camera, by OpenCV's fisheye model.
+
+    Parameters
+    ----------
+    intrinsics, size, pose, rolling, like
+        See `pinhole`.
+    distortion
+        k1 k2 k3 k4. Without, the distance from the image's centre is proportional to the angle from the axis (equidistant).
+
+    Returns
+    -------
+    Sensor
+        Directions have unit length, so that t of a hit is its range.
+
+    Raises
+    ------
+    InputError
+        If an argument does not have this form, the distortion folds over within the picture, or a corner would show an angle above pi.
+    """
+    k, (width, height) = _intrinsics(intrinsics), as_size(size)
+    x, y = _on_plane(k, np.arange(width)[None, :].astype(np.float64), np.arange(height)[:, None].astype(np.float64))
+    directions, exists = _fisheye_directions(Fisheye(distortion), *np.broadcast_arrays(x, y))
+    _require_rays(exists, FOLDS_OR_TURNS)
+    return make_sensor(directions, pose, 2, 0 if rolling else None, like)
+
+
+def project(points: ArrayLike, intrinsics: ArrayLike, distortion: ArrayLike = (), fisheye: bool = False) -> Any:
+    """Return the pixels at which a camera shows points.
+
+    Parameters
+    ----------
+    points
+        (..., 3) in the camera's frame.
+    intrinsics, distortion
+        See `pinhole`, or `fisheye` if that is True.
+
+    Returns
+    -------
+    (..., 2) float64
+        Column and row, also outside the picture; NaN for points that a pinhole camera does not see, with z <= 0.
+
+    Raises
+    ------
+    InputError
+        Names the argument and what was expected.
+    """
+    k, place = _intrinsics(intrinsics), _rows_of(points, "points", 3)
+    x, y, z = np.moveaxis(place, -1, 0)
+    with np.errstate(all="ignore"):
+        if fisheye:
+            across = np.hypot(x, y)
+            scale = np.where(across > 0.0, Fisheye(distortion).radius(np.arctan2(across, z)) / across, 0.0)
+            x, y = x * scale, y * scale
+        else:
+            ahead = np.where(z > 0.0, z, np.nan)
+            x, y = Radial(distortion).distort(x / ahead, y / ahead)
+        pixels = np.stack([k[0, 0] * x + k[0, 1] * y + k[0, 2], k[1, 1] * y + k[1, 2]], axis=-1)
+    return given_like(points, pixels)
+
+
+def unproject(pixels: ArrayLike, intrinsics: ArrayLike, distortion: ArrayLike = (), fisheye: bool = False) -> Any:
+    """Return the directions in which a camera sees pixels: the inverse of `project`.
+
+    Parameters
+    ----------
+    pixels
+        (..., 2), column and row.
+    intrinsics, distortion, fisheye
+        See `project`.
+
+    Returns
+    -------
+    (..., 3) float64
+        Directions in the camera's frame: z = 1 for a pinhole camera, unit length for a fisheye camera.
+
+    Raises
+    ------
+    InputError
+        Names the argument and what was expected, or the first pixel that no ray reaches, because the distortion folds over.
+    """
+    k, place = _intrinsics(intrinsics), _rows_of(pixels, "pixels", 2)
+    x, y = _on_plane(k, place[..., 0], place[..., 1])
+    if fisheye:
+        directions, exists = _fisheye_directions(Fisheye(distortion), x, y)
+    else:
+        (x, y), exists = Radial(distortion).undistort(x, y)
+        directions = _at_depth_1(x, y)
+    _require_rays(exists, FOLDS_OR_TURNS if fisheye else FOLDS, place)
+    return given_like(pixels, directions)
+
+
+def _intrinsics(value: ArrayLike) -> np.ndarray:
+    k = as_doubles(value, "intrinsics")
+    if k.shape != (3, 3) or not np.isfinite(k).all() or not np.array_equal(k[2], [0.0, 0.0, 1.0]) or k[1, 0] != 0.0:
+        raise InputError(f"must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]], got {k.tolist()}", argument="intrinsics")
+    if not (k[0, 0] > 0.0 and k[1, 1] > 0.0):
+        raise InputError(f"must have focal lengths above 0, got {k[0, 0]:g} and {k[1, 1]:g}", argument="intrinsics")
+    return k
+
+
+def _on_plane(k: np.ndarray, column: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points of pixels on the plane z = 1, still distorted."""
+    y = (row - k[1, 2]) / k[1, 1]
+    return (column - k[0, 2] - k[0, 1] * y) / k[0, 0], y
+
+
+def _at_depth_1(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return the directions (..., 3) to points on the plane z = 1."""
+    out = np.empty((*x.shape, 3))
+    out[..., 0], out[..., 1], out[..., 2] = x, y, 1.0
+    return out
+
+
+def _fisheye_directions(lens: Fisheye, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the unit directions that a fisheye lens shows at (x, y), and whether each exists."""
+    radius = np.hypot(x, y)
+    angle, exists = lens.angle(radius)
+    scale = np.divide(np.sin(angle), radius, out=np.ones_like(radius), where=radius > 0.0)
+    return np.stack([x * scale, y * scale, np.cos(angle)], axis=-1), exists
+
+
+def _rows_of(value: ArrayLike, name: str, columns: int) -> np.ndarray:
+    array = as_doubles(value, name)
+    if array.shape[-1:] != (columns,):
+        raise InputError(f"must be (..., {columns}), got {array.shape}", argument=name)
+    return array
+
+
+def _require_rays(exists: np.ndarray, why: str, pixels: np.ndarray | None = None) -> None:
+    """Raise InputError that names the first pixel without a ray. pixels: (..., 2), or None for the pixels of a picture."""
+    if not exists.all():
+        first = int(np.argmin(exists))
+        column, row = np.unravel_index(first, exists.shape)[::-1] if pixels is None else pixels.reshape(-1, 2)[first]
+        raise InputError(f"leaves pixel ({column:g}, {row:g}) without a ray: {why}", argument="distortion",
+                         hint="check the order of the coefficients, or fit fewer of them, or crop the picture")

@@ -1,0 +1,228 @@
+"""Rays of a sensor at one or many poses, and images of their hits."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Generic, Protocol
+
+import numpy as np
+import warp as wp
+
+from wrt.core.arrays import from_tensor, given_like, is_tensor, on_cpu, to_numpy, to_tensor_like, to_warp
+from wrt.core.checks import as_array, shown
+from wrt.core.device import empty_aligned
+from wrt.core.errors import InputError
+from wrt.core.threads import run_all, thread_count
+from wrt.core.types import ArrayLike, ArrayT
+
+MAX_ROTATION_ERROR = 1e-5  # largest entry of |R R^T - I| for the rotation matrix R of a pose
+RAYS_PER_JOB = 1 << 16
+RAYS_PER_PART = 4096  # of one matrix product: NumPy's library starts its own threads for larger ones, which wait for each other
+
+
+class FoundHits(Protocol):
+    """Part of `Hits` that images need."""
+
+    t: Any
+    prim_id: Any
+
+    @property
+    def point(self) -> Any: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor(Generic[ArrayT]):
+    """Rays of a sensor, one per pixel, and the shape of its images.
+
+    Images are arrays of NumPy, or of the library of the hits (Warp, PyTorch, JAX), on their device.
+
+    Parameters
+    ----------
+    origins, directions
+        (N, 3) float32 each, or Warp arrays (N,) of vec3, in world space: one image row after another, one image after another.
+    shape
+        (rows, columns) of an image, or (B, rows, columns) for B poses; N is the product.
+    axis
+        Unit vector in world space along which `depth` measures, float64: (3,), or an array that broadcasts with (*shape, 3).
+    """
+
+    origins: ArrayT
+    directions: ArrayT
+    shape: tuple[int, ...]
+    axis: np.ndarray
+
+    def picture(self, values: ArrayLike) -> Any:
+        """Reshape values of the rays, (N, ...) or (*shape, ...), such as hits.prim_id or hits.normal, to (*shape, ...).
+
+        The result shares the memory of `values`, unless the library copies to reshape (JAX).
+        Raises InputError if there is not one value per ray.
+        """
+        array = from_tensor(values, "values", None)
+        array = array if isinstance(array, wp.array) else np.asarray(array)
+        n, axes = int(np.prod(self.shape)), len(self.shape)
+        if array.shape[:axes] == self.shape:
+            return values
+        if array.shape[:1] != (n,):
+            raise InputError(f"must have one row per ray, ({n}, ...), got {array.shape}", argument="values")
+        shape = (*self.shape, *array.shape[1:])
+        own: Any = values
+        if hasattr(own, "reshape"):
+            return own.reshape(shape)
+        image, give = array.reshape(shape), to_tensor_like(values)
+        return image if give is None else give(image)
+
+    def range(self, hits: FoundHits) -> Any:
+        """Return the distance of each hit from the sensor, `shape` float32 in scene units; inf on a miss."""
+        return self._scaled(hits, np.linalg.norm(self._directions().astype(np.float64), axis=-1))
+
+    def depth(self, hits: FoundHits) -> Any:
+        """Return the distance of each hit along the sensor's axis, `shape` float32 in scene units.
+
+        The depth is inf on a miss and negative behind the sensor. For a camera it is z in the camera's frame, as in depth images.
+        """
+        if self.axis.ndim == 1:
+            return self._scaled(hits, self._directions().astype(np.float64) @ self.axis)
+        return self._scaled(hits, np.einsum("...k,...k->...", self._directions(), self.axis))
+
+    def points(self, hits: FoundHits | ArrayLike) -> Any:
+        """Return the points of hits, or of measured ranges, in world space: (*shape, 3) float32, NaN on a miss.
+
+        Parameters
+        ----------
+        hits
+            Hits of the rays, or ranges such as those of `with_range_noise`, (N,) or `shape`; inf is a miss.
+
+        Raises
+        ------
+        InputError
+            If there is not one value per ray.
+        """
+        if hasattr(hits, "prim_id"):
+            found: Any = hits
+            return self.picture(found.point)
+        ranges = to_numpy(self.picture(hits))[..., None]
+        ways = self._directions().astype(np.float64)
+        ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
+        places = np.full(ways.shape, np.nan)
+        np.multiply(ranges, ways, out=places, where=np.isfinite(ranges))
+        return given_like(hits, (places + to_numpy(self.origins).reshape(ways.shape)).astype(np.float32))
+
+    def _directions(self) -> np.ndarray:
+        return to_numpy(self.directions).reshape(*self.shape, 3)
+
+    def _scaled(self, hits: FoundHits, factor: np.ndarray) -> Any:
+        if not hasattr(hits, "t"):
+            raise InputError(f"must be the Hits that closest_hit returned, got {shown(hits)}", argument="hits")
+        t = to_numpy(self.picture(hits.t))
+        scaled = np.full(t.shape, np.inf)
+        np.multiply(t, factor, out=scaled, where=np.isfinite(t))
+        return given_like(hits.t, scaled.astype(np.float32))
+
+
+def make_sensor(local: np.ndarray, pose: ArrayLike | None, axis: int, rolling: int | None, like: object) -> Sensor[Any]:
+    """Make a sensor from directions (rows, columns, 3) in its own frame.
+
+    Parameters
+    ----------
+    local
+        Directions, float64.
+    pose
+        (4, 4), or (B, 4, 4); with `rolling`, (rows or columns, 4, 4) or (B, rows or columns, 4, 4).
+    axis
+        Index of the frame's axis that measures depth.
+    rolling
+        Axis of `local`, 0 or 1, along which each row or column has its own pose; None: all pixels of an image share a pose.
+    like
+        Array of the library and device that the rays get; None: those of `pose`.
+
+    Raises
+    ------
+    InputError
+        Names the argument and what was expected.
+    """
+    poses = as_poses(pose)
+    many = poses.shape[:-2]
+    if len(many) > (1 if rolling is None else 2) or (rolling is not None and many[-1:] != (local.shape[rolling],)):
+        what = "(4, 4) or (B, 4, 4)" if rolling is None else f"({local.shape[rolling]}, 4, 4) or (B, {local.shape[rolling]}, 4, 4)"
+        raise InputError(f"must be {what}, got {poses.shape}", argument="pose")
+    limit = np.finfo(np.float32).max
+    if not (max(local.max(), -local.min()) <= limit / 2.0 and np.abs(poses[..., :3, 3]).max() <= limit):  # rotated by at most sqrt(3)
+        raise InputError("rays of this sensor and pose exceed the range of float32")
+    batch = many if rolling is None else many[:-1]
+    shape = (*batch, *local.shape[:2])
+    images = int(np.prod(batch))
+    origins, directions = (empty_aligned((images, *local.shape), np.float32) for _ in range(2))
+    each = poses.reshape(images, *many[len(batch):], 4, 4)
+
+    def fill(parts: list[tuple[int, slice]]) -> None:
+        for i, rows in parts:
+            own = each[i, rows] if rolling == 0 else each[i]
+            place = own[..., :3, 3]
+            directions[i, rows] = _turned(local[rows], own[..., :3, :3], rolling)
+            origins[i, rows] = place[:, None] if rolling == 0 else place
+
+    height = max(1, RAYS_PER_PART // local.shape[1])
+    parts = [(i, slice(row, row + height)) for i in range(images) for row in range(0, local.shape[0], height)]
+    step = max(1, RAYS_PER_JOB // (min(height, local.shape[0]) * local.shape[1]))
+    run_all([partial(fill, parts[first:first + step]) for first in range(0, len(parts), step)], thread_count(None))
+    axes = each[..., :3, axis]  # (images, 3) or (images, rows or columns, 3)
+    if rolling is not None:
+        axes = np.expand_dims(axes, 2 - rolling)
+    elif batch:
+        axes = axes[:, None, None]
+    axes = axes.reshape(*batch, *axes.shape[1:]).copy()
+    like = pose if like is None else like
+    return Sensor(_of_library(origins.reshape(-1, 3), like), _of_library(directions.reshape(-1, 3), like), shape, axes)
+
+
+def _turned(local: np.ndarray, rotation: np.ndarray, rolling: int | None) -> np.ndarray:
+    """Rotate directions (rows, columns, 3) by one matrix, or by one of each row or column."""
+    if rolling is None:
+        return (local.reshape(-1, 3) @ rotation.T).reshape(local.shape)
+    if rolling == 0:
+        return local @ rotation.transpose(0, 2, 1)
+    return (local.swapaxes(0, 1) @ rotation.transpose(0, 2, 1)).swapaxes(0, 1)
+
+
+def as_doubles(value: ArrayLike, name: str) -> np.ndarray:
+    """Return an argument, also a tensor, as a NumPy array of float64. Raises InputError that names the argument."""
+    array = as_array(to_numpy(value) if is_tensor(value) or isinstance(value, wp.array) else value, np.float64, name)
+    return array.reshape(()) if getattr(value, "shape", None) == () or isinstance(value, int | float) else array  # as before as_array
+
+
+def as_poses(pose: ArrayLike | None) -> np.ndarray:
+    """Return poses (..., 4, 4) float64. Raises InputError unless each is a rotation and a translation."""
+    if pose is None:
+        return np.eye(4)
+    if isinstance(pose, tuple | list) and [np.shape(each) for each in pose] == [(3, 3), (3,)]:
+        raise InputError("must be a matrix (4, 4), sensor to world, got a pair (R, t)", argument="pose",
+                         hint="OpenCV's R and t are world to camera: pass np.linalg.inv(np.vstack([np.c_[R, t], [0, 0, 0, 1]]))")
+    poses = as_doubles(pose, "pose")
+    if poses.shape[-2:] != (4, 4) or poses.size == 0:
+        raise InputError(f"must be (4, 4) or (B, 4, 4), sensor to world, got {poses.shape}", argument="pose")
+    for good, what in _conditions(poses):
+        if not good.all():
+            place = np.unravel_index(int(np.argmin(good)), good.shape) if good.ndim else ()
+            raise InputError(f"must be {what}" + (f"; pose {', '.join(map(str, place))} is not" if place else ""), argument="pose")
+    return poses
+
+
+def _conditions(poses: np.ndarray) -> Iterator[tuple[np.ndarray, str]]:
+    """Yield, for each condition, whether each pose meets it."""
+    yield np.isfinite(poses).all(axis=(-2, -1)), "finite"
+    yield np.abs(poses[..., 3, :] - (0.0, 0.0, 0.0, 1.0)).max(axis=-1) <= 1e-6, "affine (last row 0 0 0 1)"
+    rotation = poses[..., :3, :3]
+    error = np.abs(rotation @ rotation.swapaxes(-2, -1) - np.eye(3)).max(axis=(-2, -1))
+    yield (error <= MAX_ROTATION_ERROR) & (np.linalg.det(rotation) > 0.0), "a rotation and a translation"
+
+
+def _of_library(rays: np.ndarray, like: object) -> Any:
+    """Return vectors (N, 3) as an array of the library and device of `like`, without a copy on the CPU."""
+    if isinstance(like, wp.array):
+        return to_warp(rays, wp.vec3).to(like.device)
+    give = to_tensor_like(like)
+    if give is None:
+        return rays
+    return give(rays if not is_tensor(like) or on_cpu(like) else to_warp(rays, wp.vec3).to(to_warp(like).device))
