@@ -226,7 +226,7 @@ plt.show()
 # <details><summary>Solution</summary>
 #
 # If $p\,a \log_2 n < n\,(b + c)$. If the triangles lie side by side, $nc$ is about $p$ and small triangles cost mostly $b$: rays win for
-# $n \log^{-1}_2 n > p\,a/b$. With several layers, $nc$ is a multiple of $p$, and rays win earlier.
+# $n / \log_2 n > p\,a/b$. With several layers, $nc$ is a multiple of $p$, and rays win earlier.
 # </details>
 #
 # **2.** Why does the refitted tree stay right although its boxes overlap?

@@ -17,6 +17,7 @@ import wrt
 from wrt.lab.bench.rays import ray_sets
 from wrt.lab.bench.visibility import terrain
 from wrt.lab.walk.drawing import Section
+from wrt.renderer.inspector.section import Plane, cut
 from wrt.scene.shapes import merged, quad, teapot
 
 QUICK = "WRT_QUICK" in os.environ
@@ -60,9 +61,9 @@ print(walks["octree"])
 
 # %%
 WINDOW = (-0.5, 4.4, -0.3, 2.6)
-above = Section(np.array([0.0, 0.0, 0.013]), np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), 1.0, WINDOW)
+above = Section(Plane(np.array([0.0, 0.0, 0.013]), np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])), 1.0, WINDOW)
 triangles = mesh.vertices.astype(float)[mesh.faces]
-sections = above.segments(triangles)
+sections = [cut(corners[None], above.plane) for corners in triangles]  # a line for each triangle that the plane crosses
 
 
 def outline(ax, region, **style):
@@ -105,7 +106,7 @@ for ax, (name, walk) in zip(axes.flat, walks.items(), strict=True):
                 number += 1
                 ax.text(*corners.mean(axis=0), str(number), fontsize=7, color="tab:green", ha="center", va="center")
     tested = [step.prim_id for step in walk.steps if step.prim_id >= 0]
-    for i, ends in enumerate(sections):
+    for i, (ends,) in ((i, lines) for i, lines in enumerate(sections) if len(lines)):
         ax.plot(*ends.T, color="black" if i in tested else "0.55", lw=2.2 if i in tested else 1.0)
     hits = accel.closest_hit(origin[None], direction[None], counters=True)
     counts = {key: int(getattr(hits.counters, key)[0]) for key in ("nodes", "boxes", "primitives", "pushes", "pops", "leaves")}
