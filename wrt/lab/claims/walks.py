@@ -117,10 +117,10 @@ def tree_of(geometry: Geometry, wide: WideTree) -> Tree:
     return Tree(wide, data)
 
 
-def build_tree(geometry: Geometry, width: int, max_leaf: int = 1, bits: bool = False, builder: str = "binned") -> Tree:
+def build_tree(geometry: Geometry, width: int, max_leaf: int = 1, bits: bool = False) -> Tree:
     """Build a tree of nodes with `width` children, as wrt's wide BVHs are built. bits: round boxes outwards to 8 bits per plane (width 2
     to 8, even)."""
-    options = BvhOptions(builder=builder, max_leaf=max_leaf, cost_traversal=0.0, row=width)
+    options = BvhOptions(max_leaf=max_leaf, cost_traversal=0.0, row=width)
     wide = collapse(build_binary(geometry, options, 1), width, max_leaf, 1.0, 1.0)
     if bits:
         lo, hi = decompress(compress(wide.lo, wide.hi, wide.exists), width)
