@@ -42,8 +42,8 @@ class Watch:
             timer.daemon = True
             with suppress(RuntimeError):  # no more threads: the kernel matters more than the message
                 timer.start()
-        self._report()
         try:
+            self._report()  # runs the handlers of the program, which may raise
             yield
         finally:
             with self._lock:

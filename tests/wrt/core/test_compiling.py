@@ -55,6 +55,23 @@ def test_compilation_that_takes_long_is_logged_once(caplog: pytest.LogCaptureFix
     assert not watch.is_slow()
 
 
+def test_a_filter_that_raises_leaves_no_compilation_behind() -> None:
+    def refuse(record: logging.LogRecord) -> bool:
+        raise OSError("the log is full")
+
+    watch = Watch(delay=2.0)
+    with watch.compiling():
+        pass
+    watch.delay = 0.0  # the next compilation belongs to a series that lasts too long
+    LOGGER.addFilter(refuse)
+    try:
+        with pytest.raises(OSError, match="full"), watch.compiling():
+            pass
+    finally:
+        LOGGER.removeFilter(refuse)
+    assert not watch.is_slow()
+
+
 def test_one_long_compilation_is_reported_while_it_runs(caplog: pytest.LogCaptureFixture) -> None:
     watch = Watch(delay=0.05)
     with watch.compiling():
