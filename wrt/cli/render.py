@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -167,7 +168,9 @@ def render_once(scene: Path, output: Path | None, *, assignments: Assignments, s
 
 
 def require_alone(as_json: bool, options: dict[str, Parsed]) -> None:
-    """Raise InputError for an option that writes beside a picture on stdout."""
+    """Raise InputError for an option that writes beside a picture on stdout, and if stdout is closed."""
+    if sys.stdout is None:
+        raise InputError("is stdout, which is closed", argument="-o -", hint="give -o a file name")
     for name, given in (("json", as_json), ("aov", options["aov"]), ("checkpoint", options["every"] or options["resume"])):
         if given and not (name == "checkpoint" and options["checkpoint_file"]):
             raise InputError("has no place if the picture goes to stdout", argument=f"--{name}", hint="give -o a file name")

@@ -417,6 +417,9 @@ def test_a_picture_on_stdout_is_the_file_and_nothing_else() -> None:
     Path("piped.png").write_bytes(piped.stdout)
     assert piped.stdout.startswith(b"\x89PNG") and piped.stdout.endswith(b"IEND\xaeB`\x82")
     assert np.array_equal(read_image("piped.png"), read_image("a.png")) and not Path("-").exists()
+    closed = subprocess.run([sys.executable, "-m", "wrt", "render", "box.obj", "-o", "-"], stderr=subprocess.PIPE, text=True,
+                            preexec_fn=lambda: os.close(1))
+    assert closed.returncode == 2 and closed.stderr == "error: -o - is stdout, which is closed; give -o a file name\n"
 
 
 def test_a_watched_scene_is_rendered_after_each_change_and_mistakes_are_reported(capsys: pytest.CaptureFixture[str]) -> None:
