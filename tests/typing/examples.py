@@ -68,6 +68,9 @@ def queries(accel: OneMesh, origins: Array, directions: Array) -> None:
     assert_type(hits.gradients(t=2.0 * hits.t), Gradients)
     assert_type(hits.gradients().vertices, Array)
     assert_type(hits.warp(), Hits[WarpArray])
+    assert_type(hits[hits.hit], Hits)
+    assert_type(hits[10:20].distance, Array)
+    assert_type(accel.closest_hit((0.0, 0.0, 5.0), directions, invalid="miss"), Hits)
     hit = hits.prim_id >= 0
     wrt.visible(accel, hits.point[hit], origins[hit], on_a=hits.prim_id[hit])
     assert_type(wrt.visible(accel, origins, directions), Bools)
