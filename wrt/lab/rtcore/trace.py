@@ -12,6 +12,7 @@ import numpy as np
 
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.answers import Counters
+from wrt.accel.queries.rays import Rays, rays_of
 from wrt.accel.queries.recorded_steps import RAYS_AT_ONCE, RecordedSteps, record_steps
 from wrt.core.checks import as_path, require_known
 from wrt.core.errors import InputError
@@ -217,14 +218,9 @@ def trace(accel: Accelerator, origins: ArrayLike, directions: ArrayLike, t_min: 
     InputError
         Names the argument and what was expected.
     """
-    origins, directions = np.asarray(origins), np.asarray(directions)
-    n = len(origins) if origins.ndim == 2 else 0
-    ends = [np.asarray(each) for each in (t_min, t_max)]
-    parts = []
-    for begin in range(0, max(n, 1), RAYS_AT_ONCE):
-        some = slice(begin, begin + RAYS_AT_ONCE) if n > RAYS_AT_ONCE else slice(None)
-        parts.append(trace_of(record_steps(accel, origins[some], directions[some], *(each[some] if each.ndim else each for each in ends))))
-    return joined(parts)
+    rays = rays_of(np.asarray(origins), np.asarray(directions), t_min, t_max)
+    parts = [Rays(*(each[begin : begin + RAYS_AT_ONCE] for each in rays)) for begin in range(0, max(len(rays.origins), 1), RAYS_AT_ONCE)]
+    return joined([trace_of(record_steps(accel, *part)) for part in parts])
 
 
 def joined(parts: list[Trace]) -> Trace:

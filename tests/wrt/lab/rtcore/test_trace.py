@@ -105,6 +105,10 @@ def test_wrong_arguments_are_reported() -> None:
         with pytest.raises(wrt.InputError, match=message):
             wrt.trace(*arguments)
     assert len(wrt.trace(accel, np.zeros((0, 3)), np.zeros((0, 3)))) == 0
+    wrong: list[Any] = [None, "x", 5, []]
+    for origins in wrong:
+        with pytest.raises(wrt.InputError, match="origins must be"):
+            wrt.trace(accel, origins, np.ones((0, 3)))
 
 
 def test_the_model_follows_a_changed_trace(recorded: Trace) -> None:
