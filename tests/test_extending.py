@@ -267,35 +267,35 @@ READ_IT = """
 import wrt
 from wrt.io.mesh_file import MESH_FORMATS, load_mesh, register_mesh_format
 
-register_mesh_format(".pyramid", lambda path: MESH_FORMATS[".off"](path))
-for name in ("a.off", "a.pyramid"):
+register_mesh_format(".pyramid", lambda path: MESH_FORMATS[".shape"](path))
+for name in ("a.shape", "a.pyramid"):
     mesh = load_mesh(name)
     assert len(mesh.vertices) == 5 and len(mesh.faces) == 6
     assert len(wrt.load_scene(name).objects) == 1
 try:
-    load_mesh("broken.off")
+    load_mesh("broken.shape")
     raise AssertionError("it was read")
 except wrt.InputError as error:
-    assert str(error.path) == "broken.off" and "corner" in error.what
+    assert str(error.path) == "broken.shape" and "corner" in error.what
 try:
     load_mesh("a.obj2")
     raise AssertionError("it was read")
 except wrt.InputError as error:
-    assert ".obj, .off, .ply, .stl, .pyramid" in str(error)
+    assert ".npz, .obj, .off, .ply, .shape, .stl, .pyramid" in str(error)
 print("all of it works")
 """
 
 
 def test_a_mesh_format_is_one_file(tmp_path: Path) -> None:
-    name = "wrt/io/meshes/off.py"
+    name = "wrt/io/meshes/shape.py"
     for folder in ("wrt", "kernels"):
         shutil.copytree(ROOT / folder, tmp_path / folder, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
     (tmp_path / name).write_text(next(body for _, path, body in BLOCK.findall((ROOT / "docs" / "extending.md").read_text())
                                       if path == name))
-    for file, text in (("a.off", PYRAMID), ("a.pyramid", PYRAMID), ("broken.off", PYRAMID.replace("3 3 0 4", "3 3 0 7"))):
+    for file, text in (("a.shape", PYRAMID), ("a.pyramid", PYRAMID), ("broken.shape", PYRAMID.replace("3 3 0 4", "3 3 0 7"))):
         (tmp_path / file).write_text(text)
     assert python(tmp_path, "-W", "ignore", "-c", READ_IT).endswith("all of it works\n")
-    assert "or a mesh: .obj, .off, .ply, .stl" in " ".join(python(tmp_path, "-m", "wrt", "render", "--help").split())
+    assert "or a mesh: .npz, .obj, .off, .ply, .shape, .stl" in " ".join(python(tmp_path, "-m", "wrt", "render", "--help").split())
 
 
 def test_a_camera_of_ones_own_needs_no_copy_of_the_project(tmp_path: Path) -> None:

@@ -47,7 +47,14 @@ def read_file(path: str | os.PathLike[str]) -> bytes:
 
 
 def utf8(text: bytes) -> bytes:
-    """Return a text file's bytes without UTF-8's byte order mark. Raises InputError, without the path, for UTF-16 and UTF-32."""
-    if text.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE, codecs.BOM_UTF32_BE)):
-        raise InputError("is UTF-16 or UTF-32 text", hint="save it as UTF-8")
+    """Return a text file's bytes as UTF-8 without a byte order mark; a mark of UTF-16 or UTF-32 tells the file's encoding.
+
+    Raises InputError, without the path, for text that is damaged.
+    """
+    for marks, encoding in (((codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE), "utf-32"), ((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE), "utf-16")):
+        if text.startswith(marks):
+            try:
+                return text.decode(encoding).encode()
+            except UnicodeError as error:
+                raise InputError(f"is damaged {encoding.upper()} text ({error})", hint="save it as UTF-8") from None
     return text.removeprefix(codecs.BOM_UTF8)

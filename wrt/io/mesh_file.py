@@ -43,7 +43,7 @@ def register_mesh_format(suffix: str, read: Reader) -> None:
     Parameters
     ----------
     suffix
-        Suffix of the files, in small letters, such as ".off".
+        Suffix of the files, in small letters, such as ".shape".
     read
         Function that returns the RawMesh of a path, which wrt then checks and cleans. It raises InputError, without the path, for a
         file that it cannot read.

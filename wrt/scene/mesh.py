@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from wrt.core.checks import LARGEST, as_array, shown
+from wrt.core.checks import LARGEST, as_array, as_path, shown
 from wrt.core.errors import InputError
 from wrt.core.packages import needed_by
+from wrt.core.types import PathLike
+from wrt.core.write_file import write_bytes
 from wrt.scene.clean import require_indices
 
 if TYPE_CHECKING:
@@ -111,6 +114,35 @@ class Mesh:
 
         visual = None if self.uvs is None else trimesh.visual.TextureVisuals(uv=self.uvs * (1.0, -1.0) + (0.0, 1.0))
         return trimesh.Trimesh(self.vertices, self.faces, vertex_normals=self.normals, visual=visual, process=False)
+
+    def save(self, path: PathLike) -> None:
+        """Write vertices, faces, normals and uvs to a file that `wrt.load_mesh` reads.
+
+        Parameters
+        ----------
+        path : str or path
+            .npz keeps all bits. Other suffixes are those of trimesh, such as .ply, .obj, .stl and .off; these need trimesh.
+
+        Raises
+        ------
+        InputError
+            If trimesh cannot write the format, or the file cannot be written.
+        """
+        path = as_path(path, "path")
+        if path.suffix.lower() == ".npz":
+            arrays = {name: getattr(self, name) for name in ("vertices", "faces", "normals", "uvs")}
+            data = io.BytesIO()
+            np.savez(data, **{name: array for name, array in arrays.items() if array is not None})
+            write_bytes(path, data.getvalue())
+            return
+        try:
+            written = self.to_trimesh().export(file_type=path.suffix.lower()[1:])
+        except (ValueError, KeyError) as error:
+            raise InputError(f"trimesh does not write this format ({error})", path=path,
+                             hint="use .npz, .ply, .obj, .stl or .off") from error
+        if isinstance(written, dict):
+            raise InputError("is of a format with several files", path=path, hint="use .npz, .ply, .obj, .stl, .off or .glb")
+        write_bytes(path, written.encode() if isinstance(written, str) else written)
 
     @cached_property
     def reach(self) -> float:

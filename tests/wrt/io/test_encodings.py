@@ -1,4 +1,4 @@
-"""Text files in other encodings than UTF-8: each reader takes UTF-8 with a byte order mark, and names UTF-16 and UTF-32."""
+"""Text files in other encodings than UTF-8: each reader takes UTF-8, UTF-16 and UTF-32 with a byte order mark."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ end_header
 """
 TEXTS = {
     ".obj": "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", ".ply": PLY,
+    ".off": "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n",
     ".stl": "solid a\nfacet\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\nendsolid a\n",
     ".toml": "[materials.m]\n[[quads]]\ncorner = [0, 0, 0]\nedge_u = [1, 0, 0]\nedge_v = [0, 1, 0]\nmaterial = 'm'\n",
 }
@@ -38,12 +39,18 @@ def texts(folder: Path) -> dict[str, str]:
     return {**TEXTS, ".gltf": one_triangle().write(folder, "a.gltf").read_text()}
 
 
+@pytest.mark.filterwarnings("ignore::wrt.core.errors.SceneWarning")
 @pytest.mark.parametrize("suffix", [*TEXTS, ".gltf"])
 @pytest.mark.parametrize("encoding", MARKS)
 def test_a_byte_order_mark_tells_the_encoding(suffix: str, encoding: str, tmp_path: Path) -> None:
     text, path = texts(tmp_path)[suffix], tmp_path / f"b{suffix}"
+    path.write_text(text)
+    plain, = load_scene(path).objects
     path.write_bytes(MARKS[encoding] + text.encode(encoding))
-    with refused(None, "UTF-16", path=f"b{suffix}", hint="UTF-8"):
+    marked, = load_scene(path).objects
+    assert plain.mesh.vertices.tolist() == marked.mesh.vertices.tolist() and plain.mesh.faces.tolist() == marked.mesh.faces.tolist()
+    path.write_bytes(MARKS[encoding] + text.encode(encoding) + b"x")
+    with refused(None, "damaged UTF", path=f"b{suffix}", hint="UTF-8"):
         load_scene(path)
 
 

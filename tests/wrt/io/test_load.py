@@ -501,7 +501,7 @@ def test_paths_that_are_no_scene(tmp_path: Path) -> None:
     (tmp_path / "folder.toml").mkdir()
     (tmp_path / "a.blend").write_text("")
     for name in ("none.toml", "folder.toml", "a.blend", "none"):
-        with refused(None, ".toml, .gltf, .glb, .obj, .ply, .stl", path=name):
+        with refused(None, ".toml, .gltf, .glb, .npz, .obj, .off, .ply, .stl", path=name):
             load_scene(tmp_path / name)
 
 
