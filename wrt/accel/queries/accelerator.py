@@ -154,13 +154,13 @@ class Accelerator:
         InputError
             Names the argument and what was expected. The arrays of `out` may have been overwritten.
         """
-        threads, give, shape = thread_count(threads), to_tensor_like(origins, directions), None
-        callers = None if out is None else arrays_of(out)
+        threads, shape, callers = thread_count(threads), None, None if out is None else arrays_of(out)
         if are_rows(origins, directions) and invalid == "raise":  # the usual case, whose arrays need no other shape
             rays = rays_of(origins, directions, t_min, t_max, True)  # type: ignore[arg-type]
         else:
             rays, shape = shaped_rays(origins, directions, t_min, t_max, True, invalid)
             callers, world = callers and flat_arrays(callers, shape, HIT_TYPES), worlds_of_each(world, shape)
+        give = to_tensor_like(origins, directions)
         t, u, v, prim_id = arrays = answer_arrays(HIT_TYPES, callers, len(rays.origins), self.device if rays.as_warp else None,
                                              give is not None)
         snapshot = self._snapshot  # read once, because a refit may replace it during the query
@@ -210,7 +210,7 @@ class Accelerator:
         InputError
             Names the argument and what was expected.
         """
-        threads, give, shape = thread_count(threads), to_tensor_like(origins, directions), None
+        threads, shape = thread_count(threads), None
         callers, invalid = None if out is None else [out], "raise"
         if more:
             invalid = checked_names(more, "any_hit", RayOptions).get("invalid", invalid)
@@ -219,6 +219,7 @@ class Accelerator:
         else:
             rays, shape = shaped_rays(origins, directions, t_min, t_max, invalid=invalid)
             callers, world = callers and flat_arrays(callers, shape, ANY_HIT_TYPES), worlds_of_each(world, shape)
+        give = to_tensor_like(origins, directions)
         arrays = answer_arrays(ANY_HIT_TYPES, callers, len(rays.origins), self.device if rays.as_warp else None, give is not None)
         snapshot = self._snapshot
         trace_query(snapshot, Query(rays, arrays, threads, check_world(snapshot, world, len(arrays[0]))))
