@@ -30,6 +30,8 @@ PLACE_OPTIONS = (
 @option_group("place", Place, names_of(Place), PLACE_OPTIONS)
 @click.option("--open/--no-open", "open_browser", default=True, help="Open a browser  [default: on a desktop]")
 @click.option("--spp", type=click.IntRange(1, 1 << 24), default=1024, show_default=True, help="Samples per pixel of the finished picture")
+@click.option("--target-error", type=float,
+              help="Finish once the estimated error is at most this: root mean square over the picture, linear radiance")
 @STAGING
 @shared("device", "threads", "camera", "accel", "assignments", "quiet")
 def view(scene: Path, place: Place, open_browser: bool, spp: int, assignments: Assignments, staging: dict[str, Parsed], quiet: bool,
@@ -37,11 +39,11 @@ def view(scene: Path, place: Place, open_browser: bool, spp: int, assignments: A
     """Show SCENE in a browser with an orbit camera; the picture gets finer while the camera rests.
 
     The printed address contains a secret token: everybody with the address can watch, and move the camera. Ctrl-C ends the viewer.
-    The viewer needs viser: pip install "wrt[viewer]"."""
+    The viewer needs websockets: pip install "wrt[viewer]"."""
     from wrt.viewer.page import Page
-    from wrt.viewer.server import import_viser, listen
+    from wrt.viewer.server import import_websockets, listen
 
-    import_viser()
+    import_websockets()
     listen(place).close()  # raises InputError before the scene is read
     from wrt.lab.costs import CostCounter
     from wrt.renderer.options import Options

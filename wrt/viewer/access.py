@@ -1,6 +1,6 @@
 """Access to the viewer: every request must carry the token, and a Host and an Origin of this viewer.
 
-The printed address contains the token. It redirects to the page's path `/TOKEN/`, from which viser's page derives the address of its
+The printed address contains the token. It redirects to the page's path `/TOKEN/`, from which the page derives the address of its
 WebSocket. The token is no cookie, because a browser sends cookies to every port of a host, also to another user's server.
 """
 

@@ -1,32 +1,52 @@
-"""Conversion of cameras between a scene and the browser's viewport, and from a camera to a table of a TOML scene file.
-
-viser's camera looks along +z with +y down (OpenCV's convention). wrt's camera looks along -z with +y up. The viewport's space is the
-scene's space divided by `unit`, because viser's controls suit a scene of about size 1.
-"""
+"""The camera that a user steers: orbits, pans, dollies and walks with undo and reset, and its table of a TOML scene file."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from wrt.scene.cameras import Camera, CameraKind
+from wrt.scene.cameras import Camera, CameraKind, OrthographicCamera
 from wrt.scene.defaults import bounding_sphere
 from wrt.scene.model import Scene
-
-if TYPE_CHECKING:
-    import viser
 
 PARALLEL = 0.999  # Largest |cosine| between the view direction and +y for which +y can be the up direction.
 NO_FOCUS = Camera().focus_distance  # Focus distance of a camera whose scene sets no focus.
 LEVEL = 1e-6  # Largest |y| of the x axis of an upright camera.
+STEEPEST = math.radians(89.0)  # Largest angle of the view above or below the horizon.
+MOST_UNDOS = 100
+PRECISION = 1e-5  # Largest error of a camera's TOML table, relative to the distance of its target.
 
 
-def unit_of(scene: Scene, camera: CameraKind) -> float:
-    """Return the viewport's unit in scene units: the distance from the camera to the point that it orbits."""
-    return float(np.linalg.norm(orbited_point(scene, camera) - camera.camera_to_world[:3, 3]))
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """A camera, the point (3,) that it orbits, which lies on its axis, and the unit vector (3,) that it rotates about."""
+
+    camera: CameraKind
+    target: np.ndarray
+    up: np.ndarray
+
+    @property
+    def distance(self) -> float:
+        return math.dist(self.target, self.camera.camera_to_world[:3, 3])  # without overflow
+
+    def placed(self, axes: np.ndarray, target: np.ndarray, distance: float) -> Pose:
+        """Return the pose with other axes (3, 3), target and distance. Raises InputError if a number overflows."""
+        pose = np.eye(4)
+        pose[:3, :3] = axes
+        with np.errstate(over="ignore", invalid="ignore"):  # the camera's constructor refuses values that are not finite
+            pose[:3, 3] = target + distance * axes[:, 2]
+        return Pose(replace(self.camera, camera_to_world=pose), target, self.up)
+
+
+def pose_of(scene: Scene, camera: CameraKind) -> Pose:
+    """Return a scene's camera as the start of a walk around the scene."""
+    return Pose(camera, orbited_point(scene, camera), up_of(camera))
 
 
 def orbited_point(scene: Scene, camera: CameraKind) -> np.ndarray:
@@ -44,38 +64,113 @@ def orbited_point(scene: Scene, camera: CameraKind) -> np.ndarray:
 
 
 def up_of(camera: CameraKind) -> np.ndarray:
-    """Return the axis (3,) that the viewport rotates about: +y for an upright camera, else the camera's up vector."""
+    """Return the axis (3,) that orbits rotate about: +y for an upright camera, else the camera's up vector."""
     right, up, back = camera.camera_to_world[:3, :3].T
     upright = abs(right[1]) < LEVEL and up[1] > 0.0 and abs(back[1]) < PARALLEL
     return np.array([0.0, 1.0, 0.0]) if upright else up
 
 
-def from_viewport(camera: CameraKind, viewport: viser.CameraHandle, unit: float) -> CameraKind:
-    """Return the camera with the viewport's pose. A perspective camera gets the viewport's angle of view, too."""
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_quat(np.roll(viewport.wxyz, -1)).as_matrix() * (1.0, -1.0, -1.0)
-    with np.errstate(over="ignore"):  # the camera's constructor refuses infinite values
-        pose[:3, 3] = np.asarray(viewport.position, np.float64) * unit
-    if isinstance(camera, Camera):
-        camera = replace(camera, fov_y=float(viewport.fov), least_fov_x=0.0)
-    return replace(camera, camera_to_world=pose)
+# --- moves ------------------------------------------------------------------------------------------------------------
+
+
+def orbit(pose: Pose, by: Sequence[float]) -> Pose:
+    """Orbit the target. by: the drag in heights of the picture, to the right and down; one height is half a turn."""
+    axes = pose.camera.camera_to_world[:3, :3]
+    height = math.asin(float(np.clip(axes[:, 2] @ pose.up, -1.0, 1.0)))
+    limit = max(STEEPEST, abs(height))
+    rise = min(max(height + math.pi * by[1], -limit), limit) - height
+    turn = Rotation.from_rotvec(-math.pi * by[0] * pose.up) * Rotation.from_rotvec(-rise * axes[:, 0])
+    return pose.placed((turn * Rotation.from_matrix(axes)).as_matrix(), pose.target, pose.distance)
+
+
+def pan(pose: Pose, by: Sequence[float]) -> Pose:
+    """Move the camera so that the target follows a drag. by: as for orbit."""
+    axes = pose.camera.camera_to_world[:3, :3]
+    shift = view_height(pose) * (by[1] * axes[:, 1] - by[0] * axes[:, 0])
+    return pose.placed(axes, pose.target + shift, pose.distance)
+
+
+def dolly(pose: Pose, by: Sequence[float]) -> Pose:
+    """Multiply the distance to the target by exp(by[0]); an orthographic camera's height, too."""
+    factor = math.exp(min(max(by[0], -2.0), 2.0))
+    moved = pose.placed(pose.camera.camera_to_world[:3, :3], pose.target, max(pose.distance * factor, 1e-12))
+    if isinstance(moved.camera, OrthographicCamera):
+        moved = replace(moved, camera=replace(moved.camera, height=moved.camera.height * factor))
+    return moved
+
+
+def walk(pose: Pose, by: Sequence[float]) -> Pose:
+    """Move camera and target. by: to the right, up and forward, in distances to the target."""
+    axes, distance = pose.camera.camera_to_world[:3, :3], pose.distance
+    shift = distance * (by[0] * axes[:, 0] + by[1] * pose.up - by[2] * axes[:, 2])
+    return pose.placed(axes, pose.target + shift, distance)
+
+
+def view_height(pose: Pose) -> float:
+    """Return the height of the view at the target, in scene units; for a fisheye or a panorama, the distance."""
+    camera = pose.camera
+    if isinstance(camera, OrthographicCamera):
+        return camera.height
+    return 2.0 * pose.distance * math.tan(0.5 * camera.fov_y) if isinstance(camera, Camera) else pose.distance
+
+
+MOVED: dict[str, Callable[[Pose, Sequence[float]], Pose]] = {each.__name__: each for each in (orbit, pan, dolly, walk)}
+
+
+class Steering:
+    """The pose that the user steers, and the poses before. `start` is the pose to which `reset` returns."""
+
+    def __init__(self, start: Pose) -> None:
+        self.start = self.pose = start
+        self._before: deque[Pose] = deque(maxlen=MOST_UNDOS)
+        self._changed: tuple[frozenset[str], Pose] | None = None  # fields that `change` has changed last, and the result
+
+    def move(self, kind: str, by: Sequence[float], begin: bool) -> None:
+        """Apply a move of MOVED. begin: True for the first move of a gesture, which `undo` undoes as a whole."""
+        self.put(MOVED[kind](self.pose, by), begin)
+
+    def put(self, pose: Pose, begin: bool = True) -> None:
+        if begin or not self._before:
+            self._before.append(self.pose)
+        self.pose = pose
+
+    def change(self, **fields: Any) -> None:
+        """Change fields of the camera, such as fov_y. The changes of one field in a row are undone together."""
+        names, last = frozenset(fields), self._changed
+        more = last is not None and last[0] == names and last[1] is self.pose
+        self.put(replace(self.pose, camera=replace(self.pose.camera, **fields)), not more)
+        self._changed = names, self.pose
+
+    def undo(self) -> None:
+        if self._before:
+            self.pose = self._before.pop()
+
+    def reset(self) -> None:
+        if self.pose is not self.start:
+            self.put(self.start)
+
+
+# --- scene files ------------------------------------------------------------------------------------------------------
 
 
 def _focus(camera: CameraKind) -> float:
     return camera.focus_distance if isinstance(camera, Camera) else NO_FOCUS
 
 
-def camera_toml(camera: CameraKind, name: str = "view") -> str:
-    """Return the camera as a table of a TOML scene file, exact up to the rounding of float64."""
-    pose = camera.camera_to_world
-    origin, up = pose[:3, 3], pose[:3, 1]
-    reach = max(_focus(camera), 1e-3 * float(np.abs(origin).max()))  # a nearer target would lose digits of the direction
-    values = {"position": origin, "target": origin - reach * pose[:3, 2], "up": up, **camera.as_in_files()}
+def camera_toml(pose: Pose, name: str = "view") -> str:
+    """Return the camera as a table of a TOML scene file. Its numbers are rounded: directions change by about PRECISION at most."""
+    camera = pose.camera
+    matrix = camera.camera_to_world
+    reach = max(_focus(camera) if _focus(camera) != NO_FOCUS else pose.distance, 1e-3 * float(np.abs(matrix[:3, 3]).max()))
+    decimals = math.ceil(-math.log10(PRECISION * reach))
+    ends = {"position": matrix[:3, 3], "target": matrix[:3, 3] - reach * matrix[:3, 2]}
+    values: dict[str, Any] = {key: np.round(end, decimals) for key, end in ends.items()}
+    values |= {"up": np.round(matrix[:3, 1], 6), **camera.as_in_files()}
     lines = [f"[cameras.{name}]", f'type = "{camera.kind}"', *(f"{key} = {_number(value)}" for key, value in values.items())]
     return "\n".join(lines) + "\n"
 
 
 def _number(value: Any) -> str:
     if isinstance(value, np.ndarray):
-        return f"[{', '.join(map(_number, value))}]"
-    return repr(value if isinstance(value, int) else float(value) + 0.0)  # + 0.0 turns -0.0 into 0.0
+        return f"[{', '.join(repr(float(each) + 0.0) for each in value)}]"  # + 0.0 turns -0.0 into 0.0
+    return repr(value if isinstance(value, int) else float(f"{value:.7g}") + 0.0)

@@ -1,100 +1,112 @@
-"""Checks of a browser's messages. A browser may send a camera, a click into the picture, and a control's value; nothing else."""
+"""Checks of a browser's messages, and the controls whose values a browser may set. Messages are JSON objects.
+
+| type | fields |
+|---|---|
+| size | width, height: of the picture's area, in device pixels |
+| move | kind: one of MOVES; by: three numbers; begin: True for the first move of a gesture |
+| set | name: of a Control; value |
+| click | x, y: place in the picture, 0 to 1 from the top left; sample: index of the sample to inspect |
+| undo, reset, clear | none: undo or reset the camera, clear the inspected rays |
+"""
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TypeGuard
 
+from wrt.core.types import JsonObject
 from wrt.viewer.access import Refused, shown
 
-if TYPE_CHECKING:
-    import viser
-
-    Control: TypeAlias = viser.GuiInputHandle[Any]
-
-LARGEST_VIEWPORT = 16384  # pixels a side
-FARTHEST = 1e9  # largest absolute value of a coordinate, in units of the viewport
-NARROWEST, WIDEST = 1e-5, math.pi - 1e-3  # angle of view, radians
-CAMERA = {"wxyz": 4, "position": 3, "look_at": 3, "up_direction": 3}  # vectors of a camera message, and their lengths
-LENS = ("fov", "near", "far")
-PIXELS = ("image_width", "image_height")
+LARGEST_SIDE = 16384  # pixels of the picture's area
+LONGEST_MOVE = 100.0  # largest absolute value of a number in a move
+LAST_SAMPLE = (1 << 24) - 1
+MOVES = ("orbit", "pan", "dolly", "walk")
 
 
-def check_message(message: object, control_of: Callable[[str], Control | None]) -> None:
-    """Raise Refused unless a decoded message is allowed. control_of: function from a uuid to viser's control, or None if unknown."""
-    table: dict[str, Any] = message if isinstance(message, dict) else {}
-    kind = table.get("type")
-    if kind == "ViewerCameraMessage":
-        _check_camera(table)
-    elif kind == "ScenePointerMessage":
-        _check_click(table)
-    elif kind == "GuiUpdateMessage":
-        _check_update(table, control_of)
-    elif kind == "ShareUrlRequest":
-        raise Refused("share", "a request to share the viewer on the internet")
-    else:
+def decoded(data: str | bytes) -> JsonObject:
+    """Return a message as a JSON object, after a check of its fields except the value of "set". Raises Refused."""
+    try:
+        message = json.loads(data) if isinstance(data, str) else None
+    except (ValueError, RecursionError):
+        message = None
+    if not isinstance(message, dict):
+        raise Refused("frame", "a message that is no JSON object")
+    kind = message.get("type")
+    checks = FIELDS.get(kind) if isinstance(kind, str) else None
+    if checks is None:
         raise Refused("message", f"a message of the kind {shown(kind)}")
+    if message.keys() != {"type", *checks} or not all(check(message[name]) for name, check in checks.items()):
+        raise Refused(str(kind), f"an invalid message of the kind {kind}")
+    return message
 
 
-def _check_camera(message: dict[str, Any]) -> None:
-    valid = (
-        message.keys() == {"type", *CAMERA, *LENS, *PIXELS}
-        and all(_is_vector(message[name], length) for name, length in CAMERA.items())
-        and abs(math.hypot(*message["wxyz"]) - 1.0) < 0.01
-        and all(_is_number(message[name], -math.inf, math.inf) for name in LENS)
-        and NARROWEST <= message["fov"] <= WIDEST
-        and all(type(message[name]) is int and 0 <= message[name] <= LARGEST_VIEWPORT for name in PIXELS)
-    )
-    if not valid:
-        raise Refused("camera", "an invalid camera")
+def is_number(value: object, low: float, high: float) -> TypeGuard[float]:
+    return isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high and math.isfinite(value)
 
 
-def _check_click(message: dict[str, Any]) -> None:
-    place = message.get("screen_pos")
-    valid = (
-        message.keys() == {"type", "event_type", "ray_origin", "ray_direction", "screen_pos", "modifier"}
-        and message["event_type"] == "click"
-        and _is_vector(message["ray_origin"], 3) and _is_vector(message["ray_direction"], 3)
-        and isinstance(place, list) and len(place) == 1 and _is_vector(place[0], 2, 0.0, 1.0)
-        and (message["modifier"] is None or isinstance(message["modifier"], str))
-    )
-    if not valid:
-        raise Refused("click", "an invalid click")
+def _is_whole(value: object, low: int, high: int) -> bool:
+    return type(value) is int and low <= value <= high
 
 
-def _check_update(message: dict[str, Any], control_of: Callable[[str], Control | None]) -> None:
-    updates = message.get("updates")
-    if message.keys() != {"type", "uuid", "updates"} or not isinstance(message["uuid"], str) or not isinstance(updates, dict):
-        raise Refused("control", "an invalid change of a control")
-    control = control_of(message["uuid"])
-    if control is None:
-        raise Refused("no control", "a change of an unknown control")
-    if updates.keys() != {"value"}:
-        raise Refused(f"control {control.label}", f"{control.label}: a change of another property than the value")
-    if not accepts(control, updates["value"]):
-        raise Refused(f"control {control.label}", f"{control.label}: the value {shown(updates['value'])} is not allowed")
+def _is_side(value: object) -> bool:
+    return _is_whole(value, 1, LARGEST_SIDE)
 
 
-def accepts(control: Control, value: object) -> bool:
-    """Return True if a browser may set `control` to `value`."""
-    import viser
-
-    if control.disabled or not control.visible:
-        return False
-    if isinstance(control, viser.GuiSliderHandle | viser.GuiNumberHandle):
-        low, high = (sign * math.inf if end is None else end for end, sign in ((control.min, -1.0), (control.max, 1.0)))
-        # The page rounds values to seven decimals, so that they may lie just outside the limits.
-        return (_is_number(value, low - 1e-6 * abs(low), high + 1e-6 * abs(high))
-                and (not isinstance(control.value, int) or value == int(value)))
-    if isinstance(control, viser.GuiDropdownHandle):
-        return isinstance(value, str) and value in control.options
-    return isinstance(value, bool) if isinstance(control, viser.GuiCheckboxHandle) else value is True  # a button's click
+def _is_vector(value: object) -> bool:
+    return isinstance(value, list) and len(value) == 3 and all(is_number(each, -LONGEST_MOVE, LONGEST_MOVE) for each in value)
 
 
-def _is_number(value: object, low: float, high: float) -> TypeGuard[float]:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and low <= value <= high
+FIELDS: Mapping[str, Mapping[str, Callable[[object], bool]]] = {
+    "size": {"width": _is_side, "height": _is_side},
+    "move": {"kind": lambda value: isinstance(value, str) and value in MOVES, "by": _is_vector,
+             "begin": lambda value: isinstance(value, bool)},
+    "set": {"name": lambda value: isinstance(value, str), "value": lambda value: isinstance(value, bool | int | float | str)},
+    "click": {"x": lambda value: is_number(value, 0.0, 1.0), "y": lambda value: is_number(value, 0.0, 1.0),
+              "sample": lambda value: _is_whole(value, 0, LAST_SAMPLE)},
+    "undo": {}, "reset": {}, "clear": {},
+}
 
 
-def _is_vector(value: object, length: int, low: float = -FARTHEST, high: float = FARTHEST) -> bool:
-    return isinstance(value, list) and len(value) == length and all(_is_number(each, low, high) for each in value)
+@dataclass(frozen=True, eq=False)
+class Control:
+    """A control of the panel: a slider (with low, high), a choice (with choices), or a flag (with neither).
+
+    get, apply: return and set its value. whole: only whole numbers. is_shown: whether the panel shows it now."""
+
+    name: str
+    group: str
+    get: Callable[[], object]
+    apply: Callable[..., object]
+    unit: str = ""
+    hint: str = ""
+    low: float = -math.inf
+    high: float = math.inf
+    step: float = 0.0
+    whole: bool = False
+    choices: tuple[str, ...] = field(default=())
+    is_shown: Callable[[], bool] = lambda: True
+
+    @property
+    def kind(self) -> str:
+        return "choice" if self.choices else "slider" if self.step else "flag"
+
+    def check(self, value: object) -> None:
+        """Raise Refused unless a browser may set `value` now."""
+        if not (self.is_shown() and self._accepts(value)):
+            raise Refused(f"control {self.name}", f"{self.name}: the value {shown(value)} is not allowed")
+
+    def _accepts(self, value: object) -> bool:
+        if self.choices:
+            return isinstance(value, str) and value in self.choices
+        if not self.step:
+            return isinstance(value, bool)
+        return is_number(value, self.low, self.high) and not (self.whole and value != int(value))
+
+    def as_json(self) -> JsonObject:
+        head = {"name": self.name, "group": self.group, "kind": self.kind, "unit": self.unit, "hint": self.hint, "value": self.get(),
+                "shown": self.is_shown()}
+        ends = {"low": self.low, "high": self.high, "step": self.step} if self.step else {}
+        return head | ends | ({"choices": list(self.choices)} if self.choices else {})

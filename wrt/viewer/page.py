@@ -1,274 +1,374 @@
-"""The viewer in a browser: viser's orbit controls and panel over the pictures of a wrt.viewer.refine.Viewer.
+"""The viewer's page: a picture that a user steers, a panel of controls, and the rays of a clicked pixel.
 
-Several browsers share the panel. The Viewer renders the camera that moved last, and only that camera's browser gets the picture.
+All browsers share one view and get every picture, which has the size of the window that steered last. The folder `page` beside this
+module has the page's HTML, style and script.
 """
 
 from __future__ import annotations
 
+import io
 import math
 import tempfile
 import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.errors import InputError
+from wrt.core.types import JsonObject
 from wrt.picture.film import Film
 from wrt.picture.heatmap import colors, short
 from wrt.picture.image import encode_png
 from wrt.renderer.options import Options
+from wrt.renderer.progress import time_left
 from wrt.scene.cameras import Camera, CameraKind
 from wrt.scene.model import Scene
 from wrt.scene.settings import TONEMAPS
-from wrt.viewer.access import HERE, Place, access_for
-from wrt.viewer.camera import camera_toml, from_viewport, orbited_point, unit_of, up_of
+from wrt.viewer.access import HERE, Place, Refused, access_for
+from wrt.viewer.camera import Steering, camera_toml, pose_of
+from wrt.viewer.messages import Control
+from wrt.viewer.rays import Rays, pick
 from wrt.viewer.refine import Viewer
 from wrt.viewer.renderers import CounterOf, Shown
-from wrt.viewer.server import Guard, import_viser, listen, to_stderr
+from wrt.viewer.server import Browser, Server, listen, to_stderr
 
-if TYPE_CHECKING:
-    import viser
-
-Event = TypeVar("Event")
-
-MOST_PIXELS = 1 << 21  # largest number of pixels of a picture; a larger viewport shows the picture enlarged
+MOST_PIXELS = 1 << 23  # largest number of pixels of a picture; a larger window shows the picture enlarged
 RESOLUTIONS = {"full": 1, "1/2": 2, "1/4": 4}
 PICTURE = "picture"
 QUALITY = {True: 92, False: 80}  # JPEG quality of a picture at full resolution, and of a coarse picture
+WIDEST = math.radians(160.0)  # horizontal angle of view that a narrow window may widen a camera to
 LEGEND_HEIGHT = 12  # pixels
-FARTHEST_FOCUS = 1e9  # in units of the viewport
+DARK_SHARE = 0.01  # share of visibly too dark pixels above which the page warns
+FOLDER = Path(__file__).parent / "page"
+FILES = {"/": ("page.html", "text/html; charset=utf-8"), "/page.css": ("page.css", "text/css; charset=utf-8"),
+         "/page.js": ("page.js", "text/javascript; charset=utf-8")}
+SAVED = {"/picture.png": "image/png", "/picture.exr": "image/x-exr", "/camera.toml": "application/toml"}
 
 
-def full_size(size: tuple[int, int], before: tuple[int, int]) -> tuple[int, int]:
-    """Return a viewport's size from its canvas's size, which viser shrinks if the browser is slow. before: last viewport size."""
-    smaller = size[0] <= before[0] and abs(size[0] * before[1] - size[1] * before[0]) <= max(before)
-    return before if smaller else size
+STEER = ("move", "set", "undo", "reset")  # messages after which the picture has the size of the browser's window
 
 
-def status(shown: Shown, viewer: Viewer, full: tuple[int, int], browsers: int) -> str:
-    """Return the panel's text about a picture, as Markdown. full: viewport's size in pixels. browsers: number of connected browsers."""
-    height, width = shown.codes.shape[:2]
-    rays = f"{shown.speed / 1e6:.2f} Mray/s, {shown.rays_per_sample:.1f} rays per sample"
-    if shown.view.cost:
-        content = f"**{shown.view.cost}** per pixel: mean {short(shown.mean)}, largest {short(shown.largest)}"
-    else:
-        content = f"**{shown.spp} of {viewer.spp} spp**"
-    viewport = "" if (width, height) == full else f" of {full[0]}x{full[1]}"
-    size = f"{width}x{height}{viewport}{', coarse' if shown.scale > 1 else ''}"
-    others = f"  \n{browsers} browsers are connected: the picture follows the camera that moved last" if browsers > 1 else ""
-    return f"{content}, {size}  \n{rays}  \n{viewer.renderers.describe(shown.view.accel)}{others}"
+class Click(NamedTuple):
+    """A click into the picture. x, y: 0 to 1 from the top left corner; sample: index of the sample to inspect."""
+
+    x: float
+    y: float
+    sample: int
 
 
 class Page:
-    """A server with the panel and one Viewer. Both run until `close`. `url` is the page's address with the token.
+    """A server with the page and one Viewer. Both run until `close`. `url` is the page's address with the token.
 
     spp, counter_of: see Viewer. warn: called with one line, once for each kind of refused request or message. Raises InputError if the
     server cannot listen at `place`."""
 
     def __init__(self, scene: Scene, options: Options, place: Place = HERE, spp: int = 1024, *,
                  counter_of: CounterOf | None = None, warn: Callable[[str], None] = to_stderr) -> None:
-        import_viser()
+        self.scene, self.name = scene, scene.name or "picture"
         self.viewer = Viewer(scene, options, self._show, self._report, spp, counter_of)
-        start = self.viewer.view.camera
-        self.unit, self.watching, self.name = unit_of(scene, start), -1, scene.name or "picture"
-        self.full = (0, 0)
+        self.steering = Steering(pose_of(scene, self.viewer.view.camera))
+        self.rays = Rays(self.viewer.renderers, self._report)
+        self.camera_name = self.viewer.view.camera.name
+        self.resolution = "full"
+        self.controls = {control.name: control for control in (*self._lens(), *self._light(), *self._picture())}
+        self._sizes: dict[Browser, tuple[int, int]] = {}  # of the browsers' windows, in device pixels
+        self._leader: Browser | None = None  # the browser that steered last
+        self._click: Click | None = None  # the next to inspect
+        self._clicked = threading.Condition()
+        self._activity, self._closed = "", False
+        self.failure: BaseException | None = None
+        self.server: Server | None = None
         listening = listen(place)
         try:
-            address, port = listening.getsockname()[:2]
-            access, self.url = access_for(place, address, port)
-            self.guard = Guard(access, warn)
-            self.server = self.guard.open(listening, "wrt")
+            address, self.port = listening.getsockname()[:2]
+            access, self.url = access_for(place, address, self.port)
+            self.server = Server(access, self, listening, warn)
         except BaseException:
             listening.close()
             raise
-        place_camera(self.server, start, orbited_point(scene, start), self.unit)
-        self.server.gui.configure_theme(show_share_button=False, show_logo=False, dark_mode=True)
-        self._panel(start)
-        self.server.on_client_connect(self._connected)
-        self.server.on_client_disconnect(self._disconnected)
-        self.thread = threading.Thread(target=self._run, name="wrt viewer", daemon=True)
-        self.failure: BaseException | None = None
-        self.thread.start()
+        self.thread = self._start(self.viewer.run, "wrt viewer")
+        self._start(self._inspect_clicks, "wrt viewer's inspector")
 
-    def _run(self) -> None:
-        try:
-            self.viewer.run()
-        except BaseException as error:
-            self.failure = error
+    def _start(self, work: Callable[[], None], name: str) -> threading.Thread:
+        def run() -> None:
+            try:
+                work()
+            except BaseException as error:
+                self.failure = error
+
+        thread = threading.Thread(target=run, name=name, daemon=True)
+        thread.start()
+        return thread
 
     def wait(self) -> None:
-        """Wait until `close`. Raises the error that ends the Viewer's thread."""
-        while self.thread.is_alive():
+        """Wait until `close`. Raises the error that ends a thread."""
+        while self.thread.is_alive() and self.failure is None:
             self.thread.join(0.5)
         if self.failure is not None:
             raise self.failure
 
     def close(self) -> None:
         self.viewer.stop()
-        self.guard.close()
+        with self._clicked:
+            self._closed = True
+            self._clicked.notify()
+        if self.server is not None:
+            self.server.close()
 
-    # --- the viewport -------------------------------------------------------------------------------------------------
+    # --- messages of browsers, in the server's thread -----------------------------------------------------------------
 
-    async def _connected(self, client: viser.ClientHandle) -> None:
-        client.camera.on_update(self._moved)
+    def joined(self, browser: Browser) -> None:
+        browser.put("state", self._state())
+        browser.put("activity", {"text": self._activity})
+        if self.rays.shown is not None:
+            browser.put("rays", self.rays.shown.as_json())
 
-    async def _disconnected(self, client: viser.ClientHandle) -> None:
-        if client.client_id != self.watching:
-            return
-        others = self.server.get_clients()
-        if others:
-            await self._moved(next(iter(others.values())).camera)
-        else:
+    def left(self, browser: Browser) -> None:
+        self._sizes.pop(browser, None)
+        if not self._sizes:
+            self._leader = None
             self.viewer.pause()
+        elif self._leader is browser:
+            self._leader = next(iter(self._sizes))
+            self._look()
+        self._tell_state()
 
-    async def _moved(self, viewport: viser.CameraHandle) -> None:
-        """Render a browser's new camera. viser runs coroutines in order, but functions in threads."""
-        width, height = viewport.image_width, viewport.image_height
-        if width < 1 or height < 1:
-            return
-        newcomer = self.watching != viewport.client.client_id
-        self.watching = viewport.client.client_id
-        self.full = full_size((width, height), (0, 0) if newcomer else self.full)
-        coarser = max(RESOLUTIONS[self.resolution.value], math.sqrt(width * height / MOST_PIXELS))
-        size = max(1, round(width / coarser)), max(1, round(height / coarser))
-        try:
-            changed = self.viewer.change(camera=lambda camera: from_viewport(camera, viewport, self.unit), size=size)
-        except InputError as error:  # the position overflows in scene units
-            self.guard.report("camera", f"dropped a camera: {error}")
-            return
-        if newcomer and not changed:
+    def received(self, browser: Browser, message: JsonObject) -> None:
+        """Act on a checked message."""
+        if message["type"] == "size":
+            self._sizes[browser] = message["width"], message["height"]
+            self._leader = self._leader or browser
+            if not self._look():
+                self.viewer.again()
+        else:
+            if message["type"] in STEER and browser in self._sizes:
+                self._leader = browser
+            self._act(message)
+        if message["type"] != "move":
+            self._tell_state()
+
+    def _act(self, message: JsonObject) -> None:
+        kind = message["type"]
+        if kind == "set":
+            control = self.controls.get(message["name"])
+            if control is None:
+                raise Refused("no control", "a change of an unknown control")
+            control.check(message["value"])
+            control.apply(message["value"])
+            self._look()
+        elif kind == "click":
+            with self._clicked:
+                self._click = Click(message["x"], message["y"], message["sample"])
+                self._clicked.notify()
+        elif kind == "clear":
+            self.rays.shown = None
+            self._tell("picked", {})
             self.viewer.again()
+        else:
+            before = self.steering.pose
+            if kind == "move":
+                self.steering.move(message["kind"], message["by"], message["begin"])
+            elif kind == "undo":
+                self.steering.undo()
+            else:
+                self.steering.reset()
+            self._look_or(before)
 
-    def _show(self, shown: Shown) -> None:
-        client = self.server.get_clients().get(self.watching)
-        if client is None:
-            return
-        form = {"format": "png"} if shown.done else {"format": "jpeg", "jpeg_quality": QUALITY[shown.scale == 1]}
-        client.scene.set_background_image(shown.codes, **form)
-        self.status.content = status(shown, self.viewer, self.full, len(self.server.get_clients()))
-        self.legend.visible = self.legend_text.visible = bool(shown.view.cost)
-        self.exr.disabled = bool(shown.view.cost)
-        if shown.view.cost:
-            self.legend_text.content = f"0 (dark) to {short(shown.top)} (light)"
+    def _look_or(self, before: Any) -> None:
+        """Request the steered camera. If its numbers overflow, keep the pose `before`, and raise the InputError."""
+        try:
+            self._look()
+        except InputError:
+            self.steering.pose = before
+            raise
+
+    def _look(self) -> bool:
+        """Request the picture of the steered camera in the leader's window; return False if it is the same view as before."""
+        size = self.viewer.view.size if self._leader is None else self._sizes[self._leader]
+        coarser = 1.0 if self._leader is None else max(RESOLUTIONS[self.resolution], math.sqrt(size[0] * size[1] / MOST_PIXELS))
+        size = max(1, round(size[0] / coarser)), max(1, round(size[1] / coarser))
+        return self.viewer.change(camera=widened(self.steering.pose.camera, self.scene.settings.size), size=size)
+
+    # --- messages to browsers, from any thread ------------------------------------------------------------------------
+
+    def _tell(self, kind: str, message: JsonObject, data: bytes | None = None) -> None:
+        for browser in () if self.server is None else self.server.browsers:
+            browser.put(kind, message, data)
+
+    def _tell_state(self) -> None:
+        self._tell("state", self._state())
+
+    def _state(self) -> JsonObject:
+        return {"scene": self.scene.name or "scene", "browsers": len(self._sizes),
+                "controls": [control.as_json() for control in self.controls.values()],
+                "camera": camera_toml(self.steering.pose), "counter": bool(self.viewer.view.cost)}
 
     def _report(self, text: str) -> None:
-        self.activity.content, self.activity.visible = text, bool(text)
+        self._activity = text
+        self._tell("activity", {"text": text})
+
+    def _show(self, shown: Shown) -> None:
+        data = encode_png(shown.codes) if shown.done else jpeg(shown.codes, QUALITY[shown.scale == 1])
+        inspected = self.rays.shown
+        overlay = [] if inspected is None else inspected.overlay(shown.view.camera, shown.view.size)
+        self._tell("picture", {"mime": "image/png" if shown.done else "image/jpeg", "size": shown.view.size,
+                               "overlay": overlay, **self.status(shown)}, data)
+        if shown.done and self.viewer.auto_exposure:
+            self._tell_state()
+
+    def status(self, shown: Shown) -> JsonObject:
+        """Return the panel's text about a picture."""
+        height, width = shown.codes.shape[:2]
+        target, total = self.viewer.renderers.options.target_error, self.viewer.spp
+        noise = f", noise {shown.error:.2g}" if math.isfinite(shown.error) else ""
+        noise += f" (target {target:g})" if noise and target is not None else ""
+        lines = [f"{shown.view.cost} per pixel: mean {short(shown.mean)}, largest {short(shown.largest)}" if shown.view.cost
+                 else f"{shown.spp:,} of {total:,} samples per pixel{noise}",
+                 f"{width} x {height} pixels" + (", coarse" if shown.scale > 1 else ""),
+                 f"{shown.speed / 1e6:.2f} million rays per second, {shown.rays_per_sample:.1f} rays per sample"]
+        if shown.visibly_cut > DARK_SHARE:
+            lines.append(f"{100.0 * shown.visibly_cut:.2g} % of the pixels are visibly too dark: raise bounces")
+        left = "done" if shown.done else time_left(shown.seconds_left) if shown.scale == 1 and not shown.view.cost else "coarse"
+        return {"lines": lines, "left": left, "done": 1.0 if shown.done else shown.spp / total if shown.scale == 1 else 0.0,
+                "legend": f"0 (dark) to {short(shown.top)} (light)" if shown.view.cost else ""}
+
+    # --- clicks, in a thread of their own -----------------------------------------------------------------------------
+
+    def _inspect_clicks(self) -> None:
+        while True:
+            with self._clicked:
+                self._clicked.wait_for(lambda: self._click is not None or self._closed)
+                click, self._click = self._click, None
+            if click is None:
+                return
+            try:
+                self._inspect(click)
+            except InputError as error:
+                self._report(f"error: {error}")
+
+    def _inspect(self, click: Click) -> None:
+        """Tell what is at the clicked point at once, then inspect the pixel's rays."""
+        view = self.viewer.view
+        prepared = self.viewer.renderers.prepared(view)
+        if prepared is None:
+            return
+        found = pick(prepared, view, click.x, click.y)
+        self._tell("picked", {"x": click.x, "y": click.y, "sample": click.sample, "of": self.viewer.spp,
+                              "surface": None if found is None else found.as_json()})
+        self.rays.shown = self.rays.inspect(view, *click, self.viewer.spp)
+        self._report("")
+        self._tell("rays", self.rays.shown.as_json())
+        self.viewer.again()
 
     # --- the panel ----------------------------------------------------------------------------------------------------
 
-    def _panel(self, camera: CameraKind) -> None:
-        gui = self.server.gui
-        self.status = gui.add_markdown("waiting for the first picture")
-        self.activity = gui.add_markdown("", visible=False)
-        if isinstance(camera, Camera):
-            self._lens_folder(camera)
-        with gui.add_folder("Light"):
-            depth = gui.add_slider("bounces", 0, self.viewer.deepest, 1, self.viewer.view.max_depth, hint="Number after the first hit")
-            accel = gui.add_dropdown("structure", tuple(ACCELERATORS), initial_value=self.viewer.view.accel,
-                                     hint="Acceleration structure, built at its first use. It changes speed and cost, not the picture")
-        depth.on_update(self._safe(lambda event: self.viewer.change(max_depth=int(depth.value))))
-        accel.on_update(self._safe(lambda event: self.viewer.change(accel=accel.value)))
-        self._picture_folder()
-        with gui.add_folder("Save"):
-            png = gui.add_button("picture as PNG", hint="The picture as shown")
-            self.exr = gui.add_button("picture as EXR", hint="Linear radiance, variance and number of samples")
-            toml = gui.add_button("camera as TOML", hint="The camera as a table for a scene file")
-        png.on_click(self._safe(lambda event: self._save(event.client, ".png")))
-        self.exr.on_click(self._safe(lambda event: self._save(event.client, ".exr")))
-        toml.on_click(self._safe(lambda event: show_camera(event.client, self.viewer.view.camera)))
+    def _lens(self) -> list[Control]:
+        camera, steering = self.viewer.view.camera, self.steering
+        names = tuple(each.name or f"camera {i}" for i, each in enumerate(self.scene.cameras))
+        unit = steering.pose.distance
+        lens = camera if isinstance(camera, Camera) else Camera()
+        widest = round_up(max(4.0 * lens.aperture_radius, 0.05 * unit))
 
-    def _lens_folder(self, camera: Camera) -> None:
-        gui, unit = self.server.gui, self.unit
-        widest = round_up(max(4.0 * camera.aperture_radius, 0.05 * unit))
-        with gui.add_folder("Lens"):
-            angle = gui.add_slider("angle of view", 5.0, 120.0, 0.5, min(max(round(math.degrees(camera.fov_y), 2), 5.0), 120.0),
-                                   hint="Vertical angle in degrees")
-            aperture = gui.add_slider("aperture", 0.0, widest, widest / 200.0, camera.aperture_radius,
-                                      hint="Radius of the lens in scene units; 0 is a pinhole")
-            self.focus = gui.add_number("focus", camera.focus_distance, min=1e-6 * unit, max=FARTHEST_FOCUS * unit,
-                                        step=round_up(0.01 * unit), hint="Distance of the plane in focus, in scene units")
-            self.by_click = gui.add_checkbox("click to focus", False, hint="A click into the picture focuses on the surface there")
-        angle.on_update(self._safe(lambda event: self._set_angle(math.radians(angle.value))))
-        aperture.on_update(self._safe(lambda event: self._set_lens(aperture_radius=float(aperture.value))))
-        self.focus.on_update(self._safe(lambda event: self._set_lens(focus_distance=float(self.focus.value))))
-        self.server.scene.on_click()(self._safe(self._clicked))
+        def value(name: str, scale: float = 1.0) -> Callable[[], float]:
+            return lambda: round(float(getattr(steering.pose.camera, name, 0.0)) * scale, 6)
 
-    def _picture_folder(self) -> None:
-        gui, viewer = self.server.gui, self.viewer
-        with gui.add_folder("Picture"):
-            cost = gui.add_dropdown("show", (PICTURE, *viewer.costs), initial_value=PICTURE,
-                                    hint="The picture, or a heat map of a cost: a counter summed over the rays of each pixel")
-            self.legend = gui.add_image(np.repeat(colors()[None], LEGEND_HEIGHT, axis=0), visible=False)
-            self.legend_text = gui.add_markdown("", visible=False)
-            exposure = gui.add_slider("exposure", min(-8.0, viewer.exposure), max(8.0, viewer.exposure), 0.1, viewer.exposure,
-                                      hint="In stops")
-            tonemap = gui.add_dropdown("tone mapping", TONEMAPS, initial_value=viewer.tonemap)
-            self.resolution = gui.add_dropdown("resolution", tuple(RESOLUTIONS), initial_value="full",
-                                               hint="Pixels of the picture per pixel of the viewport, along each side")
-        cost.on_update(self._safe(lambda event: viewer.change(cost="" if cost.value == PICTURE else cost.value)))
-        for control in (exposure, tonemap):
-            control.on_update(self._safe(lambda event: viewer.tone(float(exposure.value), tonemap.value)))
+        def setter(name: str, scale: float = 1.0) -> Callable[[float], None]:
+            def apply(number: float) -> None:
+                before, more = steering.pose, {"least_fov_x": 0.0} if name == "fov_y" else {}
+                steering.change(**{name: number * scale, **more})
+                self._look_or(before)
 
-        @self.resolution.on_update
-        async def resized(event: viser.GuiEvent[Any]) -> None:
-            client = self.server.get_clients().get(self.watching)
-            if client is not None:
-                await self._moved(client.camera)
+            return apply
 
-    def _safe(self, action: Callable[[Event], object]) -> Callable[[Event], None]:
-        """Return a function that calls `action` with a browser's event, and reports an error in one line in place of raising it."""
+        def is_lens() -> bool:
+            return isinstance(steering.pose.camera, Camera)
 
-        def act(event: Event) -> None:
-            try:
-                action(event)
-            except (InputError, OSError) as error:
-                self.guard.report("action", f"error: {error}")
+        cameras = [Control("camera", "Camera", lambda: self.camera_name or names[0], self._choose, choices=names,
+                           hint="A camera of the scene")] if names else []
+        return cameras + [
+            Control("angle of view", "Camera", value("fov_y", 180.0 / math.pi), setter("fov_y", math.pi / 180.0), "°", "Vertical angle",
+                    0.1, 170.0, 0.1, is_shown=is_lens),
+            Control("aperture", "Camera", value("aperture_radius"), setter("aperture_radius"), "scene units",
+                    "Radius of the lens; 0 is a pinhole", 0.0, widest, widest / 200.0, is_shown=is_lens),
+            Control("focus", "Camera", value("focus_distance"), setter("focus_distance"), "scene units",
+                    "Distance of the plane in focus", 1e-6 * unit, 1e9 * unit, round_up(0.01 * unit), is_shown=is_lens),
+        ]
 
-        return act
+    def _light(self) -> list[Control]:
+        viewer = self.viewer
+        return [
+            Control("bounces", "Light", lambda: viewer.view.max_depth, lambda value: viewer.change(max_depth=int(value)), "",
+                    "Bounces after the first hit; 0 is direct light alone", 0, viewer.deepest, 1, whole=True),
+            Control("structure", "Light", lambda: viewer.view.accel, lambda value: viewer.change(accel=value), choices=tuple(ACCELERATORS),
+                    hint="Acceleration structure: it changes the speed, not the picture"),
+        ]
 
-    def _set_angle(self, fov_y: float) -> None:
-        for client in self.server.get_clients().values():
-            client.camera.fov = fov_y  # the browser then reports a new camera
+    def _picture(self) -> list[Control]:
+        viewer = self.viewer
 
-    def _set_lens(self, **fields: float) -> None:
-        self.viewer.change(camera=lambda camera: replace(camera, **fields))
+        def resize(value: str) -> None:
+            self.resolution = value
+            self._look()
 
-    def _clicked(self, event: viser.SceneClickEvent) -> None:
-        distance = self.viewer.renderers.focus_at(self.viewer.view, *event.screen_pos) if self.by_click.value else None
-        if distance is not None:
-            self.focus.value = distance  # type: ignore[misc]  # viser sets it in __setattr__
-            self._set_lens(focus_distance=distance)
+        return [
+            Control("show", "Picture", lambda: viewer.view.cost or PICTURE,
+                    lambda value: viewer.change(cost="" if value == PICTURE else value), choices=(PICTURE, *viewer.costs),
+                    hint="The picture, or a heat map of a counter, summed over the rays of each pixel"),
+            Control("exposure", "Picture", lambda: viewer.exposure, lambda value: viewer.tone(exposure=float(value)), "stops",
+                    "Each stop doubles the displayed values", min(-8.0, viewer.exposure), max(8.0, viewer.exposure), 0.1),
+            Control("auto exposure", "Picture", lambda: viewer.auto_exposure, lambda value: viewer.tone(auto_exposure=value),
+                    hint="Add the stops that show bright parts just below white"),
+            Control("tone mapping", "Picture", lambda: viewer.tonemap, lambda value: viewer.tone(tonemap=value), choices=tuple(TONEMAPS),
+                    hint="Curve from linear radiance to the display"),
+            Control("resolution", "Picture", lambda: self.resolution, resize, choices=tuple(RESOLUTIONS),
+                    hint="Pixels of the picture per pixel of the window, along each side"),
+        ]
 
-    def _save(self, client: viser.ClientHandle | None, suffix: str) -> None:
-        picture = self.viewer.picture()
-        if client is not None and picture is not None:
-            client.send_file_download(f"{self.name}{suffix}", encoded(picture, suffix), save_immediately=True)
+    def _choose(self, name: str) -> None:
+        """Go to a camera of the scene; `reset` then returns to it."""
+        names = self.controls["camera"].choices
+        pose = pose_of(self.scene, self.scene.cameras[names.index(name)])
+        before = self.steering.pose
+        self.steering.put(pose)
+        self.steering.start, self.camera_name = pose, name
+        self._look_or(before)
 
+    # --- files, in threads of their own -------------------------------------------------------------------------------
 
-def place_camera(server: viser.ViserServer, camera: CameraKind, target: np.ndarray, unit: float) -> None:
-    """Set the camera with which every browser starts. It orbits `target` (3,), in world space. unit: viewport's unit in scene units."""
-    server.scene.set_up_direction(tuple(up_of(camera)))
-    start = server.initial_camera
-    start.position = tuple(camera.camera_to_world[:3, 3] / unit)
-    start.look_at = tuple(target / unit)
-    start.fov = (camera if isinstance(camera, Camera) else Camera()).fov_y
+    def file(self, path: str) -> tuple[str, bytes] | None:
+        if path in FILES:
+            name, kind = FILES[path]
+            return kind, (FOLDER / name).read_bytes()
+        if path == "/legend.png":
+            return "image/png", encode_png(np.repeat(colors()[None], LEGEND_HEIGHT, axis=0))
+        if path == "/camera.toml":
+            return SAVED[path], camera_toml(self.steering.pose).encode()
+        picture = self.viewer.picture() if path in SAVED else None
+        suffix = Path(path).suffix
+        if picture is None or (suffix == ".exr" and not isinstance(picture, Film)):
+            return None
+        return SAVED[path], encoded(picture, suffix)
 
 
-def show_camera(client: viser.ClientHandle | None, camera: CameraKind) -> None:
-    """Show a camera in a browser as a table of a TOML scene file, with a button to save the table."""
-    if client is None:
-        return
-    text = camera_toml(camera)
-    with client.gui.add_modal("Camera") as modal:
-        client.gui.add_markdown(f"```toml\n{text}```")
-        save = client.gui.add_button("save as a file")
-        close = client.gui.add_button("close")
-    save.on_click(lambda event: client.send_file_download("camera.toml", text.encode(), save_immediately=True))
-    close.on_click(lambda event: modal.close())
+def widened(camera: CameraKind, size: tuple[int, int]) -> CameraKind:
+    """Return a camera that shows at least the width of a picture of this size, also in a narrower window such as a phone's."""
+    if not isinstance(camera, Camera):
+        return camera
+    least = min(2.0 * math.atan(math.tan(0.5 * camera.fov_y) * size[0] / size[1]), WIDEST)
+    return replace(camera, least_fov_x=max(camera.least_fov_x, least))
+
+
+def jpeg(codes: np.ndarray, quality: int) -> bytes:
+    """Encode display codes (h, w, 3) uint8 as a JPEG file."""
+    from PIL import Image
+
+    out = io.BytesIO()
+    Image.fromarray(codes).save(out, "JPEG", quality=quality)
+    return out.getvalue()
 
 
 def encoded(picture: Film | np.ndarray, suffix: str) -> bytes:

@@ -5,6 +5,7 @@ This module is independent of browsers; wrt.viewer.page connects it to them.
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -19,7 +20,7 @@ from wrt.core.compiling import COMPILING
 from wrt.core.errors import InputError
 from wrt.picture.film import Film
 from wrt.picture.heatmap import colored, top_of
-from wrt.picture.tonemap import to_codes
+from wrt.picture.tonemap import auto_exposure, to_codes
 from wrt.renderer.options import Options, Progress
 from wrt.scene.cameras import CameraKind
 from wrt.scene.model import Scene
@@ -78,13 +79,14 @@ class Viewer:
         camera = options.camera if isinstance(options.camera, CameraKind) else scene.camera(options.camera)
         self.deepest = max(settings.max_depth, DEEPEST)
         self.view = View(camera, settings.size, settings.max_depth, options.accel)
-        self.exposure, self.tonemap = settings.exposure, settings.tonemap
+        self.exposure, self.tonemap, self.auto_exposure = settings.exposure, settings.tonemap, settings.auto_exposure
+        self._automatic: float | None = None  # stops that auto_exposure added to the last fine picture
         self.shown: Shown | None = None  # the last picture
         self.renderers = Renderers(scene.with_settings(max_depth=self.deepest), options, self._on_progress, counter_of)
         self._pace = Pace()
         self._condition = threading.Condition()
         self._requested = self._completed = 0  # number of requests, and the last request that was rendered or abandoned
-        self._watched = self._redraw = self._stopped = False
+        self._watched = self._redraw = self._retoned = self._stopped = False
         self._toning = False  # True while exposure or tone mapping change; the picture then does not count as done
         self._work: _Work | None = None
         self._film: Film | None = None  # of `shown`, unless that is a heat map
@@ -110,12 +112,19 @@ class Viewer:
             self._condition.notify_all()
             return True
 
-    def tone(self, exposure: float, tonemap: str) -> None:
-        """Change exposure and tone mapping, without tracing a ray."""
+    def tone(self, **changes: Any) -> None:
+        """Change exposure, tonemap or auto_exposure, without tracing a ray. Raises InputError for an invalid value."""
         with self._condition:
-            self.scene = self.scene.with_settings(exposure=exposure, tonemap=tonemap)  # raises for invalid values
-            self.exposure, self.tonemap = exposure, tonemap
+            settings = replace(self.scene.settings, **changes)
+            self.scene = replace(self.scene, settings=settings)
+            self.exposure, self.tonemap, self.auto_exposure = settings.exposure, settings.tonemap, settings.auto_exposure
+            self._retoned = True
         self.again()
+
+    @property
+    def stops(self) -> float:
+        """The exposure of the last picture, in stops: with auto_exposure, `exposure` and the automatic stops."""
+        return self.exposure + (self._automatic or 0.0 if self.auto_exposure else 0.0)
 
     def again(self) -> None:
         """Show the last picture once more, for a browser that has not received it."""
@@ -142,7 +151,7 @@ class Viewer:
             film, shown = self._film, self.shown
         if film is None:
             return None if shown is None else shown.codes
-        return replace(film, exposure=self.exposure, tonemap=self.tonemap)
+        return replace(film, exposure=self.stops, tonemap=self.tonemap)
 
     # --- the thread that renders --------------------------------------------------------------------------------------
 
@@ -165,15 +174,15 @@ class Viewer:
 
         While exposure or tone mapping change, the picture does not count as done, so that the page sends a smaller JPEG."""
         with self._condition:
-            redraw, self._redraw = self._redraw, False
+            redraw, retoned, self._redraw, self._retoned = self._redraw, self._retoned, False, False
             work = _Work(self.view, self._requested) if self._pending else None
         if work is not None:
             self._refine(work)
             self._completed = work.request
         elif self.shown is not None and (redraw or self._toning):
             film = self._film
-            codes = self.shown.codes if film is None else to_codes(film.pixels, self.exposure, self.tonemap)
-            self._put(replace(self.shown, codes=codes), film, rests=not redraw)
+            codes = self.shown.codes if film is None else self._codes(film, self.shown.scale)
+            self._put(replace(self.shown, codes=codes), film, rests=not retoned)
 
     def _refine(self, work: _Work) -> None:
         if not self._prepare(work.view) or self._requested != work.request:
@@ -206,7 +215,7 @@ class Viewer:
         film = self.renderers.picture(work.view, work.scale, self.spp if work.scale == 1 else 1)
         if film.stats["interrupted"]:
             return False
-        self._show_film(work, film, film.stats["rays"], film.stats["seconds"]["trace"], done=work.scale == 1)
+        self._show_film(work, film, (film.stats["rays"], film.stats["seconds"]["trace"], 0.0), done=work.scale == 1)
         return True
 
     def _on_progress(self, progress: Progress) -> None:
@@ -222,13 +231,21 @@ class Viewer:
             raise KeyboardInterrupt
         if (work.scale == 1 and pixels <= progress.done < progress.total and progress.picture is not None
                 and time.perf_counter() - work.last_shown >= EVERY):
-            self._show_film(work, progress.picture(), progress.rays, progress.seconds)
+            self._show_film(work, progress.picture(), (progress.rays, progress.seconds, progress.seconds_left))
 
-    def _show_film(self, work: _Work, film: Film, rays: int, seconds: float, done: bool = False) -> None:
-        codes = to_codes(film.pixels, self.exposure, self.tonemap)
-        self._put(Shown(codes, work.view, work.scale, int(film.samples.min()), rays / max(seconds, 1e-9),
-                        rays / max(int(film.samples.sum()), 1), done), film)
+    def _show_film(self, work: _Work, film: Film, pace: tuple[int, float, float], done: bool = False) -> None:
+        """Show a film. pace: number of rays, seconds so far, and seconds left."""
+        rays, seconds, left = pace
+        self._put(Shown(self._codes(film, work.scale), work.view, work.scale, int(film.samples.min()), rays / max(seconds, 1e-9),
+                        rays / max(int(film.samples.sum()), 1), done, left, math.sqrt(float(film.variance.mean(dtype=np.float64))),
+                        film.stats["visibly_cut"] if done else 0.0), film)
         work.last_shown = time.perf_counter()
+
+    def _codes(self, film: Film, scale: int) -> np.ndarray:
+        """Return the display codes of a film. A coarse picture keeps the automatic exposure of the last fine one, so as not to flicker."""
+        if self.auto_exposure and (scale == 1 or self._automatic is None):
+            self._automatic = auto_exposure(film.pixels)
+        return to_codes(film.pixels, self.stops, self.tonemap)
 
     def _put(self, shown: Shown, film: Film | None, rests: bool = True) -> None:
         with self._condition:
@@ -252,6 +269,6 @@ class Viewer:
         top = top_of(values)
         speed = int(costs["probes"].sum(dtype=np.int64)) / (time.perf_counter() - begin)
         self._put(Shown(colored(values, top), work.view, work.scale, 1, speed, float(costs["probes"].mean()), work.scale == 1,
-                        top, float(values.mean()), float(values.max())), None)
+                        top=top, mean=float(values.mean()), largest=float(values.max())), None)
         work.last_shown = time.perf_counter()
         return True

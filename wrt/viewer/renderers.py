@@ -1,16 +1,15 @@
-"""The viewer's renderers: one for each acceleration structure, made when a view first needs it."""
+"""The viewer's renderers: one for each acceleration structure and kind of camera, made when a view first needs it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
 from wrt.picture.film import Film
 from wrt.renderer.options import Options, Progress
-from wrt.renderer.pixel_rays import film_rays
 from wrt.renderer.prepare import Prepared
 from wrt.renderer.renderer import Renderer
 from wrt.scene.cameras import CameraKind
@@ -31,56 +30,45 @@ class Counter(Protocol):
 
 
 CounterOf = Callable[[Prepared], Counter]
+Kind: TypeAlias = tuple[str, str, tuple[tuple[str, bool], ...]]  # name of the structure, kind of camera and its switches
 
 
 class Renderers:
-    """The renderers of a scene and their counters, by name of the acceleration structure.
+    """The renderers of a scene and their counters, by `kind_of` their views.
 
     progress: callback of all renderers. counter_of: makes the counter of a prepared scene; None: no heat maps."""
 
     def __init__(self, scene: Scene, options: Options, progress: Callable[[Progress], None], counter_of: CounterOf | None) -> None:
         self.scene, self.options, self.progress, self.counter_of = scene, options, progress, counter_of
-        self.by_accel: dict[str, Renderer] = {}
-        self.counters: dict[str, Counter] = {}
+        self.by_kind: dict[Kind, Renderer] = {}
+        self.counters: dict[Kind, Counter] = {}
 
     def prepare(self, view: View) -> None:
         """Make the renderer and the counter that the view needs, if they are missing. Raises InputError if that fails."""
-        if view.accel not in self.by_accel:
+        kind = kind_of(view)
+        if kind not in self.by_kind:
             options = replace(self.options, accel=view.accel, camera=view.camera.opened(), tile_size=TILE_SIZE,
                               progress=self.progress)
-            self.by_accel[view.accel] = Renderer(self.scene, options)
-        if view.cost and self.counter_of is not None and view.accel not in self.counters:
-            self.counters[view.accel] = self.counter_of(self.by_accel[view.accel].prepared)
+            self.by_kind[kind] = Renderer(self.scene, options)
+        if view.cost and self.counter_of is not None and kind not in self.counters:
+            self.counters[kind] = self.counter_of(self.by_kind[kind].prepared)
+
+    def prepared(self, view: View) -> Prepared | None:
+        """Return the scene as prepared for the view; None before its structure is built."""
+        renderer = self.by_kind.get(kind_of(view))
+        return None if renderer is None else renderer.prepared
 
     def picture(self, view: View, scale: int, spp: int) -> Film:
         """Render the view with one pixel for each block of `scale` x `scale` pixels."""
-        renderer = self.by_accel[view.accel]
+        renderer = self.by_kind[kind_of(view)]
         renderer.aim(view.camera, view.size, **_settings(view, scale, spp))
         return renderer.run()
 
     def costs(self, view: View, scale: int, go_on: Callable[[int], bool]) -> dict[str, np.ndarray] | None:
         """Return Counter.costs of the view, with one pixel for each block of `scale` x `scale` pixels."""
-        counter = self.counters[view.accel]
+        counter = self.counters[kind_of(view)]
         counter.aim(view.camera, view.size, **_settings(view, scale, 1))
         return counter.costs(go_on)
-
-    def focus_at(self, view: View, x: float, y: float) -> float | None:
-        """Return the distance along the camera's axis, in scene units, to the surface at a point of the picture.
-
-        x, y: the point, 0 to 1 from the top left corner. None: the ray hits nothing, or the structure is not built yet."""
-        if view.accel not in self.by_accel:
-            return None
-        origins, directions = film_rays(view.camera, view.size, np.array([[x, y]]))
-        hits = self.by_accel[view.accel].accel.closest_hit(origins, directions)
-        along = float(directions[0] @ -view.camera.camera_to_world[:3, 2])
-        return float(hits.t[0]) * along if hits.prim_id[0] >= 0 else None
-
-    def describe(self, accel: str) -> str:
-        """Return a text with a structure's name, size and build time; before it is built, only the name."""
-        if accel not in self.by_accel:
-            return accel
-        stats = self.by_accel[accel].accel.stats
-        return f"{accel}: {stats.nodes:,} nodes, {stats.bytes / 2**20:.1f} MiB, {stats.build_seconds:.2f} s"
 
 
 def _settings(view: View, scale: int, spp: int) -> dict[str, Any]:
@@ -104,6 +92,11 @@ class View:
         return fields == others
 
 
+def kind_of(view: View) -> Kind:
+    """Return what two views must have in common to share a renderer. A lens is open in all of them (CameraKind.opened)."""
+    return view.accel, view.camera.kind, tuple(sorted(view.camera.opened().switches().items()))
+
+
 @dataclass(frozen=True, eq=False)
 class Shown:
     """A picture or heat map to show."""
@@ -115,6 +108,9 @@ class Shown:
     speed: float = 0.0  # rays per second
     rays_per_sample: float = 0.0  # mean
     done: bool = False  # True: the picture gets no finer
+    seconds_left: float = 0.0  # until it is done, estimated
+    error: float = np.inf  # estimated root mean square, over pixels and channels, of the standard error; inf: unknown
+    visibly_cut: float = 0.0  # as in Film.stats, of a finished picture
     # For a heat map, counts per pixel: the count shown in the last colour, the mean, and the largest count.
     top: float = 0.0
     mean: float = 0.0

@@ -133,7 +133,7 @@ def test_the_same_said_twice_is_no_contradiction() -> None:
     (("bench", "error", "box.obj"), "spp=9", "--max-spp"), (("bench", "mitsuba", "box.obj"), "spp=9", "--spp"),
 ])
 def test_what_a_command_decides_on_itself_is_not_set(command: tuple[str, ...], setting: str, who: str) -> None:
-    pytest.importorskip("viser")
+    pytest.importorskip("websockets")
     result = run(*command, "--set", setting)
     assert result.code == 2 and f"--set {setting.split('=')[0]} cannot be used with this command; {who} decides" in result.err, result
 
@@ -151,7 +151,7 @@ def test_the_other_commands_that_render_take_settings(monkeypatch: pytest.Monkey
         monkeypatch.setattr(importlib.import_module(module), name, stop)
     commands = [("animate", "box.obj", "-o", "a.gif"), ("profile", "box.obj"), ("bench", "error", "box.obj"),
                 ("bench", "mitsuba", "box.obj")]
-    if importlib.util.find_spec("viser"):
+    if importlib.util.find_spec("websockets"):
         commands.append(("view", "box.obj", "--port", "0"))
     for command in commands:
         assert "seen" in run(*command, "--set", "filter=box", "--set", "max_depth=3").err

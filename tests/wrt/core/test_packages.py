@@ -59,9 +59,9 @@ REFUSED = {
     "wrt.Motion(keys=np.ones((2, 3, 3))).transform(0.5)": "a motion needs scipy; pip install scipy",
     "wrt.inspect('box.obj', (4, 4), size=(8, 8), spp=1).figure()": 'drawing rays needs matplotlib; pip install "wrt[plots]"',
 }
-# Imported packages that no requirement names: with viser come msgspec and websockets; IPython is there in a notebook; open3d is
+# Imported packages that no requirement names: IPython is there in a notebook; open3d is
 # compared with if the user installed it.
-COME_WITH_OTHERS = {"msgspec", "websockets", "IPython", "open3d"}
+COME_WITH_OTHERS = {"IPython", "open3d"}
 BENT_OBJ = "v 0 0 0\nv 2 0 0\nv 2 2 0\nv 1 0.5 0\nv 0 2 0\nf 1 2 3 4 5\n"
 
 

@@ -1,9 +1,10 @@
-"""A client of the viewer without a browser: requests byte by byte, and a WebSocket with viser's messages."""
+"""A client of the viewer without a browser: requests byte by byte, and a WebSocket with the page's messages."""
 
 from __future__ import annotations
 
 import base64
 import contextlib
+import json
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -31,84 +32,74 @@ def raw_answer(port: int, request: bytes, host: str = "127.0.0.1") -> bytes:
         return data
 
 
-def upgrade(subprotocol: str = "viser-v1.1.1") -> list[str]:
+def upgrade() -> list[str]:
     """Return the headers of a WebSocket's handshake."""
     key = base64.b64encode(b"sixteen bytes...").decode()
-    return ["Upgrade: websocket", "Connection: Upgrade", f"Sec-WebSocket-Key: {key}", "Sec-WebSocket-Version: 13",
-            f"Sec-WebSocket-Protocol: {subprotocol}"]
+    return ["Upgrade: websocket", "Connection: Upgrade", f"Sec-WebSocket-Key: {key}", "Sec-WebSocket-Version: 13"]
 
 
 class Client:
     """A WebSocket to a page's address, like that of the page in a browser. It stores all messages of the server."""
 
     def __init__(self, url: str, **settings: Any) -> None:
-        import viser
         from websockets.sync.client import connect
 
         # With an unlimited queue of unread messages, the socket answers the server's pings even if the test reads nothing.
         parts = urlsplit(url)
-        settings = {"subprotocols": [f"viser-v{viser.__version__}"], "origin": f"http://{parts.netloc}", **settings}
+        settings = {"origin": f"http://{parts.netloc}", **settings}
         self.socket = connect(f"ws://{parts.netloc}{parts.path}?{parts.query}", compression=None, max_size=None,
                               max_queue=None, ping_interval=None, open_timeout=PATIENCE, **settings)
         self.messages: list[dict[str, Any]] = []
 
-    def send(self, **message: Any) -> None:
-        import msgspec
+    def send(self, kind: str, /, **fields: Any) -> None:
+        self.socket.send(json.dumps({"type": kind, **fields}))
 
-        self.socket.send(msgspec.msgpack.encode(message))
+    def open(self, width: int = 64, height: int = 48) -> None:
+        self.send("size", width=width, height=height)
 
-    def look(self, angle: float = 0.0, **changes: Any) -> None:
-        """Move the camera."""
-        camera = {"wxyz": [1.0, 0.0, 0.0, 0.0], "position": [angle, 0.0, -1.0], "fov": 0.8, "near": 0.01, "far": 1000.0,
-                  "image_height": 48, "image_width": 64, "look_at": [0.0, 0.0, 0.0], "up_direction": [0.0, 1.0, 0.0]}
-        self.send(type="ViewerCameraMessage", **camera | changes)
+    def move(self, angle: float, begin: bool = True) -> None:
+        """Orbit by an angle, as a drag over that share of the picture's height does."""
+        self.send("move", kind="orbit", by=[angle, 0.0, 0.0], begin=begin)
 
-    def set(self, uuid: str, value: Any) -> None:
-        self.send(type="GuiUpdateMessage", uuid=uuid, updates={"value": value})
+    def set(self, name: str, value: Any) -> None:
+        self.send("set", name=name, value=value)
 
-    def listen(self, seconds: float) -> list[dict[str, Any]]:
-        """Return the server's next messages; empty if none arrive in `seconds`."""
-        import msgspec
-        import zstandard
-
+    def listen(self, seconds: float) -> dict[str, Any] | None:
+        """Return the server's next message; None if none arrives in `seconds`. A picture's file is its "data"."""
         try:
-            data = self.socket.recv(timeout=seconds)
+            frame = self.socket.recv(timeout=seconds)
         except TimeoutError:
-            return []
-        size = int.from_bytes(data[8:16], "little")
-        messages = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(data[16 : 16 + size]))["messages"]
-        self.messages += messages
-        return messages
+            return None
+        if isinstance(frame, str):
+            message = json.loads(frame)
+        else:
+            end = 4 + int.from_bytes(frame[:4], "big")
+            message = {**json.loads(frame[4:end]), "data": frame[end:]}
+        self.messages.append(message)
+        return message
 
     def until(self, condition: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
         """Wait for the next message that fulfils a condition, and return it."""
         deadline = time.monotonic() + PATIENCE
         while True:
             assert time.monotonic() < deadline, "no such message arrived"
-            for message in self.listen(1.0):
-                if condition(message):
-                    return message
+            message = self.listen(1.0)
+            if message is not None and condition(message):
+                return message
+
+    def next(self, kind: str) -> dict[str, Any]:
+        return self.until(lambda message: message["type"] == kind)
 
     def picture(self) -> bytes:
         """Wait for a new picture, and return its file."""
-        seen = set(self.pictures)
-        self.until(lambda message: is_picture(message) and message["rgb_data"] not in seen)
-        return self.pictures[-1]
+        seen = {message["data"] for message in self.messages if message["type"] == "picture"}
+        data: bytes = self.until(lambda message: message["type"] == "picture" and message["data"] not in seen)["data"]
+        return data
 
-    @property
-    def pictures(self) -> list[bytes]:
-        return [message["rgb_data"] for message in self.messages if is_picture(message)]
-
-    def controls(self) -> dict[str, str]:
-        """Return the uuid of each control by its label, once the panel has arrived."""
-        while not any(message.get("props", {}).get("label") == "camera as TOML" for message in self.messages):
-            assert self.listen(PATIENCE), "the panel never came"
-        return {message["props"]["label"]: message["uuid"] for message in self.messages
-                if message["type"].startswith("Gui") and "container_uuid" in message and "label" in message.get("props", {})}
-
-
-def is_picture(message: dict[str, Any]) -> bool:
-    return message["type"] == "BackgroundImageMessage" and message["rgb_data"] is not None  # None: viser starts without a picture
+    def controls(self) -> dict[str, dict[str, Any]]:
+        """Return the controls of the last state by their names, once it has arrived."""
+        states = [message for message in self.messages if message["type"] == "state"] or [self.next("state")]
+        return {control["name"]: control for control in states[-1]["controls"]}
 
 
 def wait(condition: Callable[[], Any], listening: Client | None = None) -> None:

@@ -88,7 +88,7 @@ def test_a_coarse_picture_covers_the_same_view() -> None:
     fine = eye.see(size=(61, 34))
     coarse = next(shown for shown in eye.pictures if shown.scale == 8)
     tangent = np.tan(0.5 * CAMERA.fov_y)
-    prepared = eye.viewer.renderers.by_accel["bvh"].prepared
+    prepared = eye.viewer.renderers.prepared(eye.viewer.view)
     assert prepared.camera.tan_x == pytest.approx(tangent * 61 / 34) and fine.scale == 1
     x = np.linspace(0.0, 1.0, 8, endpoint=False) + 1 / 16
     y = np.linspace(0.0, 1.0, 5, endpoint=False) + 1 / 10
@@ -127,7 +127,7 @@ def test_a_slow_first_picture_is_abandoned(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(module, "PATIENCE", -1.0)
     eye = Eye()
     eye.see(size=(61, 34))
-    renderer, pictures = eye.viewer.renderers.by_accel["bvh"], len(eye.pictures)
+    (renderer,), pictures = eye.viewer.renderers.by_kind.values(), len(eye.pictures)
 
     def report(progress: Any) -> None:
         eye.viewer.change(camera=turned(5.0))
@@ -185,7 +185,7 @@ def test_another_tone_traces_no_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     eye.see(size=(61, 34))
     film = eye.viewer.picture()
     monkeypatch.setattr(Renderer, "run", lambda self: pytest.fail("rays were traced"))
-    eye.viewer.tone(-1.5, "aces")
+    eye.viewer.tone(exposure=-1.5, tonemap="aces")
     eye.viewer.step()
     assert isinstance(film, Film)
     expected = replace(film, exposure=-1.5, tonemap="aces")
@@ -197,7 +197,7 @@ def test_another_tone_traces_no_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     saved = eye.viewer.picture()
     assert isinstance(saved, Film) and (saved.exposure, saved.tonemap) == (-1.5, "aces")
     with refused("tonemap", "must be one"):
-        eye.viewer.tone(0.0, "sepia")
+        eye.viewer.tone(tonemap="sepia")
 
 
 def test_again_shows_the_last_picture_once_more(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -229,16 +229,32 @@ def test_a_heat_map_is_the_profile_of_the_picture() -> None:
     assert isinstance(eye.viewer.picture(), Film)
 
 
-def test_the_focus_at_a_clicked_point() -> None:
-    eye = Eye()
-    assert eye.viewer.renderers.focus_at(eye.viewer.view, 0.5, 0.5) is None  # nothing is built yet
+def test_auto_exposure_is_that_of_render() -> None:
+    eye = Eye(SCENE.with_settings(exposure=0.5, auto_exposure=True))
+    shown = eye.see(size=(61, 34))
+    expected = wrt.render(SCENE, spp=4, exposure=0.5, auto_exposure=True)
+    np.testing.assert_array_equal(shown.codes, expected.to_srgb8())
+    saved = eye.viewer.picture()
+    assert isinstance(saved, Film) and saved.exposure == pytest.approx(expected.exposure) != 0.5
+    eye.viewer.tone(auto_exposure=False)
+    eye.viewer.step()
+    np.testing.assert_array_equal(eye.pictures[-1].codes, replace(expected, exposure=0.5).to_srgb8())
+
+
+def test_a_coarse_picture_keeps_the_automatic_exposure() -> None:
+    eye = Eye(SCENE.with_settings(auto_exposure=True))
     eye.see(size=(61, 34))
-    corner = CAMERA.camera_to_world[:3, :3].T @ (SCENE.objects[0].mesh.vertices.max(axis=0) - CAMERA.camera_to_world[:3, 3])
-    tangent = np.tan(0.5 * CAMERA.fov_y)
-    x, y = 0.5 + 0.5 * corner[0] / -corner[2] / tangent * 34 / 61, 0.5 - 0.5 * corner[1] / -corner[2] / tangent
-    distance = eye.viewer.renderers.focus_at(eye.viewer.view, x, y + 1e-4)  # just below the nearest corner of the box
-    assert distance is not None and distance == pytest.approx(-corner[2], rel=1e-3)
-    assert eye.viewer.renderers.focus_at(eye.viewer.view, 0.5, 0.0) is None  # sky
+    stops, seen = eye.viewer.stops, list[float]()
+    eye.react = lambda shown: seen.append(eye.viewer.stops) if shown.scale > 1 else None
+    eye.viewer._pace["bvh", False] = 1.0
+    eye.see(camera=turned(120.0))
+    assert len(seen) >= 3 and set(seen) == {stops} and eye.viewer.stops != stops
+
+
+def test_a_target_error_ends_the_refinement() -> None:
+    eye = Eye(spp=4096, target_error=0.05)
+    shown = eye.see(size=(61, 34))
+    assert shown.done and shown.spp < 4096 and shown.error <= 0.05
 
 
 def test_unknown_names_are_refused_and_build_errors_reported(monkeypatch: pytest.MonkeyPatch) -> None:

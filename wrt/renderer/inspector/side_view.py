@@ -52,10 +52,13 @@ class SideView:
 
     def hidden(self, points: np.ndarray) -> np.ndarray:
         """Return for each point (N, 3) whether an opaque surface is before it, (N,) bool. Glass hides nothing."""
-        eye = np.broadcast_to(self.camera.camera_to_world[:3, 3], points.shape)
+        return self.hidden_from(np.broadcast_to(self.camera.camera_to_world[:3, 3], points.shape), points)
+
+    def hidden_from(self, eyes: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Return the same as `hidden`, but from an eye of its own for each point, (N, 3)."""
         if self.accel is None:
             return np.zeros(len(points), bool)
-        return np.asarray(self.accel.any_hit(eye, points - eye, t_max=0.998))
+        return np.asarray(self.accel.any_hit(eyes, points - eyes, t_max=0.998))
 
 
 def _see_through(material: Material) -> bool:
