@@ -13,11 +13,10 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from wrt.accel.structures import ACCELERATORS
 from wrt.core.errors import InputError
 from wrt.core.types import JsonObject
 from wrt.picture.film import Film
@@ -27,18 +26,15 @@ from wrt.renderer.options import Options
 from wrt.renderer.progress import time_left
 from wrt.scene.cameras import Camera, CameraKind
 from wrt.scene.model import Scene
-from wrt.scene.settings import TONEMAPS
 from wrt.viewer.access import HERE, Place, Refused, access_for
 from wrt.viewer.camera import Steering, camera_toml, pose_of
-from wrt.viewer.messages import Control
+from wrt.viewer.panel import RESOLUTIONS, Panel
 from wrt.viewer.rays import Rays, pick
 from wrt.viewer.refine import Viewer
 from wrt.viewer.renderers import CounterOf, Shown
 from wrt.viewer.server import Browser, Server, listen, to_stderr
 
 MOST_PIXELS = 1 << 23  # largest number of pixels of a picture; a larger window shows the picture enlarged
-RESOLUTIONS = {"full": 1, "1/2": 2, "1/4": 4}
-PICTURE = "picture"
 QUALITY = {True: 92, False: 80}  # JPEG quality of a picture at full resolution, and of a coarse picture
 WIDEST = math.radians(160.0)  # horizontal angle of view that a narrow window may widen a camera to
 LEGEND_HEIGHT = 12  # pixels
@@ -72,9 +68,7 @@ class Page:
         self.viewer = Viewer(scene, options, self._show, self._report, spp, counter_of)
         self.steering = Steering(pose_of(scene, self.viewer.view.camera))
         self.rays = Rays(self.viewer.renderers, self._report)
-        self.camera_name = self.viewer.view.camera.name
-        self.resolution = "full"
-        self.controls = {control.name: control for control in (*self._lens(), *self._light(), *self._picture())}
+        self.panel = Panel(scene, self.viewer, self.steering, self._look)
         self._sizes: dict[Browser, tuple[int, int]] = {}  # of the browsers' windows, in device pixels
         self._leader: Browser | None = None  # the browser that steered last
         self._click: Click | None = None  # the next to inspect
@@ -154,7 +148,7 @@ class Page:
     def _act(self, message: JsonObject) -> None:
         kind = message["type"]
         if kind == "set":
-            control = self.controls.get(message["name"])
+            control = self.panel.controls.get(message["name"])
             if control is None:
                 raise Refused("no control", "a change of an unknown control")
             control.check(message["value"])
@@ -176,20 +170,12 @@ class Page:
                 self.steering.undo()
             else:
                 self.steering.reset()
-            self._look_or(before)
-
-    def _look_or(self, before: Any) -> None:
-        """Request the steered camera. If its numbers overflow, keep the pose `before`, and raise the InputError."""
-        try:
-            self._look()
-        except InputError:
-            self.steering.pose = before
-            raise
+            self.panel.look_or(before)
 
     def _look(self) -> bool:
         """Request the picture of the steered camera in the leader's window; return False if it is the same view as before."""
         size = self.viewer.view.size if self._leader is None else self._sizes[self._leader]
-        coarser = 1.0 if self._leader is None else max(RESOLUTIONS[self.resolution], math.sqrt(size[0] * size[1] / MOST_PIXELS))
+        coarser = 1.0 if self._leader is None else max(RESOLUTIONS[self.panel.resolution], math.sqrt(size[0] * size[1] / MOST_PIXELS))
         size = max(1, round(size[0] / coarser)), max(1, round(size[1] / coarser))
         return self.viewer.change(camera=widened(self.steering.pose.camera, self.scene.settings.size), size=size)
 
@@ -204,7 +190,7 @@ class Page:
 
     def _state(self) -> JsonObject:
         return {"scene": self.scene.name or "scene", "browsers": len(self._sizes),
-                "controls": [control.as_json() for control in self.controls.values()],
+                "controls": [control.as_json() for control in self.panel.controls.values()],
                 "camera": camera_toml(self.steering.pose), "counter": bool(self.viewer.view.cost)}
 
     def _report(self, text: str) -> None:
@@ -216,25 +202,9 @@ class Page:
         inspected = self.rays.shown
         overlay = [] if inspected is None else inspected.overlay(shown.view.camera, shown.view.size)
         self._tell("picture", {"mime": "image/png" if shown.done else "image/jpeg", "size": shown.view.size,
-                               "overlay": overlay, **self.status(shown)}, data)
+                               "overlay": overlay, **status(shown, self.viewer)}, data)
         if shown.done and self.viewer.auto_exposure:
             self._tell_state()
-
-    def status(self, shown: Shown) -> JsonObject:
-        """Return the panel's text about a picture."""
-        height, width = shown.codes.shape[:2]
-        target, total = self.viewer.renderers.options.target_error, self.viewer.spp
-        noise = f", noise {shown.error:.2g}" if math.isfinite(shown.error) else ""
-        noise += f" (target {target:g})" if noise and target is not None else ""
-        lines = [f"{shown.view.cost} per pixel: mean {short(shown.mean)}, largest {short(shown.largest)}" if shown.view.cost
-                 else f"{shown.spp:,} of {total:,} samples per pixel{noise}",
-                 f"{width} x {height} pixels" + (", coarse" if shown.scale > 1 else ""),
-                 f"{shown.speed / 1e6:.2f} million rays per second, {shown.rays_per_sample:.1f} rays per sample"]
-        if shown.visibly_cut > DARK_SHARE:
-            lines.append(f"{100.0 * shown.visibly_cut:.2g} % of the pixels are visibly too dark: raise bounces")
-        left = "done" if shown.done else time_left(shown.seconds_left) if shown.scale == 1 and not shown.view.cost else "coarse"
-        return {"lines": lines, "left": left, "done": 1.0 if shown.done else shown.spp / total if shown.scale == 1 else 0.0,
-                "legend": f"0 (dark) to {short(shown.top)} (light)" if shown.view.cost else ""}
 
     # --- clicks, in a thread of their own -----------------------------------------------------------------------------
 
@@ -264,79 +234,6 @@ class Page:
         self._tell("rays", self.rays.shown.as_json())
         self.viewer.again()
 
-    # --- the panel ----------------------------------------------------------------------------------------------------
-
-    def _lens(self) -> list[Control]:
-        camera, steering = self.viewer.view.camera, self.steering
-        names = tuple(each.name or f"camera {i}" for i, each in enumerate(self.scene.cameras))
-        unit = steering.pose.distance
-        lens = camera if isinstance(camera, Camera) else Camera()
-        widest = round_up(max(4.0 * lens.aperture_radius, 0.05 * unit))
-
-        def value(name: str, scale: float = 1.0) -> Callable[[], float]:
-            return lambda: round(float(getattr(steering.pose.camera, name, 0.0)) * scale, 6)
-
-        def setter(name: str, scale: float = 1.0) -> Callable[[float], None]:
-            def apply(number: float) -> None:
-                before, more = steering.pose, {"least_fov_x": 0.0} if name == "fov_y" else {}
-                steering.change(**{name: number * scale, **more})
-                self._look_or(before)
-
-            return apply
-
-        def is_lens() -> bool:
-            return isinstance(steering.pose.camera, Camera)
-
-        cameras = [Control("camera", "Camera", lambda: self.camera_name or names[0], self._choose, choices=names,
-                           hint="A camera of the scene")] if names else []
-        return cameras + [
-            Control("angle of view", "Camera", value("fov_y", 180.0 / math.pi), setter("fov_y", math.pi / 180.0), "°", "Vertical angle",
-                    0.1, 170.0, 0.1, is_shown=is_lens),
-            Control("aperture", "Camera", value("aperture_radius"), setter("aperture_radius"), "scene units",
-                    "Radius of the lens; 0 is a pinhole", 0.0, widest, widest / 200.0, is_shown=is_lens),
-            Control("focus", "Camera", value("focus_distance"), setter("focus_distance"), "scene units",
-                    "Distance of the plane in focus", 1e-6 * unit, 1e9 * unit, round_up(0.01 * unit), is_shown=is_lens),
-        ]
-
-    def _light(self) -> list[Control]:
-        viewer = self.viewer
-        return [
-            Control("bounces", "Light", lambda: viewer.view.max_depth, lambda value: viewer.change(max_depth=int(value)), "",
-                    "Bounces after the first hit; 0 is direct light alone", 0, viewer.deepest, 1, whole=True),
-            Control("structure", "Light", lambda: viewer.view.accel, lambda value: viewer.change(accel=value), choices=tuple(ACCELERATORS),
-                    hint="Acceleration structure: it changes the speed, not the picture"),
-        ]
-
-    def _picture(self) -> list[Control]:
-        viewer = self.viewer
-
-        def resize(value: str) -> None:
-            self.resolution = value
-            self._look()
-
-        return [
-            Control("show", "Picture", lambda: viewer.view.cost or PICTURE,
-                    lambda value: viewer.change(cost="" if value == PICTURE else value), choices=(PICTURE, *viewer.costs),
-                    hint="The picture, or a heat map of a counter, summed over the rays of each pixel"),
-            Control("exposure", "Picture", lambda: viewer.exposure, lambda value: viewer.tone(exposure=float(value)), "stops",
-                    "Each stop doubles the displayed values", min(-8.0, viewer.exposure), max(8.0, viewer.exposure), 0.1),
-            Control("auto exposure", "Picture", lambda: viewer.auto_exposure, lambda value: viewer.tone(auto_exposure=value),
-                    hint="Add the stops that show bright parts just below white"),
-            Control("tone mapping", "Picture", lambda: viewer.tonemap, lambda value: viewer.tone(tonemap=value), choices=tuple(TONEMAPS),
-                    hint="Curve from linear radiance to the display"),
-            Control("resolution", "Picture", lambda: self.resolution, resize, choices=tuple(RESOLUTIONS),
-                    hint="Pixels of the picture per pixel of the window, along each side"),
-        ]
-
-    def _choose(self, name: str) -> None:
-        """Go to a camera of the scene; `reset` then returns to it."""
-        names = self.controls["camera"].choices
-        pose = pose_of(self.scene, self.scene.cameras[names.index(name)])
-        before = self.steering.pose
-        self.steering.put(pose)
-        self.steering.start, self.camera_name = pose, name
-        self._look_or(before)
-
     # --- files, in threads of their own -------------------------------------------------------------------------------
 
     def file(self, path: str) -> tuple[str, bytes] | None:
@@ -352,6 +249,23 @@ class Page:
         if picture is None or (suffix == ".exr" and not isinstance(picture, Film)):
             return None
         return SAVED[path], encoded(picture, suffix)
+
+
+def status(shown: Shown, viewer: Viewer) -> JsonObject:
+    """Return the panel's text about a picture."""
+    height, width = shown.codes.shape[:2]
+    target, total = viewer.renderers.options.target_error, viewer.spp
+    noise = f", noise {shown.error:.2g}" if math.isfinite(shown.error) else ""
+    noise += f" (target {target:g})" if noise and target is not None else ""
+    lines = [f"{shown.view.cost} per pixel: mean {short(shown.mean)}, largest {short(shown.largest)}" if shown.view.cost
+             else f"{shown.spp:,} of {total:,} samples per pixel{noise}",
+             f"{width} x {height} pixels" + (", coarse" if shown.scale > 1 else ""),
+             f"{shown.speed / 1e6:.2f} million rays per second, {shown.rays_per_sample:.1f} rays per sample"]
+    if shown.visibly_cut > DARK_SHARE:
+        lines.append(f"{100.0 * shown.visibly_cut:.2g} % of the pixels are visibly too dark: raise bounces")
+    left = "done" if shown.done else time_left(shown.seconds_left) if shown.scale == 1 and not shown.view.cost else "coarse"
+    return {"lines": lines, "left": left, "done": 1.0 if shown.done else shown.spp / total if shown.scale == 1 else 0.0,
+            "legend": f"0 (dark) to {short(shown.top)} (light)" if shown.view.cost else ""}
 
 
 def widened(camera: CameraKind, size: tuple[int, int]) -> CameraKind:
@@ -379,9 +293,3 @@ def encoded(picture: Film | np.ndarray, suffix: str) -> bytes:
         path = Path(folder) / f"picture{suffix}"
         picture.save(path)
         return path.read_bytes()
-
-
-def round_up(value: float) -> float:
-    """Return the smallest number that is at least `value`, and is 1, 2 or 5 times a power of ten."""
-    power = 10.0 ** math.floor(math.log10(value))
-    return next(power * factor for factor in (1.0, 2.0, 5.0, 10.0) if power * factor >= value * (1.0 - 1e-9))

@@ -284,7 +284,7 @@ def test_invalid_values_do_not_stop_pictures(rendering: Served, capfd: pytest.Ca
         for text in ("no JSON", b"\xc1", "[" * 60000, b"", "{}"):
             bad.socket.send(text)
         assert moves(bad) == 20 and moves(good) == 20
-        assert {name: control.get() for name, control in page.controls.items()} == {
+        assert {name: control.get() for name, control in page.panel.controls.items()} == {
             name: control["value"] for name, control in controls.items()}
     for name in controls:
         lines = [line for line in served.warnings if line.startswith(f"viewer: dropped {name}: ")]
@@ -301,7 +301,7 @@ def test_values_that_a_control_can_have_arrive(served: Served) -> None:
         for name, value in (("bounces", 0), ("bounces", 12.0), ("aperture", 0), ("focus", 2), ("exposure", -8), ("auto exposure", True),
                             ("tone mapping", "reinhard"), ("resolution", "1/4"), ("structure", "bvh8"), ("show", "nodes")):
             somebody.set(name, value)
-            wait(lambda name=name, value=value: page.controls[name].get() == value, somebody)
+            wait(lambda name=name, value=value: page.panel.controls[name].get() == value, somebody)
     assert served.warnings == []
 
 

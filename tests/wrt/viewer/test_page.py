@@ -192,7 +192,7 @@ def start_again(request: pytest.FixtureRequest) -> None:
         window.keyboard.press("Escape")
         for name, value in (("bounces", 3), ("show", "picture"), ("structure", "bvh"), ("exposure", 0.0), ("tone mapping", "none"),
                             ("resolution", "full"), ("camera", "main")):
-            page.controls[name].apply(value)
+            page.panel.controls[name].apply(value)
         window.keyboard.press("r")
         until(lambda: np.allclose(page.viewer.view.camera.camera_to_world, CAMERA.camera_to_world, atol=1e-12), window)
 
@@ -288,7 +288,7 @@ def test_drags_and_keys_steer_and_can_be_undone(page: Any, window: Any) -> None:
     window.get_by_role("button", name="reset").click()
     until(lambda: np.array_equal(page.steering.pose.camera.camera_to_world, CAMERA.camera_to_world), window)
     window.keyboard.press("2")
-    top = until(lambda: page.camera_name == "top" and finished(page, window), window)
+    top = until(lambda: page.panel.camera_name == "top" and finished(page, window), window)
     np.testing.assert_array_equal(top.view.camera.camera_to_world, TOP.camera_to_world)
     assert appears(window, top)
     window.keyboard.press("?")
@@ -407,12 +407,17 @@ def test_browsers_share_the_view(page: Any, window: Any, chromium: Any) -> None:
 
 def test_a_change_of_exposure_sends_no_whole_png(page: Any, window: Any) -> None:
     finished(page, window)
+
+    def is_png(message: dict[str, Any]) -> bool:
+        return message["type"] == "picture" and message["mime"] == "image/png"
+
     with client(page.url) as other:
         other.open(*page.viewer.view.size)
-        before = other.until(lambda message: message["type"] == "picture" and message["mime"] == "image/png")["data"]
+        before = other.until(is_png)["data"]
+        while other.listen(1.5) is not None:  # until the picture rests
+            pass
         other.set("exposure", 1.0)
-        changing = other.next("picture")
-        rests = other.until(lambda message: message["type"] == "picture" and message["mime"] == "image/png")
+        changing, rests = other.next("picture"), other.until(is_png)
         assert changing["mime"] == "image/jpeg" and rests["data"] != before and len(changing["data"]) < len(rests["data"])
 
 

@@ -95,8 +95,7 @@ class Inspector:
 
     def aim(self, camera: CameraKind, **settings: Unpack[SettingChanges]) -> None:
         """Set the camera and settings of the next inspections. The parameters are those of Prepared.aimed."""
-        self._recorder.prepared = self._recorder.prepared.aimed(camera, **settings)
-        self.scene, self.camera = self._recorder.prepared.plan.scene, camera
+        self.scene, self.camera = self._recorder.aim(camera, **settings).scene, camera
 
     def pixel(self, pixel: tuple[int, int], sample: int | None = None) -> Inspection:
         """Return the rays of a pixel. pixel, sample: as for `inspect`. Raises InputError if there is no such pixel or sample."""

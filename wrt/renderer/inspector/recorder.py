@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, Unpack
 
 import numpy as np
 import warp as wp
@@ -17,6 +17,8 @@ from wrt.renderer.film_arrays import DeviceFilm
 from wrt.renderer.plan import Plan
 from wrt.renderer.prepare import prepare
 from wrt.renderer.tiles import Work
+from wrt.scene.cameras import CameraKind
+from wrt.scene.settings import SettingChanges
 
 # The arrays of a Record in the order of Record.used, with the number of entries of the first attempt.
 ARRAYS = {"rays": (record.TracedRay, 256), "ends": (record.PathEnd, 128),
@@ -47,6 +49,11 @@ class Recorder:
         features = replace(plan.features, recording=True)
         self.prepared = prepare(replace(plan, structure=RecordedStructure(plan.structure), features=features), device)
         self.sizes = [size for _, size in ARRAYS.values()]
+
+    def aim(self, camera: CameraKind, **settings: Unpack[SettingChanges]) -> Plan:
+        """Set another camera and other settings, as Prepared.aimed does; return the plan with them."""
+        self.prepared = self.prepared.aimed(camera, **settings)
+        return self.prepared.plan
 
     def film(self, x: int, y: int) -> DeviceFilm:
         """Return an empty film of one pixel."""
