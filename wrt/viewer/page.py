@@ -203,7 +203,7 @@ class Page:
         overlay = [] if inspected is None else inspected.overlay(shown.view.camera, shown.view.size)
         self._tell("picture", {"mime": "image/png" if shown.done else "image/jpeg", "size": shown.view.size,
                                "overlay": overlay, **status(shown, self.viewer)}, data)
-        if shown.done and self.viewer.auto_exposure:
+        if shown.done and self.viewer.display.settings.auto_exposure:
             self._tell_state()
 
     # --- clicks, in a thread of their own -----------------------------------------------------------------------------

@@ -76,7 +76,9 @@ class Panel:
         ]
 
     def _picture(self) -> list[Control]:
-        viewer = self.viewer
+        viewer, display = self.viewer, self.viewer.display
+
+        ends = min(-8.0, display.settings.exposure), max(8.0, display.settings.exposure)
 
         def resize(value: str) -> None:
             self.resolution = value
@@ -86,11 +88,11 @@ class Panel:
             Control("show", "Picture", lambda: viewer.view.cost or PICTURE,
                     lambda value: viewer.change(cost="" if value == PICTURE else value), choices=(PICTURE, *viewer.costs),
                     hint="The picture, or a heat map of a counter, summed over the rays of each pixel"),
-            Control("exposure", "Picture", lambda: viewer.exposure, lambda value: viewer.tone(exposure=float(value)), "stops",
-                    "Each stop doubles the displayed values", min(-8.0, viewer.exposure), max(8.0, viewer.exposure), 0.1),
-            Control("auto exposure", "Picture", lambda: viewer.auto_exposure, lambda value: viewer.tone(auto_exposure=value),
+            Control("exposure", "Picture", lambda: display.settings.exposure, lambda value: viewer.tone(exposure=float(value)), "stops",
+                    "Each stop doubles the displayed values", *ends, 0.1),
+            Control("auto exposure", "Picture", lambda: display.settings.auto_exposure, lambda value: viewer.tone(auto_exposure=value),
                     hint="Add the stops that show bright parts just below white"),
-            Control("tone mapping", "Picture", lambda: viewer.tonemap, lambda value: viewer.tone(tonemap=value), choices=tuple(TONEMAPS),
+            Control("tone mapping", "Picture", lambda: display.settings.tonemap, lambda value: viewer.tone(tonemap=value), choices=tuple(TONEMAPS),
                     hint="Curve from linear radiance to the display"),
             Control("resolution", "Picture", lambda: self.resolution, resize, choices=tuple(RESOLUTIONS),
                     hint="Pixels of the picture per pixel of the window, along each side"),

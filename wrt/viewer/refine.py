@@ -24,6 +24,7 @@ from wrt.picture.tonemap import auto_exposure, to_codes
 from wrt.renderer.options import Options, Progress
 from wrt.scene.cameras import CameraKind
 from wrt.scene.model import Scene
+from wrt.scene.settings import Settings
 from wrt.viewer.renderers import CounterOf, Renderers, Shown, View
 
 COARSE = 0.08  # Target time of the first picture after a change, in seconds.
@@ -60,6 +61,25 @@ class Pace(dict[tuple[str, bool], float]):
         return [scale for scale in SCALES[::-1] if scale <= first]
 
 
+class Display:
+    """The settings exposure, tonemap and auto_exposure, applied to films."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self._automatic: float | None = None  # stops that auto_exposure added to the last fine picture
+
+    @property
+    def stops(self) -> float:
+        """The exposure of the last picture, in stops: with auto_exposure, `exposure` and the automatic stops."""
+        return self.settings.exposure + (self._automatic or 0.0 if self.settings.auto_exposure else 0.0)
+
+    def codes(self, film: Film, scale: int) -> np.ndarray:
+        """Return the display codes of a film. A coarse picture keeps the automatic exposure of the last fine one, so as not to flicker."""
+        if self.settings.auto_exposure and (scale == 1 or self._automatic is None):
+            self._automatic = auto_exposure(film.pixels)
+        return to_codes(film.pixels, self.stops, self.settings.tonemap)
+
+
 class Viewer:
     """Renders the view that `change` requested last. The caller runs `run` in a thread of its own, until `stop`.
 
@@ -79,8 +99,7 @@ class Viewer:
         camera = options.camera if isinstance(options.camera, CameraKind) else scene.camera(options.camera)
         self.deepest = max(settings.max_depth, DEEPEST)
         self.view = View(camera, settings.size, settings.max_depth, options.accel)
-        self.exposure, self.tonemap, self.auto_exposure = settings.exposure, settings.tonemap, settings.auto_exposure
-        self._automatic: float | None = None  # stops that auto_exposure added to the last fine picture
+        self.display = Display(settings)
         self.shown: Shown | None = None  # the last picture
         self.renderers = Renderers(scene.with_settings(max_depth=self.deepest), options, self._on_progress, counter_of)
         self._pace = Pace()
@@ -115,16 +134,9 @@ class Viewer:
     def tone(self, **changes: Any) -> None:
         """Change exposure, tonemap or auto_exposure, without tracing a ray. Raises InputError for an invalid value."""
         with self._condition:
-            settings = replace(self.scene.settings, **changes)
-            self.scene = replace(self.scene, settings=settings)
-            self.exposure, self.tonemap, self.auto_exposure = settings.exposure, settings.tonemap, settings.auto_exposure
+            self.display.settings = replace(self.display.settings, **changes)
             self._retoned = True
         self.again()
-
-    @property
-    def stops(self) -> float:
-        """The exposure of the last picture, in stops: with auto_exposure, `exposure` and the automatic stops."""
-        return self.exposure + (self._automatic or 0.0 if self.auto_exposure else 0.0)
 
     def again(self) -> None:
         """Show the last picture once more, for a browser that has not received it."""
@@ -151,7 +163,7 @@ class Viewer:
             film, shown = self._film, self.shown
         if film is None:
             return None if shown is None else shown.codes
-        return replace(film, exposure=self.stops, tonemap=self.tonemap)
+        return replace(film, exposure=self.display.stops, tonemap=self.display.settings.tonemap)
 
     # --- the thread that renders --------------------------------------------------------------------------------------
 
@@ -181,7 +193,7 @@ class Viewer:
             self._completed = work.request
         elif self.shown is not None and (redraw or self._toning):
             film = self._film
-            codes = self.shown.codes if film is None else self._codes(film, self.shown.scale)
+            codes = self.shown.codes if film is None else self.display.codes(film, self.shown.scale)
             self._put(replace(self.shown, codes=codes), film, rests=not retoned)
 
     def _refine(self, work: _Work) -> None:
@@ -236,16 +248,10 @@ class Viewer:
     def _show_film(self, work: _Work, film: Film, pace: tuple[int, float, float], done: bool = False) -> None:
         """Show a film. pace: number of rays, seconds so far, and seconds left."""
         rays, seconds, left = pace
-        self._put(Shown(self._codes(film, work.scale), work.view, work.scale, int(film.samples.min()), rays / max(seconds, 1e-9),
+        self._put(Shown(self.display.codes(film, work.scale), work.view, work.scale, int(film.samples.min()), rays / max(seconds, 1e-9),
                         rays / max(int(film.samples.sum()), 1), done, left, math.sqrt(float(film.variance.mean(dtype=np.float64))),
                         film.stats["visibly_cut"] if done else 0.0), film)
         work.last_shown = time.perf_counter()
-
-    def _codes(self, film: Film, scale: int) -> np.ndarray:
-        """Return the display codes of a film. A coarse picture keeps the automatic exposure of the last fine one, so as not to flicker."""
-        if self.auto_exposure and (scale == 1 or self._automatic is None):
-            self._automatic = auto_exposure(film.pixels)
-        return to_codes(film.pixels, self.stops, self.tonemap)
 
     def _put(self, shown: Shown, film: Film | None, rests: bool = True) -> None:
         with self._condition:

@@ -244,11 +244,11 @@ def test_auto_exposure_is_that_of_render() -> None:
 def test_a_coarse_picture_keeps_the_automatic_exposure() -> None:
     eye = Eye(SCENE.with_settings(auto_exposure=True))
     eye.see(size=(61, 34))
-    stops, seen = eye.viewer.stops, list[float]()
-    eye.react = lambda shown: seen.append(eye.viewer.stops) if shown.scale > 1 else None
+    stops, seen = eye.viewer.display.stops, list[float]()
+    eye.react = lambda shown: seen.append(eye.viewer.display.stops) if shown.scale > 1 else None
     eye.viewer._pace["bvh", False] = 1.0
     eye.see(camera=turned(120.0))
-    assert len(seen) >= 3 and set(seen) == {stops} and eye.viewer.stops != stops
+    assert len(seen) >= 3 and set(seen) == {stops} and eye.viewer.display.stops != stops
 
 
 def test_a_target_error_ends_the_refinement() -> None:
