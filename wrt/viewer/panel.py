@@ -92,8 +92,8 @@ class Panel:
                     "Each stop doubles the displayed values", *ends, 0.1),
             Control("auto exposure", "Picture", lambda: display.settings.auto_exposure, lambda value: viewer.tone(auto_exposure=value),
                     hint="Add the stops that show bright parts just below white"),
-            Control("tone mapping", "Picture", lambda: display.settings.tonemap, lambda value: viewer.tone(tonemap=value), choices=tuple(TONEMAPS),
-                    hint="Curve from linear radiance to the display"),
+            Control("tone mapping", "Picture", lambda: display.settings.tonemap, lambda value: viewer.tone(tonemap=value),
+                    choices=tuple(TONEMAPS), hint="Curve from linear radiance to the display"),
             Control("resolution", "Picture", lambda: self.resolution, resize, choices=tuple(RESOLUTIONS),
                     hint="Pixels of the picture per pixel of the window, along each side"),
         ]
