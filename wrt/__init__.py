@@ -120,7 +120,12 @@ def __getattr__(name: str) -> Any:
     if name in _HOME:
         value = globals()[name] = getattr(importlib.import_module(_HOME[name]), name)
         return value
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    text = f"module {__name__!r} has no attribute {name!r}"
+    if not name.startswith("_"):
+        from wrt.core.checks import did_you_mean
+
+        text += f"; {suggestion.rstrip()}" if (suggestion := did_you_mean(name, __dir__())) else ""
+    raise AttributeError(text)
 
 
 def __dir__() -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from inspect import signature
-from typing import Any, Self, TypedDict, Unpack, overload
+from typing import TYPE_CHECKING, Any, NoReturn, Self, TypedDict, Unpack, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +14,7 @@ from wrt.accel.built import AccelStats
 from wrt.accel.flat_scene import FlatScene
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry
-from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES, Hits, answer_arrays, arrays_of
+from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES, Hits, answer_arrays, arrays_of, no_attribute
 from wrt.accel.queries.batches import Query, trace_query
 from wrt.accel.queries.counting import counted
 from wrt.accel.queries.gradients import record
@@ -31,6 +31,10 @@ from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike, NumpyLike, TensorT, WarpArray, WarpStruct
 from wrt.core.warp_private import recording_tape
 from wrt.kernels.structs import Surfaces
+
+# Names of queries that are functions, not methods.
+FUNCTIONS = ("all_hits", "first_hits", "count_hits", "visible", "ray_query", "closest_points", "contains", "signed_distance",
+             "winding_number", "walk", "trace")
 
 
 class CostOptions(TypedDict, total=False):
@@ -76,6 +80,15 @@ class Accelerator:
         self._snapshot = Snapshot(self.structure, self.device, surfaces, attributes, geometry)
         self._refitting = threading.Lock()
         self._cache: dict[str, Any] = {}  # arrays that later refits reuse
+
+    if not TYPE_CHECKING:  # type checkers report unknown names themselves
+
+        def __getattr__(self, name: str) -> NoReturn:
+            if name in FUNCTIONS:
+                raise AttributeError(f"{name} is a function: wrt.{name}(accel, ...)")
+            if name == "move":
+                raise AttributeError(f"{type(self).__name__} cannot move: build it with wrt.build(..., movable=True)")
+            raise no_attribute(self, name, dir(type(self)))
 
     def __copy__(self) -> Self:
         """Return a copy that shares all arrays. A refit of either does not change the other."""

@@ -132,6 +132,8 @@ def record(hits: Any, **outputs: Any) -> None:
 
 def check_recorded(hits: Any, name: str) -> None:
     """Raise InputError if the recording tape would need gradients of hits.`name`, which has none."""
+    if hits.source is None:
+        return
     snapshot, rays, _ = hits.source
     check_no_gradients(f"hits.{name}", vertices=snapshot.followed, origins=rays.origins, directions=rays.directions)
 

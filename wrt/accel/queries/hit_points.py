@@ -173,7 +173,8 @@ class HitPoints(Generic[ArrayT]):
 
     def _source(self) -> Source:
         if self.source is None:
-            raise InputError("these hits have no rays, from which points, normals and ids are computed: use the result of closest_hit")
+            raise InputError("these hits have no rays, from which distances, points, normals and ids are computed; copies and pickled"
+                             " hits lose them", hint="ask the result of closest_hit before it is copied")
         return self.source
 
     def _given(self, values: np.ndarray) -> ArrayT:

@@ -147,6 +147,8 @@ class Trace:
     def model(self, gpu: str = "rtx2080ti", core: Core = BASE) -> Prediction:
         """Predict clocks per ray and rays per second on an RT core. gpu: a name in parameters.GPUS; core: the assumptions."""
         require_known(gpu, GPUS, "GPU", "gpu")
+        if not len(self.address):
+            raise InputError("the trace has no fetches")
         return predict(self.work(), GPUS[gpu], core)
 
     def with_prefetches(self, after: ArrayLike, address: ArrayLike, size: ArrayLike) -> Trace:

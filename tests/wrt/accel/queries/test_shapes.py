@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from typing import Any
 
 import numpy as np
@@ -156,6 +158,23 @@ def test_typing_errors_are_answered_with_the_name(ball: Any) -> None:
     with pytest.raises(TypeError, match="'tmax'; did you mean 't_max'"):
         ball.closest_hit(*some_rays(4), tmax=1.0)
     assert not hasattr(hits, "__array__") and not hasattr(hits, "wheels")
+
+
+def test_names_of_functions_and_of_the_package_are_answered_with_the_way(ball: Any) -> None:
+    for thing, name, said in ((ball, "contains", "wrt.contains(accel, ...)"), (ball, "move", "movable=True"),
+                              (ball, "closst_hit", "'closest_hit'"), (wrt, "buildd", "'build'"), (wrt, "sensor", "'sensors'")):
+        with pytest.raises(AttributeError) as error:
+            getattr(thing, name)
+        assert said in str(error.value)
+
+
+def test_copied_hits_say_that_they_have_lost_their_rays(ball: Any) -> None:
+    hits = ball.closest_hit((0.0, 0.0, 5.0), (0.0, 0.0, -1.0))
+    for lost in (copy.copy(hits), copy.deepcopy(hits), pickle.loads(pickle.dumps(hits))):
+        assert lost.t == hits.t and lost.hit
+        for name in ("distance", "points", "normals", "object"):
+            with refused(what="lose them"):
+                getattr(lost, name)
 
 
 def test_what_is_refused(ball: Any) -> None:
