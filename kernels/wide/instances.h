@@ -100,7 +100,7 @@ WRT_CALLED int exponent_near_one(double x) {
     return out;
 }
 
-constexpr double HALF_STEP = 0x1p-150;
+constexpr double HALF_STEP = 0.5 * (double)__FLT_DENORM_MIN__;
 
 // As last_local and first_local in traverse/instances.py.
 WRT_CALLED float last_local(float t, double scale) {

@@ -268,14 +268,13 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
         shared = shared_stack()
         size = int(0)
         reference = int(0)
-        found = bool(True)
-        while found:
+        while True:
             if reference < 0:
                 best = visit_leaf(accel, surfaces, reference, probe, rows, best)
                 counts = count_leaf(accel, ray, counts, reference)
                 if wp.static(any_hit):
                     if best.prim_id != NO_HIT:
-                        break
+                        return finish(accel.recorder, ray, counts, best)
             else:
                 first = reference * wp.static(layout.size)
                 counts = count_node(accel, ray, counts, reference)
@@ -315,8 +314,11 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
                 counts = count_pop(counts)
                 key = get(stack, shared, size)
                 record_pop(accel.recorder, ray, key, best)
-                reference = reference_of(key)
-                found = t_of(key) <= best.t
+                if t_of(key) <= best.t:
+                    reference = reference_of(key)
+                    found = True
+            if not found:
+                break
         return finish(accel.recorder, ray, counts, best)
 
     return traverse

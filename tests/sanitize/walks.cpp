@@ -101,7 +101,7 @@ private:
     }
 
     void walk_alone(int ray) {
-        int next = begin<ANY_HIT>(given.nodes.data(), packet.data(), ray, stack.data(), 0, slot.data());
+        int next = begin<ANY_HIT>(given.nodes.data(), 0, packet.data(), ray, stack.data(), 0, slot.data());
         while (next != EMPTY) {
             prefetch(given.nodes.data(), given.primitives.data(), next);
             if (next > 0) {

@@ -42,14 +42,14 @@ def leaf_of(path: Path, **settings: Any) -> float:
 @pytest.mark.filterwarnings("ignore:the picture is all black:wrt.SceneWarning")
 def test_what_is_in_solid_glass_of_a_gltf_file_is_lit(tmp_path: Path) -> None:
     path = block_with_a_leaf(tmp_path)
-    assert wrt.load_scene(path).settings == Settings(glass_shadows="tinted", max_depth=GLASS_DEPTH)
+    assert wrt.load_scene(path).settings == Settings(glass_shadows="tinted", max_depth=GLASS_DEPTH, auto_exposure=True)
     assert leaf_of(path) == pytest.approx(1.0, rel=1e-5)
     assert leaf_of(path, glass_shadows="opaque") == 0.0  # an explicit setting wins
 
 
 def test_a_gltf_file_without_solid_glass_has_the_settings_of_any_scene(tmp_path: Path) -> None:
     path = block_with_a_leaf(tmp_path, thickness=0.0)
-    assert wrt.load_scene(path).settings == Settings(max_depth=GLASS_DEPTH)
+    assert wrt.load_scene(path).settings == Settings(max_depth=GLASS_DEPTH, auto_exposure=True)
     assert leaf_of(path) == pytest.approx(1.0, rel=1e-5)
 
 

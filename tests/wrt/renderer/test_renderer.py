@@ -431,7 +431,7 @@ def test_the_error_names_the_argument_with_a_wrong_value(options: dict[str, Any]
 @pytest.mark.parametrize(("options", "message"), [
     ({"sp": 4}, ("sp", "unknown argument", None, None, "'spp'")), ({"fov": 4}, ("fov", "unknown argument")),
     ({"spp": 1.5}, ("spp", "whole number")), ({"spp": "many"}, ("spp", "whole number")),
-    ({"size": 640}, ("size", "two whole numbers")),
+    ({"size": 640.5}, ("size", "two whole numbers")),
     ({"size": (32.0, 18.0)}, ("size", "two whole")), ({"size": "32*18"}, ("size", "two whole numbers")),
     ({"size": (1, 2, 3)}, ("size", "two whole")), ({"seed": 0.5}, ("seed", "whole number")),
     ({"threads": "two"}, ("threads", "int")), ({"crop": (0, 0, 4)}, ("crop", "x0, y0, x1, y1")),
@@ -474,7 +474,7 @@ def test_one_name_and_text_for_a_size_and_settings_by_keyword() -> None:
 def test_the_keywords_of_render_are_typed_as_the_settings_and_options_are() -> None:
     typed = {name: each.__forward_arg__ for name, each in RenderOptions.__annotations__.items()}
     expected = {each.name: f"{each.type} | None" for each in fields(Settings)} | {each.name: each.type for each in fields(Options)}
-    expected |= {"size": "tuple[int, int] | str | None", "aov": "str | Sequence[str]"}  # render takes more
+    expected |= {"size": "tuple[int, int] | str | int | None", "aov": "str | Sequence[str]"}  # render takes more
     assert typed == expected
 
 
