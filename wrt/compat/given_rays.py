@@ -66,8 +66,10 @@ class RayFormat:
         Kernel of kernels.placed_rays. Arguments: `inputs`, `struct`, first.
     struct : WarpType
         Struct of the caller's arrays, and of those of GivenRays.
-    columns, dtype : int
-        Number of columns of each of the caller's arrays, and their type.
+    columns : tuple of int
+        Number of columns of each of the caller's arrays.
+    dtype : type
+        Type of these arrays.
     *inputs
         A value of the type of each argument before `struct`.
     """

@@ -89,7 +89,7 @@ class Tracer:
 
     def trace(self, snapshot: Snapshot, query: Query) -> None:
         """Trace on the CPU, as trace_query does. The rays are checked before tracing, or by a kernel that traces many rays at a time."""
-        rays, threads = query.rays.on(wp.get_device("cpu")) if query.rays.as_warp else query.rays, query.threads
+        rays, threads = query.rays.on(wp.get_device("cpu")), query.threads
         if not self.stream:  # `self.stream` reports invalid rays itself
             rays = rays.checked()
         inputs, results = [np.asarray(array) for array in rays], [np.asarray(array) for array in query.out]
