@@ -89,7 +89,9 @@ class Tracer:
 
     def trace(self, snapshot: Snapshot, query: Query) -> None:
         """Trace on the CPU, as trace_query does. The rays are checked before tracing, or by a kernel that traces many rays at a time."""
-        rays, threads = query.rays.on(wp.get_device("cpu")), query.threads
+        rays, threads = query.rays, query.threads
+        if rays.as_warp or not type(rays.t_min) is type(rays.t_max) is np.ndarray:
+            rays = rays.on(wp.get_device("cpu"))
         if not self.stream:  # `self.stream` reports invalid rays itself
             rays = rays.checked()
         inputs, results = [np.asarray(array) for array in rays], [np.asarray(array) for array in query.out]
