@@ -112,8 +112,8 @@ def make_struct(accel_struct: Any) -> Any:
     return Recorded
 
 
-def make_traversal(accel_struct: Any, traverse: Any) -> Any:
-    """Return a traversal like `traverse` that records the ray and its hit."""
+def make_traversal(accel_struct: Any, traverse: Any, any_hit: bool) -> Any:
+    """Return a traversal like `traverse` that records the ray and its hit. any_hit: not recorded, because render loops know it."""
     struct = make_struct(accel_struct)
 
     @wp.func

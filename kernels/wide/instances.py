@@ -201,7 +201,7 @@ def make_top_walk(units: Units, any_hit: bool) -> Any:
 
 
 def make_start(any_hit: bool, place_ray: Any, worlds: bool) -> Any:
-    """Return descend and start, which bring a slot's ray to its next placement. Both return False if there is none."""
+    """Return descend and start, which bring a slot's ray to its next placement. Both return False after the last placement."""
     top_begin, top_step = make_top_steps(any_hit)[2:4]
 
     @wp.func

@@ -227,7 +227,7 @@ def make_recorded(units: Units, accepts: Any, layout: NodeLayout) -> Any:
 
     @wp.func
     def recorded_leaf(accel: struct, surfaces: Any, reference: int, probe: Probe, rows: LaneRay, best: Hit) -> Hit:
-        """Test all primitives of a leaf one by one, also those that the test of a row rejects."""
+        """Test all primitives of a leaf one by one. The test of a row rejects some of them; a record needs each test."""
         leaf = child_of(reference)
         write_step(accel.recorder, probe.ray.slot, leaf)
         for i in range(leaf.index, leaf.index + leaf.count):

@@ -10,7 +10,7 @@ from wrt.accel.structures import ACCELERATORS
 from wrt.core.checks import accepts, did_you_mean, require_known
 from wrt.core.device import made_once
 from wrt.core.errors import InputError
-from wrt.core.types import DeviceFunction, Kernel, WarpType
+from wrt.core.types import DeviceFunction, Kernel, KernelModule, WarpType
 from wrt.kernels.query import make_any_hit_kernel, make_closest_hit_kernel, make_worlds_kernel
 from wrt.kernels.traverse import instances as traverse_instances
 from wrt.kernels.traverse.common import Units
@@ -85,6 +85,28 @@ class Structure(NamedTuple):
         if self.units.instances:
             return traverse_instances.make_traversal(self.units, any_hit, traverse, self.bottom)
         return traverse
+
+
+class WrappedStructure(NamedTuple):
+    """A structure whose traversal notes each ray, for kernels of pictures; hashable, like Structure. wrapper: module with
+    make_struct(struct) and make_traversal(struct, traverse, any_hit)."""
+
+    inner: Structure
+    wrapper: KernelModule
+
+    @property
+    def units(self) -> Units:
+        return self.inner.units
+
+    @property
+    def struct(self) -> WarpType:
+        struct: WarpType = self.wrapper.make_struct(self.inner.struct)
+        return struct
+
+    def traversal(self, *, any_hit: bool, accepts: DeviceFunction | None = None) -> DeviceFunction:
+        inner = self.inner.traversal(any_hit=any_hit, accepts=accepts)
+        wrapped: DeviceFunction = self.wrapper.make_traversal(self.inner.struct, inner, any_hit)
+        return wrapped
 
 
 @made_once

@@ -19,7 +19,8 @@ from wrt.accel.queries.raw_kernel import RawKernel
 from wrt.accel.queries.raw_launches import raw_launch
 from wrt.accel.queries.rays import Rays, constant
 from wrt.accel.snapshot import Snapshot
-from wrt.core.threads import with_stack
+from wrt.core.device import made_once
+from wrt.core.threads import FreeList, with_stack
 from wrt.core.types import Kernel, WarpType
 from wrt.core.warp_private import struct_record
 
@@ -77,7 +78,7 @@ class RayFormat:
     def __init__(self, kernel: Kernel, struct: WarpType, columns: tuple[int, ...], dtype: type, *inputs: object) -> None:
         self.kernel, self.struct, self.columns, self.dtype, self.inputs = kernel, struct, columns, dtype, inputs
         self._convert = RawKernel(kernel, *inputs, struct())
-        self._free: dict[Tracer, list[_FewRays]] = {}
+        self._few_rays = made_once(lambda tracer: FreeList(lambda: _FewRays(self, tracer)))
 
     def converted(self, arrays: tuple[np.ndarray, ...], threads: int, *inputs: object) -> GivenRays:
         """Convert the caller's arrays. inputs: records of the kernel's arguments before the struct."""
@@ -99,13 +100,10 @@ class RayFormat:
         return any_hits(accel, self.converted(arrays, threads, *inputs), threads)
 
     def _few(self, snapshot: Snapshot, any_hit: bool, arrays: tuple[np.ndarray, ...], inputs: tuple[object, ...]) -> list[np.ndarray]:
-        free = self._free.setdefault(tracer(snapshot.structure, any_hit), [])
-        try:
-            few = free.pop()
-        except IndexError:
-            few = _FewRays(self, tracer(snapshot.structure, any_hit))
+        free: FreeList[_FewRays] = self._few_rays(tracer(snapshot.structure, any_hit))
+        few = free.take()
         found = with_stack(partial(few.trace, snapshot, arrays, inputs))
-        free.append(few)  # not after an exception
+        free.give(few)
         return found
 
 

@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from functools import cache, partial
-from typing import ParamSpec, TypeVar
+from typing import Generic, ParamSpec, TypeVar
 
 from wrt.core.checks import shown
 from wrt.core.errors import InputError
@@ -203,3 +203,26 @@ def run_growing(begin: Callable[[T], tuple[Callable[[], object], Callable[[], It
                 waiting.extend(after())
     finally:
         wait(running)
+
+
+# --- things that one thread uses at a time -------------------------------------------------------------------------
+
+
+class FreeList(Generic[T]):
+    """Things that no thread uses now (`free`), for all threads. make: function that makes one more. After an exception a thing is not
+    given back, because another thread may still use it."""
+
+    def __init__(self, make: Callable[[], T]) -> None:
+        self._make = make
+        self.free: list[T] = []
+
+    def take(self) -> T:
+        """Return a free thing, or a new one if none is free."""
+        try:
+            return self.free.pop()
+        except IndexError:
+            return self._make()
+
+    def give(self, thing: T) -> None:
+        """Make a thing free again."""
+        self.free.append(thing)

@@ -5,18 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import warp as wp
 
 from wrt.accel.queries.counting import copied
-from wrt.accel.structure import Structure
+from wrt.accel.structure import WrappedStructure
 from wrt.core.device import on_host
 from wrt.core.threads import run_all
-from wrt.core.types import Device, DeviceFunction, WarpArray, WarpType
+from wrt.core.types import Device, WarpArray, WarpType
 from wrt.kernels.study import ray_log
-from wrt.kernels.traverse.common import Units
 from wrt.kernels.traverse.counters import Counts, Recorder
 from wrt.kernels.warp_private import fields_of
 from wrt.renderer.film_arrays import DeviceFilm
@@ -29,30 +28,13 @@ T = TypeVar("T")
 COUNTERS = tuple(fields_of(Counts))
 
 
-class LoggedStructure(NamedTuple):
-    """A structure that logs each ray before it traverses; hashable, like Structure."""
-
-    inner: Structure
-
-    @property
-    def units(self) -> Units:
-        return self.inner.units
-
-    @property
-    def struct(self) -> WarpType:
-        return ray_log.make_struct(self.inner.struct)
-
-    def traversal(self, *, any_hit: bool, accepts: DeviceFunction | None = None) -> DeviceFunction:
-        return ray_log.make_traversal(self.inner.struct, self.inner.traversal(any_hit=any_hit, accepts=accepts), any_hit)
-
-
 class CostCounter:
     """A render that counts traversal steps. built: the scene prepared for pictures, whose structure and arrays the counter shares."""
 
     def __init__(self, plan: Plan, device: Device, built: Prepared | None = None) -> None:
         counting = plan.structure._replace(units=plan.structure.units._replace(counters=True))
         features = replace(plan.features, counting=True)
-        self.prepared = prepare(replace(plan, structure=LoggedStructure(counting), features=features), device, built)
+        self.prepared = prepare(replace(plan, structure=WrappedStructure(counting, ray_log), features=features), device, built)
 
     @classmethod
     def beside(cls, built: Prepared) -> CostCounter:

@@ -17,7 +17,7 @@ from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.scenes.build import build, reports_progress
 from wrt.core.compiling import WATCH
 from wrt.core.device import load_kernel
-from wrt.core.threads import Pool, thread_count
+from wrt.core.threads import FreeList, Pool, thread_count
 from wrt.core.types import Device, Kernel, WarpStruct
 from wrt.renderer.film_arrays import AovFilm, DeviceFilm
 from wrt.renderer.options import Progress
@@ -25,7 +25,7 @@ from wrt.renderer.pixels import aov_launch, film_launch
 from wrt.renderer.plan import Plan
 from wrt.renderer.tiles import Rectangle, Work, corners, tiles
 from wrt.renderer.upload import DeviceScene, camera_struct, upload_scene
-from wrt.renderer.waves import CAPACITY, SceneRecords, Waves
+from wrt.renderer.waves import CAPACITY, Buffers, SceneRecords, Waves
 from wrt.scene.cameras import CameraKind
 from wrt.scene.settings import SettingChanges
 
@@ -129,7 +129,7 @@ def prepare(plan: Plan, device: Device, built: Prepared | None = None) -> Prepar
     work.run(([work.build] if built is None else []) + [partial(work.compile, kernel) for kernel in work.kernels])
     arrays, accel = (work.arrays, work.accel) if built is None else (built.arrays, built.accel)
     lights = arrays.lighting.count + plan.features.extra_lights
-    waves = Waves(plan.wave_kernels, plan.features, lights) if plan.by_waves else None
+    waves = Waves(plan.wave_kernels, lights, FreeList(partial(Buffers, plan.features, lights))) if plan.by_waves else None
     camera = camera_struct(plan.camera, plan.scene.settings.size)
     return Prepared(plan, device, work.threads, work.kernels, arrays, accel, camera, waves, work.seconds)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib import import_module
 from typing import NamedTuple
@@ -15,6 +15,7 @@ from wrt.accel.queries.batches import new_scratch
 from wrt.accel.queries.raw_launches import Launches
 from wrt.accel.structure import Structure
 from wrt.core.device import made_once, records, start, upload
+from wrt.core.threads import FreeList
 from wrt.core.types import Kernel, WarpArray, WarpStruct, WarpType
 from wrt.kernels.launches import Launch
 from wrt.kernels.loops import state, wave, wave_begin, wave_rows, wave_shade
@@ -120,9 +121,8 @@ class Waves:
     """The wave kernels of a scene, and the working memory (Buffers) of the threads."""
 
     kernels: WaveKernels
-    features: Features  # They determine the size of the buffers.
     lights: int  # Number of lights; a sampled background counts as a light.
-    free: list[Buffers] = field(default_factory=list)  # Buffers that no thread uses.
+    buffers: FreeList[Buffers]
 
     def launch(self, scene: SceneRecords, limits: list[WarpStruct], film: DeviceFilm | AovFilm) -> Callable[[Work], int]:
         """Return a function that renders the samples of a Work, adds them to the film, and returns their number.
@@ -131,15 +131,12 @@ class Waves:
         recorded: dict[int, Picture | Aovs] = {}
 
         def trace(work: Work) -> int:
-            try:
-                buffers = self.free.pop()
-            except IndexError:
-                buffers = Buffers(self.features, self.lights)
+            buffers = self.buffers.take()
             if id(buffers) not in recorded:
                 recorded[id(buffers)] = (Aovs(self, buffers, scene, film) if isinstance(film, AovFilm)
                                          else Picture(self, buffers, scene, limits, film))
             recorded[id(buffers)].trace(work)
-            self.free.append(buffers)  # After an error, the buffers are not reused.
+            self.buffers.give(buffers)
             return work.total
 
         return trace

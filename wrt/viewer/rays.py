@@ -141,7 +141,7 @@ def count(sample: Sample) -> int:
 
 
 def nodes_of(sample: Sample) -> list[Node]:
-    """Return the first MOST_NODES rays and lights of a sample, each before those that begin at its hit."""
+    """Return the first MOST_NODES rays and lights of a sample, each before the rays that begin at its hit."""
     nodes: list[Node] = []
     waiting: list[tuple[Ray | Light, int]] = [] if sample.root is None else [(sample.root, -1)]
     while waiting and len(nodes) < MOST_NODES:

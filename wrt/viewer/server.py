@@ -48,7 +48,7 @@ class Answers(Protocol):
     """What a Server serves. The server's thread calls all methods but `file`, so they must return soon."""
 
     def file(self, path: str) -> tuple[str, bytes] | None:
-        """Return the content type and the bytes of a file, or None if there is none at this path. Called in a thread of its own."""
+        """Return the content type and the bytes of a file, or None for an unknown path. Called in a thread of its own."""
 
     def joined(self, browser: Browser) -> None: ...
 
@@ -149,7 +149,7 @@ class Server:
                 max_size=LARGEST_MESSAGE, close_timeout=CLOSING, logger=QUIET, create_connection=_checked_connection(self)):
             self._ready.set()
             await self._ended.wait()
-            for connection in self._connections:  # the library would wait for those that have sent no request
+            for connection in self._connections:  # the library would wait for connections without a request
                 if connection.protocol.state == CONNECTING:
                     connection.transport.abort()
 

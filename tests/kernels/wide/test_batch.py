@@ -83,7 +83,7 @@ def test_any_number_of_rays(sphere, n):
 @cpu_only
 @pytest.mark.parametrize("threads", [1, 2, 3])
 def test_more_rays_than_a_launch(sphere, threads):
-    free = tracer(sphere.structure, False).free
+    free = tracer(sphere.structure, False).workers.free
     free.clear()
     o, d, _, _ = mixed_rays(150_001)
     for _ in range(3):

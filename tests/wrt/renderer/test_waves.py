@@ -104,14 +104,20 @@ def test_the_film_is_that_of_one_ray_at_a_time(name: str, settings: dict[str, An
     assert_same(film_of(ready, (0, 5)), expected)
     assert_same(film_of(ready, (0, 1), (1, 4)), expected)
     monkeypatch.setattr(waves, "CAPACITY", 67)
-    assert_same(film_of(replace(ready, waves=replace(ready.waves, free=[])), (0, 5)), expected)
+    assert_same(film_of(without_buffers(ready), (0, 5)), expected)
+
+
+def without_buffers(ready: Any) -> Any:
+    """Return the prepared scene, whose threads make new working memory."""
+    ready.waves.buffers.free.clear()
+    return ready
 
 
 def test_more_samples_a_pixel_than_a_wave_has(monkeypatch: pytest.MonkeyPatch) -> None:
     ready = prepared("fisheye")
     expected = film_of(ready, (0, 150))
     monkeypatch.setattr(waves, "CAPACITY", 64)
-    assert_same(film_of(replace(ready, waves=replace(ready.waves, free=[])), (0, 150)), expected)
+    assert_same(film_of(without_buffers(ready), (0, 150)), expected)
 
 
 def test_more_samples_a_pixel_than_camera_rays_are_made_at_a_time() -> None:
@@ -138,7 +144,7 @@ def test_nothing_is_read_before_it_is_written(name: str, monkeypatch: pytest.Mon
     films = [film_of(ready, (0, 3))]
     for byte in (0xCD, 0xFF, 0x01):
         monkeypatch.setattr(waves, "empty", filled_with(byte))
-        films.append(film_of(replace(ready, waves=replace(ready.waves, free=[])), (0, 3)))
+        films.append(film_of(without_buffers(ready), (0, 3)))
     for film in films[1:]:
         assert_same(films[0], film)
 

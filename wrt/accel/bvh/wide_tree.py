@@ -92,7 +92,7 @@ def collapse(tree: BinaryTree, width: int, max_leaf: int, cost_traversal: float,
 
 
 def wide_tree_of(tree: BoxTree, width: int) -> WideTree:
-    """Convert a BoxTree to nodes of `width` children, of which the last ones exist."""
+    """Convert a BoxTree to nodes of `width` children. Missing children come first."""
     missing = width - tree.width
     if missing < 0:
         raise InputError(f"must have at most {width} children per node, got {tree.width}", place="tree: child", hint="use bvh8")

@@ -14,7 +14,7 @@ import warp as wp
 from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.queries.accelerator import Accelerator, snapshot_of
 from wrt.accel.queries.answers import Hits
-from wrt.accel.queries.few_lists import MOST, FewLists
+from wrt.accel.queries.few_lists import MOST, FewLists, begins
 from wrt.accel.queries.hit_points import device_scene
 from wrt.accel.queries.part_faces import part_faces
 from wrt.accel.queries.raw_kernel import RawKernel, kernel_memory
@@ -26,7 +26,7 @@ from wrt.core.arrays import given_like, to_numpy, to_tensor_like
 from wrt.core.checks import as_integer, as_one
 from wrt.core.device import MOST_ROWS, made_once, upload
 from wrt.core.errors import InputError
-from wrt.core.threads import thread_count, with_stack
+from wrt.core.threads import FreeList, thread_count, with_stack
 from wrt.core.types import Array, ArrayLike, ArrayT, NumpyLike, TensorT, WarpArray
 from wrt.kernels.hit_lists import FEW, HitLists, copy_hits, make_list_hit, make_list_hits_kernel
 from wrt.kernels.query import HitArrays, RayArrays
@@ -140,13 +140,13 @@ class ListQuery:
             return AllHits(self.converted(few[0]), *map(self.give, few[1:]))
         counts, parts = [np.zeros(0, np.int64)], []
         for rays, lists, of_each in self._listed(limit):
-            first = _begins(of_each)
+            first = begins(of_each)
             parts.append([self.memory.empty(rows_of(first[-1]), kind) for kind in HIT_KINDS])
             counts.append(of_each)
             self._copy(rays, lists, first, parts[-1])
         if len(parts) == 1:
             return AllHits(self.converted(first), *map(self.give, parts[0]))
-        first = _begins(np.concatenate(counts))
+        first = begins(np.concatenate(counts))
         rows_of(first[-1])
         hits = [self.memory.joined(arrays, kind) for kind, *arrays in zip(HIT_KINDS, *parts, strict=True)]
         return AllHits(self.converted(first), *map(self.give, hits))
@@ -183,13 +183,10 @@ class ListQuery:
 
     def _take_few(self, limit: int, take: Callable[[FewLists, np.ndarray], T]) -> T | None:
         free = few_lists(self.snapshot.structure)
-        try:
-            lists = free.pop()
-        except IndexError:
-            lists = FewLists(list_hits(self.snapshot.structure), COPY_HITS)
+        lists = free.take()
         counts = lists.find(self.snapshot, self.rays, limit, self.mesh)
         taken = None if counts is None else take(lists, counts)
-        free.append(lists)  # not after an exception
+        free.give(lists)
         return taken
 
     def _listed(self, limit: int, counting: bool = False) -> Iterator[tuple[object, list[_Lists], np.ndarray]]:
@@ -207,7 +204,7 @@ class ListQuery:
             if counts.max() > FEW and not counting:
                 many = counts > FEW
                 lists[0] = few._replace(counts=self.memory.array(np.where(many, 0, counts), wp.int32))
-                lists.append(self._filled(rays, roots, _begins(np.where(many, np.minimum(counts, 2 * limit), 0)), limit))
+                lists.append(self._filled(rays, roots, begins(np.where(many, np.minimum(counts, 2 * limit), 0)), limit))
                 counts = np.where(many, self.memory.numpy(lists[1].counts), counts)
             yield rays, lists, counts
 
@@ -229,13 +226,6 @@ class ListQuery:
                                self.memory.array(begin, wp.int32), self.memory.struct(HitArrays, *hits), threads=self.threads)
 
 
-def _begins(counts: np.ndarray) -> np.ndarray:
-    """Return the first row of each of N adjacent lists, and the end of the last list, (N + 1,) int64."""
-    out = np.zeros(len(counts) + 1, np.int64)
-    np.cumsum(counts, out=out[1:])
-    return out
-
-
 def rows_of(hits: int) -> int:
     """Return `hits` as the size of an array. Raises InputError above 2^31 - 1, the largest size that kernels can index."""
     if hits > MOST_ROWS:
@@ -252,9 +242,9 @@ def list_hits(structure: Structure) -> RawKernel:
 
 
 @made_once
-def few_lists(structure: Structure) -> list[FewLists]:
+def few_lists(structure: Structure) -> FreeList[FewLists]:
     """Return the FewLists of a structure that no thread uses now."""
-    return []
+    return FreeList(lambda: FewLists(list_hits(structure), COPY_HITS))
 
 
 @overload

@@ -17,7 +17,7 @@ from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel, w
 from wrt.accel.structures import stack_on
 from wrt.core.arrays import to_warp
 from wrt.core.device import empty_aligned, launch_on, load_kernel, made_once, memory_of
-from wrt.core.threads import run_all
+from wrt.core.threads import FreeList, run_all
 from wrt.core.types import Array, Device, Kernel, KernelModule, WarpStruct, WarpType
 from wrt.core.warp_private import array_record, record_of, struct_record
 from wrt.kernels.query import HitArrays, RayArrays, WorldRays
@@ -85,7 +85,7 @@ class Tracer:
         self.sizes = stream.stream_sizes if self.stream else ()
         self.types = ANY_HIT_TYPES if any_hit else HIT_TYPES
         self.inputs = structure.struct(), Surfaces(), self.rays(), None if any_hit else HitArrays()
-        self.free: list[Worker] = []
+        self.workers = FreeList(lambda: Worker(self))
 
     def trace(self, snapshot: Snapshot, query: Query) -> None:
         """Trace on the CPU, as trace_query does. The rays are checked before tracing, or by a kernel that traces many rays at a time."""
@@ -108,24 +108,17 @@ class Tracer:
         refused: list[bool] = []
 
         def job(first: int, end: int) -> None:
-            worker = self.borrow()
+            worker = self.workers.take()
             if packed:
                 worker.launch(snapshot, packed, first, end)
             else:
                 worker.trace(snapshot, [array[first:end] for array in inputs], [array[first:end] for array in results])
             refused.append(bool(worker.report[ANY_REFUSED]))
-            self.free.append(worker)  # not after an exception, because a thread may still use it
+            self.workers.give(worker)
 
         run_all([partial(job, *each) for each in ranges], threads)
         if any(refused):
             rays.checked()
-
-    def borrow(self) -> Worker:
-        """Return a free worker for one launch."""
-        try:
-            return self.free.pop()
-        except IndexError:
-            return Worker(self)
 
 
 tracer, world_tracer = made_once(Tracer), made_once(partial(Tracer, rays=WorldRays))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from wrt.accel.queries.answers import HIT_TYPES
+from wrt.accel.queries.batches import SMALL
 from wrt.accel.queries.raw_kernel import HostMemory, RawKernel
 from wrt.accel.queries.raw_launches import raw_launch
 from wrt.accel.queries.rays import Rays
@@ -16,7 +17,14 @@ from wrt.kernels.hit_lists import FEW, HitLists
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import Hit
 
-MOST = 1024  # rays
+MOST = SMALL  # rays
+
+
+def begins(counts: np.ndarray) -> np.ndarray:
+    """Return the first row of each of N adjacent lists, and the end of the last list, (N + 1,) int64."""
+    out = np.zeros(len(counts) + 1, np.int64)
+    np.cumsum(counts, out=out[1:])
+    return out
 
 
 class FewLists:
@@ -65,9 +73,7 @@ class FewLists:
 
     def hits_of(self, counts: np.ndarray) -> list[np.ndarray]:
         """Return the first row of each ray's hits, (N + 1,) int64, and t, u, v and prim_id of the hits. counts: from `find`."""
-        n = len(counts)
-        first = np.zeros(n + 1, np.int64)
-        np.cumsum(counts, out=first[1:])
+        n, first = len(counts), begins(counts)
         self.begin[:n] = first[:-1]
         self.copy.set_dim(n)
         self.copy.launch()

@@ -12,9 +12,9 @@ import warp as wp
 
 from wrt.accel.queries.raw_launches import raw_launch
 from wrt.core.device import launch_on, load_kernel, row_type, upload
-from wrt.core.threads import run_all
+from wrt.core.threads import FreeList, run_all
 from wrt.core.types import Device, Kernel, WarpArray, WarpType
-from wrt.core.warp_private import RawLaunch, array_record, record_of, struct_record
+from wrt.core.warp_private import array_record, record_of, struct_record
 from wrt.kernels.warp_private import fields_of
 
 STEP = 16384  # elements of a launch: some milliseconds of work, so that Ctrl-C is answered soon
@@ -33,7 +33,7 @@ class RawKernel:
 
     def __init__(self, kernel: Kernel, *inputs: object) -> None:
         self.kernel, self.inputs = kernel, inputs
-        self._free: list[RawLaunch] = []  # launches that no thread uses now
+        self._launches = FreeList(lambda: raw_launch(kernel, *inputs, 0))
 
     def launch(self, n: int, *inputs: object, threads: int = 1) -> None:
         """Run the kernel on the CPU over n elements: contiguous NumPy arrays, records and Warp structs in.
@@ -46,15 +46,12 @@ class RawKernel:
         run_all([partial(self._launch_range, first, min(first + STEP, n), records) for first in range(0, n, STEP)], threads)
 
     def _launch_range(self, first: int, end: int, records: list[object]) -> None:
-        try:
-            command = self._free.pop()
-        except IndexError:
-            command = raw_launch(self.kernel, *self.inputs, 0)
+        command = self._launches.take()
         for i, record in enumerate((*records, first)):
             command.set(i, record)
         command.set_dim(end - first)
         command.launch()
-        self._free.append(command)  # not after an error
+        self._launches.give(command)
 
 
 class HostMemory:

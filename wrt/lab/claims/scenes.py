@@ -101,7 +101,7 @@ class Scene:
 
     @cached_property
     def workloads(self) -> dict[str, Rays]:
-        """Rays of PATH, AO and SHADOW: the camera's rays and those that start at their hits."""
+        """Rays of PATH, AO and SHADOW: the camera's rays, and rays that start at their hits."""
         return {name: rays_of(self, name) for name in (PATH, AO, SHADOW)}
 
 

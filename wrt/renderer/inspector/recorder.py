@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple, Unpack
+from typing import Unpack
 
 import numpy as np
 import warp as wp
 
-from wrt.accel.structure import Structure
+from wrt.accel.structure import WrappedStructure
 from wrt.core.device import on_host
-from wrt.core.types import Device, DeviceFunction, WarpType
+from wrt.core.types import Device
 from wrt.kernels.loops import record
-from wrt.kernels.traverse.common import Units
 from wrt.renderer.film_arrays import DeviceFilm
 from wrt.renderer.plan import Plan
 from wrt.renderer.prepare import prepare
@@ -25,29 +24,12 @@ ARRAYS = {"rays": (record.TracedRay, 256), "ends": (record.PathEnd, 128),
           "lights": (record.AskedLight, 256), "paths": (record.NewPath, 256)}
 
 
-class RecordedStructure(NamedTuple):
-    """A structure that records each ray after its traversal; hashable, like Structure."""
-
-    inner: Structure
-
-    @property
-    def units(self) -> Units:
-        return self.inner.units
-
-    @property
-    def struct(self) -> WarpType:
-        return record.make_struct(self.inner.struct)
-
-    def traversal(self, *, any_hit: bool, accepts: DeviceFunction | None = None) -> DeviceFunction:
-        return record.make_traversal(self.inner.struct, self.inner.traversal(any_hit=any_hit, accepts=accepts))
-
-
 class Recorder:
     """A scene prepared for records. plan: the plan of the render."""
 
     def __init__(self, plan: Plan, device: Device) -> None:
         features = replace(plan.features, recording=True)
-        self.prepared = prepare(replace(plan, structure=RecordedStructure(plan.structure), features=features), device)
+        self.prepared = prepare(replace(plan, structure=WrappedStructure(plan.structure, record), features=features), device)
         self.sizes = [size for _, size in ARRAYS.values()]
 
     def aim(self, camera: CameraKind, **settings: Unpack[SettingChanges]) -> Plan:

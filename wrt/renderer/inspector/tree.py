@@ -21,7 +21,7 @@ AMBIENT = "ambient term"  # name of the light that stands for the ambient term, 
 class Place:
     """A ray, and what it hits. Vectors are (3,) float32 in world space, or colours.
 
-    - origin, direction, t_min, t_max, exclude: the ray as it was traced; exclude is the prim_id that it ignores, or -1.
+    - origin, direction, t_min, t_max, exclude: the traced ray; exclude is the prim_id that it ignores, or -1.
     - t: distance of the hit in units of the direction's length; inf on a miss, NaN if the ray was not traced.
     - prim_id, object, material: of the hit; -1, "" and "" without one. Shapes without a name are called after their index.
     """
