@@ -27,7 +27,7 @@ class LidarModel:
     columns
         Columns of a turn at 10 turns a second.
     source
-        Document that has the numbers.
+        Document that has the numbers. Only the HDL-32E's angles were compared with it; check the others before you rely on them.
     """
 
     elevations: np.ndarray
@@ -55,7 +55,7 @@ def lidar(name: str, pose: ArrayLike | None = None, columns: int | None = None, 
     Parameters
     ----------
     name
-        Name in `LIDARS`, such as "vlp-16"; each entry has its source. The angles are nominal: a device's calibration differs.
+        Name in `LIDARS`, such as "vlp-16"; each entry names its source. The angles are nominal: devices differ in calibration.
     columns
         Columns of a turn; None: at 10 turns a second.
     pose, rolling, like
