@@ -16,7 +16,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import wrt
-from wrt.lab.bench import visibility
+from wrt.lab.bench import report, visibility
 from wrt.picture.heatmap import heatmap
 from wrt.scene.shapes import teapot
 
@@ -89,7 +89,7 @@ assert differ <= 1e-3 * raster.size  # pixels whose middle lies on an edge, with
 
 # %%
 plan = visibility.Plan(meshes=(), size=64 if QUICK else 256, max_size=128 if QUICK else 1024, max_triangles=MOST, runs=RUNS)
-rows = [row for row in visibility.rows(plan) if row.surface == "terrain"]
+rows = [row for row in report.run(plan) if row.surface == "terrain"]
 assert all(row.agreement.unexplained == 0 for row in rows)
 fig, axes = plt.subplots(1, 2, figsize=(9.6, 3.6), dpi=80, layout="constrained")
 for ax, sweep, fixed in ((axes[0], "triangles", f"{plan.size} x {plan.size} pixels"), (axes[1], "pixels", "about 80,000 triangles")):

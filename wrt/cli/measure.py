@@ -96,9 +96,10 @@ def profile(how: Reporting, scene: Path, assignments: Assignments, gpu: str, **o
 
 @click.command(help=Stability.__doc__)
 @planned(Stability)
-@reporting(cluster=True, quiet="Print no progress")
+@reporting(Stability.OUTPUT, cluster=True, resume=True, quiet="Print no progress")
 def stability(how: Reporting, plan: Stability) -> None:
-    from wrt.lab.bench.report import cells
+    from wrt.lab.bench.report import cells, csv_file
+    from wrt.lab.bench.resume import text_of
     from wrt.lab.hard_cases import report
     from wrt.lab.hard_cases import stability as study
 
@@ -106,14 +107,20 @@ def stability(how: Reporting, plan: Stability) -> None:
         if not how.as_json:
             say("  ".join(cells(study.COLUMNS, row)), err=False)
 
-    how.check_markdown()
+    how.check_report((".json", ".csv"))
+    finished = how.finished(plan, study.CLASSES)
     client = client_of(how.cluster)
     if not how.as_json:
         say("  ".join(study.COLUMNS), err=False)
-    result = study.run(plan, row_done, how.progress_writer, client)
-    how.write(report.text(result, plan))
-    data = {"machine": report.machine(plan), **result.as_dict(), "output": how.output}
-    how.end(f"\n{report.summary(result)}", data, interrupted=result.interrupted)
+    machine = report.machine(plan)
+    if finished.groups:
+        machine += f"; resumed after {len(finished.groups) - 1} rows of: {finished.machine}"
+    finished.machine = machine
+    result = study.run(plan, row_done, how.progress_writer, client, finished.groups)
+    data = {"machine": machine, **result.as_dict()}
+    how.write_rows(data, report.text(result, plan, machine), {".csv": lambda: csv_file(result.rows, plan, machine, ".csv")},
+                   text_of(finished, plan) if result.interrupted is not None else "")
+    how.end(f"\n{report.summary(result)}", {**data, "output": how.output}, interrupted=result.interrupted)
 
 
 @bench.command()
@@ -124,7 +131,8 @@ def stability(how: Reporting, plan: Stability) -> None:
 @reporting()
 def error(how: Reporting, plan: Error, scene: Path, assignments: Assignments, size: tuple[int, int],
           **options: Parsed) -> None:
-    """Render SCENE with various values of each option, and compare time and error of the pictures with a converged reference."""
+    """Render SCENE with various values of each option, and compare time and error of the pictures with a converged
+    reference. A stopped run cannot be resumed."""
     from wrt.lab.bench import error as study
     from wrt.lab.bench import error_report as report
     from wrt.renderer.options import Options
@@ -150,7 +158,7 @@ def error(how: Reporting, plan: Error, scene: Path, assignments: Assignments, si
 def mitsuba(how: Reporting, plan: Mitsuba, scene: Path, assignments: Assignments, size: tuple[int, int], matte: bool,
             camera: str | None) -> None:
     """Render SCENE with wrt and with Mitsuba 3 (scalar_rgb and llvm_ad_rgb) on all threads, and compare the times to equal error,
-    with and without the start of the process.
+    with and without the start of the process. A stopped run cannot be resumed.
 
     llvm_ad_rgb needs an LLVM library (19 works), named in the environment variable DRJIT_LIBLLVM_PATH."""
     from wrt.lab.mitsuba import equal_error

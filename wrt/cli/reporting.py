@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import MISSING, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 from click.core import ParameterSource
@@ -38,7 +38,12 @@ from wrt.core.write_file import check_writable, write_bytes
 from wrt.lab.plans import STRUCTURES, Plan
 from wrt.renderer.progress import TimeLeft
 
+if TYPE_CHECKING:
+    from wrt.lab.bench.resume import Finished
+
 T = TypeVar("T")
+RESUME = click.option("--resume", is_flag=True, help="Continue an interrupted run: keep the finished rows in the file of -o (.json or"
+                                                     " .csv), if its options and the version of wrt are the same")
 # The type of an option, by the annotation of the plan's field. Any other annotation means a path.
 TYPES: dict[str, Any] = {"int": int, "int | None": int, "bool": bool, "str": str, "Sequence[str]": Names(), "float": DURATION}
 
@@ -51,6 +56,7 @@ class Reporting:
     cluster: str | None = None  # address of a Dask scheduler
     quiet: bool = False
     as_json: bool = False
+    resume: bool = False
 
     def progress(self, line: str) -> None:
         if not self.quiet:
@@ -74,17 +80,29 @@ class Reporting:
         check_writable(self.output)
         return suffix
 
-    def rows_of(self, measure: Callable[[Callable[[T], None]], list[T]], line: Callable[[T], str],
-                total: int | None) -> tuple[list[T], int | None]:
-        """Measure, and show each finished row with the time left. Return the rows, and the number of the signal that ended the work.
+    def finished(self, plan: Plan, classes: Sequence[type] = ()) -> Finished:
+        """Return the groups that the report `output` of an interrupted run has, or none without --resume. classes: see resume.load."""
+        from wrt.lab.bench import resume
 
-        measure: function that takes a callback for finished rows. total: expected number of rows, None if unknown. After Ctrl-C the
-        finished rows are returned; without any, KeyboardInterrupt is raised."""
-        left, kept = TimeLeft(total or 0), list[T]()
+        if not self.resume:
+            return resume.Finished()
+        if self.cluster is not None:
+            raise InputError("works on one machine, not with --cluster", argument="--resume")
+        if self.output is None or self.output.suffix.lower() not in resume.SUFFIXES:
+            raise InputError(f"needs the report to resume: -o with a {' or '.join(resume.SUFFIXES)} file", argument="--resume")
+        return resume.load(self.output, plan, classes)
+
+    def rows_of(self, measure: Callable[[Callable[[T], None]], list[T]], line: Callable[[T], str],
+                total: int | None, before: Sequence[T] = ()) -> tuple[list[T], int | None]:
+        """Measure, and show each finished row with the time left. Return all rows, and the number of the signal that ended the work.
+
+        measure: function that takes a callback for finished rows. total: expected number of rows, None if unknown. before: rows of an
+        earlier run. After Ctrl-C the finished rows are returned; without any, KeyboardInterrupt is raised."""
+        left, kept = TimeLeft((total or 0) - len(before)), list(before)
 
         def done(row: T) -> None:
             kept.append(row)
-            left.done = len(kept)
+            left.done = len(kept) - len(before)
             self.progress(f"{line(row)}{f'  ({len(kept)} of {total}{left})' if total and len(kept) < total else ''}")
 
         try:
@@ -93,6 +111,21 @@ class Reporting:
             if not kept:
                 raise
             return kept, int(getattr(stop, "number", signal.SIGINT))
+
+    def write_rows(self, data: Mapping[str, object], text: str, files: Mapping[str, Callable[[], bytes]], saved: str = "") -> None:
+        """Write the report `output`, if any, in the format of its suffix: one of `files`, `data` as JSON, or `text` as Markdown.
+
+        saved: text for --resume; only JSON and CSV contain it."""
+        if self.output is None:
+            return
+        suffix, field = self.output.suffix.lower(), {"resume": saved} if saved else {}
+        if suffix == ".json":
+            self.write(json_text({**data, **field}))
+        elif suffix in files:
+            write_bytes(self.output, b"".join([*(f"# {name}: {text}\n".encode() for name, text in field.items() if suffix == ".csv"),
+                                               files[suffix]()]))
+        else:
+            self.write(text)
 
     def write(self, text: str) -> None:
         if self.output is not None:
@@ -112,11 +145,12 @@ class Reporting:
             raise SystemExit(exit_code(interrupted))
 
 
-def reporting(report: str = "Write the tables as Markdown (.md)", *, cluster: bool = False,
+def reporting(report: str = "Write the tables as Markdown (.md)", *, cluster: bool = False, resume: bool = False,
               quiet: str = "Print no progress and no warnings") -> Decorator:
     """Return a decorator that adds the options of Reporting. The command receives the object as `how`. report, quiet: help of -o and -q."""
     file = click.option("-o", "--output", type=click.Path(path_type=Path), help=report)
     options: list[Decorator] = [SHARED["as_json"], quiet_option(quiet), file]
+    options += [RESUME] if resume else []
     return option_group("how", Reporting, names_of(Reporting), [*options, CLUSTER] if cluster else options)
 
 
@@ -161,9 +195,10 @@ def measured(plan: type[Plan]) -> click.Command:
 
     @click.command(plan.COMMAND.split()[-1], help=plan.__doc__)
     @planned(plan)
-    @reporting(plan.OUTPUT, cluster="meshes" in plan.__annotations__)
+    @reporting(plan.OUTPUT, cluster="meshes" in plan.__annotations__, resume=True)
     def command(how: Reporting, plan: Plan) -> None:
         from wrt.lab.bench import plot, report
+        from wrt.lab.bench.resume import text_of
         from wrt.lab.bench.sweep import by_mesh
 
         study = report.study_of(plan)
@@ -171,6 +206,7 @@ def measured(plan: type[Plan]) -> click.Command:
         suffix = how.check_report((".json", *writers))
         if suffix in (".png", ".svg"):
             plot.new_figure(1.0, 1.0)  # raises InputError if matplotlib is missing
+        finished = how.finished(plan)
         total = study.total(plan) if hasattr(study, "total") else None
         client = client_of(how.cluster)
         machine = study.machine(plan) if hasattr(study, "machine") else report.machine_line()
@@ -178,15 +214,18 @@ def measured(plan: type[Plan]) -> click.Command:
             from wrt.renderer.distributed.dask import machines
 
             machine = f"a cluster, each mesh on one worker: {machines(client)}; started from {machine}"
+        before = finished.rows
+        if before:
+            machine = f"{machine}; resumed after {len(before)} rows of: {finished.machine}"
+        finished.machine = machine
+        measure = partial(report.run, finished=finished.groups) if client is None else report.run
         with warnings_reported(how.quiet):
-            rows, interrupted = how.rows_of(lambda done: by_mesh(report.run, plan, done, client), partial(report.line, plan), total)
+            rows, interrupted = how.rows_of(lambda done: by_mesh(measure, plan, done, client), partial(report.line, plan), total, before)
         if interrupted is not None:
             machine = f"{machine}; interrupted after {len(rows)} row{'s' if len(rows) > 1 else ''}"
         text, data = report.text(rows, plan, machine), {"machine": machine, **report.data(rows, plan)}
-        if how.output is not None and suffix in writers:
-            write_bytes(how.output, writers[suffix](rows, plan, machine, suffix))
-        else:
-            how.write(json_text(data) if suffix == ".json" else text)
+        files = {name: partial(writer, rows, plan, machine, name) for name, writer in writers.items()}
+        how.write_rows(data, text, files, text_of(finished, plan) if interrupted is not None and client is None else "")
         how.end(text, {**data, "output": how.output}, interrupted=interrupted)
 
     return command

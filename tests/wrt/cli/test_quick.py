@@ -21,7 +21,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Collect the plans that `bench` runs, in their order, without measuring."""
     plans: list[Any] = []
 
-    def noted(plan: Any, reported: Any = None) -> list[Any]:
+    def noted(plan: Any, reported: Any = None, finished: Any = None) -> list[Any]:
         plans.append(plan)
         return []
 

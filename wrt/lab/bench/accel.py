@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import cache, partial
 from itertools import takewhile
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,8 +17,8 @@ from wrt.accel.scenes.build import build
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.errors import InputError
 from wrt.io.mesh_file import as_mesh
-from wrt.lab.bench.rays import RaySet, mean_counters, ray_sets
-from wrt.lab.bench.report import Columns, Part, Row, grouped, machine_line, mesh_name, tabled
+from wrt.lab.bench.rays import RAY_KINDS, RaySet, mean_counters, ray_sets
+from wrt.lab.bench.report import Columns, Groups, Part, Row, grouped, machine_line, mesh_name, tabled
 from wrt.lab.bench.report import run as run
 from wrt.lab.bench.stadium import in_stadium
 from wrt.lab.bench.timing import alternate, peak_bytes, spread
@@ -64,13 +65,32 @@ def total(plan: Plan) -> int:
     return (len(plan.meshes) or sum(1 for _ in meshes(plan))) * len(names(plan)) * len(set(plan.kinds))
 
 
+def groups(plan: Plan) -> Groups:
+    """For each mesh, yield the group of the structures that refuse it, then a group for each kind of ray."""
+    for mesh in meshes(plan):
+        ready = cache(partial(prepared, plan, mesh))
+        yield partial(refused_rows, ready)
+        for kind in (kind for kind in RAY_KINDS if kind in plan.kinds):
+            yield partial(kind_rows, plan, ready, kind)
 
-def rows(plan: Plan) -> Iterator[Row]:
-    return (row for mesh in meshes(plan) for row in mesh_rows(plan, mesh))
+
+class Prepared(NamedTuple):
+    """Structures over a mesh. facts: name -> fields of each of its rows; refused: rows with the reasons of the other structures;
+    yardstick, brute_force: give the right answers."""
+
+    accels: dict[str, Accelerator]
+    facts: dict[str, dict[str, object]]
+    refused: list[Row]
+    rays: dict[str, RaySet]
+    yardstick: Accelerator
+    brute_force: Accelerator
 
 
-def mesh_rows(plan: Plan, mesh: Mesh) -> Iterator[Row]:
-    """Yield a row with the reason for each structure that refuses the mesh, then a row for each kind of ray and each accepted structure."""
+def refused_rows(ready: Callable[[], Prepared]) -> list[Row]:
+    return ready().refused
+
+
+def prepared(plan: Plan, mesh: Mesh) -> Prepared:
     yardstick = build(Geometry.of(mesh), YARDSTICK)
     sets = ray_sets(yardstick, plan.rays, plan.seed)
     mesh = in_stadium(mesh) if plan.stadium else mesh
@@ -79,31 +99,37 @@ def mesh_rows(plan: Plan, mesh: Mesh) -> Iterator[Row]:
     n = len(geometry)
     built: dict[str, Accelerator] = {}
     facts: dict[str, dict[str, object]] = {}
+    refused = []
     for name in names(plan):
         warm_up(name)
         try:
             first, peak = peak_bytes(partial(build, geometry, name))
             accels = [first, *(build(geometry, name) for _ in range(plan.builds - 1))]
         except InputError as error:
-            yield Row(mesh=where, structure=name, reason=str(error))
+            refused.append(Row(mesh=where, structure=name, reason=str(error)))
             continue
         built[name], seconds, s = accels[-1], [accel.stats.build_seconds for accel in accels], accels[-1].stats
         facts[name] = {"mesh": where, "triangles": n, "structure": name, "build": seconds,
                        "build_median": float(np.median(seconds)), "peak_bytes": peak, "bytes_per_triangle": s.bytes / n,
                        "sah_cost": s.sah_cost, "depth": s.depth, "references": s.references}
-    brute_force = build(geometry, "brute_force")
-    checked = max(min(BRUTE_FORCE_TESTS // max(n, 1), plan.rays), 1)
-    for rays in (rays for kind, rays in sets.items() if kind in plan.kinds):
-        truth = answer(yardstick, rays, None)
-        few = rays.part(slice(None, None, max(len(rays) // checked, 1)))
-        exact = answer(brute_force, few, None)
-        counted = rays.part(slice(None, None, max(len(rays) // COUNTED_RAYS, 1)))
-        timed = alternate({name: partial(answer, accel, rays, plan.threads) for name, accel in built.items()}, plan.runs)
-        for name, accel in built.items():
-            yield Row(**facts[name], kind=rays.kind, rays=len(rays), checked=len(few),
-                      **mean_counters(accel, counted, nodes="nodes", boxes="boxes", primitives="primitives"),
-                      **timing(len(rays), timed[name], next(iter(timed.values()))),
-                      differ=differing(answer(accel, rays, None), truth), wrong=differing(answer(accel, few, None), exact))
+    return Prepared(built, facts, refused, sets, yardstick, build(geometry, "brute_force"))
+
+
+def kind_rows(plan: Plan, ready: Callable[[], Prepared], kind: str) -> list[Row]:
+    """Return a row for each accepted structure."""
+    mesh = ready()
+    rays = mesh.rays[kind]
+    checked = max(min(BRUTE_FORCE_TESTS // max(len(mesh.brute_force.geometry), 1), plan.rays), 1)
+    truth = answer(mesh.yardstick, rays, None)
+    few = rays.part(slice(None, None, max(len(rays) // checked, 1)))
+    exact = answer(mesh.brute_force, few, None)
+    counted = rays.part(slice(None, None, max(len(rays) // COUNTED_RAYS, 1)))
+    timed = alternate({name: partial(answer, accel, rays, plan.threads) for name, accel in mesh.accels.items()}, plan.runs)
+    return [Row(**mesh.facts[name], kind=rays.kind, rays=len(rays), checked=len(few),
+                **mean_counters(accel, counted, nodes="nodes", boxes="boxes", primitives="primitives"),
+                **timing(len(rays), timed[name], next(iter(timed.values()))),
+                differ=differing(answer(accel, rays, None), truth), wrong=differing(answer(accel, few, None), exact))
+            for name, accel in mesh.accels.items()]
 
 
 def timing(rays: int, seconds: np.ndarray, first: np.ndarray) -> dict[str, object]:

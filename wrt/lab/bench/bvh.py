@@ -25,9 +25,10 @@ from wrt.kernels.traverse.bvh2_kdop import kdop_volumes
 from wrt.kernels.traverse.bvh2_sphere import sphere_volumes
 from wrt.lab.bench.accel import differing
 from wrt.lab.bench.rays import RaySet, ball_around, endless, mean_counters, unit
-from wrt.lab.bench.report import Columns, Part, Row, cells, grouped, mesh_name, tabled
+from wrt.lab.bench.report import Columns, Groups, Part, Row, cells, grouped, mesh_name, tabled
 from wrt.lab.bench.timing import alternate, peak_bytes, spread
 from wrt.lab.plans import Bvh as Plan
+from wrt.scene.mesh import Mesh
 
 VOLUMES = ("bvh2", "bvh2_sphere", "bvh2_kdop")
 TESTED_RAYS, TESTED_NODES = 1024, 1024  # most rays and nodes that time one bounding volume alone
@@ -56,13 +57,17 @@ def total(plan: Plan) -> int:
     return len(plan.meshes) * (len(plan.builders or BVH_BUILDERS) + len(VOLUMES))
 
 
-
-def rows(plan: Plan) -> Iterator[Row]:
+def groups(plan: Plan) -> Groups:
     for mesh in map(as_mesh, plan.meshes):
-        geometry, name = Geometry.of(mesh), mesh_name(mesh)
-        rays = inward(geometry, plan.rays, plan.seed)
-        for measured in (*builder_rows(plan, geometry, rays), *volume_rows(plan, geometry, rays)):
-            yield Row(mesh=name, n_triangles=len(geometry), **measured)
+        for builder in plan.builders or BVH_BUILDERS:
+            yield partial(mesh_rows, plan, mesh, partial(builder_rows, builder))
+        yield partial(mesh_rows, plan, mesh, volume_rows)
+
+
+def mesh_rows(plan: Plan, mesh: Mesh, measure: Callable[[Plan, Geometry, RaySet], Iterator[dict[str, object]]]) -> list[Row]:
+    geometry = Geometry.of(mesh)
+    rays = inward(geometry, plan.rays, plan.seed)
+    return [Row(mesh=mesh_name(mesh), n_triangles=len(geometry), **measured) for measured in measure(plan, geometry, rays)]
 
 
 def inward(geometry: Geometry, n: int, seed: int = 0) -> RaySet:
@@ -80,22 +85,21 @@ def inward(geometry: Geometry, n: int, seed: int = 0) -> RaySet:
     return RaySet("inward", origins[:n], directions[:n], endless(n))
 
 
-def builder_rows(plan: Plan, geometry: Geometry, rays: RaySet) -> Iterator[dict[str, object]]:
+def builder_rows(name: str, plan: Plan, geometry: Geometry, rays: RaySet) -> Iterator[dict[str, object]]:
     small = Geometry(geometry.vertices, geometry.faces[:64], geometry.spheres)
-    for name in plan.builders or BVH_BUILDERS:
-        build_binary(small, BvhOptions(name), 1)  # compiles the kernels
-        grow = partial(build_binary, geometry, BvhOptions(name), thread_count(plan.threads))
-        _, peak = peak_bytes(grow)
-        seconds, cpu_begin = [], process_time()
-        for _ in range(plan.builds):
-            begin = perf_counter()
-            grow()
-            seconds.append(perf_counter() - begin)
-        cpu_seconds = (process_time() - cpu_begin) / plan.builds
-        accel = build(geometry, "bvh2", builder=name)
-        yield {"builder": name, "sah_cost": accel.stats.sah_cost, "cost": published_cost(accel, rays), "peak_bytes": peak,
-               **mean_counters(accel, rays, nodes="nodes", leaves="leaves", triangles="primitives"), "depth": accel.stats.depth,
-               "references": accel.stats.references, "seconds": seconds, "cpu_seconds": cpu_seconds}
+    build_binary(small, BvhOptions(name), 1)  # compiles the kernels
+    grow = partial(build_binary, geometry, BvhOptions(name), thread_count(plan.threads))
+    _, peak = peak_bytes(grow)
+    seconds, cpu_begin = [], process_time()
+    for _ in range(plan.builds):
+        begin = perf_counter()
+        grow()
+        seconds.append(perf_counter() - begin)
+    cpu_seconds = (process_time() - cpu_begin) / plan.builds
+    accel = build(geometry, "bvh2", builder=name)
+    yield {"builder": name, "sah_cost": accel.stats.sah_cost, "cost": published_cost(accel, rays), "peak_bytes": peak,
+           **mean_counters(accel, rays, nodes="nodes", leaves="leaves", triangles="primitives"), "depth": accel.stats.depth,
+           "references": accel.stats.references, "seconds": seconds, "cpu_seconds": cpu_seconds}
 
 
 def published_cost(accel: OneMesh, rays: RaySet) -> float:

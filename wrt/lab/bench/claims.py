@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from wrt.lab.bench.plot import new_figure, picture_file
-from wrt.lab.bench.report import Columns, Part, Row, grouped, tabled
+from wrt.lab.bench.report import Columns, Groups, Part, Row, grouped, tabled
 from wrt.lab.claims.claim import CLAIMS, SAME_SCENE, Figure, Study
 from wrt.lab.claims.nodes import NAMES, WIDTHS
 from wrt.lab.claims.scene_files import scene_files
@@ -39,11 +39,13 @@ def said(published: float | tuple[float, float] | None) -> str:
     return f"{published[0]:.4g} to {published[1]:.4g}" if isinstance(published, tuple | list) else f"{published:.4g}"
 
 
-def rows(plan: Plan) -> Iterator[Row]:
+def groups(plan: Plan) -> Groups:
     study = Study(scene_files(plan.scene), plan.side)
-    for name in dict.fromkeys(plan.names) or CLAIMS:
-        for figure in CLAIMS[name].measure(study):
-            yield row_of(name, figure)
+    return (partial(claim_rows, study, name) for name in dict.fromkeys(plan.names) or CLAIMS)
+
+
+def claim_rows(study: Study, name: str) -> list[Row]:
+    return [row_of(name, figure) for figure in CLAIMS[name].measure(study)]
 
 
 def row_of(name: str, figure: Figure) -> Row:
@@ -97,10 +99,10 @@ def rules_of(rows: Sequence[Row]) -> dict[str, tuple[str, dict[tuple[int, str], 
 
 
 def rules_tables(rows: Sequence[Row]) -> list[Part]:
-    """Return a table for each scene. A cell is empty if Ctrl-C came before its measurement."""
+    """Return a table for each scene."""
     return [Part(f"Nodes a ray by width, order and culling, {scene}", differences,
                  ("rules", *(f"width {width}" for width in WIDTHS)),
-                 [(name, *(f"{found[width, name]:.1f}" if (width, name) in found else "" for width in WIDTHS)) for name in NAMES.values()])
+                 [(name, *(f"{found[width, name]:.1f}" for width in WIDTHS)) for name in NAMES.values()])
             for scene, (differences, found) in rules_of(rows).items()]
 
 
@@ -182,8 +184,7 @@ def bars(axes: Axes, rows: Sequence[Row]) -> None:
 def curves(axes: Axes, scene: str, found: dict[tuple[int, str], float]) -> None:
     """Draw nodes a ray over the width."""
     for name in NAMES.values():
-        widths = [width for width in WIDTHS if (width, name) in found]
-        axes.plot(widths, [found[width, name] for width in widths], marker="o", label=name)
+        axes.plot(WIDTHS, [found[width, name] for width in WIDTHS], marker="o", label=name)
     axes.set_xticks(WIDTHS)
     axes.set_ylim(bottom=0.0)
     axes.set_title(f"rules: wrt's own, {scene}: width, order of children,\nculling of popped entries", fontsize="small", loc="left")

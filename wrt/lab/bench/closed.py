@@ -17,9 +17,9 @@ from wrt.accel.queries.all_hits import AllHits, all_hits, count_hits
 from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.io.mesh_file import as_mesh
-from wrt.lab.bench.report import Columns, Part, Row, mesh_name, tabled
+from wrt.lab.bench.report import Columns, Groups, Part, Row, mesh_name, tabled
 from wrt.lab.hard_cases.common import targets, unit_vectors
-from wrt.lab.oracle.oracle import Place, Reference
+from wrt.lab.oracle.oracle import Place, Reference, reference_of
 from wrt.lab.plans import Closed as Plan
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import box, icosphere, lathe, merged, teapot, torus, tube
@@ -46,22 +46,30 @@ def total(plan: Plan) -> int:
     return (len(made()) + len(plan.meshes)) * sum(1 for n in (plan.points, plan.rays) for _ in asked(plan, n))
 
 
-
-def rows(plan: Plan) -> Iterator[Row]:
+def groups(plan: Plan) -> Groups:
     for mesh in [*made(), *map(as_mesh, plan.meshes)]:
-        geometry = Geometry.of(mesh)
-        if open_edges(geometry):
+        if open_edges(Geometry.of(mesh)):
             raise InputError("the mesh is not closed: each edge needs two faces of opposite directions", place=mesh.name)
-        reference, accel = Reference(geometry), build(geometry)
-        known = {"mesh": mesh_name(mesh), "triangles": len(geometry.faces)}
-        for who, n in asked(plan, plan.points):
-            answer = partial(contains, accel) if who == "wrt" else OTHERS[who][1](geometry)[0]
-            answer(np.zeros((2, 3), np.float32))
-            yield Row(what="inside", who=who, **known, **points_wrong(geometry, reference, answer, n, plan.seed))
-        for who, n in asked(plan, plan.rays):
-            count = partial(count_hits, accel, crossings=True) if who == "wrt" else OTHERS[who][1](geometry)[1]
-            count(np.full((2, 3), 9.0, np.float32), np.ones((2, 3), np.float32))
-            yield Row(what="crossings", who=who, **known, **crossed(geometry, accel, count, who == "wrt", n, plan.seed))
+        for measure, n in ((inside_rows, plan.points), (crossing_rows, plan.rays)):
+            for who, most in asked(plan, n):
+                yield partial(measure, mesh, who, most, plan.seed)
+
+
+def inside_rows(mesh: Mesh, who: str, n: int, seed: int) -> list[Row]:
+    geometry = Geometry.of(mesh)
+    answer = partial(contains, build(geometry)) if who == "wrt" else OTHERS[who][1](geometry)[0]
+    answer(np.zeros((2, 3), np.float32))
+    return [Row(what="inside", who=who, mesh=mesh_name(mesh), triangles=len(geometry.faces),
+                **points_wrong(geometry, reference_of(mesh), answer, n, seed))]
+
+
+def crossing_rows(mesh: Mesh, who: str, n: int, seed: int) -> list[Row]:
+    geometry = Geometry.of(mesh)
+    accel = build(geometry)
+    count = partial(count_hits, accel, crossings=True) if who == "wrt" else OTHERS[who][1](geometry)[1]
+    count(np.full((2, 3), 9.0, np.float32), np.ones((2, 3), np.float32))
+    return [Row(what="crossings", who=who, mesh=mesh_name(mesh), triangles=len(geometry.faces),
+                **crossed(geometry, accel, count, who == "wrt", n, seed))]
 
 
 def made() -> list[Mesh]:

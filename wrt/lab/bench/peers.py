@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from time import perf_counter, thread_time
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -19,8 +19,8 @@ from wrt.lab.bench import peer_points, peer_tiles
 from wrt.lab.bench.accel import timing, warm_up
 from wrt.lab.bench.instruction_sets import instruction_sets
 from wrt.lab.bench.peer_chart import chart
-from wrt.lab.bench.rays import RaySet, ray_sets
-from wrt.lab.bench.report import Columns, Part, Row, grouped, machine_line, mesh_name, tabled, versions
+from wrt.lab.bench.rays import RAY_KINDS, RaySet, ray_sets
+from wrt.lab.bench.report import Columns, Groups, Part, Row, grouped, machine_line, mesh_name, tabled, versions
 from wrt.lab.bench.timing import alternate, spread
 from wrt.lab.hard_cases import tinybvh
 from wrt.lab.hard_cases.contestants import RIVALS, Algorithm, Own, Peer
@@ -43,33 +43,48 @@ relative. tiles: 64x64 primary rays in each of many worlds of 3,202 triangles. b
 WRITERS = {".svg": chart, ".png": chart}
 
 
-def rows(plan: Plan) -> Iterator[Row]:
+def groups(plan: Plan) -> Groups:
     for mesh in map(as_mesh, plan.meshes or [icosphere(5)]):
-        geometry, facts = Geometry.of(mesh), {"mesh": mesh_name(mesh), "triangles": len(mesh.faces)}
-        if set(plan.kinds) - {"points", "tiles"}:
-            for row in ray_rows(plan, geometry):
-                yield Row(**facts, **row)
-        if "points" in plan.kinds:
-            for row in point_rows(plan, geometry):
-                yield Row(**facts, **row)
+        ready = cache(partial(prepared, plan, Geometry.of(mesh)))
+        for kind in (kind for kind in RAY_KINDS if kind in plan.kinds):
+            for threads in thread_counts(plan):
+                yield partial(rows_on, [mesh], partial(ray_rows, plan, ready, kind, threads))
+        for threads in thread_counts(plan) if "points" in plan.kinds else ():
+            yield partial(rows_on, [mesh], partial(point_rows, plan, Geometry.of(mesh), threads))
     if "tiles" in plan.kinds:
         worlds = peer_tiles.small_worlds(plan.worlds, plan.seed)
-        for row in tile_rows(plan, worlds):
-            yield Row(mesh=f"{len(worlds)} worlds", triangles=sum(len(world.faces) for world in worlds), **row)
+        for threads in thread_counts(plan):
+            yield partial(rows_on, worlds, partial(tile_rows, plan, worlds, threads))
 
 
-def ray_rows(plan: Plan, geometry: Geometry) -> Iterator[dict[str, object]]:
-    algorithms, builds = contestants(plan), []
+def rows_on(meshes: Sequence[Mesh], measure: Callable[[], Iterator[dict[str, object]]]) -> list[Row]:
+    name = mesh_name(meshes[0]) if len(meshes) == 1 else f"{len(meshes)} worlds"
+    return [Row(mesh=name, triangles=sum(len(mesh.faces) for mesh in meshes), **row) for row in measure()]
+
+
+class Prepared(NamedTuple):
+    """Libraries that have a mesh. seconds: time of each library to build its structure; rays: kind of ray -> rays."""
+
+    algorithms: list[Algorithm]
+    seconds: list[float]
+    rays: dict[str, RaySet]
+
+
+def prepared(plan: Plan, geometry: Geometry) -> Prepared:
+    algorithms, seconds = contestants(plan), []
     for algorithm in algorithms:
         begin = perf_counter()
         algorithm.prepare(geometry)
-        builds.append(perf_counter() - begin)
-    for rays in ray_sets(cast(Own, algorithms[0]).accel, plan.rays, plan.seed).values():
-        for threads in thread_counts(plan) if rays.kind in plan.kinds else ():
-            for i, measured in enumerate(compared(algorithms, rays, threads, plan.runs, plan.device)):
-                name = algorithms[i].name
-                yield {"kind": rays.kind, "rays": len(rays), "name": name, "library": getattr(algorithms[i], "family", "") or name,
-                       "build": builds[i], "threads": threads, **measured}
+        seconds.append(perf_counter() - begin)
+    return Prepared(algorithms, seconds, ray_sets(cast(Own, algorithms[0]).accel, plan.rays, plan.seed))
+
+
+def ray_rows(plan: Plan, ready: Callable[[], Prepared], kind: str, threads: int) -> Iterator[dict[str, object]]:
+    algorithms, seconds, sets = ready()
+    for i, measured in enumerate(compared(algorithms, sets[kind], threads, plan.runs, plan.device)):
+        name = algorithms[i].name
+        yield {"kind": kind, "rays": len(sets[kind]), "name": name, "library": getattr(algorithms[i], "family", "") or name,
+               "build": seconds[i], "threads": threads, **measured}
 
 
 def contestants(plan: Plan) -> list[Algorithm]:
@@ -120,40 +135,38 @@ def completed(work: Callable[[], object], device: str) -> object:
     return out
 
 
-def point_rows(plan: Plan, geometry: Geometry) -> Iterator[dict[str, object]]:
+def point_rows(plan: Plan, geometry: Geometry, threads: int) -> Iterator[dict[str, object]]:
     """Yield the figures of each library that finds closest points."""
     points = peer_points.points_around(geometry, plan.rays, plan.seed)
     chosen = [each for name, each in peer_points.LIBRARIES.items() if each.is_installed() and (each.on_gpu or plan.device == "cpu")
               and (name == "wrt" or not plan.rivals or name in plan.rivals)]
-    for threads in thread_counts(plan):
-        libraries, queries, builds = [each for each in chosen if each.has_threads or threads == 1], [], []
-        for library in libraries:
-            begin = perf_counter()
-            queries.append(library.prepare(geometry, plan.device))
-            builds.append(perf_counter() - begin)
-        works = [partial(query, points, threads) for query in queries]
-        found = [work() for work in works]
-        for i, measured in enumerate(timed(works, len(points), threads, plan.runs, plan.device)):
-            name = libraries[i].name
-            yield {"kind": "points", "rays": len(points), "name": name, "library": name, "build": builds[i], "threads": threads,
-                   "hit": 1.0, **measured, "differ": different_lengths(found[i], found[0])}
+    libraries, queries, builds = [each for each in chosen if each.has_threads or threads == 1], [], []
+    for library in libraries:
+        begin = perf_counter()
+        queries.append(library.prepare(geometry, plan.device))
+        builds.append(perf_counter() - begin)
+    works = [partial(query, points, threads) for query in queries]
+    found = [work() for work in works]
+    for i, measured in enumerate(timed(works, len(points), threads, plan.runs, plan.device)):
+        name = libraries[i].name
+        yield {"kind": "points", "rays": len(points), "name": name, "library": name, "build": builds[i], "threads": threads,
+               "hit": 1.0, **measured, "differ": different_lengths(found[i], found[0])}
 
 
-def tile_rows(plan: Plan, worlds: Sequence[Mesh]) -> Iterator[dict[str, object]]:
+def tile_rows(plan: Plan, worlds: Sequence[Mesh], threads: int) -> Iterator[dict[str, object]]:
     """Yield the figures of each library for a picture of each world."""
     rays = peer_tiles.tiles(len(worlds))
-    for threads in thread_counts(plan):
-        libraries, builds = [], []
-        for make in peer_tiles.libraries(worlds, rays, plan.device, threads):
-            begin = perf_counter()
-            libraries.append(make())
-            builds.append(perf_counter() - begin)
-        found = [library.found(library.work()) for library in libraries]
-        for i, measured in enumerate(timed([library.work for library in libraries], len(rays.world), threads, plan.runs, plan.device)):
-            name = libraries[i].name
-            yield {"kind": "tiles", "rays": len(rays.world), "name": name, "library": name.split(",")[0], "build": builds[i],
-                   "threads": threads, "hit": float(np.isfinite(found[0]).mean()), **measured,
-                   "differ": different_lengths(found[i], found[0])}
+    libraries, builds = [], []
+    for make in peer_tiles.libraries(worlds, rays, plan.device, threads):
+        begin = perf_counter()
+        libraries.append(make())
+        builds.append(perf_counter() - begin)
+    found = [library.found(library.work()) for library in libraries]
+    for i, measured in enumerate(timed([library.work for library in libraries], len(rays.world), threads, plan.runs, plan.device)):
+        name = libraries[i].name
+        yield {"kind": "tiles", "rays": len(rays.world), "name": name, "library": name.split(",")[0], "build": builds[i],
+               "threads": threads, "hit": float(np.isfinite(found[0]).mean()), **measured,
+               "differ": different_lengths(found[i], found[0])}
 
 
 def searching(algorithm: Algorithm, rays: RaySet, threads: int) -> Callable[[], list[object]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +13,7 @@ import numpy as np
 from wrt.core.checks import as_size
 from wrt.core.device import load_kernel, start
 from wrt.io.load import load_scene
-from wrt.lab.bench.report import Columns, Part, Row, cells
+from wrt.lab.bench.report import Columns, Groups, Part, Row, cells
 from wrt.lab.bench.timing import alternate, spread
 from wrt.lab.plans import Pictures as Plan
 from wrt.renderer.film_arrays import DeviceFilm
@@ -38,14 +38,16 @@ def total(plan: Plan) -> int:
     return len(plan.scenes)
 
 
+def groups(plan: Plan) -> Groups:
+    return (partial(scene_rows, plan, path) for path in plan.scenes)
 
-def rows(plan: Plan) -> Iterator[Row]:
-    for path in plan.scenes:
-        scene = load_scene(path).with_settings(size=as_size(plan.size), spp=plan.spp)
-        waves = prepare(plan_of(scene, Options(threads=1, accel=plan.accel, device="cpu")), start("cpu"))
-        kernel = render_kernel(waves.plan.features, waves.plan.structure)
-        load_kernel(kernel, waves.device)
-        yield row_of(Path(path).name, {"loop": replace(waves, waves=None, kernels=[kernel]), "waves": waves}, plan)
+
+def scene_rows(plan: Plan, path: Path) -> list[Row]:
+    scene = load_scene(path).with_settings(size=as_size(plan.size), spp=plan.spp)
+    waves = prepare(plan_of(scene, Options(threads=1, accel=plan.accel, device="cpu")), start("cpu"))
+    kernel = render_kernel(waves.plan.features, waves.plan.structure)
+    load_kernel(kernel, waves.device)
+    return [row_of(Path(path).name, {"loop": replace(waves, waves=None, kernels=[kernel]), "waves": waves}, plan)]
 
 
 def row_of(name: str, ways: dict[str, Prepared], plan: Plan) -> Row:

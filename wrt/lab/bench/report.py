@@ -5,9 +5,10 @@ from __future__ import annotations
 import csv
 import importlib
 import io
+import itertools
 import json
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass
 from functools import partial
@@ -79,20 +80,27 @@ def grouped(rows: Iterable[Row], *names: str) -> dict[tuple[Any, ...], list[Row]
 def study_of(plan: Plan) -> ModuleType:
     """Return the module that measures a plan.
 
-    The module has TITLE, LEGEND, and rows(plan), which yields each Row once it is measured. COLUMNS or parts(rows, plan) make the tables.
+    The module has TITLE, LEGEND, and groups(plan). It yields functions; each measures a group of Rows that are compared with each other.
+    A resumed run skips the first functions, so what they share is made on first use. COLUMNS or parts(rows, plan) make the tables.
     Optional are machine(plan) for the report, line(row) for a line of progress, facts(rows, plan) for more JSON fields, total(plan) for
     the expected number of rows, and WRITERS for -o (see below)."""
     return importlib.import_module(plan.STUDY)
 
 
-def run(plan: Plan, report: Callable[[Row], None] | None = None) -> Rows[Row]:
-    """Measure everything and return the rows; `report` receives each row once it is measured."""
-    out = Rows[Row]([], partial(page, plan))  # a lambda could not be pickled by a worker
-    for row in study_of(plan).rows(plan):
-        out.append(row)
+Groups = Iterator[Callable[[], list[Row]]]
+
+
+def run(plan: Plan, report: Callable[[Row], None] | None = None, finished: list[list[Row]] | None = None) -> Rows[Row]:
+    """Measure everything and return the rows; `report` receives each row once its group is measured.
+
+    finished: groups that an earlier run has measured; they are not measured again. Each new group is appended to this list."""
+    finished = [] if finished is None else finished
+    for measure in itertools.islice(study_of(plan).groups(plan), len(finished), None):
+        finished.append(measure())
         if report is not None:
-            report(row)
-    return out
+            for row in finished[-1]:
+                report(row)
+    return Rows[Row](itertools.chain.from_iterable(finished), partial(page, plan))  # a lambda could not be pickled by a worker
 
 
 def parts_of(rows: Sequence[Row], plan: Plan) -> list[Part]:

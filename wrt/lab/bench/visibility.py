@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from wrt.accel.scenes.build import build
 from wrt.core.threads import thread_count
 from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench.rasterizer import Rasterizer, RayCaster
-from wrt.lab.bench.report import Columns, Part, Row, grouped, machine_line, tabled
+from wrt.lab.bench.report import Columns, Groups, Part, Row, grouped, machine_line, tabled
 from wrt.lab.bench.timing import alternate, spread
 from wrt.lab.bench.visibility_check import agreement
 from wrt.lab.plans import Visibility as Plan
@@ -106,20 +106,23 @@ def framing(mesh: Mesh) -> Camera:
     return frame_camera(Scene(objects=(Object(mesh, (Material(),)),)))
 
 
-def rows(plan: Plan) -> Iterator[Row]:
+def groups(plan: Plan) -> Groups:
     sides = [MIN_SIDE * 2**k for k in range(int(math.log2(plan.max_size / MIN_SIDE)) + 1)]
     for surface in surfaces(plan):
         swept = min(surface.meshes, key=lambda mesh: abs(math.log(len(mesh.faces) / SWEEP_TRIANGLES)))
         for mesh in surface.meshes:
-            measure = ready(plan, surface, Geometry.of(mesh))
-            yield measure("triangles", plan.size)
-            if mesh is swept:
-                for side in sides:
-                    yield measure("pixels", side)
+            made = cache(partial(ready, plan, surface, mesh))
+            for sweep, side in [("triangles", plan.size), *(("pixels", side) for side in sides if mesh is swept)]:
+                yield partial(picture_rows, made, sweep, side)
 
 
-def ready(plan: Plan, surface: Surface, geometry: Geometry) -> Callable[[str, int], Row]:
-    """Prepare one geometry for both methods. Return a function (sweep, side) -> row that measures a picture of `side` x `side` pixels."""
+def picture_rows(made: Callable[[], Callable[[str, int], Row]], sweep: str, side: int) -> list[Row]:
+    return [made()(sweep, side)]
+
+
+def ready(plan: Plan, surface: Surface, mesh: Mesh) -> Callable[[str, int], Row]:
+    """Prepare one mesh for both methods. Return a function (sweep, side) -> row that measures a picture of `side` x `side` pixels."""
+    geometry = Geometry.of(mesh)
     rasterizer = Rasterizer(geometry, plan.device, plan.threads)
     caster = RayCaster(geometry, plan.accel, plan.device, plan.threads)
     again = [build(geometry, plan.accel, plan.device, plan.threads) for _ in range(min(plan.runs, MAX_BUILDS) - 1)]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from functools import partial
 from statistics import median
 
-from wrt.lab.bench.report import Columns, Part, Row, cells, grouped, machine_line, versions
+from wrt.lab.bench.report import Columns, Groups, Part, Row, cells, grouped, machine_line, versions
 from wrt.lab.hard_cases.conformance import COLUMNS as CASE_COLUMNS
-from wrt.lab.hard_cases.conformance import results
-from wrt.lab.hard_cases.libraries import LIBRARIES, usable
+from wrt.lab.hard_cases.conformance import Case, case_names
+from wrt.lab.hard_cases.libraries import LIBRARIES, Library, usable
 from wrt.lab.plans import HardCases as Plan
 
 KINDS = ("lost", "invented", "wrong_triangle")
@@ -20,14 +21,19 @@ rounding, or reported points that are not on the ray. wrong triangle: another tr
 distance any face is right. ulp: largest error of t, in float32 steps at the exact t. Input that is not finite may be refused."""
 
 
-def rows(plan: Plan) -> Iterator[Row]:
+def groups(plan: Plan) -> Groups:
     for name in plan.libraries or LIBRARIES:
         library, reason = LIBRARIES[name], usable(name)
         if reason:
-            yield Row(library=library.name, missing=reason)
+            yield partial(list, [Row(library=library.name, missing=reason)])
             continue
-        for result in results(library.closest_hit, plan.cases, plan.rays, plan.seed):
-            yield Row(library=library.name, missing="", note=result.note, wrong=result.wrong, **vars(result))
+        for case in case_names(plan.cases):
+            yield partial(case_rows, library, Case(case, plan.rays, plan.seed))
+
+
+def case_rows(library: Library, case: Case) -> list[Row]:
+    result = case.result(library.closest_hit)
+    return [Row(library=library.name, missing="", note=result.note, wrong=result.wrong, **vars(result))]
 
 
 def line(row: Row) -> str:

@@ -11,7 +11,7 @@ from wrt.lab.bench.report import Columns, Part, machine_line, markdown, repeatin
 from wrt.lab.bench.report import Row as Line
 from wrt.lab.bench.timing import shown
 from wrt.lab.hard_cases.cases import Verdict
-from wrt.lab.hard_cases.stability import COLUMNS, COMPARED, Plan, Result, Row
+from wrt.lab.hard_cases.stability import COLUMNS, COMPARED, CaseRow, Plan, Result
 
 LEGEND = f"""\
 judged: the first rays of a case, {{sample}} at most, which the oracle judges. For further rays the right answer is known in advance:
@@ -23,7 +23,7 @@ passes an edge by less than the bound. duplicates: an all-hits query reports one
 steps at the exact t. t / bound: largest error of t over its bound."""
 
 
-def sums(rows: Sequence[Row]) -> dict[str, Verdict]:
+def sums(rows: Sequence[CaseRow]) -> dict[str, Verdict]:
     """Return the sum of each algorithm's verdicts over all cases."""
     out: dict[str, Verdict] = {}
     for row in rows:
@@ -35,7 +35,7 @@ def wrong(verdict: Verdict) -> int:
     return verdict.misses + verdict.false_hits + verdict.wrong_prim + verdict.self_hits
 
 
-def usual_error(rows: Sequence[Row], algorithm: str) -> float:
+def usual_error(rows: Sequence[CaseRow], algorithm: str) -> float:
     """Return the median over the cases of the 99.9th percentile of the error of t, in ulp.
     A percentile over all rays would show only two or three ill-conditioned cases, such as edge-on or denormal triangles."""
     errors = [row.verdict.t.percentile(99.9) for row in rows if row.algorithm == algorithm]
@@ -70,9 +70,9 @@ def _groups(result: Result) -> Part:
                            for name, group in groups.items()], f"The default ({default}) by group")
 
 
-def text(result: Result, plan: Plan) -> str:
+def text(result: Result, plan: Plan, machine: str) -> str:
     """Return the whole report as Markdown."""
-    head = "\n\n".join([f"Machine: {machine(plan)}; the run took {result.seconds:.0f} s.", f"To repeat: `{repeating(plan)}`",
+    head = "\n\n".join([f"Machine: {machine}; the run took {result.seconds:.0f} s.", f"To repeat: `{repeating(plan)}`",
                         LEGEND.format(sample=plan.sample), *(f"{line}." for line in _notes(result))])
     return markdown([Part("Stability of the intersection tests", head), _summary(result), _groups(result),
                      tabled(COLUMNS, result.rows, "Every case")])

@@ -31,6 +31,7 @@ from wrt.lab.bench.sweep import cancel, one_at_a_time, result, submitter
 from wrt.lab.bench.timing import alternate, quartiles
 from wrt.lab.hard_cases.cases import UNKNOWN, HardCase, Verdict, check, chosen, chunks, fewer, generate, judge, judge_all_hits, judge_next
 from wrt.lab.hard_cases.contestants import PEERS, Algorithm, Own, own_algorithms
+from wrt.lab.hard_cases.judge import Errors
 from wrt.lab.plans import Stability as Plan
 from wrt.renderer.distributed.installed import DIGEST
 from wrt.renderer.distributed.workers import worker_name
@@ -53,7 +54,7 @@ COLUMNS: Columns = {
 
 
 @dataclass
-class Row:
+class CaseRow:
     """Result of one case and algorithm. judged: rays that the oracle judged; refused: None for finite input, True if refused."""
 
     case: str
@@ -66,28 +67,37 @@ class Row:
         return {name: value for name, value in vars(self).items() if name != "verdict"} | self.verdict.as_dict()
 
 
+CLASSES = (CaseRow, Verdict, Errors)  # of the objects that a resumed run restores
+
+
 class Result(Line):
-    """Results of `run`. rows: a Row for each case and algorithm; speed: algorithm -> result of `measure_speed`.
+    """Results of `run`. rows: a CaseRow for each case and algorithm; speed: algorithm -> result of `measure_speed`.
     - not_installed: names of missing libraries; undone: names of unfinished cases; interrupted: number of the signal that ended the run."""
 
 
-def run(plan: Plan, report: Callable[[Row], None] = lambda row: None,
-        progress: Callable[[str], None] = lambda line: None, executor: object = None) -> Result:
+def run(plan: Plan, report: Callable[[CaseRow], None] = lambda row: None, progress: Callable[[str], None] = lambda line: None,
+        executor: object = None, finished: list[list[Any]] | None = None) -> Result:
     """Run every chosen case with every algorithm, on the same rays.
 
     - report: receives each finished row; progress: receives lines of text from any thread.
     - executor: a concurrent.futures.Executor or dask.distributed.Client; its workers trace and judge, and this process measures speed.
+    - finished: the speeds, then the rows of each case and algorithm, as an earlier run measured them. New ones are appended.
 
     After Ctrl-C, return the finished rows, or raise KeyboardInterrupt if no row is finished. Raise InputError for an unknown case."""
     begin, names, algorithms = time.perf_counter(), chosen(plan.cases), all_algorithms(plan)
-    progress("measuring the speed")
-    found = Result(rows=[], speed=measure_speed(algorithms, plan.runs), interrupted=None, undone=[],
+    finished = [] if finished is None else finished
+    if not finished:
+        progress("measuring the speed")
+        finished.append([measure_speed(algorithms, plan.runs)])
+    found = Result(rows=[], speed=finished[0][0], interrupted=None, undone=[],
                    not_installed=[peer.name for peer in PEERS.values() if plan.peers and not peer.is_installed()])
     pool = None if executor is None else submitter(executor)
     try:
-        for row in _rows(names, [algorithm.name for algorithm in algorithms], plan, progress, pool):
-            found.rows.append(row)
-            report(row)
+        tasks = [(name, algorithm.name) for name in names for algorithm in algorithms]
+        for rows in chain(finished[1:], _rows(tasks[len(finished) - 1:], algorithms[0].name, plan, progress, pool, finished)):
+            found.rows += rows
+            for row in rows:
+                report(row)
     except KeyboardInterrupt as stop:
         if not found.rows:
             raise
@@ -103,32 +113,32 @@ def all_algorithms(plan: Plan) -> list[Algorithm]:
     return [*own_algorithms(), *(peer() for peer in PEERS.values() if plan.peers and peer.is_installed())]
 
 
-def _rows(names: list[str], algorithms: list[str], plan: Plan, progress: Callable[[str], None], pool: Any) -> Iterator[Row]:
-    """Yield the row of each case and algorithm. A pool gets a task for each row and for each chunk of rays beyond the sample."""
-    tasks = [(name, algorithm) for name in names for algorithm in algorithms]
+def _rows(tasks: list[tuple[str, str]], default: str, plan: Plan, progress: Callable[[str], None], pool: Any,
+          finished: list[list[Any]]) -> Iterator[list[CaseRow]]:
+    """Yield the row of each case and algorithm, or none if the algorithm does not support the case; append the same to `finished`.
+    A pool gets a task for each row and for each chunk of rays beyond the sample, which only the default algorithm traces."""
     futures, further = {}, {}
     if pool is not None:
         futures = {task: pool.submit(one_at_a_time, DIGEST, case_row, *task, plan) for task in tasks}
         further = {name: [pool.submit(one_at_a_time, DIGEST, further_chunk, name, plan, index) for index in range(n_chunks(name, plan))]
-                   for name in names}
+                   for name in dict.fromkeys(name for name, _ in tasks)}
     left = TimeLeft(len(tasks))
     try:
         for i, (name, algorithm) in enumerate(tasks):
             left.done = i
             progress(f"{i} of {len(tasks)} rows are done; now {name}, {algorithm}{left}")
             row = result(pool, futures[name, algorithm]) if pool is not None else case_row(name, algorithm, plan)
-            if row is None:
-                continue
-            if algorithm == algorithms[0] and row.refused is None:
+            if row is not None and algorithm == default and row.refused is None:
                 rest = (result(pool, part) for part in further[name]) if pool is not None else judge_further(name, plan, progress)
                 row.verdict = sum(rest, row.verdict)
-            yield row
+            finished.append([] if row is None else [row])
+            yield finished[-1]
     finally:
         if pool is not None:
             cancel(pool, chain(futures.values(), *further.values()))
 
 
-def case_row(name: str, algorithm: str, plan: Plan) -> Row | None:
+def case_row(name: str, algorithm: str, plan: Plan) -> CaseRow | None:
     """Run a case with the algorithm of this name. Raise InputError if this worker does not have the algorithm."""
     known = {each.name: each for each in all_algorithms(plan)}
     if algorithm not in known:
@@ -136,10 +146,10 @@ def case_row(name: str, algorithm: str, plan: Plan) -> Row | None:
     return run_case(name, fewer(name, min(plan.sample, plan.rays)), known[algorithm], plan.seed)
 
 
-def run_case(name: str, rays: int, algorithm: Algorithm, seed: int = 0) -> Row | None:
+def run_case(name: str, rays: int, algorithm: Algorithm, seed: int = 0) -> CaseRow | None:
     """Run one case, let the oracle judge it, and return its row, or None if the algorithm does not support the case.
     Peers support only triangles, finite input and t_min = 0."""
-    row = Row(name, algorithm.name)
+    row = CaseRow(name, algorithm.name)
     for case in chunks(name, rays, seed):
         if case.refused:
             if algorithm.is_peer:

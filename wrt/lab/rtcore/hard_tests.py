@@ -4,7 +4,7 @@ Record the triangle tests of closest-hit queries through bvh2, then classify eac
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -18,8 +18,9 @@ from wrt.kernels.structs import Primitive, size_of
 from wrt.kernels.study.hard_tests import HARD, REFUSED, classify
 from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
 from wrt.lab.bench.rays import RaySet, ray_sets
-from wrt.lab.bench.report import Columns, Row, mesh_name
+from wrt.lab.bench.report import Columns, Groups, Row, mesh_name
 from wrt.lab.plans import Float64 as Plan
+from wrt.scene.mesh import Mesh
 
 TITLE = "How often the triangle test needs float64 on a GPU"
 COLUMNS: Columns = {
@@ -35,13 +36,14 @@ def total(plan: Plan) -> int:
     return len(plan.meshes) * len(plan.kinds)
 
 
+def groups(plan: Plan) -> Groups:
+    return (partial(mesh_rows, plan, mesh) for mesh in map(as_mesh, plan.meshes))
 
-def rows(plan: Plan) -> Iterator[Row]:
-    for mesh in map(as_mesh, plan.meshes):
-        accel = build(mesh, "bvh2")
-        sets = ray_sets(accel, plan.rays, plan.seed, plan.inside)
-        for kind in plan.kinds:
-            yield Row(mesh=mesh_name(mesh), kind=kind, **counted(accel, sets[kind]))
+
+def mesh_rows(plan: Plan, mesh: Mesh) -> list[Row]:
+    accel = build(mesh, "bvh2")
+    sets = ray_sets(accel, plan.rays, plan.seed, plan.inside)
+    return [Row(mesh=mesh_name(mesh), kind=kind, **counted(accel, sets[kind])) for kind in plan.kinds]
 
 
 def counted(accel: Accelerator, rays: RaySet) -> dict[str, int]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from wrt.core.errors import InputError
 from wrt.core.write_file import check_writable
 from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench.rays import RaySet, ray_sets
-from wrt.lab.bench.report import Columns, Part, Row, grouped, mesh_name, tabled
+from wrt.lab.bench.report import Columns, Groups, Part, Row, grouped, mesh_name, tabled
 from wrt.lab.plans import RtCore as Plan
 from wrt.lab.rtcore.model import LEGEND as LEGEND
 from wrt.lab.rtcore.model import MODEL_COLUMNS, model_row, parameters, simt, trace_rays
@@ -25,6 +26,7 @@ from wrt.lab.rtcore.parameters import GPUS
 from wrt.lab.rtcore.trace import Trace
 from wrt.lab.rtcore.trace import trace as record
 from wrt.lab.rtcore.warps import WARP, blocks
+from wrt.scene.mesh import Mesh
 
 
 def bvhs() -> list[str]:
@@ -65,33 +67,45 @@ def check_trace(plan: Plan) -> None:
     check_writable(plan.trace)
 
 
-def row_of_trace(trace: Trace, name: str, plan: Plan) -> Row:
+def trace_rows(plan: Plan, path: Path) -> list[Row]:
+    trace = Trace.load(path)
     work = trace.work("trace")
-    return model_row(work, GPUS[plan.gpu], simt(work.counters.counts, work.warp, trace.origin, trace.direction), mesh=name,
-                     mesh_triangles=0, structure=trace.structure, bytes=0)
+    return [model_row(work, GPUS[plan.gpu], simt(work.counters.counts, work.warp, trace.origin, trace.direction), mesh=mesh_name(path),
+                      mesh_triangles=0, structure=trace.structure, bytes=0)]
 
 
-def rows(plan: Plan) -> Iterator[Row]:
+def groups(plan: Plan) -> Groups:
     check_trace(plan)
     for path in plan.meshes:
         if isinstance(path, str | Path) and Path(path).suffix.lower() == ".npz":
-            yield row_of_trace(Trace.load(path), mesh_name(path), plan)
+            yield partial(trace_rows, plan, Path(path))
             continue
         mesh = as_mesh(path)
-        geometry, sets = Geometry.of(mesh), None
-        for name in dict.fromkeys(plan.structures) or bvhs():
-            accel = build(geometry, name)
-            sets = sets or in_warps(accel, ray_sets(accel, plan.rays, plan.seed, plan.inside))
-            for rays in (sets[kind] for kind in plan.kinds):
-                if plan.trace:
-                    recorded = record(accel, rays.origins, rays.directions, t_max=rays.t_max)
-                    recorded.save(plan.trace)
-                    work = recorded.work(rays.kind)
-                else:  # shadow rays also search the closest hit
-                    work = trace_rays(accel, rays.kind, rays.origins, rays.directions, rays.t_max)
-                efficiencies = simt(work.counters.counts, work.warp, rays.origins, rays.directions)
-                yield model_row(work, GPUS[plan.gpu], efficiencies, mesh=mesh_name(mesh),
-                                mesh_triangles=len(geometry), structure=name, bytes=accel.stats.bytes)
+        names = list(dict.fromkeys(plan.structures)) or bvhs()
+        rays = cache(partial(mesh_rays, plan, mesh, names[0]))
+        for name in names:
+            yield partial(structure_rows, plan, mesh, name, rays)
+
+
+def mesh_rays(plan: Plan, mesh: Mesh, structure: str) -> dict[str, RaySet]:
+    accel = build(Geometry.of(mesh), structure)
+    return in_warps(accel, ray_sets(accel, plan.rays, plan.seed, plan.inside))
+
+
+def structure_rows(plan: Plan, mesh: Mesh, structure: str, rays_by_kind: Callable[[], dict[str, RaySet]]) -> list[Row]:
+    geometry, out = Geometry.of(mesh), []
+    accel = build(geometry, structure)
+    for rays in (rays_by_kind()[kind] for kind in plan.kinds):
+        if plan.trace:
+            recorded = record(accel, rays.origins, rays.directions, t_max=rays.t_max)
+            recorded.save(plan.trace)
+            work = recorded.work(rays.kind)
+        else:  # shadow rays also search the closest hit
+            work = trace_rays(accel, rays.kind, rays.origins, rays.directions, rays.t_max)
+        efficiencies = simt(work.counters.counts, work.warp, rays.origins, rays.directions)
+        out.append(model_row(work, GPUS[plan.gpu], efficiencies, mesh=mesh_name(mesh), mesh_triangles=len(geometry),
+                             structure=structure, bytes=accel.stats.bytes))
+    return out
 
 
 def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,7 @@ from wrt.io.mesh_file import as_mesh
 from wrt.kernels.study.bvh2_study import LEVELS, STACK_SIZE, Study, child_0_first
 from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
 from wrt.lab.bench.rays import RaySet, ray_sets
-from wrt.lab.bench.report import Columns, Part, Row, cells, mesh_name, tabled
+from wrt.lab.bench.report import Columns, Groups, Part, Row, cells, mesh_name, tabled
 from wrt.lab.bench.report import run as run
 from wrt.lab.plans import WhatIf as Plan
 from wrt.lab.rtcore.meshes import bvhs, in_warps
@@ -184,17 +184,19 @@ STUDIES: dict[str, Callable[[Bvh2, RaySet], Iterator[Variant]]] = {
     "width": width, "stack": stack, "planes": planes, "order": order, "sorting": sorting, "rates": width}
 
 
-def rows(plan: Plan) -> Iterator[Row]:
+def groups(plan: Plan) -> Groups:
+    return (partial(kind_rows, plan, kind) for kind in dict.fromkeys(plan.kinds))
+
+
+def kind_rows(plan: Plan, kind: str) -> list[Row]:
     tree = Bvh2(Geometry.of(as_mesh(plan.mesh)))
-    sets = in_warps(tree, ray_sets(tree, plan.rays, plan.seed, plan.inside))
-    for kind in dict.fromkeys(plan.kinds):
-        first = None
-        for variant in STUDIES[plan.study](tree, sets[kind]):
-            first = first or variant
-            if plan.study == "rates":
-                yield from rate_rows(variant, kind, GPUS[plan.gpu])
-            else:
-                yield row_of(variant, first, kind, GPUS[plan.gpu])
+    rays = in_warps(tree, ray_sets(tree, plan.rays, plan.seed, plan.inside))[kind]
+    first: Variant | None = None
+    out: list[Row] = []
+    for variant in STUDIES[plan.study](tree, rays):
+        first = first or variant
+        out += rate_rows(variant, kind, GPUS[plan.gpu]) if plan.study == "rates" else [row_of(variant, first, kind, GPUS[plan.gpu])]
+    return out
 
 
 def row_of(variant: Variant, first: Variant, kind: str, gpu: Gpu) -> Row:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import itertools
 import json
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from PIL import Image
 from tests.command_line import wrt
 from tests.refused import refused
 from wrt.lab.bench import claims as bench
-from wrt.lab.bench.report import Row, markdown
+from wrt.lab.bench.report import Row, markdown, run
 from wrt.lab.bench.visibility import terrain
 from wrt.lab.claims import scenes
 from wrt.lab.claims.claim import CLAIMS, Claim, Figure, Study
@@ -57,13 +56,13 @@ def test_every_claim_says_what_differs_and_why(name: str) -> None:
 
 def test_equal_options_give_equal_rows() -> None:
     plan = Plan(names=("ttp-nodes", "coop-rt"), side=16)
-    one, two = ([row.as_dict() for row in bench.rows(plan)] for _ in range(2))
+    one, two = ([row.as_dict() for row in run(plan)] for _ in range(2))
     assert one == two and {row["claim"] for row in one} == {"ttp-nodes", "coop-rt"}
 
 
 def test_the_report_has_the_numbers_the_sources_and_the_table_of_rules() -> None:
     plan = Plan(names=("rules", "ttp-nodes"), side=16)
-    rows = list(bench.rows(plan))
+    rows = run(plan)
     text = markdown(bench.parts(rows, plan))
     assert "arXiv 2605.16253, Table I" in text and "of 6 compared numbers agree" in text and "width 8" in text
     picture = bench.as_picture(rows, plan, "", ".png")
@@ -71,17 +70,9 @@ def test_the_report_has_the_numbers_the_sources_and_the_table_of_rules() -> None
 
 def test_each_table_of_rules_names_its_own_scene() -> None:
     plan = Plan(names=("rules",), side=8)
-    tables = {part.title: part.text for part in bench.parts(list(bench.rows(plan)), plan) if part.title.startswith("Nodes a ray")}
+    tables = {part.title: part.text for part in bench.parts(run(plan), plan) if part.title.startswith("Nodes a ray")}
     assert [text.split(":")[0] for text in tables.values()] == ["scene ball", "scene terrain"]
     assert [title.split(", ")[-1] for title in tables] == ["bunny", "sponza"]
-
-
-def test_rules_that_ctrl_c_cut_off_are_empty_cells() -> None:
-    plan = Plan(names=("rules",), side=8)
-    rows = list(itertools.islice(bench.rows(plan), 5))
-    (table,) = (part for part in bench.parts(rows, plan) if part.lines and part.title.startswith("Nodes a ray"))
-    assert [[cell == "" for cell in line[1:]] for line in table.lines] == [[False, False, True, True]] + [[False, True, True, True]] * 3
-    assert bench.as_picture(rows, plan, "", ".png")
 
 
 def claims_rows(count: int) -> list[Row]:

@@ -58,7 +58,7 @@ def test_the_hard_cases_come_out_the_same(pool: Executor, monkeypatch: pytest.Mo
     monkeypatch.setattr(stability, "measure_speed", lambda algorithms, runs: {})
     monkeypatch.setattr(stability, "CHUNK", 100)
     plan = stability.Plan(("E_grid", "I_rays_not_finite"), rays=350, sample=40, runs=1)
-    told: list[stability.Row] = []
+    told: list[stability.CaseRow] = []
     here = stability.run(plan)
     there = stability.run(plan, told.append, executor=pool)
     as_text = [[str(row.as_dict()) for row in rows] for rows in (here.rows, there.rows, told)]  # nan is not nan

@@ -145,7 +145,7 @@ def result():
 def test_the_report_has_a_row_for_each(result, tmp_path) -> None:
     found, plan = result
     assert {row.algorithm for row in found.rows} == {a.name for a in own_algorithms()} == set(found.speed)
-    text = report.text(found, plan)
+    text = report.text(found, plan, "a machine")
     grid = next(line for line in text.splitlines() if line.startswith("| E_grid") and "| " in line and " watertight |" in line)
     assert [cell.strip() for cell in grid.split("|")[3:8]] == ["60", "40", "0", "0", "0"]
     assert "--rays 60 --sample 40" in text and "| A to H" in text and "refused" in text
@@ -180,6 +180,25 @@ def test_ctrl_c_keeps_the_rows_that_are_done(monkeypatch, tmp_path, rows, undone
         assert sum(line.lstrip("| ").startswith("E_grid") for line in text.splitlines()) == rows
     told = json.loads(interrupted_after(rows, monkeypatch, "--json").out)
     assert (told["interrupted"], told["undone"], len(told["rows"])) == (signal.SIGINT, undone, rows)
+
+
+@pytest.mark.parametrize("suffix", [".json", ".csv"])
+def test_a_stopped_run_is_resumed_with_the_rows_that_are_done(monkeypatch, tmp_path, suffix) -> None:
+    path, whole = tmp_path / f"a{suffix}", tmp_path / f"whole{suffix}"
+    count = len(own_algorithms()) + 1
+    assert interrupted_after(count, monkeypatch, "-o", path).code == 130
+    again = interrupted_after(2, monkeypatch, "-o", path, "--resume")  # two rows more, and Ctrl-C
+    assert again.code == 130 and sum(line.startswith(("E_grid", "D_published")) for line in again.out.splitlines()) == count + 2
+    assert interrupted_after(-1, monkeypatch, "-o", path, "--resume").code == 0
+    assert interrupted_after(-1, monkeypatch, "-o", whole).code == 0
+    resumed, other = (rows_in(each) for each in (path, whole))
+    assert resumed == other and f"resumed after {count + 2} rows of" in path.read_text()
+    refused_run = interrupted_after(-1, monkeypatch, "-o", path, "--resume")
+    assert refused_run.code == 2 and "is not the report of an interrupted run" in refused_run.err
+
+
+def rows_in(path) -> object:
+    return json.loads(path.read_text())["rows"] if path.suffix == ".json" else path.read_text().splitlines()[2:]
 
 
 def test_ctrl_c_before_the_first_row_has_nothing_to_keep(monkeypatch) -> None:
