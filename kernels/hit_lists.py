@@ -10,6 +10,7 @@ from wrt.kernels.structs import Hit, Ray, kernel
 from wrt.kernels.units.triangle import is_crossed, to_ray_space, triangle_ray
 
 FEW = wp.constant(8)  # hits: most rays have no more, and sorting so few takes no measurable time
+TOUCHES = wp.constant(-1)  # value of HitLists.count for a ray that hits triangles and crosses none
 
 
 @wp.struct
@@ -20,12 +21,12 @@ class HitLists:
     crossings: bool  # True: list only triangles that the ray crosses (units.triangle.is_crossed).
     vertices: wp.array(dtype=wp.vec3)  # vertices and faces are read only if `crossings` is True.
     faces: wp.array(dtype=wp.vec3i)
+    first_face: wp.array(dtype=wp.int32)  # For instances: index in `faces` of the face with prim_id 0 of each structure below.
     first: wp.array(dtype=wp.int32)  # Ray i has room for the hits rows[first[i]] .. rows[first[i + 1] - 1].
-    count: wp.array(dtype=wp.int32)  # Number of hits of ray i; above the list's length, the list is incomplete (list_hit).
+    count: wp.array(dtype=wp.int32)  # Number of hits of ray i, or TOUCHES; above the list's length, the list is incomplete (list_hit).
     rows: wp.array(dtype=Hit)
     # The other arrays are for instances only.
     root: wp.array(dtype=wp.int32)  # Root node of the world of ray i; below 0, the ray hits nothing.
-    first_face: wp.array(dtype=wp.int32)  # Index in `faces` of the face with prim_id 0 of each structure of the lower level.
     # Of the placement that ray i is in now (kernels.traverse.instances): the results of local_scale, and face index minus prim_id.
     scale: wp.array(dtype=wp.float64)
     to_face: wp.array(dtype=wp.int32)
@@ -80,16 +81,27 @@ def sort_and_trim(rows: wp.array(dtype=Hit), first: int, count: int, limit: int)
     return kept
 
 
+@wp.func
+def off_edges(hit: Hit) -> bool:
+    """Return True only if the watertight test found areas of one sign, none of them 0: then the ray crosses the triangle (is_crossed).
+    u and v round areas' ratios, and are above 0 only if the areas are; the third ratio is 1 - u - v up to 2^-22."""
+    return hit.u > 0.0 and hit.v > 0.0 and hit.u + hit.v < wp.static(1.0 - 2.0**-20)
+
+
 @cache
-def make_list_hit(instances: bool) -> Any:
-    """Make list_hit, which stores the hits of a traversal in its lists (common.make_better)."""
+def make_list_hit(instances: bool, watertight: bool) -> Any:
+    """Make list_hit, which stores the hits of a traversal in its lists (common.make_better).
+    watertight: whether the traversal's triangle test is the watertight one."""
 
     @wp.func
     def list_hit(lists: HitLists, ray: Ray, hit: Hit, best: Hit) -> Hit:
         """Append a hit to the list of its ray. The returned `best` stays a miss, but the walk may stop beyond best.t.
         If the list is too short, count[i] exceeds the list's length. Then a list for count[i] or 2 limit hits suffices, whichever is
         less."""
-        if lists.crossings:
+        crosses = not lists.crossings
+        if wp.static(watertight):
+            crosses = crosses or off_edges(hit)
+        if not crosses:
             shear = triangle_ray(ray)
             index = hit.prim_id
             if wp.static(instances):
@@ -98,12 +110,14 @@ def make_list_hit(instances: bool) -> Any:
             if not is_crossed(to_ray_space(lists.vertices[face[0]] - ray.origin, shear),
                               to_ray_space(lists.vertices[face[1]] - ray.origin, shear),
                               to_ray_space(lists.vertices[face[2]] - ray.origin, shear)):
+                if lists.count[ray.slot] == 0:
+                    lists.count[ray.slot] = TOUCHES
                 return best
         if wp.static(instances):
             hit.t = float(wp.float64(hit.t) * lists.scale[ray.slot])
         first = lists.first[ray.slot]
         capacity = lists.first[ray.slot + 1] - first
-        n = lists.count[ray.slot]
+        n = wp.max(lists.count[ray.slot], 0)
         if n < capacity:
             lists.rows[first + n] = hit
         n += 1
@@ -127,7 +141,7 @@ def make_list_hit(instances: bool) -> Any:
 
 
 def make_list_hits_kernel(accel_struct: Any, traverse: Any, instances: bool) -> Any:
-    """Make the kernel that fills the list of each ray; `traverse` is made with Units.lists and accepts=make_list_hit(instances)."""
+    """Make the kernel that fills the list of each ray; `traverse` is made with Units.lists and accepts=make_list_hit."""
 
     @kernel
     def list_hits(accel: accel_struct, rays: RayArrays, lists: HitLists, start: int):
@@ -140,7 +154,7 @@ def make_list_hits_kernel(accel_struct: Any, traverse: Any, instances: bool) -> 
             lists.end[i] = float(wp.inf)
         if capacity > 0 and ray.first_prim >= 0:
             traverse(accel, lists, ray)
-            if lists.count[i] <= capacity:
+            if lists.count[i] > 1 and lists.count[i] <= capacity:
                 lists.count[i] = sort_and_trim(lists.rows, first, lists.count[i], lists.limit)
 
     return list_hits

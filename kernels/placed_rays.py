@@ -5,7 +5,6 @@ import warp as wp
 from wrt.kernels.query import FARTHEST
 from wrt.kernels.structs import kernel, largest
 
-vec3l = wp.types.vector(3, wp.int64)
 # A direction whose largest component is within these limits is used as it is; others are multiplied by STEP or 1 / STEP.
 SMALLEST, LARGEST, STEP = 2.0**-30, 2.0**30, 2.0**60
 
@@ -46,7 +45,7 @@ class HitPoints64:
     origins: wp.array(dtype=wp.vec3d)  # By ray, as directions.
     directions: wp.array(dtype=wp.vec3d)
     vertices: wp.array(dtype=wp.vec3d)
-    faces: wp.array(dtype=vec3l)
+    faces: wp.array(dtype=wp.vec3i)
     ray: wp.array(dtype=wp.int64)
     face: wp.array(dtype=wp.int64)
     u: wp.array(dtype=wp.float32)

@@ -58,6 +58,10 @@ def _traced(accel: Accelerator, rays: GivenRays, threads: int, types: Mapping[st
     return out
 
 
+def _empty(n: int) -> GivenRays:
+    return GivenRays(np.empty((n, 3), np.float32), np.empty((n, 3), np.float32), np.empty(n, np.float32))
+
+
 class RayFormat:
     """A form of rays, and the kernel that converts them.
 
@@ -78,12 +82,19 @@ class RayFormat:
     def __init__(self, kernel: Kernel, struct: WarpType, columns: tuple[int, ...], dtype: type, *inputs: object) -> None:
         self.kernel, self.struct, self.columns, self.dtype, self.inputs = kernel, struct, columns, dtype, inputs
         self._convert = RawKernel(kernel, *inputs, struct())
-        self._few_rays = made_once(lambda tracer: FreeList(lambda: _FewRays(self, tracer)))
+        self._few_rays = FreeList(lambda: _FewRays(self, _empty(SMALL)))
+        self._few_queries = made_once(lambda tracer: FreeList(lambda: _FewQueries(self, tracer)))
 
     def converted(self, arrays: tuple[np.ndarray, ...], threads: int, *inputs: object) -> GivenRays:
         """Convert the caller's arrays. inputs: records of the kernel's arguments before the struct."""
         n = len(arrays[0])
-        rays = GivenRays(np.empty((n, 3), np.float32), np.empty((n, 3), np.float32), np.empty(n, np.float32))
+        if n <= SMALL:
+            few = self._few_rays.take()
+            with_stack(partial(few.convert, arrays, inputs))
+            rays = GivenRays(*(array[:n].copy() for array in few.rays))
+            self._few_rays.give(few)
+            return rays
+        rays = _empty(n)
         self._convert.launch(n, *inputs, struct_record(self.struct, (*arrays, *rays)), threads=threads)
         return rays
 
@@ -100,7 +111,7 @@ class RayFormat:
         return any_hits(accel, self.converted(arrays, threads, *inputs), threads)
 
     def _few(self, snapshot: Snapshot, any_hit: bool, arrays: tuple[np.ndarray, ...], inputs: tuple[object, ...]) -> list[np.ndarray]:
-        free: FreeList[_FewRays] = self._few_rays(tracer(snapshot.structure, any_hit))
+        free: FreeList[_FewQueries] = self._few_queries(tracer(snapshot.structure, any_hit))
         few = free.take()
         found = with_stack(partial(few.trace, snapshot, arrays, inputs))
         free.give(few)
@@ -108,29 +119,41 @@ class RayFormat:
 
 
 class _FewRays:
-    """Buffers for SMALL rays, and recorded launches that convert and trace them: a tenth of the time of records for new arrays.
+    """Buffers for SMALL rays, and a recorded launch that converts them: a tenth of the time of records for new arrays.
 
-    One thread uses it at a time.
+    One thread uses it at a time. rays: buffers of the converted rays.
     """
 
-    def __init__(self, form: RayFormat, tracer: Tracer) -> None:
-        self.worker = Worker(tracer)
+    def __init__(self, form: RayFormat, rays: GivenRays) -> None:
+        self.rays = rays
         self.arrays: list[np.ndarray] = [np.empty((SMALL, columns), form.dtype) for columns in form.columns]
-        origins, directions, t_min, t_max = self.worker.rays
-        t_min[:] = 0.0
         self.inputs: list[object] = [None] * len(form.inputs)  # of the last launch
-        self.convert = raw_launch(form.kernel, *form.inputs, form.struct(), 0)
-        self.convert.set(len(self.inputs), struct_record(form.struct, (*self.arrays, origins, directions, t_max)))
+        self.launch = raw_launch(form.kernel, *form.inputs, form.struct(), 0)
+        self.launch.set(len(self.inputs), struct_record(form.struct, (*self.arrays, *rays)))
 
-    def trace(self, snapshot: Snapshot, arrays: tuple[np.ndarray, ...], inputs: tuple[object, ...]) -> list[np.ndarray]:
+    def convert(self, arrays: tuple[np.ndarray, ...], inputs: tuple[object, ...]) -> None:
         n = len(arrays[0])
         for buffer, array in zip(self.arrays, arrays, strict=True):
             buffer[:n] = array
         for i, record in enumerate(inputs):
             if record is not self.inputs[i]:
-                self.convert.set(i, record)
+                self.launch.set(i, record)
                 self.inputs[i] = record
-        self.convert.set_dim(n)
-        self.convert.launch()
+        self.launch.set_dim(n)
+        self.launch.launch()
+
+
+class _FewQueries:
+    """Buffers for SMALL rays, and recorded launches that convert and trace them. One thread uses it at a time."""
+
+    def __init__(self, form: RayFormat, tracer: Tracer) -> None:
+        self.worker = Worker(tracer)
+        origins, directions, t_min, t_max = self.worker.rays
+        t_min[:] = 0.0
+        self.rays = _FewRays(form, GivenRays(origins, directions, t_max))
+
+    def trace(self, snapshot: Snapshot, arrays: tuple[np.ndarray, ...], inputs: tuple[object, ...]) -> list[np.ndarray]:
+        n = len(arrays[0])
+        self.rays.convert(arrays, inputs)
         self.worker.launch(snapshot, self.worker.packed, 0, n)
         return [found[:n].copy() for found in self.worker.results]

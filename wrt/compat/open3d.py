@@ -20,7 +20,7 @@ from wrt.accel.queries.all_hits import ListQuery
 from wrt.accel.queries.rays import vectors
 from wrt.accel.scenes.build import build
 from wrt.compat.given_rays import GivenRays, RayFormat, closest_hits
-from wrt.compat.surfaces import every_hit, scatter
+from wrt.compat.surfaces import every_hit, hit_counts, scatter
 from wrt.core.arrays import float32, real_numbers
 from wrt.core.checks import as_integer, shown
 from wrt.core.errors import InputError
@@ -144,8 +144,7 @@ class RaycastingScene:
         """Count the intersections of each ray with surfaces, (...) int32. An intersection at an edge or a corner counts once."""
         threads = _threads(nthreads)
         shape, given = _given_rays(rays, threads)
-        ray, *_ = every_hit(self._scene()[0], given, threads)
-        return _answer(np.bincount(ray, minlength=len(given.t_max)).astype(np.int32), shape)
+        return _answer(hit_counts(self._scene()[0], given, threads).astype(np.int32), shape)
 
     def list_intersections(self, rays: ArrayLike, nthreads: int = 0) -> dict[str, Answer]:
         """List the M intersections that `count_intersections` counts, ray by ray in order of distance.

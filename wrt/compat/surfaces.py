@@ -7,7 +7,8 @@ import numpy as np
 from wrt.accel.points.contains import open_edges_of
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.all_hits import ALL, ListQuery, first_hits
-from wrt.compat.given_rays import GivenRays, any_hits
+from wrt.accel.queries.answers import Hits
+from wrt.compat.given_rays import GivenRays
 
 
 def every_hit(accel: Accelerator, rays: GivenRays, threads: int, limit: int = ALL) -> tuple[np.ndarray, ...]:
@@ -16,20 +17,32 @@ def every_hit(accel: Accelerator, rays: GivenRays, threads: int, limit: int = AL
     A ray hits the faces that it crosses (`all_hits` with crossings). A ray that only touches faces hits the first touched face. If
     the mesh is closed, that ray hits up to two touched faces, the nearest ones, as entry and exit.
     """
-    crossed = ListQuery(accel, threads, crossings=True).of_valid(rays.rays).all(limit)
+    query = ListQuery(accel, threads, crossings=True).of_valid(rays.rays)
+    crossed = query.all(limit)
     found = [crossed.ray_id, crossed.prim_id, crossed.t, crossed.u, crossed.v]
-    rest = np.flatnonzero(crossed.counts == 0)
-    if len(rest):
-        rest = rest[any_hits(accel, rays.of(rest), threads)]
-    if len(rest):
-        origins, directions, t_max = rays.of(rest)
-        touched = first_hits(accel, 1 if open_edges_of(accel.snapshot) else 2, origins, directions, t_max=t_max, threads=threads)
+    if len(rest := np.flatnonzero(query.touches)):
+        touched = _touched(accel, rays.of(rest), threads)
         row, column = np.nonzero(touched.prim_id >= 0)
         more = rest[row], *(array[row, column] for array in (touched.prim_id, touched.t, touched.u, touched.v))
         found = [np.concatenate(pair) for pair in zip(found, more, strict=True)]
         order = np.argsort(found[0], kind="stable")
         found = [array[order] for array in found]
     return tuple(found)
+
+
+def hit_counts(accel: Accelerator, rays: GivenRays, threads: int) -> np.ndarray:
+    """Return the number of hits of each ray in `every_hit`, (N,) int64."""
+    query = ListQuery(accel, threads, crossings=True).of_valid(rays.rays)
+    counts = query.counts()
+    if len(rest := np.flatnonzero(query.touches)):
+        counts[rest] = (_touched(accel, rays.of(rest), threads).prim_id >= 0).sum(axis=1)
+    return counts
+
+
+def _touched(accel: Accelerator, rays: GivenRays, threads: int) -> Hits[np.ndarray]:
+    """Return the hits of rays that only touch faces, (N, 1) or (N, 2)."""
+    origins, directions, t_max = rays
+    return first_hits(accel, 1 if open_edges_of(accel.snapshot) else 2, origins, directions, t_max=t_max, threads=threads)
 
 
 def scatter(found: np.ndarray, valid: np.ndarray | None, missing: object) -> np.ndarray:

@@ -6,22 +6,25 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from wrt.accel.points.contains import contains, open_edges_of
+from wrt.accel.queries.batches import SMALL
 from wrt.accel.queries.raw_kernel import RawKernel
+from wrt.accel.queries.raw_launches import raw_launch
 from wrt.accel.scenes.build import build
 from wrt.compat.given_rays import RayFormat
-from wrt.compat.surfaces import every_hit
+from wrt.compat.surfaces import every_hit, hit_counts
 from wrt.core.arrays import real_numbers
 from wrt.core.errors import InputError
 from wrt.core.packages import needed_by
-from wrt.core.threads import thread_count
+from wrt.core.threads import FreeList, thread_count, with_stack
 from wrt.core.types import ArrayLike, WarpStruct
-from wrt.core.warp_private import record_of, struct_record
+from wrt.core.warp_private import array_record, record_of, struct_record
 from wrt.kernels.placed_rays import HitPoints64, PlacedRays, Placement, locate_hits, place_rays
 from wrt.scene.mesh import Mesh
 
@@ -32,6 +35,7 @@ with needed_by("wrt.compat.trimesh"):
 if TYPE_CHECKING:
     import trimesh
 
+MAX_HITS = 100  # of a ray, by default, as in trimesh
 FAR = 4.0  # in radii of a mesh: an origin farther from the mesh is moved near it before it is rounded to float32
 PLACED = RayFormat(place_rays, PlacedRays, (3, 3), np.float64, Placement())
 LOCATE_HITS = RawKernel(locate_hits, HitPoints64())
@@ -68,7 +72,7 @@ class RayMeshIntersector:
         """Structure over the present mesh."""
         return _ScaledStructure(self.mesh.vertices, self.mesh.faces, **self._options)
 
-    def intersects_id(self, ray_origins: ArrayLike, ray_directions: ArrayLike, multiple_hits: bool = True, max_hits: int = 100,
+    def intersects_id(self, ray_origins: ArrayLike, ray_directions: ArrayLike, multiple_hits: bool = True, max_hits: int = MAX_HITS,
                       return_locations: bool = False) -> tuple[np.ndarray, ...]:
         """Find the faces that rays hit: first hits in the order of the rays, then second hits, and so on.
 
@@ -93,7 +97,7 @@ class RayMeshIntersector:
         return (face, ray, scaled.located(origins, directions, ray, face, u, v)) if return_locations else (face, ray)
 
     def intersects_location(self, ray_origins: ArrayLike, ray_directions: ArrayLike, multiple_hits: bool = True,
-                            max_hits: int = 100) -> tuple[np.ndarray, ...]:
+                            max_hits: int = MAX_HITS) -> tuple[np.ndarray, ...]:
         """Find the points where rays hit the mesh, in the order of `intersects_id`.
 
         Returns
@@ -121,9 +125,12 @@ class RayMeshIntersector:
         points = np.asarray(points, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 3:
             raise InputError(f"must be (N, 3), got {points.shape}", argument="points")
-        if not self._scaled.closed and len(self.mesh.faces):
-            return contains_points(self, points)
-        return self._scaled.contains(points)
+        scaled = self._scaled
+        inside = ((points >= scaled.low) & (points <= scaled.high)).all(axis=1)
+        if inside.any():
+            near = points[inside]
+            inside[inside] = scaled.contains(near) if scaled.closed else contains_points(_Counter(self.mesh, scaled), near)
+        return inside
 
     def __getstate__(self) -> dict[str, Any]:
         return {"mesh": self.mesh, "_options": self._options}
@@ -157,7 +164,7 @@ class _ScaledStructure:
         self.exponent = -int(np.frexp(half)[1]) if scale_to_box else 0
         vertices[unused] = self.low
         self.accel = build(Mesh(self.to_local(vertices), faces), device=device, threads=threads)
-        self.threads, self.vertices, self.faces = thread_count(threads), vertices, faces
+        self.threads, self.vertices, self.faces = thread_count(threads), vertices, faces.astype(np.int32)
         box = self.to_local(np.stack([self.low, self.high]))
         center, radius = box.mean(axis=0), float(np.linalg.norm(box[1] - box[0])) / 2
         place: WarpStruct = Placement()
@@ -190,18 +197,61 @@ class _ScaledStructure:
         ray, face, _, u, v = every_hit(self.accel, rays, self.threads, limit)
         return ray, face.astype(np.int64), u, v
 
+    def hit_counts(self, *rays: np.ndarray) -> np.ndarray:
+        """Return the number of all hits of each ray, (N,) int64."""
+        return hit_counts(self.accel, PLACED.converted(rays, self.threads, self.placement), self.threads)
+
     def located(self, origins: np.ndarray, directions: np.ndarray, *hits: np.ndarray) -> np.ndarray:
         """Return the points (M, 3) float64 of hits: ray and face (M,) int64, u and v (M,) float32."""
+        if max(len(origins), len(hits[0])) <= SMALL:
+            few = FEW_LOCATIONS.take()
+            points = with_stack(partial(few.located, (self.vertices, self.faces), (origins, directions, *hits)))
+            FEW_LOCATIONS.give(few)
+            return points
         points = np.empty((len(hits[0]), 3))
         arrays = origins, directions, self.vertices, self.faces, *map(np.ascontiguousarray, hits), points
         LOCATE_HITS.launch(len(points), struct_record(HitPoints64, arrays), threads=self.threads)
         return points
 
     def contains(self, points: np.ndarray) -> np.ndarray:
-        out = ((points >= self.low) & (points <= self.high)).all(axis=1)
-        if out.any():
-            out[out] = contains(self.accel, self.to_local(points[out]), threads=self.threads)
-        return out
+        return contains(self.accel, self.to_local(points), threads=self.threads)
+
+
+class _FewLocations:
+    """Buffers for SMALL hits of SMALL rays, and a recorded launch that locates them. One thread uses it at a time."""
+
+    def __init__(self) -> None:
+        origins, directions, self.points = np.empty((3, SMALL, 3))
+        ray, face = np.empty((2, SMALL), np.int64)
+        u, v = np.empty((2, SMALL), np.float32)
+        self.buffers: list[np.ndarray] = [origins, directions, ray, face, u, v]
+        self.record = struct_record(HitPoints64, (origins, directions, None, None, ray, face, u, v, self.points))
+        self.launch = raw_launch(locate_hits, HitPoints64(), 0)
+
+    def located(self, mesh: tuple[np.ndarray, np.ndarray], rays_and_hits: tuple[np.ndarray, ...]) -> np.ndarray:
+        """Return points as `_ScaledStructure.located`. mesh: vertices and faces."""
+        for buffer, array in zip(self.buffers, rays_and_hits, strict=True):
+            buffer[:len(array)] = array
+        self.record.vertices, self.record.faces = map(array_record, mesh)
+        self.launch.set(0, self.record)
+        self.launch.set_dim(n := len(rays_and_hits[-1]))
+        self.launch.launch()
+        return self.points[:n].copy()
+
+
+FEW_LOCATIONS = FreeList(_FewLocations)
+
+
+class _Counter(NamedTuple):
+    """The part of a ray class that trimesh's contains_points uses: it only counts the hits of each ray."""
+
+    mesh: trimesh.Trimesh
+    scaled: _ScaledStructure
+
+    def intersects_location(self, origins: np.ndarray, directions: np.ndarray, multiple_hits: bool) -> tuple[None, np.ndarray, None]:
+        """Return the ray of each hit, (M,) int64, in the second place."""
+        counts = np.minimum(self.scaled.hit_counts(origins, directions), MAX_HITS)
+        return None, np.repeat(np.arange(len(counts)), counts), None
 
 
 def _rays(origins: ArrayLike, directions: ArrayLike) -> tuple[np.ndarray, np.ndarray]:

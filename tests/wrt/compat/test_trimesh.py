@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from trimesh.ray.ray_util import contains_points
 
 import wrt
 from tests.refused import refused
@@ -17,6 +18,7 @@ from wrt.compat.trimesh import RayMeshIntersector
 from wrt.kernels.hit_lists import FEW
 from wrt.scene import shapes
 
+TRIMESH_DIRECTION = np.array([0.4395064455, 0.617598629942, 0.652231566745])  # in which its rule looks first
 DOWN = np.array([[0.0, 0.0, -1.0]])
 
 
@@ -214,6 +216,25 @@ def test_points_inside_of_an_open_mesh_go_by_the_rule_of_trimesh() -> None:
     radius = np.linalg.norm(points, axis=1)
     inside = RayMeshIntersector(ball).contains_points(points)
     assert inside[radius < 0.9].mean() > 0.98 and not inside[radius > 1.0].any()
+
+
+def sheets(n: int) -> trimesh.Trimesh:
+    """Return n triangles above each other."""
+    corners = np.repeat([[[-9.0, -9.0, 0.0], [9.0, -9.0, 0.0], [0.0, 9.0, 0.0]]], n, axis=0)
+    corners[:, :, 2] = np.linspace(-0.5, 0.5, n)[:, None]
+    return trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * n).reshape(-1, 3), process=False)
+
+
+@pytest.mark.parametrize("mesh", [trimesh.Trimesh(trimesh.creation.box().vertices, trimesh.creation.box().faces[1:], process=False),
+                                  sheets(3), sheets(230)], ids=["box", "sheets", "more hits than are counted"])
+def test_points_inside_of_an_open_mesh_are_those_of_the_rule_with_all_hits(mesh: trimesh.Trimesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("trimesh.util.random_generator", lambda: np.random.default_rng(4))  # for points where two rays disagree
+    around = np.random.default_rng(5).uniform(-0.6, 0.6, (400, 3))
+    to_edges = 0.5 * np.eye(3)[[0, 1, 2]].repeat(2, axis=0) - np.outer([0.1, 0.2, 0.1, 0.2, 0.1, 0.2], TRIMESH_DIRECTION)
+    ray = RayMeshIntersector(mesh)
+    for points in (around, to_edges, around[:1], 9.0 + around):
+        inside = ray.contains_points(points)
+        assert np.array_equal(inside, contains_points(ray, points)) and np.array_equal(inside[:1], ray.contains_points(points[:1]))
 
 
 def test_copies_and_pickles_answer_the_same() -> None:

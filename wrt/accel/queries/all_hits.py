@@ -14,7 +14,7 @@ import warp as wp
 from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.queries.accelerator import Accelerator, snapshot_of
 from wrt.accel.queries.answers import Hits
-from wrt.accel.queries.few_lists import MOST, FewLists, begins
+from wrt.accel.queries.few_lists import MOST, FewLists, Mesh, begins
 from wrt.accel.queries.hit_points import device_scene
 from wrt.accel.queries.part_faces import part_faces
 from wrt.accel.queries.raw_kernel import RawKernel, kernel_memory
@@ -85,11 +85,11 @@ class _Lists(NamedTuple):
     crossings: bool
     vertices: WarpArray | None
     faces: WarpArray | None
+    first_face: WarpArray | None
     first: Array
     counts: Array
     rows: Array
     root: Array | None = None
-    first_face: WarpArray | None = None
     scale: Array | None = None
     to_face: Array | None = None
     end: Array | None = None
@@ -102,6 +102,7 @@ class ListQuery:
     shape: Shape | None = None  # of the rays; None: (n,)
     rays: Rays
     roots: np.ndarray | None = None  # (N,) int32, root node of each ray's world, or -1; None without instances
+    touches: np.ndarray  # (N,) bool, if crossings are found: the ray hits triangles, but crosses none
     give: Any  # converts arrays to those of the caller's library
 
     def __init__(self, accel: Accelerator, threads: int | None, crossings: bool = False) -> None:
@@ -110,15 +111,18 @@ class ListQuery:
         self.memory: Any = kernel_memory(self.device)
         self.give = to_numpy
         self.crossings = as_one(crossings, bool, "crossings")
-        self.mesh: tuple[WarpArray | None, WarpArray | None] = (None, None)
-        if crossings:
-            surfaces = part_faces(self.snapshot) if self.snapshot.roots is not None else device_scene(self.snapshot).surfaces
-            self.mesh = surfaces.vertices, surfaces.faces
+        vertices = faces = first_face = None
+        if self.snapshot.roots is not None:
+            vertices, faces, first_face = part_faces(self.snapshot)
+        elif crossings:
+            surfaces = device_scene(self.snapshot).surfaces
+            vertices, faces = surfaces.vertices, surfaces.faces
+        self.mesh: Mesh = (vertices, faces, first_face) if crossings else (None, None, first_face)
 
     def of_valid(self, rays: Rays) -> ListQuery:
         """Set rays that are valid: contiguous NumPy arrays of float32. Not over several worlds."""
         self.n, self.rays = len(rays.origins), rays if self.device.is_cpu else arrays_on(self.device, rays)
-        self.roots = roots_of(self.snapshot, None, self.n)
+        self.roots, self.touches = roots_of(self.snapshot, None, self.n), np.zeros(self.n, bool)
         return self
 
     def of(self, origins: ArrayLike, directions: ArrayLike | None, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
@@ -130,7 +134,7 @@ class ListQuery:
             rays, self.shape = shaped_rays(origins, directions, t_min, t_max)
             world = worlds_of_each(world, self.shape)
         self.n, self.rays = len(rays.origins), host_arrays(rays) if self.device.is_cpu else arrays_on(self.device, rays)
-        self.roots = roots_of(self.snapshot, world, self.n)
+        self.roots, self.touches = roots_of(self.snapshot, world, self.n), np.zeros(self.n, bool)
         self.give = to_tensor_like(origins, directions) or to_numpy
         return self
 
@@ -177,17 +181,23 @@ class ListQuery:
         return values if self.give is to_numpy else self.give(upload(values, wp.int64, self.device))
 
     def _few(self, limit: int, take: Callable[[FewLists, np.ndarray], T]) -> T | None:
-        """Return `take` of the lists of few rays and their numbers of hits; None on a GPU, over instances, and for many rays or hits."""
-        is_few = self.n <= MOST and self.device.is_cpu and self.roots is None
-        return with_stack(partial(self._take_few, limit, take)) if is_few else None
+        """Return `take` of the lists of few rays and their numbers of hits; None on a GPU, and for many rays or hits."""
+        return with_stack(partial(self._take_few, limit, take)) if self.n <= MOST and self.device.is_cpu else None
 
     def _take_few(self, limit: int, take: Callable[[FewLists, np.ndarray], T]) -> T | None:
         free = few_lists(self.snapshot.structure)
         lists = free.take()
-        counts = lists.find(self.snapshot, self.rays, limit, self.mesh)
-        taken = None if counts is None else take(lists, counts)
+        counts = lists.find(self.snapshot, self.rays, self.roots, limit, self.mesh)
+        taken = None if counts is None else take(lists, self._noted(counts))
         free.give(lists)
         return taken
+
+    def _noted(self, counts: np.ndarray, first: int = 0) -> np.ndarray:
+        """Convert HitLists.count of the rays from `first` on to numbers of hits, int64, and set `touches` of these rays."""
+        if self.crossings:
+            self.touches[first:first + len(counts)] = counts < 0
+            counts = np.maximum(counts, 0)
+        return counts.astype(np.int64)
 
     def _listed(self, limit: int, counting: bool = False) -> Iterator[tuple[object, list[_Lists], np.ndarray]]:
         """Yield, for each batch of the rays: these rays, one or two HitLists, and the number of hits of each ray.
@@ -200,7 +210,7 @@ class ListQuery:
             rays = self.memory.struct(RayArrays, *(array[begin:begin + n] for array in self.rays))
             roots = None if self.roots is None else self.memory.array(self.roots[begin:begin + n], wp.int32)
             few = self._filled(rays, roots, FEW * np.arange(n + 1), limit)
-            lists, counts = [few], self.memory.numpy(few.counts).astype(np.int64)
+            lists, counts = [few], self._noted(self.memory.numpy(few.counts), begin)
             if counts.max() > FEW and not counting:
                 many = counts > FEW
                 lists[0] = few._replace(counts=self.memory.array(np.where(many, 0, counts), wp.int32))
@@ -214,8 +224,7 @@ class ListQuery:
         lists = _Lists(limit, self.crossings, *self.mesh, self.memory.array(first, wp.int32),
                        self.memory.array(np.zeros(n, np.int32), wp.int32), self.memory.empty(rows, Hit))
         if roots is not None:
-            walk = (self.memory.empty(n, kind) for kind in (wp.float64, wp.int32, wp.float32))
-            lists = _Lists(*lists[:7], roots, part_faces(self.snapshot).first_face, *walk)
+            lists = _Lists(*lists[:8], roots, *(self.memory.empty(n, kind) for kind in (wp.float64, wp.int32, wp.float32)))
         self.memory.launch(list_hits(self.snapshot.structure), n, self.snapshot.data, rays, self.memory.struct(HitLists, *lists),
                            threads=self.threads)
         return lists
@@ -236,7 +245,8 @@ def rows_of(hits: int) -> int:
 @made_once
 def list_hits(structure: Structure) -> RawKernel:
     listing, instances = structure._replace(units=structure.units._replace(lists=True)), structure.units.instances
-    traverse = listing.traversal(any_hit=False, accepts=make_list_hit(instances))
+    accepts = make_list_hit(instances, structure.units.triangle == "watertight")
+    traverse = listing.traversal(any_hit=False, accepts=accepts)
     kernel = make_list_hits_kernel(structure.struct, traverse, instances)
     return RawKernel(kernel, structure.struct(), RayArrays(), HitLists())
 

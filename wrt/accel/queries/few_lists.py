@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TypeAlias
+
 import numpy as np
 
 from wrt.accel.queries.answers import HIT_TYPES
@@ -18,6 +20,7 @@ from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import Hit
 
 MOST = SMALL  # rays
+Mesh: TypeAlias = tuple[WarpArray | None, WarpArray | None, WarpArray | None]  # vertices, faces and first_face of HitLists
 
 
 def begins(counts: np.ndarray) -> np.ndarray:
@@ -28,7 +31,7 @@ def begins(counts: np.ndarray) -> np.ndarray:
 
 
 class FewLists:
-    """Lists of FEW hits for each of MOST rays. One thread uses it at a time.
+    """Lists of FEW hits for each of MOST rays, or longer ones for fewer rays. One thread uses it at a time.
 
     Parameters
     ----------
@@ -40,36 +43,43 @@ class FewLists:
         for each in (fill, copy):
             load_kernel(each.kernel, start("cpu"))
         self.rays = [np.empty((MOST, 3), np.float32), np.empty((MOST, 3), np.float32), *np.empty((2, MOST), np.float32)]
-        self.first = np.arange(0, FEW * MOST + 1, FEW, dtype=np.int32)
-        self.counts, self.begin = np.empty((2, MOST), np.int32)
+        self.indices = np.arange(MOST + 1, dtype=np.int32)
+        self.first, self.capacity = FEW * self.indices, FEW
+        self.counts, self.begin, self.root, to_face = np.empty((4, MOST), np.int32)
+        self.walk = [np.empty(MOST, np.float64), to_face, np.empty(MOST, np.float32)]  # scale, to_face and end of HitLists
         self.rows = HostMemory().empty(FEW * MOST, Hit)
         self.out = [np.empty(FEW * MOST, dtype) for dtype in HIT_TYPES.values()]
-        self.lists = struct_record(HitLists, [0, False, None, None, self.first, self.counts, self.rows])
+        self.lists = struct_record(HitLists, [0, False, None, None, None, self.first, self.counts, self.rows, self.root, *self.walk])
         rays = struct_record(RayArrays, self.rays)
         self.fill, self.copy = raw_launch(fill.kernel, *fill.inputs, 0), raw_launch(copy.kernel, *copy.inputs, 0)
         self.fill.set(1, rays)
         for i, record in enumerate((rays, self.lists, array_record(self.begin), struct_record(HitArrays, self.out))):
             self.copy.set(i, record)
 
-    def find(self, snapshot: Snapshot, rays: Rays, limit: int, mesh: tuple[WarpArray | None, WarpArray | None]) -> np.ndarray | None:
-        """Fill the lists. Return the number of hits of each ray, (N,) int64; None if a ray has more than FEW hits.
+    def find(self, snapshot: Snapshot, rays: Rays, roots: np.ndarray | None, limit: int, mesh: Mesh) -> np.ndarray | None:
+        """Fill the lists. Return HitLists.count of the rays, (N,) int32, until the next call; None if a list is too short.
 
-        mesh: vertices and faces, to list crossings only; else two times None.
+        roots: (N,) int32, HitLists.root; None without instances. mesh: with vertices and faces to list crossings only.
         """
         n = len(rays.t_min)
         for buffer, array in zip(self.rays, rays, strict=True):
             buffer[:n] = array
         self.counts[:n] = 0
-        vertices, faces = mesh
-        self.lists.limit, self.lists.crossings = limit, vertices is not None
-        if vertices is not None and faces is not None:
-            self.lists.vertices, self.lists.faces = record_of(vertices), record_of(faces)
+        if self.capacity != (capacity := FEW * MOST // max(n, 1)):
+            self.capacity = capacity
+            np.multiply(self.indices, capacity, out=self.first)
+        if roots is not None:
+            self.root[:n] = roots
+        self.lists.limit, self.lists.crossings = limit, mesh[0] is not None
+        for name, field in zip(("vertices", "faces", "first_face"), mesh, strict=True):
+            if field is not None:
+                setattr(self.lists, name, record_of(field))
         self.fill.set(0, record_of(snapshot.data))
         self.fill.set(2, self.lists)
         self.fill.set_dim(n)
         self.fill.launch()
-        counts = self.counts[:n].astype(np.int64)
-        return counts if counts.max(initial=0) <= FEW else None
+        counts = self.counts[:n]
+        return counts if counts.max(initial=0) <= capacity else None
 
     def hits_of(self, counts: np.ndarray) -> list[np.ndarray]:
         """Return the first row of each ray's hits, (N + 1,) int64, and t, u, v and prim_id of the hits. counts: from `find`."""

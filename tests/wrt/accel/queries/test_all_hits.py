@@ -115,12 +115,13 @@ def test_thousands_of_hits_in_one_place() -> None:
 
 def test_counting_keeps_no_hits(monkeypatch: pytest.MonkeyPatch) -> None:
     mesh = wrt.Mesh(np.tile(np.float32([[-1, -1, 0], [2, -1, 0], [-1, 2, 0]]), (50, 1)), np.arange(150).reshape(-1, 3))
-    asked = np.tile(np.float32([0.1, 0.2, 3.0]), (10, 1)), np.tile(np.float32([0.0, 0.0, -1.0]), (10, 1))
+    n = MOST + 1
+    asked = np.tile(np.float32([0.1, 0.2, 3.0]), (n, 1)), np.tile(np.float32([0.0, 0.0, -1.0]), (n, 1))
     accel = wrt.build(mesh)
-    monkeypatch.setattr("wrt.accel.queries.all_hits.MOST_ROWS", 100)
+    monkeypatch.setattr("wrt.accel.queries.all_hits.MOST_ROWS", 49 * n)
     for crossings in (False, True):
         assert (wrt.count_hits(accel, *asked, crossings=crossings) == 50).all()
-    with refused(what="500 hits"):
+    with refused(what=f"{50 * n} hits"):
         wrt.all_hits(accel, *asked)
 
 
@@ -137,14 +138,18 @@ def test_more_rays_than_are_asked_at_once(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.mark.parametrize("mesh", [shapes.torus(1.0, 0.4, 32, 16), soup(np.random.default_rng(6))], ids=["torus", "soup"])
+@pytest.mark.parametrize("places", [0, 3], ids=["mesh", "instances"])
 @pytest.mark.parametrize("crossings", [False, True])
-def test_few_rays_hit_what_they_hit_among_many(mesh: wrt.Mesh, crossings: bool) -> None:
+def test_few_rays_hit_what_they_hit_among_many(mesh: wrt.Mesh, places: int, crossings: bool) -> None:
     """A call with few rays uses buffers of earlier calls; rays of the soup can have more hits than these hold."""
-    accel = wrt.build(mesh)
+    matrices = [np.diag([scale, scale, scale, 1.0]) for scale in 1.0 / (1.0 + np.arange(places))]
+    scene = wrt.Scene([wrt.Object(mesh, (wrt.Material(),), matrix) for matrix in matrices])
+    accel = wrt.build(scene, movable=True) if places else wrt.build(mesh)
     asked = rays(np.random.default_rng(7), mesh, MOST + 1)
     among = wrt.all_hits(accel, *asked, crossings=crossings)
     begin = 0
-    for n in (1, 0, 3, 700, MOST - 704):
+    for n in (1, 0, 3, 550, 585, MOST):  # 550 and 585 rays have lists of equal length
+        begin = min(begin, MOST + 1 - n)
         few = wrt.all_hits(accel, *(array[begin:begin + n] for array in asked), crossings=crossings)
         rows = slice(among.first[begin], among.first[begin + n])
         assert np.array_equal(few.first, among.first[begin:begin + n + 1] - rows.start)
