@@ -7,7 +7,6 @@ take longer than a ray.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +19,7 @@ from wrt.accel.queries.raw_launches import raw_launch
 from wrt.accel.queries.rays import Rays, constant
 from wrt.accel.snapshot import Snapshot
 from wrt.core.device import made_once
-from wrt.core.threads import FreeList, with_stack
+from wrt.core.threads import FreeList
 from wrt.core.types import Kernel, WarpType
 from wrt.core.warp_private import struct_record
 
@@ -45,11 +44,6 @@ class GivenRays(NamedTuple):
 def closest_hits(accel: Accelerator, rays: GivenRays, threads: int) -> list[np.ndarray]:
     """Return t, u, v and prim_id of each ray's closest hit."""
     return _traced(accel, rays, threads, HIT_TYPES)
-
-
-def any_hits(accel: Accelerator, rays: GivenRays, threads: int) -> np.ndarray:
-    """Return whether each ray hits anything, (N,) bool."""
-    return _traced(accel, rays, threads, ANY_HIT_TYPES)[0]
 
 
 def _traced(accel: Accelerator, rays: GivenRays, threads: int, types: Mapping[str, type]) -> list[np.ndarray]:
@@ -89,11 +83,7 @@ class RayFormat:
         """Convert the caller's arrays. inputs: records of the kernel's arguments before the struct."""
         n = len(arrays[0])
         if n <= SMALL:
-            few = self._few_rays.take()
-            with_stack(partial(few.convert, arrays, inputs))
-            rays = GivenRays(*(array[:n].copy() for array in few.rays))
-            self._few_rays.give(few)
-            return rays
+            return self._few_rays.run(lambda few: few.converted(arrays, inputs))
         rays = _empty(n)
         self._convert.launch(n, *inputs, struct_record(self.struct, (*arrays, *rays)), threads=threads)
         return rays
@@ -105,17 +95,14 @@ class RayFormat:
         return closest_hits(accel, self.converted(arrays, threads, *inputs), threads)
 
     def any_hits(self, accel: Accelerator, arrays: tuple[np.ndarray, ...], threads: int, *inputs: object) -> np.ndarray:
-        """Convert rays and return whether they hit anything, as `any_hits`."""
+        """Convert rays and return whether each of them hits anything, (N,) bool."""
         if len(arrays[0]) <= SMALL and accel.device.is_cpu:
             return self._few(accel.snapshot, True, arrays, inputs)[0]
-        return any_hits(accel, self.converted(arrays, threads, *inputs), threads)
+        return _traced(accel, self.converted(arrays, threads, *inputs), threads, ANY_HIT_TYPES)[0]
 
     def _few(self, snapshot: Snapshot, any_hit: bool, arrays: tuple[np.ndarray, ...], inputs: tuple[object, ...]) -> list[np.ndarray]:
         free: FreeList[_FewQueries] = self._few_queries(tracer(snapshot.structure, any_hit))
-        few = free.take()
-        found = with_stack(partial(few.trace, snapshot, arrays, inputs))
-        free.give(few)
-        return found
+        return free.run(lambda few: few.trace(snapshot, arrays, inputs))
 
 
 class _FewRays:
@@ -131,7 +118,12 @@ class _FewRays:
         self.launch = raw_launch(form.kernel, *form.inputs, form.struct(), 0)
         self.launch.set(len(self.inputs), struct_record(form.struct, (*self.arrays, *rays)))
 
+    def converted(self, arrays: tuple[np.ndarray, ...], inputs: tuple[object, ...]) -> GivenRays:
+        self.convert(arrays, inputs)
+        return GivenRays(*(array[:len(arrays[0])].copy() for array in self.rays))
+
     def convert(self, arrays: tuple[np.ndarray, ...], inputs: tuple[object, ...]) -> None:
+        """Write converted rays to the buffers."""
         n = len(arrays[0])
         for buffer, array in zip(self.arrays, arrays, strict=True):
             buffer[:n] = array

@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -22,7 +21,7 @@ from wrt.compat.surfaces import every_hit, hit_counts
 from wrt.core.arrays import real_numbers
 from wrt.core.errors import InputError
 from wrt.core.packages import needed_by
-from wrt.core.threads import FreeList, thread_count, with_stack
+from wrt.core.threads import FreeList, thread_count
 from wrt.core.types import ArrayLike, WarpStruct
 from wrt.core.warp_private import array_record, record_of, struct_record
 from wrt.kernels.placed_rays import HitPoints64, PlacedRays, Placement, locate_hits, place_rays
@@ -197,17 +196,10 @@ class _ScaledStructure:
         ray, face, _, u, v = every_hit(self.accel, rays, self.threads, limit)
         return ray, face.astype(np.int64), u, v
 
-    def hit_counts(self, *rays: np.ndarray) -> np.ndarray:
-        """Return the number of all hits of each ray, (N,) int64."""
-        return hit_counts(self.accel, PLACED.converted(rays, self.threads, self.placement), self.threads)
-
     def located(self, origins: np.ndarray, directions: np.ndarray, *hits: np.ndarray) -> np.ndarray:
         """Return the points (M, 3) float64 of hits: ray and face (M,) int64, u and v (M,) float32."""
         if max(len(origins), len(hits[0])) <= SMALL:
-            few = FEW_LOCATIONS.take()
-            points = with_stack(partial(few.located, (self.vertices, self.faces), (origins, directions, *hits)))
-            FEW_LOCATIONS.give(few)
-            return points
+            return FEW_LOCATIONS.run(lambda few: few.located((self.vertices, self.faces), (origins, directions, *hits)))
         points = np.empty((len(hits[0]), 3))
         arrays = origins, directions, self.vertices, self.faces, *map(np.ascontiguousarray, hits), points
         LOCATE_HITS.launch(len(points), struct_record(HitPoints64, arrays), threads=self.threads)
@@ -250,7 +242,8 @@ class _Counter(NamedTuple):
 
     def intersects_location(self, origins: np.ndarray, directions: np.ndarray, multiple_hits: bool) -> tuple[None, np.ndarray, None]:
         """Return the ray of each hit, (M,) int64, in the second place."""
-        counts = np.minimum(self.scaled.hit_counts(origins, directions), MAX_HITS)
+        rays = PLACED.converted((origins, directions), self.scaled.threads, self.scaled.placement)
+        counts = np.minimum(hit_counts(self.scaled.accel, rays, self.scaled.threads), MAX_HITS)
         return None, np.repeat(np.arange(len(counts)), counts), None
 
 

@@ -20,6 +20,7 @@ MOST_THREADS = 1 << 10
 STACK = 2 << 20
 P = ParamSpec("P")
 T = TypeVar("T")
+R = TypeVar("R")
 
 
 def thread_count(threads: int | None) -> int:
@@ -226,3 +227,10 @@ class FreeList(Generic[T]):
     def give(self, thing: T) -> None:
         """Make a thing free again."""
         self.free.append(thing)
+
+    def run(self, task: Callable[[T], R]) -> R:
+        """Run a task, which may launch kernels, with a free thing."""
+        thing = self.take()
+        result = task(thing) if _has_stack() else submit(task, thing).result()
+        self.give(thing)
+        return result

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Generic, NamedTuple, TypeVar, overload
 
 import numpy as np
@@ -26,7 +25,7 @@ from wrt.core.arrays import given_like, to_numpy, to_tensor_like
 from wrt.core.checks import as_integer, as_one
 from wrt.core.device import MOST_ROWS, made_once, upload
 from wrt.core.errors import InputError
-from wrt.core.threads import FreeList, thread_count, with_stack
+from wrt.core.threads import FreeList, thread_count
 from wrt.core.types import Array, ArrayLike, ArrayT, NumpyLike, TensorT, WarpArray
 from wrt.kernels.hit_lists import FEW, HitLists, copy_hits, make_list_hit, make_list_hits_kernel
 from wrt.kernels.query import HitArrays, RayArrays
@@ -122,7 +121,7 @@ class ListQuery:
     def of_valid(self, rays: Rays) -> ListQuery:
         """Set rays that are valid: contiguous NumPy arrays of float32. Not over several worlds."""
         self.n, self.rays = len(rays.origins), rays if self.device.is_cpu else arrays_on(self.device, rays)
-        self.roots, self.touches = roots_of(self.snapshot, None, self.n), np.zeros(self.n, bool)
+        self.roots = roots_of(self.snapshot, None, self.n)
         return self
 
     def of(self, origins: ArrayLike, directions: ArrayLike | None, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
@@ -134,7 +133,7 @@ class ListQuery:
             rays, self.shape = shaped_rays(origins, directions, t_min, t_max)
             world = worlds_of_each(world, self.shape)
         self.n, self.rays = len(rays.origins), host_arrays(rays) if self.device.is_cpu else arrays_on(self.device, rays)
-        self.roots, self.touches = roots_of(self.snapshot, world, self.n), np.zeros(self.n, bool)
+        self.roots = roots_of(self.snapshot, world, self.n)
         self.give = to_tensor_like(origins, directions) or to_numpy
         return self
 
@@ -182,19 +181,17 @@ class ListQuery:
 
     def _few(self, limit: int, take: Callable[[FewLists, np.ndarray], T]) -> T | None:
         """Return `take` of the lists of few rays and their numbers of hits; None on a GPU, and for many rays or hits."""
-        return with_stack(partial(self._take_few, limit, take)) if self.n <= MOST and self.device.is_cpu else None
+        def find(lists: FewLists) -> T | None:
+            counts = lists.find(self.snapshot, self.rays, self.roots, limit, self.mesh)
+            return None if counts is None else take(lists, self._noted(counts))
 
-    def _take_few(self, limit: int, take: Callable[[FewLists, np.ndarray], T]) -> T | None:
-        free = few_lists(self.snapshot.structure)
-        lists = free.take()
-        counts = lists.find(self.snapshot, self.rays, self.roots, limit, self.mesh)
-        taken = None if counts is None else take(lists, self._noted(counts))
-        free.give(lists)
-        return taken
+        return few_lists(self.snapshot.structure).run(find) if self.n <= MOST and self.device.is_cpu else None
 
     def _noted(self, counts: np.ndarray, first: int = 0) -> np.ndarray:
         """Convert HitLists.count of the rays from `first` on to numbers of hits, int64, and set `touches` of these rays."""
         if self.crossings:
+            if first == 0:
+                self.touches = np.zeros(self.n, bool)
             self.touches[first:first + len(counts)] = counts < 0
             counts = np.maximum(counts, 0)
         return counts.astype(np.int64)

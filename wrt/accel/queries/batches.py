@@ -16,7 +16,7 @@ from wrt.accel.snapshot import Snapshot
 from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel, worlds_kernel
 from wrt.accel.structures import stack_on
 from wrt.core.arrays import to_warp
-from wrt.core.device import empty_aligned, launch_on, load_kernel, made_once, memory_of
+from wrt.core.device import empty_aligned, launch_on, made_once, memory_of
 from wrt.core.threads import FreeList, run_all
 from wrt.core.types import Array, Device, Kernel, KernelModule, WarpStruct, WarpType
 from wrt.core.warp_private import array_record, record_of, struct_record
@@ -145,7 +145,6 @@ class Worker:
     """
 
     def __init__(self, tracer: Tracer) -> None:
-        load_kernel(tracer.kernel, wp.get_device("cpu"))
         self.rays = [np.empty((FEWEST, 3), np.float32), np.empty((FEWEST, 3), np.float32), *np.empty((2, FEWEST), np.float32)]
         self.results = [np.empty(FEWEST, dtype) for dtype in tracer.types.values()]
         if tracer.rays is WorldRays:

@@ -12,7 +12,6 @@ from wrt.accel.queries.raw_kernel import HostMemory, RawKernel
 from wrt.accel.queries.raw_launches import raw_launch
 from wrt.accel.queries.rays import Rays
 from wrt.accel.snapshot import Snapshot
-from wrt.core.device import load_kernel, start
 from wrt.core.types import WarpArray
 from wrt.core.warp_private import array_record, record_of, struct_record
 from wrt.kernels.hit_lists import FEW, HitLists
@@ -40,8 +39,6 @@ class FewLists:
     """
 
     def __init__(self, fill: RawKernel, copy: RawKernel) -> None:
-        for each in (fill, copy):
-            load_kernel(each.kernel, start("cpu"))
         self.rays = [np.empty((MOST, 3), np.float32), np.empty((MOST, 3), np.float32), *np.empty((2, MOST), np.float32)]
         self.indices = np.arange(MOST + 1, dtype=np.int32)
         self.first, self.capacity = FEW * self.indices, FEW
@@ -68,12 +65,12 @@ class FewLists:
         if self.capacity != (capacity := FEW * MOST // max(n, 1)):
             self.capacity = capacity
             np.multiply(self.indices, capacity, out=self.first)
-        if roots is not None:
-            self.root[:n] = roots
-        self.lists.limit, self.lists.crossings = limit, mesh[0] is not None
-        for name, field in zip(("vertices", "faces", "first_face"), mesh, strict=True):
-            if field is not None:
-                setattr(self.lists, name, record_of(field))
+        vertices, faces, first_face = mesh
+        self.lists.limit, self.lists.crossings = limit, vertices is not None
+        if vertices is not None and faces is not None:
+            self.lists.vertices, self.lists.faces = record_of(vertices), record_of(faces)
+        if roots is not None and first_face is not None:
+            self.root[:n], self.lists.first_face = roots, record_of(first_face)
         self.fill.set(0, record_of(snapshot.data))
         self.fill.set(2, self.lists)
         self.fill.set_dim(n)

@@ -42,6 +42,7 @@ class Launches:
 def raw_launch(kernel: Kernel, *inputs: object) -> RawLaunch:
     """Record a launch of one thread with values of the arguments' types. Raises InputError if the self-test fails."""
     check_raw_launches()
+    load_kernel(kernel, wp.get_device("cpu"))
     command = wp.launch(kernel, dim=1, inputs=list(inputs), device="cpu", record_cmd=True, record_tape=False)
     return RawLaunch(command)
 
