@@ -81,7 +81,7 @@ class Study:
         assert isinstance(found, Scene)
         return found
 
-    def tree(self, name: str, width: int, max_leaf: int = 1, bits: bool = False) -> Tree:
+    def tree(self, name: str, width: int, max_leaf: int = 1, bits: int = 32) -> Tree:
         found = self.keep(("tree", name, width, max_leaf, bits), lambda: build_tree(self.scene(name).geometry, width, max_leaf, bits))
         assert isinstance(found, Tree)
         return found
@@ -133,6 +133,7 @@ CLAIMS: Registry[Claim] = Registry("claim", {
     "turing": "wrt.lab.claims.machines:TURING",
     "predictors": "wrt.lab.claims.classics:PREDICTORS",
     "cells": "wrt.lab.claims.classics:CELLS",
+    "kd-build": "wrt.lab.claims.classics:KD_BUILD",
     "reordering": "wrt.lab.claims.classics:REORDERING",
     "watertight": "wrt.lab.claims.classics:WATERTIGHT",
 }, "wrt.claims")

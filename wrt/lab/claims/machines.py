@@ -35,17 +35,14 @@ def machines(study: Study) -> Iterator[Figure]:
                                                                   f" {study.ttp(name).fetches[rays.kind == 0].mean():.1f}")
     yield Figure("use of the box unit over use of the triangle unit, bvh6", boxes / core.boxes / (triangles / core.triangles), 1.55 / 1.04,
                  "factor", f"{said}; {core.boxes:g} boxes and {core.triangles:g} triangles a clock", numbers)
-    loose = walk(study.tree(name, 4, 4), part, Rules(False, False)).counts
-    for structure, published, gpu in (("bvh8c", 111.76 / 19.61, "RX 9070"), ("bvh4", 38.8 / 10.76, "RX 6900 XT")):
-        found = counters_of(study, name, structure, part)
-        nodes, wide = float(found.nodes.mean()), float(found.boxes.mean())
-        few = float(found.primitives.mean())
-        yield Figure(f"boxes for each triangle, {structure} as {gpu}", wide / few, published, "factor",
-                     f"{study.differences(name, '3DMark DXR feature test')}; own leaves of up to {structure[3]} triangles; planes of"
-                     f" {8 if structure == 'bvh8c' else 32} bits, no rotated boxes", f"{nodes:.1f} nodes, {wide:.1f} boxes, {few:.2f}"
-                                                                                     " triangles a ray; without order and culling, width"
-                                                                                     " 4, binned tree:"
-                     f" {loose['boxes'].sum() / loose['tests'].sum():.1f}")
+    for width, bits, published, gpu in ((8, 12, 111.76 / 19.61, "RX 9070"), (4, 32, 38.8 / 10.76, "RX 6900 XT")):
+        here, *others = (walk(study.tree(name, width, width, each), part, rules).counts for each, rules in
+                         ((bits, Rules()), (8, Rules()), (32, Rules()), (bits, Rules(False, False))))
+        eight, full, loose = (counts["boxes"].sum() / counts["tests"].sum() for counts in others)
+        yield Figure(f"boxes for each triangle, {width} children as {gpu}", here["boxes"].sum() / here["tests"].sum(), published, "factor",
+                     f"{study.differences(name, '3DMark DXR feature test')}; own leaves of up to {width} triangles; planes of {bits} bits,"
+                     " no rotated boxes", f"{here['inner'].mean():.1f} nodes, {here['boxes'].mean():.1f} boxes, {here['tests'].mean():.2f}"
+                     f" triangles a ray; planes of 8 bits: {eight:.1f}, of 32 bits: {full:.1f}; without order and culling: {loose:.1f}")
 
 
 def turing(study: Study) -> Iterator[Figure]:

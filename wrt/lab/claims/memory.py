@@ -107,7 +107,7 @@ def eight_bits(study: Study) -> Iterator[Figure]:
     rays = study.rays(name)
     part = rays.part((rays.kind == 0) & (rays.depth > 0))
     warp = np.unique(part.warp, return_inverse=True)[1]
-    logs = [walk(study.tree(name, 8, 8, bits), part, Rules(), log=True) for bits in (False, True)]
+    logs = [walk(study.tree(name, 8, 8, bits), part, Rules(), log=True) for bits in (32, 8)]
     alone = [float((log.counts["inner"] * NODE[i] + log.counts["tests"].astype(np.float64) * TRIANGLE[i]).mean())
              for i, log in enumerate(logs)]
     boxes = float((logs[1].counts["inner"] * NODE[1] + logs[1].counts["tests"].astype(np.float64) * TRIANGLE[0]).mean())

@@ -36,7 +36,7 @@ def short_stack(study: Study) -> Iterator[Figure]:
     """Compare the nodes a ray of short stacks with those of a full stack, and primitive tests with and without culling at the pop."""
     name = "sponza"
     rays, said = study.rays(name), study.differences(name, "their own scenes")
-    for label, width, bits in (("bvh4", 4, False), ("bvh8c", 8, True)):
+    for label, width, bits in (("bvh4", 4, 32), ("bvh8c", 8, 8)):
         tree = study.tree(name, width, width, bits)
         nodes = {entries: float(short_walk(tree, rays, entries)["inner"].mean()) for entries in (*ENTRIES, FULL)}
         curve = ", ".join(f"{entries}: {mean / nodes[FULL]:.2f}" for entries, mean in nodes.items() if entries < FULL)
@@ -44,7 +44,7 @@ def short_stack(study: Study) -> Iterator[Figure]:
                      f"{said}; published as 'close to a full stack', compared with 1; nodes read again after a restart count",
                      f"by entries: {curve}",
                      factor=1.1)
-    plain, culled = (walk(study.tree(name, 8, 8, True), rays, Rules(True, each)).counts["tests"].mean() for each in (False, True))
+    plain, culled = (walk(study.tree(name, 8, 8, 8), rays, Rules(True, each)).counts["tests"].mean() for each in (False, True))
     yield Figure("primitive tests that culling of popped leaves saves, bvh8c", 100.0 * float(1.0 - culled / plain), (0.0, 14.0), "%",
                  f"{said}; published as 'up to 14 %'; ours culls inner nodes too", f"{plain:.2f} tests a ray without, {culled:.2f} with"
                                                                                    " culling")

@@ -20,6 +20,7 @@ from wrt.kernels.structs import Primitive, Surfaces
 from wrt.kernels.study import tree_walk as kernels
 from wrt.kernels.study.tree_walk import QUEUE
 from wrt.kernels.traverse.common import Units
+from wrt.lab.rtcore.whatif import quantised
 
 RAYS_PER_LAUNCH = 2048
 NODE_BYTES = 64  # of an inner node and of a leaf
@@ -117,13 +118,13 @@ def tree_of(geometry: Geometry, wide: WideTree) -> Tree:
     return Tree(wide, data)
 
 
-def build_tree(geometry: Geometry, width: int, max_leaf: int = 1, bits: bool = False) -> Tree:
-    """Build a tree of nodes with `width` children, as wrt's wide BVHs are built. bits: round boxes outwards to 8 bits per plane (width 2
-    to 8, even)."""
+def build_tree(geometry: Geometry, width: int, max_leaf: int = 1, bits: int = 32) -> Tree:
+    """Build a tree of nodes with `width` children, as wrt's wide BVHs are built. bits: of a plane of a box, rounded outwards; 8: in the
+    nodes of bvh8c (width 2 to 8, even); 32: float32."""
     options = BvhOptions(max_leaf=max_leaf, cost_traversal=0.0, row=width)
     wide = collapse(build_binary(geometry, options, 1), width, max_leaf, 1.0, 1.0)
-    if bits:
-        lo, hi = decompress(compress(wide.lo, wide.hi, wide.exists), width)
+    if bits < 32:
+        lo, hi = decompress(compress(wide.lo, wide.hi, wide.exists), width) if bits == 8 else quantised(wide.lo, wide.hi, bits)[:2]
         wide = WideTree(np.ascontiguousarray(lo), np.ascontiguousarray(hi), wide.children, wide.order, wide.leaves, wide.depth, wide.stack)
     return tree_of(geometry, wide)
 

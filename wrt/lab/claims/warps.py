@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import warp as wp
 
+from wrt.accel.scenes.build import build
 from wrt.core.device import launch, load_kernel, start, upload
 from wrt.core.types import WarpStruct
 from wrt.kernels.study import warp_loops as kernels
@@ -15,6 +17,8 @@ from wrt.lab.claims.nodes import THEIRS
 from wrt.lab.claims.prefetch import device_log, replayed
 from wrt.lab.claims.scenes import AO, PATH, SHADOW
 from wrt.lab.claims.walks import Rays, Rules, Walk, walk
+from wrt.lab.rtcore.model import Work, predict
+from wrt.lab.rtcore.parameters import GPUS
 from wrt.lab.rtcore.warps import WARP, longest_of
 
 LOOP_NAMES = {"if-if": kernels.IF_IF, "while-while": kernels.WHILE_WHILE, "speculative while-while": kernels.SPECULATIVE}
@@ -73,6 +77,22 @@ def coop_rt(study: Study) -> Iterator[Figure]:
                      f"lanes active {gains[workload][1]:.1%} without and {gains[workload][2]:.1%} with help; a gain in steps leaves out"
                      " waits"
                      f" for memory. Order of the gains: {order}")
+    yield occupancy(study, name, said)
+
+
+def occupancy(study: Study, name: str, said: str) -> Figure:
+    """Predict what more warps at a time gain. said: differences of set-up."""
+    rays, accel, gpu = study.rays(name), build(study.scene(name).geometry, "bvh6"), GPUS["rtx2060"]
+    part = rays.part(rays.kind == 0)
+    counters = accel.closest_hit(part.origins, part.directions, trace=True).counters
+    assert counters is not None
+    work = Work(PATH, counters, np.unique(part.warp, return_inverse=True)[1])
+    few, many = (predict(work, gpu, replace(gpu.core, boxes=6.0, warps=warps)) for warps in (4, 32))
+    slow = [predict(work, gpu, replace(gpu.core, warps=warps)).rays_per_second for warps in (4, 32)]
+    return Figure("speed with 32 warps at a time over 4, path tracing", many.rays_per_second / few.rays_per_second, 1.64, "ratio",
+                  f"{said}; the model of docs/rt_core.md in place of a simulator; one node of six boxes a clock assumed; camera and bounce"
+                  " rays, sorted and culled", f"4 warps wait for {few.limit}: {few.clocks[few.limit]:.1f} clocks a ray; 32 for"
+                  f" {many.limit}: {many.clocks[many.limit]:.1f}; with 4 boxes a clock the ratio is {slow[1] / slow[0]:.2f}")
 
 
 def repacked(cost: np.ndarray, warp: np.ndarray, below: int = REPACK_BELOW) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import OrderedDict, deque
 from functools import cache
 from typing import Any
@@ -12,8 +13,10 @@ import pytest
 from tests.rewalk import INF, WalkRay
 from tests.rewalk import rays as with_hits
 from wrt.accel.bvh.six import Bvh6
+from wrt.accel.cells.kdtree import KdTree
 from wrt.accel.geometry import Geometry
 from wrt.kernels.study.k_hits import KEPT
+from wrt.lab.claims.classics import split_references
 from wrt.lab.claims.prefetch import AHEAD, Accesses, fully_associative, in_order, replayed, through_caches
 from wrt.lab.claims.scenes import hall, statue
 from wrt.lab.claims.stacks import FULL, cloud, k_walk, short_walk
@@ -75,9 +78,9 @@ def twin(tree: Tree, i: int, rules: Rules) -> tuple[list[int], list[int], list[i
 
 
 @pytest.mark.parametrize("rules", RULES, ids=str)
-@pytest.mark.parametrize(("width", "max_leaf"), [(2, 1), (6, 1), (8, 5)])
-def test_a_walk_is_that_of_plain_python(width: int, max_leaf: int, rules: Rules) -> None:
-    tree = build_tree(BALLS, width, max_leaf, bits=width == 6)
+@pytest.mark.parametrize(("width", "max_leaf", "bits"), [(2, 1, 32), (6, 1, 8), (8, 5, 12)])
+def test_a_walk_is_that_of_plain_python(width: int, max_leaf: int, bits: int, rules: Rules) -> None:
+    tree = build_tree(BALLS, width, max_leaf, bits)
     log = walk(tree, some_rays(), rules, log=True)
     for i in range(len(some_rays())):
         fetches, entered, pushed, prim_id = twin(tree, i, rules)
@@ -218,9 +221,22 @@ def test_repacking_is_between_the_warps_and_full_lanes() -> None:
     assert repacked(np.full(64, 7), np.arange(64) // 32) == 1.0
 
 
+def test_planes_of_fewer_bits_give_larger_boxes_and_the_same_hits() -> None:
+    rays = some_rays()
+    trees = [build_tree(BALLS, 8, 4, bits) for bits in (32, 12, 8, 4)]
+    for finer, coarser in itertools.pairwise(trees):
+        exists = finer.wide.exists
+        for axis in range(3):
+            assert (coarser.wide.lo[exists][:, axis] <= trees[0].wide.lo[exists][:, axis]).all()
+            assert (coarser.wide.hi[exists][:, axis] >= trees[0].wide.hi[exists][:, axis]).all()
+        one, two = (walk(tree, rays, Rules(False, False)).counts for tree in (finer, coarser))
+        assert two["boxes"].sum() >= one["boxes"].sum() and np.array_equal(one["prim_id"], two["prim_id"])
+    assert (trees[-1].wide.hi - trees[-1].wide.lo)[exists].sum() > 1.05 * (trees[0].wide.hi - trees[0].wide.lo)[exists].sum()
+
+
 @pytest.mark.parametrize("width", [2, 4, 8])
 def test_a_short_stack_finds_the_same_hits(width: int) -> None:
-    rays, tree = some_rays(), build_tree(BALLS, width, 2, bits=width == 8)
+    rays, tree = some_rays(), build_tree(BALLS, width, 2, bits=8 if width == 8 else 32)
     full = walk(tree, rays, Rules()).counts
     last = None
     for entries in (FULL, 3, 2, 1, 0):
@@ -307,3 +323,21 @@ def test_treelets_hold_every_node_once_and_rays_make_every_fetch() -> None:
 
 def test_generated_scenes_have_the_stated_size() -> None:
     assert len(statue().faces) == 81_920 and 80_000 < len(hall().faces) < 120_000
+
+
+def test_the_references_of_split_cells_are_those_of_plain_python() -> None:
+    tree = KdTree(BALLS)
+    nodes = tree.built.arrays["nodes"]
+    total = 0
+
+    def below(node: int) -> set[int]:
+        nonlocal total
+        first, axis = divmod(int(nodes["word"][node]), 4)
+        if axis == 3:
+            return set(tree.built.order[first : first + int(nodes["split"][node])].tolist())
+        found = below(first) | below(first + 1)
+        total += len(found)
+        return found
+
+    assert below(0) == set(range(len(BALLS)))
+    assert split_references(tree) == total > len(BALLS)
