@@ -145,7 +145,12 @@ for row in report:
 # %% [markdown]
 # ## Which tree?
 # A BVH can be built in many ways. The surface area heuristic (SAH) predicts the number of steps of a random line through the root's box,
-# if no hit stops the line. The line meets a node with the probability (area of the node's box) / (area of the root's box). The plot
+# if no hit stops the line. The line meets a node with the probability (area of the node's box) / (area of the root's box). So a builder
+# divides a node of the area $A$ where this cost is lowest:
+#
+# $$ c_{node} + c_{triangle}\,\frac{A_1 N_1 + A_2 N_2}{A} $$
+#
+# for children of the areas $A_i$ with $N_i$ triangles. If a leaf, $c_{triangle}\,(N_1 + N_2)$, costs less, it makes a leaf. The plot
 # compares six builders over the stadium with its pot: the prediction, and the measured steps of random lines and of the picture's rays.
 
 # %%

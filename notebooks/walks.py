@@ -120,12 +120,14 @@ plt.show()
 
 # %% [markdown]
 # - **Grid**: all cells are equal. The ray goes from cell to neighbouring cell, through empty ones, too.
-# - **Octree**: a cell is cut into eight equal parts (four, seen from above) while it has many triangles. Empty space costs few steps.
-# - **k-d tree**: a plane at right angles to an axis cuts each cell where this makes random rays cheapest.
+# - **Octree**: a cell is cut into eight equal parts (four, seen from above) while it has many triangles. Empty space costs few steps. The
+#   signs of the direction give the order of the parts from near to far.
+# - **k-d tree**: a plane at right angles to an axis cuts each cell where this makes random rays cheapest. The side from which the ray comes
+#   is visited first.
 # - **BSP tree** (binary space partitioning): the planes have any orientation. They are planes of the triangles themselves, so that cells
-#   fit the pillars; but every plane test costs more.
+#   fit the pillars; but every plane test costs more. The order is that of the k-d tree.
 # - **BVH**: boxes surround groups of triangles. Boxes may overlap, each triangle is in one leaf, and empty space is in no box. `bvh2` has
-#   two children per node, `bvh8` eight: fewer nodes, about as many box tests.
+#   two children per node, `bvh8` eight: fewer nodes, about as many box tests. The box that the ray enters first is visited first.
 #
 # ## Step by step
 # `walk.draw(step=...)` draws the walk up to a step, `walk.save("walk.gif")` an animation of all. Its horizontal axis is the ray itself,

@@ -276,7 +276,7 @@ class WhatIf(Plan):
     STUDY names the part. "width": children, format and bounding volume of a node. "stack": entries of a short stack with restarts.
     "planes": bits of a box plane. "order": order of children, early stop. "sorting": order of the rays. "rates": tests a clock."""
 
-    COMMAND, STUDY = "whatif", "wrt.lab.rtcore.whatif"
+    COMMAND, STUDY, QUICK = "whatif", "wrt.lab.rtcore.whatif", {"rays": 1 << 12}
     study: str = option(MISSING, of=("study", "wrt.lab.rtcore.whatif:STUDIES"))
     mesh: Any = option(MISSING)  # noqa: RUF009
     kinds: Sequence[str] = the_kinds("primary", "diffuse")

@@ -22,13 +22,12 @@ if TYPE_CHECKING:
 MOST_COLUMNS, COLUMN_BARS = 3, 24  # of a picture: columns, and height in bars from which a column is divided
 AROUND = 3  # height of a panel's title and axis in bars
 TITLE = "Published claims, repeated"
-FOUND: Columns = {"claim": "{claim}", "what": "{what}", "unit": "{unit}",
-                  "published": lambda row: said(row.published), "ours": "{ours:.4g}",
-                  "ratio": lambda row: "" if row.ratio is None else f"{row.ratio:.2f}", "verdict": "{verdict}"}
+OWN: Columns = {"claim": "{claim}", "what": "{what}", "unit": "{unit}", "ours": "{ours:.4g}"}
+COMPARED: Columns = {**OWN, "published": lambda row: said(row.published), "ratio": "{ratio:.2f}", "verdict": "{verdict}"}
 LEGEND = f"""\
 published: a number, or the two ends of a range; ratio: ours over it, 1 within a range. agrees: within a factor of 1.5 ({SAME_SCENE:g}
-where said), and on the same side of 1 for a unit of ratio. differs: the list of sources says what a measurement shows about it. own
-finding: no number to compare with. In brackets after a source: read in the original, quoted by others, the abstract alone, or memory.
+where said), and on the same side of 1 for a unit of ratio. differs: the list of sources says what a measurement shows about it. Own
+findings have no number to compare with. In brackets after a source: read in the original, quoted by others, the abstract alone, or memory.
 Generated scenes stand in for scenes without a file. Nothing is timed: equal options give equal rows."""
 
 
@@ -55,12 +54,15 @@ def row_of(name: str, figure: Figure) -> Row:
 
 
 def parts(rows: Sequence[Row], plan: Plan) -> list[Part]:
-    """Return the table of numbers, the tables of rules (width, order, culling), and a list with the source and set-up of each claim."""
+    """Return the tables of compared and of other numbers, the tables of rules (width, order, culling), and a list with the source and
+    set-up of each claim."""
     compared = [row for row in rows if row.published is not None]
     agree = sum(row.verdict == "agrees" for row in compared)
-    numbers, rules = ([row for row in rows if (row.claim == "rules") == chosen] for chosen in (False, True))
+    rules = [row for row in rows if row.claim == "rules"]
+    own = [row for row in rows if row.published is None and row.claim != "rules"]
     items = [item(group) for group in grouped(rows, "claim").values()]
-    return [tabled(FOUND, numbers, "Numbers", f"{agree} of {len(compared)} compared numbers agree."), *rules_tables(rules),
+    return [tabled(COMPARED, compared, "Compared numbers", f"{agree} of {len(compared)} compared numbers agree."),
+            *([tabled(OWN, own, "Own findings")] if own else []), *rules_tables(rules),
             Part("Sources, differences of set-up, and what explains them", "\n".join(items))]
 
 
@@ -175,7 +177,7 @@ def bars(axes: Axes, rows: Sequence[Row]) -> None:
         end = max(row.ours, 0.0, *(np.ravel(row.published) if row.published is not None else ()))
         axes.text(end, y, f"  {text}", va="center", fontsize="x-small")
     axes.set_yticks(at, [textwrap.fill(row.what, 40) for row in rows], fontsize="x-small")
-    axes.margins(x=0.5)
+    axes.margins(x=0.6)
     axes.set_title(textwrap.fill(f"{claim}: {source}", 66), fontsize="small", loc="left")
     axes.set_xlabel(unit or "correlation (no unit)", fontsize="x-small")
     axes.tick_params(axis="x", labelsize="x-small")
