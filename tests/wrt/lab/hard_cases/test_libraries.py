@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from tests.command_line import wrt as run
+from wrt.lab.bench import report
 from wrt.lab.hard_cases import libraries
-from wrt.lab.hard_cases.comparison import parts, rows
+from wrt.lab.hard_cases.comparison import parts
 from wrt.lab.hard_cases.conformance import Case
 from wrt.lab.hard_cases.libraries import LIBRARIES, Library, usable
 from wrt.lab.plans import HardCases
@@ -32,7 +33,7 @@ def test_what_is_not_installed_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     nowhere = Library("Nowhere", LIBRARIES["wrt"].closest_hit, ["no_such_package_at_all"])
     monkeypatch.setitem(libraries.LIBRARIES, "nowhere", nowhere)
     plan = HardCases(("D_published",), libraries=("nowhere",), rays=5)
-    found = list(rows(plan))
+    found = report.run(plan)
     assert [row.missing for row in found] == ["not installed: no_such_package_at_all"]
     assert parts(found, plan)[0].text == "Nowhere: not installed: no_such_package_at_all."
 
@@ -43,7 +44,7 @@ def test_errors_are_counted_beside_wrong_rays(monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setitem(libraries.LIBRARIES, "wrt", Library("wrt", broken))
     plan = HardCases(("D_published", "I_mesh_not_finite"), libraries=("wrt",), rays=5)
-    found = parts(list(rows(plan)), plan)
+    found = parts(report.run(plan), plan)
     assert ("all", "10", "0 and 1 errors") in found[0].lines
     assert [line[:2] for line in found[1].lines] == [("D_published", "5"), ("I_mesh_not_finite", "5")]
 
