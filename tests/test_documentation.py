@@ -29,7 +29,7 @@ from wrt.io.mesh_file import load_mesh
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "kernels" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 NOTES = sorted((ROOT / "docs" / "lab_notes").glob("*.md"))  # dated: their commands and Python are not run
 # Commands of other programs, and commands of wrt that have their own tests or that .ci/run runs.
-OTHERS = ("pip install ", "pytest", "python -m pdoc ", "dask ", "python -m tests.fuzz ", "python -m tests.virtual_gpu ",
+OTHERS = ("pip install ", "pytest", "mkdocs ", "dask ", "python -m tests.fuzz ", "python -m tests.virtual_gpu ",
           "openssl req ", "python -m tests.inspect_all", "export DASK_", "ulimit -v ", "timeout -k ", "prlimit ")
 # Placeholders in command lines, and the files of the fixture `folder` that replace them.
 STANDS_FOR = {"MESH...": "model.ply", "MESH": "model.ply", "SCENE": "scenes/whitted.toml", "FILE.gif": "file.gif", "STUDY": "order",
@@ -206,6 +206,57 @@ def test_python_runs(page: str, folder: Path, tmp_path: Path, monkeypatch: pytes
         file = tmp_path / f"block_{i}.py"  # Warp reads the source of kernels
         file.write_text(cheap, encoding="utf-8")
         exec(compile(cheap, file, "exec"), names)
+
+
+def calls(theirs: str) -> list[tuple[str, str]]:
+    """Return the code of both columns of the table of docs/compat.md whose first head begins with `theirs`, from the cells of each row."""
+    text = (ROOT / "docs" / "compat.md").read_text(encoding="utf-8")
+    table = re.search(rf"^\| {theirs}[^|]*\| the same in wrt \|\n\|---\|---\|\n((?:\|.*\n)+)", text, re.MULTILINE)
+    assert table, theirs
+    cells = [(row.strip("| ").split(" | ")) for row in table[1].splitlines()]
+    return [("\n".join(re.findall("`([^`]+)`", a)), "\n".join(re.findall("`([^`]+)`", b))) for a, b in cells]
+
+
+@pytest.mark.parametrize("theirs", ["trimesh", "Open3D", "Embree 4", "Mitsuba 3"])
+def test_calls_in_the_tables_for_other_libraries_run(theirs: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """wrt's calls of a table run in the order of the rows; trimesh's calls run, too, and arrays of both agree."""
+    import trimesh
+
+    import wrt
+    from wrt.scene.shapes import icosphere
+
+    shutil.copytree(folder, tmp_path / "here")
+    monkeypatch.chdir(tmp_path / "here")
+    ball = icosphere(2)
+    origins = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3)) + (0, 0, 5)
+    directions = np.tile((0.0, 0.0, -1.0), (50, 1))
+    names: dict[str, Any] = {
+        "np": np, "wrt": wrt, "mesh": ball, "vertices": ball.vertices, "faces": ball.faces, "moved": ball.vertices, "points": origins,
+        "origins": origins, "directions": directions, "rays": np.concatenate([origins, directions], axis=1), "pose": np.eye(4),
+        "K": np.diag([500.0, 500.0, 1.0]), "colors": np.zeros((10_000, 3)), "scene": wrt.Scene.of([ball, ball]),
+        "trimesh_mesh": ball.to_trimesh(), "query": wrt.ray_query("bvh")}
+    theirs_names = {**names, "trimesh": trimesh, "mesh": ball.to_trimesh(), "scene": trimesh.Scene(ball.to_trimesh())}
+    names["accel"] = wrt.build(ball)
+    run_lines, agree = 0, 0
+    for call, ours in calls(theirs):
+        code = ours.replace('"bunny.ply"', '"model.ply"').replace("spp=64", "spp=1, size=(16, 9)").replace(", size=(640, 360)", "")
+        lines = [line for line in code.splitlines() if line != 'device="cuda:0"']
+        run_lines += len(lines)
+        result = [value_of(line, names) for line in lines][-1:]
+        if theirs == "trimesh":
+            call = re.sub(r"(trimesh\.proximity\.\w+)\(.*", r"\1", call)  # trimesh needs rtree to run these
+            other = [value_of(line, theirs_names) for line in call.replace('"bunny.ply"', '"model.ply"').splitlines()]
+            if other and isinstance(other[0], np.ndarray) and other[0].shape == np.shape(result[0]):
+                np.testing.assert_allclose(result[0], other[0], atol=1e-5)
+                agree += 1
+    assert run_lines > 12 and agree >= (3 if theirs == "trimesh" else 0)
+
+
+def value_of(line: str, names: dict[str, Any]) -> Any:
+    """Run a line of Python and return its value, None for a statement."""
+    if re.match(r"\w+ = |[\w.]+ = ", line):
+        return exec(line, names)
+    return eval(line, names)
 
 
 # --- the API reference ------------------------------------------------------------------------------------------------

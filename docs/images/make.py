@@ -1,6 +1,8 @@
-"""Make the three pictures of README.md: `PYTHONPATH=. python docs/images/make.py`."""
+"""Make the pictures of README.md and docs/gallery.md: `PYTHONPATH=. python docs/images/make.py`."""
 
+import contextlib
 import io
+import re
 import tempfile
 from pathlib import Path
 
@@ -83,7 +85,22 @@ def rays() -> None:
     picture.save(HERE / "rays.jpg", quality=88, optimize=True)
 
 
+def gallery() -> dict[str, str]:
+    """Return the code of each picture of docs/gallery.md, by the name of its file."""
+    page = (HERE.parent / "gallery.md").read_text(encoding="utf-8")
+    codes = re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
+    return {re.search(r'save\("(.*)"\)\n\Z', code)[1]: code for code in codes}
+
+
+def run(code: str, folder: Path) -> None:
+    """Run the code of a picture, which saves the picture in `folder`."""
+    with contextlib.chdir(folder):
+        exec(code.replace('"scenes/', f'"{HERE.parents[1]}/scenes/'), {})
+
+
 def main() -> None:
+    for code in gallery().values():
+        run(code, HERE / "gallery")
     stadium = HERE.parents[1] / "scenes" / "stadium.toml"
     wrt.render(stadium, spp=64, size=SIZE).save(HERE / "mesh.png")
     with tempfile.TemporaryDirectory() as folder:

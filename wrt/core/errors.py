@@ -20,6 +20,9 @@ PREDICATE = re.compile(r"(must|is|are|has|have|holds?|needs?|requires?|shares|ca
 class InputError(ValueError):
     """Input that cannot be used: a file, a scene, an option.
 
+    The parameters are attributes of the error. `str` gives the message: where, what is wrong, what would be right. If one file
+    includes another, `path` is the included file, and `outside` says where the first file names it: "scene.toml: include[0]".
+
     Parameters
     ----------
     what : what is wrong: a predicate of the argument ("must be 1 or more, got 0"), or a complete sentence
@@ -27,9 +30,6 @@ class InputError(ValueError):
     path : the file that is wrong
     place : where in the file, or in which object: "nodes[3].scale", "line 7", "camera 'main'"
     hint : what would be right, or what to do
-
-    The parameters are attributes of the error. `str` gives the message: where, what is wrong, what would be right. If one file
-    includes another, `path` is the included file, and `outside` says where the first file names it: "scene.toml: include[0]".
     """
 
     def __init__(self, what: str, *, argument: str | None = None, path: str | os.PathLike[str] | None = None,
