@@ -20,6 +20,7 @@ from wrt.accel.queries.counting import counted
 from wrt.accel.queries.gradients import record
 from wrt.accel.queries.rays import are_rows, rays_of
 from wrt.accel.queries.shapes import flat_arrays, in_shape, shaped_rays, worlds_of_each
+from wrt.accel.queries.tiles import tiled_width
 from wrt.accel.queries.world_ids import check_world
 from wrt.accel.snapshot import Snapshot
 from wrt.accel.structure import Structure, check_units
@@ -178,7 +179,7 @@ class Accelerator:
                                              give is not None)
         snapshot = self._snapshot  # read once, because a refit may replace it during the query
         worlds = check_world(snapshot, world, len(t))
-        query, counters = Query(rays, arrays, threads, worlds), None
+        query, counters = Query(rays, arrays, threads, worlds, tiled_width(shape) if shape else 0), None
         if costs and any(checked_names(costs, "closest_hit", CostOptions).values()):
             counters = counted(snapshot, query, fetches_too=costs.get("trace", False))
         else:
@@ -235,7 +236,8 @@ class Accelerator:
         give = to_tensor_like(origins, directions)
         arrays = answer_arrays(ANY_HIT_TYPES, callers, len(rays.origins), self.device if rays.as_warp else None, give is not None)
         snapshot = self._snapshot
-        trace_query(snapshot, Query(rays, arrays, threads, check_world(snapshot, world, len(arrays[0]))))
+        worlds = check_world(snapshot, world, len(arrays[0]))
+        trace_query(snapshot, Query(rays, arrays, threads, worlds, tiled_width(shape) if shape else 0))
         found = arrays[0] if shape is None else in_shape(arrays[0], shape)
         return found if give is None else give(found)
 

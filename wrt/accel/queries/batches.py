@@ -11,6 +11,7 @@ import warp as wp
 from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES
 from wrt.accel.queries.raw_launches import raw_launch
 from wrt.accel.queries.rays import Rays, rays_on
+from wrt.accel.queries.tiles import SIDE, copy_from_tiles, copy_to_tiles
 from wrt.accel.queries.world_ids import WorldIds
 from wrt.accel.snapshot import Snapshot
 from wrt.accel.structure import Structure, any_hit_kernel, closest_hit_kernel, worlds_kernel
@@ -33,16 +34,21 @@ MOST_ON_GPU = 1 << 26  # largest number of rays that are copied to a GPU at once
 BYTES_OF_RAY = 48  # a ray and its hit
 FITS_ANY_GPU = 1 << 20  # up to this number of rays, the free memory of the GPU is not queried
 MOST_PACKED = (1 << 31) - 64  # rays: kernels index in int32, and their last block may exceed the range
+BUFFERED = 16384  # rays in a worker's buffers, and in a launch of tiles: 640 KB, which stay in the core's cache
 SMALL = 1024  # up to this number of rays, a copy is faster than kernel records of the caller's arrays
 
 
 class Query(NamedTuple):
-    """A call of closest_hit or any_hit. out: arrays for the results: t, u, v and prim_id, or one array of bool."""
+    """A call of closest_hit or any_hit.
+
+    out: arrays for the results: t, u, v and prim_id, or one array of bool. width: see tiles.tiled_width.
+    """
 
     rays: Rays
     out: list[Array]
     threads: int
     worlds: WorldIds | None = None
+    width: int = 0
 
 
 def trace_query(snapshot: Snapshot, query: Query) -> None:
@@ -99,11 +105,14 @@ class Tracer:
         in_place = SMALL < n <= MOST_PACKED and all(map(readable, inputs))
         if query.worlds is not None:
             inputs.append(query.worlds.arrays.id.numpy())
-        packed = pack(self.rays, inputs, results) if in_place else None
+        width = query.width if in_place and self.stream else 0
+        packed = pack(self.rays, inputs, results) if in_place and not width else None
         if packed and self.stream:
             ranges = parts(n, threads, self.block) if n > FEWEST else [(0, n)]
         else:
             part = RAYS_PER_LAUNCH if packed else FEWEST
+            if width:
+                part = BUFFERED // (SIDE * width) * SIDE * width
             ranges = [(first, min(first + part, n)) for first in range(0, n, part)]
         refused: list[bool] = []
 
@@ -112,7 +121,7 @@ class Tracer:
             if packed:
                 worker.launch(snapshot, packed, first, end)
             else:
-                worker.trace(snapshot, [array[first:end] for array in inputs], [array[first:end] for array in results])
+                worker.trace(snapshot, [array[first:end] for array in inputs], [array[first:end] for array in results], width)
             refused.append(bool(worker.report[ANY_REFUSED]))
             self.workers.give(worker)
 
@@ -145,10 +154,10 @@ class Worker:
     """
 
     def __init__(self, tracer: Tracer) -> None:
-        self.rays = [np.empty((FEWEST, 3), np.float32), np.empty((FEWEST, 3), np.float32), *np.empty((2, FEWEST), np.float32)]
-        self.results = [np.empty(FEWEST, dtype) for dtype in tracer.types.values()]
+        self.rays = [np.empty((BUFFERED, 3), np.float32), np.empty((BUFFERED, 3), np.float32), *np.empty((2, BUFFERED), np.float32)]
+        self.results = [np.empty(BUFFERED, dtype) for dtype in tracer.types.values()]
         if tracer.rays is WorldRays:
-            self.rays.append(np.empty(FEWEST, np.int32))
+            self.rays.append(np.empty(BUFFERED, np.int32))
         self.packed = pack(tracer.rays, self.rays, self.results)
         self.block, self.scratch = tracer.block, new_scratch(tracer.sizes)
         self.report = self.scratch.report.numpy() if tracer.stream else np.zeros(REPORT_SIZE, np.int32)
@@ -158,18 +167,23 @@ class Worker:
         self.inputs: list[object] = [None] * (len(own) + 5)  # of the last launch
         self.own = [record_of(self.scratch)] if tracer.stream else []
 
-    def trace(self, snapshot: Snapshot, rays: list[np.ndarray], results: list[np.ndarray]) -> None:
-        """Trace at most FEWEST rays by means of the buffers. Values beyond float32 become infinite."""
+    def trace(self, snapshot: Snapshot, rays: list[np.ndarray], results: list[np.ndarray], width: int = 0) -> None:
+        """Trace at most BUFFERED rays by means of the buffers, in tiles if `width` is not 0. Values beyond float32 become infinite."""
         n = len(rays[0])
         for target, source in zip(self.rays, rays, strict=True):
-            if source.dtype == np.float32:
+            if width and source.flags.c_contiguous:
+                copy_to_tiles(target[:n], source, width)
+            elif source.dtype == np.float32:
                 target[:n] = source
             else:
                 with np.errstate(over="ignore"):
                     target[:n] = source
         self.launch(snapshot, self.packed, 0, n)
         for result, found in zip(results, self.results, strict=True):
-            result[:] = found[:n]
+            if width:
+                copy_from_tiles(result, found[:n], width)
+            else:
+                result[:] = found[:n]
 
     def launch(self, snapshot: Snapshot, packed: tuple[Any, Any], first: int, end: int) -> None:
         """Trace the rays [first, end) of `packed`, from `pack`. Afterwards report[ANY_REFUSED] tells whether one of them was invalid."""
