@@ -18,7 +18,8 @@ from wrt.core.checks import did_you_mean, shown
 from wrt.core.device import empty_aligned
 from wrt.core.errors import InputError
 from wrt.core.html import html_table
-from wrt.core.types import Array, ArrayT, Device, TensorT, WarpArray
+from wrt.core.tables import write_table
+from wrt.core.types import Array, ArrayT, Device, PathLike, TensorT, WarpArray
 
 HIT_TYPES = {"out.t": np.float32, "out.u": np.float32, "out.v": np.float32, "out.prim_id": np.int32}
 ANY_HIT_TYPES = {"out": np.bool_}
@@ -128,6 +129,30 @@ class Hits(HitPoints[ArrayT]):
         if len(t):
             facts |= {"nearest t": float(t.min()), "farthest t": float(t.max())}
         return html_table("Hits", (), facts.items()) + (self.counters._repr_html_() if self.counters else "")
+
+    def save(self, path: PathLike) -> None:
+        """Write a table with one row per element of `t`, in C order.
+
+        Its columns are index, t, u, v, prim_id; x, y and z of `point`, if the hits have a `source`; and `counters`, if any.
+        Numbers keep their bits. On a miss, t is inf, prim_id -1, and x, y and z are NaN.
+
+        Parameters
+        ----------
+        path : str or path
+            A .csv or .parquet file.
+
+        Raises
+        ------
+        InputError
+            For another suffix, for Parquet without pyarrow, or if the file cannot be written.
+        """
+        hits = self.numpy()
+        columns = {"index": np.arange(hits.t.size), "t": hits.t, "u": hits.u, "v": hits.v, "prim_id": hits.prim_id}
+        if hits.source is not None:
+            columns |= dict(zip("xyz", np.moveaxis(hits.point, -1, 0), strict=True))
+        if hits.counters is not None:
+            columns |= {name: hits.counters.counts[name] for name in hits.counters.counts.dtype.names or ()}
+        write_table(path, {name: column.reshape(-1) for name, column in columns.items()})
 
     def numpy(self) -> Hits[npt.NDArray[Any]]:
         """Return the hits with NumPy arrays, which share the memory of hits on the CPU."""

@@ -17,6 +17,7 @@ from wrt.accel.queries.recorded_steps import RAYS_AT_ONCE, RecordedSteps, record
 from wrt.core.checks import as_path, require_known
 from wrt.core.errors import InputError
 from wrt.core.files import require_file
+from wrt.core.tables import TABLES, write_table
 from wrt.core.types import ArrayLike, PathLike
 from wrt.core.write_file import write_bytes
 from wrt.kernels.traverse import steps as of
@@ -175,9 +176,17 @@ class Trace:
         return replace(self, first=before[self.first], child_first=child_before[self.child_first[np.append(rows, True)]], **arrays)
 
     def save(self, path: PathLike) -> None:
-        """Write the trace to a .npz file, which np.load reads without wrt. Raises InputError if it cannot be written."""
-        if as_path(path, "path").suffix.lower() != ".npz":
-            raise InputError("the file of a trace must have the suffix .npz", path=path)
+        """Write the trace to a .npz file, which `load` and np.load read, or its fetches to a .csv or .parquet file.
+
+        A table has one row per fetch: ray (the index), address, size, depth, test (a name in `TESTS`), tests, result. It leaves out
+        rays, children and prefetches. Raises InputError for another suffix, without pyarrow (Parquet), or if writing fails.
+        """
+        suffix = as_path(path, "path").suffix.lower()
+        if suffix in TABLES:
+            columns = {name: getattr(self, name) for name in ("ray", *PER_FETCH)}
+            return write_table(path, {**columns, "test": np.array(TESTS)[self.test]})
+        if suffix != ".npz":
+            raise InputError(f"the file of a trace must have the suffix .npz, {' or '.join(TABLES)}", path=path)
         data = io.BytesIO()
         arrays: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(self)}
         np.savez_compressed(data, allow_pickle=False, **arrays)
