@@ -138,7 +138,7 @@ def signed_distance(accel: Accelerator, points: ArrayLike, threads: int | None =
         See `closest_points`.
     sign : str
         What decides on inside: "crossings" is `contains`, for closed meshes; "winding" is a `winding_number` above 0.5, for open
-        meshes and loose triangles, too, but not for instances.
+        meshes and loose triangles, too.
 
     Returns
     -------
@@ -153,6 +153,9 @@ def signed_distance(accel: Accelerator, points: ArrayLike, threads: int | None =
     require_known(sign, SIGNS, "rule of signs", "sign")
     accel = copy(accel)  # a refit by another thread does not change the copy
     points = vectors(points, "points", FARTHEST)  # queries return tensors for tensors
-    inside = contains(accel, points, threads, world=world) if sign == "crossings" else winding_number(accel, points, threads) > 0.5
+    if sign == "crossings":
+        inside = contains(accel, points, threads, world=world)
+    else:
+        inside = winding_number(accel, points, threads, world=world) > 0.5
     distance = closest_points(accel, points, threads, world=world).distance
     return np.where(inside, -distance, distance)

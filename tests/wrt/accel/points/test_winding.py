@@ -114,13 +114,57 @@ def test_triangles_with_a_corner_that_is_not_finite_are_left_out() -> None:
         assert wrt.winding_number(accel, [[0.1, 0.2, 0.3]], exact=True) == pytest.approx(expected, abs=1e-12)
 
 
+def placed(seed: int, even: bool) -> np.ndarray:
+    """Return a matrix that rotates, may mirror, and moves, with even or uneven scales."""
+    matrix, rng = np.eye(4), np.random.default_rng(seed)
+    matrix[:3, :3] = np.linalg.qr(rng.normal(size=(3, 3)))[0] @ np.diag([0.7, -0.7, 0.7] if even else [0.7, -1.0, 1.4])
+    matrix[:3, 3] = rng.normal(size=3) * 0.3
+    return matrix
+
+
+@pytest.mark.parametrize("exact", [False, True])
+def test_instances_and_worlds_have_the_numbers_of_the_flat_mesh(exact: bool) -> None:
+    """Also mirrored, after moves and of an open mesh; each world has its own."""
+    bowl, ball, grey = wrt.Mesh(shapes.icosphere(3).vertices, shapes.icosphere(3).faces[:700]), shapes.icosphere(2), (wrt.Material(),)
+    scenes = [wrt.Scene((wrt.Object(bowl, grey, placed(0, True), name="a"), wrt.Object(ball, grey, placed(1, False), name="b"),
+                         wrt.Object(ball, grey, placed(seed, False), name="c"))) for seed in (2, 3)]
+    points = np.random.default_rng(0).uniform(-1.5, 1.5, (300, 3)).astype(np.float32)
+    world = np.random.default_rng(1).integers(0, 2, len(points))
+    flat = [wrt.winding_number(wrt.build(scene), points, exact=True) for scene in scenes]
+    expected = np.where(world, flat[1], flat[0])
+    worlds = wrt.build(scenes)
+    found = wrt.winding_number(worlds, points, exact=exact, world=world)
+    # Rounding local points moves them by 1e-7, which matters close to the surface alone.
+    near = np.abs(wrt.signed_distance(worlds, points, world=world, sign="winding")) < 1e-3
+    assert near.sum() < 10 and np.unique(np.round(expected)).size > 1
+    np.testing.assert_allclose(found[~near], expected[~near], rtol=0.0, atol=1e-5 if exact else 3.0 * ERROR)
+    worlds.move(object="c", world=[0, 1], matrix=np.stack([placed(3, False), placed(2, False)]))
+    swapped = wrt.winding_number(worlds, points, exact=exact, world=1 - world)
+    np.testing.assert_array_equal(swapped, found)
+
+
+def test_an_instance_that_maps_points_exactly_has_the_bits_of_the_flat_mesh() -> None:
+    ball, matrix = shapes.icosphere(2), np.eye(4)
+    matrix[:3, 3] = 0.5, -2.0, 1.0
+    points = np.round(np.random.default_rng(0).uniform(-2.0, 2.0, (200, 3)) * 4096.0) / 4096.0
+    one = wrt.build(wrt.Scene((wrt.Object(ball, (wrt.Material(),), matrix),)), movable=True)
+    for exact in (False, True):
+        expected = wrt.winding_number(wrt.build(ball), points - matrix[:3, 3], exact=exact)
+        assert np.array_equal(wrt.winding_number(one, points, exact=exact), expected)
+
+
 def test_corners_nothing_and_what_is_refused() -> None:
     ball = wrt.build(shapes.icosphere(1))
     assert np.isfinite(wrt.winding_number(ball, ball.geometry.vertices)).all()
     edges = wrt.winding_number(wrt.build(shapes.box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))), [[1.0, 1.0, 0.25], [-1.0, 0.5, 1.0]])
     assert ((edges > -1e-9) & (edges < 1.0 + 1e-9)).all()
     assert wrt.winding_number(ball, np.zeros((0, 3))).shape == (0,)
+    bowl = wrt.Mesh(shapes.icosphere(1).vertices, shapes.icosphere(1).faces[:50])
+    with refused("accel", "instance 0 is an open mesh", hint="changes the winding numbers"):
+        wrt.winding_number(wrt.build(wrt.Scene((wrt.Object(bowl, (wrt.Material(),), placed(0, False)),)), movable=True), np.zeros((1, 3)))
+    with refused("world", "2 worlds"):
+        wrt.winding_number(wrt.build([shapes.icosphere(1)] * 2), np.zeros((1, 3)))
     for accel, points, said in ((ball, [[np.nan, 0.0, 0.0]], ("points", "finite")), (ball, [0.0], ("points", "(N, 3)")),
-                                ("bvh", [[0.0, 0.0, 0.0]], ("accel", "structure over one mesh"))):
+                                ("bvh", [[0.0, 0.0, 0.0]], ("accel", "structure without spheres"))):
         with refused(*said):
             wrt.winding_number(accel, points)  # type: ignore[arg-type]
