@@ -254,6 +254,41 @@ def test_noise_repeats_and_is_each_elements_own() -> None:
     assert np.array_equal(with_range_noise(ranges, 0), ranges) and (with_range_noise(np.zeros(1000), 0, 1.0) >= 0.0).all()
 
 
+def test_opencvs_pairs_of_rotation_and_translation_are_poses() -> None:
+    """A point X is seen at the pixel K (R X + t)."""
+    poses = np.stack([a_pose(seed) for seed in range(4)])
+    inverse = np.linalg.inv(poses)
+    for pair in ((inverse[:, :3, :3], inverse[:, :3, 3]), (inverse[:, :3, :3], inverse[:, :3, 3:])):
+        same, expected = pinhole(K, (8, 6), pair), pinhole(K, (8, 6), poses)
+        assert same.shape == (4, 6, 8)
+        np.testing.assert_allclose(same.origins, expected.origins, rtol=1e-6)
+        np.testing.assert_allclose(same.directions, expected.directions, atol=1e-6)
+    for angle in (0.0, 1e-9, 0.7, np.pi):
+        axis, shift = np.array([2.0, -1.0, 2.0]) / 3.0, np.array([1.0, 2.0, 3.0])
+        sensor = pinhole(K, (8, 6), ((angle * axis)[:, None], shift[:, None]))
+        # Rotating by the angle about the axis: the part along the axis stays, the rest turns.
+        v = sensor.origins + 7.0 * sensor.directions.astype(np.float64)
+        along = (v @ axis)[:, None] * axis
+        seen = along + np.cos(angle) * (v - along) + np.sin(angle) * np.cross(axis, v) + shift
+        pixels = (seen / seen[:, 2:]) @ K.T
+        np.testing.assert_allclose(pixels[:, :2].reshape(6, 8, 2), np.indices((6, 8))[::-1].transpose(1, 2, 0), atol=2e-3)
+
+
+@pytest.mark.parametrize("make", [pinhole, fisheye])
+@pytest.mark.parametrize("rolling", [False, True])
+def test_several_intrinsics_are_several_cameras(make: Any, rolling: bool) -> None:
+    ks = np.stack([K, K * 2.0 - np.diag([0.0, 0.0, 1.0]), K + np.diag([9.0, 5.0, 0.0])])
+    poses = np.stack([a_pose(seed) for seed in range(3)])
+    poses = np.repeat(poses[:, None], 4, axis=1) if rolling else poses
+    many, lens = make(ks, (6, 4), poses, (0.01, -0.002, 0.001, 0.0), rolling=rolling), (0.01, -0.002, 0.001, 0.0)
+    shared = make(ks, (6, 4), poses[0], lens, rolling=rolling)
+    assert many.shape == shared.shape == (3, 4, 6)
+    for i in range(3):
+        for sensor, pose in ((many, poses[i]), (shared, poses[0])):
+            one = make(ks[i], (6, 4), pose, lens, rolling=rolling)
+            assert all(np.array_equal(rays[i], own) for rays, own in zip(sensor.rays, one.rays, strict=True))
+
+
 @pytest.mark.parametrize("call, said", [
     (lambda: with_range_noise([1.0, np.nan], 0), ("ranges", "0 or more")),
     (lambda: with_range_noise(np.float32([[np.inf, -3.0]]), 0), ("ranges", "0 or more")),
@@ -280,7 +315,12 @@ def test_noise_repeats_and_is_each_elements_own() -> None:
     (lambda: pinhole(K, (4, 5), np.zeros((4, 4, 4)) + np.eye(4), rolling=True), ("pose", "(5, 4, 4) or (B, 5, 4, 4)")),
     (lambda: pinhole(K, (4, 4), np.stack([np.eye(4), np.diag([1.0, 1.0, 2.0, 1.0])])), ("pose", "translation; pose 1 is not")),
     (lambda: pinhole(K, (4, 4), np.full((4, 4), np.nan)), ("pose", "finite")),
-    (lambda: pinhole(K, (4, 4), (np.eye(3), np.zeros(3))), ("pose", "got a pair (R, t)", None, None, "world to camera")),
+    (lambda: pinhole(K, (4, 4), (np.eye(3), np.zeros(2))), ("pose", "(R, t), of (3, 3) and (3,)")),
+    (lambda: pinhole(K, (4, 4), (2.0 * np.eye(3), np.zeros(3))), ("pose", "a rotation")),
+    (lambda: pinhole([K, -K], (4, 4)), ("intrinsics[1]", "[[fx, s, cx]")),
+    (lambda: pinhole([K, K], (4, 4), np.stack([np.eye(4)] * 3)), ("pose", "one for each of 2 intrinsics, got 3")),
+    (lambda: pinhole(np.zeros((4096, 3)), (4, 4)), ("intrinsics", "got an array (4096, 3) of float64")),
+    (lambda: wrt.Sphere(np.zeros((9, 3)), 1.0, wrt.Material()), ("center", "got an array (9, 3) of float64", "sphere")),
     (lambda: with_range_noise([1.0], 0, np.inf), ("constant", "finite")),
     (lambda: with_range_noise([1.0], 0, dropout=np.nan), ("dropout", "finite")),
     (lambda: lidar("vlp16"), ("name", "no LiDAR 'vlp16'", None, None, "'vlp-16'")),

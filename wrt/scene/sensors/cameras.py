@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from wrt.core.arrays import given_like
-from wrt.core.checks import as_size
+from wrt.core.checks import as_size, shown
 from wrt.core.errors import InputError
 from wrt.core.types import ArrayLike
 from wrt.scene.sensors.distortion import Fisheye, Radial
@@ -24,12 +25,13 @@ def pinhole(intrinsics: ArrayLike, size: tuple[int, int] | str, pose: ArrayLike 
     Parameters
     ----------
     intrinsics
-        K, (3, 3) in pixels. The camera's frame is that of OpenCV: x right, y down, z forward. A point p in this frame projects to
-        K p / z, with (0, 0) at the centre of the top left pixel.
+        K, (3, 3) in pixels, or (B, 3, 3) for B cameras. The camera's frame is that of OpenCV: x right, y down, z forward. A point p in
+        this frame projects to K p / z, with (0, 0) at the centre of the top left pixel.
     size
         Width and height in pixels, or text such as "640x480".
     pose
-        (4, 4), camera to world: a rotation and a translation. (B, 4, 4): B cameras. None: the identity.
+        (4, 4), camera to world: a rotation and a translation. (B, 4, 4): B cameras. None: the identity. A pair (R, t) is OpenCV's,
+        world to camera: R (3, 3) or (B, 3, 3), or a rotation vector (3,).
     distortion
         OpenCV's coefficients in its order: k1 k2 p1 p2 (radial and tangential), k3, k4 k5 k6 (rational), s1 s2 s3 s4 (thin prism):
         4, 5, 8 or 12 numbers.
@@ -48,12 +50,14 @@ def pinhole(intrinsics: ArrayLike, size: tuple[int, int] | str, pose: ArrayLike 
     InputError
         If an argument does not have this form, the distortion folds over within the picture, or the rays exceed the range of float32.
     """
-    k, (width, height) = _intrinsics(intrinsics), as_size(size)
-    x, y = _on_plane(k, np.arange(width)[None, :].astype(np.float64), np.arange(height)[:, None].astype(np.float64))
-    x, y = np.broadcast_arrays(x, y)
-    (x, y), exists = Radial(distortion).undistort_picture(x, y)
-    _require_rays(exists, FOLDS)
-    return make_sensor(_at_depth_1(x, y), pose, 2, 0 if rolling else None, like)
+    lens = Radial(distortion)
+
+    def directions(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        (x, y), exists = lens.undistort_picture(x, y)
+        _require_rays(exists, FOLDS)
+        return _at_depth_1(x, y)
+
+    return make_sensor(_picture(intrinsics, size, directions), pose, 2, 0 if rolling else None, like)
 
 
 def fisheye(intrinsics: ArrayLike, size: tuple[int, int] | str, pose: ArrayLike | None = None, distortion: ArrayLike = (),
@@ -77,11 +81,14 @@ def fisheye(intrinsics: ArrayLike, size: tuple[int, int] | str, pose: ArrayLike 
     InputError
         If an argument does not have this form, the distortion folds over within the picture, or a corner would show an angle above pi.
     """
-    k, (width, height) = _intrinsics(intrinsics), as_size(size)
-    x, y = _on_plane(k, np.arange(width)[None, :].astype(np.float64), np.arange(height)[:, None].astype(np.float64))
-    directions, exists = _fisheye_directions(Fisheye(distortion), *np.broadcast_arrays(x, y))
-    _require_rays(exists, FOLDS_OR_TURNS)
-    return make_sensor(directions, pose, 2, 0 if rolling else None, like)
+    lens = Fisheye(distortion)
+
+    def directions(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        out, exists = _fisheye_directions(lens, x, y)
+        _require_rays(exists, FOLDS_OR_TURNS)
+        return out
+
+    return make_sensor(_picture(intrinsics, size, directions), pose, 2, 0 if rolling else None, like)
 
 
 def project(points: ArrayLike, intrinsics: ArrayLike, distortion: ArrayLike = (), fisheye: bool = False) -> Any:
@@ -149,12 +156,26 @@ def unproject(pixels: ArrayLike, intrinsics: ArrayLike, distortion: ArrayLike = 
     return given_like(pixels, directions)
 
 
-def _intrinsics(value: ArrayLike) -> np.ndarray:
+def _picture(intrinsics: ArrayLike, size: tuple[int, int] | str, directions: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
+    """Return the directions of all pixels: (rows, columns, 3), or (B, rows, columns, 3) for B intrinsics.
+
+    directions: makes them from the pixels' points on the plane z = 1, which are still distorted.
+    """
+    ks, (width, height) = as_doubles(intrinsics, "intrinsics"), as_size(size)
+    columns, rows = np.arange(float(width))[None, :], np.arange(float(height))[:, None]
+    if ks.ndim != 3 or not len(ks):
+        return directions(*np.broadcast_arrays(*_on_plane(_intrinsics(ks), columns, rows)))
+    return np.stack([directions(*np.broadcast_arrays(*_on_plane(_intrinsics(k, i), columns, rows))) for i, k in enumerate(ks)])
+
+
+def _intrinsics(value: ArrayLike, index: int | None = None) -> np.ndarray:
     k = as_doubles(value, "intrinsics")
+    name = "intrinsics" if index is None else f"intrinsics[{index}]"
     if k.shape != (3, 3) or not np.isfinite(k).all() or not np.array_equal(k[2], [0.0, 0.0, 1.0]) or k[1, 0] != 0.0:
-        raise InputError(f"must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]], got {k.tolist()}", argument="intrinsics")
+        given = k.tolist() if k.shape == (3, 3) else shown(k)
+        raise InputError(f"must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]], got {given}", argument=name)
     if not (k[0, 0] > 0.0 and k[1, 1] > 0.0):
-        raise InputError(f"must have focal lengths above 0, got {k[0, 0]:g} and {k[1, 1]:g}", argument="intrinsics")
+        raise InputError(f"must have focal lengths above 0, got {k[0, 0]:g} and {k[1, 1]:g}", argument=name)
     return k
 
 

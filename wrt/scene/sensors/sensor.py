@@ -53,6 +53,15 @@ class Sensor(Generic[ArrayT]):
     shape: tuple[int, ...]
     axis: np.ndarray
 
+    @property
+    def rays(self) -> tuple[Any, Any]:
+        """Origins and directions as pictures: (*shape, 3), or Warp arrays of vec3 in `shape`, in the memory of the rays.
+
+        `accel.closest_hit(*sensor.rays)` returns hits in this shape. On the CPU, small pictures are then traced in tiles of 4x4 pixels,
+        which is faster.
+        """
+        return self.picture(self.origins), self.picture(self.directions)
+
     def picture(self, values: ArrayLike) -> Any:
         """Reshape values of the rays, (N, ...) or (*shape, ...), such as hits.prim_id or hits.normal, to (*shape, ...).
 
@@ -122,14 +131,14 @@ class Sensor(Generic[ArrayT]):
 
 
 def make_sensor(local: np.ndarray, pose: ArrayLike | None, axis: int, rolling: int | None, like: object) -> Sensor[Any]:
-    """Make a sensor from directions (rows, columns, 3) in its own frame.
+    """Make a sensor from directions in its own frame: (rows, columns, 3), or (B, rows, columns, 3) for B different sensors.
 
     Parameters
     ----------
     local
         Directions, float64.
     pose
-        (4, 4), or (B, 4, 4); with `rolling`, (rows or columns, 4, 4) or (B, rows or columns, 4, 4).
+        (4, 4), or (B, 4, 4); with `rolling`, (rows or columns, 4, 4) or (B, rows or columns, 4, 4). Or OpenCV's pair (R, t).
     axis
         Index of the frame's axis that measures depth.
     rolling
@@ -142,30 +151,34 @@ def make_sensor(local: np.ndarray, pose: ArrayLike | None, axis: int, rolling: i
     InputError
         Names the argument and what was expected.
     """
-    poses = as_poses(pose)
-    many = poses.shape[:-2]
-    if len(many) > (1 if rolling is None else 2) or (rolling is not None and many[-1:] != (local.shape[rolling],)):
-        what = "(4, 4) or (B, 4, 4)" if rolling is None else f"({local.shape[rolling]}, 4, 4) or (B, {local.shape[rolling]}, 4, 4)"
-        raise InputError(f"must be {what}, got {poses.shape}", argument="pose")
+    poses, size = as_poses(pose), local.shape[-3:]
+    many, own = poses.shape[:-2], () if rolling is None else (size[rolling],)
+    if len(many) > 1 + len(own) or many[len(many) - len(own):] != own:
+        line = ", ".join(map(str, (*own, 4, 4)))
+        raise InputError(f"must be ({line}) or (B, {line}), got {poses.shape}", argument="pose")
+    batch = many[:len(many) - len(own)]
+    if local.ndim == 4 and batch not in ((), local.shape[:1]):
+        raise InputError(f"must be one, or one for each of {len(local)} intrinsics, got {batch[0]}", argument="pose")
     limit = np.finfo(np.float32).max
     if not (max(local.max(), -local.min()) <= limit / 2.0 and np.abs(poses[..., :3, 3]).max() <= limit):  # rotated by at most sqrt(3)
         raise InputError("rays of this sensor and pose exceed the range of float32")
-    batch = many if rolling is None else many[:-1]
-    shape = (*batch, *local.shape[:2])
+    batch = local.shape[:1] if local.ndim == 4 else batch
+    shape = (*batch, *size[:2])
     images = int(np.prod(batch))
-    origins, directions = (empty_aligned((images, *local.shape), np.float32) for _ in range(2))
-    each = poses.reshape(images, *many[len(batch):], 4, 4)
+    origins, directions = (empty_aligned((images, *size), np.float32) for _ in range(2))
+    each = np.broadcast_to(poses, (*batch, *own, 4, 4)).reshape(images, *own, 4, 4)
+    frame_rays = np.broadcast_to(local, (images, *size))
 
     def fill(parts: list[tuple[int, slice]]) -> None:
         for i, rows in parts:
-            own = each[i, rows] if rolling == 0 else each[i]
-            place = own[..., :3, 3]
-            directions[i, rows] = _turned(local[rows], own[..., :3, :3], rolling)
+            frames = each[i, rows] if rolling == 0 else each[i]
+            place = frames[..., :3, 3]
+            directions[i, rows] = _turned(frame_rays[i, rows], frames[..., :3, :3], rolling)
             origins[i, rows] = place[:, None] if rolling == 0 else place
 
-    height = max(1, RAYS_PER_PART // local.shape[1])
-    parts = [(i, slice(row, row + height)) for i in range(images) for row in range(0, local.shape[0], height)]
-    step = max(1, RAYS_PER_JOB // (min(height, local.shape[0]) * local.shape[1]))
+    height = max(1, RAYS_PER_PART // size[1])
+    parts = [(i, slice(row, row + height)) for i in range(images) for row in range(0, size[0], height)]
+    step = max(1, RAYS_PER_JOB // (min(height, size[0]) * size[1]))
     run_all([partial(fill, parts[first:first + step]) for first in range(0, len(parts), step)], thread_count(None))
     axes = each[..., :3, axis]  # (images, 3) or (images, rows or columns, 3)
     if rolling is not None:
@@ -173,7 +186,7 @@ def make_sensor(local: np.ndarray, pose: ArrayLike | None, axis: int, rolling: i
     elif batch:
         axes = axes[:, None, None]
     axes = axes.reshape(*batch, *axes.shape[1:]).copy()
-    like = pose if like is None else like
+    like = (pose[0] if isinstance(pose, tuple) else pose) if like is None else like
     return Sensor(_of_library(origins.reshape(-1, 3), like), _of_library(directions.reshape(-1, 3), like), shape, axes)
 
 
@@ -196,9 +209,8 @@ def as_poses(pose: ArrayLike | None) -> np.ndarray:
     """Return poses (..., 4, 4) float64. Raises InputError unless each is a rotation and a translation."""
     if pose is None:
         return np.eye(4)
-    if isinstance(pose, tuple | list) and [np.shape(each) for each in pose] == [(3, 3), (3,)]:
-        raise InputError("must be a matrix (4, 4), sensor to world, got a pair (R, t)", argument="pose",
-                         hint="OpenCV's R and t are world to camera: pass np.linalg.inv(np.vstack([np.c_[R, t], [0, 0, 0, 1]]))")
+    if isinstance(pose, tuple | list) and len(pose) == 2 and np.shape(pose[0])[-2:] != (4, 4):
+        pose = _from_opencv(*(as_doubles(part, f"pose[{i}]") for i, part in enumerate(pose)))
     poses = as_doubles(pose, "pose")
     if poses.shape[-2:] != (4, 4) or poses.size == 0:
         raise InputError(f"must be (4, 4) or (B, 4, 4), sensor to world, got {poses.shape}", argument="pose")
@@ -206,6 +218,26 @@ def as_poses(pose: ArrayLike | None) -> np.ndarray:
         if not good.all():
             place = np.unravel_index(int(np.argmin(good)), good.shape) if good.ndim else ()
             raise InputError(f"must be {what}" + (f"; pose {', '.join(map(str, place))} is not" if place else ""), argument="pose")
+    return poses
+
+
+def _from_opencv(rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """Return poses (..., 4, 4), sensor to world, from OpenCV's R and t, world to sensor.
+
+    rotation: (..., 3, 3), or a rotation vector (3,) or (3, 1); shift: (..., 3) or (..., 3, 1).
+    """
+    if rotation.shape in ((3,), (3, 1)):  # Rodrigues' formula, for the matrix of the cross product with the axis
+        angle = np.linalg.norm(rotation)
+        x, y, z = rotation.reshape(3) / (angle or 1.0)
+        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        rotation = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
+    many = rotation.shape[:-2]
+    if rotation.shape[-2:] != (3, 3) or shift.shape not in ((*many, 3), (*many, 3, 1)):
+        raise InputError(f"must be (R, t), of (3, 3) and (3,) or of (B, 3, 3) and (B, 3), got {rotation.shape} and {shift.shape}",
+                         argument="pose")
+    poses = np.zeros((*many, 4, 4))
+    poses[..., :3, :3], poses[..., 3, 3] = rotation.swapaxes(-2, -1), 1.0
+    poses[..., :3, 3] = -(poses[..., :3, :3] @ shift.reshape(*many, 3, 1))[..., 0]
     return poses
 
 
