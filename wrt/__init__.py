@@ -92,6 +92,10 @@ def _public() -> dict[str, str]:
 
 
 _HOME = _public()
+# What users of other libraries look for, and where it is.
+ELSEWHERE = {"closest_hit": "wrt.build(mesh).closest_hit(origins, directions)", "any_hit": "wrt.build(mesh).any_hit(origins, directions)",
+             "PinholeCamera": "wrt.Camera, or wrt.sensors.pinhole for a matrix K", "PerspectiveCamera": "wrt.Camera",
+             "look_at": "wrt.Camera.look_at", "Ray": "arrays of origins and directions (docs/usage.md)"}
 _MODULES = [name for name, module in _HOME.items() if module == __name__]
 __all__ = ["__version__", *(name for name in _HOME if name not in _MODULES)]
 
@@ -120,12 +124,20 @@ def __getattr__(name: str) -> Any:
     if name in _HOME:
         value = globals()[name] = getattr(importlib.import_module(_HOME[name]), name)
         return value
-    text = f"module {__name__!r} has no attribute {name!r}"
-    if not name.startswith("_"):
-        from wrt.core.checks import did_you_mean
+    hint = "" if name.startswith("_") else _hint(name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint and '; ' + hint}")
 
-        text += f"; {suggestion.rstrip()}" if (suggestion := did_you_mean(name, __dir__())) else ""
-    raise AttributeError(text)
+
+def _hint(name: str) -> str:
+    """Return where an unknown name is, or the most similar public name; "" without either."""
+    from wrt.core.checks import did_you_mean
+
+    if name in ELSEWHERE:
+        return f"use {ELSEWHERE[name]}"
+    for place in ("wrt.sensors", "wrt.scene.shapes"):
+        if callable(getattr(importlib.import_module(place), name, None)):
+            return f"use {place}.{name}"
+    return did_you_mean(name, __dir__()).rstrip()
 
 
 def __dir__() -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import PurePath
 from typing import TypeAlias
 
 import numpy as np
@@ -25,10 +26,11 @@ class InstanceNames:
         end = len(geometry.part) if scene is None or scene.objects is None else len(scene.objects)
         self.first = np.array([0, end], np.int64) if geometry.worlds is None else geometry.first_instance
         self.names = [names[begin:stop] for begin, stop in zip(self.first[:-1], self.first[1:], strict=True)]
-        self.ids: dict[tuple[int, str], list[int]] = {}  # by world and name
+        self.ids: dict[tuple[int, str], list[int]] = {}  # by world and name, or a path's name without folder and suffix
         for world, each in enumerate(self.names):
             for index, name in enumerate(each):
-                self.ids.setdefault((world, name), []).append(int(self.first[world]) + index)
+                for each_name in {name, PurePath(name).stem}:  # a mesh that was read from a file has the path as its name
+                    self.ids.setdefault((world, each_name), []).append(int(self.first[world]) + index)
 
     def find(self, thing: ObjectId | Sequence[ObjectId], world: ArrayLike | None) -> np.ndarray:
         """Return the values of `hits.instance` of objects: one, or (R,) if either argument is a sequence.

@@ -7,7 +7,7 @@ from functools import cache
 from typing import Any, NamedTuple, TypeVar, get_type_hints
 
 from wrt.accel.structures import ACCELERATORS
-from wrt.core.checks import accepts, did_you_mean, require_known
+from wrt.core.checks import accepts, did_you_mean, require_known, shown
 from wrt.core.device import made_once
 from wrt.core.errors import InputError
 from wrt.core.types import DeviceFunction, Kernel, KernelModule, WarpType
@@ -46,7 +46,7 @@ def options_of(name: str, options: type[T], values: dict[str, object]) -> T:
             raise InputError(f"is no option of {name}",
                              argument=option, hint=f"{did_you_mean(option, names)}there is {', '.join(names)}")
         if not accepts(types[option], value):
-            raise InputError(f"must be {known[option].type}, got {value!r}", argument=option)
+            raise InputError(f"must be {known[option].type}, got {shown(value)}", argument=option)
     return options(**values)
 
 

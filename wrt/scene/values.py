@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from wrt.core.checks import LARGEST, as_array
+from wrt.core.checks import LARGEST, as_array, shown
 from wrt.core.errors import InputError, wrong
 
 Color = tuple[float, float, float]
@@ -23,11 +23,11 @@ def as_vector(value: object, what: str, *, low: float = -math.inf, high: float =
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise wrong(what, f"must be three numbers, got {value!r}") from error
+        raise wrong(what, f"must be three numbers, got {shown(value)}") from error
     if array.ndim == 0:
         array = np.repeat(array, 3)
     if array.shape != (3,) or not np.isfinite(array).all():
-        raise wrong(what, f"must be three finite numbers, got {value!r}")
+        raise wrong(what, f"must be three finite numbers, got {shown(value)}")
     low, high = max(low, -LARGEST), min(high, LARGEST)
     if (array < low).any() or (array > high).any():
         raise wrong(what, f"must lie in [{low:g}, {high:g}], got {array.tolist()}")
@@ -39,10 +39,10 @@ def as_number(value: object, what: str, *, low: float = -math.inf, high: float =
     try:
         number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError) as error:
-        raise wrong(what, f"must be a number, got {value!r}") from error
+        raise wrong(what, f"must be a number, got {shown(value)}") from error
     low, high = max(low, -LARGEST), min(high, LARGEST)
     if not math.isfinite(number) or not low <= number <= high:
-        raise wrong(what, f"must be finite and in [{low:g}, {high:g}], got {value!r}")
+        raise wrong(what, f"must be finite and in [{low:g}, {high:g}], got {shown(value)}")
     return number
 
 

@@ -16,6 +16,7 @@ from wrt.accel.built import Built
 from wrt.accel.cells.common import require_between
 from wrt.accel.geometry import Geometry
 from wrt.accel.store import check_tree
+from wrt.core.checks import shown
 from wrt.core.device import launch, on_host, records, start, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import run_all
@@ -61,7 +62,7 @@ class BspOptions:
         require_between(samples=(self.samples, 0, 1 << 30), max_depth=(self.max_depth, 0, MAX_DEPTH),
                         max_growth=(self.max_growth, 1.0, 1000.0))
         if self.progress is not None and not callable(self.progress):
-            raise InputError(f"must be a function of one number, got {self.progress!r}", argument="progress")
+            raise InputError(f"must be a function of one number, got {shown(self.progress)}", argument="progress")
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickle without `progress`, which is a function of this process."""

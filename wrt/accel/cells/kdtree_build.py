@@ -12,6 +12,7 @@ import warp as wp
 from wrt.accel.built import Built
 from wrt.accel.cells.common import require_between
 from wrt.accel.geometry import Geometry
+from wrt.core.checks import shown
 from wrt.core.device import launch, load_kernel, on_host, records, start, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import run_all
@@ -52,7 +53,7 @@ class KdOptions:
 
     def __post_init__(self) -> None:
         if self.max_depth is not None and (isinstance(self.max_depth, bool) or not isinstance(self.max_depth, int)):
-            raise InputError(f"must be int or None, got {self.max_depth!r}", argument="max_depth")
+            raise InputError(f"must be int or None, got {shown(self.max_depth)}", argument="max_depth")
         require_between(max_leaf=(self.max_leaf, 1, MAX_IN_LEAF), max_depth=(self.max_depth or 0, 0, STACK_SIZE),
                         perfect_below=(self.perfect_below, 1024, 1 << 27), cost_traversal=(self.cost_traversal, 0.0, 1e6),
                         cost_intersection=(self.cost_intersection, 0.0, 1e6), empty_bonus=(self.empty_bonus, 0.0, 1.0),

@@ -7,7 +7,7 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from wrt.core.checks import as_integer, as_tuple, unknown
+from wrt.core.checks import as_integer, as_tuple, shown, unknown
 from wrt.core.device import start
 from wrt.core.errors import InputError
 from wrt.io.load import as_scene
@@ -114,7 +114,7 @@ def as_pixel(pixel: tuple[int, int], size: tuple[int, int]) -> tuple[int, int]:
     """Return x and y of a pixel. Raises InputError if it is outside the picture of this size."""
     numbers = as_tuple(pixel, (int, np.integer), "pixel")
     if len(numbers) != 2:
-        raise InputError(f"must be x, y from the top left, got {pixel!r}", argument="pixel")
+        raise InputError(f"must be x, y from the top left, got {shown(pixel)}", argument="pixel")
     (x, y), (width, height) = (as_integer(each, "pixel", -2**31, 2**31) for each in numbers), size
     if not (0 <= x < width and 0 <= y < height):
         raise InputError(f"must be within the picture of {width}x{height}, x 0 to {width - 1} and y 0 to {height - 1}, got {x},{y}",

@@ -162,7 +162,9 @@ def test_typing_errors_are_answered_with_the_name(ball: Any) -> None:
 
 def test_names_of_functions_and_of_the_package_are_answered_with_the_way(ball: Any) -> None:
     for thing, name, said in ((ball, "contains", "wrt.contains(accel, ...)"), (ball, "move", "movable=True"),
-                              (ball, "closst_hit", "'closest_hit'"), (wrt, "buildd", "'build'"), (wrt, "sensor", "'sensors'")):
+                              (ball, "closst_hit", "'closest_hit'"), (wrt, "buildd", "'build'"), (wrt, "sensor", "'sensors'"),
+                              (wrt, "pinhole", "wrt.sensors.pinhole"), (wrt, "icosphere", "wrt.scene.shapes.icosphere"),
+                              (wrt, "PinholeCamera", "wrt.Camera"), (wrt, "any_hit", "wrt.build(mesh).any_hit")):
         with pytest.raises(AttributeError) as error:
             getattr(thing, name)
         assert said in str(error.value)
