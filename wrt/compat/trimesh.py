@@ -90,7 +90,7 @@ class RayMeshIntersector:
         origins, directions = _rays(ray_origins, ray_directions)
         scaled, most = self._scaled, max_hits if multiple_hits else min(max_hits, 1)
         ray, face, u, v = scaled.every_hit(origins, directions, most) if most > 1 else scaled.first_hit(origins, directions)
-        if most == 0 or (most > 1 and len(origins) > 1):  # the hits of one ray are in order
+        if most < 1 or (most > 1 and len(origins) > 1):  # the hits of one ray are in order
             order = _first_hits_first(ray) if most > 1 else np.zeros(0, np.int64)
             ray, face, u, v = (array[order] for array in (ray, face, u, v))
         return (face, ray, scaled.located(origins, directions, ray, face, u, v)) if return_locations else (face, ray)
@@ -117,11 +117,11 @@ class RayMeshIntersector:
         return PLACED.any_hits(scaled.accel, _rays(ray_origins, ray_directions), scaled.threads, scaled.placement)
 
     def contains_points(self, points: Any) -> np.ndarray:
-        """Test whether points (N, 3) are inside, by wrt.contains: (N,) bool.
+        """Test whether points (N, 3) are inside, by wrt.contains: (N,) bool; False for points that are not finite.
 
         For an open mesh, trimesh's rule decides from the hits of this class: rays in two opposite directions must agree.
         """
-        points = np.asarray(points, dtype=np.float64)
+        points = _rows(points, "points")
         if points.ndim != 2 or points.shape[1] != 3:
             raise InputError(f"must be (N, 3), got {points.shape}", argument="points")
         scaled = self._scaled
@@ -247,10 +247,14 @@ class _Counter(NamedTuple):
         return None, np.repeat(np.arange(len(counts)), counts), None
 
 
+def _rows(value: ArrayLike, name: str) -> np.ndarray:
+    """Convert to contiguous float64; an empty list becomes (0, 3). Raises InputError for values that are not real numbers."""
+    rows = np.asarray(real_numbers(value, name, "(N, 3)"), np.float64)
+    return np.ascontiguousarray(rows.reshape(0, 3) if rows.shape == (0,) else rows)
+
+
 def _rays(origins: ArrayLike, directions: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    named = {"ray_origins": origins, "ray_directions": directions}
-    out = [np.asarray(real_numbers(rays, name, "(N, 3)"), np.float64) for name, rays in named.items()]
-    origins, directions = (np.ascontiguousarray(rays.reshape(0, 3) if rays.shape == (0,) else rays) for rays in out)
+    origins, directions = _rows(origins, "ray_origins"), _rows(directions, "ray_directions")
     if origins.ndim != 2 or origins.shape[1] != 3 or origins.shape != directions.shape:
         raise InputError(f"and ray_directions must both be (N, 3), got {origins.shape} and {directions.shape}",
                          argument="ray_origins")

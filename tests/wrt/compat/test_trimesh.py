@@ -95,7 +95,7 @@ def test_more_hits_than_one_walk_takes_and_no_more_than_asked_for() -> None:
     assert ray.tolist() == [ray_id for ray_id, _ in first_seconds]
     assert face.tolist() == [(2 * FEW, FEW, 0, 2)[ray_id] - 1 - hit for ray_id, hit in first_seconds]
     assert np.array_equal(where[:, 2], face) and np.allclose(where[:, :2], origins[ray, :2], rtol=0.0, atol=1e-15)
-    for most in (0, 1, 2, FEW, FEW + 1):
+    for most in (-1, 0, 1, 2, FEW, FEW + 1):
         part = RayMeshIntersector(walls).intersects_id(origins, np.repeat(DOWN, 4, axis=0), max_hits=most)
         assert part[1].tolist() == [ray_id for ray_id, hit in first_seconds if hit < most]
 
@@ -204,9 +204,10 @@ def test_points_inside() -> None:
     assert inside.dtype == bool and np.array_equal(inside[clear], (np.abs(points) < 0.5).all(axis=1)[clear])
     ray = RayMeshIntersector(trimesh.creation.box())
     assert ray.contains_points([[np.nan, 0.0, 0.0], [0.0, 0.0, 0.0], [1e300, 0.0, 0.0]]).tolist() == [False, True, False]
-    assert ray.contains_points(np.zeros((0, 3))).shape == (0,)
-    with refused("points", "(N, 3)"):
-        ray.contains_points([0.0, 0.0, 0.0])
+    assert ray.contains_points(np.zeros((0, 3))).shape == ray.contains_points([]).shape == (0,)
+    for wrong in ([0.0, 0.0, 0.0], [[1j, 0.0, 0.0]]):
+        with refused("points", "(N, 3)"):
+            ray.contains_points(wrong)
 
 
 def test_points_inside_of_an_open_mesh_go_by_the_rule_of_trimesh() -> None:
