@@ -14,7 +14,7 @@ from wrt.core.errors import InputError
 @click.option("--check", is_flag=True, help="Compare a device with the CPU, bit for bit, and measure its speed; exit code 1 if"
                                             " a bit differs. Compiling all kernels takes minutes")
 @click.option("--tune", "tunes", is_flag=True, help="Find the fastest structure on a device, and print the options that select it")
-@click.option("--device", help="Device for --check or --tune: cuda:0 ...  [default: cuda:0]")
+@click.option("--device", help="Device for --check or --tune: cuda:0 ...  [default: cuda:0; for --check without a GPU: cpu]")
 @click.option("--scene", "scenes", type=click.Path(path_type=Path), multiple=True,
               help="Scene file for --check; repeatable  [default: the scenes of wrt]")
 @click.option("--rays", type=int, help="Number of rays for --check, per kind of ray, mesh and structure  [default: 20000]")
@@ -48,7 +48,8 @@ def devices(check: bool, tunes: bool, device: str | None, scenes: tuple[Path, ..
         return
     from wrt.lab.device_check import Check, run
 
-    plan = Check(device or "cuda:0", scenes, 20_000 if rays is None else rays)
+    without_a_gpu = not any(line.startswith("cuda:0") for line in describe_devices())
+    plan = Check(device or ("cpu" if without_a_gpu else "cuda:0"), scenes, 20_000 if rays is None else rays)
     with warnings_reported(quiet):
         result = run(plan, (lambda line: None) if quiet else say)
     if as_json:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests import bits
 from tests.command_line import wrt as run
 from tests.refused import refused
 from wrt.accel.queries.answers import Hits
@@ -82,6 +83,19 @@ def test_one_wrong_bit_is_reported(scene: Path, monkeypatch: pytest.MonkeyPatch)
     assert "1 results differ from the CPU's" in result.out
     line = next(line for line in result.out.splitlines() if line.startswith("| hits") and " bvh8 " in line)
     assert [cell.strip() for cell in line.split("|")][3:6] == [str(4 * 17**2), "1", f"ball, {kinds[0]}"]
+
+
+def test_a_picture_of_another_processor_is_reported(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a CPU, pictures of the shipped scenes are compared with stored hashes."""
+    monkeypatch.setattr(device_check, "FOLDER", scene.parent)
+    monkeypatch.setattr(device_check, "STORED", scene.parent / "bits.txt")
+    pixels = render(scene, **device_check.PICTURE).pixels
+    for stored, differ in ((bits.digest(pixels), 0), (bits.digest(pixels + 1.0), 1)):
+        device_check.STORED.write_text(f"hits 0\nfloor {stored}\n")
+        result = run("devices", "--check", "--device", "cpu", "--rays", "300", "-q", "--json")
+        pictures = [row for row in strict(result.out)["rows"] if row["part"] == "picture of x86-64"]
+        assert [(row["what"], row["count"], row["differ"]) for row in pictures] == [("floor", 1, differ)]
+        assert result.code == differ
 
 
 def test_bits_are_compared_and_not_numbers() -> None:
