@@ -134,10 +134,10 @@ bool pixels(FILE* file) {
         const std::vector<char> expected = next<char>(file);
         return expected.size() == bytes && same(found, expected.data(), bytes);
     };
-    return as_expected(mean.data(), 12 * mean.size()) & as_expected(m2.data(), 12 * m2.size())
-           & as_expected(samples.data(), 4 * samples.size()) & as_expected(rays.data(), 8 * rays.size())
-           & as_expected(cut_depth.data(), 4 * cut_depth.size()) & as_expected(cut_throughput.data(), 4 * cut_throughput.size())
-           & as_expected(lost.data(), 4 * lost.size()) & as_expected(not_finite.data(), 4 * not_finite.size());
+    return as_expected(mean.data(), 12 * mean.size()) && as_expected(m2.data(), 12 * m2.size())
+           && as_expected(samples.data(), 4 * samples.size()) && as_expected(rays.data(), 8 * rays.size())
+           && as_expected(cut_depth.data(), 4 * cut_depth.size()) && as_expected(cut_throughput.data(), 4 * cut_throughput.size())
+           && as_expected(lost.data(), 4 * lost.size()) && as_expected(not_finite.data(), 4 * not_finite.size());
 }
 
 }  // namespace

@@ -59,8 +59,8 @@ COLUMNS: Columns = {"results": "{part}", "of": "{what}", "compared": "{count}", 
 SPEED: Columns = {"structure": "{who}", "rays": "{kind}", "Mray/s": lambda row: spread(row.mrays),
                   "default / structure": "{first_over_it:.2f}"}
 LEGEND = """\
-compared: number of results; "picture of x86-64" is one result for each picture. differ: results whose bits are not the CPU's. places: meshes
-and rays of these results. Each difference is a fault: please report it with this table."""
+compared: number of results; "picture of x86-64" is one result for each picture. differ: results whose bits are not the CPU's. places:
+meshes and rays of these results. Each difference is a fault: please report it with this table."""
 TIMED = """\
 Rays and hits are in device memory. Mray/s: median of alternating runs, quartiles in brackets. default / structure: speed of wrt's default
 structure over that of the row's structure."""
