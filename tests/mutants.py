@@ -27,6 +27,7 @@ from pathlib import Path
 from queue import SimpleQueue
 
 from tests.data import ROOT
+from tests.trust import record
 
 FOLDERS = "kernels/units", "kernels/wide"
 SWAPS = {"+": "-", "-": "+", "*": "/", "/": "*", "<": "<=", "<=": "<", ">": ">=", ">=": ">", "==": "!=", "!=": "==", "&": "|", "|": "&",
@@ -38,7 +39,8 @@ CPP_TOKEN = re.compile(r"(?<= )(?:[<>=!]=|[-+&|]=|&&|\|\||<<|>>|[-+*/<>&|])(?= )
 CPP_SKIPPED = re.compile(r'//.*|"(?:\\.|[^"\\])*"|^\s*#.*|^\s*(?:template|typedef)\b.*', re.MULTILINE)
 # Tests by the name of a changed file, where they are not those of the same name.
 TESTS = {"closest_point": "tests/wrt/accel/points/test_closest_points.py",
-         "closest_placed": "tests/wrt/accel/queries/test_placed_queries.py", "nodes": "tests/kernels/wide/test_lanes.py"}
+         "closest_placed": "tests/wrt/accel/queries/test_placed_queries.py", "nodes": "tests/kernels/wide/test_lanes.py",
+         "traverse": "tests/kernels/traverse/test_common.py -k bvh4"}
 SANITIZE = ["tests/sanitize/test_headers.py", "-k", "results and walks"]
 GENERAL = (["tests/test_bits.py", "-k", "hits and bvh8 or whitted or instances"],
            ["tests/kernels/wide/test_packets.py", "tests/kernels/wide/test_batch.py", "tests/kernels/wide/test_instances.py"])
@@ -119,7 +121,7 @@ def stages(path: str, thorough: bool) -> list[list[str]]:
     folder, stem = Path(path).parent.name, Path(path).stem
     own = f"tests/kernels/{folder}/test_{stem}.py"
     own = own if (ROOT / own).exists() else TESTS.get(stem, "")
-    nearest = [SANITIZE] * path.endswith(".h") + [[own]] * bool(own)
+    nearest = [SANITIZE] * path.endswith(".h") + [own.split()] * bool(own)
     return [*nearest, *GENERAL][: None if thorough else len(nearest) + 1]
 
 
@@ -163,6 +165,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--thorough", action="store_true", help="run slow tests, too: minutes for each survivor")
+    parser.add_argument("--record", action="store_true", help="store the figures in tests/trust.json")
     parser.add_argument("--show", action="store_true", help="print the mutants, and run nothing")
     options = parser.parse_args()
     everything = sample(options.seed)
@@ -190,7 +193,10 @@ def main() -> None:
                 survivors += [] if noticed else [mutant]
                 outcome = f"noticed: {noticed}" if noticed else "SURVIVED"
                 print(f"{index}: {mutant}: {outcome} ({time.perf_counter() - begin:.0f} s)", flush=True)
-    print(f"{len(chosen)} mutants, {len(chosen) - len(survivors)} noticed, {len(survivors)} survived", *survivors, sep="\n")
+    noticed = len(chosen) - len(survivors)
+    print(f"{len(chosen)} mutants, {noticed} noticed, {len(survivors)} survived", *survivors, sep="\n")
+    if options.record:
+        record("mutants", f"{len(chosen)} one-token changes of {' and '.join(FOLDERS)}", f"{noticed} noticed, {len(survivors)} survived")
 
 
 if __name__ == "__main__":

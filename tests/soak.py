@@ -28,6 +28,7 @@ from tests import bits, device
 from tests.data import ROOT
 from tests.placed import place
 from tests.structures import STRUCTURES
+from tests.trust import record
 from tests.wrt.accel.test_move import matrices
 from tests.wrt.viewer.client import Client, answer
 from tests.wrt.viewer.test_access import Served, attempts
@@ -181,8 +182,8 @@ def slope(seconds: list[float], memory: list[float]) -> tuple[float, float]:
     return 3600.0 * per_second, per_second * (seconds[-1] - seconds[first])
 
 
-def run(seconds: float, seed: int, growth: float, report: Callable[[str], None] = print) -> int:
-    """Soak, report one line a minute, and return the exit code."""
+def run(seconds: float, seed: int, growth: float, report: Callable[[str], None], records: bool = False) -> int:
+    """Soak, report one line a minute, and return the exit code. records: store the figures in tests/trust.json."""
     done, times, memory, begin = Counter[str](), list[float](), list[float](), time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         soak = Soak(seed, Path(folder))
@@ -209,6 +210,8 @@ def run(seconds: float, seed: int, growth: float, report: Callable[[str], None] 
     if grown > growth:
         report(f"the process grew by {grown:.0f} MiB, more than {growth:.0f}")
         return 1
+    if records:
+        record("soak", f"{done.total():,} steps in {times[-1] / 60.0:.0f} minutes", f"0 wrong answers, {per_hour:+.1f} MiB per hour")
     return 0
 
 
@@ -217,8 +220,9 @@ def main() -> None:
     parser.add_argument("--hours", type=float, default=1.0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--growth", type=float, default=32.0, help="largest growth of memory in MiB  [default: 32]")
+    parser.add_argument("--record", action="store_true", help="store the figures in tests/trust.json")
     options = parser.parse_args()
-    sys.exit(run(3600.0 * options.hours, options.seed, options.growth, lambda line: print(line, flush=True)))
+    sys.exit(run(3600.0 * options.hours, options.seed, options.growth, lambda line: print(line, flush=True), options.record))
 
 
 if __name__ == "__main__":
