@@ -70,7 +70,7 @@ def test_what_is_refused(tmp_path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)  # as if it were not installed
     with pytest.raises(wrt.InputError, match="a Parquet file needs pyarrow") as refused:
         hits.save(tmp_path / "hits.parquet")
-    assert refused.value.hint == "pip install pyarrow"
+    assert refused.value.hint == 'pip install "wrt[tables]"'
     with pytest.raises(wrt.InputError, match="its folder does not exist"):
         hits.save(tmp_path / "none" / "hits.csv")
     assert not list(tmp_path.iterdir())

@@ -39,6 +39,16 @@ class Accessors:
                 self._arrays[index] = self._decode(accessor, f"accessors[{index}]")
         return self._arrays[index]
 
+    def put(self, index: int, values: np.ndarray, place: str) -> None:
+        """Set the array of accessor `index`, (count, components), which a compressed mesh holds. Raises InputError if it does not fit."""
+        accessor = self._document.item("accessors", index, place)
+        shape = accessor.count, _WIDTHS.get(accessor.type)
+        if values.shape != shape:
+            raise InputError(f"decodes to {values.shape} numbers, but accessors[{index}] has {shape}", place=place)
+        array = _normalised(values, f"accessors[{index}]") if accessor.normalized else values.copy()
+        array.flags.writeable = False
+        self._arrays[index] = array
+
     def _decode(self, accessor: Any, where: str) -> np.ndarray:
         dtype, count = _dtype(accessor.componentType, where), accessor.count
         most = _MAX_COUNT if accessor.bufferView is not None else _MAX_IMPLICIT_COUNT

@@ -29,7 +29,7 @@ GLB_MAGIC = b"glTF"
 _CHUNK_JSON, _CHUNK_BIN = 0x4E4F534A, 0x004E4942
 
 SUPPORTED_EXTENSIONS = frozenset({
-    "KHR_lights_punctual", "KHR_texture_transform", "KHR_mesh_quantization", "EXT_mesh_gpu_instancing",
+    "KHR_lights_punctual", "KHR_draco_mesh_compression", "KHR_texture_transform", "KHR_mesh_quantization", "EXT_mesh_gpu_instancing",
     "KHR_materials_transmission", "KHR_materials_volume", "KHR_materials_ior", "KHR_materials_emissive_strength",
     "KHR_materials_unlit", "EXT_texture_webp", "EXT_texture_avif",
 })
@@ -42,8 +42,7 @@ METADATA_EXTENSIONS = frozenset({
 })
 DEFAULT_LOOK = frozenset({"KHR_materials_variants"})  # wrt shows the default look
 _CODECS = frozenset({
-    "KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression", "KHR_texture_basisu",
-    "MSFT_texture_dds",
+    "EXT_meshopt_compression", "KHR_meshopt_compression", "KHR_texture_basisu", "MSFT_texture_dds",
 })
 
 

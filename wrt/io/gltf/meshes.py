@@ -12,6 +12,7 @@ import numpy as np
 from wrt.core.errors import InputError, at
 from wrt.io.gltf.accessors import Accessors
 from wrt.io.gltf.document import Document, GltfObject
+from wrt.io.gltf.draco import decode
 from wrt.io.gltf.nodes import compose
 from wrt.io.gltf.schema import Instancing
 from wrt.io.polygons import strip
@@ -73,6 +74,7 @@ class Meshes:
         return self._meshes[key]
 
     def _make(self, primitive: GltfObject, name: str, place: str) -> Mesh | None:
+        decode(self._document, self._accessors, primitive, place)
         positions = self._attribute(primitive, "POSITION", "VEC3", place)
         normals = self._attribute(primitive, "NORMAL", "VEC3", place)
         uvs = self._attribute(primitive, "TEXCOORD_0", "VEC2", place)

@@ -95,6 +95,12 @@ class PunctualLightOfNode:
 
 
 @dataclass
+class DracoMesh:
+    bufferView: int
+    attributes: dict[str, int] = field(default_factory=dict)
+
+
+@dataclass
 class Instancing:
     attributes: dict[str, int] = field(default_factory=dict)
 
