@@ -10,6 +10,10 @@ from pathlib import Path
 import warp as wp
 
 FOLDER = Path(__file__).parent
+# Vectors of these types are traversal stacks. Their constructor without arguments sets no entry: Warp's would write 512 bytes for each ray.
+STACK_LENGTHS, STACK_TYPES = (64, 65, 66), ("uint64", "int32")
+STACKS = "".join(f"template <> inline CUDA_CALLABLE wp::vec_t<{length}, wp::{kind}>::vec_t() {{}}\n"
+                 for length in STACK_LENGTHS for kind in STACK_TYPES)
 LINE = re.compile(r'#include "(\w+\.h)"|#pragma once')
 
 
@@ -49,5 +53,5 @@ def _add(path: Path, written: Mapping[str, str], out: list[str], seen: set[Path]
 
 
 def with_headers(*files: str, **written: str) -> wp.ModuleBuildOptions:
-    """Return the headers as the Warp module option "extra_build_options"; the headers apply to CPU code only."""
-    return wp.ModuleBuildOptions(extra_cpu_preamble=text_of(*files, **written))
+    """Return STACKS and the headers as the Warp module option "extra_build_options"; the headers apply to CPU code only."""
+    return wp.ModuleBuildOptions(extra_cpu_preamble=STACKS + text_of(*files, **written), extra_cuda_preamble=STACKS)

@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from wrt.kernels.structs import Hit, Ray, Surfaces, kernel
+from wrt.kernels.structs import Hit, Ray, Surfaces, kernel, query_kernel
 
 LARGEST = wp.constant(3.4028234663852886e38)  # Largest finite float32.
 FARTHEST = 1e37  # Largest absolute coordinate of an origin in a NumPy array: the difference of two coordinates stays finite.
@@ -91,7 +91,7 @@ def load_ray(rays: RayArrays, i: int) -> Ray:
 def make_closest_hit_kernel(accel_struct: Any, traverse: Any) -> Any:
     """Make the kernel that stores the closest hits of rays first .. first + dim - 1, for the launch size dim."""
 
-    @kernel
+    @query_kernel
     def closest_hit(accel: accel_struct, surfaces: Surfaces, rays: RayArrays, hits: HitArrays, first: int):
         i = first + wp.tid()
         scale = direction_scale(rays.direction[i])
@@ -104,7 +104,7 @@ def make_closest_hit_kernel(accel_struct: Any, traverse: Any) -> Any:
 def make_any_hit_kernel(accel_struct: Any, traverse: Any) -> Any:
     """Make the kernel that stores whether each of the rays first .. first + dim - 1 hits anything, for the launch size dim."""
 
-    @kernel
+    @query_kernel
     def any_hit(accel: accel_struct, surfaces: Surfaces, rays: RayArrays, occluded: wp.array(dtype=wp.bool), first: int):
         i = first + wp.tid()
         hit = traverse(accel, surfaces, load_ray(rays, i))
@@ -137,7 +137,7 @@ def make_worlds_kernel(accel_struct: Any, traverse: Any, any_hit: bool) -> Any:
     """Make the kernel that traces each ray in its own world. Its argument `out` is HitArrays or, with any_hit, an array of bool."""
     out_type = wp.array(dtype=wp.bool) if any_hit else HitArrays
 
-    @kernel
+    @query_kernel
     def trace_worlds(accel: accel_struct, surfaces: Surfaces, rays: RayArrays, worlds: Worlds, out: out_type, first: int):
         i = first + wp.tid()
         hit = traverse(accel, surfaces, load_ray_of_world(rays, worlds, i))

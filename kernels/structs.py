@@ -20,13 +20,19 @@ MODULE_OPTIONS = {"fuse_fp": False, "enable_backward": False, "extra_build_optio
 if TYPE_CHECKING:  # type checkers skip device code, because Warp's annotations are not Python types
     from typing import no_type_check as kernel
     from typing import no_type_check as noinline
+    from typing import no_type_check as query_kernel
 else:
-    def kernel(function, **options):
+    def kernel(function, registers=None, **options):
         """Make a Warp kernel in a module of its own, without fused multiply-add and without code for gradients.
         Kernels of wrt are compiled in release mode, whatever wp.config.mode is: in debug mode, a kernel of Warp 1.19 ends the process if
-        several threads launch it. Kernels of a user follow wp.config.mode."""
+        several threads launch it. Kernels of a user follow wp.config.mode. registers: most registers of a CUDA thread."""
         own = {"mode": "release"} if str(function.__module__).startswith("wrt.") else {}  # __module__ is None in code made by exec
-        return wp.kernel(function, module="unique", module_options=MODULE_OPTIONS | own | options, enable_backward=False)
+        return wp.kernel(function, module="unique", module_options=MODULE_OPTIONS | own | options, enable_backward=False,
+                         cuda_max_registers=registers)
+
+    def query_kernel(function):
+        """Make a kernel that traces one ray per thread. With at most 80 registers, a multiprocessor holds 24 warps."""
+        return kernel(function, registers=80)
 
     def noinline(function):
         """Make a Warp function that is called, never inlined."""
@@ -42,6 +48,19 @@ else:
 """)
 def on_cuda() -> bool:
     """Test whether the code runs on CUDA. Callers then choose a faster form of the same arithmetic."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const int arch = __CUDA_ARCH__;
+    return arch == 600 || arch == 700 || arch == 800 || arch == 900 || arch == 1000;
+#else
+    return false;
+#endif
+""")
+def fast_float64() -> bool:
+    """Test whether the code runs on a GPU for data centres (sm_60, sm_70, sm_80, sm_90, sm_100): its float64 has half the rate of float32,
+    that of other GPUs 1/32 to 1/64."""
 
 
 def size_of(struct: Any) -> int:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from wrt.kernels.structs import NO_HIT, Hit, PlanePrimitive, Primitive, Ray, noinline, on_cuda
+from wrt.kernels.structs import NO_HIT, Hit, PlanePrimitive, Primitive, Ray, fast_float64, noinline, on_cuda
 from wrt.kernels.units.box import FAR_PAD, BoxRay, box_pad, padded_hi, padded_lo, slab_interval
 from wrt.kernels.units.float_float import difference_of_products, pair_quotient, pair_sum, pair_times, rounding_is_certain
 
@@ -214,7 +214,7 @@ def watertight(origin: wp.vec3, shear: TriangleRay, v0: wp.vec3, v1: wp.vec3, v2
     c = to_ray_space(v2 - origin, shear)
     if outside(edge_areas(a, b, c)):
         return no_triangle()
-    if on_cuda():
+    if on_cuda() and not fast_float64():
         hit = sure_crossing(a, b, c, shear.shear_z)
         if hit.prim_id == NO_HIT:
             hit = hard_crossing(a, b, c, shear.shear_z)

@@ -63,6 +63,37 @@ def bits(rows: wp.array(dtype=wp.float32), i: int) -> int:
     """Return the bits of rows[i] as an int32."""
 
 
+@wp.func_native("""
+    struct alignas(16) Four { float numbers[4]; };
+    const Four found = *(const Four*)(rows.data + (long long)i);
+    return wp::vec_t<4, wp::float32>(found.numbers[0], found.numbers[1], found.numbers[2], found.numbers[3]);
+""")
+def four(rows: wp.array(dtype=wp.float32), i: int) -> wp.vec4:
+    """Return rows[i : i + 4] of a contiguous array by one load on CUDA; they must begin at a multiple of 16 bytes."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return fmaxf(a, b);
+#else
+    return a > b ? a : b;
+#endif
+""")
+def larger(a: float, b: float) -> float:
+    """Return the larger number, or b if a is NaN."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return fminf(a, b);
+#else
+    return a < b ? a : b;
+#endif
+""")
+def smaller(a: float, b: float) -> float:
+    """Return the smaller number, or b if a is NaN."""
+
+
 @wp.func_native(f"""
 #if !defined(__CUDA_ARCH__)
     for (int k = 0; k < lines; ++k) __builtin_prefetch(rows.data + (long long)first + {CACHE_LINE} * k);
@@ -80,28 +111,35 @@ def row_type(width: int) -> Any:
 
 @cache
 def make_plain_cull(width: int) -> Any:
-    """Return the function of `make_cull` in plain Warp: it processes one lane after another."""
+    """Return the function of `make_cull` in plain Warp: it tests four triangles for each load."""
 
     @wp.func
-    def corner(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay) -> wp.vec3:
-        """Return a corner in the space where the ray is the z axis. In world space, its coordinate k is rows[first + k * width]."""
-        x = value(rows, first + width * ray.kx)
-        y = value(rows, first + width * ray.ky)
-        z = value(rows, first + width * ray.kz)
-        return sheared(wp.vec3(x, y, z) - ray.origin, ray.shear_x, ray.shear_y)
+    def coordinates(rows: wp.array(dtype=wp.float32), first: int, axis: int) -> wp.vec4:
+        return four(rows, first + width * axis)
 
     @wp.func
-    def cull(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay) -> int:
-        mask = int(0)
-        j = int(0)
-        while j < width:  # Warp would unroll a `for`, which doubles the number of instructions of a traversal.
-            a = corner(rows, first + j, ray)
-            b = corner(rows, first + j + 3 * width, ray)
-            c = corner(rows, first + j + 6 * width, ray)
-            if not outside(edge_areas(a, b, c)):
-                mask = mask | (1 << j)
-            j = j + 1
-        return mask
+    def turned(x: wp.vec4, y: wp.vec4, z: wp.vec4, j: int, ray: LaneRay) -> wp.vec3:
+        """Return a corner in the space where the ray is the z axis."""
+        return sheared(wp.vec3(x[j], y[j], z[j]) - ray.origin, ray.shear_x, ray.shear_y)
+
+    @wp.func
+    def cull(rows: wp.array(dtype=wp.float32), first: int, mask: int, ray: LaneRay) -> int:
+        out = int(0)
+        lane = int(0)
+        while lane < width:  # Warp would unroll a `for`, which doubles the number of instructions of a traversal.
+            if (mask >> lane) & 15 != 0:
+                i = first + lane
+                a_x, a_y, a_z = coordinates(rows, i, ray.kx), coordinates(rows, i, ray.ky), coordinates(rows, i, ray.kz)
+                i = i + 3 * width
+                b_x, b_y, b_z = coordinates(rows, i, ray.kx), coordinates(rows, i, ray.ky), coordinates(rows, i, ray.kz)
+                i = i + 3 * width
+                c_x, c_y, c_z = coordinates(rows, i, ray.kx), coordinates(rows, i, ray.ky), coordinates(rows, i, ray.kz)
+                for j in range(4):
+                    a, b, c = turned(a_x, a_y, a_z, j, ray), turned(b_x, b_y, b_z, j, ray), turned(c_x, c_y, c_z, j, ray)
+                    if not outside(edge_areas(a, b, c)):
+                        out = out | (1 << (lane + j))
+            lane = lane + 4
+        return out & mask
 
     return cull
 
@@ -110,21 +148,21 @@ def make_plain_cull(width: int) -> Any:
 def make_native_cull(width: int) -> Any:
     """Return the function of `make_cull` in C++, for the CPU only."""
 
-    @wp.func_native(lanes_only(f"return wrt::cull<{width}>(rows.data + (long long)first, ray);"))
-    def cull(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay) -> int: ...
+    @wp.func_native(lanes_only(f"return mask & wrt::cull<{width}>(rows.data + (long long)first, ray);"))
+    def cull(rows: wp.array(dtype=wp.float32), first: int, mask: int, ray: LaneRay) -> int: ...
 
     return cull
 
 
 @cache
 def make_cull(width: int) -> Any:
-    """Return cull(rows, first, ray): the mask of the triangles, in the row at rows[first], that the float32 areas do not reject."""
+    """Return cull(rows, first, mask, ray): the triangles in `mask`, of the row at rows[first], that the float32 areas do not reject."""
     plain, vector = make_plain_cull(width), make_native_cull(width)
 
     @wp.func
-    def cull(rows: wp.array(dtype=wp.float32), first: int, ray: LaneRay) -> int:
+    def cull(rows: wp.array(dtype=wp.float32), first: int, mask: int, ray: LaneRay) -> int:
         if on_cuda():
-            return plain(rows, first, ray)
-        return vector(rows, first, ray)
+            return plain(rows, first, mask, ray)
+        return vector(rows, first, mask, ray)
 
     return cull

@@ -14,11 +14,18 @@ import warp as wp
 
 from wrt.kernels.structs import on_cuda
 from wrt.kernels.units.box import RAY_AABB
-from wrt.kernels.wide.lanes import LANE_PAD, LaneRay, bits, lanes_only, row_type, value
+from wrt.kernels.wide.lanes import LANE_PAD, LaneRay, bits, four, lanes_only, larger, row_type, smaller, value
 from wrt.kernels.wide.layout import EXIST_SHIFT, EXPONENT_BITS, FIRST_BYTES, HI_X, HI_Y, HI_Z, LO_X, LO_Y, LO_Z, MANTISSA_BITS, WORD
 
 # Factor of far distances for the box tests that have a vectorised form, by their names in RAY_AABB.
 ROW_PADS = {"conservative": LANE_PAD, "minmax": 1.0}
+
+
+@wp.func
+def step_of(nodes: wp.array(dtype=wp.float32), first: int, axis: int) -> float:
+    """Return the distance between the planes of two successive bytes of a compressed node."""
+    exponent = (bits(nodes, first + WORD) >> (EXPONENT_BITS * axis)) & wp.static((1 << EXPONENT_BITS) - 1)
+    return wp.cast(exponent << MANTISSA_BITS, wp.float32)
 
 
 @cache
@@ -28,11 +35,9 @@ def make_plane(width: int, compressed: bool) -> Any:
     @wp.func
     def plane(nodes: wp.array(dtype=wp.float32), first: int, k: int, lane: int) -> float:
         if wp.static(compressed):
-            axis = k >> 1
             at = k * width + lane  # Index among the bytes; a word has four.
             byte = (bits(nodes, first + FIRST_BYTES + (at >> 2)) >> (8 * (at & 3))) & 255
-            exponent = (bits(nodes, first + WORD) >> (EXPONENT_BITS * axis)) & wp.static((1 << EXPONENT_BITS) - 1)
-            return value(nodes, first + axis) + float(byte) * wp.cast(exponent << MANTISSA_BITS, wp.float32)
+            return value(nodes, first + (k >> 1)) + float(byte) * step_of(nodes, first, k >> 1)
         return value(nodes, first + k * width + lane)
 
     @wp.func
@@ -81,7 +86,10 @@ def make_scalar(width: int, compressed: bool, box: str) -> Any:
 
 @cache
 def make_plain(width: int, compressed: bool) -> Any:
-    """Return children (see make_children) in plain Warp."""
+    """Return children(nodes, first, ray, t_max) -> mask and entry(nodes, first, lane, ray) -> t in plain Warp, for CUDA.
+
+    A thread tests four boxes for each load. It computes the entry distance of an entered child anew: to keep the distances of all
+    children, a thread would write a row to its local memory for each node."""
     plane, _ = make_plane(width, compressed)
 
     @wp.func
@@ -89,18 +97,43 @@ def make_plain(width: int, compressed: bool) -> Any:
         return wp.where(axis == 0, ray.near_x, wp.where(axis == 1, ray.near_y, ray.near_z))
 
     @wp.func
-    def enters(nodes: wp.array(dtype=wp.float32), first: int, j: int, ray: LaneRay, t_max: float) -> float:
-        enter = float(ray.box.t_min)
-        leave = float(t_max)
-        for axis in range(3):
-            near = near_plane(ray, axis)
-            t = (plane(nodes, first, near, j) - ray.box.origin[axis]) * ray.box.inv_dir[axis]
-            enter = wp.where(t > enter, t, enter)
-            t = (plane(nodes, first, near ^ 1, j) - ray.box.origin[axis]) * ray.far_inv_dir[axis]
-            leave = wp.where(t < leave, t, leave)
-        return wp.where(enter <= leave, enter, float(wp.inf))
+    def planes(nodes: wp.array(dtype=wp.float32), first: int, k: int, lane: int) -> wp.vec4:
+        """Return PLANES[k] of the four children from `lane` on."""
+        if wp.static(compressed):
+            word = bits(nodes, first + FIRST_BYTES + ((k * width + lane) >> 2))
+            origin, step = value(nodes, first + (k >> 1)), step_of(nodes, first, k >> 1)
+            return wp.vec4(origin + float(word & 255) * step, origin + float((word >> 8) & 255) * step,
+                           origin + float((word >> 16) & 255) * step, origin + float((word >> 24) & 255) * step)
+        return four(nodes, first + k * width + lane)
 
-    return lane_by_lane(width, compressed, enters)
+    @wp.func
+    def children(nodes: wp.array(dtype=wp.float32), first: int, ray: LaneRay, t_max: float) -> int:
+        mask = int(0)
+        for h in range(width // 4):
+            enter = wp.vec4(ray.box.t_min)
+            leave = wp.vec4(t_max)
+            for axis in range(3):
+                near = near_plane(ray, axis)
+                nearest, farthest = planes(nodes, first, near, 4 * h), planes(nodes, first, near ^ 1, 4 * h)
+                for j in range(4):
+                    enter[j] = larger((nearest[j] - ray.box.origin[axis]) * ray.box.inv_dir[axis], enter[j])
+                    leave[j] = smaller((farthest[j] - ray.box.origin[axis]) * ray.far_inv_dir[axis], leave[j])
+            for j in range(4):
+                if enter[j] <= leave[j]:
+                    mask = mask | (1 << (4 * h + j))
+        if wp.static(compressed):
+            return mask & (bits(nodes, first + WORD) >> EXIST_SHIFT)
+        return mask
+
+    @wp.func
+    def entry(nodes: wp.array(dtype=wp.float32), first: int, lane: int, ray: LaneRay) -> float:
+        out = float(ray.box.t_min)
+        for axis in range(3):
+            t = (plane(nodes, first, near_plane(ray, axis), lane) - ray.box.origin[axis]) * ray.box.inv_dir[axis]
+            out = larger(t, out)
+        return out
+
+    return children, entry
 
 
 @cache
@@ -131,21 +164,34 @@ def make_native(width: int, compressed: bool) -> Any:
 
 @cache
 def make_children(width: int, compressed: bool, box: str) -> Any:
-    """Return children(nodes, first, ray, t_max) -> (row, mask) for the node at nodes[first] and a finite t_max.
+    """Return children(nodes, first, ray, t_max) -> (row, mask) for the node at nodes[first] and a finite t_max, and
+    entry(row, nodes, first, lane, ray) -> t.
 
-    The mask has the children that the ray's segment [t_min, t_max] enters. The row has the entry distances, at least t_min. The box test
+    The mask has the children that the ray's segment [t_min, t_max] enters. Their entry distances are at least t_min. The box test
     `box` is a name in RAY_AABB; ray.far_inv_dir must include the factor far_pad(box). CUDA and the CPU run different forms."""
+    row = row_type(width)
+
+    @wp.func
+    def entry_of(entries: row, nodes: wp.array(dtype=wp.float32), first: int, lane: int, ray: LaneRay) -> float:
+        return entries[lane]
+
     if box not in ROW_PADS:
-        return make_scalar(width, compressed, box)
-    plain, vector = make_plain(width, compressed), make_native(width, compressed)
+        return make_scalar(width, compressed, box), entry_of
+    (plain, plain_entry), vector = make_plain(width, compressed), make_native(width, compressed)
 
     @wp.func
     def children(nodes: wp.array(dtype=wp.float32), first: int, ray: LaneRay, t_max: float):
         if on_cuda():
-            return plain(nodes, first, ray, t_max)
+            return row(), plain(nodes, first, ray, t_max)
         return vector(nodes, first, ray, t_max)
 
-    return children
+    @wp.func
+    def entry(entries: row, nodes: wp.array(dtype=wp.float32), first: int, lane: int, ray: LaneRay) -> float:
+        if on_cuda():
+            return plain_entry(nodes, first, lane, ray)
+        return entries[lane]
+
+    return children, entry
 
 
 def far_pad(box: str) -> float:

@@ -6,6 +6,7 @@ The functions below are device code. The host calls `leaf_first.func(...)`, for 
 import warp as wp
 
 EMPTY = wp.constant(0)  # A child that does not exist. (Index 0 is the root, which is no node's child.)
+DONE = wp.constant(0x7FFFFFFF)  # No reference: a walk has no more children to visit.
 LEAF_BITS = 6
 MAX_LEAF = 1 << LEAF_BITS  # Largest number of primitives in a leaf.
 MAX_FIRST = 1 << (31 - LEAF_BITS)  # Upper bound, exclusive, of a leaf's `first`.

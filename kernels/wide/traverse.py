@@ -23,7 +23,7 @@ from wrt.kernels.units.triangle import component
 from wrt.kernels.wide.lanes import LaneRay, bits, lowest, make_cull, prefetch
 from wrt.kernels.wide.layout import HI_X, HI_Y, HI_Z, LO_X, LO_Y, LO_Z, STACK_SIZE, NodeLayout
 from wrt.kernels.wide.nodes import far_pad, make_children, make_plane
-from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
+from wrt.kernels.wide.references import DONE, EMPTY, leaf_count, leaf_first
 
 
 @cache
@@ -99,7 +99,7 @@ def make_row_test(units: Units, any_hit: bool, accepts: Any, width: int) -> Any:
     def test_row(rows: wp.array(dtype=wp.float32), first: int, mask: int, surfaces: Any, probe: Probe, ray: LaneRay,
                  best: Hit) -> Hit:
         if wp.static(culled):
-            mask = mask & cull(rows, first, ray)
+            mask = cull(rows, first, mask, ray)
         while mask != 0:
             best = intersect(probe, surfaces, gather(rows, first + lowest(mask)), best)
             mask = mask & (mask - 1)
@@ -242,13 +242,14 @@ def make_recorded(units: Units, accepts: Any, layout: NodeLayout) -> Any:
 def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout) -> Any:
     """Return traverse(accel, surfaces, ray) -> Hit: the closest hit or, with any_hit, the first hit found."""
     struct = make_struct(units.triangle_test.record)
-    children = make_children(layout.width, layout.compressed, units.box)
+    children, entry = make_children(layout.width, layout.compressed, units.box)
     probe_of = make_probe(units)
     prefetch_next = make_prefetch(units.triangle_test.record, layout)
     count_node, count_leaf, count_pop, count_push, finish = make_counting(units, layout)
     record_children, record_push, record_pop, recorded_leaf = make_recorded(units, accepts, layout)
     visit_leaf = recorded_leaf if units.steps else make_leaf_test(units, any_hit, accepts, layout)
     new_stack, shared_stack, put, get = make_stack(units.stack, STACK_SIZE, wp.uint64, 8)
+    entries = wp.types.vector(STACK_SIZE, wp.uint64)
 
     @wp.func
     def child(accel: struct, first: int, lane: int) -> int:
@@ -256,6 +257,19 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
         reference = bits(accel.nodes, first + wp.static(layout.references) + lane)
         prefetch_next(accel, reference)
         return reference
+
+    @wp.func
+    def pop(recorder: Recorder, ray: Ray, stack: wp.ref[entries], shared: wp.uint64, size: int, counts: Counts, best: Hit):
+        """Return the next child that begins at or before the closest hit: at the same t, it may have a hit with a lower prim_id."""
+        reference = int(DONE)
+        while size > 0 and reference == DONE:
+            size = size - 1
+            counts = count_pop(counts)
+            key = get(stack, shared, size)
+            record_pop(recorder, ray, key, best)
+            if t_of(key) <= best.t:
+                reference = reference_of(key)
+        return reference, size, counts
 
     @wp.func
     def traverse(accel: struct, surfaces: Any, ray: Ray) -> Hit:
@@ -268,25 +282,19 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
         shared = shared_stack()
         size = int(0)
         reference = int(0)
-        while True:
-            if reference < 0:
-                best = visit_leaf(accel, surfaces, reference, probe, rows, best)
-                counts = count_leaf(accel, ray, counts, reference)
-                if wp.static(any_hit):
-                    if best.prim_id != NO_HIT:
-                        return finish(accel.recorder, ray, counts, best)
-            else:
+        while reference != DONE:
+            while reference >= 0 and reference != DONE:
                 first = reference * wp.static(layout.size)
                 counts = count_node(accel, ray, counts, reference)
                 t, mask = children(accel.nodes, first, rows, best.t)
                 record_children(accel, ray.slot, first, t, mask)
                 if mask != 0:
                     lane, mask = lowest(mask), mask & (mask - 1)
-                    near = key_of(t[lane], child(accel, first, lane))
+                    near = key_of(entry(t, accel.nodes, first, lane, rows), child(accel, first, lane))
                     begin = size
                     while mask != 0:
                         lane, mask = lowest(mask), mask & (mask - 1)
-                        key = key_of(t[lane], child(accel, first, lane))
+                        key = key_of(entry(t, accel.nodes, first, lane, rows), child(accel, first, lane))
                         if wp.static(any_hit):
                             record_push(accel.recorder, ray, near, size)
                             put(stack, shared, size, near)
@@ -306,19 +314,15 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
                         size = size + 1
                         counts = count_push(counts, size)
                     reference = reference_of(near)
-                    continue
-            # Pop the next child that begins at or before the closest hit: at the same t, it may have a hit with a lower prim_id.
-            found = bool(False)
-            while size > 0 and not found:
-                size = size - 1
-                counts = count_pop(counts)
-                key = get(stack, shared, size)
-                record_pop(accel.recorder, ray, key, best)
-                if t_of(key) <= best.t:
-                    reference = reference_of(key)
-                    found = True
-            if not found:
-                break
+                else:
+                    reference, size, counts = pop(accel.recorder, ray, stack, shared, size, counts, best)
+            if reference != DONE:
+                best = visit_leaf(accel, surfaces, reference, probe, rows, best)
+                counts = count_leaf(accel, ray, counts, reference)
+                if wp.static(any_hit):
+                    if best.prim_id != NO_HIT:
+                        return finish(accel.recorder, ray, counts, best)
+                reference, size, counts = pop(accel.recorder, ray, stack, shared, size, counts, best)
         return finish(accel.recorder, ray, counts, best)
 
     return traverse

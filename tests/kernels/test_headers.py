@@ -6,7 +6,7 @@ import pytest
 
 from tests.data import ROOT
 
-from tests.kernel_tools import launch, zeros  # isort: skip (starts Warp)
+from tests.kernel_tools import cpu_only, launch, zeros  # isort: skip (starts Warp)
 import warp as wp
 
 from wrt.kernels import headers
@@ -28,6 +28,7 @@ def result(size: int) -> float:
     return float(out.numpy()[0])
 
 
+@cpu_only
 def test_a_changed_header_is_compiled_again(tmp_path, monkeypatch):
     monkeypatch.setattr(headers, "FOLDER", tmp_path)
     whole, part = tmp_path / "whole.h", tmp_path / "part.h"

@@ -24,14 +24,14 @@ from wrt.accel.structures import ACCELERATORS
 from wrt.core.checks import as_integer
 from wrt.core.device import load_kernel, start
 from wrt.core.threads import run_all, thread_count
-from wrt.core.types import Device, JsonObject
+from wrt.core.types import JsonObject
 from wrt.io.load import load_scene
 from wrt.kernels.study.elementary import FUNCTIONS, call_functions
 from wrt.lab.bench.accel import BRUTE_FORCE_TESTS, answer
 from wrt.lab.bench.instruction_sets import instruction_sets
 from wrt.lab.bench.rays import RaySet, ray_sets
 from wrt.lab.bench.report import Columns, Row, machine_line, markdown, tabled
-from wrt.lab.bench.timing import alternate, spread
+from wrt.lab.bench.timing import alternate_on, spread
 from wrt.lab.bench.visibility import terrain
 from wrt.lab.hard_cases.cases import HARD_CASES, generate
 from wrt.lab.hard_cases.contestants import CONSTRUCTORS, Own, WarpMesh
@@ -62,8 +62,8 @@ LEGEND = """\
 compared: number of results; "picture of x86-64" is one result for each picture. differ: results whose bits are not the CPU's. places:
 meshes and rays of these results. Each difference is a fault: please report it with this table."""
 TIMED = """\
-Rays and hits are in device memory. Mray/s: median of alternating runs, quartiles in brackets. default / structure: speed of wrt's default
-structure over that of the row's structure."""
+Rays and hits are in device memory. Mray/s: median of alternating runs (on a GPU of 10 calls each), quartiles in brackets. default /
+structure: speed of wrt's default structure over that of the row's structure."""
 
 
 @dataclass(frozen=True)
@@ -217,17 +217,12 @@ def speed_rows(plan: Check) -> tuple[list[Row], str]:
     algorithms |= warps
     kinds = ray_sets(build(geometry, device="cpu"), FAST if device.is_cuda else SLOW) if warps else {}
     for kind, rays in kinds.items():
-        jobs = {name: partial(finished, each.search(rays, thread_count(None)), device) for name, each in algorithms.items()}
-        seconds = alternate(jobs, RUNS)
+        jobs = {name: each.search(rays, thread_count(None)) for name, each in algorithms.items()}
+        seconds = alternate_on(device, jobs, RUNS)
         first = seconds[next(iter(algorithms))]
         out += [Row(who=name, kind=kind, rays=len(rays), mrays=(len(rays) / taken / 1e6).tolist(),
                     first_over_it=float(np.median(taken / first))) for name, taken in seconds.items()]
     return out, "; ".join(skipped)
-
-
-def finished(search: Callable[[], object], device: Device) -> None:
-    search()
-    wp.synchronize_device(device)
 
 
 @dataclass(frozen=True)

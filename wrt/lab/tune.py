@@ -21,7 +21,7 @@ from wrt.core.threads import thread_count
 from wrt.core.types import Device, JsonObject
 from wrt.lab.bench.rays import RaySet, ray_sets
 from wrt.lab.bench.report import Columns, Row, machine_line, markdown, tabled
-from wrt.lab.bench.timing import alternate, spread
+from wrt.lab.bench.timing import QUEUE, alternate_on, spread
 from wrt.lab.bench.visibility import terrain
 from wrt.lab.hard_cases.contestants import Own
 
@@ -34,8 +34,8 @@ MARGIN = 1.03  # Least speed over the default's that counts as faster; less may 
 COLUMNS: Columns = {"structure": "{accel}", "block": "{block}", "stack": "{stack}", "rays": "{kind}",
                     "Mray/s": lambda row: spread(row.mrays), "speed / default": "{speed:.2f}"}
 LEGEND = """\
-Rays and hits are in device memory. Mray/s: median of alternating runs, quartiles in brackets. speed / default: geometric mean over the
-kinds of rays. block (threads a block) and stack (memory of the traversal stack) are settings of wrt.core.cuda."""
+Rays and hits are in device memory. Mray/s: median of alternating runs (on a GPU of 10 calls each), quartiles in brackets. speed / default:
+geometric mean over the kinds of rays. block (threads a block) and stack (memory of the traversal stack) are settings of wrt.core.cuda."""
 
 
 class Choice(NamedTuple):
@@ -127,9 +127,9 @@ def measure(choices: list[Choice], geometry: Geometry, rays: Mapping[str, RaySet
         own.prepare(geometry)
         for kind in KINDS:
             search = own.search(rays[kind], thread_count(None))
-            jobs |= {(choice, kind): partial(search_with, choice, search, device) for choice in choices if choice.accel == accel}
-    round_seconds = sum(float(run.sum()) for run in alternate(jobs, 1, clock).values())
-    runs = alternate(jobs, min(max(int(seconds / round_seconds), FEWEST), MOST), clock)
+            jobs |= {(choice, kind): partial(search_with, choice, search) for choice in choices if choice.accel == accel}
+    round_seconds = (1 if device.is_cpu else QUEUE) * sum(float(run.sum()) for run in alternate_on(device, jobs, 1, clock).values())
+    runs = alternate_on(device, jobs, min(max(int(seconds / round_seconds), FEWEST), MOST), clock)
     median = {key: float(np.median(each)) for key, each in runs.items()}
     speeds = {choice: float(np.exp(np.mean([np.log(median[choices[0], kind] / median[choice, kind]) for kind in KINDS])))
               for choice in choices}
@@ -145,11 +145,10 @@ def fastest(speeds: Mapping[Choice, float]) -> Choice:
     return best if speeds[best] >= MARGIN else DEFAULT
 
 
-def search_with(choice: Choice, search: Callable[[], object], device: Device) -> None:
+def search_with(choice: Choice, search: Callable[[], object]) -> None:
     before = cuda.block_dim, cuda.stack
     cuda.block_dim, cuda.stack = choice.block_dim, choice.stack
     try:
         search()
-        wp.synchronize_device(device)
     finally:
         cuda.block_dim, cuda.stack = before

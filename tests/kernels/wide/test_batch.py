@@ -210,6 +210,7 @@ def test_moved_vertices(sphere):
     assert_same(accel, o, d)
 
 
+@cpu_only
 def test_packets_are_given_up_where_they_fall_apart():
     # Triangles far smaller than the distance of the rays: the answers are the same before and after.
     accel = build(Geometry.of(icosphere(6)), "bvh8")

@@ -8,6 +8,7 @@ import pytest
 from tests.kernel_tools import DEVICE, cpu_only, floats, ints, launch, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
+from tests.kernels.wide.plain_rows import make_plain_rows
 from wrt.accel.bvh.compress import compress
 from wrt.kernels.query import RayArrays, load_ray
 from wrt.kernels.structs import Ray, kernel
@@ -16,7 +17,7 @@ from wrt.kernels.units.box import FAR_PAD, box_ray, ray_aabb
 from wrt.kernels.warp_private import fields_of
 from wrt.kernels.wide.lanes import LANE_PAD, lowest, make_native_cull, make_plain_cull, row_type
 from wrt.kernels.wide.layout import node_size
-from wrt.kernels.wide.nodes import make_native, make_plain
+from wrt.kernels.wide.nodes import make_native
 from wrt.kernels.wide.traverse import lane_ray
 
 WIDTHS = (4, 8)
@@ -46,12 +47,12 @@ def both_kernel(width, compressed):
             entries, entered = children(nodes, node, lanes, ray.t_max)
             out.entries[i] = entries
             out.entered[i] = entered
-            out.candidates[i] = cull(rows, first, lanes)
+            out.candidates[i] = cull(rows, first, (1 << width) - 1, lanes)
 
         return run
 
     return (Out, make(make_native_cull(width), make_native(width, compressed)),
-            make(make_plain_cull(width), make_plain(width, compressed)))
+            make(make_plain_cull(width), make_plain_rows(width, compressed)))
 
 
 def results(width, compressed, nodes, rows, rays):

@@ -5,9 +5,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from tests.kernel_tools import DEVICE, floats, launch, vec3s, zeros  # isort: skip (starts Warp)
+from tests.kernel_tools import DEVICE, cpu_only, floats, launch, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
+from tests.kernels.wide.plain_rows import make_plain_rows
 from wrt.kernels.query import LARGEST, RayArrays, direction_scale, load_ray
 from wrt.kernels.structs import NO_HIT, Hit, Primitive, Surfaces, kernel
 from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hit
@@ -15,11 +16,11 @@ from wrt.kernels.wide import packets
 from wrt.kernels.wide.batch import PACKETS, SLOTS
 from wrt.kernels.wide.lanes import LANE_PAD, row_type
 from wrt.kernels.wide.layout import BEAM, COHERENT, ENTRY, ENTRY_RAYS, FIELDS, LANES, PACKET_SIZE, SLOT_SIZE, STACK_SIZE, STACK_WORDS, WIDTH
-from wrt.kernels.wide.nodes import make_plain
 from wrt.kernels.wide.packets import Scratch, WideBvh, packet_kernel
 from wrt.kernels.wide.references import EMPTY
 from wrt.kernels.wide.traverse import lane_ray
 
+pytestmark = cpu_only
 EXCLUDE = LANES * FIELDS.index("exclude")
 NOTHING = wp.constant(99)
 CHILDREN = np.array([-3, -2, -1, 1, 2, 3, 4, 5], np.int32)  # References of a node to leaves and nodes; none is EMPTY.
@@ -154,7 +155,7 @@ def triangles_ray_by_ray(accel: WideBvh, state: wp.array(dtype=wp.int32), in_row
 def scalar_kernel():
     row = row_type(WIDTH)
     probe_of, intersect = make_probe(Units()), make_intersect(Units())
-    children = make_plain(WIDTH, False)
+    children = make_plain_rows(WIDTH, False)
 
     @wp.struct
     class Scalars:

@@ -17,6 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import wrt
+from tests import device
 from tests.command_line import BOX_OBJ
 from tests.command_line import wrt as command
 from tests.refused import Refusal, refused
@@ -75,12 +76,13 @@ def test_a_structure_goes_through_pickle(name: str) -> None:
 
 def test_a_structure_over_arrays_of_a_device_goes_through_pickle(saved: Path) -> None:
     """The copy is over a Geometry, also if load_accel got Warp arrays."""
-    over = DeviceGeometry(wp.array(BALL.vertices, dtype=wp.vec3, device="cpu"), wp.array(BALL.faces, dtype=wp.vec3i, device="cpu"))
+    points, faces = (wp.array(rows, dtype=kind, device=device.NAME) for rows, kind in ((BALL.vertices, wp.vec3), (BALL.faces, wp.vec3i)))
+    over = DeviceGeometry(points, faces)
     for before in (build(over, "bvh2"), load_accel(saved, over)):
         for after in (pickle.loads(pickle.dumps(before)), deepcopy(before)):
             same(before, after)
             assert type(after.geometry) is Geometry and after.geometry.digest() == before.geometry.digest()
-            after.refit(wp.array(2.0 * BALL.vertices, dtype=wp.vec3, device="cpu"), in_place=True)
+            after.refit(wp.array(2.0 * BALL.vertices, dtype=wp.vec3, device=device.NAME), in_place=True)
             same(after, build((2.0 * BALL.vertices, BALL.faces), "bvh2"))
 
 

@@ -36,8 +36,8 @@ def measured_by(monkeypatch: pytest.MonkeyPatch) -> Callable[[Costs], tuning.Tun
     def by(costs: Costs) -> tuning.Tuning:
         search_with, now = tuning.search_with, [0.0]
 
-        def slow(choice: Choice, search: Any, target: Any) -> None:
-            search_with(choice, search, target)
+        def slow(choice: Choice, search: Any) -> None:
+            search_with(choice, search)
             now[0] += costs.get(choice, 1.0)
 
         monkeypatch.setattr(tuning, "search_with", slow)
@@ -48,8 +48,8 @@ def measured_by(monkeypatch: pytest.MonkeyPatch) -> Callable[[Costs], tuning.Tun
 
 def test_the_fastest_choice_is_returned_as_arguments(measured_by: Callable[[Costs], tuning.Tuning]) -> None:
     there, before = start(device.NAME), (cuda.block_dim, cuda.stack)
-    found = measured_by({Choice("bvh2"): 0.5, Choice("bvh2", 32): 0.4, Choice("bvh2", 32, "local"): 0.25})
-    best = Choice("bvh2", 32, "local") if there.is_cuda else Choice("bvh2")
+    found = measured_by({Choice("bvh2"): 0.5, Choice("bvh2", 32): 0.4, Choice("bvh2", 32, "shared"): 0.25})
+    best = Choice("bvh2", 32, "shared") if there.is_cuda else Choice("bvh2")
     assert found.best == best and (cuda.block_dim, cuda.stack) == before
     assert found.speeds[DEFAULT] == 1.0 and found.speeds[best] == (4.0 if there.is_cuda else 2.0)
     assert found.arguments == {"accel": "bvh2", "device": device.NAME}

@@ -223,8 +223,8 @@ def trace_on_gpu(snapshot: Snapshot, query: Query) -> None:
     part = n if rays.as_warp else rays_on_gpu(n, device)
     for first in range(0, n, max(part, 1)):
         some = slice(first, min(first + part, n))
-        copied = rays_on(device, rays if part == n else Rays(*(array[some] for array in rays)))
-        launch_over(device, kernel, [snapshot.data, snapshot.surfaces, copied], [array[some] for array in out])
+        rays_of_part, out_of_part = (rays, out) if part >= n else (Rays(*(array[some] for array in rays)), [array[some] for array in out])
+        launch_over(device, kernel, [snapshot.data, snapshot.surfaces, rays_on(device, rays_of_part)], out_of_part)
 
 
 def trace_worlds(snapshot: Snapshot, query: Query, worlds: WorldIds) -> None:

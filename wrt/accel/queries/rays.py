@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ctypes import c_float
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -123,9 +124,18 @@ def host_arrays(rays: Rays) -> Rays:
 
 def constant_array(value: float, n: int, device: Device) -> WarpArray:
     """Return an array (n,) of stride 0, all of whose elements are `value`. A CUDA graph can capture this call."""
-    one = wp.full(1, value, dtype=wp.float32, device=device)
+    known = value in (0.0, np.inf) and device.is_cuda and not device.is_capturing
+    one = default_end(value, device.alias) if known else wp.full(1, value, dtype=wp.float32, device=device)
     out = wp.array(ptr=one.ptr, shape=(n,), strides=(0,), dtype=wp.float32, device=device)
     keep(out, one)
+    return out
+
+
+@cache
+def default_end(value: float, device: str) -> WarpArray:
+    """Return an array (1,) of a usual t_min or t_max, which all calls share: an array takes longer to make than a launch."""
+    out = wp.full(1, value, dtype=wp.float32, device=device)
+    wp.synchronize_device(device)  # other streams read it, too
     return out
 
 
@@ -159,7 +169,8 @@ def _checked_ends(array: Array, name: str) -> Array:
             return array
     elif array.strides != (0,):
         array = float32(array)
-    _check_ends(np.asarray(array).min(initial=np.inf), name)
+    numbers = np.asarray(array)
+    _check_ends((numbers[:1] if numbers.strides == (0,) else numbers).min(initial=np.inf), name)
     return array
 
 

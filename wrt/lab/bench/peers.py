@@ -13,6 +13,7 @@ import numpy as np
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.answers import Hits
 from wrt.accel.structures import ACCELERATORS
+from wrt.core.device import start
 from wrt.core.threads import run_all, thread_count
 from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench import peer_points, peer_tiles
@@ -21,7 +22,7 @@ from wrt.lab.bench.instruction_sets import instruction_sets
 from wrt.lab.bench.peer_chart import chart
 from wrt.lab.bench.rays import RAY_KINDS, RaySet, ray_sets
 from wrt.lab.bench.report import Columns, Groups, Part, Row, grouped, machine_line, mesh_name, tabled, versions
-from wrt.lab.bench.timing import alternate, spread
+from wrt.lab.bench.timing import alternate_on, spread
 from wrt.lab.hard_cases import tinybvh
 from wrt.lab.hard_cases.contestants import RIVALS, Algorithm, Own, Peer
 from wrt.lab.plans import Peers as Plan
@@ -34,12 +35,13 @@ TITLE = "wrt and other libraries"
 COLUMNS: Columns = {"rays": "{kind}", "threads": "{threads}", "hit": "{hit:.0%}", "library": "{name}", "ns/ray": "{ns:.3g}",
                     "Mray/s": lambda row: spread(row.mrays), "wrt / library": "{first_over_it:.2f}", "differ": "{differ} of {rays}"}
 LEGEND = """\
-ns/ray, Mray/s: the thread's CPU seconds and the rays (wall-clock seconds for several threads and for a GPU), medians of alternating
-runs; quartiles in brackets. Rays and results are in each library's own arrays. If a library runs on one thread, each thread calls it
-with parts of the rays. wrt / library: speed of the table's first structure over the library's, median of the ratios run by run. differ:
-rays that hit in one library and miss in the other, or hit different primitives at t that differ by more than 1e-4 relative. Any-hit rays
-(shadow) differ if one library says occluded and the other does not. points: closest points; distances differ by more than 1e-4
-relative. tiles: 64x64 primary rays in each of many worlds of 3,202 triangles. best mode: the fastest of a library's modes for each mesh."""
+ns/ray, Mray/s: the thread's CPU seconds and the rays (wall-clock seconds for several threads and for a GPU), medians of alternating runs;
+quartiles in brackets. A run on a GPU is 10 calls and one wait. Rays and results are in each library's own arrays. If a library runs on one
+thread, each thread calls it with parts of the rays. wrt / library: speed of the table's first structure over the library's, median of the
+ratios run by run. differ: rays that hit in one library and miss in the other, or hit different primitives at t that differ by more than
+1e-4 relative. Any-hit rays (shadow) differ if one library says occluded and the other does not. points: closest points; distances differ
+by more than 1e-4 relative. tiles: 64x64 primary rays in each of many worlds of 3,202 triangles. best mode: the fastest of a library's
+modes for each mesh."""
 WRITERS = {".svg": chart, ".png": chart}
 
 
@@ -118,21 +120,12 @@ def compared(algorithms: Sequence[Algorithm], rays: RaySet, threads: int, runs: 
 
 def timed(works: Sequence[Callable[[], object]], n: int, threads: int, runs: int, device: str) -> Iterator[dict[str, object]]:
     """Run these functions, each of which answers n queries, by turns; yield the figures of each.
-    seconds: time of each run, CPU time for one thread, and wall-clock time for several threads or a GPU."""
-    jobs = dict(enumerate(works if device == "cpu" else [partial(completed, work, device) for work in works]))
-    seconds = alternate(jobs, runs, thread_time if threads == 1 and device == "cpu" else perf_counter)
+    seconds: time of each run, CPU time for one thread, and wall-clock time for several threads or a GPU (of one of QUEUE calls)."""
+    jobs = dict(enumerate(works))
+    seconds = alternate_on(start(device), jobs, runs, thread_time if threads == 1 and device == "cpu" else perf_counter)
     for i in jobs:
         yield {**timing(n, seconds[i], seconds[0]), "ns": 1e9 * float(np.median(seconds[i])) / n,
                "first_over_it": float(np.median(seconds[i] / seconds[0]))}
-
-
-def completed(work: Callable[[], object], device: str) -> object:
-    """Do the work, and wait until the device has completed it."""
-    import warp as wp
-
-    out = work()
-    wp.synchronize_device(device)
-    return out
 
 
 def point_rows(plan: Plan, geometry: Geometry, threads: int) -> Iterator[dict[str, object]]:

@@ -9,13 +9,18 @@ import re
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
+import warp as wp
+
+from wrt.core.types import Device
 
 Quartiles = tuple[float, float, float]  # first quartile, median, third quartile
+QUEUE = 10  # calls of a timed run on a GPU, so that the host prepares a call while the GPU works on others
 K = TypeVar("K")
 T = TypeVar("T")
 
@@ -32,6 +37,21 @@ def alternate(jobs: Mapping[K, Callable[[], object]], runs: int, clock: Callable
             jobs[name]()
             seconds[name].append(max(clock() - begin, 1e-9))  # a thread's CPU time may have coarse steps
     return {name: np.array(times) for name, times in seconds.items()}
+
+
+def alternate_on(device: Device, jobs: Mapping[K, Callable[[], object]], runs: int,
+                 clock: Callable[[], float] = time.perf_counter) -> dict[K, np.ndarray]:
+    """Return seconds (runs,) of a call of each job, as `alternate` does. A run on a GPU is QUEUE calls and one wait."""
+    if device.is_cpu:
+        return alternate(jobs, runs, clock)
+    seconds = alternate({name: partial(_queued, job, device) for name, job in jobs.items()}, runs, clock)
+    return {name: each / QUEUE for name, each in seconds.items()}
+
+
+def _queued(job: Callable[[], object], device: Device) -> None:
+    for _ in range(QUEUE):
+        job()
+    wp.synchronize_device(device)
 
 
 def quartiles(values: npt.ArrayLike) -> Quartiles:

@@ -121,6 +121,7 @@ def test_a_world_of_another_kind_is_told_and_hits_nothing(capfd: pytest.CaptureF
     kernel = make_kernel(wrt.ray_query("bvh2"), wrt.kernel)
     assert np.isfinite(answers(kernel, wrt.build(mesh, "bvh2"), asked)[0][0])
     assert np.isinf(answers(kernel, wrt.build(mesh, "bvh2", triangle="moeller_trumbore"), asked)[0][0])
+    wp.synchronize()
     ctypes.CDLL(None).fflush(None)
     assert "accel.world is of another structure or triangle test" in capfd.readouterr().out
 
