@@ -11,9 +11,8 @@ import warp as wp
 
 FOLDER = Path(__file__).parent
 # Vectors of these types are traversal stacks. Their constructor without arguments sets no entry: Warp's would write 512 bytes for each ray.
-STACK_LENGTHS, STACK_TYPES = (64, 65, 66), ("uint64", "int32")
 STACKS = "".join(f"template <> inline CUDA_CALLABLE wp::vec_t<{length}, wp::{kind}>::vec_t() {{}}\n"
-                 for length in STACK_LENGTHS for kind in STACK_TYPES)
+                 for length in (64, 65, 66) for kind in ("uint64", "int32"))
 LINE = re.compile(r'#include "(\w+\.h)"|#pragma once')
 
 

@@ -8,8 +8,6 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from wrt.kernels.headers import STACK_LENGTHS, STACK_TYPES
-
 PLACES = ("local", "shared")
 SHARED = 64  # Bytes of shared memory per thread. With more, fewer warps would fit on a multiprocessor of a T4.
 
@@ -26,7 +24,6 @@ class Stack(NamedTuple):
 @cache
 def make_uninitialized(length: int, dtype: Any) -> Any:
     """Make uninitialized(), which returns a vector whose entries are not set in kernels of wrt (headers.STACKS), and 0 in others."""
-    assert length in STACK_LENGTHS and dtype.__name__ in STACK_TYPES
     of = f"wp::vec_t<{length}, wp::{dtype.__name__}>"
 
     @wp.func_native(f"alignas({of}) char memory[sizeof({of})]; return *({of}*)memory;")
