@@ -16,6 +16,7 @@ class Served:
     misses: wp.array(dtype=wp.int64)  # Fetches whose line is not in the cache.
     prefetches: wp.array(dtype=wp.int64)  # Prefetches whose line is not in the cache.
     used: wp.array(dtype=wp.int64)  # Prefetched lines that a fetch uses before they leave the cache.
+    missed: wp.array(dtype=wp.int8)  # 1 for each access, fetch or prefetch, whose line is not in the cache.
 
 
 @kernel
@@ -34,6 +35,7 @@ def replay_prefetches(caches: Caches, first: wp.array(dtype=wp.int64), line: wp.
             if (tag >> wp.int64(1)) == line[i]:
                 found = True
                 break
+        out.missed[i] = wp.int8(wp.where(found, 0, 1))
         if ahead:
             if found:
                 caches.tags[begin] = moved  # keeps the line's flag

@@ -17,12 +17,13 @@ from wrt.accel.cells.kdtree import KdTree
 from wrt.accel.geometry import Geometry
 from wrt.kernels.study.k_hits import KEPT
 from wrt.lab.claims.classics import split_references
-from wrt.lab.claims.prefetch import AHEAD, Accesses, fully_associative, in_order, replayed, through_caches
+from wrt.lab.claims.prefetch import AHEAD, Accesses, fully_associative, in_order, replayed, through_caches, through_l2
 from wrt.lab.claims.scenes import hall, statue
 from wrt.lab.claims.stacks import FULL, cloud, k_walk, short_walk
 from wrt.lab.claims.treelets import cut, schedule
 from wrt.lab.claims.walks import NODE_BYTES, Rays, Rules, Tree, Walk, build_tree, tree_of, walk
 from wrt.lab.claims.warps import LOOP_NAMES, helped, looped, repacked
+from wrt.lab.rtcore.caches import LINE, Cache
 from wrt.scene.shapes import icosphere
 
 RULES = [Rules(a, b, c) for a in (False, True) for b in (False, True) for c in (False, True)]
@@ -132,24 +133,40 @@ def test_a_stack_is_replayed_as_in_plain_python(rules: Rules, ahead: tuple[int, 
         assert (used[some_rays().kind[owner] == 0] > 0).all()
 
 
+class CacheTwin:
+    """A cache in plain Python. totals: fetches, their misses, prefetches that load a line, used lines."""
+
+    def __init__(self, sets: int, ways: int) -> None:
+        self.sets: list[OrderedDict[int, bool]] = [OrderedDict() for _ in range(sets)]  # line -> prefetched and unused
+        self.ways, self.totals = ways, np.zeros(4, int)
+
+    def misses(self, line: int, ahead: bool) -> bool:
+        kept = self.sets[line % len(self.sets)]
+        hit = line in kept
+        self.totals += [not ahead, not ahead and not hit, ahead and not hit, not ahead and hit and kept[line]]
+        kept[line] = ahead and (not hit or kept[line])
+        kept.move_to_end(line)
+        if len(kept) > self.ways:
+            kept.popitem(last=False)
+        return not hit
+
+
 def test_caches_with_prefetches_are_those_of_plain_python() -> None:
     rng, sms, ways = np.random.default_rng(0), 3, 7
     n = 4000
     accesses = Accesses(rng.integers(200, size=n), rng.integers(40, size=n), rng.integers(60, size=n),
                         rng.integers(2, size=n).astype(np.int8))
-    first, line, prefetch = in_order(accesses, np.arange(200) // 8, sms, 2)
-    totals = np.zeros(4, int)
-    for sm in range(sms):
-        kept: OrderedDict[int, bool] = OrderedDict()  # line -> prefetched and unused
-        for where, ahead in zip(line[first[sm] : first[sm + 1]].tolist(), prefetch[first[sm] : first[sm + 1]].tolist(), strict=True):
-            hit = where in kept
-            totals += [not ahead, not ahead and not hit, ahead and not hit, not ahead and hit and kept[where]]
-            kept[where] = bool(ahead) and (not hit or kept[where])
-            kept.move_to_end(where)
-            if len(kept) > ways:
-                kept.popitem(last=False)
-    found = through_caches((first, line, prefetch), fully_associative(ways * 64, 64))
-    assert [found.fetches, found.misses, found.prefetches, found.used] == totals.tolist()
+    ordered = first, line, prefetch = in_order(accesses, np.arange(200) // 8, sms, 2)
+    l1s, l2 = [CacheTwin(1, ways) for _ in range(sms)], CacheTwin(4, 5)
+    for turn in range(int(np.diff(first).max())):
+        for sm in range(sms):
+            at = first[sm] + turn
+            if at < first[sm + 1] and l1s[sm].misses(int(line[at]), bool(prefetch[at])):
+                l2.misses(int(line[at]), bool(prefetch[at]))
+    found = through_caches(ordered, fully_associative(ways * 64, 64))
+    shared = through_l2(ordered, found.missed, Cache(4 * 5 * LINE, 5))
+    for each, totals in ((found, sum((level.totals for level in l1s), np.zeros(4, int))), (shared, l2.totals)):
+        assert [each.fetches, each.misses, each.prefetches, each.used] == totals.tolist() and totals.all()
     order = in_order(accesses, np.arange(200) // 8, sms, 2)
     assert len({*zip(accesses.ray // 8, accesses.step, accesses.prefetch, accesses.line, strict=True)}) == len(order[1])
 
