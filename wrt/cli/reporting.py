@@ -93,17 +93,18 @@ class Reporting:
         return resume.load(self.output, plan, classes)
 
     def rows_of(self, measure: Callable[[Callable[[T], None]], list[T]], line: Callable[[T], str],
-                total: int | None, before: Sequence[T] = ()) -> tuple[list[T], int | None]:
+                finished: Finished, total: int) -> tuple[list[T], int | None]:
         """Measure, and show each finished row with the time left. Return all rows, and the number of the signal that ended the work.
 
-        measure: function that takes a callback for finished rows. total: expected number of rows, None if unknown. before: rows of an
-        earlier run. After Ctrl-C the finished rows are returned; without any, KeyboardInterrupt is raised."""
-        left, kept = TimeLeft((total or 0) - len(before)), list(before)
+        measure: function that takes a callback for finished rows. finished: groups of an earlier run; `measure` appends its own. total:
+        number of groups, 0 if unknown. After Ctrl-C the finished rows are returned; without any, KeyboardInterrupt is raised."""
+        before, kept = len(finished.groups), finished.rows
+        left = TimeLeft(total - before)
 
         def done(row: T) -> None:
             kept.append(row)
-            left.done = len(kept) - len(before)
-            self.progress(f"{line(row)}{f'  ({len(kept)} of {total}{left})' if total and len(kept) < total else ''}")
+            left.done = len(finished.groups) - before
+            self.progress(f"{line(row)}{f'  ({len(finished.groups)} of {total}{left})' if len(finished.groups) < total else ''}")
 
         try:
             return measure(done), None
@@ -207,20 +208,19 @@ def measured(plan: type[Plan]) -> click.Command:
         if suffix in (".png", ".svg"):
             plot.new_figure(1.0, 1.0)  # raises InputError if matplotlib is missing
         finished = how.finished(plan)
-        total = study.total(plan) if hasattr(study, "total") else None
         client = client_of(how.cluster)
+        total = sum(1 for _ in study.groups(plan)) if client is None else 0  # reads all meshes, and so refuses a damaged one at once
         machine = study.machine(plan) if hasattr(study, "machine") else report.machine_line()
         if client is not None:
             from wrt.renderer.distributed.dask import machines
 
             machine = f"a cluster, each mesh on one worker: {machines(client)}; started from {machine}"
-        before = finished.rows
-        if before:
-            machine = f"{machine}; resumed after {len(before)} rows of: {finished.machine}"
+        if finished.groups:
+            machine = f"{machine}; resumed after {len(finished.rows)} rows of: {finished.machine}"
         finished.machine = machine
         measure = partial(report.run, finished=finished.groups) if client is None else report.run
         with warnings_reported(how.quiet):
-            rows, interrupted = how.rows_of(lambda done: by_mesh(measure, plan, done, client), partial(report.line, plan), total, before)
+            rows, interrupted = how.rows_of(lambda done: by_mesh(measure, plan, done, client), partial(report.line, plan), finished, total)
         if interrupted is not None:
             machine = f"{machine}; interrupted after {len(rows)} row{'s' if len(rows) > 1 else ''}"
         text, data = report.text(rows, plan, machine), {"machine": machine, **report.data(rows, plan)}

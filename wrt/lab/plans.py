@@ -232,7 +232,7 @@ class Claims(Plan):
 
     COMMAND, STUDY = "bench claims", "wrt.lab.bench.claims"
     QUICK = {"side": 48, "names": ("ttp-nodes", "rules", "coop-rt", "cwbvh", "short-stack")}
-    OUTPUT = "Write the tables as Markdown (.md), the figures as .csv, or charts as .svg or .png"
+    OUTPUT = "Write the tables as Markdown (.md), the figures as .csv or .json, or charts as .svg or .png"
     names: Sequence[str] = option((), of=("claim", "wrt.lab.claims.claim:CLAIMS"))
     scene: Sequence[str] = option((), "Published scenes that you have, as bunny=FILE,sponza=FILE,conference=FILE")
     side: int = option(128, "Side of the square pictures, in pixels", (8, 1024))

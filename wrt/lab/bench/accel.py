@@ -60,11 +60,6 @@ def meshes(plan: Plan) -> Iterator[Mesh]:
     yield from map(as_mesh, plan.meshes) if plan.meshes else map(terrain, takewhile(lambda n: 2 * n * n <= plan.max_triangles, cells))
 
 
-def total(plan: Plan) -> int:
-    """Return the number of rows if no structure refuses a mesh."""
-    return (len(plan.meshes) or sum(1 for _ in meshes(plan))) * len(names(plan)) * len(set(plan.kinds))
-
-
 def groups(plan: Plan) -> Groups:
     """For each mesh, yield the group of the structures that refuse it, then a group for each kind of ray."""
     for mesh in meshes(plan):

@@ -53,10 +53,6 @@ over the surface of their boxes. ns/test: time to test one volume on one thread,
 run. Mray/s: on one thread. differ: rays whose prim_id or t, bit for bit, is not that of bvh2."""
 
 
-def total(plan: Plan) -> int:
-    return len(plan.meshes) * (len(plan.builders or BVH_BUILDERS) + len(VOLUMES))
-
-
 def groups(plan: Plan) -> Groups:
     for mesh in map(as_mesh, plan.meshes):
         for builder in plan.builders or BVH_BUILDERS:

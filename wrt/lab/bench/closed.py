@@ -42,10 +42,6 @@ count_hits with crossings. us/answer: microseconds a point or a crossing.
 """
 
 
-def total(plan: Plan) -> int:
-    return (len(made()) + len(plan.meshes)) * sum(1 for n in (plan.points, plan.rays) for _ in asked(plan, n))
-
-
 def groups(plan: Plan) -> Groups:
     for mesh in [*made(), *map(as_mesh, plan.meshes)]:
         if open_edges(Geometry.of(mesh)):

@@ -34,10 +34,6 @@ quartiles in brackets; loop / waves is a ratio run by run. rays/sample includes 
 0)."""
 
 
-def total(plan: Plan) -> int:
-    return len(plan.scenes)
-
-
 def groups(plan: Plan) -> Groups:
     return (partial(scene_rows, plan, path) for path in plan.scenes)
 

@@ -82,8 +82,8 @@ def study_of(plan: Plan) -> ModuleType:
 
     The module has TITLE, LEGEND, and groups(plan). It yields functions; each measures a group of Rows that are compared with each other.
     A resumed run skips the first functions, so what they share is made on first use. COLUMNS or parts(rows, plan) make the tables.
-    Optional are machine(plan) for the report, line(row) for a line of progress, facts(rows, plan) for more JSON fields, total(plan) for
-    the expected number of rows, and WRITERS for -o (see below)."""
+    Optional are machine(plan) for the report, line(row) for a line of progress, facts(rows, plan) for more JSON fields, and
+    WRITERS for -o (see below)."""
     return importlib.import_module(plan.STUDY)
 
 

@@ -32,11 +32,6 @@ One thread, alternating runs. The default is the watertight triangle test in con
 the time of the row's test, run by run, as median [quartiles], lowest and highest. Above 1 the default is slower."""
 
 
-def total(plan: Plan) -> int:
-    triangles = len(RAY_TRIANGLE)
-    return (len(plan.meshes) or 3) * 2 * (triangles + len(RAY_AABB) - 1) + triangles
-
-
 def groups(plan: Plan) -> Groups:
     """Yield timings of triangle tests with the default box test, box tests with the default triangle test, and triangle tests alone."""
     triangles = [{"triangle": name} for name in RAY_TRIANGLE]

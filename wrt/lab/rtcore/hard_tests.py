@@ -32,10 +32,6 @@ Closest hits through bvh2. accepted in float32: tests that float32 cannot refuse
 them; the others are hard and take float64. hard rays: rays with at least one hard test."""
 
 
-def total(plan: Plan) -> int:
-    return len(plan.meshes) * len(plan.kinds)
-
-
 def groups(plan: Plan) -> Groups:
     return (partial(mesh_rows, plan, mesh) for mesh in map(as_mesh, plan.meshes))
 
