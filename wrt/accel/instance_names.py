@@ -26,11 +26,12 @@ class InstanceNames:
         end = len(geometry.part) if scene is None or scene.objects is None else len(scene.objects)
         self.first = np.array([0, end], np.int64) if geometry.worlds is None else geometry.first_instance
         self.names = [names[begin:stop] for begin, stop in zip(self.first[:-1], self.first[1:], strict=True)]
-        self.ids: dict[tuple[int, str], list[int]] = {}  # by world and name, or a path's name without folder and suffix
+        self.ids: dict[tuple[int, str], list[int]] = {}  # by world and name
+        self.stems: dict[tuple[int, str], list[int]] = {}  # by the name of a file, for meshes that have its path as their name
         for world, each in enumerate(self.names):
             for index, name in enumerate(each):
-                for each_name in {name, PurePath(name).stem}:  # a mesh that was read from a file has the path as its name
-                    self.ids.setdefault((world, each_name), []).append(int(self.first[world]) + index)
+                for ids, key in ((self.ids, name), (self.stems, PurePath(name).stem)):
+                    ids.setdefault((world, key), []).append(int(self.first[world]) + index)
 
     def find(self, thing: ObjectId | Sequence[ObjectId], world: ArrayLike | None) -> np.ndarray:
         """Return the values of `hits.instance` of objects: one, or (R,) if either argument is a sequence.
@@ -60,7 +61,7 @@ class InstanceNames:
     def _find(self, thing: object, world: int) -> int:
         place = f"world {world}" if len(self.names) > 1 else None
         if isinstance(thing, str):
-            found = self.ids.get((world, thing), [])
+            found = self.ids.get((world, thing)) or self.stems.get((world, thing), [])
             if not found:
                 raise unknown(thing, "object", [name for name in self.names[world] if name], argument="object", place=place)
             if len(found) > 1:

@@ -17,6 +17,7 @@ from wrt.accel.instanced_geometry import InstancedGeometry, NumberedGeometry
 from wrt.accel.instances import Instances
 from wrt.accel.scenes.build import build
 from wrt.scene.materials import Material
+from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene, Sphere
 from wrt.scene.shapes import icosphere, torus
 
@@ -223,3 +224,14 @@ def test_move_by_name() -> None:
             worlds.move(matrix=matrix, **more)  # type: ignore[call-overload]
     with refused("object", hint="did you mean 'robot'?"):
         worlds.move(object="robt", world=0, matrix=matrix)
+
+
+def test_an_object_that_was_read_from_a_file_has_the_files_name() -> None:
+    """An object that has the name itself comes first."""
+    parts = [Mesh(icosphere(1).vertices, icosphere(1).faces, name=name) for name in ("parts/robot.ply", "floor.v2", "floor")]
+    accel, matrix = build(Scene.of(parts), movable=True), np.eye(4)
+    for name, instance in (("robot", 0), ("parts/robot.ply", 0), ("floor", 2), ("floor.v2", 1)):
+        matrix[0, 3] += 10.0
+        accel.move(object=name, matrix=matrix)
+        hits = accel.closest_hit([[matrix[0, 3], 0.0, 5.0]], [[0.0, 0.0, -1.0]])
+        assert hits.instance[0] == instance
