@@ -7,13 +7,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import warp as wp
 
-from wrt.accel.bvh.refit import Fitting, parents_of, tree_of
+from wrt.accel.bvh.refit import Fitting, tree_of
 from wrt.accel.bvh.top_down import build_data, build_options, in_order
 from wrt.accel.bvh.tree import BvhOptions, half_areas, squeeze
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry, inverse_of, spread_of
-from wrt.core.device import launch, on_host, records, start, upload
+from wrt.accel.queries.raw_kernel import launch_raw
+from wrt.core.device import on_host, records, start, upload
 from wrt.kernels.build import bvh2 as build_bvh2
+from wrt.kernels.build.fit import NO_PARENT
 from wrt.kernels.build.records import BuildTask
 from wrt.kernels.traverse.bvh2 import Bvh2Node
 from wrt.kernels.traverse.instances import Placement
@@ -66,7 +68,10 @@ def build_top(geometry: InstancedGeometry, low: np.ndarray, high: np.ndarray) ->
     """Build the trees over the boxes of all instances."""
     first = geometry.first_instance
     nodes, order, roots, depth = split_worlds(low, high, first)
-    parents = parents_of(upload(nodes, Bvh2Node, start("cpu"))).numpy()
+    parents = np.full(len(nodes), NO_PARENT, np.int32)
+    for side in "01":
+        inner = np.flatnonzero((nodes["count_" + side] == 0) & (nodes["first_" + side] > 0))
+        parents[nodes["first_" + side][inner]] = inner
     rows = np.arange(len(order))
     top = TopLevel(nodes, roots, parents, order, depth, low, high, np.empty(len(order)), records(Placement, len(order)))
     return write_placements(top, geometry, rows)
@@ -74,7 +79,7 @@ def build_top(geometry: InstancedGeometry, low: np.ndarray, high: np.ndarray) ->
 
 def split_worlds(low: np.ndarray, high: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
     """Build a tree by binned SAH over the boxes [first[w], first[w + 1]) of each world; return nodes, order, roots, depth."""
-    cpu, count, n = start("cpu"), np.diff(first), len(low)
+    count = np.diff(first)
     # A tree has as many slots for nodes as it has boxes, at least one.
     slot = np.cumsum([0, *np.maximum(count, 1)])
     nodes = records(Bvh2Node, int(slot[-1]))
@@ -87,13 +92,11 @@ def split_worlds(low: np.ndarray, high: np.ndarray, first: np.ndarray) -> tuple[
         nodes[name][slot[alone]] = value
     tasks = records(BuildTask, len(many))
     tasks["begin"], tasks["end"], tasks["slot"], tasks["parent"] = first[many], first[many + 1], slot[many], -1
-    data = build_data(records=in_order(low, high), nodes=nodes, used=used)
-    depth, none = wp.zeros(1, dtype=wp.int32, device=cpu), wp.zeros(1, dtype=wp.int32, device=cpu)
-    launch(build_bvh2.make_build_ranges(build_bvh2.SPLIT["binned"]), len(tasks), data, upload(tasks, BuildTask, cpu),
-           build_options(BvhOptions(max_leaf=1)), 0, wp.empty(1, dtype=BuildTask, device=cpu), none, depth)
-    used = data.used.numpy() != 0
-    order = on_host(data.records)["prim_id"].copy() if n else np.zeros(0, np.int32)
-    return squeeze(on_host(data.nodes), used), order, (np.cumsum(used) - 1)[slot[:-1]].astype(np.int32), int(depth.numpy()[0]) + 1
+    build, (depth, none) = in_order(low, high), np.zeros((2, 1), np.int32)
+    launch_raw(build_bvh2.make_build_ranges(build_bvh2.SPLIT["binned"]), len(tasks), build_data(records=build, nodes=nodes, used=used),
+               tasks, build_options(BvhOptions(max_leaf=1)), 0, records(BuildTask, 1), none, depth)
+    roots = (np.cumsum(used != 0) - 1)[slot[:-1]].astype(np.int32)
+    return squeeze(nodes, used != 0), build["prim_id"].copy(), roots, int(depth[0]) + 1
 
 
 def write_placements(top: TopLevel, geometry: InstancedGeometry, rows: np.ndarray) -> TopLevel:

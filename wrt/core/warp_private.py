@@ -157,6 +157,11 @@ def is_own(kernel: Kernel) -> bool:
     return str(kernel.func.__module__).startswith("wrt.")  # the module of code made by exec is None
 
 
+def argument_types(kernel: Kernel) -> list[WarpType]:
+    """Return the Warp types of a kernel's arguments, in order."""
+    return [kind for name, kind in kernel.func.__annotations__.items() if name != "return"]
+
+
 def short_name(kernel: Kernel) -> str:
     """Return the name of a kernel's function, without the names of the functions around it."""
     return str(kernel.key).rsplit("__", 1)[-1]

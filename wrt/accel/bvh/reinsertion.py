@@ -6,13 +6,13 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-import warp as wp
 
 from wrt.accel.bvh.top_down import build_binned, build_options
 from wrt.accel.bvh.tree import BinaryTree, BvhOptions
 from wrt.accel.geometry import Geometry
-from wrt.core.device import launch, on_host, preloading, records, start, upload
-from wrt.core.types import WarpArray, WarpStruct
+from wrt.accel.queries.raw_kernel import launch_raw
+from wrt.core.device import preloading, records
+from wrt.core.warp_private import struct_record
 from wrt.kernels.build import reinsertion as kernels
 from wrt.kernels.build.shape import half_area
 from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node
@@ -31,6 +31,16 @@ class Effort(NamedTuple):
     share: float
     rounds: int
     least_gain: float
+
+
+class Walk(NamedTuple):
+    """Arrays of kernels.build.reinsertion.Walk."""
+
+    order: np.ndarray
+    level: np.ndarray
+    count: np.ndarray
+    cost: np.ndarray
+    depth: np.ndarray
 
 
 EVERY_NODE = Effort(1.0, 12, 2e-3)
@@ -57,7 +67,7 @@ def build_refined(geometry: Geometry, options: BvhOptions, threads: int) -> Bina
         if len(tree.nodes) < 2:
             return tree
         links, walk, fell = optimized(tree, LARGEST_NODES, threads)
-    return tree if fell < LARGEST_NODES.least_gain else with_leaves(tree, on_host(links), walk)
+    return tree if fell < LARGEST_NODES.least_gain else with_leaves(tree, links, walk)
 
 
 def leaf_begins(tree: BinaryTree) -> np.ndarray:
@@ -101,42 +111,38 @@ def scale_of(links: np.ndarray) -> np.float32:
     return np.float32(1.0) / max(extent, np.float32(2.0**-126)) if np.isfinite(extent) else np.float32(0.0)
 
 
-def optimized(tree: BinaryTree, effort: Effort, threads: int) -> tuple[WarpArray, WarpStruct, float]:
+def optimized(tree: BinaryTree, effort: Effort, threads: int) -> tuple[np.ndarray, Walk, float]:
     """Return the optimised links, their kernels.build.reinsertion.Walk, and the fraction by which the sum of all boxes' areas fell.
 
     If the tree becomes deeper than the traversal stack, the optimisation begins again with half as many rounds.
     """
     before, rounds = links_of(tree), effort.rounds
     while True:
-        links = upload(before.copy(), kernels.Link, start("cpu"))
+        links = before.copy()
         fell = move(links, effort, rounds, threads)
         walk = order_nodes(links)
-        if rounds == 0 or int(walk.depth.numpy()[0]) <= STACK_SIZE:
+        if rounds == 0 or int(walk.depth[0]) <= STACK_SIZE:
             return links, walk, fell
         rounds //= 2
 
 
-def move(links: WarpArray, effort: Effort, rounds: int, threads: int) -> float:
+def move(links: np.ndarray, effort: Effort, rounds: int, threads: int) -> float:
     """In each round, find the best new place of each large node; then make these moves, the move with the largest gain first.
 
     Return the fraction by which the sum of all boxes' areas fell.
     """
-    cpu = start("cpu")
-    view = on_host(links)
-    scale = scale_of(view)
-    areas = half_areas(view, scale)
+    scale = scale_of(links)
+    areas = half_areas(links, scale)
     area = first = float(areas.sum(dtype=np.float64))
     for _ in range(rounds if scale > 0.0 else 0):
-        nodes = largest(view, areas, effort.share)
+        nodes = largest(links, areas, effort.share)
         moves = records(kernels.Move, len(nodes))
         moves["node"] = nodes
-        found = upload(moves, kernels.Move, cpu)
-        launch(kernels.find_moves, len(nodes), links, found, None, scale, threads=threads, step=NODES_PER_LAUNCH)
-        moves = on_host(found)
+        launch_raw(kernels.find_moves, len(nodes), links, moves, None, scale, threads=threads, step=NODES_PER_LAUNCH)
         moves = moves[moves["gain"] > 0.0]
         moves = moves[np.argsort(-moves["gain"], kind="stable")]
-        touched = wp.zeros(len(view), dtype=wp.uint8, device=cpu)
-        launch(kernels.make_moves, 1, links, upload(areas, wp.float32, cpu), upload(moves, kernels.Move, cpu), touched, scale)
+        touched = np.zeros(len(links), np.uint8)
+        launch_raw(kernels.make_moves, 1, links, areas, moves, touched, scale)
         last, area = area, float(areas.sum(dtype=np.float64))
         if not area < last * (1.0 - effort.least_gain):
             break
@@ -152,27 +158,22 @@ def largest(links: np.ndarray, areas: np.ndarray, share: float) -> np.ndarray:
     return np.flatnonzero(movable).astype(np.int32)
 
 
-def order_nodes(links: WarpArray) -> WarpStruct:
-    cpu = start("cpu")
-    walk = kernels.Walk()
-    for name in ("order", "level", "count"):
-        setattr(walk, name, wp.empty(len(links), dtype=wp.int32, device=cpu))
-    walk.cost = wp.empty(len(links), dtype=wp.float32, device=cpu)
-    walk.depth = wp.zeros(1, dtype=wp.int32, device=cpu)
-    launch(kernels.order_nodes, 1, links, walk)
+def order_nodes(links: np.ndarray) -> Walk:
+    walk = Walk(*np.empty((3, len(links)), np.int32), np.empty(len(links), np.float32), np.zeros(1, np.int32))
+    launch_raw(kernels.order_nodes, 1, links, struct_record(kernels.Walk, walk))
     return walk
 
 
-def with_leaves(tree: BinaryTree, links: np.ndarray, walk: WarpStruct) -> BinaryTree:
+def with_leaves(tree: BinaryTree, links: np.ndarray, walk: Walk) -> BinaryTree:
     """Convert links to a tree with the leaves of the original tree. The primitives of a subtree become adjacent."""
-    n_inner, order = len(tree.nodes), walk.order.numpy()
+    n_inner, order = len(tree.nodes), walk.order
     before, begins, counts = np.zeros((3, len(links)), np.int32)
     before[n_inner:] = np.flatnonzero(leaf_begins(tree))
     counts[n_inner:] = np.diff(before[n_inner:], append=len(tree.order))
     leaves = order[order >= n_inner]
     begins[leaves] = np.cumsum(counts[leaves]) - counts[leaves]
     at = np.arange(len(tree.order)) + np.repeat(before[leaves] - begins[leaves], counts[leaves])
-    return BinaryTree(nodes_of(links, order[order < n_inner], begins, counts), tree.order[at], int(walk.depth.numpy()[0]))
+    return BinaryTree(nodes_of(links, order[order < n_inner], begins, counts), tree.order[at], int(walk.depth[0]))
 
 
 def nodes_of(links: np.ndarray, inner: np.ndarray, begins: np.ndarray, counts: np.ndarray) -> np.ndarray:
@@ -189,17 +190,17 @@ def nodes_of(links: np.ndarray, inner: np.ndarray, begins: np.ndarray, counts: n
     return nodes
 
 
-def collapse(tree: BinaryTree, links: WarpArray, walk: WarpStruct, options: BvhOptions) -> BinaryTree:
+def collapse(tree: BinaryTree, links: np.ndarray, walk: Walk, options: BvhOptions) -> BinaryTree:
     """Collapse subtrees of a tree with one primitive per leaf into larger leaves wherever that costs no more."""
-    launch(kernels.choose_leaves, 1, links, walk, build_options(options), scale_of(on_host(links)))
-    rows, order, counts = on_host(links), walk.order.numpy(), walk.count.numpy().copy()
+    launch_raw(kernels.choose_leaves, 1, links, struct_record(kernels.Walk, walk), build_options(options), scale_of(links))
+    order, counts = walk.order, walk.count.copy()
     # The 2 count - 2 links below a link come next in the walk: those below a leaf are inside it.
-    leaf, after = rows["left"][order] < 0, np.arange(1, len(order) + 1)
+    leaf, after = links["left"][order] < 0, np.arange(1, len(order) + 1)
     change = np.bincount(after[leaf], minlength=len(order) + 1)
     inside = np.cumsum(change - np.bincount((after + 2 * counts[order] - 2)[leaf], minlength=len(order) + 1))[:-1] > 0
     inner, leaves = order[~leaf & ~inside], order[leaf & ~inside]
-    begins = np.zeros(len(rows), np.int32)
+    begins = np.zeros(len(links), np.int32)
     begins[leaves] = np.cumsum(counts[leaves]) - counts[leaves]
     n_inner = len(tree.nodes)
-    return BinaryTree(nodes_of(rows, inner, begins, counts), tree.order[order[order >= n_inner] - n_inner],
-                      int(walk.level.numpy()[inner].max()))
+    return BinaryTree(nodes_of(links, inner, begins, counts), tree.order[order[order >= n_inner] - n_inner],
+                      int(walk.level[inner].max()))

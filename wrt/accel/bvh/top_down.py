@@ -6,13 +6,14 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 from wrt.accel.bvh.tree import BinaryTree, BvhOptions, small_tree, squeeze
 from wrt.accel.geometry import Geometry
-from wrt.core.device import load_kernel, on_host, records, start, upload
+from wrt.accel.queries.raw_kernel import launch_raw
+from wrt.core.device import load_kernel, record_dtype, records, start
 from wrt.core.threads import run_growing
 from wrt.core.types import Kernel, WarpStruct
+from wrt.core.warp_private import Record, struct_record
 from wrt.kernels.build import bvh2 as build_bvh2
 from wrt.kernels.build import records as build_records
 from wrt.kernels.traverse.bvh2 import Bvh2Node
@@ -55,12 +56,9 @@ def in_order(lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
     return build
 
 
-def build_data(**arrays: np.ndarray) -> WarpStruct:
-    """Make kernels.build.records.BuildData with these arrays."""
-    data: WarpStruct = build_records.BuildData()
-    for name, array in arrays.items():
-        setattr(data, name, upload(array, fields_of(build_records.BuildData)[name].dtype, start("cpu")))
-    return data
+def build_data(**fields: np.ndarray | float) -> Record:
+    """Make a record of kernels.build.records.BuildData with these fields. The caller keeps the arrays."""
+    return struct_record(build_records.BuildData, [fields.get(name) for name in fields_of(build_records.BuildData)])
 
 
 def split_ranges(builder: str, build: np.ndarray, options: BvhOptions, threads: int, **arrays: np.ndarray) -> BinaryTree:
@@ -68,9 +66,10 @@ def split_ranges(builder: str, build: np.ndarray, options: BvhOptions, threads: 
     n = len(build)
     if n <= 1:
         return small_tree(build["lo"], build["hi"])
-    data = build_data(records=build, nodes=records(Bvh2Node, n - 1), used=np.zeros(n - 1, np.uint8), **arrays)
+    nodes, used = records(Bvh2Node, n - 1), np.zeros(n - 1, np.uint8)
+    data = build_data(records=build, nodes=nodes, used=used, **arrays)
     depth = run_tasks(build_bvh2.make_build_ranges(build_bvh2.SPLIT[builder]), data, build_options(options), n, threads)
-    return BinaryTree(squeeze(on_host(data.nodes), data.used.numpy() != 0), on_host(data.records)["prim_id"].copy(), depth)
+    return BinaryTree(squeeze(nodes, used != 0), build["prim_id"].copy(), depth)
 
 
 def build_options(options: BvhOptions) -> WarpStruct:
@@ -81,14 +80,13 @@ def build_options(options: BvhOptions) -> WarpStruct:
     return out
 
 
-def run_tasks(kernel: Kernel, data: WarpStruct, options: WarpStruct, n: int, threads: int, capacity: int = 0) -> int:
+def run_tasks(kernel: Kernel, data: Record, options: WarpStruct, n: int, threads: int, capacity: int = 0) -> int:
     """Build the tree over n records on all threads, and return its depth. The tree does not depend on `threads`.
 
     A task with a large range of records splits it into parts of about half its size or less. Each part becomes a new task.
     capacity: number of records that the arrays can hold, for builders that duplicate references.
     """
-    cpu = start("cpu")
-    load_kernel(kernel, cpu)
+    load_kernel(kernel, start("cpu"))
     least = max(n // 64, 4096)
     depths = []
 
@@ -97,15 +95,14 @@ def run_tasks(kernel: Kernel, data: WarpStruct, options: WarpStruct, n: int, thr
         stop = max(size // 2, least) if threads > 1 and size > least else 0
         # New tasks are disjoint ranges of at least two records, which bounds their number.
         most = (max(int(task["limit"][0]), int(task["end"][0])) - int(task["begin"][0])) // 2 if stop else 1
-        deferred = wp.empty(most, dtype=build_records.BuildTask, device=cpu)
-        count, depth = (wp.zeros(1, dtype=wp.int32, device=cpu) for _ in range(2))
-        inputs = [data, upload(task, build_records.BuildTask, cpu), options, stop, deferred, count, depth]
+        deferred = np.empty(most, record_dtype(build_records.BuildTask))
+        count, depth = np.zeros((2, 1), np.int32)
 
         def parts() -> list[np.ndarray]:
-            depths.append(int(depth.numpy()[0]))
-            return [on_host(deferred)[i : i + 1] for i in range(int(count.numpy()[0]))]
+            depths.append(int(depth[0]))
+            return [deferred[i : i + 1] for i in range(int(count[0]))]
 
-        return partial(wp.launch, kernel, dim=1, device=cpu, inputs=inputs), parts
+        return partial(launch_raw, kernel, 1, data, task, options, stop, deferred, count, depth), parts
 
     root = records(build_records.BuildTask, 1)
     root["end"], root["parent"], root["limit"] = n, -1, capacity

@@ -10,10 +10,11 @@ import warp as wp
 from wrt.accel.box_tree import BoxTree
 from wrt.accel.bvh.tree import BinaryTree, expected_cost, half_areas
 from wrt.accel.geometry import Geometry
+from wrt.accel.queries.raw_kernel import launch_raw
 from wrt.core.device import launch, start, upload
 from wrt.core.errors import InputError
+from wrt.core.warp_private import struct_record
 from wrt.kernels.build import wide as build_wide
-from wrt.kernels.traverse.bvh2 import Bvh2Node
 from wrt.kernels.wide.layout import STACK_SIZE
 from wrt.kernels.wide.references import EMPTY, MAX_FIRST, leaf_count, leaf_first, leaf_reference
 
@@ -64,31 +65,24 @@ def leaf_rows(references: np.ndarray) -> np.ndarray:
 
 def collapse(tree: BinaryTree, width: int, max_leaf: int, cost_traversal: float, cost_intersection: float) -> WideTree:
     """Collapse a binary tree of two or more leaves into the wide tree of least expected cost."""
-    cpu = start("cpu")
     n = len(tree.nodes)
     options = build_wide.CollapseOptions()
     options.width, options.max_leaf, options.stack = width, max_leaf, STACK_SIZE
     options.cost_traversal, options.cost_intersection = cost_traversal, cost_intersection
-    nodes, order = upload(tree.nodes, Bvh2Node, cpu), upload(tree.order, wp.int32, cpu)
-    trees = build_wide.Subtrees()
-    trees.size, trees.height = (wp.zeros(n, dtype=wp.int32, device=cpu) for _ in range(2))
-    trees.cost = wp.zeros(build_wide.MAX_WIDTH * n, dtype=wp.float32, device=cpu)
-    trees.choice = wp.zeros(build_wide.MAX_WIDTH * n, dtype=wp.uint8, device=cpu)
-    launch(build_wide.subtree_costs, 1, nodes, options, trees)
-    out = build_wide.WideTree()
-    out.children = wp.empty(n * width, dtype=wp.int32, device=cpu)
-    out.lo, out.hi = (wp.empty(n * width, dtype=wp.vec3, device=cpu) for _ in range(2))
-    out.source = wp.empty(width, dtype=wp.int32, device=cpu)
-    out.order = wp.empty(len(tree.order) * width, dtype=wp.int32, device=cpu)
-    out.count = wp.zeros(5, dtype=wp.int32, device=cpu)
-    launch(build_wide.collapse, 1, nodes, order, options, trees, out)
-    n_nodes, rows, leaves, depth, stack = out.count.numpy().tolist()
+    cells = int(build_wide.MAX_WIDTH) * n
+    arrays = *np.zeros((2, n), np.int32), np.zeros(cells, np.float32), np.zeros(cells, np.uint8)
+    trees = struct_record(build_wide.Subtrees, arrays)
+    launch_raw(build_wide.subtree_costs, 1, tree.nodes, options, trees)
+    children, (lo, hi) = np.empty(n * width, np.int32), np.empty((2, n * width, 3), np.float32)
+    source, order, count = np.empty(width, np.int32), np.empty(len(tree.order) * width, np.int32), np.zeros(5, np.int32)
+    out = struct_record(build_wide.WideTree, (children, lo, hi, source, order, count))
+    launch_raw(build_wide.collapse, 1, tree.nodes, tree.order, options, trees, out)
+    n_nodes, rows, leaves, depth, stack = count.tolist()
     if rows > MAX_FIRST:
         raise InputError(f"a wide BVH holds at most {MAX_FIRST} rows of primitives, and these need {rows}",
                          hint="use accel='bvh2'")
-    children, lo, hi = (array.numpy()[: n_nodes * width].reshape(-1, width, *array.numpy().shape[1:]).copy()
-                        for array in (out.children, out.lo, out.hi))
-    return WideTree(lo, hi, children, out.order.numpy()[: rows * width].reshape(-1, width).copy(), leaves, depth, stack)
+    children, lo, hi = (array[: n_nodes * width].reshape(-1, width, *array.shape[1:]).copy() for array in (children, lo, hi))
+    return WideTree(lo, hi, children, order[: rows * width].reshape(-1, width).copy(), leaves, depth, stack)
 
 
 def wide_tree_of(tree: BoxTree, width: int) -> WideTree:

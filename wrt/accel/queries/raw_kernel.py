@@ -1,6 +1,7 @@
-"""Kernels of queries, and the memory that they work on: on the CPU without Warp's arrays and launches.
+"""Kernels of queries and builders, and the memory that they work on: on the CPU without Warp's arrays and launches.
 
-For a few rays these take longer than the kernel: a Warp array 5 us and a launch 20, where a record by hand takes 1 and a launch 5.
+For a few rays or triangles these take longer than the kernel: a Warp array 5 us and a launch 20, where a record by hand takes 1 and a
+launch 5.
 """
 
 from __future__ import annotations
@@ -11,13 +12,42 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.queries.raw_launches import raw_launch
-from wrt.core.device import launch_on, load_kernel, row_type, upload
+from wrt.core.device import launch_on, load_kernel, made_once, row_type, upload
 from wrt.core.threads import FreeList, run_all
 from wrt.core.types import Device, Kernel, WarpArray, WarpType
-from wrt.core.warp_private import array_record, record_of, struct_record
+from wrt.core.warp_private import RawLaunch, argument_types, array_record, record_of, struct_record
 from wrt.kernels.warp_private import fields_of
 
 STEP = 16384  # elements of a launch: some milliseconds of work, so that Ctrl-C is answered soon
+
+
+@made_once
+def _free_launches(kernel: Kernel) -> FreeList[RawLaunch]:
+    kinds = argument_types(kernel)
+    return FreeList(lambda: raw_launch(kernel, *(None if isinstance(kind, wp.array) else kind() for kind in kinds)))
+
+
+def launch_raw(kernel: Kernel, n: int, *inputs: object, threads: int = 1, step: int = 0) -> None:
+    """Launch a kernel on the CPU over n elements, as wrt.core.device.launch does, but with contiguous NumPy arrays, records and structs.
+
+    The caller keeps their memory. An input of None is replaced by the first index of each range of `step` elements.
+    """
+    if n == 0:
+        return
+    load_kernel(kernel, wp.get_device("cpu"))
+    records = [array_record(each) if isinstance(each, np.ndarray) else record_of(each) if hasattr(each, "__ctype__") else each
+               for each in inputs]
+    free = _free_launches(kernel)
+
+    def job(first: int) -> None:
+        command = free.take()
+        for i, record in enumerate(records):
+            command.set(i, first if record is None else record)
+        command.set_dim(min(step or n, n - first))
+        command.launch()
+        free.give(command)
+
+    run_all([partial(job, first) for first in range(0, n, step or n)], threads)
 
 
 class RawKernel:
@@ -33,25 +63,13 @@ class RawKernel:
 
     def __init__(self, kernel: Kernel, *inputs: object) -> None:
         self.kernel, self.inputs = kernel, inputs
-        self._launches = FreeList(lambda: raw_launch(kernel, *inputs, 0))
 
     def launch(self, n: int, *inputs: object, threads: int = 1) -> None:
         """Run the kernel on the CPU over n elements: contiguous NumPy arrays, records and Warp structs in.
 
         The caller keeps their memory.
         """
-        load_kernel(self.kernel, wp.get_device("cpu"))
-        records = [array_record(each) if isinstance(each, np.ndarray) else record_of(each) if hasattr(each, "__ctype__") else each
-                   for each in inputs]
-        run_all([partial(self._launch_range, first, min(first + STEP, n), records) for first in range(0, n, STEP)], threads)
-
-    def _launch_range(self, first: int, end: int, records: list[object]) -> None:
-        command = self._launches.take()
-        for i, record in enumerate((*records, first)):
-            command.set(i, record)
-        command.set_dim(end - first)
-        command.launch()
-        self._launches.give(command)
+        launch_raw(self.kernel, n, *inputs, None, threads=threads, step=STEP)
 
 
 class HostMemory:
