@@ -18,6 +18,8 @@ def triangulate(corners: np.ndarray, counts: np.ndarray, vertices: np.ndarray) -
     counts, corners = np.asarray(counts, dtype=np.int64), np.asarray(corners)
     fan = np.maximum(counts - 2, 0)
     small = np.int32 if max(len(corners), len(counts)) < 1 << 31 else np.int64
+    if len(counts) and counts.min() == counts.max() == 3:  # as in most large files
+        return np.arange(len(corners), dtype=small).reshape(-1, 3), np.arange(len(counts), dtype=small)
     start = (np.cumsum(counts) - counts).astype(small)
     polygon = np.repeat(np.arange(len(counts), dtype=small), fan)
     step = np.arange(len(polygon), dtype=small) - np.repeat((np.cumsum(fan) - fan).astype(small), fan)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -33,7 +33,8 @@ class Effort(NamedTuple):
     least_gain: float
 
 
-class Walk(NamedTuple):
+@dataclass(frozen=True)
+class Walk:
     """Arrays of kernels.build.reinsertion.Walk."""
 
     order: np.ndarray
@@ -159,8 +160,9 @@ def largest(links: np.ndarray, areas: np.ndarray, share: float) -> np.ndarray:
 
 
 def order_nodes(links: np.ndarray) -> Walk:
-    walk = Walk(*np.empty((3, len(links)), np.int32), np.empty(len(links), np.float32), np.zeros(1, np.int32))
-    launch_raw(kernels.order_nodes, 1, links, struct_record(kernels.Walk, walk))
+    order, level, count = np.empty((3, len(links)), np.int32)
+    walk = Walk(order, level, count, np.empty(len(links), np.float32), np.zeros(1, np.int32))
+    launch_raw(kernels.order_nodes, 1, links, struct_record(kernels.Walk, vars(walk).values()))
     return walk
 
 
@@ -192,7 +194,7 @@ def nodes_of(links: np.ndarray, inner: np.ndarray, begins: np.ndarray, counts: n
 
 def collapse(tree: BinaryTree, links: np.ndarray, walk: Walk, options: BvhOptions) -> BinaryTree:
     """Collapse subtrees of a tree with one primitive per leaf into larger leaves wherever that costs no more."""
-    launch_raw(kernels.choose_leaves, 1, links, struct_record(kernels.Walk, walk), build_options(options), scale_of(links))
+    launch_raw(kernels.choose_leaves, 1, links, struct_record(kernels.Walk, vars(walk).values()), build_options(options), scale_of(links))
     order, counts = walk.order, walk.count.copy()
     # The 2 count - 2 links below a link come next in the walk: those below a leaf are inside it.
     leaf, after = links["left"][order] < 0, np.arange(1, len(order) + 1)

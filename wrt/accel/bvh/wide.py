@@ -19,7 +19,8 @@ from wrt.accel.bvh.small import SMALL, small_tree, small_trees
 from wrt.accel.bvh.tree import binary_tree_of
 from wrt.accel.bvh.wide_tree import COLLAPSE, WideTree, check_wide, collapse, lanes_of, packed, refit, row_starts, wide_tree_of
 from wrt.accel.geometry import Geometry
-from wrt.core.device import empty_aligned, launch, preloading, record_dtype, start
+from wrt.accel.queries.raw_kernel import launch_raw
+from wrt.core.device import empty_aligned, preloading, record_dtype, start
 from wrt.core.errors import InputError
 from wrt.core.threads import run_all
 from wrt.core.types import Kernel, WarpStruct
@@ -178,8 +179,8 @@ class WideBvh(CollapsedBvh):
         floats = record_dtype(units.triangle_test.record).itemsize // 4
         rows = empty_aligned((len(starts) - 1, floats, width), np.float32)
         if self._rows_by_kernel():
-            launch(write_rows, len(rows), self.geometry.on(start("cpu")), order, starts, width, rows.reshape(-1), None,
-                   threads=self.threads, step=ROWS_PER_JOB)
+            launch_raw(write_rows, len(rows), self.geometry.on(start("cpu")), order, starts, width, rows.reshape(-1), None,
+                       threads=self.threads, step=ROWS_PER_JOB)
             return rows.reshape(-1)
 
         def fill(first: int) -> None:

@@ -81,8 +81,10 @@ def collapse(tree: BinaryTree, width: int, max_leaf: int, cost_traversal: float,
     if rows > MAX_FIRST:
         raise InputError(f"a wide BVH holds at most {MAX_FIRST} rows of primitives, and these need {rows}",
                          hint="use accel='bvh2'")
-    children, lo, hi = (array[: n_nodes * width].reshape(-1, width, *array.shape[1:]).copy() for array in (children, lo, hi))
-    return WideTree(lo, hi, children, order[: rows * width].reshape(-1, width).copy(), leaves, depth, stack)
+    used = n_nodes * width
+    boxes = lo[:used].reshape(-1, width, 3).copy(), hi[:used].reshape(-1, width, 3).copy()
+    return WideTree(*boxes, children[:used].reshape(-1, width).copy(), order[: rows * width].reshape(-1, width).copy(), leaves, depth,
+                    stack)
 
 
 def wide_tree_of(tree: BoxTree, width: int) -> WideTree:
