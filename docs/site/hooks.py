@@ -110,5 +110,5 @@ def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -
     if plain := re.search(r"^(<p>)?(\|.*\||- \w.*)$", re.sub(r"<pre.*?</pre>", "", html, flags=re.DOTALL), re.MULTILINE):
         raise PluginError(f"{page.file.src_uri}: not read as a list or a table: {plain[0]}")
     html = re.sub(r'<span class="arithmatex">\\\((.*?)\\\)</span>', lambda match: convert(unescape(match[1])), html, flags=re.DOTALL)
-    return re.sub(r'<div class="arithmatex">\\\[(.*?)\\\]</div>', lambda match: convert(unescape(match[1]), display="block"), html,
-                  flags=re.DOTALL)
+    return re.sub(r'<div class="arithmatex">\\\[(.*?)\\\]</div>',
+                  lambda match: f'<div class="output">{convert(unescape(match[1]), display="block")}</div>', html, flags=re.DOTALL)
