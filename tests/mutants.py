@@ -43,7 +43,8 @@ TESTS = {"closest_point": "tests/wrt/accel/points/test_closest_points.py",
          "traverse": "tests/kernels/traverse/test_common.py -k bvh4"}
 SANITIZE = ["tests/sanitize/test_headers.py", "-k", "results and walks"]
 GENERAL = (["tests/test_bits.py", "-k", "hits and bvh8 or whitted or instances"],
-           ["tests/kernels/wide/test_packets.py", "tests/kernels/wide/test_batch.py", "tests/kernels/wide/test_instances.py"])
+           ["tests/kernels/wide/test_packets.py", "tests/kernels/wide/test_batch.py", "tests/kernels/wide/test_instances.py",
+            "tests/wrt/accel/queries/test_all_hits.py"])
 PROCESSOR_SECONDS = 150  # of one run of pytest; an endless loop ends here
 
 
