@@ -17,12 +17,14 @@ from wrt.kernels.traverse.common import Probe, Units, make_better, sphere_hit
 from wrt.kernels.traverse.stack import reference_of, t_of
 from wrt.kernels.wide.lanes import bits, lowest
 from wrt.kernels.wide.lanes import value as number
-from wrt.kernels.wide.layout import ACTIVE, COHERENT, FIELD, LANES, PACKET_SIZE, PRIM_ID_ROW, REFUSED, ROW_SIZE, SLOT, SLOT_SIZE, WIDTH
+from wrt.kernels.wide.layout import ACTIVE, COHERENT, FIELD, LANES, MIXED, PACKET_SIZE, PRIM_ID_ROW, REFUSED, ROW_SIZE, SLOT, SLOT_SIZE, WIDTH
 from wrt.kernels.wide.nodes import far_pad
 from wrt.kernels.wide.packets import (
     ANY_REFUSED,
     FAILED,
+    MIXED_FAILED,
     PAUSED,
+    REPORT_SIZE,
     Scratch,
     WideBvh,
     count_of,
@@ -51,6 +53,10 @@ PACKETS = 4  # Number of packets that are set up together.
 SLOTS = 24  # Number of interleaved rays in progress.
 FEW_RAYS = 6  # If a packet has at most so many rays in a leaf, the rays are tested one by one.
 MIN_VISITS = 6  # Mean number of rays per node from which a packet is faster than interleaving its rays.
+FIRST_STOP, LAST_STOP = 6, 16  # Numbers of nodes between which a walk of closest-hit rays, or of a MIXED packet, stops if it is below MIN_VISITS.
+# Results of a packet's walk: all rays are finished, and their visits reached or did not reach MIN_VISITS; or the walk has stopped, and the
+# rays begin again one by one. The hits found so far shorten them.
+TOGETHER, APART, STOPPED = (wp.constant(result) for result in range(3))
 # A packet below MIN_VISITS has failed. After MAX_FAILED failures in succession, the rays of the next PAUSE packets are interleaved.
 MAX_FAILED, PAUSE = 4, 32
 
@@ -195,24 +201,32 @@ def make_packet_leaf(units: Units, any_hit: bool, accepts: Any) -> Any:
 
 def make_packet_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
     """Return walk, which traces a packet of rays through the tree.
-    The packet must have a beam: bounds of the origins and directions of all its rays, tested first at each node (layout.BEAM)."""
+    The packet must have a beam: bounds of the origins and directions of all its rays, tested first at each node (layout.BEAM).
+    Only any-hit packets may be MIXED: for closest hits, interleaving their rays is faster."""
     children, test_leaf = make_children(any_hit), make_packet_leaf(units, any_hit, accepts)
+    mixed_children = make_children(any_hit, True) if any_hit else children
+    may_stop = wp.constant(MIXED if any_hit else 0)  # Least value of `active` with which a walk may stop.
 
     @wp.func
-    def walk(accel: WideBvh, surfaces: Surfaces, scratch: Scratch, base: int, active: int) -> bool:
-        """Trace the rays in the mask `active`. Return whether on average at least MIN_VISITS of them visited each node."""
+    def walk(accel: WideBvh, surfaces: Surfaces, scratch: Scratch, base: int, active: int) -> int:
+        """Trace the active rays; active: the result of set_up. Return TOGETHER, APART or STOPPED."""
         nodes = int(0)
         visits = int(0)
         size = int(0)
         reference = int(0)
-        mask = int(active)
+        mask = active & wp.static(COHERENT - 1)
         while True:
             if reference < 0:
                 test_leaf(accel, surfaces, reference, mask, scratch, base)
             else:
                 nodes += 1
                 visits += count_of(mask)
-                size = children(accel, scratch, base, reference, mask, size)
+                if visits < MIN_VISITS * nodes and nodes >= FIRST_STOP and nodes <= LAST_STOP and active >= may_stop:
+                    return STOPPED
+                if active >= MIXED:
+                    size = mixed_children(accel, scratch, base, reference, mask, size)
+                else:
+                    size = children(accel, scratch, base, reference, mask, size)
             mask = int(0)
             while size > 0 and mask == 0:
                 size = size - 1
@@ -220,9 +234,19 @@ def make_packet_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
             if mask == 0:
                 break
             reference = reference_of(key_at(scratch.stacks, size))
-        return visits >= MIN_VISITS * nodes
+        return wp.where(visits >= MIN_VISITS * nodes, TOGETHER, APART)
 
     return walk
+
+
+@wp.func
+def count_walk(scratch: Scratch, failed_at: int, together: bool):
+    """Count a packet's walk in scratch.report: the entry failed_at, FAILED or MIXED_FAILED, and the one behind it, PAUSED or MIXED_PAUSED."""
+    failed = wp.where(together, 0, slot_at(scratch.report, failed_at) + 1)
+    if failed == MAX_FAILED:  # After this pause, a single failure starts the next pause.
+        failed = failed - 1
+        put_int(scratch.report, failed_at + wp.static(PAUSED - FAILED), PAUSE)
+    put_int(scratch.report, failed_at, failed)
 
 
 def make_interleaved(units: Units, any_hit: bool, accepts: Any) -> Any:
@@ -291,15 +315,14 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
     The kernel writes to `out` (HitArrays or, with any_hit, an array of bool) and to scratch.report. All arrays must be contiguous."""
     walk_packet = make_packet_walk(units, any_hit, accepts)
     interleaved = make_interleaved(units, any_hit, accepts)
-    set_up = make_set_up(rays_struct)
+    set_up = make_set_up(rays_struct, may_mix=any_hit)
     write = write_occluded if any_hit else write_hits
     out_type = wp.array(dtype=wp.bool) if any_hit else HitArrays
 
     @packet_kernel
     def trace(accel: WideBvh, surfaces: Surfaces, rays: rays_struct, out: out_type, scratch: Scratch, first: int, end: int):
-        put_int(scratch.report, FAILED, 0)
-        put_int(scratch.report, PAUSED, 0)
-        put_int(scratch.report, ANY_REFUSED, 0)
+        for i in range(REPORT_SIZE):
+            put_int(scratch.report, i, 0)
         for block in range(first, end, wp.static(PACKETS * LANES)):
             single_rays = wp.uint64(0)
             packets = wp.min((end - block + LANES - 1) / LANES, PACKETS)  # Not a constant: Warp would unroll the loop over the walk.
@@ -313,18 +336,16 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
             for p in range(packets):
                 base = PACKET_SIZE * p
                 active = bits(scratch.packets, base + ACTIVE)
-                paused = slot_at(scratch.report, PAUSED)
+                failed_at = wp.where(active >= MIXED, MIXED_FAILED, FAILED)
+                paused = slot_at(scratch.report, failed_at + wp.static(PAUSED - FAILED))
+                result = int(STOPPED)
                 if active >= COHERENT and paused == 0:
-                    coherent = walk_packet(accel, surfaces, scratch, base, active - COHERENT)
-                    failed = wp.where(coherent, 0, slot_at(scratch.report, FAILED) + 1)
-                    if failed == MAX_FAILED:  # After this pause, a single failure starts the next pause.
-                        failed = failed - 1
-                        put_int(scratch.report, PAUSED, PAUSE)
-                    put_int(scratch.report, FAILED, failed)
+                    result = walk_packet(accel, surfaces, scratch, base, active)
+                    count_walk(scratch, failed_at, result == TOGETHER)
                 else:
-                    put_int(scratch.report, PAUSED, wp.max(paused - 1, 0))
-                    active = active & wp.static(COHERENT - 1)
-                    active = rays_meeting_root(accel, scratch, base, active)
+                    put_int(scratch.report, failed_at + wp.static(PAUSED - FAILED), wp.max(paused - 1, 0))
+                if result == STOPPED:
+                    active = rays_meeting_root(accel, scratch, base, active & wp.static(COHERENT - 1))
                     single_rays = single_rays | (wp.uint64(active) << wp.uint64(LANES * p))
             interleaved(accel, surfaces, scratch, single_rays)
             for p in range(packets):

@@ -169,7 +169,7 @@ WRT_INLINE PlacedRays<N> place_rays(const SomeRays<N>& world, const Placement& p
 template <class Placement> WRT_CALLED int place_packet(float* world, const Placement& place, int mask, float far_pad, float* local) {
     const auto placed = place_rays<LANES>({world}, place, far_pad, {local});
     const int active = mask & mask_of(placed.rays.t_max >= placed.rays.t_min);
-    return store_beam(local, placed.rays, placed.inv_dir, active, far_pad) ? active | COHERENT : active;
+    return active | store_beam<false>(local, placed.rays, placed.inv_dir, active, far_pad);
 }
 
 // As place_packet, for one ray.

@@ -16,7 +16,7 @@ from wrt.kernels.structs import Surfaces, kernel
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.traverse.instances import make_struct
 from wrt.kernels.traverse.stack import reference_of, t_of
-from wrt.kernels.wide.batch import MAX_FAILED, MIN_VISITS, PACKETS, PAUSE, SLOTS, make_interleaved, make_packet_walk, make_row_test
+from wrt.kernels.wide.batch import MIN_VISITS, PACKETS, SLOTS, STOPPED, count_walk, make_interleaved, make_packet_walk, make_row_test
 from wrt.kernels.wide.lanes import bits, lowest
 from wrt.kernels.wide.lanes import value as number
 from wrt.kernels.wide.layout import (
@@ -166,9 +166,10 @@ def make_top_walk(units: Units, any_hit: bool) -> Any:
         """Trace the rays of the mask through a placement's structure."""
         bottom = accel.bottoms[accel.placements[placement].bottom]
         active = place_packet(accel, placement, scratch, base, mask)
+        result = int(STOPPED)
         if active >= COHERENT and count_of(mask) > FEW_PLACED:
-            walk_packet(bottom, surfaces, scratch, 0, active - COHERENT)
-        else:
+            result = walk_packet(bottom, surfaces, scratch, 0, active)
+        if result == STOPPED:
             active = rays_meeting_root(bottom, scratch, 0, active & wp.static(COHERENT - 1))
             interleaved(bottom, surfaces, scratch, wp.uint64(active))
         take_packet(accel, placement, scratch, base)
@@ -334,11 +335,7 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays) -> An
                     root = bits(scratch.packets, base + wp.static(FIELD["root"]) + lowest(active))
                 if active >= COHERENT and paused == 0:
                     coherent = walk(accel, surfaces, scratch, base, root, active - COHERENT)
-                    failed = wp.where(coherent, 0, slot_at(scratch.report, FAILED) + 1)
-                    if failed == MAX_FAILED:
-                        failed = failed - 1
-                        put_int(scratch.report, PAUSED, PAUSE)
-                    put_int(scratch.report, FAILED, failed)
+                    count_walk(scratch, FAILED, coherent)
                 else:
                     put_int(scratch.report, PAUSED, wp.max(paused - 1, 0))
                     active = active & wp.static(COHERENT - 1)

@@ -64,7 +64,8 @@ WIDTH = 8  # Number of children of a node, and of triangles in a row.
 LANES = 16  # Number of rays in a packet.
 PRIM_ID_ROW = size_of(Primitive) // 4 - 1  # Index of prim_id among the 4-byte values of a primitive.
 ROW_SIZE = size_of(Primitive) // 4 * WIDTH  # Number of floats in a row of primitives.
-COHERENT = 1 << LANES  # Bit that set_up adds to the mask of active rays if they have a beam.
+# Bits that set_up adds to the mask of active rays: COHERENT if they have a beam, MIXED if it has no bounds on some axes.
+COHERENT, MIXED = 1 << LANES, 2 << LANES
 LINES = 5  # Number of cache lines to prefetch: a row of triangles has 5, a node 4. Prefetching 5 is faster than a branch.
 
 # A packet is a block of floats. It begins with a vector of sixteen lanes for each field of a ray. The fields `turned` are the origin in
@@ -79,8 +80,9 @@ AXIS_BITS = 2
 # After the fields comes the beam: intervals that contain the origins and the reciprocal directions of all rays. Each entry has three
 # values, for x, y and z. Of all origins, near_origin is closest to the near planes, and far_origin to the far planes. Of all reciprocals,
 # `largest` and `smallest` have the largest and the smallest magnitude. Multiplied by the far pad, they are far_largest and far_smallest.
-# The index of the near plane in PLANES, as a float, is near_row. The lowest t_min of all rays is a single value. Two more words follow:
-# REFUSED, the mask of invalid rays, which a query rejects (wrt.accel.queries.rays); and ACTIVE, the result of set_up.
+# The index of the near plane in PLANES, as a float, is near_row. On an axis along which directions differ in sign, the beam's values are NaN,
+# which narrow no interval. The lowest t_min of all rays is a single value. Two more words follow: REFUSED, the mask of invalid rays, which a
+# query rejects (wrt.accel.queries.rays); and ACTIVE, the result of set_up.
 BEAM_WORDS = ("near_origin", "far_origin", "largest", "smallest", "far_largest", "far_smallest", "near_row", "t_min")
 BEAM = {name: LANES * len(FIELDS) + 3 * i for i, name in enumerate(BEAM_WORDS)}
 REFUSED = BEAM["t_min"] + 1
@@ -113,7 +115,7 @@ SLOT = {name: i for i, name in enumerate(SLOT_WORDS)}
 SLOT_SIZE = 4
 
 _NUMBERS = {
-    "WIDTH": WIDTH, "LANES": LANES, "COHERENT": COHERENT, "AXIS_BITS": AXIS_BITS, "AXIS_MASK": (1 << AXIS_BITS) - 1,
+    "WIDTH": WIDTH, "LANES": LANES, "COHERENT": COHERENT, "MIXED": MIXED, "AXIS_BITS": AXIS_BITS, "AXIS_MASK": (1 << AXIS_BITS) - 1,
     "REFUSED": REFUSED, "ROOT_ENTRIES": ROOT_ENTRIES, "PACKET_SIZE": PACKET_SIZE, "ENTRY": ENTRY, "ENTRY_RAYS": ENTRY_RAYS,
     "LEAF_BITS": LEAF_BITS, "CACHE_LINE": CACHE_LINE, "LINES": LINES, "LEVEL": LEVEL, "LEVEL_REFERENCES": LEVEL_REFERENCES,
     "LEVEL_LEFT": LEVEL_LEFT, "KEY_MASK": KEY_MASK, "STACK_WORDS": STACK_WORDS, "SLOT_SIZE": SLOT_SIZE,

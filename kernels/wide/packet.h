@@ -154,19 +154,23 @@ template <bool ANY_HIT> WRT_INLINE void push(unsigned* stack, int begin, int siz
 }
 
 // Push the children of the node at `p` that rays of the mask enter onto a stack of `size` entries; return the new size. The packet must
-// have a beam. What the children's references lead to, in `nodes` or `primitives`, is prefetched.
-template <bool ANY_HIT>
+// have a beam. MIXED: near planes differ by ray. What the children's references lead to, in `nodes` or `primitives`, is prefetched.
+template <bool ANY_HIT, bool MIXED = false>
 WRT_INLINE int children_at(const float* p, const float* nodes, const float* primitives, float* packet, int mask, unsigned* stack, int size) {
     const int near[3] = {(int)packet[BEAM_NEAR_ROW], (int)packet[BEAM_NEAR_ROW + 1], (int)packet[BEAM_NEAR_ROW + 2]};
     const Interval<Children> beam = beam_interval(packet, p, near);
-    const float *near_x = p + WIDTH * near[0], *near_y = p + WIDTH * near[1], *near_z = p + WIDTH * near[2];
-    const float *far_x = p + WIDTH * (near[0] ^ 1), *far_y = p + WIDTH * (near[1] ^ 1), *far_z = p + WIDTH * (near[2] ^ 1);
+    const int x = MIXED ? LO_X : near[0], y = MIXED ? LO_Y : near[1], z = MIXED ? LO_Z : near[2];
+    const float *near_x = p + WIDTH * x, *near_y = p + WIDTH * y, *near_z = p + WIDTH * z;
+    const float *far_x = p + WIDTH * (x ^ 1), *far_y = p + WIDTH * (y ^ 1), *far_z = p + WIDTH * (z ^ 1);
     int left = mask_of(beam.enter <= beam.leave), top = size;
     for (; left; left &= left - 1) {
         const int child = lowest(left);
         const AllRays rays = {REGISTER < LANES ? opaque(packet) : packet};
-        const Interval<Rays> t = interval_in(packet_ray(rays), in_lanes<Rays>(Vec3<float>{{near_x[child], near_y[child], near_z[child]}}),
-                                             in_lanes<Rays>(Vec3<float>{{far_x[child], far_y[child], far_z[child]}}));
+        const PacketRay ray = packet_ray(rays);
+        const BoxRay<Rays> box = {ray.origin, ray.inv_dir};
+        const auto lo = in_lanes<Rays>(Vec3<float>{{near_x[child], near_y[child], near_z[child]}});
+        const auto hi = in_lanes<Rays>(Vec3<float>{{far_x[child], far_y[child], far_z[child]}});
+        const Interval<Rays> t = MIXED ? interval_in(ray, near_planes(box, lo, hi), near_planes(box, hi, lo)) : interval_in(ray, lo, hi);
         const int met = mask_of(t.enter <= t.leave) & mask;
         if (!met) continue;
         const int next = load<int>(p + REFERENCES + child);
@@ -179,9 +183,9 @@ WRT_INLINE int children_at(const float* p, const float* nodes, const float* prim
 }
 
 // Call children_at, without inlining, for the node with index `node`.
-template <bool ANY_HIT>
+template <bool ANY_HIT, bool MIXED>
 WRT_CALLED int children(const float* nodes, const float* primitives, float* packet, int node, int mask, unsigned* stack, int size) {
-    return children_at<ANY_HIT>(nodes + (long long)node * NODE_SIZE, nodes, primitives, packet, mask, stack, size);
+    return children_at<ANY_HIT, MIXED>(nodes + (long long)node * NODE_SIZE, nodes, primitives, packet, mask, stack, size);
 }
 
 // Return the mask of the rays in `mask` that enter a child of the root, and store their entry distances in ROOT_ENTRIES. The rays have one

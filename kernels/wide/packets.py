@@ -26,9 +26,10 @@ else:
         return kernel(function, extra_build_options=HEADERS)
 
 
-# Indices of Scratch.report: packets that failed in succession; packets to interleave before the next is walked; 1 if a ray was invalid.
-FAILED, PAUSED, ANY_REFUSED = (wp.constant(place) for place in range(3))
-REPORT_SIZE = 3
+# Indices of Scratch.report: packets that failed in succession; packets to interleave before the next is walked; both for packets whose
+# directions differ in sign; 1 if a ray was invalid.
+FAILED, PAUSED, MIXED_FAILED, MIXED_PAUSED, ANY_REFUSED = (wp.constant(place) for place in range(5))
+REPORT_SIZE = 5
 
 
 @wp.struct
@@ -38,7 +39,7 @@ class Scratch:
     packets: wp.array(dtype=wp.float32)  # PACKET_SIZE floats per packet.
     stacks: wp.array(dtype=wp.uint32)  # STACK_WORDS words per slot; during a packet's walk, the packet's stack.
     slots: wp.array(dtype=wp.int32)  # SLOT_SIZE words per slot.
-    report: wp.array(dtype=wp.int32)  # Entries FAILED, PAUSED and ANY_REFUSED, which a launch sets to 0 first.
+    report: wp.array(dtype=wp.int32)  # REPORT_SIZE counts, which a launch sets to 0 first.
 
 
 def flag(value: bool) -> str:
@@ -50,16 +51,18 @@ def flag(value: bool) -> str:
 
 
 @cache
-def make_set_up(rays_struct: Any) -> Any:
-    """Return set_up for rays_struct: RayArrays, WorldRays, or RenderRays, whose directions it does not scale."""
+def make_set_up(rays_struct: Any, may_mix: bool = False) -> Any:
+    """Return set_up for rays_struct: RayArrays, WorldRays, or RenderRays, whose directions it does not scale.
+
+    may_mix: the walk accepts packets whose directions differ in sign (MIXED)."""
     plain = rays_struct is not RenderRays
     excludes = "nullptr" if plain else "rays.exclude.data + first"
 
     @wp.func_native(f"""
-    return wrt::set_up<{flag(plain)}>(wrt::pointers_to(rays, first, {excludes}), count, pad, scratch.packets.data + base);
+    return wrt::set_up<{flag(plain)}, {flag(may_mix)}>(wrt::pointers_to(rays, first, {excludes}), count, pad, scratch.packets.data + base);
     """)
     def set_up(rays: rays_struct, first: int, count: int, pad: float, scratch: Scratch, base: int) -> int:
-        """Set up rays first .. first + count - 1. Return the mask of rays whose segments are not empty, plus COHERENT if there is a beam.
+        """Set up rays first .. first + count - 1. Return the mask of rays whose segments are not empty, plus COHERENT or MIXED.
 
         The factor `pad` is nodes.far_pad."""
 
@@ -67,15 +70,16 @@ def make_set_up(rays_struct: Any) -> Any:
 
 
 @cache
-def make_children(any_hit: bool) -> Any:
+def make_children(any_hit: bool, mixed: bool = False) -> Any:
     @wp.func_native(f"""
-    return wrt::children<{flag(any_hit)}>(accel.nodes.data, accel.primitives.data, scratch.packets.data + base, reference, mask,
+    return wrt::children<{flag(any_hit)}, {flag(mixed)}>(accel.nodes.data, accel.primitives.data, scratch.packets.data + base, reference, mask,
                                           scratch.stacks.data, size);
     """)
     def children(accel: WideBvh, scratch: Scratch, base: int, reference: int, mask: int, size: int) -> int:
         """Push the children of node `reference` that rays of the mask enter onto a stack of `size` entries; return the new size.
 
-        The nearest child is on top. For any-hit rays, the node's last entered child is on top. The packet must have a beam."""
+        The nearest child is on top. For any-hit rays, the node's last entered child is on top. The packet must have a beam.
+        mixed: the beam may have no bounds on some axes."""
 
     return children
 

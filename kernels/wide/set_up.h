@@ -164,15 +164,19 @@ WRT_INLINE Rays lesser(Rays a, Rays b) {
 
 WRT_INLINE Rays lesser(Rays a, Rays b, Rays c, Rays d) { return lesser(lesser(a, b), lesser(c, d)); }
 
-// Store the beam around all active rays of the packet (layout.py: BEAM_WORDS). Return false if there are no active rays, or if their
-// directions differ in sign along an axis.
-WRT_INLINE bool store_beam(float* packet, const SixteenRays& rays, const Vec3<Rays>& inv_dir, int active, float far_pad) {
-    int down[3];
+// Store the beam around all active rays of the packet (layout.py: BEAM_WORDS); return COHERENT. If their directions differ in sign along an
+// axis, return MIXED, or 0 without MAY_MIX. Return 0 if there are no active rays.
+template <bool MAY_MIX> WRT_INLINE int store_beam(float* packet, const SixteenRays& rays, const Vec3<Rays>& inv_dir, int active, float far_pad) {
+    if (active == 0) return 0;
+    int down[3], kind = COHERENT;
+    bool mixed[3] = {};
     for (int k = 0; k < 3; ++k) {
         down[k] = mask_of(inv_dir[k] < 0.0f) & active;
-        if (down[k] && down[k] != active) return false;
+        if (down[k] == 0 || down[k] == active) continue;
+        if constexpr (!MAY_MIX) return 0;
+        mixed[k] = true;
+        kind = MIXED;
     }
-    if (active == 0) return false;
     // A lane without an active ray takes the values of an active one.
     const int some = lowest(active);
     const RayInts on = in_mask<RayInts>(active);
@@ -196,11 +200,14 @@ WRT_INLINE bool store_beam(float* packet, const SixteenRays& rays, const Vec3<Ra
     for (int k = 0; k < 6; ++k) packet[BEAM_FAR_LARGEST + k] = far[6 + k];
     for (int k = 0; k < 3; ++k) packet[BEAM_NEAR_ROW + k] = 2 * k + (down[k] != 0);
     packet[BEAM_T_MIN] = least[12];
-    return true;
+    if constexpr (MAY_MIX)
+        for (int k = 0; k < 3; ++k)
+            for (int word = BEAM_NEAR_ORIGIN + k; mixed[k] && word < BEAM_NEAR_ROW; word += 3) packet[word] = __builtin_nanf("");
+    return kind;
 }
 
-// Set up `count` rays; return the mask of rays whose segments are not empty, plus COHERENT if these rays have a beam.
-template <bool SCALED> WRT_CALLED int set_up(const RayPointers& from, int count, float far_pad, float* numbers) {
+// Set up `count` rays; return the mask of rays whose segments are not empty, plus the result of store_beam.
+template <bool SCALED, bool MAY_MIX> WRT_CALLED int set_up(const RayPointers& from, int count, float far_pad, float* numbers) {
     SixteenRays rays = load_rays(from, count);
     const AllRays packet = {numbers};
     store(numbers + REFUSED, refused(rays));
@@ -208,7 +215,7 @@ template <bool SCALED> WRT_CALLED int set_up(const RayPointers& from, int count,
     rays.t_max = no_hit(rays);
     const Vec3<Rays> i = store_rays<LANES>(packet, rays, far_pad);
     const int active = mask_of(rays.t_max >= rays.t_min) & ((1 << count) - 1);
-    return store_beam(numbers, rays, i, active, far_pad) ? active | COHERENT : active;
+    return active | store_beam<MAY_MIX>(numbers, rays, i, active, far_pad);
 }
 
 }  // namespace wrt

@@ -22,7 +22,7 @@ from wrt.kernels.structs import Surfaces
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.wide.batch import MAX_FAILED, PACKETS
 from wrt.kernels.wide.layout import LANES, STACK_SIZE
-from wrt.kernels.wide.packets import FAILED, PAUSED
+from wrt.kernels.wide.packets import FAILED, MIXED_FAILED, MIXED_PAUSED, PAUSED
 from wrt.kernels.wide.references import EMPTY, leaf_reference
 from wrt.kernels.wide.stream import BatchTraversal
 from wrt.lab.bench.rays import ray_sets
@@ -211,21 +211,28 @@ def test_moved_vertices(sphere):
 
 
 @cpu_only
-def test_packets_are_given_up_where_they_fall_apart():
+@pytest.mark.parametrize(("any_hit", "side"), [(False, 1.0), (True, 1.0), (True, -1.0)], ids=["closest", "any", "any, signs differ"])
+def test_packets_are_given_up_where_they_fall_apart(any_hit, side):
     # Triangles far smaller than the distance of the rays: the answers are the same before and after.
     accel = build(Geometry.of(icosphere(6)), "bvh8")
     rays = ray_sets(accel, 6_000)["primary"]
     assert_same(accel, rays.origins, rays.directions)
-    # Packets of parallel rays that are far from each other fall apart. Packets of neighbouring rays do not.
+    # Packets of nearly parallel rays that are far from each other fall apart. Packets of neighbouring rays do not.
     n = PACKETS * LANES
     apart = np.random.default_rng(7).uniform(-1.0, 1.0, (n, 2)).astype(np.float32)
     for xy, failed in ((apart, MAX_FAILED - 1), (0.3 + 0.001 * apart, 0)):
         o = np.concatenate([xy, np.full((n, 1), 3.0, np.float32)], axis=1)
         scratch = new_scratch(BatchTraversal.stream_sizes)
-        rays = rays_on(accel.device, rays_of(o, np.tile([0.1, 0.1, -1.0], (n, 1)), 0.0, np.inf))
-        inputs = [accel.data, accel.snapshot.surfaces, rays, new_hits(n), scratch, 0, n]
-        wp.launch(tracer(accel.structure, False).kernel, 1, inputs, device=DEVICE)
-        assert scratch.report.numpy()[FAILED] == failed and (scratch.report.numpy()[PAUSED] > 0) == (failed > 0)
+        d = np.tile([0.001, 0.001, -1.0], (n, 1)) * np.where(np.arange(n) % 2, side, 1.0)[:, None] ** [1, 1, 0]
+        assert_same(accel, o, d)
+        rays = rays_on(accel.device, rays_of(o, d, 0.0, np.inf))
+        out = wp.zeros(n, dtype=wp.bool, device=DEVICE) if any_hit else new_hits(n)
+        wp.launch(tracer(accel.structure, any_hit).kernel, 1, [accel.data, accel.snapshot.surfaces, rays, out, scratch, 0, n], device=DEVICE)
+        report = scratch.report.numpy()
+        counted, others = (FAILED, PAUSED), (MIXED_FAILED, MIXED_PAUSED)
+        if side < 0.0:
+            counted, others = others, counted
+        assert report[counted[0]] == failed and (report[counted[1]] > 0) == (failed > 0) and not report[list(others)].any()
 
 
 def test_units_without_lanes_have_no_stream():
