@@ -210,6 +210,7 @@ def make_packet_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
     @wp.func
     def walk(accel: WideBvh, surfaces: Surfaces, scratch: Scratch, base: int, active: int) -> int:
         """Trace the active rays; active: the result of set_up. Return TOGETHER, APART or STOPPED."""
+        result = int(APART)
         nodes = int(0)
         visits = int(0)
         size = int(0)
@@ -222,8 +223,9 @@ def make_packet_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
                 nodes += 1
                 visits += count_of(mask)
                 if visits < MIN_VISITS * nodes and nodes >= FIRST_STOP and nodes <= LAST_STOP and active >= may_stop:
-                    return STOPPED
-                if active >= MIXED:
+                    result = STOPPED
+                    size = int(0)
+                elif active >= MIXED:
                     size = mixed_children(accel, scratch, base, reference, mask, size)
                 else:
                     size = children(accel, scratch, base, reference, mask, size)
@@ -234,7 +236,9 @@ def make_packet_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
             if mask == 0:
                 break
             reference = reference_of(key_at(scratch.stacks, size))
-        return wp.where(visits >= MIN_VISITS * nodes, TOGETHER, APART)
+        if result != STOPPED and visits >= MIN_VISITS * nodes:
+            result = TOGETHER
+        return result
 
     return walk
 
