@@ -17,7 +17,20 @@ from wrt.kernels.traverse.common import Probe, Units, make_better, sphere_hit
 from wrt.kernels.traverse.stack import reference_of, t_of
 from wrt.kernels.wide.lanes import bits, lowest
 from wrt.kernels.wide.lanes import value as number
-from wrt.kernels.wide.layout import ACTIVE, COHERENT, FIELD, LANES, MIXED, PACKET_SIZE, PRIM_ID_ROW, REFUSED, ROW_SIZE, SLOT, SLOT_SIZE, WIDTH
+from wrt.kernels.wide.layout import (
+    ACTIVE,
+    COHERENT,
+    FIELD,
+    LANES,
+    MIXED,
+    PACKET_SIZE,
+    PRIM_ID_ROW,
+    REFUSED,
+    ROW_SIZE,
+    SLOT,
+    SLOT_SIZE,
+    WIDTH,
+)
 from wrt.kernels.wide.nodes import far_pad
 from wrt.kernels.wide.packets import (
     ANY_REFUSED,
@@ -53,7 +66,8 @@ PACKETS = 4  # Number of packets that are set up together.
 SLOTS = 24  # Number of interleaved rays in progress.
 FEW_RAYS = 6  # If a packet has at most so many rays in a leaf, the rays are tested one by one.
 MIN_VISITS = 6  # Mean number of rays per node from which a packet is faster than interleaving its rays.
-FIRST_STOP, LAST_STOP = 6, 16  # Numbers of nodes between which a walk of closest-hit rays, or of a MIXED packet, stops if it is below MIN_VISITS.
+# Numbers of nodes between which a walk of closest-hit rays, or of a MIXED packet, stops if it is below MIN_VISITS.
+FIRST_STOP, LAST_STOP = 6, 16
 # Results of a packet's walk: all rays are finished, and their visits reached or did not reach MIN_VISITS; or the walk has stopped, and the
 # rays begin again one by one. The hits found so far shorten them.
 TOGETHER, APART, STOPPED = (wp.constant(result) for result in range(3))
@@ -245,7 +259,7 @@ def make_packet_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
 
 @wp.func
 def count_walk(scratch: Scratch, failed_at: int, together: bool):
-    """Count a packet's walk in scratch.report: the entry failed_at, FAILED or MIXED_FAILED, and the one behind it, PAUSED or MIXED_PAUSED."""
+    """Count a packet's walk in scratch.report; failed_at: FAILED or MIXED_FAILED. The entry behind it is PAUSED or MIXED_PAUSED."""
     failed = wp.where(together, 0, slot_at(scratch.report, failed_at) + 1)
     if failed == MAX_FAILED:  # After this pause, a single failure starts the next pause.
         failed = failed - 1

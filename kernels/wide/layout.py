@@ -80,9 +80,9 @@ AXIS_BITS = 2
 # After the fields comes the beam: intervals that contain the origins and the reciprocal directions of all rays. Each entry has three
 # values, for x, y and z. Of all origins, near_origin is closest to the near planes, and far_origin to the far planes. Of all reciprocals,
 # `largest` and `smallest` have the largest and the smallest magnitude. Multiplied by the far pad, they are far_largest and far_smallest.
-# The index of the near plane in PLANES, as a float, is near_row. On an axis along which directions differ in sign, the beam's values are NaN,
-# which narrow no interval. The lowest t_min of all rays is a single value. Two more words follow: REFUSED, the mask of invalid rays, which a
-# query rejects (wrt.accel.queries.rays); and ACTIVE, the result of set_up.
+# The index of the near plane in PLANES, as a float, is near_row. On an axis along which directions differ in sign, the beam's values are
+# NaN, which narrow no interval. The lowest t_min of all rays is a single value. Two more words follow: REFUSED, the mask of invalid rays,
+# which a query rejects (wrt.accel.queries.rays); and ACTIVE, the result of set_up.
 BEAM_WORDS = ("near_origin", "far_origin", "largest", "smallest", "far_largest", "far_smallest", "near_row", "t_min")
 BEAM = {name: LANES * len(FIELDS) + 3 * i for i, name in enumerate(BEAM_WORDS)}
 REFUSED = BEAM["t_min"] + 1

@@ -72,8 +72,8 @@ def make_set_up(rays_struct: Any, may_mix: bool = False) -> Any:
 @cache
 def make_children(any_hit: bool, mixed: bool = False) -> Any:
     @wp.func_native(f"""
-    return wrt::children<{flag(any_hit)}, {flag(mixed)}>(accel.nodes.data, accel.primitives.data, scratch.packets.data + base, reference, mask,
-                                          scratch.stacks.data, size);
+    return wrt::children<{flag(any_hit)}, {flag(mixed)}>(accel.nodes.data, accel.primitives.data, scratch.packets.data + base, reference,
+                                          mask, scratch.stacks.data, size);
     """)
     def children(accel: WideBvh, scratch: Scratch, base: int, reference: int, mask: int, size: int) -> int:
         """Push the children of node `reference` that rays of the mask enter onto a stack of `size` entries; return the new size.

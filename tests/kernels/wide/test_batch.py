@@ -227,7 +227,8 @@ def test_packets_are_given_up_where_they_fall_apart(any_hit, side):
         assert_same(accel, o, d)
         rays = rays_on(accel.device, rays_of(o, d, 0.0, np.inf))
         out = wp.zeros(n, dtype=wp.bool, device=DEVICE) if any_hit else new_hits(n)
-        wp.launch(tracer(accel.structure, any_hit).kernel, 1, [accel.data, accel.snapshot.surfaces, rays, out, scratch, 0, n], device=DEVICE)
+        inputs = [accel.data, accel.snapshot.surfaces, rays, out, scratch, 0, n]
+        wp.launch(tracer(accel.structure, any_hit).kernel, 1, inputs, device=DEVICE)
         report = scratch.report.numpy()
         counted, others = (FAILED, PAUSED), (MIXED_FAILED, MIXED_PAUSED)
         if side < 0.0:
