@@ -192,6 +192,10 @@ class Material:
     metallic: float
     roughness: float
     transmission: float
+    specular_factor: float
+    specular_color: wp.vec3
+    clearcoat: float
+    clearcoat_roughness: float
     emission: wp.vec3
     two_sided: int
     alpha: float
@@ -201,6 +205,10 @@ class Material:
     albedo_texture: int
     metallic_roughness_texture: int
     transmission_texture: int
+    specular_texture: int
+    specular_color_texture: int
+    clearcoat_texture: int
+    clearcoat_roughness_texture: int
     emission_texture: int
     normal_texture: int
 

@@ -235,7 +235,7 @@ wrt.side_by_side({"": wrt.render(around, size=SIZE, spp=2 * SPP)})
 # A picture that silently lacks something is worse than an error. One warning names everything in a file that wrt does not render:
 
 # %%
-glb.json["materials"][2]["extensions"] = {"KHR_materials_clearcoat": {"clearcoatFactor": 1.0}}
+glb.json["materials"][2]["extensions"] = {"KHR_materials_iridescence": {"iridescenceFactor": 1.0}}
 glb.json["animations"] = [{"name": "spin", "channels": [], "samplers": []}]
 glb.write(folder / "table.glb")
 with warnings.catch_warnings(record=True) as caught:

@@ -20,6 +20,7 @@ from wrt.kernels.shade.sampling import hash_pair, make_sample_2d, quantile
 from wrt.kernels.shade.shading import make_cutout, make_shading
 from wrt.kernels.shade.shadows import make_transmittance
 from wrt.kernels.shade.step import DirectLight, Sample, Step, add_light, add_surface_light, make_shaded, make_step, receives_light
+from wrt.kernels.shade.surface import with_normal
 from wrt.kernels.structs import AovFilm, Film, Hit, Lighting, Limits, Ray, Surfaces, any_positive, kernel
 
 
@@ -96,11 +97,14 @@ def make_radiance(features: Features, accel_struct: Any, closest_hit: Any, any_h
                 continue
             surface = shading.surface_at(surfaces, ray, hit)
             texels = shading.look_up(surfaces, surface)
-            surface.shading = shading.shading_normal(surfaces, surface, texels, -path.direction)
+            surface = with_normal(surface, shading.shading_normal(surfaces, surface, texels, -path.direction))
             shaded = step.shade(surfaces, lighting, path, surface, texels, hit.t, step.choose_facet(path.key, index))
             next = follow_up(surfaces, shaded, limits, traced)
             if next.onward == FOLLOWED:
                 stack[size] = shaded.onward
+                size = size + 1
+            if next.coated == FOLLOWED:
+                stack[size] = shaded.coated
                 size = size + 1
             if next.reflected == FOLLOWED:
                 stack[size] = shaded.reflected

@@ -11,7 +11,7 @@ import warp as wp
 
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.follow_up import NONE, FollowUp
-from wrt.kernels.shade.paths import ONWARD, REFLECTED, REFRACTED, make_path
+from wrt.kernels.shade.paths import COATED, ONWARD, REFLECTED, REFRACTED, make_path
 from wrt.kernels.shade.shadows import Shadow
 from wrt.kernels.shade.step import DirectLight, ShadowRequest, make_shaded
 from wrt.kernels.shade.surface import Surface
@@ -72,7 +72,7 @@ class NewPath:
     """A path that begins at a surface, and the verdict on it (follow_up.py)."""
 
     end: int  # Index of the surface in Record.ends.
-    branch: int  # REFLECTED, REFRACTED or ONWARD.
+    branch: int  # REFLECTED, REFRACTED, ONWARD or COATED.
     bends: int  # Scatter.bends: 1 if the refracted path enters another medium.
     verdict: int
     depth: int
@@ -223,6 +223,7 @@ def make_recorder(features: Features) -> Recorder:
     @wp.func
     def surface(record: Record, ray: int, path: Path, s: Surface, shaded: Shaded, next: FollowUp, direct: DirectLight):
         new_path(record, shaded.onward, ONWARD, 0, next.onward)
+        new_path(record, shaded.coated, COATED, 0, next.coated)
         new_path(record, shaded.reflected, REFLECTED, 0, next.reflected)
         new_path(record, shaded.refracted, REFRACTED, shaded.scatter.bends, next.refracted)
         entry = end_of(path, ray)

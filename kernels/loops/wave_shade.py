@@ -21,6 +21,7 @@ from wrt.kernels.shade.paths import make_paths
 from wrt.kernels.shade.shading import Shading, make_shading
 from wrt.kernels.shade.shadows import begin_shadow
 from wrt.kernels.shade.step import DirectLight, Sample, ShadowRequest, Step, add_surface_light, make_shaded, make_step, receives_light
+from wrt.kernels.shade.surface import with_normal
 from wrt.kernels.structs import Lighting, Limits, Surfaces, any_positive
 
 Shaded = make_shaded(False)
@@ -167,7 +168,7 @@ def make_block_functions(features: Features, shading: Shading, step: Step) -> Bl
             facet = load_facet(wave.block.rows, i)
         surface = hit_surface(wave, surfaces, i, hit.k)
         texels = texels_at(wave, surfaces, surface, i)
-        surface.shading = normal_at(wave, surfaces, surface, texels, -hit.path.direction, i)
+        surface = with_normal(surface, normal_at(wave, surfaces, surface, texels, -hit.path.direction, i))
         return step.shade(surfaces, lighting, hit.path, surface, texels, wave.queue.hits.t[hit.k], facet)
 
     return BlockFunctions(prepare, needs_keys or textures_vectorised(features), shade, lights.at)
@@ -221,6 +222,10 @@ def make_push_paths(features: Features) -> Any:
         if wp.static(features.blend):
             if next.onward == FOLLOWED:
                 push_path(wave.samples, wave.capacity, hit.sample, pending, shaded.onward)
+                pending += 1
+        if wp.static(features.clearcoat):
+            if next.coated == FOLLOWED:
+                push_path(wave.samples, wave.capacity, hit.sample, pending, shaded.coated)
                 pending += 1
         if wp.static(features.reflection):
             if next.reflected == FOLLOWED:

@@ -30,7 +30,7 @@ class Attributes:
         normals, uvs = () if self.smooth else ("n0", "n1", "n2"), () if self.uvs else ("u", "v")
         self.not_of_hits = (*(f"triangle.{name}" for name in normals + uvs), *(() if self.uvs else ("material",)),
                             *(() if self.tangents else ("is_mapped", "normal_scale")))
-        self.not_of_surfaces = ("material", "exclude_plus_one", *uvs, *(() if self.tangents else ("tangent", "bitangent_sign")))
+        self.not_of_surfaces = ("material", "exclude_plus_one", "smooth", *uvs, *(() if self.tangents else ("tangent", "bitangent_sign")))
 
 
 def make_load_triangles(has: Attributes) -> Any:

@@ -74,6 +74,11 @@ def make_reflected_light(features: Features) -> Any:
             if sample.area == 0 or (scatter.traced == 0 and sample.distant == 0 and sample.area != AMBIENT):
                 if any_positive(scatter.highlight):
                     value = value + scatter.highlight * blinn_phong(s.shading, sample.wi, wo, scatter.exponent)
+            if wp.static(features.clearcoat):
+                if sample.area == 0 and scatter.coat_exponent > 0.0:
+                    share = scatter.coated * wp.max(0.0, wp.dot(s.smooth, sample.wi)) / cosine
+                    glint = share * blinn_phong(s.smooth, sample.wi, wo, scatter.coat_exponent)
+                    value = value + wp.vec3(glint, glint, glint)
         return cosine * wp.cw_mul(value, sample.weight)
 
     return sample_light, reflected_light

@@ -27,6 +27,8 @@ class Features:
     transmission: bool = False  # Some material of kind metallic_roughness transmits light.
     rough: bool = False  # Some material has microfacets, which blur reflections.
     highlight: bool = False  # Scatter.highlight is used.
+    specular: bool = False  # Some dielectric's reflectance differs from that of its index.
+    clearcoat: bool = False  # Some material has a clear coat.
     schlick: bool = False  # Schlick's approximation replaces Fresnel's formulas of dielectrics.
     emission: bool = False  # Some material emits light.
     lights: tuple[str, ...] = ()  # The kinds of lights that the scene has.

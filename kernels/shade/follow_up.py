@@ -2,7 +2,7 @@
 
 A new path is cut after max_depth bounces, after MAX_TRANSPARENT surfaces passed straight in a row, or below min_throughput. All new
 paths of a sample are cut after MAX_RAYS rays: with min_throughput = 0, a tree of 64 levels would never end. The loops push the
-FOLLOWED paths in the order onward, reflected, refracted, and trace the path pushed last first."""
+FOLLOWED paths in the order onward, coated, reflected, refracted, and trace the path pushed last first."""
 
 from typing import Any
 
@@ -24,16 +24,17 @@ CUT_BY_THROUGHPUT = wp.constant(3)
 
 @wp.struct
 class FollowUp:
-    """The verdicts on the three new paths that begin at a hit, and the light that cut paths lose.
+    """The verdicts on the four new paths that begin at a hit, and the light that cut paths lose.
     A verdict is NONE (no path), FOLLOWED, CUT_BY_DEPTH (too many bounces, surfaces or rays) or CUT_BY_THROUGHPUT (too little light)."""
 
     onward: int  # Verdict on the path straight through a partly transparent surface.
     reflected: int  # Verdict on the reflected path.
     refracted: int  # Verdict on the refracted path.
-    cut_depth: int  # Number of these three paths that have the verdict CUT_BY_DEPTH.
-    cut_throughput: int  # Number of these three paths that have the verdict CUT_BY_THROUGHPUT.
+    coated: int  # Verdict on the path reflected by a clear coat.
+    cut_depth: int  # Number of these paths that have the verdict CUT_BY_DEPTH.
+    cut_throughput: int  # Number of these paths that have the verdict CUT_BY_THROUGHPUT.
     lost: float  # If the onward path is cut: the radiance that it would have added in surroundings of radiance 1. Else 0.
-    pending_light: PendingLight  # The surface's own light and the losses of the other two paths, added after the shadow rays.
+    pending_light: PendingLight  # The surface's own light and the losses of the other paths, added after the shadow rays.
 
 
 @wp.func
@@ -94,6 +95,10 @@ def make_follow_up(features: Features) -> Any:
             out.refracted = verdict_of(shaded.refracted, limits, traced)
             out.pending_light.lost_refracted = lost(surfaces, shaded.refracted, out.refracted)
             out = add_verdict(out, out.refracted)
+        if wp.static(features.clearcoat):
+            out.coated = verdict_of(shaded.coated, limits, traced)
+            out.pending_light.lost_reflected += lost(surfaces, shaded.coated, out.coated)
+            out = add_verdict(out, out.coated)
         return out
 
     return follow_up

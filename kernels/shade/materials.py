@@ -8,10 +8,12 @@ from wrt.kernels.shade.elementary import LOG_2, exp, power
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.fresnel import fresnel_conductor, fresnel_dielectric, fresnel_schlick, fresnel_tint
 from wrt.kernels.shade.sampling import PI, ggx_normal, ggx_visible_share
-from wrt.kernels.shade.surface import Surface
+from wrt.kernels.shade.surface import Surface, visible_normal
 from wrt.kernels.structs import Material
 
 SMOOTH = wp.constant(1.0e-4)  # Largest GGX alpha of a smooth surface: its facets deviate by less than float32 directions resolve.
+
+COAT_IOR = wp.constant(1.5)  # Index of refraction of a clear coat (KHR_materials_clearcoat).
 
 
 @wp.struct
@@ -27,6 +29,10 @@ class Scatter:
     highlight: wp.vec3  # Colour of the highlight of lights that no ray can hit.
     exponent: float  # Exponent of the highlight (blinn_phong).
     traced: int  # 1 if reflected rays find area lights, so that these have no highlight.
+    below: float  # Share of the light that the clear coat leaves to everything below it.
+    coated: float  # Weight of the ray in direction `coat_reflection`, which the clear coat reflects.
+    coat_reflection: wp.vec3
+    coat_exponent: float  # Exponent of the highlight of a rough clear coat; 0: none.
 
 
 @wp.func
@@ -40,13 +46,19 @@ def blinn_phong(n: wp.vec3, wi: wp.vec3, wo: wp.vec3, exponent: float) -> float:
 
 
 @wp.func
+def highlight_exponent(alpha: float) -> float:
+    """Return the exponent of a highlight as wide as the reflection of a rough surface (Walter et al. 2007, eq. 41)."""
+    return wp.min(2.0 / (alpha * alpha) - 2.0, 1.0e5)
+
+
+@wp.func
 def with_highlight(m: Material, before: Scatter) -> Scatter:
-    """Add to a rough surface a highlight for lights that no ray can hit, as wide as its reflection (Walter et al. 2007, eq. 41)."""
+    """Add to a rough surface a highlight for lights that no ray can hit, as wide as its reflection."""
     out = before
     alpha = m.roughness * m.roughness
     if alpha > SMOOTH:
         out.highlight = out.reflected
-        out.exponent = wp.min(2.0 / (alpha * alpha) - 2.0, 1.0e5)
+        out.exponent = highlight_exponent(alpha)
         out.traced = 1
     return out
 
@@ -88,9 +100,33 @@ def conductor(m: Material, s: Surface, n: wp.vec3, wo: wp.vec3, out: Scatter) ->
     return with_highlight(m, result)
 
 
-def make_glass(features: Features) -> Any:
-    """Return the function that reflects and refracts at a boundary to a medium of index m.ior, or at a thin pane."""
+def make_reflectance(features: Features, scaled: bool) -> Any:
+    """Return reflectance(m, cos_i, eta) -> vec3 of a dielectric; `scaled`: by m.specular_factor and m.specular_color.
+
+    The source of the scale is KHR_materials_specular: `f + (1 - f) rise`, with the colour f at normal incidence. There, the rise to
+    1 at grazing incidence is Schlick's. Here, it is that of the formula in use. Total internal reflection is not scaled."""
     fresnel = fresnel_schlick if features.schlick else fresnel_dielectric
+
+    @wp.func
+    def reflectance(m: Material, cos_i: float, eta: float) -> wp.vec3:
+        share = fresnel(cos_i, eta)
+        white = wp.vec3(1.0, 1.0, 1.0)
+        if wp.static(scaled):
+            if share < 1.0:
+                normal = (eta - 1.0) * (eta - 1.0) / ((eta + 1.0) * (eta + 1.0))
+                f = wp.min(normal * m.specular_color, white)
+                # For an index above 3.7, the reflectance first falls, below 0 for a dark f.
+                return m.specular_factor * wp.max(f + ((share - normal) / (1.0 - normal)) * (white - f), wp.vec3(0.0, 0.0, 0.0))
+        return share * white
+
+    return reflectance
+
+
+def make_glass(features: Features, scaled: bool = False) -> Any:
+    """Return the function that reflects and refracts at a boundary to a medium of index m.ior, or at a thin pane.
+
+    scaled: of make_reflectance. As in KHR_materials_specular, the light that the strongest channel does not reflect is transmitted."""
+    reflectance = make_reflectance(features, scaled)
 
     @wp.func
     def glass(m: Material, s: Surface, n: wp.vec3, wo: wp.vec3, before: Scatter) -> Scatter:
@@ -99,15 +135,14 @@ def make_glass(features: Features) -> Any:
         if wp.static(features.thin_glass):
             if m.thin != 0:
                 # The sum over all reflections between the two faces: R + T^2 R + T^2 R^3 + ... = 2 R / (1 + R).
-                r = fresnel(cos_o, m.ior)
-                both = 2.0 * r / (1.0 + r)
-                out.reflected = wp.vec3(both, both, both)
-                out.transmitted = (1.0 - both) * m.albedo
+                r = reflectance(m, cos_o, m.ior)
+                out.reflected = wp.cw_div(2.0 * r, wp.vec3(1.0, 1.0, 1.0) + r)
+                out.transmitted = (1.0 - wp.max(out.reflected)) * m.albedo
                 out.refraction = -wo
                 return out
         eta = wp.where(s.front != 0, m.ior, 1.0 / m.ior)
-        share = fresnel(cos_o, eta)
-        out.reflected = wp.vec3(share, share, share)
+        out.reflected = reflectance(m, cos_o, eta)
+        share = wp.max(out.reflected)
         if share < 1.0:
             cos_t = wp.sqrt(wp.max(0.0, 1.0 - (1.0 - cos_o * cos_o) / (eta * eta)))
             out.refraction = wp.normalize((cos_o / eta - cos_t) * n - wo / eta)
@@ -121,8 +156,7 @@ def make_glass(features: Features) -> Any:
 
 def make_metallic_roughness(features: Features) -> Any:
     """Return the function for glTF 2.0's material (appendix B): a metal, mixed by `metallic` with a coated diffuse or clear body."""
-    fresnel = fresnel_schlick if features.schlick else fresnel_dielectric
-    glass = make_glass(features)
+    reflectance, glass = make_reflectance(features, features.specular), make_glass(features, features.specular)
 
     @wp.func
     def metallic_roughness(m: Material, s: Surface, n: wp.vec3, wo: wp.vec3, before: Scatter) -> Scatter:
@@ -131,15 +165,14 @@ def make_metallic_roughness(features: Features) -> Any:
         body = Scatter()
         if wp.static(features.transmission):
             body = glass(m, s, n, wo, body)
-        coat = fresnel(wp.clamp(wp.dot(n, wo), 0.0, 1.0), m.ior)
-        opaque = wp.vec3(coat, coat, coat)
+        opaque = reflectance(m, wp.clamp(wp.dot(n, wo), 0.0, 1.0), m.ior)
         out.reflected = m.metallic * metal + (1.0 - m.metallic) * (
             m.transmission * body.reflected + (1.0 - m.transmission) * opaque
         )
         out.transmitted = (1.0 - m.metallic) * m.transmission * body.transmitted
         out.refraction = body.refraction
         out.bends = body.bends
-        out.diffuse = ((1.0 - m.metallic) * (1.0 - m.transmission) * (1.0 - coat)) * m.albedo
+        out.diffuse = ((1.0 - m.metallic) * (1.0 - m.transmission) * (1.0 - wp.max(opaque))) * m.albedo
         return with_highlight(m, out)
 
     return metallic_roughness
@@ -186,9 +219,47 @@ def make_link(kind: int, function: Any, others: Any) -> Any:
     return of_kind
 
 
+def make_add_coat(features: Features) -> Any:
+    """Return add_coat(m, surface, wo, facet, scatter) -> Scatter: put the clear coat of KHR_materials_clearcoat on a surface.
+
+    The coat reflects by its own normal, which no normal map bends, and takes the reflected light from everything below. A ray inside
+    solid glass does not meet it: glass and coat have about the same index."""
+    fresnel = fresnel_schlick if features.schlick else fresnel_dielectric
+
+    @wp.func
+    def add_coat(m: Material, s: Surface, wo: wp.vec3, facet: wp.vec3, before: Scatter) -> Scatter:
+        out = before
+        out.below = 1.0
+        if m.clearcoat <= 0.0 or (s.front == 0 and m.transmission > 0.0 and m.thin == 0):
+            return out
+        smooth = visible_normal(s.smooth, wo)
+        n = smooth
+        alpha = m.clearcoat_roughness * m.clearcoat_roughness
+        if wp.static(features.rough):
+            if alpha > SMOOTH:
+                n = ggx_normal(facet, smooth, wo, alpha)
+        out.coated = m.clearcoat * fresnel(wp.clamp(wp.dot(n, wo), 0.0, 1.0), COAT_IOR)
+        out.coat_reflection = 2.0 * wp.dot(n, wo) * n - wo
+        out.below = 1.0 - out.coated
+        out.reflected = out.below * out.reflected
+        out.transmitted = out.below * out.transmitted
+        out.diffuse = out.below * out.diffuse
+        out.highlight = out.below * out.highlight
+        if wp.static(features.rough):
+            if alpha > SMOOTH:
+                out.coat_exponent = highlight_exponent(alpha)
+                cos_i = wp.dot(smooth, out.coat_reflection)
+                out.coated = wp.where(cos_i > 0.0, ggx_visible_share(wp.dot(smooth, wo), cos_i, alpha), 0.0) * out.coated
+        if wp.dot(out.coat_reflection, s.geometric) <= 0.0:
+            out.coat_reflection = 2.0 * wp.dot(s.geometric, wo) * s.geometric - wo
+        return out
+
+    return add_coat
+
+
 def make_scatter(features: Features) -> Any:
     """Return scatter(m, surface, wo, facet) -> Scatter, for every kind of the scene."""
-    of_kind = make_of_kind(features)
+    of_kind, add_coat = make_of_kind(features), make_add_coat(features)
 
     @wp.func
     def scatter(m: Material, s: Surface, wo: wp.vec3, facet: wp.vec3) -> Scatter:
@@ -215,6 +286,8 @@ def make_scatter(features: Features) -> Any:
             out.reflection = 2.0 * wp.dot(s.geometric, wo) * s.geometric - wo
         if wp.dot(out.refraction, s.geometric) >= 0.0:
             out.refraction = -wo
+        if wp.static(features.clearcoat):
+            out = add_coat(m, s, wo, facet, out)
         return out
 
     return scatter

@@ -10,8 +10,8 @@ from wrt.kernels.shade.surface import Surface, spawn_point
 from wrt.kernels.structs import Ray, make_ray
 
 UNKNOWN = wp.constant(-2)  # Path.medium of a camera ray, which may start inside glass.
-CAMERA, REFLECTED, REFRACTED, ONWARD = (wp.constant(branch) for branch in range(4))  # The branch that made a path.
-BRANCHES = wp.constant(4)
+CAMERA, REFLECTED, REFRACTED, ONWARD, COATED = (wp.constant(branch) for branch in range(5))  # The branch that made a path.
+BRANCHES = wp.constant(5)
 
 
 @wp.func
@@ -37,7 +37,7 @@ def make_path(counting: bool) -> Any:
         exclude_plus_one: int  # 1 + prim_id of the triangle that the ray starts on and ignores; 0: none.
         key: wp.uint32  # Seed of the random numbers at the ray's hit.
         if counting:
-            branch: int  # CAMERA, REFLECTED, REFRACTED or ONWARD.
+            branch: int  # CAMERA, REFLECTED, REFRACTED, ONWARD or COATED.
 
     return Path
 

@@ -26,6 +26,10 @@ class Texels:
     roughness: float
     metallic: float
     transmission: float
+    specular_factor: float
+    specular_color: wp.vec3
+    clearcoat: float
+    clearcoat_roughness: float
     normal: wp.vec3
 
 
@@ -51,6 +55,10 @@ TEXTURES = {
     "emission_texture": MaterialTexture({"emission": "rgb"}, ""),
     "metallic_roughness_texture": MaterialTexture({"roughness": "g", "metallic": "b"}),
     "transmission_texture": MaterialTexture({"transmission": "r"}),
+    "specular_texture": MaterialTexture({"specular_factor": "a"}, "specular"),
+    "specular_color_texture": MaterialTexture({"specular_color": "rgb"}, "specular"),
+    "clearcoat_texture": MaterialTexture({"clearcoat": "r"}, "clearcoat"),
+    "clearcoat_roughness_texture": MaterialTexture({"clearcoat_roughness": "g"}, "clearcoat"),
     "normal_texture": MaterialTexture({"normal": "rgb"}, "normal_maps"),
 }
 
@@ -96,11 +104,12 @@ def make_texture_link(name: str, texture: MaterialTexture, sample_texture: Any, 
 
 def make_resolve(features: Features) -> Any:
     """Return resolve(surfaces, surface, texels) -> Material at a point: parameters times textures."""
+    textured = features.textures or features.checkerboards
 
     @wp.func
     def resolve(surfaces: Surfaces, s: Surface, texels: Texels) -> Material:
         m = surfaces.materials[s.material]
-        if wp.static(features.textures or features.checkerboards):
+        if wp.static(textured):
             m.albedo = wp.cw_mul(m.albedo, texels.albedo)
             m.alpha = m.alpha * texels.alpha
             m.emission = wp.cw_mul(m.emission, texels.emission)
@@ -108,6 +117,12 @@ def make_resolve(features: Features) -> Any:
             m.roughness = m.roughness * texels.roughness
             m.metallic = m.metallic * texels.metallic
             m.transmission = m.transmission * texels.transmission
+        if wp.static(textured and features.specular):
+            m.specular_factor = m.specular_factor * texels.specular_factor
+            m.specular_color = wp.cw_mul(m.specular_color, texels.specular_color)
+        if wp.static(textured and features.clearcoat):
+            m.clearcoat = m.clearcoat * texels.clearcoat
+            m.clearcoat_roughness = m.clearcoat_roughness * texels.clearcoat_roughness
         return m
 
     return resolve

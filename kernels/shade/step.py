@@ -1,8 +1,8 @@
 """The integrator's step: shades the hit of a path. It traces no rays; kernels/loops does.
 
 It is Whitted 1980, "An Improved Illumination Model for Shaded Display", without recursion. A hit yields emission, the ambient term,
-a shadow request for each light, and at most three new paths: straight on through a partly transparent surface, reflected, and
-refracted. Each path carries its throughput. follow_up.py decides which paths are followed and which are cut."""
+a shadow request for each light, and at most four new paths: straight on through a partly transparent surface, reflected, refracted,
+and reflected by a clear coat. Each path carries its throughput. follow_up.py decides which paths are followed and which are cut."""
 
 from functools import cache
 from typing import Any, NamedTuple
@@ -13,7 +13,7 @@ from wrt.kernels.shade.direct import make_reflected_light, shadow_ray
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.lights import LightSample
 from wrt.kernels.shade.materials import Scatter
-from wrt.kernels.shade.paths import ONWARD, REFLECTED, REFRACTED, UNKNOWN, make_path, make_paths
+from wrt.kernels.shade.paths import COATED, ONWARD, REFLECTED, REFRACTED, UNKNOWN, make_path, make_paths
 from wrt.kernels.shade.sampling import cap_point, make_sample_2d
 from wrt.kernels.shade.shading import BLEND, Shading, Texels
 from wrt.kernels.shade.shadows import OUTSIDE, Shadow, attenuation
@@ -41,6 +41,7 @@ def make_shaded(counting: bool) -> Any:
         onward: path_struct  # Straight through a partly transparent surface.
         reflected: path_struct
         refracted: path_struct
+        coated: path_struct  # Reflected by the clear coat.
 
     return Shaded
 
@@ -91,7 +92,7 @@ class PendingLight:
 
     light: wp.vec3  # Shaded.light.
     throughput: wp.vec3  # Shaded.throughput.
-    lost_reflected: float  # What the reflected path adds to Sample.lost: 0 unless it is cut.
+    lost_reflected: float  # What the reflected path and that of a clear coat add to Sample.lost: 0 unless they are cut.
     lost_refracted: float  # What the refracted path adds to Sample.lost: 0 unless it is cut.
 
 
@@ -108,7 +109,7 @@ class DirectLight:
 @wp.func
 def receives_light(scatter: Scatter) -> bool:
     """Return whether a surface with this scattering reflects direct light."""
-    return any_positive(scatter.diffuse) or any_positive(scatter.highlight)
+    return any_positive(scatter.diffuse) or any_positive(scatter.highlight) or scatter.coat_exponent > 0.0
 
 
 @wp.func
@@ -219,13 +220,18 @@ def make_shade(features: Features, shading: Shading) -> Any:
         if wp.static(features.ambient):
             out.light = wp.cw_mul(scatter.diffuse, lighting.ambient)
         if wp.static(features.emission):
-            out.light += emitted(m, s)
+            if wp.static(features.clearcoat):
+                out.light += scatter.below * emitted(m, s)
+            else:
+                out.light += emitted(m, s)
         if wp.static(features.reflection):
             out.reflected = child(path, s, scatter.reflection, wp.cw_mul(path.throughput, scatter.reflected), REFLECTED)
         if wp.static(features.refraction):
             out.refracted = child(path, s, scatter.refraction, wp.cw_mul(path.throughput, scatter.transmitted), REFRACTED)
             if scatter.bends != 0:
                 out.refracted.medium = wp.where(s.front != 0, s.material, OUTSIDE)
+        if wp.static(features.clearcoat):
+            out.coated = child(path, s, scatter.coat_reflection, scatter.coated * path.throughput, COATED)
         return out
 
     return shade

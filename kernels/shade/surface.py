@@ -18,7 +18,8 @@ class Surface:
     point: wp.vec3
     error: wp.vec3  # Bound on the point's rounding error, per axis.
     geometric: wp.vec3  # Unit normal of the flat triangle or the sphere, on the ray's side.
-    shading: wp.vec3  # Interpolated unit normal, on the ray's side.
+    shading: wp.vec3  # Interpolated unit normal, on the ray's side; `shade` gets it with the normal map.
+    smooth: wp.vec3  # The same without the normal map. Set for `shade` only, in scenes with clear coats.
     tangent: wp.vec3  # Unit vector along growing u, not always perpendicular to the normal.
     bitangent_sign: float  # -1 if the texture is mirrored, else 1.
     u: float  # Texture coordinates: two floats, as a vec2 does not vectorise.
@@ -275,6 +276,15 @@ def visible_normal(n: wp.vec3, wo: wp.vec3) -> wp.vec3:
     """Return the shading normal n, bent towards wo as far as needed for a cosine of about MIN_COSINE."""
     facing = wp.dot(n, wo)
     return where_vec3(facing < MIN_COSINE, unit(n + (MIN_COSINE - facing) * wo), n)
+
+
+@wp.func
+def with_normal(s: Surface, normal: wp.vec3) -> Surface:
+    """Return the surface for `shade`: with the shading normal `normal`, while `smooth` keeps the interpolated one."""
+    out = s
+    out.smooth = s.shading
+    out.shading = normal
+    return out
 
 
 def make_on_sphere(uvs: bool, tangents: bool) -> Any:

@@ -45,12 +45,27 @@ def test_glass_in_a_furnace_is_seen_only_by_what_was_cut() -> None:
     assert 1.0 - pixels.mean(dtype=np.float64) == pytest.approx(lost, abs=2e-6)
 
 
+def test_clear_coats_in_a_furnace() -> None:
+    # On a lossless mirror a coat cannot be seen. On black it shows Fresnel's reflectance: 4 % in the middle of the ball.
+    mirror = Material("metallic_roughness", albedo=WHITE, metallic=1.0, clearcoat=0.7)
+    black = Material("metallic_roughness", albedo=BLACK, specular_factor=0.0, clearcoat=0.7)
+    camera = Camera.look_at((0.0, 0.0, 5.0), (0.0, 0.0, 0.0), fov_y=0.2)
+    for material, expected in ((mirror, 1.0), (black, 0.7 * 0.04)):
+        scene = Scene(spheres=(Sphere((0.0, 0.0, 0.0), 1.0, material), Sphere((1e4, 0.0, 0.0), 1.0, black)), background=WHITE_SKY,
+                      cameras=(camera,), settings=Settings(filter="box", min_throughput=0.0))
+        film = wrt.render(scene, size=(9, 9), spp=1)
+        assert film.pixels[4, 4] == pytest.approx(expected, abs=1e-5)
+        assert film.pixels.min() >= expected - 1e-5 and film.pixels.max() <= 1.0 + 1e-5
+
+
 def random_material(rng: np.random.Generator) -> Material:
     """Return a material of a random kind: white or coloured, rough or smooth, blended or opaque."""
     kind = str(rng.choice(["diffuse", "mirror", "conductor", "glass", "metallic_roughness"]))
     transmission, thin = float(rng.choice([0.0, rng.random()])), bool(rng.random() < 0.3)
     return Material(kind, albedo=WHITE if rng.random() < 0.5 else tuple(rng.random(3)), ior=float(rng.uniform(1.0, 2.5)),
                     roughness=float(rng.choice([0.0, rng.random()])), metallic=float(rng.random()), transmission=transmission,
+                    specular_factor=float(rng.choice([1.0, rng.random()])), specular_color=tuple(rng.uniform(0.0, 3.0, 3)),
+                    clearcoat=float(rng.choice([0.0, rng.random()])), clearcoat_roughness=float(rng.choice([0.0, rng.random()])),
                     thin=thin, absorption=(float(rng.choice([0.0, 0.5])),) * 3, alpha=float(rng.random()),
                     alpha_mode=str(rng.choice(["opaque", "blend"])))
 
@@ -68,7 +83,8 @@ def test_never_more_light_than_comes_in(seed: int) -> None:
         spheres.append(Sphere(tuple(rng.uniform(-1.2, 1.2, 3)), float(rng.uniform(0.1, 0.4)), random_material(rng)))
     # A distant object for each feature, so that all seeds share a kernel.
     kinds = [Material("glass", thin=True), Material("glass", absorption=(1, 1, 1), roughness=0.5), Material("mirror"),
-             Material("conductor"), Material("metallic_roughness", transmission=0.5), Material(alpha_mode="blend", alpha=0.5)]
+             Material("conductor"), Material(alpha_mode="blend", alpha=0.5), Material(
+                 "metallic_roughness", transmission=0.5, clearcoat=0.5, clearcoat_roughness=0.5, specular_factor=0.5)]
     spheres += [Sphere((1e4, 10.0 * i, 0.0), 1.0, material) for i, material in enumerate(kinds)]
     camera = Camera.look_at(tuple(rng.normal(size=3) + np.array([0, 0, 6.0])), (0, 0, 0), fov_y=0.6)
     scene = Scene(objects=tuple(objects), spheres=tuple(spheres), background=WHITE_SKY, cameras=(camera,),

@@ -10,16 +10,16 @@ import numpy as np
 from wrt.accel.scenes.instancing import instanced_meshes
 from wrt.core.types import JsonObject
 from wrt.kernels.shade.features import Features
+from wrt.kernels.shade.shading import TEXTURES
 from wrt.scene.backgrounds import BACKGROUNDS
 from wrt.scene.cameras import CameraKind
 from wrt.scene.lights import EMISSIVE, LIGHTS
-from wrt.scene.materials import MATERIALS, SLOTS, Checkerboard, Texture
+from wrt.scene.materials import MATERIALS, Checkerboard, Texture
 from wrt.scene.model import Scene
 
 STACK_STEP = 16  # Stack sizes are multiples of this, so that scenes share kernels.
 TOOLS = {"counting", "recording"}  # features for measurements and the inspector, which no scene asks for
-# Textures that do not need the feature `parameter_textures`.
-COMMON = {"albedo_texture", "emission_texture", "normal_texture"}
+PARAMETER_TEXTURES = tuple(name for name, texture in TEXTURES.items() if texture.feature == "parameter_textures")
 
 
 def switches(features: Features) -> dict[str, bool]:
@@ -48,7 +48,8 @@ def features_of(scene: Scene, camera: CameraKind, meshes: frozenset[int] = froze
     tinted = settings.glass_shadows == "tinted" and any(not m.thin for m in clear)
     reflection = any(MATERIALS[kind].reflects for kind in kinds)
     refraction = bool(clear)
-    children = int(reflection) + int(refraction) + int(blend)
+    clearcoat = any(m.is_coated for m in materials)
+    children = int(reflection) + int(refraction) + int(blend) + int(clearcoat)
     # A ray is popped before its children are pushed, so that each level adds children - 1 rays to the stack. The ray straight through a
     # blended surface does not increase the depth: it waits on the stack below its siblings until they are done.
     pending = (children - 1) * (settings.max_depth + 1) + 1
@@ -63,7 +64,7 @@ def features_of(scene: Scene, camera: CameraKind, meshes: frozenset[int] = froze
         textures=any(isinstance(texture, Texture) for texture in textures),
         checkerboards=any(isinstance(texture, Checkerboard) for texture in textures),
         normal_maps=any(m.normal_texture is not None for m in materials),
-        parameter_textures=any(m.reads(name) and getattr(m, name) is not None for m in materials for name in SLOTS.keys() - COMMON),
+        parameter_textures=any(m.reads(name) and getattr(m, name) is not None for m in materials for name in PARAMETER_TEXTURES),
         cutout=any(m.alpha_mode == "mask" for m in materials),
         blend=blend,
         materials=tuple(name for name in MATERIALS if name in kinds),
@@ -72,6 +73,8 @@ def features_of(scene: Scene, camera: CameraKind, meshes: frozenset[int] = froze
         transmission=any(m.uses("transmission") for m in clear),
         rough=rough,
         highlight=highlight,
+        specular=any(m.scales_reflectance for m in materials),
+        clearcoat=clearcoat,
         schlick=settings.fresnel == "schlick" and any(m.uses("ior") for m in materials),
         emission=any(m.is_emissive for m in materials),
         lights=tuple(name for name in (*LIGHTS, *EMISSIVE) if lit and name in lights),

@@ -86,8 +86,9 @@ MATERIALS: dict[str, MaterialKind] = {
     "conductor": MaterialKind("Fresnel reflection of a metal", ("eta", "k", "roughness")),
     "glass": MaterialKind("reflection and refraction", ("ior", "absorption", "thin", "roughness"), clear=True),
     "metallic_roughness": MaterialKind(
-        "glTF's", ("ior", "absorption", "thin", "roughness", "metallic", "transmission", "metallic_roughness_texture",
-                   "transmission_texture"), scatters=True),
+        "glTF's", ("ior", "absorption", "thin", "roughness", "metallic", "transmission", "specular_factor", "specular_color", "clearcoat",
+                   "clearcoat_roughness", "metallic_roughness_texture", "transmission_texture", "specular_texture",
+                   "specular_color_texture", "clearcoat_texture", "clearcoat_roughness_texture"), scatters=True),
 }
 ALPHA_MODES = ("opaque", "mask", "blend")
 # Complex index of refraction at 630, 532 and 465 nm, rounded to three decimals (optical tables of the pure metals).
@@ -110,7 +111,8 @@ class Material:
         - "mirror": reflectance `albedo` at every angle.
         - "conductor": exact Fresnel reflection with the index of refraction `eta` + i `k` (presets in CONDUCTORS) and `roughness`.
         - "glass": dielectric of index `ior`; `albedo` tints transmission. Also reads `absorption`, `thin` and `roughness`.
-        - "metallic_roughness": as in glTF 2.0, from `albedo` (base colour), `metallic`, `roughness`, `ior`, `transmission`.
+        - "metallic_roughness": as in glTF 2.0, from `albedo` (base colour), `metallic`, `roughness`, `ior`, `transmission`,
+          `specular_factor`, `specular_color`, `clearcoat` and `clearcoat_roughness`.
     albedo
         Reflectance; for glass the transmittance of each surface.
     absorption
@@ -119,6 +121,10 @@ class Material:
         True for an infinitely thin pane: light is not bent, and the reflections of both faces are summed.
     roughness
         Perceptual roughness of glTF in [0, 1]; the GGX alpha is its square. 0 is a perfect mirror.
+    specular_factor, specular_color
+        Factor on the reflectance of a dielectric at every angle, and on that at normal incidence (KHR_materials_specular).
+    clearcoat, clearcoat_roughness
+        Share of the surface under a clear coat of index 1.5, and the coat's own roughness (KHR_materials_clearcoat).
     emission, two_sided
         Emitted radiance, linear; True if both sides emit, and not only the front (corners counter-clockwise).
     emits_light
@@ -129,6 +135,8 @@ class Material:
         Factor on `albedo`, and its alpha channel on `alpha`; factor on `emission`; tangent-space normal map, scaled by `normal_scale`.
     metallic_roughness_texture, transmission_texture
         Factors on `roughness` (green) and `metallic` (blue); factor on `transmission` (red).
+    specular_texture, specular_color_texture, clearcoat_texture, clearcoat_roughness_texture
+        Factors on the parameters of these names: alpha on `specular_factor`, colour, red, green.
 
     Raises
     ------
@@ -153,6 +161,14 @@ class Material:
         "number", "square root of the GGX alpha; 0: a perfect mirror (conductor, glass, metallic_roughness)", ge=0.0, le=1.0))
     transmission: float = field(default=0.0, metadata=given(
         "number", "share of the light that the body transmits (metallic_roughness)", ge=0.0, le=1.0))
+    specular_factor: float = field(default=1.0, metadata=given(
+        "number", "factor on the reflectance of a dielectric (metallic_roughness)", ge=0.0, le=1.0))
+    specular_color: Color = field(default=(1.0, 1.0, 1.0), metadata=given(
+        "color", "factor on the reflectance of a dielectric at normal incidence (metallic_roughness)", le=1e3))
+    clearcoat: float = field(default=0.0, metadata=given(
+        "number", "share of the surface under a clear coat of index 1.5 (metallic_roughness)", ge=0.0, le=1.0))
+    clearcoat_roughness: float = field(default=0.0, metadata=given(
+        "number", "roughness of the clear coat (metallic_roughness)", ge=0.0, le=1.0))
     emission: Color = field(default=BLACK, metadata=given("color", "emitted by the front side", "radiance"))
     two_sided: bool = field(default=False, metadata=given("flag", "both sides emit"))
     emits_light: bool = field(default=True, metadata=given("flag", "the emission lights other surfaces; false: it is only visible"))
@@ -166,6 +182,13 @@ class Material:
     metallic_roughness_texture: Texture | None = field(default=None, metadata=given(
         "texture", "green multiplies roughness, blue metallic", among=(Texture,)))
     transmission_texture: Texture | None = field(default=None, metadata=given("texture", "red multiplies transmission", among=(Texture,)))
+    specular_texture: Texture | None = field(default=None, metadata=given(
+        "texture", "alpha multiplies specular_factor", among=(Texture,)))
+    specular_color_texture: Texture | Checkerboard | None = field(default=None, metadata=given(
+        "texture", "multiplies specular_color", among=(Texture, Checkerboard)))
+    clearcoat_texture: Texture | None = field(default=None, metadata=given("texture", "red multiplies clearcoat", among=(Texture,)))
+    clearcoat_roughness_texture: Texture | None = field(default=None, metadata=given(
+        "texture", "green multiplies clearcoat_roughness", among=(Texture,)))
     emission_texture: Texture | Checkerboard | None = field(default=None, metadata=given(
         "texture", "multiplies emission", among=(Texture, Checkerboard)))
     normal_texture: Texture | None = field(default=None, metadata=given("texture", "tangent-space normal map", among=(Texture,)))
@@ -191,7 +214,18 @@ class Material:
     @property
     def is_rough(self) -> bool:
         """True if reflections are blurred. Up to a roughness of 0.01 the blur is below the resolution of float32 directions."""
-        return self.uses("roughness") and self.roughness > 0.01
+        return (self.uses("roughness") and self.roughness > 0.01) or (self.is_coated and self.clearcoat_roughness > 0.01)
+
+    @property
+    def is_coated(self) -> bool:
+        """True if the surface has a clear coat."""
+        return self.uses("clearcoat") and self.clearcoat > 0.0
+
+    @property
+    def scales_reflectance(self) -> bool:
+        """True if the reflectance differs from that of a dielectric with the index `ior`."""
+        plain = self.specular_factor == 1.0 and self.specular_color == (1.0, 1.0, 1.0)
+        return self.uses("specular_factor") and not (plain and self.specular_texture is None and self.specular_color_texture is None)
 
     @property
     def is_emissive(self) -> bool:

@@ -1,5 +1,6 @@
 """Fresnel's formulas against closed forms and complex arithmetic, and the scattering of each kind of material."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -153,6 +154,9 @@ EVERYTHING = Features(materials=tuple(MATERIALS), thin_glass=True, transmission=
                       refraction=True)
 
 
+COATED = replace(EVERYTHING, specular=True, clearcoat=True)
+
+
 @cache
 def scatter_kernel(features):
     scatter = make_scatter(features)
@@ -165,6 +169,7 @@ def scatter_kernel(features):
         s.front = front
         s.geometric = geometric
         s.shading = shading
+        s.smooth = geometric
         out[i] = scatter(materials[0], s, wo[i], cap_point(xi[i]))
 
     return run_scatter
@@ -241,6 +246,56 @@ def test_thin_glass_sums_the_reflections_of_both_faces():
     assert out["reflected"][0, 0] == pytest.approx(1.0 / 13.0, abs=1e-6)
 
 
+@pytest.mark.parametrize("ior", [1.33, 1.5, 5.0])
+def test_specular_scales_the_reflectance_of_the_index(ior):
+    degrees = np.linspace(0.0, 89.0, 60)
+    wo, expected = slanted(degrees), fresnel(np.cos(np.radians(degrees)), ior)
+    black = {"albedo": (0.0, 0.0, 0.0), "ior": ior}
+    halved = scatter(Material("metallic_roughness", specular_factor=0.5, **black), wo, features=COATED)["reflected"]
+    assert np.abs(halved - 0.5 * expected[:, None]).max() < 1e-5
+    color = np.array([0.25, 0.0, 1e3])
+    normal = np.minimum(1.0, ((ior - 1.0) / (ior + 1.0)) ** 2 * color)
+    tinted = scatter(Material("metallic_roughness", specular_color=tuple(color), **black), wo, features=COATED)["reflected"]
+    assert np.abs(tinted[0] - normal).max() < 1e-6
+    assert (tinted >= 0.0).all() and (tinted <= 1.0).all()
+    # With Schlick's approximation, this is the formula of KHR_materials_specular.
+    schlick = scatter(Material("metallic_roughness", specular_color=tuple(color), **black), wo, features=replace(COATED, schlick=True))
+    rise = (1.0 - np.cos(np.radians(degrees)))[:, None] ** 5
+    assert np.abs(schlick["reflected"] - (normal + (1.0 - normal) * rise)).max() < 1e-5
+
+
+def test_what_the_strongest_channel_does_not_reflect_stays_below():
+    out = scatter(Material("metallic_roughness", albedo=(1.0, 1.0, 1.0), ior=2.0, specular_color=(3.0, 1.0, 0.0)), slanted(0.0),
+                  features=COATED)
+    assert np.allclose(out["reflected"], [3.0 / 9.0, 1.0 / 9.0, 0.0]) and np.allclose(out["diffuse"], 6.0 / 9.0)
+
+
+@pytest.mark.parametrize("share", [0.3, 1.0])
+def test_a_clear_coat_takes_its_fresnel_share_from_what_is_below(share):
+    degrees = np.linspace(0.0, 89.0, 60)
+    base = {"albedo": (0.8, 0.5, 0.2), "roughness": 0.6, "metallic": 0.3, "transmission": 0.4, "thin": True}
+    bare = scatter(Material("metallic_roughness", **base), slanted(degrees), features=COATED)
+    out = scatter(Material("metallic_roughness", clearcoat=share, **base), slanted(degrees), features=COATED)
+    coat = share * fresnel(np.cos(np.radians(degrees)), 1.5)
+    assert np.abs(out["coated"] - coat).max() < 1e-5 and coat[0] == pytest.approx(0.04 * share)
+    assert np.allclose(out["coat_reflection"], slanted(degrees) * [-1, -1, 1], atol=1e-6) and not out["coat_exponent"].any()
+    for name in ("reflected", "transmitted", "diffuse", "highlight"):
+        assert bare[name].any() and np.allclose(out[name], (1.0 - coat)[:, None] * bare[name], atol=1e-6)
+    assert np.allclose(out["below"], 1.0 - coat, atol=1e-6) and (bare["below"] == 1.0).all() and not bare["coated"].any()
+
+
+def test_no_normal_map_bends_a_clear_coat():
+    out = scatter(Material("metallic_roughness", clearcoat=1.0), slanted(30.0), shading=unit(np.array([0.4, 0.0, 1.0])), features=COATED)
+    assert np.allclose(out["coat_reflection"], slanted(30.0) * [-1, -1, 1], atol=1e-6)
+    assert not np.allclose(out["reflection"], out["coat_reflection"], atol=0.1)
+
+
+def test_a_ray_inside_solid_glass_meets_no_coat():
+    glass = Material("metallic_roughness", transmission=1.0, clearcoat=1.0)
+    assert not scatter(glass, slanted(20.0), front=False, features=COATED)["coated"].any()
+    assert scatter(replace(glass, thin=True), slanted(20.0), front=False, features=COATED)["coated"].all()
+
+
 def some_materials():
     """Yield materials of each kind and extremes of metallic_roughness, all with albedo 1. Smooth ones must not absorb light."""
     rest = {"albedo": (1.0, 1.0, 1.0)}
@@ -254,24 +309,33 @@ def some_materials():
     yield Material("diffuse", **rest)
 
 
+def layered_materials():
+    """Yield materials with clear coats and scaled reflectances, all with albedo 1."""
+    for transmission in (0.0, 1.0):
+        for roughness in (0.0, 0.7):
+            yield Material("metallic_roughness", albedo=(1.0, 1.0, 1.0), transmission=transmission, roughness=roughness, clearcoat=0.9,
+                           clearcoat_roughness=roughness, specular_factor=0.6, specular_color=(1.0, 5.0, 40.0))
+
+
 @pytest.mark.parametrize("front", [True, False])
-@pytest.mark.parametrize("material", list(some_materials()),
-                         ids=lambda m: f"{m.kind}-{m.metallic}-{m.transmission}-{m.roughness}-{m.thin}")
+@pytest.mark.parametrize("material", [*some_materials(), *layered_materials()],
+                         ids=lambda m: f"{m.kind}-{m.metallic}-{m.transmission}-{m.roughness}-{m.thin}-{m.clearcoat}")
 def test_no_kind_creates_energy(material, front):
     rng = np.random.default_rng(2)
     xi = sobol_like(512, rng)
     for degrees in (0.0, 20.0, 45.0, 75.0, 88.0):
-        out = scatter(material, np.repeat(slanted(degrees), 512, axis=0), xi, front=front)
+        features = COATED if material.is_coated else EVERYTHING
+        out = scatter(material, np.repeat(slanted(degrees), 512, axis=0), xi, front=front, features=features)
         eta = np.where(out["bends"] != 0, material.ior if front else 1.0 / material.ior, 1.0)
-        total = out["reflected"] + out["transmitted"] * (eta**2)[:, None] + out["diffuse"]
+        total = out["reflected"] + out["transmitted"] * (eta**2)[:, None] + out["diffuse"] + out["coated"][:, None]
         assert np.isfinite(total).all() and (total >= 0.0).all()
         assert (total <= 1.0 + 1e-5).all()
-        for name, side in (("reflection", 1.0), ("refraction", -1.0)):
-            used = out["reflected" if name == "reflection" else "transmitted"].max(axis=1) > 0.0
+        for name, weight, side in (("reflection", "reflected", 1.0), ("refraction", "transmitted", -1.0), ("coat_reflection", "coated", 1.0)):
+            used = out[weight].reshape(len(out), -1).max(axis=1) > 0.0
             direction = out[name][used].astype(np.float64)
             assert np.abs(np.linalg.norm(direction, axis=1) - 1.0).max(initial=0.0) < 1e-5
             assert (direction[:, 2] * side > 0.0).all()
-        if material.roughness == 0.0 and material.kind != "conductor":
+        if material.roughness == 0.0 and material.kind != "conductor" and not material.is_coated:
             assert (total > 1.0 - 1e-4).all()  # A smooth white surface absorbs nothing.
 
 

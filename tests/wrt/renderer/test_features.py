@@ -79,6 +79,12 @@ def test_a_black_opaque_scene_needs_nothing() -> None:
     (scene_of(Material("metallic_roughness", albedo=(0, 0, 0))), {"metallic_roughness", "reflection"}),
     (scene_of(Material("metallic_roughness", albedo=(0, 0, 0), transmission=0.5)),
      {"metallic_roughness", "reflection", "refraction", "transmission"}),
+    (scene_of(Material("metallic_roughness", albedo=(0, 0, 0), specular_factor=0.5)), {"metallic_roughness", "reflection", "specular"}),
+    (scene_of(Material("metallic_roughness", albedo=(0, 0, 0), clearcoat=0.5)), {"metallic_roughness", "reflection", "clearcoat"}),
+    (scene_of(Material("metallic_roughness", albedo=(0, 0, 0), clearcoat_roughness=0.5)), {"metallic_roughness", "reflection"}),
+    (scene_of(Material("metallic_roughness", albedo=(0, 0, 0), clearcoat=0.5, clearcoat_roughness=0.5, clearcoat_texture=PICTURE)),
+     {"metallic_roughness", "reflection", "clearcoat", "rough", "highlight", "textures"}),
+    (scene_of(Material(clearcoat=0.5, specular_factor=0.5)), set()),  # its kind of material uses neither
     (scene_of(Material(specular=(0.1, 0, 0))), {"highlight"}),
     (scene_of(Material(alpha_mode="mask")), {"cutout"}),
     (scene_of(Material(alpha_mode="blend"), lights=(POINT,)), {"blend", "point_lights", "transparent_shadows"}),

@@ -15,7 +15,18 @@ import numpy as np
 from wrt.core.checks import short
 from wrt.core.errors import InputError, at
 from wrt.io.gltf.document import Document, GltfObject
-from wrt.io.gltf.schema import EmissiveStrength, Ior, TextureSource, TextureTransform, Transmission, Unlit, Volume, exactly
+from wrt.io.gltf.schema import (
+    Clearcoat,
+    EmissiveStrength,
+    Ior,
+    Specular,
+    TextureSource,
+    TextureTransform,
+    Transmission,
+    Unlit,
+    Volume,
+    exactly,
+)
 from wrt.picture.decode import decode_rgba8
 from wrt.scene.materials import Material, Texture
 from wrt.scene.values import BLACK, Color, as_number, as_vector
@@ -27,14 +38,11 @@ _ALPHA_MODES = {"OPAQUE": "opaque", "MASK": "mask", "BLEND": "blend"}
 
 # Values with which an unsupported extension has no effect: the warning then leaves it out.
 _NEUTRAL: dict[str, dict[str, Any]] = {
-    "KHR_materials_clearcoat": {"clearcoatFactor": 0},
     "KHR_materials_sheen": {"sheenColorFactor": [0, 0, 0]},
     "KHR_materials_iridescence": {"iridescenceFactor": 0},
     "KHR_materials_anisotropy": {"anisotropyStrength": 0},
     "KHR_materials_dispersion": {"dispersion": 0},
     "KHR_materials_diffuse_transmission": {"diffuseTransmissionFactor": 0},
-    "KHR_materials_specular": {"specularFactor": 1, "specularColorFactor": [1, 1, 1], "specularTexture": None,
-                               "specularColorTexture": None},
 }
 
 
@@ -157,6 +165,7 @@ class Materials:
             fields = _unlit(fields)
         else:
             fields |= {"kind": "metallic_roughness"} | self._reflection(source, name, place)
+            fields |= self._specular(source, name, place) | self._clearcoat(source, name, place)
             fields |= self._transmission(source, name, place) | self._emission(source, name, place)
         with at(place):
             return Material(**fields)
@@ -204,6 +213,32 @@ class Materials:
             with at(f"{place}.extensions.KHR_materials_volume"):
                 fields |= {"thin": False, "absorption": absorption(volume)}
         return fields
+
+    def _specular(self, source: GltfObject, name: str, place: str) -> dict[str, Any]:
+        specular = self._document.extension(source, "KHR_materials_specular", Specular, place)
+        if specular is None:
+            return {}
+        place = f"{place}.extensions.KHR_materials_specular"
+        return {
+            "specular_factor": specular.specularFactor,
+            "specular_color": tuple(exactly(specular.specularColorFactor, 3, f"{place}.specularColorFactor")),
+            "specular_texture": self._textures.texture(specular.specularTexture, False, name, f"{place}.specularTexture"),
+            "specular_color_texture": self._textures.texture(specular.specularColorTexture, True, name, f"{place}.specularColorTexture"),
+        }
+
+    def _clearcoat(self, source: GltfObject, name: str, place: str) -> dict[str, Any]:
+        coat = self._document.extension(source, "KHR_materials_clearcoat", Clearcoat, place)
+        if coat is None or coat.clearcoatFactor == 0.0:
+            return {}
+        place = f"{place}.extensions.KHR_materials_clearcoat"
+        if coat.clearcoatNormalTexture is not None:
+            self._document.left_out.add("clearcoatNormalTexture", "material", name)
+        return {
+            "clearcoat": coat.clearcoatFactor, "clearcoat_roughness": coat.clearcoatRoughnessFactor,
+            "clearcoat_texture": self._textures.texture(coat.clearcoatTexture, False, name, f"{place}.clearcoatTexture"),
+            "clearcoat_roughness_texture": self._textures.texture(
+                coat.clearcoatRoughnessTexture, False, name, f"{place}.clearcoatRoughnessTexture"),
+        }
 
     def _emission(self, source: GltfObject, name: str, place: str) -> dict[str, Any]:
         factor = exactly(source.emissiveFactor, 3, f"{place}.emissiveFactor")

@@ -59,6 +59,23 @@ class Ior:
 
 
 @dataclass
+class Specular:
+    specularFactor: float = 1.0
+    specularTexture: TextureInfo | None = None
+    specularColorFactor: list[float] = field(default_factory=lambda: [1.0, 1.0, 1.0])
+    specularColorTexture: TextureInfo | None = None
+
+
+@dataclass
+class Clearcoat:
+    clearcoatFactor: float = 0.0
+    clearcoatTexture: TextureInfo | None = None
+    clearcoatRoughnessFactor: float = 0.0
+    clearcoatRoughnessTexture: TextureInfo | None = None
+    clearcoatNormalTexture: TextureInfo | None = None
+
+
+@dataclass
 class EmissiveStrength:
     emissiveStrength: float = 1.0
 

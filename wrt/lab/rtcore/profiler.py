@@ -18,7 +18,7 @@ from wrt.core.html import html_table
 from wrt.core.packages import needed_by
 from wrt.core.types import PathLike
 from wrt.io.load import as_scene
-from wrt.kernels.shade.paths import BRANCHES
+from wrt.kernels.shade.paths import BRANCHES, COATED, REFLECTED
 from wrt.kernels.study import ray_log
 from wrt.kernels.traverse.counters import SIZE_RANGE, Counts, Recorder
 from wrt.lab.costs import COUNTERS, CostCounter
@@ -270,7 +270,8 @@ class Profiler:
         label = rays["label"]
         path = np.maximum.accumulate(np.where(label > 0, np.arange(len(rays)), 0))  # for a shadow ray, the last path ray before it
         shadow = KINDS.index("shadow")
-        kind = np.where(label > 0, (label - 1) % int(BRANCHES), shadow).astype(np.int8)
+        branch = (label - 1) % int(BRANCHES)
+        kind = np.where(label > 0, np.where(branch == COATED, REFLECTED, branch), shadow).astype(np.int8)
         depth = (label[path] - 1) // int(BRANCHES)
         trace = [tile.trace for tile in tiles if tile.trace is not None]
         kept = np.concatenate([np.full(len(tile.rays), tile.trace is not None) for tile in tiles])

@@ -11,7 +11,7 @@ import numpy as np
 from wrt.accel.flat_scene import FlatScene
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.follow_up import CUT_BY_DEPTH, FOLLOWED
-from wrt.kernels.shade.paths import ONWARD, REFLECTED
+from wrt.kernels.shade.paths import COATED, ONWARD, REFLECTED
 from wrt.renderer.inspector.tree import AMBIENT, Light, Place, Ray
 from wrt.renderer.upload import mesh_lights
 from wrt.scene.model import Scene
@@ -102,6 +102,6 @@ def _names(things: Any, noun: str) -> list[str]:
 
 
 def _kind(path: Row) -> str:
-    if path["branch"] == ONWARD:
-        return "onward"
+    if path["branch"] in (ONWARD, COATED):
+        return "onward" if path["branch"] == ONWARD else "coated"
     return "reflected" if path["branch"] == REFLECTED else "refracted" if path["bends"] else "transmitted"

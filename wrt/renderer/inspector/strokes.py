@@ -9,8 +9,8 @@ import numpy as np
 
 from wrt.renderer.inspector.tree import AMBIENT, Light, Ray, Sample
 
-COLORS = {"camera": "#202020", "reflected": "#1668c4", "refracted": "#d1342b", "transmitted": "#c2378f", "onward": "#2b8a3e",
-          "shadow ray": "#e59a00", "blocked": "#8a7f70"}
+COLORS = {"camera": "#202020", "reflected": "#1668c4", "coated": "#0b8f9c", "refracted": "#d1342b", "transmitted": "#c2378f",
+          "onward": "#2b8a3e", "shadow ray": "#e59a00", "blocked": "#8a7f70"}
 # A marker of matplotlib for each end of a ray, and its description.
 ENDS = {"absorbed": ("o", "ends at a surface"), "emission": ("*", "ends at a light"), "missed": (">", "leaves the scene"),
         "cut by depth": ("s", "cut by depth"), "cut by throughput": ("X", "cut by throughput"), "blocked": ("x", "shadow ray blocked")}

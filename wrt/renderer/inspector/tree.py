@@ -65,7 +65,8 @@ class Light:
 class Ray(Place):
     """A ray of a path. Vectors are (3,) float32; point and normals are NaN without a hit.
 
-    - kind: "camera", "reflected", "refracted", "transmitted" (through thin glass), or "onward" (straight through a blended surface).
+    - kind: "camera", "reflected", "coated" (by a clear coat), "refracted", "transmitted" (through thin glass), or "onward" (straight
+      through a blended surface).
     - depth: bounces so far. throughput: weight of the ray's radiance in the sample.
     - ended: "missed", "emission" or "absorbed" (a surface that makes no new ray), "continued", "cut by depth", "cut by throughput".
     - point, normal, shading_normal: the hit point, and the unit normals on the ray's side. front: whether the ray meets the front.
@@ -91,7 +92,7 @@ class Ray(Place):
     children: tuple[Ray, ...]
 
     def walk(self) -> Iterator[Ray]:
-        """Yield the ray and all rays below it, in the order in which the renderer traces them: refracted, reflected, onward."""
+        """Yield the ray and all rays below it, in the order in which the renderer traces them: refracted, reflected, coated, onward."""
         waiting = [self]
         while waiting:
             ray = waiting.pop()

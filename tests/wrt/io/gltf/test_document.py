@@ -131,7 +131,7 @@ def test_buffer_without_data(tmp_path):
     (["EXT_meshopt_compression"], "EXT_meshopt_compression", "no decoder"),
     (["EXT_meshopt_compression", "KHR_mesh_quantization"], "EXT_meshopt_compression", "no decoder"),
     (["KHR_texture_basisu"], "KHR_texture_basisu", "no decoder"),
-    (["KHR_materials_clearcoat", "ACME_unheard_of"], "'ACME_unheard_of', 'KHR_materials_clearcoat'", ""),
+    (["KHR_materials_sheen", "ACME_unheard_of"], "'ACME_unheard_of', 'KHR_materials_sheen'", ""),
 ])
 def test_required_extensions_that_are_not_supported(tmp_path, required, what, hint):
     file = one_triangle()

@@ -164,12 +164,10 @@ def test_wrong_materials_are_refused(tmp_path, source, message):
 
 
 @pytest.mark.parametrize("extension, value, named", [
-    ("KHR_materials_clearcoat", {"clearcoatFactor": 1}, True),
-    ("KHR_materials_clearcoat", {"clearcoatRoughnessFactor": 0.5}, False),
     ("KHR_materials_sheen", {"sheenColorFactor": [0, 0, 0]}, False),
-    ("KHR_materials_specular", {"specularFactor": 1.0}, False),
-    ("KHR_materials_specular", {"specularFactor": 0.5}, True),
-    ("KHR_materials_specular", {"specularTexture": {"index": 0}}, True),
+    ("KHR_materials_sheen", {"sheenColorFactor": [0, 0, 1]}, True),
+    ("KHR_materials_clearcoat", {"clearcoatFactor": 0.5}, False),
+    ("KHR_materials_specular", {"specularFactor": 0.5}, False),
     ("KHR_materials_dispersion", {"dispersion": 0.2}, True),
     ("NV_materials_mdl", {}, True),
     ("KHR_materials_pbrSpecularGlossiness", "no object", True),
@@ -182,6 +180,41 @@ def test_extensions_are_named_where_they_change_the_picture(tmp_path, extension,
         warnings.simplefilter("always")
         load_gltf(path, staged=False)
     assert [f"{extension} (material 'paint')" in str(w.message) for w in caught] == ([True] if named else [])
+
+
+def test_clear_coat_and_specular(tmp_path):
+    coat = {"clearcoatFactor": 0.5, "clearcoatRoughnessFactor": 0.25}
+    specular = {"specularFactor": 0.75, "specularColorFactor": [1, 0.5, 2]}
+    material = material_of({"extensions": {"KHR_materials_clearcoat": coat, "KHR_materials_specular": specular}}, tmp_path)
+    assert (material.clearcoat, material.clearcoat_roughness) == (0.5, 0.25)
+    assert (material.specular_factor, material.specular_color) == (0.75, (1.0, 0.5, 2.0))
+    assert material.is_coated and material.scales_reflectance
+    plain = material_of({"extensions": {"KHR_materials_clearcoat": {"clearcoatRoughnessFactor": 1}, "KHR_materials_specular": {}}}, tmp_path)
+    assert not plain.is_coated and not plain.scales_reflectance and plain.is_rough
+
+
+def test_textures_of_clear_coat_and_specular(tmp_path):
+    slot = {"index": 0}
+    source = {"extensions": {
+        "KHR_materials_clearcoat": {"clearcoatFactor": 1, "clearcoatTexture": slot, "clearcoatRoughnessTexture": slot,
+                                    "clearcoatNormalTexture": slot},
+        "KHR_materials_specular": {"specularTexture": slot, "specularColorTexture": slot}}}
+    with pytest.warns(SceneWarning, match="clearcoatNormalTexture .material 'material 0'"):
+        material = load_gltf(textured(source).write(tmp_path), staged=False).materials[0]
+    assert not material.clearcoat_texture.srgb and not material.clearcoat_roughness_texture.srgb and not material.specular_texture.srgb
+    assert material.specular_color_texture.srgb and material.scales_reflectance
+
+
+@pytest.mark.parametrize("source, message", [
+    ({"KHR_materials_clearcoat": {"clearcoatFactor": 2}}, ("clearcoat", "finite", "materials[0]: material 'material 0'")),
+    ({"KHR_materials_clearcoat": {"clearcoatFactor": "thick"}},
+     (None, "number", "materials[0].extensions.KHR_materials_clearcoat.clearcoatFactor")),
+    ({"KHR_materials_specular": {"specularColorFactor": [1, 1]}},
+     (None, "3", "materials[0].extensions.KHR_materials_specular.specularColorFactor")),
+])
+def test_wrong_coats_are_refused(tmp_path, source, message):
+    with refused(*message):
+        material_of({"extensions": source}, tmp_path)
 
 
 # --- textures ---------------------------------------------------------------------------------------------------------
