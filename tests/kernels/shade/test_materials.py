@@ -330,7 +330,8 @@ def test_no_kind_creates_energy(material, front):
         total = out["reflected"] + out["transmitted"] * (eta**2)[:, None] + out["diffuse"] + out["coated"][:, None]
         assert np.isfinite(total).all() and (total >= 0.0).all()
         assert (total <= 1.0 + 1e-5).all()
-        for name, weight, side in (("reflection", "reflected", 1.0), ("refraction", "transmitted", -1.0), ("coat_reflection", "coated", 1.0)):
+        sides = (("reflection", "reflected", 1.0), ("refraction", "transmitted", -1.0), ("coat_reflection", "coated", 1.0))
+        for name, weight, side in sides:
             used = out[weight].reshape(len(out), -1).max(axis=1) > 0.0
             direction = out[name][used].astype(np.float64)
             assert np.abs(np.linalg.norm(direction, axis=1) - 1.0).max(initial=0.0) < 1e-5
