@@ -340,6 +340,8 @@ class Film:
     cut_throughput: wp.array(dtype=wp.int32)  # Number of rays cut by min_throughput.
     lost: wp.array(dtype=wp.float32)  # Sum of the throughputs of the cut rays, each averaged over the colour channels.
     not_finite: wp.array(dtype=wp.int32)  # Number of samples that were NaN or infinite; they enter the mean as 0.
+    clamp: float  # Largest radiance of a sample in any channel; brighter samples are scaled down to it. 0: no limit.
+    clamped: wp.array(dtype=wp.float32)  # Sum of the radiance that this took from samples, averaged over the colour channels.
     filter_icdf: wp.array(dtype=wp.float32)  # Inverse cumulative distribution of the pixel filter along x or y, in pixels.
 
 

@@ -83,7 +83,7 @@ def test_a_scene_renders(path: Path) -> None:
     assert film.stats["not_finite"] == 0
     assert np.isfinite(film.pixels).all() and (film.pixels >= 0.0).all()
     assert film.pixels.max() > 0.0
-    visibly_cut = depth_hint(film.stats["visibly_cut"], load(path).settings.max_depth) is not None
+    visibly_cut = depth_hint(film.stats, load(path).settings.max_depth) is not None
     assert visibly_cut == (path.stem in ("frosted", "metallic_roughness"))  # as docs/concepts.md says
 
 

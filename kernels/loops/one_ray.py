@@ -185,7 +185,7 @@ def make_render_kernel(features: Features, structure: Any, camera_kind: Any) -> 
             if tile.threads > 1:
                 tile.samples[tid] = sample
             else:
-                pixel = add_sample(pixel, sample)
+                pixel = add_sample(pixel, sample, film.clamp)
         if tile.threads == 1:
             store_pixel(film, at, pixel)
 
@@ -199,7 +199,7 @@ def add_samples(film: Film, tile: Tile):
     at = (tile.y + tid / tile.width - film.y) * film.columns + tile.x + tid % tile.width - film.x
     pixel = load_pixel(film, at)
     for i in range(tile.n_samples):
-        pixel = add_sample(pixel, tile.samples[tid * tile.n_samples + i])
+        pixel = add_sample(pixel, tile.samples[tid * tile.n_samples + i], film.clamp)
     store_pixel(film, at, pixel)
 
 

@@ -108,13 +108,13 @@ def add_to_film(wave: Wave, film: Film):
     for p in range(task.pixels):
         wave.pixels.film_index[p] = film_index(task, wave.pixels.order[p], film.x, film.y, film.columns)
     p = int(0)
-    while p + LANES <= task.pixels:
+    while p + LANES <= task.pixels and film.clamp == 0.0:  # The vectorised code clamps nothing.
         add_to_pixels(film, wave.pixels.film_index, wave.samples.total, p, task.samples)
         p += LANES
     while p < task.pixels:
         pixel = load_pixel(film, wave.pixels.film_index[p])
         for j in range(task.samples):
-            pixel = add_sample(pixel, wave.samples.total[p * task.samples + j])
+            pixel = add_sample(pixel, wave.samples.total[p * task.samples + j], film.clamp)
         store_pixel(film, wave.pixels.film_index[p], pixel)
         p += 1
 

@@ -6,7 +6,7 @@ import warp as wp
 
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.shading import make_shading
-from wrt.kernels.shade.step import Sample
+from wrt.kernels.shade.step import Sample, mean3
 from wrt.kernels.structs import AovFilm, Film, Hit, Ray, Surfaces
 
 
@@ -22,6 +22,7 @@ class Pixel:
     cut_throughput: int
     lost: float
     not_finite: int
+    clamped: float
 
 
 @wp.func
@@ -35,6 +36,7 @@ def load_pixel(film: Film, i: int) -> Pixel:
     pixel.cut_throughput = film.cut_throughput[i]
     pixel.lost = film.lost[i]
     pixel.not_finite = film.not_finite[i]
+    pixel.clamped = film.clamped[i]
     return pixel
 
 
@@ -48,16 +50,23 @@ def store_pixel(film: Film, i: int, pixel: Pixel):
     film.cut_throughput[i] = pixel.cut_throughput
     film.lost[i] = pixel.lost
     film.not_finite[i] = pixel.not_finite
+    film.clamped[i] = pixel.clamped
 
 
 @wp.func
-def add_sample(before: Pixel, sample: Sample) -> Pixel:
-    """Add a sample to mean and sum of squared deviations (Welford 1962). If its radiance is not finite, count it and add black."""
+def add_sample(before: Pixel, sample: Sample, clamp: float) -> Pixel:
+    """Add a sample to mean and sum of squared deviations (Welford 1962). If its radiance is not finite, count it and add black.
+
+    clamp: Film.clamp."""
     pixel = before
     color = sample.radiance
     if not wp.isfinite(color[0] + color[1] + color[2]):
         pixel.not_finite += 1
         color = wp.vec3(0.0, 0.0, 0.0)
+    largest = wp.max(color)
+    if clamp > 0.0 and largest > clamp:
+        color = (clamp / largest) * color
+        pixel.clamped += mean3(sample.radiance - color)
     pixel.samples += 1
     delta = color - pixel.mean
     pixel.mean = pixel.mean + delta / float(pixel.samples)

@@ -35,7 +35,7 @@ def animate(scene: Path, output: Path, fps: float, assignments: Assignments, qui
     rendering = Options(**options)
     target = animation.check_output(output)
     loaded = load(scene, quiet).with_settings(**settings)
-    pictures, rows, signal, visibly_cut = [], [], None, 0.0
+    pictures, rows, signal, darkest = [], [], None, {"visibly_cut": 0.0}
     begin = time.perf_counter()
     with warnings_reported(quiet), naming(scene):
         for film in animation.animate(loaded, plan, rendering):
@@ -44,7 +44,7 @@ def animate(scene: Path, output: Path, fps: float, assignments: Assignments, qui
                 break
             row = film.stats["frame"] | {"trace": film.stats["seconds"]["trace"]}
             rows.append(row)
-            visibly_cut = max(visibly_cut, film.stats["visibly_cut"])
+            darkest = max(darkest, film.stats, key=lambda stats: stats["visibly_cut"])
             if target.is_dir():
                 film.save(animation.frame_path(target, row["number"], plan.frames))
             else:
@@ -58,7 +58,7 @@ def animate(scene: Path, output: Path, fps: float, assignments: Assignments, qui
         say_json({"output": str(target), "frames": rows, "seconds": time.perf_counter() - begin})
     elif rows:
         say(target, err=False)
-    hint = depth_hint(visibly_cut, loaded.settings.max_depth, "--set max_depth")
+    hint = depth_hint(darkest, loaded.settings.max_depth, "--set max_depth=")
     if hint and not quiet:
         say(hint)
     if len(rows) < plan.frames:

@@ -33,7 +33,6 @@ Decorator: TypeAlias = Callable[[Callable[..., None]], Callable[..., None]]
 Parsed: TypeAlias = Any  # The value of an option, which click has converted to the option's type.
 Assignments: TypeAlias = tuple[tuple[str, bool | int | float | str], ...]  # The names and values of all --set options.
 DIGITS = "[0-9]{1,9}"  # A pixel coordinate. Longer numbers are an error, as Python refuses thousands of digits.
-HINT_SHARE = 0.003  # Smallest share of dark pixels for a hint: 26x26 pixels of 640x360. Fewer look like noise.
 
 
 class PatternType(click.ParamType):
@@ -155,7 +154,7 @@ SHARED: dict[str, Decorator] = {
     "assignments": click.option(
         "--set", "assignments", type=Setting(), multiple=True,
         help="Change a setting of the scene, such as glass_shadows=tinted; repeatable. The settings are size, spp, max_depth,"
-             " min_throughput, filter, fresnel, glass_shadows, sampler, exposure, tonemap and auto_exposure (docs/scene_format.md)"),
+             " min_throughput, clamp, filter, fresnel, glass_shadows, sampler, exposure, tonemap and auto_exposure (docs/scene_format.md)"),
     "seed": click.option("--seed", type=int, default=0, show_default=True, help="Seed of the samples: another seed gives other noise"),
     "device": click.option("--device", default=DEFAULT_DEVICE, show_default=True, help="cpu, cuda:0 ... (`devices` lists them)"),
     "threads": click.option("--threads", type=int, help="Threads on the CPU  [default: all cores]"),
@@ -226,14 +225,16 @@ def settings_of(assignments: Assignments, flags: Mapping[str, Parsed] | None = N
     return cast("SettingChanges", {**flags, **settings})
 
 
-def depth_hint(visibly_cut: float, max_depth: int, option: str = "--max-depth") -> str | None:
-    """Return advice on max_depth, or None if few pixels are visibly too dark. visibly_cut: share of such pixels (Film.stats)."""
+def depth_hint(stats: dict[str, Any], max_depth: int, option: str = "--max-depth ") -> str | None:
+    """Return advice on max_depth, or None if few pixels are visibly too dark. stats: Film.stats."""
+    from wrt.renderer.film_arrays import FEW
     from wrt.scene.settings import MAX_DEPTH
 
-    if visibly_cut < HINT_SHARE:
+    if stats["visibly_cut"] < FEW:
         return None
-    advice = f"raise {option}" if max_depth < MAX_DEPTH else f"{MAX_DEPTH} is the maximum"
-    return f"max_depth {max_depth} leaves {100.0 * visibly_cut:.2g}% of the pixels visibly too dark: {advice}"
+    advice = f"try {option}{stats['needed_depth']}" if max_depth < MAX_DEPTH else f"{MAX_DEPTH} is the maximum"
+    return (f"max_depth {max_depth} leaves {100.0 * stats['visibly_cut']:.2g}% of the pixels visibly too dark; in surroundings of radiance 1,"
+            f" the cut rays would add {stats['lost_by_depth']:.2g} to the picture's mean: {advice}")
 
 
 def device_options(cluster: str | None, device: str) -> dict[str, Parsed]:

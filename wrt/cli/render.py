@@ -57,6 +57,7 @@ WATCH_EVERY = 0.2  # seconds between two looks at a watched file
 @CLUSTER
 @shared("threads", "crop", "camera", "max_depth")
 @click.option("--min-throughput", type=float, help="Cut rays whose throughput is below this  [default: the scene's, or 0.001]")
+@click.option("--clamp", type=float, help="Largest radiance of a sample, against single sparks; the light lost is reported  [default: none]")
 @click.option("--filter", "filter_name", type=OneOf("wrt.scene.settings:FILTERS"), help="Pixel filter  [default: the scene's]")
 @click.option("--fresnel", type=OneOf("wrt.scene.settings:FRESNELS"), help="Fresnel reflectance: exact, or schlick (cheaper, approximate)")
 @click.option("--sampler", type=OneOf("wrt.scene.settings:SAMPLERS"), help="Sample points: sobol (evenly spread), or independent (random)")
@@ -185,7 +186,7 @@ def check_options(output: Path, assignments: Assignments, options: dict[str, Par
 
     flags = {"filter": options.pop("filter_name")}
     flags |= {name: options.pop(name) for name in (
-        "spp", "size", "max_depth", "min_throughput", "fresnel", "sampler", "tonemap", "exposure")}
+        "spp", "size", "max_depth", "min_throughput", "clamp", "fresnel", "sampler", "tonemap", "exposure")}
     if flags["exposure"] == "auto":
         flags |= {"exposure": None, "auto_exposure": True}
     settings = settings_of(assignments, flags)
@@ -221,10 +222,12 @@ def _summary(film: Film, auto_exposure: bool) -> str:
     if film.samples.min() == 0:
         note = f" ({end}: {(film.samples == 0).mean():.0%} of the pixels are still black)"
     black = f"; {s['not_finite']} samples were not finite and count as black" if s["not_finite"] else ""
+    if "clamp" in film.metadata:
+        black += f"; clamp {film.metadata['clamp']:g} took {s['clamped_share']:.2g} of the light"
     if s.get("target_error") is not None:
         note += f", estimated error {s['estimated_error']:.3g}"
         note += "" if s["target_reached"] else f" (above the target of {s['target_error']:g})"
-    hint = depth_hint(s["visibly_cut"], film.metadata["max_depth"])
+    hint = depth_hint(s, film.metadata["max_depth"])
     hint = f"\n{hint}" if hint else ""
     saved = f"\n{s['checkpoint']}: --resume continues from this checkpoint" if s.get("checkpoint") else ""
     resumed = f" ({s['resumed']['seconds']:.2f} before the resume)" if s.get("resumed") else ""

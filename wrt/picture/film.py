@@ -45,7 +45,8 @@ class Film:
     stats
         Counts and times. `stats["seconds"]` has the wall-clock seconds of each stage, also of the runs before a resume: "compile" (runs
         beside "upload" and "build"), "aov" and "trace". "lost_throughput_per_sample" is the radiance that cut rays would have added in
-        surroundings of radiance 1. "visibly_cut" is the share of pixels that lose 5 % or more of their radiance by `max_depth`.
+        surroundings of radiance 1; "lost_by_depth" is the part by `max_depth`. "visibly_cut" is the share of pixels that lose 0.05 or more
+        by `max_depth`, "needed_depth" an estimate of a depth that is enough, "clamped_share" the share of the light that `clamp` took.
     metadata
         Entries that `save` writes into files: scene, spp, seed, seconds, version ...
     exposure, tonemap

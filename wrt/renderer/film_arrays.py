@@ -12,16 +12,18 @@ from wrt.core.device import upload
 from wrt.core.types import Device, WarpArray
 from wrt.kernels import structs
 from wrt.renderer.features import filter_icdf
-from wrt.scene.settings import Settings
+from wrt.scene.settings import MAX_DEPTH, Settings
 
 # Number of groups with a target error; each is an independent sequence. Eight groups estimate a picture's error no better than four. They
 # have up to 1.4 times the error of four, because longer sequences converge faster.
 GROUPS = 4
 # Bytes per pixel: a film with one group and the picture written from it; each further group; AOVs.
-BYTES_OF_FILM, BYTES_OF_GROUP, BYTES_OF_AOVS = 132, 20, 36
+BYTES_OF_FILM, BYTES_OF_GROUP, BYTES_OF_AOVS = 136, 20, 36
 OF_A_GROUP = {"mean": wp.vec3, "samples": wp.int32, "lost": wp.float32}
+FEW = 0.003  # Share of the pixels that is too small to be noticed if they are too dark: 26x26 pixels of 640x360. Fewer look like noise.
 VISIBLE = 0.05  # Smallest difference, as a share of the surrounding brightness, that people see in a detail of a few pixels.
-SHARED = {"m2": wp.vec3, "rays": wp.int64, "cut_depth": wp.int32, "cut_throughput": wp.int32, "not_finite": wp.int32}
+SHARED = {"m2": wp.vec3, "rays": wp.int64, "cut_depth": wp.int32, "cut_throughput": wp.int32, "not_finite": wp.int32,
+          "clamped": wp.float32}
 OF_AOVS = {"depth": wp.float32, "normal": wp.vec3, "albedo": wp.vec3, "prim_id": wp.int32, "material_id": wp.int32}
 
 
@@ -46,6 +48,7 @@ class DeviceFilm:
             film = structs.Film()
             film.width, film.height = settings.size
             film.x, film.y, film.columns = x0, y0, x1 - x0
+            film.clamp = settings.clamp
             for name, array in {**shared, **own}.items():
                 setattr(film, name, array)
             self.groups.append(film)
@@ -87,16 +90,20 @@ class DeviceFilm:
         """Return the sum of the throughputs of all cut rays, over all samples and pixels."""
         return sum(float(self.picture(film.lost).sum(dtype=np.float64)) for film in self.groups)
 
-    def visibly_cut(self, most_by_throughput: float) -> float:
-        """Return a lower bound of the share of pixels that are visibly too dark because of max_depth.
+    def clamped_share(self) -> float:
+        """Return the share of the samples' radiance that Settings.clamp took away."""
+        clamped = float(self.view(self.groups[0].clamped).sum(dtype=np.float64))
+        left = sum(float((self.view(film.mean).mean(axis=2, dtype=np.float64) * self.view(film.samples)).sum()) for film in self.groups)
+        return clamped / (left + clamped) if clamped > 0.0 else 0.0
 
-        Visibly too dark: in surroundings of radiance 1, the rays cut by max_depth would have added more than VISIBLE to the pixel.
+    def lost_by_depth(self, most_by_throughput: float) -> np.ndarray:
+        """Return lower bounds of what rays cut by max_depth would have added to the pixels in surroundings of radiance 1, (H, W) float64.
 
         most_by_throughput: upper bound of the throughput of one ray cut by min_throughput, which `lost` contains, too."""
         film = self.groups[0]
         lost = sum((self.view(group.lost) for group in self.groups[1:]), self.view(film.lost))
         by_depth = np.where(self.view(film.cut_depth) > 0, lost - most_by_throughput * self.view(film.cut_throughput), 0.0)
-        return float((by_depth > VISIBLE * self.samples()).mean())
+        return np.asarray(np.maximum(by_depth, 0.0) / np.maximum(self.samples(), 1))
 
     def samples(self) -> np.ndarray:
         """Return the number of samples of each pixel, summed over the groups, (H, W) int32."""
@@ -127,6 +134,17 @@ class DeviceFilm:
             mean = sum(self.picture(film.mean) / np.float64(n) for film in self.groups)
             variance = sum((self.picture(film.mean) - mean) ** 2 for film in self.groups) / (n * (n - 1.0))
         return np.asarray(mean), np.where(self.samples()[..., None] > 0, variance, np.inf)
+
+
+def needed_depth(lost: np.ndarray, max_depth: int) -> int:
+    """Estimate the least max_depth that leaves at most FEW of the pixels with a loss over VISIBLE.
+
+    lost: result of DeviceFilm.lost_by_depth for a picture of `max_depth` bounces. The estimate assumes that each further bounce reduces
+    a pixel's loss by the same factor as the mean bounce so far: lost ** (1 / (max_depth + 1)). The result is at most MAX_DEPTH."""
+    factor = float(np.quantile(lost, 1.0 - FEW, method="higher")) ** (1.0 / (max_depth + 1))
+    if factor >= VISIBLE ** (1.0 / (MAX_DEPTH + 1)):
+        return MAX_DEPTH
+    return max(max_depth, math.ceil(math.log(VISIBLE, factor) - 1.0 - 1e-9)) if factor > 0.0 else max_depth
 
 
 class AovFilm:

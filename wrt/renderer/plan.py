@@ -27,7 +27,7 @@ from wrt.scene.model import Scene
 from wrt.scene.settings import SettingChanges, Settings
 
 # Settings that the kernels do not depend on.
-AIMED = ("size", "spp", "max_depth", "min_throughput", "exposure", "tonemap", "auto_exposure")
+AIMED = ("size", "spp", "max_depth", "min_throughput", "clamp", "exposure", "tonemap", "auto_exposure")
 
 
 @made_once

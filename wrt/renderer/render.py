@@ -28,7 +28,7 @@ def render(scene: Scene | Mesh | str | os.PathLike[str], **options: Unpack[Rende
     ----------
     scene
         A Scene, a Mesh, or the path of a scene or mesh file. `load_scene` says how a Mesh or a path becomes a scene.
-    size, spp, max_depth, min_throughput, filter, fresnel, glass_shadows, sampler, exposure, tonemap, auto_exposure
+    size, spp, max_depth, min_throughput, clamp, filter, fresnel, glass_shadows, sampler, exposure, tonemap, auto_exposure
         Replace the scene's setting of the same name; see Settings. None keeps it. A `size` may also be a width,
         which keeps the aspect ratio, or text such as "640x360".
     seed

@@ -28,6 +28,9 @@ class Settings:
         Bounces after the first hit; 0 is direct light alone. None: 64 if light passes through a material of the scene, else 8.
     min_throughput
         A ray ends if the largest channel of its throughput would fall below this value.
+    clamp
+        Largest radiance of a sample: brighter ones are scaled down, so that single sparks vanish. The picture gets darker by
+        `stats["clamped_share"]`. 0: no limit.
     filter
         Pixel filter: "box", "gaussian" or "blackman-harris".
     fresnel
@@ -54,6 +57,8 @@ class Settings:
         "whole", f"bounces after the first hit (default: {GLASS_DEPTH} if light passes through a material, else {DEPTH})", ge=0,
         le=MAX_DEPTH))
     min_throughput: float = field(default=1e-3, metadata=given("number", "a ray ends below this throughput", ge=0.0, le=1.0))
+    clamp: float = field(default=0.0, metadata=given(
+        "number", "largest radiance of a sample, brighter ones are scaled down to it; 0: no limit", "radiance", ge=0.0, le=1e18))
     filter: str = field(default="blackman-harris", metadata=given("choice", "pixel filter", among=FILTERS))
     fresnel: str = field(default="exact", metadata=given("choice", "Fresnel term of dielectrics", among=FRESNELS))
     glass_shadows: str = field(default="opaque", metadata=given(
@@ -79,6 +84,7 @@ class SettingChanges(TypedDict, total=False):
     spp: int | None
     max_depth: int | None
     min_throughput: float | None
+    clamp: float | None
     filter: str | None
     fresnel: str | None
     glass_shadows: str | None

@@ -20,11 +20,10 @@ import wrt
 from tests.command_line import BOX_OBJ, Result
 from tests.command_line import wrt as run
 from tests.data import ROOT
-from wrt.cli import common as cli_common
 from wrt.cli.common import ACCEL, depth_hint
 from wrt.cli.main import cli
 from wrt.picture.image import read_image
-from wrt.renderer.film_arrays import GROUPS, VISIBLE
+from wrt.renderer.film_arrays import FEW, GROUPS, VISIBLE
 from wrt.scene.backgrounds import ConstantBackground
 from wrt.scene.cameras import Camera
 from wrt.scene.materials import Material
@@ -263,10 +262,27 @@ def test_glass_without_a_given_depth_is_followed_through_all_its_surfaces(pane: 
     assert mirrors(0.5).settings.max_depth == DEPTH == replace(scene, objects=(), settings=Settings()).settings.max_depth
 
 
+@pytest.mark.parametrize(("albedo", "needed"), [(0.5, 4), (0.9, 28), (1.0, MAX_DEPTH)])
+def test_the_needed_depth_between_two_mirrors(albedo: float, needed: int) -> None:
+    # After n bounces the share albedo^n of the light is left: below VISIBLE after needed + 1 bounces.
+    mirror = Material("mirror", albedo=(albedo,) * 3)
+    walls = tuple(Object(quad((-1e4, -1e4, z), (2e4, 0, 0), (0, 2e4, 0)), (mirror,)) for z in (-1.0, 1.0))
+    scene = Scene(walls, background=ConstantBackground((1, 1, 1)), cameras=(Camera.look_at((0, 0, 0), (0, 0, 1), fov_y=0.1),),
+                  settings=Settings(size=(8, 6), spp=1, filter="box"))
+    for depth in (1, 2, 3):
+        stats = wrt.render(scene, max_depth=depth).stats
+        assert stats["visibly_cut"] == 1.0 and stats["needed_depth"] == needed
+        assert stats["lost_by_depth"] == pytest.approx(albedo ** (depth + 1), rel=1e-5)
+    enough = wrt.render(scene, max_depth=needed).stats
+    assert enough["visibly_cut"] == (albedo == 1.0) and enough["needed_depth"] == needed
+
+
 def test_the_hint_names_the_value_and_what_to_do() -> None:
-    assert depth_hint(0.0, 8) is None and depth_hint(0.9 * cli_common.HINT_SHARE, 8) is None
-    assert depth_hint(0.032, 8) == "max_depth 8 leaves 3.2% of the pixels visibly too dark: raise --max-depth"
-    assert depth_hint(0.25, MAX_DEPTH) == "max_depth 64 leaves 25% of the pixels visibly too dark: 64 is the maximum"
+    stats = {"visibly_cut": 0.032, "lost_by_depth": 0.00721, "needed_depth": 20}
+    assert depth_hint(stats | {"visibly_cut": 0.0}, 8) is None and depth_hint(stats | {"visibly_cut": 0.9 * FEW}, 8) is None
+    begin, middle = "max_depth 8 leaves 3.2% of the pixels visibly too dark", "in surroundings of radiance 1, the cut rays would add 0.0072"
+    assert depth_hint(stats, 8) == f"{begin}; {middle} to the picture's mean: try --max-depth 20"
+    assert depth_hint(stats, MAX_DEPTH).endswith("to the picture's mean: 64 is the maximum")
 
 
 def hints(result: Result) -> list[str]:
@@ -278,7 +294,7 @@ def test_the_command_line_tells_what_was_cut() -> None:
     with_settings("max_depth = 1")
     small = ("--size", "32x18", "--spp", "4")
     told, = hints(run("render", "scene.toml", *small))
-    assert re.fullmatch(r"max_depth 1 leaves [0-9.]+% of the pixels visibly too dark: raise --max-depth", told)
+    assert re.fullmatch(r"max_depth 1 leaves [0-9.]+% of the pixels visibly too dark; .*: try --max-depth [0-9]+", told)
     assert not hints(run("render", "scene.toml", *small, "-q"))
     assert not hints(run("render", "scene.toml", *small, "--max-depth", 20))
     assert 0.0 < json.loads(run("render", "scene.toml", *small, "--json").out)["visibly_cut"] < 0.5
