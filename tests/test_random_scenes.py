@@ -13,7 +13,7 @@ from wrt.scene.kinds import FORMS, forms
 from wrt.scene.settings import Settings
 
 # Together these groups use every feature. If a new feature is in none of them, choose other groups.
-GROUPS = 15, 28, 45, 140, 146
+GROUPS = 95, 118, 137, 144
 SCENES = 25  # in each group
 
 

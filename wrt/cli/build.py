@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import click
@@ -9,6 +10,8 @@ import click
 from wrt.cli.common import Assignments, Setting, progress_writer, say, say_json, shared, values_of, warnings_reported
 from wrt.core.errors import InputError
 from wrt.io.meshes import SUFFIXES
+
+SLOW = 1.0  # seconds after which a build reports its progress
 
 
 @click.command(help=f"Build an acceleration structure over MESH ({SUFFIXES}) and save it to a file, which wrt.load_accel reads.")
@@ -22,16 +25,18 @@ def build(mesh: Path, output: Path, accel: str, assignments: Assignments, thread
 
     import wrt
     from wrt.accel.instances import Instances
-    from wrt.accel.scenes.build import reports_progress
     from wrt.accel.store import check_target
 
     check_target(output)
     options = values_of(assignments, mesh="MESH", accel="--accel", device="the CPU", threads="--threads", progress="-q")
-    if reports_progress(accel):
-        write = progress_writer(quiet)
-        options["progress"] = lambda done: write(f"{accel}: {100.0 * done:.0f} % built")
+    write, begin = progress_writer(quiet), time.monotonic()
+
+    def progress(done: float) -> None:
+        if time.monotonic() - begin > SLOW:
+            write(f"{accel}: {100.0 * done:.0f} % built")
+
     with warnings_reported(quiet):
-        structure = wrt.build(mesh, accel, threads=threads, **options)
+        structure = wrt.build(mesh, accel, threads=threads, progress=progress, **options)
     if isinstance(structure, Instances):
         raise InputError("a scene with instances has no structure in a file", path=mesh)
     structure.save(output)

@@ -233,8 +233,8 @@ def depth_hint(stats: dict[str, Any], max_depth: int, option: str = "--max-depth
     if stats["visibly_cut"] < FEW:
         return None
     advice = f"try {option}{stats['needed_depth']}" if max_depth < MAX_DEPTH else f"{MAX_DEPTH} is the maximum"
-    return (f"max_depth {max_depth} leaves {100.0 * stats['visibly_cut']:.2g}% of the pixels visibly too dark; in surroundings of radiance 1,"
-            f" the cut rays would add {stats['lost_by_depth']:.2g} to the picture's mean: {advice}")
+    return (f"max_depth {max_depth} leaves {100.0 * stats['visibly_cut']:.2g}% of the pixels visibly too dark; in surroundings of"
+            f" radiance 1, the cut rays would add {stats['lost_by_depth']:.2g} to the picture's mean: {advice}")
 
 
 def device_options(cluster: str | None, device: str) -> dict[str, Parsed]:

@@ -14,7 +14,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from wrt.accel.queries.accelerator import Accelerator
-from wrt.accel.scenes.build import build, reports_progress
+from wrt.accel.scenes.build import build
 from wrt.core.compiling import WATCH
 from wrt.core.device import load_kernel
 from wrt.core.threads import FreeList, Pool, thread_count
@@ -181,7 +181,6 @@ class _Preparation:
         self.arrays = upload_scene(self.plan.scene, self.device, self.plan.meshes)
         uploaded = time.perf_counter()
         chosen: dict[str, Any] = {"triangle": options.triangle, "box": options.box, **options.accel_options}
-        if reports_progress(self.plan.accel):
-            chosen = {"progress": partial(setattr, self, "fraction_built"), **chosen}
-        self.accel = build(self.arrays.world.geometry, self.plan.accel, options.device, self.threads, **chosen)
+        self.accel = build(self.arrays.world.geometry, self.plan.accel, options.device, self.threads,
+                           progress=partial(setattr, self, "fraction_built"), **chosen)
         self.seconds |= {"upload": uploaded - begin, "build": time.perf_counter() - uploaded}

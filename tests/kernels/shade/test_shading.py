@@ -47,7 +47,7 @@ def test_channels_go_to_numbers_of_texels_that_follow_one_another() -> None:
 @pytest.mark.parametrize("name", SLOTS)
 def test_a_scene_has_the_switch_of_each_texture_that_is_read(name: str) -> None:
     for kind in MATERIALS:
-        material = Material(kind, **{name: PICTURE})
+        material = Material(kind, clearcoat=1.0, **{name: PICTURE})
         scene = Scene(objects=(Object(quad((0, 0, 0), (1, 0, 0), (0, 1, 0)), (material,)),))
         found = textures_of(features_of(scene, Camera()))
         assert (name in found) == material.reads(name) or TEXTURES[name].feature == ""
@@ -55,7 +55,7 @@ def test_a_scene_has_the_switch_of_each_texture_that_is_read(name: str) -> None:
     assert textures_of(Features()) == {}
 
 
-resolve = make_resolve(Features(textures=True, parameter_textures=True, normal_maps=True))
+resolve = make_resolve(Features(textures=True, parameter_textures=True, normal_maps=True, specular=True, clearcoat=True))
 
 
 @kernel

@@ -20,6 +20,7 @@ from wrt.accel.bvh.tree import binary_tree_of
 from wrt.accel.bvh.wide_tree import COLLAPSE, WideTree, check_wide, collapse, lanes_of, packed, refit, row_starts, wide_tree_of
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.raw_kernel import launch_raw
+from wrt.core.building import parts, report
 from wrt.core.device import empty_aligned, preloading, record_dtype, start
 from wrt.core.errors import InputError
 from wrt.core.threads import run_all
@@ -31,6 +32,7 @@ from wrt.kernels.wide.stream import BatchTraversal
 from wrt.kernels.wide.traverse import WideTraversal
 
 ROWS_PER_JOB = 4096
+BINARY = 0.8  # share of a build's time after which the binary tree is finished, for large meshes
 ROWS_BY_KERNEL = 1 << 15  # triangles
 
 
@@ -72,6 +74,7 @@ class CollapsedBvh(OneMesh):
         of_binary = replace(options, max_leaf=min(options.max_leaf, self.width), cost_traversal=0.0, cost_intersection=1.0)
         with preloading(*(COLLAPSE if len(self.geometry) > 1 else ()), *kernels):
             binary = build_binary(self.geometry, of_binary, self.threads)
+            report(BINARY)
             if len(binary.order) < 2:
                 return small_tree(*self.geometry.bounds(), options)
             tree = collapse(binary, self.width, options.max_leaf, options.cost_traversal, options.cost_intersection)
@@ -130,7 +133,7 @@ class WideBvh(CollapsedBvh):
         options = BvhOptions(**asdict(options), row=cls.width)
         few = [each for each in structures if options.builder == "refined" and len(each.geometry) <= SMALL]
         trees = dict(zip(map(id, few), small_trees([each.geometry.bounds() for each in few], options), strict=True))
-        return [each._built(trees.get(id(each)), options) for each in structures]
+        return [each._built(trees.get(id(each)), options) for each in parts(structures)]
 
     def _built(self, tree: WideTree | None, options: BvhOptions) -> Built:
         """Return the arrays of a tree. Build the tree if it is None, or too deep."""

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -16,7 +14,7 @@ from wrt.accel.built import Built
 from wrt.accel.cells.common import require_between
 from wrt.accel.geometry import Geometry
 from wrt.accel.store import check_tree
-from wrt.core.checks import shown
+from wrt.core.building import tally
 from wrt.core.device import launch, on_host, records, start, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import run_all
@@ -43,7 +41,7 @@ class BspOptions:
     cost_intersection, cost_axis, cost_plane: SAH cost of a primitive, of a node with an axis-aligned plane, and of any other node, with
     the defaults of the Manta renderer. samples: number of triangles per cell, evenly spread over its list, that propose four planes
     each; 0: a k-d tree. max_depth: 1 to 60; 0: 16 + 2 log2 of the number of primitives. max_growth: limit of references per primitive,
-    1 to 1000. max_triangles: largest number of primitives. progress: called from several threads with the finished fraction.
+    1 to 1000. max_triangles: largest number of primitives.
     """
 
     cost_intersection: float = 75.0
@@ -53,7 +51,6 @@ class BspOptions:
     max_depth: int = 0
     max_growth: float = 16.0
     max_triangles: int = 500_000
-    progress: Callable[[float], None] | None = None
 
     def __post_init__(self) -> None:
         for name in ("cost_intersection", "cost_axis", "cost_plane"):
@@ -61,12 +58,6 @@ class BspOptions:
                 raise InputError(f"must be above 0 and finite, got {value}", argument=name)
         require_between(samples=(self.samples, 0, 1 << 30), max_depth=(self.max_depth, 0, MAX_DEPTH),
                         max_growth=(self.max_growth, 1.0, 1000.0))
-        if self.progress is not None and not callable(self.progress):
-            raise InputError(f"must be a function of one number, got {shown(self.progress)}", argument="progress")
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Pickle without `progress`, which is a function of this process."""
-        return {**self.__dict__, "progress": None}
 
     def on_device(self, lo: np.ndarray, hi: np.ndarray, n: int) -> WarpStruct:
         """Convert the options for kernels. n: number of primitives; lo, hi: their boxes, (n, 3)."""
@@ -97,9 +88,7 @@ class Bsp(OneMesh):
                           "extent": np.zeros(1, np.float32), "first": np.zeros(1, np.int32), "count": np.zeros(1, np.int32)},
                          np.zeros(0, np.int32), sah_cost=0.0)
         lo, hi = (bound.astype(np.float64) for bound in self.geometry.bounds())
-        builder = Builder(self.geometry, options.on_device(lo, hi, n), self.threads, int(options.max_growth * n),
-                          options.progress or (lambda done: None))
-        return builder.build()
+        return Builder(self.geometry, options.on_device(lo, hi, n), self.threads, int(options.max_growth * n)).build()
 
     def _check(self, built: Built) -> None:
         if any(built.arrays[name].size != size for name, size in (("lo", 3), ("hi", 3), ("extent", 1), ("first", 1), ("count", 1))):
@@ -158,15 +147,14 @@ class Subtree:
 class Builder:
     """Builds the top of the tree in one launch, and then the subtrees below on all threads, the largest first."""
 
-    def __init__(self, geometry: Geometry, options: WarpStruct, threads: int, budget: int, progress: Callable[[float], None]) -> None:
-        self.options, self.threads, self.budget, self.progress = options, threads, budget, progress
+    def __init__(self, geometry: Geometry, options: WarpStruct, threads: int, budget: int) -> None:
+        self.options, self.threads, self.budget = options, threads, budget
         self.source, corners = start_pieces(geometry)
         lo, hi = geometry.bounds()
         with np.errstate(over="ignore"):
             self.extent = np.nextafter((hi - lo).max(), np.float32(np.inf)).reshape(1)
         self.n = len(geometry)
         self.corners = upload(corners, wp.vec3d, start("cpu"))
-        self.done = 0
 
     def launch(self, source: WarpStruct, tasks: WarpArray, cells: WarpStruct, which: int, n: int, keep: int) -> Launch:
         """Launch, and double the memory until it suffices. keep: cells of at most `keep` pieces become tasks of later launches; 0: none."""
@@ -189,15 +177,13 @@ class Builder:
         tasks = on_host(top.output.deferred)[: top.results[build_bsp.N_DEFERRED]]
         size = tasks["end"] - tasks["begin"]
         subtrees: list[Subtree | None] = [None] * len(tasks)
+        finished = tally(int(size.sum()))
 
         def job(i: int) -> None:
             subtrees[i] = Subtree(self.launch(top.tools.pieces, top.output.deferred, top.output.deferred_cells, i, int(size[i]), 0))
-            self.done += int(size[i])
-            self.progress(self.done / max(int(size.sum()), 1))
+            finished(int(size[i]))
 
         run_all([partial(job, int(i)) for i in np.argsort(-size, kind="stable")], self.threads)
-        if not len(tasks):
-            self.progress(1.0)
         return self.join(top, [subtree for subtree in subtrees if subtree is not None])
 
     def join(self, top: Launch, subtrees: list[Subtree]) -> Built:

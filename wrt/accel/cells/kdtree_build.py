@@ -12,6 +12,7 @@ import warp as wp
 from wrt.accel.built import Built
 from wrt.accel.cells.common import require_between
 from wrt.accel.geometry import Geometry
+from wrt.core.building import tally
 from wrt.core.checks import shown
 from wrt.core.device import launch, load_kernel, on_host, records, start, upload
 from wrt.core.errors import InputError
@@ -202,9 +203,11 @@ def build_subtrees(tasks: list[Cell], shapes: WarpStruct, options: KdOptions, th
     chosen.max_depth = options.depth(shapes.exact.shape[0])
     load_kernel(kernels.build_subtree, start("cpu"))
     parts: list[Any] = [None] * len(tasks)
+    finished = tally(sum(len(task.prim_id) for task in tasks))
 
     def job(i: int) -> None:
         parts[i] = build_subtree(tasks[i], shapes, chosen)
+        finished(len(tasks[i].prim_id))
 
     # The largest cells come first, so that all threads end at about the same time.
     run_all([partial(job, i) for i in sorted(range(len(tasks)), key=lambda i: -len(tasks[i].prim_id))], threads)

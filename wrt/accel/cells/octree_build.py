@@ -11,6 +11,7 @@ from wrt.accel.built import Built
 from wrt.accel.bvh.tree import half_areas
 from wrt.accel.cells.common import cell_source, require_between, triangle_reach
 from wrt.accel.geometry import Geometry
+from wrt.core.building import report
 from wrt.core.device import launch, records, start, upload
 from wrt.core.types import WarpArray, WarpStruct
 from wrt.kernels.build import octree as build_octree
@@ -124,6 +125,7 @@ def build_tree(geometry: Geometry, options: OctreeOptions, threads: int) -> Buil
         references.append(leaves.references)
         n_references += len(leaves.references)
         cells = children
+        report(len(levels) / (layout.levels + 1))
     nodes = np.concatenate(levels)
     pad, extent = triangle_reach(geometry, *bounds)
     return Built({"lo": np.array(layout.lo), "hi": np.array(layout.hi), "size": np.array(layout.size, np.float32),

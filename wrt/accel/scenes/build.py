@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict, TypeVar, Unpack, overload
 
@@ -19,9 +21,9 @@ from wrt.accel.scenes.flatten import flatten
 from wrt.accel.scenes.instancing import instanced_meshes
 from wrt.accel.scenes.worlds import worlds_over
 from wrt.accel.store import read
-from wrt.accel.structure import default_options
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.arrays import from_tensor, is_tensor, to_numpy
+from wrt.core.building import reported_to
 from wrt.core.checks import as_one, shown
 from wrt.core.default_device import DEFAULT_DEVICE
 from wrt.core.errors import InputError
@@ -65,7 +67,6 @@ class BuildOptions(TypedDict, total=False):
     cost_plane: float
     samples: int
     max_triangles: int
-    progress: Callable[[float], None] | None
     max_depth: int | None  # kdtree, octree, bsp
     max_growth: float
     by_cost: bool  # kdtree, octree
@@ -76,61 +77,57 @@ class BuildOptions(TypedDict, total=False):
     mailbox: bool  # grid, octree
 
 
-def reports_progress(accel: str) -> bool:
-    """Return whether the structure has the option `progress`, because its build is slow."""
-    return accel in ACCELERATORS and "progress" in default_options(accel)
-
-
 @overload
 def build(mesh: list[WorldT], accel: str = ..., device: str = ..., threads: int | None = ..., *, movable: bool = ...,
-          **options: Unpack[BuildOptions]) -> Instances: ...
+          progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Instances: ...
 @overload
 def build(mesh: MeshLike, accel: str = ..., device: str = ..., threads: int | None = ..., *, movable: Literal[True],
-          **options: Unpack[BuildOptions]) -> Instances: ...
+          progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Instances: ...
 @overload
 def build(mesh: OneMeshLike, accel: Literal["bvh", "bvh8"] = ..., device: str = ..., threads: int | None = ...,
-          **options: Unpack[BuildOptions]) -> Bvh8: ...
+          *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bvh8: ...
 @overload
 def build(mesh: OneMeshLike, accel: Literal["bvh4"], device: str = ..., threads: int | None = ...,
-          **options: Unpack[BuildOptions]) -> Bvh4: ...
+          *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bvh4: ...
 @overload
 def build(mesh: OneMeshLike, accel: Literal["bvh6"], device: str = ..., threads: int | None = ...,
-          **options: Unpack[BuildOptions]) -> Bvh6: ...
+          *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bvh6: ...
 @overload
 def build(mesh: OneMeshLike, accel: Literal["bvh8c"], device: str = ..., threads: int | None = ...,
-          **options: Unpack[BuildOptions]) -> Bvh8c: ...
+          *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bvh8c: ...
 @overload
 def build(mesh: OneMeshLike, accel: Literal["bvh2"], device: str = ..., threads: int | None = ...,
-          **options: Unpack[BuildOptions]) -> Bvh2: ...
+          *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bvh2: ...
 @overload
 def build(mesh: OneMeshLike, accel: Literal["bvh2_sphere"], device: str = ..., threads: int | None = ...,
-          **options: Unpack[BuildOptions]) -> Bvh2Sphere: ...
+          *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bvh2Sphere: ...
 @overload
 def build(mesh: OneMeshLike, accel: Literal["bvh2_kdop"], device: str = ..., threads: int | None = ...,
-          **options: Unpack[BuildOptions]) -> Bvh2Kdop: ...
+          *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bvh2Kdop: ...
 @overload
 def build(mesh: OneMeshLike, accel: Literal["kdtree"], device: str = ..., threads: int | None = ...,
-          **options: Unpack[BuildOptions]) -> KdTree: ...
+          *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> KdTree: ...
 @overload
 def build(mesh: OneMeshLike, accel: Literal["bsp"], device: str = ..., threads: int | None = ...,
-          **options: Unpack[BuildOptions]) -> Bsp: ...
+          *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bsp: ...
 @overload
 def build(mesh: OneMeshLike, accel: Literal["brute_force"], device: str = ..., threads: int | None = ...,
-          **options: Unpack[BuildOptions]) -> BruteForce: ...
+          *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> BruteForce: ...
 @overload
 def build(mesh: OneMeshLike, accel: Literal["grid"], device: str = ..., threads: int | None = ...,
-          **options: Unpack[BuildOptions]) -> Grid: ...
+          *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Grid: ...
 @overload
 def build(mesh: OneMeshLike, accel: Literal["octree"], device: str = ..., threads: int | None = ...,
-          **options: Unpack[BuildOptions]) -> Octree: ...
+          *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Octree: ...
 @overload
 def build(mesh: OneMeshLike, accel: str, device: str = ..., threads: int | None = ...,
-          **options: Unpack[BuildOptions]) -> OneMesh: ...
+          *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> OneMesh: ...
 @overload
 def build(mesh: SceneLike, accel: str = ..., device: str = ..., threads: int | None = ..., *, movable: bool = ...,
-          **options: Unpack[BuildOptions]) -> OneMesh | Instances: ...
+          progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> OneMesh | Instances: ...
 def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = DEFAULT_DEVICE, threads: int | None = None, *,
-          movable: bool = False, **options: Unpack[BuildOptions]) -> OneMesh | Instances:
+          movable: bool = False, progress: Callable[[float], None] | None = None,
+          **options: Unpack[BuildOptions]) -> OneMesh | Instances:
     """Build an acceleration structure over a mesh, a scene or several worlds.
 
     In a scene, prim_ids number the faces of all objects in order, then the spheres. A mesh that several objects share is stored once
@@ -149,6 +146,8 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = DEFAULT_
         Threads that build and refit; one per core by default.
     movable : bool
         Make each object of the scene, or the mesh, an instance that `Instances.move` moves. Not for scenes with spheres.
+    progress : function, optional
+        Function that is called with the finished share of the build, 0 to 1, perhaps from several threads.
     **options
         Intersection tests `triangle` and `box`, and the options of the structure (`BuildOptions`).
 
@@ -170,9 +169,12 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = DEFAULT_
     flat = (worlds_over([to_mesh_or_scene(each) for each in mesh]) if isinstance(mesh, list)
              else None if isinstance(mesh, Geometry | InstancedGeometry) else to_flat_scene(mesh))  # a geometry has no attributes
     geometry = mesh if flat is None else flat.geometry
-    if isinstance(geometry, InstancedGeometry):
-        return Instances(kind, geometry, flat, device=device, threads=threads, **options)
-    return kind(geometry, flat, device=device, threads=threads, **options)
+    structure: type[Any] | partial[Any] = partial(Instances, kind) if isinstance(geometry, InstancedGeometry) else kind
+    if not (progress is None or callable(progress)):
+        raise InputError(f"must be a function of one number, got {shown(progress)}", argument="progress")
+    with nullcontext() if progress is None else reported_to(progress):
+        built: OneMesh | Instances = structure(geometry, flat, device=device, threads=threads, **options)
+    return built
 
 
 @overload

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -158,8 +159,8 @@ def profile(scene: Scene | Mesh | PathLike, **options: Unpack[ProfileOptions]) -
     scene : Scene, Mesh or path
         As for `wrt.render`.
     **options
-        Settings and options of `wrt.render`, listed in `ProfileOptions`. The default of `spp` is 1, not the scene's value.
-        `progress` counts the samples of three passes over the picture.
+        Settings and options of `wrt.render`, listed in `ProfileOptions`. The default of `spp` is the value of a Scene or a TOML
+        file, else 1. `progress` counts the samples of three passes over the picture.
 
     Returns
     -------
@@ -172,10 +173,13 @@ def profile(scene: Scene | Mesh | PathLike, **options: Unpack[ProfileOptions]) -
     """
     others: dict[str, Any] = {**options}
     settings = {name: others.pop(name) for name in SETTINGS if name in others}
-    settings = {"spp": 1, **{name: value for name, value in settings.items() if value is not None}}
     for name in others:
         if name not in ProfileOptions.__optional_keys__:
             raise InputError("is not an argument of wrt.profile", argument=name)
+    if not isinstance(scene, Scene | Mesh) and os.fspath(scene).endswith(".toml"):
+        scene = as_scene(scene)
+    if settings.get("spp") is None and not isinstance(scene, Scene):
+        settings["spp"] = 1
     return Profiler(as_scene(scene).with_settings(**settings), Options(**{"tile_size": TILE_SIZE, **others})).measure()
 
 

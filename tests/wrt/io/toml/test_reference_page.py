@@ -20,9 +20,10 @@ from wrt.io.toml.report import check
 PAGE = ROOT / "docs" / "scene_format.md"
 # Numbers without a unit: shares, counts, factors, directions of any length, indices of refraction.
 NO_UNIT = {
-    "albedo", "alpha", "alpha_cutoff", "axis", "blades", "color_a", "color_b", "count", "direction", "eta", "exponent",
-    "f_number", "first", "ior", "k", "matrix", "max_depth", "metallic", "min_throughput", "normal_scale", "offset", "roughness",
-    "scale", "segments", "sides", "specular", "spp", "subdivisions", "transmission", "tube_segments", "up"}
+    "albedo", "alpha", "alpha_cutoff", "axis", "blades", "clearcoat", "clearcoat_roughness", "color_a", "color_b", "count", "direction",
+    "eta", "exponent", "f_number", "first", "ior", "k", "matrix", "max_depth", "metallic", "min_throughput", "normal_scale", "offset",
+    "roughness", "scale", "segments", "sides", "specular", "specular_color", "specular_factor", "spp", "subdivisions", "transmission",
+    "tube_segments", "up"}
 
 
 def tables() -> dict[str, Any]:

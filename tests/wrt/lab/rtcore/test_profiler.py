@@ -25,6 +25,7 @@ from wrt.renderer.features import features_of
 from wrt.renderer.options import Progress
 from wrt.renderer.plan import render_kernel
 from wrt.scene.model import Scene
+from wrt.scene.shapes import box
 
 # Left, a matte wall under one lamp; right, two mirrors that face each other with the camera between them.
 MIRRORS = """
@@ -128,10 +129,13 @@ def test_a_crop_is_a_part(scene: Scene, measured: Profile) -> None:
         np.testing.assert_array_equal(picture, measured.maps[name][2:7, 6:12])
 
 
-def test_one_sample_is_taken_where_none_is_asked_for_and_progress_ends_at_all_samples(scene: Scene) -> None:
+def test_a_scene_has_its_own_samples_a_mesh_one_and_progress_ends_at_all_samples(scene: Scene, tmp_path: Path) -> None:
     told: list[Progress] = []
-    found = profile(scene, tile_size=5, progress=told.append)
-    assert found.spp == 1 and scene.settings.spp > 1
+    found = profile(scene.with_settings(spp=2), tile_size=5, progress=told.append)
+    assert found.spp == 2
+    (tmp_path / "mirrors.toml").write_text(MIRRORS.replace("[settings]", "[settings]\nspp = 3"))
+    box().save(tmp_path / "box.obj")
+    assert [profile(path, size=8).spp for path in (tmp_path / "mirrors.toml", tmp_path / "box.obj", box())] == [3, 1, 1]
     assert [each.done for each in told] == sorted({each.done for each in told}) and len(told) > 2
     assert told[-1].done == told[-1].total == 3 * found.size[0] * found.size[1] and told[-1].rays == 3 * len(found.rays)
 

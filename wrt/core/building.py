@@ -1,0 +1,54 @@
+"""Progress of a build: builders report the finished share to the function that the caller of `wrt.build` gave."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import TypeVar
+
+T = TypeVar("T")
+_report: ContextVar[Callable[[float], None]] = ContextVar("report", default=lambda done: None)
+
+
+@contextmanager
+def reported_to(progress: Callable[[float], None]) -> Iterator[None]:
+    """Call `progress` with 0 at the begin of the block, with 1 at its end, and between with what builders in this thread report."""
+    token = _report.set(progress)
+    try:
+        progress(0.0)
+        yield
+        progress(1.0)
+    finally:
+        _report.reset(token)
+
+
+def report(done: float) -> None:
+    """Report that the share `done`, 0 to 1, of the build is finished."""
+    _report.get()(done)
+
+
+def parts(items: Sequence[T]) -> Iterator[T]:
+    """Yield the items one after another. What builders report meanwhile is the share of one item, and not of the whole build."""
+    whole = _report.get()
+    for i, item in enumerate(items):
+        token = _report.set(lambda done, i=i: whole((i + done) / len(items)))  # type: ignore[misc]
+        try:
+            yield item
+        finally:
+            _report.reset(token)
+        whole((i + 1) / len(items))
+
+
+def tally(total: int) -> Callable[[int], None]:
+    """Return a function for any thread that adds finished work, and reports its share of `total`."""
+    whole, lock, done = _report.get(), threading.Lock(), 0
+
+    def add(size: int) -> None:
+        nonlocal done
+        with lock:
+            done += size
+            whole(done / max(total, 1))
+
+    return add
