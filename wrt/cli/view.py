@@ -46,6 +46,7 @@ def view(scene: Path, place: Place, open_browser: bool, spp: int, assignments: A
     import_websockets()
     listen(place).close()  # raises InputError before the scene is read
     from wrt.lab.costs import CostCounter
+    from wrt.lab.walk.walk import walk
     from wrt.renderer.options import Options
 
     rendering = Options(**options)
@@ -53,7 +54,7 @@ def view(scene: Path, place: Place, open_browser: bool, spp: int, assignments: A
     loaded = load(scene, quiet, staging).with_settings(**settings)
     with naming(scene):
         loaded.camera(options["camera"])  # raises InputError with the file's name
-    page = Page(loaded, rendering, place, spp, counter_of=CostCounter.beside, warn=(lambda text: None) if quiet else say)
+    page = Page(loaded, rendering, place, spp, counter_of=CostCounter.beside, walk_of=walk, warn=(lambda text: None) if quiet else say)
     say(page.url, err=False)
     if not quiet:
         say("Ctrl-C ends the viewer")

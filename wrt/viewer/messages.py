@@ -6,6 +6,7 @@
 | move | kind: one of MOVES; by: three numbers; begin: True for the first move of a gesture |
 | set | name: of a Control; value |
 | click | x, y: place in the picture, 0 to 1 from the top left; sample: index of the sample to inspect |
+| walk | step: index of the step of the clicked ray's walk to show |
 | undo, reset, clear | none: undo or reset the camera, clear the inspected rays |
 """
 
@@ -22,7 +23,7 @@ from wrt.viewer.access import Refused, shown
 
 LARGEST_SIDE = 16384  # pixels of the picture's area
 LONGEST_MOVE = 100.0  # largest absolute value of a number in a move
-LAST_SAMPLE = (1 << 24) - 1
+LAST_SAMPLE = LAST_STEP = (1 << 24) - 1
 MOVES = ("orbit", "pan", "dolly", "walk")
 
 
@@ -66,6 +67,7 @@ FIELDS: Mapping[str, Mapping[str, Callable[[object], bool]]] = {
     "set": {"name": lambda value: isinstance(value, str), "value": lambda value: isinstance(value, bool | int | float | str)},
     "click": {"x": lambda value: is_number(value, 0.0, 1.0), "y": lambda value: is_number(value, 0.0, 1.0),
               "sample": lambda value: _is_whole(value, 0, LAST_SAMPLE)},
+    "walk": {"step": lambda value: _is_whole(value, 0, LAST_STEP)},
     "undo": {}, "reset": {}, "clear": {},
 }
 

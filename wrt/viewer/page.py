@@ -31,8 +31,9 @@ from wrt.viewer.camera import Steering, camera_toml, pose_of
 from wrt.viewer.panel import RESOLUTIONS, Panel
 from wrt.viewer.rays import Rays, pick
 from wrt.viewer.refine import Viewer
-from wrt.viewer.renderers import CounterOf, Shown
+from wrt.viewer.renderers import CounterOf, Shown, View
 from wrt.viewer.server import Browser, Server, listen, to_stderr
+from wrt.viewer.walks import Walk, WalkOf, drawing, walk_at
 
 MOST_PIXELS = 1 << 23  # largest number of pixels of a picture; a larger window shows the picture enlarged
 QUALITY = {True: 92, False: 80}  # JPEG quality of a picture at full resolution, and of a coarse picture
@@ -59,11 +60,11 @@ class Click(NamedTuple):
 class Page:
     """A server with the page and one Viewer. Both run until `close`. `url` is the page's address with the token.
 
-    spp, counter_of: see Viewer. warn: called with one line, once for each kind of refused request or message. Raises InputError if the
-    server cannot listen at `place`."""
+    spp, counter_of: see Viewer. walk_of: see wrt.viewer.walks; None: no walks. warn: called with one line, once for each kind of refused
+    request or message. Raises InputError if the server cannot listen at `place`."""
 
     def __init__(self, scene: Scene, options: Options, place: Place = HERE, spp: int = 1024, *,
-                 counter_of: CounterOf | None = None, warn: Callable[[str], None] = to_stderr) -> None:
+                 counter_of: CounterOf | None = None, walk_of: WalkOf | None = None, warn: Callable[[str], None] = to_stderr) -> None:
         self.scene, self.name = scene, scene.name or "picture"
         self.viewer = Viewer(scene, options, self._show, self._report, spp, counter_of)
         self.steering = Steering(pose_of(scene, self.viewer.view.camera))
@@ -71,7 +72,10 @@ class Page:
         self.panel = Panel(scene, self.viewer, self.steering, self._look)
         self._sizes: dict[Browser, tuple[int, int]] = {}  # of the browsers' windows, in device pixels
         self._leader: Browser | None = None  # the browser that steered last
-        self._click: Click | None = None  # the next to inspect
+        self.walk_of = walk_of
+        self._asked: dict[str, Click | int] = {}  # "click": the next to inspect; "walk": the next step to show
+        self._last: tuple[View, Click] | None = None  # what was clicked last
+        self._walk: Walk | None = None  # of the ray that was clicked last
         self._clicked = threading.Condition()
         self._activity, self._closed = "", False
         self.failure: BaseException | None = None
@@ -155,9 +159,9 @@ class Page:
             control.apply(message["value"])
             self._look()
         elif kind == "click":
-            with self._clicked:
-                self._click = Click(message["x"], message["y"], message["sample"])
-                self._clicked.notify()
+            self._ask("click", Click(message["x"], message["y"], message["sample"]))
+        elif kind == "walk":
+            self._ask("walk", message["step"])
         elif kind == "clear":
             self.rays.shown = None
             self._tell("picked", {})
@@ -171,6 +175,11 @@ class Page:
             else:
                 self.steering.reset()
             self.panel.look_or(before)
+
+    def _ask(self, kind: str, what: Click | int) -> None:
+        with self._clicked:
+            self._asked[kind] = what
+            self._clicked.notify()
 
     def _look(self) -> bool:
         """Request the picture of the steered camera in the leader's window; return False if it is the same view as before."""
@@ -191,7 +200,8 @@ class Page:
     def _state(self) -> JsonObject:
         return {"scene": self.scene.name or "scene", "browsers": len(self._sizes),
                 "controls": [control.as_json() for control in self.panel.controls.values()],
-                "camera": camera_toml(self.steering.pose), "counter": bool(self.viewer.view.cost)}
+                "camera": camera_toml(self.steering.pose), "counter": bool(self.viewer.view.cost),
+                "walks": self.walk_of is not None}
 
     def _report(self, text: str) -> None:
         self._activity = text
@@ -211,12 +221,17 @@ class Page:
     def _inspect_clicks(self) -> None:
         while True:
             with self._clicked:
-                self._clicked.wait_for(lambda: self._click is not None or self._closed)
-                click, self._click = self._click, None
-            if click is None:
+                self._clicked.wait_for(lambda: self._asked or self._closed)
+                asked, self._asked = self._asked, {}
+            if not asked:
                 return
             try:
-                self._inspect(click)
+                for kind in sorted(asked):  # a click before the step
+                    what = asked[kind]
+                    if isinstance(what, Click):
+                        self._inspect(what)
+                    else:
+                        self._show_step(what)
             except InputError as error:
                 self._report(f"error: {error}")
 
@@ -229,10 +244,23 @@ class Page:
         found = pick(prepared, view, click.x, click.y)
         self._tell("picked", {"x": click.x, "y": click.y, "sample": click.sample, "of": self.viewer.spp,
                               "surface": None if found is None else found.as_json()})
+        self._last, self._walk = (view, click), None
         self.rays.shown = self.rays.inspect(view, *click, self.viewer.spp)
         self._report("")
         self._tell("rays", self.rays.shown.as_json())
         self.viewer.again()
+
+    def _show_step(self, step: int) -> None:
+        """Tell a step of the walk of the clicked ray through the structure; follow the ray first, if it is a new one."""
+        prepared = None if self._last is None else self.viewer.renderers.prepared(self._last[0])
+        if self.walk_of is None or self._last is None or prepared is None:
+            return
+        if self._walk is None:
+            self._report("following the ray ...")
+            view, click = self._last
+            self._walk = walk_at(self.walk_of, prepared, view, click.x, click.y)
+        self._tell("step", *drawing(self._walk, step))
+        self._report("")
 
     # --- files, in threads of their own -------------------------------------------------------------------------------
 

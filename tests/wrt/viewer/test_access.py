@@ -25,7 +25,7 @@ NONSENSE = (None, True, [], {}, [1.0], {"value": 1}, "", "x" * 9000, "\x1b[31m\n
 SENSE = {"exposure": (-1, 0.5e-300), "aperture": (0.5e-300,), "auto exposure": (True,)}
 MOVE = {"type": "move", "kind": "orbit", "by": [0.1, 0, 0.0], "begin": True}
 ALLOWED = (MOVE, {"type": "size", "width": 64, "height": 48}, {"type": "set", "name": "bounces", "value": 1}, {"type": "reset"},
-           {"type": "click", "x": 0, "y": 1.0, "sample": 0}, {"type": "undo"}, {"type": "clear"})
+           {"type": "click", "x": 0, "y": 1.0, "sample": 0}, {"type": "undo"}, {"type": "clear"}, {"type": "walk", "step": 3})
 
 
 # --- the address ------------------------------------------------------------------------------------------------------
@@ -252,7 +252,7 @@ def test_invalid_fields_are_refused(kind: str, field: str) -> None:
     message = next(each for each in ALLOWED if each["type"] == kind)
     fine: tuple[type, ...] = {"begin": (bool,), "value": (bool, int, float, str), "name": (str,)}.get(field, ())
     for value in (*NONSENSE, [1.0, 2.0, math.nan], [1.0, 2.0], [1.0, 2.0, 101.0], [True, 0, 0], 16385, 1.5):
-        if type(value) in fine or (field in ("x", "y") and value == 0.5e-300) or (kind == "click" and field == "sample" and value == 16385):
+        if type(value) in fine or (field in ("x", "y") and value == 0.5e-300) or (field in ("sample", "step") and value == 16385):
             continue
         with pytest.raises(Refused):
             decoded(json.dumps({**message, field: value}))

@@ -22,12 +22,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import wrt
 from tests.command_line import wrt as run
 from tests.data import ROOT
 from tests.wrt.viewer.client import answer, client
 from tests.wrt.viewer.test_refine import CAMERA, SCENE
 from wrt.lab.costs import CostCounter
 from wrt.renderer.options import Options
+from wrt.renderer.pixel_rays import film_rays
 from wrt.renderer.render import render
 from wrt.scene.cameras import Camera, OrthographicCamera
 from wrt.viewer.access import Place
@@ -147,7 +149,7 @@ def page() -> Iterator[Any]:
     pytest.importorskip("websockets")
     from wrt.viewer.page import Page
 
-    page = Page(ROOM, Options(threads=1), Place(port=0), spp=SPP, counter_of=CostCounter.beside)
+    page = Page(ROOM, Options(threads=1), Place(port=0), spp=SPP, counter_of=CostCounter.beside, walk_of=wrt.walk)
     yield page
     page.close()
 
@@ -363,6 +365,32 @@ def test_a_click_shows_the_surface_and_the_rays_of_the_pixel(page: Any, window: 
     until(lambda: window.locator("#overlay line").count() == 0 and page.rays.shown is None, window)
     window.locator("#stage").click(position={"x": 2, "y": 2})
     until(lambda: "no surface: the background" in window.inner_text("#picked"), window)
+
+
+def test_a_walk_steps_the_clicked_ray_through_the_structure(page: Any, window: Any) -> None:
+    view = finished(page, window).view
+    corner = SCENE.objects[0].mesh.vertices.max(axis=0)
+    x, y = (int(value) for value in place_of(view.camera, view.size, corner - 0.05))
+    window.locator("#stage").click(position={"x": x, "y": y})
+    window.locator("#tree li").first.wait_for()
+    origins, directions = film_rays(view.camera, view.size, np.array([[x / view.size[0], y / view.size[1]]]))
+    steps = wrt.walk(page.viewer.renderers.prepared(view).accel, origins[0], directions[0]).steps
+
+    def shows(step: int) -> bool:
+        return bool(until(lambda: window.inner_text("#steptext") == steps[step].text and window.input_value("#step") == str(step), window))
+
+    window.get_by_role("button", name="walk").click()
+    assert shows(0) and window.inner_text("#last") == f"of {len(steps) - 1}"
+    until(lambda: window.evaluate("document.getElementById('drawing').naturalWidth") > 300, window)
+    window.keyboard.press(".")
+    assert shows(1)
+    window.fill("#step", str(len(steps) + 5))
+    window.press("#step", "Enter")
+    assert shows(len(steps) - 1)
+    window.get_by_role("button", name="<", exact=True).click()
+    assert shows(len(steps) - 2)
+    window.keyboard.press("Escape")
+    until(lambda: not window.locator("#walking").is_visible(), window)
 
 
 def test_a_phone_leaves_the_picture_free_and_shows_the_whole_width(page: Any, window: Any, chromium: Any) -> None:

@@ -77,8 +77,8 @@ def section_of(walk: WalkRecord) -> Section:
     axis = np.eye(3)[int(np.argmin(np.abs(along)))]
     across = axis - (axis @ along) * along
     plane = Plane(walk.origin.astype(np.float64), along, across / np.linalg.norm(across))
-    points = walk.geometry.vertices.astype(np.float64)
-    lo, hi = points.min(axis=0), points.max(axis=0)
+    low, high = walk.geometry.bounds()  # of each triangle and sphere
+    lo, hi = low.min(axis=0).astype(np.float64), high.max(axis=0).astype(np.float64)
     corners = np.array([[(lo, hi)[k >> a & 1][a] for a in range(3)] for k in range(8)])
     flat = plane.project(corners)
     x0, x1, y0, y1 = flat[:, 0].min(), flat[:, 0].max(), min(flat[:, 1].min(), 0.0), max(flat[:, 1].max(), 0.0)

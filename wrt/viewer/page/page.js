@@ -35,7 +35,7 @@ function send(type, fields = {}) {
   if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify({type, ...fields}));
 }
 
-const RECEIVED = {state: showState, activity: message => activity(message.text), picture: showPicture, picked: showPicked, rays: showRays};
+const RECEIVED = {state: showState, activity: message => activity(message.text), picture: showPicture, picked: showPicked, rays: showRays, step: showStep};
 
 function activity(text) {
   by("activity").textContent = text;
@@ -188,6 +188,7 @@ const HELD = {
 const PRESSED = {
   u: () => send("undo"), r: () => send("reset"), p: togglePanel, "?": () => by("help").showModal(), Escape: clearRays,
   f: () => document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen(),
+  ",": () => walk(-1), ".": () => walk(1),
   "[": () => expose(-0.5), "]": () => expose(0.5),
 };
 
@@ -226,6 +227,7 @@ function showState(state) {
   by("title").textContent = state.scene + (state.browsers > 1 ? ` (${state.browsers} browsers)` : "");
   by("title").title = state.browsers > 1 ? "All browsers share this view" : state.scene;
   by("camera").textContent = state.camera;
+  by("walk").hidden = !state.walks;
   by("png").download = `${state.scene}.png`;
   by("exr").download = `${state.scene}.exr`;
   for (const control of state.controls) {
@@ -292,6 +294,7 @@ function showPicked(message) {
   surface = message.surface;
   picked = message.x === undefined ? null : message;
   by("tools").hidden = !picked;
+  leaveWalk();
   by("tree").replaceChildren();
   const text = !picked ? "Click into the picture: its surface and its rays appear here."
     : surface ? `${surface.object} (${surface.material}), primitive ${surface.prim}, at distance ${surface.distance} scene units`
@@ -324,6 +327,32 @@ function showRays(message) {
   by("tools").hidden = false;
 }
 
+let steps = null;  // {step, last} of the walk that is shown
+function showStep(head, blob) {
+  steps = head;
+  by("walking").hidden = false;
+  by("step").value = head.step;
+  by("step").max = head.last;
+  by("last").textContent = `of ${head.last}`;
+  by("steptext").textContent = head.text;
+  URL.revokeObjectURL(by("drawing").src);
+  by("drawing").src = by("enlarge").href = URL.createObjectURL(blob);
+}
+
+function walk(by_steps) {
+  if (!picked || by("walk").hidden) return;
+  goTo(steps ? steps.step + by_steps : 0);
+}
+
+function goTo(step) {
+  send("walk", {step: Math.min(Math.max(0, Math.round(step)), steps ? steps.last : 0)});
+}
+
+function leaveWalk() {
+  steps = null;
+  by("walking").hidden = true;
+}
+
 function mark(node = chosen) {
   chosen = node;
   for (const each of overlay.children) each.classList.toggle("picked", chosen >= 0 && each.dataset.node === String(chosen));
@@ -336,6 +365,11 @@ function clearRays() {
 by("sample").onchange = () => picked && send("click", {x: picked.x, y: picked.y, sample: Math.min(Math.max(0, Math.round(by("sample").value)), picked.of - 1)});
 by("focus").onclick = () => send("set", {name: "focus", value: surface.depth});
 by("clear").onclick = clearRays;
+by("walk").onclick = () => { leaveWalk(); goTo(0); };
+by("back").onclick = () => walk(-1);
+by("next").onclick = () => walk(1);
+by("step").onchange = () => goTo(Number(by("step").value));
+by("leave").onclick = leaveWalk;
 by("undo").onclick = () => send("undo");
 by("reset").onclick = () => send("reset");
 by("keys").onclick = () => by("help").showModal();

@@ -17,7 +17,9 @@ from wrt.lab.walk.drawing import section_of
 from wrt.lab.walk.record import counted
 from wrt.lab.walk.regions import Region
 from wrt.lab.walk.step import Entry
+from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
+from wrt.scene.model import Scene, Sphere
 from wrt.scene.shapes import icosphere
 
 RAY = ([0.1, 0.2, 3.0], [0.15, -0.3, -2.0])
@@ -120,6 +122,9 @@ def test_a_walk_draws_itself(tmp_path: Path) -> None:
     assert walk.draw(axes, step) is axes and "t times" in axes.get_xlabel()
     x, y = map(np.asarray, axes.lines[-1].get_data())
     assert np.isclose(x[0], walk.steps[step].t * np.linalg.norm(walk.direction)) and y[0] == 0.0
+    balls = Scene(spheres=(Sphere((0.0, 0.0, 0.0), 1.0, Material()), Sphere((3.0, 0.0, 0.0), 0.5, Material())))
+    of_spheres = wrt.walk(wrt.build(balls), (0.0, 0.0, 5.0), (0.0, 0.0, -1.0)).draw(Figure().subplots())
+    assert of_spheres.get_xlim()[0] < 4.0 < 6.0 < of_spheres.get_xlim()[1]  # the hit ball is between
     walk.save(tmp_path / "walk.png")
     assert (tmp_path / "walk.png").stat().st_size > 5000
     with pytest.raises(wrt.InputError, match="must be"):
