@@ -72,10 +72,8 @@ def make_radiance(features: Features, accel_struct: Any, closest_hit: Any, any_h
     recorder = make_recorder(features)
 
     @wp.func
-    def radiance(
-        accel: accel_struct, surfaces: Surfaces, lighting: Lighting, limits: Limits, camera_ray: Ray, key: wp.uint32,
-        index: wp.uint32,
-    ) -> Sample:
+    def radiance(accel: accel_struct, surfaces: Surfaces, lighting: Lighting, limits: Limits, camera_ray: Ray, key: wp.uint32,
+                 index: wp.uint32) -> Sample:
         out = Sample()
         stack = wp.zeros(shape=wp.static(features.stack_size), dtype=Path)
         stack[0] = paths.camera_path(camera_ray, key)

@@ -27,13 +27,14 @@ from wrt.renderer.progress import time_left
 from wrt.scene.cameras import Camera, CameraKind
 from wrt.scene.model import Scene
 from wrt.viewer.access import HERE, Place, Refused, access_for
+from wrt.viewer.asked import Asked
 from wrt.viewer.camera import Steering, camera_toml, pose_of
 from wrt.viewer.panel import RESOLUTIONS, Panel
 from wrt.viewer.rays import Rays, pick
 from wrt.viewer.refine import Viewer
-from wrt.viewer.renderers import CounterOf, Shown, View
+from wrt.viewer.renderers import CounterOf, Shown
 from wrt.viewer.server import Browser, Server, listen, to_stderr
-from wrt.viewer.walks import Walk, WalkOf, drawing, walk_at
+from wrt.viewer.walks import WalkOf, Walks
 
 MOST_PIXELS = 1 << 23  # largest number of pixels of a picture; a larger window shows the picture enlarged
 QUALITY = {True: 92, False: 80}  # JPEG quality of a picture at full resolution, and of a coarse picture
@@ -72,12 +73,9 @@ class Page:
         self.panel = Panel(scene, self.viewer, self.steering, self._look)
         self._sizes: dict[Browser, tuple[int, int]] = {}  # of the browsers' windows, in device pixels
         self._leader: Browser | None = None  # the browser that steered last
-        self.walk_of = walk_of
-        self._asked: dict[str, Click | int] = {}  # "click": the next to inspect; "walk": the next step to show
-        self._last: tuple[View, Click] | None = None  # what was clicked last
-        self._walk: Walk | None = None  # of the ray that was clicked last
-        self._clicked = threading.Condition()
-        self._activity, self._closed = "", False
+        self.walks = Walks(walk_of)
+        self._asked = Asked()  # "click": a Click to inspect; "walk": a step to show
+        self._activity = ""
         self.failure: BaseException | None = None
         self.server: Server | None = None
         listening = listen(place)
@@ -111,9 +109,7 @@ class Page:
 
     def close(self) -> None:
         self.viewer.stop()
-        with self._clicked:
-            self._closed = True
-            self._clicked.notify()
+        self._asked.close()
         if self.server is not None:
             self.server.close()
 
@@ -159,9 +155,9 @@ class Page:
             control.apply(message["value"])
             self._look()
         elif kind == "click":
-            self._ask("click", Click(message["x"], message["y"], message["sample"]))
+            self._asked.put(kind, Click(message["x"], message["y"], message["sample"]))
         elif kind == "walk":
-            self._ask("walk", message["step"])
+            self._asked.put(kind, message["step"])
         elif kind == "clear":
             self.rays.shown = None
             self._tell("picked", {})
@@ -175,11 +171,6 @@ class Page:
             else:
                 self.steering.reset()
             self.panel.look_or(before)
-
-    def _ask(self, kind: str, what: Click | int) -> None:
-        with self._clicked:
-            self._asked[kind] = what
-            self._clicked.notify()
 
     def _look(self) -> bool:
         """Request the picture of the steered camera in the leader's window; return False if it is the same view as before."""
@@ -201,7 +192,7 @@ class Page:
         return {"scene": self.scene.name or "scene", "browsers": len(self._sizes),
                 "controls": [control.as_json() for control in self.panel.controls.values()],
                 "camera": camera_toml(self.steering.pose), "counter": bool(self.viewer.view.cost),
-                "walks": self.walk_of is not None}
+                "walks": self.walks.walk_of is not None}
 
     def _report(self, text: str) -> None:
         self._activity = text
@@ -219,19 +210,12 @@ class Page:
     # --- clicks, in a thread of their own -----------------------------------------------------------------------------
 
     def _inspect_clicks(self) -> None:
-        while True:
-            with self._clicked:
-                self._clicked.wait_for(lambda: self._asked or self._closed)
-                asked, self._asked = self._asked, {}
-            if not asked:
-                return
+        while asked := self._asked.take():
             try:
-                for kind in sorted(asked):  # a click before the step
-                    what = asked[kind]
-                    if isinstance(what, Click):
-                        self._inspect(what)
-                    else:
-                        self._show_step(what)
+                if "click" in asked:
+                    self._inspect(asked["click"])
+                if "walk" in asked and (shown := self.walks.step(asked["walk"])):
+                    self._tell("step", *shown)
             except InputError as error:
                 self._report(f"error: {error}")
 
@@ -244,23 +228,11 @@ class Page:
         found = pick(prepared, view, click.x, click.y)
         self._tell("picked", {"x": click.x, "y": click.y, "sample": click.sample, "of": self.viewer.spp,
                               "surface": None if found is None else found.as_json()})
-        self._last, self._walk = (view, click), None
+        self.walks.aim(prepared, view, click.x, click.y)
         self.rays.shown = self.rays.inspect(view, *click, self.viewer.spp)
         self._report("")
         self._tell("rays", self.rays.shown.as_json())
         self.viewer.again()
-
-    def _show_step(self, step: int) -> None:
-        """Tell a step of the walk of the clicked ray through the structure; follow the ray first, if it is a new one."""
-        prepared = None if self._last is None else self.viewer.renderers.prepared(self._last[0])
-        if self.walk_of is None or self._last is None or prepared is None:
-            return
-        if self._walk is None:
-            self._report("following the ray ...")
-            view, click = self._last
-            self._walk = walk_at(self.walk_of, prepared, view, click.x, click.y)
-        self._tell("step", *drawing(self._walk, step))
-        self._report("")
 
     # --- files, in threads of their own -------------------------------------------------------------------------------
 
