@@ -20,13 +20,15 @@ INCHES, DOTS = (4.4, 3.5), 150  # size of a drawing, and its pixels per inch
 class Step(Protocol):
     """A step of a walk, as wrt.lab.walk.step.WalkStep."""
 
-    text: str
+    @property
+    def text(self) -> str: ...
 
 
 class Walk(Protocol):
     """A walk, as wrt.lab.walk.walk.Walk."""
 
-    steps: Sequence[Step]
+    @property
+    def steps(self) -> Sequence[Step]: ...
 
     def draw(self, axes: Any, step: int) -> object: ...
 

@@ -70,7 +70,8 @@ def with_settings(text: str) -> None:
 
 
 def test_set_is_the_setting_of_a_file() -> None:
-    values = {"size": [20, 12], "spp": 3, "max_depth": 3, "min_throughput": 0.01, "filter": "gaussian", "fresnel": "schlick",
+    values = {"size": [20, 12], "spp": 3, "max_depth": 3, "min_throughput": 0.01, "clamp": 0.8, "filter": "gaussian",
+              "fresnel": "schlick",
               "glass_shadows": "tinted", "sampler": "independent", "exposure": -1, "tonemap": "reinhard",
               "auto_exposure": True}
     assert tuple(values) == SETTINGS
