@@ -36,6 +36,7 @@ from wrt.kernels.wide.packets import (
     ANY_REFUSED,
     FAILED,
     MIXED_FAILED,
+    MIXED_PAUSED,
     PAUSED,
     REPORT_SIZE,
     Scratch,
@@ -66,13 +67,14 @@ PACKETS = 4  # Number of packets that are set up together.
 SLOTS = 24  # Number of interleaved rays in progress.
 FEW_RAYS = 6  # If a packet has at most so many rays in a leaf, the rays are tested one by one.
 MIN_VISITS = 6  # Mean number of rays per node from which a packet is faster than interleaving its rays.
-# Numbers of nodes between which a walk of closest-hit rays, or of a MIXED packet, stops if it is below MIN_VISITS.
+# Numbers of nodes between which the walk of a MIXED packet stops if it is below MIN_VISITS.
 FIRST_STOP, LAST_STOP = 6, 16
 # Results of a packet's walk: all rays are finished, and their visits reached or did not reach MIN_VISITS; or the walk has stopped, and the
 # rays begin again one by one. The hits found so far shorten them.
 TOGETHER, APART, STOPPED = (wp.constant(result) for result in range(3))
-# A packet below MIN_VISITS has failed. After MAX_FAILED failures in succession, the rays of the next PAUSE packets are interleaved.
-MAX_FAILED, PAUSE = 4, 32
+# A packet below MIN_VISITS has failed. After MAX_FAILED failures in succession, the rays of the next PAUSE packets are interleaved, or of
+# the next MIXED_PAUSE packets of the kind MIXED.
+MAX_FAILED, PAUSE, MIXED_PAUSE = 4, 32, 128
 
 
 @wp.func
@@ -219,7 +221,6 @@ def make_packet_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
     Only any-hit packets may be MIXED: for closest hits, interleaving their rays is faster."""
     children, test_leaf = make_children(any_hit), make_packet_leaf(units, any_hit, accepts)
     mixed_children = make_children(any_hit, True) if any_hit else children
-    may_stop = wp.constant(MIXED if any_hit else 0)  # Least value of `active` with which a walk may stop.
 
     @wp.func
     def walk(accel: WideBvh, surfaces: Surfaces, scratch: Scratch, base: int, active: int) -> int:
@@ -236,13 +237,15 @@ def make_packet_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
             else:
                 nodes += 1
                 visits += count_of(mask)
-                if visits < MIN_VISITS * nodes and nodes >= FIRST_STOP and nodes <= LAST_STOP and active >= may_stop:
+                if wp.static(not any_hit):
+                    size = children(accel, scratch, base, reference, mask, size)
+                elif active < MIXED:
+                    size = children(accel, scratch, base, reference, mask, size)
+                elif visits < MIN_VISITS * nodes and nodes >= FIRST_STOP and nodes <= LAST_STOP:
                     result = STOPPED
                     size = int(0)
-                elif active >= MIXED:
-                    size = mixed_children(accel, scratch, base, reference, mask, size)
                 else:
-                    size = children(accel, scratch, base, reference, mask, size)
+                    size = mixed_children(accel, scratch, base, reference, mask, size)
             mask = int(0)
             while size > 0 and mask == 0:
                 size = size - 1
@@ -263,7 +266,8 @@ def count_walk(scratch: Scratch, failed_at: int, together: bool):
     failed = wp.where(together, 0, slot_at(scratch.report, failed_at) + 1)
     if failed == MAX_FAILED:  # After this pause, a single failure starts the next pause.
         failed = failed - 1
-        put_int(scratch.report, failed_at + wp.static(PAUSED - FAILED), PAUSE)
+        pause = wp.where(failed_at == MIXED_FAILED, MIXED_PAUSE, PAUSE)
+        put_int(scratch.report, failed_at + wp.static(PAUSED - FAILED), pause)
     put_int(scratch.report, failed_at, failed)
 
 
@@ -343,21 +347,22 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
             put_int(scratch.report, i, 0)
         for block in range(first, end, wp.static(PACKETS * LANES)):
             single_rays = wp.uint64(0)
+            mixes = slot_at(scratch.report, MIXED_PAUSED) == 0  # Else MIXED packets get no beam, which takes long.
             packets = wp.min((end - block + LANES - 1) / LANES, PACKETS)  # Not a constant: Warp would unroll the loop over the walk.
             for p in range(packets):
                 base = PACKET_SIZE * p
                 count = wp.min(end - block - LANES * p, LANES)
-                active = set_up(rays, block + LANES * p, count, wp.static(far_pad(units.box)), scratch, base)
+                active = set_up(rays, block + LANES * p, count, wp.static(far_pad(units.box)), mixes, scratch, base)
                 store_bits(scratch.packets, base + ACTIVE, active)
                 if bits(scratch.packets, base + REFUSED) != 0:
                     put_int(scratch.report, ANY_REFUSED, 1)
             for p in range(packets):
                 base = PACKET_SIZE * p
                 active = bits(scratch.packets, base + ACTIVE)
-                failed_at = wp.where(active >= MIXED, MIXED_FAILED, FAILED)
+                failed_at = wp.where(wp.static(any_hit) and active >= MIXED, MIXED_FAILED, FAILED)
                 paused = slot_at(scratch.report, failed_at + wp.static(PAUSED - FAILED))
                 result = int(STOPPED)
-                if active >= COHERENT and paused == 0:
+                if active >= COHERENT and paused == 0 and (mixes or active < MIXED):
                     result = walk_packet(accel, surfaces, scratch, base, active)
                     count_walk(scratch, failed_at, result == TOGETHER)
                 else:

@@ -320,7 +320,7 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays) -> An
             for p in range(packets):
                 base = PACKET_SIZE * (PLACED + p)
                 count = wp.min(end - block - LANES * p, LANES)
-                active = set_up(rays, block + LANES * p, count, wp.static(far_pad(units.box)), scratch, base)
+                active = set_up(rays, block + LANES * p, count, wp.static(far_pad(units.box)), False, scratch, base)
                 if wp.static(worlds):
                     active = store_roots(accel, rays, block + LANES * p, count, active, scratch, base)
                 store_bits(scratch.packets, base + ACTIVE, active)

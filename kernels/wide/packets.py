@@ -59,12 +59,13 @@ def make_set_up(rays_struct: Any, may_mix: bool = False) -> Any:
     excludes = "nullptr" if plain else "rays.exclude.data + first"
 
     @wp.func_native(f"""
-    return wrt::set_up<{flag(plain)}, {flag(may_mix)}>(wrt::pointers_to(rays, first, {excludes}), count, pad, scratch.packets.data + base);
+    return wrt::set_up<{flag(plain)}, {flag(may_mix)}>(wrt::pointers_to(rays, first, {excludes}), count, pad, mixes,
+                                                       scratch.packets.data + base);
     """)
-    def set_up(rays: rays_struct, first: int, count: int, pad: float, scratch: Scratch, base: int) -> int:
+    def set_up(rays: rays_struct, first: int, count: int, pad: float, mixes: bool, scratch: Scratch, base: int) -> int:
         """Set up rays first .. first + count - 1. Return the mask of rays whose segments are not empty, plus COHERENT or MIXED.
 
-        The factor `pad` is nodes.far_pad."""
+        The factor `pad` is nodes.far_pad. mixes: also store the beam of a MIXED packet."""
 
     return set_up
 

@@ -165,8 +165,9 @@ WRT_INLINE Rays lesser(Rays a, Rays b) {
 WRT_INLINE Rays lesser(Rays a, Rays b, Rays c, Rays d) { return lesser(lesser(a, b), lesser(c, d)); }
 
 // Store the beam around all active rays of the packet (layout.py: BEAM_WORDS); return COHERENT. If their directions differ in sign along an
-// axis, return MIXED, or 0 without MAY_MIX. Return 0 if there are no active rays.
-template <bool MAY_MIX> WRT_INLINE int store_beam(float* packet, const SixteenRays& rays, const Vec3<Rays>& inv_dir, int active, float far_pad) {
+// axis, return MIXED (and store the beam only if `mixes`), or 0 without MAY_MIX. Return 0 if there are no active rays.
+template <bool MAY_MIX>
+WRT_INLINE int store_beam(float* packet, const SixteenRays& rays, const Vec3<Rays>& inv_dir, int active, float far_pad, bool mixes = false) {
     if (active == 0) return 0;
     int down[3], kind = COHERENT;
     bool mixed[3] = {};
@@ -174,6 +175,7 @@ template <bool MAY_MIX> WRT_INLINE int store_beam(float* packet, const SixteenRa
         down[k] = mask_of(inv_dir[k] < 0.0f) & active;
         if (down[k] == 0 || down[k] == active) continue;
         if constexpr (!MAY_MIX) return 0;
+        if (!mixes) return MIXED;
         mixed[k] = true;
         kind = MIXED;
     }
@@ -207,7 +209,8 @@ template <bool MAY_MIX> WRT_INLINE int store_beam(float* packet, const SixteenRa
 }
 
 // Set up `count` rays; return the mask of rays whose segments are not empty, plus the result of store_beam.
-template <bool SCALED, bool MAY_MIX> WRT_CALLED int set_up(const RayPointers& from, int count, float far_pad, float* numbers) {
+template <bool SCALED, bool MAY_MIX>
+WRT_CALLED int set_up(const RayPointers& from, int count, float far_pad, bool mixes, float* numbers) {
     SixteenRays rays = load_rays(from, count);
     const AllRays packet = {numbers};
     store(numbers + REFUSED, refused(rays));
@@ -215,7 +218,7 @@ template <bool SCALED, bool MAY_MIX> WRT_CALLED int set_up(const RayPointers& fr
     rays.t_max = no_hit(rays);
     const Vec3<Rays> i = store_rays<LANES>(packet, rays, far_pad);
     const int active = mask_of(rays.t_max >= rays.t_min) & ((1 << count) - 1);
-    return active | store_beam<MAY_MIX>(numbers, rays, i, active, far_pad);
+    return active | store_beam<MAY_MIX>(numbers, rays, i, active, far_pad, mixes);
 }
 
 }  // namespace wrt

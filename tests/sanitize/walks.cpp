@@ -53,9 +53,9 @@ public:
     void trace(int first, int count, bool together) {
         RayArrays rays = {{(Vector*)given.origins.data(), {12}}, {(Vector*)given.directions.data(), {12}},
                           {given.t_mins.data(), {given.t_mins.size() == 1 ? 0 : 4}}, {given.t_maxs.data(), {4}}};
-        const int state = set_up<true>(pointers_to(rays, first, given.excludes.data() + first), count, FAR, packet.data());
+        const int state = set_up<true, ANY_HIT>(pointers_to(rays, first, given.excludes.data() + first), count, FAR, true, packet.data());
         if (state >= COHERENT && together) {
-            walk_packet(state - COHERENT);
+            walk_packet(state);
         } else {
             int alone = rays_meeting_root(given.nodes.data(), state & (COHERENT - 1), packet.data());
             for (; alone; alone &= alone - 1) walk_alone(lowest(alone));
@@ -68,13 +68,14 @@ public:
 private:
     static constexpr float FAR = Bounds::FAR_PAD * (1.0f + 8.0f / (1 << 24));  // lanes.py: LANE_PAD
 
-    void walk_packet(int active) {
-        int size = 0, reference = 0, mask = active;
+    void walk_packet(int state) {
+        const auto push_children = state >= MIXED ? children<ANY_HIT, ANY_HIT> : children<ANY_HIT, false>;
+        int size = 0, reference = 0, mask = state & (COHERENT - 1);
         for (;;) {
             if (reference < 0) {
                 leaf_of_packet(reference, mask);
             } else {
-                size = children<ANY_HIT>(given.nodes.data(), given.primitives.data(), packet.data(), reference, mask, stack.data(), size);
+                size = push_children(given.nodes.data(), given.primitives.data(), packet.data(), reference, mask, stack.data(), size);
             }
             unsigned long long key = 0;
             for (mask = 0; size > 0 && mask == 0;) {

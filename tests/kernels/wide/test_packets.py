@@ -103,7 +103,7 @@ def by_packets(rays: RayArrays, count: int, reach: float, empty: int, accel: Wid
     """Test packet i with node i of accel (`nodes`), and a slot for each ray. Only the first `count` rays of a packet are active."""
     i = wp.tid()
     base = PACKET_SIZE * i
-    active = set_up(rays, LANES * i, count, LANE_PAD, scratch, base)
+    active = set_up(rays, LANES * i, count, LANE_PAD, False, scratch, base)
     out.state[i] = active
     mask = active & wp.static(COHERENT - 1)
     root = WideBvh()
