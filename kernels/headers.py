@@ -10,9 +10,10 @@ from pathlib import Path
 import warp as wp
 
 FOLDER = Path(__file__).parent
-# Vectors of these types are traversal stacks. Their constructor without arguments sets no entry: Warp's would write 512 bytes for each ray.
-STACKS = "".join(f"template <> inline CUDA_CALLABLE wp::vec_t<{length}, wp::{kind}>::vec_t() {{}}\n"
-                 for length in (64, 65, 66) for kind in ("uint64", "int32"))
+# Vectors of this length are traversal stacks, of a length that no other vector has. In kernels of wrt their constructor without arguments
+# sets no entry: Warp's would write 512 bytes for each ray.
+STACK_LENGTH = 67
+STACKS = "".join(f"template <> inline CUDA_CALLABLE wp::vec_t<{STACK_LENGTH}, wp::{kind}>::vec_t() {{}}\n" for kind in ("uint64", "int32"))
 LINE = re.compile(r'#include "(\w+\.h)"|#pragma once')
 
 

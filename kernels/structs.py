@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from wrt.kernels.headers import with_headers
+from wrt.kernels.headers import STACK_LENGTH, text_of, with_headers
 
 NO_HIT = wp.constant(0x7FFFFFFF)  # prim_id of a miss during traversal: larger than every index, so that a hit at equal t wins
 EPSILON = wp.constant(2.0**-24)  # unit roundoff u of float32
@@ -14,7 +14,9 @@ EPSILON = wp.constant(2.0**-24)  # unit roundoff u of float32
 # exact negatives, and a ray could slip between the triangles.
 #
 # The headers contain vectorised box and edge tests for the traversal of wide BVHs on a CPU.
-MODULE_OPTIONS = {"fuse_fp": False, "enable_backward": False, "extra_build_options": with_headers("wide/triangle.h")}
+MODULE_OPTIONS = {"fuse_fp": False, "enable_backward": False,
+                  "extra_build_options": wp.ModuleBuildOptions(extra_cpu_preamble=text_of("wide/triangle.h"))}
+OWN_OPTIONS = {"mode": "release", "extra_build_options": with_headers("wide/triangle.h")}
 
 
 if TYPE_CHECKING:  # type checkers skip device code, because Warp's annotations are not Python types
@@ -26,7 +28,7 @@ else:
         """Make a Warp kernel in a module of its own, without fused multiply-add and without code for gradients.
         Kernels of wrt are compiled in release mode, whatever wp.config.mode is: in debug mode, a kernel of Warp 1.19 ends the process if
         several threads launch it. Kernels of a user follow wp.config.mode. registers: most registers of a CUDA thread."""
-        own = {"mode": "release"} if str(function.__module__).startswith("wrt.") else {}  # __module__ is None in code made by exec
+        own = OWN_OPTIONS if str(function.__module__).startswith("wrt.") else {}  # __module__ is None in code made by exec
         return wp.kernel(function, module="unique", module_options=MODULE_OPTIONS | own | options, enable_backward=False,
                          cuda_max_registers=registers)
 
@@ -61,6 +63,11 @@ def on_cuda() -> bool:
 def fast_float64() -> bool:
     """Test whether the code runs on a GPU for data centres (sm_60, sm_70, sm_80, sm_90, sm_100): its float64 has half the rate of float32,
     that of other GPUs 1/32 to 1/64."""
+
+
+def stack_type(dtype: Any) -> Any:
+    """Return the type of a traversal stack: a vector whose entries kernels of wrt do not set when they make it (headers.STACKS)."""
+    return wp.types.vector(STACK_LENGTH, dtype)
 
 
 def size_of(struct: Any) -> int:

@@ -8,6 +8,8 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
+from wrt.kernels.structs import STACK_LENGTH, stack_type
+
 PLACES = ("local", "shared")
 SHARED = 64  # Bytes of shared memory per thread. With more, fewer warps would fit on a multiprocessor of a T4.
 
@@ -23,11 +25,12 @@ class Stack(NamedTuple):
 
 @cache
 def make_uninitialized(length: int, dtype: Any) -> Any:
-    """Make uninitialized(), which returns a vector whose entries are not set in kernels of wrt (headers.STACKS), and 0 in others."""
-    of = f"wp::vec_t<{length}, wp::{dtype.__name__}>"
+    """Make uninitialized(), which returns a stack for `length` entries. Kernels of wrt set no entry, others all."""
+    assert length <= STACK_LENGTH
+    of = f"wp::vec_t<{STACK_LENGTH}, wp::{dtype.__name__}>"
 
     @wp.func_native(f"alignas({of}) char memory[sizeof({of})]; return *({of}*)memory;")
-    def uninitialized() -> wp.types.vector(length, dtype): ...
+    def uninitialized() -> stack_type(dtype): ...
 
     return uninitialized
 
@@ -37,7 +40,7 @@ def make_stack(place: str, size: int, dtype: Any, entry_bytes: int) -> Stack:
     """Make the functions of a stack with `size` entries of type `dtype`. place: its memory, one of PLACES.
     A walk may split its entries over several stacks, each with one part of every entry. entry_bytes: size of all parts together. Stacks
     that are made with equal arguments share one block of shared memory."""
-    vector = wp.types.vector(size, dtype)
+    vector = stack_type(dtype)
     short = SHARED // entry_bytes if place == "shared" else 0
     at = f"((wp::{dtype.__name__}*)shared)[i * WP_TILE_BLOCK_DIM]"
 

@@ -13,7 +13,7 @@ from typing import Any
 import warp as wp
 
 from wrt.kernels.query import LARGEST
-from wrt.kernels.structs import NO_HIT, Hit, Ray, size_of
+from wrt.kernels.structs import NO_HIT, Hit, Ray, size_of, stack_type
 from wrt.kernels.traverse.common import Probe, Units, make_intersect, make_probe, no_hit
 from wrt.kernels.traverse.counters import Counts, Recorder, make_counters, write_step
 from wrt.kernels.traverse.recording import make_recorded_test, make_recording
@@ -249,7 +249,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
     record_children, record_push, record_pop, recorded_leaf = make_recorded(units, accepts, layout)
     visit_leaf = recorded_leaf if units.steps else make_leaf_test(units, any_hit, accepts, layout)
     new_stack, shared_stack, put, get = make_stack(units.stack, STACK_SIZE, wp.uint64, 8)
-    entries = wp.types.vector(STACK_SIZE, wp.uint64)
+    entries = stack_type(wp.uint64)
 
     @wp.func
     def child(accel: struct, first: int, lane: int) -> int:

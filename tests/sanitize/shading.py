@@ -99,6 +99,7 @@ def pixels(rng: np.random.Generator) -> Iterator[list[np.ndarray]]:
         order, film = rng.permutation(n)[: 2 * LANES].astype(np.int32), Film()
         for name, dtype in OF_FILM.items():
             setattr(film, name, zeros(n, dtype))
+        film.clamped = zeros(n, wp.float32)
         launch(pixel_kernel, 1, film, upload(order, wp.int32, DEVICE), upload(done, Sample, DEVICE), 0, samples)
         yield [PIXELS, order, np.int32([n]), done, *(getattr(film, name).numpy() for name in OF_FILM)]
 

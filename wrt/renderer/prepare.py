@@ -166,7 +166,7 @@ class _Preparation:
 
     def _report(self, progress: Callable[[Progress], None], seconds: float) -> None:
         """Call `progress` if the stage or its percentage has changed, and the stage takes long."""
-        stage, done = ("build", int(100.0 * self.fraction_built)) if self.fraction_built > 0.0 else ("compile", 0)
+        stage, done = ("build", int(100.0 * self.fraction_built)) if 0.0 < self.fraction_built < 1.0 else ("compile", 0)
         if (stage, done) != self.reported and (seconds >= PREPARING_REPORTED if stage == "build" else WATCH.is_slow()):
             self.reported = stage, done
             progress(Progress(done, 100, 0, seconds, stage=stage))

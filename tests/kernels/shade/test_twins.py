@@ -181,7 +181,7 @@ def pixel_kernel(film: Film, pixels: wp.array(dtype=wp.int32), done: wp.array(dt
     for p in range(first, first + LANES):
         pixel = load_pixel(film, pixels[p])
         for j in range(samples):
-            pixel = add_sample(pixel, done[p * samples + j])
+            pixel = add_sample(pixel, done[p * samples + j], film.clamp)
         store_pixel(film, pixels[p], pixel)
 
 
@@ -204,6 +204,7 @@ def check_film() -> None:
             arrays = {name: zeros(n, dtype) for name, dtype in OF_FILM.items()}
             for name, array in arrays.items():
                 setattr(film, name, array)
+            film.clamped = zeros(n, wp.float32)  # the vectorised code clamps nothing
             for _ in range(2):
                 launch(kind, 1, film, upload(order, wp.int32, DEVICE), upload(done, Sample, DEVICE), LANES, samples)
             films.append({name: array.numpy() for name, array in arrays.items()})

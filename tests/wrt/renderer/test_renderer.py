@@ -512,6 +512,7 @@ def test_slow_compiling_is_reported_once(monkeypatch: pytest.MonkeyPatch, caplog
 
     watch, load, seen = Watch(delay=0.2), prepare.load_kernel, list[Progress]()
     render(SCENE, spp=2)
+    caplog.clear()
     monkeypatch.setattr(prepare, "WATCH", watch)
     render(SCENE, spp=2, progress=seen.append)
     assert not reported()
