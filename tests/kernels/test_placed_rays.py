@@ -103,7 +103,8 @@ def test_points_are_where_the_lines_meet_the_planes():
     weights = rng.dirichlet([1.0, 1.0, 1.0], 200)
     targets = np.einsum("nk,nkj->nj", weights, corners)
     origins = rng.normal(size=(200, 3))
-    arrays = (origins, targets - origins, corners.reshape(-1, 3), np.arange(600, dtype=np.int32).reshape(-1, 3), np.arange(200), np.arange(200),
+    faces = np.arange(600, dtype=np.int32).reshape(-1, 3)
+    arrays = (origins, targets - origins, corners.reshape(-1, 3), faces, np.arange(200), np.arange(200),
               weights[:, 1].astype(np.float32), weights[:, 2].astype(np.float32), np.empty((200, 3)))
     LOCATE.launch(200, struct_record(HitPoints64, arrays))
     expected = np.array([exact_point(*row) for row in zip(corners, origins, targets - origins, strict=True)])

@@ -188,7 +188,8 @@ def test_means_are_geometric_and_of_each_number_of_threads() -> None:
 
 
 def test_ratios_are_medians_of_the_runs(monkeypatch) -> None:
-    monkeypatch.setattr(peers, "alternate_on", lambda device, jobs, runs, clock: {0: np.array([1.0, 2.0, 4.0]), 1: np.array([2.0, 6.0, 4.0])})
+    seconds = {0: np.array([1.0, 2.0, 4.0]), 1: np.array([2.0, 6.0, 4.0])}
+    monkeypatch.setattr(peers, "alternate_on", lambda device, jobs, runs, clock: seconds)
     monkeypatch.setattr(peers, "searching", lambda who, rays, threads: lambda: None)
     monkeypatch.setattr(peers, "answer", lambda who, rays, out: np.array([True]))
     rays = ray_sets(build(Geometry.of(icosphere(0))), 16)["shadow"]
