@@ -2,6 +2,7 @@
 
 Each mutant is a copy of the project with one change, run with a kernel cache of its own. The tests of the changed file come first, then
 tests of hits and pixels. A mutant that no test notices *survives*: the change is equivalent, or a test is missing.
+Before the first mutant of a file, its tests run without a change. If they fail, no mutant of that file counts.
 `--first 60` goes on after the first 60 mutants of a seed, and `--show` prints the changes without running tests.
 """
 
@@ -20,7 +21,8 @@ import sys
 import tempfile
 import time
 import tokenize
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
@@ -45,6 +47,7 @@ SANITIZE = ["tests/sanitize/test_headers.py", "-k", "results and walks"]
 GENERAL = (["tests/test_bits.py", "-k", "hits and bvh8 or whitted or instances"],
            ["tests/kernels/wide/test_packets.py", "tests/kernels/wide/test_batch.py", "tests/kernels/wide/test_instances.py",
             "tests/wrt/accel/queries/test_all_hits.py"])
+OUTCOMES = "noticed", "survived", "not counted"
 PROCESSOR_SECONDS = 150  # of one run of pytest; an endless loop ends here
 
 
@@ -131,6 +134,7 @@ class Worker:
 
     def __init__(self, folder: Path, thorough: bool) -> None:
         self.root, self.cache, self.thorough = folder / "project", folder / "cache", thorough
+        self.unchanged: dict[str, str] = {}  # by the arguments of pytest: its first failure without a change
         shutil.copytree(ROOT, self.root, symlinks=True, ignore=shutil.ignore_patterns(".git", "__pycache__", ".*_cache", "docs"))
 
     def pytest(self, arguments: list[str]) -> str:
@@ -148,15 +152,49 @@ class Worker:
             return f"signal {-done.returncode}"
         return next((line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))), done.stdout[-200:])
 
-    def run(self, mutant: Mutant) -> str:
-        """Return what noticed the mutant; "" if it survived."""
+    def baseline(self, arguments: list[str]) -> str:
+        """Return the first failure of tests of the unchanged project; "" if they pass."""
+        key = " ".join(arguments)
+        if key not in self.unchanged:
+            self.unchanged[key] = self.pytest(arguments)
+        return self.unchanged[key]
+
+    def run(self, mutant: Mutant) -> tuple[str, str]:
+        """Return one of OUTCOMES, and the failure."""
+        tests = stages(mutant.path, self.thorough)
+        if failure := next(filter(None, map(self.baseline, tests)), ""):
+            return "not counted", f"its tests fail without a change: {failure}"
         file = self.root / mutant.path
         before = file.read_text("utf-8")
         file.write_text(mutant.apply(before), "utf-8")
         try:
-            return next(filter(None, map(self.pytest, stages(mutant.path, self.thorough))), "")
+            failure = next(filter(None, map(self.pytest, tests)), "")
         finally:
             file.write_text(before, "utf-8")
+        return ("noticed" if failure else "survived"), failure
+
+
+def run_all(chosen: list[Mutant], options: argparse.Namespace) -> dict[Mutant, str]:
+    """Run mutants until `--minutes` have passed, print a line for each, and return their outcomes."""
+    outcomes, begin = dict[Mutant, str](), time.monotonic()
+    with tempfile.TemporaryDirectory() as folder:
+        free: SimpleQueue[Worker] = SimpleQueue()
+        for number in range(options.workers):
+            free.put(Worker(Path(folder) / str(number), options.thorough))
+
+        def run(index: int, mutant: Mutant) -> None:
+            if time.monotonic() - begin >= 60.0 * options.minutes:
+                return
+            worker = free.get()
+            try:
+                outcomes[mutant], failure = worker.run(mutant)
+            finally:
+                free.put(worker)
+            print(f"{index}: {mutant}: {outcomes[mutant]} {failure} ({time.monotonic() - begin:.0f} s)", flush=True)
+
+        with ThreadPoolExecutor(options.workers) as pool:
+            list(pool.map(run, range(options.first, options.first + len(chosen)), chosen))
+    return outcomes
 
 
 def main() -> None:
@@ -164,6 +202,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=60, help="number of mutants")
     parser.add_argument("--first", type=int, default=0, help="index of the first mutant")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="start no mutant after this time")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--thorough", action="store_true", help="run slow tests, too: minutes for each survivor")
     parser.add_argument("--record", action="store_true", help="store the figures in tests/trust.json")
@@ -174,30 +213,13 @@ def main() -> None:
     if options.show:
         print(*chosen, f"{len(everything)} changes of {len({mutant.path for mutant in everything})} files", sep="\n")
         return
-    survivors, begin = [], time.perf_counter()
-    with tempfile.TemporaryDirectory() as folder:
-        free: SimpleQueue[Worker] = SimpleQueue()
-        for number in range(options.workers):
-            free.put(Worker(Path(folder) / str(number), options.thorough))
-
-        def run(mutant: Mutant) -> tuple[Mutant, str]:
-            worker = free.get()
-            try:
-                return mutant, worker.run(mutant)
-            finally:
-                free.put(worker)
-
-        with ThreadPoolExecutor(options.workers) as pool:
-            for done in as_completed([pool.submit(run, mutant) for mutant in chosen]):
-                mutant, noticed = done.result()
-                index = everything.index(mutant)
-                survivors += [] if noticed else [mutant]
-                outcome = f"noticed: {noticed}" if noticed else "SURVIVED"
-                print(f"{index}: {mutant}: {outcome} ({time.perf_counter() - begin:.0f} s)", flush=True)
-    noticed = len(chosen) - len(survivors)
-    print(f"{len(chosen)} mutants, {noticed} noticed, {len(survivors)} survived", *survivors, sep="\n")
+    outcomes = run_all(chosen, options)
+    counts = Counter(outcomes.values())
+    found = ", ".join(f"{counts[outcome]} {outcome}" for outcome in OUTCOMES if counts[outcome])
+    print(f"{len(outcomes)} mutants: {found}", *(mutant for mutant in outcomes if outcomes[mutant] == "survived"), sep="\n")
     if options.record:
-        record("mutants", f"{len(chosen)} one-token changes of {' and '.join(FOLDERS)}", f"{noticed} noticed, {len(survivors)} survived")
+        counted = counts["noticed"] + counts["survived"]
+        record("mutants", f"{counted} one-token changes of {' and '.join(FOLDERS)}", found)
 
 
 if __name__ == "__main__":

@@ -47,11 +47,16 @@ def test_mutants_are_valid_code_with_one_change() -> None:
 
 def test_a_mutant_is_noticed_by_the_tests_of_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     worker = object.__new__(mutants.Worker)
-    worker.root, worker.thorough = tmp_path, False
-    (tmp_path / "a.py").write_text("x = 1\n")
-    monkeypatch.setattr(worker, "pytest", lambda arguments: (tmp_path / "a.py").read_text())
-    assert worker.run(mutants.Mutant("a.py", 1, 4, 5, "1", "0")) == "x = 0\n"
-    assert (tmp_path / "a.py").read_text() == "x = 1\n"
+    worker.root, worker.thorough, worker.unchanged = tmp_path, False, {}
+    file, mutant = tmp_path / "a.py", mutants.Mutant("a.py", 1, 4, 5, "1", "0")
+    file.write_text("x = 1\n")
+    monkeypatch.setattr(worker, "pytest", lambda arguments: file.read_text().replace("x = 1\n", ""))
+    assert worker.run(mutant) == ("noticed", "x = 0\n") and file.read_text() == "x = 1\n"
+    monkeypatch.setattr(worker, "pytest", lambda arguments: "")
+    assert worker.run(mutant) == ("survived", "")
+    monkeypatch.setattr(worker, "unchanged", {})
+    monkeypatch.setattr(worker, "pytest", lambda arguments: "FAILED always")
+    assert worker.run(mutant) == ("not counted", "its tests fail without a change: FAILED always")
     for path in ("kernels/units/box.py", "kernels/wide/box.h", "kernels/wide/nodes.py"):
         assert all((ROOT / stage[0]).exists() for stage in mutants.stages(path, thorough=True))
 

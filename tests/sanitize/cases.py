@@ -44,6 +44,15 @@ def rays(rng: np.random.Generator, n: int, corners: np.ndarray) -> tuple[np.ndar
     return origin, direction, t_min, rng.choice(np.array([np.inf, np.inf, 3.4e38, 1.0, 0.0], np.float32), n)
 
 
+def in_faces(rng: np.random.Generator, n: int) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+    """Return corners (24, 3, 3) and n rays that start in faces of the triangles' boxes, almost along z: their shear underflows."""
+    size = 10.0 ** rng.uniform(-20.0, 0.0)
+    corners, origin = rng.integers(-3, 4, (24, 3, 3)) * size, rng.integers(-2, 3, (n, 3)) * size
+    direction = np.concatenate([10.0 ** rng.uniform(-45.0, -15.0, (n, 2)), np.ones((n, 1))], axis=1)
+    return corners.astype(np.float32), (origin.astype(np.float32), direction.astype(np.float32), np.zeros(1, np.float32),
+                                        np.full(n, np.inf, np.float32))
+
+
 def answers(accel: Any, rays: tuple[np.ndarray, ...]) -> list[np.ndarray]:
     """Return t, u, v and prim_id of the closest hits, and any_hit as int32, by the kernels that trace one ray at a time."""
     origin, direction, t_min, t_max = rays
@@ -63,15 +72,21 @@ def answers(accel: Any, rays: tuple[np.ndarray, ...]) -> list[np.ndarray]:
 def cases() -> Iterator[list[np.ndarray]]:
     """Yield the arrays of each case, in the order in which walks.cpp reads them."""
     rng = np.random.default_rng(1)
+
+    def case(corners: np.ndarray, max_leaf: int, rays_of_case: list[tuple[np.ndarray, ...]]) -> Iterator[list[np.ndarray]]:
+        mesh = Mesh(corners.reshape(-1, 3), np.arange(corners.size // 3, dtype=np.int32).reshape(-1, 3))
+        accel = build(mesh, "bvh8", max_leaf=max_leaf)
+        for given in rays_of_case:
+            yield [accel.data.nodes.numpy(), accel.data.primitives.numpy(), *given, np.zeros(len(given[0]), np.int32),
+                   *answers(accel, given)]
+
     for count in FACES:
         corners = triangles(rng, count)
-        mesh = Mesh(corners.reshape(-1, 3), np.arange(3 * count, dtype=np.int32).reshape(-1, 3))
         for max_leaf in (1, 8, 20):
-            accel = build(mesh, "bvh8", max_leaf=max_leaf)
-            tree = [accel.data.nodes.numpy(), accel.data.primitives.numpy()]
-            for n in RAYS if count in (8, 300) else (17,):
-                given = rays(rng, n, corners)
-                yield [*tree, *given, np.zeros(n, np.int32), *answers(accel, given)]
+            yield from case(corners, max_leaf, [rays(rng, n, corners) for n in (RAYS if count in (8, 300) else (17,))])
+    for _ in range(20):
+        corners, given = in_faces(rng, 200)
+        yield from case(corners, 8, [given])
 
 
 def write_cases(path: Path) -> None:

@@ -9,13 +9,27 @@ from tests.kernel_tools import DEVICE, cpu_only, floats, launch, vec3s, zeros  #
 import warp as wp
 
 from tests.kernels.wide.plain_rows import make_plain_rows
-from wrt.kernels.query import LARGEST, RayArrays, direction_scale, load_ray
+from wrt.accel.queries.rays import is_valid
+from wrt.kernels.query import FARTHEST, LARGEST, RayArrays, direction_scale, load_ray
 from wrt.kernels.structs import NO_HIT, Hit, Primitive, Surfaces, kernel
 from wrt.kernels.traverse.common import Units, make_intersect, make_probe, no_hit
 from wrt.kernels.wide import packets
 from wrt.kernels.wide.batch import PACKETS, SLOTS
 from wrt.kernels.wide.lanes import LANE_PAD, row_type
-from wrt.kernels.wide.layout import BEAM, COHERENT, ENTRY, ENTRY_RAYS, FIELDS, LANES, PACKET_SIZE, SLOT_SIZE, STACK_SIZE, STACK_WORDS, WIDTH
+from wrt.kernels.wide.layout import (
+    BEAM,
+    COHERENT,
+    ENTRY,
+    ENTRY_RAYS,
+    FIELDS,
+    LANES,
+    PACKET_SIZE,
+    REFUSED,
+    SLOT_SIZE,
+    STACK_SIZE,
+    STACK_WORDS,
+    WIDTH,
+)
 from wrt.kernels.wide.packets import Scratch, WideBvh, packet_kernel
 from wrt.kernels.wide.references import EMPTY
 from wrt.kernels.wide.traverse import lane_ray
@@ -326,6 +340,23 @@ def underflow_case(rng, n):
     return rays, plain_nodes(low.astype(np.float32), (low + size).astype(np.float32)), corners
 
 
+def limit_case(rng, n):
+    """Return rays at the limits of what a query accepts, and beside them."""
+    def beside(limit):
+        limit = np.float32(limit)
+        with np.errstate(over="ignore"):
+            values = np.array([np.nextafter(limit, np.float32(0.0)), limit, np.nextafter(limit, np.float32(np.inf))])
+        return np.concatenate([values, -values])
+
+    def choose(values, shape, rest):
+        return np.where(rng.random(shape) < 0.2, rng.choice(values, shape), rest)
+
+    (_, _, t_min, t_max), boxes, corners = special_case(rng, n)
+    origin = choose(beside(FARTHEST), (n * LANES, 3), 1.0)
+    direction = choose(np.concatenate([beside(LARGEST), beside(0.0)]), (n * LANES, 3), 0.0)
+    return (origin, direction, choose(beside(0.0), n * LANES, t_min), choose([np.nan], n * LANES, t_max)), boxes, corners
+
+
 CASES = {"coherent": lambda rng: random_case(rng, 2000, True), "incoherent": lambda rng: random_case(rng, 1000, False),
          "special": lambda rng: special_case(rng, 3000), "underflow": lambda rng: underflow_case(rng, 3000)}
 
@@ -345,6 +376,16 @@ def test_set_up_is_that_of_the_scalar_units(name):
     t_min, t = both.lane_rows(both.set_up, ["t_min", "t"]).T
     np.testing.assert_array_equal(both.active.reshape(-1), t >= t_min)
     np.testing.assert_array_equal(both.reaching[:, None] >> np.arange(LANES) & 1, (t >= 0.5).reshape(-1, LANES))
+
+
+@pytest.mark.parametrize("name", [*CASES, "limits"])
+def test_invalid_rays_are_those_of_the_check_of_arrays(name):
+    # The check of arrays decides. A ray that set_up reports and the check accepts costs time only, so no query would show it.
+    both = case(name) if name in CASES else Both(*limit_case(np.random.default_rng(0), 500))
+    given = [getattr(both.rays, of).numpy() for of in ("origin", "direction", "t_min", "t_max")]
+    refused = both.set_up[:, REFUSED].view(np.int32)[:, None] >> np.arange(LANES) & 1
+    np.testing.assert_array_equal(refused.reshape(-1) == 0, is_valid(*given))
+    assert name != "limits" or 0.1 < refused.mean() < 0.9
 
 
 @pytest.mark.parametrize("name", CASES)
