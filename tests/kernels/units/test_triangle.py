@@ -509,6 +509,15 @@ def test_every_test_agrees_with_float64_on_sound_triangles(test):
 
 
 @pytest.mark.parametrize("test", RAY_TRIANGLE)
+def test_every_test_hits_edges_and_corners_where_nothing_is_rounded(test):
+    # u or v is exactly 0, or their sum exactly 1.
+    x, y = (a.reshape(-1) for a in np.mgrid[-1:6, -1:6])
+    origin = np.stack([x, y, 2 + 0 * x], axis=1)
+    hits = closest(test, origin, np.broadcast_to([0.0, 0.0, -1.0], origin.shape), [[[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [0.0, 4.0, 0.0]]])
+    assert np.array_equal(hits.prim_id == 0, (x >= 0) & (y >= 0) & (x + y <= 4))
+
+
+@pytest.mark.parametrize("test", RAY_TRIANGLE)
 def test_every_test_misses_triangles_without_area_and_behind(test):
     rng = np.random.default_rng(11)
     a, b = rounded(rng.normal(size=(2, 3)))

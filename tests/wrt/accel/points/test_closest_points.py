@@ -118,6 +118,23 @@ def test_of_equal_ones_the_lowest_is_told() -> None:
     assert (other.prim_id < len(ball.faces)).all() and np.array_equal(mine.prim_id, other.prim_id)
 
 
+@pytest.mark.parametrize("alike", ((), (0,), (0, 1)))
+def test_at_a_common_edge_both_faces_are_equally_close(alike: tuple[int, ...]) -> None:
+    """alike: the coordinates in which the edge's ends agree. Whichever way a face runs along the edge, the lowest face is the answer."""
+    rng = np.random.default_rng(len(alike))
+    for _ in range(20):
+        a, b = rng.normal(size=(2, 3)).astype(np.float32)
+        b[list(alike)] = a[list(alike)]
+        out = np.cross(b - a, rng.normal(size=3))
+        out /= np.linalg.norm(out)
+        side = np.cross(b - a, out)
+        middle = 0.5 * (a + b)
+        mesh = wrt.Mesh(np.stack([a, b, middle - out + side, middle - out - side]).astype(np.float32), np.array([[0, 1, 2], [1, 0, 3]]))
+        points = middle + rng.uniform(-0.4, 0.4, (500, 1)) * (b - a) + rng.uniform(0.1, 2.0, (500, 1)) * out
+        found = wrt.closest_points(wrt.build(mesh, "bvh8"), points.astype(np.float32))
+        assert (found.prim_id == 0).all()
+
+
 def test_signed_distances() -> None:
     box = wrt.build(wrt.Mesh.from_trimesh(trimesh.creation.box()), "bvh8")
     found = wrt.signed_distance(box, [[0.0, 0.0, 0.0], [0.0, 0.0, 0.4], [0.0, 0.0, 2.0], [1.5, 1.5, 0.0]])
