@@ -93,9 +93,12 @@ def _public() -> dict[str, str]:
 
 _HOME = _public()
 # What users of other libraries look for, and where it is.
-ELSEWHERE = {"closest_hit": "wrt.build(mesh).closest_hit(origins, directions)", "any_hit": "wrt.build(mesh).any_hit(origins, directions)",
+_CLOSEST, _ANY = (f"wrt.build(mesh).{name}(origins, directions)" for name in ("closest_hit", "any_hit"))
+ELSEWHERE = {"closest_hit": _CLOSEST, "cast_rays": _CLOSEST, "intersect": _CLOSEST, "any_hit": _ANY, "BVH": "wrt.build(mesh)",
+             "RaycastingScene": "wrt.compat.open3d.RaycastingScene", "RayMeshIntersector": "wrt.compat.trimesh.RayMeshIntersector",
              "PinholeCamera": "wrt.Camera, or wrt.sensors.pinhole for a matrix K", "PerspectiveCamera": "wrt.Camera",
-             "look_at": "wrt.Camera.look_at", "Ray": "arrays of origins and directions (docs/usage.md)"}
+             "look_at": "wrt.Camera.look_at", "load": "wrt.load_mesh, or wrt.load_scene",
+             "Ray": "arrays of origins and directions (docs/usage.md)"}
 _MODULES = [name for name, module in _HOME.items() if module == __name__]
 __all__ = ["__version__", *(name for name in _HOME if name not in _MODULES)]
 

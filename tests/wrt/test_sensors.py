@@ -302,8 +302,9 @@ def test_several_intrinsics_are_several_cameras(make: Any, rolling: bool) -> Non
     (lambda: pinhole(K, (4, 4), 2.0 * np.eye(4)), ("pose", "affine")),
     (lambda: pinhole(K, (4, 4), np.diag([1.0, 1.0, -1.0, 1.0])), ("pose", "rotation")),
     (lambda: rotating_lidar([], 4), ("elevations", "one or more angles")),
-    (lambda: rotating_lidar([2.0], 4), ("elevations", "one or more angles")),
+    (lambda: rotating_lidar([2.0], 4), ("elevations", "got [2.0]", None, None, "np.radians")),
     (lambda: rotating_lidar([0.0], 0), ("steps", "1")),
+    (lambda: wrt.Camera.look_at((0, 0, 5), (0, 0, 0), fov_y=60), ("fov_y", "radians, got 60", "camera")),
     (lambda: raster_lidar((7.0, 1.0), (4, 4)), ("fov", "at most 2 pi")),
     (lambda: raster_lidar((1.0,), (4, 4)), ("fov", "two angles")),  # type: ignore[arg-type]
     (lambda: with_range_noise([1.0], 0, -1.0), ("constant",)),

@@ -32,7 +32,7 @@ from wrt.cli.common import (
     shared,
     warnings_reported,
 )
-from wrt.cli.save import checkpoint_options, remove_checkpoint, save_film, write_to_stdout
+from wrt.cli.save import SUFFIX, checkpoint_options, remove_checkpoint, save_film, write_to_stdout
 from wrt.core.default_device import DEFAULT_DEVICE
 from wrt.core.errors import InputError
 from wrt.core.interrupts import Interrupted, exit_code
@@ -142,6 +142,8 @@ def render_once(scene: Path, output: Path | None, *, assignments: Assignments, s
     checkpoint = options.get("checkpoint")
     if checkpoint is not None and options["resume"] and not (os.path.lexists(checkpoint) or quiet):
         say(f"{checkpoint}: no checkpoint yet, rendering from the beginning")
+    if checkpoint is None and not quiet and os.path.lexists(unused := output.with_name(output.name + SUFFIX)):
+        say(f"{unused}: a checkpoint of an earlier render is here; --resume continues from it, this render begins anew")
 
     with warnings_reported(quiet):
         film = trace(loaded, scene, settings.get("spp"), options, quiet)

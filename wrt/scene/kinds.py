@@ -21,7 +21,7 @@ Record = dict[str, Any]  # values by the field names of a device struct: scalars
 def _number(value: Any, what: str, limits: Limits, unit: float = 1.0) -> float:
     low = max(limits.get(each, -math.inf) for each in ("ge", "gt"))
     high = min(limits.get(each, math.inf) for each in ("le", "lt"))
-    return as_number(value, what, low=low * unit, high=high * unit)
+    return as_number(value, what, low=low * unit, high=high * unit, unit="" if unit == 1.0 else "radians")
 
 
 def _image(value: Any, what: str, limits: Limits) -> np.ndarray:

@@ -34,15 +34,15 @@ def as_vector(value: object, what: str, *, low: float = -math.inf, high: float =
     return (float(array[0]), float(array[1]), float(array[2]))
 
 
-def as_number(value: object, what: str, *, low: float = -math.inf, high: float = math.inf) -> float:
-    """Return one finite float in [low, high]. Raises InputError that names `what`."""
+def as_number(value: object, what: str, *, low: float = -math.inf, high: float = math.inf, unit: str = "") -> float:
+    """Return one finite float in [low, high]. Raises InputError that names `what` and the unit."""
     try:
         number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError) as error:
         raise wrong(what, f"must be a number, got {shown(value)}") from error
     low, high = max(low, -LARGEST), min(high, LARGEST)
     if not math.isfinite(number) or not low <= number <= high:
-        raise wrong(what, f"must be finite and in [{low:g}, {high:g}], got {shown(value)}")
+        raise wrong(what, f"must be finite and in [{low:g}, {high:g}]{unit and ' ' + unit}, got {shown(value)}")
     return number
 
 

@@ -198,6 +198,15 @@ def test_resume_without_a_checkpoint_says_that_it_begins() -> None:
     assert run("render", "box.obj", *SMALL, "--resume", "-q").err == ""
 
 
+def test_a_render_beside_a_checkpoint_says_that_it_begins_anew() -> None:
+    Path("box.png.checkpoint").write_bytes(b"of an earlier render")
+    said = "box.png.checkpoint: a checkpoint of an earlier render is here; --resume continues from it"
+    result = run("render", "box.obj", *SMALL)
+    assert result.code == 0 and said in result.err and Path("box.png.checkpoint").read_bytes() == b"of an earlier render"
+    assert said not in run("render", "box.obj", *SMALL, "-q").err
+    assert said not in run("render", "box.obj", *SMALL, "-o", "a.png").err
+
+
 @pytest.mark.parametrize(("arguments", "message"), [
     (["--checkpoint", "soon"], "write 30s, 5m or 1h"), (["--checkpoint", "0s"], "checkpoint_every must be more than 0"),
     (["--checkpoint-file", "./a.png"], "a.png: is the picture; a checkpoint needs a file of its own"),

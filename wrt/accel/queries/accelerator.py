@@ -14,7 +14,7 @@ from wrt.accel.built import AccelStats
 from wrt.accel.flat_scene import FlatScene
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry
-from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES, Hits, answer_arrays, arrays_of, no_attribute
+from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES, OTHER_NAMES, Hits, answer_arrays, arrays_of, no_attribute, other_name
 from wrt.accel.queries.batches import Query, trace_query
 from wrt.accel.queries.counting import counted
 from wrt.accel.queries.gradients import record
@@ -25,7 +25,7 @@ from wrt.accel.queries.world_ids import check_world
 from wrt.accel.snapshot import Snapshot
 from wrt.accel.structure import Structure, check_units
 from wrt.core.arrays import to_tensor_like
-from wrt.core.checks import did_you_mean, shown
+from wrt.core.checks import shown
 from wrt.core.device import start, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
@@ -85,9 +85,10 @@ class Accelerator:
     if not TYPE_CHECKING:  # type checkers report unknown names themselves
 
         def __getattr__(self, name: str) -> NoReturn:
-            if name in FUNCTIONS:
-                raise AttributeError(f"{name} is a function: wrt.{name}(accel, ...)")
-            if name == "move":
+            ours = OTHER_NAMES.get(name, name)
+            if ours in FUNCTIONS:
+                raise AttributeError(f"{ours} is a function: wrt.{ours}(accel, ...)")
+            if ours == "move" and not hasattr(type(self), "move"):
                 raise AttributeError(f"{type(self).__name__} cannot move: build it with wrt.build(..., movable=True)")
             raise no_attribute(self, name, dir(type(self)))
 
@@ -169,6 +170,8 @@ class Accelerator:
             Names the argument and what was expected. The arrays of `out` may have been overwritten.
         """
         threads, shape, callers = thread_count(threads), None, None if out is None else arrays_of(out)
+        if costs:
+            checked_names(costs, "closest_hit", CostOptions)
         if are_rows(origins, directions) and invalid == "raise":  # the usual case, whose arrays need no other shape
             rays = rays_of(origins, directions, t_min, t_max, True)  # type: ignore[arg-type]
         else:
@@ -180,7 +183,7 @@ class Accelerator:
         snapshot = self._snapshot  # read once, because a refit may replace it during the query
         worlds = check_world(snapshot, world, len(t))
         query, counters = Query(rays, arrays, threads, worlds, tiled_width(shape) if shape else 0), None
-        if costs and any(checked_names(costs, "closest_hit", CostOptions).values()):
+        if costs and any(costs.values()):
             counters = counted(snapshot, query, fetches_too=costs.get("trace", False))
         else:
             trace_query(snapshot, query)
@@ -246,8 +249,8 @@ def checked_names(options: Any, method: str, kind: type) -> Any:
     """Return the options of a method. Raises TypeError for a name that is none of a TypedDict's (`kind`)."""
     for name in options:
         if name not in kind.__annotations__:
-            near = did_you_mean(name, [*signature(getattr(Accelerator, method)).parameters, *kind.__annotations__])
-            raise TypeError(f"{method}() got an unexpected keyword argument {name!r}{near and '; ' + near.rstrip()}")
+            near = other_name(name, [*signature(getattr(Accelerator, method)).parameters, *kind.__annotations__])
+            raise TypeError(f"{method}() got an unexpected keyword argument {name!r}{near}")
     return options
 
 

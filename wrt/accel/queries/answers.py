@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from itertools import combinations
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -23,6 +23,19 @@ from wrt.core.types import Array, ArrayT, Device, PathLike, TensorT, WarpArray
 
 HIT_TYPES = {"out.t": np.float32, "out.u": np.float32, "out.v": np.float32, "out.prim_id": np.int32}
 ANY_HIT_TYPES = {"out": np.bool_}
+
+# Names of other ray libraries, and what wrt calls the same thing; of hits, of structures, and of arguments of queries.
+OTHER_NAMES = {
+    "t_hit": "t", "depth": "distance", "locations": "points", "face_normals": "normals", "primitive_normals": "normals",
+    "primitive_ids": "prim_id", "face_id": "prim_id", "index_tri": "prim_id", "geometry_ids": "object", "geom_id": "object",
+    "valid": "hit", "is_valid": "hit", "mask": "hit",
+    "cast_rays": "closest_hit", "intersect": "closest_hit", "intersects_first": "closest_hit", "intersects_location": "closest_hit",
+    "intersects_any": "any_hit", "occluded": "any_hit", "test_occlusions": "any_hit", "update": "refit", "set_transform": "move",
+    "compute_signed_distance": "signed_distance", "compute_occupancy": "contains", "compute_distance": "closest_points",
+    "compute_closest_points": "closest_points", "closest_point": "closest_points", "count_intersections": "count_hits",
+    "list_intersections": "all_hits", "intersects_id": "all_hits",
+    "tfar": "t_max", "max_distance": "t_max", "max_dist": "t_max", "tnear": "t_min", "worlds": "world", "env_ids": "world",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,9 +189,15 @@ class Hits(HitPoints[ArrayT]):
 
 
 def no_attribute(thing: object, name: str, known: Iterable[str]) -> AttributeError:
-    """Return the error about an unknown attribute, with the most similar public one."""
-    near = did_you_mean(name, [each for each in known if not each.startswith("_")]) if not name.startswith("_") else ""
-    return AttributeError(f"{type(thing).__name__} has no attribute {name!r}{near and '; ' + near.rstrip()}")
+    """Return the error about an unknown attribute, with the public one that means the same or is most similar."""
+    near = other_name(name, [each for each in known if not each.startswith("_")]) if not name.startswith("_") else ""
+    return AttributeError(f"{type(thing).__name__} has no attribute {name!r}{near}")
+
+
+def other_name(name: str, known: Collection[str]) -> str:
+    """Return "; did you mean ...?" with the known name that means the same as `name` or is most similar; "" without either."""
+    near = did_you_mean(OTHER_NAMES[name] if OTHER_NAMES.get(name) in known else name, known)
+    return near and f"; {near.rstrip()}"
 
 
 def arrays_of(out: object) -> list[Any]:

@@ -162,7 +162,10 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = DEFAULT_
     InputError
         Names the argument and what was expected.
     """
-    ACCELERATORS.check(as_one(accel, str, "accel"), "accel")
+    if not isinstance(accel, str):
+        raise InputError(f"must be the name of a structure, got {shown(accel)}", argument="accel",
+                         hint="vertices and faces are one argument: wrt.build((vertices, faces))")
+    ACCELERATORS.check(accel, "accel")
     kind, device = ACCELERATORS[accel], as_one(device, str, "device")
     if as_one(movable, bool, "movable") and not isinstance(mesh, list):
         mesh = [mesh]

@@ -109,7 +109,8 @@ def rotating_lidar(elevations: ArrayLike, steps: int, pose: ArrayLike | None = N
     """
     rows = as_array(elevations, np.float64, "elevations")
     if rows.ndim != 1 or not len(rows) or not (np.abs(rows) <= 0.5 * np.pi).all():
-        raise InputError("must be one or more angles, -pi/2 to pi/2 radians", argument="elevations")
+        raise InputError(f"must be one or more angles, -pi/2 to pi/2 radians, got {shown(elevations)}", argument="elevations",
+                         hint="np.radians converts degrees")
     steps = as_integer(steps, "steps", 1, 1 << 24)
     azimuths = as_number(start, "start") + as_number(turn, "turn") * np.arange(steps) / steps
     return make_sensor(_spherical(azimuths[None, :], rows[:, None]), pose, 0, 1 if rolling else None, like)

@@ -13,6 +13,8 @@ import warp as wp
 import wrt
 from tests.kernel_tools import DEVICE
 from tests.refused import refused
+from wrt.accel.queries.accelerator import FUNCTIONS
+from wrt.accel.queries.answers import OTHER_NAMES
 from wrt.core.arrays import to_numpy
 from wrt.scene.shapes import icosphere
 
@@ -155,8 +157,12 @@ def test_typing_errors_are_answered_with_the_name(ball: Any) -> None:
                               (hits.counters, "node", "nodes")):
         with pytest.raises(AttributeError, match=f"{name}'; did you mean '{near}'"):
             getattr(thing, name)
-    with pytest.raises(TypeError, match="'tmax'; did you mean 't_max'"):
-        ball.closest_hit(*some_rays(4), tmax=1.0)
+    for method in (ball.closest_hit, ball.any_hit):
+        for name in ("tmax", "tfar", "max_distance"):
+            with pytest.raises(TypeError, match=f"'{name}'; did you mean 't_max'"):
+                method(*some_rays(4), **{name: 1.0})
+    with pytest.raises(TypeError, match="'env_ids'; did you mean 'world'"):  # not that `world` is missing
+        wrt.build([icosphere(1), icosphere(1)]).closest_hit(*some_rays(4), env_ids=0)
     assert not hasattr(hits, "__array__") and not hasattr(hits, "wheels")
 
 
@@ -164,10 +170,26 @@ def test_names_of_functions_and_of_the_package_are_answered_with_the_way(ball: A
     for thing, name, said in ((ball, "contains", "wrt.contains(accel, ...)"), (ball, "move", "movable=True"),
                               (ball, "closst_hit", "'closest_hit'"), (wrt, "buildd", "'build'"), (wrt, "sensor", "'sensors'"),
                               (wrt, "pinhole", "wrt.sensors.pinhole"), (wrt, "icosphere", "wrt.scene.shapes.icosphere"),
-                              (wrt, "PinholeCamera", "wrt.Camera"), (wrt, "any_hit", "wrt.build(mesh).any_hit")):
+                              (wrt, "PinholeCamera", "wrt.Camera"), (wrt, "any_hit", "wrt.build(mesh).any_hit"),
+                              (wrt, "cast_rays", "wrt.build(mesh).closest_hit"), (wrt, "RaycastingScene", "wrt.compat.open3d")):
         with pytest.raises(AttributeError) as error:
             getattr(thing, name)
         assert said in str(error.value)
+
+
+def test_names_of_other_libraries_are_answered_with_ours(ball: Any) -> None:
+    hits, movable = ball.closest_hit(*some_rays(4)), wrt.build(wrt.Scene.of([icosphere(1)]), movable=True)
+    assert {*OTHER_NAMES.values()} <= {*dir(hits), *dir(ball), *dir(movable), *FUNCTIONS, "t_min", "t_max", "world"}
+    for name, said in (("set_transform", "movable=True"), ("compute_signed_distance", "wrt.signed_distance(accel, ...)")):
+        with pytest.raises(AttributeError) as error:
+            getattr(ball, name)
+        assert said in str(error.value)
+    for thing, name, ours in ((hits, "t_hit", "t"), (hits, "primitive_ids", "prim_id"), (hits, "geom_id", "object"),
+                              (ball, "cast_rays", "closest_hit"), (ball, "intersects_any", "any_hit"), (movable, "set_transform", "move")):
+        with pytest.raises(AttributeError, match=f"'{name}'; did you mean '{ours}'"):
+            getattr(thing, name)
+    with refused("accel", hint="wrt.build((vertices, faces))"):
+        wrt.build(np.zeros((3, 3)), np.array([[0, 1, 2]]))  # type: ignore[call-overload]
 
 
 def test_copied_hits_say_that_they_have_lost_their_rays(ball: Any) -> None:
