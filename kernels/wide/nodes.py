@@ -49,31 +49,11 @@ def make_plane(width: int, compressed: bool) -> Any:
     return plane, exists
 
 
-def lane_by_lane(width: int, compressed: bool, enters: Any) -> Any:
-    """Return children (see make_children), which tests a node's children one by one: enters(nodes, first, lane, ray, t_max) -> t or inf."""
-    row = row_type(width)
-    _, exists = make_plane(width, compressed)
-
-    @wp.func
-    def children(nodes: wp.array(dtype=wp.float32), first: int, ray: LaneRay, t_max: float):
-        entries = row()
-        mask = int(0)
-        for j in range(width):
-            entry = enters(nodes, first, j, ray, t_max)
-            entries[j] = entry
-            if exists(nodes, first, j) and entry < wp.inf:
-                mask = mask | (1 << j)
-        return entries, mask
-
-    return children
-
-
 @cache
 def make_scalar(width: int, compressed: bool, box: str) -> Any:
     """Return children(nodes, first, ray, t_max) -> (row, mask) for a box test without a vectorised form.
     It tests a node's children one by one with RAY_AABB[box]. `make_children` describes row and mask."""
-    plane, _ = make_plane(width, compressed)
-    ray_aabb = RAY_AABB[box]
+    (plane, exists), ray_aabb, row = make_plane(width, compressed), RAY_AABB[box], row_type(width)
 
     @wp.func
     def enters(nodes: wp.array(dtype=wp.float32), first: int, j: int, ray: LaneRay, t_max: float) -> float:
@@ -81,7 +61,17 @@ def make_scalar(width: int, compressed: bool, box: str) -> Any:
         hi = wp.vec3(plane(nodes, first, HI_X, j), plane(nodes, first, HI_Y, j), plane(nodes, first, HI_Z, j))
         return ray_aabb(ray.box, lo, hi, t_max)
 
-    return lane_by_lane(width, compressed, enters)
+    @wp.func
+    def children(nodes: wp.array(dtype=wp.float32), first: int, ray: LaneRay, t_max: float):
+        entries = row()
+        mask = int(0)
+        for j in range(width):
+            entries[j] = enters(nodes, first, j, ray, t_max)
+            if exists(nodes, first, j) and entries[j] < wp.inf:
+                mask = mask | (1 << j)
+        return entries, mask
+
+    return children
 
 
 @cache

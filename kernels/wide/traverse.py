@@ -192,7 +192,7 @@ def make_recorded(units: Units, accepts: Any, layout: NodeLayout) -> Any:
     """Return record_children, record_push, record_pop and recorded_leaf, which write the steps of kernels.traverse.steps."""
     record, width = units.triangle_test.record, layout.width
     struct = make_struct(record)
-    plane, _ = make_plane(width, layout.compressed)
+    plane, (_, entry) = make_plane(width, layout.compressed)[0], make_children(width, layout.compressed, units.box)
     record_pushed, record_popped = make_recording(units)
     gather, recorded_test = make_gather(record, width), make_recorded_test(units, accepts)
 
@@ -203,7 +203,7 @@ def make_recorded(units: Units, accepts: Any, layout: NodeLayout) -> Any:
         return simple_step(LEAF, reference, INNER)
 
     @wp.func
-    def record_children(accel: struct, slot: int, first: int, t: Any, mask: int):
+    def record_children(accel: struct, slot: int, first: int, t: Any, mask: int, rows: LaneRay):
         if wp.static(units.steps):
             nodes = accel.nodes
             for j in range(width):
@@ -211,9 +211,9 @@ def make_recorded(units: Units, accepts: Any, layout: NodeLayout) -> Any:
                 if reference != EMPTY:
                     lo = wp.vec3(plane(nodes, first, LO_X, j), plane(nodes, first, LO_Y, j), plane(nodes, first, LO_Z, j))
                     hi = wp.vec3(plane(nodes, first, HI_X, j), plane(nodes, first, HI_Y, j), plane(nodes, first, HI_Z, j))
-                    entry = wp.where((mask >> j) & 1 != 0, t[j], float(wp.inf))
+                    begin = wp.where((mask >> j) & 1 != 0, entry(t, nodes, first, j, rows), float(wp.inf))
                     child = child_of(reference)
-                    write_step(accel.recorder, slot, box_step(child.index, child.count, lo, hi, entry))
+                    write_step(accel.recorder, slot, box_step(child.index, child.count, lo, hi, begin))
 
     @wp.func
     def record_push(recorder: Recorder, ray: Ray, key: wp.uint64, below: int):
@@ -287,7 +287,7 @@ def make_traversal(units: Units, any_hit: bool, accepts: Any, layout: NodeLayout
                 first = reference * wp.static(layout.size)
                 counts = count_node(accel, ray, counts, reference)
                 t, mask = children(accel.nodes, first, rows, best.t)
-                record_children(accel, ray.slot, first, t, mask)
+                record_children(accel, ray.slot, first, t, mask, rows)
                 if mask != 0:
                     lane, mask = lowest(mask), mask & (mask - 1)
                     near = key_of(entry(t, accel.nodes, first, lane, rows), child(accel, first, lane))

@@ -318,6 +318,7 @@ def test_several_intrinsics_are_several_cameras(make: Any, rolling: bool) -> Non
     (lambda: pinhole(K, (4, 4), np.full((4, 4), np.nan)), ("pose", "finite")),
     (lambda: pinhole(K, (4, 4), (np.eye(3), np.zeros(2))), ("pose", "(R, t), of (3, 3) and (3,)")),
     (lambda: pinhole(K, (4, 4), (2.0 * np.eye(3), np.zeros(3))), ("pose", "a rotation")),
+    (lambda: pinhole(K, (4, 4), [[[1.0, 2.0], [3.0]], [1.0]]), ("pose[0]", "array of numbers")),
     (lambda: pinhole([K, -K], (4, 4)), ("intrinsics[1]", "[[fx, s, cx]")),
     (lambda: pinhole([K, K], (4, 4), np.stack([np.eye(4)] * 3)), ("pose", "one for each of 2 intrinsics, got 3")),
     (lambda: pinhole(np.zeros((4096, 3)), (4, 4)), ("intrinsics", "got an array (4096, 3) of float64")),

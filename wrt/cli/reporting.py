@@ -119,12 +119,12 @@ class Reporting:
         saved: text for --resume; only JSON and CSV contain it."""
         if self.output is None:
             return
-        suffix, field = self.output.suffix.lower(), {"resume": saved} if saved else {}
+        suffix = self.output.suffix.lower()
         if suffix == ".json":
-            self.write(json_text({**data, **field}))
+            self.write(json_text({**data, **({"resume": saved} if saved else {})}))
         elif suffix in files:
-            write_bytes(self.output, b"".join([*(f"# {name}: {text}\n".encode() for name, text in field.items() if suffix == ".csv"),
-                                               files[suffix]()]))
+            first = f"# resume: {saved}\n" if saved and suffix == ".csv" else ""
+            write_bytes(self.output, first.encode() + files[suffix]())
         else:
             self.write(text)
 

@@ -122,4 +122,4 @@ def _local_points(geometry: InstancedGeometry, points: np.ndarray, world: np.nda
         wide = points[some].astype(np.float64)
         for i in range(first[w], first[w + 1]):
             local = wide @ to_local[i, :, :3].T + to_local[i, :, 3]
-            yield some, np.ascontiguousarray(local, np.float32), int(geometry.part[i])
+            yield some, np.ascontiguousarray(np.clip(local, -FARTHEST, FARTHEST), np.float32), int(geometry.part[i])

@@ -125,7 +125,7 @@ def host_arrays(rays: Rays) -> Rays:
 def constant_array(value: float, n: int, device: Device) -> WarpArray:
     """Return an array (n,) of stride 0, all of whose elements are `value`. A CUDA graph can capture this call."""
     known = value in (0.0, np.inf) and device.is_cuda and not device.is_capturing
-    one = default_end(value, device.alias) if known else wp.full(1, value, dtype=wp.float32, device=device)
+    one = default_end(abs(value), device.alias) if known else wp.full(1, value, dtype=wp.float32, device=device)
     out = wp.array(ptr=one.ptr, shape=(n,), strides=(0,), dtype=wp.float32, device=device)
     keep(out, one)
     return out

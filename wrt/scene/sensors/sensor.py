@@ -209,8 +209,9 @@ def as_poses(pose: ArrayLike | None) -> np.ndarray:
     """Return poses (..., 4, 4) float64. Raises InputError unless each is a rotation and a translation."""
     if pose is None:
         return np.eye(4)
-    if isinstance(pose, tuple | list) and len(pose) == 2 and np.shape(pose[0])[-2:] != (4, 4):
-        pose = _from_opencv(*(as_doubles(part, f"pose[{i}]") for i, part in enumerate(pose)))
+    if isinstance(pose, tuple | list) and len(pose) == 2:
+        parts = [as_doubles(part, f"pose[{i}]") for i, part in enumerate(pose)]
+        pose = pose if parts[0].shape[-2:] == (4, 4) else _from_opencv(*parts)
     poses = as_doubles(pose, "pose")
     if poses.shape[-2:] != (4, 4) or poses.size == 0:
         raise InputError(f"must be (4, 4) or (B, 4, 4), sensor to world, got {poses.shape}", argument="pose")

@@ -153,6 +153,15 @@ def test_an_instance_that_maps_points_exactly_has_the_bits_of_the_flat_mesh() ->
         assert np.array_equal(wrt.winding_number(one, points, exact=exact), expected)
 
 
+@pytest.mark.filterwarnings("error")
+def test_points_that_are_too_far_from_a_tiny_instance_for_float32_are_outside() -> None:
+    scene = wrt.Scene((wrt.Object(shapes.icosphere(1), (wrt.Material(),), np.diag([1e-30, 1e-30, 1e-30, 1.0])),))
+    accel = wrt.build(scene, movable=True)
+    for exact in (False, True):
+        found = wrt.winding_number(accel, [[1e10, 0.0, 0.0], [-1e36, 1e36, 0.0], [0.0, 0.0, 0.0]], exact=exact)
+        assert found == pytest.approx([0.0, 0.0, 1.0], abs=ERROR)
+
+
 def test_corners_nothing_and_what_is_refused() -> None:
     ball = wrt.build(shapes.icosphere(1))
     assert np.isfinite(wrt.winding_number(ball, ball.geometry.vertices)).all()

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import wrt
+from tests import device
 from tests.data import data_path
 from tests.structures import STRUCTURES, families_first
 from wrt.accel.queries.recorded_steps import record_steps
@@ -49,6 +50,14 @@ def check_counts(mesh: Mesh, name: str, n: int) -> None:
 @pytest.mark.parametrize("name", families_first())
 def test_the_steps_give_the_counters(name: str) -> None:
     check_counts(icosphere(2), name, 500)
+
+
+@pytest.mark.skipif(device.NAME == "cpu", reason="needs a GPU")
+@pytest.mark.parametrize("name", ["bvh2", "bvh6", "bvh8", "bvh8c"])
+def test_a_gpu_records_the_steps_of_the_cpu(name: str) -> None:
+    rays = aimed(icosphere(2), 200, 0)
+    steps = [record_steps(wrt.build(icosphere(2), name, device=where), *rays).steps for where in ("cpu", device.NAME)]
+    assert steps[0].tobytes() == steps[1].tobytes()
 
 
 @pytest.mark.slow
