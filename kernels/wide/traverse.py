@@ -192,7 +192,8 @@ def make_recorded(units: Units, accepts: Any, layout: NodeLayout) -> Any:
     """Return record_children, record_push, record_pop and recorded_leaf, which write the steps of kernels.traverse.steps."""
     record, width = units.triangle_test.record, layout.width
     struct = make_struct(record)
-    plane, (_, entry) = make_plane(width, layout.compressed)[0], make_children(width, layout.compressed, units.box)
+    plane, _ = make_plane(width, layout.compressed)
+    _, entry = make_children(width, layout.compressed, units.box)
     record_pushed, record_popped = make_recording(units)
     gather, recorded_test = make_gather(record, width), make_recorded_test(units, accepts)
 
