@@ -33,7 +33,10 @@ inline float __int_as_float(int bits) { return __builtin_bit_cast(float, bits); 
 inline void __threadfence() {}
 inline int __float_as_int(float number) { return __builtin_bit_cast(int, number); }
 
-// For CUDA's fminf and fmaxf, -0 is less than 0. Warp's functions for the CPU return the first of two equal arguments.
+// For CUDA's fminf and fmaxf, -0 is less than 0, and NaN is left out. Warp's functions for the CPU return the first of two equal arguments.
+inline float fminf(float a, float b) { return a != a || b < a || (a == b && __builtin_signbit(b)) ? b : a; }
+inline float fmaxf(float a, float b) { return a != a || b > a || (a == b && !__builtin_signbit(b)) ? b : a; }
+
 namespace wp {
 template <class T> inline T cuda_min(T a, T b) { return min(a, b); }
 template <class T> inline T cuda_max(T a, T b) { return max(a, b); }
