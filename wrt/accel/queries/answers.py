@@ -119,6 +119,8 @@ class Hits(HitPoints[ArrayT]):
 
     def __getitem__(self, index: object) -> Hits[ArrayT]:
         """Return the hits of some rays. index: mask, slice, integers, or a tuple of these. Raises InputError under a recording tape."""
+        if isinstance(index, str):
+            raise TypeError(f"hits[...] selects rays; write hits.{OTHER_NAMES.get(index, index)} in place of hits[{index!r}]")
         check_no_gradients("hits[...]", t=self.t)
         keys = tuple(to_numpy(key) if is_tensor(key) or isinstance(key, wp.array) else key
                      for key in (index if isinstance(index, tuple) else (index,)))

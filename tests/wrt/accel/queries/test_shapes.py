@@ -188,6 +188,8 @@ def test_names_of_other_libraries_are_answered_with_ours(ball: Any) -> None:
                               (ball, "cast_rays", "closest_hit"), (ball, "intersects_any", "any_hit"), (movable, "set_transform", "move")):
         with pytest.raises(AttributeError, match=f"'{name}'; did you mean '{ours}'"):
             getattr(thing, name)
+    with pytest.raises(TypeError, match=r"write hits\.t in place of"):
+        _ = hits["t_hit"]
     with refused("accel", hint="wrt.build((vertices, faces))"):
         wrt.build(np.zeros((3, 3)), np.array([[0, 1, 2]]))  # type: ignore[call-overload]
 
