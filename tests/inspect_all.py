@@ -1,9 +1,10 @@
 """Compare the sum over the inspector's tree with the pixel of `wrt.render`, bit by bit: `python -m tests.inspect_all [PIXELS] [SPP]`.
 
-It inspects that many random pixels (1,000) of each scene in scenes/, with that many samples per pixel (2), for every camera."""
+It inspects random pixels of each scene in scenes/, for every camera."""
 
 from __future__ import annotations
 
+import argparse
 import sys
 import time
 from pathlib import Path
@@ -34,7 +35,11 @@ def differing_pixels(path: Path, camera: int, pixels: int, spp: int, seed: int =
 
 
 def main() -> None:
-    pixels, spp = int((*sys.argv[1:2], 1000)[0]), int((*sys.argv[2:3], 2)[0])
+    parser = argparse.ArgumentParser(prog="python -m tests.inspect_all", description=__doc__)
+    parser.add_argument("pixels", type=int, nargs="?", default=1000, help="number of pixels of each scene and camera [default: 1000]")
+    parser.add_argument("spp", type=int, nargs="?", default=2, help="samples per pixel [default: 2]")
+    options = parser.parse_args()
+    pixels, spp = options.pixels, options.spp
     failed = total = 0
     for path in SCENES:
         for camera in range(len(wrt.load_scene(path).cameras)):
