@@ -82,12 +82,12 @@ def test_as_many_cells_as_the_density_asks_for(density):
 def test_too_many_references_make_larger_cells_and_a_warning(monkeypatch):
     geometry = triangles(np.random.default_rng(4).uniform(-1.0, 1.0, (2000, 3, 3)))
     monkeypatch.setattr(module, "MAX_REFERENCES", 50_000)
-    with pytest.warns(RuntimeWarning, match="references fit"):
+    with pytest.warns(RuntimeWarning, match="limited to .* 50000 references"):
         grid = build(geometry, "grid")
     assert 2000 < grid.stats.references <= 50_000
     assert max(grid.data.n) > 1
     monkeypatch.setattr(module, "MAX_CELLS", 1000)
-    with pytest.warns(RuntimeWarning, match="at most 1000 cells"):
+    with pytest.warns(RuntimeWarning, match="limited to 1000 cells"):
         assert build(icosphere(4), "grid").stats.nodes <= 1000
 
 
