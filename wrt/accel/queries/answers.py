@@ -185,9 +185,14 @@ class Hits(HitPoints[ArrayT]):
         return self.in_shape((int(np.prod(self.shape)),))
 
     def in_shape(self, shape: tuple[int, ...]) -> Hits[ArrayT]:
-        """Return hits of N rays, views of the same arrays, in another shape."""
+        """Return the hits in another shape, in views of the same arrays. The number of hits stays the same."""
         costs = self.counters and replace(self.counters, counts=self.counters.counts.reshape(shape))
-        return replace(self.each(lambda array: in_shape(array, shape)), counters=costs)
+
+        def view(array: Any) -> ArrayT:
+            shaped: ArrayT = in_shape(array if isinstance(array, wp.array) else array.reshape(-1), shape)
+            return shaped
+
+        return replace(self.each(view), counters=costs)
 
 
 def no_attribute(thing: object, name: str, known: Iterable[str]) -> AttributeError:

@@ -102,10 +102,11 @@ class Tracer:
             rays = rays.checked()
         inputs, results = [np.asarray(array) for array in rays], [np.asarray(array) for array in query.out]
         n = len(inputs[0])
-        in_place = SMALL < n <= MOST_PACKED and all(map(readable, inputs))
+        is_large = SMALL < n <= MOST_PACKED
+        in_place = is_large and all(map(readable, inputs))
         if query.worlds is not None:
             inputs.append(query.worlds.arrays.id.numpy())
-        width = query.width if in_place and self.stream else 0
+        width = query.width if is_large and self.stream else 0
         packed = pack(self.rays, inputs, results) if in_place and not width else None
         if packed and self.stream:
             ranges = parts(n, threads, self.block) if n > FEWEST else [(0, n)]
@@ -171,13 +172,13 @@ class Worker:
         """Trace at most BUFFERED rays by means of the buffers, in tiles if `width` is not 0. Values beyond float32 become infinite."""
         n = len(rays[0])
         for target, source in zip(self.rays, rays, strict=True):
-            if width and source.flags.c_contiguous:
-                copy_to_tiles(target[:n], source, width)
-            elif source.dtype == np.float32:
-                target[:n] = source
-            else:
+            if source.dtype != target.dtype:
                 with np.errstate(over="ignore"):
-                    target[:n] = source
+                    source = source.astype(target.dtype)  # of stride 0, one number for all rays becomes an array
+            if width and source.strides[0]:
+                copy_to_tiles(target[:n], np.ascontiguousarray(source), width)
+            else:
+                target[:n] = source
         self.launch(snapshot, self.packed, 0, n)
         for result, found in zip(results, self.results, strict=True):
             if width:

@@ -151,6 +151,15 @@ def test_gradients_have_the_rays_shape(ball: Any) -> None:
         ball.closest_hit(leaves[0][:1], leaves[1])
 
 
+@pytest.mark.parametrize("form", [np.asarray, lambda array: wp.array(array, dtype=wp.vec3, device=DEVICE)])
+def test_hits_of_several_dimensions_get_another_shape(ball: Any, form: Any) -> None:
+    o, d = some_rays(*SHAPE)
+    rows = ball.closest_hit(o.reshape(-1, 3), d.reshape(-1, 3))
+    hits = ball.closest_hit(form(o), form(d), counters=True).in_shape((5, 1, 3))
+    assert hits.counters.nodes.shape == (5, 1, 3)
+    assert_same(hits, rows, (5, 1, 3))
+
+
 def test_typing_errors_are_answered_with_the_name(ball: Any) -> None:
     hits = ball.closest_hit(*some_rays(4), counters=True)
     for thing, name, near in ((hits, "normls", "normals"), (hits, "distances", "distance"), (hits, "primid", "prim_id"),

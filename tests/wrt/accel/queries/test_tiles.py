@@ -6,6 +6,7 @@ import warp as wp
 
 import wrt
 import wrt.sensors
+from wrt.accel.queries import batches
 from wrt.accel.queries.tiles import copy_from_tiles, copy_to_tiles, tiled_width
 from wrt.scene.shapes import icosphere
 
@@ -34,6 +35,23 @@ def test_pictures_have_the_bits_of_rows(worlds, shape) -> None:
             hits = accel.closest_hit(origins, directions, threads=threads, **options)
             assert all(getattr(hits, name).tobytes() == getattr(expected, name).tobytes() for name in FIELDS)
             assert np.array_equal(accel.any_hit(origins, directions, threads=threads, **options).reshape(-1), occluded)
+
+
+def test_pictures_of_other_types_and_orders_are_traced_in_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
+    """float64 rays are converted, and arrays with gaps copied, block by block; values beyond float32 become infinite."""
+    ball, rng, shape = wrt.build(icosphere(3)), np.random.default_rng(1), (2, 64, 32)
+    origins, directions = rng.normal(size=(*shape, 3)) * 0.5 + (0.0, 0.0, 4.0), rng.normal(size=(*shape, 3)) * 0.3 - (0.0, 0.0, 4.0)
+    ends = np.where(rng.random(shape) < 0.5, 1e300, 3.5)
+    rays = [np.float32(each).reshape(-1, 3) for each in (origins, directions)]
+    expected = ball.closest_hit(*rays, t_max=np.where(ends > 4.0, np.inf, 3.5).astype(np.float32).reshape(-1))
+    widths: list[int] = []
+    monkeypatch.setattr(batches, "copy_to_tiles", lambda tiles, rows, width: widths.append(width) or copy_to_tiles(tiles, rows, width))
+    gaps = np.repeat(np.float32(origins), 2, axis=-1)[..., ::2]
+    for each in (origins, np.float32(origins), gaps):
+        widths.clear()
+        hits = ball.closest_hit(each, directions, t_max=ends)
+        assert all(getattr(hits, name).tobytes() == getattr(expected, name).tobytes() for name in FIELDS)
+        assert widths and set(widths) == {32}
 
 
 def test_a_bad_ray_of_a_picture_is_named_by_its_place_among_the_rays() -> None:
