@@ -15,7 +15,7 @@ from wrt.core.files import require_file
 from wrt.core.registry import Registry
 from wrt.core.types import PathLike
 from wrt.io.meshes import PLACES
-from wrt.scene.clean import clean
+from wrt.scene.clean import Cleaned, clean
 from wrt.scene.mesh import Mesh, unit_rows
 
 
@@ -31,6 +31,7 @@ class RawMesh:
     face_group: np.ndarray | None = None
     incomplete: int = 0  # number of faces with fewer than three corners
     positions: int = 0  # number of positions in the file
+    exact: bool = False  # the arrays are those of a Mesh, and stay as they are
 
 
 Reader = Callable[[Path], RawMesh]
@@ -58,7 +59,7 @@ def load_mesh(path: PathLike, parts: Sequence[tuple[int, int]] = ()) -> Mesh:
 
     Polygons become triangles. Faces without area and vertices without a face are dropped (`Mesh.dropped` counts the faces); nothing is
     merged. Normals are scaled to unit length, and v is flipped so that (0, 0) is the top left of an image. Normals and uvs that are
-    not finite become zero, with one SceneWarning.
+    not finite become zero, with one SceneWarning. An .npz file of `Mesh.save` is read bit by bit instead.
 
     Parameters
     ----------
@@ -84,14 +85,15 @@ def load_mesh(path: PathLike, parts: Sequence[tuple[int, int]] = ()) -> Mesh:
         if len(raw.faces) == 0:
             raise InputError(f"has no triangles ({raw.positions} positions, {raw.incomplete} faces with fewer than 3 corners)")
         groups, face_group = _part_groups(parts, len(raw.faces)) if parts else (raw.groups, raw.face_group)
-    cleaned = clean(raw.vertices, raw.faces, raw.normals, raw.uvs, face_group)
+    arrays = raw.vertices, raw.faces, raw.normals, raw.uvs, face_group
+    cleaned = Cleaned(*arrays, 0) if raw.exact else clean(*arrays)
     if len(cleaned.faces) == 0:
         raise InputError(f"none of its {len(raw.faces)} triangles has an area", path=path)
     normals = _finite(cleaned.normals, "normals", path)
     return Mesh(
         vertices=cleaned.vertices,
         faces=cleaned.faces,
-        normals=None if normals is None else unit_rows(normals),
+        normals=normals if normals is None or raw.exact else unit_rows(normals),
         uvs=_finite(cleaned.uvs, "uvs", path),
         groups=groups,
         face_group=cleaned.face_group,

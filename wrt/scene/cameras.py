@@ -48,6 +48,16 @@ class CameraKind:
         return {key: math.degrees(value) if form == "angle" else value for key, (value, form) in values.items()}
 
     @classmethod
+    def posed(cls, matrix: np.ndarray, **fields: Any) -> Self:
+        """Return a camera with the pose `matrix`, (4, 4). If it is a rotation to within 1e-14, it keeps its bits, as `Scene.save` needs.
+
+        Raises InputError as the constructor."""
+        camera = cls(matrix, **fields)
+        if np.abs(camera.camera_to_world - matrix).max() <= 1e-14:
+            object.__setattr__(camera, "camera_to_world", np.array(matrix, np.float64))
+        return camera
+
+    @classmethod
     def look_at(cls, position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 1.0, 0.0), **fields: Any) -> Self:
         """Return a camera at `position` that looks at `target`.
 

@@ -116,7 +116,7 @@ class Mesh:
         return trimesh.Trimesh(self.vertices, self.faces, vertex_normals=self.normals, visual=visual, process=False)
 
     def save(self, path: PathLike) -> None:
-        """Write vertices, faces, normals and uvs to a file that `wrt.load_mesh` reads.
+        """Write vertices, faces, normals and uvs to a file that `wrt.load_mesh` reads; .npz also has the groups.
 
         Parameters
         ----------
@@ -131,8 +131,10 @@ class Mesh:
         path = as_path(path, "path")
         if path.suffix.lower() == ".npz":
             arrays = {name: getattr(self, name) for name in ("vertices", "faces", "normals", "uvs")}
+            if self.face_group is not None:
+                arrays |= {"face_group": self.face_group, "groups": np.array(self.groups, np.str_)}
             data = io.BytesIO()
-            np.savez(data, **{name: array for name, array in arrays.items() if array is not None})
+            np.savez(data, exact=np.True_, **{name: array for name, array in arrays.items() if array is not None})
             write_bytes(path, data.getvalue())
             return
         try:

@@ -9,15 +9,18 @@ from __future__ import annotations
 import contextlib
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import product
+from pathlib import Path
 from typing import Any, Self, Unpack
 
 import numpy as np
 
-from wrt.core.checks import as_array, as_one, as_tuple, at_thing, shown, unknown
+from wrt.core.checks import as_array, as_one, as_path, as_tuple, at_thing, shown, unknown
 from wrt.core.errors import InputError, wrong
+from wrt.core.registry import Registry
+from wrt.core.types import PathLike
 from wrt.scene.backgrounds import BACKGROUNDS, Background, ConstantBackground
 from wrt.scene.cameras import CameraKind
 from wrt.scene.lights import LIGHTS, Light
@@ -185,6 +188,30 @@ class Scene:
         spheres = tuple(thing for thing in things if isinstance(thing, Sphere))
         return cls(tuple(thing for thing in things if isinstance(thing, Object)), spheres, **fields)
 
+    def save(self, path: PathLike) -> None:
+        """Write a TOML scene file, from which `wrt.load_scene` makes a scene that renders to the same bits.
+
+        Meshes (.npz), textures (.png) and images (.exr) become files in a folder beside it, "room_files" for "room.toml". Their names
+        contain digests, so that a scene saved before stays whole until its file is replaced; its files are not removed.
+        Names that are empty or occur twice change, and materials that no face has are left out. As from any file, a scene without a camera
+        or light gets one when it is read.
+
+        Parameters
+        ----------
+        path : str or path
+            A .toml file in a folder that exists.
+
+        Raises
+        ------
+        InputError
+            For another suffix, if a file cannot be written, and for what scene files do not hold: singular transforms, meshes without
+            triangles, classes that are not registered, and their fields without a description (`wrt.scene.kinds.given`).
+        """
+        path = as_path(path, "path")
+        if path.suffix.lower() not in WRITERS:
+            raise InputError(f"a scene is written as {' or '.join(WRITERS)}, not as {path.suffix or 'a file without suffix'}", path=path)
+        WRITERS[path.suffix.lower()](self, path)
+
     def __repr__(self) -> str:
         counts = {"triangle": sum(len(thing.mesh.faces) for thing in self.objects), "object": len(self.objects),
                   "sphere": len(self.spheres), "material": len(self.materials), "light": len(self.lights),
@@ -269,6 +296,9 @@ class Scene:
         if "exposure" in changed:
             changed.setdefault("auto_exposure", False)
         return replace(self, settings=replace(self.settings, **changed))
+
+
+WRITERS: Registry[Callable[[Scene, Path], None]] = Registry("scene format", {".toml": "wrt.io.toml.write:write_toml"})
 
 
 def moves(scene: Scene) -> bool:

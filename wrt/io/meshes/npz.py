@@ -1,4 +1,6 @@
-"""NumPy archives with the arrays of a mesh: vertices and faces, perhaps normals and uvs, as in `Mesh`. `Mesh.save` writes them."""
+"""NumPy archives with the arrays of a mesh: vertices and faces, perhaps normals and uvs, as in `Mesh`.
+
+`Mesh.save` writes them, with an array `exact`: the mesh is then read bit by bit, and not cleaned."""
 
 from __future__ import annotations
 
@@ -19,7 +21,8 @@ def read(path: Path) -> RawMesh:
     """Read the arrays of a mesh. uvs: (0, 0) is the top left of an image. Raises InputError for other arrays; nothing is unpickled."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            arrays = {name: np.asarray(file[name]) for name in SHAPES if name in file}
+            arrays = {name: np.asarray(file[name]) for name in (*SHAPES, "groups", "face_group") if name in file}
+            exact = "exact" in file
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"is no NumPy archive of arrays of numbers ({error})") from error
     for name, columns in SHAPES.items():
@@ -35,4 +38,11 @@ def read(path: Path) -> RawMesh:
     require_indices(faces, len(vertices))
     if not np.isfinite(vertices).all():
         raise InputError("vertices must be finite", place=f"row {int(np.argmin(np.isfinite(vertices).all(axis=1)))}")
-    return RawMesh(vertices, faces.astype(np.int64), arrays.get("normals"), arrays.get("uvs"), positions=len(vertices))
+    groups, face_group = arrays.get("groups", np.empty(0, "U1")), arrays.get("face_group")
+    if not (groups.ndim == 1 and groups.dtype.kind == "U"):
+        raise InputError(f"groups must be (G,) text, got {shown(groups)}")
+    if face_group is not None and not (face_group.shape == faces.shape[:1] and face_group.dtype.kind in "iu"
+                                       and (face_group >= 0).all() and (face_group < len(groups)).all()):
+        raise InputError(f"face_group must be ({len(faces)},) indices of {len(groups)} groups, got {shown(face_group)}")
+    return RawMesh(vertices, faces.astype(np.int64), arrays.get("normals"), arrays.get("uvs"), tuple(groups.tolist()), face_group,
+                   positions=len(vertices), exact=exact)

@@ -182,12 +182,13 @@ class _Builder:
             else:
                 cosine, sine = cosine_sine(table.rotation)
                 (u, v), (du, dv) = table.scale, table.offset
+                # As in KHR_texture_transform: scale, then rotate (v points down), then translate.
+                placed = [[cosine * u, sine * v, du], [-sine * u, cosine * v, dv]]
                 self._textures[key] = Texture(
                     self.image(self.file(str(table.file))),
                     srgb=is_color if table.srgb is None else table.srgb,
                     wrap=(table.wrap[0], table.wrap[1]),
-                    # As in KHR_texture_transform: scale, then rotate (v points down), then translate.
-                    uv_transform=np.array([[cosine * u, sine * v, du], [-sine * u, cosine * v, dv]]),
+                    uv_transform=np.array(placed if table.matrix is None else table.matrix).reshape(2, 3),
                     name=str(table.file),
                 )
         return self._textures[key]
@@ -249,6 +250,6 @@ def make_camera(table: PoseTable, name: str) -> CameraKind:
         values |= Camera.lens(focal_length, values.get("focus_distance", 1.0), sensor_height,
                               f_number=getattr(table, "f_number", None), aperture_radius=values.get("aperture_radius"))
     if table.matrix is not None:
-        return kind(np.array(table.matrix).reshape(4, 4), name=name, **values)
+        return kind.posed(np.array(table.matrix).reshape(4, 4), name=name, **values)
     assert table.position is not None and table.target is not None  # as the schema checks
     return kind.look_at(table.position, table.target, table.up, name=name, **values)

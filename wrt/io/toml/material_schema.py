@@ -23,6 +23,14 @@ class _PlacedImage(Table):
     scale: Scale2 = Field([1.0, 1.0], description="repetitions in one unit of u and of v")
     offset: Annotated[list[float], Field(min_length=2, max_length=2)] = Field([0.0, 0.0], description="added to u and v")
     rotation: Angle = Field(0.0, description="rotation of the image about uv (0, 0), clockwise")
+    matrix: Annotated[list[float], Field(min_length=6, max_length=6)] | None = Field(
+        None, description="two rows of three: (u, v, 1) to the image's (u, v), in place of scale, offset and rotation")
+
+    @model_validator(mode="after")
+    def _check_matrix(self) -> _PlacedImage:
+        if self.matrix is not None and {"scale", "offset", "rotation"} & self.model_fields_set:
+            raise ValueError("a matrix takes no scale, offset or rotation beside it")
+        return self
 
 
 class ImageTable(_PlacedImage):

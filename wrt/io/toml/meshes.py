@@ -54,12 +54,13 @@ class Meshes:
             index = {name: i for i, name in enumerate(names)}
             of_group[used] = [index[str(name)] for name in used_names]
             face_material = of_group[mesh.face_group]
-        placements = [] if table.instances else [np.eye(4)]
+        to_world = transform(table.transform)
+        placements = [] if table.instances else [to_world]
         for i, instance in enumerate(table.instances or ()):
             with at(f"instances[{i}]"):
-                placements.append(transform(instance))
-        to_world, used_materials, motion = transform(table.transform), tuple(materials[name] for name in names), self._motion(table)
-        return [Object(mesh, used_materials, to_world @ matrix, face_material, table.name or place, motion) for matrix in placements]
+                placements.append(to_world @ transform(instance))
+        used_materials, motion = tuple(materials[name] for name in names), self._motion(table)
+        return [Object(mesh, used_materials, matrix, face_material, table.name or place, motion) for matrix in placements]
 
     def _motion(self, table: MeshTable) -> Motion | None:
         if table.motion is None and table.morph is None:

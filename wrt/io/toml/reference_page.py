@@ -22,7 +22,7 @@ prints the JSON Schema for editors, and this page with `--markdown`.
 
 - [Concepts](concepts.md#spaces-and-units) describes spaces and units. Angles are in degrees here, and in radians in Python.
 - Matrices are 16 numbers, row by row, and act on column vectors. One number for a colour is a grey.
-- File names are relative to the scene file.
+- File names are relative to the scene file. `scene.save("room.toml")` writes a scene, and its meshes and images to `room_files`.
 - Objects and lights may have a `name`, for messages.
 
 ## Example
