@@ -44,7 +44,7 @@ TESTS = {"closest_point": "tests/wrt/accel/points/test_closest_points.py",
          "closest_placed": "tests/wrt/accel/queries/test_placed_queries.py", "nodes": "tests/kernels/wide/test_lanes.py",
          "traverse": "tests/kernels/traverse/test_common.py -k bvh4"}
 SANITIZE = ["tests/sanitize/test_headers.py", "-k", "results and walks"]
-GENERAL = (["tests/test_bits.py", "-k", "hits and bvh8 or whitted or instances"],
+GENERAL = (["tests/test_bits.py", "tests/kernels/wide/test_triangle.py", "-k", "hits and bvh8 or whitted or instances or lanes_clamp"],
            ["tests/kernels/wide/test_packets.py", "tests/kernels/wide/test_batch.py", "tests/kernels/wide/test_instances.py",
             "tests/wrt/accel/queries/test_all_hits.py"])
 OUTCOMES = "noticed", "survived", "not counted"

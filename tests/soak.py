@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import ctypes
 import gc
 import os
 import random
@@ -55,7 +56,10 @@ BAD_REQUESTS = (b"", b"\r\n\r\n", b"GET", b"GET / HTTP/1.1\r\nHost: ", b"\x16\x0
 
 
 def resident() -> float:
-    """Return the memory of this process in MiB."""
+    """Return the memory of this process in MiB, after garbage and, with glibc, the free pages of malloc are given back."""
+    gc.collect()
+    with contextlib.suppress(AttributeError, OSError):
+        ctypes.CDLL(None).malloc_trim(0)
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
@@ -173,13 +177,13 @@ class Soak:
             path.unlink()
 
 
-def slope(seconds: list[float], memory: list[float]) -> tuple[float, float]:
-    """Return the slope in MiB per hour, and the growth in MiB, of a line through the last two thirds of the samples."""
-    first = len(seconds) // 3
-    if len(seconds) - first < 2:
+def slope(seconds: list[float], memory: list[float], first: int = 1, end: int = 3) -> tuple[float, float]:
+    """Return the slope in MiB per hour, and the growth in MiB, of a line through the thirds first .. end - 1 of the samples."""
+    x, y = (values[len(values) * first // 3 : len(values) * end // 3] for values in (seconds, memory))
+    if len(x) < 2:
         return 0.0, 0.0
-    per_second = float(np.polyfit(seconds[first:], memory[first:], 1)[0])
-    return 3600.0 * per_second, per_second * (seconds[-1] - seconds[first])
+    per_second = float(np.polyfit(x, y, 1)[0])
+    return 3600.0 * per_second, per_second * (x[-1] - x[0])
 
 
 def run(seconds: float, seed: int, growth: float, report: Callable[[str], None], records: bool = False) -> int:
@@ -194,7 +198,6 @@ def run(seconds: float, seed: int, growth: float, report: Callable[[str], None],
                 step = soak.random.choice(soak.steps)
                 step()
                 done[step.__name__] += 1
-                gc.collect()
                 memory.append(resident())
                 times.append(time.monotonic() - begin)
                 if len(times) == 1 or times[-1] // 60 > times[-2] // 60:
@@ -206,7 +209,8 @@ def run(seconds: float, seed: int, growth: float, report: Callable[[str], None],
             soak.close()
     per_hour, grown = slope(times, memory)
     report(f"{done.total()} steps in {times[-1]:.0f} s, all right: {', '.join(f'{count} {name}' for name, count in sorted(done.items()))}")
-    report(f"memory: {memory[0]:.0f} MiB after warming up, {memory[-1]:.0f} at the end, slope {per_hour:+.1f} MiB per hour")
+    report(f"memory: {memory[0]:.0f} MiB after warming up, {memory[-1]:.0f} at the end, slope {per_hour:+.1f} MiB per hour,"
+           f" by thirds {', '.join(f'{slope(times, memory, third, third + 1)[0]:+.1f}' for third in range(3))}")
     if grown > growth:
         report(f"the process grew by {grown:.0f} MiB, more than {growth:.0f}")
         return 1
