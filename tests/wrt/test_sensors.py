@@ -294,6 +294,8 @@ def test_several_intrinsics_are_several_cameras(make: Any, rolling: bool) -> Non
     (lambda: with_range_noise(np.float32([[np.inf, -3.0]]), 0), ("ranges", "0 or more")),
     (lambda: with_range_noise(-np.inf, 0), ("ranges", "0 or more")),
     (lambda: with_range_noise([[1.0, 2.0], [3.0]], 0), ("ranges", "array of numbers")),
+    (lambda: pinhole(K, (4, 4), ([1e200, 0.0, 0.0], np.zeros(3))), ("pose[0]", "finite, and within")),
+    (lambda: pinhole(K, (4, 4), (np.eye(3), [np.inf, 0.0, 0.0])), ("pose[1]", "finite, and within")),
     (lambda: pinhole(np.eye(2), (4, 4)), ("intrinsics",)),
     (lambda: pinhole([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]], (4, 4)),
      ("intrinsics", "focal lengths above 0")),

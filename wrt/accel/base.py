@@ -23,7 +23,7 @@ from wrt.accel.store import check_order, save
 from wrt.accel.structure import Structure, options_of
 from wrt.accel.tree_exchange import TreeExchange
 from wrt.core.arrays import check_no_gradients, from_tensor
-from wrt.core.building import parts
+from wrt.core.building import report_parts
 from wrt.core.default_device import DEFAULT_DEVICE
 from wrt.core.device import upload
 from wrt.core.errors import InputError
@@ -251,7 +251,7 @@ def build_each(kind: type[MeshT], geometries: Sequence[Geometry], device: str, t
     for each, geometry in zip(structures, geometries, strict=True):
         Accelerator.__init__(each, Structure(kind, units), geometry.unshared(), None, device, threads)
         each.__dict__.update(built_with=built_with)
-    built = kind.build_all(structures, built_with) if kind.build_all else [each._build(built_with) for each in parts(structures)]
+    built = kind.build_all(structures, built_with) if kind.build_all else report_parts(structures, lambda each: each._build(built_with))
     for each, arrays in zip(structures, built, strict=True):
         each._install(arrays, begin, arrays.sah_cost)
     return structures

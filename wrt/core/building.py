@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import TypeVar
 
-T = TypeVar("T")
+T, R = TypeVar("T"), TypeVar("R")
 _report: ContextVar[Callable[[float], None]] = ContextVar("report", default=lambda done: None)
 
 
@@ -29,16 +29,17 @@ def report(done: float) -> None:
     _report.get()(done)
 
 
-def parts(items: Sequence[T]) -> Iterator[T]:
-    """Yield the items one after another. What builders report meanwhile is the share of one item, and not of the whole build."""
-    whole = _report.get()
+def report_parts(items: Sequence[T], work: Callable[[T], R]) -> list[R]:
+    """Return work(item) of each item. What `work` reports is the share of its item, and not of the whole build."""
+    whole, out = _report.get(), []
     for i, item in enumerate(items):
         token = _report.set(lambda done, i=i: whole((i + done) / len(items)))  # type: ignore[misc]
         try:
-            yield item
+            out.append(work(item))
         finally:
             _report.reset(token)
         whole((i + 1) / len(items))
+    return out
 
 
 def tally(total: int) -> Callable[[int], None]:

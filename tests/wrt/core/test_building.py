@@ -59,3 +59,21 @@ def test_what_cannot_be_called_is_refused_and_an_error_ends_the_build() -> None:
         wrt.build(icosphere(1), progress="bar")  # type: ignore[call-overload]
     with pytest.raises(KeyboardInterrupt):
         wrt.build(icosphere(1), progress=lambda done: (_ for _ in ()).throw(KeyboardInterrupt))
+
+
+@pytest.mark.parametrize("accel", ["bvh", "octree"])
+def test_after_an_error_in_the_function_later_builds_do_not_call_it(accel: str) -> None:
+    calls = 0
+
+    def stop(done: float) -> None:
+        nonlocal calls
+        calls += 1
+        if done > 0.0:
+            raise RuntimeError("stop")
+
+    with pytest.raises(RuntimeError) as kept:  # keeps the frames of the build alive
+        wrt.build([icosphere(1), icosphere(2)], accel, progress=stop)
+    before = calls
+    del kept
+    wrt.build([icosphere(1), icosphere(2)], accel)
+    assert calls == before

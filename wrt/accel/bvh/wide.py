@@ -20,7 +20,7 @@ from wrt.accel.bvh.tree import binary_tree_of
 from wrt.accel.bvh.wide_tree import COLLAPSE, WideTree, check_wide, collapse, lanes_of, packed, refit, row_starts, wide_tree_of
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.raw_kernel import launch_raw
-from wrt.core.building import parts, report
+from wrt.core.building import report, report_parts
 from wrt.core.device import empty_aligned, preloading, record_dtype, start
 from wrt.core.errors import InputError
 from wrt.core.threads import run_all
@@ -133,7 +133,7 @@ class WideBvh(CollapsedBvh):
         options = BvhOptions(**asdict(options), row=cls.width)
         few = [each for each in structures if options.builder == "refined" and len(each.geometry) <= SMALL]
         trees = dict(zip(map(id, few), small_trees([each.geometry.bounds() for each in few], options), strict=True))
-        return [each._built(trees.get(id(each)), options) for each in parts(structures)]
+        return report_parts(structures, lambda each: each._built(trees.get(id(each)), options))
 
     def _built(self, tree: WideTree | None, options: BvhOptions) -> Built:
         """Return the arrays of a tree. Build the tree if it is None, or too deep."""

@@ -227,6 +227,9 @@ def _from_opencv(rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
 
     rotation: (..., 3, 3), or a rotation vector (3,) or (3, 1); shift: (..., 3) or (..., 3, 1).
     """
+    for i, part in enumerate((rotation, shift)):
+        if not (np.abs(part) <= np.finfo(np.float32).max).all():
+            raise InputError("must be finite, and within the range of float32", argument=f"pose[{i}]")
     if rotation.shape in ((3,), (3, 1)):  # Rodrigues' formula, for the matrix of the cross product with the axis
         angle = np.linalg.norm(rotation)
         x, y, z = rotation.reshape(3) / (angle or 1.0)
