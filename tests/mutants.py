@@ -208,6 +208,8 @@ def main() -> None:
     parser.add_argument("--record", action="store_true", help="store the figures in tests/trust.json")
     parser.add_argument("--show", action="store_true", help="print the mutants, and run nothing")
     options = parser.parse_args()
+    if min(options.count, options.workers) < 1 or options.first < 0:
+        parser.error("--count and --workers must be at least 1, and --first must be at least 0")
     everything = sample(options.seed)
     chosen = everything[options.first : options.first + options.count]
     if options.show:

@@ -226,6 +226,8 @@ def main() -> None:
     parser.add_argument("--growth", type=float, default=32.0, help="largest growth of memory in MiB  [default: 32]")
     parser.add_argument("--record", action="store_true", help="store the figures in tests/trust.json")
     options = parser.parse_args()
+    if not (options.hours > 0.0 and options.growth > 0.0):
+        parser.error("--hours and --growth must be above 0")
     sys.exit(run(3600.0 * options.hours, options.seed, options.growth, lambda line: print(line, flush=True), options.record))
 
 

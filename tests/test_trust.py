@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import json
 import re
 from pathlib import Path
@@ -27,6 +28,18 @@ def test_a_soak_checks_answers_and_memory(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(soak.Soak, "hits", lambda self, *rays: hits(self, *rays) + str(self.random.random()).encode())
     assert soak.run(1e9, seed=3, growth=1000.0, report=lines.append) == 1
     assert lines[-1].startswith("seed 3, step ")
+
+
+@pytest.mark.parametrize("name, arguments", [("soak", ("--hours", "nan")), ("soak", ("--growth", "-1")), ("mutants", ("--count", "-1")),
+                                             ("mutants", ("--workers", "0")), ("mutants", ("--first", "-1"))])
+def test_wrong_arguments_are_refused(name: str, arguments: tuple[str, str], monkeypatch: pytest.MonkeyPatch,
+                                     capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("websockets")
+    monkeypatch.setattr("sys.argv", [name, *arguments])
+    with pytest.raises(SystemExit) as ended:
+        importlib.import_module(f"tests.{name}").main()
+    said = capsys.readouterr().err
+    assert ended.value.code == 2 and "must be a" in said and arguments[0] in said
 
 
 def test_mutants_are_valid_code_with_one_change() -> None:

@@ -138,7 +138,9 @@ def test_what_cannot_be_resumed_says_so(tmp_path: Path, monkeypatch: pytest.Monk
     assert path.read_bytes() == before
     assert run("--count", 7, *files, "-o", path, "--resume").exit_code == 0
     for name, text in (("whole.json", path.read_text()), ("b.json", "{"), ("c.json", "[]"), ("d.csv", "a,b\n1,2\n"), ("e.csv", ""),
-                       ("f.json", '{"resume": "{}"}'), ("g.json", '{"resume": 3}')):
+                       ("f.json", '{"resume": "{}"}'), ("g.json", '{"resume": 3}'), ("h.json", "[" * 100000),
+                       *((f"{i}.json", json.dumps({"resume": json.dumps({"of": {}, "machine": "", "groups": groups})}))
+                         for i, groups in enumerate((1, [1], [None], {"is": "Row", "of": {}})))):
         (tmp_path / name).write_text(text)
         assert "is not the report of an interrupted run" in refusal("--count", 7, *files, "-o", tmp_path / name)
     for arguments in ((), ("-o", tmp_path / "a.md")):

@@ -63,7 +63,9 @@ def load(path: Path, plan: Plan, classes: Sequence[type] = ()) -> Finished:
         text = json.loads(text)[FIELD] if path.suffix.lower() == ".json" else text.split("\n", 1)[0].removeprefix(f"# {FIELD}: ")
         saved, by_name = json.loads(text), {each.__name__: each for each in classes}
         there, machine, groups = dict(saved["of"]), str(saved["machine"]), decoded(saved["groups"], by_name)
-    except (ValueError, KeyError, TypeError) as error:
+        if not all(isinstance(each, list) for each in (groups, *groups)):
+            raise TypeError("groups must be a list of lists")
+    except (OSError, ValueError, KeyError, TypeError, ArithmeticError, RecursionError) as error:
         raise InputError("is not the report of an interrupted run, so there is nothing to resume", path=path,
                          hint="run without --resume to replace it") from error
     here = identity(plan)
