@@ -166,7 +166,7 @@ class _Preparation:
 
     def _report(self, progress: Callable[[Progress], None], seconds: float) -> None:
         """Call `progress` if the stage or its percentage has changed, and the stage takes long."""
-        stage, done = ("build", int(100.0 * self.fraction_built)) if 0.0 < self.fraction_built < 1.0 else ("compile", 0)
+        stage, done = ("build", int(100.0 * self.fraction_built)) if self.fraction_built > 0.0 else ("compile", 0)
         if (stage, done) != self.reported and (seconds >= PREPARING_REPORTED if stage == "build" else WATCH.is_slow()):
             self.reported = stage, done
             progress(Progress(done, 100, 0, seconds, stage=stage))
@@ -183,4 +183,5 @@ class _Preparation:
         chosen: dict[str, Any] = {"triangle": options.triangle, "box": options.box, **options.accel_options}
         self.accel = build(self.arrays.world.geometry, self.plan.accel, options.device, self.threads,
                            progress=partial(setattr, self, "fraction_built"), **chosen)
+        self.fraction_built = 0.0  # what takes long from now on is compiling
         self.seconds |= {"upload": uploaded - begin, "build": time.perf_counter() - uploaded}
