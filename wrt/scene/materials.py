@@ -223,7 +223,7 @@ class Material:
 
     @property
     def scales_reflectance(self) -> bool:
-        """True if the reflectance differs from that of a dielectric with the index `ior`."""
+        """True if the reflectance is not the one of a dielectric with the index `ior`."""
         plain = self.specular_factor == 1.0 and self.specular_color == (1.0, 1.0, 1.0)
         return self.uses("specular_factor") and not (plain and self.specular_texture is None and self.specular_color_texture is None)
 

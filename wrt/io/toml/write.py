@@ -191,7 +191,7 @@ def _groups(objects: tuple[Object, ...]) -> dict[int, tuple[np.ndarray, np.ndarr
 
 
 def _by_unique_name(things: tuple[T, ...], noun: str) -> dict[str, T]:
-    """Return named things by name. Things without a name, and things whose name an earlier one has, get a new one."""
+    """Return named things by name. A thing without a name, or with the name of an earlier thing, gets a new name."""
     out: dict[str, T] = {}
     for i, thing in enumerate(things):
         name: str = getattr(thing, "name", "") or f"{noun}_{i}"

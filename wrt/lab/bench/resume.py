@@ -1,7 +1,7 @@
 """Resume an interrupted measurement from its report.
 
 The report of an interrupted run (.json or .csv) also contains a JSON text: the options, the version of the code, and every finished group
-of rows without any loss. A group is what a study measures together, because its times are comparable only among themselves."""
+of rows without any loss. A study measures the rows of a group together, because their times are comparable only with each other."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from wrt.renderer.distributed.installed import DIGEST
 
 FIELD = "resume"  # of the JSON object; in CSV the first line is "# resume: TEXT"
 SUFFIXES = (".json", ".csv")
-LIBRARIES = ("embreex", "open3d", "open3d-cpu", "trimesh", "rtree", "mitsuba")  # those that a measurement runs if they are installed
+LIBRARIES = ("embreex", "open3d", "open3d-cpu", "trimesh", "rtree", "mitsuba")  # measured where they are installed
 
 
 @dataclass
