@@ -307,9 +307,9 @@ def test_a_camera_of_ones_own_needs_no_copy_of_the_project(tmp_path: Path) -> No
 
 def test_a_package_adds_commands_measurements_and_structures(tmp_path: Path) -> None:
     """The package is installed as pip does it: the module, and a .dist-info folder with the entry points."""
-    blocks = {name: body for _, name, body in BLOCK.findall((ROOT / "docs" / "extending.md").read_text())}
-    (tmp_path / "my_lab.py").write_text(blocks["my_lab.py"])
-    project = tomllib.loads(blocks["pyproject.toml"])["project"]
+    package = ROOT / "docs" / "my_lab"
+    shutil.copy(package / "my_lab.py", tmp_path)
+    project = tomllib.loads((package / "pyproject.toml").read_text())["project"]
     installed = tmp_path / "my_lab-1.0.dist-info"
     installed.mkdir()
     (installed / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n")
