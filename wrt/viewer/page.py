@@ -58,22 +58,32 @@ class Click(NamedTuple):
     sample: int
 
 
+class Tools(NamedTuple):
+    """Functions of the laboratory for a page. counter_of: see Viewer. walk_of: see wrt.viewer.walks; None: no walks."""
+
+    counter_of: CounterOf | None = None
+    walk_of: WalkOf | None = None
+
+
+NO_TOOLS = Tools()
+
+
 class Page:
     """A server with the page and one Viewer. Both run until `close`. `url` is the page's address with the token.
 
-    spp, counter_of: see Viewer. walk_of: see wrt.viewer.walks; None: no walks. warn: called with one line, once for each kind of refused
-    request or message. Raises InputError if the server cannot listen at `place`."""
+    spp: see Viewer. warn: called with one line, once for each kind of refused request or message. Raises InputError if the server cannot
+    listen at `place`."""
 
     def __init__(self, scene: Scene, options: Options, place: Place = HERE, spp: int = 1024, *,
-                 counter_of: CounterOf | None = None, walk_of: WalkOf | None = None, warn: Callable[[str], None] = to_stderr) -> None:
+                 tools: Tools = NO_TOOLS, warn: Callable[[str], None] = to_stderr) -> None:
         self.scene, self.name = scene, scene.name or "picture"
-        self.viewer = Viewer(scene, options, self._show, self._report, spp, counter_of)
+        self.viewer = Viewer(scene, options, self._show, self._report, spp, tools.counter_of)
         self.steering = Steering(pose_of(scene, self.viewer.view.camera))
         self.rays = Rays(self.viewer.renderers, self._report)
         self.panel = Panel(scene, self.viewer, self.steering, self._look)
         self._sizes: dict[Browser, tuple[int, int]] = {}  # of the browsers' windows, in device pixels
         self._leader: Browser | None = None  # the browser that steered last
-        self.walks = Walks(walk_of)
+        self.walks = Walks(tools.walk_of)
         self._asked = Asked()  # "click": a Click to inspect; "walk": a step to show
         self._activity = ""
         self.failure: BaseException | None = None

@@ -81,10 +81,10 @@ class Served:
     """A page, its warnings, and its port."""
 
     def __init__(self, **place: Any) -> None:
-        from wrt.viewer.page import Page
+        from wrt.viewer.page import Page, Tools
 
         self.warnings: list[str] = []
-        self.page = Page(SCENE, Options(threads=1), Place(port=0, **place), spp=1, counter_of=CostCounter.beside,
+        self.page = Page(SCENE, Options(threads=1), Place(port=0, **place), spp=1, tools=Tools(CostCounter.beside),
                          warn=self.warnings.append)
         self.port, self.token = self.page.port, self.page.server.access.token
 

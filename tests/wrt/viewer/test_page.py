@@ -147,9 +147,9 @@ SPP = 4
 @pytest.fixture(scope="module")
 def page() -> Iterator[Any]:
     pytest.importorskip("websockets")
-    from wrt.viewer.page import Page
+    from wrt.viewer.page import Page, Tools
 
-    page = Page(ROOM, Options(threads=1), Place(port=0), spp=SPP, counter_of=CostCounter.beside, walk_of=wrt.walk)
+    page = Page(ROOM, Options(threads=1), Place(port=0), spp=SPP, tools=Tools(CostCounter.beside, wrt.walk))
     yield page
     page.close()
 

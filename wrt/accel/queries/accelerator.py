@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable, Mapping
 from inspect import signature
 from typing import TYPE_CHECKING, Any, NoReturn, Self, TypedDict, Unpack, overload
 
@@ -45,10 +46,20 @@ class CostOptions(TypedDict, total=False):
     trace: bool
 
 
-class RayOptions(TypedDict, total=False):
+class WorldOptions(TypedDict, total=False):
+    """Option of all queries over worlds."""
+
+    world: ArrayLike | None
+
+
+class RayOptions(WorldOptions, total=False):
     """Options of `any_hit` about rays."""
 
     invalid: str
+
+
+class HitOptions(CostOptions, RayOptions, total=False):
+    """Options of `closest_hit` by keyword."""
 
 
 class Accelerator:
@@ -120,16 +131,13 @@ class Accelerator:
 
     @overload
     def closest_hit(self, origins: WarpArray, directions: WarpArray | None = ..., t_min: ArrayLike = ..., t_max: ArrayLike = ...,
-                    threads: int | None = ..., *, out: Hits[WarpArray] | None = ...,
-                    world: ArrayLike | None = ..., invalid: str = ..., **costs: Unpack[CostOptions]) -> Hits[WarpArray]: ...
+                    threads: int | None = ..., *, out: Hits[WarpArray] | None = ..., **options: Unpack[HitOptions]) -> Hits[WarpArray]: ...
     @overload
     def closest_hit(self, origins: NumpyLike, directions: NumpyLike | None = ..., t_min: ArrayLike = ..., t_max: ArrayLike = ...,
-                    threads: int | None = ..., *, out: Hits | None = ...,
-                    world: ArrayLike | None = ..., invalid: str = ..., **costs: Unpack[CostOptions]) -> Hits: ...
+                    threads: int | None = ..., *, out: Hits | None = ..., **options: Unpack[HitOptions]) -> Hits: ...
     @overload
     def closest_hit(self, origins: TensorT, directions: TensorT | None = ..., t_min: ArrayLike = ..., t_max: ArrayLike = ...,
-                    threads: int | None = ..., *, out: Hits[TensorT] | None = ...,
-                    world: ArrayLike | None = ..., invalid: str = ..., **costs: Unpack[CostOptions]) -> Hits[TensorT]: ...
+                    threads: int | None = ..., *, out: Hits[TensorT] | None = ..., **options: Unpack[HitOptions]) -> Hits[TensorT]: ...
     def closest_hit(self, origins: ArrayLike, directions: ArrayLike | None = None, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
                     threads: int | None = None, *, out: Hits[Any] | None = None, world: ArrayLike | None = None,
                     invalid: str = "raise", **costs: Unpack[CostOptions]) -> Hits[Any]:
@@ -171,7 +179,7 @@ class Accelerator:
         """
         threads, shape, callers = thread_count(threads), None, None if out is None else arrays_of(out)
         if costs:
-            checked_names(costs, "closest_hit", CostOptions)
+            checked_names(costs, Accelerator.closest_hit, CostOptions)
         if are_rows(origins, directions) and invalid == "raise":  # the usual case, whose arrays need no other shape
             rays = rays_of(origins, directions, t_min, t_max, True)  # type: ignore[arg-type]
         else:
@@ -195,27 +203,26 @@ class Accelerator:
 
     @overload
     def any_hit(self, origins: WarpArray, directions: WarpArray | None = ..., t_min: ArrayLike = ..., t_max: ArrayLike = ...,
-                threads: int | None = ..., *, out: WarpArray | None = ..., world: ArrayLike | None = ...,
-                invalid: str = ...) -> WarpArray: ...
+                threads: int | None = ..., *, out: WarpArray | None = ..., **options: Unpack[RayOptions]) -> WarpArray: ...
     @overload
     def any_hit(self, origins: NumpyLike, directions: NumpyLike | None = ..., t_min: ArrayLike = ..., t_max: ArrayLike = ...,
                 threads: int | None = ..., *, out: npt.NDArray[np.bool_] | None = ...,
-                world: ArrayLike | None = ..., invalid: str = ...) -> npt.NDArray[np.bool_]: ...
+                **options: Unpack[RayOptions]) -> npt.NDArray[np.bool_]: ...
     @overload
     def any_hit(self, origins: TensorT, directions: TensorT | None = ..., t_min: ArrayLike = ..., t_max: ArrayLike = ...,
-                threads: int | None = ..., *, out: TensorT | None = ..., world: ArrayLike | None = ..., invalid: str = ...) -> TensorT: ...
+                threads: int | None = ..., *, out: TensorT | None = ..., **options: Unpack[RayOptions]) -> TensorT: ...
     def any_hit(self, origins: ArrayLike, directions: ArrayLike | None = None, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
-                threads: int | None = None, *, out: object = None, world: ArrayLike | None = None, **more: Unpack[RayOptions]) -> object:
+                threads: int | None = None, *, out: object = None, **options: Unpack[RayOptions]) -> object:
         """Test whether each ray hits anything in its segment: True exactly where `closest_hit` finds a hit.
 
         Parameters
         ----------
-        origins, directions, t_min, t_max, threads, world
+        origins, directions, t_min, t_max, threads
             See `closest_hit`.
         out : (...) bool, optional
             Array of the rays' shape that receives the results.
-        **more
-            `invalid="raise"` or `"miss"`: see `closest_hit`.
+        **options
+            `world` and `invalid`: see `closest_hit`.
 
         Returns
         -------
@@ -227,10 +234,11 @@ class Accelerator:
         InputError
             Names the argument and what was expected.
         """
-        threads, shape = thread_count(threads), None
-        callers, invalid = None if out is None else [out], "raise"
-        if more:
-            invalid = checked_names(more, "any_hit", RayOptions).get("invalid", invalid)
+        threads, shape, callers = thread_count(threads), None, None if out is None else [out]
+        world, invalid = None, "raise"
+        if options:
+            checked_names(options, Accelerator.any_hit, RayOptions)
+            world, invalid = options.get("world"), options.get("invalid", invalid)
         if are_rows(origins, directions) and invalid == "raise":
             rays = rays_of(origins, directions, t_min, t_max)  # type: ignore[arg-type]
         else:
@@ -245,13 +253,12 @@ class Accelerator:
         return found if give is None else give(found)
 
 
-def checked_names(options: Any, method: str, kind: type) -> Any:
-    """Return the options of a method. Raises TypeError for a name that is none of a TypedDict's (`kind`)."""
+def checked_names(options: Mapping[str, object], query: Callable[..., object], kind: type) -> None:
+    """Raise TypeError for an option that is none of a TypedDict's (`kind`)."""
     for name in options:
         if name not in kind.__annotations__:
-            near = other_name(name, [*signature(getattr(Accelerator, method)).parameters, *kind.__annotations__])
-            raise TypeError(f"{method}() got an unexpected keyword argument {name!r}{near}")
-    return options
+            near = other_name(name, [*signature(query).parameters, *kind.__annotations__])
+            raise TypeError(f"{query.__name__}() got an unexpected keyword argument {name!r}{near}")
 
 
 def snapshot_of(accel: Accelerator, instances: bool = False) -> Snapshot:

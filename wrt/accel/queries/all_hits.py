@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Generic, NamedTuple, TypeVar, overload
+from typing import Any, Generic, NamedTuple, TypeVar, Unpack, overload
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
 from wrt.accel.instanced_geometry import InstancedGeometry
-from wrt.accel.queries.accelerator import Accelerator, snapshot_of
+from wrt.accel.queries.accelerator import Accelerator, WorldOptions, snapshot_of
 from wrt.accel.queries.answers import Hits
 from wrt.accel.queries.few_lists import MOST, FewLists, Mesh, begins
 from wrt.accel.queries.hit_points import device_scene
@@ -36,6 +36,12 @@ RAYS_AT_ONCE = 1 << 18  # rays per batch; their hit lists take 32 MiB in the fir
 HIT_KINDS = wp.float32, wp.float32, wp.float32, wp.int32  # of HitArrays
 T = TypeVar("T")
 COPY_HITS = RawKernel(copy_hits, RayArrays(), HitLists(), None, HitArrays())
+
+
+class ListOptions(WorldOptions, total=False):
+    """Options of `first_hits` by keyword."""
+
+    crossings: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,10 +262,11 @@ def few_lists(structure: Structure) -> FreeList[FewLists]:
 
 @overload
 def all_hits(accel: Accelerator, origins: NumpyLike | WarpArray, directions: NumpyLike | WarpArray | None = ..., t_min: ArrayLike = ...,
-             t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ..., world: ArrayLike | None = ...) -> AllHits: ...
+             t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ..., **options: Unpack[WorldOptions]) -> AllHits: ...
 @overload
-def all_hits(accel: Accelerator, origins: TensorT, directions: TensorT | None = ..., t_min: ArrayLike = ..., t_max: ArrayLike = ...,
-             threads: int | None = ..., crossings: bool = ..., world: ArrayLike | None = ...) -> AllHits[TensorT]: ...
+def all_hits(accel: Accelerator, origins: TensorT, directions: TensorT | None = ..., t_min: ArrayLike = ...,
+             t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ...,
+             **options: Unpack[WorldOptions]) -> AllHits[TensorT]: ...
 def all_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike | None = None, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
              threads: int | None = None, crossings: bool = False, world: ArrayLike | None = None) -> AllHits[Any]:
     """Find every hit of each ray in its segment, in order of distance. A ray hits each triangle at most once.
@@ -294,10 +301,10 @@ def all_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike | Non
 @overload
 def count_hits(accel: Accelerator, origins: NumpyLike | WarpArray, directions: NumpyLike | WarpArray | None = ..., t_min: ArrayLike = ...,
                t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ...,
-               world: ArrayLike | None = ...) -> npt.NDArray[np.int64]: ...
+               **options: Unpack[WorldOptions]) -> npt.NDArray[np.int64]: ...
 @overload
-def count_hits(accel: Accelerator, origins: TensorT, directions: TensorT | None = ..., t_min: ArrayLike = ..., t_max: ArrayLike = ...,
-               threads: int | None = ..., crossings: bool = ..., world: ArrayLike | None = ...) -> TensorT: ...
+def count_hits(accel: Accelerator, origins: TensorT, directions: TensorT | None = ..., t_min: ArrayLike = ...,
+               t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ..., **options: Unpack[WorldOptions]) -> TensorT: ...
 def count_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike | None = None, t_min: ArrayLike = 0.0,
                t_max: ArrayLike = np.inf, threads: int | None = None, crossings: bool = False, world: ArrayLike | None = None) -> object:
     """Count the hits of each ray in its segment. The hits take no memory unless the structure has triangles in several leaves.
@@ -324,12 +331,11 @@ def count_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike | N
 
 @overload
 def first_hits(accel: Accelerator, k: int, origins: NumpyLike | WarpArray, directions: NumpyLike | WarpArray | None = ...,
-               t_min: ArrayLike = ..., t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ...,
-               world: ArrayLike | None = ...) -> Hits: ...
+               t_min: ArrayLike = ..., t_max: ArrayLike = ..., threads: int | None = ..., **options: Unpack[ListOptions]) -> Hits: ...
 @overload
 def first_hits(accel: Accelerator, k: int, origins: TensorT, directions: TensorT | None = ...,
-               t_min: ArrayLike = ..., t_max: ArrayLike = ...,
-               threads: int | None = ..., crossings: bool = ..., world: ArrayLike | None = ...) -> Hits[TensorT]: ...
+               t_min: ArrayLike = ..., t_max: ArrayLike = ..., threads: int | None = ...,
+               **options: Unpack[ListOptions]) -> Hits[TensorT]: ...
 def first_hits(accel: Accelerator, k: int, origins: ArrayLike, directions: ArrayLike | None = None, t_min: ArrayLike = 0.0,
                t_max: ArrayLike = np.inf, threads: int | None = None, crossings: bool = False, world: ArrayLike | None = None) -> Hits[Any]:
     """Find the first k hits of each ray in order of distance. The traversal ends at the k-th hit.

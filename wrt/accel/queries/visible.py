@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from copy import copy
-from typing import Any, overload
+from typing import Any, Unpack, overload
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -12,7 +12,7 @@ import warp as wp
 
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry
-from wrt.accel.queries.accelerator import Accelerator
+from wrt.accel.queries.accelerator import Accelerator, WorldOptions
 from wrt.accel.queries.all_hits import first_hits
 from wrt.accel.queries.answers import ANY_HIT_TYPES, answer_arrays
 from wrt.accel.queries.hit_points import device_scene
@@ -34,14 +34,14 @@ _cached_extents: WeakKeyDictionary[Geometry, tuple[float, float]] = WeakKeyDicti
 
 @overload
 def visible(accel: Accelerator, a: WarpArray, b: WarpArray, on_a: ArrayLike | None = ..., on_b: ArrayLike | None = ...,
-            threads: int | None = ..., *, out: WarpArray | None = ..., world: ArrayLike | None = ...) -> WarpArray: ...
+            threads: int | None = ..., *, out: WarpArray | None = ..., **options: Unpack[WorldOptions]) -> WarpArray: ...
 @overload
 def visible(accel: Accelerator, a: NumpyLike, b: NumpyLike, on_a: ArrayLike | None = ..., on_b: ArrayLike | None = ...,
             threads: int | None = ..., *, out: npt.NDArray[np.bool_] | None = ...,
-            world: ArrayLike | None = ...) -> npt.NDArray[np.bool_]: ...
+            **options: Unpack[WorldOptions]) -> npt.NDArray[np.bool_]: ...
 @overload
 def visible(accel: Accelerator, a: TensorT, b: TensorT, on_a: ArrayLike | None = ..., on_b: ArrayLike | None = ...,
-            threads: int | None = ..., *, out: TensorT | None = ..., world: ArrayLike | None = ...) -> TensorT: ...
+            threads: int | None = ..., *, out: TensorT | None = ..., **options: Unpack[WorldOptions]) -> TensorT: ...
 def visible(accel: Accelerator, a: ArrayLike, b: ArrayLike, on_a: ArrayLike | None = None, on_b: ArrayLike | None = None,
             threads: int | None = None, *, out: object = None, world: ArrayLike | None = None) -> object:
     """Test whether each point of `a` sees the point of `b` in the same row: no surface meets the open segment between them.
