@@ -12,8 +12,6 @@ The fastest structure on a device: tune. Errors and warnings: InputError, SceneW
 Further modules: sensors, compat (trimesh, open3d), testing.
 """
 
-from __future__ import annotations
-
 import ast
 import importlib
 import importlib.util

@@ -5,8 +5,6 @@
 >>> depth, faces = sensor.depth(hits), sensor.picture(hits.prim_id)
 """
 
-from __future__ import annotations
-
 from wrt.scene.sensors.cameras import fisheye, pinhole, project, unproject
 from wrt.scene.sensors.lidars import LIDARS, LidarModel, lidar, raster_lidar, rotating_lidar
 from wrt.scene.sensors.noise import with_range_noise

@@ -1,7 +1,5 @@
 """End-point overlap of a BVH: the part of the surface that lies in a node's box but not in the node's subtree."""
 
-from __future__ import annotations
-
 import numpy as np
 import warp as wp
 

@@ -1,7 +1,5 @@
 """A scene as arrays: geometry, and the places, normals, texture coordinates, materials and objects of its primitives."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Instances by the names or indices of their objects, for `Instances.move`."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import PurePath
 from typing import TypeAlias

@@ -1,7 +1,5 @@
 """Instances: each mesh is stored once in its own space, and each instance has a transform to world space."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

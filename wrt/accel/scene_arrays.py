@@ -1,7 +1,5 @@
 """A structure's scene as named arrays, for files of structures that hold their scene (wrt.accel.store)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from itertools import pairwise
 from typing import Any

@@ -1,7 +1,5 @@
 """Class of a structure with its intersection tests: the key by which kernels are cached."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 from functools import cache
 from typing import Any, NamedTuple, TypeVar, get_type_hints

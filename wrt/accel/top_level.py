@@ -1,7 +1,5 @@
 """Upper level of instances: a binary tree for each world, all in one array of nodes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

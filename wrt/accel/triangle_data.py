@@ -1,7 +1,5 @@
 """Records of triangle tests, computed from corners. LAYOUTS has a function for each layout in kernels.units.triangle.RAY_TRIANGLE."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Upper level of instances in nodes with eight children, for the traversal of many rays (kernels.wide.instances)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The command `animate`, which renders frames of a scene into a folder or an animated picture."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

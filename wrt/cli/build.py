@@ -1,7 +1,5 @@
 """The command `build`, which builds an acceleration structure and saves it in a file."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

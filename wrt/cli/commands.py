@@ -1,7 +1,5 @@
 """The table of commands, from name to "module:function". The module is imported when the command runs or --help lists it."""
 
-from __future__ import annotations
-
 import click
 
 from wrt.core.registry import Registry

@@ -1,7 +1,5 @@
 """The command `compare`, which measures the error of a picture."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

@@ -1,7 +1,5 @@
 """The command `compile`, which fills the kernel cache in advance."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

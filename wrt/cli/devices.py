@@ -1,7 +1,5 @@
 """The command `devices`, which lists devices, compares a device with the CPU, or finds its fastest structure."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

@@ -1,7 +1,5 @@
 """The command `inspect`, which shows every ray of a pixel."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

@@ -5,8 +5,6 @@ means a user's mistake, which one message describes. After an interrupt, the cod
 for SIGTERM, 129 for SIGHUP. Each command function imports slow modules itself, so that --help is fast.
 """
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import gc

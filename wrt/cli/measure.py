@@ -1,7 +1,5 @@
 """The commands that measure: `bench` with its subcommands, `stability`, `profile`, `whatif`."""
 
-from __future__ import annotations
-
 import tempfile
 from dataclasses import replace
 from pathlib import Path

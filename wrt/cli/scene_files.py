@@ -1,7 +1,5 @@
 """The commands `info`, `schema` and `validate`, which read scene files without rendering."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import cast

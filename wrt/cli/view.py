@@ -1,7 +1,5 @@
 """The command `view`, which shows a scene in a browser."""
 
-from __future__ import annotations
-
 import contextlib
 import html
 import os

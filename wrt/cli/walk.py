@@ -1,7 +1,5 @@
 """The command `walk`, which shows the steps of one ray through a structure."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import click

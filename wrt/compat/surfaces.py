@@ -1,7 +1,5 @@
 """All hits of rays, counted as in other libraries: a ray through an edge or a corner of a surface hits the surface once."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from wrt.accel.points.contains import open_edges_of

@@ -1,7 +1,5 @@
 """Arrays shared with other libraries without a copy: with NumPy, Warp, and all libraries that have DLPack or `__array__`."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from functools import partial

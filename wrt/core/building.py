@@ -1,7 +1,5 @@
 """Progress of a build: builders report the finished share to the function that the caller of `wrt.build` gave."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Checks of arguments, which also convert them. `what` names the argument, if need be after its place: "camera 'main': fov_y"."""
 
-from __future__ import annotations
-
 import difflib
 import operator
 import os

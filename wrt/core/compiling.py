@@ -4,8 +4,6 @@ The report is a message of the logger "wrt". If the program has not configured `
 `logging.getLogger("wrt").setLevel(logging.ERROR)`. A caller that reports the progress of its work reads `is_slow` instead.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

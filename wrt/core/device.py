@@ -1,7 +1,5 @@
 """Start of Warp, loading and launching of kernels, and copies of arrays to and from a device."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import os

@@ -1,7 +1,5 @@
 """Reading of untrusted files."""
 
-from __future__ import annotations
-
 import codecs
 import os
 import stat

@@ -1,7 +1,5 @@
 """HTML tables for notebooks. All text in them is escaped, because names come from files."""
 
-from __future__ import annotations
-
 import html
 from collections.abc import Callable, Iterable, Sequence
 from typing import TypeVar

@@ -2,8 +2,6 @@
 
 On the command line SIGTERM and SIGHUP act like Ctrl-C, so that the picture so far survives the end of a batch job or a terminal."""
 
-from __future__ import annotations
-
 import signal
 import threading
 from collections.abc import Callable, Iterator

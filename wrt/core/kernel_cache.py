@@ -1,7 +1,5 @@
 """Files in the kernel cache: precompiled headers that all processes share, and objects with checksums."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

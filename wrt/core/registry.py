@@ -1,7 +1,5 @@
 """Table of names whose entries are imported on first use, so that a program imports only the modules that it uses."""
 
-from __future__ import annotations
-
 import importlib
 from collections import UserDict
 from collections.abc import Iterator, Mapping

@@ -1,7 +1,5 @@
 """Clock for the build time of acceleration structures, without the loading of kernels."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Tables of equally long columns as files: CSV, and Parquet with pyarrow."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 import numpy as np

@@ -1,7 +1,5 @@
 """CPU threads: their number, the size of their stacks, and tasks on them."""
 
-from __future__ import annotations
-
 import contextlib
 import operator
 import os

@@ -3,8 +3,6 @@
 Annotate a value that is only checked, shown or passed on as `object`, and other values with a type of their own module.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:

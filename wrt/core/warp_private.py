@@ -3,8 +3,6 @@
 Device code uses private parts only in kernels/warp_private.py. All assumptions are about Warp 1.19 (WORKS_WITH): `prepare` and the
 self-test in wrt.accel.queries.raw_launches refuse a Warp that differs. docs/warp.md lists each assumption and its test."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import re

@@ -4,8 +4,6 @@ A link at the path is replaced and never followed: in a shared folder, another u
 killed process leaves its temporary file, `.wrt-*` (docs/long_renders.md).
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import os

@@ -1,7 +1,5 @@
 """Triangulation of the polygons of mesh files: a fan for convex polygons, ear clipping for concave ones."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from wrt.core.packages import needed_by

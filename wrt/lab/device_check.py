@@ -3,8 +3,6 @@
 The CPU computes hits with the default structure, since all structures find the same hits. On a CPU, pictures of the shipped scenes are
 compared with those of an x86-64 CPU, whose hashes are in tests/bits.txt of a checkout."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial

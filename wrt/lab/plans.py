@@ -2,8 +2,6 @@
 
 This module imports nothing heavy, because the command line reads all plans for its help."""
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields

@@ -1,7 +1,5 @@
 """Decode untrusted PNG, JPEG and similar pictures with Pillow: few formats are allowed, and the size is checked before the pixels."""
 
-from __future__ import annotations
-
 import io
 import warnings
 from collections.abc import Iterator

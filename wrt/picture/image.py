@@ -5,8 +5,6 @@ HDR; Pillow reads the rest (wrt.picture.decode), and writes JPEG and WebP. PNG i
 OpenImageIO's PNG writer damages text outside ASCII and reports success on a full disk.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

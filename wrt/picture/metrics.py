@@ -1,7 +1,5 @@
 """Error of a picture `a` against a reference `b`, (H, W, 3) linear Rec. 709 each: mean errors, FLIP, and a difference image."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

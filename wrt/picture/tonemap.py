@@ -3,8 +3,6 @@
 All colours are linear Rec. 709 until `encode_srgb`. "Display-linear" is the light that the display emits, in [0, 1].
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

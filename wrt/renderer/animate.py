@@ -1,7 +1,5 @@
 """Animations: the camera orbits, meshes move, and the acceleration structure is refitted or rebuilt."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Iterator, Sequence

@@ -5,8 +5,6 @@ pixel), the progress, and the film's arrays with the number of samples of each p
 tiles. If two renders write the same checkpoint, the file has the film of the render that wrote last.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

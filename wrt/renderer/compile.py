@@ -1,7 +1,5 @@
 """Compile kernels ahead of time, for containers and the workers of a cluster."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The Features (kernels/shade/features.py) with which the render kernels of a scene are compiled."""
 
-from __future__ import annotations
-
 import math
 from functools import cache
 

@@ -1,7 +1,5 @@
 """The camera rays of a picture as arrays, for ray queries."""
 
-from __future__ import annotations
-
 from importlib import import_module
 
 import numpy as np

@@ -3,8 +3,6 @@
 A thread renders all samples of a pixel. If the pixels are too few to occupy a GPU, a thread renders one sample only.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import warp as wp

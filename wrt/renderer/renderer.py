@@ -1,7 +1,5 @@
 """Repeated renders of one scene on one device: with other seeds, cameras and settings, and after objects have moved."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import asdict, replace
 from typing import Any, Unpack

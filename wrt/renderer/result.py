@@ -1,7 +1,5 @@
 """Films made from device arrays, with their statistics."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Schedule of a render: passes of tiles, until the samples, the time limit, the target error or Ctrl-C end it."""
 
-from __future__ import annotations
-
 import math
 import time
 import warnings

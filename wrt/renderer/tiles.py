@@ -1,7 +1,5 @@
 """Tiles of a picture, and the samples that each tile still needs."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Clean a mesh for tracing: remove faces without area and vertices without a face."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

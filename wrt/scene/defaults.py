@@ -1,7 +1,5 @@
 """Default camera and lights, so that a file that holds only shapes can be rendered."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """SHA-256 digests of scenes and cameras: equal digests mean equal pictures. Names of files and parts do not enter a digest."""
 
-from __future__ import annotations
-
 from hashlib import sha256
 
 import numpy as np

@@ -8,8 +8,6 @@ For a triangle with corners v0, v1, v2, let `a, b, c = v0 - o, v1 - o, v2 - o` a
 the plane at `t = a.N / d.N`. There the barycentric of v0 is `w0 = d.(b x c) / d.N`. The triple products of w0, w1, w2 add up to `d.N`.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from enum import IntEnum

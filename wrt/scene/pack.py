@@ -1,7 +1,5 @@
 """Scenes as JSON text and NumPy arrays, for other processes. The format holds no code."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import fields, is_dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Smallest size of a scene: below it, single precision cannot represent differences of positions, or their squares."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

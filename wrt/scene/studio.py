@@ -1,7 +1,5 @@
 """A photographer's studio as an environment: soft boxes in a grey room, by formula, for metals and glass to reflect."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Checks of the numbers, vectors, colours and transforms of a scene."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

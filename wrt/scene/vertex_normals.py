@@ -1,7 +1,5 @@
 """Smooth vertex normals for meshes without normals."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -4,8 +4,6 @@ The printed address contains the token. It redirects to the page's path `/TOKEN/
 WebSocket. The token is no cookie, because a browser sends cookies to every port of a host, also to another user's server.
 """
 
-from __future__ import annotations
-
 import hmac
 import re
 import secrets

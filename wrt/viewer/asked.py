@@ -1,7 +1,5 @@
 """What browsers ask of a thread of its own: of each kind, only the latest is answered."""
 
-from __future__ import annotations
-
 import threading
 from typing import Any
 

@@ -10,8 +10,6 @@
 | undo, reset, clear | none: undo or reset the camera, clear the inspected rays |
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Mapping

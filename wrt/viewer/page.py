@@ -4,8 +4,6 @@ All browsers share one view and get every picture, which has the size of the win
 module has the page's HTML, style and script.
 """
 
-from __future__ import annotations
-
 import io
 import math
 import tempfile

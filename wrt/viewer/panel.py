@@ -1,7 +1,5 @@
 """The controls of the viewer's panel: what each of them is called, which values it can have, and what it changes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -3,8 +3,6 @@
 This module is independent of browsers; wrt.viewer.page connects it to them.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 import time

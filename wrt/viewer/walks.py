@@ -1,7 +1,5 @@
 """The way of a clicked pixel's ray through the structure, step by step, as text and drawings for the page."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol

@@ -1,7 +1,5 @@
 """Registry of builders of binary BVHs: the option `builder` of binary and wide structures."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from wrt.accel.bvh.tree import BinaryOptions, BinaryTree, BvhOptions, sah_cost

@@ -3,8 +3,6 @@
 Ylitie, Karras and Laine 2017, "Efficient Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs", section 3.2.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from wrt.kernels.wide.layout import EXIST_SHIFT, EXPONENT_BITS, FIRST_BYTES, MANTISSA_BITS, PLANES, WORD, first_reference

@@ -1,7 +1,5 @@
 """Surface areas of 14-DOPs (kernels/units/kdop.py) in closed form, for the surface area heuristic."""
 
-from __future__ import annotations
-
 import numpy as np
 
 DIAGONALS = np.array([[1.0, 1.0, 1.0], [-1.0, 1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, -1.0]])

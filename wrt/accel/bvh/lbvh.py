@@ -1,7 +1,5 @@
 """LBVH builder, along a Morton curve, for the CPU and CUDA (kernels: kernels/build/lbvh.py)."""
 
-from __future__ import annotations
-
 import warp as wp
 
 from wrt.accel.bvh.refit import Fitting, Root, tree_of

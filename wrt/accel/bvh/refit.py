@@ -1,7 +1,5 @@
 """Refits of binary trees on the CPU and CUDA (kernels: kernels/build/fit.py)."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import warp as wp

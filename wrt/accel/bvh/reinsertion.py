@@ -1,7 +1,5 @@
 """Optimisation of built trees by reinsertion of subtrees (kernels: kernels/build/reinsertion.py)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Builder with spatial splits (kernel: kernels/build/sbvh.py)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from wrt.accel.bvh.top_down import build_data, build_options, in_order, run_tasks

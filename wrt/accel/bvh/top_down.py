@@ -1,7 +1,5 @@
 """Top-down builders, which split ranges of primitives in place (kernels: kernels/build/bvh2.py)."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Options and results of the builders of binary BVHs, and the surface area heuristic."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Shared code of the grid, octree, k-d tree and BSP tree: input of the builders, and checks of files."""
 
-from __future__ import annotations
-
 import numpy as np
 import warp as wp
 

@@ -1,7 +1,5 @@
 """The k-d tree: axis-aligned planes split space, and every leaf lists the primitives that overlap it."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from wrt.accel.base import OneMesh

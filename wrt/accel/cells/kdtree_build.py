@@ -1,7 +1,5 @@
 """Builder of k-d trees: binned SAH in NumPy for large cells, and a kernel that tries all planes for the subtrees below."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Tree for winding numbers: each subtree has a multipole expansion of its solid angle (kernels/winding.py)."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Kernel launches of a query, on CPU threads or a GPU. Some structures have a CPU kernel that traces many rays at a time."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any, NamedTuple
 

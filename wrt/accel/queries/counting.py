@@ -1,7 +1,5 @@
 """Queries that count the nodes and primitives of each ray, and can record every fetch or every step."""
 
-from __future__ import annotations
-
 import numpy as np
 import warp as wp
 

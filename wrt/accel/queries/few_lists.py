@@ -1,7 +1,5 @@
 """Lists of all hits of a few rays: buffers and launches that later calls reuse. Records for new arrays take longer than a ray."""
 
-from __future__ import annotations
-
 from typing import TypeAlias
 
 import numpy as np

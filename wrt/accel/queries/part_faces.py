@@ -1,7 +1,5 @@
 """Faces of the structures below instances, for queries that read corners of triangles in a mesh's own space."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -3,8 +3,6 @@
 Warp's own wp.launch takes longer than a small query or a wave of paths. A kernel can also launch other kernels in this way.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import warp as wp
 

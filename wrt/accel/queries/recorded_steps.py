@@ -1,7 +1,5 @@
 """Steps of rays through a structure, from the recorder that counts: the source of `wrt.walk` and `wrt.trace`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

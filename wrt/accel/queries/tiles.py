@@ -1,7 +1,5 @@
 """Pictures of rays in tiles of 4x4 pixels: a packet of 16 rays then covers a square, and its rays share more nodes than in a row."""
 
-from __future__ import annotations
-
 import numpy as np
 
 SIDE = 4  # pixels; 16 rays are a packet (kernels.wide.layout.LANES)

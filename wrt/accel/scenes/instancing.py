@@ -1,7 +1,5 @@
 """Choice between meshes that are stored once, with an instance for each object, and meshes that are copied."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 
 import numpy as np

@@ -3,8 +3,6 @@
 The command line's help lists the suffixes. This file must not import NumPy, which would delay the help.
 """
 
-from __future__ import annotations
-
 from pkgutil import iter_modules
 
 PLACES = {f".{module.name}": f"{__name__}.{module.name}:read" for module in iter_modules(__path__)}

@@ -2,8 +2,6 @@
 
 `Mesh.save` writes them, with an array `exact`: the mesh is then read bit by bit, and not cleaned."""
 
-from __future__ import annotations
-
 import zipfile
 from pathlib import Path
 

@@ -5,8 +5,6 @@ of materials without an .mtl file. It fails with an IndexError on relative indic
 separate indices, it keeps one normal for each position.
 """
 
-from __future__ import annotations
-
 import io
 from array import array
 from collections import defaultdict

@@ -1,7 +1,5 @@
 """OFF files: text, with the keyword OFF, or with colours (C), normals (N) and texture coordinates (ST) of vertices, which are not read."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path

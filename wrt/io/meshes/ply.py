@@ -4,8 +4,6 @@ trimesh 5.2 is not used. It refuses binary files that mix triangles with other p
 of all quads after all first halves, and recomputes the normals of files with texture coordinates.
 """
 
-from __future__ import annotations
-
 import io
 import re
 from array import array

@@ -4,8 +4,6 @@ trimesh 5.2 is not used. It leaves out the triangles before a missing `endsolid`
 number. It lets NumPy warn of positions that are not finite.
 """
 
-from __future__ import annotations
-
 import re
 from array import array
 from pathlib import Path

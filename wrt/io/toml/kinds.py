@@ -1,7 +1,5 @@
 """Pydantic tables made from the described fields of a class (wrt.scene.kinds), and lights and backgrounds made from such tables."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, fields

@@ -1,7 +1,5 @@
 """docs/scene_format.md, the reference of scene files, made from the schema that checks them: `wrt schema --markdown`."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

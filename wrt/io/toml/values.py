@@ -1,7 +1,5 @@
 """Types of the values in a TOML scene file, and the base class of its tables. A single number in place of a colour is a grey."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Annotated, Any, Literal, TypeAlias
 

@@ -1,7 +1,5 @@
 """Writing of a scene as a TOML scene file, with its meshes, textures and images in a folder beside it."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

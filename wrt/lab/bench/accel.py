@@ -1,7 +1,5 @@
 """`python -m wrt bench accel`: build time, memory and traversal time of every structure, on the same rays."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import cache, partial

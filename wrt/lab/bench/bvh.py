@@ -1,7 +1,5 @@
 """`python -m wrt bench bvh`: compare builders of binary BVHs, and boxes, spheres and 14-DOPs as bounding volumes of one tree."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from time import perf_counter, process_time

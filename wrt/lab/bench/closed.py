@@ -1,7 +1,5 @@
 """`python -m wrt bench closed`: points inside closed meshes, and rays through corners and edges, by wrt and other libraries."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 from collections.abc import Callable, Iterator, Sequence

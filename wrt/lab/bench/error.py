@@ -3,8 +3,6 @@
 A knob is a setting or option that the study varies, one knob at a time. Each value is rendered with 1, 2, 4 ... samples per pixel and
 several seeds. Every picture is compared with one reference of the same scene."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 import platform

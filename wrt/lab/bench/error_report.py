@@ -1,7 +1,5 @@
 """Results of `bench error`, and their tables for the terminal, a report and a notebook."""
 
-from __future__ import annotations
-
 import math
 
 from wrt.lab.bench.error_statistics import CONFIDENCE, Estimate

@@ -1,7 +1,5 @@
 """Statistics of renders with several seeds: bias and noise with confidence intervals, slopes, and the Pareto front."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Names of the vector instructions that a processor has, and that wrt's kernels are compiled for."""
 
-from __future__ import annotations
-
 import re
 
 import warp as wp

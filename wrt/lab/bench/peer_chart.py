@@ -1,7 +1,5 @@
 """The bar chart that `bench peers -o` writes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from statistics import geometric_mean
 

@@ -1,7 +1,5 @@
 """Closest points of wrt, Open3D and trimesh, for `bench peers`."""
 
-from __future__ import annotations
-
 import importlib.util
 from collections.abc import Callable
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """The set-up of batch renderers for robots and games, for `bench peers`: a picture of 64x64 pixels in each of many small worlds."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple

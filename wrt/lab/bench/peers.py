@@ -1,7 +1,5 @@
 """`python -m wrt bench peers`: compare wrt with other libraries (Embree, Open3D, trimesh, Warp, tinybvh) on the same rays and points."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from pathlib import Path

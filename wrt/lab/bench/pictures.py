@@ -1,7 +1,5 @@
 """`python -m wrt bench pictures`: compare rendering by waves of samples with rendering one ray at a time."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace

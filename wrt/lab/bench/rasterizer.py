@@ -3,8 +3,6 @@
 Both return depth (H, W) float32, the distance along the ray through the pixel's centre (inf on a miss), and prim_id (H, W) int32 (-1 on a
 miss)."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

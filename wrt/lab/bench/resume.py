@@ -3,8 +3,6 @@
 The report of an interrupted run (.json or .csv) also contains a JSON text: the options, the version of the code, and every finished group
 of rows without any loss. A study measures the rows of a group together, because their times are comparable only with each other."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping, Sequence

@@ -2,8 +2,6 @@
 
 The teapot in a stadium: Haines 1988, "Spline Surface Rendering, and What's Wrong with Octrees", Ray Tracing News 1(2)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from wrt.scene.mesh import Mesh

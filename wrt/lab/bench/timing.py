@@ -1,7 +1,5 @@
 """Time several jobs by turns in one process, so that disturbances hit all of them alike; measure the peak of memory."""
 
-from __future__ import annotations
-
 import ctypes
 import gc
 import math

@@ -1,7 +1,5 @@
 """`python -m wrt bench units`: compare the time of the default intersection tests with that of the other tests."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 from typing import Any

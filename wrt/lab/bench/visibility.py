@@ -1,7 +1,5 @@
 """`python -m wrt bench visibility`: compare rasterising with ray casting as the numbers of triangles and pixels grow."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace

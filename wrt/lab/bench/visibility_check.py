@@ -1,7 +1,5 @@
 """Compare the pictures of z-buffer and rays: rounding must explain each pixel that differs; count the unexplained pixels."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from wrt.accel.geometry import Geometry

@@ -1,7 +1,5 @@
 """Older claims: predictors of a tree's cost, planes of any orientation, sorted rays, and watertight tests."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

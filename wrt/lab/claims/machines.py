@@ -1,7 +1,5 @@
 """Claims about whole GPUs: ratios of tests and of units in use, and NVIDIA's 10 Grays/s."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 from wrt.accel.queries.answers import Counters

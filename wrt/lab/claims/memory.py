@@ -1,7 +1,5 @@
 """Claims about memory: treelets and their traffic, treelet prefetching, compressed nodes, boxes and triangles of 8 bits."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Claims about nodes per ray: the walk of Vulkan-Sim, breadth first against depth first, and what width, order and culling do."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

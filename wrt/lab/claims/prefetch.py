@@ -1,7 +1,5 @@
 """Claims about prefetching the next entries of the stack."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """The caller's mesh files of published scenes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from wrt.core.checks import require_known

@@ -1,7 +1,5 @@
 """Scenes, cameras and workloads of the claims: path tracing, ambient occlusion and shadow rays."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property

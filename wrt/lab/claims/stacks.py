@@ -1,7 +1,5 @@
 """Claims about stacks and early ends: short stacks, no stack, prediction of hits, and a bound for the k nearest hits."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,8 +1,6 @@
 """Cut a tree into treelets, and schedule rays by treelets: Aila and Karras 2010, "Architecture Considerations for Tracing Incoherent
 Rays"."""
 
-from __future__ import annotations
-
 import heapq
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Claims about warps: idle lanes and their help, repacking of rays, and the loops of software traversal."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

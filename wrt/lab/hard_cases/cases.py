@@ -11,8 +11,6 @@ otherwise it passes p by at most 2^-24 of the distance on each axis.
 >>> for case in chunks("A_far_vertices", 1_000_000, seed=0):
 ...     verdict += judge(case, accel.closest_hit(case.origins, case.directions, case.t_min, case.t_max))"""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial

@@ -9,8 +9,6 @@ hits it.
 A case with HIT therefore needs only origins inside. Rounding to float32 moves a vertex by less than the origin's distance to the surface,
 so the surface never passes over the origin and keeps its winding number."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

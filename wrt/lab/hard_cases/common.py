@@ -1,7 +1,5 @@
 """The type HardCase, aimed rays, and meshes that several cases share."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache

@@ -1,7 +1,5 @@
 """`python -m wrt bench hard-cases`: test the closest hits of wrt and other libraries on the hard cases."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 from statistics import median

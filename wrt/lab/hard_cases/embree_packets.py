@@ -1,7 +1,5 @@
 """Embree's queries for packets of 16 rays, its fastest ones, called in the C library of the embreex package."""
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Callable
 from functools import cache

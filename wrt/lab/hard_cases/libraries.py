@@ -1,7 +1,5 @@
 """Each ray library as one function: closest_hit(vertices, faces, origins, directions) -> t, prim_id."""
 
-from __future__ import annotations
-
 import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass

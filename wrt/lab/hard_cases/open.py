@@ -1,7 +1,5 @@
 """Rays at open surfaces, bad triangles and spheres; for most rays only the oracle knows the right answer."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Results of `stability`: tables for the terminal, and a report as Markdown."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

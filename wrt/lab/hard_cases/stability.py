@@ -1,7 +1,5 @@
 """`python -m wrt stability`: run the hard cases on the intersection tests, and measure errors and speed."""
 
-from __future__ import annotations
-
 import signal
 import threading
 import time

@@ -1,7 +1,5 @@
 """tinybvh's BVH4_CPU and BVH8_CPU with spatial splits: a C++ file of wrt, compiled together with the user's copy of tinybvh's header."""
 
-from __future__ import annotations
-
 import ctypes
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Translate materials and textures to Mitsuba; refuse those without an exact counterpart."""
 
-from __future__ import annotations
-
 from types import ModuleType
 from typing import Any, NoReturn, TypeAlias
 

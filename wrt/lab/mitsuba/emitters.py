@@ -1,7 +1,5 @@
 """Translate lights and backgrounds to Mitsuba."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from types import ModuleType

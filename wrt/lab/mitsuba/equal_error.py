@@ -4,8 +4,6 @@ All pictures are compared with one reference. wrt takes a fixed number of sample
 the same error. Its samples are independent, so its mean squared error falls as 1 / time. Mitsuba's time for exactly wrt's error follows.
 Runs alternate, each with its own seed, and use the same number of threads. Each variant of Mitsuba has its own process."""
 
-from __future__ import annotations
-
 import math
 import subprocess
 import sys

@@ -10,8 +10,6 @@ Mitsuba's picture has the expectation of wrt's picture in these cases:
 - "direct": diffuse surfaces, without a mirror or glass in view.
 Mitsuba never cuts rays by their throughput, so compare with min_throughput = 0. All other features are refused with an InputError."""
 
-from __future__ import annotations
-
 import importlib
 import math
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """A Whitted integrator for Mitsuba: wrt's light transport on Mitsuba's geometry, BSDFs and emitters."""
 
-from __future__ import annotations
-
 import importlib
 from types import ModuleType
 

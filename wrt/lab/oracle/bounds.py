@@ -26,8 +26,6 @@ float64, where the products are exact. So a reported hit has weights l_i >= 0 wi
 *The sphere test* runs in float64 and rounds once. The box to which t is clamped contains the sphere, so only the rounding of the slabs
 counts: gamma(5) |t|. At grazing angles the error of float64 itself grows: see `sphere_bounds`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

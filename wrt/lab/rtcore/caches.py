@@ -1,7 +1,5 @@
 """Simulate the caches of a GPU: which recorded fetches miss in the L1 of each SM and in the shared L2."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 

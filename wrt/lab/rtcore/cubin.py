@@ -4,8 +4,6 @@ Since Volta an instruction has 16 bytes, and its lowest 9 bits number the operat
 from binaries of known source, a method of Jia et al. (2019, "Dissecting the NVIDIA Turing T4 GPU via Microbenchmarking"). A test compiles
 some operations and checks their numbers. Unknown operations count as "other"."""
 
-from __future__ import annotations
-
 import struct
 from collections import Counter
 from dataclasses import dataclass

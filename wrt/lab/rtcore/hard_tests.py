@@ -2,8 +2,6 @@
 
 Record the triangle tests of closest-hit queries through bvh2, then classify each test. Both steps run on the CPU."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -3,8 +3,6 @@
 The counts come from compiled binaries, without a GPU. They are static: how often an instruction stands in the code, not how often it
 runs."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """`python -m wrt bench rtcore`: apply the model of the RT core to meshes, structures and kinds of rays."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import cache, partial
 from pathlib import Path

@@ -4,8 +4,6 @@ An RT core tests boxes and triangles at fixed rates, reads nodes and triangles t
 Each of these limits is a term, in clocks per ray. The terms overlap in time, so the largest term decides, as in a roofline model. NVIDIA
 has not published Turing's rates. So results are ranges over assumptions; they serve to order variants and to find sensitivities."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property

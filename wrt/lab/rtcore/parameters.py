@@ -1,7 +1,5 @@
 """Parameters of the model of the RT core: published and assumed values with their sources."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from wrt.lab.rtcore.caches import Cache

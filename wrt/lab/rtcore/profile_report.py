@@ -1,7 +1,5 @@
 """Report of `profile`: tables, the model of the RT core, heat maps, EXR layers and histograms."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path

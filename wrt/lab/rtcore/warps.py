@@ -1,7 +1,5 @@
 """Assign rays to warps of 32 lanes, and compute SIMT efficiency, the share of the lanes' time that rays use."""
 
-from __future__ import annotations
-
 import numpy as np
 
 WARP = 32

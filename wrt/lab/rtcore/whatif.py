@@ -2,8 +2,6 @@
 
 Every variant must find the same hits; the column `differ` counts the rays whose hit differs (must be 0)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial

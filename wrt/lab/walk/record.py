@@ -1,7 +1,5 @@
 """The record of a walk: its steps with the stack and the closest hit, and their counts."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

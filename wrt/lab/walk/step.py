@@ -1,7 +1,5 @@
 """The steps of a walk, as values and in words."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields
 from typing import Any

@@ -3,8 +3,6 @@
 All machines that share work must have the same parts. Comparing wrt's version is not enough: two checkouts of it can differ in any line.
 """
 
-from __future__ import annotations
-
 import sys
 from hashlib import sha256
 from importlib import import_module

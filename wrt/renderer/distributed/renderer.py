@@ -2,8 +2,6 @@
 
 The pixels have the same bits as those of a render on one device."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections import Counter

@@ -4,8 +4,6 @@ A tile is a pure function of the scene, the samples to trace and the tile's prev
 it, also again after another worker died. A worker process prepares a scene once, and caches it under the scene's digest.
 """
 
-from __future__ import annotations
-
 import os
 import socket
 import threading

@@ -1,7 +1,5 @@
 """From the records of a sample (wrt.kernels.loops.record) to its tree of rays."""
 
-from __future__ import annotations
-
 import math
 from collections import defaultdict
 from typing import Any

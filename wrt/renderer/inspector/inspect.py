@@ -1,7 +1,5 @@
 """`wrt.inspect`: every ray of one pixel, as the renderer traces it."""
 
-from __future__ import annotations
-
 import os
 from typing import Any, Unpack
 

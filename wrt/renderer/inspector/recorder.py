@@ -1,7 +1,5 @@
 """The records of a pixel: run the render kernel over a structure that records its rays (wrt.kernels.loops.record)."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Unpack
 

@@ -1,7 +1,5 @@
 """The section of a scene by the plane that holds most of a sample's rays, in 2D."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

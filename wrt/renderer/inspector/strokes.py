@@ -1,7 +1,5 @@
 """The lines that stand for a sample's rays in a drawing, and their colours."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """A pixel's rays as text: one line for each ray and each light, indented as a tree."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

@@ -4,8 +4,6 @@ Source: OpenCV's documentation, "Camera Calibration and 3D Reconstruction" and "
 z = 1 of the camera's frame. `distort` moves it to where the lens shows it; a pixel's ray needs the inverse, which has no closed form.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from wrt.core.checks import as_array, shown
