@@ -1,4 +1,4 @@
-"""The instructions of docs/extending.md work: their code blocks are applied to a copy of the project, and run."""
+"""The instructions of docs/extending.md work: their code blocks are applied to a copy of the project, and run, as are docs/extensions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from pathlib import Path
 
 from tests.data import ROOT
 
-BLOCK = re.compile(r"^```(python|diff|toml)\n# (\S+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+EXTENSIONS = ROOT / "docs" / "extensions"
+BLOCK = re.compile(r"^```(python|diff)\n# (\S+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 TRY_IT = """
 import numpy as np, stored_normal, wrt
@@ -253,7 +254,8 @@ def test_the_text_can_be_followed(tmp_path: Path) -> None:
     for folder in ("wrt", "kernels"):
         shutil.copytree(ROOT / folder, tmp_path / folder, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
     apply(tmp_path)
-    shutil.copy(ROOT / "tests" / "stored_normal.py", tmp_path)
+    for file in (ROOT / "tests" / "stored_normal.py", EXTENSIONS / "beam.py", EXTENSIONS / "horizon.py"):
+        shutil.copy(file, tmp_path)
     (tmp_path / "sign.toml").write_text(SIGN)
     (tmp_path / "stage.toml").write_text(STAGE)
     assert python(tmp_path, "-c", TRY_IT).endswith("all of it works\n")
@@ -290,8 +292,7 @@ def test_a_mesh_format_is_one_file(tmp_path: Path) -> None:
     name = "wrt/io/meshes/shape.py"
     for folder in ("wrt", "kernels"):
         shutil.copytree(ROOT / folder, tmp_path / folder, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
-    (tmp_path / name).write_text(next(body for _, path, body in BLOCK.findall((ROOT / "docs" / "extending.md").read_text())
-                                      if path == name))
+    shutil.copy(EXTENSIONS / "shape.py", tmp_path / name)
     for file, text in (("a.shape", PYRAMID), ("a.pyramid", PYRAMID), ("broken.shape", PYRAMID.replace("3 3 0 4", "3 3 0 7"))):
         (tmp_path / file).write_text(text)
     assert python(tmp_path, "-W", "ignore", "-c", READ_IT).endswith("all of it works\n")
@@ -299,15 +300,14 @@ def test_a_mesh_format_is_one_file(tmp_path: Path) -> None:
 
 
 def test_a_camera_of_ones_own_needs_no_copy_of_the_project(tmp_path: Path) -> None:
-    blocks = {name: body for _, name, body in BLOCK.findall((ROOT / "docs" / "extending.md").read_text())}
-    (tmp_path / "cylinder.py").write_text(blocks["cylinder.py"])
+    shutil.copy(EXTENSIONS / "cylinder.py", tmp_path)
     (tmp_path / "cylinder.toml").write_text(CYLINDER)
     assert python(tmp_path, "-c", A_CAMERA, path=ROOT).endswith("all of it works\n")
 
 
 def test_a_package_adds_commands_measurements_and_structures(tmp_path: Path) -> None:
     """The package is installed as pip does it: the module, and a .dist-info folder with the entry points."""
-    package = ROOT / "docs" / "my_lab"
+    package = EXTENSIONS / "my_lab"
     shutil.copy(package / "my_lab.py", tmp_path)
     project = tomllib.loads((package / "pyproject.toml").read_text())["project"]
     installed = tmp_path / "my_lab-1.0.dist-info"
