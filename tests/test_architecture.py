@@ -436,7 +436,7 @@ def test_type_checkers_see_the_public_names() -> None:
 
 
 @pytest.mark.parametrize("name", ["sensors.pinhole", "compat.open3d.RaycastingScene", "compat.trimesh.RayMeshIntersector",
-                                  "testing.hard_cases", "torch.closest_hit", "jax.closest_hit"])
+                                  "compat.pyvista.RayTracer", "testing.hard_cases", "torch.closest_hit", "jax.closest_hit"])
 def test_public_modules_are_found_without_an_import_of_their_own(name: str) -> None:
     code = f"import sys, wrt; assert not {{'numpy', 'warp'}} & set(sys.modules); print(wrt.{name}.__name__)"
     result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)

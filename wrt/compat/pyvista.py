@@ -1,0 +1,164 @@
+"""The ray methods of PyVista's PolyData, implemented with wrt's queries, and conversions between PolyData and `wrt.Mesh`.
+
+>>> from wrt.compat.pyvista import RayTracer
+>>> points, rays, cells = RayTracer(polydata).multi_ray_trace(origins, directions)  # in place of polydata.multi_ray_trace
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from wrt.accel.queries.all_hits import ALL
+from wrt.compat.trimesh import RayMeshIntersector
+from wrt.core.arrays import real_numbers
+from wrt.core.errors import InputError
+from wrt.core.packages import needed_by
+from wrt.core.types import ArrayLike
+from wrt.scene.mesh import Mesh, unit_rows
+
+if TYPE_CHECKING:
+    import pyvista
+
+
+class RayTracer:
+    """The methods `multi_ray_trace` and `ray_trace` of a PolyData. docs/compat.md lists the differences.
+
+    `wrt.compat.trimesh.RayMeshIntersector` finds the hits: points are computed in float64, and a ray that is not finite, or has
+    direction 0, hits nothing. Both methods raise pyvista.NotAllTrianglesError for a mesh with other cells, and InputError for arrays of
+    other shapes; both are ValueErrors.
+
+    Parameters
+    ----------
+    mesh : pyvista.PolyData
+        Mesh of triangles. After its points or faces change, the next call builds a new structure.
+    device, threads
+        See `wrt.build`.
+    """
+
+    def __init__(self, mesh: pyvista.PolyData, *, device: str = "cpu", threads: int | None = None) -> None:
+        self.mesh, self._device, self._threads = mesh, device, threads
+        self._built: tuple[int, np.ndarray, RayMeshIntersector] | None = None  # VTK's time of the last change, points
+
+    def multi_ray_trace(self, origins: ArrayLike, directions: ArrayLike, first_point: bool = False,
+                        retry: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Intersect rays with the mesh: the first hits in the order of the rays, then the second hits, and so on.
+
+        Parameters
+        ----------
+        origins, directions : (N, 3) array_like
+            Rays in the mesh's units; directions of any length.
+        first_point
+            Return only the first hit of each ray; otherwise at most 100 hits, as PyVista.
+        retry
+            Sort the rows by ray, and by distance within a ray. No ray is traced again, because no ray is lost.
+
+        Returns
+        -------
+        tuple
+            Point (M, 3) float64, ray (M,) int64 and cell (M,) int64 of each hit.
+        """
+        points, ray, cell = self._intersector("multi_ray_trace").intersects_location(origins, directions, multiple_hits=not first_point)
+        order = np.argsort(ray, kind="stable") if retry else slice(None)
+        return points[order], ray[order], cell[order]
+
+    def ray_trace(self, origin: ArrayLike, end_point: ArrayLike, first_point: bool = False) -> tuple[np.ndarray, np.ndarray]:
+        """Intersect a segment with the mesh; rows are in the order of distance from `origin`, each point once.
+
+        Parameters
+        ----------
+        origin, end_point : (3,) array_like
+            Ends of the segment in the mesh's units.
+        first_point
+            Return only the point nearest to `origin`, (3,); the cells remain.
+
+        Returns
+        -------
+        tuple
+            Point (M, 3), in the dtype of the mesh's points, and cell (M,) int64 of each hit. (0, 3) and (0,) on a miss.
+        """
+        start, end = (np.asarray(real_numbers(value, name, "(3,)"), np.float64) for value, name in (
+            (origin, "origin"), (end_point, "end_point")))
+        if start.shape != (3,) or end.shape != (3,):
+            raise InputError(f"and end_point must both be (3,), got {start.shape} and {end.shape}", argument="origin")
+        along = end - start
+        where, _, cells = self._intersector("ray_trace").intersects_location(start[None], along[None], max_hits=ALL)
+        points = where.astype(self.mesh.points.dtype)
+        kept = (where - start) @ along <= (1.0 + 1e-12) * (along @ along)  # within rounding, a surface at the end is hit
+        kept[1:] &= (points[1:] != points[:-1]).any(axis=1)
+        points = points[kept]
+        return points[0] if first_point and len(points) else points, cells[kept]
+
+    def _intersector(self, method: str) -> RayMeshIntersector:
+        """Return the ray class over the present mesh."""
+        import trimesh
+
+        points, faces = _triangles(self.mesh, method)
+        changed = self.mesh.GetMTime()
+        # VTK's time does not notice `points += 1` on a view of the points.
+        if self._built is None or self._built[0] != changed or not np.array_equal(self._built[1], points):
+            own = trimesh.Trimesh(np.array(points, np.float64), np.array(faces), process=False)
+            self._built = changed, np.array(points), RayMeshIntersector(own, device=self._device, threads=self._threads)
+        return self._built[2]
+
+
+def to_mesh(polydata: pyvista.PolyData) -> Mesh:
+    """Return the triangles of a PolyData, in the same order, with its normals and texture coordinates if there are any.
+
+    Parameters
+    ----------
+    polydata : pyvista.PolyData
+        Mesh of triangles; its points are rounded to float32.
+
+    Raises
+    ------
+    pyvista.NotAllTrianglesError
+        If the mesh has cells that are not triangles.
+    InputError
+        If a point is not finite.
+    """
+    points, faces = _triangles(polydata, "to_mesh")
+    normals, uvs = polydata.point_data.active_normals, polydata.active_texture_coordinates
+    return Mesh(np.array(points), np.array(faces), None if normals is None else unit_rows(np.array(normals)),
+                None if uvs is None else np.array(uvs)[:, :2] * (1.0, -1.0) + (0.0, 1.0))  # VTK counts v upwards
+
+
+def to_polydata(mesh: Mesh) -> pyvista.PolyData:
+    """Return a PolyData with copies of a mesh's arrays, in the same order, with its normals and texture coordinates if there are any.
+
+    Parameters
+    ----------
+    mesh : wrt.Mesh
+        Mesh.
+
+    Returns
+    -------
+    pyvista.PolyData
+        Points (V, 3) float32 and F triangles.
+
+    Raises
+    ------
+    InputError
+        If PyVista is missing.
+    """
+    with needed_by("a mesh of PyVista"):
+        import pyvista
+
+    polydata = pyvista.PolyData.from_regular_faces(mesh.vertices.copy(), mesh.faces.copy())
+    if mesh.normals is not None:
+        polydata.point_data["Normals"] = mesh.normals.copy()
+        polydata.GetPointData().SetActiveNormals("Normals")
+    if mesh.uvs is not None:
+        polydata.point_data["uvs"] = (mesh.uvs * (1.0, -1.0) + (0.0, 1.0)).astype(np.float32)
+        polydata.GetPointData().SetActiveTCoords("uvs")
+    return polydata
+
+
+def _triangles(mesh: pyvista.PolyData, method: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points (N, 3) and faces (F, 3) of a mesh of triangles; PyVista's error for other meshes."""
+    if not mesh.is_all_triangles:
+        from pyvista.core.errors import NotAllTrianglesError
+
+        raise NotAllTrianglesError(f"Input mesh for {method} must be all triangles.")
+    return np.asarray(mesh.points), np.asarray(mesh.regular_faces)
