@@ -20,7 +20,7 @@ from wrt.accel.queries.answers import Hits
 from wrt.accel.scenes.build import build
 from wrt.accel.structures import ACCELERATORS
 from wrt.core.checks import as_integer
-from wrt.core.device import load_kernel, start
+from wrt.core.device import launch_on, load_kernel, start
 from wrt.core.threads import run_all, thread_count
 from wrt.core.types import JsonObject
 from wrt.io.load import load_scene
@@ -146,8 +146,7 @@ def function_rows(plan: Check) -> Iterator[Row]:
 def function_values(x: np.ndarray, y: np.ndarray, name: str) -> np.ndarray:
     device = start(name)
     out = wp.empty((len(x), len(FUNCTIONS)), dtype=wp.float32, device=device)
-    load_kernel(call_functions, device)
-    wp.launch(call_functions, len(x), [*(wp.array(each, dtype=wp.float32, device=device) for each in (x, y)), out], device=device)
+    launch_on(device, call_functions, len(x), *(wp.array(each, dtype=wp.float32, device=device) for each in (x, y)), out)
     return out.numpy()
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.accelerator import Accelerator
+from wrt.accel.queries.answers import Counters
 
 RAY_KINDS = ("primary", "shadow", "diffuse", "random")
 TAN_HALF_FOV = 0.55  # a field of view of 58 degrees
@@ -32,9 +33,16 @@ class RaySet:
         return RaySet(self.kind, self.origins[rows], self.directions[rows], self.t_max[rows], self.any_hit)
 
 
+def counters_of(accel: Accelerator, rays: Any, trace: bool = False) -> Counters:
+    """Trace closest hits; return their counters. rays: origins, directions and t_max, such as a RaySet. trace: also record fetches."""
+    counters = accel.closest_hit(rays.origins, rays.directions, 0.0, rays.t_max, counters=True, trace=trace).counters
+    assert counters is not None
+    return counters
+
+
 def mean_counters(accel: Accelerator, rays: RaySet, **names: str) -> dict[str, float]:
     """Trace closest hits; return means of counters over the rays. names: key in the result = name of the counter."""
-    counters = accel.closest_hit(rays.origins, rays.directions, 0.0, rays.t_max, counters=True).counters
+    counters = counters_of(accel, rays)
     return {name: float(getattr(counters, counter).mean()) for name, counter in names.items()}
 
 
@@ -110,11 +118,15 @@ def ray_sets(accel: Accelerator, n: int, seed: int = 0, inside: bool = False) ->
 
 def _camera(eye: np.ndarray, target: np.ndarray, n: int) -> RaySet:
     """Return a camera's rays through the centres of a square of at most n pixels, row by row."""
-    side = max(int(np.sqrt(n)), 1)
+    origins, directions = through_pixels(eye, target, max(int(np.sqrt(n)), 1))
+    return RaySet("primary", origins.astype(np.float32), directions.astype(np.float32), endless(len(directions)))
+
+
+def through_pixels(eye: np.ndarray, target: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return origins and unit directions through the centres of side x side pixels, (side^2, 3) float64 each, row by row."""
     forward = unit(target - eye)
     right = unit(np.cross(forward, [0.0, 1.0, 0.0]))
     up = np.cross(right, forward)
     x, y = np.meshgrid((np.arange(side) + 0.5) / side * 2.0 - 1.0, 1.0 - (np.arange(side) + 0.5) / side * 2.0)
     directions = unit(forward + TAN_HALF_FOV * (x[..., None] * right + y[..., None] * up)).reshape(-1, 3)
-    origins = np.broadcast_to(eye, directions.shape)
-    return RaySet("primary", origins.astype(np.float32), directions.astype(np.float32), endless(len(directions)))
+    return np.broadcast_to(eye, directions.shape), directions

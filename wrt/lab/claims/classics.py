@@ -9,7 +9,7 @@ from wrt.accel.cells.kdtree import KdTree
 from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
 from wrt.kernels.traverse.kdtree import LEAF
-from wrt.lab.bench.rays import ball_around, random
+from wrt.lab.bench.rays import ball_around, counters_of, random
 from wrt.lab.bench.visibility import terrain
 from wrt.lab.claims.claim import SAME_SCENE, Claim, Figure, Study
 from wrt.lab.claims.prefetch import SLOTS, SMS, fetches_of, fully_associative, in_order, through_caches
@@ -36,12 +36,10 @@ def predictors(study: Study) -> Iterator[Figure]:
             accel = build(scene.geometry, "bvh2", builder=builder)
             sah.append(float(accel.stats.sah_cost))
             epo.append(accel.epo())
-            for out, o, d in ((crossing, lines.origins, lines.directions), (ending, part.origins, part.directions)):
-                counters = accel.closest_hit(o, d, counters=True).counters
-                assert counters is not None
+            for out, traced in ((crossing, lines), (ending, part)):
+                counters = counters_of(accel, traced)
                 out.append(float((counters.nodes + counters.primitives).mean()))
-                if out is ending:
-                    spread.append(float(counters.leaves.std()))
+            spread.append(float(counters.leaves.std()))
         mixes = [correlation([(1.0 - a) * s + a * e for s, e in zip(sah, epo, strict=True)], ending) for a in np.linspace(0.0, 1.0, 101)]
         said = f"{study.differences(name, 'their own scenes')}; {len(sah)} builders of bvh2; no number was at hand to compare with"
         yield Figure(f"correlation of SAH cost with steps, random lines, {name}", correlation(sah, crossing), None, "", said)
@@ -60,8 +58,7 @@ def cells(study: Study) -> Iterator[Figure]:
         part = rays.part(rays.kind == 0)
         found = {}
         for structure in ("bvh2", "kdtree", "bsp"):
-            counters = build(study.scene(name).geometry, structure).closest_hit(part.origins, part.directions, counters=True).counters
-            assert counters is not None
+            counters = counters_of(build(study.scene(name).geometry, structure), part)
             found[structure] = float(counters.nodes.mean()), float(counters.primitives.mean())
         for structure in ("kdtree", "bsp"):
             (nodes, tests), (of_bvh, tests_of_bvh) = found[structure], found["bvh2"]
@@ -147,9 +144,7 @@ def watertight(study: Study) -> Iterator[Figure]:
     name = "sponza"
     rays = study.rays(name)
     part = rays.part(rays.kind == 0)
-    exact, wide = (build(study.scene(name).geometry, "bvh2", box=box).closest_hit(part.origins, part.directions, counters=True).counters
-                   for box in ("minmax", "conservative"))
-    assert exact is not None and wide is not None
+    exact, wide = (counters_of(build(study.scene(name).geometry, "bvh2", box=box), part) for box in ("minmax", "conservative"))
     yield Figure("boxes tested a ray, conservative box test over minmax", float(wide.boxes.sum() / exact.boxes.sum()), None, "ratio",
                  f"{study.differences(name, 'their own scenes')}; Ize 2013 widens the interval of each box; triangles tested a ray"
                  f" {wide.primitives.mean():.4f} against {exact.primitives.mean():.4f}")

@@ -2,21 +2,13 @@
 
 from collections.abc import Iterator
 
-from wrt.accel.queries.answers import Counters
 from wrt.accel.scenes.build import build
-from wrt.lab.bench.rays import ray_sets
+from wrt.lab.bench.rays import counters_of, ray_sets
 from wrt.lab.claims.claim import Claim, Figure, Study
-from wrt.lab.claims.walks import Rays, Rules, walk
+from wrt.lab.claims.walks import Rules, walk
 from wrt.lab.rtcore.meshes import in_warps
 from wrt.lab.rtcore.model import RANGE, predict, sensitivity, span, sweep, trace_rays
 from wrt.lab.rtcore.parameters import GPUS
-
-
-def counters_of(study: Study, name: str, structure: str, rays: Rays) -> Counters:
-    accel = build(study.scene(name).geometry, structure)
-    counters = accel.closest_hit(rays.origins, rays.directions, 0.0, rays.t_max, counters=True).counters
-    assert counters is not None
-    return counters
 
 
 def machines(study: Study) -> Iterator[Figure]:
@@ -24,7 +16,7 @@ def machines(study: Study) -> Iterator[Figure]:
     name = "sponza"
     rays = study.rays(name)
     part, core = rays.part(rays.kind == 0), GPUS["arcb580"].core
-    arc = counters_of(study, name, "bvh6", part)
+    arc = counters_of(build(study.scene(name).geometry, "bvh6"), part)
     boxes, triangles = float(arc.boxes.mean()), float(arc.primitives.mean())
     said = f"{study.differences(name, 'a frame of a game, not shared')}; camera and bounce rays, sorted and culled"
     steps = float((arc.nodes + arc.leaves).mean())

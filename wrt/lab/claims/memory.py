@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from wrt.accel.scenes.build import build
+from wrt.lab.bench.rays import counters_of
 from wrt.lab.claims.claim import Claim, Figure, Study
 from wrt.lab.claims.nodes import THEIRS
 from wrt.lab.claims.prefetch import SLOTS, SMS, Accesses, fetches_of, fully_associative, in_order, through_caches
@@ -83,8 +84,7 @@ def cwbvh(study: Study) -> Iterator[Figure]:
         sizes, moved = {}, {}
         for structure in ("bvh2", "bvh8c"):
             accel = build(scene.geometry, structure)
-            counters = accel.closest_hit(diffuse.origins, diffuse.directions, counters=True).counters
-            assert counters is not None
+            counters = counters_of(accel, diffuse)
             sizes[structure] = accel.stats.bytes / len(scene.geometry)
             moved[structure] = float((counters.node_bytes.astype(np.float64) + counters.primitive_bytes).mean())
         numbers = (f"bytes a triangle {sizes['bvh2']:.0f} to {sizes['bvh8c']:.0f}, triangles included; bytes a diffuse ray"

@@ -2,13 +2,12 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import warp as wp
 
-from wrt.core.device import load_kernel, start, upload
-from wrt.core.threads import run_all, thread_count
+from wrt.core.device import launch, start, upload
+from wrt.core.threads import thread_count
 from wrt.core.types import WarpStruct
 from wrt.kernels.study import stack_replay, tree_walk
 from wrt.kernels.study.cache_prefetch import Served, replay_prefetches
@@ -49,10 +48,7 @@ def replayed(log: Walk, ahead: tuple[int, int, int] = AHEAD) -> tuple[np.ndarray
     cpu, n, out = start("cpu"), len(log.counts), stack_replay.Entries()
     out.used, out.prefetched = (wp.full(len(log.push), -1, dtype=wp.int32, device=cpu) for _ in range(2))
     scratch, given = wp.empty(RAYS_PER_LAUNCH * int(QUEUE), dtype=wp.int64, device=cpu), device_log(log)
-    load_kernel(stack_replay.replay_stacks, cpu)
-    for first in range(0, n, RAYS_PER_LAUNCH):
-        wp.launch(stack_replay.replay_stacks, dim=min(RAYS_PER_LAUNCH, n - first), device=cpu,
-                  inputs=[given, wp.vec3i(*ahead), first, scratch, out])
+    launch(stack_replay.replay_stacks, n, given, wp.vec3i(*ahead), None, scratch, out, step=RAYS_PER_LAUNCH)
     return out.used.numpy().copy(), out.prefetched.numpy().copy()
 
 
@@ -87,9 +83,7 @@ def through_caches(ordered: tuple[np.ndarray, np.ndarray, np.ndarray], cache: Ca
     out.fetches, out.misses, out.prefetches, out.used = (wp.zeros(sms, dtype=wp.int64, device=cpu) for _ in range(4))
     out.missed = wp.zeros(len(line), dtype=wp.int8, device=cpu)
     caches, arrays = caches_of(cache, sms), (upload(first, wp.int64, cpu), upload(line, wp.int64, cpu), upload(prefetch, wp.int8, cpu))
-    load_kernel(replay_prefetches, cpu)
-    run_all([partial(wp.launch, replay_prefetches, dim=1, inputs=[caches, *arrays, sm, out], device=cpu) for sm in range(sms)],
-            thread_count(None))
+    launch(replay_prefetches, sms, caches, *arrays, None, out, threads=thread_count(None), step=1)
     fetches, misses, prefetches, used = (int(getattr(out, name).numpy().sum()) for name in ("fetches", "misses", "prefetches", "used"))
     return Traffic(fetches, misses, prefetches, used, out.missed.numpy().astype(bool))
 

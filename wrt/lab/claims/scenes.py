@@ -11,7 +11,7 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.scenes.build import build
 from wrt.core.types import PathLike
 from wrt.io.mesh_file import as_mesh
-from wrt.lab.bench.rays import OFFSET, ball_around, unit
+from wrt.lab.bench.rays import OFFSET, ball_around, through_pixels, unit
 from wrt.lab.bench.visibility import terrain
 from wrt.lab.claims.walks import Rays
 from wrt.lab.rtcore.warps import WARP, blocks
@@ -19,7 +19,6 @@ from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import box, icosphere, merged, torus, tube
 
 BOUNCES = 3
-TAN_HALF_FOV = 0.55  # a field of view of 58 degrees
 INSIDE = ("sponza", "conference", "hall", "kitchen", "room")  # scenes that the camera sees from the middle of their box
 AO_RADIUS = 0.1  # length of ambient occlusion rays over the radius of the scene's bounding sphere
 PATH, AO, SHADOW = "path tracing", "ambient occlusion", "shadow"
@@ -120,7 +119,7 @@ def rays_of(scene: Scene, workload: str, seed: int = 0) -> Rays:
     lo, hi, center, radius = ball_around(scene.geometry)
     rng = np.random.default_rng(seed)
     light = center + (np.array([0.05, 0.4, 0.05]) * (hi - lo) if scene.inside else radius * np.array([0.8, 1.7, 0.6]))
-    origins, directions = camera_rays(scene)
+    origins, directions = through_pixels(*scene.camera, scene.side)
     pixel = np.arange(len(origins))
     waves: list[Rays] = []
 
@@ -155,18 +154,6 @@ def in_warps(scene: Scene, rays: Rays) -> Rays:
     out = rays.part(order)
     out.warp[...] = number
     return out
-
-
-def camera_rays(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Return origins and directions through the centres of the pixels, (side^2, 3) float64, row by row."""
-    eye, target = scene.camera
-    forward = unit(target - eye)
-    right = unit(np.cross(forward, [0.0, 1.0, 0.0]))
-    up = np.cross(right, forward)
-    at = (np.arange(scene.side) + 0.5) / scene.side * 2.0 - 1.0
-    x, y = np.meshgrid(at, -at)
-    directions = unit(forward + TAN_HALF_FOV * (x[..., None] * right + y[..., None] * up)).reshape(-1, 3)
-    return np.broadcast_to(eye, directions.shape).astype(np.float64), directions
 
 
 def surface(geometry: Geometry, origins: np.ndarray, directions: np.ndarray, t: np.ndarray, prim_id: np.ndarray) -> tuple[np.ndarray,

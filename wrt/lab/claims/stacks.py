@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.geometry import Geometry
-from wrt.core.device import launch, load_kernel, on_host, start
+from wrt.core.device import launch, on_host, start
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.study import k_hits as k_kernels
 from wrt.kernels.study import wide_short_stack as short_kernels
@@ -145,10 +145,7 @@ def k_walk(tree: Tree, rays: Rays, bounded: bool) -> np.ndarray:
     cpu, n = start("cpu"), len(rays)
     out, given = wp.zeros(n, dtype=Work, device=cpu), upload_rays(rays)
     scratch = wp.empty(RAYS_PER_LAUNCH * int(QUEUE), dtype=wp.uint64, device=cpu)
-    load_kernel(k_kernels.walk_k_hits, cpu)
-    for first in range(0, n, RAYS_PER_LAUNCH):
-        wp.launch(k_kernels.walk_k_hits, dim=min(RAYS_PER_LAUNCH, n - first), device=cpu,
-                  inputs=[tree.data, Surfaces(), given, int(bounded), first, scratch, out])
+    launch(k_kernels.walk_k_hits, n, tree.data, Surfaces(), given, int(bounded), None, scratch, out, step=RAYS_PER_LAUNCH)
     return on_host(out).copy()
 
 

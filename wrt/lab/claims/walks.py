@@ -13,7 +13,7 @@ from wrt.accel.bvh.builders import BvhOptions, build_binary
 from wrt.accel.bvh.compress import compress, decompress
 from wrt.accel.bvh.wide_tree import WideTree, collapse, leaf_rows
 from wrt.accel.geometry import Geometry
-from wrt.core.device import load_kernel, on_host, start, upload
+from wrt.core.device import launch, on_host, start, upload
 from wrt.core.errors import InputError
 from wrt.core.types import WarpStruct
 from wrt.kernels.structs import Primitive, Surfaces
@@ -145,13 +145,10 @@ def walk(tree: Tree, rays: Rays, rules: Rules, log: bool = False, starts: np.nda
     given, device_rules, out = upload_rays(rays, starts), kernels.Rules(), wp.zeros(n, dtype=kernels.Work, device=cpu)
     device_rules.ordered, device_rules.culled, device_rules.queue = map(int, rules)
     scratch = wp.empty(RAYS_PER_LAUNCH * int(QUEUE), dtype=wp.uint64, device=cpu)
-    load_kernel(kernels.walk, cpu)
 
     def trace(record: WarpStruct) -> np.ndarray:
         record.work = out
-        for first in range(0, n, RAYS_PER_LAUNCH):
-            wp.launch(kernels.walk, dim=min(RAYS_PER_LAUNCH, n - first), device=cpu,
-                      inputs=[tree.data, Surfaces(), given, device_rules, first, scratch, record])
+        launch(kernels.walk, n, tree.data, Surfaces(), given, device_rules, None, scratch, record, step=RAYS_PER_LAUNCH)
         return on_host(out).copy()
 
     counts = trace(kernels.WalkLog())

@@ -7,9 +7,10 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.scenes.build import build
-from wrt.core.device import launch, load_kernel, start, upload
+from wrt.core.device import launch, start, upload
 from wrt.core.types import WarpStruct
 from wrt.kernels.study import warp_loops as kernels
+from wrt.lab.bench.rays import counters_of
 from wrt.lab.claims.claim import Claim, Figure, Study
 from wrt.lab.claims.nodes import THEIRS
 from wrt.lab.claims.prefetch import device_log, replayed
@@ -47,9 +48,8 @@ def looped(log: Walk, warp: np.ndarray, loop: int) -> WarpStruct:
     cpu, first, out = start("cpu"), firsts(warp), kernels.LaneSteps()
     for name in ("node", "test", "node_lanes", "test_lanes", "rounds"):
         setattr(out, name, wp.zeros(len(first) - 1, dtype=wp.int64, device=cpu))
-    load_kernel(kernels.loop_steps, cpu)
-    wp.launch(kernels.loop_steps, dim=len(first) - 1, device=cpu,
-              inputs=[upload(first, wp.int64, cpu), device_log(log), int(loop), wp.zeros(len(warp), dtype=kernels.Lane, device=cpu), out])
+    launch(kernels.loop_steps, len(first) - 1, upload(first, wp.int64, cpu), device_log(log), int(loop),
+           wp.zeros(len(warp), dtype=kernels.Lane, device=cpu), out)
     return out
 
 
@@ -82,9 +82,7 @@ def occupancy(study: Study, name: str, said: str) -> Figure:
     """Predict what more warps at a time gain. said: differences of set-up."""
     rays, accel, gpu = study.rays(name), build(study.scene(name).geometry, "bvh6"), GPUS["rtx2060"]
     part = rays.part(rays.kind == 0)
-    counters = accel.closest_hit(part.origins, part.directions, trace=True).counters
-    assert counters is not None
-    work = Work(PATH, counters, np.unique(part.warp, return_inverse=True)[1])
+    work = Work(PATH, counters_of(accel, part, trace=True), np.unique(part.warp, return_inverse=True)[1])
     few, many = (predict(work, gpu, replace(gpu.core, boxes=6.0, warps=warps)) for warps in (4, 32))
     slow = [predict(work, gpu, replace(gpu.core, warps=warps)).rays_per_second for warps in (4, 32)]
     return Figure("speed with 32 warps at a time over 4, path tracing", many.rays_per_second / few.rays_per_second, 1.64, "ratio",

@@ -16,7 +16,7 @@ import warp as wp
 
 from wrt.accel.queries.all_hits import all_hits
 from wrt.accel.structure import Structure
-from wrt.core.device import load_kernel, upload
+from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
 from wrt.core.types import JsonObject, Kernel
@@ -232,8 +232,6 @@ def respawn(algorithm: Own, case: HardCase) -> tuple[np.ndarray, np.ndarray]:
     """Return prim_id of each ray's hit, and prim_id of the next hit from that point along case.next_directions, (N,) int32 each."""
     accel, n = algorithm.accel, len(case)
     assert case.next_directions is not None
-    kernel = _respawn_kernel(accel.structure)
-    load_kernel(kernel, accel.device)
     out = Respawn()
     out.direction = upload(case.next_directions, wp.vec3, accel.device)
     out.exclude = 1
@@ -243,7 +241,7 @@ def respawn(algorithm: Own, case: HardCase) -> tuple[np.ndarray, np.ndarray]:
     surfaces.vertices, surfaces.faces = upload(geometry.vertices, wp.vec3, accel.device), upload(geometry.faces, wp.vec3i, accel.device)
     surfaces.spheres = upload(geometry.spheres, wp.vec4, accel.device)
     surfaces.prim_material = wp.zeros(len(geometry), dtype=wp.int32, device=accel.device)
-    wp.launch(kernel, dim=n, inputs=[accel.data, surfaces, case.on(accel.device), out, 0], device=accel.device)
+    launch_on(accel.device, _respawn_kernel(accel.structure), n, accel.data, surfaces, case.on(accel.device), out, 0)
     return out.first_prim_id.numpy(), out.next_prim_id.numpy()
 
 
