@@ -1,7 +1,5 @@
 """Result of a builder, and statistics of structures and refits."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -29,7 +27,7 @@ class Built:
     sah_cost: float = float("nan")
     parents: WarpArray | None = None
 
-    def on_host(self) -> Built:
+    def on_host(self) -> "Built":
         """Convert the arrays to NumPy arrays."""
         if not isinstance(self.order, wp.array):
             return self

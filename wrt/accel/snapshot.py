@@ -1,7 +1,5 @@
 """State of a structure at one time: everything that a query reads and a refit replaces."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Concatenate, ParamSpec, TypeVar
@@ -58,7 +56,7 @@ class Snapshot:
         assert self.built is not None
         return self.built
 
-    def counting(self, data: WarpStruct, steps: bool = False) -> Snapshot:
+    def counting(self, data: WarpStruct, steps: bool = False) -> "Snapshot":
         """Return the snapshot with `data` in place of its own data, for kernels that count, and that record each step if `steps`."""
         units = self.structure.units._replace(counters=True, steps=steps)
         return replace(self, structure=self.structure._replace(units=units), data=data)

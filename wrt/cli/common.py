@@ -1,7 +1,5 @@
 """Parts that the commands share: types of options, loading of scenes, and output."""
 
-from __future__ import annotations
-
 import ast
 import contextlib
 import dataclasses
@@ -104,7 +102,7 @@ class OneOf(click.ParamType):
     def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
         return f"[{'|'.join(self.names())}]"
 
-    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> "list[CompletionItem]":
         from click.shell_completion import CompletionItem
 
         return [CompletionItem(name) for name in self.names() if name.startswith(incomplete)]
@@ -207,7 +205,7 @@ def values_of(assignments: Assignments, **reserved: str) -> dict[str, Parsed]:
     return values
 
 
-def settings_of(assignments: Assignments, flags: Mapping[str, Parsed] | None = None, **reserved: str) -> SettingChanges:
+def settings_of(assignments: Assignments, flags: Mapping[str, Parsed] | None = None, **reserved: str) -> "SettingChanges":
     """Return changes of the scene's settings from --set and from `flags`, the values of options such as --spp by setting (None: absent).
 
     reserved: see values_of. Raises InputError for an invalid setting, and if --set and an option give different values."""
@@ -248,7 +246,7 @@ def device_options(cluster: str | None, device: str) -> dict[str, Parsed]:
     return {"device": device, "executor": client_of(cluster)}
 
 
-def client_of(cluster: str | None) -> Client | None:
+def client_of(cluster: str | None) -> "Client | None":
     """Return a Dask client of the scheduler at address `cluster`, connected until the command ends; None if `cluster` is None."""
     if cluster is None:
         return None
@@ -269,7 +267,7 @@ STAGING = option_group("staging", dict, ("up", "studio", "floor", "fill"), (
                  help="Radiance of a fill light beside a glTF file's own lights  [default: 0, or an estimate beside emissive surfaces]")))
 
 
-def load(path: Path, quiet: bool, staging: dict[str, Parsed] | None = None) -> Scene:
+def load(path: Path, quiet: bool, staging: dict[str, Parsed] | None = None) -> "Scene":
     """Read a scene, and write the loader's warnings to stderr. staging: keywords of load_scene, the values of STAGING's options."""
     from wrt.io.load import load_scene
 

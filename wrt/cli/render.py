@@ -1,7 +1,5 @@
 """The command `render`, which makes a picture."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal
@@ -179,7 +177,7 @@ def require_alone(as_json: bool, options: dict[str, Parsed]) -> None:
             raise InputError("has no place if the picture goes to stdout", argument=f"--{name}", hint="give -o a file name")
 
 
-def check_options(output: Path, assignments: Assignments, options: dict[str, Parsed]) -> SettingChanges:
+def check_options(output: Path, assignments: Assignments, options: dict[str, Parsed]) -> "SettingChanges":
     """Return changes of the scene's settings, and convert `options` in place to the options of `wrt.render`.
 
     Raises InputError for an invalid setting or option, before the scene is read."""
@@ -199,7 +197,7 @@ def check_options(output: Path, assignments: Assignments, options: dict[str, Par
     return settings
 
 
-def trace(loaded: Scene, path: Path, spp: int | None, options: dict[str, Parsed], quiet: bool) -> Film:
+def trace(loaded: "Scene", path: Path, spp: int | None, options: dict[str, Parsed], quiet: bool) -> "Film":
     """Render a scene, with progress on stderr. path: the scene's file. Raises Interrupted if interrupted before the first sample."""
     from wrt.renderer.progress import progress_reporter
     from wrt.renderer.render import render as render_scene
@@ -213,7 +211,7 @@ def trace(loaded: Scene, path: Path, spp: int | None, options: dict[str, Parsed]
     return film
 
 
-def _summary(film: Film, auto_exposure: bool) -> str:
+def _summary(film: "Film", auto_exposure: bool) -> str:
     """Return a text with samples, rays, cut rays, and the seconds of each stage ("compile" overlaps "upload" and "build")."""
     s = film.stats
     cut = f"cut: {s['cut_by_depth']} rays by depth, {s['cut_by_throughput']} by throughput"

@@ -1,7 +1,5 @@
 """Parts that the measuring commands share: options, progress, and the report as text, JSON and Markdown file."""
 
-from __future__ import annotations
-
 import dataclasses
 import signal
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -80,7 +78,7 @@ class Reporting:
         check_writable(self.output)
         return suffix
 
-    def finished(self, plan: Plan, classes: Sequence[type] = ()) -> Finished:
+    def finished(self, plan: Plan, classes: Sequence[type] = ()) -> "Finished":
         """Return the groups that the report `output` of an interrupted run has, or none without --resume. classes: see resume.load."""
         from wrt.lab.bench import resume
 
@@ -93,7 +91,7 @@ class Reporting:
         return resume.load(self.output, plan, classes)
 
     def rows_of(self, measure: Callable[[Callable[[T], None]], list[T]], line: Callable[[T], str],
-                finished: Finished, total: int) -> tuple[list[T], int | None]:
+                finished: "Finished", total: int) -> tuple[list[T], int | None]:
         """Measure, and show each finished row with the time left. Return all rows, and the number of the signal that ended the work.
 
         measure: function that takes a callback for finished rows. finished: groups of an earlier run; `measure` appends its own. total:

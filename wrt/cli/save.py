@@ -1,7 +1,5 @@
 """Files of a long render: its checkpoint, and a second folder for a picture that cannot be written to the first."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shutil
@@ -32,7 +30,8 @@ def checkpoint_options(output: Path, every: float | None, file: Path | None, res
     return {"checkpoint": file, "checkpoint_every": EVERY if every is None else every, "resume": resume}
 
 
-def save_film(film: Film, output: Path, bits: int | None, layers: Sequence[str] | None) -> tuple[list[Path], list[int], InputError | None]:
+def save_film(film: "Film", output: Path, bits: int | None, layers: Sequence[str] | None
+              ) -> tuple[list[Path], list[int], InputError | None]:
     """Write the picture to `output`. If that fails, write it to a new folder wrt-* in the folder for temporary files (TMPDIR).
 
     Returns the paths written, the numbers of the signals that arrived meanwhile, and the error if writing to `output` failed. Raises
@@ -50,7 +49,7 @@ def save_film(film: Film, output: Path, bits: int | None, layers: Sequence[str] 
             raise
 
 
-def write_to_stdout(film: Film, bits: int | None) -> tuple[list[Path], list[int], InputError | None]:
+def write_to_stdout(film: "Film", bits: int | None) -> tuple[list[Path], list[int], InputError | None]:
     """Write the picture to stdout as a PNG file. The result is that of save_film, without paths."""
     from wrt.picture.image import encode_png
     from wrt.picture.tonemap import to_codes

@@ -4,8 +4,6 @@ A ray that is not finite, or has direction 0, hits nothing. The queries leave ou
 take longer than a ray.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -36,7 +34,7 @@ class GivenRays(NamedTuple):
         """Rays of a query."""
         return Rays(self.origins, self.directions, constant(0.0, len(self.t_max)), self.t_max)
 
-    def of(self, rows: np.ndarray) -> GivenRays:
+    def of(self, rows: np.ndarray) -> "GivenRays":
         """Return some of the rays. rows: indices (M,)."""
         return GivenRays(*(array[rows] for array in self))
 

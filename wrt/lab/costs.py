@@ -1,7 +1,5 @@
 """Cost of every pixel: run the render kernel over a structure that counts its steps and logs its rays."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
@@ -37,7 +35,7 @@ class CostCounter:
         self.prepared = prepare(replace(plan, structure=WrappedStructure(counting, ray_log), features=features), device, built)
 
     @classmethod
-    def beside(cls, built: Prepared) -> CostCounter:
+    def beside(cls, built: Prepared) -> "CostCounter":
         """Return a counter that shares the structure and arrays of `built`, a scene prepared for pictures."""
         return cls(built.plan, built.device, built)
 

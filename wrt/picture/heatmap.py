@@ -1,7 +1,5 @@
 """Heat maps: a colour for the value of each pixel, with a colour scale."""
 
-from __future__ import annotations
-
 import math
 from functools import cache
 from typing import TYPE_CHECKING
@@ -93,7 +91,7 @@ def short(value: float) -> str:
 
 
 @cache
-def font(size: int) -> FreeTypeFont | ImageFont:
+def font(size: int) -> "FreeTypeFont | ImageFont":
     from PIL.ImageFont import load_default
 
     return load_default(size)

@@ -1,7 +1,5 @@
 """The film on the device. With a target error, a pixel's samples form several groups, which estimate the error."""
 
-from __future__ import annotations
-
 import math
 from copy import copy
 
@@ -54,7 +52,7 @@ class DeviceFilm:
             self.groups.append(film)
         self._read: dict[int, np.ndarray] | None = None  # in a snapshot: host copies of arrays, by device address
 
-    def snapshot(self) -> DeviceFilm:
+    def snapshot(self) -> "DeviceFilm":
         """Return a read-only copy of this object. The copy fetches each array from a GPU only once, at its first use."""
         out = copy(self)
         out._read = {}

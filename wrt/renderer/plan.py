@@ -1,7 +1,5 @@
 """The plan of a render, made before any work: camera, features, crop, and kernels."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -109,7 +107,7 @@ class Plan:
         limits.seed = seed
         return limits
 
-    def aimed(self, camera: CameraKind, **settings: Unpack[SettingChanges]) -> Plan:
+    def aimed(self, camera: CameraKind, **settings: Unpack[SettingChanges]) -> "Plan":
         """Return the plan with another camera and other settings (those in AIMED), for the same kernels.
 
         Raises InputError if the kernels do not suffice: for another kind of camera, a lens in place of a pinhole, or more bounces."""
@@ -123,7 +121,7 @@ class Plan:
             raise InputError(f"this renderer was not made for {lacks[0]}")
         return replace(self, scene=scene, camera=camera, crop=_crop(scene.settings, self.options))
 
-    def moved(self, scene: Scene) -> Plan:
+    def moved(self, scene: Scene) -> "Plan":
         """Return the plan for a scene with the same objects in other places."""
         return replace(self, scene=scene, meshes=instanced_meshes(scene, self.options.instancing))
 

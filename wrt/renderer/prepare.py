@@ -1,7 +1,5 @@
 """Preparation of a scene for one device: kernels compiled, arrays uploaded, acceleration structure built."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -53,7 +51,7 @@ class Prepared:
     waves: Waves | None
     seconds: dict[str, float]
 
-    def aimed(self, camera: CameraKind, angles_of: tuple[int, int] | None = None, **settings: Unpack[SettingChanges]) -> Prepared:
+    def aimed(self, camera: CameraKind, angles_of: tuple[int, int] | None = None, **settings: Unpack[SettingChanges]) -> "Prepared":
         """Return this scene with another camera and other settings; Plan.aimed says which.
 
         angles_of: width and height whose ratio is the camera's aspect ratio. None: the picture's own width and height."""

@@ -1,7 +1,5 @@
 """The camera that a user steers: orbits, pans, dollies and walks with undo and reset, and its table of a TOML scene file."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -35,7 +33,7 @@ class Pose:
     def distance(self) -> float:
         return math.dist(self.target, self.camera.camera_to_world[:3, 3])  # without overflow
 
-    def placed(self, axes: np.ndarray, target: np.ndarray, distance: float) -> Pose:
+    def placed(self, axes: np.ndarray, target: np.ndarray, distance: float) -> "Pose":
         """Return the pose with other axes (3, 3), target and distance. Raises InputError if a number overflows."""
         pose = np.eye(4)
         pose[:3, :3] = axes

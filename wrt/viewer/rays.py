@@ -1,7 +1,5 @@
 """What is at a clicked pixel: the surface there, and the rays of the inspector, as JSON for the page."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -65,7 +63,7 @@ class Rays:
         self._inspectors: dict[object, Inspector] = {}
         self._scenery: SideView | None = None  # the scene's opaque surfaces, made at the first inspection
 
-    def inspect(self, view: View, x: float, y: float, sample: int, spp: int) -> Inspected:
+    def inspect(self, view: View, x: float, y: float, sample: int, spp: int) -> "Inspected":
         """Trace a sample of the pixel at a point of the picture, as `render` would. Raises InputError if the scene cannot be rendered."""
         scene, options, key = self.renderers.scene, self.renderers.options, kind_of(view)
         if key not in self._inspectors:

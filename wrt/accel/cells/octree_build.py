@@ -1,7 +1,5 @@
 """Builder of octrees: level by level from the root down, all cells of a level at once."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,7 +59,7 @@ class Cells:
     def count(self) -> np.ndarray:
         return np.diff(self.begin)
 
-    def part(self, chosen: np.ndarray) -> Cells:
+    def part(self, chosen: np.ndarray) -> "Cells":
         """Return the cells in the mask `chosen`, (M,) bool."""
         count = self.count
         references = self.references[np.repeat(chosen, count)]
@@ -134,7 +132,7 @@ def build_tree(geometry: Geometry, options: OctreeOptions, threads: int) -> Buil
                  np.arange(n, dtype=np.int32), n_nodes, int((nodes["count"] >= 0).sum()), len(levels), cost)
 
 
-def choose(cells: Cells, split: _Splitter, half: int, options: OctreeOptions) -> tuple[np.ndarray, np.ndarray, Cells]:
+def choose(cells: Cells, split: "_Splitter", half: int, options: OctreeOptions) -> tuple[np.ndarray, np.ndarray, Cells]:
     """Choose K of M cells to split; return their mask (M,), the number of references per octant (K, 8), and the next level's cells."""
     chosen = cells.count > options.max_leaf if half else np.zeros(len(cells.corner), bool)
     large = cells.part(chosen)

@@ -1,7 +1,5 @@
 """Gradients of closest hits in closed form, shared by NumPy, wp.Tape, PyTorch and JAX."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any, Generic, NamedTuple
 
@@ -44,7 +42,7 @@ class Cotangents(NamedTuple):
     v: ArrayLike | None = None
     point: ArrayLike | None = None
 
-    def checked(self, shape: tuple[int, ...]) -> Cotangents:
+    def checked(self, shape: tuple[int, ...]) -> "Cotangents":
         """Convert the fields, of the rays' shape, to NumPy arrays (N,) and (N, 3). Raises InputError for other shapes."""
         arrays = [field if field is None else to_numpy(field) for field in self]
         for i, (name, array) in enumerate(zip(self._fields, arrays, strict=True)):

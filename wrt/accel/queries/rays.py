@@ -1,7 +1,5 @@
 """Rays of a query: checks of the caller's arrays, and their conversion for kernels."""
 
-from __future__ import annotations
-
 from ctypes import c_float
 from functools import cache
 from typing import Any, NamedTuple
@@ -37,16 +35,16 @@ class Rays(NamedTuple):
     def as_warp(self) -> bool:
         return isinstance(self.origins, wp.array)
 
-    def on(self, device: Device) -> Rays:
+    def on(self, device: Device) -> "Rays":
         """Copy Warp arrays of other devices to `device`."""
         return Rays(*[array.to(device) if isinstance(array, wp.array) else array for array in self])
 
-    def of(self, rows: np.ndarray) -> Rays:
+    def of(self, rows: np.ndarray) -> "Rays":
         """Return some of the rays. rows: indices (M,)."""
         return Rays(*(wp.array(array.numpy()[rows], dtype=array.dtype, device=array.device) if isinstance(array, wp.array)
                       else constant(array[0], len(rows)) if array.strides == (0,) and len(array) else array[rows] for array in self))
 
-    def checked(self) -> Rays:
+    def checked(self) -> "Rays":
         """Convert the rays to contiguous float32. Raises InputError for the first value that is not valid.
 
         If the rays are Warp arrays, only t_min and t_max are checked, and only on the CPU.

@@ -1,7 +1,5 @@
 """Indices of the worlds that the rays of a query see, in a structure over several worlds."""
 
-from __future__ import annotations
-
 from copy import copy
 from typing import TypeGuard
 
@@ -39,7 +37,7 @@ class WorldIds:
             raise InputError(f"must be 0 to {count - 1}, got {ids.min() if ids.min() < 0 else ids.max()}", argument="world")
         return upload(np.broadcast_to(ids, (n,)).astype(np.int32), wp.int32, device)
 
-    def of(self, rays: np.ndarray) -> WorldIds:
+    def of(self, rays: np.ndarray) -> "WorldIds":
         """Return the worlds of some of the rays, given by their indices."""
         some = copy(self)
         arrays: WarpStruct = Worlds()

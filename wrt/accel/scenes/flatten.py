@@ -1,7 +1,5 @@
 """Scenes as arrays: joined triangles in world space, and instanced meshes in their own space."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,7 +65,7 @@ def flatten_instanced(scene: Scene, meshes: frozenset[int]) -> FlatScene:
     return _placed_scene(scene, index, parts, rows, materials, prim_ids, first_prim)
 
 
-def _placed_scene(scene: Scene, index: dict[int, int], parts: dict[int, _Joined], rows: list[tuple[int, int, int, int, np.ndarray]],
+def _placed_scene(scene: Scene, index: dict[int, int], parts: "dict[int, _Joined]", rows: list[tuple[int, int, int, int, np.ndarray]],
                   materials: dict[tuple[int, ...], tuple[int, np.ndarray]], prim_ids: list[np.ndarray], n_triangles: int) -> FlatScene:
     """Assemble the result of `flatten_instanced` from its local variables."""
     spheres = _spheres(scene)

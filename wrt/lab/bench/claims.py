@@ -1,7 +1,5 @@
 """`python -m wrt bench claims`: published claims about ray tracing hardware, repeated with exact counts."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -145,7 +143,7 @@ class Panel(NamedTuple):
     """A chart. height: in bars, without its title and axis."""
 
     height: int
-    draw: Callable[[Axes], None]
+    draw: "Callable[[Axes], None]"
 
 
 def in_columns(panels: Sequence[Panel]) -> list[list[Panel]]:
@@ -161,7 +159,7 @@ def in_columns(panels: Sequence[Panel]) -> list[list[Panel]]:
     return [column for column in columns if column]
 
 
-def bars(axes: Axes, rows: Sequence[Row]) -> None:
+def bars(axes: "Axes", rows: Sequence[Row]) -> None:
     """Draw the numbers of a claim that have one unit."""
     claim, unit, source = rows[0].claim, rows[0].unit, rows[0].source
     if all(row.published is None for row in rows):
@@ -183,7 +181,7 @@ def bars(axes: Axes, rows: Sequence[Row]) -> None:
     axes.tick_params(axis="x", labelsize="x-small")
 
 
-def curves(axes: Axes, scene: str, found: dict[tuple[int, str], float]) -> None:
+def curves(axes: "Axes", scene: str, found: dict[tuple[int, str], float]) -> None:
     """Draw nodes a ray over the width."""
     for name in NAMES.values():
         axes.plot(WIDTHS, [found[width, name] for width in WIDTHS], marker="o", label=name)

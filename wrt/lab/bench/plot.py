@@ -1,7 +1,5 @@
 """Draw histograms with matplotlib, as an array of pixels."""
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Mapping
@@ -49,7 +47,7 @@ def bins(values: Mapping[str, np.ndarray]) -> np.ndarray:
     return np.arange(0, math.ceil((top + 1.0) / width) + 1) * width
 
 
-def new_figure(width: float, height: float) -> Figure:
+def new_figure(width: float, height: float) -> "Figure":
     """Return an empty matplotlib Figure of this size in inches. Raise InputError if matplotlib is missing."""
     try:
         from matplotlib.figure import Figure
@@ -77,7 +75,7 @@ def bars(panels: Mapping[str, Mapping[str, float]], title: str, suffix: str) -> 
     return picture_file(figure, suffix)
 
 
-def picture_file(figure: Figure, suffix: str) -> bytes:
+def picture_file(figure: "Figure", suffix: str) -> bytes:
     """Return the contents of a .svg or .png file; equal figures give equal bytes."""
     from matplotlib import rc_context
 

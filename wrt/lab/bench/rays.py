@@ -1,7 +1,5 @@
 """Sets of rays that measure structures: primary, shadow and diffuse rays of a picture, and incoherent random rays."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,7 +27,7 @@ class RaySet:
     def __len__(self) -> int:
         return len(self.origins)
 
-    def part(self, rows: slice | np.ndarray) -> RaySet:
+    def part(self, rows: slice | np.ndarray) -> "RaySet":
         return RaySet(self.kind, self.origins[rows], self.directions[rows], self.t_max[rows], self.any_hit)
 
 

@@ -1,7 +1,5 @@
 """What all measurements share: description of the machine, rows, and tables as Markdown and HTML."""
 
-from __future__ import annotations
-
 import csv
 import importlib
 import io
@@ -103,7 +101,7 @@ def run(plan: Plan, report: Callable[[Row], None] | None = None, finished: list[
     return Rows[Row](itertools.chain.from_iterable(finished), partial(page, plan))  # a lambda could not be pickled by a worker
 
 
-def parts_of(rows: Sequence[Row], plan: Plan) -> list[Part]:
+def parts_of(rows: Sequence[Row], plan: Plan) -> "list[Part]":
     """Return the tables and texts of a study: its parts(), or one table with its COLUMNS."""
     study = study_of(plan)
     return study.parts(rows, plan) if hasattr(study, "parts") else [tabled(study.COLUMNS, rows)]

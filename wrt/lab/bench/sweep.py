@@ -2,8 +2,6 @@
 
 Times are comparable only within one worker. So one worker measures everything that is compared on a mesh."""
 
-from __future__ import annotations
-
 import os
 import threading
 from collections.abc import Callable, Iterable
@@ -23,7 +21,7 @@ T = TypeVar("T")
 _alone = threading.Lock()
 
 
-def submitter(executor: object) -> Executor | Submitter:
+def submitter(executor: object) -> "Executor | Submitter":
     """Return the executor itself, or a Submitter if it is a dask.distributed.Client."""
     if not hasattr(executor, "get_executor"):
         return cast(Executor, executor)
@@ -32,7 +30,7 @@ def submitter(executor: object) -> Executor | Submitter:
     return Submitter(executor)
 
 
-def result(pool: Executor | Submitter, future: Future[T]) -> T:
+def result(pool: "Executor | Submitter", future: Future[T]) -> T:
     """Return the result of a future. Raise the worker's error, or InputError if the work was cancelled or the executor broke."""
     try:
         return future.result()
@@ -42,7 +40,7 @@ def result(pool: Executor | Submitter, future: Future[T]) -> T:
         raise InputError(str(error), argument="executor") from error
 
 
-def cancel(pool: Executor | Submitter, futures: Iterable[Future[T]]) -> None:
+def cancel(pool: "Executor | Submitter", futures: Iterable[Future[T]]) -> None:
     """Cancel the futures that have not begun."""
     if hasattr(pool, "cancel"):
         pool.cancel(futures)

@@ -1,7 +1,5 @@
 """What a claim is: a published number, its source and set-up, and the function that repeats it. CLAIMS is the registry."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 
@@ -60,7 +58,7 @@ class Claim:
     source: str
     setup: str
     sure: str
-    measure: Callable[[Study], Iterator[Figure]]
+    measure: "Callable[[Study], Iterator[Figure]]"
 
 
 @dataclass(eq=False)

@@ -1,7 +1,5 @@
 """Walks of wide trees by other rules than wrt's own: counts and logs of each ray (kernel: kernels/study/tree_walk.py)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -45,7 +43,7 @@ class Rays:
     def __len__(self) -> int:
         return len(self.origins)
 
-    def part(self, rows: np.ndarray) -> Rays:
+    def part(self, rows: np.ndarray) -> "Rays":
         return Rays(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
 

@@ -1,7 +1,5 @@
 """Algorithms that find closest hits: wrt's intersection tests in its structures, and the queries of other libraries (peers)."""
 
-from __future__ import annotations
-
 import importlib.util
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -90,7 +88,7 @@ class Peer(Algorithm):
     family: ClassVar[str] = ""  # of peers that are modes of one library: the reports also show the fastest of them
 
     @classmethod
-    def modes(cls, device: str) -> list[Peer]:
+    def modes(cls, device: str) -> "list[Peer]":
         """Return the peers to compare on this device."""
         return [cls()]
 

@@ -5,8 +5,6 @@ more than the algorithm's rounding, or a t outside the segment. A *wrong prim_id
 The derived error bound (wrt.lab.oracle.bounds) cannot settle all answers. Open answers are not wrong, but counted: borderline
 misses and hits, ties (exactly equal t) and near ties (t equal within the bound)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -62,7 +60,7 @@ class Errors:
     def p999(self) -> float:
         return self.percentile(99.9)
 
-    def __add__(self, other: Errors) -> Errors:
+    def __add__(self, other: "Errors") -> "Errors":
         return Errors(max(self.largest, other.largest), max(self.largest_ratio, other.largest_ratio),
                       self.over + other.over, self.histogram + other.histogram)
 
@@ -103,7 +101,7 @@ class Verdict:
         wrong = self.misses + self.false_hits + self.wrong_prim + self.self_hits + self.duplicate_hits
         return wrong + self.t.over + self.u.over + self.v.over == 0
 
-    def __add__(self, other: Verdict) -> Verdict:
+    def __add__(self, other: "Verdict") -> "Verdict":
         out = Verdict(**{f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(Verdict)})
         del out.examples[EXAMPLES:]
         return out

@@ -2,8 +2,6 @@
 
 For example, LLVM 15 and 16 crash at the first picture."""
 
-from __future__ import annotations
-
 import importlib.util
 import multiprocessing
 import os
@@ -97,7 +95,7 @@ class MitsubaProcess:
         self._process.kill()
         self._process.join()
 
-    def __enter__(self) -> MitsubaProcess:
+    def __enter__(self) -> "MitsubaProcess":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:

@@ -1,7 +1,5 @@
 """Translate objects and spheres to Mitsuba: a mesh in world space for each material of an object, and exact spheres."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from types import ModuleType
 from typing import NamedTuple
@@ -27,7 +25,7 @@ class Triangles(NamedTuple):
     normals: np.ndarray | None
     uvs: np.ndarray | None
 
-    def of(self, vertices: np.ndarray, faces: np.ndarray) -> Triangles:
+    def of(self, vertices: np.ndarray, faces: np.ndarray) -> "Triangles":
         """Return triangles over some of the vertices. vertices: indices of the vertices to keep; faces: indices into `vertices`."""
         normals, uvs = (None if array is None else array[vertices] for array in (self.normals, self.uvs))
         return Triangles(self.vertices[vertices], faces.reshape(-1, 3), normals, uvs)

@@ -3,8 +3,6 @@
 The x axis is the ray itself. The y axis is at right angles to it, and as close as possible to the coordinate axis that the ray follows
 least."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -87,7 +85,7 @@ def section_of(walk: WalkRecord) -> Section:
     return Section(plane, length, (x0 - 0.05 * size, x1 + 0.05 * size, y0 - 0.05 * size, y1 + 0.05 * size))
 
 
-def draw(walk: WalkRecord, axes: Axes | None, step: int | None) -> Axes:
+def draw(walk: WalkRecord, axes: "Axes | None", step: int | None) -> "Axes":
     """Draw the walk up to a step. Green: entered; red: missed; grey: visited nodes; blue: entries of the stack; black: tested triangles."""
     if axes is None:
         with needed_by("a drawing"):
@@ -119,7 +117,7 @@ def draw(walk: WalkRecord, axes: Axes | None, step: int | None) -> Axes:
     return axes
 
 
-def draw_regions(walk: WalkRecord, axes: Axes, section: Section, last: int) -> None:
+def draw_regions(walk: WalkRecord, axes: "Axes", section: Section, last: int) -> None:
     """Draw the sections of all visited nodes, of the stack's entries, and of the step `last`."""
     regions, steps = walk.regions, walk.steps
     outlines: list[tuple[Region | None, dict[str, Any]]] = []

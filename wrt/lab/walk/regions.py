@@ -1,7 +1,5 @@
 """Regions of space that the steps of a walk are about: half spaces that bound boxes and cells, and spheres."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,12 +22,12 @@ class Region:
     radius: float = 0.0
 
     @classmethod
-    def box(cls, lo: np.ndarray, hi: np.ndarray, radius: float = 0.0) -> Region:
+    def box(cls, lo: np.ndarray, hi: np.ndarray, radius: float = 0.0) -> "Region":
         lo, hi = lo.astype(np.float64), hi.astype(np.float64)
         with np.errstate(invalid="ignore"):
             return cls(AXES, np.concatenate([-hi, lo]), 0.5 * (lo + hi), radius)
 
-    def cut(self, normal: np.ndarray, offset: float) -> Region:
+    def cut(self, normal: np.ndarray, offset: float) -> "Region":
         """Return the part on the side of a plane where dot(normal, p) + offset <= 0."""
         return Region(np.append(self.normals, [normal.astype(np.float64)], axis=0), np.append(self.offsets, offset), self.center)
 

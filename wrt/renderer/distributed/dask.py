@@ -4,8 +4,6 @@ The scheduler repeats the tasks of a worker that died. The scene is scattered to
 died. Dask is imported at first use.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import pkgutil
@@ -32,7 +30,7 @@ PATIENCE = 60.0  # seconds without any worker after which a render fails
 
 
 @contextmanager
-def connected(address: str) -> Iterator[Client]:
+def connected(address: str) -> "Iterator[Client]":
     """Yield a dask.distributed.Client of the scheduler at an address such as tcp://host:8786.
 
     Raises InputError if the scheduler does not answer or has no worker, or if a worker has a different installation."""
@@ -66,7 +64,7 @@ async def _identity(address: str) -> str:
         return str((await there.identity())["type"])
 
 
-def check_workers(client: Client) -> None:
+def check_workers(client: "Client") -> None:
     """Raise InputError if there is no worker, or if a worker lacks wrt or has a different installation than this process."""
     if client.asynchronous:
         raise InputError("is an asynchronous Client", argument="executor", hint="make one without asynchronous=True")
@@ -86,7 +84,7 @@ def check_workers(client: Client) -> None:
                 raise InputError(f"worker {worker} has {differs}", hint=SAME_EVERYWHERE)
 
 
-def machines(client: Client) -> str:
+def machines(client: "Client") -> str:
     """Return the devices of the workers as text, with the number of workers for each device."""
     devices = [lines[0] for lines in client.run(describe_devices).values()]
     return "; ".join(f"{devices.count(line)} workers of {line}" for line in dict.fromkeys(devices))

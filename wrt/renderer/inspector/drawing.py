@@ -1,7 +1,5 @@
 """Drawings of a sample's rays with matplotlib: a section in 2D, and the rays over a picture from the side."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -30,7 +28,7 @@ DPI = 150
 PANEL = (8.0, 4.5)  # inches
 
 
-def figure(inspection: InspectedPixel, view: str, index: int | None) -> Figure:
+def figure(inspection: InspectedPixel, view: str, index: int | None) -> "Figure":
     """Return the drawing; Inspection.figure describes the arguments and errors."""
     as_choice(view, VIEWS, "view")
     sample = sample_of(inspection, index)
@@ -78,7 +76,7 @@ def sample_of(inspection: InspectedPixel, index: int | None) -> Sample:
     return sample
 
 
-def draw_section(axes: Axes, inspection: InspectedPixel, sample: Sample) -> None:
+def draw_section(axes: "Axes", inspection: InspectedPixel, sample: Sample) -> None:
     plane = plane_of(sample, inspection.camera)
     low, high = frame(sample, plane, PANEL[0] / PANEL[1])
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[], facecolor="#fbfaf8")
@@ -100,7 +98,7 @@ def draw_section(axes: Axes, inspection: InspectedPixel, sample: Sample) -> None
     axes.set_title(f"section by the plane of the rays{note}", fontsize=8, color="#5c564c")
 
 
-def add_legend(drawn: Figure, sample: Sample) -> None:
+def add_legend(drawn: "Figure", sample: Sample) -> None:
     """Explain the colours and markers that occur in the sample, below the drawing."""
     from matplotlib.lines import Line2D
 

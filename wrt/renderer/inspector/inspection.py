@@ -1,7 +1,5 @@
 """Inspection, the result of `wrt.inspect`: a tree of rays that prints and draws itself."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -31,7 +29,7 @@ class Inspection(InspectedPixel):
         The inspected samples: all samples of the pixel, or one.
     """
 
-    def figure(self, view: str = "both", sample: int | None = None) -> Figure:
+    def figure(self, view: str = "both", sample: int | None = None) -> "Figure":
         """Draw the rays of one sample.
 
         Parameters

@@ -1,7 +1,5 @@
 """Rays, outlines and names on the axes of matplotlib, for both drawings."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -20,7 +18,7 @@ FILLS = {"clear": ("#d3e8f5", "#4f8fb5"), "emissive": ("#ffe9a8", "#c99a10"), "o
 FAINT = 0.35  # opacity of hidden parts
 
 
-def draw_outline(axes: Axes, shape: Outline) -> None:
+def draw_outline(axes: "Axes", shape: Outline) -> None:
     """Draw the section of a shape; closed curves are filled."""
     fill, edge = FILLS["clear" if shape.material.is_clear else "emissive" if shape.material.is_emissive else "opaque"]
     for curve in shape.curves:
@@ -30,7 +28,7 @@ def draw_outline(axes: Axes, shape: Outline) -> None:
             axes.plot(*curve.T, color=edge, linewidth=2.0, zorder=1, solid_capstyle="round")
 
 
-def draw_stroke(axes: Axes, stroke: Stroke, points: np.ndarray, hidden: np.ndarray | None = None) -> None:
+def draw_stroke(axes: "Axes", stroke: Stroke, points: np.ndarray, hidden: np.ndarray | None = None) -> None:
     """Draw a ray.
 
     points: (N, 2), from its start to its end, in the coordinates of the axes; hidden: (N - 1,) bool, the parts to draw faintly."""
@@ -64,7 +62,7 @@ def runs(flags: np.ndarray) -> list[tuple[int, int, bool]]:
     return [(first, end, bool(flags[first])) for first, end in pairwise(edges)]
 
 
-def label_points(axes: Axes, sample: Sample, strokes: list[Stroke], project: Callable[[np.ndarray], np.ndarray]) -> None:
+def label_points(axes: "Axes", sample: Sample, strokes: list[Stroke], project: Callable[[np.ndarray], np.ndarray]) -> None:
     """Mark and name the camera and the lights that are seen. project: from world space (N, 3) to the coordinates of the axes (N, 2)."""
     from matplotlib.patheffects import withStroke
 
@@ -87,7 +85,7 @@ def label_points(axes: Axes, sample: Sample, strokes: list[Stroke], project: Cal
         text.set_in_layout(False)
 
 
-def label_shapes(axes: Axes, shapes: list[Outline], corners: np.ndarray, lines: np.ndarray) -> None:
+def label_shapes(axes: "Axes", shapes: list[Outline], corners: np.ndarray, lines: np.ndarray) -> None:
     """Write the name of each shape at its part in the frame, where it covers no other name and as little as possible of the lines.
 
     corners: lowest and highest corner of the frame, (2, 2). lines: (N, 2, 2)."""

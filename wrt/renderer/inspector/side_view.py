@@ -1,7 +1,5 @@
 """The rays of a sample over a picture of the scene from the side, so that the eye sees them in space."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -37,7 +35,7 @@ class SideView:
         spheres = tuple(sphere for sphere in scene.spheres if not _see_through(sphere.material))
         self.accel = build(replace(scene, objects=objects, spheres=spheres)) if objects or spheres else None
 
-    def aimed(self, camera: Camera) -> SideView:
+    def aimed(self, camera: Camera) -> "SideView":
         view = object.__new__(SideView)
         view.camera, view.accel = camera, self.accel
         return view
@@ -107,7 +105,7 @@ def framed(points: np.ndarray, towards_eye: np.ndarray, up: np.ndarray) -> Camer
     return Camera.look_at(axes @ (middle + [0.0, 0.0, distance]), axes @ middle, up, fov_y=FOV)
 
 
-def draw_picture(axes: Axes, inspection: InspectedPixel, sample: Sample) -> None:
+def draw_picture(axes: "Axes", inspection: InspectedPixel, sample: Sample) -> None:
     """Render the scene from the side, and draw the rays over the picture. Parts behind opaque surfaces are faint."""
     extent = float(np.ptp(frame_points(sample), axis=0).max())
     strokes = strokes_of(sample, extent)

@@ -1,7 +1,5 @@
 """The tree of rays of a pixel: InspectedPixel, Sample, Ray, Light and Place. A pixel is a mean of samples, a sample a sum over rays."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING
@@ -89,9 +87,9 @@ class Ray(Place):
     direct: np.ndarray
     radiance: np.ndarray
     lights: tuple[Light, ...]
-    children: tuple[Ray, ...]
+    children: "tuple[Ray, ...]"
 
-    def walk(self) -> Iterator[Ray]:
+    def walk(self) -> "Iterator[Ray]":
         """Yield the ray and all rays below it, in the order in which the renderer traces them: refracted, reflected, coated, onward."""
         waiting = [self]
         while waiting:
@@ -125,8 +123,8 @@ class Sample:
 class InspectedPixel:
     """The data of an Inspection, which documents the fields."""
 
-    scene: Scene = field(repr=False)
-    camera: CameraKind = field(repr=False)
+    scene: "Scene" = field(repr=False)
+    camera: "CameraKind" = field(repr=False)
     pixel: tuple[int, int]
     size: tuple[int, int]
     seed: int
