@@ -44,7 +44,7 @@ def options_of(name: str, options: type[T], values: dict[str, object]) -> T:
             raise InputError(f"is no option of {name}",
                              argument=option, hint=f"{did_you_mean(option, names)}there is {', '.join(names)}")
         if not accepts(types[option], value):
-            raise InputError(f"must be {known[option].type}, got {shown(value)}", argument=option)
+            raise InputError(f"must be {getattr(types[option], '__name__', types[option])}, got {shown(value)}", argument=option)
     return options(**values)
 
 

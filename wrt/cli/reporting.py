@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import MISSING, dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, get_origin
 
 import click
 from click.core import ParameterSource
@@ -43,7 +43,7 @@ T = TypeVar("T")
 RESUME = click.option("--resume", is_flag=True, help="Continue an interrupted run: keep the finished rows in the file of -o (.json or"
                                                      " .csv), if its options and the version of wrt are the same")
 # The type of an option, by the annotation of the plan's field. Any other annotation means a path.
-TYPES: dict[str, Any] = {"int": int, "int | None": int, "bool": bool, "str": str, "Sequence[str]": Names(), "float": DURATION}
+TYPES: dict[object, Any] = {int: int, int | None: int, bool: bool, str: str, Sequence[str]: Names(), float: DURATION}
 
 
 @dataclass(frozen=True)
@@ -175,9 +175,9 @@ def planned(plan: type[Plan]) -> Decorator:
 def parameter(each: dataclasses.Field[object]) -> Decorator:
     """Return a decorator that adds a plan's field `each` to a command, as an argument or an option."""
     known, needed = each.metadata, each.default is MISSING
-    kind = TYPES.get(str(each.type), click.Path(path_type=Path))
+    kind = TYPES.get(each.type, click.Path(path_type=Path))
     if not known["text"]:
-        several: dict[str, Any] = {"nargs": -1, "required": needed} if str(each.type).startswith("Sequence") else {}
+        several: dict[str, Any] = {"nargs": -1, "required": needed} if get_origin(each.type) is Sequence else {}
         kind = OneOf(known["of"][1]) if known["of"] else str if each.name == "cases" else kind
         return click.argument(each.name, type=kind, metavar=each.name.upper() if known["of"] else None, **several)
     flag = f"--{each.name.replace('_', '-')}"
