@@ -55,6 +55,7 @@ def worlds(origins: Array, directions: Array) -> None:
     assert_type(accel.move(object=0, world=2, matrix=np.eye(4)), Refit)
     robot = wrt.build(wrt.Scene.of([box(), icosphere(2)]), movable=True)
     assert_type(robot, Instances)
+    assert_type(robot.move("arm", np.eye(4)), Refit)
     assert_type(robot.move(object="arm", matrix=np.eye(4), rebuild_at=2.0), Refit)
 
 

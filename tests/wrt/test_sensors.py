@@ -289,6 +289,20 @@ def test_several_intrinsics_are_several_cameras(make: Any, rolling: bool) -> Non
             assert all(np.array_equal(rays[i], own) for rays, own in zip(sensor.rays, one.rays, strict=True))
 
 
+@pytest.mark.parametrize("ks, count", [(1, 1), (1, 3), (3, 1), (3, 3)])
+@pytest.mark.parametrize("rolling", [False, True])
+def test_one_camera_is_repeated_beside_many(ks: int, count: int, rolling: bool) -> None:
+    """K (k, 3, 3) and poses (B, 4, 4) broadcast: also a batch of one with a batch of many."""
+    intrinsics = np.stack([K + np.diag([9.0 * i, 5.0, 0.0]) for i in range(ks)])
+    places = np.stack([a_pose(seed) for seed in range(count)])
+    places = np.repeat(places[:, None], 4, axis=1) if rolling else places
+    many = pinhole(intrinsics, (6, 4), places, rolling=rolling)
+    assert many.shape == (max(ks, count), 4, 6) and many.depth(wrt.build(shapes.icosphere(1)).closest_hit(*many.rays)).shape == many.shape
+    for i in range(max(ks, count)):
+        one = pinhole(intrinsics[i % ks], (6, 4), places[i % count], rolling=rolling)
+        assert all(np.array_equal(rays[i], own) for rays, own in zip(many.rays, one.rays, strict=True))
+
+
 @pytest.mark.parametrize("call, said", [
     (lambda: with_range_noise([1.0, np.nan], 0), ("ranges", "0 or more")),
     (lambda: with_range_noise(np.float32([[np.inf, -3.0]]), 0), ("ranges", "0 or more")),
@@ -322,7 +336,7 @@ def test_several_intrinsics_are_several_cameras(make: Any, rolling: bool) -> Non
     (lambda: pinhole(K, (4, 4), (2.0 * np.eye(3), np.zeros(3))), ("pose", "a rotation")),
     (lambda: pinhole(K, (4, 4), [[[1.0, 2.0], [3.0]], [1.0]]), ("pose[0]", "array of numbers")),
     (lambda: pinhole([K, -K], (4, 4)), ("intrinsics[1]", "[[fx, s, cx]")),
-    (lambda: pinhole([K, K], (4, 4), np.stack([np.eye(4)] * 3)), ("pose", "one for each of 2 intrinsics, got 3")),
+    (lambda: pinhole([K, K], (4, 4), np.stack([np.eye(4)] * 3)), ("intrinsics", "equally many cameras, or of one: got 2 intrinsics and 3 poses")),
     (lambda: pinhole(np.zeros((4096, 3)), (4, 4)), ("intrinsics", "got an array (4096, 3) of float64")),
     (lambda: wrt.Sphere(np.zeros((9, 3)), 1.0, wrt.Material()), ("center", "got an array (9, 3) of float64", "sphere")),
     (lambda: with_range_noise([1.0], 0, np.inf), ("constant", "finite")),

@@ -19,6 +19,7 @@ from wrt.kernels.units.box import PAD_COORDINATE, PAD_EXTENT, PAD_SMALLEST
 from wrt.scene.mesh import Mesh
 
 RECORDS_PER_JOB = 32768
+MESH_OF_A_SPHERE = "wrt.scene.shapes.icosphere makes a mesh of a sphere"  # hint of errors about spheres
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Self, overload
+from typing import Self, TypeGuard, overload
 
 import numpy as np
 import warp as wp
@@ -99,9 +99,11 @@ class Instances(Accelerator):
     @overload
     def move(self, instance: ArrayLike, matrix: ArrayLike, rebuild_at: float = ...) -> Refit: ...
     @overload
+    def move(self, instance: str | Sequence[str], matrix: ArrayLike, rebuild_at: float = ..., *, world: ArrayLike | None = ...) -> Refit: ...
+    @overload
     def move(self, *, object: ObjectId | Sequence[ObjectId], matrix: ArrayLike, world: ArrayLike | None = ...,
              rebuild_at: float = ...) -> Refit: ...
-    def move(self, instance: ArrayLike | None = None, matrix: ArrayLike | None = None, rebuild_at: float = np.inf, *,
+    def move(self, instance: ArrayLike | str | Sequence[str] | None = None, matrix: ArrayLike | None = None, rebuild_at: float = np.inf, *,
              object: ObjectId | Sequence[ObjectId] | None = None, world: ArrayLike | None = None) -> Refit:
         """Move instances to new matrices and fit the boxes of the upper level. Hits are bit for bit those of a new structure.
 
@@ -109,9 +111,9 @@ class Instances(Accelerator):
 
         Parameters
         ----------
-        instance : int or (R,) array_like of int
-            Values of `hits.instance`, without repeats. Over a scene they are indices of objects; else they are rows of
-            `geometry.to_world`. Over several worlds, row `geometry.first_instance[w] + k` is object k of world w.
+        instance : int, (R,) array_like of int, str or list of str
+            Values of `hits.instance`, without repeats, or names as for `object`. Over a scene the values are indices of objects; else
+            they are rows of `geometry.to_world`. Over several worlds, row `geometry.first_instance[w] + k` is object k of world w.
         matrix : (4, 4) or (R, 4, 4) array_like
             Affine maps from object to world space.
         rebuild_at : float
@@ -135,6 +137,8 @@ class Instances(Accelerator):
             begin, before = build_clock(), self._snapshot
             geometry = before.geometry
             assert isinstance(geometry, InstancedGeometry)
+            if is_named(instance):
+                instance, object = object, instance
             if (instance is None) == (object is None) or matrix is None or (object is None and world is not None):
                 raise InputError("takes instance and matrix, or object, world and matrix", place="move")
             if object is not None:
@@ -186,6 +190,11 @@ class Instances(Accelerator):
                 f"{len(self.bottoms)} {self.structure.accel.name}, {s.bytes / 1e6:.1f} MB, built in {s.build_seconds:.3f} s)")
 
 
+def is_named(instance: object) -> TypeGuard[str | list[str]]:
+    """Return True for one or more names."""
+    return isinstance(instance, str) or (isinstance(instance, list | tuple) and any(isinstance(each, str) for each in instance))
+
+
 def rows_of(geometry: InstancedGeometry, scene: FlatScene | None) -> np.ndarray:
     """Return the row of geometry.to_world for each value of hits.instance; -1 for objects that are not instances."""
     placed = np.flatnonzero(geometry.is_placed)
@@ -212,7 +221,7 @@ def checked_moves(row_of: np.ndarray, instance: ArrayLike, matrix: ArrayLike) ->
         raise InputError("must be affine: its last row must be 0, 0, 0, 1", argument="matrix")
     ids, matrices = rows.reshape(-1).astype(np.int64), matrices[..., :3, :].reshape(-1, 3, 4)
     if len(ids) and not (ids.min() >= 0 and ids.max() < len(row_of)):
-        raise InputError(f"must be 0 to {len(row_of) - 1}", argument="instance")
+        raise InputError(f"must be 0 to {len(row_of) - 1}, got {shown(instance)}", argument="instance")
     if len(np.unique(ids)) < len(ids):
         raise InputError("must not have the same index twice", argument="instance")
     rows = row_of[ids]

@@ -124,7 +124,7 @@ def read(path: PathLike, geometry: Geometry | None, attributes: FlatScene | None
                     return cls.restore(built, geometry, attributes, device, threads, units=units)
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         if isinstance(error, InputError):
-            raise error.at(path) from error
+            raise (error if error.path else error.at(path)) from error
         raise InputError(f"is not a structure of this version of wrt ({type(error).__name__}: {error})", path=path) from error
 
 

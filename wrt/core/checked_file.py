@@ -44,7 +44,7 @@ def read_checked(path: str | os.PathLike[str], magic: bytes, what: str, threads:
             file.seek(0)
             data = memoryview(file.read(os.fstat(file.fileno()).st_size))
     except OSError as error:
-        raise InputError(error.strerror or str(error), path=path) from error
+        raise InputError(f"cannot be read: {error.strerror or error}", path=path) from error
     except InputError as error:
         raise error.at(path) from error
     end = bytes(data[: len(magic) + MAX_HEADER]).find(b"\n", len(magic))

@@ -40,7 +40,7 @@ class Object:
     Parameters
     ----------
     mesh, materials
-        The geometry, which objects can share; one or more materials.
+        The geometry, which objects can share; one or more materials, by default a grey one.
     transform
         (4, 4), object to world, acting on column vectors. If it mirrors, the outside of the mesh stays outside.
     face_material
@@ -55,7 +55,7 @@ class Object:
     """
 
     mesh: Mesh
-    materials: tuple[Material, ...]
+    materials: tuple[Material, ...] = (Material(),)
     transform: np.ndarray = field(default_factory=lambda: np.eye(4), repr=False)
     face_material: np.ndarray | None = field(default=None, repr=False)
     name: str = ""
@@ -175,7 +175,7 @@ class Scene:
         --------
         >>> accel = wrt.build(wrt.Scene.of([floor, robot]))    # wrt.build([floor, robot]): two worlds, of one mesh each
         """
-        grey, things = Material(), []
+        things: list[Object | Sphere] = []
         for i, thing in enumerate([meshes] if isinstance(meshes, Mesh) else meshes):
             at = f"meshes[{i}]"
             if isinstance(thing, tuple) and len(thing) == 2:
@@ -184,7 +184,7 @@ class Scene:
                 thing = Mesh.from_trimesh(thing)  # type: ignore[arg-type]
             if isinstance(thing, str | os.PathLike):
                 raise InputError(f"must be a mesh, got {shown(thing)}", argument=at, hint="wrt.load_mesh reads a file")
-            things.append(Object(thing, (grey,), name=thing.name) if isinstance(thing, Mesh) else as_one(thing, (Object, Sphere), at))
+            things.append(Object(thing, name=thing.name) if isinstance(thing, Mesh) else as_one(thing, (Object, Sphere), at))
         spheres = tuple(thing for thing in things if isinstance(thing, Sphere))
         return cls(tuple(thing for thing in things if isinstance(thing, Object)), spheres, **fields)
 
@@ -236,7 +236,7 @@ class Scene:
     def camera(self, name: str | int | None = None) -> CameraKind:
         """Return the camera of a name or index, or the first camera for None. Raises InputError if there is no such camera."""
         if not self.cameras:
-            raise InputError("the scene has no camera")
+            raise InputError("the scene has no camera", hint="give one: camera=wrt.Camera.look_at((0, 1, 5), (0, 0, 0))")
         if name is None:
             return self.cameras[0]
         for camera in self.cameras:

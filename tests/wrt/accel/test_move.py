@@ -212,13 +212,17 @@ def test_move_by_name() -> None:
     worlds = build([Scene((robot, floor)), scene, Scene((floor, robot))])
     worlds.move(object="floor", world=[0, 2], matrix=np.stack([matrix, 2.0 * matrix - np.diag([0.0, 0.0, 0.0, 1.0])]))
     worlds.move(object=2, world=1, matrix=matrix)
+    worlds.move("floor", matrix, world=1)
+    worlds.move(["robot", "floor"], np.stack([np.eye(4), matrix]), world=[0, 1])
     scales = worlds.geometry.to_world[:, 0, 0].tolist()
-    assert scales == [1.0, 2.0, 1.0, 1.0, 2.0, 4.0, 1.0]
+    assert scales == [1.0, 2.0, 2.0, 1.0, 2.0, 4.0, 1.0]
     for more, told in (
             ({"object": "robt", "world": 0}, ("object", "unknown object 'robt'")), ({"object": "robot"}, ("world", "3 worlds")),
             ({"object": "robot", "world": 1}, ("object", "2 objects are called")), ({"object": 2, "world": 0}, ("object", "0 to 1")),
             ({"object": 1.5, "world": 0}, ("object", "0 to 1")), ({"object": "robot", "world": 3}, ("world", "0 to 2")),
             ({"object": ["robot"] * 3, "world": [0, 2]}, ("world", "3 worlds")),
+            ({"instance": "robt", "world": 0}, ("object", "unknown object 'robt'")), ({"instance": "robot"}, ("world", "3 worlds")),
+            ({"instance": "robot", "object": 0}, (None, "instance and matrix")), ({"instance": 99}, ("instance", "0 to 6, got 99")),
             ({"instance": 0, "object": 0}, (None, "instance and matrix")), ({"instance": 0, "world": 0}, (None, "instance and matrix"))):
         with refused(*told):
             worlds.move(matrix=matrix, **more)  # type: ignore[call-overload]

@@ -216,8 +216,9 @@ def test_a_damaged_or_foreign_file_is_refused(saved: Path, spoil, message: Refus
 
 
 def test_missing_files_and_wrong_suffixes(tmp_path: Path) -> None:
-    with refused(path="nothing.accel"):
+    with refused(what="cannot be read", path="nothing.accel") as caught:
         load_accel(tmp_path / "nothing.accel", BALL)
+    assert str(caught.value).count("nothing.accel") == 1
     with refused(what="suffix .accel"):
         build(BALL).save(tmp_path / "x.npz")
     with refused(what="does not exist"):

@@ -550,7 +550,7 @@ def test_a_picture_larger_than_the_memory_is_refused_before_any_work(monkeypatch
 
 
 def test_a_scene_without_a_camera_is_refused() -> None:
-    with refused(what="scene has no camera"):
+    with refused(what="scene has no camera", hint="wrt.Camera.look_at"):
         render(replace(SCENE, cameras=()))
 
 

@@ -13,7 +13,7 @@ import warp as wp
 
 from wrt.accel.built import AccelStats
 from wrt.accel.flat_scene import FlatScene
-from wrt.accel.geometry import Geometry
+from wrt.accel.geometry import MESH_OF_A_SPHERE, Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES, OTHER_NAMES, Hits, answer_arrays, arrays_of, no_attribute, other_name
 from wrt.accel.queries.batches import Query, trace_query
@@ -269,5 +269,5 @@ def snapshot_of(accel: Accelerator, instances: bool = False) -> Snapshot:
     if not isinstance(accel, Accelerator):
         raise InputError(message, argument="accel")
     if accel.structure.units.spheres or (accel.structure.units.instances and not instances):
-        raise InputError(message, argument="accel")
+        raise InputError(message, argument="accel", hint=MESH_OF_A_SPHERE if accel.structure.units.spheres else None)
     return accel.snapshot

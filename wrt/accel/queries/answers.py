@@ -28,7 +28,8 @@ ANY_HIT_TYPES = {"out": np.bool_}
 OTHER_NAMES = {
     "t_hit": "t", "depth": "distance", "locations": "points", "face_normals": "normals", "primitive_normals": "normals",
     "primitive_ids": "prim_id", "face_id": "prim_id", "index_tri": "prim_id", "geometry_ids": "object", "geom_id": "object",
-    "valid": "hit", "is_valid": "hit", "mask": "hit",
+    "face": "prim_id", "faces": "prim_id", "triangle": "prim_id", "triangle_id": "prim_id", "geomID": "object", "instID": "instance",
+    "barycentric": "u", "primitive_uvs": "u", "valid": "hit", "is_valid": "hit", "mask": "hit",
     "cast_rays": "closest_hit", "intersect": "closest_hit", "intersects_first": "closest_hit", "intersects_location": "closest_hit",
     "intersects_any": "any_hit", "occluded": "any_hit", "test_occlusions": "any_hit", "update": "refit", "set_transform": "move",
     "compute_signed_distance": "signed_distance", "compute_occupancy": "contains", "compute_distance": "closest_points",

@@ -216,11 +216,11 @@ class HitPoints(Generic[ArrayT]):
 def _require(scene: FlatScene, name: str) -> None:
     """Raise InputError if hits in this scene do not have the property."""
     if name == "uv" and not len(scene.uvs):
-        raise InputError("the mesh has no texture coordinates (uvs)")
+        raise InputError("the mesh has no texture coordinates (uvs)", hint="the weights of a face's corners are hits.u and hits.v")
     if name == "instance" and not isinstance(scene.geometry, InstancedGeometry):
-        raise InputError("the structure has no instances")
+        raise InputError("the structure has no instances", hint="wrt.build(scene, movable=True) makes some")
     if name in ("object", "material") and scene.objects is None and scene.own_materials is None:
-        raise InputError(f"hits have no {name}, because the structure is not over a scene")
+        raise InputError(f"hits have no {name}, because the structure is not over a scene", hint="wrt.build(wrt.Scene.of([mesh]))")
 
 
 def own_ids(name: str, scene: FlatScene, worlds: WorldIds | None) -> Callable[[np.ndarray], np.ndarray] | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import zlib
 from typing import NamedTuple
 
+from wrt.accel.geometry import MESH_OF_A_SPHERE
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.snapshot import Snapshot
 from wrt.accel.structure import Structure, check_units
@@ -98,7 +99,7 @@ def query_of(structure: Structure) -> tuple[WarpType, DeviceFunction, DeviceFunc
 def require_no_spheres(structure: Structure, message: str) -> None:
     """Raise InputError with `message` if the structure has spheres."""
     if structure.units.spheres:
-        raise InputError(message, argument="accel")
+        raise InputError(message, argument="accel", hint=MESH_OF_A_SPHERE)
 
 
 def kind_of(structure: Structure) -> int:

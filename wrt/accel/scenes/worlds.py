@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from wrt.accel.flat_scene import FlatScene
+from wrt.accel.geometry import MESH_OF_A_SPHERE
 from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.scenes.flatten import flatten
 from wrt.accel.scenes.instancing import is_invertible
@@ -25,7 +26,8 @@ def worlds_over(worlds: Sequence[Mesh | Scene]) -> FlatScene:
                 raise InputError("is flattened or sheared too much to be an instance",
                                  place=f"world {index}: object {thing.name!r}")
         if isinstance(scene, Scene) and scene.spheres:
-            raise InputError("has spheres, but worlds must consist of meshes", place=f"world {index}")
+            raise InputError("has spheres, but worlds must consist of meshes", place=f"world {index}",
+                             hint=MESH_OF_A_SPHERE)
     grey = (Material(),)
     objects = [scene.objects if isinstance(scene, Scene) else (Object(scene, grey, name=scene.name),) for scene in worlds]
     together = tuple(thing for each in objects for thing in each)

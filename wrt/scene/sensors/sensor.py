@@ -157,12 +157,14 @@ def make_sensor(local: np.ndarray, pose: ArrayLike | None, axis: int, rolling: i
         line = ", ".join(map(str, (*own, 4, 4)))
         raise InputError(f"must be ({line}) or (B, {line}), got {poses.shape}", argument="pose")
     batch = many[:len(many) - len(own)]
-    if local.ndim == 4 and batch not in ((), local.shape[:1]):
-        raise InputError(f"must be one, or one for each of {len(local)} intrinsics, got {batch[0]}", argument="pose")
     limit = np.finfo(np.float32).max
     if not (max(local.max(), -local.min()) <= limit / 2.0 and np.abs(poses[..., :3, 3]).max() <= limit):  # rotated by at most sqrt(3)
         raise InputError("rays of this sensor and pose exceed the range of float32")
-    batch = local.shape[:1] if local.ndim == 4 else batch
+    try:
+        batch = np.broadcast_shapes(batch, local.shape[:-3])
+    except ValueError:
+        raise InputError(f"and pose must be of equally many cameras, or of one: got {len(local)} intrinsics and {batch[0]} poses",
+                         argument="intrinsics") from None
     shape = (*batch, *size[:2])
     images = int(np.prod(batch))
     origins, directions = (empty_aligned((images, *size), np.float32) for _ in range(2))

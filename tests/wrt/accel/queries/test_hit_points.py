@@ -278,10 +278,9 @@ def test_what_is_not_there() -> None:
     origin, direction = asked(5)
     hits = wrt.build((np.eye(3), [[0, 1, 2]])).closest_hit(origin, direction)
     np.testing.assert_array_equal(hits.shading_normal, hits.normal)
-    for name, said in (("uv", (None, "no texture coordinates")), ("object", (None, "not over a scene")),
-                       ("material", (None, "not over a scene")),
-                       ("instance", (None, "no instances"))):
-        with refused(*said):
+    for name, what, hint in (("uv", "no texture coordinates", "hits.u"), ("object", "not over a scene", "wrt.Scene.of"),
+                             ("material", "not over a scene", "wrt.Scene.of"), ("instance", "no instances", "movable=True")):
+        with refused(what=what, hint=hint):
             getattr(hits, name)
     with refused(what="have no rays"):
         _ = wrt.first_hits(wrt.build(shapes.icosphere(1)), 2, origin, direction).point

@@ -139,3 +139,10 @@ def test_tests_that_there_are_not(arguments: dict, said: Refusal) -> None:
 def test_what_is_refused(accel: object, said: Refusal) -> None:
     with refused(*said):
         wrt.ray_query(accel)
+
+
+def test_what_replaces_a_sphere_is_in_the_message() -> None:
+    accel = wrt.build(wrt.Scene(spheres=(wrt.Sphere((0.0, 0.0, 0.0), 1.0, wrt.Material()),)))
+    for ask in (lambda: wrt.ray_query(accel), lambda: wrt.all_hits(accel, np.zeros((1, 3)), np.ones((1, 3)))):
+        with refused("accel", "without spheres", hint="icosphere"):
+            ask()

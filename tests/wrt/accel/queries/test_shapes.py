@@ -193,7 +193,7 @@ def test_names_of_other_libraries_are_answered_with_ours(ball: Any) -> None:
         with pytest.raises(AttributeError) as error:
             getattr(ball, name)
         assert said in str(error.value)
-    for thing, name, ours in ((hits, "t_hit", "t"), (hits, "primitive_ids", "prim_id"), (hits, "geom_id", "object"),
+    for thing, name, ours in ((hits, "t_hit", "t"), (hits, "primitive_ids", "prim_id"), (hits, "geom_id", "object"), (hits, "faces", "prim_id"),
                               (ball, "cast_rays", "closest_hit"), (ball, "intersects_any", "any_hit"), (movable, "set_transform", "move")):
         with pytest.raises(AttributeError, match=f"'{name}'; did you mean '{ours}'"):
             getattr(thing, name)

@@ -166,7 +166,7 @@ def test_worlds_that_are_none(world: Any, told: Refusal) -> None:
 def test_what_is_no_world() -> None:
     flat = Object(BALL, (Material(),), np.diag([1.0, 1.0, 0.0, 1.0]), name="flat")
     for given, told in (([], ("mesh", "at least one object")), ([Scene()], ("mesh", "at least one object")),
-                        ([BALL, Scene(spheres=(Sphere((0, 0, 0), 1.0, Material()),))], (None, "spheres", "world 1")),
+                        ([BALL, Scene(spheres=(Sphere((0, 0, 0), 1.0, Material()),))], (None, "spheres", "world 1", None, "icosphere")),
                         ([Scene((flat,))], (None, "flattened", "world 0: object 'flat'")), ([BALL, 5], ("mesh", "Mesh, a Scene"))):
         with refused(*told):
             wrt.build(given)
