@@ -92,7 +92,8 @@ def _public() -> dict[str, str]:
 _HOME = _public()
 # What users of other libraries look for, and where it is.
 _CLOSEST, _ANY = (f"wrt.build(mesh).{name}(origins, directions)" for name in ("closest_hit", "any_hit"))
-ELSEWHERE = {"closest_hit": _CLOSEST, "cast_rays": _CLOSEST, "intersect": _CLOSEST, "any_hit": _ANY, "BVH": "wrt.build(mesh)",
+ELSEWHERE = {"closest_hit": _CLOSEST, "any_hit": _ANY, "BVH": "wrt.build(mesh)", "Trimesh": "wrt.Mesh",
+             "shapes": "wrt.scene.shapes", "read_triangle_mesh": "wrt.load_mesh",
              "RaycastingScene": "wrt.compat.open3d.RaycastingScene", "RayMeshIntersector": "wrt.compat.trimesh.RayMeshIntersector",
              "PinholeCamera": "wrt.Camera, or wrt.sensors.pinhole for a matrix K", "PerspectiveCamera": "wrt.Camera",
              "look_at": "wrt.Camera.look_at", "load": "wrt.load_mesh, or wrt.load_scene",
@@ -132,9 +133,10 @@ def __getattr__(name: str) -> Any:
 def _hint(name: str) -> str:
     """Return where an unknown name is, or the most similar public name; "" without either."""
     from wrt.core.checks import did_you_mean
+    from wrt.core.other_names import OTHER_NAMES
 
-    if name in ELSEWHERE:
-        return f"use {ELSEWHERE[name]}"
+    if (ours := OTHER_NAMES.get(name, name)) in ELSEWHERE:
+        return f"use {ELSEWHERE[ours]}"
     for place in ("wrt.sensors", "wrt.scene.shapes"):
         if callable(getattr(importlib.import_module(place), name, None)):
             return f"use {place}.{name}"

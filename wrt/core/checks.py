@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from wrt.core.errors import InputError, wrong
+from wrt.core.other_names import OTHER_NAMES
 
 T = TypeVar("T")
 LARGEST = 1e30  # largest absolute value of a number in a scene; float32 ends at 3.4e38
@@ -112,8 +113,10 @@ def listed(names: Collection[str], most: int = 5) -> str:
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """Return "did you mean ...? " with the most similar known name; "" if none is similar."""
-    near = most_similar(name, known) if isinstance(name, str) else ""
+    """Return "did you mean ...? " with the known name that means the same or is most similar; "" if none is."""
+    names = list(islice(known, 1000))
+    same = OTHER_NAMES.get(name) if isinstance(name, str) else None
+    near = same if same in names else most_similar(name, names) if isinstance(name, str) else ""
     return f"did you mean {near!r}? " if near else ""
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from wrt.core.checks import at_thing
 from wrt.core.errors import InputError, wrong
+from wrt.core.suggestions import suggest_fields
 from wrt.core.types import ArrayLike
 from wrt.scene.kinds import Record, check_fields, forms, given
 from wrt.scene.values import SMALLEST, as_number, as_transform, as_vector
@@ -101,6 +102,7 @@ class CameraKind:
         return self
 
 
+@suggest_fields
 @dataclass(frozen=True, eq=False)
 class Camera(CameraKind):
     """A pinhole camera, or a thin lens if the aperture is larger than 0.

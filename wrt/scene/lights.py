@@ -7,6 +7,7 @@ import numpy as np
 
 from wrt.core.checks import at_thing
 from wrt.core.errors import wrong
+from wrt.core.suggestions import suggest_fields
 from wrt.scene.kinds import Kind, Record, given
 from wrt.scene.values import Color, as_number
 
@@ -17,6 +18,7 @@ class Light(Kind):
     what = "light"
 
 
+@suggest_fields
 @dataclass(frozen=True)
 class PointLight(Light):
     """A point that emits equally in all directions: irradiance = intensity / distance^2."""
@@ -30,6 +32,7 @@ class PointLight(Light):
         return {"position": self.position, "color": self.intensity}
 
 
+@suggest_fields
 @dataclass(frozen=True)
 class DirectionalLight(Light):
     """Parallel light from infinity."""
@@ -43,6 +46,7 @@ class DirectionalLight(Light):
         return {"direction": self.direction, "color": self.irradiance}
 
 
+@suggest_fields
 @dataclass(frozen=True)
 class SpotLight(Light):
     """A point light limited to a cone.

@@ -20,6 +20,7 @@ import numpy as np
 from wrt.core.checks import as_array, as_one, as_path, as_tuple, at_thing, shown, unknown
 from wrt.core.errors import InputError, wrong
 from wrt.core.registry import Registry
+from wrt.core.suggestions import suggest_fields
 from wrt.core.types import PathLike
 from wrt.scene.backgrounds import BACKGROUNDS, Background, ConstantBackground
 from wrt.scene.cameras import CameraKind
@@ -30,9 +31,11 @@ from wrt.scene.motion import Motion
 from wrt.scene.settings import DEPTH, GLASS_DEPTH, SETTINGS, SettingChanges, Settings
 from wrt.scene.values import BLACK, MAX_REACH, SMALLEST, Color, as_number, as_transform, as_vector, require_count
 
+GREY = Material()
 MANY_VERTICES = 1 << 26  # of all objects together; with more, `outlines` replaces repeated meshes by their boxes
 
 
+@suggest_fields
 @dataclass(frozen=True, eq=False)
 class Object:
     """A mesh placed in the world.
@@ -55,7 +58,7 @@ class Object:
     """
 
     mesh: Mesh
-    materials: tuple[Material, ...] = (Material(),)
+    materials: tuple[Material, ...] = (GREY,)
     transform: np.ndarray = field(default_factory=lambda: np.eye(4), repr=False)
     face_material: np.ndarray | None = field(default=None, repr=False)
     name: str = ""
@@ -83,13 +86,14 @@ class Object:
             as_one(self.motion, Motion, at + "motion").check(self.mesh)
 
 
+@suggest_fields
 @dataclass(frozen=True, eq=False)
 class Sphere:
     """An exact sphere in world space. u runs around +y from -x (0 to 1), v from the top (0) to the bottom (1)."""
 
     center: Color
     radius: float
-    material: Material
+    material: Material = GREY
     name: str = ""
 
     def __post_init__(self) -> None:
@@ -99,6 +103,7 @@ class Sphere:
         object.__setattr__(self, "radius", as_number(self.radius, at + "radius", low=SMALLEST, high=MAX_REACH))
 
 
+@suggest_fields
 @dataclass(frozen=True, eq=False)
 class Scene:
     """Everything that a render needs. A frozen dataclass: `dataclasses.replace` makes changed copies.
@@ -175,7 +180,7 @@ class Scene:
         --------
         >>> accel = wrt.build(wrt.Scene.of([floor, robot]))    # wrt.build([floor, robot]): two worlds, of one mesh each
         """
-        things: list[Object | Sphere] = []
+        things: list[Any] = []
         for i, thing in enumerate([meshes] if isinstance(meshes, Mesh) else meshes):
             at = f"meshes[{i}]"
             if isinstance(thing, tuple) and len(thing) == 2:

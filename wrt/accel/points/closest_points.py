@@ -14,7 +14,7 @@ from wrt.accel.points.winding import winding_number
 from wrt.accel.queries.accelerator import Accelerator, snapshot_of
 from wrt.accel.queries.hit_points import device_scene
 from wrt.accel.queries.part_faces import part_faces
-from wrt.accel.queries.rays import vectors
+from wrt.accel.queries.shapes import in_shape, shaped_points
 from wrt.accel.queries.world_ids import roots_of
 from wrt.accel.snapshot import Snapshot, once
 from wrt.core.checks import require_known
@@ -22,7 +22,6 @@ from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike, KernelModule, WarpStruct
-from wrt.kernels.query import FARTHEST
 from wrt.kernels.warp_private import fields_of
 from wrt.kernels.wide.closest_placed import PointPlaces, make_placed_points_kernel
 from wrt.kernels.wide.closest_point import PointArrays, make_closest_point_kernel
@@ -38,13 +37,13 @@ class ClosestPoints:
 
     Attributes
     ----------
-    distance : (N,) float32
+    distance : (...) float32
         Distance from the query point.
-    point : (N, 3) float32
+    point : (..., 3) float32
         Closest point.
-    u, v : (N,) float32
+    u, v : (...) float32
         Barycentric coordinates: the closest point is (1 - u - v) v0 + u v1 + v v2.
-    prim_id : (N,) int32
+    prim_id : (...) int32
         Index of the face that the closest point is on.
     """
 
@@ -58,7 +57,7 @@ class ClosestPoints:
         return len(self.distance)
 
     def __repr__(self) -> str:
-        return f"ClosestPoints({len(self)} points)"
+        return f"ClosestPoints({self.distance.size} points)"
 
 
 def closest_points(accel: Accelerator, points: ArrayLike, threads: int | None = None, *,
@@ -75,17 +74,17 @@ def closest_points(accel: Accelerator, points: ArrayLike, threads: int | None = 
     ----------
     accel : Accelerator
         A bvh4, bvh8 or bvh8c without spheres, or instances of such, with the watertight triangle test.
-    points : (N, 3) array_like
+    points : (..., 3) array_like
         Query points, converted to float32.
     threads : int, optional
         Threads on the CPU; one per core by default.
-    world : int or (N,) array_like of int, optional
+    world : int or (...) array_like of int, optional
         Index of the world of each point; required over several worlds.
 
     Returns
     -------
     ClosestPoints
-        NumPy arrays.
+        NumPy arrays of the points' shape.
 
     Raises
     ------
@@ -98,7 +97,7 @@ def closest_points(accel: Accelerator, points: ArrayLike, threads: int | None = 
     if not isinstance(kernels, WideTraversal) or structure.units.triangle != "watertight":
         raise InputError("closest points need a bvh4, bvh8 or bvh8c with the watertight triangle test, got a"
                          f" {structure.accel.name} with {structure.units.triangle!r}")
-    rows, device = vectors(points, "points", FARTHEST), snapshot.device
+    (rows, shape, world), device = shaped_points(points, world), snapshot.device
     n, out = len(rows), PointArrays()
     for name, field in fields_of(PointArrays).items():
         setattr(out, name, wp.empty(n, dtype=field.dtype, device=device))
@@ -109,7 +108,7 @@ def closest_points(accel: Accelerator, points: ArrayLike, threads: int | None = 
         kernel, inputs[1] = make_placed_points_kernel(kernels.layout), point_places(snapshot)
         inputs.append(upload(roots, wp.int32, device))
     launch_on(device, kernel, n, *inputs, out, None, threads=thread_count(threads), step=POINTS_PER_LAUNCH)
-    return ClosestPoints(*(getattr(out, name).numpy() for name in fields_of(PointArrays)))
+    return ClosestPoints(*(in_shape(getattr(out, name).numpy(), shape) for name in fields_of(PointArrays)))
 
 
 @once
@@ -142,8 +141,8 @@ def signed_distance(accel: Accelerator, points: ArrayLike, threads: int | None =
 
     Returns
     -------
-    (N,) float32
-        NumPy array.
+    (...) float32
+        NumPy array of the points' shape.
 
     Raises
     ------
@@ -152,10 +151,10 @@ def signed_distance(accel: Accelerator, points: ArrayLike, threads: int | None =
     """
     require_known(sign, SIGNS, "rule of signs", "sign")
     accel = copy(accel)  # a refit by another thread does not change the copy
-    points = vectors(points, "points", FARTHEST)  # queries return tensors for tensors
+    rows, shape, world = shaped_points(points, world)  # NumPy arrays: queries return tensors for tensors
     if sign == "crossings":
-        inside = contains(accel, points, threads, world=world)
+        inside = contains(accel, rows, threads, world=world)
     else:
-        inside = winding_number(accel, points, threads, world=world) > 0.5
-    distance = closest_points(accel, points, threads, world=world).distance
-    return np.where(inside, -distance, distance)
+        inside = winding_number(accel, rows, threads, world=world) > 0.5
+    distance = closest_points(accel, rows, threads, world=world).distance
+    return np.where(inside, -distance, distance).reshape(shape)

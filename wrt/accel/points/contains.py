@@ -13,13 +13,11 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.all_hits import ListQuery
-from wrt.accel.queries.rays import vectors
+from wrt.accel.queries.shapes import in_shape, shaped_points
 from wrt.accel.snapshot import Snapshot, once
-from wrt.core.arrays import to_tensor_like
-from wrt.core.device import upload
+from wrt.core.arrays import given_like
 from wrt.core.errors import InputError
 from wrt.core.types import ArrayLike, NumpyLike, TensorT, WarpArray
-from wrt.kernels.query import FARTHEST
 
 
 def finite_faces(geometry: Geometry) -> np.ndarray:
@@ -70,16 +68,16 @@ def contains(accel: Accelerator, points: ArrayLike, threads: int | None = None, 
     ----------
     accel : Accelerator
         Structure over a closed mesh, or over instances of closed meshes, without spheres.
-    points : (N, 3) array_like
+    points : (..., 3) array_like
         Points, converted to float32.
     threads : int, optional
         Threads on the CPU; one per core by default.
-    world : int or (N,) array_like of int, optional
+    world : int or (...) array_like of int, optional
         Index of the world of each point; required over several worlds.
 
     Returns
     -------
-    (N,) bool
+    (...) bool
         Array of NumPy, or of the library of `points`: PyTorch, JAX.
 
     Raises
@@ -87,13 +85,13 @@ def contains(accel: Accelerator, points: ArrayLike, threads: int | None = None, 
     InputError
         For a mesh that is not closed, other structures, and points that are not finite.
     """
-    rows, give = vectors(points, "points", FARTHEST), to_tensor_like(points)
+    rows, shape, world = shaped_points(points, world)
     query = ListQuery(accel, threads, crossings=True)
     if count := open_edges_of(query.snapshot):
         raise InputError(f"the mesh is not closed: {count} edges have an odd number of faces"
                          "; wrt.winding_number is above 0.5 mostly inside")
-    inside = odd_crossings(query, rows, world=world)
-    return inside if give is None else give(upload(inside, wp.bool, query.device))
+    inside = in_shape(odd_crossings(query, rows, world=world), shape)
+    return inside if isinstance(points, wp.array) else given_like(points, inside)
 
 
 def odd_crossings(query: ListQuery, rows: np.ndarray, seed: int = 0, world: ArrayLike | None = None) -> np.ndarray:

@@ -14,10 +14,10 @@ from wrt.accel.points.contains import open_edges_of
 from wrt.accel.points.winding_tree import winding_tree
 from wrt.accel.queries.accelerator import Accelerator, snapshot_of
 from wrt.accel.queries.hit_points import device_scene
-from wrt.accel.queries.rays import vectors
+from wrt.accel.queries.shapes import in_shape, shaped_points
 from wrt.accel.queries.world_ids import check_world
 from wrt.accel.snapshot import Snapshot
-from wrt.core.arrays import to_tensor_like
+from wrt.core.arrays import given_like
 from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
@@ -52,18 +52,18 @@ def winding_number(accel: Accelerator, points: ArrayLike, threads: int | None = 
     ----------
     accel : Accelerator
         Structure over one mesh, instances or worlds, without spheres.
-    points : (N, 3) array_like
+    points : (..., 3) array_like
         Points, converted to float32.
     threads : int, optional
         Threads on the CPU; one per core by default.
     exact : bool
         Sum all solid angles instead: the error is 1e-12, and a point takes 15 ns per triangle.
-    world : int or (N,) array_like of int, optional
+    world : int or (...) array_like of int, optional
         Index of the world of each point; required over several worlds. In a world that does not exist, the result is 0.
 
     Returns
     -------
-    (N,) float64
+    (...) float64
         Array of NumPy, or of the library of `points`: PyTorch, JAX.
 
     Raises
@@ -77,7 +77,7 @@ def winding_number(accel: Accelerator, points: ArrayLike, threads: int | None = 
     Schmidt, Levin and Jacobson 2018, "Fast Winding Numbers for Soups and Clouds".
     """
     snapshot, threads = snapshot_of(accel, instances=True), thread_count(threads)
-    rows, give, device = vectors(points, "points", FARTHEST), to_tensor_like(points), snapshot.device
+    rows, shape, world = shaped_points(points, world)
     worlds = check_world(snapshot, world, len(rows))
     if isinstance(snapshot.geometry, InstancedGeometry):
         out = np.zeros(len(rows))
@@ -88,7 +88,8 @@ def winding_number(accel: Accelerator, points: ArrayLike, threads: int | None = 
             out[some] += _of_mesh(parts[part], local, threads, exact)
     else:
         out = _of_mesh(snapshot, rows, threads, exact)
-    return out if give is None else give(upload(out, wp.float64, device))
+    out = in_shape(out, shape)
+    return out if isinstance(points, wp.array) else given_like(points, out)
 
 
 def _of_mesh(snapshot: Snapshot, points: np.ndarray, threads: int, exact: bool) -> np.ndarray:

@@ -15,7 +15,7 @@ from wrt.accel.built import AccelStats
 from wrt.accel.flat_scene import FlatScene
 from wrt.accel.geometry import MESH_OF_A_SPHERE, Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry
-from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES, OTHER_NAMES, Hits, answer_arrays, arrays_of, no_attribute, other_name
+from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES, Hits, answer_arrays, arrays_of
 from wrt.accel.queries.batches import Query, trace_query
 from wrt.accel.queries.counting import counted
 from wrt.accel.queries.gradients import record
@@ -29,6 +29,8 @@ from wrt.core.arrays import to_tensor_like
 from wrt.core.checks import shown
 from wrt.core.device import start, upload
 from wrt.core.errors import InputError
+from wrt.core.other_names import OTHER_NAMES
+from wrt.core.suggestions import no_argument, no_attribute
 from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike, NumpyLike, TensorT, WarpArray, WarpStruct
 from wrt.core.warp_private import recording_tape
@@ -257,8 +259,7 @@ def checked_names(options: Mapping[str, object], query: Callable[..., object], k
     """Raise TypeError for an option that is none of a TypedDict's (`kind`)."""
     for name in options:
         if name not in kind.__annotations__:
-            near = other_name(name, [*signature(query).parameters, *kind.__annotations__])
-            raise TypeError(f"{query.__name__}() got an unexpected keyword argument {name!r}{near}")
+            raise no_argument(query.__name__, name, [*signature(query).parameters, *kind.__annotations__])
 
 
 def snapshot_of(accel: Accelerator, instances: bool = False) -> Snapshot:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from itertools import combinations
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -14,29 +14,17 @@ import warp as wp
 from wrt.accel.queries.hit_points import HitPoints, Source
 from wrt.accel.queries.shapes import in_shape
 from wrt.core.arrays import check_no_gradients, from_tensor, is_tensor, to_numpy, to_warp
-from wrt.core.checks import did_you_mean, shown
+from wrt.core.checks import shown
 from wrt.core.device import empty_aligned
 from wrt.core.errors import InputError
 from wrt.core.html import html_table
+from wrt.core.other_names import OTHER_NAMES
+from wrt.core.suggestions import no_attribute
 from wrt.core.tables import write_table
 from wrt.core.types import Array, ArrayT, Device, PathLike, TensorT, WarpArray
 
 HIT_TYPES = {"out.t": np.float32, "out.u": np.float32, "out.v": np.float32, "out.prim_id": np.int32}
 ANY_HIT_TYPES = {"out": np.bool_}
-
-# Names of other ray libraries, and what wrt calls the same thing; of hits, of structures, and of arguments of queries.
-OTHER_NAMES = {
-    "t_hit": "t", "depth": "distance", "locations": "points", "face_normals": "normals", "primitive_normals": "normals",
-    "primitive_ids": "prim_id", "face_id": "prim_id", "index_tri": "prim_id", "geometry_ids": "object", "geom_id": "object",
-    "face": "prim_id", "faces": "prim_id", "triangle": "prim_id", "triangle_id": "prim_id", "geomID": "object", "instID": "instance",
-    "barycentric": "u", "primitive_uvs": "u", "valid": "hit", "is_valid": "hit", "mask": "hit",
-    "cast_rays": "closest_hit", "intersect": "closest_hit", "intersects_first": "closest_hit", "intersects_location": "closest_hit",
-    "intersects_any": "any_hit", "occluded": "any_hit", "test_occlusions": "any_hit", "update": "refit", "set_transform": "move",
-    "compute_signed_distance": "signed_distance", "compute_occupancy": "contains", "compute_distance": "closest_points",
-    "compute_closest_points": "closest_points", "closest_point": "closest_points", "count_intersections": "count_hits",
-    "list_intersections": "all_hits", "intersects_id": "all_hits",
-    "tfar": "t_max", "max_distance": "t_max", "max_dist": "t_max", "tnear": "t_min", "worlds": "world", "env_ids": "world",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,18 +182,6 @@ class Hits(HitPoints[ArrayT]):
             return shaped
 
         return replace(self.each(view), counters=costs)
-
-
-def no_attribute(thing: object, name: str, known: Iterable[str]) -> AttributeError:
-    """Return the error about an unknown attribute, with the public one that means the same or is most similar."""
-    near = other_name(name, [each for each in known if not each.startswith("_")]) if not name.startswith("_") else ""
-    return AttributeError(f"{type(thing).__name__} has no attribute {name!r}{near}")
-
-
-def other_name(name: str, known: Collection[str]) -> str:
-    """Return "; did you mean ...?" with the known name that means the same as `name` or is most similar; "" without either."""
-    near = did_you_mean(OTHER_NAMES[name] if OTHER_NAMES.get(name) in known else name, known)
-    return near and f"; {near.rstrip()}"
 
 
 def arrays_of(out: object) -> list[Any]:

@@ -1,4 +1,4 @@
-"""Rays of any leading shape: broadcast and flattened for a query, whose results then get the shape of the rays."""
+"""Rays and points of any leading shape: broadcast and flattened for a query, whose results then get their shape."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.queries.rays import Rays, is_valid, rays_of
+from wrt.accel.queries.rays import Rays, is_valid, rays_of, vectors
 from wrt.core.arrays import from_tensor, real_numbers
 from wrt.core.checks import as_choice
 from wrt.core.errors import InputError
 from wrt.core.types import Array, ArrayLike, WarpArray
 from wrt.core.warp_private import recording_tape
+from wrt.kernels.query import FARTHEST
 
 Shape = tuple[int, ...]
 INVALID = "raise", "miss"
@@ -35,16 +36,26 @@ def shaped_rays(origins: ArrayLike, directions: ArrayLike | None, t_min: ArrayLi
         arrays = [_vectors(origins, "origins", 3), _vectors(directions, "directions", 3)]
     if len({isinstance(array, wp.array) for array in arrays}) > 1:
         raise InputError("and directions must both be Warp arrays, or both NumPy arrays", argument="origins")
-    shapes = [array.shape if isinstance(array, wp.array) else array.shape[:-1] for array in arrays]
-    try:
-        shape = np.broadcast_shapes(*shapes)
-    except ValueError:
-        raise InputError(f"must have the shape of origins, or one that broadcasts with it: {shapes[1]} does not with {shapes[0]}",
-                         argument="directions") from None
-    flat = [_flat(array, shape, name) for array, name in zip(arrays, ("origins", "directions"), strict=True)]
+    flat, shape = _broadcast(arrays, ("origins", "directions"))
     ends = [_of_each(end, shape, name) for end, name in ((t_min, "t_min"), (t_max, "t_max"))]
     rays = rays_of(flat[0], flat[1], ends[0], ends[1], gradients)
     return rays if invalid == "raise" else _without_invalid(rays), shape
+
+
+def shaped_pairs(a: ArrayLike, b: ArrayLike) -> tuple[list[Array], Shape]:
+    """Broadcast points `a` and `b`, (..., 3) each. Return them in C order, (N, 3) or Warp's (N,) of vec3, and their shape."""
+    return _broadcast([_vectors(a, "a", 3), _vectors(b, "b", 3)], ("a", "b"))
+
+
+def shaped_points(points: ArrayLike, world: ArrayLike | None) -> tuple[np.ndarray, Shape, ArrayLike | None]:
+    """Return points as rows (N, 3) float32 in C order, their shape, and the world of each row.
+
+    Raises InputError that names the argument.
+    """
+    array: Any = _vectors(points, "points", 3)
+    shape = array.shape if isinstance(array, wp.array) else array.shape[:-1]
+    rows = (array.numpy() if isinstance(array, wp.array) else array).reshape(-1, 3)
+    return vectors(rows, "points", FARTHEST), shape, worlds_of_each(world, shape)
 
 
 def _vectors(value: ArrayLike, name: str, columns: int) -> Array:
@@ -63,6 +74,17 @@ def _vectors(value: ArrayLike, name: str, columns: int) -> Array:
         kinds = "(..., 6) float32" if columns == 6 else "of vec3, or (..., 3) float32"
         raise InputError(f"must be {kinds}, got {array.shape} {array.dtype.__name__}", argument=name, hint=hint)
     return array if columns == 6 else array.view(wp.vec3)
+
+
+def _broadcast(arrays: list[Any], names: tuple[str, str]) -> tuple[list[Array], Shape]:
+    """Broadcast two arrays of vectors and flatten them; return also their common shape."""
+    shapes = [array.shape if isinstance(array, wp.array) else array.shape[:-1] for array in arrays]
+    try:
+        shape = np.broadcast_shapes(*shapes)
+    except ValueError:
+        raise InputError(f"must have the shape of {names[0]}, or one that broadcasts with it: {shapes[1]} does not with {shapes[0]}",
+                         argument=names[1]) from None
+    return [_flat(array, shape, name) for array, name in zip(arrays, names, strict=True)], shape
 
 
 def _halves(rays: Array, first: int) -> Array:

@@ -17,13 +17,14 @@ from wrt.accel.queries.all_hits import first_hits
 from wrt.accel.queries.answers import ANY_HIT_TYPES, answer_arrays
 from wrt.accel.queries.hit_points import device_scene
 from wrt.accel.queries.rays import vectors
+from wrt.accel.queries.shapes import flat_array, in_shape, shaped_pairs, worlds_of_each
 from wrt.accel.queries.world_ids import check_world
-from wrt.core.arrays import check_no_gradients, from_tensor, real_numbers, to_numpy, to_tensor_like
+from wrt.core.arrays import check_no_gradients, real_numbers, to_numpy, to_tensor_like
 from wrt.core.checks import shown
 from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
-from wrt.core.types import ArrayLike, Device, Kernel, NumpyLike, TensorT, WarpArray, WarpStruct
+from wrt.core.types import Array, ArrayLike, Device, Kernel, NumpyLike, TensorT, WarpArray, WarpStruct
 from wrt.kernels.query import FARTHEST, RayArrays
 from wrt.kernels.shade.segments import Pairs, segments, to_visible
 from wrt.kernels.structs import Surfaces
@@ -56,21 +57,22 @@ def visible(accel: Accelerator, a: ArrayLike, b: ArrayLike, on_a: ArrayLike | No
     ----------
     accel : Accelerator
         Any structure.
-    a, b : (N, 3) array_like, or Warp arrays (N,) of vec3
-        Points, converted to float32. Values of Warp arrays on a GPU are not checked; a point that is not finite sees nothing.
-    on_a, on_b : (N,) array_like of int, optional
+    a, b : (..., 3) array_like, or Warp arrays (...) of vec3
+        Points, converted to float32; they broadcast. Values of Warp arrays on a GPU are not checked; a point that is not finite sees
+        nothing.
+    on_a, on_b : (...) array_like of int, optional
         Primitive on which each point lies (`hits.prim_id` for `hits.point`), or -1. The point is moved off that triangle or sphere
         by its rounding error, as for shadow rays. In a structure without spheres, that triangle cannot block. Not for instances.
     threads : int, optional
         Threads on the CPU; one per core by default.
-    out : (N,) bool, optional
+    out : (...) bool, optional
         Array that receives the results.
-    world : int or (N,) array_like of int, optional
+    world : int or (...) array_like of int, optional
         Index of the world of each pair; required over several worlds.
 
     Returns
     -------
-    (N,) bool
+    (...) bool
         Array of NumPy, or of the library of `a`: Warp, PyTorch, JAX.
 
     Raises
@@ -83,18 +85,19 @@ def visible(accel: Accelerator, a: ArrayLike, b: ArrayLike, on_a: ArrayLike | No
     accel = copy(accel)  # a refit by another thread does not change the copy
     threads, device = thread_count(threads), accel.device
     check_no_gradients(a=a, b=b)
-    p, q = (_points(value, name, device) for value, name in ((a, "a"), (b, "b")))
-    n, as_warp, give = len(p), isinstance(from_tensor(a, "a"), wp.array), to_tensor_like(a, b)
-    if len(q) != n:
-        raise InputError(f"must have as many rows as a ({n}), got {len(q)}", argument="b")
-    array: Any = answer_arrays(ANY_HIT_TYPES, None if out is None else [out], n, device if as_warp else None, give is not None)[0]
+    flat, shape = shaped_pairs(a, b)
+    p, q = (_points(value, name, device) for value, name in zip(flat, "ab", strict=True))
+    n, as_warp, give = len(p), isinstance(flat[0], wp.array), to_tensor_like(a, b)
+    given = None if out is None else [flat_array(out, shape, "out")]
+    array: Any = answer_arrays(ANY_HIT_TYPES, given, n, device if as_warp else None, give is not None)[0]
+    world = worlds_of_each(world, shape)
     snapshot, has_ids, surfaces = accel.snapshot, on_a is not None or on_b is not None, Surfaces()
     check_world(snapshot, world, n)
     if has_ids:
         if accel.structure.units.instances:
             raise InputError("is for structures without instances", argument="on_a" if on_a is not None else "on_b")
         surfaces = device_scene(snapshot).surfaces
-    ids = [_prim_ids(value, name, n, len(snapshot.geometry)) if has_ids else np.zeros(0, np.int32)
+    ids = [_prim_ids(value, name, shape, len(snapshot.geometry)) if has_ids else np.zeros(0, np.int32)
            for value, name in ((on_a, "on_a"), (on_b, "on_b"))]
 
     def run(kernel: Kernel, *inputs: object) -> None:
@@ -117,6 +120,9 @@ def visible(accel: Accelerator, a: ArrayLike, b: ArrayLike, on_a: ArrayLike | No
         array.assign(result)
     else:
         array[:] = to_numpy(result)
+    if out is not None:
+        return out
+    array = in_shape(array, shape)
     return array if give is None else give(array)
 
 
@@ -151,26 +157,24 @@ def _ignore_own_triangles(accel: Accelerator, rays: tuple[WarpArray, ...], ids: 
     seen[rows] = ((prim_id < 0) | (prim_id == ids[0][rows, None]) | (prim_id == ids[1][rows, None])).all(axis=1)
 
 
-def _points(value: ArrayLike, name: str, device: Device) -> WarpArray:
-    """Return points as a Warp array on the device. Raises InputError that names the argument."""
-    value = from_tensor(value, name)
+def _points(value: Array, name: str, device: Device) -> WarpArray:
+    """Return points, (N, 3) or Warp's (N,) of vec3, as a Warp array on the device. Raises InputError that names the argument."""
     if isinstance(value, wp.array):
-        if value.dtype != wp.vec3 or value.ndim != 1:
-            raise InputError(f"must be (N,) vec3, got {value.shape} {value.dtype.__name__}", argument=name)
         if value.device.is_cpu:
             vectors(value.numpy(), name, FARTHEST)
         return (value if value.is_contiguous else value.contiguous()).to(device)
     return upload(vectors(value, name, FARTHEST), wp.vec3, device)
 
 
-def _prim_ids(value: ArrayLike | None, name: str, n: int, count: int) -> np.ndarray:
-    """Convert prim_ids to (n,) int32; None becomes -1. Raises InputError that names the argument."""
+def _prim_ids(value: ArrayLike | None, name: str, shape: tuple[int, ...], count: int) -> np.ndarray:
+    """Convert prim_ids in `shape` to (N,) int32; None becomes -1. Raises InputError that names the argument."""
     if value is None:
-        return np.full(n, -1, np.int32)
-    array = real_numbers(value, name, f"({n},) prim_ids")
-    if array.shape != (n,) or array.dtype.kind not in "iu":
-        raise InputError(f"must be ({n},) whole numbers, got {shown(array)}", argument=name)
-    if n and not (array.min() >= -1 and array.max() < count):
+        return np.full(int(np.prod(shape)), -1, np.int32)
+    array = real_numbers(value, name, f"{shape} prim_ids")
+    if array.shape != shape or array.dtype.kind not in "iu":
+        raise InputError(f"must be {shape} whole numbers, got {shown(array)}", argument=name)
+    array = array.reshape(-1)
+    if array.size and not (array.min() >= -1 and array.max() < count):
         row = int(np.argmax((array < -1) | (array >= count)))
         raise InputError(f"must be -1 to {count - 1}; row {row} is {array[row]}", argument=name)
     return array.astype(np.int32)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict, TypeVar, Unpack, overload
 
 import numpy as np
+import warp as wp
 
 from wrt.accel.base import OneMesh
 from wrt.accel.box_tree import BoxTree
@@ -46,7 +47,7 @@ if TYPE_CHECKING:
     from wrt.accel.cells.kdtree import KdTree
     from wrt.accel.cells.octree import Octree
 
-    OneMeshLike: TypeAlias = Mesh | Geometry | trimesh.Trimesh | tuple[ArrayLike, ArrayLike]
+    OneMeshLike: TypeAlias = Mesh | Geometry | trimesh.Trimesh | wp.Mesh | tuple[ArrayLike, ArrayLike]
     SceneLike: TypeAlias = Scene | InstancedGeometry | trimesh.Scene | PathLike
     MeshLike: TypeAlias = OneMeshLike | SceneLike
     WorldT = TypeVar("WorldT", bound=MeshLike)
@@ -136,8 +137,8 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = DEFAULT_
 
     Parameters
     ----------
-    mesh : Mesh, Scene, path, trimesh mesh or scene, pair (vertices, faces), geometry, or list of these
-        Surfaces that rays can hit. A path names a mesh file or a scene file.
+    mesh : Mesh, Scene, path, trimesh mesh or scene, wp.Mesh, pair (vertices, faces), geometry, or list of these
+        Surfaces that rays can hit; vertices are copied. A path names a mesh file or a scene file.
     accel : str
         Name in `wrt.ACCELERATORS`; "bvh" is bvh8.
     device : str
@@ -274,10 +275,12 @@ def to_mesh_or_scene(mesh: MeshLike) -> Mesh | Scene:
     elif isinstance(mesh, tuple) and len(mesh) == 2:
         vertices, faces = (np.array(to_numpy(from_tensor(each, name, None))) if is_tensor(each) else each  # copy: the caller may modify it
                            for each, name in zip(mesh, ("vertices", "faces"), strict=True))
-        mesh = Mesh(vertices, faces)  # type: ignore[arg-type]  # which converts them
+        mesh = Mesh(vertices, faces)
+    elif isinstance(mesh, wp.Mesh):
+        mesh = Mesh(mesh.points.numpy(), mesh.indices.numpy().reshape(-1, 3))
     elif type(mesh).__module__.split(".")[0] == "trimesh":
         mesh = Mesh.from_trimesh(mesh)  # type: ignore[arg-type]  # narrowed without an import of trimesh
     if isinstance(mesh, Scene | Mesh):
         return mesh
-    raise InputError("must be a Mesh, a Scene, the path of a mesh or scene file, a trimesh.Trimesh or trimesh.Scene, or a pair"
+    raise InputError("must be a Mesh, a Scene, the path of a mesh or scene file, a trimesh.Trimesh or trimesh.Scene, a wp.Mesh, or a pair"
                      f" (vertices, faces), got {shown(mesh)}", argument="mesh")

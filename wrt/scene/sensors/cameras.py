@@ -25,8 +25,8 @@ def pinhole(intrinsics: ArrayLike, size: tuple[int, int] | str, pose: ArrayLike 
     Parameters
     ----------
     intrinsics
-        K, (3, 3) in pixels, or (B, 3, 3) for B cameras; broadcast with `pose`. The camera's frame is that of OpenCV: x right, y down, z forward. A point p in
-        this frame projects to K p / z, with (0, 0) at the centre of the top left pixel.
+        K, (3, 3) in pixels, or (B, 3, 3) for B cameras; broadcasts with `pose`. The camera's frame is that of OpenCV: x right, y down,
+        z forward. A point p in this frame projects to K p / z, with (0, 0) at the centre of the top left pixel.
     size
         Width and height in pixels, or text such as "640x480".
     pose

@@ -269,7 +269,7 @@ def test_what_is_refused() -> None:
             (wrt.build(ball, "kdtree"), np.zeros((1, 3)), (None, "bvh4, bvh8")),
             (wrt.build(ball, "bvh8", triangle="plane"), np.zeros((1, 3)), (None, "bvh8 with 'plane'")),
             (wrt.build([ball, ball]), np.zeros((1, 3)), ("world", "2 worlds")), (5, np.zeros((1, 3)), ("accel", "got 5")),
-            (wrt.build(ball), np.zeros((1, 2)), ("points", "(N, 3)")),
+            (wrt.build(ball), np.zeros((1, 2)), ("points", "(..., 3)")),
             (wrt.build(ball), [[np.nan, 0, 0]], ("points", "finite"))):
         with refused(*told):
             wrt.closest_points(accel, points)  # type: ignore[arg-type]

@@ -128,8 +128,8 @@ def test_what_is_refused_and_what_is_empty() -> None:
     flat = wrt.build(shapes.quad())
     for accel, points, said in ((flat, [[0.0, 0.0, 0.0]], (None, "mesh")),
                                 (ball, [[0.0, np.nan, 0.0]], ("points", "finite")),
-                                (ball, [0.0, 1.0], ("points", "(N, 3)")),
-                                (ball, [[0.0, 1.0, 2.0], [0.0]], ("points", "(N, 3)")),
+                                (ball, [0.0, 1.0], ("points", "(..., 3)")),
+                                (ball, [[0.0, 1.0, 2.0], [0.0]], ("points", "(..., 3)")),
                                 (ball, np.ma.zeros((1, 3)), ("points", "masked array")),
                                 ("bvh", [[0.0, 0.0, 0.0]], ("accel", "structure"))):
         with refused(*said):

@@ -173,7 +173,7 @@ def test_corners_nothing_and_what_is_refused() -> None:
         wrt.winding_number(wrt.build(wrt.Scene((wrt.Object(bowl, (wrt.Material(),), placed(0, False)),)), movable=True), np.zeros((1, 3)))
     with refused("world", "2 worlds"):
         wrt.winding_number(wrt.build([shapes.icosphere(1)] * 2), np.zeros((1, 3)))
-    for accel, points, said in ((ball, [[np.nan, 0.0, 0.0]], ("points", "finite")), (ball, [0.0], ("points", "(N, 3)")),
+    for accel, points, said in ((ball, [[np.nan, 0.0, 0.0]], ("points", "finite")), (ball, [0.0], ("points", "(..., 3)")),
                                 ("bvh", [[0.0, 0.0, 0.0]], ("accel", "structure without spheres"))):
         with refused(*said):
             wrt.winding_number(accel, points)  # type: ignore[arg-type]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import pickle
 from typing import Any
 
@@ -14,8 +15,10 @@ import wrt
 from tests.kernel_tools import DEVICE
 from tests.refused import refused
 from wrt.accel.queries.accelerator import FUNCTIONS
-from wrt.accel.queries.answers import OTHER_NAMES
 from wrt.core.arrays import to_numpy
+from wrt.core.other_names import OTHER_NAMES
+from wrt.scene.materials import MATERIALS
+from wrt.scene.settings import SETTINGS
 from wrt.scene.shapes import icosphere
 
 SHAPE = 3, 5
@@ -188,19 +191,51 @@ def test_names_of_functions_and_of_the_package_are_answered_with_the_way(ball: A
 
 def test_names_of_other_libraries_are_answered_with_ours(ball: Any) -> None:
     hits, movable = ball.closest_hit(*some_rays(4)), wrt.build(wrt.Scene.of([icosphere(1)]), movable=True)
-    assert {*OTHER_NAMES.values()} <= {*dir(hits), *dir(ball), *dir(movable), *FUNCTIONS, "t_min", "t_max", "world"}
+    fields = {each.name for kind in (wrt.Material, wrt.Camera, wrt.Object) for each in dataclasses.fields(kind)}
+    assert {*OTHER_NAMES.values()} <= {*dir(hits), *dir(ball), *dir(movable), *FUNCTIONS, "t_min", "t_max", "world",
+                                       *fields, *MATERIALS, *SETTINGS}
     for name, said in (("set_transform", "movable=True"), ("compute_signed_distance", "wrt.signed_distance(accel, ...)")):
         with pytest.raises(AttributeError) as error:
             getattr(ball, name)
         assert said in str(error.value)
-    for thing, name, ours in ((hits, "t_hit", "t"), (hits, "primitive_ids", "prim_id"), (hits, "geom_id", "object"), (hits, "faces", "prim_id"),
-                              (ball, "cast_rays", "closest_hit"), (ball, "intersects_any", "any_hit"), (movable, "set_transform", "move")):
+    for thing, name, ours in ((hits, "t_hit", "t"), (hits, "primitive_ids", "prim_id"), (hits, "geom_id", "object"),
+                              (hits, "faces", "prim_id"), (ball, "raycast", "closest_hit"), (ball, "cast_rays", "closest_hit"),
+                              (ball, "intersects_any", "any_hit"), (movable, "set_transform", "move")):
         with pytest.raises(AttributeError, match=f"'{name}'; did you mean '{ours}'"):
             getattr(thing, name)
     with pytest.raises(TypeError, match=r"write hits\.t in place of"):
         _ = hits["t_hit"]
     with refused("accel", hint="wrt.build((vertices, faces))"):
         wrt.build(np.zeros((3, 3)), np.array([[0, 1, 2]]))  # type: ignore[call-overload]
+
+
+def test_names_of_fields_and_kinds_are_answered_with_ours() -> None:
+    eye = (0.0, 0.0, 5.0), (0.0, 0.0, 0.0)
+    for call, said in ((lambda: wrt.Material(color=(1, 0, 0)), "'color'; did you mean 'albedo'"),  # type: ignore[call-arg]
+                       (lambda: wrt.Camera.look_at(*eye, fov=1.0), "'fov'; did you mean 'fov_y'"),
+                       (lambda: wrt.Object(icosphere(1), matrix=np.eye(4)), "'matrix'; did you mean 'transform'"),  # type: ignore[call-arg]
+                       (lambda: wrt.PointLight((0, 3, 0), intnsity=5.0), "did you mean 'intensity'")):  # type: ignore[call-arg]
+        with pytest.raises(TypeError, match=said):
+            call()
+    with refused("kind", hint="'glass'"):
+        wrt.Material("dielectric")
+    for name, ours in (("width", "size"), ("samples", "spp")):
+        with refused(name, hint=f"did you mean '{ours}'"):
+            wrt.render(icosphere(1), **{name: 64})  # type: ignore[arg-type]
+    for name, ours in (("raycast", "closest_hit"), ("Trimesh", "wrt.Mesh"), ("shapes", "wrt.scene.shapes")):
+        with pytest.raises(AttributeError, match=ours):
+            getattr(wrt, name)
+
+
+def test_an_object_and_a_sphere_are_grey_unless_a_material_is_given() -> None:
+    scene = wrt.Scene((wrt.Object(icosphere(1)), wrt.Object(icosphere(2))), wrt.Sphere((0.0, 3.0, 0.0), 1.0))
+    assert [material.albedo for material in scene.materials] == [wrt.Material().albedo] and wrt.build(scene) is not None
+
+
+def test_a_mesh_of_warp_is_a_mesh(ball: Any) -> None:
+    mesh = icosphere(3)
+    warps = wp.Mesh(wp.array(mesh.vertices, dtype=wp.vec3, device=DEVICE), wp.array(mesh.faces.reshape(-1), dtype=int, device=DEVICE))
+    assert np.array_equal(wrt.build(warps).closest_hit(*some_rays(50)).t, wrt.build(mesh).closest_hit(*some_rays(50)).t)
 
 
 def test_copied_hits_say_that_they_have_lost_their_rays(ball: Any) -> None:

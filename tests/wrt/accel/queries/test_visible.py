@@ -219,18 +219,34 @@ def test_warp_arrays_on_the_cpu_are_looked_at() -> None:
 @pytest.mark.parametrize("a, b, more, said", [
     ([[np.nan, 0, 0]], [[0, 0, 1]], {}, ("a", "row 0")),
     ([[0, 0, 0]], [[0, 0, np.inf]], {}, ("b", "row 0")),
-    ([[0, 0, 0]], [[0, 0, 1], [0, 0, 2]], {}, ("b", "as many rows")),
-    ([0, 0, 0], [[0, 0, 1]], {}, ("a", "(N, 3)")),
+    ([[0, 0, 0]] * 3, [[0, 0, 1], [0, 0, 2]], {}, ("b", "(2,) does not with (3,)")),
+    ([0, 0], [[0, 0, 1]], {}, ("a", "(..., 3)")),
     ([[0, 0, 2e37]], [[0, 0, 1]], {}, ("a", "within 1e")),
     ([[0, 0, 0]], [[0, 0, 1]], {"on_a": [60]}, ("on_a", "row 0")),
     ([[0, 0, 0]], [[0, 0, 1]], {"on_b": [0.5]}, ("on_b", "whole numbers")),
     ([[0, 0, 0]], [[0, 0, 1]], {"on_b": [0, 1]}, ("on_b", "whole numbers")),
-    ([[0, 0, 0]], [[0, 0, 1]], {"out": np.zeros(2, bool)}, ("out", "NumPy array")),
+    ([[0, 0, 0]], [[0, 0, 1]], {"out": np.zeros(2, bool)}, ("out", "shape (1,)")),
     ([[0, 0, 0]], [[0, 0, 1]], {"threads": 0}, ("threads", "1 or more")),
 ])
 def test_what_is_refused(a: Any, b: Any, more: dict[str, Any], said: Refusal) -> None:
     with refused(*said):
         wrt.visible(wrt.build(soup()), a, b, **more)
+
+
+def test_points_of_any_shape_broadcast() -> None:
+    """From one point to a picture of points, also with ids, `out` and worlds: the bits of rows."""
+    mesh, (a, b) = soup(), pairs(60)
+    accel, worlds = wrt.build(mesh), wrt.build([mesh, shapes.box()])
+    eye, many = b[0], a.reshape(3, 20, 3)
+    ids, world, out = np.arange(60).reshape(3, 20), np.arange(20) % 2, np.zeros((3, 20), bool)
+    rows = np.tile(eye, (60, 1))
+    for seen, expected in ((wrt.visible(accel, eye, many), wrt.visible(accel, rows, a)),
+                           (wrt.visible(accel, many, eye, ids), wrt.visible(accel, a, rows, ids.reshape(-1))),
+                           (wrt.visible(worlds, many, eye, world=world), wrt.visible(worlds, a, rows, world=np.tile(world, 3))),
+                           (wrt.visible(accel, vec3s(a).reshape((3, 20)), vec3s(eye[None])), wrt.visible(accel, a, rows))):
+        assert seen.shape == (3, 20) and np.array_equal(to_numpy(seen).reshape(-1), expected) and 0 < expected.sum() < 60
+    assert wrt.visible(accel, many, eye, out=out) is out and np.array_equal(out.reshape(-1), wrt.visible(accel, a, rows))
+    assert wrt.visible(accel, eye, a[0]).shape == ()
 
 
 def test_what_takes_no_prim_ids() -> None:

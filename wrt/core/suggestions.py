@@ -1,0 +1,44 @@
+"""Errors about unknown names of attributes and arguments, with the name that means the same or is most similar."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from dataclasses import fields
+from functools import wraps
+from typing import Any, TypeVar
+
+from wrt.core.checks import did_you_mean
+
+T = TypeVar("T")
+
+
+def no_attribute(thing: object, name: str, known: Iterable[str]) -> AttributeError:
+    """Return the error about an unknown attribute, with the public one that means the same or is most similar."""
+    near = other_name(name, [each for each in known if not each.startswith("_")]) if not name.startswith("_") else ""
+    return AttributeError(f"{type(thing).__name__} has no attribute {name!r}{near}")
+
+
+def no_argument(function: str, name: str, known: Collection[str]) -> TypeError:
+    """Return the error about an unknown keyword of a function."""
+    return TypeError(f"{function}() got an unexpected keyword argument {name!r}{other_name(name, known)}")
+
+
+def other_name(name: str, known: Collection[str]) -> str:
+    """Return "; did you mean ...?" with the known name that means the same as `name` or is most similar; "" without either."""
+    near = did_you_mean(name, known)
+    return near and f"; {near.rstrip()}"
+
+
+def suggest_fields(cls: type[T]) -> type[T]:
+    """Let a dataclass answer an unknown keyword with the field that means the same or is most similar."""
+    known, init = [each.name for each in fields(cls)], cls.__init__  # type: ignore[arg-type]
+
+    @wraps(init)
+    def __init__(self: T, *args: Any, **keywords: Any) -> None:
+        for name in keywords:
+            if name not in known:
+                raise no_argument(cls.__name__, name, known)
+        init(self, *args, **keywords)
+
+    cls.__init__ = __init__  # type: ignore[method-assign, assignment]
+    return cls
