@@ -1,7 +1,5 @@
 """Names that users of other libraries type, and what wrt calls the same thing. `did_you_mean` suggests it where it is known."""
 
-from __future__ import annotations
-
 OTHER_NAMES = {
     # Of hits.
     "t_hit": "t", "depth": "distance", "locations": "points", "face_normals": "normals", "primitive_normals": "normals", "p": "point",

@@ -1,7 +1,5 @@
 """Errors about unknown names of attributes and arguments, with the name that means the same or is most similar."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable
 from dataclasses import fields
 from functools import wraps
