@@ -31,7 +31,8 @@ _CHUNK_JSON, _CHUNK_BIN = 0x4E4F534A, 0x004E4942
 SUPPORTED_EXTENSIONS = frozenset({
     "KHR_lights_punctual", "KHR_draco_mesh_compression", "KHR_texture_transform", "KHR_mesh_quantization", "EXT_mesh_gpu_instancing",
     "KHR_materials_transmission", "KHR_materials_volume", "KHR_materials_ior", "KHR_materials_emissive_strength",
-    "KHR_materials_unlit", "KHR_materials_specular", "KHR_materials_clearcoat", "EXT_texture_webp", "EXT_texture_avif",
+    "KHR_materials_unlit", "KHR_materials_specular", "KHR_materials_clearcoat", "KHR_materials_pbrSpecularGlossiness",
+    "EXT_texture_webp", "EXT_texture_avif",
 })
 # Extensions that describe the file or its use, and change no pixel.
 METADATA_EXTENSIONS = frozenset({

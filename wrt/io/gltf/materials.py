@@ -8,6 +8,7 @@ Source: Khronos, glTF 2.0 specification, sections 3.8 (texture data) and 3.9 (ma
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from wrt.io.gltf.schema import (
     EmissiveStrength,
     Ior,
     Specular,
+    SpecularGlossiness,
     TextureSource,
     TextureTransform,
     Transmission,
@@ -34,6 +36,8 @@ from wrt.scene.values import BLACK, Color, as_number, as_vector
 _WRAPS = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 _NEAREST = 9728
 _DARKEST = 1e-6  # channel of an attenuation colour; 0 would need infinite absorption
+_FULL_REFLECTANCE = 25.0  # factor on the reflectance of the index 1.5, 0.04, that makes it 1
+_GLOSSY = "KHR_materials_pbrSpecularGlossiness"
 _ALPHA_MODES = {"OPAQUE": "opaque", "MASK": "mask", "BLEND": "blend"}
 
 # Values with which an unsupported extension has no effect: the warning then leaves it out.
@@ -53,6 +57,7 @@ class Textures:
         self._document = document
         self._images: dict[int, np.ndarray] = {}
         self._textures: dict[tuple[Any, ...], Texture] = {}
+        self._roughness: dict[tuple[int, float], Texture] = {}
 
     def texture(self, info: GltfObject, srgb: bool, material: str, place: str) -> Texture | None:
         """Return the texture of a textureInfo. None: there is no textureInfo or no image, or it uses coordinates other than TEXCOORD_0."""
@@ -81,6 +86,15 @@ class Textures:
             name = texture.name or image.name or file or f"image {source}"
             self._textures[key] = Texture(self._image(source), srgb=srgb, wrap=wrap, uv_transform=matrix, name=name)
         return self._textures[key]
+
+    def roughness(self, texture: Texture, glossiness: float) -> Texture:
+        """Return a texture of 1 - `glossiness` alpha in green, which multiplies a roughness; rounded to 8 bits."""
+        key = (id(texture), glossiness)
+        if key not in self._roughness:
+            image = np.full_like(texture.image, 255)
+            image[..., 1] = np.rint(255.0 - glossiness * texture.image[..., 3])
+            self._roughness[key] = replace(texture, image=image, srgb=False)
+        return self._roughness[key]
 
     def _wrap(self, texture: GltfObject, material: str, place: str) -> tuple[str, str]:
         if texture.sampler is None:
@@ -158,22 +172,27 @@ class Materials:
             neutral = _NEUTRAL.get(extension) if isinstance(raw, dict) else None
             if neutral is None or any(raw.get(key, value) != value for key, value in neutral.items()):
                 self._document.left_out.add_extensions({extension: raw}, "material", name)
-        if source.pbrMetallicRoughness is None:
+        glossy = self._document.extension(source, _GLOSSY, SpecularGlossiness, place)
+        if source.pbrMetallicRoughness is None or glossy is not None:
             source.pbrMetallicRoughness = pygltflib.PbrMetallicRoughness()
-        fields = self._base(source, name, place)
+        fields = self._base(source, glossy, name, place)
         if self._document.extension(source, "KHR_materials_unlit", Unlit, place) is not None:
             fields = _unlit(fields)
         else:
             fields |= {"kind": "metallic_roughness"} | self._reflection(source, name, place)
             fields |= self._specular(source, name, place) | self._clearcoat(source, name, place)
             fields |= self._transmission(source, name, place) | self._emission(source, name, place)
+            fields |= self._glossy(glossy, name, f"{place}.extensions.{_GLOSSY}") if glossy is not None else {}
         with at(place):
             return Material(**fields)
 
-    def _base(self, source: GltfObject, name: str, place: str) -> dict[str, Any]:
-        """Return the fields that lit and unlit materials share: name, base colour, alpha and sides."""
-        pbr = source.pbrMetallicRoughness
-        factor = exactly(pbr.baseColorFactor, 4, f"{place}.pbrMetallicRoughness.baseColorFactor")
+    def _base(self, source: GltfObject, glossy: SpecularGlossiness | None, name: str, place: str) -> dict[str, Any]:
+        """Return the fields that lit and unlit materials share: name, base colour or diffuse colour, alpha and sides."""
+        pbr, color = source.pbrMetallicRoughness, f"{place}.pbrMetallicRoughness.baseColor"
+        factor, texture = pbr.baseColorFactor, pbr.baseColorTexture
+        if glossy is not None:
+            factor, texture, color = glossy.diffuseFactor, glossy.diffuseTexture, f"{place}.extensions.{_GLOSSY}.diffuse"
+        factor = exactly(factor, 4, f"{color}Factor")
         if source.alphaMode not in _ALPHA_MODES:
             raise InputError(f"must be one of {', '.join(_ALPHA_MODES)}, got {short(source.alphaMode)}", place=f"{place}.alphaMode")
         alpha, cutoff = factor[3], 0.5 if source.alphaCutoff is None else source.alphaCutoff
@@ -182,7 +201,7 @@ class Materials:
         return {
             "name": name, "albedo": tuple(factor[:3]), "alpha": alpha, "alpha_mode": _ALPHA_MODES[source.alphaMode],
             "alpha_cutoff": cutoff, "two_sided": source.doubleSided,
-            "albedo_texture": self._textures.texture(pbr.baseColorTexture, True, name, f"{place}.pbrMetallicRoughness.baseColorTexture"),
+            "albedo_texture": self._textures.texture(texture, True, name, f"{color}Texture"),
         }
 
     def _reflection(self, source: GltfObject, name: str, place: str) -> dict[str, Any]:
@@ -193,11 +212,6 @@ class Materials:
         if (normal := source.normalTexture) is not None:
             fields["normal_texture"] = self._textures.texture(normal, False, name, f"{place}.normalTexture")
             fields["normal_scale"] = normal.scale
-        if (ior := self._document.extension(source, "KHR_materials_ior", Ior, place)) is not None:
-            if ior.ior == 0.0:  # means an infinite index, for older specular-glossiness materials
-                self._document.left_out.add("KHR_materials_ior of 0", "material", name)
-            else:
-                fields["ior"] = ior.ior
         return fields
 
     def _transmission(self, source: GltfObject, name: str, place: str) -> dict[str, Any]:
@@ -215,15 +229,32 @@ class Materials:
         return fields
 
     def _specular(self, source: GltfObject, name: str, place: str) -> dict[str, Any]:
-        specular = self._document.extension(source, "KHR_materials_specular", Specular, place)
-        if specular is None:
-            return {}
+        """Return the index and the factors on its reflectance. An index of 0 means the reflectance 1 times these factors."""
+        ior = (self._document.extension(source, "KHR_materials_ior", Ior, place) or Ior()).ior
+        specular = self._document.extension(source, "KHR_materials_specular", Specular, place) or Specular()
         place = f"{place}.extensions.KHR_materials_specular"
+        color = exactly(specular.specularColorFactor, 3, f"{place}.specularColorFactor")
         return {
-            "specular_factor": specular.specularFactor,
-            "specular_color": tuple(exactly(specular.specularColorFactor, 3, f"{place}.specularColorFactor")),
+            "ior": ior or 1.5, "specular_factor": specular.specularFactor,
+            "specular_color": tuple((1.0 if ior else _FULL_REFLECTANCE) * channel for channel in color),
             "specular_texture": self._textures.texture(specular.specularTexture, False, name, f"{place}.specularTexture"),
             "specular_color_texture": self._textures.texture(specular.specularColorTexture, True, name, f"{place}.specularColorTexture"),
+        }
+
+    def _glossy(self, glossy: SpecularGlossiness, name: str, place: str) -> dict[str, Any]:
+        """Return the fields of a surface that has the specular colour as its reflectance at normal incidence.
+
+        Where the specification multiplies the diffuse colour by 1 - max(specular), wrt multiplies it by 1 - F, F being the largest
+        channel of the reflectance at each angle: the same at normal incidence."""
+        with at(place):
+            specular = as_vector(glossy.specularFactor, "specularFactor", low=0.0, high=1.0)
+            glossiness = as_number(glossy.glossinessFactor, "glossinessFactor", low=0.0, high=1.0)
+        texture = self._textures.texture(glossy.specularGlossinessTexture, True, name, f"{place}.specularGlossinessTexture")
+        return {
+            "metallic": 0.0, "ior": 1.5, "specular_factor": 1.0, "specular_texture": None, "specular_color_texture": texture,
+            "specular_color": tuple(_FULL_REFLECTANCE * channel for channel in specular),
+            "roughness": 1.0 - glossiness if texture is None else 1.0,
+            "metallic_roughness_texture": None if texture is None else self._textures.roughness(texture, glossiness),
         }
 
     def _clearcoat(self, source: GltfObject, name: str, place: str) -> dict[str, Any]:

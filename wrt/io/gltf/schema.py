@@ -67,6 +67,15 @@ class Specular:
 
 
 @dataclass
+class SpecularGlossiness:
+    diffuseFactor: list[float] = field(default_factory=lambda: [1.0, 1.0, 1.0, 1.0])
+    diffuseTexture: TextureInfo | None = None
+    specularFactor: list[float] = field(default_factory=lambda: [1.0, 1.0, 1.0])
+    glossinessFactor: float = 1.0
+    specularGlossinessTexture: TextureInfo | None = None
+
+
+@dataclass
 class Clearcoat:
     clearcoatFactor: float = 0.0
     clearcoatTexture: TextureInfo | None = None

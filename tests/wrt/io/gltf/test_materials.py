@@ -8,19 +8,24 @@ import math
 import struct
 import warnings
 import zlib
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
+import wrt
 from tests.gltf_files import GltfFile, encode, load_warned, one_material, one_triangle
 from tests.refused import refused
 from wrt.core.errors import InputError, SceneWarning
 from wrt.io.gltf.reader import load_gltf
 from wrt.picture.decode import MAX_SIDE, decode_rgba8
+from wrt.scene.backgrounds import ConstantBackground
+from wrt.scene.cameras import Camera
 from wrt.scene.materials import Material
 from wrt.scene.model import Scene
+from wrt.scene.settings import Settings
 from wrt.scene.values import BLACK
 
 PIXELS = np.arange(4 * 6 * 4, dtype=np.uint8).reshape(4, 6, 4) * 2
@@ -170,7 +175,7 @@ def test_wrong_materials_are_refused(tmp_path, source, message):
     ("KHR_materials_specular", {"specularFactor": 0.5}, False),
     ("KHR_materials_dispersion", {"dispersion": 0.2}, True),
     ("NV_materials_mdl", {}, True),
-    ("KHR_materials_pbrSpecularGlossiness", "no object", True),
+    ("KHR_materials_iridescence", "no object", True),
     ("KHR_xmp_json_ld", {"packet": 0}, False),
 ])
 def test_extensions_are_named_where_they_change_the_picture(tmp_path, extension, value, named):
@@ -216,6 +221,64 @@ def test_textures_of_clear_coat_and_specular(tmp_path):
 def test_wrong_coats_are_refused(tmp_path, source, message):
     with refused(*message):
         material_of({"extensions": source}, tmp_path)
+
+
+GLOSSY = "KHR_materials_pbrSpecularGlossiness"
+
+
+def glossy(**fields: Any) -> dict[str, Any]:
+    """A material of specular-glossiness; a reader that knows the extension ignores the metallic-roughness beside it."""
+    return {"pbrMetallicRoughness": {"metallicFactor": 1, "roughnessFactor": 0.9, "baseColorFactor": [1, 0, 1, 0.1]},
+            "extensions": {GLOSSY: fields}}
+
+
+def seen(source: dict[str, Any], folder: Any, pixels: np.ndarray | None = None) -> np.ndarray:
+    """Return the radiance of the quad from ahead, in surroundings of radiance 1."""
+    file = one_material(source) if pixels is None else textured(source, pixels)
+    scene = replace(load(file, folder), background=ConstantBackground((1.0, 1.0, 1.0)), settings=Settings(filter="box", min_throughput=0.0),
+                    cameras=(Camera.look_at((0.4, 0.3, 9), (0.4, 0.3, 0), fov_y=1e-3),))
+    return wrt.render(scene, size=(1, 1), spp=1).pixels[0, 0]
+
+
+def test_specular_glossiness_has_its_reflectance_at_normal_incidence(tmp_path):
+    specular, diffuse = np.array([0.9, 0.5, 0.02]), np.array([0.5, 0.25, 1.0])
+    material = material_of(glossy(diffuseFactor=[*diffuse, 0.75], specularFactor=specular.tolist(), glossinessFactor=0.75), tmp_path)
+    assert (material.albedo, material.alpha, material.roughness, material.metallic) == (tuple(diffuse), 0.75, 0.25, 0.0)
+    factors = {"diffuseFactor": [*diffuse, 1.0], "specularFactor": specular.tolist()}
+    # F0 and c_diff = diffuse (1 - max(specular)) of the specification, by factors and by a texture.
+    assert seen(glossy(**factors), tmp_path) == pytest.approx(specular + diffuse * (1.0 - specular.max()), abs=1e-5)
+    source = glossy(**factors, specularGlossinessTexture={"index": 0})
+    specular[2] = 0.0
+    texels = np.broadcast_to(np.array([255, 188, 0, 255], np.uint8), (2, 2, 4))  # 188 in sRGB is 0.503
+    specular[1] = 0.5 * ((188 / 255 + 0.055) / 1.055) ** 2.4
+    assert seen(source, tmp_path, texels) == pytest.approx(specular + diffuse * (1.0 - specular.max()), abs=1e-5)
+
+
+def test_textures_of_specular_glossiness(tmp_path):
+    source = glossy(diffuseTexture={"index": 0}, specularGlossinessTexture={"index": 0}, glossinessFactor=0.5)
+    material = load(textured(source, wrapS=33071), tmp_path).materials[0]
+    assert material.albedo_texture is material.specular_color_texture and material.albedo_texture.srgb
+    rough = material.metallic_roughness_texture
+    assert not rough.srgb and rough.wrap == ("clamp", "repeat") and material.roughness == 1.0
+    assert np.abs(rough.image[..., 1] / 255.0 - (1.0 - 0.5 * PIXELS[..., 3] / 255.0)).max() < 0.51 / 255.0
+
+
+def test_an_index_of_0_means_the_specular_colour_itself(tmp_path):
+    source = {"KHR_materials_ior": {"ior": 0}, "KHR_materials_specular": {"specularColorFactor": [0.5, 1, 0]}}
+    pbr = {"metallicFactor": 0, "roughnessFactor": 0}
+    assert seen({"extensions": source, "pbrMetallicRoughness": pbr}, tmp_path) == pytest.approx([0.5, 1.0, 0.0], abs=1e-5)
+
+
+@pytest.mark.parametrize("fields, message", [
+    ({"diffuseFactor": [1, 1, 1]}, (None, "hold 4 numbers", f"materials[0].extensions.{GLOSSY}.diffuseFactor")),
+    ({"specularFactor": [1, 2, 1]}, ("specularFactor", "lie in [0, 1]", f"materials[0].extensions.{GLOSSY}")),
+    ({"glossinessFactor": 2}, ("glossinessFactor", "1", f"materials[0].extensions.{GLOSSY}")),
+    ({"specularGlossinessTexture": {"index": 9}},
+     (None, "is 9, but there are", f"materials[0].extensions.{GLOSSY}.specularGlossinessTexture.index")),
+])
+def test_wrong_specular_glossiness_is_refused(tmp_path, fields, message):
+    with refused(*message):
+        material_of(glossy(**fields), tmp_path)
 
 
 # --- textures ---------------------------------------------------------------------------------------------------------
