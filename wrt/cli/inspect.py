@@ -6,7 +6,7 @@ import click
 
 from wrt.cli.common import DIGITS, Assignments, Parsed, PatternType, load, naming, say, say_json, settings_of, shared, warnings_reported
 
-PIXEL = PatternType("X,Y", rf"\s*({DIGITS})\s*,\s*({DIGITS})\s*", "a pixel; write X,Y in pixels from the top left",
+PIXEL = PatternType("X,Y", rf"\s*({DIGITS})\s*,\s*({DIGITS})\s*", "a pixel; write X,Y: column and row, 0,0 is at the top left",
                     lambda *ends: tuple(map(int, ends)))
 
 

@@ -55,7 +55,8 @@ WATCH_EVERY = 0.2  # seconds between two looks at a watched file
 @CLUSTER
 @shared("threads", "crop", "camera", "max_depth")
 @click.option("--min-throughput", type=float, help="Cut rays whose throughput is below this  [default: the scene's, or 0.001]")
-@click.option("--clamp", type=float, help="Largest radiance of a sample, against sparks; the loss is reported  [default: none]")
+@click.option("--clamp", type=float, help="Largest radiance of a sample, against sparks; the loss is reported; 0: no limit"
+              "  [default: the scene's, or 0]")
 @click.option("--filter", "filter_name", type=OneOf("wrt.scene.settings:FILTERS"), help="Pixel filter  [default: the scene's]")
 @click.option("--fresnel", type=OneOf("wrt.scene.settings:FRESNELS"), help="Fresnel reflectance: exact, or schlick (cheaper, approximate)")
 @click.option("--sampler", type=OneOf("wrt.scene.settings:SAMPLERS"), help="Sample points: sobol (evenly spread), or independent (random)")

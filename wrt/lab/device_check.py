@@ -1,7 +1,8 @@
 """`python -m wrt devices --check`: compare a device's results with the CPU's, bit for bit, and measure its speed.
 
-The CPU computes hits with the default structure, since all structures find the same hits. On a CPU, pictures of the shipped scenes are
-compared with those of an x86-64 CPU, whose hashes are in tests/bits.txt of a checkout."""
+A GPU's hits are compared with those of the default structure on the CPU, since all structures find the same hits. A CPU is compared with
+recorded bits: hashes of an x86-64 CPU's pictures, in tests/bits.txt of a checkout. What has no recorded bits is compared between two
+structures; what does not depend on a structure, such as functions, is left out."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -52,13 +53,15 @@ MESHES: dict[str, Callable[[], Mesh]] = {
     "teapot": partial(shapes.teapot, 32), "teapot in a ring": lambda: shapes.merged([shapes.torus(500.0), shapes.teapot(16)], "")}
 FAST, SLOW, RUNS = 1 << 20, 1 << 15, 7  # number of timed rays on CUDA and on the CPU, and of timed runs
 TIMED_CELLS = 192  # cells a side of the timed terrain
-COLUMNS: Columns = {"results": "{part}", "of": "{what}", "compared": "{count}", "differ": "{differ}",
+DEFAULT, OTHER = "bvh8", "bvh2"  # on a CPU, results of the default structure are compared with those of the other
+RECORDED = "bits recorded on x86-64"
+COLUMNS: Columns = {"results": "{part}", "of": "{what}", "compared with": "{against}", "compared": "{count}", "differ": "{differ}",
                     "places": lambda row: ", ".join(row.where[:4]) + (", ..." if len(row.where) > 4 else "")}
 SPEED: Columns = {"structure": "{who}", "rays": "{kind}", "Mray/s": lambda row: spread(row.mrays),
                   "default / structure": "{first_over_it:.2f}"}
 LEGEND = """\
-compared: number of results; "picture of x86-64" is one result for each picture. differ: results whose bits are not the CPU's. places:
-meshes and rays of these results. Each difference is a fault: please report it with this table."""
+compared: number of results; with recorded bits, a picture is one result. differ: results whose bits are others. places: meshes and rays of
+these results. On a CPU, functions have no row: they would be compared with themselves. Each difference is a fault: please report it with this table."""
 TIMED = """\
 Rays and hits are in device memory. Mray/s: median of alternating runs (on a GPU of 10 calls each), quartiles in brackets. default /
 structure: speed of wrt's default structure over that of the row's structure."""
@@ -77,6 +80,10 @@ class Check:
         start(self.device)
         as_integer(self.rays, "rays", 1, 2**26)
 
+    @property
+    def on_gpu(self) -> bool:
+        return bool(start(self.device).is_cuda)
+
     @cached_property
     def pictures(self) -> dict[str, Scene]:
         found = self.scenes or sorted(FOLDER.glob("*.toml"))
@@ -85,7 +92,7 @@ class Check:
     @property
     def hashes(self) -> dict[str, str]:
         """Hashes of the pixels of an x86-64 CPU, by scene; empty for a GPU, for the user's scenes, and outside a checkout."""
-        if start(self.device).is_cuda or self.scenes or not STORED.exists():
+        if self.on_gpu or self.scenes or not STORED.exists():
             return {}
         return dict(line.split() for line in STORED.read_text(encoding="utf-8").splitlines())
 
@@ -108,7 +115,8 @@ def rows(plan: Check, report: Callable[[str], None]) -> Iterator[Row]:
     """Yield a row after each comparison; `report` receives the name of the next comparison."""
     report("compiling")
     compile_all(plan)
-    yield from function_rows(plan)
+    if plan.on_gpu:
+        yield from function_rows(plan)
     report("hits")
     yield from hit_rows(plan)
     report("hard cases")
@@ -119,9 +127,10 @@ def rows(plan: Check, report: Callable[[str], None]) -> Iterator[Row]:
         pixels = render(scene, device=plan.device, **PICTURE).pixels
         if hashes:
             differs = sha256(pixels.tobytes()).hexdigest()[:32] != hashes[name]
-            yield row("picture of x86-64", name, {"": np.array([differs])})
+            yield row("picture", name, RECORDED, {"": np.array([differs])})
         else:
-            yield row("pixels", name, {"": different(render(scene, device="cpu", **PICTURE).pixels.reshape(-1, 3), pixels.reshape(-1, 3))})
+            truth = render(scene, device="cpu", accel=DEFAULT if plan.on_gpu else OTHER, **PICTURE).pixels
+            yield row("pixels", name, "the CPU" if plan.on_gpu else OTHER, {"": different(truth.reshape(-1, 3), pixels.reshape(-1, 3))})
 
 
 def compile_all(plan: Check) -> None:
@@ -140,7 +149,7 @@ def function_rows(plan: Check) -> Iterator[Row]:
     x, y = np.concatenate([common, rng.integers(0, 2**32, size=common.shape, dtype=np.uint32).view(np.float32)], axis=1)
     on_cpu, on_device = (function_values(x, y, device) for device in ("cpu", plan.device))
     for i, name in enumerate(FUNCTIONS):
-        yield row("functions", name, {"": different(on_cpu[:, i], on_device[:, i])})
+        yield row("functions", name, "the CPU", {"": different(on_cpu[:, i], on_device[:, i])})
 
 
 def function_values(x: np.ndarray, y: np.ndarray, name: str) -> np.ndarray:
@@ -155,14 +164,17 @@ def hit_rows(plan: Check) -> Iterator[Row]:
     geometries = {name: Geometry.of(make()) for name, make in MESHES.items()}
     on_cpu = {name: build(geometry, device="cpu") for name, geometry in geometries.items()}
     rays = {name: ray_sets(accel, plan.rays) for name, accel in on_cpu.items()}
+    against = f"{DEFAULT} of the CPU" if plan.on_gpu else DEFAULT
     for structure in structures():
+        if structure == DEFAULT and not plan.on_gpu:
+            continue
         differ = dict[str, np.ndarray]()
         for mesh, geometry in geometries.items():
             accel = build(geometry, structure, device=plan.device)
             n = BRUTE_FORCE_TESTS // (20 * len(geometry)) if structure == "brute_force" else plan.rays
             for kind, of_kind in rays[mesh].items():
                 differ[f"{mesh}, {kind}"] = compare(accel, on_cpu[mesh], of_kind.part(slice(0, n)))
-        yield row("hits", structure, differ)
+        yield row("hits", structure, against, differ)
 
 
 def compare(accel: Accelerator, truth: Accelerator, rays: RaySet) -> np.ndarray:
@@ -180,19 +192,20 @@ def different(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def hard_row(plan: Check) -> Row:
-    """Return the row that compares the default structure's hits in all hard cases whose rays and meshes wrt accepts."""
+    """Return the row that compares a structure's hits in all hard cases whose rays and meshes wrt accepts."""
+    structure = DEFAULT if plan.on_gpu else OTHER
     differ = dict[str, np.ndarray]()
     for name in HARD_CASES:
         case = generate(name, plan.cases)
         if not case.refused:
             rays = RaySet(name, case.origins, case.directions, case.t_max)
-            differ[name] = compare(build(case.geometry, device=plan.device), build(case.geometry, device="cpu"), rays)
-    return row("hits", f"bvh8, {len(differ)} hard cases", differ)
+            differ[name] = compare(build(case.geometry, structure, device=plan.device), build(case.geometry, device="cpu"), rays)
+    return row("hits", f"{structure}, {len(differ)} hard cases", f"{DEFAULT} of the CPU" if plan.on_gpu else DEFAULT, differ)
 
 
-def row(part: str, what: str, differ: dict[str, np.ndarray]) -> Row:
+def row(part: str, what: str, against: str, differ: dict[str, np.ndarray]) -> Row:
     """Return the row that counts the differences. differ: name of meshes or rays -> flags of their results that differ."""
-    return Row(part=part, what=what, count=sum(map(len, differ.values())), differ=sum(int(each.sum()) for each in differ.values()),
+    return Row(part=part, what=what, against=against, count=sum(map(len, differ.values())), differ=sum(int(each.sum()) for each in differ.values()),
                where=[place for place, each in differ.items() if each.any() and place])
 
 
@@ -236,7 +249,7 @@ class Result:
         return sum(each.differ for each in self.rows)
 
     def text(self) -> str:
-        verdict = "Every bit equals the CPU's." if self.differ == 0 else f"{self.differ} results differ from the CPU's."
+        verdict = f"{self.differ or 'No'} result{'s' if self.differ > 1 else ''} differ{'' if self.differ > 1 else 's'}."
         parts = [tabled(COLUMNS, self.rows, "Bits", f"Machine: {self.machine}\n\n{verdict}\n\n{LEGEND}"),
                  tabled(SPEED, self.speed, "Speed", "\n\n".join(filter(None, [
                      TIMED if self.speed else "", f"Skipped: {self.skipped}" if self.skipped else ""])))]

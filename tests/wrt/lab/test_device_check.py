@@ -1,4 +1,4 @@
-"""`devices --check` of the CPU against itself; tests/virtual_gpu checks virtual GPUs."""
+"""`devices --check` of a CPU; tests/virtual_gpu checks virtual GPUs."""
 
 from __future__ import annotations
 
@@ -54,35 +54,43 @@ def strict(text: str) -> dict[str, Any]:
     return json.loads(text, parse_constant=refuse)
 
 
-def test_the_cpu_agrees_with_itself(scene: Path) -> None:
+def test_on_a_cpu_structures_agree_and_nothing_is_compared_with_itself(scene: Path) -> None:
     result = run(*WORDS, str(scene), "--json")
     assert result.code == 0, result.err
     data = strict(result.out)
     assert data["differ"] == 0 and data["machine"].startswith("cpu: ")
-    compared = {(row["part"], row["what"]): row["count"] for row in data["rows"]}
-    assert compared == {**{("functions", name): 100_000 for name in ("sin", "cos", "acos", "exp", "atan2", "power")},
-                        ("hits", "bvh8"): 4 * 17**2, ("hits", "brute_force"): 4 * 17**2, ("hits", "bvh8, 1 hard cases"): 2000,
-                        ("pixels", "floor"): 64 * 36}
+    compared = {(row["part"], row["what"], row["against"]): row["count"] for row in data["rows"]}
+    assert compared == {("hits", "brute_force", "bvh8"): 4 * 17**2, ("hits", "bvh2, 1 hard cases", "bvh8"): 2000,
+                        ("pixels", "floor", "bvh2"): 64 * 36}
     assert {row["who"] for row in data["speed"]} >= {"wrt bvh8", "Warp, sah"}
     assert all(rate > 0.0 for row in data["speed"] for rate in row["mrays"])
 
 
-def test_one_wrong_bit_is_reported(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    answer, kinds = device_check.answer, []
+@pytest.mark.parametrize("of", ["brute_force", "bvh2, 1 hard cases", "floor"])
+def test_one_wrong_bit_is_reported_by_each_row(scene: Path, monkeypatch: pytest.MonkeyPatch, of: str) -> None:
+    """A bit is wrong in the results of the structure that the row names, not in those of the default structure."""
+    answer, draw, places = device_check.answer, device_check.render, []
 
-    def wrong(accel: Any, rays: Any, threads: Any) -> Any:
+    def wrong_hits(accel: Any, rays: Any, threads: Any) -> Any:
         hits = answer(accel, rays, threads)
-        kinds.append(rays.kind)
-        if isinstance(hits, Hits) and len(kinds) == 1:
+        if isinstance(hits, Hits) and accel.name == of.partition(",")[0] and not places:
             hits.v.view(np.int32)[7] ^= 1
+            places.append(f"ball, {rays.kind}" if of == "brute_force" else rays.kind)
         return hits
 
-    monkeypatch.setattr(device_check, "answer", wrong)
+    def wrong_picture(scene: Any, **options: Any) -> Any:
+        film = draw(scene, **options)
+        if of == "floor" and options.get("accel") == "bvh2":
+            film.pixels.view(np.int32)[3, 4, 1] ^= 1
+            places.append("")
+        return film
+
+    monkeypatch.setattr(device_check, "answer", wrong_hits)
+    monkeypatch.setattr(device_check, "render", wrong_picture)
     result = run(*WORDS, str(scene))
-    assert result.code == 1
-    assert "1 results differ from the CPU's" in result.out
-    line = next(line for line in result.out.splitlines() if line.startswith("| hits") and " bvh8 " in line)
-    assert [cell.strip() for cell in line.split("|")][3:6] == [str(4 * 17**2), "1", f"ball, {kinds[0]}"]
+    assert result.code == 1 and "\n1 result differs.\n" in result.out
+    table = [[cell.strip() for cell in line.split("|")] for line in result.out.splitlines() if line.startswith("|")]
+    assert [cells[5:7] for cells in table if cells[2] == of] == [["1", *places]]
 
 
 def test_a_picture_of_another_processor_is_reported(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -93,7 +101,7 @@ def test_a_picture_of_another_processor_is_reported(scene: Path, monkeypatch: py
     for stored, differ in ((bits.digest(pixels), 0), (bits.digest(pixels + 1.0), 1)):
         device_check.STORED.write_text(f"hits 0\nfloor {stored}\n")
         result = run("devices", "--check", "--device", "cpu", "--rays", "300", "-q", "--json")
-        pictures = [row for row in strict(result.out)["rows"] if row["part"] == "picture of x86-64"]
+        pictures = [row for row in strict(result.out)["rows"] if row["against"] == device_check.RECORDED]
         assert [(row["what"], row["count"], row["differ"]) for row in pictures] == [("floor", 1, differ)]
         assert result.code == differ
 

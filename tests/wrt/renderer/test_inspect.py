@@ -194,6 +194,18 @@ def test_mistakes_are_named() -> None:
         inspector().pixel((1, 2), 0).figure("above")
 
 
+def test_a_pixel_outside_is_refused_before_kernels_are_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("wrt.renderer.inspector.inspect.Inspector", lambda *args, **options: pytest.fail("work was done"))
+    with refused("pixel", "x 0 to 639 and y 0 to 359, got 640,1"):
+        wrt.inspect(GLASS, (640, 1))
+
+
+def test_a_wrong_pixel_is_answered_with_the_form() -> None:
+    for text in ("5", "a,b", "5,5,5", "-1,5"):
+        assert f"{text!r} is not a pixel; write X,Y: column and row, 0,0 is at the top left" in command_line.wrt(
+            "inspect", GLASS, "--pixel", text).err
+
+
 @pytest.mark.parametrize("arguments", [("--pixel", "640,1"), ("--pixel", "1"), ("--pixel", "1,2", "--sample", "-1"), (),
                                        ("--pixel", "1,2", "-o", "rays.txt"), ("--pixel", "1,2", "--view", "top")])
 def test_the_command_ends_with_code_2(arguments: tuple[str, ...]) -> None:

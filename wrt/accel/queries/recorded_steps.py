@@ -77,7 +77,7 @@ def record_steps(accel: Accelerator, origins: ArrayLike, directions: ArrayLike, 
         raise InputError(f"must be a structure (wrt.build), got {shown(accel)}", argument="accel")
     if accel.structure.units.instances:
         raise InputError("must be a structure over one mesh, not over instances", argument="accel",
-                         hint="build a structure over one of the meshes")
+                         hint="wrt.build(mesh) over one of the meshes, or wrt.build(wrt.Scene.of(meshes)) over all")
     snapshot = accel.snapshot
     rays = rays_of(np.asarray(origins), np.asarray(directions), t_min, t_max, True)
     out = answer_arrays(HIT_TYPES, None, len(rays.origins), None, False)

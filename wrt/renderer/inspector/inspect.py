@@ -72,7 +72,10 @@ def inspect(scene: Scene | Mesh | str | os.PathLike[str], pixel: tuple[int, int]
     >>> print(tree)
     >>> tree.save("rays.svg")
     """
-    return Inspector(scene, **options).pixel(pixel, sample)
+    keywords: dict[str, Any] = {**options}
+    scene = as_scene(scene).with_settings(**{name: keywords.pop(name) for name in SETTINGS if name in keywords})
+    as_pixel(pixel, scene.settings.size)  # before kernels are compiled
+    return Inspector(scene, **keywords).pixel(pixel, sample)
 
 
 class Inspector:

@@ -114,7 +114,8 @@ def test_a_walk_prints_and_exports(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "walk.json").read_text())["counts"] == walk.counts
     accel = wrt.build(icosphere(1))
     for given, message in (((walk.geometry, *RAY), "must be a structure"), ((accel, [0, 0], [0, 0, 1]), "three numbers"),
-                           ((accel, [0, 0, 3], [0, 0, 0]), "directions")):
+                           ((accel, [0, 0, 3], [0, 0, 0]), "directions"),
+                           ((wrt.build([icosphere(1)]), *RAY), "not over instances; wrt.build.mesh. over one of the meshes")):
         with pytest.raises(wrt.InputError, match=message):
             wrt.walk(*given)
     with pytest.raises(wrt.InputError, match="suffix"):
