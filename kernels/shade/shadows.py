@@ -153,6 +153,11 @@ def make_pass_hit(features: Features, shading: Shading) -> Any:
         texels = shading.look_up(surfaces, s)
         m = shading.resolve(surfaces, s, texels)
         m.roughness = 0.0
+        if wp.static(features.clearcoat):
+            s.smooth = s.shading
+            m.clearcoat_roughness = 0.0
+            if s.front == 0 and shading.is_solid(m):
+                m.clearcoat = 0.0  # As in add_coat: light inside solid glass meets no coat. pass_surface takes each side as the front.
         d = wp.normalize(ray.direction)
         s.shading = shading.shading_normal(surfaces, s, texels, -d)
         walk.passage = pass_surface(surfaces, walk.passage, m, s, -d, hit.t * wp.length(ray.direction))

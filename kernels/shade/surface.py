@@ -19,7 +19,7 @@ class Surface:
     error: wp.vec3  # Bound on the point's rounding error, per axis.
     geometric: wp.vec3  # Unit normal of the flat triangle or the sphere, on the ray's side.
     shading: wp.vec3  # Interpolated unit normal, on the ray's side; `shade` gets it with the normal map.
-    smooth: wp.vec3  # The same without the normal map. Set for `shade` only, in scenes with clear coats.
+    smooth: wp.vec3  # The same without the normal map. Set for `shade` and shadow rays, in scenes with clear coats.
     tangent: wp.vec3  # Unit vector along growing u, not always perpendicular to the normal.
     bitangent_sign: float  # -1 if the texture is mirrored, else 1.
     u: float  # Texture coordinates: two floats, as a vec2 does not vectorise.
