@@ -61,7 +61,8 @@ SPEED: Columns = {"structure": "{who}", "rays": "{kind}", "Mray/s": lambda row: 
                   "default / structure": "{first_over_it:.2f}"}
 LEGEND = """\
 compared: number of results; with recorded bits, a picture is one result. differ: results whose bits are others. places: meshes and rays of
-these results. On a CPU, functions have no row: they would be compared with themselves. Each difference is a fault: please report it with this table."""
+these results. On a CPU, functions have no row: they would be compared with themselves. Each difference is a
+fault: please report it with this table."""
 TIMED = """\
 Rays and hits are in device memory. Mray/s: median of alternating runs (on a GPU of 10 calls each), quartiles in brackets. default /
 structure: speed of wrt's default structure over that of the row's structure."""
@@ -205,7 +206,8 @@ def hard_row(plan: Check) -> Row:
 
 def row(part: str, what: str, against: str, differ: dict[str, np.ndarray]) -> Row:
     """Return the row that counts the differences. differ: name of meshes or rays -> flags of their results that differ."""
-    return Row(part=part, what=what, against=against, count=sum(map(len, differ.values())), differ=sum(int(each.sum()) for each in differ.values()),
+    return Row(part=part, what=what, against=against, count=sum(map(len, differ.values())),
+               differ=sum(int(each.sum()) for each in differ.values()),
                where=[place for place, each in differ.items() if each.any() and place])
 
 

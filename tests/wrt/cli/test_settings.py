@@ -97,6 +97,7 @@ def test_set_wins_over_the_file_and_stands_beside_flags() -> None:
 def test_clamp_0_is_no_limit_as_the_help_says() -> None:
     assert "0: no limit" in " ".join(run("render", "--help").out.split())
     plain = ("render", "scene.toml", "--size", "20x12", "--json")
+    with_settings("")
     free = json.loads(run(*plain, "-o", "free.png").out)
     with_settings("clamp = 0.2")
     assert json.loads(run(*plain, "-o", "dark.png").out)["clamped_share"] > 0.0 == free["clamped_share"]

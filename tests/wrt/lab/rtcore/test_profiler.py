@@ -194,3 +194,19 @@ def without_counting(text: str) -> str:
     for old, new in (("counting: bool", ""), ("(features.counting)", "()"), ("(counting)", "()")):
         bare = bare.replace(old, new)
     return "".join(line + "\n" for line in bare.splitlines() if "counting" not in line)
+
+
+def test_a_profile_is_written_as_a_table_of_its_rays(scene: Scene, tmp_path: Path) -> None:
+    """Its rows have the numbers of `rays`, and sums over pixels are the maps."""
+    found = profile(scene, spp=1)
+    found.save(tmp_path / "rays.csv")
+    head, *lines = (tmp_path / "rays.csv").read_text().splitlines()
+    table = dict(zip(head.split(","), zip(*(line.split(",") for line in lines), strict=True), strict=True))
+    assert len(lines) == len(found.rays) and list(table["kind"]) == [KINDS[kind] for kind in found.rays.kind]
+    for name, expected in (("dy", found.rays.rays["direction"][:, 1]), ("t_max", found.rays.rays["t_max"]), ("depth", found.rays.depth)):
+        assert np.array_equal(np.array(table[name], expected.dtype), expected)
+    nodes = np.zeros_like(found.maps["nodes"])
+    np.add.at(nodes, (np.int64(table["y"]), np.int64(table["x"])), np.float64(table["nodes"]))
+    assert np.array_equal(nodes, found.maps["nodes"])
+    with refused(what="suffix .csv"):
+        found.save(tmp_path / "rays.npy")
