@@ -2,8 +2,8 @@
 
 Times depend on the machine and its load; these figures do not. wrt's counters give nodes, boxes and triangles a ray. Valgrind's
 callgrind gives the instructions, for kernels compiled for x86-64-v3 (AVX2) on every machine. Meshes and rays are drawn here.
-The command exits with 1 if a ray of the default structure fetches more nodes or tests more boxes or triangles than the file says, or
-takes over 3 % more instructions. Instructions of calls with one ray are mostly Python's: another Python or NumPy asks for `--write`.
+The command exits with 1 if a ray of the default structure visits more nodes, boxes or triangles than the file says, or takes over 3 %
+more instructions. Instructions of calls with one ray are mostly Python's: another Python or NumPy asks for `--write`.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ from wrt.scene.shapes import icosphere
 
 STORED = Path(__file__).with_suffix(".txt")
 DEFAULT = "bvh8"
-SLACK = 1.03  # largest ratio of instructions to the stored ones
-SIDE = 160  # primary rays in a row
-LARGE = SIDE * SIDE  # rays of each kind
-OTHERS = 4  # structures other than the default one trace LARGE / OTHERS of the rays, because Valgrind is slow
-FEW, MANY = 10, 40  # calls with one ray
+SLACK = 1.03  # Largest ratio of instructions to the stored ones.
+SIDE = 160  # Primary rays in a row.
+LARGE = SIDE * SIDE  # Rays of each kind.
+OTHERS = 4  # Structures other than the default one trace LARGE / OTHERS of the rays, because Valgrind is slow.
+FEW, MANY = 10, 40  # Calls with one ray.
 COUNTED = "nodes", "boxes", "primitives"
-FLAGS = "-target-cpu x86-64-v3"  # instead of -march=native, because Valgrind has no AVX-512
+FLAGS = "-target-cpu x86-64-v3"  # Instead of -march=native, because Valgrind has no AVX-512.
 Costs = dict[str, list[float]]  # "structure mesh kind" -> nodes, boxes and triangles a ray (NaN: not counted), instructions a ray
 
 

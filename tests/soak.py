@@ -2,7 +2,7 @@
 
 Steps: queries, refits, moved instances, renders, saved files, processes that are killed while they save or render, and strangers at the
 viewer. An answer must have the bits of a new structure, or of the first answer. The program ends with exit code 1 at the first wrong
-answer, or if the process has grown too much: the line through the memory of the last two thirds of the run rises by more than `--growth`.
+answer, or if the process has grown too much. The limit `--growth` is for the line through the memory of the last two thirds of the run.
 """
 
 from __future__ import annotations

@@ -41,12 +41,12 @@ class OneMesh(TreeExchange, ABC):
     in kernels.wide.packets.Scratch).
     """
 
-    name: ClassVar[str]  # key in wrt.ACCELERATORS
-    kernels: KernelModule  # with make_struct(record) -> Warp struct of the arrays, and make_traversal(units, any_hit, accepts)
-    stream: ClassVar[KernelModule | None] = None  # module of a CPU kernel that traces many rays at a time, if there is one
-    options: ClassVar[type[Any]]  # a frozen dataclass, which raises InputError for values out of range
-    build_all: ClassVar[Callable[..., list[Built]] | None] = None  # (structures, options), if it is faster than `_build` of each
-    can_refit: ClassVar[bool] = False  # whether `_refit` is implemented
+    name: ClassVar[str]  # Key in wrt.ACCELERATORS.
+    kernels: KernelModule  # With make_struct(record) -> Warp struct of the arrays, and make_traversal(units, any_hit, accepts).
+    stream: ClassVar[KernelModule | None] = None  # Module of a CPU kernel that traces many rays at a time.
+    options: ClassVar[type[Any]]  # A frozen dataclass, which raises InputError for values out of range.
+    build_all: ClassVar[Callable[..., list[Built]] | None] = None  # (structures, options), if it is faster than `_build` of each.
+    can_refit: ClassVar[bool] = False  # True if `_refit` is implemented.
 
     def __init__(self, geometry: Geometry, attributes: FlatScene | None = None, /, device: str = DEFAULT_DEVICE,
                  threads: int | None = None, *, triangle: str = "watertight", box: str = "conservative", **options: object) -> None:

@@ -13,19 +13,17 @@ from wrt.core.types import WarpArray
 class Built:
     """Result of a builder, in NumPy arrays, or in Warp arrays if it was built on the device.
 
-    arrays: one array for each field of the structure's Warp struct, except `primitives` (records of the triangle test) and
-    `recorder`. order: (R,) int32, prim_id of each record in `primitives`; a prim_id may occur several times. In a grid or octree,
-    cells share records: arrays["references"] lists the indices of each cell's records. nodes, leaves, depth, sah_cost: as in
-    AccelStats. parents: index of each node's parent, in a Warp array; None if `arrays` are NumPy arrays.
+    In a grid or octree, cells share records: arrays["references"] lists the indices of each cell's records. The other fields are as in
+    AccelStats.
     """
 
-    arrays: dict[str, Any]
-    order: Any
+    arrays: dict[str, Any]  # For each field of the Warp struct, except `primitives` (records of the triangle test) and `recorder`.
+    order: Any  # (R,) int32, prim_id of each record in `primitives`; a prim_id may occur several times.
     nodes: int = 0
     leaves: int = 0
     depth: int = 0
     sah_cost: float = float("nan")
-    parents: WarpArray | None = None
+    parents: WarpArray | None = None  # (N,) Warp array, index of each node's parent; None if `arrays` are NumPy arrays.
 
     def on_host(self) -> "Built":
         """Convert the arrays to NumPy arrays."""

@@ -14,9 +14,9 @@ TRIANGLES_PER_LAUNCH = 16384
 def end_point_overlap(tree: WarpStruct, geometry: Geometry, threads: int) -> float:
     """Compute the end-point overlap of a BVH, at cost 1 per node and 1 per primitive; 0 without any area.
 
-    tree: kernels.build.end_point_overlap.Children on the CPU. Aila, Karras and Laine 2013, "On Quality Metrics of Bounding Volume
-    Hierarchies", equation 2: the sum over all nodes of the node's cost times the fraction of the surface that is in the node's box
-    but not in its subtree. Only finite triangles have surface. A triangle with several references is in several subtrees.
+    tree: kernels.build.end_point_overlap.Children on the CPU. The source is Aila, Karras and Laine 2013, "On Quality Metrics of Bounding
+    Volume Hierarchies", equation 2. It sums over all nodes: cost times the fraction of the surface that is in the node's box, but not in
+    its subtree. Only finite triangles have surface. A triangle with several references is in several subtrees.
     """
     cpu = start("cpu")
     n = len(geometry.faces)

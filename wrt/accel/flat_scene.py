@@ -10,40 +10,33 @@ from wrt.accel.instanced_geometry import InstancedGeometry
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """Runs of consecutive prim_ids. A run is an instance or a series of joined objects; in a scene, the last run is all spheres.
+    """Runs of consecutive prim_ids. A run is an instance or a series of joined objects; in a scene, the last run is all spheres."""
 
-    (I,) int64 each: first_prim, a run's first prim_id; first_face, its index in FlatScene.faces; first_material, its index in
-    FlatScene.prim_material; material_step, 0 if the run has one material, else 1. to_world: (I, 3, 4) float64.
-    """
-
-    first_prim: np.ndarray
-    first_face: np.ndarray
-    first_material: np.ndarray
-    material_step: np.ndarray
-    to_world: np.ndarray
+    first_prim: np.ndarray  # (I,) int64, first prim_id of each run.
+    first_face: np.ndarray  # (I,) int64, its index in FlatScene.faces.
+    first_material: np.ndarray  # (I,) int64, its index in FlatScene.prim_material.
+    material_step: np.ndarray  # (I,) int64, 0 if the run has one material, else 1.
+    to_world: np.ndarray  # (I, 3, 4) float64.
 
 
 @dataclass(frozen=True, eq=False)
 class FlatScene:
     """All shapes of a scene, or one mesh, as arrays. prim_ids number the faces of all objects in order, then the spheres.
 
-    vertices: (V, 3); faces: (F, 3); normals: (V, 3) or None; uvs: (V, 2). Objects without normals or uvs have zeros; a mesh without
-    uvs has (0, 2). prim_material: index in the scene's materials. Without `placed`, arrays are in world space, in the order of prim_id.
-    With `placed`, instanced meshes are stored once, in their own spaces. objects: first prim_id of each object, then of each sphere; None
-    over worlds, whose objects are the instances. own_materials: over worlds, (K, 3) int: a world, an index in prim_material's scene, and
-    the index of this material in the world's own scene; sorted. names: of all objects, if there are instances.
+    Without `placed`, arrays are in world space, in the order of prim_id. With `placed`, instanced meshes are stored once, in their own
+    spaces. A row of `own_materials` is a world, an index in prim_material's scene, and the index of this material in the world's own scene.
     """
 
     geometry: Geometry | InstancedGeometry
-    vertices: np.ndarray
-    faces: np.ndarray
-    normals: np.ndarray | None
-    uvs: np.ndarray
-    prim_material: np.ndarray
+    vertices: np.ndarray  # (V, 3)
+    faces: np.ndarray  # (F, 3)
+    normals: np.ndarray | None  # (V, 3), with zeros for objects without normals.
+    uvs: np.ndarray  # (V, 2), with zeros for objects without uvs; (0, 2) for a mesh without uvs.
+    prim_material: np.ndarray  # Index in the scene's materials.
     placed: Placed | None = None
-    objects: np.ndarray | None = None
-    own_materials: np.ndarray | None = None
-    names: tuple[str, ...] = ()
+    objects: np.ndarray | None = None  # First prim_id of each object, then of each sphere. None over worlds: the instances are the objects.
+    own_materials: np.ndarray | None = None  # Over worlds, (K, 3) int, sorted, see above.
+    names: tuple[str, ...] = ()  # Of all objects, if there are instances.
 
     def places(self, prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the index of each triangle in `faces`, and the index of its run in `placed` (0 without `placed`), (N,) each."""

@@ -28,20 +28,14 @@ class NumberedGeometry(Geometry):
 
 @dataclass(frozen=True, eq=False)
 class InstancedGeometry:
-    """Instances of geometries in world space.
+    """Instances of geometries in world space. Spheres belong to part 0, and their prim_ids come after the triangles."""
 
-    parts: geometries in their own spaces, whose prim_ids begin at 0. part: (I,) int, index of each instance's part. to_world:
-    (I, 3, 4) float64, affine and invertible. first_prim: (I,) int, which an instance adds to the prim_ids of its part. n_triangles:
-    number of triangles of all instances. Spheres belong to part 0, and their prim_ids come after the triangles. worlds: (W + 1,) int:
-    world w has the instances [worlds[w], worlds[w + 1]); None: there is one world.
-    """
-
-    parts: tuple[Geometry, ...]
-    part: np.ndarray
-    to_world: np.ndarray
-    first_prim: np.ndarray
-    n_triangles: int
-    worlds: np.ndarray | None = None
+    parts: tuple[Geometry, ...]  # In their own spaces; their prim_ids begin at 0.
+    part: np.ndarray  # (I,) int, index of each instance's part.
+    to_world: np.ndarray  # (I, 3, 4) float64, affine and invertible.
+    first_prim: np.ndarray  # (I,) int, which an instance adds to the prim_ids of its part.
+    n_triangles: int  # Number of triangles of all instances.
+    worlds: np.ndarray | None = None  # (W + 1,) int. World w has the instances [worlds[w], worlds[w + 1]); None: one world.
 
     @property
     def first_instance(self) -> np.ndarray:

@@ -21,28 +21,21 @@ UNBUILT = AccelStats()
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """State of a structure. A refit makes a new one; only a refit in place modifies its arrays.
-
-    surfaces: kernels.structs.Surfaces, of which only n_triangles and spheres are set. attributes: normals, materials and the like;
-    None if the structure was built from a geometry. data: Warp struct of the arrays. built: None for instances. built_cost: SAH cost
-    at the last build. roots: for instances, (W,) index of each world's root node; order: (I,) row of
-    geometry.to_world of each placement. followed: vertices of the last refit, if they
-    require gradients. changes: True if refits in place modify the arrays.
-    """
+    """State of a structure. A refit makes a new one; only a refit in place modifies its arrays."""
 
     structure: Structure
     device: Device
-    surfaces: WarpStruct
-    attributes: FlatScene | None
+    surfaces: WarpStruct  # kernels.structs.Surfaces, with only n_triangles and spheres set.
+    attributes: FlatScene | None  # Normals, materials and the like; None if the structure was built from a geometry.
     geometry: Geometry | InstancedGeometry
-    data: WarpStruct = None
+    data: WarpStruct = None  # Warp struct of the arrays.
     stats: AccelStats = UNBUILT
-    built: Built | None = None
-    built_cost: float = float("nan")
-    roots: WarpArray | None = None
-    order: np.ndarray | None = None
-    followed: WarpArray | None = None
-    changes: bool = False
+    built: Built | None = None  # None for instances.
+    built_cost: float = float("nan")  # SAH cost at the last build.
+    roots: WarpArray | None = None  # For instances, (W,) index of each world's root node.
+    order: np.ndarray | None = None  # For instances, (I,) row of geometry.to_world of each placement.
+    followed: WarpArray | None = None  # Vertices of the last refit, if they require gradients.
+    changes: bool = False  # True if refits in place modify the arrays.
 
     @property
     def mesh(self) -> Geometry:

@@ -20,32 +20,27 @@ from wrt.kernels.traverse.instances import Placement
 from wrt.kernels.units.box import PAD_COORDINATE
 
 ROUNDOFF = 2.0**-24
-SLACK = 32.0 * ROUNDOFF  # see kernels.traverse.instances.enter
-BOXES = 1 << 22  # primitives' boxes to transform in a build, summed over all instances
-MOVED_BOXES = 1 << 18  # as BOXES, but in a move: fewer boxes take less time, and make the boxes of instances slightly larger
-MATRICES = 1 << 17  # boxes to transform at a time
+SLACK = 32.0 * ROUNDOFF  # See kernels.traverse.instances.enter.
+BOXES = 1 << 22  # primitives' boxes to transform in a build, summed over all instances.
+MOVED_BOXES = 1 << 18  # As BOXES, but in a move: fewer boxes take less time, and make the boxes of instances slightly larger.
+MATRICES = 1 << 17  # Boxes to transform at a time.
 
 Boxes = tuple[np.ndarray, np.ndarray]  # centers and halves, (G, 3) float64 each
 
 
 @dataclass(frozen=True, eq=False)
 class TopLevel:
-    """Trees over instances.
+    """Trees over instances."""
 
-    nodes: (N,) Bvh2Node records, one tree per world, each with its root first. roots: (W,) indices of the roots. parents: (N,) int32,
-    -1 for a root. order: (I,) int32, instance of each leaf. depth: depth of the deepest tree. low, high: (I, 3) float32, boxes of
-    the instances. spread: (I,), see `spread_of`. placements: (I,) Placement records in the order of the leaves.
-    """
-
-    nodes: np.ndarray
-    roots: np.ndarray
-    parents: np.ndarray
-    order: np.ndarray
-    depth: int
-    low: np.ndarray
-    high: np.ndarray
-    spread: np.ndarray
-    placements: np.ndarray
+    nodes: np.ndarray  # (N,) Bvh2Node records, one tree per world, each with its root first.
+    roots: np.ndarray  # (W,) indices of the roots.
+    parents: np.ndarray  # (N,) int32, -1 for a root.
+    order: np.ndarray  # (I,) int32, instance of each leaf.
+    depth: int  # Depth of the deepest tree.
+    low: np.ndarray  # (I, 3) float32, low corners of the instances' boxes.
+    high: np.ndarray  # (I, 3) float32, high corners.
+    spread: np.ndarray  # (I,), see `spread_of`.
+    placements: np.ndarray  # (I,) Placement records in the order of the leaves.
 
     @property
     def slack(self) -> float:

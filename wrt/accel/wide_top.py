@@ -14,15 +14,11 @@ NONE = -1
 
 @dataclass(frozen=True, eq=False)
 class WideTop:
-    """Topology of the wide trees over a list of binary trees, without boxes.
+    """Topology of the wide trees over a list of binary trees, without boxes."""
 
-    children: (N, 8) int32 references; a leaf is one placement. source: (N, 8), box of each child as 2 * binary node + side, or -1.
-    roots: (W,) int32, root of each tree.
-    """
-
-    children: np.ndarray
-    source: np.ndarray
-    roots: np.ndarray
+    children: np.ndarray  # (N, 8) int32 references; a leaf is one placement.
+    source: np.ndarray  # (N, 8), box of each child as 2 * binary node + side, or -1.
+    roots: np.ndarray  # (W,) int32, root of each tree.
 
     def nodes(self, binary: np.ndarray) -> np.ndarray:
         """Return the nodes in the layout of kernels.wide.nodes, with the boxes of the binary nodes (Bvh2Node records).

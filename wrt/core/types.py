@@ -33,10 +33,10 @@ if TYPE_CHECKING:
     Kernel: TypeAlias = wp.Kernel
     DeviceFunction: TypeAlias = wp.Function
     # Types whose fields are known only at run time:
-    WarpStruct: TypeAlias = Any  # an instance of a wp.struct
-    WarpType: TypeAlias = Any  # wp.float32, wp.vec3, a wp.struct
-    KernelModule: TypeAlias = Any  # a module of kernels/ that a structure or a material chooses
-    JsonObject: TypeAlias = dict[str, Any]  # a table of a TOML, JSON or glTF file before it is checked
+    WarpStruct: TypeAlias = Any  # An instance of a wp.struct.
+    WarpType: TypeAlias = Any  # wp.float32, wp.vec3, a wp.struct.
+    KernelModule: TypeAlias = Any  # A module of kernels/ that a structure or a material chooses.
+    JsonObject: TypeAlias = dict[str, Any]  # A table of a TOML, JSON or glTF file before it is checked.
 else:
     from typing import TypeVar
 

@@ -87,10 +87,10 @@ class Recorded(NamedTuple):
     """Addresses of a launch on the CPU. The machine code at `entry` is a C function of the two addresses `bounds` and `args`."""
 
     entry: int
-    bounds: int  # address of the launch's size
-    args: int  # address of a C struct of all arguments
-    last: int  # address of the last argument in the struct
-    owners: tuple[Any, ...]  # the launch, its bounds, the struct of its arguments: they own the memory at these addresses
+    bounds: int  # Address of the launch's size.
+    args: int  # Address of a C struct of all arguments.
+    last: int  # Address of the last argument in the struct.
+    owners: tuple[Any, ...]  # The launch, its bounds, the struct of its arguments: they own the memory at these addresses.
 
 
 def recorded(command: wp.Launch) -> Recorded:

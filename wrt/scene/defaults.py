@@ -17,17 +17,17 @@ from wrt.scene.size import require_size
 from wrt.scene.studio import studio
 from wrt.scene.values import BLACK, LUMINANCE, SMALLEST, as_number
 
-_THREE_QUARTER = np.array([0.62, 0.42, 1.0])  # direction from the scene to the camera; the front of glTF is +z, up is +y
+_THREE_QUARTER = np.array([0.62, 0.42, 1.0])  # Direction from the scene to the camera; the front of glTF is +z, up is +y.
 FLAT = (0.2, 0.02, 0.2)  # A subject this thin along x, y or z, relative to its next longer side, is seen face on.
-FILL = 0.85  # of the picture's tighter side, by the subject
-NARROWEST = math.radians(0.001)  # angle of view
+FILL = 0.85  # Of the picture's tighter side, by the subject.
+NARROWEST = math.radians(0.001)  # Angle of view.
 
 # A white surface that faces the key light, and the sky or the studio, has a radiance near 1.
 _KEY_IRRADIANCE = {"sky": 1.7, "studio": 1.2}
 DARK = 0.01  # a lower radiance counts as unlit; a display shows it as code 25 of 255
 _SKY = GradientBackground(bottom=(0.22, 0.21, 0.20), top=(0.50, 0.60, 0.75))
 
-FILL_REACH = 0.3  # radius within which surfaces occlude the fill light, in radii of the scene's bounding sphere
+FILL_REACH = 0.3  # Radius within which surfaces occlude the fill light, in radii of the scene's bounding sphere.
 MATTE = 0.4  # A surface this rough shows no soft boxes, and reflects a pale sky with less noise.
 UP = {"x": np.array([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]), "y": np.eye(4),
       "z": np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])}  # rotations that turn an axis to +y
@@ -168,8 +168,8 @@ def emission_named(scene: Scene) -> str:
 def add_fill(scene: Scene, fill: float | None) -> tuple[Scene, str]:
     """Return a glTF scene that is lit by its own lights with a fill light, and a sentence on it. fill: see Staging.
 
-    The fill light is an ambient term that surfaces nearby occlude. Where emission is the only light, the estimate is the radiosity
-    method's ambient term (Cohen, Chen, Wallace, Greenberg 1988, section 3.3) for a mean albedo of 1/2: emitted power over area."""
+    The fill light is an ambient term that surfaces nearby occlude. Where emission is the only light, the estimate is emitted power
+    over area. This is the radiosity method's ambient term for a mean albedo of 1/2 (Cohen, Chen, Wallace, Greenberg 1988, section 3.3)."""
     lamps = f"it has no lights but {emission_named(scene)}: " if not scene.lights else ""
     if fill is None:
         fill = _emitted_power(scene) / _integral(scene, lambda material: 1.0) if lamps else 0.0
@@ -207,8 +207,8 @@ def stage(scene: Scene, staging: Staging | None = None) -> tuple[Scene, list[str
     """Return the scene with a camera and lights, and a sentence on each addition.
 
     A scene without a camera gets one that frames it. A scene that is not lit (`is_lit`) gets a key light from above the first camera's
-    right shoulder, and a studio if it has surfaces that reflect one (`shines`), else a pale sky. Raises InputError for a scene without
-    cameras and shapes, and for a scene that is too small."""
+    right shoulder. It also gets a studio if it has surfaces that reflect one (`shines`), else a pale sky. Raises InputError for a scene
+    without cameras and shapes, and for a scene that is too small."""
     require_size(scene)
     staging = staging or Staging()
     added = []

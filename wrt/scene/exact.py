@@ -41,12 +41,12 @@ class Crossings:
 
     t, u and v are inf or NaN for a line parallel to the plane. Misses can have NaN in all fields but `place`."""
 
-    place: np.ndarray  # int8, values of Place
-    t: np.ndarray  # float64, in units of the direction's length
-    u: np.ndarray  # float64, barycentric of v1
-    v: np.ndarray  # float64, barycentric of v2
-    t_error: np.ndarray  # bound on |t - exact t|
-    slope: np.ndarray  # d.N, as the module's docstring defines it
+    place: np.ndarray  # int8, values of Place.
+    t: np.ndarray  # float64, in units of the direction's length.
+    u: np.ndarray  # float64, barycentric of v1.
+    v: np.ndarray  # float64, barycentric of v2.
+    t_error: np.ndarray  # Bound on |t - exact t|.
+    slope: np.ndarray  # d.N, as the module's docstring defines it.
 
     @property
     def hit(self) -> np.ndarray:
@@ -165,10 +165,10 @@ class SphereCrossings:
 
     t is NaN on a miss. A line that touches its sphere has equal t[0] and t[1]."""
 
-    hit: np.ndarray  # (N,) bool
-    touching: np.ndarray  # (N,) bool: the line is tangent to the sphere
-    t: np.ndarray  # (2, N) float64: entry t[0] and exit t[1], in units of the direction's length
-    t_error: np.ndarray  # (2, N) bounds on |t - exact t|
+    hit: np.ndarray  # (N,) bool.
+    touching: np.ndarray  # (N,) bool: the line is tangent to the sphere.
+    t: np.ndarray  # (2, N) float64: entry t[0] and exit t[1], in units of the direction's length.
+    t_error: np.ndarray  # (2, N) bounds on |t - exact t|.
 
 
 def sphere_crossings(o: np.ndarray, d: np.ndarray, center: np.ndarray, radius: np.ndarray) -> SphereCrossings:

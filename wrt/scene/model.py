@@ -209,8 +209,8 @@ class Scene:
         Raises
         ------
         InputError
-            For another suffix, if a file cannot be written, and for what scene files do not hold: singular transforms, meshes without
-            triangles, classes that are not registered, and their fields without a description (`wrt.scene.kinds.given`).
+            For another suffix, and if a file cannot be written. Scene files do not hold singular transforms, meshes without triangles,
+            classes that are not registered, and fields without a description (`wrt.scene.kinds.given`).
         """
         path = as_path(path, "path")
         if path.suffix.lower() not in WRITERS:

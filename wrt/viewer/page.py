@@ -34,11 +34,11 @@ from wrt.viewer.renderers import CounterOf, Shown
 from wrt.viewer.server import Browser, Server, listen, to_stderr
 from wrt.viewer.walks import WalkOf, Walks
 
-MOST_PIXELS = 1 << 23  # largest number of pixels of a picture; a larger window shows the picture enlarged
-QUALITY = {True: 92, False: 80}  # JPEG quality of a picture at full resolution, and of a coarse picture
-WIDEST = math.radians(160.0)  # horizontal angle of view that a narrow window may widen a camera to
-LEGEND_HEIGHT = 12  # pixels
-DARK_SHARE = 0.01  # share of visibly too dark pixels above which the page warns
+MOST_PIXELS = 1 << 23  # Largest number of pixels of a picture; a larger window shows the picture enlarged.
+QUALITY = {True: 92, False: 80}  # JPEG quality of a picture at full resolution, and of a coarse picture.
+WIDEST = math.radians(160.0)  # Horizontal angle of view that a narrow window may widen a camera to.
+LEGEND_HEIGHT = 12  # Pixels.
+DARK_SHARE = 0.01  # Share of visibly too dark pixels above which the page warns.
 FOLDER = Path(__file__).parent / "page"
 FILES = {"/": ("page.html", "text/html; charset=utf-8"), "/page.css": ("page.css", "text/css; charset=utf-8"),
          "/page.js": ("page.js", "text/javascript; charset=utf-8")}

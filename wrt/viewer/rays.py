@@ -19,10 +19,10 @@ from wrt.renderer.prepare import Prepared
 from wrt.scene.cameras import Camera, CameraKind, OrthographicCamera
 from wrt.viewer.renderers import Renderers, View, kind_of
 
-KEPT = ("seed", "device", "threads", "accel_options", "triangle", "box", "instancing")  # options of the viewer for its inspectors
-MOST_NODES = 500  # rays and lights of the tree that the page shows
-PARTS = 32  # parts of a line that are drawn as hidden or not
-NEAR = 1e-4  # smallest depth of a drawn point, over the distance of the line's farther end
+KEPT = ("seed", "device", "threads", "accel_options", "triangle", "box", "instancing")  # Options of the viewer for its inspectors.
+MOST_NODES = 500  # Rays and lights of the tree that the page shows.
+PARTS = 32  # Parts of a line that are drawn as hidden or not.
+NEAR = 1e-4  # Smallest depth of a drawn point, over the distance of the line's farther end.
 
 
 @dataclass(frozen=True, eq=False)

@@ -101,16 +101,16 @@ def kind_of(view: View) -> Kind:
 class Shown:
     """A picture or heat map to show."""
 
-    codes: np.ndarray  # (h, w, 3) uint8, display values
+    codes: np.ndarray  # (h, w, 3) uint8, display values.
     view: View
-    scale: int  # one pixel stands for scale x scale pixels of the view
-    spp: int  # smallest number of samples of a pixel
-    speed: float = 0.0  # rays per second
-    rays_per_sample: float = 0.0  # mean
-    done: bool = False  # True: the picture gets no finer
-    seconds_left: float = 0.0  # until it is done, estimated
-    error: float = np.inf  # estimated root mean square, over pixels and channels, of the standard error; inf: unknown
-    visibly_cut: float = 0.0  # as in Film.stats, of a finished picture
+    scale: int  # One pixel stands for scale x scale pixels of the view.
+    spp: int  # Smallest number of samples of a pixel.
+    speed: float = 0.0  # Rays per second.
+    rays_per_sample: float = 0.0  # Mean.
+    done: bool = False  # True: the picture gets no finer.
+    seconds_left: float = 0.0  # Until it is done, estimated.
+    error: float = np.inf  # Estimated root mean square, over pixels and channels, of the standard error; inf: unknown.
+    visibly_cut: float = 0.0  # As in Film.stats, of a finished picture.
     # For a heat map, counts per pixel: the count shown in the last colour, the mean, and the largest count.
     top: float = 0.0
     mean: float = 0.0

@@ -20,15 +20,11 @@ SMALL_LEAF = 4  # primitives per leaf at most while build_refined moves subtrees
 
 
 class Effort(NamedTuple):
-    """Extent of the optimisation.
+    """Extent of the optimisation."""
 
-    share: fraction of the nodes, the largest ones, that a round tries to move. rounds: maximum number of rounds. least_gain: the
-    optimisation ends after a round that reduces the sum of all boxes' areas by less than this fraction.
-    """
-
-    share: float
-    rounds: int
-    least_gain: float
+    share: float  # Fraction of the nodes, the largest ones, that a round tries to move.
+    rounds: int  # Maximum number of rounds.
+    least_gain: float  # A round that reduces the sum of all boxes' areas by a smaller fraction is the last.
 
 
 @dataclass(frozen=True)

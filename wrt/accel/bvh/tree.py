@@ -50,15 +50,11 @@ class BvhOptions(BinaryOptions):
 
 @dataclass(frozen=True, eq=False)
 class BinaryTree:
-    """A binary tree.
+    """A binary tree."""
 
-    nodes: (N,) Bvh2Node records, each parent before its children. order: (R,) int32, prim_ids of the leaves one after another; a
-    prim_id may occur several times. depth: inner nodes on the longest path from the root.
-    """
-
-    nodes: np.ndarray
-    order: np.ndarray
-    depth: int
+    nodes: np.ndarray  # (N,) Bvh2Node records, each parent before its children.
+    order: np.ndarray  # (R,) int32, prim_ids of the leaves one after another; a prim_id may occur several times.
+    depth: int  # Inner nodes on the longest path from the root.
 
     @property
     def leaves(self) -> int:

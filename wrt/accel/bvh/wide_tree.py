@@ -23,20 +23,15 @@ COLLAPSE = build_wide.subtree_costs, build_wide.collapse  # kernels of `collapse
 
 @dataclass(frozen=True, eq=False)
 class WideTree:
-    """A tree of nodes with W children.
+    """A tree of nodes with W children."""
 
-    lo, hi: (N, W, 3) float32, boxes of the children; empty boxes come first. children: (N, W) int32, see kernels.wide.references.
-    order: (rows, W) int32, prim_id in each lane of the leaves' rows; -1 in an unused lane. depth: number of nodes on the longest path
-    from the root. stack: largest number of entries on a traversal stack.
-    """
-
-    lo: np.ndarray
-    hi: np.ndarray
-    children: np.ndarray
-    order: np.ndarray
+    lo: np.ndarray  # (N, W, 3) float32, low corners of the children's boxes; empty boxes come first.
+    hi: np.ndarray  # (N, W, 3) float32, high corners.
+    children: np.ndarray  # (N, W) int32, see kernels.wide.references.
+    order: np.ndarray  # (rows, W) int32, prim_id in each lane of the leaves' rows; -1 in an unused lane.
     leaves: int
-    depth: int
-    stack: int
+    depth: int  # Number of nodes on the longest path from the root.
+    stack: int  # Largest number of entries on a traversal stack.
 
     @property
     def exists(self) -> np.ndarray:

@@ -34,21 +34,15 @@ PIECE = {"prim_id": (wp.int32, ()), "first": (wp.int32, ()), "count": (wp.int32,
 
 @dataclass(frozen=True)
 class BspOptions:
-    """Options of the BSP tree. Raises InputError for values out of range.
+    """Options of the BSP tree. Raises InputError for values out of range."""
 
-    cost_intersection, cost_axis, cost_plane: SAH cost of a primitive, of a node with an axis-aligned plane, and of any other node, with
-    the defaults of the Manta renderer. samples: number of triangles per cell, evenly spread over its list, that propose four planes
-    each; 0: a k-d tree. max_depth: 1 to 60; 0: 16 + 2 log2 of the number of primitives. max_growth: limit of references per primitive,
-    1 to 1000. max_triangles: largest number of primitives.
-    """
-
-    cost_intersection: float = 75.0
-    cost_axis: float = 10.0
-    cost_plane: float = 20.0
-    samples: int = 128
-    max_depth: int = 0
-    max_growth: float = 16.0
-    max_triangles: int = 500_000
+    cost_intersection: float = 75.0  # SAH cost of a primitive; the three defaults are those of the Manta renderer.
+    cost_axis: float = 10.0  # SAH cost of a node with an axis-aligned plane.
+    cost_plane: float = 20.0  # SAH cost of any other node.
+    samples: int = 128  # Triangles per cell, evenly spread over its list, that propose four planes each; 0: a k-d tree.
+    max_depth: int = 0  # From 1 to 60; 0: 16 + 2 log2 of the number of primitives.
+    max_growth: float = 16.0  # Limit of references per primitive, 1 to 1000.
+    max_triangles: int = 500_000  # Largest number of primitives.
 
     def __post_init__(self) -> None:
         for name in ("cost_intersection", "cost_axis", "cost_plane"):

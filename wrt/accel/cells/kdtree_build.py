@@ -25,30 +25,24 @@ from wrt.kernels.traverse.kdtree import LEAF, STACK_SIZE, KdNode
 BINS = 64
 # Triangles outside of these sizes are not clipped, because the error margin of clipping would underflow or be infinite.
 CLIP_SIZES = (1e-30, 1e30)
-MAX_IN_LEAF = 1 << 24  # primitives, because a node stores their number as a float32
-MAX_INDEX = 1 << 29  # of a node or reference, because a node's word has 29 bits for it
-Part = tuple[np.ndarray, np.ndarray, Any]  # nodes, order and totals of a subtree
+MAX_IN_LEAF = 1 << 24  # primitives, because a node stores their number as a float32.
+MAX_INDEX = 1 << 29  # Of a node or reference, because a node's word has 29 bits for it.
+Part = tuple[np.ndarray, np.ndarray, Any]  # nodes, order and totals of a subtree.
 
 
 @dataclass(frozen=True)
 class KdOptions:
-    """Options of the k-d tree. Raises InputError for values out of range.
+    """Options of the k-d tree. Raises InputError for values out of range."""
 
-    max_leaf: cells of at most max_leaf primitives are not split. max_depth: levels below the root; None: 8 + 1.3 log2 n. by_cost: do
-    not split if that costs more than a leaf. cost_traversal, cost_intersection: SAH cost of a node and of a primitive. empty_bonus:
-    discount, 0 to 1, for splits that cut off empty space. perfect_below: cells with more primitives are split between 64 bins, other
-    cells at the best of all planes. clip: clip triangles to cells exactly. max_growth: limit of references and empty leaves per primitive.
-    """
-
-    max_leaf: int = 1
-    max_depth: int | None = None
-    by_cost: bool = True
-    cost_traversal: float = 2.0
-    cost_intersection: float = 1.0
-    empty_bonus: float = 0.1
-    perfect_below: int = 65536
-    clip: bool = True
-    max_growth: float = 16.0
+    max_leaf: int = 1  # Cells of so many primitives or fewer are not split.
+    max_depth: int | None = None  # Levels below the root; None: 8 + 1.3 log2 n.
+    by_cost: bool = True  # Do not split if that costs more than a leaf.
+    cost_traversal: float = 2.0  # SAH cost of a node.
+    cost_intersection: float = 1.0  # SAH cost of a primitive.
+    empty_bonus: float = 0.1  # Discount, 0 to 1, for splits that cut off empty space.
+    perfect_below: int = 65536  # Cells with more primitives are split between 64 bins, other cells at the best of all planes.
+    clip: bool = True  # Clip triangles to cells exactly.
+    max_growth: float = 16.0  # Limit of references and empty leaves per primitive.
 
     def __post_init__(self) -> None:
         if self.max_depth is not None and (isinstance(self.max_depth, bool) or not isinstance(self.max_depth, int)):

@@ -24,18 +24,13 @@ OCTANTS = np.arange(8)[:, None] >> np.arange(3) & 1  # (8, 3): 0 for the lower a
 
 @dataclass(frozen=True)
 class OctreeOptions:
-    """Options of the octree. Raises InputError for values out of range.
+    """Options of the octree. Raises InputError for values out of range."""
 
-    max_leaf: cells with at most max_leaf primitives are not split. max_depth: levels below the root, 0 to MAX_LEVELS. by_cost: do not
-    split a cell whose octants cost a ray as much as the cell. max_growth: limit of references per primitive in every part of the
-    tree. mailbox: avoid testing a ray against the same primitive in several cells.
-    """
-
-    max_leaf: int = 8
-    max_depth: int = MAX_LEVELS
-    by_cost: bool = True
-    max_growth: float = 16.0
-    mailbox: bool = True
+    max_leaf: int = 8  # Cells of so many primitives or fewer are not split.
+    max_depth: int = MAX_LEVELS  # Levels below the root, 0 to MAX_LEVELS.
+    by_cost: bool = True  # Do not split a cell whose octants cost a ray as much as the cell.
+    max_growth: float = 16.0  # Limit of references per primitive in every part of the tree.
+    mailbox: bool = True  # Avoid testing a ray against the same primitive in several cells.
 
     def __post_init__(self) -> None:
         require_between(max_leaf=(self.max_leaf, 1, 1 << 20), max_depth=(self.max_depth, 0, MAX_LEVELS),
@@ -44,16 +39,12 @@ class OctreeOptions:
 
 @dataclass
 class Cells:
-    """The M cells of one level.
+    """The M cells of one level."""
 
-    corner: (M, 3) int32, lowest corners in units of finest cells. references: (R,) prim_ids; references[begin[i] : begin[i + 1]] belong
-    to cell i. growth: (M,) factor by which the number of references may grow from a cell to the leaves below it.
-    """
-
-    corner: np.ndarray
+    corner: np.ndarray  # (M, 3) int32, lowest corners in units of finest cells.
     begin: np.ndarray
-    references: np.ndarray
-    growth: np.ndarray
+    references: np.ndarray  # (R,) prim_ids. Cell i has references[begin[i] : begin[i + 1]].
+    growth: np.ndarray  # (M,) factor by which the number of references may grow from a cell to the leaves below it.
 
     @property
     def count(self) -> np.ndarray:

@@ -102,11 +102,11 @@ class ListQuery:
     """A query for all hits of rays, on a snapshot of a structure. `of` sets the rays; `all`, `first` and `counts` return results."""
 
     n = 0
-    shape: Shape | None = None  # of the rays; None: (n,)
+    shape: Shape | None = None  # Of the rays; None: (n,).
     rays: Rays
-    roots: np.ndarray | None = None  # (N,) int32, root node of each ray's world, or -1; None without instances
-    touches: np.ndarray  # (N,) bool, if crossings are found: the ray hits triangles, but crosses none
-    give: Any  # converts arrays to those of the caller's library
+    roots: np.ndarray | None = None  # (N,) int32, root node of each ray's world, or -1; None without instances.
+    touches: np.ndarray  # (N,) bool, if crossings are found: the ray hits triangles, but crosses none.
+    give: Any  # Converts arrays to those of the caller's library.
 
     def __init__(self, accel: Accelerator, threads: int | None, crossings: bool = False) -> None:
         self.snapshot = snapshot_of(accel, instances=True)

@@ -27,13 +27,13 @@ from wrt.kernels.wide.packets import ANY_REFUSED, REPORT_SIZE, Scratch
 # Rays per launch, which lasts some milliseconds, so that its overhead is small and Ctrl-C acts soon. A query of at most FEWEST rays
 # is one launch. Else each launch gets 1 / (SHARES threads) of the remaining rays, LEAST to MOST, so that all threads end together.
 FEWEST, MOST, LEAST, SHARES = 8192, 131072, 4096, 2
-RAYS_PER_LAUNCH = 16384  # for kernels that trace one ray at a time
-MOST_ON_GPU = 1 << 26  # largest number of rays that are copied to a GPU at once: 3 GB with their hits
-BYTES_OF_RAY = 48  # a ray and its hit
-FITS_ANY_GPU = 1 << 20  # up to this number of rays, the free memory of the GPU is not queried
-MOST_PACKED = (1 << 31) - 64  # rays: kernels index in int32, and their last block may exceed the range
-BUFFERED = 16384  # rays in a worker's buffers, and in a launch of tiles: 640 KB, which stay in the core's cache
-SMALL = 1024  # up to this number of rays, a copy is faster than kernel records of the caller's arrays
+RAYS_PER_LAUNCH = 16384  # For kernels that trace one ray at a time.
+MOST_ON_GPU = 1 << 26  # Largest number of rays that are copied to a GPU at once: 3 GB with their hits.
+BYTES_OF_RAY = 48  # A ray and its hit.
+FITS_ANY_GPU = 1 << 20  # Up to this number of rays, the free memory of the GPU is not queried.
+MOST_PACKED = (1 << 31) - 64  # rays: kernels index in int32, and their last block may exceed the range.
+BUFFERED = 16384  # Rays in a worker's buffers, and in a launch of tiles: 640 KB, which stay in the core's cache.
+SMALL = 1024  # Up to this number of rays, a copy is faster than kernel records of the caller's arrays.
 
 
 class Query(NamedTuple):

@@ -13,15 +13,11 @@ from wrt.core.types import WarpArray
 
 
 class PartFaces(NamedTuple):
-    """Triangles of all parts of an InstancedGeometry, on the structure's device.
+    """Triangles of all parts of an InstancedGeometry, on the structure's device."""
 
-    vertices, faces: in the parts' own spaces; each part's faces in the order of its prim_ids, with gaps where a part lacks prim_ids.
-    first_face: (P,) int32, index in `faces` of the face with prim_id 0 of each part.
-    """
-
-    vertices: WarpArray
-    faces: WarpArray
-    first_face: WarpArray
+    vertices: WarpArray  # In the parts' own spaces.
+    faces: WarpArray  # Of each part in the order of its prim_ids, with gaps where the part lacks prim_ids.
+    first_face: WarpArray  # (P,) int32, index in `faces` of the face with prim_id 0 of each part.
 
 
 @once

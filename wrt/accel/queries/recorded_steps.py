@@ -21,23 +21,19 @@ RAYS_AT_ONCE = 1 << 12  # rays whose steps are in memory at once, about 10 kB ea
 
 @dataclass(frozen=True, eq=False)
 class RecordedSteps:
-    """Steps of N rays that search their closest hit.
-
-    origin, direction: (N, 3) float32. t, u, v, prim_id: (N,), the hits. counts: (N,), as in Counters. steps: (M,) records of
-    kernels.traverse.steps.Step; ray i has the steps first[i] .. first[i + 1] - 1. node_bytes, primitive_bytes: size of one record.
-    """
+    """Steps of N rays that search their closest hit. The hits are t, u, v and prim_id, (N,) each."""
 
     structure: str
-    origin: np.ndarray
-    direction: np.ndarray
+    origin: np.ndarray  # (N, 3) float32.
+    direction: np.ndarray  # (N, 3) float32.
     t: np.ndarray
     u: np.ndarray
     v: np.ndarray
     prim_id: np.ndarray
-    counts: np.ndarray
-    first: np.ndarray
-    steps: np.ndarray
-    node_bytes: int
+    counts: np.ndarray  # (N,), as in Counters.
+    first: np.ndarray  # (N + 1,). Ray i has the steps first[i] .. first[i + 1] - 1.
+    steps: np.ndarray  # (M,) records of kernels.traverse.steps.Step.
+    node_bytes: int  # Size of a record.
     primitive_bytes: int
 
     def __len__(self) -> int:

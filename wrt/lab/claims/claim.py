@@ -17,19 +17,15 @@ TTP_RULES = Rules(ordered=False, culled=False)  # the walk of Vulkan-Sim: childr
 
 @dataclass(frozen=True)
 class Figure:
-    """One repeated number of a claim.
+    """One repeated number of a claim."""
 
-    what: what is counted, with its scene; unit: of both numbers, "ratio" where 1 means no change. published: a number or the two ends of a
-    range; None for a finding of wrt's own. differences: of set-up. reason: what a measurement says about the difference. factor: largest
-    ratio, either way, that counts as agreement."""
-
-    what: str
+    what: str  # What is counted, with its scene.
     ours: float
-    published: float | tuple[float, float] | None = None
-    unit: str = ""
-    differences: str = ""
-    reason: str = ""
-    factor: float = OTHER_CAMERA
+    published: float | tuple[float, float] | None = None  # A number or the ends of a range; None for a finding of wrt's own.
+    unit: str = ""  # Of both numbers; "ratio" if 1 means no change.
+    differences: str = ""  # Of set-up.
+    reason: str = ""  # What a measurement says about the difference.
+    factor: float = OTHER_CAMERA  # Largest ratio, either way, that counts as agreement.
 
     @property
     def ratio(self) -> float | None:
@@ -52,13 +48,12 @@ class Figure:
 
 @dataclass(frozen=True)
 class Claim:
-    """A published claim. source: authors, venue, and the figure or table; setup: of the paper.
-    sure: "read" in the original, "quoted" by others, "abstract" read alone, or "memory". measure: yields the repeated numbers."""
+    """A published claim."""
 
-    source: str
-    setup: str
-    sure: str
-    measure: "Callable[[Study], Iterator[Figure]]"
+    source: str  # Authors, venue, and the figure or table.
+    setup: str  # Of the paper.
+    sure: str  # "read" in the original, "quoted" by others, "abstract" read alone, or "memory".
+    measure: "Callable[[Study], Iterator[Figure]]"  # Yields the repeated numbers.
 
 
 @dataclass(eq=False)

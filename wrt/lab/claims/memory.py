@@ -13,7 +13,7 @@ from wrt.lab.claims.treelets import cut, schedule
 from wrt.lab.claims.walks import NODE_BYTES, Rules, Walk, walk
 from wrt.lab.rtcore.caches import LINE, Cache
 
-TREELET_BYTES = 32 << 10  # as the cache that holds a treelet
+TREELET_BYTES = 32 << 10  # As the cache that holds a treelet.
 # Of a ray that leaves for a queue and comes back: origin, direction, t, state and the top of its stack, written and read.
 QUEUED_BYTES = 2 * 64
 PREFETCHED_BYTES = 512

@@ -24,14 +24,13 @@ L2_BYTES, L2_WAYS = 512 << 10, 16
 
 @dataclass(frozen=True, eq=False)
 class Traffic:
-    """Totals of `through_caches`: fetches and their misses; prefetches that load a line; lines among these that a fetch uses.
-    missed: (A,) bool, whether the line of each access was not in the cache."""
+    """Totals of `through_caches`."""
 
     fetches: int
-    misses: int
-    prefetches: int
-    used: int
-    missed: np.ndarray
+    misses: int  # Fetches that miss.
+    prefetches: int  # Prefetches that load a line.
+    used: int  # Lines among these that a fetch uses.
+    missed: np.ndarray  # (A,) bool, True if the line of an access was not in the cache.
 
 
 def device_log(log: Walk) -> WarpStruct:

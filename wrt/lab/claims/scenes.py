@@ -19,8 +19,8 @@ from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import box, icosphere, merged, torus, tube
 
 BOUNCES = 3
-INSIDE = ("sponza", "conference", "hall", "kitchen", "room")  # scenes that the camera sees from the middle of their box
-AO_RADIUS = 0.1  # length of ambient occlusion rays over the radius of the scene's bounding sphere
+INSIDE = ("sponza", "conference", "hall", "kitchen", "room")  # Scenes that the camera sees from the middle of their box.
+AO_RADIUS = 0.1  # Length of ambient occlusion rays over the radius of the scene's bounding sphere.
 PATH, AO, SHADOW = "path tracing", "ambient occlusion", "shadow"
 
 

@@ -26,19 +26,15 @@ NODE_BYTES = 64  # of an inner node and of a leaf
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Rays of a workload, arrays (N,), sorted by depth, kind and pixel.
+    """Rays of a workload, arrays (N,), sorted by depth, kind and pixel."""
 
-    origins, directions: (N, 3) float32. kind: 0 camera or bounce, 1 shadow or ambient occlusion; these end at their first hit. depth:
-    bounces
-    before the ray; pixel: index of its pixel. warp: (N,) int64, warp of 32 rays in which the ray runs, ascending; gaps are idle lanes."""
-
-    origins: np.ndarray
-    directions: np.ndarray
+    origins: np.ndarray  # (N, 3) float32.
+    directions: np.ndarray  # (N, 3) float32.
     t_max: np.ndarray
-    kind: np.ndarray
-    depth: np.ndarray
-    pixel: np.ndarray
-    warp: np.ndarray
+    kind: np.ndarray  # The value 0 for camera or bounce, 1 for shadow or ambient occlusion. The latter end at their first hit.
+    depth: np.ndarray  # Bounces before the ray.
+    pixel: np.ndarray  # Index of its pixel.
+    warp: np.ndarray  # (N,) int64, warp of 32 rays in which the ray runs, ascending; gaps are idle lanes.
 
     def __len__(self) -> int:
         return len(self.origins)
@@ -72,19 +68,15 @@ class Rules(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Walk:
-    """Result of `walk`. counts: (N,) records of kernels.study.tree_walk.Work. The log has M fetches and P pushes of all rays.
+    """Result of `walk`. The log has M fetches and P pushes of all rays."""
 
-    first: (N + 1,) int64, ray i has the fetches first[i] .. first[i + 1] - 1. fetch: (M,) int32 references. entered: (M,) int64, entries
-    that
-    each fetch pushed. push_first: (N + 1,) int64; push: (P,) int32 references."""
-
-    counts: np.ndarray
-    first: np.ndarray
-    fetch: np.ndarray
-    entered: np.ndarray
-    push_first: np.ndarray
-    push: np.ndarray
-    nodes: int  # of the tree
+    counts: np.ndarray  # (N,) records of kernels.study.tree_walk.Work.
+    first: np.ndarray  # (N + 1,) int64. Ray i has the fetches first[i] .. first[i + 1] - 1.
+    fetch: np.ndarray  # (M,) int32 references.
+    entered: np.ndarray  # (M,) int64, entries that each fetch pushed.
+    push_first: np.ndarray  # (N + 1,) int64.
+    push: np.ndarray  # (P,) int32 references.
+    nodes: int  # Of the tree.
 
     @cached_property
     def fetches(self) -> np.ndarray:

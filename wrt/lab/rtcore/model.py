@@ -55,8 +55,9 @@ class Work:
 
 
 class Prediction(Row):
-    """Result of `predict`. rays_per_second: of the whole GPU; limit: name of the largest term (see TERMS).
-    clocks: term -> clocks of an RT core per ray. utilisation: term -> its clocks over the clocks of the largest term."""
+    """Result of `predict`: `rays_per_second` of the whole GPU, and `limit`, the name of the largest term (see TERMS).
+
+    The dict `clocks` has the clocks of an RT core per ray for each term, `utilisation` these over the clocks of the largest term."""
 
 
 def predict(work: Work, gpu: Gpu, core: Core = BASE) -> Prediction:

@@ -12,10 +12,10 @@ COLORS = {"camera": "#202020", "reflected": "#1668c4", "coated": "#0b8f9c", "ref
 # A marker of matplotlib for each end of a ray, and its description.
 ENDS = {"absorbed": ("o", "ends at a surface"), "emission": ("*", "ends at a light"), "missed": (">", "leaves the scene"),
         "cut by depth": ("s", "cut by depth"), "cut by throughput": ("X", "cut by throughput"), "blocked": ("x", "shadow ray blocked")}
-LEAVES, STUB = 0.22, 0.1  # length of a ray that leaves the scene, and of a ray that was cut, over the extent of the drawing
-FAR = 3.5  # a hit farther than this, over the distance of the first hit, does not widen the drawing
-NEAR = 0.8  # longest part of the camera ray that is shown, over the largest distance between the first hit and another one
-WIDEST, THINNEST = 2.6, 0.8  # of the lines, in points: throughput 1, and 0
+LEAVES, STUB = 0.22, 0.1  # Length of a ray that leaves the scene, and of a ray that was cut, over the extent of the drawing.
+FAR = 3.5  # A hit farther than this, over the distance of the first hit, does not widen the drawing.
+NEAR = 0.8  # Longest part of the camera ray that is shown, over the largest distance between the first hit and another one.
+WIDEST, THINNEST = 2.6, 0.8  # Of the lines, in points: throughput 1, and 0.
 
 
 class Stroke(NamedTuple):

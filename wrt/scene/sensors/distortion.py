@@ -1,7 +1,8 @@
 """Lens distortion as OpenCV defines it, and its inverse.
 
 Source: OpenCV's documentation, "Camera Calibration and 3D Reconstruction" and "Fisheye camera model". A point (x, y) is on the plane
-z = 1 of the camera's frame. `distort` moves it to where the lens shows it; a pixel's ray needs the inverse, which has no closed form.
+z = 1 of the camera's frame. The function `distort` moves it to where the lens shows it. A pixel's ray needs the inverse, which
+has no closed form.
 """
 
 import numpy as np
@@ -10,10 +11,10 @@ from wrt.core.checks import as_array, shown
 from wrt.core.errors import InputError
 from wrt.core.types import ArrayLike
 
-LENGTHS = 0, 4, 5, 8, 12  # numbers of coefficients: k1 k2 p1 p2, k3, k4 k5 k6, s1 s2 s3 s4
-STEPS = 64  # of the path from the centre to a point
-NODES = 65  # of the grid of a picture, at most, along each side
-EXACT = 1e-13  # largest error of an inverse, on the plane z = 1 and relative to a point there that is farther than 1
+LENGTHS = 0, 4, 5, 8, 12  # Numbers of coefficients: k1 k2 p1 p2, k3, k4 k5 k6, s1 s2 s3 s4.
+STEPS = 64  # Of the path from the centre to a point.
+NODES = 65  # Of the grid of a picture, at most, along each side.
+EXACT = 1e-13  # Largest error of an inverse, on the plane z = 1 and relative to a point there that is farther than 1.
 Points = tuple[np.ndarray, np.ndarray]  # x and y
 
 
