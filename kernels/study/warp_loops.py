@@ -28,7 +28,7 @@ class LaneSteps:
 def helped_steps(warp_first: wp.array(dtype=wp.int64), log: WalkLog, push_of: wp.array(dtype=wp.int64), used: wp.array(dtype=wp.int32),
                  scratch: wp.array(dtype=wp.int64), steps: wp.array(dtype=wp.int64)):
     """Count the steps of warp tid if 32 lanes take the entries of all its rays in turn, the oldest first.
-    push_of: first entry that each fetch pushes; used: stack_replay.Entries.used; scratch: one entry for each fetch."""
+    push_of: first entry that each fetch pushes; used: cache_prefetch.Entries.used; scratch: one entry for each fetch."""
     warp = wp.tid()
     tail = log.fetch_first[warp_first[warp]]
     head = tail

@@ -16,11 +16,32 @@ from typing import NoReturn
 import click
 
 import wrt
-from wrt.cli.commands import COMMANDS
 from wrt.cli.common import Commands, say
 from wrt.core.errors import InputError
 from wrt.core.interrupts import Interrupted, exit_code, raise_on_termination
 from wrt.core.packages import needed_by
+from wrt.core.registry import Registry
+
+# Name -> "module:function". The module is imported when the command runs or --help lists it.
+COMMANDS: Registry[click.Command] = Registry("command", {
+    "animate": "wrt.cli.animate:animate",
+    "bench": "wrt.cli.measure:bench",
+    "build": "wrt.cli.build:build",
+    "compare": "wrt.cli.compare:compare",
+    "compile": "wrt.cli.compile:compile_kernels",
+    "devices": "wrt.cli.devices:devices",
+    "info": "wrt.cli.scene_files:info",
+    "inspect": "wrt.cli.inspect:inspect",
+    "profile": "wrt.cli.measure:profile",
+    "render": "wrt.cli.render:render",
+    "schema": "wrt.cli.scene_files:schema",
+    "stability": "wrt.cli.measure:stability",
+    "validate": "wrt.cli.scene_files:validate",
+    "view": "wrt.cli.view:view",
+    "walk": "wrt.cli.inspect:walk",
+    "whatif": "wrt.cli.measure:whatif",
+}, "wrt.commands")
+
 
 GC_THRESHOLD = 500_000  # New objects between two garbage collections. Starting wrt makes 300,000 objects, which stay.
 # Parts of error messages that mean lack of memory: for a thread, for an array of Warp, for a shared library.

@@ -1,7 +1,7 @@
 """`python -m wrt bench bvh`: compare builders of binary BVHs, and boxes, spheres and 14-DOPs as bounding volumes of one tree."""
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from functools import cache, partial
 from time import perf_counter, process_time
 
 import numpy as np
@@ -26,8 +26,8 @@ from wrt.lab.bench.rays import RaySet, ball_around, endless, mean_counters, unit
 from wrt.lab.bench.report import Columns, Groups, Part, Row, cells, grouped, mesh_name, tabled
 from wrt.lab.bench.timing import alternate, peak_bytes, spread
 from wrt.lab.plans import Bvh as Plan
-from wrt.scene.mesh import Mesh
 
+Measure = Callable[[Geometry, RaySet], Iterator[dict[str, object]]]
 VOLUMES = ("bvh2", "bvh2_sphere", "bvh2_kdop")
 TESTED_RAYS, TESTED_NODES = 1024, 1024  # most rays and nodes that time one bounding volume alone
 TITLE = "Builders of binary BVHs, and bounding volumes"
@@ -53,15 +53,14 @@ run. Mray/s: on one thread. differ: rays whose prim_id or t, bit for bit, is not
 
 def groups(plan: Plan) -> Groups:
     for mesh in map(as_mesh, plan.meshes):
-        for builder in plan.builders or BVH_BUILDERS:
-            yield partial(mesh_rows, plan, mesh, partial(builder_rows, builder))
-        yield partial(mesh_rows, plan, mesh, volume_rows)
+        geometry = Geometry.of(mesh)
+        rays = cache(partial(inward, geometry, plan.rays, plan.seed))
+        for measure in (*(partial(builder_rows, builder) for builder in plan.builders or BVH_BUILDERS), volume_rows):
+            yield partial(mesh_rows, mesh_name(mesh), geometry, rays, partial(measure, plan))
 
 
-def mesh_rows(plan: Plan, mesh: Mesh, measure: Callable[[Plan, Geometry, RaySet], Iterator[dict[str, object]]]) -> list[Row]:
-    geometry = Geometry.of(mesh)
-    rays = inward(geometry, plan.rays, plan.seed)
-    return [Row(mesh=mesh_name(mesh), n_triangles=len(geometry), **measured) for measured in measure(plan, geometry, rays)]
+def mesh_rows(mesh: str, geometry: Geometry, rays: Callable[[], RaySet], measure: Measure) -> list[Row]:
+    return [Row(mesh=mesh, n_triangles=len(geometry), **measured) for measured in measure(geometry, rays())]
 
 
 def inward(geometry: Geometry, n: int, seed: int = 0) -> RaySet:

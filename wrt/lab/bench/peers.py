@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from pathlib import Path
+from statistics import geometric_mean
 from time import perf_counter, thread_time
 from typing import Any, NamedTuple, cast
 
@@ -17,7 +18,7 @@ from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench import peer_points, peer_tiles
 from wrt.lab.bench.accel import timing, warm_up
 from wrt.lab.bench.instruction_sets import instruction_sets
-from wrt.lab.bench.peer_chart import chart
+from wrt.lab.bench.plot import bars
 from wrt.lab.bench.rays import RAY_KINDS, RaySet, ray_sets
 from wrt.lab.bench.report import Columns, Groups, Part, Row, grouped, machine_line, mesh_name, tabled, versions
 from wrt.lab.bench.timing import alternate_on, spread
@@ -26,6 +27,25 @@ from wrt.lab.hard_cases.contestants import RIVALS, Algorithm, Own, Peer
 from wrt.lab.plans import Peers as Plan
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
+
+KINDS = {"primary": "primary rays", "shadow": "any hit: shadow rays", "diffuse": "bounce: diffuse rays", "random": "random rays",
+         "points": "closest points", "tiles": "64x64 pixels in many worlds"}
+
+
+def chart(rows: Sequence[Row], plan: Plan, machine: str, suffix: str) -> bytes:
+    """Return a picture: a panel for each kind of ray, a bar for each library in its best mode; fewest threads, geometric means over the
+    meshes."""
+    fewest = min(row.threads for row in rows)
+    best: dict[tuple[str, str], list[float]] = {}
+    used = [row for row in rows if row.threads == fewest]
+    for (_, _, kind, library), modes in grouped(used, "mesh", "triangles", "kind", "library").items():
+        best.setdefault((kind, library), []).append(min(row.ns for row in modes))
+    panels: dict[str, dict[str, float]] = {}
+    for (kind, library), each in best.items():
+        panels.setdefault(KINDS[kind], {})[library] = geometric_mean(each)
+    where = f"{fewest} thread{'s' if fewest > 1 else ''}" if plan.device == "cpu" else plan.device
+    return bars(panels, f"Nanoseconds a ray or point; {where}; less is better", suffix)
+
 
 SAME_T = 1e-4  # largest relative difference of t at which two triangles are a tie
 PARTS = 4  # parts of the rays for each thread, if a library uses one thread a call

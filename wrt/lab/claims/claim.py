@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import TypeVar, cast
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from wrt.lab.claims.scenes import PATH, Scene, open_scene
 from wrt.lab.claims.walks import Rays, Rules, Tree, Walk, build_tree, tree_of, walk
 from wrt.scene.mesh import Mesh
 
+T = TypeVar("T")
 SAME_SCENE, OTHER_CAMERA = 1.25, 1.5  # factors within which a repeated number agrees
 TTP_RULES = Rules(ordered=False, culled=False)  # the walk of Vulkan-Sim: children unsorted, popped entries not culled
 
@@ -64,35 +66,25 @@ class Study:
     side: int = 128
     _kept: dict[tuple[object, ...], object] = field(default_factory=dict)
 
-    def keep(self, key: tuple[object, ...], make: Callable[[], object]) -> object:
-        if key not in self._kept:
-            self._kept[key] = make()
-        return self._kept[key]
+    def keep(self, key: tuple[object, ...], make: Callable[[], T]) -> T:
+        return cast(T, self._kept[key] if key in self._kept else self._kept.setdefault(key, make()))
 
     def scene(self, name: str) -> Scene:
-        found = self.keep(("scene", name), lambda: open_scene(name, self.files.get(name), self.side))
-        assert isinstance(found, Scene)
-        return found
+        return self.keep(("scene", name), lambda: open_scene(name, self.files.get(name), self.side))
 
     def tree(self, name: str, width: int, max_leaf: int = 1, bits: int = 32) -> Tree:
-        found = self.keep(("tree", name, width, max_leaf, bits), lambda: build_tree(self.scene(name).geometry, width, max_leaf, bits))
-        assert isinstance(found, Tree)
-        return found
+        return self.keep(("tree", name, width, max_leaf, bits), lambda: build_tree(self.scene(name).geometry, width, max_leaf, bits))
 
     def six(self, name: str) -> Tree:
         """Return the tree of bvh6."""
         from wrt.accel.bvh.six import Bvh6
 
-        scene = self.scene(name)
-        found = self.keep(("six", name), lambda: tree_of(scene.geometry, Bvh6(scene.geometry).decoded()))
-        assert isinstance(found, Tree)
-        return found
+        geometry = self.scene(name).geometry
+        return self.keep(("six", name), lambda: tree_of(geometry, Bvh6(geometry).decoded()))
 
     def ttp(self, name: str, workload: str = PATH, rules: Rules = TTP_RULES) -> Walk:
         """Return the logged walk of bvh6 by the rays of a workload."""
-        found = self.keep(("ttp", name, workload, rules), lambda: walk(self.six(name), self.rays(name, workload), rules, log=True))
-        assert isinstance(found, Walk)
-        return found
+        return self.keep(("ttp", name, workload, rules), lambda: walk(self.six(name), self.rays(name, workload), rules, log=True))
 
     def rays(self, name: str, workload: str = PATH) -> Rays:
         return self.scene(name).workloads[workload]

@@ -46,7 +46,7 @@ def finer(study: Study, name: str) -> str:
         return (f"the scene's detail: with every triangle cut into four ({len(geometry)} triangles), camera and bounce rays take"
                 f" {counts.mean():.1f} nodes, {counts.max()} at most")
 
-    return str(study.keep(("finer", name), measure))
+    return study.keep(("finer", name), measure)
 
 
 def ttp_breadth(study: Study) -> Iterator[Figure]:

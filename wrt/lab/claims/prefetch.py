@@ -9,8 +9,8 @@ import warp as wp
 from wrt.core.device import launch, start, upload
 from wrt.core.threads import thread_count
 from wrt.core.types import WarpStruct
-from wrt.kernels.study import stack_replay, tree_walk
-from wrt.kernels.study.cache_prefetch import Served, replay_prefetches
+from wrt.kernels.study import tree_walk
+from wrt.kernels.study.cache_prefetch import Entries, Served, replay_prefetches, replay_stacks
 from wrt.kernels.study.tree_walk import QUEUE
 from wrt.lab.claims.claim import TTP_RULES, Claim, Figure, Study
 from wrt.lab.claims.nodes import SETUP, THEIRS, TTP
@@ -44,10 +44,10 @@ def device_log(log: Walk) -> WarpStruct:
 def replayed(log: Walk, ahead: tuple[int, int, int] = AHEAD) -> tuple[np.ndarray, np.ndarray]:
     """Return the step at which each pushed entry is used, and at which it is prefetched, (P,) int32 each; -1 for never.
     The log must be one of a stack."""
-    cpu, n, out = start("cpu"), len(log.counts), stack_replay.Entries()
+    cpu, n, out = start("cpu"), len(log.counts), Entries()
     out.used, out.prefetched = (wp.full(len(log.push), -1, dtype=wp.int32, device=cpu) for _ in range(2))
     scratch, given = wp.empty(RAYS_PER_LAUNCH * int(QUEUE), dtype=wp.int64, device=cpu), device_log(log)
-    launch(stack_replay.replay_stacks, n, given, wp.vec3i(*ahead), None, scratch, out, step=RAYS_PER_LAUNCH)
+    launch(replay_stacks, n, given, wp.vec3i(*ahead), None, scratch, out, step=RAYS_PER_LAUNCH)
     return out.used.numpy().copy(), out.prefetched.numpy().copy()
 
 

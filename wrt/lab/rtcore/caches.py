@@ -1,14 +1,13 @@
 """Simulate the caches of a GPU: which recorded fetches miss in the L1 of each SM and in the shared L2."""
 
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import warp as wp
 
 from wrt.accel.queries.answers import Counters
-from wrt.core.device import load_kernel, start, upload
-from wrt.core.threads import run_all, thread_count
+from wrt.core.device import launch, start, upload
+from wrt.core.threads import thread_count
 from wrt.kernels.study.cache_lru import Caches, Missed, Trace, replay_lru, replay_warps
 from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
 
@@ -85,8 +84,7 @@ def replay(line: np.ndarray, cache: Cache) -> np.ndarray:
     """Return flags of the accesses that hit, (M,) bool, in an LRU cache that is empty at first. Line n is in set n modulo cache.sets."""
     cpu = start("cpu")
     hit = wp.zeros(len(line), dtype=wp.int8, device=cpu)
-    load_kernel(replay_lru, cpu)
-    wp.launch(replay_lru, dim=1, inputs=[caches_of(cache, 1), upload(line, wp.int64, cpu), hit], device=cpu)
+    launch(replay_lru, 1, caches_of(cache, 1), upload(line, wp.int64, cpu), hit)
     return hit.numpy().astype(bool)
 
 
@@ -135,8 +133,7 @@ def first_level(warp: np.ndarray, fetches: Counters, sms: int, slots: int, l1: C
     out.seen_size = 32 * int(touched.max(initial=1))
     out.seen, out.seen_at = (wp.zeros(sms * out.seen_size, dtype=wp.int64, device=cpu) for _ in range(2))
     caches = caches_of(l1, sms)
-    load_kernel(replay_warps, cpu)
-    run_all([partial(wp.launch, replay_warps, dim=1, inputs=[trace, caches, out, sm], device=cpu) for sm in range(sms)], thread_count(None))
+    launch(replay_warps, sms, trace, caches, out, None, threads=thread_count(None), step=1)
     used = np.concatenate([np.arange(a, a + n) for a, n in zip(begin, out.misses.numpy(), strict=False)])
     return Level1(int(out.accesses.numpy().sum()), int(out.wanted.numpy().sum()), out.line.numpy()[used],
                   out.time.numpy()[used], out.lanes.numpy()[used])

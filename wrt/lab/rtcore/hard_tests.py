@@ -9,13 +9,13 @@ import warp as wp
 
 from wrt.accel.base import Accelerator
 from wrt.accel.scenes.build import build
-from wrt.core.device import load_kernel, upload
+from wrt.core.device import launch_on, upload
 from wrt.io.mesh_file import as_mesh
 from wrt.kernels.query import RayArrays
 from wrt.kernels.structs import Primitive, size_of
 from wrt.kernels.study.hard_tests import HARD, REFUSED, classify
 from wrt.kernels.traverse.counters import PRIMITIVE_SPACE
-from wrt.lab.bench.rays import RaySet, ray_sets
+from wrt.lab.bench.rays import RaySet, counters_of, ray_sets
 from wrt.lab.bench.report import Columns, Groups, Row, mesh_name
 from wrt.lab.plans import Float64 as Plan
 from wrt.scene.mesh import Mesh
@@ -42,8 +42,7 @@ def mesh_rows(plan: Plan, mesh: Mesh) -> list[Row]:
 
 def counted(accel: Accelerator, rays: RaySet) -> dict[str, int]:
     """Count the triangle tests of all rays, and the hard tests, which need float64. accel: a bvh2 over triangles, on the CPU."""
-    counters = accel.closest_hit(rays.origins, rays.directions, t_max=rays.t_max, trace=True).counters
-    assert counters is not None
+    counters = counters_of(accel, rays, trace=True)
     of_ray = np.repeat(np.arange(len(rays)), np.diff(counters.first))
     tests = counters.address >= int(PRIMITIVE_SPACE)
     of_ray, place = of_ray[tests], (counters.address[tests] - int(PRIMITIVE_SPACE)) // size_of(Primitive)
@@ -59,8 +58,7 @@ def classified(accel: Accelerator, rays: RaySet, of_ray: np.ndarray, place: np.n
     arrays.origin, arrays.direction = (upload(rows, wp.vec3, accel.device) for rows in (rays.origins, rays.directions))
     arrays.t_min, arrays.t_max = wp.zeros(len(rays), device=accel.device), upload(rays.t_max, wp.float32, accel.device)
     out = wp.zeros(len(of_ray), dtype=wp.int32, device=accel.device)
-    load_kernel(classify, accel.device)
     indices = [upload(each, wp.int32, accel.device) for each in (of_ray, place)]
-    wp.launch(classify, len(of_ray), [accel.data.primitives, arrays, *indices, out], device=accel.device)
+    launch_on(accel.device, classify, len(of_ray), accel.data.primitives, arrays, *indices, out)
     return out.numpy()
 

@@ -17,10 +17,10 @@ from wrt.accel.cells.kdtree import KdTree
 from wrt.accel.geometry import Geometry
 from wrt.kernels.study.k_hits import KEPT
 from wrt.lab.claims.classics import split_references
+from wrt.lab.claims.memory import cut, schedule
 from wrt.lab.claims.prefetch import AHEAD, Accesses, fully_associative, in_order, replayed, through_caches, through_l2
 from wrt.lab.claims.scenes import hall, statue
 from wrt.lab.claims.stacks import FULL, cloud, k_walk, short_walk
-from wrt.lab.claims.treelets import cut, schedule
 from wrt.lab.claims.walks import NODE_BYTES, Rays, Rules, Tree, Walk, build_tree, tree_of, walk
 from wrt.lab.claims.warps import LOOP_NAMES, helped, looped, repacked
 from wrt.lab.rtcore.caches import LINE, Cache
