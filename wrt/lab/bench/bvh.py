@@ -55,8 +55,10 @@ def groups(plan: Plan) -> Groups:
     for mesh in map(as_mesh, plan.meshes):
         geometry = Geometry.of(mesh)
         rays = cache(partial(inward, geometry, plan.rays, plan.seed))
-        for measure in (*(partial(builder_rows, builder) for builder in plan.builders or BVH_BUILDERS), volume_rows):
-            yield partial(mesh_rows, mesh_name(mesh), geometry, rays, partial(measure, plan))
+        measures: list[Measure] = [partial(builder_rows, plan, builder) for builder in plan.builders or BVH_BUILDERS]
+        measures.append(partial(volume_rows, plan))
+        for measure in measures:
+            yield partial(mesh_rows, mesh_name(mesh), geometry, rays, measure)
 
 
 def mesh_rows(mesh: str, geometry: Geometry, rays: Callable[[], RaySet], measure: Measure) -> list[Row]:
@@ -78,7 +80,7 @@ def inward(geometry: Geometry, n: int, seed: int = 0) -> RaySet:
     return RaySet("inward", origins[:n], directions[:n], endless(n))
 
 
-def builder_rows(name: str, plan: Plan, geometry: Geometry, rays: RaySet) -> Iterator[dict[str, object]]:
+def builder_rows(plan: Plan, name: str, geometry: Geometry, rays: RaySet) -> Iterator[dict[str, object]]:
     small = Geometry(geometry.vertices, geometry.faces[:64], geometry.spheres)
     build_binary(small, BvhOptions(name), 1)  # compiles the kernels
     grow = partial(build_binary, geometry, BvhOptions(name), thread_count(plan.threads))
