@@ -1,5 +1,7 @@
 """Closest hits with gradients for JAX: `wrt.jax.closest_hit`."""
 
+from __future__ import annotations
+
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def closest_hit(accel: OneMesh, vertices: ArrayLike | None, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0,
-                t_max: ArrayLike = np.inf, *, rebuild_at: float = 2.0) -> "HitTensors[Array]":
+                t_max: ArrayLike = np.inf, *, rebuild_at: float = 2.0) -> HitTensors[Array]:
     """Find the closest hit of each ray, with gradients, also in jax.jit, jax.grad and jax.vmap.
 
     A callback on the host queries the structure, which is a constant of the traced function. JAX wraps exceptions of the callback.

@@ -1,5 +1,7 @@
 """Closest hits with gradients for PyTorch: `wrt.torch.closest_hit`."""
 
+from __future__ import annotations
+
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -14,8 +16,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-def closest_hit(accel: OneMesh, vertices: "Tensor | None", origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0,
-                t_max: ArrayLike = np.inf, *, rebuild_at: float = 2.0) -> "HitTensors[Tensor]":
+def closest_hit(accel: OneMesh, vertices: Tensor | None, origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike = 0.0,
+                t_max: ArrayLike = np.inf, *, rebuild_at: float = 2.0) -> HitTensors[Tensor]:
     """Find the closest hit of each ray, with gradients of t, u, v and point at fixed prim_id.
 
     Gradients are computed in float64 on the CPU and have the same bits in every run. Gradients of misses are 0. There are no

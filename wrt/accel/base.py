@@ -1,5 +1,7 @@
 """Structures over one mesh: construction, refits, files."""
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from copy import copy

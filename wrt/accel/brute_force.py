@@ -1,5 +1,7 @@
 """Test of all primitives: the reference for every structure."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from wrt.accel.base import OneMesh

@@ -1,5 +1,7 @@
 """Triangles in Warp arrays, over which bvh2 is built and refitted without a copy to the host."""
 
+from __future__ import annotations
+
 from functools import cached_property
 
 import numpy as np
@@ -51,7 +53,7 @@ class DeviceGeometry(Geometry):
         if n := int(outside.numpy()[0]):
             raise InputError(f"must be 0 to {len(points) - 1}; {n} triangles have other indices", argument="indices")
 
-    def _set(self, points: WarpArray, indices: WarpArray, spheres: np.ndarray) -> "DeviceGeometry":
+    def _set(self, points: WarpArray, indices: WarpArray, spheres: np.ndarray) -> DeviceGeometry:
         self.__dict__.update(points=points, indices=indices, spheres=spheres)
         return self
 
@@ -63,11 +65,11 @@ class DeviceGeometry(Geometry):
         return array if array.is_contiguous else array.contiguous()
 
     @staticmethod
-    def unchecked(points: WarpArray, indices: WarpArray, spheres: np.ndarray) -> "DeviceGeometry":
+    def unchecked(points: WarpArray, indices: WarpArray, spheres: np.ndarray) -> DeviceGeometry:
         """Make a geometry from arrays that are known to be valid. indices: (F,) of vec3i; spheres: as in Geometry."""
         return DeviceGeometry.__new__(DeviceGeometry)._set(points, indices, spheres)
 
-    def unshared(self) -> "DeviceGeometry":
+    def unshared(self) -> DeviceGeometry:
         """Return the geometry with a copy of the points."""
         return DeviceGeometry.unchecked(wp.clone(self.points), self.indices, self.spheres)
 

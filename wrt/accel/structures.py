@@ -1,5 +1,7 @@
 """Table of acceleration structures: name -> module and class. Modules are imported on first use: `--help` does not wait for Warp."""
 
+from __future__ import annotations
+
 from typing import Any
 
 from wrt.core import cuda

@@ -1,5 +1,7 @@
 """Closest hits for PyTorch and JAX: shared code of wrt.torch and wrt.jax."""
 
+from __future__ import annotations
+
 import importlib
 from types import ModuleType
 from typing import Any, Generic, NamedTuple

@@ -1,5 +1,7 @@
 """Exchange of trees with other builders: what structures over one mesh have in common."""
 
+from __future__ import annotations
+
 from abc import abstractmethod
 from typing import Any, ClassVar, Self
 

@@ -3,6 +3,8 @@
 >>> from wrt.compat.open3d import RaycastingScene          # in place of open3d.t.geometry.RaycastingScene
 """
 
+from __future__ import annotations
+
 import math
 import sys
 from contextlib import suppress
@@ -40,7 +42,7 @@ class Array(np.ndarray):
         """Return a plain array that shares the memory."""
         return self.view(np.ndarray)
 
-    def cpu(self) -> "Array":
+    def cpu(self) -> Array:
         """Return the array itself."""
         return self
 

@@ -1,5 +1,7 @@
 """InputError, for every mistake of a user: the command line prints its message and exits with code 2. SceneWarning, for scene files."""
 
+from __future__ import annotations
+
 import copy
 import os
 import re

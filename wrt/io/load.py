@@ -1,5 +1,7 @@
 """Readers of scene files: TOML, glTF, or a mesh alone."""
 
+from __future__ import annotations
+
 import os
 import re
 import tomllib

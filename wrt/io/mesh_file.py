@@ -1,5 +1,7 @@
 """Reading of mesh files. MESH_FORMATS has a reader for each suffix."""
 
+from __future__ import annotations
+
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

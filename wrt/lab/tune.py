@@ -1,5 +1,7 @@
 """`wrt.tune`: find the fastest structure on a device; on CUDA also its best block size and memory for the traversal stack."""
 
+from __future__ import annotations
+
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -1,5 +1,7 @@
 """Film, the result of a render: pixels, variance and AOVs; their display and their files."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,5 +1,7 @@
 """Options of a render beyond the scene, and the progress that it reports."""
 
+from __future__ import annotations
+
 import math
 import os
 from collections.abc import Callable, Sequence
@@ -95,7 +97,7 @@ class Options:
     checkpoint_every: float = 60.0
     resume: bool = False
     devices: Sequence[str] | None = None
-    executor: "Executor | Client | None" = None
+    executor: Executor | Client | None = None
 
     def __post_init__(self) -> None:
         for name in ("accel", "device", "triangle", "box", "instancing"):
@@ -176,4 +178,4 @@ class RenderOptions(SettingChanges, total=False):
     checkpoint_every: float
     resume: bool
     devices: Sequence[str] | None
-    executor: "Executor | Client | None"
+    executor: Executor | Client | None

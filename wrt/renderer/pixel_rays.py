@@ -1,5 +1,7 @@
 """The camera rays of a picture as arrays, for ray queries."""
 
+from __future__ import annotations
+
 from importlib import import_module
 
 import numpy as np

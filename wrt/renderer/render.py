@@ -1,5 +1,7 @@
 """`wrt.render`: render a scene to a film in one call, on one device or with several workers."""
 
+from __future__ import annotations
+
 import os
 from typing import Any, Unpack
 

@@ -1,5 +1,7 @@
 """Backgrounds: the radiance of rays that hit nothing. One class and one entry of BACKGROUNDS for each kind."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Cameras: one class and one entry of CAMERAS for each kind."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Self

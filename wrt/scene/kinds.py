@@ -1,5 +1,7 @@
 """Descriptions of dataclass fields, for Python, for scene files and for the reference page; the base class of lights and backgrounds."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable
 from dataclasses import Field, fields, replace

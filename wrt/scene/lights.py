@@ -1,5 +1,7 @@
 """Lights without a surface: one class and one entry of LIGHTS for each kind. Area lights are surfaces with an emissive material."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass, field
 

@@ -1,5 +1,7 @@
 """Materials of surfaces, and their textures."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
 from typing import NamedTuple
 

@@ -1,5 +1,7 @@
 """Triangle meshes, validated on construction, and their conversion from and to trimesh."""
 
+from __future__ import annotations
+
 import io
 from dataclasses import dataclass
 from functools import cached_property
@@ -87,7 +89,7 @@ class Mesh:
         return array
 
     @classmethod
-    def from_trimesh(cls, mesh: "trimesh.Trimesh | trimesh.Scene", smooth: bool = False) -> "Mesh":
+    def from_trimesh(cls, mesh: trimesh.Trimesh | trimesh.Scene, smooth: bool = False) -> Mesh:
         """Return the triangles of a trimesh mesh, or of a whole trimesh scene in world space.
 
         The result has the texture coordinates of the mesh, if there are any, and its vertex normals if `smooth`. Faces without area
@@ -105,7 +107,7 @@ class Mesh:
         return cls(np.array(mesh.vertices), np.array(mesh.faces), np.array(mesh.vertex_normals) if smooth else None, uvs,
                    name=str(getattr(source, "file_name", None) or ""))
 
-    def to_trimesh(self) -> "trimesh.Trimesh":
+    def to_trimesh(self) -> trimesh.Trimesh:
         """Return a trimesh mesh with the same vertices and faces in the same order, and with normals and uvs if there are any."""
         with needed_by("a mesh of trimesh"):
             import trimesh

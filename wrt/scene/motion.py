@@ -1,5 +1,7 @@
 """Movement of an object within one period of an animation."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass, field, replace
 

@@ -1,5 +1,7 @@
 """Settings of a picture: size, samples, bounces, filter, tone mapping."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field, fields
 from typing import TypedDict
 

@@ -2,6 +2,8 @@
 
 `SHAPES` names the shapes of scene files. Every function raises InputError for an argument that is out of range."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Sequence
 

@@ -1,5 +1,7 @@
 """Pictures in a notebook: a running render, and several pictures side by side."""
 
+from __future__ import annotations
+
 import base64
 import html
 import time
@@ -79,7 +81,7 @@ class LiveView:
 TITLE, GAP = 22, 8  # pixels: height of a title above a picture, and space between pictures
 
 
-def side_by_side(pictures: Mapping[str, Film | np.ndarray], columns: int = 2, scale: int = 1) -> "Image.Image":
+def side_by_side(pictures: Mapping[str, Film | np.ndarray], columns: int = 2, scale: int = 1) -> Image.Image:
     """Return an image of several pictures in rows, with a title above each picture.
 
     Parameters

@@ -1,5 +1,7 @@
 """bvh6: a wide BVH as in ray tracing units: six children in a node of 64 bytes, one primitive per leaf."""
 
+from __future__ import annotations
+
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np

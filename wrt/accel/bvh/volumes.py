@@ -1,5 +1,7 @@
 """Binary BVHs with other bounding volumes: the trees of bvh2, with spheres or 14-DOPs in place of boxes."""
 
+from __future__ import annotations
+
 import numpy as np
 import warp as wp
 

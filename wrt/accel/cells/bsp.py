@@ -1,5 +1,7 @@
 """BSP tree: cells are split by planes of any orientation (kernels: kernels/build/bsp*.py)."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from functools import partial

@@ -1,5 +1,7 @@
 """Uniform grid: cells of one size, each with a list of the primitives that overlap it."""
 
+from __future__ import annotations
+
 import warnings
 from dataclasses import dataclass
 

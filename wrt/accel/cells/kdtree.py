@@ -1,5 +1,7 @@
 """The k-d tree: axis-aligned planes split space, and every leaf lists the primitives that overlap it."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from wrt.accel.base import OneMesh

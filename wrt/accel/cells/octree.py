@@ -1,5 +1,7 @@
 """Octree: a cell with many primitives is split into eight octants. An empty octant takes no memory."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from wrt.accel.base import OneMesh

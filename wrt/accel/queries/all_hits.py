@@ -1,5 +1,7 @@
 """All hits of a ray in order of distance."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, TypeVar, Unpack, overload
@@ -122,14 +124,14 @@ class ListQuery:
             vertices, faces = surfaces.vertices, surfaces.faces
         self.mesh: Mesh = (vertices, faces, first_face) if crossings else (None, None, first_face)
 
-    def of_valid(self, rays: Rays) -> "ListQuery":
+    def of_valid(self, rays: Rays) -> ListQuery:
         """Set rays that are valid: contiguous NumPy arrays of float32. Not over several worlds."""
         self.n, self.rays = len(rays.origins), rays if self.device.is_cpu else arrays_on(self.device, rays)
         self.roots = roots_of(self.snapshot, None, self.n)
         return self
 
     def of(self, origins: ArrayLike, directions: ArrayLike | None, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
-           world: ArrayLike | None = None) -> "ListQuery":
+           world: ArrayLike | None = None) -> ListQuery:
         """Set the rays. Raises InputError that names the argument."""
         if are_rows(origins, directions):
             rays = rays_of(origins, directions, t_min, t_max)  # type: ignore[arg-type]

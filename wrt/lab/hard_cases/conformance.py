@@ -1,5 +1,7 @@
 """Test the closest-hit function of any ray library on the hard cases; the oracle judges each ray."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any

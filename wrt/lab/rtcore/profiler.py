@@ -1,5 +1,7 @@
 """`wrt.profile`: record every ray of a picture, with its counters and the addresses of its fetches."""
 
+from __future__ import annotations
+
 import os
 import threading
 import time
@@ -106,7 +108,7 @@ class Profile:
             sums[f"probes_{kind}"] = np.bincount(rays.pixel, rays.kind == i, n) / self.spp
         return {name: value.reshape(self.size[1], self.size[0]) for name, value in sums.items()}
 
-    def heatmap(self, name: str) -> "Image.Image":
+    def heatmap(self, name: str) -> Image.Image:
         """Return a map of `maps` as a PIL image with a colour scale. Raise InputError for an unknown name."""
         with needed_by("a heat map"):
             from PIL import Image

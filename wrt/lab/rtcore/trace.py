@@ -2,6 +2,8 @@
 
 docs/rt_core.md describes the arrays and shows how to add an idea for hardware. The steps come from the recorder of `wrt.walk`."""
 
+from __future__ import annotations
+
 import io
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -150,7 +152,7 @@ class Trace:
             raise InputError("the trace has no fetches")
         return predict(self.work(), GPUS[gpu], core)
 
-    def with_prefetches(self, after: ArrayLike, address: ArrayLike, size: ArrayLike) -> "Trace":
+    def with_prefetches(self, after: ArrayLike, address: ArrayLike, size: ArrayLike) -> Trace:
         """Return the trace with more prefetches, (P,) arrays in any order: index of the fetch that starts each one, first byte, bytes."""
         added = [np.atleast_1d(np.asarray(each, np.int64)) for each in (after, address, size)]
         if len({len(each) for each in added}) > 1:
@@ -160,7 +162,7 @@ class Trace:
         order = np.argsort(both[0], kind="stable")
         return replace(self, prefetch_after=both[0][order], prefetch_address=both[1][order], prefetch_size=both[2][order])
 
-    def keep(self, mask: ArrayLike) -> "Trace":
+    def keep(self, mask: ArrayLike) -> Trace:
         """Return the trace of only some fetches, with their children and prefetches. mask: (M,) bool."""
         rows = np.asarray(mask)
         if rows.shape != self.address.shape or rows.dtype != bool:
@@ -191,7 +193,7 @@ class Trace:
         write_bytes(path, data.getvalue())
 
     @classmethod
-    def load(cls, path: PathLike) -> "Trace":
+    def load(cls, path: PathLike) -> Trace:
         """Read a trace that `save` wrote. Raises InputError if the file is missing, damaged, or not a trace."""
         require_file(as_path(path, "path"))
         try:

@@ -1,5 +1,7 @@
 """One ray through a structure, step by step: `wrt.walk`. The steps come from the recorder that counts, as those of `wrt.trace`."""
 
+from __future__ import annotations
+
 import json
 import math
 from typing import TYPE_CHECKING
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
 class Walk(WalkRecord):
     __doc__ = WalkRecord.__doc__
 
-    def draw(self, axes: "Axes | None" = None, step: int | None = None) -> "Axes":
+    def draw(self, axes: Axes | None = None, step: int | None = None) -> Axes:
         """Draw the walk up to a step, in the plane through the ray, as wrt.lab.walk.drawing.draw describes.
 
         Parameters

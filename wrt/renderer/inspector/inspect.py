@@ -1,5 +1,7 @@
 """`wrt.inspect`: every ray of one pixel, as the renderer traces it."""
 
+from __future__ import annotations
+
 import os
 from dataclasses import replace
 from typing import Any, Unpack

@@ -1,5 +1,7 @@
 """LiDARs as arrays of rays: by their angles, or by the name of a device."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Any
 

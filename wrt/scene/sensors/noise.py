@@ -1,5 +1,7 @@
 """Noise of range sensors."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import numpy as np
