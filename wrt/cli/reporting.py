@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import MISSING, dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, get_origin
+from typing import TYPE_CHECKING, Any, TypeVar, get_origin, get_type_hints
 
 import click
 from click.core import ParameterSource
@@ -168,16 +168,18 @@ def planned(plan: type[Plan]) -> Decorator:
             values |= smaller
         return plan(**values)
 
+    types = get_type_hints(plan)
     flag = click.option("--quick", is_flag=True, help="Get rough figures soon: use smaller defaults, and list them on stderr")
-    return option_group("plan", make, ["quick", *names_of(plan)], [*map(parameter, dataclasses.fields(plan)[::-1]), flag])
+    parameters = [parameter(each, types[each.name]) for each in dataclasses.fields(plan)]
+    return option_group("plan", make, ["quick", *names_of(plan)], [*parameters[::-1], flag])
 
 
-def parameter(each: dataclasses.Field[object]) -> Decorator:
+def parameter(each: dataclasses.Field[object], of_type: object) -> Decorator:
     """Return a decorator that adds a plan's field `each` to a command, as an argument or an option."""
     known, needed = each.metadata, each.default is MISSING
-    kind = TYPES.get(each.type, click.Path(path_type=Path))
+    kind = TYPES.get(of_type, click.Path(path_type=Path))
     if not known["text"]:
-        several: dict[str, Any] = {"nargs": -1, "required": needed} if get_origin(each.type) is Sequence else {}
+        several: dict[str, Any] = {"nargs": -1, "required": needed} if get_origin(of_type) is Sequence else {}
         kind = OneOf(known["of"][1]) if known["of"] else str if each.name == "cases" else kind
         return click.argument(each.name, type=kind, metavar=each.name.upper() if known["of"] else None, **several)
     flag = f"--{each.name.replace('_', '-')}"
