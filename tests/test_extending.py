@@ -1,4 +1,4 @@
-"""The instructions of docs/extending.md work: their code blocks are applied to a copy of the project, and run, as are docs/extensions."""
+"""The instructions of docs/extending.md work: their edits are applied to a copy of the project and run, as are docs/extensions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 from tests.data import ROOT
 
 EXTENSIONS = ROOT / "docs" / "extensions"
-BLOCK = re.compile(r"^```(python|diff)\n# (\S+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+BLOCK = re.compile(r"^```diff\n# (\S+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 TRY_IT = """
 import numpy as np, stored_normal, wrt
@@ -225,22 +225,17 @@ material = "glow"
 
 
 def apply(copy: Path) -> None:
-    """Write the files and apply the diffs of docs/extending.md. The old lines of a diff must occur exactly once in the file."""
+    """Apply the diffs of docs/extending.md. The old lines of a diff must occur exactly once in the file."""
     text = (ROOT / "docs" / "extending.md").read_text()
     blocks = BLOCK.findall(text)
     assert 2 * len(blocks) == text.count("```"), "a block names no file"
-    for kind, name, body in blocks:
-        path = copy / name
-        if kind != "diff":
-            assert not path.exists()
-            path.write_text(body)
-        else:
-            lines = body.splitlines()
-            old = "\n".join(line[1:] for line in lines if line[:1] in (" ", "-")) + "\n"
-            new = "\n".join(line[1:] for line in lines if line[:1] in (" ", "+")) + "\n"
-            before = path.read_text()
-            assert before.count("\n" + old) == 1, f"{name}: {old}"
-            path.write_text(before.replace("\n" + old, "\n" + new))
+    for name, body in blocks:
+        lines = body.splitlines()
+        old = "\n".join(line[1:] for line in lines if line[:1] in (" ", "-")) + "\n"
+        new = "\n".join(line[1:] for line in lines if line[:1] in (" ", "+")) + "\n"
+        before = (copy / name).read_text()
+        assert before.count("\n" + old) == 1, f"{name}: {old}"
+        (copy / name).write_text(before.replace("\n" + old, "\n" + new))
 
 
 def python(folder: Path, *arguments: str, path: Path | str = "") -> str:
@@ -253,6 +248,7 @@ def python(folder: Path, *arguments: str, path: Path | str = "") -> str:
 def test_the_text_can_be_followed(tmp_path: Path) -> None:
     for folder in ("wrt", "kernels"):
         shutil.copytree(ROOT / folder, tmp_path / folder, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(EXTENSIONS / "structure", tmp_path, dirs_exist_ok=True)
     apply(tmp_path)
     for file in (ROOT / "tests" / "stored_normal.py", EXTENSIONS / "beam.py", EXTENSIONS / "horizon.py"):
         shutil.copy(file, tmp_path)
