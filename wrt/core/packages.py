@@ -11,7 +11,7 @@ from wrt.core.errors import InputError
 INSTALLED_AS = {"OpenImageIO": "openimageio", "PIL": "pillow", "mapbox_earcut": "mapbox-earcut"}
 # Modules that only an extra of wrt installs, and the extra; tests/wrt/core/test_packages.py compares with pyproject.toml.
 EXTRAS = {"DracoPy": "draco", "distributed": "cluster", "elftools": "instructions", "embreex": "peers", "jax": "jax", "matplotlib": "plots",
-          "mitsuba": "peers", "pyarrow": "tables", "pyvista": "pyvista", "torch": "torch", "websockets": "viewer"}
+          "meshopt": "meshopt", "mitsuba": "peers", "pyarrow": "tables", "pyvista": "pyvista", "torch": "torch", "websockets": "viewer"}
 
 
 @contextmanager

@@ -21,7 +21,8 @@ from wrt.core.errors import InputError, at
 from wrt.core.files import read_file, utf8
 from wrt.core.packages import needed_by
 from wrt.core.types import JsonObject, PathLike
-from wrt.io.gltf.schema import read_as
+from wrt.io.gltf import meshopt
+from wrt.io.gltf.schema import MeshoptView, read_as
 
 T = TypeVar("T")
 GltfObject: TypeAlias = Any  # a dataclass of pygltflib, which has no types
@@ -32,7 +33,7 @@ SUPPORTED_EXTENSIONS = frozenset({
     "KHR_lights_punctual", "KHR_draco_mesh_compression", "KHR_texture_transform", "KHR_mesh_quantization", "EXT_mesh_gpu_instancing",
     "KHR_materials_transmission", "KHR_materials_volume", "KHR_materials_ior", "KHR_materials_emissive_strength",
     "KHR_materials_unlit", "KHR_materials_specular", "KHR_materials_clearcoat", "KHR_materials_pbrSpecularGlossiness",
-    "EXT_texture_webp", "EXT_texture_avif",
+    "EXT_texture_webp", "EXT_texture_avif", *meshopt.NAMES,
 })
 # Extensions that describe the file or its use, and change no pixel.
 METADATA_EXTENSIONS = frozenset({
@@ -42,9 +43,7 @@ METADATA_EXTENSIONS = frozenset({
     "MSFT_lod",
 })
 DEFAULT_LOOK = frozenset({"KHR_materials_variants"})  # wrt shows the default look
-_CODECS = frozenset({
-    "EXT_meshopt_compression", "KHR_meshopt_compression", "KHR_texture_basisu", "MSFT_texture_dds",
-})
+_CODECS = frozenset({"KHR_texture_basisu", "MSFT_texture_dds"})
 
 
 class LeftOut:
@@ -95,6 +94,7 @@ class Document:
         _check_required_extensions(self.gltf.extensionsRequired)
         self.left_out = LeftOut()
         self._buffers: dict[int, np.ndarray] = {}
+        self._decoded: dict[int, np.ndarray] = {}  # compressed buffer views
 
     def item(self, array: str, index: int, place: str) -> GltfObject:
         """Return `gltf.<array>[index]`. Raises InputError at `place` if the index is out of range."""
@@ -110,8 +110,18 @@ class Document:
 
     def view(self, index: int, place: str) -> tuple[np.ndarray, int | None]:
         """Return the bytes (N,) uint8 of a buffer view, and its stride in bytes or None."""
-        view = self.item("bufferViews", index, place)
-        where = f"bufferViews[{index}]"
+        view, where = self.item("bufferViews", index, place), f"bufferViews[{index}]"
+        for name in meshopt.NAMES:
+            compressed = self.extension(view, name, MeshoptView, where) if name in (self.gltf.extensionsRequired or ()) else None
+            if compressed is not None:
+                if index not in self._decoded:
+                    inside = f"{where}.extensions.{name}"
+                    self._decoded[index] = meshopt.decode(self._slice(compressed, inside), compressed, view.byteLength, inside)
+                return self._decoded[index], view.byteStride
+        return self._slice(view, where), view.byteStride
+
+    def _slice(self, view: GltfObject, where: str) -> np.ndarray:
+        """Return the bytes of a buffer from `byteOffset` on."""
         data = self._buffer(view.buffer, f"{where}.buffer")
         start, length = view.byteOffset or 0, view.byteLength
         if length < 1:
@@ -119,7 +129,7 @@ class Document:
         if start < 0 or start + length > len(data):
             raise InputError(f"bytes {start} to {start + length} reach outside of buffers[{view.buffer}], "
                              f"which has {len(data)} bytes", place=where)
-        return data[start:start + length], view.byteStride
+        return data[start:start + length]
 
     def _buffer(self, index: int, place: str) -> np.ndarray:
         if index not in self._buffers:

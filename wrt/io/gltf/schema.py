@@ -127,6 +127,17 @@ class DracoMesh:
 
 
 @dataclass
+class MeshoptView:
+    buffer: int
+    byteLength: int
+    byteStride: int
+    count: int
+    mode: str
+    byteOffset: int = 0
+    filter: str = "NONE"
+
+
+@dataclass
 class Instancing:
     attributes: dict[str, int] = field(default_factory=dict)
 
