@@ -18,8 +18,7 @@ from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.ray_query import kernel_argument
 from wrt.accel.store import save_instances
 from wrt.accel.structure import Structure
-from wrt.accel.top_level import BOXES, MOVED_BOXES, Boxes, build_top, part_boxes, refit_top, world_boxes
-from wrt.accel.wide_top import widen
+from wrt.accel.top_level import BOXES, MOVED_BOXES, Boxes, build_top, part_boxes, refit_top, widen, world_boxes
 from wrt.core.arrays import real_numbers, to_warp
 from wrt.core.checks import shown
 from wrt.core.default_device import DEFAULT_DEVICE

@@ -16,7 +16,7 @@ INCHES, DOTS = (4.4, 3.5), 150  # size of a drawing, and its pixels per inch
 
 
 class Step(Protocol):
-    """A step of a walk, as wrt.lab.walk.step.WalkStep."""
+    """A step of a walk, as wrt.lab.walk.record.WalkStep."""
 
     @property
     def text(self) -> str: ...

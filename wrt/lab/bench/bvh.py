@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
-from time import perf_counter, process_time
+from time import process_time
 
 import numpy as np
 import warp as wp
@@ -24,7 +24,7 @@ from wrt.kernels.traverse.bvh2_sphere import sphere_volumes
 from wrt.lab.bench.accel import differing
 from wrt.lab.bench.rays import RaySet, ball_around, endless, mean_counters, unit
 from wrt.lab.bench.report import Columns, Groups, Part, Row, cells, grouped, mesh_name, tabled
-from wrt.lab.bench.timing import alternate, peak_bytes, spread
+from wrt.lab.bench.timing import alternate, peak_bytes, spread, with_seconds
 from wrt.lab.plans import Bvh as Plan
 
 Measure = Callable[[Geometry, RaySet], Iterator[dict[str, object]]]
@@ -85,11 +85,8 @@ def builder_rows(plan: Plan, name: str, geometry: Geometry, rays: RaySet) -> Ite
     build_binary(small, BvhOptions(name), 1)  # compiles the kernels
     grow = partial(build_binary, geometry, BvhOptions(name), thread_count(plan.threads))
     _, peak = peak_bytes(grow)
-    seconds, cpu_begin = [], process_time()
-    for _ in range(plan.builds):
-        begin = perf_counter()
-        grow()
-        seconds.append(perf_counter() - begin)
+    cpu_begin = process_time()
+    seconds = [with_seconds(grow)[1] for _ in range(plan.builds)]
     cpu_seconds = (process_time() - cpu_begin) / plan.builds
     accel = build(geometry, "bvh2", builder=name)
     yield {"builder": name, "sah_cost": accel.stats.sah_cost, "cost": published_cost(accel, rays), "peak_bytes": peak,

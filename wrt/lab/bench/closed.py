@@ -4,7 +4,6 @@ import importlib
 import importlib.util
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from time import perf_counter
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from wrt.accel.scenes.build import build
 from wrt.core.errors import InputError
 from wrt.io.mesh_file import as_mesh
 from wrt.lab.bench.report import Columns, Groups, Part, Row, mesh_name, tabled
+from wrt.lab.bench.timing import with_seconds
 from wrt.lab.hard_cases.common import targets, unit_vectors
 from wrt.lab.oracle.oracle import Place, Reference, reference_of
 from wrt.lab.plans import Closed as Plan
@@ -89,9 +89,8 @@ def points_wrong(geometry: Geometry, reference: Reference, answer: Answer, n: in
     rng, wrong, touching, seconds = np.random.default_rng(seed), 0, 0, 0.0
     for first in range(0, n, CHUNK):
         points = points_in(geometry, rng, min(CHUNK, n - first))
-        begin = perf_counter()
-        inside = answer(points)
-        seconds += perf_counter() - begin
+        inside, taken = with_seconds(partial(answer, points))
+        seconds += taken
         exactly, on_surface = exactly_inside(reference, points, rng)
         differ = np.flatnonzero((inside != exactly) & ~on_surface)
         wrong += len(differ)
@@ -145,9 +144,8 @@ def crossed(geometry: Geometry, accel: Accelerator, count: Answer, own: bool, n:
         origins = (0.5 * (low + high) + 1.5 * np.linalg.norm(high - low) * unit_vectors(rng, size)).astype(np.float32)
         at = np.where(np.arange(size)[:, None] % 2 == 0, *(targets(geometry, rng, size, aim) for aim in ("vertices", "edges")))
         directions = (at - origins).astype(np.float32)
-        begin = perf_counter()
-        crossings = np.asarray(count(origins, directions))
-        seconds, hits = seconds + perf_counter() - begin, hits + int(crossings.sum())
+        crossings, taken = with_seconds(lambda o=origins, d=directions: np.asarray(count(o, d)))
+        seconds, hits = seconds + taken, hits + int(crossings.sum())
         touches = crossings_of(geometry, all_hits(accel, origins, directions), directions)[1] > 0
         touching += int(touches.sum())
         wrong += int((crossings % 2 == 1)[~touches | own].sum())

@@ -27,8 +27,8 @@ class Tiles(NamedTuple):
     world: np.ndarray
 
 
-class TileLibrary(NamedTuple):
-    """A library with its worlds. work: the function to time; found: from its result to t, (N,), infinite where a ray misses."""
+class PeerQuery(NamedTuple):
+    """A library with its structures. work: the function to time; found: from its result to lengths (N,), infinite where there is none."""
 
     name: str
     work: Callable[[], Any]
@@ -56,14 +56,14 @@ def tiles(worlds: int) -> Tiles:
     return Tiles(np.tile(np.array([0.0, 2.5, 4.0], np.float32), (len(world), 1)), np.tile(one, (worlds, 1)), world)
 
 
-def of_wrt(worlds: Sequence[Mesh], rays: Tiles, device: str, threads: int) -> TileLibrary:
+def of_wrt(worlds: Sequence[Mesh], rays: Tiles, device: str, threads: int) -> PeerQuery:
     accel = build(list(worlds), device=device)
     o, d, world = uploaded(rays, device)
 
-    return TileLibrary("wrt bvh8, worlds", lambda: accel.closest_hit(o, d, threads=threads, world=world), lambda hits: hits.t.numpy())
+    return PeerQuery("wrt bvh8, worlds", lambda: accel.closest_hit(o, d, threads=threads, world=world), lambda hits: hits.t.numpy())
 
 
-def of_warp(worlds: Sequence[Mesh], rays: Tiles, device: str, constructor: str) -> TileLibrary:
+def of_warp(worlds: Sequence[Mesh], rays: Tiles, device: str, constructor: str) -> PeerQuery:
     place = start(device)
     meshes = [wp.Mesh(points=wp.array(mesh.vertices, dtype=wp.vec3, device=place), bvh_constructor=constructor,
                       indices=wp.array(mesh.faces.ravel(), dtype=wp.int32, device=place)) for mesh in worlds]
@@ -76,14 +76,14 @@ def of_warp(worlds: Sequence[Mesh], rays: Tiles, device: str, constructor: str) 
         wp.launch(warp_worlds_query, dim=len(o), inputs=[ids, world, o, d, *out], device=place)
         return out
 
-    return TileLibrary(f"Warp mesh_query_ray, {constructor}, a mesh a world", work, lambda out: out[0].numpy())
+    return PeerQuery(f"Warp mesh_query_ray, {constructor}, a mesh a world", work, lambda out: out[0].numpy())
 
 
 def uploaded(rays: Tiles, device: str) -> list[wp.array]:
     return [wp.array(array, dtype=dtype, device=start(device)) for array, dtype in zip(rays, (wp.vec3, wp.vec3, wp.int32), strict=True)]
 
 
-def libraries(worlds: Sequence[Mesh], rays: Tiles, device: str, threads: int) -> list[Callable[[], TileLibrary]]:
+def libraries(worlds: Sequence[Mesh], rays: Tiles, device: str, threads: int) -> list[Callable[[], PeerQuery]]:
     """Return a function for each library that builds its structures; Warp uses one thread on the CPU."""
     warp = [partial(of_warp, worlds, rays, device, constructor) for constructor in constructors(device)]
     return [partial(of_wrt, worlds, rays, device, threads), *(warp if threads == 1 else [])]

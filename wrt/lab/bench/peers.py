@@ -21,7 +21,7 @@ from wrt.lab.bench.instruction_sets import instruction_sets
 from wrt.lab.bench.plot import bars
 from wrt.lab.bench.rays import RAY_KINDS, RaySet, ray_sets
 from wrt.lab.bench.report import Columns, Groups, Part, Row, grouped, machine_line, mesh_name, tabled, versions
-from wrt.lab.bench.timing import alternate_on, spread
+from wrt.lab.bench.timing import alternate_on, spread, with_seconds
 from wrt.lab.hard_cases import tinybvh
 from wrt.lab.hard_cases.contestants import RIVALS, Algorithm, Own, Peer
 from wrt.lab.plans import Peers as Plan
@@ -91,11 +91,8 @@ class Prepared(NamedTuple):
 
 
 def prepared(plan: Plan, geometry: Geometry) -> Prepared:
-    algorithms, seconds = contestants(plan), []
-    for algorithm in algorithms:
-        begin = perf_counter()
-        algorithm.prepare(geometry)
-        seconds.append(perf_counter() - begin)
+    algorithms = contestants(plan)
+    seconds = [with_seconds(partial(algorithm.prepare, geometry))[1] for algorithm in algorithms]
     return Prepared(algorithms, seconds, ray_sets(cast(Own, algorithms[0]).accel, plan.rays, plan.seed))
 
 
@@ -151,33 +148,29 @@ def point_rows(plan: Plan, geometry: Geometry, threads: int) -> Iterator[dict[st
     points = peer_points.points_around(geometry, plan.rays, plan.seed)
     chosen = [each for name, each in peer_points.LIBRARIES.items() if each.is_installed() and (each.on_gpu or plan.device == "cpu")
               and (name == "wrt" or not plan.rivals or name in plan.rivals)]
-    libraries, queries, builds = [each for each in chosen if each.has_threads or threads == 1], [], []
-    for library in libraries:
-        begin = perf_counter()
-        queries.append(library.prepare(geometry, plan.device))
-        builds.append(perf_counter() - begin)
-    works = [partial(query, points, threads) for query in queries]
-    found = [work() for work in works]
-    for i, measured in enumerate(timed(works, len(points), threads, plan.runs, plan.device)):
-        name = libraries[i].name
-        yield {"kind": "points", "rays": len(points), "name": name, "library": name, "build": builds[i], "threads": threads,
-               "hit": 1.0, **measured, "differ": different_lengths(found[i], found[0])}
+    libraries = [each for each in chosen if each.has_threads or threads == 1]
+    made = [with_seconds(partial(each.prepare, geometry, plan.device)) for each in libraries]
+    queries = [(peer_tiles.PeerQuery(each.name, partial(query, points, threads), np.asarray), seconds)
+               for each, (query, seconds) in zip(libraries, made, strict=True)]
+    return length_rows(plan, "points", len(points), threads, queries)
 
 
 def tile_rows(plan: Plan, worlds: Sequence[Mesh], threads: int) -> Iterator[dict[str, object]]:
     """Yield the figures of each library for a picture of each world."""
     rays = peer_tiles.tiles(len(worlds))
-    libraries, builds = [], []
-    for make in peer_tiles.libraries(worlds, rays, plan.device, threads):
-        begin = perf_counter()
-        libraries.append(make())
-        builds.append(perf_counter() - begin)
-    found = [library.found(library.work()) for library in libraries]
-    for i, measured in enumerate(timed([library.work for library in libraries], len(rays.world), threads, plan.runs, plan.device)):
-        name = libraries[i].name
-        yield {"kind": "tiles", "rays": len(rays.world), "name": name, "library": name.split(",")[0], "build": builds[i],
-               "threads": threads, "hit": float(np.isfinite(found[0]).mean()), **measured,
-               "differ": different_lengths(found[i], found[0])}
+    queries = [with_seconds(make) for make in peer_tiles.libraries(worlds, rays, plan.device, threads)]
+    return length_rows(plan, "tiles", len(rays.world), threads, queries)
+
+
+def length_rows(plan: Plan, kind: str, n: int, threads: int,
+                queries: Sequence[tuple[peer_tiles.PeerQuery, float]]) -> Iterator[dict[str, object]]:
+    """Yield the figures of libraries for n lengths. queries: a query of each library, and the seconds to build its structure."""
+    found = [query.found(query.work()) for query, _ in queries]
+    hit = float(np.isfinite(found[0]).mean())
+    for i, measured in enumerate(timed([query.work for query, _ in queries], n, threads, plan.runs, plan.device)):
+        (name, _, _), build = queries[i]
+        yield {"kind": kind, "rays": n, "name": name, "library": name.split(",")[0], "build": build, "threads": threads, "hit": hit,
+               **measured, "differ": different_lengths(found[i], found[0])}
 
 
 def searching(algorithm: Algorithm, rays: RaySet, threads: int) -> Callable[[], list[object]]:

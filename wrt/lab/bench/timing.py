@@ -52,6 +52,12 @@ def _queued(job: Callable[[], object], device: Device) -> None:
     wp.synchronize_device(device)
 
 
+def with_seconds(work: Callable[[], T]) -> tuple[T, float]:
+    """Return the result of `work` and its wall-clock seconds."""
+    begin = time.perf_counter()
+    return work(), time.perf_counter() - begin
+
+
 def quartiles(values: npt.ArrayLike) -> Quartiles:
     low, middle, high = (float(x) for x in np.quantile(np.asarray(values), (0.25, 0.5, 0.75)))
     return low, middle, high

@@ -15,9 +15,8 @@ from tests.structures import STRUCTURES, families_first
 from wrt.accel.queries.recorded_steps import record_steps
 from wrt.kernels.traverse import steps as of
 from wrt.lab.walk.drawing import section_of
-from wrt.lab.walk.record import counted
+from wrt.lab.walk.record import Entry, counted
 from wrt.lab.walk.regions import Region
-from wrt.lab.walk.step import Entry
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Scene, Sphere
