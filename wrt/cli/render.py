@@ -1,4 +1,4 @@
-"""The command `render`, which makes a picture."""
+"""The command `render`, which makes a picture; its checkpoint, and a second folder for a picture that cannot be written to the first."""
 
 import contextlib
 import os

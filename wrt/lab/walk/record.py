@@ -1,4 +1,4 @@
-"""The record of a walk: its steps with the stack and the closest hit, and their counts."""
+"""The record of a walk: its steps, as values and in words, with the stack and the closest hit, and their counts."""
 
 import math
 from dataclasses import dataclass, fields
