@@ -5,8 +5,6 @@ scene itself (wrt.accel.scene_arrays). The types of the arrays come from the str
 them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from math import prod

@@ -1,5 +1,5 @@
-"""Upper level of instances: a binary tree for each world, all in one array of nodes. For the traversal of many rays (kernels.wide.instances)
-the same trees have nodes with eight children."""
+"""Upper level of instances: a binary tree for each world, all in one array of nodes. For the traversal of many rays
+(kernels.wide.instances) the same trees have nodes with eight children."""
 
 from dataclasses import dataclass, replace
 

@@ -2,8 +2,6 @@
 
 Nothing in such a file is evaluated or unpickled."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Iterable, Iterator

@@ -1,7 +1,5 @@
 """Optional packages: imported when they are needed. The message about a missing package says how to install it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 

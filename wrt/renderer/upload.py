@@ -1,7 +1,5 @@
 """Upload of a scene to a device: geometry, and tables of materials, textures and lights."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from functools import cache

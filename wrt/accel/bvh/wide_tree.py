@@ -1,7 +1,5 @@
 """Wide trees: binary BVHs collapsed into nodes of several children (kernels: kernels/build/wide.py)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rays and points of any leading shape: broadcast and flattened for a query, whose results then get their shape."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Several worlds in one structure: all their objects are instances in one geometry."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

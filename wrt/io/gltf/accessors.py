@@ -3,8 +3,6 @@
 Source: Khronos, glTF 2.0 specification, section 3.6.2 (accessors), and KHR_mesh_quantization for integer positions.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -3,8 +3,6 @@
 Source: Khronos, glTF 2.0 specification, sections 2 (concepts), 3.6 (buffers) and 4 (GLB).
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import re

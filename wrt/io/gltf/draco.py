@@ -3,8 +3,6 @@
 Source: Khronos, KHR_draco_mesh_compression. A file that does not require the extension has plain accessors, which wrt reads instead.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from wrt.core.errors import InputError

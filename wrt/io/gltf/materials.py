@@ -5,8 +5,6 @@ textures are not needed, because rays hit the far side of a volume. Back faces a
 Source: Khronos, glTF 2.0 specification, sections 3.8 (texture data) and 3.9 (materials), and each extension's own text.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

@@ -3,8 +3,6 @@
 Source: Khronos, glTF 2.0 specification, section 3.7; EXT_mesh_gpu_instancing, KHR_mesh_quantization.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The node graph of a glTF file, and the transforms of its nodes. Source: Khronos, glTF 2.0 specification, section 3.5."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

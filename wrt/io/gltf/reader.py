@@ -6,8 +6,6 @@ default scene the first scene is read, and without scenes every root node.
 Source: Khronos, glTF 2.0 specification, section 3; KHR_lights_punctual, EXT_mesh_gpu_instancing, KHR_mesh_quantization.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
