@@ -144,7 +144,7 @@ def crossed(geometry: Geometry, accel: Accelerator, count: Answer, own: bool, n:
         origins = (0.5 * (low + high) + 1.5 * np.linalg.norm(high - low) * unit_vectors(rng, size)).astype(np.float32)
         at = np.where(np.arange(size)[:, None] % 2 == 0, *(targets(geometry, rng, size, aim) for aim in ("vertices", "edges")))
         directions = (at - origins).astype(np.float32)
-        crossings, taken = with_seconds(lambda o=origins, d=directions: np.asarray(count(o, d)))
+        crossings, taken = with_seconds(partial(count, origins, directions))
         seconds, hits = seconds + taken, hits + int(crossings.sum())
         touches = crossings_of(geometry, all_hits(accel, origins, directions), directions)[1] > 0
         touching += int(touches.sum())
