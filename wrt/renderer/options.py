@@ -155,25 +155,35 @@ class Options:
 OPTIONS = tuple(each.name for each in fields(Options))
 
 
-class RenderOptions(SettingChanges, total=False):
-    """The keywords of `render`: the scene's settings, and the fields of Options."""
+class PixelOptions(SettingChanges, total=False):
+    """The keywords of `inspect`: the scene's settings, and those fields of Options that decide on a pixel or on its computation."""
 
     seed: int
     device: str
     accel: str
     threads: int | None
     camera: str | int | CameraKind | None
-    crop: tuple[int, int, int, int] | None
-    aov: str | Sequence[str]
-    time_limit: float | None
-    target_error: float | None
-    tile_size: int | None
-    pass_size: int | None
-    progress: Callable[[Progress], None] | None
     triangle: str
     box: str
     instancing: str
     accel_options: dict[str, object]
+
+
+class ProfileOptions(PixelOptions, total=False):
+    """The keywords of `profile`."""
+
+    crop: tuple[int, int, int, int] | None
+    tile_size: int | None
+    progress: Callable[[Progress], None] | None
+
+
+class RenderOptions(ProfileOptions, total=False):
+    """The keywords of `render`: the scene's settings, and the fields of Options."""
+
+    aov: str | Sequence[str]
+    time_limit: float | None
+    target_error: float | None
+    pass_size: int | None
     checkpoint: str | os.PathLike[str] | None
     checkpoint_every: float
     resume: bool

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Unpack
@@ -25,13 +24,12 @@ from wrt.kernels.study import ray_log
 from wrt.kernels.traverse.counters import SIZE_RANGE, Counts, Recorder
 from wrt.lab.costs import COUNTERS, CostCounter
 from wrt.lab.rtcore.caches import distinct_lines
-from wrt.renderer.options import Options, Progress
+from wrt.renderer.options import Options, ProfileOptions, Progress
 from wrt.renderer.plan import plan_of
 from wrt.renderer.tiles import Rectangle
-from wrt.scene.cameras import CameraKind
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Scene
-from wrt.scene.settings import SETTINGS, SettingChanges
+from wrt.scene.settings import SETTINGS
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -145,23 +143,6 @@ class Profile:
         columns |= {f"{name[0]}{axis}": logged[name][:, i] for name in ("origin", "direction") for i, axis in enumerate("xyz")}
         columns |= {name: logged[name] for name in ("t_min", "t_max", "hit")}
         write_table(path, columns | {name: rays.counts[name] for name in COUNTERS} | {"lines": rays.lines})
-
-
-class ProfileOptions(SettingChanges, total=False):
-    """Keyword arguments of `profile`: settings of the scene and options of the render."""
-
-    seed: int
-    device: str
-    accel: str
-    accel_options: dict[str, Any]
-    threads: int | None
-    camera: str | int | CameraKind | None
-    crop: tuple[int, int, int, int] | None
-    triangle: str
-    box: str
-    instancing: str
-    tile_size: int | None
-    progress: Callable[[Progress], None] | None
 
 
 def profile(scene: Scene | Mesh | PathLike, **options: Unpack[ProfileOptions]) -> Profile:

@@ -20,7 +20,7 @@ from wrt.renderer.film_arrays import DeviceFilm
 from wrt.renderer.inspector.assemble import Assembler
 from wrt.renderer.inspector.inspection import Inspection
 from wrt.renderer.inspector.tree import Sample
-from wrt.renderer.options import Options
+from wrt.renderer.options import Options, PixelOptions
 from wrt.renderer.plan import Plan, plan_of
 from wrt.renderer.prepare import prepare
 from wrt.renderer.tiles import Work
@@ -33,22 +33,8 @@ from wrt.scene.settings import SETTINGS, SettingChanges
 OPTIONS = ("seed", "device", "threads", "accel", "accel_options", "triangle", "box", "instancing", "camera")
 
 
-class InspectOptions(SettingChanges, total=False):
-    """The keywords of `inspect`: the scene's settings, and some of the fields of Options."""
-
-    seed: int
-    device: str
-    threads: int | None
-    accel: str
-    accel_options: dict[str, object]
-    triangle: str
-    box: str
-    instancing: str
-    camera: str | int | CameraKind | None
-
-
 def inspect(scene: Scene | Mesh | str | os.PathLike[str], pixel: tuple[int, int], sample: int | None = None,
-            **options: Unpack[InspectOptions]) -> Inspection:
+            **options: Unpack[PixelOptions]) -> Inspection:
     """Trace one pixel as `render` does, and return all of its rays.
 
     The kernel that renders also records. So the sum over the tree is the pixel of `render` with the same options, bit for bit.
@@ -90,7 +76,7 @@ def inspect(scene: Scene | Mesh | str | os.PathLike[str], pixel: tuple[int, int]
 class Inspector:
     """A prepared scene whose pixels are inspected one after another. The arguments are those of `inspect`."""
 
-    def __init__(self, scene: Scene | Mesh | str | os.PathLike[str], **options: Unpack[InspectOptions]) -> None:
+    def __init__(self, scene: Scene | Mesh | str | os.PathLike[str], **options: Unpack[PixelOptions]) -> None:
         keywords: dict[str, Any] = {**options}
         changes = {name: keywords.pop(name) for name in SETTINGS if name in keywords}
         for name in keywords:
