@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, reduce
 from hashlib import sha256
+from zlib import crc32
 
 import numpy as np
 import warp as wp
@@ -51,12 +53,21 @@ class Geometry:
         """Number of vertices."""
         return len(self.vertices)
 
-    def digest(self) -> str:
-        """Return the SHA-256 of the arrays."""
-        out = sha256()
+    def _content(self) -> Iterator[bytes | memoryview]:
+        """Yield the shapes, types and bytes of the arrays."""
         for array in (self.vertices, self.faces, self.spheres):
-            out.update(f"{array.shape}{array.dtype.str}".encode())
-            out.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
+            yield f"{array.shape}{array.dtype.str}".encode()
+            yield np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
+
+    def checksum(self) -> str:
+        """Return the CRC-32 of the arrays."""
+        return f"{reduce(lambda before, part: crc32(part, before), self._content(), 0):08x}"
+
+    def digest(self) -> str:
+        """Return the SHA-256 of the arrays: older files have it in place of the checksum."""
+        out = sha256()
+        for part in self._content():
+            out.update(part)
         return out.hexdigest()
 
     def on(self, device: Device, faces: WarpArray | None = None) -> WarpStruct:

@@ -1,6 +1,6 @@
 """Files of structures, which `wrt build` writes and `wrt.load_accel` reads.
 
-A file has a checksum (wrt.core.checked_file). Its header describes the structure and the arrays. It has a hash of the geometry, or the
+A file has a checksum (wrt.core.checked_file). Its header describes the structure and the arrays. It has a checksum of the geometry, or the
 scene itself (wrt.accel.scene_arrays). The types of the arrays come from the structure's class. Indices are checked before a ray follows
 them.
 """
@@ -60,7 +60,7 @@ def save(snapshot: Snapshot, path: PathLike, mesh: bool = False) -> None:
     body = [each.tobytes() for each in built_rows(structure, built)]
     sizes = {"bytes": dict(zip(array_types(structure.accel, structure.units.triangle), map(len, body), strict=False)),
              "order": len(built.order)}
-    header = header_of(structure) | {"geometry": snapshot.mesh.digest()} | sizes | {name: getattr(built, name) for name in STATS}
+    header = header_of(structure) | {"geometry": snapshot.mesh.checksum()} | sizes | {name: getattr(built, name) for name in STATS}
     scene = arrays_of(snapshot) if as_one(mesh, bool, "mesh") else {}
     with replacing(path) as file:
         write_checked(file, MAGIC, header | listed(scene), [*scene.values(), *body])
@@ -167,7 +167,7 @@ def parts_of(cls: type[Any], units: Units, arrays: dict[str, np.ndarray], body: 
 
 def require_same_mesh(header: JsonObject, geometry: Geometry) -> None:
     """Raise InputError unless the structure was built over a geometry with the same arrays."""
-    if header["geometry"] != geometry.digest():
+    if header["geometry"] != geometry.checksum() and header["geometry"] != geometry.digest():
         raise InputError("was built over another mesh")
 
 
@@ -189,8 +189,10 @@ def read_arrays(cls: type[Any], header: JsonObject, body: memoryview) -> Built:
 
 def check_order(order: np.ndarray, count: int, name: str) -> None:
     """Raise InputError unless `order` contains exactly the prim_ids 0 .. count - 1, each at least once."""
-    within = order.min(initial=0) >= 0 and order.max(initial=-1) < count
-    if not (within and np.bincount(order, minlength=count).all()):
+    found, within = np.zeros(count, bool), order.min(initial=0) >= 0 and order.max(initial=-1) < count
+    if within:
+        found[order] = True
+    if not (within and found.all()):
         raise InputError(f"is not a {name} over this geometry: its prim_ids are not those of the geometry")
 
 

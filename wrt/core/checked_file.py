@@ -1,6 +1,7 @@
-"""Checked files of arrays: a line with the kind of file, a line of JSON, the bytes of the arrays, and the SHA-256 of all these bytes.
+"""Checked files of arrays: a line with the kind of file, a line of JSON, the bytes of the arrays, and a checksum of all these bytes.
 
-Nothing in such a file is evaluated or unpickled."""
+The checksum is a CRC-32, which finds damage in a third of the time of a hash. It stands behind zeros, in the place of the SHA-256 of
+older files. Nothing in such a file is evaluated or unpickled."""
 
 import json
 import os
@@ -8,6 +9,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from hashlib import sha256
 from typing import BinaryIO
+from zlib import crc32
 
 import numpy as np
 
@@ -17,17 +19,25 @@ from wrt.core.threads import verifying
 from wrt.core.types import JsonObject
 
 DIGEST_BYTES = 32
+CRC_BYTES = 4
 MAX_HEADER = 1 << 16
 
 
 def write_checked(file: BinaryIO, magic: bytes, header: JsonObject, parts: Iterable[bytes | np.ndarray]) -> None:
     """Write a checked file. magic: the first line with its line end; header: at most MAX_HEADER bytes as JSON."""
-    digest = sha256()
+    checksum = 0
     for part in (magic, json.dumps(header).encode() + b"\n", *parts):
         view = part if isinstance(part, bytes) else np.ascontiguousarray(part).reshape(-1).view(np.uint8).data
-        digest.update(view)
+        checksum = crc32(view, checksum)
         file.write(view)
-    file.write(digest.digest())
+    file.write(checksum.to_bytes(DIGEST_BYTES, "big"))
+
+
+def is_whole(data: memoryview) -> bool:
+    """Return whether a file's content matches its checksum."""
+    content, digest = data[:-DIGEST_BYTES], bytes(data[-DIGEST_BYTES:])
+    is_hash = any(digest[:-CRC_BYTES])
+    return digest == (sha256(content).digest() if is_hash else crc32(content).to_bytes(DIGEST_BYTES, "big"))
 
 
 @contextmanager
@@ -40,7 +50,8 @@ def read_checked(path: str | os.PathLike[str], magic: bytes, what: str, threads:
             if file.read(len(magic)) != magic:
                 raise InputError(f"is no {what} of this version")
             file.seek(0)
-            data = memoryview(file.read(os.fstat(file.fileno()).st_size))
+            memory = np.empty(os.fstat(file.fileno()).st_size, np.uint8)  # in huge pages: half of the time of `bytes`
+            data = memory.data[:file.readinto(memory)]
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror or error}", path=path) from error
     except InputError as error:
@@ -48,7 +59,7 @@ def read_checked(path: str | os.PathLike[str], magic: bytes, what: str, threads:
     end = bytes(data[: len(magic) + MAX_HEADER]).find(b"\n", len(magic))
 
     def verify() -> None:
-        if end < 0 or sha256(data[:-DIGEST_BYTES]).digest() != data[-DIGEST_BYTES:]:
+        if end < 0 or not is_whole(data):
             raise InputError("is damaged: its checksum does not match its content", path=path)
 
     with verifying(verify, threads):

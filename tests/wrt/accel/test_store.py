@@ -215,6 +215,21 @@ def test_a_damaged_or_foreign_file_is_refused(saved: Path, spoil, message: Refus
         load_accel(saved, BALL)
 
 
+def test_a_file_of_an_older_version_has_hashes_in_place_of_checksums(saved: Path) -> None:
+    """Files before CRC-32: the SHA-256 of the geometry in the header, and of the content at the end."""
+    whole, new = load_accel(saved, BALL), saved.read_bytes()
+    mesh = Geometry.of(BALL)
+    old = signed(new[:-DIGEST_BYTES].replace(mesh.checksum().encode(), mesh.digest().encode()))
+    assert len(old) == len(new) + len(mesh.digest()) - len(mesh.checksum())
+    saved.write_bytes(old)
+    same(whole, load_accel(saved, BALL))
+    with refused(what="another mesh"):
+        load_accel(saved, Mesh(2.0 * BALL.vertices, BALL.faces))
+    saved.write_bytes(old[:5000] + bytes([old[5000] ^ 1]) + old[5001:])
+    with refused(None, "damaged"):
+        load_accel(saved, BALL)
+
+
 def test_missing_files_and_wrong_suffixes(tmp_path: Path) -> None:
     with refused(what="cannot be read", path="nothing.accel") as caught:
         load_accel(tmp_path / "nothing.accel", BALL)

@@ -213,9 +213,9 @@ class WideBvh(CollapsedBvh):
         if self.compressed and (existing_children(self._nodes(built), self.width) != (references != EMPTY)).any():
             raise InputError("is damaged: a node's mask of children differs from its references")
         if not self.compressed:
-            node, child = np.nonzero(references == EMPTY)
+            node, child = np.divmod(np.flatnonzero(references == EMPTY), self.width)
             boxes = self._nodes(built)[:, : first_reference(self.width, False)].reshape(-1, 3, 2, self.width)[node, :, :, child]
-            if (boxes != np.array([np.inf, -np.inf], np.float32)).any():
+            if (boxes[..., 0] != np.inf).any() or (boxes[..., 1] != -np.inf).any():
                 raise InputError("is damaged: a child that does not exist has a box")
 
 

@@ -157,12 +157,12 @@ def check_wide(children: np.ndarray, n_primitives: int, unit: int) -> None:
     The leaves must hold n_primitives primitives without gaps. unit: number of primitives by which references to leaves count.
     """
     n = len(children)
-    inner = children > 0
-    if n == 0 or (children[inner] >= n).any() or (children <= np.arange(n)[:, None])[inner].any():
+    parent, child = links(children)
+    if n == 0 or (child >= n).any() or (child <= parent).any():
         raise InputError("is damaged: a node leads out of the tree")
-    if (np.bincount(children[inner], minlength=n) != (np.arange(n) > 0)).any():
+    if (np.bincount(child, minlength=n) != (np.arange(n) > 0)).any():
         raise InputError("is damaged: its nodes do not form a tree")
-    leaves = -np.sort(-children[children < 0].astype(np.int64))  # a later leaf has a smaller reference
+    leaves = ~np.sort(~children[children < 0])  # a later leaf has a smaller reference
     count = leaf_count.func(leaves)
     units = -(-count // unit)
     if (leaf_first.func(leaves) != np.cumsum(units) - units).any() or count.sum() != n_primitives:
@@ -171,12 +171,19 @@ def check_wide(children: np.ndarray, n_primitives: int, unit: int) -> None:
         raise InputError(f"is damaged: a traversal needs more than {STACK_SIZE} entries on its stack")
 
 
+def links(children: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the node and the child of each link between inner nodes, for references (N, width)."""
+    inner = np.flatnonzero(children > 0)
+    return inner // children.shape[1], children.reshape(-1)[inner]
+
+
 def stack_need(children: np.ndarray) -> int:
     """Return the largest number of entries on the traversal stack, for a tree of references (N, width)."""
-    level, used, most = np.zeros(1, np.int64), np.zeros(1, np.int64), 0
-    while len(level):
-        below = used + np.maximum((children[level] != EMPTY).sum(axis=1) - 1, 0)
-        most = max(most, int(below.max()))
-        inner = children[level] > 0
-        level, used = children[level][inner].astype(np.int64), np.repeat(below, inner.sum(axis=1))
-    return most
+    n, (parent, child) = len(children), links(children)
+    need = np.append(np.maximum((children != EMPTY).sum(axis=1) - 1, 0), 0)  # of each node and its ancestors, after the loop
+    above = np.full(n + 1, n)
+    above[child] = parent
+    while (above < n).any():
+        need += need[above]
+        above = above[above]
+    return int(need.max())
