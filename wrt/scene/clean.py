@@ -114,7 +114,7 @@ def _flipped(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nd
     """Return faces and source of `flip_collinear`, and (F,) bool: True for faces that still have no area."""
     faces, source = faces.copy(), np.arange(len(faces))
     suspects, without = source.copy(), ~has_area(vertices, faces)
-    for _ in range(ROUNDS):
+    for _ in range(ROUNDS if without.any() else 0):
         flat, ends, middle = _longest_edges(vertices, faces, suspects[without[suspects]])
         if not len(flat):
             break

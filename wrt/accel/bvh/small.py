@@ -1,158 +1,243 @@
-"""Wide trees over few primitives, built in Python, because loading or compiling the builders' kernels would take longer."""
+"""Wide trees over few primitives, built in NumPy, because loading or compiling the builders' kernels would take longer.
+
+Each step handles the subtrees of all trees at once: NumPy takes longer for a call than for a few boxes.
+"""
 
 from __future__ import annotations
 
+from itertools import groupby
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
 
 from wrt.accel.bvh.tree import BvhOptions, half_areas
-from wrt.accel.bvh.wide_tree import WideTree, lanes_of, stack_need
+from wrt.accel.bvh.wide_tree import WideTree
 from wrt.kernels.wide.references import EMPTY, leaf_reference
 
 SMALL = 128  # primitives
+BATCH = 1 << 14  # primitives that are handled at once, which bounds the memory
+FEW = 1024  # boxes: splitting subtrees of different sizes together takes less time than a call for each size
+MOST_AREA = 3e78  # of half_areas
+Boxes = tuple[np.ndarray, np.ndarray]
 
 
-class _Choice(NamedTuple):
-    """Cheapest set of children, up to some number, by which a wide node represents a subtree.
+class _Subtrees(NamedTuple):
+    """Subtrees of binary trees: first the whole trees, then their halves, then the halves of these, down to single boxes.
 
-    cost: SAH cost of the children. children: number of children. first: number of children that come from the subtree's parts[0];
-    0: the subtree itself is the only child.
+    items: (N,) indices of boxes. A subtree has the boxes items[begin : begin + size]. area: half the area of the box around them. left:
+    index of a subtree's first half, which the second half follows; -1 if it has fewer than two boxes. levels: end of each level.
     """
 
-    cost: float
-    children: int
-    first: int
+    items: np.ndarray
+    begin: np.ndarray
+    size: np.ndarray
+    area: np.ndarray
+    left: np.ndarray
+    levels: list[int]
 
 
-class _Subtree:
-    """Subtree of a binary tree: primitives `items` (n,), their boxes lo, hi (n, 3), and half the area of the box around them.
+class _Choices(NamedTuple):
+    """Best ways to represent each subtree by children of a wide node.
 
-    Function `split` fills parts: two halves, or none for a single primitive. Method `choose` sets choices[k], the best choice of at most
-    k + 1 children, and opened, the best choice of two or more children.
+    is_leaf: whether its only child would be a leaf. children: (T, W) number of children, if there may be at most 1 .. W. first: (T, W + 1)
+    number of these that come from the first half, by the number of children. opened: best number of children, two or more, of a node
+    for the subtree; 1 if a leaf costs less than they.
     """
 
-    choices: list[_Choice]
-    opened: _Choice
-
-    def __init__(self, items: np.ndarray, lo: np.ndarray, hi: np.ndarray, area: float, options: BvhOptions) -> None:
-        self.items, self.lo, self.hi, self.area, self.options = items, lo, hi, area, options
-        self.parts: list[_Subtree] = []
-        # Mean of two costs: a single ray tests a row of primitives at once; a packet of rays tests primitives one by one.
-        rows = 0.5 * -(-len(items) // options.row) + 0.5 * len(items) / options.row
-        self.leaf_cost = options.cost_intersection * rows * area if len(items) <= options.max_leaf else np.inf
-
-    def choose(self) -> None:
-        """Set `choices` and `opened` by dynamic programming, as kernels.build.wide does. Call it for the parts first."""
-        self.choices = [_Choice(self.leaf_cost, 1, 0)]
-        self.opened = _Choice(np.inf, 0, 0)
-        if self.parts:
-            first, second = ([choice.cost for choice in part.choices] for part in self.parts)
-            several = []
-            for k in range(2, min(self.options.row, len(self.items)) + 1):
-                costs = [first[a - 1] + second[k - a - 1] for a in range(1, k)]
-                cost = min(costs)
-                several.append(_Choice(cost, k, 1 + costs.index(cost)))
-            self.opened = min(several)
-            self.choices = [min(self.choices[0], _Choice(self.options.cost_traversal * self.area + self.opened.cost, 1, 0))]
-            for choice in several:
-                self.choices.append(min(self.choices[-1], choice))
-        self.choices += self.choices[-1:] * (self.options.row - len(self.choices))
-
-    def _is_leaf_beside(self, cost: float) -> bool:
-        """Return whether a leaf is best: always for one primitive, else if max_leaf allows it and it costs at most `cost`, maybe inf."""
-        return len(self.items) == 1 or (len(self.items) <= self.options.max_leaf and self.leaf_cost <= cost)
-
-    @property
-    def is_leaf(self) -> bool:
-        return self._is_leaf_beside(self.choices[0].cost)
-
-    def roots(self, choice: _Choice) -> list[_Subtree]:
-        if choice.first == 0:
-            return [self]
-        first, second = self.parts
-        return first.roots(first.choices[choice.first - 1]) + second.roots(second.choices[choice.children - choice.first - 1])
-
-    def children(self) -> list[_Subtree]:
-        """Return the children of this subtree's node: inner nodes, then leaves, by ascending area. Any-hit rays visit the last first."""
-        if self._is_leaf_beside(self.opened.cost):
-            return [self]
-        return sorted(self.roots(self.opened), key=lambda child: (child.is_leaf, child.area))
+    is_leaf: np.ndarray
+    children: np.ndarray
+    first: np.ndarray
+    opened: np.ndarray
 
 
-def split(subtrees: list[_Subtree]) -> None:
-    """Append two halves to `parts` of subtrees with equally many primitives, unless each has only one.
+def _areas(boxes: np.ndarray) -> np.ndarray:
+    """Return half the area of boxes (2, 3, ...), low corners and negated high corners; a number for NaN, too."""
+    low, high = np.moveaxis(boxes, 1, -1)
+    return np.fmin(half_areas(low, -high), MOST_AREA)
 
-    Split at the least SAH cost of a sweep along all axes. At equal cost, prefer parts of equal size.
+
+def _ranges(begin: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the indices begin .. begin + count - 1 of all ranges, one after another, and the place of each in its range."""
+    place = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    return np.repeat(begin, count) + place, place
+
+
+def _split(boxes: np.ndarray, items: np.ndarray, begin: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Sort the items of each subtree (S,) so that its first half comes first. Return the halves' counts and areas, (2, S).
+
+    Split at the least SAH cost of a sweep along all axes. At equal cost, prefer parts of equal size. boxes: (2, 3, N), low corners, and
+    negated high corners: the minimum of both is the box around all.
     """
-    n = len(subtrees[0].items)
-    if n == 1:
-        return
-    items, los, his = (np.stack([getattr(subtree, name) for subtree in subtrees]) for name in ("items", "lo", "hi"))
-    with np.errstate(invalid="ignore"):  # a box may be all of space
-        orders = (0.5 * los + 0.5 * his).argsort(axis=1, kind="stable")  # (subtree, n, axis)
-    lo, hi = (np.take_along_axis(box[:, :, None], orders[..., None], axis=1) for box in (los, his))  # (subtree, n, axis, 3)
-    # Areas around the first 1, 2, .. and around the last 1, 2, .. items along each axis.
-    below, above = half_areas(np.minimum.accumulate(np.stack([lo, lo[:, ::-1]]), axis=2),
-                              np.maximum.accumulate(np.stack([hi, hi[:, ::-1]]), axis=2))
-    below, above = below[:, :-1], above[:, -2::-1]
-    count = np.arange(1, n)[:, None]
-    cost = below * count + above * (n - count)
-    places = np.where(cost == cost.min(axis=(1, 2), keepdims=True), abs(2 * count - n), n).reshape(len(cost), -1).argmin(axis=1)
-    every, (ks, axes) = np.arange(len(subtrees)), np.divmod(places, 3)
-    items, lo, hi = np.take_along_axis(items, orders[every, :, axes], axis=1), lo[every, :, axes], hi[every, :, axes]
-    areas = zip(below[every, ks, axes].tolist(), above[every, ks, axes].tolist(), strict=True)
-    for i, (subtree, k, (first, second)) in enumerate(zip(subtrees, (ks + 1).tolist(), areas, strict=True)):
-        subtree.parts.append(_Subtree(items[i, :k], lo[i, :k], hi[i, :k], first, subtree.options))
-        subtree.parts.append(_Subtree(items[i, k:], lo[i, k:], hi[i, k:], second, subtree.options))
+    every, places = np.arange(len(count)), np.arange(count.max())[:, None]
+    exists = places < count
+    mine = items[begin + np.where(exists, places, 0)]  # (place, subtree)
+    some = np.where(exists, boxes[:, :, mine], np.float32(np.inf))
+    # The center is NaN, and comes last, if no box exists, and if a box is all of space.
+    orders = (0.5 * some[0] - 0.5 * some[1]).argsort(axis=1, kind="stable")  # (axis, place, subtree)
+    some = some[:, :, orders, every].transpose(3, 0, 1, 2, 4)  # (place, 2, 3, axis, subtree)
+    # After the loop: the first 1, 2, .. and the last 1, 2, .. boxes along each axis.
+    around = np.empty((len(some), 2, *some.shape[1:]), np.float32)
+    around[:, 0], around[:, 1] = some, some[::-1]
+    for i in range(1, len(around)):
+        np.minimum(around[i], around[i - 1], out=around[i])
+    areas, firsts = _areas(around.transpose(2, 3, 0, 1, 4, 5)), places[1:, None]
+    below, above = areas[:-1, 0], areas[-2::-1, 1]  # (place, axis, subtree)
+    cost = np.where(firsts < count, below * firsts + above * (count - firsts), np.inf)
+    uneven = np.where((cost == cost.min(axis=(0, 1))) & (firsts < count), abs(2 * firsts - count), len(places))
+    k, axis = np.divmod(uneven.reshape(-1, len(count)).argmin(axis=0), 3)
+    items[(begin + places)[exists]] = mine[orders[axis, :, every].T, every][exists]
+    return np.stack([k + 1, count - k - 1]), np.stack([below[k, axis, every], above[k, axis, every]])
 
 
-def small_trees(boxes: list[tuple[np.ndarray, np.ndarray]], options: BvhOptions) -> list[WideTree]:
-    """Build a wide tree over each pair of boxes lo, hi (n, 3) float32, with up to options.row children per node.
+def _subtrees(boxes: np.ndarray, begin: np.ndarray, count: np.ndarray) -> _Subtrees:
+    """Build binary trees of single boxes by the surface area heuristic (MacDonald and Booth 1990).
 
-    Build a binary tree of single boxes by the surface area heuristic (MacDonald and Booth 1990), and collapse it at the least cost.
-    Subtrees of all trees are split together, because NumPy takes longer for a call than for a few boxes.
+    boxes: of all trees, as for _split. begin, count: the boxes of each tree.
     """
-    roots = [_Subtree(np.arange(len(lo), dtype=np.int32), lo, hi, float(half_areas(lo.min(axis=0), hi.max(axis=0))), options)
-             if len(lo) else None for lo, hi in boxes]
-    subtrees = level = [root for root in roots if root]
-    while level:
-        groups: dict[int, list[_Subtree]] = {}
-        for subtree in level:
-            groups.setdefault(len(subtree.items), []).append(subtree)
-        for group in groups.values():
-            split(group)
-        level = [part for subtree in level for part in subtree.parts]
-        subtrees = subtrees + level
-    for subtree in reversed(subtrees):
-        subtree.choose()
-    return [wide_tree(root, options.row) for root in roots]
+    items, area, some = np.arange(boxes.shape[2]), np.zeros(len(begin)), count > 0
+    if some.any():
+        area[some] = _areas(np.minimum.reduceat(boxes, begin[some], axis=2))
+    parts, levels, lefts = [(begin, count, area)], [len(begin)], []
+    while len(begin):
+        inner = np.flatnonzero(count > 1)
+        left = np.full(len(begin), -1)
+        left[inner] = levels[-1] + 2 * np.arange(len(inner))
+        lefts.append(left)
+        begin, count = begin[inner], count[inner]
+        counts, areas = np.empty((2, len(inner)), np.int64), np.empty((2, len(inner)))
+        size = np.frexp(count - 1)[1] * (len(count) * count.max(initial=0) > FEW)  # subtrees of about equal size are split together
+        for each in np.unique(size):
+            some = size == each
+            counts[:, some], areas[:, some] = _split(boxes, items, begin[some], count[some])
+        begin, count = np.stack([begin, begin + counts[0]], axis=1).reshape(-1), counts.T.reshape(-1)
+        parts.append((begin, count, areas.T.reshape(-1)))
+        levels.append(levels[-1] + len(begin))
+    begin, count, area = (np.concatenate(each) for each in zip(*parts, strict=True))
+    return _Subtrees(items, begin, count, area, np.concatenate(lefts), levels[:-1])
+
+
+def _choose(trees: _Subtrees, options: BvhOptions) -> _Choices:
+    """Choose children of least SAH cost by dynamic programming, as kernels.build.wide does."""
+    width, n = options.row, trees.size
+    # Mean of two costs: a single ray tests a row of primitives at once; a packet of rays tests primitives one by one.
+    leaf = options.cost_intersection * (0.5 * -(-n // width) + 0.5 * n / width) * trees.area
+    leaf[n > options.max_leaf] = np.inf
+    cost = np.repeat(np.append(leaf[:, None], np.full((len(n), 1), np.inf), axis=1), (width, 1), axis=1)
+    children, first, opened = np.ones((len(n), width), int), np.zeros((len(n), width + 1), int), np.ones(len(n), int)
+    ks, a = np.arange(2, width + 1)[:, None], np.arange(1, width)
+    of_second = np.where(a < ks, ks - a - 1, width)  # the last cost is infinite
+    for begin, end in reversed(list(zip([0, *trees.levels], trees.levels, strict=False))):
+        at = begin + np.flatnonzero(trees.left[begin:end] >= 0)
+        several = cost[trees.left[at]][:, None, :-2] + cost[trees.left[at] + 1][:, of_second]  # (subtree, k, a)
+        first[at, 2:], several = 1 + several.argmin(axis=2), several.min(axis=2)
+        least = several.min(axis=1)
+        opened[at] = np.where((n[at] <= options.max_leaf) & (leaf[at] <= least), 1, 2 + several.argmin(axis=1))
+        several = np.append(np.minimum(leaf[at], options.cost_traversal * trees.area[at] + least)[:, None], several, axis=1)
+        cost[at, :-1] = best = np.minimum.accumulate(several, axis=1)
+        better = several[:, 1:] < best[:, :-1]
+        children[at, 1:] = np.maximum.accumulate(np.where(better, ks[:, 0], 1), axis=1)
+    return _Choices((n == 1) | ((n <= options.max_leaf) & (leaf <= cost[:, 0])), children, first, opened)
+
+
+def _roots(trees: _Subtrees, choices: _Choices, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the subtrees that become children of the nodes for the subtrees `nodes`, and the index of the node of each.
+
+    Inner nodes come first, then leaves, by ascending area. Any-hit rays visit the last first.
+    """
+    parent = np.flatnonzero(trees.size[nodes] > 0)
+    roots = nodes[parent]
+    k = choices.opened[roots]
+    while (k > 1).any():
+        twice = np.repeat(np.arange(len(k)), np.where(k > 1, 2, 1))
+        second = np.append(False, twice[1:] == twice[:-1])
+        parent, roots, k = parent[twice], roots[twice], k[twice]
+        split, firsts = k > 1, choices.first[roots, k]
+        roots = np.where(split, trees.left[roots] + second, roots)
+        k = np.where(split, choices.children[roots, np.where(second, k - firsts, firsts) - 1], 1)
+    order = np.lexsort((trees.area[roots], choices.is_leaf[roots], parent))
+    return roots[order], parent[order]
+
+
+class _Nodes(NamedTuple):
+    """Nodes of wide trees, tree after tree, each parent before its children; and all children, node after node.
+
+    tree: (G,) the tree of each node. need: (G,) entries on a traversal's stack below the node. depth: of each tree. node: (C,) index of
+    the node of each child. subtree: (C,) index in _Subtrees. below: (C,) index of the child's own node; of no meaning for leaves.
+    """
+
+    tree: np.ndarray
+    need: np.ndarray
+    depth: np.ndarray
+    node: np.ndarray
+    subtree: np.ndarray
+    below: np.ndarray
+
+
+def _nodes(trees: _Subtrees, choices: _Choices, n_trees: int) -> _Nodes:
+    """Make the nodes of all trees, level by level."""
+    roots, tree, need = np.arange(n_trees), np.arange(n_trees), np.zeros(n_trees, int)
+    depth, nodes, children, total = np.zeros(n_trees, int), [], [], 0
+    while len(roots):
+        subtree, parent = _roots(trees, choices, roots)
+        need = need + np.maximum(np.bincount(parent, minlength=len(roots)) - 1, 0)
+        depth[tree] += 1
+        nodes.append((tree, need))
+        children.append((parent + total, subtree))
+        total += len(roots)
+        inner = ~choices.is_leaf[subtree]
+        roots, tree, need = subtree[inner], tree[parent[inner]], need[parent[inner]]
+    (tree, need), (node, subtree) = ([np.concatenate(each) for each in zip(*parts, strict=True)] for parts in (nodes, children))
+    inner, order, place = ~choices.is_leaf[subtree], np.argsort(tree, kind="stable"), np.empty(total, int)
+    place[order] = np.arange(total)
+    below = np.full(len(node), -1)
+    below[inner] = place[n_trees:]  # after the roots, nodes are made in the order of the inner children
+    by_node = np.argsort(place[node], kind="stable")
+    return _Nodes(tree[order], need[order], depth, place[node][by_node], subtree[by_node], below[by_node])
+
+
+def small_trees(boxes: list[Boxes], options: BvhOptions) -> list[WideTree]:
+    """Build a wide tree over each pair of boxes lo, hi (n, 3) float32, with up to options.row children per node."""
+    ends = np.cumsum([len(low) for low, _ in boxes])
+    batches = groupby(zip(ends // BATCH, boxes, strict=True), key=itemgetter(0))
+    return [tree for _, batch in batches for tree in _small_trees([each for _, each in batch], options)]
+
+
+def _small_trees(boxes: list[Boxes], options: BvhOptions) -> list[WideTree]:
+    width, n_trees = options.row, len(boxes)
+    bounds = np.stack([np.concatenate([low for low, _ in boxes]).T, -np.concatenate([high for _, high in boxes]).T])
+    n_boxes = np.array([len(low) for low, _ in boxes])
+    first_box = np.cumsum(n_boxes) - n_boxes
+    with np.errstate(over="ignore", invalid="ignore"):
+        trees = _subtrees(bounds, first_box, n_boxes)
+        choices = _choose(trees, options)
+    nodes = _nodes(trees, choices, n_trees)
+    tree, is_leaf, begin, count = nodes.tree[nodes.node], *(each[nodes.subtree] for each in (choices.is_leaf, trees.begin, trees.size))
+    n_nodes, n_leaves = np.bincount(nodes.tree, minlength=n_trees), np.bincount(tree[is_leaf], minlength=n_trees)
+    rows = np.where(is_leaf, -(-count // width), 0)
+    end_row, end_node = np.cumsum(np.bincount(tree, rows, n_trees).astype(int)), np.cumsum(n_nodes)
+    row = np.cumsum(rows) - rows
+    siblings = np.bincount(nodes.node, minlength=end_node[-1])
+    place = width - siblings[nodes.node] + _ranges(siblings, siblings)[1]
+    references = np.full((end_node[-1], width), EMPTY, np.int32)
+    references[nodes.node, place] = np.where(is_leaf, leaf_reference.func(row - np.append(0, end_row)[tree], count),
+                                             nodes.below - np.append(0, end_node)[tree])
+    around = np.full((2, 3, *references.shape), np.inf, np.float32)
+    lanes = np.full((end_row[-1], width), -1, np.int32)
+    if len(count):
+        items = trees.items[_ranges(begin, count)[0]]
+        around[..., nodes.node, place] = np.minimum.reduceat(bounds[..., items], np.cumsum(count) - count, axis=2)
+        leaf, (_, within) = np.repeat(np.arange(len(count)), count), _ranges(begin, count)
+        items = (items - first_box[tree[leaf]])[np.lexsort((items, leaf))]
+        there = is_leaf[leaf]
+        lanes[(row[leaf] + within // width)[there], (within % width)[there]] = items[there]
+    low, high = np.moveaxis(around, 1, -1)
+    stack = np.maximum.reduceat(nodes.need, end_node - n_nodes)
+    return [WideTree(low[a:b], -high[a:b], references[a:b], lanes[c:d], *numbers) for a, b, c, d, *numbers in zip(
+        (end_node - n_nodes).tolist(), end_node.tolist(), [0, *end_row.tolist()], end_row.tolist(), n_leaves.tolist(),
+        nodes.depth.tolist(), stack.tolist(), strict=False)]
 
 
 def small_tree(lo: np.ndarray, hi: np.ndarray, options: BvhOptions) -> WideTree:
     """Call `small_trees` for a single tree."""
     return small_trees([(lo, hi)], options)[0]
-
-
-def wide_tree(root: _Subtree | None, width: int) -> WideTree:
-    """Return the wide tree of a root that `choose` was called for; None: over no primitives."""
-    nodes, children_of = [root] if root else [], []
-    for node in nodes:  # the loop appends to the list
-        children_of.append(node.children())
-        nodes += [child for child in children_of[-1] if not child.is_leaf]
-    shape = (max(len(nodes), 1), width)
-    low, high = np.full((*shape, 3), np.inf, np.float32), np.full((*shape, 3), -np.inf, np.float32)
-    references, depth, rows = np.full(shape, EMPTY, np.int32), [1], 0
-    order: list[int] = []
-    for i, children in enumerate(children_of):
-        for place, child in enumerate(children, width - len(children)):
-            low[i, place], high[i, place] = child.lo.min(axis=0), child.hi.max(axis=0)
-            if child.is_leaf:
-                references[i, place] = leaf_reference.func(rows, len(child.items))
-                order += sorted(child.items.tolist())
-                rows += -(-len(child.items) // width)
-            else:
-                references[i, place] = len(depth)
-                depth.append(depth[i] + 1)
-    lanes, leaves = lanes_of(references, np.array(order, np.int32), width), int((references < 0).sum())
-    return WideTree(low, high, references, lanes, leaves, depth[-1], stack_need(references))

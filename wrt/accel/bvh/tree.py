@@ -97,8 +97,9 @@ def binary_tree_of(tree: BoxTree) -> BinaryTree:
 
 def half_areas(lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
     """Return half the surface area of each box lo, hi (..., 3), in float64; 0 for empty boxes."""
-    e = np.clip(hi.astype(np.float64) - lo.astype(np.float64), 0.0, 1e39)
-    return np.asarray(half_area.func(np.moveaxis(e, -1, 0)))
+    e = np.subtract(hi, lo, dtype=np.float64)
+    np.minimum(np.maximum(e, 0.0, out=e), 1e39, out=e)
+    return np.asarray(half_area.func((e[..., 0], e[..., 1], e[..., 2])))
 
 
 def root_area(nodes: np.ndarray) -> float:

@@ -37,16 +37,17 @@ def flatten_joined(scene: Scene) -> FlatScene:
 def flatten_instanced(scene: Scene, meshes: frozenset[int]) -> FlatScene:
     """Convert a scene to arrays with instances of `meshes`, given by id(). Other objects are joined in world space: parts[0]."""
     index = {id(material): i for i, material in enumerate(scene.materials)}
-    flat = _joined(tuple(thing for thing in scene.objects if not is_instance(thing, meshes)), index)
+    instanced = [is_instance(thing, meshes) for thing in scene.objects]
+    flat = _joined(tuple(thing for thing, apart in zip(scene.objects, instanced, strict=True) if not apart), index)
     parts = {0: flat}  # then by id of the mesh
     materials: dict[tuple[int, ...], tuple[int, np.ndarray]] = {(): (0, flat.material)}
     n_material = len(flat.material)
     rows: list[tuple[int, int, int, int, np.ndarray]] = []  # first_prim, part, first material, step, to_world
     prim_ids: list[np.ndarray] = []  # of part 0
     first_prim = n_flat = 0
-    for thing in scene.objects:
+    for thing, apart in zip(scene.objects, instanced, strict=True):
         count = len(thing.mesh.faces)
-        if not is_instance(thing, meshes):
+        if not apart:
             if not rows or rows[-1][1] != 0:  # otherwise the object extends the last run
                 rows.append((first_prim, 0, n_flat, 1, np.eye(4)))
             prim_ids.append(np.arange(first_prim, first_prim + count, dtype=np.int64))
