@@ -3,13 +3,13 @@
 import codecs
 import os
 import stat
+from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO
 
 from wrt.core.errors import InputError
 
 
-def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
+def open_regular(path: str | os.PathLike[str]) -> BufferedReader:
     """Open a regular file for reading.
 
     Raises InputError, without the path, for a folder, and for a pipe or a device, which may never end. Raises OSError like `open`."""

@@ -3,8 +3,6 @@
 Each step handles the subtrees of all trees at once: NumPy takes longer for a call than for a few boxes.
 """
 
-from __future__ import annotations
-
 from itertools import groupby
 from operator import itemgetter
 from typing import NamedTuple
