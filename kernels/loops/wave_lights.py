@@ -6,7 +6,7 @@ import warp as wp
 
 from wrt.kernels.loops.state import Wave
 from wrt.kernels.loops.wave_normals import normal_rows
-from wrt.kernels.loops.wave_rows import EMITTERS, KEYS, LIGHTS, SKY, SKY_POINTS, SURFACES, EmitterPoint, Key
+from wrt.kernels.loops.wave_rows import DRAWN, EMITTERS, KEYS, LIGHTS, SKY, SKY_POINTS, SURFACES, Drawn, EmitterPoint, Key
 from wrt.kernels.rows import Rows
 from wrt.kernels.shade import lights as kinds
 from wrt.kernels.shade.backgrounds import BACKGROUNDS, make_sky_point, make_sky_sample
@@ -15,7 +15,7 @@ from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.lights import LightSample, choose_emitter, emitter_corners, from_emitter
 from wrt.kernels.shade.sampling import triangle_numbers
 from wrt.kernels.shade.shading import Shading
-from wrt.kernels.shade.surface import Surface, triangle_point, triangle_point_error
+from wrt.kernels.shade.surface import Surface, make_place_of, triangle_point, triangle_point_error
 from wrt.kernels.structs import Lighting, Surfaces
 
 MESH = list(kinds.LIGHTS).index("mesh")
@@ -37,7 +37,9 @@ class BlockSamples:
         by_cosine = features.sky_light and kind.sample is None and kind.make_block_radiance is None
         self.normals: Rows | None = normal_rows(features)  # Rows of the shading normals, if they are stored.
         self.mesh = "mesh" in features.lights and not features.instances  # Samples of light 0, if it is a mesh.
-        self.sky = by_cosine and self.normals is not None  # Samples of the background.
+        self.cosine = by_cosine and self.normals is not None  # Samples of the background by the cosine, which need normals.
+        # Samples of the background by a function of its kind, for hits that may need one.
+        self.by_kind = kind.make_block_samples(SKY_POINTS, SKY) if features.sky_light and kind.make_block_samples else None
         self.points = by_cosine and self.normals is None  # Of the background's samples, only the result of sky_point.
 
 
@@ -53,33 +55,63 @@ def make_store_spheres(features: Features, sampled: BlockSamples, shading: Shadi
             if wave.queue.hits.prim_id[k] >= surfaces.n_triangles:
                 s = hit_surface(wave, surfaces, j - first, k)
                 store_point(wave.block.rows, j - first, s.point)
-                if wp.static(sampled.sky):
+                if wp.static(sampled.cosine):
                     wo = -wave.queue.rays.direction[k]
                     store_normal(wave.block.rows, j - first, shading_normal(surfaces, s, look_up(surfaces, s), wo))
 
     return store_spheres
 
 
-def make_sample_sky(features: Features, sampled: BlockSamples) -> Any:
-    """Return sample_sky(wave, lighting, count): store background samples in the rows SKY, or sky_point's results in SKY_POINTS."""
-    sky_point, sky_sample, light_xi = make_sky_point(features), make_sky_sample(features), make_light_points(features).xi
-    load_key, load_normal = KEYS.load(), (sampled.normals or SURFACES.field("shading")).load()
-    store_point, store_sample = SKY_POINTS.store(), SKY.store("end", "distant", "area")
+def make_keep_diffuse(features: Features) -> Any:
+    """Return keep_diffuse(wave, surfaces, first, end) -> int: leave out the SKY_POINTS of hits that are not diffuse, and set DRAWN.
+
+    The result is the number of points left. Clear materials are not diffuse: others may not be either, but then a sample does no harm."""
+    place_of = make_place_of(features.instances)
+    load_point, store_point, store_drawn = SKY_POINTS.load(), SKY_POINTS.store(), DRAWN.store()
 
     @wp.func
-    def sample_sky(wave: Wave, lighting: Lighting, count: int):
+    def keep_diffuse(wave: Wave, surfaces: Surfaces, first: int, end: int) -> int:
+        rows = wave.block.rows
+        kept = int(0)
+        for i in range(end - first):
+            drawn = Drawn()
+            drawn.i = -1
+            place = place_of(surfaces, wave.queue.hits.prim_id[wave.outcomes.hit_rays[first + i]])
+            if surfaces.materials[place.material].transmission < 1.0:
+                drawn.i = kept
+                store_point(rows, kept, load_point(rows, i))
+                kept += 1
+            store_drawn(rows, i, drawn)
+        return kept
+
+    return keep_diffuse
+
+
+def make_sample_sky(features: Features, sampled: BlockSamples) -> Any:
+    """Return sample_sky(wave, surfaces, lighting, first, end): store background samples in the rows SKY, or sky_point's results in
+    SKY_POINTS."""
+    sky_point, sky_sample, light_xi = make_sky_point(features), make_sky_sample(features), make_light_points(features).xi
+    load_key, load_normal = KEYS.load(), (sampled.normals or SURFACES.field("shading")).load()
+    store_point, store_sample, by_kind = SKY_POINTS.store(), SKY.store("end", "distant", "area"), sampled.by_kind
+    keep_diffuse = make_keep_diffuse(features)
+
+    @wp.func
+    def sample_sky(wave: Wave, surfaces: Surfaces, lighting: Lighting, first: int, end: int):
         background = lighting.background
+        count = end - first
         rows = wave.block.rows
         light = lighting.count
         i = int(0)
         while i < count:
             at = load_key(rows, i)
             point = sky_point(light_xi(at.key, at.index, light))
-            if wp.static(sampled.sky):
+            if wp.static(sampled.cosine):
                 store_sample(rows, i, sky_sample(background, load_normal(rows, i), point))
             else:
                 store_point(rows, i, point)
             i = i + 1
+        if wp.static(by_kind is not None):
+            by_kind(background, rows, keep_diffuse(wave, surfaces, first, end))
 
     return sample_sky
 
@@ -145,6 +177,14 @@ def make_light_at(features: Features, sampled: BlockSamples, sample_light: Any) 
     """Return light_at(wave, surfaces, lighting, vertex, light) -> LightSample. It loads the sample from rows, or calls sample_light."""
     light_point = make_light_points(features).point
     load_light, load_sky, load_point = LIGHTS.load("distant", "area"), SKY.load("end", "distant", "area"), SKY_POINTS.load()
+    load_drawn = DRAWN.load()
+
+    @wp.func
+    def sky_at(wave: Wave, i: int) -> LightSample:
+        sky = load_sky(wave.block.rows, i)
+        sky.distant = 1
+        sky.area = 1
+        return sky
 
     @wp.func
     def light_at(wave: Wave, surfaces: Surfaces, lighting: Lighting, vertex: Vertex, light: int) -> LightSample:
@@ -153,12 +193,14 @@ def make_light_at(features: Features, sampled: BlockSamples, sample_light: Any) 
                 mesh = load_light(wave.block.rows, vertex.i)
                 mesh.area = 1
                 return mesh
-        if wp.static(sampled.sky):
+        if wp.static(sampled.cosine):
             if light == lighting.count:
-                sky = load_sky(wave.block.rows, vertex.i)
-                sky.distant = 1
-                sky.area = 1
-                return sky
+                return sky_at(wave, vertex.i)
+        if wp.static(sampled.by_kind is not None):
+            if light == lighting.count:
+                drawn = load_drawn(wave.block.rows, vertex.i)
+                if drawn.i >= 0:
+                    return sky_at(wave, drawn.i)
         if wp.static(sampled.points):
             if light == lighting.count:
                 return sample_light(lighting, surfaces, light, vertex.surface, load_point(wave.block.rows, vertex.i))
@@ -180,16 +222,17 @@ def make_wave_lights(features: Features, shading: Shading, hit_surface: Any, sam
     """Return the WaveLights of a scene. `hit_surface` comes from make_wave_surfaces, sample_light from make_step."""
     sampled = BlockSamples(features)
     store_spheres = make_store_spheres(features, sampled, shading, hit_surface)
+    sky = sampled.cosine or sampled.by_kind is not None or sampled.points
     sample_sky, sample_mesh = make_sample_sky(features, sampled), make_sample_mesh(features)
 
     @wp.func
     def sample(wave: Wave, surfaces: Surfaces, lighting: Lighting, first: int, end: int):
-        if wp.static(features.spheres and (sampled.sky or sampled.mesh)):
+        if wp.static(features.spheres and (sampled.cosine or sampled.mesh)):
             store_spheres(wave, surfaces, first, end)
-        if wp.static(sampled.sky or sampled.points):
-            sample_sky(wave, lighting, end - first)
+        if wp.static(sky):
+            sample_sky(wave, surfaces, lighting, first, end)
         if wp.static(sampled.mesh):
             if first_is_mesh(lighting):
                 sample_mesh(wave, surfaces, lighting, end - first)
 
-    return WaveLights(sample, make_light_at(features, sampled, sample_light), sampled.sky or sampled.points or sampled.mesh)
+    return WaveLights(sample, make_light_at(features, sampled, sample_light), sky or sampled.mesh)

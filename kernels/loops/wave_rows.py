@@ -41,6 +41,13 @@ class EmitterPoint:
     xi: wp.vec2  # Places the point on the emitter, in [0, 1)^2.
 
 
+@wp.struct
+class Drawn:
+    """Tells where the background's sample for a hit is, if only some hits of a block have one."""
+
+    i: int  # Its index in the rows SKY; -1: there is none.
+
+
 HITS = Rows(TriangleHit, BLOCK)
 SURFACES = Rows(Surface, BLOCK, HITS.end)
 TEXELS = Rows(Texels, BLOCK, SURFACES.end)
@@ -51,6 +58,7 @@ EMITTERS = Rows(EmitterPoint, BLOCK, FACETS.end)
 LIGHTS = Rows(LightSample, BLOCK, EMITTERS.end)  # Samples of light 0, if it is a mesh.
 SKY = Rows(LightSample, BLOCK, LIGHTS.end)  # Samples of the background.
 SKY_POINTS = Rows(wp.vec3, BLOCK, SKY.end)  # Results of sky_point.
-MISS_DIRECTIONS = Rows(wp.vec3, BLOCK, SKY_POINTS.end)  # Directions of missed rays.
+DRAWN = Rows(Drawn, BLOCK, SKY_POINTS.end)
+MISS_DIRECTIONS = Rows(wp.vec3, BLOCK, DRAWN.end)  # Directions of missed rays.
 MISS_COLORS = Rows(wp.vec3, BLOCK, MISS_DIRECTIONS.end)  # The background's radiance in these directions.
 ROWS = MISS_COLORS.end

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from wrt.kernels.rows import Rows
-from wrt.kernels.shade.elementary import acos, atan2, sin_cos
+from wrt.kernels.shade.elementary import acos, atan2, near_sin_cos, sin_cos
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.lights import LightSample
 from wrt.kernels.shade.sampling import PI, TWO_PI, cosine_point, rotated_to, search_cdf, share_of_row
@@ -113,26 +113,77 @@ def make_environment_block(directions: Rows, colors: Rows) -> Any:
 
 
 @wp.func
-def environment_sample(b: Background, xi: wp.vec2) -> LightSample:
-    """Sample a direction with a density in proportion to the picture's brightness, uniform in angle within a pixel."""
+def environment_place(b: Background, xi: wp.vec2) -> wp.vec3:
+    """Draw a point of the picture with a density in proportion to the brightness of its pixel, and uniform within the pixel.
+
+    Return row and column, in pixels with a fraction, and the probability of the pixel."""
     row = search_cdf(b.row_cdf, 0, b.height, xi[0])
     first = row * b.width
     column = search_cdf(b.column_cdf, first, b.width, xi[1])
     p_row = share_of_row(b.row_cdf, 0, row)
     p_column = share_of_row(b.column_cdf, first, column)
-    # The position of xi within its interval of the cdf is uniform again. It places the direction within the pixel.
+    # The position of xi within its interval of the cdf is uniform again. It places the point within the pixel.
     v = 1.0 - (b.row_cdf[row] - xi[0]) / p_row
     u = 1.0 - (b.column_cdf[first + column] - xi[1]) / p_column
-    theta = PI * (float(row) + wp.clamp(v, 0.0, 1.0)) / float(b.height)
-    phi = TWO_PI * ((float(column) + wp.clamp(u, 0.0, 1.0)) / float(b.width) - 0.5)
-    sin_theta, cos_theta = sin_cos(theta)
-    sin_phi, cos_phi = sin_cos(phi)
+    return wp.vec3(float(row) + wp.clamp(v, 0.0, 1.0), float(column) + wp.clamp(u, 0.0, 1.0), p_row * p_column)
+
+
+@wp.func_native("""
+    float* const x = rows.data + (long long)at;
+    wrt::environment_place(background, x, x + length, x + 2 * (long long)length, count);
+""")
+def environment_places(background: Background, rows: wp.array(dtype=wp.float32), at: int, length: int, count: int) -> None:
+    """Replace `count` pairs of random numbers by the results of environment_place. The arrays are as in environment_colors."""
+
+
+@wp.func
+def environment_direction(b: Background, place: wp.vec3, sin: float, cos: float) -> tuple[wp.vec3, float]:
+    """Return the unit direction of an environment_place, and its density per steradian. sin, cos: result of rotation_of(b.rotation)."""
+    sin_theta, cos_theta = near_sin_cos(PI * place[0] / float(b.height))
+    sin_phi, cos_phi = near_sin_cos(TWO_PI * (place[1] / float(b.width) - 0.5))
+    density = place[2] * float(b.width * b.height) / (TWO_PI * PI * wp.max(sin_theta, 1.0e-9))
+    return rotated(wp.vec3(sin_theta * sin_phi, cos_theta, -sin_theta * cos_phi), sin, cos), density
+
+
+@wp.func
+def environment_sample(b: Background, xi: wp.vec2) -> LightSample:
+    """Sample a direction with a density in proportion to the picture's brightness, uniform in angle within a pixel."""
+    sin, cos = rotation_of(b.rotation)
+    wi, density = environment_direction(b, environment_place(b, xi), sin, cos)
     sample = LightSample()
-    local = wp.vec3(sin_theta * sin_phi, cos_theta, -sin_theta * cos_phi)
-    sample.wi = rotate_y(local, b.rotation)
-    density = p_row * p_column * float(b.width * b.height) / (TWO_PI * PI * wp.max(sin_theta, 1.0e-9))
-    sample.weight = environment(b, sample.wi) / density
+    sample.wi = wi
+    sample.weight = environment(b, wi) / density
     return sample
+
+
+def make_environment_samples(points: Rows, samples: Rows) -> Any:
+    """Return environment_samples(b, rows, count): store `environment_sample` of the first `count` points in `samples`, vectorised.
+
+    points: rows of vec3 with random numbers x and y, which are overwritten. samples: rows of LightSample, whose wi and weight are set."""
+    load_place, store_place = points.load(), points.store()
+    wi, weight = samples.field("wi"), samples.field("weight")
+    store_wi, load_weight, store_weight = wi.store(), weight.load(), weight.store()
+    look_up = make_environment_block(wi, weight)
+
+    @wp.func
+    def environment_samples(b: Background, rows: wp.array(dtype=wp.float32), count: int):
+        environment_places(b, rows, wp.static(points.first * points.length), wp.static(points.length), count)
+        sin, cos = rotation_of(b.rotation)
+        i = int(0)
+        while i < count:
+            direction, density = environment_direction(b, load_place(rows, i), sin, cos)
+            store_wi(rows, i, direction)
+            store_place(rows, i, wp.vec3(density, 0.0, 0.0))
+            i = i + 1
+        look_up(b, rows, count)
+        i = int(0)
+        while i < count:
+            w = load_weight(rows, i)
+            density = load_place(rows, i)[0]
+            store_weight(rows, i, wp.vec3(w[0] / density, w[1] / density, w[2] / density))
+            i = i + 1
+
+    return environment_samples
 
 
 class BackgroundKind(NamedTuple):
@@ -141,13 +192,14 @@ class BackgroundKind(NamedTuple):
     radiance: Any  # (background, direction) -> radiance.
     sample: Any = None  # (background, xi) -> LightSample with wi and weight. None: sample by the cosine.
     make_block_radiance: Any = None  # Vectorised `radiance`, with the signature of make_environment_block. None: it is not faster.
+    make_block_samples: Any = None  # Vectorised `sample`, with the signature of make_environment_samples.
 
 
 # The keys are the names in wrt.scene.backgrounds.BACKGROUNDS.
 BACKGROUNDS = {
     "constant": BackgroundKind(constant),
     "gradient": BackgroundKind(gradient),
-    "environment": BackgroundKind(environment, environment_sample, make_environment_block),
+    "environment": BackgroundKind(environment, environment_sample, make_environment_block, make_environment_samples),
 }
 
 

@@ -113,6 +113,39 @@ def check_environment() -> None:
         np.testing.assert_array_equal(found.view(np.int32), expected.numpy().view(np.int32))
 
 
+@lanes_kernel
+def places_kernel(b: Background, rows: wp.array(dtype=float), length: int, count: int):
+    backgrounds.environment_places(b, rows, 0, length, count)
+
+
+@kernel
+def place_kernel(b: Background, numbers: wp.array(dtype=wp.vec2), out: wp.array(dtype=wp.vec3)):
+    i = wp.tid()
+    out[i] = backgrounds.environment_place(b, numbers[i])
+
+
+def check_places() -> None:
+    """Compare random numbers, also at both ends and on the entries of the distributions, in pictures of several sizes with black parts."""
+    for size in ((1, 1), (2, 3), (5, 8), (33, 17)):
+        rng = np.random.default_rng(size[0])
+        pixels = rng.random((*size, 3)) * (rng.random(size) < 0.6)[..., None]
+        pixels[-1, 0] = 1.0
+        b = upload_scene(Scene(background=EnvironmentBackground(pixels)), DEVICE).lighting.background
+        ends = np.array([0.0, np.nextafter(np.float32(1.0), np.float32(0.0))], np.float32)
+        special = np.concatenate([ends, b.row_cdf.numpy(), b.column_cdf.numpy()])
+        numbers = rng.random((300, 2)).astype(np.float32)
+        numbers = np.where(rng.random(numbers.shape) < 0.5, rng.choice(special[special < 1.0], numbers.shape), numbers)
+        for n in (1, 16, 300):
+            length = n + LANES
+            rows, expected = np.full((3, length), np.nan), zeros(n, wp.vec3)
+            rows[:2, :n] = numbers[:n].T
+            lanes = floats(rows.ravel())
+            launch(places_kernel, 1, b, lanes, length, n)
+            launch(place_kernel, n, b, wp.array(numbers[:n], dtype=wp.vec2, device=DEVICE), expected)
+            found = lanes.numpy().reshape(3, length)[:, :n].T.copy()
+            np.testing.assert_array_equal(found.view(np.int32), expected.numpy().view(np.int32))
+
+
 @wp.func_native(f"""
     const float *const us = uv.data, *const vs = us + {BLOCK};
     wrt::sample_texture<{BLOCK}>(surfaces, wanted.data, us, vs, count, channels, out.data);
@@ -229,6 +262,7 @@ TWINS = (
     Twin(quantiles, sampling, "quantile", check_quantiles),
     Twin(make_sample_texture("albedo_texture", TEXTURES["albedo_texture"]), textures, "sample_texture", check_textures),
     Twin(backgrounds.environment_colors, backgrounds, "environment_at", check_environment),
+    Twin(backgrounds.environment_places, backgrounds, "environment_place", check_places),
     Twin(add_to_pixels, film_file, "add_sample", check_film),
 )
 
