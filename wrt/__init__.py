@@ -93,7 +93,7 @@ _HOME = _public()
 # What users of other libraries look for, and where it is.
 _CLOSEST, _ANY = (f"wrt.build(mesh).{name}(origins, directions)" for name in ("closest_hit", "any_hit"))
 ELSEWHERE = {"closest_hit": _CLOSEST, "any_hit": _ANY, "BVH": "wrt.build(mesh)", "Trimesh": "wrt.Mesh",
-             "shapes": "wrt.scene.shapes", "read_triangle_mesh": "wrt.load_mesh",
+             "shapes": "wrt.scene.shapes", "read_triangle_mesh": "wrt.load_mesh", "load_obj": "wrt.load_mesh",
              "RaycastingScene": "wrt.compat.open3d.RaycastingScene", "RayMeshIntersector": "wrt.compat.trimesh.RayMeshIntersector",
              "PinholeCamera": "wrt.Camera, or wrt.sensors.pinhole for a matrix K", "PerspectiveCamera": "wrt.Camera",
              "look_at": "wrt.Camera.look_at", "load": "wrt.load_mesh, or wrt.load_scene",

@@ -13,6 +13,8 @@ OTHER_NAMES = {
     "update": "refit", "set_transform": "move", "compute_signed_distance": "signed_distance", "compute_occupancy": "contains",
     "compute_distance": "closest_points", "compute_closest_points": "closest_points", "closest_point": "closest_points",
     "count_intersections": "count_hits", "list_intersections": "all_hits", "intersects_id": "all_hits",
+    # Of pictures.
+    "write": "save", "write_bitmap": "save", "export": "save", "rgb": "pixels", "image": "pixels",
     # Of arguments.
     "tfar": "t_max", "max_distance": "t_max", "max_dist": "t_max", "tnear": "t_min", "worlds": "world", "env_ids": "world",
     "width": "size", "height": "size", "resolution": "size", "samples": "spp", "samples_per_pixel": "spp",

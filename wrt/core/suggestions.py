@@ -3,11 +3,20 @@
 from collections.abc import Collection, Iterable
 from dataclasses import fields
 from functools import wraps
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from wrt.core.checks import did_you_mean
 
 T = TypeVar("T")
+
+
+class Suggests:
+    """A dataclass that answers an unknown attribute with the public one that means the same or is most similar."""
+
+    if not TYPE_CHECKING:  # type checkers report unknown names themselves
+
+        def __getattr__(self, name: str) -> NoReturn:
+            raise no_attribute(self, name, dir(type(self)) + [each.name for each in fields(self)])
 
 
 def no_attribute(thing: object, name: str, known: Iterable[str]) -> AttributeError:

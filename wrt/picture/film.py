@@ -11,6 +11,7 @@ import numpy as np
 
 from wrt.core.checks import as_names, require_known
 from wrt.core.errors import InputError
+from wrt.core.suggestions import Suggests
 from wrt.core.types import PathLike, WarpArray
 from wrt.picture.image import as_half, check_writable, color_channels, encode_png, output_format, write_codes, write_exr, write_image
 from wrt.picture.tonemap import to_codes
@@ -20,7 +21,7 @@ LETTERS = {"variance": "RGB", "depth": "Z", "normal": "XYZ", "albedo": "RGB"}
 
 
 @dataclass(eq=False)
-class Film:
+class Film(Suggests):
     """The result of `render`.
 
     The results of `np.asarray(film)`, of any library's `from_dlpack(film)`, of `numpy()` and of `warp()` share the memory of the pixels.

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +19,7 @@ from wrt.core.device import empty_aligned
 from wrt.core.errors import InputError
 from wrt.core.html import html_table
 from wrt.core.other_names import OTHER_NAMES
-from wrt.core.suggestions import no_attribute
+from wrt.core.suggestions import Suggests, no_attribute
 from wrt.core.tables import write_table
 from wrt.core.types import Array, ArrayT, Device, PathLike, TensorT, WarpArray
 
@@ -71,7 +71,7 @@ class Counters:
 
 
 @dataclass(frozen=True, eq=False)
-class Hits(HitPoints[ArrayT]):
+class Hits(HitPoints[ArrayT], Suggests):
     """Hits of rays, in arrays of the rays' shape (...). The arrays are NumPy's, or those of the rays' library: Warp, PyTorch or JAX.
 
     `hits[mask]`, `hits[10:20]` and `hits[i, j]` are the hits of some rays, in copied arrays, as NumPy indexes `t`.
@@ -120,11 +120,6 @@ class Hits(HitPoints[ArrayT]):
         snapshot, own, worlds = self.source
         flat = rays.reshape(-1)
         return replace(some, counters=self.counters and self.counters.of(rays), source=(snapshot, own.of(flat), worlds and worlds.of(flat)))
-
-    if not TYPE_CHECKING:  # type checkers report unknown names themselves
-
-        def __getattr__(self, name: str) -> NoReturn:
-            raise no_attribute(self, name, dir(type(self)) + [each.name for each in fields(self)])
 
     def _repr_html_(self) -> str:
         hits = self.numpy()

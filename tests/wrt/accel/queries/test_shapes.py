@@ -193,7 +193,7 @@ def test_names_of_other_libraries_are_answered_with_ours(ball: Any) -> None:
     hits, movable = ball.closest_hit(*some_rays(4)), wrt.build(wrt.Scene.of([icosphere(1)]), movable=True)
     fields = {each.name for kind in (wrt.Material, wrt.Camera, wrt.Object) for each in dataclasses.fields(kind)}
     assert {*OTHER_NAMES.values()} <= {*dir(hits), *dir(ball), *dir(movable), *FUNCTIONS, "t_min", "t_max", "world",
-                                       *fields, *MATERIALS, *SETTINGS}
+                                       *fields, *MATERIALS, *SETTINGS, "save", "pixels"}
     for name, said in (("set_transform", "movable=True"), ("compute_signed_distance", "wrt.signed_distance(accel, ...)")):
         with pytest.raises(AttributeError) as error:
             getattr(ball, name)
@@ -217,6 +217,11 @@ def test_names_of_fields_and_kinds_are_answered_with_ours() -> None:
                        (lambda: wrt.PointLight((0, 3, 0), intnsity=5.0), "did you mean 'intensity'")):  # type: ignore[call-arg]
         with pytest.raises(TypeError, match=said):
             call()
+    near = wrt.closest_points(wrt.build(icosphere(1)), eye[0])
+    film = wrt.render(wrt.Scene.of([icosphere(1)]), camera=wrt.Camera.look_at(*eye), size=(4, 3), spp=1)
+    for thing, name, ours in ((near, "distances", "distance"), (film, "write", "save")):
+        with pytest.raises(AttributeError, match=f"{name}'; did you mean '{ours}'"):
+            getattr(thing, name)
     with refused("kind", hint="'glass'"):
         wrt.Material("dielectric")
     for name, ours in (("width", "size"), ("samples", "spp")):
