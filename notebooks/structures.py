@@ -14,8 +14,8 @@ import numpy as np
 
 import wrt
 from wrt.lab.bench import accel as bench
+from wrt.lab.bench.accel import in_stadium
 from wrt.lab.bench.rays import ray_sets
-from wrt.lab.bench.stadium import in_stadium
 from wrt.picture.heatmap import heatmap
 from wrt.scene.shapes import teapot
 

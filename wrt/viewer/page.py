@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,7 +25,6 @@ from wrt.renderer.progress import time_left
 from wrt.scene.cameras import Camera, CameraKind
 from wrt.scene.model import Scene
 from wrt.viewer.access import HERE, Place, Refused, access_for
-from wrt.viewer.asked import Asked
 from wrt.viewer.camera import Steering, camera_toml, pose_of
 from wrt.viewer.panel import RESOLUTIONS, Panel
 from wrt.viewer.rays import Rays, pick
@@ -33,6 +32,34 @@ from wrt.viewer.refine import Viewer
 from wrt.viewer.renderers import CounterOf, Shown
 from wrt.viewer.server import Browser, Server, listen, to_stderr
 from wrt.viewer.walks import WalkOf, Walks
+
+
+class Asked:
+    """What browsers ask of a thread of its own: a queue with one place for each kind of question, of which only the latest is answered."""
+
+    def __init__(self) -> None:
+        self._waiting: dict[str, Any] = {}
+        self._changed, self._closed = threading.Condition(), False
+
+    def put(self, kind: str, what: Any) -> None:
+        """Ask `what`, in place of an older question of this kind that waits."""
+        with self._changed:
+            self._waiting[kind] = what
+            self._changed.notify()
+
+    def take(self) -> dict[str, Any]:
+        """Wait for questions and return them by kind; an empty dict after `close`."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting or self._closed)
+            taken, self._waiting = {} if self._closed else self._waiting, {}
+        return taken
+
+    def close(self) -> None:
+        """End `take`."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+
 
 MOST_PIXELS = 1 << 23  # Largest number of pixels of a picture; a larger window shows the picture enlarged.
 QUALITY = {True: 92, False: 80}  # JPEG quality of a picture at full resolution, and of a coarse picture.

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from wrt.accel.scenes.build import build
+from wrt.lab.bench.accel import in_stadium, stands
 from wrt.lab.bench.rays import ray_sets
-from wrt.lab.bench.stadium import in_stadium, stands
 from wrt.scene.shapes import icosphere
 
 
