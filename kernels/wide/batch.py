@@ -42,6 +42,7 @@ from wrt.kernels.wide.packets import (
     Scratch,
     WideBvh,
     count_of,
+    keep_best,
     key_at,
     lowest_of_all,
     make_children,
@@ -54,6 +55,7 @@ from wrt.kernels.wide.packets import (
     rays_at,
     rays_meeting_root,
     rays_reaching,
+    restore_best,
     slot_at,
     spheres_of,
     store_bits,
@@ -184,10 +186,39 @@ def make_row_test(units: Units, any_hit: bool, accepts: Any, inlined: bool) -> A
     return test_row
 
 
+def make_accepted_in_lanes(any_hit: bool, accepts: Any, test_row: Any) -> Any:
+    """Return accepted_in_lanes, which tests the first n triangles of a row against the rays in the mask; `accepts` may reject hits.
+
+    It returns the mask of the finished rays, as test_row. First all triangles count as accepted. Rays whose hit is then rejected take
+    back their best hit, and test the row again one by one."""
+    triangles = make_triangles(False)
+
+    @wp.func
+    def accepted_in_lanes(accel: WideBvh, surfaces: Surfaces, first: int, n: int, mask: int, scratch: Scratch, base: int) -> int:
+        keep_best(scratch, base)
+        left = triangles(accel, first, n, mask, scratch, base)
+        finished = int(0)
+        while left != 0:
+            lane = lowest(left)
+            left = left & (left - 1)
+            hit = best_at(scratch.packets, base + lane)
+            done = bool(wp.static(any_hit))
+            if not accepts(surfaces, hit.prim_id, hit.u, hit.v):
+                restore_best(scratch, base, lane)
+                done = test_row(accel, first, n, surfaces, scratch, base + lane)
+            elif wp.static(any_hit):
+                put_number(scratch.packets, base + lane + wp.static(FIELD["t"]), -float(wp.inf))
+            if done:
+                finished = finished | (1 << lane)
+        return finished
+
+    return accepted_in_lanes
+
+
 def make_packet_leaf(units: Units, any_hit: bool, accepts: Any) -> Any:
     """Return test_leaf, which tests a leaf against the packet's rays in its argument `mask`: all at once, or one by one (FEW_RAYS)."""
     test_row = make_row_test(units, any_hit, accepts, False)
-    triangles = make_triangles(any_hit)
+    triangles, accepted_in_lanes = make_triangles(any_hit), make_accepted_in_lanes(any_hit, accepts, test_row)
 
     @wp.func
     def test_leaf(accel: WideBvh, surfaces: Surfaces, reference: int, mask: int, scratch: Scratch, base: int):
@@ -195,11 +226,15 @@ def make_packet_leaf(units: Units, any_hit: bool, accepts: Any) -> Any:
         first = leaf_first(reference) * ROW_SIZE
         while left > 0 and mask != 0:
             n = wp.min(left, WIDTH)
-            lanes = bool(wp.static(accepts is None) and count_of(mask) > FEW_RAYS)
+            lanes = bool(count_of(mask) > FEW_RAYS)
             if wp.static(units.spheres):
                 lanes = lanes and spheres_of(accel, first, (2 << (n - 1)) - 1, surfaces.n_triangles) == 0
             if lanes:
-                found = triangles(accel, first, n, mask, scratch, base)
+                found = int(0)
+                if wp.static(accepts is None):
+                    found = triangles(accel, first, n, mask, scratch, base)
+                else:
+                    found = accepted_in_lanes(accel, surfaces, first, n, mask, scratch, base)
                 if wp.static(any_hit):
                     mask = mask & ~found
             else:
