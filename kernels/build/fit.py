@@ -5,9 +5,9 @@ inner children, and moves up. Where two threads meet at a node, the first ends. 
 import warp as wp
 
 from wrt.kernels.build.records import BuildOptions, row_count
-from wrt.kernels.build.shape import half_area
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse.bvh2 import Bvh2Node
+from wrt.kernels.units.box import half_area
 from wrt.kernels.units.triangle import lower, upper
 
 NO_PARENT = wp.constant(-1)

@@ -7,9 +7,9 @@ import warp as wp
 
 from wrt.kernels.build.clip import Clippable, clip_to_cell
 from wrt.kernels.build.kdtree_split import KdEvent, KdOptions, KdSplit, KdTask, KdWork, cheapest_split
-from wrt.kernels.build.shape import half_area
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse.kdtree import LEAF, STACK_SIZE, KdNode
+from wrt.kernels.units.box import half_area
 
 BOTH = wp.constant(wp.uint8(0))
 LEFT = wp.constant(wp.uint8(1))

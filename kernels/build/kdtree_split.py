@@ -5,7 +5,7 @@ references' boxes; a sweep over the sorted faces finds the best. The host splits
 
 import warp as wp
 
-from wrt.kernels.build.shape import half_area
+from wrt.kernels.units.box import half_area
 
 
 @wp.struct

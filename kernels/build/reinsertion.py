@@ -6,8 +6,8 @@ thread makes the moves, the best first, and skips moves that conflict with an ea
 import warp as wp
 
 from wrt.kernels.build.records import BuildOptions, row_count
-from wrt.kernels.build.shape import half_area
 from wrt.kernels.structs import kernel
+from wrt.kernels.units.box import half_area
 
 QUEUE = 96
 QUEUE_SIZE = wp.constant(QUEUE)

@@ -3,8 +3,6 @@ The results equal those of the host's functions to the last bit (Geometry.bounds
 is for CPUs.
 A launch of size dim processes the primitives or records first .. first + dim - 1."""
 
-from typing import Any
-
 import warp as wp
 
 from wrt.kernels.memory import prefetch
@@ -52,12 +50,6 @@ def bounds(shape: Shape, low: wp.array(dtype=wp.vec3), high: wp.array(dtype=wp.v
     pad = box_pad(lo, hi)
     low[i] = padded_lo(lo, pad)
     high[i] = padded_hi(hi, pad)
-
-
-@wp.func
-def half_area(extent: Any) -> Any:
-    """Return half the surface area of a box with this extent (vec3 or vec3d). The host calls half_area.func with (3, ...) arrays."""
-    return extent[0] * extent[1] + extent[1] * extent[2] + extent[2] * extent[0]
 
 
 @wp.func

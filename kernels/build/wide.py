@@ -5,9 +5,9 @@ for each k. From the top down, `collapse` writes the best choice. A leaf's cost 
 
 import warp as wp
 
-from wrt.kernels.build.shape import half_area
 from wrt.kernels.structs import kernel
 from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node
+from wrt.kernels.units.box import half_area
 from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first, leaf_reference
 
 MAX_WIDTH = wp.constant(8)

@@ -9,6 +9,8 @@ together, in `kernels/wide/nodes.py` and, on a CPU, `kernels/wide/box.h`. There,
 distance (tests/kernels/wide/test_lanes.py, tests/kernels/wide/test_packets.py). The table of all cases is in kernels/README.md.
 """
 
+from typing import Any
+
 import warp as wp
 
 from wrt.kernels.structs import Ray
@@ -22,6 +24,12 @@ FAR_PAD = wp.constant(1.0 + 2.0 * (7.0 * 2.0**-24) / (1.0 - 7.0 * 2.0**-24))
 PAD_EXTENT = 2.0**-21
 PAD_COORDINATE = 2.0**-22
 PAD_SMALLEST = 2.0**-148
+
+
+@wp.func
+def half_area(extent: Any) -> Any:
+    """Return half the surface area of a box with this extent (vec3 or vec3d). The host calls half_area.func with (3, ...) arrays."""
+    return extent[0] * extent[1] + extent[1] * extent[2] + extent[2] * extent[0]
 
 
 @wp.struct

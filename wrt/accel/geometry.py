@@ -15,7 +15,6 @@ from wrt.accel.triangle_data import LAYOUTS
 from wrt.core.device import records, upload
 from wrt.core.threads import run_all
 from wrt.core.types import Device, WarpArray, WarpStruct
-from wrt.kernels.build.shape import Shape
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.units.box import PAD_COORDINATE, PAD_EXTENT, PAD_SMALLEST
 from wrt.scene.mesh import Mesh
@@ -72,6 +71,8 @@ class Geometry:
 
     def on(self, device: Device, faces: WarpArray | None = None) -> WarpStruct:
         """Upload to a device, as kernels.build.shape.Shape. faces: the faces, if they are on the device already."""
+        from wrt.kernels.build.shape import Shape  # not at the top: starts that build few primitives do not need it
+
         shape = Shape()
         shape.vertices = upload(self.vertices, wp.vec3, device, read_only=True)
         shape.faces = upload(self.faces, wp.vec3i, device, read_only=True) if faces is None else faces

@@ -6,16 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import warp as wp
 
-from wrt.accel.bvh.refit import Fitting, tree_of
-from wrt.accel.bvh.top_down import build_data, build_options, in_order
 from wrt.accel.bvh.tree import BvhOptions, half_areas, squeeze
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry, inverse_of, spread_of
 from wrt.accel.queries.raw_kernel import launch_raw
 from wrt.core.device import empty_aligned, on_host, records, start, upload
-from wrt.kernels.build import bvh2 as build_bvh2
-from wrt.kernels.build.fit import NO_PARENT
-from wrt.kernels.build.records import BuildTask
 from wrt.kernels.traverse.bvh2 import Bvh2Node
 from wrt.kernels.traverse.instances import Placement
 from wrt.kernels.units.box import PAD_COORDINATE
@@ -62,6 +57,8 @@ class TopLevel:
 
 def build_top(geometry: InstancedGeometry, low: np.ndarray, high: np.ndarray) -> TopLevel:
     """Build the trees over the boxes of all instances."""
+    from wrt.kernels.build.fit import NO_PARENT  # builders are imported when they are needed: most scenes have no instances
+
     first = geometry.first_instance
     nodes, order, roots, depth = split_worlds(low, high, first)
     parents = np.full(len(nodes), NO_PARENT, np.int32)
@@ -75,6 +72,10 @@ def build_top(geometry: InstancedGeometry, low: np.ndarray, high: np.ndarray) ->
 
 def split_worlds(low: np.ndarray, high: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
     """Build a tree by binned SAH over the boxes [first[w], first[w + 1]) of each world; return nodes, order, roots, depth."""
+    from wrt.accel.bvh.top_down import build_data, build_options, in_order
+    from wrt.kernels.build.bvh2 import SPLIT, make_build_ranges
+    from wrt.kernels.build.records import BuildTask
+
     count = np.diff(first)
     # A tree has as many slots for nodes as it has boxes, at least one.
     slot = np.cumsum([0, *np.maximum(count, 1)])
@@ -89,7 +90,7 @@ def split_worlds(low: np.ndarray, high: np.ndarray, first: np.ndarray) -> tuple[
     tasks = records(BuildTask, len(many))
     tasks["begin"], tasks["end"], tasks["slot"], tasks["parent"] = first[many], first[many + 1], slot[many], -1
     build, (depth, none) = in_order(low, high), np.zeros((2, 1), np.int32)
-    launch_raw(build_bvh2.make_build_ranges(build_bvh2.SPLIT["binned"]), len(tasks), build_data(records=build, nodes=nodes, used=used),
+    launch_raw(make_build_ranges(SPLIT["binned"]), len(tasks), build_data(records=build, nodes=nodes, used=used),
                tasks, build_options(BvhOptions(max_leaf=1)), 0, records(BuildTask, 1), none, depth)
     roots = (np.cumsum(used != 0) - 1)[slot[:-1]].astype(np.int32)
     return squeeze(nodes, used != 0), build["prim_id"].copy(), roots, int(depth[0]) + 1
@@ -115,6 +116,8 @@ def refit_top(top: TopLevel, geometry: InstancedGeometry, rows: np.ndarray, low:
     geometry: already has the new matrices. rows: (R,) indices of the moved instances, without repeats. low, high: (R, 3) float32, the
     new boxes of these instances in world space.
     """
+    from wrt.accel.bvh.refit import Fitting, tree_of
+
     cpu, fitting = start("cpu"), Fitting(start("cpu"), len(top.order), len(top.nodes))
     all_low, all_high = top.low.copy(), top.high.copy()
     all_low[rows], all_high[rows] = low, high

@@ -12,8 +12,8 @@ from wrt.accel.queries.raw_kernel import launch_raw
 from wrt.core.device import preloading, records
 from wrt.core.warp_private import struct_record
 from wrt.kernels.build import reinsertion as kernels
-from wrt.kernels.build.shape import half_area
 from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node
+from wrt.kernels.units.box import half_area
 
 NODES_PER_LAUNCH = 256
 SMALL_LEAF = 4  # primitives per leaf at most while build_refined moves subtrees; wide BVHs merge leaves afterwards

@@ -105,7 +105,7 @@ def _subtrees(boxes: np.ndarray, begin: np.ndarray, count: np.ndarray) -> _Subtr
         begin, count = begin[inner], count[inner]
         counts, areas = np.empty((2, len(inner)), np.int64), np.empty((2, len(inner)))
         size = np.frexp(count - 1)[1] * (len(count) * count.max(initial=0) > FEW)  # subtrees of about equal size are split together
-        for each in np.unique(size):
+        for each in set(size.tolist()):
             some = size == each
             counts[:, some], areas[:, some] = _split(boxes, items, begin[some], count[some])
         begin, count = np.stack([begin, begin + counts[0]], axis=1).reshape(-1), counts.T.reshape(-1)

@@ -7,8 +7,8 @@ import numpy as np
 from wrt.accel.box_tree import BoxTree
 from wrt.core.device import records
 from wrt.core.errors import InputError
-from wrt.kernels.build.shape import half_area
 from wrt.kernels.traverse.bvh2 import Bvh2Node
+from wrt.kernels.units.box import half_area
 
 MAX_LEAF = 64
 

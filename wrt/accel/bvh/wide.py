@@ -17,7 +17,7 @@ from wrt.accel.bvh.builders import BinaryOptions, BvhOptions, build_binary
 from wrt.accel.bvh.compress import compress, decompress, existing_children
 from wrt.accel.bvh.small import SMALL, small_tree, small_trees
 from wrt.accel.bvh.tree import binary_tree_of
-from wrt.accel.bvh.wide_tree import COLLAPSE, WideTree, check_wide, collapse, lanes_of, packed, refit, row_starts, wide_tree_of
+from wrt.accel.bvh.wide_tree import WideTree, check_wide, collapse, collapse_kernels, lanes_of, packed, refit, row_starts, wide_tree_of
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.raw_kernel import launch_raw
 from wrt.core.building import report, report_parts
@@ -25,7 +25,6 @@ from wrt.core.device import empty_aligned, preloading, record_dtype, start
 from wrt.core.errors import InputError
 from wrt.core.threads import run_all
 from wrt.core.types import Kernel, WarpStruct
-from wrt.kernels.build.shape import write_rows
 from wrt.kernels.wide.layout import PLANES, STACK_SIZE, first_reference, node_size
 from wrt.kernels.wide.references import EMPTY, MAX_FIRST, leaf_count, leaf_first
 from wrt.kernels.wide.stream import BatchTraversal
@@ -34,6 +33,13 @@ from wrt.kernels.wide.traverse import WideTraversal
 ROWS_PER_JOB = 4096
 BINARY = 0.8  # share of a build's time after which the binary tree is finished, for large meshes
 ROWS_BY_KERNEL = 1 << 15  # triangles
+
+
+def rows_kernel() -> Kernel:
+    """Return the kernel that writes rows of triangles. It is imported when it is needed."""
+    from wrt.kernels.build.shape import write_rows
+
+    return write_rows
 
 
 @dataclass(frozen=True)
@@ -72,7 +78,7 @@ class CollapsedBvh(OneMesh):
         """Build a binary tree and collapse it; load `kernels`, which the structure needs afterwards, at the same time."""
         # Two leaves count as cheaper than one if they have less area, because the cost of inner nodes depends on the collapse.
         of_binary = replace(options, max_leaf=min(options.max_leaf, self.width), cost_traversal=0.0, cost_intersection=1.0)
-        with preloading(*(COLLAPSE if len(self.geometry) > 1 else ()), *kernels):
+        with preloading(*(collapse_kernels() if len(self.geometry) > 1 else ()), *kernels):
             binary = build_binary(self.geometry, of_binary, self.threads)
             report(BINARY)
             if len(binary.order) < 2:
@@ -137,7 +143,7 @@ class WideBvh(CollapsedBvh):
 
     def _built(self, tree: WideTree | None, options: BvhOptions) -> Built:
         """Return the arrays of a tree. Build the tree if it is None, or too deep."""
-        kernels = [write_rows] if self._rows_by_kernel() else []
+        kernels = [rows_kernel()] if self._rows_by_kernel() else []
         if tree is None or tree.stack > STACK_SIZE:
             tree = self._collapsed(options, *kernels)
         built = Built(self._arrays(tree), tree.order[tree.order >= 0], len(tree.children), tree.leaves, tree.depth)
@@ -182,7 +188,7 @@ class WideBvh(CollapsedBvh):
         floats = record_dtype(units.triangle_test.record).itemsize // 4
         rows = empty_aligned((len(starts) - 1, floats, width), np.float32)
         if self._rows_by_kernel():
-            launch_raw(write_rows, len(rows), self.geometry.on(start("cpu")), order, starts, width, rows.reshape(-1), None,
+            launch_raw(rows_kernel(), len(rows), self.geometry.on(start("cpu")), order, starts, width, rows.reshape(-1), None,
                        threads=self.threads, step=ROWS_PER_JOB)
             return rows.reshape(-1)
 

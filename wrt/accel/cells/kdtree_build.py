@@ -19,8 +19,8 @@ from wrt.core.types import WarpStruct
 from wrt.kernels.build import kdtree as kernels
 from wrt.kernels.build.clip import Clippable, clip_references
 from wrt.kernels.build.kdtree_split import split_cost
-from wrt.kernels.build.shape import half_area
 from wrt.kernels.traverse.kdtree import LEAF, STACK_SIZE, KdNode
+from wrt.kernels.units.box import half_area
 
 BINS = 64
 # Triangles outside of these sizes are not clipped, because the error margin of clipping would underflow or be infinite.

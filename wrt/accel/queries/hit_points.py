@@ -23,7 +23,6 @@ from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike, ArrayT, WarpStruct
 from wrt.kernels import structs
 from wrt.kernels.query import HitArrays
-from wrt.kernels.shade.hit_points import HitPlaces, ObjectIds, hit_places
 from wrt.kernels.warp_private import fields_of
 
 HITS_PER_LAUNCH = 65536
@@ -183,6 +182,8 @@ class HitPoints(Generic[ArrayT]):
         return given
 
     def _filled(self, name: str) -> ArrayT:
+        from wrt.kernels.shade.hit_points import HitPlaces, hit_places  # not at the top: pictures do not need it
+
         snapshot, rays, worlds = self._source()
         n, device, shape = len(rays.origins), snapshot.device, self.shape
         if name in ("error", "normal", "shading", "uv"):
@@ -247,6 +248,8 @@ def own_ids(name: str, scene: FlatScene, worlds: WorldIds | None) -> Callable[[n
 @once
 def device_scene(snapshot: Snapshot) -> DeviceScene:
     """Upload the scene of a structure to its device."""
+    from wrt.kernels.shade.hit_points import ObjectIds
+
     geometry, device = snapshot.geometry, snapshot.device
     scene, surfaces = snapshot.attributes or flat_scene_of(geometry), structs.Surfaces()
     placed = placed_now(scene, geometry)
