@@ -174,7 +174,7 @@ def test_every_file_loads_with_its_triangles_or_is_refused(name):
 @pytest.mark.filterwarnings("ignore::wrt.core.errors.SceneWarning")
 def test_world_bounds_agree_with_trimesh(name):
     trimesh = pytest.importorskip("trimesh")
-    theirs = trimesh.load(data_path(name), process=False).bounds
+    theirs = trimesh.load(data_path(name), process=False, skip_materials=True).bounds  # trimesh 4.5 refuses emissiveFactor > 1
     ours = load_gltf(data_path(name)).bounds()
     assert np.array(ours) == pytest.approx(theirs, rel=1e-5, abs=1e-5 * np.ptp(theirs, axis=0).max())
 
