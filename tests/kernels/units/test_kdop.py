@@ -73,7 +73,7 @@ def test_host_and_device_project_alike():
     np.testing.assert_array_equal(out.numpy(), host_project(v.astype(np.float32)))
 
 
-@pytest.mark.parametrize("kind", ["any", "edge", "grazing", "sliver", "far", "axis"])
+@pytest.mark.parametrize("kind", ["any", "edge", "grazing", "sliver", "far", "axis", "corner"])
 def test_every_hit_of_the_triangle_is_let_through(kind):
     # The rays are aimed at points on the triangles. The 14-DOPs' common centre `middle` is near the triangles or far from them.
     rng = np.random.default_rng(3)
@@ -96,6 +96,8 @@ def test_every_hit_of_the_triangle_is_let_through(kind):
         direction += 10.0 ** rng.uniform(-9, -4, (n, 1)) * rng.normal(size=(n, 3))
     away = 10.0 ** (rng.uniform(2, 6, (n, 1)) if kind == "far" else rng.uniform(-1, 2, (n, 1)))
     origin = rounded(point - away * scale * direction)
+    if kind == "corner":  # From the middle, where the ray's own pad is 0: only the pad of the 14-DOP covers the rounding.
+        point, origin = corners[:, 0], np.zeros((n, 3))
     for middle in ([0.0, 0.0, 0.0], [1e3, -2e3, 500.0]):
         t_hit, entry, box_entry = run(origin, rounded(point - origin), corners, middle)
         hit = (t_hit >= 0.0) & (t_hit < np.inf)
