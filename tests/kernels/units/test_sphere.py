@@ -96,6 +96,13 @@ def test_a_sphere_as_the_ground(radius):
     assert np.allclose(t[hit], expected[hit, 0], rtol=8.0 * 2.0**-24, atol=0.0)
 
 
+def test_a_tiny_sphere_far_away_is_hit_through_its_centre():
+    # Up to rounding, the distances to all planes of its padded box are the same number.
+    direction = rounded(directions(np.random.default_rng(12), 10_000))
+    t = run(-(2.0**20) * direction, direction, [0.0, 0.0, 0.0], 2.0**-10)
+    assert np.allclose(t, 2.0**20, rtol=8.0 * 2.0**-24, atol=0.0)
+
+
 def test_a_small_sphere_far_from_the_origin_is_whole():
     # The box's corners are rounded by some percent of the radius. This must not cut a slice off the sphere.
     rng = np.random.default_rng(7)
