@@ -467,6 +467,22 @@ def test_certain_float_float_hits_have_the_bits_of_float64(seed):
         assert without_float64(*given)[0].sum() > 5000
 
 
+@pytest.mark.parametrize("large", range(3))
+@pytest.mark.parametrize("swap", [False, True])
+def test_float_float_arithmetic_is_not_certain_beside_a_midpoint(large, swap):
+    """One product of coordinates is 2^25 times as large as all others, so that an area over the sum of all is 1 - 2^-25, less than
+    u^2 from the midpoint of two float32. It is u or v and, by the choice of z, also t."""
+    rng = np.random.default_rng(14)
+    x, y = rounded(rng.uniform(1.0, 2.0, (2, 1000)))
+    part = rng.uniform(0.5, 1.5, 1000)
+    triangle = np.zeros((1000, 3, 3))
+    triangle[:, large] = np.stack([(part - 2.0) * x, -part * y, np.full(1000, 2.0**26 - 2.0)], axis=1) / (2.0**26 - 2.0)
+    triangle[:, (large + 1) % 3, 1], triangle[:, (large + 2) % 3, 0] = y, x
+    triangle = triangle[..., [1, 0, 2]] if swap else triangle
+    told, hit = without_float64(np.zeros((1000, 3)), np.broadcast_to([0.0, 0.0, 1.0], (1000, 3)), triangle)
+    assert hit.all() and not told.any()
+
+
 def test_rays_through_an_edge_or_from_the_plane_are_hard_cases():
     square = np.array([[-1.0, -1.0, 0.0], [3.0, -1.0, 0.0], [-1.0, 3.0, 0.0]])
     origin = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 1.0], [0.0, 0.0, 0.0], [np.nan, 0.0, 1.0]])
