@@ -473,7 +473,8 @@ def test_float_float_arithmetic_is_not_certain_beside_a_midpoint(large, swap):
     """One product of coordinates is 2^25 times as large as all others, so that an area over the sum of all is 1 - 2^-25, less than
     u^2 from the midpoint of two float32. It is u or v and, by the choice of z, also t."""
     rng = np.random.default_rng(14)
-    x, y = rounded(rng.uniform(1.0, 2.0, (2, 1000)))
+    exponent = rng.choice([-10.0, 10.0], 1000)
+    x, y = rounded(rng.uniform(1.0, 2.0, (2, 1000)) * np.exp2([exponent, -exponent]))
     part = rng.uniform(0.5, 1.5, 1000)
     triangle = np.zeros((1000, 3, 3))
     triangle[:, large] = np.stack([(part - 2.0) * x, -part * y, np.full(1000, 2.0**26 - 2.0)], axis=1) / (2.0**26 - 2.0)
