@@ -137,13 +137,14 @@ def make_changes(any_hit: bool, pad: float) -> Changes:
 
 
 @wp.func_native(f"""
-    int* const words = slots.data + {SLOT_SIZE} * slot;
+    int* const words = scratch.slots.data + {SLOT_SIZE} * slot;
+    wrt::clear(scratch.stacks.data, {STACK_WORDS} * slot);
     words[{SLOT["ray"]}] = ray;
     words[{SLOT["next"]}] = next;
     words[{SLOT["place"]}] = {STACK_WORDS} * slot;
     words[{SLOT["placement"]}] = placement;
 """)
-def fill_slot(slots: wp.array(dtype=wp.int32), slot: int, ray: int, next: int, placement: int) -> None:
+def fill_slot(scratch: Scratch, slot: int, ray: int, next: int, placement: int) -> None:
     """Put a ray with an empty stack into a slot."""
 
 
@@ -216,7 +217,7 @@ def make_start(any_hit: bool, place_ray: Any, worlds: bool) -> Any:
         local = slot / LANES * PACKET_SIZE + slot % LANES
         placement = leaf_first(next)
         place_ray(accel, placement, scratch, slot_at(scratch.slots, top + wp.static(SLOT["ray"])), local)
-        fill_slot(scratch.slots, slot, local, 0, placement)
+        fill_slot(scratch, slot, local, 0, placement)
         return True
 
     @wp.func
@@ -227,7 +228,7 @@ def make_start(any_hit: bool, place_ray: Any, worlds: bool) -> Any:
         if wp.static(worlds):
             root = bits(scratch.packets, column + wp.static(FIELD["root"]))
             if root < 0:
-                fill_slot(scratch.slots, SLOTS + slot, column, ~root, 0)
+                fill_slot(scratch, SLOTS + slot, column, ~root, 0)
                 return descend(accel, scratch, slot, top_step(accel, scratch, SLOTS + slot))
         return descend(accel, scratch, slot, top_begin(accel, scratch, SLOTS + slot, root, column))
 

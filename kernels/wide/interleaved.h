@@ -5,13 +5,19 @@
 
 namespace wrt {
 
-// Take the next child from a ray's stack, whose last level begins at stacks[at]. For any-hit rays, it is the last child of that level.
-// Otherwise, it is the nearest child of a level, and begins at or before `reach`.
+// Make a ray's stack empty: its first level has one child, the first of the root, for which `take` returns 0.
+WRT_INLINE void clear(unsigned* stacks, int bottom) {
+    stacks[bottom + LEVEL_REFERENCES] = REFERENCES;
+    stacks[bottom + LEVEL_LEFT] = 1;
+}
+
+// Take the next child from a ray's stack, whose last level begins at stacks[at]. For any-hit rays, it is the last child of that level, and
+// no branch asks whether the stack is empty: it would be mispredicted late. Otherwise, it is the nearest child of a level, and begins at or
+// before `reach`.
 template <bool ANY_HIT> WRT_INLINE int take(const float* nodes, float reach, unsigned* stacks, int bottom, int at, int* slot) {
     unsigned* level;
     int child;
     if constexpr (ANY_HIT) {
-        if (at == bottom) return 0;
         level = stacks + at;
         child = 31 - __builtin_clz(level[LEVEL_LEFT]);
     } else {
@@ -29,7 +35,8 @@ template <bool ANY_HIT> WRT_INLINE int take(const float* nodes, float reach, uns
     }
     const unsigned left = level[LEVEL_LEFT] ^ 1u << child;
     level[LEVEL_LEFT] = left;
-    const int next = load<int>(nodes + (long long)level[LEVEL_REFERENCES] + child);
+    const int found = load<int>(nodes + (long long)level[LEVEL_REFERENCES] + child);
+    const int next = !ANY_HIT || WRT_UNPREDICTABLE(at != bottom) ? found : 0;
     slot[SLOT_NEXT] = next;
     slot[SLOT_PLACE] = left != 0 ? at : at - LEVEL;
     return next;
@@ -63,6 +70,7 @@ WRT_INLINE int begin(const float* nodes, int root, float* packets, int ray, unsi
     for (int child = 0; child < WIDTH; ++child) enter[child] = packets[ray + ROOT_ENTRIES + LANES * child];
     slot[SLOT_RAY] = ray;
     slot[SLOT_PLACE] = bottom;
+    clear(stacks, bottom);
     const float reach = __builtin_inff();
     return push_and_take<ANY_HIT>(nodes, root * NODE_SIZE, {enter, all<Children>(LARGEST)}, reach, stacks, bottom, slot);
 }

@@ -100,7 +100,7 @@ ENTRY, ENTRY_RAYS = 4, 2
 # The stack of an interleaved ray is a list of levels: one for each ancestor of the present node that has pending children. A level holds
 # eight keys, the index of the node's references (LEVEL_REFERENCES), and the mask of pending children (LEVEL_LEFT). A key is the entry
 # distance, with its last four bits replaced by the child's index + 8; the order of children does not need these bits. If a child is not
-# pending, all bits of its key are 1, which is a NaN. Any-hit rays need no order and have no keys. The first level is empty.
+# pending, all bits of its key are 1, which is a NaN. Any-hit rays need no order and have no keys. The first level ends the stack.
 LEVEL = 16
 LEVEL_REFERENCES = WIDTH
 LEVEL_LEFT = WIDTH + 1

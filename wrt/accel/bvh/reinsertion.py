@@ -16,7 +16,7 @@ from wrt.kernels.traverse.bvh2 import STACK_SIZE, Bvh2Node
 from wrt.kernels.units.box import half_area
 
 NODES_PER_LAUNCH = 256
-SMALL_LEAF = 4  # primitives per leaf at most while build_refined moves subtrees; wide BVHs merge leaves afterwards
+SMALL_LEAF = 3  # primitives per leaf at most while build_refined moves subtrees; wide BVHs merge leaves afterwards
 
 
 class Effort(NamedTuple):
