@@ -11,34 +11,53 @@ WRT_INLINE void clear(unsigned* stacks, int bottom) {
     stacks[bottom + LEVEL_LEFT] = 1;
 }
 
-// Take the next child from a ray's stack, whose last level begins at stacks[at]. For any-hit rays, it is the last child of that level, and
-// no branch asks whether the stack is empty: it would be mispredicted late. Otherwise, it is the nearest child of a level, and begins at or
-// before `reach`.
-template <bool ANY_HIT> WRT_INLINE int take(const float* nodes, float reach, unsigned* stacks, int bottom, int at, int* slot) {
-    unsigned* level;
-    int child;
-    if constexpr (ANY_HIT) {
-        level = stacks + at;
-        child = 31 - __builtin_clz(level[LEVEL_LEFT]);
-    } else {
-        // Keys are not sorted, because most rays enter only one child or two. So search the least.
-        unsigned key;
-        for (;; at -= LEVEL) {
-            if (at == bottom) return 0;
-            level = stacks + at;
-            key = least_of(load<Lanes<WIDTH>::Keys>(level));
-            // A child that begins exactly at `reach` may have a hit with a lower prim_id.
-            if (__builtin_bit_cast(float, key & ~(unsigned)KEY_MASK) <= reach) break;
-        }
-        child = key & (WIDTH - 1);
-        level[child] = ~0u;
-    }
+// What `take` needs of a level of a ray's stack, which begins at stacks[at].
+struct Level {
+    int at;
+    unsigned left, references;
+};
+
+WRT_INLINE Level level_at(const unsigned* stacks, int at) { return {at, stacks[at + LEVEL_LEFT], stacks[at + LEVEL_REFERENCES]}; }
+
+WRT_INLINE unsigned least_key(const unsigned* stacks, int at) { return least_of(load<Lanes<WIDTH>::Keys>(stacks + at)); }
+
+// Take the last child of an any-hit ray's last level, which begins at stacks[at]. With AVX-512, no branch asks whether the stack is empty:
+// it would be mispredicted late. With AVX2, the branch is faster.
+WRT_INLINE int take_last(const float* nodes, unsigned* stacks, int bottom, int at, int* slot) {
+    if (REGISTER < LANES && at == bottom) return 0;
+    unsigned* const level = stacks + at;
+    const int child = 31 - __builtin_clz(level[LEVEL_LEFT]);
     const unsigned left = level[LEVEL_LEFT] ^ 1u << child;
     level[LEVEL_LEFT] = left;
     const int found = load<int>(nodes + (long long)level[LEVEL_REFERENCES] + child);
-    const int next = !ANY_HIT || WRT_UNPREDICTABLE(at != bottom) ? found : 0;
+    const int next = WRT_UNPREDICTABLE(at != bottom) ? found : 0;
     slot[SLOT_NEXT] = next;
     slot[SLOT_PLACE] = left != 0 ? at : at - LEVEL;
+    return next;
+}
+
+// Take the nearest child of a ray's last level or, if it begins beyond `reach`, of a level below. `key` is the last level's least key: keys
+// are not sorted, because most rays enter only one child or two. A child that begins exactly at `reach` may have a hit with a lower prim_id.
+// Distances are not negative, so their bits have their order.
+WRT_INLINE int take_nearest(const float* nodes, float reach, unsigned* stacks, int bottom, Level level, unsigned key, int* slot) {
+    const unsigned last = __builtin_bit_cast(unsigned, reach) | KEY_MASK;
+    int at = level.at;
+    if (at == bottom) return 0;
+    if (key > last) {
+        do {
+            at -= LEVEL;
+            if (at == bottom) return 0;
+            key = least_key(stacks, at);
+        } while (key > last);
+        level = level_at(stacks, at);
+    }
+    const int child = key & (WIDTH - 1);
+    stacks[level.at + child] = ~0u;
+    const unsigned left = level.left ^ 1u << child;
+    stacks[level.at + LEVEL_LEFT] = left;
+    const int next = load<int>(nodes + (long long)level.references + child);
+    slot[SLOT_NEXT] = next;
+    slot[SLOT_PLACE] = left != 0 ? level.at : level.at - LEVEL;
     return next;
 }
 
@@ -50,16 +69,25 @@ WRT_INLINE int push_and_take(const float* nodes, int first, const Interval<Lanes
     typedef Lanes<WIDTH>::Keys Keys;
     static_assert(WIDTH == 8, "`child` lists eight indices");
     const auto met = t.enter <= t.leave;
-    const unsigned left = mask_of(met);
-    const int place = slot[SLOT_PLACE];
-    unsigned* const level = stacks + place + LEVEL;
-    if constexpr (!ANY_HIT) {
+    const unsigned left = mask_of(met), references = first + REFERENCES;
+    const int place = slot[SLOT_PLACE], above = place + LEVEL;
+    const bool some = WRT_UNPREDICTABLE(left != 0);
+    unsigned* const level = stacks + above;
+    if constexpr (ANY_HIT) {
+        level[LEVEL_LEFT] = left;
+        level[LEVEL_REFERENCES] = references;
+        return take_last(nodes, stacks, bottom, some ? above : place, slot);
+    } else {
         const Keys child = {0, 1, 2, 3, 4, 5, 6, 7};
-        store(level, (__builtin_bit_cast(Keys, t.enter) & ~(unsigned)KEY_MASK) | (child + WIDTH) | ~__builtin_bit_cast(Keys, met));
+        const Keys keys = (__builtin_bit_cast(Keys, t.enter) & ~(unsigned)KEY_MASK) | (child + WIDTH) | ~__builtin_bit_cast(Keys, met);
+        store(level, keys);
+        level[LEVEL_REFERENCES] = references;
+        // The level's words are chosen in registers: loads would wait for the stores.
+        const Level last = level_at(stacks, place);
+        const Level chosen = {some ? above : place, some ? left : last.left, some ? references : last.references};
+        const unsigned new_key = least_of(keys), old_key = least_key(stacks, place);
+        return take_nearest(nodes, reach, stacks, bottom, chosen, some ? new_key : old_key, slot);
     }
-    level[LEVEL_LEFT] = left;
-    level[LEVEL_REFERENCES] = first + REFERENCES;
-    return take<ANY_HIT>(nodes, reach, stacks, bottom, WRT_UNPREDICTABLE(left != 0) ? place + LEVEL : place, slot);
 }
 
 // Put a ray into a slot, and take the first of the children of node `root`. rays_meeting has stored their ROOT_ENTRIES.
@@ -101,7 +129,9 @@ template <bool ANY_HIT> WRT_INLINE int step(const float* nodes, float* packets, 
 
 // After a leaf, take a child from the stack that begins at or before `reach`, the ray's t.
 template <bool ANY_HIT> WRT_INLINE int pop(const float* nodes, float reach, unsigned* stacks, int bottom, int* slot) {
-    return take<ANY_HIT>(nodes, reach, stacks, bottom, slot[SLOT_PLACE], slot);
+    const int place = slot[SLOT_PLACE];
+    if constexpr (ANY_HIT) return take_last(nodes, stacks, bottom, place, slot);
+    return take_nearest(nodes, reach, stacks, bottom, level_at(stacks, place), least_key(stacks, place), slot);
 }
 
 // Test the triangles of a row that are in the mask. Store the nearest hit in the ray's column; return its lane, or -1 on a miss. For an

@@ -73,6 +73,11 @@ def leaf_begins(tree: BinaryTree) -> np.ndarray:
     return begins
 
 
+def words(array: np.ndarray) -> np.ndarray:
+    """Return a view of (N,) records of 32-bit fields, (N, K) int32: rows are moved much faster than fields."""
+    return array.view(np.int32).reshape(len(array), -1)
+
+
 def links_of(tree: BinaryTree) -> np.ndarray:
     """Convert a tree to kernels.build.reinsertion.Link records: inner nodes first, then leaves in the order of their primitives."""
     nodes, n_inner = tree.nodes, len(tree.nodes)
@@ -85,9 +90,7 @@ def links_of(tree: BinaryTree) -> np.ndarray:
         place[index] = np.arange(side, 2 * n_inner, 2, dtype=np.int32)
     place[0] = 0
     links["parent"] = place >> 1
-    boxes = np.stack([nodes[f"{end}_{side}"] for side in (0, 1) for end in ("lo", "hi")], axis=1).reshape(-1, 6)
-    boxes = boxes.take(place, axis=0)  # much faster than indexing the fields of records
-    links["lo"], links["hi"] = boxes[:, :3], boxes[:, 3:]
+    words(links)[:, 3:] = words(nodes)[:, :12].reshape(-1, 6).take(place, axis=0)
     links["parent"][0] = -1
     links["lo"][0] = np.minimum(nodes["lo_0"][0], nodes["lo_1"][0])
     links["hi"][0] = np.maximum(nodes["hi_0"][0], nodes["hi_1"][0])
@@ -176,13 +179,12 @@ def nodes_of(links: np.ndarray, inner: np.ndarray, begins: np.ndarray, counts: n
     """Convert a tree's inner nodes, links[inner], to Bvh2Node records in the order of `inner`.
     begins, counts: one entry per link. For a leaf: position of its first primitive in the tree's order, and number of primitives.
     For inner nodes, the function overwrites the entries."""
-    nodes, boxes = records(Bvh2Node, len(inner)), np.concatenate([links["lo"], links["hi"]], axis=1)
+    nodes = records(Bvh2Node, len(inner))
     begins[inner], counts[inner] = np.arange(len(inner)), 0
-    for side, name in (("0", "left"), ("1", "right")):
-        child = links[name][inner]
-        box = boxes.take(child, axis=0)
-        nodes["lo_" + side], nodes["hi_" + side] = box[:, :3], box[:, 3:]
-        nodes["first_" + side], nodes["count_" + side] = begins[child], counts[child]
+    for side, name in enumerate(("left", "right")):
+        child = links[name].take(inner)
+        words(nodes)[:, 6 * side : 6 * side + 6] = words(links).take(child, axis=0)[:, 3:]
+        nodes[f"first_{side}"], nodes[f"count_{side}"] = begins.take(child), counts.take(child)
     return nodes
 
 
