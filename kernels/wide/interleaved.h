@@ -5,13 +5,13 @@
 
 namespace wrt {
 
-// Make a ray's stack empty: its first level has one child, the first of the root, for which `take` returns 0.
+// Make a ray's stack empty: its first level has one child, the first of the root, for which `take_last` returns 0.
 WRT_INLINE void clear(unsigned* stacks, int bottom) {
     stacks[bottom + LEVEL_REFERENCES] = REFERENCES;
     stacks[bottom + LEVEL_LEFT] = 1;
 }
 
-// What `take` needs of a level of a ray's stack, which begins at stacks[at].
+// A level of a ray's stack, which begins at stacks[at].
 struct Level {
     int at;
     unsigned left, references;
