@@ -32,7 +32,7 @@ def test_bytes_come_whole(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("path", "message"), [
-    ("/dev/zero", "no regular file"), ("/dev/null", "no regular file"), (".", "Is a directory"), ("a\0b", "null byte"),
+    ("/dev/zero", "no regular file"), ("/dev/null", "no regular file"), (".", "Is a directory"), ("a\0b", "embedded null"),
     ("nowhere", "No such file"), ("x" * 5000, "name too long"), ("/proc/self/mem/x", "Not a directory"),
 ])
 def test_what_is_no_file(path: str, message: str) -> None:
