@@ -4,8 +4,8 @@ A ray that is not finite, or has direction 0, hits nothing. The queries leave ou
 take longer than a ray.
 """
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -20,7 +20,9 @@ from wrt.core.device import made_once
 from wrt.core.threads import FreeList
 from wrt.core.types import Kernel, WarpType
 from wrt.core.warp_private import struct_record
+from wrt.kernels.placed_rays import FAR
 
+Ends: TypeAlias = tuple[np.ndarray, np.ndarray]  # t_min and t_max of each ray, (N,) float32
 
 class GivenRays(NamedTuple):
     """Valid rays: origins and directions (N, 3), t_max (N,), float32. A ray with t_max = -inf hits nothing."""
@@ -32,7 +34,13 @@ class GivenRays(NamedTuple):
     @property
     def rays(self) -> Rays:
         """Rays of a query."""
-        return Rays(self.origins, self.directions, constant(0.0, len(self.t_max)), self.t_max)
+        return self.between(None)
+
+    def between(self, ends: Ends | None) -> Rays:
+        """Return rays of a query with these ends; None: 0 and infinity."""
+        if ends is None:
+            return Rays(self.origins, self.directions, constant(0.0, len(self.t_max)), self.t_max)
+        return Rays(self.origins, self.directions, ends[0], np.minimum(self.t_max, ends[1]))
 
     def of(self, rows: np.ndarray) -> "GivenRays":
         """Return some of the rays. rows: indices (M,)."""
@@ -41,12 +49,12 @@ class GivenRays(NamedTuple):
 
 def closest_hits(accel: Accelerator, rays: GivenRays, threads: int) -> list[np.ndarray]:
     """Return t, u, v and prim_id of each ray's closest hit."""
-    return _traced(accel, rays, threads, HIT_TYPES)
+    return _traced(accel, rays.rays, threads, HIT_TYPES)
 
 
-def _traced(accel: Accelerator, rays: GivenRays, threads: int, types: Mapping[str, type]) -> list[np.ndarray]:
+def _traced(accel: Accelerator, rays: Rays, threads: int, types: Mapping[str, type]) -> list[np.ndarray]:
     out: list[Any] = [np.empty(len(rays.t_max), dtype) for dtype in types.values()]
-    trace_query(accel.snapshot, Query(rays.rays, out, threads))
+    trace_query(accel.snapshot, Query(rays, out, threads))
     return out
 
 
@@ -69,10 +77,14 @@ class RayFormat:
         Type of these arrays.
     *inputs
         A value of the type of each argument before `struct`.
+    refuse : Callable, optional
+        Function of the caller's arrays that raises InputError. It is called if the kernel gives a ray the t_max FAR.
     """
 
-    def __init__(self, kernel: Kernel, struct: WarpType, columns: tuple[int, ...], dtype: type, *inputs: object) -> None:
+    def __init__(self, kernel: Kernel, struct: WarpType, columns: tuple[int, ...], dtype: type, *inputs: object,
+                 refuse: Callable[..., object] | None = None) -> None:
         self.kernel, self.struct, self.columns, self.dtype, self.inputs = kernel, struct, columns, dtype, inputs
+        self._refuse = refuse
         self._convert = RawKernel(kernel, *inputs, struct())
         self._few_rays = FreeList(lambda: _FewRays(self, _empty(SMALL)))
         self._few_queries = made_once(lambda tracer: FreeList(lambda: _FewQueries(self, tracer)))
@@ -84,7 +96,13 @@ class RayFormat:
             return self._few_rays.run(lambda few: few.converted(arrays, inputs))
         rays = _empty(n)
         self._convert.launch(n, *inputs, struct_record(self.struct, (*arrays, *rays)), threads=threads)
+        self.check(arrays, rays.t_max)
         return rays
+
+    def check(self, arrays: tuple[np.ndarray, ...], t_max: np.ndarray) -> None:
+        """Raise the error of `refuse` if a converted ray has the t_max FAR."""
+        if self._refuse is not None and np.count_nonzero(t_max == float(FAR)):
+            self._refuse(*arrays)
 
     def closest_hits(self, accel: Accelerator, arrays: tuple[np.ndarray, ...], threads: int, *inputs: object) -> list[np.ndarray]:
         """Convert rays and return their hits as `closest_hits`."""
@@ -92,15 +110,17 @@ class RayFormat:
             return self._few(accel.snapshot, False, arrays, inputs)
         return closest_hits(accel, self.converted(arrays, threads, *inputs), threads)
 
-    def any_hits(self, accel: Accelerator, arrays: tuple[np.ndarray, ...], threads: int, *inputs: object) -> np.ndarray:
-        """Convert rays and return whether each of them hits anything, (N,) bool."""
+    def any_hits(self, accel: Accelerator, arrays: tuple[np.ndarray, ...], threads: int, *inputs: object,
+                 ends: Ends | None = None) -> np.ndarray:
+        """Convert rays and return whether each of them hits anything between its ends, (N,) bool."""
         if len(arrays[0]) <= SMALL and accel.device.is_cpu:
-            return self._few(accel.snapshot, True, arrays, inputs)[0]
-        return _traced(accel, self.converted(arrays, threads, *inputs), threads, ANY_HIT_TYPES)[0]
+            return self._few(accel.snapshot, True, arrays, inputs, ends)[0]
+        return _traced(accel, self.converted(arrays, threads, *inputs).between(ends), threads, ANY_HIT_TYPES)[0]
 
-    def _few(self, snapshot: Snapshot, any_hit: bool, arrays: tuple[np.ndarray, ...], inputs: tuple[object, ...]) -> list[np.ndarray]:
+    def _few(self, snapshot: Snapshot, any_hit: bool, arrays: tuple[np.ndarray, ...], inputs: tuple[object, ...],
+             ends: Ends | None = None) -> list[np.ndarray]:
         free: FreeList[_FewQueries] = self._few_queries(tracer(snapshot.structure, any_hit))
-        return free.run(lambda few: few.trace(snapshot, arrays, inputs))
+        return free.run(lambda few: few.trace(snapshot, arrays, inputs, ends))
 
 
 class _FewRays:
@@ -110,7 +130,7 @@ class _FewRays:
     """
 
     def __init__(self, form: RayFormat, rays: GivenRays) -> None:
-        self.rays = rays
+        self.form, self.rays = form, rays
         self.arrays: list[np.ndarray] = [np.empty((SMALL, columns), form.dtype) for columns in form.columns]
         self.inputs: list[object] = [None] * len(form.inputs)  # of the last launch
         self.launch = raw_launch(form.kernel, *form.inputs, form.struct(), 0)
@@ -131,6 +151,7 @@ class _FewRays:
                 self.inputs[i] = record
         self.launch.set_dim(n)
         self.launch.launch()
+        self.form.check(arrays, self.rays.t_max[:n])
 
 
 class _FewQueries:
@@ -138,12 +159,15 @@ class _FewQueries:
 
     def __init__(self, form: RayFormat, tracer: Tracer) -> None:
         self.worker = Worker(tracer)
-        origins, directions, t_min, t_max = self.worker.rays
-        t_min[:] = 0.0
+        origins, directions, _, t_max = self.worker.rays
         self.rays = _FewRays(form, GivenRays(origins, directions, t_max))
 
-    def trace(self, snapshot: Snapshot, arrays: tuple[np.ndarray, ...], inputs: tuple[object, ...]) -> list[np.ndarray]:
+    def trace(self, snapshot: Snapshot, arrays: tuple[np.ndarray, ...], inputs: tuple[object, ...], ends: Ends | None) -> list[np.ndarray]:
         n = len(arrays[0])
         self.rays.convert(arrays, inputs)
+        t_min, t_max = (array[:n] for array in self.worker.rays[2:4])
+        t_min[:] = 0.0 if ends is None else ends[0]
+        if ends is not None:
+            np.minimum(t_max, ends[1], out=t_max)
         self.worker.launch(snapshot, self.worker.packed, 0, n)
         return [found[:n].copy() for found in self.worker.results]

@@ -8,7 +8,8 @@ from __future__ import annotations
 import math
 import sys
 from contextlib import suppress
-from typing import Any, ClassVar, TypeAlias
+from functools import partial
+from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -17,22 +18,22 @@ from wrt.accel.points.closest_points import closest_points
 from wrt.accel.points.contains import odd_crossings
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.all_hits import ListQuery
-from wrt.accel.queries.rays import vectors
+from wrt.accel.queries.few_lists import begins
+from wrt.accel.queries.rays import segment_ends, vectors
 from wrt.accel.scenes.build import build
-from wrt.compat.given_rays import GivenRays, RayFormat, closest_hits
+from wrt.compat.given_rays import RayFormat
 from wrt.compat.surfaces import every_hit, hit_counts, scatter
 from wrt.core.arrays import float32, real_numbers
 from wrt.core.checks import as_integer, shown
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike
-from wrt.kernels.placed_rays import FAR, SplitRays, split_rays
+from wrt.kernels.placed_rays import SplitRays, split_rays
 from wrt.kernels.query import FARTHEST
 from wrt.scene.values import LARGEST, as_number
 
 MOST_SAMPLES = 1 << 16
 WIDEST = 1 << 15  # pixels
-SPLIT = RayFormat(split_rays, SplitRays, (6,), np.float32)
 
 
 class Array(np.ndarray):
@@ -76,7 +77,7 @@ class RaycastingScene:
         name = str(device).lower()
         self._device, self._threads = "cpu" if name == "cpu:0" else name, _threads(nthreads)
         self._meshes: list[tuple[np.ndarray, np.ndarray]] = []
-        self._built: tuple[Accelerator, np.ndarray, np.ndarray] | None = None
+        self._built: _Built | None = None
 
     def add_triangles(self, vertex_positions: MeshOrArray = None, triangle_indices: ArrayLike | None = None,
                       mesh: object = None) -> int:
@@ -117,14 +118,9 @@ class RaycastingScene:
             t_hit (...), inf on a miss; geometry_ids and primitive_ids (...) uint32, INVALID_ID on a miss; primitive_uvs (..., 2)
             and primitive_normals (..., 3), 0 on a miss.
         """
-        accel, _, normals = self._scene()
-        threads = _threads(nthreads)
-        shape, given = _given_rays(rays, threads)
-        t, u, v, prim_id = closest_hits(accel, given, threads)
-        geometry_ids, primitive_ids = self._ids(prim_id)
-        found = {"t_hit": t, "geometry_ids": geometry_ids, "primitive_ids": primitive_ids,
-                 "primitive_uvs": np.stack([u, v], axis=1), "primitive_normals": normals[prim_id]}
-        return {name: _answer(array, shape) for name, array in found.items()}
+        scene, (shape, rows) = self._scene(), _rows(rays, "rays", 6)
+        t, u, v, prim_id = SPLIT.closest_hits(scene.accel, (rows,), _threads(nthreads))
+        return _answers({"t_hit": t, **scene.found(prim_id, u, v), "primitive_normals": scene.normals.take(prim_id, 0)}, shape)
 
     def test_occlusions(self, rays: ArrayLike, tnear: float = 0.0, tfar: float = math.inf, nthreads: int = 0) -> Answer:
         """Test whether each ray hits anything: (...) bool.
@@ -134,17 +130,14 @@ class RaycastingScene:
         tnear, tfar
             Ends of the segment in units of the direction's length.
         """
-        accel = self._scene()[0]
-        threads = _threads(nthreads)
-        shape, given = _given_rays(rays, threads)
-        ends = np.where(given.t_max > 0.0, tfar, given.t_max)
-        return _answer(accel.any_hit(given.origins, given.directions, tnear, ends, threads=threads), shape)
+        shape, rows = _rows(rays, "rays", 6)
+        t_min, t_max = (float32(np.asarray(segment_ends(end, len(rows), name))) for end, name in ((tnear, "t_min"), (tfar, "t_max")))
+        return _answer(SPLIT.any_hits(self._scene().accel, (rows,), _threads(nthreads), ends=(t_min, t_max)), shape)
 
     def count_intersections(self, rays: ArrayLike, nthreads: int = 0) -> Answer:
         """Count the intersections of each ray with surfaces, (...) int32. An intersection at an edge or a corner counts once."""
-        threads = _threads(nthreads)
-        shape, given = _given_rays(rays, threads)
-        return _answer(hit_counts(self._scene()[0], given, threads).astype(np.int32), shape)
+        threads, (shape, rows) = _threads(nthreads), _rows(rays, "rays", 6)
+        return _answer(hit_counts(self._scene().accel, SPLIT.converted((rows,), threads), threads).astype(np.int32), shape)
 
     def list_intersections(self, rays: ArrayLike, nthreads: int = 0) -> dict[str, Answer]:
         """List the M intersections that `count_intersections` counts, ray by ray in order of distance.
@@ -155,14 +148,11 @@ class RaycastingScene:
             ray_splits (N + 1,): rows ray_splits[i] .. ray_splits[i + 1] - 1 are of ray i; ray_ids, geometry_ids, primitive_ids (M,),
             all uint32; t_hit (M,); primitive_uvs (M, 2).
         """
-        threads = _threads(nthreads)
-        shape, given = _given_rays(rays, threads)
-        ray, face, t, u, v = every_hit(self._scene()[0], given, threads)
-        splits = np.concatenate([[0], np.cumsum(np.bincount(ray, minlength=math.prod(shape)))])
-        geometry_ids, primitive_ids = self._ids(face)
-        found = {"ray_splits": splits.astype(np.uint32), "ray_ids": ray.astype(np.uint32), "t_hit": t,
-                 "geometry_ids": geometry_ids, "primitive_ids": primitive_ids, "primitive_uvs": np.stack([u, v], axis=1)}
-        return {name: _answer(array, array.shape[:1]) for name, array in found.items()}
+        scene, threads, (_, rows) = self._scene(), _threads(nthreads), _rows(rays, "rays", 6)
+        ray, face, t, u, v = every_hit(scene.accel, SPLIT.converted((rows,), threads), threads)
+        splits = begins(np.bincount(ray, minlength=len(rows)))
+        return _answers({"ray_splits": splits.astype(np.uint32), "ray_ids": ray.astype(np.uint32), "t_hit": t,
+                         **scene.found(face, u, v)})
 
     def compute_closest_points(self, query_points: ArrayLike, nthreads: int = 0) -> dict[str, Answer]:
         """Find the point on the meshes that is closest to each query point (wrt.closest_points).
@@ -174,12 +164,12 @@ class RaycastingScene:
             Without a mesh, IDs are INVALID_ID, and all other values are 0.
         """
         shape, valid, points = _valid_points(query_points)
-        accel, _, normals = self._scene()
-        found = closest_points(accel, points, _threads(nthreads))
-        geometry_ids, primitive_ids = self._ids(found.prim_id)
-        answers = {"points": found.point, "geometry_ids": geometry_ids, "primitive_ids": primitive_ids,
-                   "primitive_uvs": np.stack([found.u, found.v], axis=1), "primitive_normals": normals[found.prim_id]}
-        return _answers(answers, valid, shape)
+        scene = self._scene()
+        found = closest_points(scene.accel, points, _threads(nthreads))
+        answers = {"points": found.point, **scene.found(found.prim_id, found.u, found.v),
+                   "primitive_normals": scene.normals.take(found.prim_id, 0)}
+        missing = dict.fromkeys(("geometry_ids", "primitive_ids"), self.INVALID_ID)
+        return _answers({name: scatter(array, valid, missing.get(name, 0.0)) for name, array in answers.items()}, shape)
 
     def compute_distance(self, query_points: ArrayLike, nthreads: int = 0) -> Answer:
         """Compute the distance of each point to the meshes, (...) float32: inf without a mesh, NaN for points that are not finite."""
@@ -219,35 +209,43 @@ class RaycastingScene:
         rays = make(*given, **named)
         return _answer(rays.reshape(-1, 6), rays.shape[:2])
 
-    def _scene(self) -> tuple[Accelerator, np.ndarray, np.ndarray]:
-        """Return the structure, the first prim_id of each mesh, and the unit normals of all faces, with a last row 0 for prim_id -1."""
+    def _scene(self) -> _Built:
+        """Return the structure over the present meshes."""
         if self._built is None:
             vertices, faces = [np.zeros((1, 3), np.float32)], [np.zeros((0, 3), np.int64)]
             for positions, indices in self._meshes:
                 faces.append(indices + sum(map(len, vertices)))
                 vertices.append(positions)
-            first = np.cumsum([0, *(len(indices) for _, indices in self._meshes)])[:-1]
             mesh = Geometry(np.concatenate(vertices), np.concatenate(faces).astype(np.int32), np.zeros((0, 4), np.float32))
-            self._built = build(mesh, "bvh8", device=self._device, threads=self._threads), first, _normals(mesh)
+            ids = [(np.full(len(indices), i, np.uint32), np.arange(len(indices), dtype=np.uint32))
+                   for i, (_, indices) in enumerate(self._meshes)]
+            of_face, of_mesh = (np.concatenate(column) for column in zip(*ids, ([np.uint32(self.INVALID_ID)],) * 2, strict=True))
+            self._built = _Built(build(mesh, "bvh8", device=self._device, threads=self._threads), of_face, of_mesh, _normals(mesh))
         return self._built
-
-    def _ids(self, prim_id: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return geometry_ids and primitive_ids."""
-        first = self._scene()[1]
-        if not len(first):
-            return (np.full(len(prim_id), self.INVALID_ID, np.uint32),) * 2
-        mesh = np.searchsorted(first, prim_id, side="right") - 1
-        ids = np.where(prim_id >= 0, [mesh, prim_id - first[mesh]], self.INVALID_ID).astype(np.uint32)
-        return ids[0], ids[1]
 
     def _inside(self, points: np.ndarray, nthreads: int, nsamples: int) -> np.ndarray:
         if as_integer(nsamples, "nsamples", 1, MOST_SAMPLES) % 2 == 0:
             raise InputError(f"must be odd, got {nsamples}", argument="nsamples")
-        query = ListQuery(self._scene()[0], _threads(nthreads), crossings=True)
+        query = ListQuery(self._scene().accel, _threads(nthreads), crossings=True)
         votes = np.zeros(len(points), np.int32)
         for seed in range(nsamples):
             votes += odd_crossings(query, points, seed)
         return np.asarray(2 * votes > nsamples)
+
+
+class _Built(NamedTuple):
+    """A structure, and what the answers say about its faces, with a last row for prim_id -1."""
+
+    accel: Accelerator
+    geometry_ids: np.ndarray  # (F + 1,) uint32, as primitive_ids
+    primitive_ids: np.ndarray
+    normals: np.ndarray  # (F + 1, 3) float32
+
+    def found(self, prim_id: np.ndarray, u: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the IDs and coordinates of hits, by the names of the answers."""
+        uvs = np.empty((len(u), 2), np.float32)
+        uvs[:, 0], uvs[:, 1] = u, v
+        return {"geometry_ids": self.geometry_ids.take(prim_id), "primitive_ids": self.primitive_ids.take(prim_id), "primitive_uvs": uvs}
 
 
 def _threads(nthreads: int) -> int:
@@ -292,18 +290,11 @@ def _normals(mesh: Geometry) -> np.ndarray:
     return np.concatenate([unit, np.zeros((1, 3))]).astype(np.float32)
 
 
-def _given_rays(value: Any, threads: int) -> tuple[tuple[int, ...], GivenRays]:
-    """Return the leading shape of the caller's rays, and the rays."""
-    shape, rows = _rows(value, "rays", 6)
-    rays = SPLIT.converted((rows,), threads)
-    if (rays.t_max == FAR).any():
-        _finite(rows, "rays")
-    return shape, rays
-
-
 def _valid_points(value: Any) -> tuple[tuple[int, ...], np.ndarray | None, np.ndarray]:
     """Return the leading shape, the mask of finite points (None: all), and the finite points."""
     shape, points = _rows(value, "query_points", 3)
+    if (np.abs(points) <= FARTHEST).all():  # the usual case
+        return shape, None, points
     valid = _finite(points, "query_points")
     return (shape, None, points) if valid.all() else (shape, valid, points[valid])
 
@@ -316,19 +307,18 @@ def _finite(array: np.ndarray, name: str) -> np.ndarray:
     return valid
 
 
-def _answers(found: dict[str, np.ndarray], valid: np.ndarray | None, shape: tuple[int, ...]) -> dict[str, Any]:
-    """Return results for all points of the caller, as arrays or tensors.
+SPLIT = RayFormat(split_rays, SplitRays, (6,), np.float32, refuse=partial(_finite, name="rays"))
 
-    found: results by name, one row for each valid point. All other points get the values for a structure without faces. shape:
-    leading shape of the caller's points.
-    """
-    missed = {"geometry_ids": RaycastingScene.INVALID_ID, "primitive_ids": RaycastingScene.INVALID_ID}
-    return {name: _answer(scatter(array, valid, missed.get(name, 0.0)), shape) for name, array in found.items()}
+
+def _answers(found: dict[str, np.ndarray], shape: tuple[int, ...] | None = None) -> dict[str, Answer]:
+    """Convert results, by name, as `_answer`."""
+    return {name: _answer(array, array.shape[:1] if shape is None else shape) for name, array in found.items()}
 
 
 def _answer(array: np.ndarray, shape: tuple[int, ...]) -> Answer:
     """Convert a result to an array or tensor with the leading shape of the caller's rays or points."""
-    array = np.ascontiguousarray(array).reshape((*shape, *array.shape[1:]))
+    if len(shape) != 1 or not array.flags.c_contiguous:
+        array = np.ascontiguousarray(array).reshape((*shape, *array.shape[1:]))
     open3d = sys.modules.get("open3d")
     return array.view(Array) if open3d is None else open3d.core.Tensor.from_numpy(array)
 

@@ -19,6 +19,8 @@ REAL = "iufO"  # NumPy's kinds of real numbers, and objects such as fractions: n
 
 def to_numpy(array: ArrayLike) -> np.ndarray:
     """Return a NumPy array of the same memory, or a copy of an array on a GPU."""
+    if type(array) is np.ndarray:
+        return array
     array = from_tensor(array, "an array", None)
     return array.numpy() if isinstance(array, wp.array) else np.asarray(array)
 
@@ -53,6 +55,8 @@ def real_numbers(value: object, name: str, shape: str) -> np.ndarray:
 
 def float32(array: np.ndarray) -> np.ndarray:
     """Return a contiguous and aligned float32 array, without a copy if possible. Values beyond float32 become infinite."""
+    if array.dtype == np.float32 and array.flags.c_contiguous and array.flags.aligned:  # NumPy's check takes ten times as long
+        return array
     with np.errstate(over="ignore"):
         return np.require(array, np.float32, ["C", "A"])
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -14,11 +15,12 @@ from wrt.accel.points.winding import winding_number
 from wrt.accel.queries.accelerator import Accelerator, snapshot_of
 from wrt.accel.queries.hit_points import device_scene
 from wrt.accel.queries.part_faces import part_faces
+from wrt.accel.queries.raw_kernel import RawKernel, kernel_memory
 from wrt.accel.queries.shapes import in_shape, shaped_points
 from wrt.accel.queries.world_ids import roots_of
 from wrt.accel.snapshot import Snapshot, once
 from wrt.core.checks import require_known
-from wrt.core.device import launch_on, upload
+from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.core.suggestions import Suggests
 from wrt.core.threads import thread_count
@@ -29,6 +31,7 @@ from wrt.kernels.wide.closest_point import PointArrays, make_closest_point_kerne
 from wrt.kernels.wide.traverse import WideTraversal
 
 POINTS_PER_LAUNCH = 4096
+POINT_KINDS = [field.dtype for field in fields_of(PointArrays).values()]
 SIGNS = ("crossings", "winding")
 
 
@@ -99,17 +102,17 @@ def closest_points(accel: Accelerator, points: ArrayLike, threads: int | None = 
         raise InputError("closest points need a bvh4, bvh8 or bvh8c with the watertight triangle test, got a"
                          f" {structure.accel.name} with {structure.units.triangle!r}")
     (rows, shape, world), device = shaped_points(points, world), snapshot.device
-    n, out = len(rows), PointArrays()
-    for name, field in fields_of(PointArrays).items():
-        setattr(out, name, wp.empty(n, dtype=field.dtype, device=device))
-    inputs, roots = [snapshot.data, None, upload(rows, wp.vec3, device)], roots_of(snapshot, world, n)
+    n, memory, roots = len(rows), kernel_memory(device), roots_of(snapshot, world, len(rows))
+    out: list[Any] = [memory.empty(n, kind) for kind in POINT_KINDS]
+    points_and_roots: list[Any] = [memory.array(rows, wp.vec3)]
     if roots is None:
-        kernel, inputs[1] = make_closest_point_kernel(kernels.layout), device_scene(snapshot).surfaces
+        kernel, scene = make_closest_point_kernel(kernels.layout), device_scene(snapshot).surfaces
     else:
-        kernel, inputs[1] = make_placed_points_kernel(kernels.layout), point_places(snapshot)
-        inputs.append(upload(roots, wp.int32, device))
-    launch_on(device, kernel, n, *inputs, out, None, threads=thread_count(threads), step=POINTS_PER_LAUNCH)
-    return ClosestPoints(*(in_shape(getattr(out, name).numpy(), shape) for name in fields_of(PointArrays)))
+        kernel, scene = make_placed_points_kernel(kernels.layout), point_places(snapshot)
+        points_and_roots.append(memory.array(roots, wp.int32))
+    memory.launch(RawKernel(kernel, step=POINTS_PER_LAUNCH), n, snapshot.data, scene, *points_and_roots,
+                  memory.struct(PointArrays, *out), threads=thread_count(threads))
+    return ClosestPoints(*(in_shape(memory.numpy(array), shape) for array in out))
 
 
 @once

@@ -13,6 +13,7 @@ from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.all_hits import ListQuery
+from wrt.accel.queries.rays import Rays, constant
 from wrt.accel.queries.shapes import in_shape, shaped_points
 from wrt.accel.snapshot import Snapshot, once
 from wrt.core.arrays import given_like
@@ -95,12 +96,17 @@ def contains(accel: Accelerator, points: ArrayLike, threads: int | None = None, 
 
 
 def odd_crossings(query: ListQuery, rows: np.ndarray, seed: int = 0, world: ArrayLike | None = None) -> np.ndarray:
-    """Return whether a ray from each point in `rows`, (N, 3), crosses the surface an odd number of times. seed: of its direction."""
+    """Return whether a ray from each point in `rows` crosses the surface an odd number of times.
+
+    rows: (N, 3) float32, valid origins. seed: of the rays' direction.
+    """
     inside = np.zeros(len(rows), bool)
     low, high = used_bounds(query.snapshot)
     within = np.nonzero(((rows >= low) & (rows <= high)).all(axis=1))[0]
     if len(within):
-        counts = query.of(rows[within], np.broadcast_to(direction_of(seed), (len(within), 3)), world=world).counts()
+        n = len(within)
+        rays = Rays(rows[within], np.tile(direction_of(seed), (n, 1)), constant(0.0, n), constant(np.inf, n))
+        counts = query.of_valid(rays, world).counts()
         inside[within] = counts % 2 == 1
     return inside
 

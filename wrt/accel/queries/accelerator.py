@@ -266,9 +266,8 @@ def snapshot_of(accel: Accelerator, instances: bool = False) -> Snapshot:
     """Return the snapshot of a structure over one mesh without spheres, or, if `instances`, over instances or worlds.
     Raises InputError for any other structure."""
     what = "" if instances else " over one mesh"
-    message = f"must be a structure{what} without spheres (wrt.build), got {shown(accel)}"
-    if not isinstance(accel, Accelerator):
-        raise InputError(message, argument="accel")
-    if accel.structure.units.spheres or (accel.structure.units.instances and not instances):
-        raise InputError(message, argument="accel", hint=MESH_OF_A_SPHERE if accel.structure.units.spheres else None)
+    units = accel.structure.units if isinstance(accel, Accelerator) else None
+    if units is None or units.spheres or (units.instances and not instances):
+        raise InputError(f"must be a structure{what} without spheres (wrt.build), got {shown(accel)}", argument="accel",
+                         hint=MESH_OF_A_SPHERE if units and units.spheres else None)
     return accel.snapshot

@@ -124,10 +124,10 @@ class ListQuery:
             vertices, faces = surfaces.vertices, surfaces.faces
         self.mesh: Mesh = (vertices, faces, first_face) if crossings else (None, None, first_face)
 
-    def of_valid(self, rays: Rays) -> ListQuery:
-        """Set rays that are valid: contiguous NumPy arrays of float32. Not over several worlds."""
+    def of_valid(self, rays: Rays, world: ArrayLike | None = None) -> ListQuery:
+        """Set rays that are valid: contiguous NumPy arrays of float32. world: see `of`."""
         self.n, self.rays = len(rays.origins), rays if self.device.is_cpu else arrays_on(self.device, rays)
-        self.roots = roots_of(self.snapshot, None, self.n)
+        self.roots = roots_of(self.snapshot, world, self.n)
         return self
 
     def of(self, origins: ArrayLike, directions: ArrayLike | None, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
@@ -212,7 +212,7 @@ class ListQuery:
             n = min(RAYS_AT_ONCE, self.n - begin)
             rays = self.memory.struct(RayArrays, *(array[begin:begin + n] for array in self.rays))
             roots = None if self.roots is None else self.memory.array(self.roots[begin:begin + n], wp.int32)
-            few = self._filled(rays, roots, FEW * np.arange(n + 1), limit)
+            few = self._filled(rays, roots, (1 if counting else FEW) * np.arange(n + 1), limit, counting)
             lists, counts = [few], self._noted(self.memory.numpy(few.counts), begin)
             if counts.max() > FEW and not counting:
                 many = counts > FEW
@@ -221,15 +221,15 @@ class ListQuery:
                 counts = np.where(many, self.memory.numpy(lists[1].counts), counts)
             yield rays, lists, counts
 
-    def _filled(self, rays: object, roots: Array | None, first: np.ndarray, limit: int) -> _Lists:
+    def _filled(self, rays: object, roots: Array | None, first: np.ndarray, limit: int, counting: bool = False) -> _Lists:
         """Traverse the structure and return lists of hits. The list of ray i has the rows first[i] .. first[i + 1] - 1."""
         rows, n = rows_of(first[-1]), len(first) - 1
         lists = _Lists(limit, self.crossings, *self.mesh, self.memory.array(first, wp.int32),
                        self.memory.array(np.zeros(n, np.int32), wp.int32), self.memory.empty(rows, Hit))
         if roots is not None:
             lists = _Lists(*lists[:8], roots, *(self.memory.empty(n, kind) for kind in (wp.float64, wp.int32, wp.float32)))
-        self.memory.launch(list_hits(self.snapshot.structure), n, self.snapshot.data, rays, self.memory.struct(HitLists, *lists),
-                           threads=self.threads)
+        self.memory.launch(list_hits(self.snapshot.structure, not counting), n, self.snapshot.data, rays,
+                           self.memory.struct(HitLists, *lists), threads=self.threads)
         return lists
 
     def _copy(self, rays: object, lists: list[_Lists], begin: np.ndarray, hits: list[Array]) -> None:
@@ -246,10 +246,11 @@ def rows_of(hits: int) -> int:
 
 
 @made_once
-def list_hits(structure: Structure) -> RawKernel:
+def list_hits(structure: Structure, ordered: bool) -> RawKernel:
+    """Return the kernel that lists hits. ordered: it visits near nodes first, so that it ends early if the number of hits is limited."""
     listing, instances = structure._replace(units=structure.units._replace(lists=True)), structure.units.instances
     accepts = make_list_hit(instances, structure.units.triangle == "watertight")
-    traverse = listing.traversal(any_hit=False, accepts=accepts)
+    traverse = listing.traversal(any_hit=not ordered, accepts=accepts)
     kernel = make_list_hits_kernel(structure.struct, traverse, instances)
     return RawKernel(kernel, structure.struct(), RayArrays(), HitLists())
 
@@ -257,7 +258,7 @@ def list_hits(structure: Structure) -> RawKernel:
 @made_once
 def few_lists(structure: Structure) -> FreeList[FewLists]:
     """Return the FewLists of a structure that no thread uses now."""
-    return FreeList(lambda: FewLists(list_hits(structure), COPY_HITS))
+    return FreeList(lambda: FewLists(list_hits(structure, True), COPY_HITS))
 
 
 @overload

@@ -56,18 +56,20 @@ class RawKernel:
     kernel
         Kernel for one element.
     *inputs
-        A value of the type of each argument but the last.
+        A value of the type of each argument but the last, for a recorded launch.
+    step
+        Number of elements of a launch.
     """
 
-    def __init__(self, kernel: Kernel, *inputs: object) -> None:
-        self.kernel, self.inputs = kernel, inputs
+    def __init__(self, kernel: Kernel, *inputs: object, step: int = STEP) -> None:
+        self.kernel, self.inputs, self.step = kernel, inputs, step
 
     def launch(self, n: int, *inputs: object, threads: int = 1) -> None:
         """Run the kernel on the CPU over n elements: contiguous NumPy arrays, records and Warp structs in.
 
         The caller keeps their memory.
         """
-        launch_raw(self.kernel, n, *inputs, None, threads=threads, step=STEP)
+        launch_raw(self.kernel, n, *inputs, None, threads=threads, step=self.step)
 
 
 class HostMemory:

@@ -75,7 +75,7 @@ def rays_of(origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike, t_max: 
     n = len(rays[0])
     if len(rays[1]) != n:
         raise InputError(f"must have as many rows as origins ({n}), got {len(rays[1])}", argument="directions")
-    return Rays(rays[0], rays[1], _segment_ends(t_min, n, "t_min"), _segment_ends(t_max, n, "t_max"))
+    return Rays(rays[0], rays[1], segment_ends(t_min, n, "t_min"), segment_ends(t_max, n, "t_max"))
 
 
 def are_rows(origins: Any, directions: Any) -> bool:
@@ -137,7 +137,8 @@ def default_end(value: float, device: str) -> WarpArray:
     return out
 
 
-def _segment_ends(value: ArrayLike, n: int, name: str) -> Array:
+def segment_ends(value: ArrayLike, n: int, name: str) -> Array:
+    """Convert t_min or t_max (`name`) of n rays to an array (n,). Raises InputError for other shapes, and for an invalid number."""
     if type(value) is not float:  # a float, the usual case, needs no conversion
         value = from_tensor(value, name, wp.float32)
     if isinstance(value, wp.array):
