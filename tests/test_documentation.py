@@ -55,6 +55,11 @@ SLOW = {  # run by `pytest -m slow`
 }
 
 
+def test_a_version_has_at_most_thirty_lines_of_changes() -> None:
+    versions = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8").split("\n## ")[1:]
+    assert versions and all(len(text.splitlines()) <= 31 for text in versions)  # with the heading
+
+
 def page_id(path: Path) -> str:
     return path.relative_to(ROOT).as_posix()
 
