@@ -61,8 +61,9 @@ def visible(accel: Accelerator, a: ArrayLike, b: ArrayLike, on_a: ArrayLike | No
         Points, converted to float32; they broadcast. Values of Warp arrays on a GPU are not checked; a point that is not finite sees
         nothing.
     on_a, on_b : (...) array_like of int, optional
-        Primitive on which each point lies (`hits.prim_id` for `hits.point`), or -1. The point is moved off that triangle or sphere
-        by its rounding error, as for shadow rays. In a structure without spheres, that triangle cannot block. Not for instances.
+        Primitive on which each point lies (`hits.prim_id` for `hits.point`), or -1; they broadcast, too. The point is moved off that
+        triangle or sphere by its rounding error, as for shadow rays. In a structure without spheres, that triangle cannot block. Not for
+        instances.
     threads : int, optional
         Threads on the CPU; one per core by default.
     out : (...) bool, optional
@@ -167,13 +168,16 @@ def _points(value: Array, name: str, device: Device) -> WarpArray:
 
 
 def _prim_ids(value: ArrayLike | None, name: str, shape: tuple[int, ...], count: int) -> np.ndarray:
-    """Convert prim_ids in `shape` to (N,) int32; None becomes -1. Raises InputError that names the argument."""
+    """Broadcast prim_ids to `shape`, as (N,) int32; None becomes -1. Raises InputError that names the argument."""
     if value is None:
         return np.full(int(np.prod(shape)), -1, np.int32)
     array = real_numbers(value, name, f"{shape} prim_ids")
-    if array.shape != shape or array.dtype.kind not in "iu":
+    try:
+        array = np.broadcast_to(array, shape).reshape(-1)
+    except ValueError:
+        raise InputError(f"must be {shape} whole numbers, or broadcast with them, got {shown(array)}", argument=name) from None
+    if array.dtype.kind not in "iu":
         raise InputError(f"must be {shape} whole numbers, got {shown(array)}", argument=name)
-    array = array.reshape(-1)
     if array.size and not (array.min() >= -1 and array.max() < count):
         row = int(np.argmax((array < -1) | (array >= count)))
         raise InputError(f"must be -1 to {count - 1}; row {row} is {array[row]}", argument=name)

@@ -242,6 +242,8 @@ def test_points_of_any_shape_broadcast() -> None:
     rows = np.tile(eye, (60, 1))
     for seen, expected in ((wrt.visible(accel, eye, many), wrt.visible(accel, rows, a)),
                            (wrt.visible(accel, many, eye, ids), wrt.visible(accel, a, rows, ids.reshape(-1))),
+                           (wrt.visible(accel, many, eye, ids[:, :1]), wrt.visible(accel, a, rows, ids[:, :1].repeat(20))),
+                           (wrt.visible(accel, many, eye, 5), wrt.visible(accel, a, rows, np.full(60, 5))),
                            (wrt.visible(worlds, many, eye, world=world), wrt.visible(worlds, a, rows, world=np.tile(world, 3))),
                            (wrt.visible(accel, vec3s(a).reshape((3, 20)), vec3s(eye[None])), wrt.visible(accel, a, rows))):
         assert seen.shape == (3, 20) and np.array_equal(to_numpy(seen).reshape(-1), expected) and 0 < expected.sum() < 60
