@@ -16,7 +16,7 @@ from wrt.kernels.structs import Surfaces, kernel
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.traverse.instances import make_struct
 from wrt.kernels.traverse.stack import reference_of, t_of
-from wrt.kernels.wide.batch import MIN_VISITS, PACKETS, SLOTS, STOPPED, count_walk, make_interleaved, make_packet_walk, make_row_test
+from wrt.kernels.wide.batch import MIN_VISITS, PACKETS, SLOTS, STOPPED, count_walk, make_interleaved, make_packet_walk
 from wrt.kernels.wide.lanes import bits, lowest
 from wrt.kernels.wide.lanes import value as number
 from wrt.kernels.wide.layout import (
@@ -34,6 +34,7 @@ from wrt.kernels.wide.layout import (
     STACK_WORDS,
     WIDTH,
 )
+from wrt.kernels.wide.leaves import make_row_test
 from wrt.kernels.wide.nodes import far_pad
 from wrt.kernels.wide.packets import (
     ANY_REFUSED,
