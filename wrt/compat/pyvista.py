@@ -39,7 +39,8 @@ class RayTracer:
 
     def __init__(self, mesh: pyvista.PolyData, *, device: str = "cpu", threads: int | None = None) -> None:
         self.mesh, self._device, self._threads = mesh, device, threads
-        self._built: tuple[int, np.ndarray, RayMeshIntersector] | None = None  # VTK's time of the last change, points
+        # VTK's time of the last change, the mesh's points, and a copy of them.
+        self._built: tuple[int, np.ndarray, np.ndarray, RayMeshIntersector] | None = None
 
     def multi_ray_trace(self, origins: ArrayLike, directions: ArrayLike, first_point: bool = False,
                         retry: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -92,15 +93,16 @@ class RayTracer:
 
     def _intersector(self, method: str) -> RayMeshIntersector:
         """Return the ray class over the present mesh."""
-        import trimesh
-
-        points, faces = _triangles(self.mesh, method)
         changed = self.mesh.GetMTime()
         # VTK's time does not notice `points += 1` on a view of the points.
-        if self._built is None or self._built[0] != changed or not np.array_equal(self._built[1], points):
+        if self._built is None or self._built[0] != changed or not np.array_equal(*self._built[1:3]):
+            import trimesh
+
+            points, faces = _triangles(self.mesh, method)
             own = trimesh.Trimesh(np.array(points, np.float64), np.array(faces), process=False)
-            self._built = changed, np.array(points), RayMeshIntersector(own, device=self._device, threads=self._threads)
-        return self._built[2]
+            intersector = RayMeshIntersector(own, device=self._device, threads=self._threads)
+            self._built = self.mesh.GetMTime(), points, np.array(points), intersector
+        return self._built[3]
 
 
 def to_mesh(polydata: pyvista.PolyData) -> Mesh:

@@ -38,7 +38,8 @@ METADATA_EXTENSIONS = frozenset({
     "KHR_xmp", "KHR_xmp_json_ld", "KHR_animation_pointer", "KHR_interactivity", "KHR_node_selectability",
     "KHR_node_hoverability", "KHR_audio_emitter", "EXT_structural_metadata", "EXT_mesh_features",
     "EXT_instance_features", "AGI_articulations", "AGI_stk_metadata", "FB_geometry_metadata", "MSFT_audio_emitter",
-    "MSFT_lod",
+    "MSFT_lod", "KHR_physics_rigid_bodies", "KHR_implicit_shapes", "EXT_mesh_manifold", "GODOT_single_root", "GRIFFEL_bim_data",
+    "VRMC_vrm",  # unlike VRM, whose version 0 has materials
 })
 DEFAULT_LOOK = frozenset({"KHR_materials_variants"})  # wrt shows the default look
 _CODECS = frozenset({"KHR_texture_basisu", "MSFT_texture_dds"})

@@ -141,7 +141,8 @@ def test_required_extensions_that_are_not_supported(tmp_path, required, what, hi
 
 def test_required_extensions_that_are_supported(tmp_path):
     file = one_triangle()
-    file.json["extensionsRequired"] = ["KHR_materials_transmission", "KHR_lights_punctual", "KHR_xmp_json_ld"]
+    file.json["extensionsRequired"] = ["KHR_materials_transmission", "KHR_lights_punctual", "KHR_xmp_json_ld", "KHR_implicit_shapes",
+                                       "KHR_physics_rigid_bodies", "EXT_mesh_manifold", "GODOT_single_root", "GRIFFEL_bim_data", "VRMC_vrm"]
     assert len(load_gltf(file.write(tmp_path), staged=False).objects) == 1
 
 
