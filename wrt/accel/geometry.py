@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial, reduce
-from hashlib import sha256
+from functools import partial
 from zlib import crc32
 
 import numpy as np
@@ -52,22 +50,13 @@ class Geometry:
         """Number of vertices."""
         return len(self.vertices)
 
-    def _content(self) -> Iterator[bytes | memoryview]:
-        """Yield the shapes, types and bytes of the arrays."""
-        for array in (self.vertices, self.faces, self.spheres):
-            yield f"{array.shape}{array.dtype.str}".encode()
-            yield np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
-
     def checksum(self) -> str:
-        """Return the CRC-32 of the arrays."""
-        return f"{reduce(lambda before, part: crc32(part, before), self._content(), 0):08x}"
-
-    def digest(self) -> str:
-        """Return the SHA-256 of the arrays: older files have it in place of the checksum."""
-        out = sha256()
-        for part in self._content():
-            out.update(part)
-        return out.hexdigest()
+        """Return the CRC-32 of the arrays: of their shapes, types and bytes."""
+        checksum = 0
+        for array in (self.vertices, self.faces, self.spheres):
+            checksum = crc32(f"{array.shape}{array.dtype.str}".encode(), checksum)
+            checksum = crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data, checksum)
+        return f"{checksum:08x}"
 
     def on(self, device: Device, faces: WarpArray | None = None) -> WarpStruct:
         """Upload to a device, as kernels.build.shape.Shape. faces: the faces, if they are on the device already."""

@@ -34,7 +34,7 @@ from wrt.core.write_file import check_writable, replacing
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.warp_private import fields_of
 
-MAGIC = b"wrt acceleration structure 1\n"
+MAGIC = b"wrt acceleration structure 2\n"
 STATS = ("nodes", "leaves", "depth", "sah_cost")
 SIZES, OF_PARTS = "sizes of parts", "statistics of parts"  # arrays of files of instances: (P, n), and (P, 4) with STATS
 
@@ -167,7 +167,7 @@ def parts_of(cls: type[Any], units: Units, arrays: dict[str, np.ndarray], body: 
 
 def require_same_mesh(header: JsonObject, geometry: Geometry) -> None:
     """Raise InputError unless the structure was built over a geometry with the same arrays."""
-    if header["geometry"] != geometry.checksum() and header["geometry"] != geometry.digest():
+    if header["geometry"] != geometry.checksum():
         raise InputError("was built over another mesh")
 
 

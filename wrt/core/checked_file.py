@@ -1,13 +1,11 @@
 """Checked files of arrays: a line with the kind of file, a line of JSON, the bytes of the arrays, and a checksum of all these bytes.
 
-The checksum is a CRC-32, which finds damage in a third of the time of a hash. It stands behind zeros, in the place of the SHA-256 of
-older files. Nothing in such a file is evaluated or unpickled."""
+The checksum is a CRC-32, which finds damage in a third of the time of a hash. Nothing in such a file is evaluated or unpickled."""
 
 import json
 import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from hashlib import sha256
 from typing import BinaryIO
 from zlib import crc32
 
@@ -18,8 +16,7 @@ from wrt.core.files import open_regular
 from wrt.core.threads import verifying
 from wrt.core.types import JsonObject
 
-DIGEST_BYTES = 32
-CRC_BYTES = 4
+CHECKSUM_BYTES = 4
 MAX_HEADER = 1 << 16
 
 
@@ -30,14 +27,12 @@ def write_checked(file: BinaryIO, magic: bytes, header: JsonObject, parts: Itera
         view = part if isinstance(part, bytes) else np.ascontiguousarray(part).reshape(-1).view(np.uint8).data
         checksum = crc32(view, checksum)
         file.write(view)
-    file.write(checksum.to_bytes(DIGEST_BYTES, "big"))
+    file.write(checksum.to_bytes(CHECKSUM_BYTES, "big"))
 
 
 def is_whole(data: memoryview) -> bool:
     """Return whether a file's content matches its checksum."""
-    content, digest = data[:-DIGEST_BYTES], bytes(data[-DIGEST_BYTES:])
-    is_hash = any(digest[:-CRC_BYTES])
-    return digest == (sha256(content).digest() if is_hash else crc32(content).to_bytes(DIGEST_BYTES, "big"))
+    return crc32(data[:-CHECKSUM_BYTES]) == int.from_bytes(data[-CHECKSUM_BYTES:], "big")
 
 
 @contextmanager
@@ -69,4 +64,4 @@ def read_checked(path: str | os.PathLike[str], magic: bytes, what: str, threads:
             header = None
         if not isinstance(header, dict):
             raise InputError(f"is no {what} of this version", path=path)
-        yield header, data[end + 1:-DIGEST_BYTES]
+        yield header, data[end + 1:-CHECKSUM_BYTES]

@@ -25,7 +25,7 @@ from wrt.renderer.plan import Plan
 from wrt.scene.digest import digest
 from wrt.scene.settings import SETTINGS
 
-MAGIC = b"wrt checkpoint 1\n"
+MAGIC = b"wrt checkpoint 2\n"
 # Options and settings that may change on resume; and `camera` and `device`, since the digest and the kind are compared instead.
 NO_PIXEL = ("spp", "exposure", "tonemap", "auto_exposure", "threads", "aov", "time_limit", "target_error", "tile_size", "pass_size",
             "progress", "checkpoint", "checkpoint_every", "resume", "camera", "device", "devices", "executor")
