@@ -11,6 +11,7 @@ from wrt.io.load import as_scene
 from wrt.picture.film import Film
 from wrt.renderer.options import OPTIONS, Options, RenderOptions
 from wrt.renderer.renderer import Renderer
+from wrt.scene.defaults import is_lit
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Scene
 from wrt.scene.settings import SETTINGS
@@ -77,7 +78,8 @@ def render(scene: Scene | Mesh | str | os.PathLike[str], **options: Unpack[Rende
     Warns
     -----
     SceneWarning
-        If wrt leaves out a part of the scene, or the picture is all black although the scene has lights.
+        If wrt leaves out a part of the scene, or the picture is all black: without any light (no warning with `aov`), or although
+        the scene has lights.
 
     Examples
     --------
@@ -99,6 +101,9 @@ def render(scene: Scene | Mesh | str | os.PathLike[str], **options: Unpack[Rende
         from wrt.renderer.distributed.renderer import DistributedRenderer
 
         film = DistributedRenderer(scene, resolved).run()
-    if scene.lights and film.samples.all() and not film.pixels.any():
-        warn("the picture is all black: no light reaches the visible surfaces (a surface may enclose them, with all lights outside)")
+    if film.samples.all() and not film.pixels.any():
+        if scene.lights:
+            warn("the picture is all black: no light reaches the visible surfaces (a surface may enclose them, with all lights outside)")
+        elif not (resolved.aov or is_lit(scene) or any(material.is_emissive for material in scene.materials)):
+            warn("the picture is all black: the scene has no lights, no background, no ambient light and no emission")
     return film

@@ -46,6 +46,7 @@ def measured_by(monkeypatch: pytest.MonkeyPatch) -> Callable[[Costs], tuning.Tun
     return by
 
 
+@pytest.mark.filterwarnings("ignore:the picture is all black:wrt.SceneWarning")
 def test_the_fastest_choice_is_returned_as_arguments(measured_by: Callable[[Costs], tuning.Tuning]) -> None:
     there, before = start(device.NAME), (cuda.block_dim, cuda.stack)
     found = measured_by({Choice("bvh2"): 0.5, Choice("bvh2", 32): 0.4, Choice("bvh2", 32, "shared"): 0.25})

@@ -99,6 +99,7 @@ def test_a_crop_counts_its_own_error_only() -> None:
     assert crop.stats["estimated_error"] == pytest.approx(expected, rel=1e-5)
 
 
+@pytest.mark.filterwarnings("ignore:the picture is all black:wrt.SceneWarning")
 def test_a_black_picture_has_no_error_at_all() -> None:
     film = render(Scene(cameras=SCENE.cameras, settings=SCENE.settings), target_error=1e-12)
     assert film.metadata["spp"] == GROUPS and film.stats["estimated_error"] == 0.0

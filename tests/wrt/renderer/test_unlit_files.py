@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -83,3 +84,12 @@ def test_a_camera_in_a_closed_box_sees_nothing_and_that_is_told(tmp_path: Path) 
     pixels, told = rendered(gltf_box(tmp_path, -4, 4, translation=[0, 0, 0]))
     assert not pixels.any()
     assert len(told) == 2 and "a key light" in told[0] and "the picture is all black" in told[1]
+
+
+def test_a_scene_without_any_light_is_told_unless_it_is_rendered_for_its_aovs() -> None:
+    scene = wrt.Scene(spheres=[wrt.Sphere((0.0, 0.0, -3.0), 1.0)], cameras=[wrt.Camera(np.eye(4))])
+    with pytest.warns(wrt.SceneWarning, match="all black: the scene has no lights, no background"):
+        assert not wrt.render(scene, size="16x16", spp=1).pixels.any()
+    assert wrt.render(scene, size="16x16", spp=1, aov=["depth"]).aov["depth"].any()  # a warning would be an error
+    glowing = wrt.Material(emission=(1.0, 1.0, 1.0))
+    assert wrt.render(replace(scene, spheres=(replace(scene.spheres[0], material=glowing),)), size="16x16", spp=1).pixels.any()

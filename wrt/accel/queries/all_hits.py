@@ -269,7 +269,7 @@ def all_hits(accel: Accelerator, origins: TensorT, directions: TensorT | None = 
              t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ...,
              **options: Unpack[WorldOptions]) -> AllHits[TensorT]: ...
 def all_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike | None = None, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
-             threads: int | None = None, crossings: bool = False, world: ArrayLike | None = None) -> AllHits[Any]:
+             threads: int | None = None, crossings: bool = False, *, world: ArrayLike | None = None) -> AllHits[Any]:
     """Find every hit of each ray in its segment, in order of distance. A ray hits each triangle at most once.
 
     No ray passes between two adjacent triangles: through their common edge it hits one or both, depending on rounding. The time
@@ -307,7 +307,7 @@ def count_hits(accel: Accelerator, origins: NumpyLike | WarpArray, directions: N
 def count_hits(accel: Accelerator, origins: TensorT, directions: TensorT | None = ..., t_min: ArrayLike = ...,
                t_max: ArrayLike = ..., threads: int | None = ..., crossings: bool = ..., **options: Unpack[WorldOptions]) -> TensorT: ...
 def count_hits(accel: Accelerator, origins: ArrayLike, directions: ArrayLike | None = None, t_min: ArrayLike = 0.0,
-               t_max: ArrayLike = np.inf, threads: int | None = None, crossings: bool = False, world: ArrayLike | None = None) -> object:
+               t_max: ArrayLike = np.inf, threads: int | None = None, crossings: bool = False, *, world: ArrayLike | None = None) -> object:
     """Count the hits of each ray in its segment. The hits take no memory unless the structure has triangles in several leaves.
 
     Parameters
@@ -338,7 +338,8 @@ def first_hits(accel: Accelerator, k: int, origins: TensorT, directions: TensorT
                t_min: ArrayLike = ..., t_max: ArrayLike = ..., threads: int | None = ...,
                **options: Unpack[ListOptions]) -> Hits[TensorT]: ...
 def first_hits(accel: Accelerator, k: int, origins: ArrayLike, directions: ArrayLike | None = None, t_min: ArrayLike = 0.0,
-               t_max: ArrayLike = np.inf, threads: int | None = None, crossings: bool = False, world: ArrayLike | None = None) -> Hits[Any]:
+               t_max: ArrayLike = np.inf, threads: int | None = None, *, crossings: bool = False,
+               world: ArrayLike | None = None) -> Hits[Any]:
     """Find the first k hits of each ray in order of distance. The traversal ends at the k-th hit.
 
     Parameters

@@ -209,6 +209,7 @@ def test_names_of_other_libraries_are_answered_with_ours(ball: Any) -> None:
         wrt.build(np.zeros((3, 3)), np.array([[0, 1, 2]]))  # type: ignore[call-overload]
 
 
+@pytest.mark.filterwarnings("ignore:the picture is all black:wrt.SceneWarning")
 def test_names_of_fields_and_kinds_are_answered_with_ours() -> None:
     eye = (0.0, 0.0, 5.0), (0.0, 0.0, 0.0)
     for call, said in ((lambda: wrt.Material(color=(1, 0, 0)), "'color'; did you mean 'albedo'"),  # type: ignore[call-arg]
