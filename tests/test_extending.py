@@ -34,6 +34,11 @@ for field in ("t", "u", "v", "prim_id"):
     assert np.array_equal(getattr(brute, field), getattr(runs, field)), field
 assert (runs.counters.nodes == len(ball.faces) // 16).all()
 assert runs.counters.primitives.mean() < 0.7 * len(ball.faces)
+sorted_boxes, bvh8 = (wrt.build(ball, accel=accel) for accel in ("runs", "bvh8"))
+lists, expected = (wrt.all_hits(accel, *rays) for accel in (sorted_boxes, bvh8))
+assert np.array_equal(lists.first, expected.first) and np.array_equal(lists.t, expected.t)
+assert np.array_equal(lists.prim_id, expected.prim_id)
+assert np.array_equal(wrt.contains(sorted_boxes, target), inside := wrt.contains(bvh8, target)) and 1000 < inside.sum() < 4000
 both = brute.prim_id == volumes.prim_id
 assert both.mean() > 0.995
 found = both & (brute.prim_id >= 0)

@@ -32,7 +32,7 @@ def load_scene(path: PathLike, *, up: str = "y", studio: bool = True, floor: boo
     Parameters
     ----------
     path
-        The file. Its suffix gives the format: .toml, .gltf, .glb or one of wrt.MESH_FORMATS.
+        The file. Its suffix gives the format: .toml, .gltf, .glb or one of wrt.io.mesh_file.MESH_FORMATS.
     up
         Axis of a mesh file that points up in the picture: "x", "y" or "z". Scene files have +y up.
     studio

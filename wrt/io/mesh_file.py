@@ -64,7 +64,7 @@ def load_mesh(path: PathLike, parts: Sequence[tuple[int, int]] = ()) -> Mesh:
     Parameters
     ----------
     path
-        A file with a suffix of wrt.MESH_FORMATS.
+        A file with a suffix of `wrt.io.mesh_file.MESH_FORMATS`: .npz, .obj, .off, .ply or .stl.
     parts
         Ranges (first, count) of the file's triangles, counted before any is dropped. They become the groups "0", "1" ... in place of the
         file's groups; triangles outside of all ranges become the last group, "rest".

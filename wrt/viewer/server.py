@@ -17,7 +17,6 @@ from collections.abc import Callable, Mapping
 from http import HTTPStatus
 from types import ModuleType
 from typing import TYPE_CHECKING, Protocol
-from weakref import WeakSet
 
 from wrt.core.errors import InputError
 from wrt.core.packages import needed_by
@@ -121,7 +120,7 @@ class Server:
         import_websockets()
         self.access, self.answers, self.warn = access, answers, warn
         self.browsers: tuple[Browser, ...] = ()
-        self._connections: WeakSet[ServerConnection] = WeakSet()
+        self.connections: set[ServerConnection] = set()  # Open, with or without a token.
         self._reported: set[str] = set()
         self._lock, self._ready = threading.Lock(), threading.Event()
         self.thread = threading.Thread(target=lambda: asyncio.run(self._serve(listening)), name="wrt viewer's server", daemon=True)
@@ -149,7 +148,7 @@ class Server:
                 max_size=LARGEST_MESSAGE, close_timeout=CLOSING, logger=QUIET, create_connection=_checked_connection(self)):
             self._ready.set()
             await self._ended.wait()
-            for connection in self._connections:  # the library would wait for connections without a request
+            for connection in self.connections:  # the library would wait for connections without a request
                 if connection.protocol.state == CONNECTING:
                     connection.transport.abort()
 
@@ -203,8 +202,8 @@ class Server:
         self.report(f"failure {type(error).__name__}", f"error: {text}")
 
     def accepts_another(self, connection: ServerConnection) -> bool:
-        self._connections.add(connection)
-        if len(connection.server.handlers) <= MOST_CONNECTIONS:
+        if len(self.connections) < MOST_CONNECTIONS:
+            self.connections.add(connection)
             return True
         self.report("connections", f"closed a connection, because {MOST_CONNECTIONS} are open already")
         return False
@@ -219,6 +218,10 @@ def _checked_connection(server: Server) -> type[ServerConnection]:
             super().connection_made(transport)
             if not server.accepts_another(self):
                 self.transport.abort()
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            server.connections.discard(self)
+            super().connection_lost(exc)
 
     return Checked
 

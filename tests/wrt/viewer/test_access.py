@@ -368,6 +368,8 @@ def test_a_large_message_ends_the_connection_and_too_many_are_closed(served: Ser
     assert [connection.recv(1) for connection in idle[2:]] == [b"", b""]
     for connection in idle:
         connection.close()
+    with client(served.page.url) as again:  # closed connections no longer count
+        again.controls()
     out, err = capfd.readouterr()
     assert (out, err) == ("", "")
 

@@ -1,10 +1,11 @@
 """The traversal unit of a list of boxes."""
 
 from functools import cache
+from typing import Any
 
 import warp as wp
 
-from wrt.kernels.structs import NO_HIT, Hit, Ray, Surfaces
+from wrt.kernels.structs import NO_HIT, Hit, Ray
 from wrt.kernels.traverse.common import Units, make_probe, no_hit
 from wrt.kernels.traverse.counters import Counts, Recorder, make_counters
 from wrt.kernels.traverse.leaf import make_leaf
@@ -39,7 +40,7 @@ def make_traversal(units: Units, any_hit: bool, accepts=None):
     struct = make_struct(units.triangle_test.record)
 
     @wp.func
-    def traverse(accel: struct, surfaces: Surfaces, ray: Ray) -> Hit:
+    def traverse(accel: struct, surfaces: Any, ray: Ray) -> Hit:
         probe = probe_of(ray)
         best = no_hit(ray)
         counts = Counts()
