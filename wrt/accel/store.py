@@ -101,7 +101,8 @@ def read(path: PathLike, geometry: Geometry | None, attributes: FlatScene | None
     """
     at_once = thread_count(threads)
     try:
-        with read_checked(path, MAGIC, "acceleration structure", at_once) as (header, body):
+        with (read_checked(path, MAGIC, "acceleration structure", at_once) as (header, body),
+              np.errstate(over="ignore", invalid="ignore")):  # for values near the largest float32
             cls = ACCELERATORS.get(header["accel"])
             if cls is None:
                 raise InputError(f"holds a structure {header['accel']!r}, which this version of wrt does not have")
@@ -118,8 +119,7 @@ def read(path: PathLike, geometry: Geometry | None, attributes: FlatScene | None
                 geometry = mesh_of(attributes)
             with verifying(partial(require_same_mesh, header, geometry), at_once):
                 built = read_arrays(cls, header, body)
-                with np.errstate(over="ignore", invalid="ignore"):  # for values near the largest float32
-                    return cls.restore(built, geometry, attributes, device, threads, units=units)
+                return cls.restore(built, geometry, attributes, device, threads, units=units)
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         if isinstance(error, InputError):
             raise (error if error.path else error.at(path)) from error

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import multiprocessing
 import pickle
 from copy import deepcopy
@@ -281,6 +282,23 @@ def test_boxes_of_any_size_are_looked_at_without_a_word(name: str, tmp_path: Pat
             (tmp_path / "x.accel").write_bytes(signed(bytes(changed)))
             with contextlib.suppress(InputError):
                 load_accel(tmp_path / "x.accel", BALL)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("threads", [1, 2])
+def test_numbers_of_any_size_in_instances_are_read_without_a_word(threads: int, tmp_path: Path) -> None:
+    path = tmp_path / "x.accel"
+    build([BALL]).save(path)
+    data = path.read_bytes()[:-CHECKSUM_BYTES]
+    at = data.index(b"\n", len(MAGIC)) + 1
+    for kind, *shape in json.loads(data[len(MAGIC):at])["arrays"].values():
+        number = np.dtype(kind)
+        if number.kind == "f" and 0 not in shape:
+            for value in np.array([3.4e38, -3.4e38, np.inf, np.nan, np.finfo(number).max], number):
+                path.write_bytes(signed(data[:at] + value.tobytes() + data[at + number.itemsize:]))
+                with contextlib.suppress(InputError):
+                    load_accel(path, threads=threads)
+        at += number.itemsize * math.prod(shape)
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
