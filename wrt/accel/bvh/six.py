@@ -90,8 +90,10 @@ class Bvh6(CollapsedBvh):
     def _check(self, built: Built) -> None:
         nodes = built.arrays["nodes"]
         inner, leaves = _counts(nodes)
-        if ((nodes["counts"] < 0) | (inner + leaves > WIDTH)).any() or (nodes["primitive"] < 0).any() or (nodes["node"] < 0).any():
+        if ((nodes["counts"] < 0) | (inner + leaves > WIDTH)).any() or (nodes["primitive"] < 0).any():
             raise InputError("is damaged: a node has an impossible number of children")
+        if (nodes["node"] < (inner > 0)).any():  # 0 is the root, and EMPTY among references
+            raise InputError("is damaged: a node leads out of the tree")
         if (nodes["primitive"] > len(built.order)).any():
             raise InputError("is damaged: a leaf leads to other primitives")
         check_wide(self._references(built), len(built.order), 1)

@@ -50,3 +50,12 @@ def test_a_damaged_node_is_refused(field: str, value: int) -> None:
     nodes[field][at] = value
     with refused(what="damaged"):
         accel._check(accel.built)
+
+
+def test_a_node_that_leads_to_the_root_is_refused() -> None:
+    """A ray would go round in circles. In a list of references, the root stands for an empty slot."""
+    accel = build(BALL, "bvh6")
+    counts = accel.built.arrays["nodes"]["counts"]
+    counts[np.flatnonzero((counts & 255 == 0) & (counts >> 8 < 6))[0]] += 1
+    with refused(what="damaged"):
+        accel._check(accel.built)
