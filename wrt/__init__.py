@@ -97,7 +97,7 @@ ELSEWHERE = {"closest_hit": _CLOSEST, "any_hit": _ANY, "BVH": "wrt.build(mesh)",
              "RaycastingScene": "wrt.compat.open3d.RaycastingScene", "RayMeshIntersector": "wrt.compat.trimesh.RayMeshIntersector",
              "PinholeCamera": "wrt.Camera, or wrt.sensors.pinhole for a matrix K", "PerspectiveCamera": "wrt.Camera",
              "look_at": "wrt.Camera.look_at", "load": "wrt.load_mesh, or wrt.load_scene",
-             "Ray": "arrays of origins and directions (docs/usage.md)"}
+             "set_variant": "device= of wrt.build and wrt.render", "Ray": "arrays of origins and directions (docs/usage.md)"}
 _MODULES = [name for name, module in _HOME.items() if module == __name__]
 __all__ = ["__version__", *(name for name in _HOME if name not in _MODULES)]
 
@@ -133,9 +133,9 @@ def __getattr__(name: str) -> Any:
 def _hint(name: str) -> str:
     """Return where an unknown name is, or the most similar public name; "" without either."""
     from wrt.core.checks import did_you_mean
-    from wrt.core.other_names import OTHER_NAMES
+    from wrt.core.other_names import same_name
 
-    if (ours := OTHER_NAMES.get(name, name)) in ELSEWHERE:
+    if (ours := same_name(name, ELSEWHERE) or name) in ELSEWHERE:
         return f"use {ELSEWHERE[ours]}"
     for place in ("wrt.sensors", "wrt.scene.shapes"):
         if callable(getattr(importlib.import_module(place), name, None)):

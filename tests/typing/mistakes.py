@@ -29,6 +29,7 @@ wrt.first_hits(accel, rays, rays)  # Error: k before the rays.
 wrt.all_hits(accel, rays, rays).distance  # Error: t.
 wrt.DeviceGeometry(rays, wp.zeros(3, dtype=wp.int32))  # Error: Warp arrays.
 wrt.render("scenes/whitted.toml", ssp=64)  # Error: spp.
+wrt.Camera.look_at((0, 1, 5), (0, 0, 0), fov=0.7)  # Error: fov_y.
 wrt.render("scenes/whitted.toml", spp="many")  # Error: a number.
 wrt.profile("scenes/whitted.toml", acel="bvh4")  # Error: accel.
 wrt.Film().save(3)  # Error: wrt.render makes films.

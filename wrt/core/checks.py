@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from wrt.core.errors import InputError, wrong
-from wrt.core.other_names import OTHER_NAMES
+from wrt.core.other_names import same_name
 
 T = TypeVar("T")
 LARGEST = 1e30  # largest absolute value of a number in a scene; float32 ends at 3.4e38
@@ -60,22 +60,22 @@ def as_path(value: object, what: str) -> Path:
         raise wrong(what, f"must be a path, got {shown(value)}") from None
 
 
-def as_one(value: object, kind: type[T] | tuple[type[T], ...], what: str) -> T:
-    """Return the value. Raises InputError unless it is an instance of `kind`."""
+def as_one(value: object, kind: type[T] | tuple[type[T], ...], what: str, hint: str | None = None) -> T:
+    """Return the value. Raises InputError, with the hint, unless it is an instance of `kind`."""
     kinds = kind if isinstance(kind, tuple) else (kind,)
     if not isinstance(value, kinds):
-        raise wrong(what, f"must be {' or '.join(_a(each.__name__) for each in kinds)}, got {shown(value)}")
+        raise wrong(what, f"must be {' or '.join(_a(each.__name__) for each in kinds)}, got {shown(value)}", hint)
     return value
 
 
-def as_tuple(value: object, kind: type[T] | tuple[type[T], ...], what: str) -> tuple[T, ...]:
+def as_tuple(value: object, kind: type[T] | tuple[type[T], ...], what: str, hint: str | None = None) -> tuple[T, ...]:
     """Return a tuple of instances of `kind`, from an iterable of instances or from a single instance."""
     if isinstance(value, kind):
         return (value,)
     if isinstance(value, str) or not hasattr(value, "__iter__"):
-        as_one(value, kind, f"{what}: each")
+        as_one(value, kind, f"{what}: each", hint)
     values: Iterable[object] = value  # type: ignore[assignment]
-    return tuple(as_one(each, kind, f"{what}[{i}]") for i, each in enumerate(values))
+    return tuple(as_one(each, kind, f"{what}[{i}]", hint) for i, each in enumerate(values))
 
 
 def as_names(value: object, what: str) -> tuple[str, ...]:
@@ -115,8 +115,7 @@ def listed(names: Collection[str], most: int = 5) -> str:
 def did_you_mean(name: object, known: Iterable[str]) -> str:
     """Return "did you mean ...? " with the known name that means the same or is most similar; "" if none is."""
     names = list(islice(known, 1000))
-    same = OTHER_NAMES.get(name) if isinstance(name, str) else None
-    near = same if same in names else most_similar(name, names) if isinstance(name, str) else ""
+    near = same_name(name, names) or most_similar(name, names) if isinstance(name, str) else ""
     return f"did you mean {near!r}? " if near else ""
 
 

@@ -1,13 +1,15 @@
 """Errors about unknown names of attributes and arguments, with the name that means the same or is most similar."""
 
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import fields
 from functools import wraps
+from inspect import Parameter, signature
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from wrt.core.checks import did_you_mean
 
 T = TypeVar("T")
+F = TypeVar("F", bound=Callable[..., Any])
 
 
 class Suggests:
@@ -49,3 +51,26 @@ def suggest_fields(cls: type[T]) -> type[T]:
 
     cls.__init__ = __init__  # type: ignore[method-assign, assignment]
     return cls
+
+
+def suggest_keywords(function: F) -> F:
+    """Let a function, or a class method that passes its other keywords to a dataclass, answer an unknown keyword as suggest_fields does."""
+    form = signature(function)
+    own = [each.name for each in form.parameters.values() if each.kind is not Parameter.VAR_KEYWORD]
+
+    @wraps(function)
+    def with_suggestions(*args: Any, **keywords: Any) -> Any:
+        cls = args[0] if own[0] == "cls" else None
+        name, known = function.__name__, own
+        if cls:
+            name, known = f"{cls.__name__}.{name}", [*own[1:], *(each.name for each in fields(cls))]
+        for keyword in keywords:
+            if keyword not in known:
+                raise no_argument(name, keyword, known)
+        try:
+            form.bind(*args, **keywords)
+        except TypeError as error:
+            raise TypeError(f"{name}(): {error}") from None
+        return function(*args, **keywords)
+
+    return with_suggestions  # type: ignore[return-value]

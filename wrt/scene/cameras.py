@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypedDict, Unpack
 
 import numpy as np
 
 from wrt.core.checks import at_thing
 from wrt.core.errors import InputError, wrong
-from wrt.core.suggestions import suggest_fields
+from wrt.core.suggestions import suggest_fields, suggest_keywords
 from wrt.core.types import ArrayLike
 from wrt.scene.kinds import Record, check_fields, forms, given
 from wrt.scene.values import SMALLEST, as_number, as_transform, as_vector
@@ -59,6 +59,7 @@ class CameraKind:
         return camera
 
     @classmethod
+    @suggest_keywords
     def look_at(cls, position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 1.0, 0.0), **fields: Any) -> Self:
         """Return a camera at `position` that looks at `target`.
 
@@ -104,6 +105,18 @@ class CameraKind:
         return self
 
 
+class CameraFields(TypedDict, total=False):
+    """Keywords of `Camera.look_at`: the fields of Camera."""
+
+    fov_y: float
+    aperture_radius: float
+    focus_distance: float
+    blades: int
+    blade_rotation: float
+    least_fov_x: float
+    name: str
+
+
 @suggest_fields
 @dataclass(frozen=True, eq=False)
 class Camera(CameraKind):
@@ -136,6 +149,12 @@ class Camera(CameraKind):
     blade_rotation: float = field(default=0.0, metadata=given("angle", "rotation of the aperture"))
     least_fov_x: float = field(default=0.0, metadata=given(
         "angle", "least horizontal angle of view: a picture too narrow for it widens fov_y", ge=0.0, le=179.94))
+
+    if TYPE_CHECKING:  # editors complete the keywords
+
+        @classmethod
+        def look_at(cls, position: ArrayLike, target: ArrayLike, up: ArrayLike = ...,  # type: ignore[override]
+                    **fields: Unpack[CameraFields]) -> Self: ...
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -12,6 +12,7 @@ import numpy as np
 from wrt.core.checks import LARGEST, as_array, as_path, shown
 from wrt.core.errors import InputError
 from wrt.core.packages import needed_by
+from wrt.core.suggestions import suggest_fields
 from wrt.core.types import PathLike
 from wrt.core.write_file import write_bytes
 from wrt.scene.clean import require_indices
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     import trimesh
 
 
+@suggest_fields
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """A triangle mesh in object space.

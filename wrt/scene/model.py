@@ -66,7 +66,7 @@ class Object:
 
     def __post_init__(self) -> None:
         at = at_thing("object", self.name)
-        as_one(self.mesh, Mesh, at + "mesh")
+        as_one(self.mesh, Mesh, at + "mesh", hint="wrt.Mesh.from_trimesh converts a mesh of trimesh")
         object.__setattr__(self, "materials", as_tuple(self.materials, Material, at + "materials"))
         if not self.materials:
             raise wrong(at + "materials", "must hold at least one material")
@@ -148,7 +148,8 @@ class Scene:
     def __post_init__(self) -> None:
         kinds: dict[str, Any] = {"objects": Object, "spheres": Sphere, "cameras": CameraKind, "lights": tuple(LIGHTS.values())}
         for name, kind in kinds.items():
-            object.__setattr__(self, name, as_tuple(getattr(self, name), kind, name))
+            hint = "wrt.Scene.of makes a scene of meshes" if name == "objects" else None
+            object.__setattr__(self, name, as_tuple(getattr(self, name), kind, name, hint))
         for name in ("objects", "spheres", "lights"):
             require_count(len(getattr(self, name)), name)
         as_one(self.background, tuple(BACKGROUNDS.values()), "background")
@@ -181,7 +182,7 @@ class Scene:
         >>> accel = wrt.build(wrt.Scene.of([floor, robot]))    # wrt.build([floor, robot]): two worlds, of one mesh each
         """
         things: list[Any] = []
-        for i, thing in enumerate([meshes] if isinstance(meshes, Mesh) else meshes):
+        for i, thing in enumerate(meshes if isinstance(meshes, Iterable) and not isinstance(meshes, Mesh) else [meshes]):
             at = f"meshes[{i}]"
             if isinstance(thing, tuple) and len(thing) == 2:
                 thing = Mesh(*thing)

@@ -108,6 +108,7 @@ def test_clamp_0_is_no_limit_as_the_help_says() -> None:
 
 @pytest.mark.parametrize(("arguments", "message"), [
     (["--set", "fitler=box"], "--set: fitler: unknown key 'fitler'; did you mean 'filter'?"),
+    (["--set", "ambient=1"], "--set: ambient: is a key of the scene, not of its settings"),
     (["--set", "filter=gausian"], "--set: filter: unknown value 'gausian'; did you mean 'gaussian'?"),
     (["--set", "glass_shadows=tint"], "did you mean 'tinted'? known are 'opaque', 'tinted'"),
     (["--set", "spp=1.5"], "--set: spp: got 1.5, expected a whole number"), (["--set", "spp=0"], "spp: got 0, expected"),

@@ -89,8 +89,8 @@ def contains(accel: Accelerator, points: ArrayLike, threads: int | None = None, 
     rows, shape, world = shaped_points(points, world)
     query = ListQuery(accel, threads, crossings=True)
     if count := open_edges_of(query.snapshot):
-        raise InputError(f"the mesh is not closed: {count} edges have an odd number of faces"
-                         "; wrt.winding_number is above 0.5 mostly inside")
+        raise InputError(f"the mesh is not closed: {count} edges have an odd number of faces",
+                         hint="for an open mesh, use wrt.winding_number(accel, points) > 0.5, or wrt.signed_distance(..., sign='winding')")
     inside = in_shape(odd_crossings(query, rows, world=world), shape)
     return inside if isinstance(points, wp.array) else given_like(points, inside)
 

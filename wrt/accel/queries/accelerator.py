@@ -29,7 +29,7 @@ from wrt.core.arrays import to_tensor_like
 from wrt.core.checks import shown
 from wrt.core.device import start, upload
 from wrt.core.errors import InputError
-from wrt.core.other_names import OTHER_NAMES
+from wrt.core.other_names import same_name
 from wrt.core.suggestions import no_argument, no_attribute
 from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike, NumpyLike, TensorT, WarpArray, WarpStruct
@@ -98,7 +98,9 @@ class Accelerator:
     if not TYPE_CHECKING:  # type checkers report unknown names themselves
 
         def __getattr__(self, name: str) -> NoReturn:
-            ours = OTHER_NAMES.get(name, name)
+            ours = same_name(name, (*FUNCTIONS, "move")) or name
+            if name in ("to", "cuda"):
+                raise AttributeError(f"{type(self).__name__} stays on its device: build it with wrt.build(..., device=...)")
             if ours in FUNCTIONS:
                 raise AttributeError(f"{ours} is a function: wrt.{ours}(accel, ...)")
             if ours == "move" and not hasattr(type(self), "move"):
@@ -268,6 +270,6 @@ def snapshot_of(accel: Accelerator, instances: bool = False) -> Snapshot:
     what = "" if instances else " over one mesh"
     units = accel.structure.units if isinstance(accel, Accelerator) else None
     if units is None or units.spheres or (units.instances and not instances):
-        raise InputError(f"must be a structure{what} without spheres (wrt.build), got {shown(accel)}", argument="accel",
-                         hint=MESH_OF_A_SPHERE if units and units.spheres else None)
+        hint = "build one first: accel = wrt.build(mesh)" if units is None else MESH_OF_A_SPHERE if units.spheres else None
+        raise InputError(f"must be a structure{what} without spheres, got {shown(accel)}", argument="accel", hint=hint)
     return accel.snapshot

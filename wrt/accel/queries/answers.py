@@ -18,7 +18,7 @@ from wrt.core.checks import shown
 from wrt.core.device import empty_aligned
 from wrt.core.errors import InputError
 from wrt.core.html import html_table
-from wrt.core.other_names import OTHER_NAMES
+from wrt.core.other_names import same_name
 from wrt.core.suggestions import Suggests, no_attribute
 from wrt.core.tables import write_table
 from wrt.core.types import Array, ArrayT, Device, PathLike, TensorT, WarpArray
@@ -109,7 +109,7 @@ class Hits(HitPoints[ArrayT], Suggests):
     def __getitem__(self, index: object) -> Hits[ArrayT]:
         """Return the hits of some rays. index: mask, slice, integers, or a tuple of these. Raises InputError under a recording tape."""
         if isinstance(index, str):
-            raise TypeError(f"hits[...] selects rays; write hits.{OTHER_NAMES.get(index, index)} in place of hits[{index!r}]")
+            raise TypeError(f"hits[...] selects rays; write hits.{same_name(index, dir(self)) or index} in place of hits[{index!r}]")
         check_no_gradients("hits[...]", t=self.t)
         keys = tuple(to_numpy(key) if is_tensor(key) or isinstance(key, wp.array) else key
                      for key in (index if isinstance(index, tuple) else (index,)))

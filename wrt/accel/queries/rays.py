@@ -71,7 +71,7 @@ def rays_of(origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike, t_max: 
         if any(not isinstance(array, wp.array) or array.dtype != wp.vec3 for array in rays):
             raise InputError("and directions must both be Warp arrays of vec3, or both NumPy arrays", argument="origins")
     else:
-        rays = [_rows(rays[0], "origins"), _rows(rays[1], "directions")]
+        rays = [_rows(rays[0], "origins", "(..., 3)"), _rows(rays[1], "directions", "(..., 3)")]
     n = len(rays[0])
     if len(rays[1]) != n:
         raise InputError(f"must have as many rows as origins ({n}), got {len(rays[1])}", argument="directions")
@@ -179,10 +179,10 @@ def _check_ends(least: float, name: str) -> None:
         raise InputError("must not be NaN" + (" or below 0" if name == "t_min" else ""), argument=name)
 
 
-def _rows(value: ArrayLike, name: str) -> np.ndarray:
-    array = real_numbers(value, name, "(N, 3)")
+def _rows(value: ArrayLike, name: str, form: str = "(N, 3)") -> np.ndarray:
+    array = real_numbers(value, name, form)
     if array.ndim != 2 or array.shape[1] != 3:
-        raise InputError(f"must be (N, 3), got {array.shape}", argument=name)
+        raise InputError(f"must be {form}, got {array.shape}", argument=name)
     return array
 
 

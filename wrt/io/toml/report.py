@@ -37,8 +37,11 @@ def check(data: JsonObject, path: Path) -> SceneTable:
 
 def check_settings(values: JsonObject, origin: str) -> JsonObject:
     """Check settings by the rules of [settings] in a scene file. Raises one InputError that begins with `origin` and lists all mistakes."""
-    from wrt.io.toml.schema import SettingsTable
+    from wrt.io.toml.schema import SceneTable, SettingsTable
 
+    for name in values:
+        if name in SceneTable.model_fields:
+            raise InputError("is a key of the scene, not of its settings", path=origin, place=name, hint="write it into the scene file")
     return _models(SettingsTable, values, Path(origin)).given()
 
 

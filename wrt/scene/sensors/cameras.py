@@ -10,6 +10,7 @@ import numpy as np
 from wrt.core.arrays import given_like
 from wrt.core.checks import as_size, shown
 from wrt.core.errors import InputError
+from wrt.core.suggestions import suggest_keywords
 from wrt.core.types import ArrayLike
 from wrt.scene.sensors.distortion import Fisheye, Radial
 from wrt.scene.sensors.sensor import Sensor, as_doubles, make_sensor
@@ -18,6 +19,7 @@ FOLDS = "it folds over before this pixel"
 FOLDS_OR_TURNS = FOLDS + ", or the angle from the axis would exceed pi"
 
 
+@suggest_keywords
 def pinhole(intrinsics: ArrayLike, size: tuple[int, int] | str, pose: ArrayLike | None = None, distortion: ArrayLike = (),
             rolling: bool = False, like: object = None) -> Sensor[Any]:
     """Make one ray through the centre of each pixel of a pinhole camera.

@@ -180,7 +180,10 @@ def test_typing_errors_are_answered_with_the_name(ball: Any) -> None:
 
 def test_names_of_functions_and_of_the_package_are_answered_with_the_way(ball: Any) -> None:
     for thing, name, said in ((ball, "contains", "wrt.contains(accel, ...)"), (ball, "move", "movable=True"),
-                              (ball, "closst_hit", "'closest_hit'"), (wrt, "buildd", "'build'"), (wrt, "sensor", "'sensors'"),
+                              (ball, "closst_hit", "'closest_hit'"), (wrt, "mesh_query_ray", "'ray_query'"),
+                              (wrt, "load_file", "'load_scene'"),
+                              (wrt, "set_variant", "device="), (ball, "to", "device="), (ball, "intersects_location", "wrt.all_hits"),
+                              (wrt, "buildd", "'build'"), (wrt, "sensor", "'sensors'"),
                               (wrt, "pinhole", "wrt.sensors.pinhole"), (wrt, "icosphere", "wrt.scene.shapes.icosphere"),
                               (wrt, "PinholeCamera", "wrt.Camera"), (wrt, "any_hit", "wrt.build(mesh).any_hit"),
                               (wrt, "cast_rays", "wrt.build(mesh).closest_hit"), (wrt, "RaycastingScene", "wrt.compat.open3d")):
@@ -191,15 +194,18 @@ def test_names_of_functions_and_of_the_package_are_answered_with_the_way(ball: A
 
 def test_names_of_other_libraries_are_answered_with_ours(ball: Any) -> None:
     hits, movable = ball.closest_hit(*some_rays(4)), wrt.build(wrt.Scene.of([icosphere(1)]), movable=True)
-    fields = {each.name for kind in (wrt.Material, wrt.Camera, wrt.Object) for each in dataclasses.fields(kind)}
-    assert {*OTHER_NAMES.values()} <= {*dir(hits), *dir(ball), *dir(movable), *FUNCTIONS, "t_min", "t_max", "world",
-                                       *fields, *MATERIALS, *SETTINGS, "save", "pixels"}
+    fields = {each.name for kind in (wrt.Material, wrt.Camera, wrt.Object, wrt.Mesh, wrt.PointLight, wrt.DirectionalLight)
+              for each in dataclasses.fields(kind)}
+    assert {*" ".join(OTHER_NAMES.values()).split()} <= {*dir(hits), *dir(ball), *dir(movable), *FUNCTIONS, "t_min", "t_max", "world",
+                                       *fields, *MATERIALS, *SETTINGS, "save", "pixels", "target",
+                                       "load_scene", "intrinsics"}
     for name, said in (("set_transform", "movable=True"), ("compute_signed_distance", "wrt.signed_distance(accel, ...)")):
         with pytest.raises(AttributeError) as error:
             getattr(ball, name)
         assert said in str(error.value)
     for thing, name, ours in ((hits, "t_hit", "t"), (hits, "primitive_ids", "prim_id"), (hits, "geom_id", "object"),
-                              (hits, "faces", "prim_id"), (ball, "raycast", "closest_hit"), (ball, "cast_rays", "closest_hit"),
+                              (hits, "faces", "prim_id"), (hits, "cpu", "numpy"), (ball, "num_triangles", "geometry"),
+                              (ball, "raycast", "closest_hit"), (ball, "cast_rays", "closest_hit"),
                               (ball, "intersects_any", "any_hit"), (movable, "set_transform", "move")):
         with pytest.raises(AttributeError, match=f"'{name}'; did you mean '{ours}'"):
             getattr(thing, name)
@@ -207,24 +213,38 @@ def test_names_of_other_libraries_are_answered_with_ours(ball: Any) -> None:
         _ = hits["t_hit"]
     with refused("accel", hint="wrt.build((vertices, faces))"):
         wrt.build(np.zeros((3, 3)), np.array([[0, 1, 2]]))  # type: ignore[call-overload]
+    with refused("accel", hint="wrt.build(mesh)"):
+        wrt.closest_points(icosphere(1), (0.0, 0.0, 0.0))  # type: ignore[arg-type]
 
 
 @pytest.mark.filterwarnings("ignore:the picture is all black:wrt.SceneWarning")
 def test_names_of_fields_and_kinds_are_answered_with_ours() -> None:
     eye = (0.0, 0.0, 5.0), (0.0, 0.0, 0.0)
     for call, said in ((lambda: wrt.Material(color=(1, 0, 0)), "'color'; did you mean 'albedo'"),  # type: ignore[call-arg]
-                       (lambda: wrt.Camera.look_at(*eye, fov=1.0), "'fov'; did you mean 'fov_y'"),
+                       (lambda: wrt.Camera.look_at(*eye, fov=1.0), r"Camera\.look_at\(\).*'fov'; did you mean 'fov_y'"),
+                       (lambda: wrt.Camera.look_at(eye=1, center=2), r"Camera\.look_at\(\).*'eye'; did you mean 'position'"),
+                       (lambda: wrt.Camera.look_at(eye[0]), r"Camera\.look_at\(\).*'target'"),  # type: ignore[call-arg]
+                       (lambda: wrt.sensors.pinhole(fx=3), "'fx'; did you mean 'intrinsics'"),  # type: ignore[call-arg]
+                       (lambda: wrt.Mesh(points=1, indices=2), "'points'; did you mean 'vertices'"),  # type: ignore[call-arg]
+                       (lambda: wrt.PointLight(eye[0], color=1), "'color'; did you mean 'intensity'"),  # type: ignore[call-arg]
+                       (lambda: wrt.DirectionalLight(eye[0], color=1), "'color'; did you mean 'irradiance'"),  # type: ignore[call-arg]
                        (lambda: wrt.Object(icosphere(1), matrix=np.eye(4)), "'matrix'; did you mean 'transform'"),  # type: ignore[call-arg]
                        (lambda: wrt.PointLight((0, 3, 0), intnsity=5.0), "did you mean 'intensity'")):  # type: ignore[call-arg]
         with pytest.raises(TypeError, match=said):
             call()
     near = wrt.closest_points(wrt.build(icosphere(1)), eye[0])
     film = wrt.render(wrt.Scene.of([icosphere(1)]), camera=wrt.Camera.look_at(*eye), size=(4, 3), spp=1)
-    for thing, name, ours in ((near, "distances", "distance"), (film, "write", "save")):
+    for thing, name, ours in ((near, "distances", "distance"), (film, "write", "save"), (film, "show", "save")):
         with pytest.raises(AttributeError, match=f"{name}'; did you mean '{ours}'"):
             getattr(thing, name)
     with refused("kind", hint="'glass'"):
         wrt.Material("dielectric")
+    with refused("kind", hint="'diffuse'"):
+        wrt.Material("lambert")
+    with refused("mesh", hint="wrt.Mesh.from_trimesh"):
+        wrt.Object(icosphere)  # type: ignore[arg-type]
+    with refused("objects[0]", hint="wrt.Scene.of"):
+        wrt.Scene([icosphere(1)])  # type: ignore[arg-type]
     for name, ours in (("width", "size"), ("samples", "spp")):
         with refused(name, hint=f"did you mean '{ours}'"):
             wrt.render(icosphere(1), **{name: 64})  # type: ignore[arg-type]
@@ -258,6 +278,7 @@ def test_what_is_refused(ball: Any) -> None:
     for call, said in (
             (lambda: ball.closest_hit(o), ("origins", "(..., 6)", "holds both")),
             (lambda: ball.closest_hit(np.concatenate([o, d], axis=-1), d), ("origins", "(..., 3)", "alone")),
+            (lambda: ball.closest_hit(o[0].T, d[0].T), ("origins", "(..., 3)")),
             (lambda: ball.closest_hit(o, d[:2]), ("directions", "broadcasts")),
             (lambda: ball.closest_hit(o, d, t_max=np.ones(3)), ("t_max", "(3, 5)")),
             (lambda: ball.closest_hit(o, d, out=wrt.first_hits(ball, 5, o[:, 0], d[:, 0])[:2]), ("out.t", "(3, 5)")),
