@@ -22,7 +22,7 @@ from wrt.core.interrupts import exit_code
 @shared("spp", "size", "assignments", "seed", "device", "threads", "camera", "accel", "quiet", "as_json")
 def animate(scene: Path, output: Path, fps: float, assignments: Assignments, quiet: bool, as_json: bool,
             **options: Parsed) -> None:
-    """Render an animation of SCENE: a turntable, or the motion of its objects (`motion` and `morph` in TOML)."""
+    """Render an animation of SCENE. It is a turntable, or the motion of its objects (`motion` and `morph` in TOML)."""
     from wrt.renderer import animate as animation
     from wrt.renderer.options import Options
 

@@ -12,7 +12,8 @@ from wrt.io.meshes import SUFFIXES
 SLOW = 1.0  # seconds after which a build reports its progress
 
 
-@click.command(help=f"Build an acceleration structure over MESH ({SUFFIXES}) and save it to a file, which wrt.load_accel reads.")
+@click.command(help="Build an acceleration structure over MESH, and save both."
+                    f" MESH is {SUFFIXES}. wrt.load_accel reads the file.")
 @click.argument("mesh", type=click.Path(path_type=Path))
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="File to write, with the suffix .accel")
 @click.option("--set", "assignments", type=Setting(), multiple=True, help="An option of the structure, such as max_leaf=8; repeatable")
@@ -37,7 +38,7 @@ def build(mesh: Path, output: Path, accel: str, assignments: Assignments, thread
         structure = wrt.build(mesh, accel, threads=threads, progress=progress, **options)
     if isinstance(structure, Instances):
         raise InputError("a scene with instances has no structure in a file", path=mesh)
-    structure.save(output)
+    structure.save(output, mesh=True)
     if as_json:
         say_json({"output": output, "accel": structure.name, **asdict(structure.stats)})
         return

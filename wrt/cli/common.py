@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 Decorator: TypeAlias = Callable[[Callable[..., None]], Callable[..., None]]
 Parsed: TypeAlias = Any  # The value of an option, which click has converted to the option's type.
 Assignments: TypeAlias = tuple[tuple[str, bool | int | float | str], ...]  # The names and values of all --set options.
+BROKEN_PIPE = 141  # Exit code: 128 plus the number of SIGPIPE, which Windows does not have.
 DIGITS = "[0-9]{1,9}"  # A pixel coordinate. Longer numbers are an error, as Python refuses thousands of digits.
 
 
@@ -82,6 +83,8 @@ class Commands(click.Group):
             near = most_similar({"--width": "size", "--height": "size"}.get(error.option_name, error.option_name.strip("-")), known)
             hint = f" Did you mean '--{near}'?" if near else ""
             raise click.UsageError(f"No such option {error.option_name!r}.{hint}", error.ctx) from None
+        except BrokenPipeError:  # the reader of stdout has ended; click would exit with 1
+            raise SystemExit(BROKEN_PIPE) from None
 
 
 class OneOf(click.ParamType):

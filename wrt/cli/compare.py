@@ -21,7 +21,7 @@ from wrt.core.errors import InputError
 @click.option("--exposure", type=float, default=0.0, show_default=True, help="Exposure in stops before PSNR and FLIP")
 @shared("as_json")
 def compare(a: Path, b: Path, output: Path | None, tonemap: str, exposure: float, as_json: bool, **limits: float | None) -> None:
-    """Measure the error of picture A against the reference B; exit code 1 if a limit is exceeded."""
+    """Measure the error of picture A against the reference B. Exit code 1 if a limit is exceeded."""
     from wrt.picture import metrics
     from wrt.picture.image import check_writable, read_image, write_codes
     from wrt.scene.settings import Settings

@@ -8,7 +8,7 @@ import click
 from wrt.cli.common import load, naming, say, say_json, shared, warnings_reported
 
 
-@click.command("compile", help="Fill Warp's kernel cache (WARP_CACHE_PATH) in advance, for a container or a cluster: with the kernels that"
+@click.command("compile", help="Fill Warp's kernel cache (WARP_CACHE_PATH) in advance. It gets the kernels that"
                " query a structure, and the kernels that render SCENES with all AOVs. Kernels already in the cache are skipped.")
 @click.argument("scenes", nargs=-1, type=click.Path(path_type=Path))
 @shared("accel", "device", "threads", "quiet", "as_json")

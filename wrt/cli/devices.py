@@ -19,7 +19,7 @@ from wrt.core.errors import InputError
 @shared("quiet", "as_json")
 def devices(check: bool, tunes: bool, device: str | None, scenes: tuple[Path, ...], rays: int | None, quiet: bool,
             as_json: bool) -> None:
-    """List the devices that Warp can compute on, compare one with the CPU, or find its fastest structure."""
+    """List the devices that Warp can compute on; check or tune one. --check compares it with the CPU; --tune finds its best structure."""
     from wrt.core.device import describe_devices
 
     if check and tunes:

@@ -20,7 +20,7 @@ PIXEL = PatternType("X,Y", rf"\s*({DIGITS})\s*,\s*({DIGITS})\s*", "a pixel; writ
               help="What to draw: section (2D), picture (the rays in a picture from the side) or both")
 @shared("spp", "size", "seed", "threads", "camera", "max_depth", "assignments", "accel", "device", "quiet", "as_json")
 def inspect(scene: Path, output: Path | None, view: str, assignments: Assignments, quiet: bool, as_json: bool, **options: Parsed) -> None:
-    """Print the tree of rays of a pixel of SCENE: what each ray hits, why it ends, and what it adds to the pixel."""
+    """Print the tree of rays of a pixel of SCENE. It has what each ray hits, why it ends, and what it adds to the pixel."""
     from wrt.core.checks import as_choice
     from wrt.core.write_file import check_writable
     from wrt.renderer.inspector.drawing import VIEWS, require_drawable
@@ -47,7 +47,7 @@ def inspect(scene: Path, output: Path | None, view: str, assignments: Assignment
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Also write .gif, .mp4, .png, .json or .txt; a{}.png: all steps")
 @shared("accel", "as_json")
 def walk(mesh: Path, ray: str, output: Path | None, accel: str, as_json: bool) -> None:
-    """List the steps of one ray through a structure over MESH: nodes, boxes, planes, stack, and triangle tests."""
+    """List the steps of one ray through a structure over MESH. Steps are nodes, boxes, planes, stack, and triangle tests."""
     import wrt
 
     try:

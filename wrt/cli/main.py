@@ -2,7 +2,8 @@
 
 stdout is for data, stderr for messages. Exit code 1 means that `compare` or `devices --check` found more difference than allowed. Code 2
 means a user's mistake, which one message describes. After an interrupt, the code is 128 plus the signal's number: 130 for Ctrl-C, 143
-for SIGTERM, 129 for SIGHUP. Each command function imports slow modules itself, so that --help is fast.
+for SIGTERM, 129 for SIGHUP. It is 141 if the reader of stdout ends first. Each command function imports slow modules itself, so that
+--help is fast.
 """
 
 import atexit
@@ -11,6 +12,7 @@ import gc
 import io
 import os
 import sys
+from traceback import extract_tb
 from typing import NoReturn
 
 import click
@@ -70,7 +72,8 @@ def main() -> None:
         error.show()
         code = error.exit_code
     except OSError as error:  # for example a path too long for the system, or stdout on a full disk
-        say(f"error: {error}")
+        to_stdout = error.__traceback__ and extract_tb(error.__traceback__)[-1].name == "echo"  # of click
+        say(f"error: {f'stdout: {error.strerror}' if to_stdout else error}")
         code = 2
     except (click.Abort, KeyboardInterrupt) as error:  # click raises Abort from KeyboardInterrupt
         cause = error.__cause__ if isinstance(error, click.Abort) else error

@@ -21,7 +21,7 @@ BENCHES: Registry[click.Command] = Registry("bench", {}, "wrt.benches")
                                             " file with --quick, in a minute on two cores")
 @click.pass_context
 def bench(context: click.Context, quick: bool) -> None:
-    """Measure the speed and the error of renders, and compare methods."""
+    """Measure speed and error of renders, and compare methods."""
     if not quick:
         return
     if context.invoked_subcommand is not None:
@@ -46,7 +46,7 @@ whatif = measured(plans.WhatIf)
 @click.option("--structures", type=Names(), default=("bvh", "bvh2"), show_default=True, help="Names of structures")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON")
 def instructions(structures: tuple[str, ...], as_json: bool) -> None:
-    """Count the machine instructions of each box and triangle test on Turing GPUs, and show registers, stack and code size of
+    """Count the instructions of each box and triangle test. Machine code is for Turing GPUs. Show registers, stack and code size of
     traversals on Turing and Hopper GPUs."""
     from wrt.accel.structures import ACCELERATORS
     from wrt.lab.bench.report import markdown
@@ -71,7 +71,7 @@ def instructions(structures: tuple[str, ...], as_json: bool) -> None:
 @click.option("--gpu", default="rtx2080ti", show_default=True, help=plans.MODELLED)
 @reporting("Folder for heat maps, EXR layers, histograms and a report")
 def profile(how: Reporting, scene: Path, assignments: Assignments, gpu: str, **options: Parsed) -> None:
-    """Count the work of every ray of SCENE by pixel, kind of ray and depth, and estimate its time on an RT core."""
+    """Count the work of the rays of SCENE, and model an RT core. Count by pixel, kind of ray and depth; estimate the time on the core."""
     from wrt.core.checks import require_known
     from wrt.lab.rtcore import profile_report as report
     from wrt.lab.rtcore.parameters import GPUS
@@ -129,7 +129,7 @@ def stability(how: Reporting, plan: Stability) -> None:
 @reporting()
 def error(how: Reporting, plan: Error, scene: Path, assignments: Assignments, size: tuple[int, int],
           **options: Parsed) -> None:
-    """Render SCENE with various values of each option, and compare time and error of the pictures with a converged
+    """Render SCENE with various values of each option. Compare time and error of the pictures with a converged
     reference. A stopped run cannot be resumed."""
     from wrt.lab.bench import error as study
     from wrt.lab.bench import error_report as report
@@ -155,7 +155,7 @@ def error(how: Reporting, plan: Error, scene: Path, assignments: Assignments, si
 @reporting()
 def mitsuba(how: Reporting, plan: Mitsuba, scene: Path, assignments: Assignments, size: tuple[int, int], matte: bool,
             camera: str | None) -> None:
-    """Render SCENE with wrt and with Mitsuba 3 (scalar_rgb and llvm_ad_rgb) on all threads, and compare the times to equal error,
+    """Render SCENE with wrt and with Mitsuba 3. Use scalar_rgb and llvm_ad_rgb, and all threads. Compare the times to equal error,
     with and without the start of the process. A stopped run cannot be resumed.
 
     llvm_ad_rgb needs an LLVM library (19 works), named in the environment variable DRJIT_LIBLLVM_PATH."""

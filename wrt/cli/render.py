@@ -46,7 +46,7 @@ STDOUT = Path("-")
 WATCH_EVERY = 0.2  # seconds between two looks at a watched file
 
 
-@click.command(help=f"Render SCENE (.toml, .gltf, .glb, or a mesh: {SUFFIXES}) to a picture.")
+@click.command(help=f"Render SCENE to a picture. SCENE is .toml, .gltf, .glb, or a mesh: {SUFFIXES}.")
 @shared("scene")
 @click.option("-o", "--output", type=click.Path(path_type=Path),
               help="Picture to write: .png, .exr, .hdr, .jpg or .webp; - is a PNG on stdout  [default: the scene's file name with .png]")

@@ -13,7 +13,7 @@ from wrt.core.errors import InputError
 @click.command()
 @shared("scene", "camera", "assignments", "as_json")
 def info(scene: Path, camera: str | None, assignments: Assignments, as_json: bool) -> None:
-    """Describe SCENE, and list the features that its render kernels are compiled with."""
+    """Describe SCENE, and list the features of its render kernels."""
     from wrt.renderer.features import describe
 
     settings = settings_of(assignments)
@@ -50,7 +50,7 @@ def schema(markdown: bool) -> None:
 @click.command()
 @click.argument("scenes", nargs=-1, required=True, type=click.Path(path_type=Path))
 def validate(scenes: tuple[Path, ...]) -> None:
-    """Check SCENES without rendering; exit code 2 if any of them is invalid."""
+    """Check SCENES without rendering. Exit code 2 if any of them is invalid."""
     code = 0
     for scene in scenes:
         try:

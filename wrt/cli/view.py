@@ -34,7 +34,7 @@ PLACE_OPTIONS = (
 @shared("device", "threads", "camera", "accel", "assignments", "quiet")
 def view(scene: Path, place: Place, open_browser: bool, spp: int, assignments: Assignments, staging: dict[str, Parsed], quiet: bool,
          **options: Parsed) -> None:
-    """Show SCENE in a browser with an orbit camera; the picture gets finer while the camera rests.
+    """Show SCENE in a browser with an orbit camera. The picture gets finer while the camera rests.
 
     The printed address contains a secret token: everybody with the address can watch, and move the camera. Ctrl-C ends the viewer.
     The viewer needs websockets: pip install "wrt[viewer]"."""

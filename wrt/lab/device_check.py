@@ -4,6 +4,7 @@ A GPU's hits are compared with those of the default structure on the CPU, since 
 recorded bits: hashes of an x86-64 CPU's pictures, in tests/bits.txt of a checkout. What has no recorded bits is compared between two
 structures; what does not depend on a structure, such as functions, is left out."""
 
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -220,10 +221,12 @@ def speed_rows(plan: Check) -> tuple[list[Row], str]:
     for constructor in CONSTRUCTORS:
         warp = WarpMesh(plan.device, constructor)
         try:
-            warp.prepare(geometry)
+            with warnings.catch_warnings():
+                warnings.simplefilter("error", UserWarning)  # Warp warns when it builds by another constructor
+                warp.prepare(geometry)
             warps[f"Warp, {constructor}"] = warp
-        except RuntimeError as error:  # includes NotImplementedError
-            skipped.append(f"Warp, {constructor}: {error}")
+        except (RuntimeError, UserWarning) as error:  # includes NotImplementedError
+            skipped.append(f"Warp, {constructor}: {str(error).partition('. Falling back')[0]}")
     for own in algorithms.values() if warps else ():
         own.prepare(geometry)
     algorithms |= warps

@@ -74,7 +74,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Visibility(Plan):
-    """Compare rasterising with ray casting as triangles and pixels grow: the time of both, and the pixels where they differ.
+    """Compare rasterising with ray casting. As triangles and pixels grow: the time of both, and the pixels where they differ.
 
     MESHES: mesh files; default: a sphere and a terrain."""
 
@@ -92,7 +92,7 @@ class Visibility(Plan):
 
 @dataclass(frozen=True)
 class Units(Plan):
-    """Compare the default triangle and box tests with the other tests: ratios of times, with their spread, on one thread.
+    """Compare the default triangle and box tests with the others. Columns: ratios of times, with their spread, on one thread.
 
     MESHES: mesh files; default: a sphere, a terrain and a teapot."""
 
@@ -106,8 +106,8 @@ class Units(Plan):
 
 @dataclass(frozen=True)
 class Peers(Plan):
-    """Compare wrt with Embree (robust, fast, in packets), Open3D, trimesh, Warp and tinybvh on the same rays and points: nanoseconds
-    a ray, ratios of the speeds, and the number of answers that differ.
+    """Compare wrt with other ray libraries. They are Embree (robust, fast, in packets), Open3D, trimesh, Warp and tinybvh. All
+    get the same rays and points. Columns: nanoseconds a ray, ratios of the speeds, and the number of answers that differ.
 
     MESHES: mesh files; default: a sphere."""
 
@@ -145,7 +145,7 @@ class Peers(Plan):
 
 @dataclass(frozen=True)
 class HardCases(Plan):
-    """Run the hard cases on wrt and other ray libraries: count rays lost, hits invented and wrong triangles, and measure the error of t.
+    """Run the hard cases on wrt and other ray libraries. Count rays lost, hits invented and wrong triangles, and measure the error of t.
 
     CASES: names such as E_grid, or letters of groups such as E; default: all that need no spheres and no t_min."""
 
@@ -159,7 +159,7 @@ class HardCases(Plan):
 
 @dataclass(frozen=True)
 class Closed(Plan):
-    """Test closed meshes: which points are inside, and rays through corners and edges, which must cross an even number of times.
+    """Test which points are inside of closed meshes. Rays through corners and edges must cross an even number of times.
     Open3D and trimesh answer too, if installed.
 
     MESHES: closed mesh files, in addition to seven built-in meshes."""
@@ -174,7 +174,7 @@ class Closed(Plan):
 
 @dataclass(frozen=True)
 class Accel(Plan):
-    """Compare all structures: build time, memory, traversal steps and time, and the number of answers that differ (must be 0).
+    """Compare all structures. Columns: build time, memory, traversal steps and time, and the number of answers that differ (must be 0).
 
     MESHES: mesh files; default: a terrain that grows from a thousand triangles on."""
 
@@ -193,7 +193,7 @@ class Accel(Plan):
 
 @dataclass(frozen=True)
 class Bvh(Plan):
-    """Compare builders of binary BVHs over MESHES by quality, time and memory; compare boxes, spheres and 14-DOPs on one tree."""
+    """Compare builders of binary BVHs over MESHES. Columns: quality, time, memory. Also compare boxes, spheres and 14-DOPs on one tree."""
 
     COMMAND, STUDY, QUICK = "bench bvh", "wrt.lab.bench.bvh", {"rays": 1 << 14, "builds": 1, "runs": 3}
     meshes: Sequence[Any] = the_meshes(MISSING)
@@ -207,7 +207,7 @@ class Bvh(Plan):
 
 @dataclass(frozen=True)
 class RtCore(Plan):
-    """Model the RT core on MESHES: what limits it, a range of rays a second, and which assumption changes that range most.
+    """Model the RT core on MESHES. Find what limits it, a range of rays a second, and which assumption changes that range most.
 
     A trace that --trace or wrt.trace wrote (.npz) can stand in place of a mesh."""
 
@@ -224,7 +224,7 @@ class RtCore(Plan):
 
 @dataclass(frozen=True)
 class Claims(Plan):
-    """Repeat published claims about ray tracing hardware with exact counts: the published number, wrt's, their ratio, and what differs.
+    """Repeat published claims about ray tracing hardware. By exact counts: the published number, wrt's, their ratio, and what differs.
 
     NAMES: claims; default: all. Without files, generated scenes stand in for the published ones."""
 
@@ -244,7 +244,7 @@ class Claims(Plan):
 
 @dataclass(frozen=True)
 class Float64(Plan):
-    """Count the triangle tests that need float64 if a GPU runs the watertight test on MESHES, and the rays that have such a test."""
+    """Count the triangle tests on MESHES that need float64. A GPU runs the watertight test. Count the rays with such a test, too."""
 
     COMMAND, STUDY, QUICK = "bench float64", "wrt.lab.rtcore.hard_tests", {"rays": 1 << 12}
     meshes: Sequence[Any] = the_meshes(MISSING)
@@ -256,7 +256,7 @@ class Float64(Plan):
 
 @dataclass(frozen=True)
 class Pictures(Plan):
-    """Render SCENES by waves of samples, as the CPU does, and one ray at a time. Compare nanoseconds a sample on one thread, and
+    """Render SCENES by waves of samples and one ray at a time. The CPU uses waves. Compare nanoseconds a sample on one thread, and
     count the pixels that differ (must be 0)."""
 
     COMMAND, STUDY, QUICK = "bench pictures", "wrt.lab.bench.pictures", {"size": "160x90", "spp": 4, "runs": 3}
@@ -269,7 +269,7 @@ class Pictures(Plan):
 
 @dataclass(frozen=True)
 class WhatIf(Plan):
-    """Change one part of the RT core's design, trace the same rays through MESH, and compare their cost.
+    """Change one part of the RT core's design, and compare costs. Both designs trace the same rays through MESH.
 
     STUDY names the part. "width": children, format and bounding volume of a node. "stack": entries of a short stack with restarts.
     "planes": bits of a box plane. "order": order of children, early stop. "sorting": order of the rays. "rates": tests a clock."""
@@ -320,7 +320,7 @@ class Mitsuba(Plan):
 
 @dataclass(frozen=True)
 class Stability(Plan):
-    """Run the hard cases on the intersection tests: rays lost, errors and speed.
+    """Run the hard cases on the intersection tests. Count rays lost, and measure errors and speed.
 
     CASES: names such as E_grid, or letters of groups such as E; default: all."""
 

@@ -21,7 +21,7 @@ from tests.command_line import BOX_OBJ, Result, largest_file, without_compiling
 from tests.command_line import wrt as run
 from tests.data import ROOT
 from tests.picture_metadata import read_metadata
-from wrt import __version__
+from wrt import __version__, load_accel
 from wrt.cli import common as cli_common
 from wrt.cli.render import watched
 from wrt.core.errors import InputError
@@ -568,7 +568,7 @@ def test_a_process_refuses() -> None:
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a shell")
 @pytest.mark.parametrize(("redirection", "code", "out", "err"), [
     ("2>&-", 0, "box.png\n", ""), (">&-", 0, "", "seconds"), (">&- 2>&-", 0, "", ""), ("<&-", 0, "box.png\n", "seconds"),
-    (">/dev/full", 2, "", "error: "),
+    (">/dev/full", 2, "", "error: stdout: No space left on device"),
 ])
 def test_closed_and_full_streams(redirection: str, code: int, out: str, err: str) -> None:
     if "full" in redirection and not Path("/dev/full").is_char_device():
@@ -577,6 +577,28 @@ def test_closed_and_full_streams(redirection: str, code: int, out: str, err: str
     done = subprocess.run(shell, text=True, capture_output=True, env={**os.environ, "PYTHONPATH": str(ROOT)}, check=False)
     assert (done.returncode, done.stdout) == (code, out) and err in done.stderr and "Traceback" not in done.stderr
     assert read_image("box.png").shape == (18, 32, 3)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs pipes of POSIX")
+def test_a_reader_that_ends_first_is_no_error() -> None:
+    receiving, sending = os.pipe()
+    os.close(receiving)
+    done = subprocess.run([sys.executable, "-m", "wrt", "schema"], stdout=sending, stderr=subprocess.PIPE, check=False)
+    os.close(sending)
+    assert (done.returncode, done.stderr) == (141, b"")
+
+
+@pytest.mark.parametrize("command", [(), ("bench",)])
+def test_the_list_of_commands_fits_in_80_columns(command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    lines = run(*command, "--help").out.split("Commands:\n")[1].splitlines()
+    assert len(lines) > 10
+    assert all(re.fullmatch(r"  \S+ +\S.*\w\.?", line) and not line.endswith("...") and len(line) <= 80 for line in lines), lines
+
+
+def test_a_structure_in_a_file_holds_its_mesh() -> None:
+    assert run("build", "box.obj", "-q", "-o", "box.accel").code == 0
+    assert len(load_accel("box.accel").geometry) == 12
 
 
 # Let the real reporter print its first line at once, so that the test knows when the process traces.

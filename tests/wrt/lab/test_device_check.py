@@ -63,6 +63,7 @@ def test_on_a_cpu_structures_agree_and_nothing_is_compared_with_itself(scene: Pa
     assert compared == {("hits", "brute_force", "bvh8"): 4 * 17**2, ("hits", "bvh2, 1 hard cases", "bvh8"): 2000,
                         ("pixels", "floor", "bvh2"): 64 * 36}
     assert {row["who"] for row in data["speed"]} >= {"wrt bvh8", "Warp, sah"}
+    assert "LBVH" not in result.err and not any(row["who"] == "Warp, lbvh" for row in data["speed"])  # the CPU has no LBVH
     assert all(rate > 0.0 for row in data["speed"] for rate in row["mrays"])
 
 

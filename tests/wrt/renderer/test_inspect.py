@@ -167,6 +167,18 @@ def test_the_command_prints_and_draws(tmp_path: Path) -> None:
     assert json.loads(done.out)["samples"][0]["index"] == 1
 
 
+def test_a_section_says_that_shadow_rays_leave_it() -> None:
+    pytest.importorskip("matplotlib")
+    from matplotlib.figure import Figure
+
+    from wrt.renderer.inspector.drawing import draw_section
+
+    tree, axes = wrt.inspect(GLASS, (100, 300), 0, spp=1), Figure().subplots()
+    assert all(abs(plane_of(tree.samples[0], tree.camera).distance(ray.origin[None])).max() < 1e-5 for ray in tree.samples[0].rays)
+    draw_section(axes, tree, tree.samples[0])
+    assert "rays that leave it" in axes.get_title()
+
+
 def test_the_rays_are_drawn_over_a_picture(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     from PIL import Image

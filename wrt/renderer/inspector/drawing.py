@@ -92,9 +92,9 @@ def draw_section(axes: "Axes", inspection: InspectedPixel, sample: Sample) -> No
         draw_stroke(axes, stroke, line)
     label_shapes(axes, shapes, np.array([low, high]), lines)
     label_points(axes, sample, strokes, plane.project)
-    ends = np.array([(stroke.start, stroke.end) for stroke in strokes if not (stroke.is_shadow or stroke.goes_on)])
+    ends = np.array([(stroke.start, stroke.end) for stroke in strokes if not stroke.goes_on])
     off = float(np.abs(plane.distance(ends)).max()) if len(ends) else 0.0
-    note = f"; paths that leave it, by up to {off:.2g} units, are projected onto it" if off > 1e-3 * extent else ""
+    note = f"; rays that leave it, by up to {off:.2g} units, are projected onto it" if off > 1e-3 * extent else ""
     axes.set_title(f"section by the plane of the rays{note}", fontsize=8, color="#5c564c")
 
 
