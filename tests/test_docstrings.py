@@ -6,11 +6,12 @@ import importlib
 import inspect
 import re
 from collections.abc import Callable, Iterator
-from typing import get_args
+from typing import Any, get_args
 
 import pytest
 
 import wrt
+from tests.data import ROOT
 
 MODULES = ("wrt.torch", "wrt.jax", "wrt.sensors", "wrt.testing", "wrt.compat.trimesh", "wrt.compat.open3d", "wrt.compat.pyvista",
            "wrt.picture.metrics")
@@ -78,3 +79,28 @@ def test_functions_that_check_arguments_say_what_they_raise() -> None:
     raising = [(name, function) for name, function, of_class in callables()
                if not of_class and re.search(r"raise InputError|\bas_(one|choice|integer)\(", inspect.getsource(function))]
     assert len(raising) > 5 and [name for name, function in raising if not section(function.__doc__ or "", "Raises")] == []
+
+
+def test_the_site_shows_the_type_of_each_parameter() -> None:
+    """Parameters that a docstring describes together without a type each get their own (docs/site/grouped_parameters.py)."""
+    griffe = pytest.importorskip("griffe")
+    extensions = griffe.load_extensions(ROOT / "docs" / "site" / "grouped_parameters.py")
+    package = griffe.load("wrt", search_paths=[ROOT], extensions=extensions, docstring_parser="numpy",
+                          docstring_options={"warn_unknown_params": False, "warn_missing_types": False})
+    compared = 0
+    for thing in public_objects(package):
+        own = {each.name: each for each in thing.parameters}
+        sections = thing.docstring.parsed if thing.docstring else []
+        for shown in [each for section in sections if section.kind.value == "parameters" for each in section.value]:
+            if shown.name in own and not re.search(rf"^(\S+, )*{re.escape(shown.name)}(, \S+)* : ", thing.docstring.value, re.M):
+                assert str(shown.annotation) == str(own[shown.name].annotation), (thing.path, shown.name)
+                compared += 1
+    assert compared > 300
+
+
+def public_objects(owner: Any) -> Iterator[Any]:
+    """Yield the functions and classes that a griffe module or class defines, also in its modules and classes."""
+    for member in owner.members.values():
+        if not member.is_alias and (member.is_module or member.is_class or member.is_function):
+            yield from [] if member.is_module else [member]
+            yield from public_objects(member)

@@ -258,6 +258,31 @@ def test_calls_in_the_tables_for_other_libraries_run(theirs: str, folder: Path, 
     assert run_lines > 12 and agree >= (3 if theirs == "trimesh" else 0)
 
 
+def test_the_table_for_trimesh_makes_the_rays_of_its_camera() -> None:
+    import trimesh
+
+    import wrt
+
+    camera = trimesh.scene.Camera(resolution=(640, 480), fov=(60.0, 45.0))
+    pose = trimesh.transformations.rotation_matrix(0.7, [1.0, 2.0, 3.0])
+    pose[:3, 3] = 1.0, 2.0, 3.0
+
+    def difference(row: str) -> float:
+        """Return the largest difference of a unit direction. trimesh has the pixels column by column, each from the top."""
+        origins, theirs, _ = trimesh.Scene(trimesh.creation.box(), camera=camera, camera_transform=pose).camera_rays()
+        names: dict[str, Any] = {"np": np, "wrt": wrt, "K": camera.K, "pose": pose}
+        code = next(ours for call, ours in calls("trimesh") if row in call).replace("fov_y=0.6", f"fov_y={np.radians(camera.fov[1])}")
+        values = [value_of(line, names) for line in code.splitlines()]
+        ours, directions = values[-1] if isinstance(values[-1], tuple) else values[-2:]
+        np.testing.assert_allclose(ours, origins, atol=1e-6)
+        unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        return float(np.abs(unit.reshape(480, 640, 3).transpose(1, 0, 2) - theirs.reshape(640, 480, 3)).max())
+
+    assert difference("scene.camera_rays()") < 2e-7
+    camera.fov = 60.0, np.degrees(2.0 * np.arctan(0.75 * np.tan(np.radians(30.0))))
+    assert max(difference("scene.camera_rays()"), difference("scene.camera.fov")) < 2e-7
+
+
 def value_of(line: str, names: dict[str, Any]) -> Any:
     """Run a line of Python and return its value, None for a statement."""
     if re.match(r"\w+ = |[\w.]+ = ", line):

@@ -79,12 +79,6 @@ class BuildOptions(TypedDict, total=False):
 
 
 @overload
-def build(mesh: list[WorldT], accel: str = ..., device: str = ..., threads: int | None = ..., *, movable: bool = ...,
-          progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Instances: ...
-@overload
-def build(mesh: MeshLike, accel: str = ..., device: str = ..., threads: int | None = ..., *, movable: Literal[True],
-          progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Instances: ...
-@overload
 def build(mesh: OneMeshLike, accel: Literal["bvh", "bvh8"] = ..., device: str = ..., threads: int | None = ...,
           *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bvh8: ...
 @overload
@@ -124,8 +118,14 @@ def build(mesh: OneMeshLike, accel: Literal["octree"], device: str = ..., thread
 def build(mesh: OneMeshLike, accel: str, device: str = ..., threads: int | None = ...,
           *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> OneMesh: ...
 @overload
+def build(mesh: MeshLike, accel: str = ..., device: str = ..., threads: int | None = ..., *, movable: Literal[True],
+          progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Instances: ...
+@overload
 def build(mesh: SceneLike, accel: str = ..., device: str = ..., threads: int | None = ..., *, movable: bool = ...,
           progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> OneMesh | Instances: ...
+@overload
+def build(mesh: list[WorldT], accel: str = ..., device: str = ..., threads: int | None = ..., *, movable: bool = ...,
+          progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Instances: ...
 def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = DEFAULT_DEVICE, threads: int | None = None, *,
           movable: bool = False, progress: Callable[[float], None] | None = None,
           **options: Unpack[BuildOptions]) -> OneMesh | Instances:
