@@ -95,7 +95,7 @@ def test_the_site_shows_the_type_of_each_parameter() -> None:
             if shown.name in own and not re.search(rf"^(\S+, )*{re.escape(shown.name)}(, \S+)* : ", thing.docstring.value, re.M):
                 assert str(shown.annotation) == str(own[shown.name].annotation), (thing.path, shown.name)
                 compared += 1
-    assert compared > 300
+    assert compared > 200
 
 
 def public_objects(owner: Any) -> Iterator[Any]:

@@ -213,10 +213,12 @@ def trace(loaded: "Scene", path: Path, spp: int | None, options: dict[str, Parse
     return film
 
 
+LEAST_LOSS = 0.001  # Mean radiance lost by cut rays that the summary mentions, in surroundings of radiance 1; 8 bits have steps of 0.004.
+
+
 def _summary(film: "Film", auto_exposure: bool) -> str:
-    """Return a text with samples, rays, cut rays, and the seconds of each stage ("compile" overlaps "upload" and "build")."""
+    """Return a text with samples, rays, what cut rays cost, and the seconds of each stage ("compile" overlaps "upload" and "build")."""
     s = film.stats
-    cut = f"cut: {s['cut_by_depth']} rays by depth, {s['cut_by_throughput']} by throughput"
     end = "interrupted" if s["interrupted"] else "time limit" if s["timed_out"] else ""
     note = f" ({end})" if end else ""
     if s.get("resumed"):
@@ -230,13 +232,16 @@ def _summary(film: "Film", auto_exposure: bool) -> str:
         note += f", estimated error {s['estimated_error']:.3g}"
         note += "" if s["target_reached"] else f" (above the target of {s['target_error']:g})"
     hint = depth_hint(s, film.metadata["max_depth"])
+    lost = s["lost_throughput_per_sample"]
+    cut = (f"; rays cut by max_depth and min_throughput would add {lost:.2g} to the picture's mean in surroundings of radiance 1"
+           if lost >= LEAST_LOSS and not hint else "")
     hint = f"\n{hint}" if hint else ""
     saved = f"\n{s['checkpoint']}: --resume continues from this checkpoint" if s.get("checkpoint") else ""
     resumed = f" ({s['resumed']['seconds']:.2f} before the resume)" if s.get("resumed") else ""
     seconds = ", ".join(f"{name} {value:.2f}{resumed if name == 'trace' else ''}" for name, value in s["seconds"].items())
     exposed = f"exposure {film.exposure:+.2g}, chosen automatically (--exposure 0: none)\n" if auto_exposure else ""
-    return (f"{exposed}{film.metadata['spp']} spp{note}, {s['rays'] / 1e6:.2f} M rays, {s['rays_per_second'] / 1e6:.2f} Mray/s; "
-            f"{cut}, lost throughput {s['lost_throughput_per_sample']:.2g} per sample{black}\nseconds: {seconds}{saved}{hint}")
+    return (f"{exposed}{film.metadata['spp']} spp{note}, {s['rays'] / 1e6:.2f} M rays, {s['rays_per_second'] / 1e6:.2f} Mray/s"
+            f"{cut}{black}\nseconds: {seconds}{saved}{hint}")
 
 
 EVERY = 60.0  # seconds between two checkpoints

@@ -27,43 +27,57 @@ def render(scene: Scene | Mesh | str | os.PathLike[str], **options: Unpack[Rende
 
     Parameters
     ----------
-    scene
-        A Scene, a Mesh, or the path of a scene or mesh file. `load_scene` says how a Mesh or a path becomes a scene.
-    size, spp, max_depth, min_throughput, clamp, filter, fresnel, glass_shadows, sampler, exposure, tonemap, auto_exposure
-        Replace the scene's setting of the same name; see Settings. None keeps it. A `size` may also be a width,
-        which keeps the aspect ratio, or text such as "640x360".
-    seed
+    scene : Scene, Mesh or path
+        What to render; a path names a scene or mesh file. `load_scene` says how a Mesh or a path becomes a scene.
+    size : (int, int), int or str, optional
+        Width and height in pixels; a width, which keeps the scene's aspect ratio; or text such as "640x360".
+    spp, max_depth : int, optional
+        As for all parameters down to `auto_exposure`: replace the scene's setting of the same name, see Settings. None keeps it.
+    min_throughput, clamp, exposure : float, optional
+        See Settings.
+    filter, fresnel, glass_shadows, sampler, tonemap : str, optional
+        See Settings.
+    auto_exposure : bool, optional
+        See Settings.
+    seed : int
         Seed of the samples.
-    device, threads
-        Name of a Warp device such as "cpu" or "cuda:0"; number of CPU threads (None: one for each core).
-    accel, accel_options, triangle, box
-        Name of the acceleration structure in ACCELERATORS, its options (see `build`), and its triangle and box test.
-    instancing
+    device : str
+        Name of a Warp device such as "cpu" or "cuda:0".
+    threads : int, optional
+        Number of CPU threads; one for each core by default.
+    accel, triangle, box : str
+        Name of the acceleration structure in ACCELERATORS, and its triangle and box test.
+    accel_options : dict
+        The structure's options; see `build`.
+    instancing : str
         Which of the meshes that several objects share are stored once: "auto" (large meshes), "always" or "never".
-    camera
+    camera : str, int or camera, optional
         Name or index of one of the scene's cameras, or a camera of any kind. None: the first.
-    crop
+    crop : (int, int, int, int), optional
         x0, y0, x1, y1 in pixels from the top left: the rectangle to render.
-    aov
+    aov : str or sequence of str
         Layers to return beside the pixels: "depth", "normal", "albedo", "prim_id", "material_id". Film defines them.
-    time_limit
+    time_limit : float, optional
         Seconds of tracing after which the render stops. Each pixel gets at least one sample.
-    target_error
+    target_error : float, optional
         Stop once the estimated error is at most this: the root mean square, over pixels and channels, of the standard error in
         linear radiance. The estimate covers noise, but not the radiance that max_depth and min_throughput cut. Each pixel's samples
         form four independent sequences. The error is estimated when each sequence has 1, 2, 4, 8 ... samples. The keyword `spp` is
         then the upper limit, rounded down to a multiple of four. Without the keyword, the limit is 65,536; the scene's spp is ignored.
-    tile_size, pass_size
+    tile_size, pass_size : int, optional
         Side of a tile in pixels, and samples per pixel in one pass. None: wrt chooses.
-    progress
+    progress : function, optional
         Function that is called with a Progress about ten times per second.
-    checkpoint, checkpoint_every, resume
-        File for the samples so far, written every `checkpoint_every` seconds of tracing and at the end. If the file exists, `resume`
-        must be True. The render then continues from the file, and the picture has the bits of an uninterrupted render.
-    devices
+    checkpoint : path, optional
+        File for the samples so far, written at the end, too.
+    checkpoint_every : float
+        Seconds of tracing between two writes of the checkpoint.
+    resume : bool
+        Continue from the checkpoint; must be True if the file exists. The picture has the bits of an uninterrupted render.
+    devices : sequence of str, optional
         Several devices of one kind on this machine, which share the tiles. They replace `device`.
-    executor
-        A concurrent.futures.Executor or a dask.distributed.Client. Its workers trace the tiles, each on its `device`.
+    executor : concurrent.futures.Executor or dask.distributed.Client, optional
+        Its workers trace the tiles, each on its `device`.
 
     Returns
     -------

@@ -92,9 +92,18 @@ def test_render_writes_a_picture_and_says_its_name_on_stdout() -> None:
         assert image.size == (32, 18) and image.mode == "RGB"
     warning, *summary = result.err.splitlines()
     assert warning.startswith("warning: box.obj: it has no camera") and summary[0].startswith("2 spp, ")
-    assert "cut: 0 rays by depth, 0 by throughput" in summary[0] and summary[1].startswith("seconds: import ")
+    assert summary[0].endswith(" Mray/s") and summary[1].startswith("seconds: import ")
     metadata = read_metadata("box.png")
     assert metadata.items() >= {"scene": "box.obj", "camera": "framing", "spp": "2", "seed": "0"}.items()
+
+
+def test_the_summary_says_what_cut_rays_cost_only_if_it_matters() -> None:
+    command = ("render", str(ROOT / "scenes" / "whitted.toml"), *SMALL, "-o", "whitted.png", "--json")
+    for least in ("0.0001", "0.5"):
+        stats = json.loads(run(*command, "--min-throughput", least).out)
+        told = f" would add {stats['lost_throughput_per_sample']:.2g} to the picture's mean in surroundings of radiance 1"
+        result = run(*command[:-1], "--min-throughput", least)
+        assert stats["cut_by_throughput"] > 0 and (told in result.err) == (least == "0.5"), result.err
 
 
 def test_quiet_is_silent_but_for_the_data() -> None:
