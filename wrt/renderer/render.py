@@ -32,21 +32,23 @@ def render(scene: Scene | Mesh | str | os.PathLike[str], **options: Unpack[Rende
     size : (int, int), int or str, optional
         Width and height in pixels; a width, which keeps the scene's aspect ratio; or text such as "640x360".
     spp, max_depth : int, optional
-        As for all parameters down to `auto_exposure`: replace the scene's setting of the same name, see Settings. None keeps it.
+        Replace the scene's setting of the same name; see Settings. None keeps it.
     min_throughput, clamp, exposure : float, optional
-        See Settings.
+        Replace settings, like `spp`.
     filter, fresnel, glass_shadows, sampler, tonemap : str, optional
-        See Settings.
+        Replace settings, like `spp`.
     auto_exposure : bool, optional
-        See Settings.
+        Replace settings, like `spp`.
     seed : int
         Seed of the samples.
     device : str
         Name of a Warp device such as "cpu" or "cuda:0".
     threads : int, optional
         Number of CPU threads; one for each core by default.
-    accel, triangle, box : str
-        Name of the acceleration structure in ACCELERATORS, and its triangle and box test.
+    accel : str
+        Name of the acceleration structure in ACCELERATORS.
+    triangle, box : str
+        Names of the intersection tests for triangles and boxes; see `build`.
     accel_options : dict
         The structure's options; see `build`.
     instancing : str
