@@ -45,10 +45,8 @@ def render(scene: Scene | Mesh | str | os.PathLike[str], **options: Unpack[Rende
         Name of a Warp device such as "cpu" or "cuda:0".
     threads : int, optional
         Number of CPU threads; one for each core by default.
-    accel : str
-        Name of the acceleration structure in ACCELERATORS.
-    triangle, box : str
-        Names of the intersection tests for triangles and boxes; see `build`.
+    accel, triangle, box : str
+        Names of the acceleration structure (in ACCELERATORS), of its triangle test, and of its box test.
     accel_options : dict
         The structure's options; see `build`.
     instancing : str
@@ -62,10 +60,10 @@ def render(scene: Scene | Mesh | str | os.PathLike[str], **options: Unpack[Rende
     time_limit : float, optional
         Seconds of tracing after which the render stops. Each pixel gets at least one sample.
     target_error : float, optional
-        Stop once the estimated error is at most this: the root mean square, over pixels and channels, of the standard error in
-        linear radiance. The estimate covers noise, but not the radiance that max_depth and min_throughput cut. Each pixel's samples
-        form four independent sequences. The error is estimated when each sequence has 1, 2, 4, 8 ... samples. The keyword `spp` is
-        then the upper limit, rounded down to a multiple of four. Without the keyword, the limit is 65,536; the scene's spp is ignored.
+        Stop once the estimated error is at most this: the root mean square, over pixels and channels, of the standard error in linear
+        radiance. It covers noise, but not what max_depth and min_throughput cut. Each pixel's samples form four independent sequences;
+        the error is estimated when each has 1, 2, 4, 8 ... samples. The keyword `spp` is then the upper limit (default 65,536; the
+        scene's is ignored), rounded down to a multiple of four.
     tile_size, pass_size : int, optional
         Side of a tile in pixels, and samples per pixel in one pass. None: wrt chooses.
     progress : function, optional
@@ -94,8 +92,7 @@ def render(scene: Scene | Mesh | str | os.PathLike[str], **options: Unpack[Rende
     Warns
     -----
     SceneWarning
-        If wrt leaves out a part of the scene, or the picture is all black: without any light (no warning with `aov`), or although
-        the scene has lights.
+        If wrt leaves out a part of the scene, or the picture is all black (with `aov`: only if the scene has lights).
 
     Examples
     --------
@@ -106,9 +103,8 @@ def render(scene: Scene | Mesh | str | os.PathLike[str], **options: Unpack[Rende
     changes = {name: keywords.pop(name) for name in SETTINGS if name in keywords}
     if keywords.get("target_error") is not None and changes.get("spp") is None:
         changes["spp"] = MAX_SPP
-    for name in keywords:
-        if name not in OPTIONS:
-            raise unknown(name, "argument of render", (*SETTINGS, *OPTIONS), argument=name)
+    for name in [each for each in keywords if each not in OPTIONS]:
+        raise unknown(name, "argument of render", (*SETTINGS, *OPTIONS), argument=name)
     resolved = Options(**keywords)
     scene = as_scene(scene).with_settings(**changes)
     if resolved.executor is None and resolved.devices is None:
