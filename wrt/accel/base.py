@@ -233,9 +233,8 @@ class OneMesh(TreeExchange, ABC):
 
     def __repr__(self) -> str:
         s = self.stats
-        cost = "" if s.sah_cost != s.sah_cost else f"SAH {s.sah_cost:.1f}, "
         return (f"{type(self).__name__}({len(self.geometry)} primitives, {s.nodes} nodes, depth {s.depth}, "
-                f"{s.bytes / 1e6:.1f} MB, {cost}built in {s.build_seconds:.3f} s)")
+                f"{s.bytes / 1e6:.1f} MB, {f'SAH {s.sah_cost:.1f}, ' if s.sah_cost == s.sah_cost else ''}built in {s.build_seconds:.3f} s)")
 
 
 def array_bytes(data: WarpStruct) -> int:
