@@ -11,7 +11,6 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
-from hashlib import sha256
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -22,6 +21,7 @@ from tests.fuzz import seeds
 from tests.fuzz.mutate import BYTES, INTEGERS, TEXT, mutate, mutate_tree
 from tests.fuzz.seeds import Seed
 from tests.gltf_files import pack_glb
+from wrt.core.checked_file import CHECKSUM_BYTES
 
 
 @dataclass(frozen=True)
@@ -224,7 +224,7 @@ def damaged_checked(seed: Seed, other: Seed, rng: Random) -> Seed:
     if rng.random() < 0.05:
         return Seed(seed.suffix, mutate(seed.data, rng, BYTES, other.data))
     magic, header, body = seed.data.split(b"\n", 2)
-    body = body[:-32]
+    body = body[:-CHECKSUM_BYTES]
     if rng.random() < 0.3:
         tree = mutate_tree(json.loads(header), rng, ("bvh2", "bvh4", "bvh6", "bvh8", "bvh8c", "grid", "kdtree", "octree",
                                                      "brute_force", "fast", "order"))
@@ -236,7 +236,7 @@ def damaged_checked(seed: Seed, other: Seed, rng: Random) -> Seed:
 
 def signed(suffix: str, *parts: bytes) -> Seed:
     data = b"\n".join(parts)
-    return Seed(suffix, data + sha256(data).digest())
+    return Seed(suffix, data + zlib.crc32(data).to_bytes(CHECKSUM_BYTES, "big"))
 
 
 def damaged_numbers(body: bytes, rng: Random) -> bytes:
