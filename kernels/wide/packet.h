@@ -267,6 +267,18 @@ template <bool ANY_HIT> WRT_CALLED int triangles(const float* row, int count, in
     return found;
 }
 
+constexpr int BEST[] = {T, U, V, PRIM_ID};  // the fields of a ray's best hit
+
+// Copy the best hits of all rays of a packet to `kept`, one vector for each field of BEST.
+WRT_INLINE void keep_best(const float* numbers, float* kept) {
+    for (int k = 0; k < 4; ++k) store(kept + LANES * k, load<Rays>(numbers + BEST[k]));
+}
+
+// Give one ray of a packet the best hit that keep_best kept.
+WRT_INLINE void restore_best(float* numbers, const float* kept, int lane) {
+    for (int k = 0; k < 4; ++k) store(numbers + BEST[k] + lane, load<int>(kept + LANES * k + lane));
+}
+
 // Write the hits of `count` rays to HitArrays (query.py), from index `first` on. A miss gets t = inf and prim_id = -1.
 template <class HitArrays> WRT_INLINE void write_hits(const HitArrays& hits, int first, int count, float* numbers) {
     const AllRays packet = {numbers};

@@ -108,17 +108,12 @@ def make_triangles(any_hit: bool) -> Any:
     return triangles
 
 
-# The best hits of a packet's rays wait in Scratch.slots, which only interleaved rays use.
-BEST = "for (int k = 0, field; k < 4; ++k) { field = k == 0 ? wrt::T : k == 1 ? wrt::U : k == 2 ? wrt::V : wrt::PRIM_ID;"
-BEST_FIELD, BEST_KEPT = "scratch.packets.data + base + field", "(float*)scratch.slots.data + wrt::LANES * k"
-
-
-@wp.func_native(f"{BEST} __builtin_memcpy({BEST_KEPT}, {BEST_FIELD}, 4 * wrt::LANES); }}")
+@wp.func_native("wrt::keep_best(scratch.packets.data + base, (float*)scratch.slots.data);")
 def keep_best(scratch: Scratch, base: int) -> None:
-    """Keep the best hits of all rays of a packet."""
+    """Keep the best hits of all rays of a packet in Scratch.slots, which only interleaved rays use."""
 
 
-@wp.func_native(f"{BEST} __builtin_memcpy({BEST_FIELD} + lane, {BEST_KEPT} + lane, 4); }}")
+@wp.func_native("wrt::restore_best(scratch.packets.data + base, (float*)scratch.slots.data, lane);")
 def restore_best(scratch: Scratch, base: int, lane: int) -> None:
     """Give one ray of the packet the best hit that keep_best kept."""
 

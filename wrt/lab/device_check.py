@@ -52,7 +52,8 @@ PICTURE: dict[str, Any] = {"size": (64, 36), "spp": 4, "seed": 3}
 MESHES: dict[str, Callable[[], Mesh]] = {
     "ball": partial(shapes.icosphere, 3), "torus": partial(shapes.torus, 1.0, 0.4, 64, 32), "terrain": partial(terrain, 48),
     "teapot": partial(shapes.teapot, 32), "teapot in a ring": lambda: shapes.merged([shapes.torus(500.0), shapes.teapot(16)], "")}
-FAST, SLOW, RUNS = 1 << 20, 1 << 15, 7  # number of timed rays on CUDA and on the CPU, and of timed runs
+FAST, SLOW = 1 << 20, 1 << 15  # timed rays on CUDA and on the CPU
+RUNS = 7  # timed runs
 TIMED_CELLS = 192  # cells a side of the timed terrain
 DEFAULT, OTHER = "bvh8", "bvh2"  # on a CPU, results of the default structure are compared with those of the other
 RECORDED = "bits recorded on x86-64"

@@ -35,7 +35,7 @@ from wrt.viewer.walks import WalkOf, Walks
 
 
 class Asked:
-    """What browsers ask of a thread of its own: a queue with one place for each kind of question, of which only the latest is answered."""
+    """Questions of browsers to a thread: a queue with one place for each kind. Only the latest question of a kind is answered."""
 
     def __init__(self) -> None:
         self._waiting: dict[str, Any] = {}

@@ -28,7 +28,7 @@ class Tiles(NamedTuple):
 
 
 class PeerQuery(NamedTuple):
-    """A library with its structures. work: the function to time; found: from its result to lengths (N,), infinite where there is none."""
+    """A library with its structures. work: the function to time; found: from its result to lengths (N,); a miss has inf."""
 
     name: str
     work: Callable[[], Any]

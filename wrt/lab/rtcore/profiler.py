@@ -52,8 +52,8 @@ class Rays:
     """Every ray of a picture, arrays (N,): sorted by tile, then by pixel, then in the order of tracing.
 
     - rays: kernels.study.ray_log.LoggedRay; counts: kernels.traverse.counters.Counts; lines: number of distinct cache lines.
-    - pixel: row * width + column; kind: index in KINDS. A "reflection" may be that of a clear coat; a
-      "straight" ray continues through a blended surface without refraction.
+    - pixel: row * width + column; kind: index in KINDS. A clear coat's reflection is a "reflection",
+      too. A "straight" ray continues through a blended surface without refraction.
     - depth: bounces before the ray; a shadow ray has the depth of the ray whose hit it starts from.
     - trace_rows: indices of the rays whose fetches were recorded; trace_first: index of each such ray's first fetch, and the end.
     - address, size: of each recorded fetch, in bytes (wrt.accel.queries.answers.Counters)."""
