@@ -29,6 +29,7 @@ from wrt.kernels.wide.packets import (
     REPORT_SIZE,
     Scratch,
     WideBvh,
+    clear_counts,
     count_of,
     key_at,
     lowest_of_all,
@@ -42,6 +43,7 @@ from wrt.kernels.wide.packets import (
     rays_reaching,
     slot_at,
     store_bits,
+    write_counts,
     write_hits,
     write_occluded,
 )
@@ -53,7 +55,7 @@ MIN_VISITS = 6  # Mean number of rays per node from which a packet is faster tha
 # Numbers of nodes between which the walk of a MIXED packet stops if it is below MIN_VISITS.
 FIRST_STOP, LAST_STOP = 6, 16
 # Results of a packet's walk: all rays are finished, and their visits reached or did not reach MIN_VISITS; or the walk has stopped, and the
-# rays begin again one by one. The hits found so far shorten them.
+# rays begin again one by one. The hits found so far shorten them; counts begin at 0.
 TOGETHER, APART, STOPPED = (wp.constant(result) for result in range(3))
 # A packet below MIN_VISITS has failed. After MAX_FAILED failures in succession, the rays of the next PAUSE packets are interleaved, or of
 # the next MIXED_PAUSE packets of the kind MIXED.
@@ -179,12 +181,15 @@ def make_interleaved(units: Units, any_hit: bool, accepts: Any) -> Any:
 def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accepts: Any = None) -> Any:
     """Return the kernel that traces the rays first .. end - 1 in a single thread, PACKETS packets at a time.
 
-    The kernel writes to `out` (HitArrays or, with any_hit, an array of bool) and to scratch.report. All arrays must be contiguous."""
+    The kernel writes to `out` and to scratch.report. `out` is HitArrays or, with any_hit, an array of bool. With units.lists, which needs
+    any_hit, it is an array of two numbers for each ray: of crossings (units.triangle.is_crossed) and of other hits. All arrays must be
+    contiguous."""
     walk_packet = make_packet_walk(units, any_hit, accepts)
     interleaved = make_interleaved(units, any_hit, accepts)
     set_up = make_set_up(rays_struct, may_mix=any_hit)
-    write = write_occluded if any_hit else write_hits
-    out_type = wp.array(dtype=wp.bool) if any_hit else HitArrays
+    write, out_type = (write_occluded, wp.array(dtype=wp.bool)) if any_hit else (write_hits, HitArrays)
+    if units.lists:
+        write, out_type = write_counts, wp.array(dtype=wp.vec2i)
 
     @packet_kernel
     def trace(accel: WideBvh, surfaces: Surfaces, rays: rays_struct, out: out_type, scratch: Scratch, first: int, end: int):
@@ -213,6 +218,8 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
                 else:
                     put_int(scratch.report, failed_at + wp.static(PAUSED - FAILED), wp.max(paused - 1, 0))
                 if result == STOPPED:
+                    if wp.static(units.lists):
+                        clear_counts(scratch, base)  # the rays begin again
                     active = rays_meeting_root(accel, scratch, base, active & wp.static(COHERENT - 1))
                     single_rays = single_rays | (wp.uint64(active) << wp.uint64(LANES * p))
             interleaved(accel, surfaces, scratch, single_rays)

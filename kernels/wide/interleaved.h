@@ -135,15 +135,21 @@ template <bool ANY_HIT> WRT_INLINE int pop(const float* nodes, float reach, unsi
 }
 
 // Test the triangles of a row that are in the mask. Store the nearest hit in the ray's column; return its lane, or -1 on a miss. For an
-// any-hit ray that hits, store only t = -inf and prim_id = 0, and return 0.
-template <bool ANY_HIT> WRT_INLINE int ray_triangles_here(const float* row, int mask, float* column) {
+// any-hit ray that hits, store only t = -inf and prim_id = 0, and return 0. If hits are counted, return -1.
+template <int GOAL> WRT_INLINE int ray_triangles_here(const float* row, int mask, float* column) {
     const OneRay ray = {column};
     const LeafRow triangles = {{row}};
     const int axes = ray.bits(AXES);
     if ((mask &= mask_of(candidates<WIDTH>(triangles, ray, axes))) == 0) return -1;
     const Hits<WIDTH> hit = ray_triangle<WIDTH>(triangles, ray, axes, mask);
     if (hit.mask == 0) return -1;
-    if constexpr (ANY_HIT) {
+    if constexpr (GOAL == COUNT_ALL) {
+        const int crossings = crossed<WIDTH>(triangles, triangle_ray(ray, axes), hit);
+        ray.put_bits(CROSSED, ray.bits(CROSSED) + __builtin_popcount(crossings));
+        ray.put_bits(TOUCHED, ray.bits(TOUCHED) + __builtin_popcount(hit.mask & ~crossings));
+        return -1;
+    }
+    if constexpr (GOAL == FIND_ANY) {
         ray.put(T, -__builtin_inff());
         ray.put_bits(PRIM_ID, 0);
         return 0;
@@ -163,8 +169,8 @@ template <bool ANY_HIT> WRT_INLINE int ray_triangles_here(const float* row, int 
 }
 
 // Call ray_triangles_here, without inlining.
-template <bool ANY_HIT> WRT_CALLED int ray_triangles(const float* row, int mask, float* column) {
-    return ray_triangles_here<ANY_HIT>(row, mask, column);
+template <int GOAL> WRT_CALLED int ray_triangles(const float* row, int mask, float* column) {
+    return ray_triangles_here<GOAL>(row, mask, column);
 }
 
 }  // namespace wrt

@@ -77,6 +77,11 @@ FIELDS = ("origin_x", "origin_y", "origin_z", "inverse_x", "inverse_y", "inverse
 FIELD = {name: LANES * i for i, name in enumerate(FIELDS)}  # Index in a packet of each field's first lane.
 AXIS_BITS = 2
 
+# The goal of a traversal: find each ray's closest hit, find any hit, or count all hits. A count stores in place of u and v the number of
+# crossings (units.triangle.is_crossed) and the number of other hits, as int32.
+FIND_CLOSEST, FIND_ANY, COUNT_ALL = range(3)
+CROSSED, TOUCHED = FIELD["u"], FIELD["v"]
+
 # After the fields comes the beam: intervals that contain the origins and the reciprocal directions of all rays. Each entry has three
 # values, for x, y and z. Of all origins, near_origin is closest to the near planes, and far_origin to the far planes. Of all reciprocals,
 # `largest` and `smallest` have the largest and the smallest magnitude. Multiplied by the far pad, they are far_largest and far_smallest.
@@ -120,6 +125,7 @@ _NUMBERS = {
     "LEAF_BITS": LEAF_BITS, "CACHE_LINE": CACHE_LINE, "LINES": LINES, "LEVEL": LEVEL, "LEVEL_REFERENCES": LEVEL_REFERENCES,
     "LEVEL_LEFT": LEVEL_LEFT, "KEY_MASK": KEY_MASK, "STACK_WORDS": STACK_WORDS, "SLOT_SIZE": SLOT_SIZE,
     "NODE_SIZE": node_size(WIDTH, False), "REFERENCES": first_reference(WIDTH, False),
+    "CROSSED": CROSSED, "TOUCHED": TOUCHED, "FIND_CLOSEST": FIND_CLOSEST, "FIND_ANY": FIND_ANY, "COUNT_ALL": COUNT_ALL,
     "PRIM_ID_ROW": PRIM_ID_ROW, "ROW_SIZE": ROW_SIZE, "NO_HIT": NO_HIT,
     "LARGEST": LARGEST, "FARTHEST": FARTHEST, "SHORTEST": SHORTEST, "LONGEST": LONGEST, "LENGTHEN": LENGTHEN, "SHORTEN": SHORTEN,
     "LENGTHEN_EXPONENT": math.frexp(LENGTHEN)[1] - 1,

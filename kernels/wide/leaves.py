@@ -12,7 +12,7 @@ from wrt.kernels.structs import NO_HIT, Hit, Surfaces
 from wrt.kernels.traverse.common import Probe, Units, make_better, sphere_hit
 from wrt.kernels.wide.lanes import bits, lowest
 from wrt.kernels.wide.lanes import value as number
-from wrt.kernels.wide.layout import FIELD, LANES, PRIM_ID_ROW, ROW_SIZE, WIDTH
+from wrt.kernels.wide.layout import COUNT_ALL, FIELD, FIND_ANY, FIND_CLOSEST, LANES, PRIM_ID_ROW, ROW_SIZE, WIDTH
 from wrt.kernels.wide.packets import (
     Scratch,
     WideBvh,
@@ -68,6 +68,11 @@ def store_best(packet: wp.array(dtype=wp.float32), ray: int, best: Hit):
     store_bits(packet, ray + wp.static(FIELD["prim_id"]), best.prim_id)
 
 
+def goal_of(units: Units, any_hit: bool) -> int:
+    """Return the goal of a traversal. Counting all hits (Units.lists) takes a traversal for any-hit rays, whose order is free."""
+    return COUNT_ALL if units.lists else FIND_ANY if any_hit else FIND_CLOSEST
+
+
 def make_sphere_test(units: Units, any_hit: bool, accepts: Any) -> Any:
     """Return test_spheres, which tests the spheres in the mask of a row against one ray (`ray`: index of its column).
     It returns whether the ray is finished: for any-hit rays, whether the ray hits a sphere; else False."""
@@ -117,7 +122,7 @@ def make_accepted(any_hit: bool, accepts: Any, ray_triangles: Any) -> Any:
 def make_row_test(units: Units, any_hit: bool, accepts: Any, inlined: bool) -> Any:
     """Return test_row, which tests the first `count` primitives of a row against one ray.
     It returns whether the ray is finished: for any-hit rays, whether the ray hits a primitive; else False."""
-    ray_triangles = make_ray_triangles(any_hit and accepts is None, inlined)
+    ray_triangles = make_ray_triangles(goal_of(units, any_hit and accepts is None), inlined)
     test_spheres, nearest_accepted = make_sphere_test(units, any_hit, accepts), make_accepted(any_hit, accepts, ray_triangles)
 
     @wp.func
@@ -169,7 +174,7 @@ def make_accepted_in_lanes(any_hit: bool, accepts: Any, test_row: Any) -> Any:
 def make_packet_leaf(units: Units, any_hit: bool, accepts: Any) -> Any:
     """Return test_leaf, which tests a leaf against the packet's rays in its argument `mask`: all at once, or one by one (FEW_RAYS)."""
     test_row = make_row_test(units, any_hit, accepts, False)
-    triangles, accepted_in_lanes = make_triangles(any_hit), make_accepted_in_lanes(any_hit, accepts, test_row)
+    triangles, accepted_in_lanes = make_triangles(goal_of(units, any_hit)), make_accepted_in_lanes(any_hit, accepts, test_row)
 
     @wp.func
     def test_leaf(accel: WideBvh, surfaces: Surfaces, reference: int, mask: int, scratch: Scratch, base: int):

@@ -215,17 +215,23 @@ WRT_INLINE int rays_meeting_root(const float* root, int mask, float* packet) {
 // Return the mask of the rays whose t is at least t_entry.
 WRT_INLINE int rays_reaching(float t_entry, float* packet) { return mask_of(AllRays{packet}[T] >= t_entry); }
 
-// Test a triangle against N rays of a packet, in the lanes of `mask`, and store hits; return their mask.
-template <int N, bool ANY_HIT, class Axes>
+// Test a triangle against N rays of a packet, in the lanes of `mask`, and store hits; return their mask. Counted hits are not in the result.
+template <int N, int GOAL, class Axes>
 WRT_INLINE int test(const Triangle<N>& triangle, const SomeRays<N>& rays, Axes axes, int mask) {
     typedef typename Lanes<N>::Floats Floats;
     typedef typename Lanes<N>::Ints Ints;
     const Hits<N> hit = ray_triangle<N>(triangle, rays, axes, mask);
     if (hit.mask == 0) return 0;
     const Ints on = in_mask<Ints>(hit.mask);
-    rays.put(T, on ? (ANY_HIT ? all<Floats>(-__builtin_inff()) : hit.t) : rays[T]);
+    if constexpr (GOAL == COUNT_ALL) {
+        const int crossings = crossed<N>(triangle, triangle_ray(rays, axes), hit);
+        rays.put_bits(CROSSED, rays.bits(CROSSED) - in_mask<Ints>(crossings));
+        rays.put_bits(TOUCHED, rays.bits(TOUCHED) - in_mask<Ints>(hit.mask & ~crossings));
+        return 0;
+    }
+    rays.put(T, on ? (GOAL == FIND_ANY ? all<Floats>(-__builtin_inff()) : hit.t) : rays[T]);
     rays.put_bits(PRIM_ID, on ? triangle.prim_id() : rays.bits(PRIM_ID));
-    if constexpr (!ANY_HIT) {
+    if constexpr (GOAL == FIND_CLOSEST) {
         rays.put(U, on ? narrowed<N>(hit.areas[1] / hit.area) : rays[U]);
         rays.put(V, on ? narrowed<N>(hit.areas[2] / hit.area) : rays[V]);
     }
@@ -234,7 +240,7 @@ WRT_INLINE int test(const Triangle<N>& triangle, const SomeRays<N>& rays, Axes a
 
 // Test the first `count` triangles of a row, one after another, against the rays of the mask, which have the same axes; return the mask of
 // the rays that hit a triangle. The rays of one register are tested at a time: the values of more do not fit into sixteen registers.
-template <bool ANY_HIT, class Axes>
+template <int GOAL, class Axes>
 WRT_INLINE int triangles_along(Axes axes, const float* row, int count, int mask, float* numbers) {
     constexpr int PARTS = LANES / REGISTER, FULL = (1 << REGISTER) - 1;
     int found = 0;
@@ -244,24 +250,24 @@ WRT_INLINE int triangles_along(Axes axes, const float* row, int count, int mask,
         for (int k = 0; k < PARTS; ++k) {
             const SomeRays<REGISTER> rays = {numbers + REGISTER * k};
             const int left = mask_of(candidates<REGISTER>(triangle, rays, axes)) & mask >> REGISTER * k & FULL;
-            if (left) hits |= test<REGISTER, ANY_HIT>(triangle, rays, axes, left) << REGISTER * k;
+            if (left) hits |= test<REGISTER, GOAL>(triangle, rays, axes, left) << REGISTER * k;
         }
         found |= hits;
-        if (ANY_HIT && (mask &= ~hits) == 0) break;
+        if (GOAL == FIND_ANY && (mask &= ~hits) == 0) break;
     }
     return found;
 }
 
 // Test the first `count` triangles of a row against the rays of the mask; return the mask of the rays that hit a triangle. In any-hit rays
 // that hit, t becomes -inf. Rays with the same axes are tested together, so that corners need no selection by ray: mostly, these are all.
-template <bool ANY_HIT> WRT_CALLED int triangles(const float* row, int count, int mask, float* numbers) {
+template <int GOAL> WRT_CALLED int triangles(const float* row, int count, int mask, float* numbers) {
     const AllRays packet = {numbers};
-    if constexpr (REGISTER == LANES) return triangles_along<ANY_HIT>(packet.bits(AXES), row, count, mask, numbers);
+    if constexpr (REGISTER == LANES) return triangles_along<GOAL>(packet.bits(AXES), row, count, mask, numbers);
     int found = 0;
     while (mask) {
         const int axes = load<int>(numbers + AXES + lowest(mask));
         const int along = mask & mask_of(packet.bits(AXES) == axes);
-        found |= triangles_along<ANY_HIT>(axes, row, count, along, numbers);
+        found |= triangles_along<GOAL>(axes, row, count, along, numbers);
         mask &= ~along;
     }
     return found;
@@ -297,6 +303,17 @@ template <class HitArrays> WRT_INLINE void write_hits(const HitArrays& hits, int
         hits.v.data[first + j] = numbers[V + j];
         hits.prim_id.data[first + j] = prim_id[j];
     }
+}
+
+// Set the counts of hits of all rays to 0.
+WRT_INLINE void clear_counts(float* numbers) {
+    store(numbers + CROSSED, RayInts{});
+    store(numbers + TOUCHED, RayInts{});
+}
+
+// Write the numbers of crossings and of touches of `count` rays.
+template <class Pair> WRT_INLINE void write_counts(Pair* counts, int count, float* numbers) {
+    for (int j = 0; j < count; ++j) counts[j] = {load<int>(numbers + CROSSED + j), load<int>(numbers + TOUCHED + j)};
 }
 
 WRT_INLINE void write_occluded(bool* occluded, int count, float* numbers) {

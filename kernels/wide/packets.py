@@ -96,14 +96,14 @@ def rays_reaching(t_entry: float, scratch: Scratch, base: int) -> int:
 
 
 @cache
-def make_triangles(any_hit: bool) -> Any:
+def make_triangles(goal: int) -> Any:
     @wp.func_native(f"""
-    return wrt::triangles<{flag(any_hit)}>(accel.primitives.data + first, count, mask, scratch.packets.data + base);
+    return wrt::triangles<{int(goal)}>(accel.primitives.data + first, count, mask, scratch.packets.data + base);
     """)
     def triangles(accel: WideBvh, first: int, count: int, mask: int, scratch: Scratch, base: int) -> int:
         """Test the first `count` triangles of a row against the rays of the mask; return the mask of rays that hit a triangle.
 
-        For any-hit rays that hit a triangle, t becomes -inf."""
+        goal FIND_ANY: t of rays that hit a triangle becomes -inf. COUNT_ALL: the result is 0."""
 
     return triangles
 
@@ -124,6 +124,14 @@ def write_hits(hits: HitArrays, first: int, count: int, scratch: Scratch, base: 
 
 @wp.func_native("wrt::write_occluded(occluded.data + first, count, scratch.packets.data + base);")
 def write_occluded(occluded: wp.array(dtype=wp.bool), first: int, count: int, scratch: Scratch, base: int) -> None: ...
+
+
+@wp.func_native("wrt::clear_counts(scratch.packets.data + base);")
+def clear_counts(scratch: Scratch, base: int) -> None: ...
+
+
+@wp.func_native("wrt::write_counts(counts.data + first, count, scratch.packets.data + base);")
+def write_counts(counts: wp.array(dtype=wp.vec2i), first: int, count: int, scratch: Scratch, base: int) -> None: ...
 
 
 @wp.func_native(f"return wrt::load<wp::uint64>(stacks.data + {ENTRY} * i);")
@@ -171,14 +179,14 @@ def spheres_of(accel: WideBvh, first: int, mask: int, n_triangles: int) -> int:
 
 
 @cache
-def make_ray_triangles(any_hit: bool, inlined: bool) -> Any:
+def make_ray_triangles(goal: int, inlined: bool) -> Any:
     name = "ray_triangles_here" if inlined else "ray_triangles"
 
-    @wp.func_native(f"return wrt::{name}<{flag(any_hit)}>(accel.primitives.data + first, mask, scratch.packets.data + ray);")
+    @wp.func_native(f"return wrt::{name}<{int(goal)}>(accel.primitives.data + first, mask, scratch.packets.data + ray);")
     def ray_triangles(accel: WideBvh, first: int, mask: int, scratch: Scratch, ray: int) -> int:
         """Test the triangles in the mask of a row. Store the nearest hit in the ray's column; return the triangle's lane, or -1 on a miss.
 
-        For any-hit rays, the result tells only hit (0) or miss (-1), and u and v are not set."""
+        goal FIND_ANY: the result tells only hit (0) or miss (-1), and u and v are not set. COUNT_ALL: the result is -1."""
 
     return ray_triangles
 

@@ -24,9 +24,12 @@ class BatchTraversal(WideTraversal):
 
     def make_stream(self, units: Units, any_hit: bool, rays_struct: Any = RayArrays, accepts: Any = None) -> Any:
         """Return the kernel of batch.make_kernel or instances.make_kernel, or None if the units have no vectorised form.
-        Instances have none for cut-outs, and for other box tests, whose rounding kernels.traverse.instances.enter does not cover."""
+        Instances have none for cut-outs and counts. They have none for other box tests, whose rounding kernels.traverse.instances.enter
+        does not cover."""
         if units.triangle != "watertight" or units.box not in ROW_PADS or units.counters or units.resumes:
             return None
         if not units.instances:
             return batch.make_kernel(units, any_hit, rays_struct, accepts)
-        return instances.make_kernel(units, any_hit, rays_struct) if accepts is None and units.box == "conservative" else None
+        if accepts is not None or units.lists or units.box != "conservative":
+            return None
+        return instances.make_kernel(units, any_hit, rays_struct)

@@ -89,6 +89,28 @@ WRT_INLINE Hits<N> crossing(const Vec3<Floats>& a, const Vec3<Floats>& b, const 
     return hit;
 }
 
+// Return the mask of triangles on whose side the z axis passes an edge, if it is moved by an infinitesimal where it meets the edge.
+// `areas` are those of this edge; `up` is the mask of triangles whose winding is positive.
+template <class Doubles, class Floats>
+WRT_INLINE int inside_edge(Doubles areas, const Vec3<Floats>& start, const Vec3<Floats>& end, int up) {
+    const Doubles zero = {};
+    const auto level = start[1] == end[1];
+    const int above = mask_of((start[1] > end[1]) | (level & (end[0] > start[0])));
+    const int below = mask_of((start[1] < end[1]) | (level & (end[0] < start[0])));
+    return mask_of(areas != zero) | (up & above) | (~up & below);
+}
+
+// Return the hits that are crossings (units/triangle.py: is_crossed). All areas of a hit that are not 0 have one sign.
+template <int N, class Triangles, class Int, class Number>
+WRT_INLINE int crossed(const Triangles& triangles, const TriangleRay<Int, Number>& ray, const Hits<N>& hit) {
+    const typename Lanes<N>::Doubles zero = {};
+    const Vec3<typename Lanes<N>::Doubles>& areas = hit.areas;
+    if ((hit.mask & mask_of((areas[0] == zero) | (areas[1] == zero) | (areas[2] == zero))) == 0) return hit.mask;
+    const auto a = to_ray_space(triangles, 0, ray), b = to_ray_space(triangles, 1, ray), c = to_ray_space(triangles, 2, ray);
+    const int up = mask_of(hit.area > zero);
+    return hit.mask & inside_edge(areas[0], c, b, up) & inside_edge(areas[1], a, c, up) & inside_edge(areas[2], b, a, up);
+}
+
 template <class T> WRT_INLINE Vec3<T> lower(const Vec3<T>& a, const Vec3<T>& b) {
     return {{b[0] < a[0] ? b[0] : a[0], b[1] < a[1] ? b[1] : a[1], b[2] < a[2] ? b[2] : a[2]}};
 }

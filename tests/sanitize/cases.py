@@ -8,12 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from tests.kernel_tools import floats, launch, vec3s, zeros  # isort: skip (starts Warp)
+from tests.kernel_tools import DEVICE, floats, launch, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
 
+from wrt.accel.queries.all_hits import ALL, list_hits
+from wrt.accel.queries.hit_points import device_scene
 from wrt.accel.scenes.build import build
 from wrt.accel.structure import any_hit_kernel, closest_hit_kernel
+from wrt.kernels.hit_lists import HitLists
 from wrt.kernels.query import HitArrays, RayArrays
+from wrt.kernels.structs import Hit
 from wrt.scene.mesh import Mesh
 
 FACES = (*range(1, 10), 15, 16, 17, 63, 64, 65, 300)
@@ -53,8 +57,20 @@ def in_faces(rng: np.random.Generator, n: int) -> tuple[np.ndarray, tuple[np.nda
                                         np.full(n, np.inf, np.float32))
 
 
+def counts(accel: Any, rays: RayArrays, n: int, crossings: bool) -> np.ndarray:
+    """Return the number of hits or crossings of each of n rays, by the kernel that lists hits for one ray at a time."""
+    lists, surfaces = HitLists(), device_scene(accel.snapshot).surfaces
+    lists.limit, lists.crossings, lists.vertices, lists.faces = ALL, crossings, surfaces.vertices, surfaces.faces
+    lists.first = wp.array(np.arange(n + 1), dtype=wp.int32, device=DEVICE)
+    lists.count, lists.rows = zeros(n, wp.int32), zeros(n, Hit)
+    if n > 0:
+        launch(list_hits(accel.structure, False).kernel, n, accel.data, rays, lists, 0)
+    return np.maximum(lists.count.numpy(), 0)
+
+
 def answers(accel: Any, rays: tuple[np.ndarray, ...]) -> list[np.ndarray]:
-    """Return t, u, v and prim_id of the closest hits, and any_hit as int32, by the kernels that trace one ray at a time."""
+    """Return t, u, v and prim_id of the closest hits, any_hit as int32, and the numbers of crossings and of hits, by the kernels that
+    trace one ray at a time."""
     origin, direction, t_min, t_max = rays
     n = len(origin)
     arrays, hits = RayArrays(), HitArrays()
@@ -66,7 +82,7 @@ def answers(accel: Any, rays: tuple[np.ndarray, ...]) -> list[np.ndarray]:
         launch(closest_hit_kernel(accel.structure), n, accel.data, accel.snapshot.surfaces, arrays, hits, 0)
         launch(any_hit_kernel(accel.structure), n, accel.data, accel.snapshot.surfaces, arrays, any_hits, 0)
     found = [getattr(hits, name).numpy() for name in ("t", "u", "v", "prim_id")]
-    return [*found, any_hits.numpy().astype(np.int32)]
+    return [*found, any_hits.numpy().astype(np.int32), *(counts(accel, arrays, n, crossings) for crossings in (True, False))]
 
 
 def cases() -> Iterator[list[np.ndarray]]:

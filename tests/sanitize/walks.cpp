@@ -33,19 +33,23 @@ struct HitArrays {
     Array<int> prim_id;
 };
 
+struct Pair {
+    int crossings, others;
+};
+
 struct Case {
     std::vector<float> nodes, primitives;  // of a BVH with 8 children per node
     std::vector<float> origins, directions, t_mins, t_maxs;
     std::vector<int> excludes;
     std::vector<float> t, u, v;  // the hits by the kernel for one ray
-    std::vector<int> prim_id, occluded;
+    std::vector<int> prim_id, occluded, crossings, hits;
     int rays;
 };
 
 int leaf_first(int reference) { return (-1 - reference) >> LEAF_BITS; }
 int leaf_count(int reference) { return ((-1 - reference) & ((1 << LEAF_BITS) - 1)) + 1; }
 
-template <bool ANY_HIT> class Walk {
+template <int GOAL> class Walk {
 public:
     explicit Walk(Case& c) : given(c), packet(PACKET_SIZE), stack(STACK_WORDS), slot(SLOT_SIZE) {}
 
@@ -53,7 +57,7 @@ public:
     void trace(int first, int count, bool together) {
         RayArrays rays = {{(Vector*)given.origins.data(), {12}}, {(Vector*)given.directions.data(), {12}},
                           {given.t_mins.data(), {given.t_mins.size() == 1 ? 0 : 4}}, {given.t_maxs.data(), {4}}};
-        const int state = set_up<true, ANY_HIT>(pointers_to(rays, first, given.excludes.data() + first), count, FAR, true, packet.data());
+        const int state = set_up<true, UNORDERED>(pointers_to(rays, first, given.excludes.data() + first), count, FAR, true, packet.data());
         if (state >= COHERENT && together) {
             walk_packet(state);
         } else {
@@ -64,12 +68,14 @@ public:
 
     void write(HitArrays hits, int first, int count) { write_hits(hits, first, count, packet.data()); }
     void write(bool* occluded, int count) { write_occluded(occluded, count, packet.data()); }
+    void write(Pair* counts, int count) { write_counts(counts, count, packet.data()); }
 
 private:
+    static constexpr bool UNORDERED = GOAL != FIND_CLOSEST;
     static constexpr float FAR = Bounds::FAR_PAD * (1.0f + 8.0f / (1 << 24));  // lanes.py: LANE_PAD
 
     void walk_packet(int state) {
-        const auto push_children = state >= MIXED ? children<ANY_HIT, ANY_HIT> : children<ANY_HIT, false>;
+        const auto push_children = state >= MIXED ? children<UNORDERED, UNORDERED> : children<UNORDERED, false>;
         int size = 0, reference = 0, mask = state & (COHERENT - 1);
         for (;;) {
             if (reference < 0) {
@@ -93,28 +99,28 @@ private:
         for (int left = leaf_count(reference); left > 0; left -= WIDTH, row += ROW_SIZE) {
             const int n = left < WIDTH ? left : WIDTH;
             if (mask & 1) {  // cover both forms: rays in lanes, and ray by ray
-                mask &= ~(triangles<ANY_HIT>(row, n, mask, packet.data()) & (ANY_HIT ? ~0 : 0));
+                mask &= ~(triangles<GOAL>(row, n, mask, packet.data()) & (GOAL == FIND_ANY ? ~0 : 0));
             } else {
                 for (int rays = mask; rays; rays &= rays - 1)
-                    ray_triangles<ANY_HIT>(row, (2 << (n - 1)) - 1, packet.data() + lowest(rays));
+                    ray_triangles<GOAL>(row, (2 << (n - 1)) - 1, packet.data() + lowest(rays));
             }
         }
     }
 
     void walk_alone(int ray) {
-        int next = begin<ANY_HIT>(given.nodes.data(), 0, packet.data(), ray, stack.data(), 0, slot.data());
+        int next = begin<UNORDERED>(given.nodes.data(), 0, packet.data(), ray, stack.data(), 0, slot.data());
         while (next != EMPTY) {
             prefetch(given.nodes.data(), given.primitives.data(), next);
             if (next > 0) {
-                next = step<ANY_HIT>(given.nodes.data(), packet.data(), stack.data(), 0, slot.data());
+                next = step<UNORDERED>(given.nodes.data(), packet.data(), stack.data(), 0, slot.data());
                 continue;
             }
             const float* row = given.primitives.data() + leaf_first(next) * ROW_SIZE;
             for (int left = leaf_count(next); left > 0; left -= WIDTH, row += ROW_SIZE) {
-                const int lane = ray_triangles_here<ANY_HIT>(row, (2 << ((left < WIDTH ? left : WIDTH) - 1)) - 1, packet.data() + ray);
-                if (ANY_HIT && lane >= 0) return;
+                const int lane = ray_triangles_here<GOAL>(row, (2 << ((left < WIDTH ? left : WIDTH) - 1)) - 1, packet.data() + ray);
+                if (GOAL == FIND_ANY && lane >= 0) return;
             }
-            next = pop<ANY_HIT>(given.nodes.data(), packet[ray + T], stack.data(), 0, slot.data());
+            next = pop<UNORDERED>(given.nodes.data(), packet[ray + T], stack.data(), 0, slot.data());
         }
     }
 
@@ -128,23 +134,29 @@ private:
 bool agrees(Case& c, int most, bool together) {
     std::vector<float> t(c.rays), u(c.rays), v(c.rays);
     std::vector<int> prim_id(c.rays);
+    std::vector<Pair> counts(c.rays);
     bool* const occluded = new bool[c.rays];
-    Walk<false> closest(c);
-    Walk<true> any(c);
+    Walk<FIND_CLOSEST> closest(c);
+    Walk<FIND_ANY> any(c);
+    Walk<COUNT_ALL> all(c);
     for (int first = 0; first < c.rays; first += most) {
         const int count = c.rays - first < most ? c.rays - first : most;
         closest.trace(first, count, together);
         closest.write({{t.data(), {4}}, {u.data(), {4}}, {v.data(), {4}}, {prim_id.data(), {4}}}, first, count);
         any.trace(first, count, together);
         any.write(occluded + first, count);
+        all.trace(first, count, together);
+        all.write(counts.data() + first, count);
     }
     int wrong = 0;
     for (int i = 0; i < c.rays; ++i) {
         const bool same = !memcmp(&t[i], &c.t[i], 4) && !memcmp(&u[i], &c.u[i], 4) && !memcmp(&v[i], &c.v[i], 4)
-                          && prim_id[i] == c.prim_id[i] && occluded[i] == (c.occluded[i] != 0);
+                          && prim_id[i] == c.prim_id[i] && occluded[i] == (c.occluded[i] != 0)
+                          && counts[i].crossings == c.crossings[i] && counts[i].crossings + counts[i].others == c.hits[i];
         if (!same && wrong++ < 3)
-            printf("    ray %d: triangle %d at %.9g, any %d; one ray at a time: %d at %.9g, any %d\n", i, prim_id[i], t[i],
-                   occluded[i], c.prim_id[i], c.t[i], c.occluded[i]);
+            printf("    ray %d: triangle %d at %.9g, any %d, %d and %d hits; one ray at a time: %d at %.9g, any %d, %d of %d hits\n", i,
+                   prim_id[i], t[i], occluded[i], counts[i].crossings, counts[i].others, c.prim_id[i], c.t[i], c.occluded[i],
+                   c.crossings[i], c.hits[i]);
     }
     delete[] occluded;
     return wrong == 0;
@@ -167,7 +179,8 @@ int main(int, char** arguments) {
     for (; read(file, c.nodes); ++cases) {
         if (!(read(file, c.primitives) && read(file, c.origins) && read(file, c.directions) && read(file, c.t_mins)
               && read(file, c.t_maxs) && read(file, c.excludes) && read(file, c.t) && read(file, c.u) && read(file, c.v)
-              && read(file, c.prim_id) && read(file, c.occluded)))
+              && read(file, c.prim_id) && read(file, c.occluded)
+              && read(file, c.crossings) && read(file, c.hits)))
             return 2;
         c.rays = (int)c.excludes.size();
         for (int most : {LANES, 7, 1})

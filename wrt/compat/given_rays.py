@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from wrt.accel.queries.accelerator import Accelerator
+from wrt.accel.queries.all_hits import counter_of
 from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES
 from wrt.accel.queries.batches import SMALL, Query, Tracer, Worker, trace_query, tracer
 from wrt.accel.queries.raw_kernel import RawKernel
@@ -107,19 +108,24 @@ class RayFormat:
     def closest_hits(self, accel: Accelerator, arrays: tuple[np.ndarray, ...], threads: int, *inputs: object) -> list[np.ndarray]:
         """Convert rays and return their hits as `closest_hits`."""
         if len(arrays[0]) <= SMALL and accel.device.is_cpu:
-            return self._few(accel.snapshot, False, arrays, inputs)
+            return self._few(accel.snapshot, tracer(accel.snapshot.structure, False), arrays, inputs)
         return closest_hits(accel, self.converted(arrays, threads, *inputs), threads)
 
     def any_hits(self, accel: Accelerator, arrays: tuple[np.ndarray, ...], threads: int, *inputs: object,
                  ends: Ends | None = None) -> np.ndarray:
         """Convert rays and return whether each of them hits anything between its ends, (N,) bool."""
         if len(arrays[0]) <= SMALL and accel.device.is_cpu:
-            return self._few(accel.snapshot, True, arrays, inputs, ends)[0]
+            return self._few(accel.snapshot, tracer(accel.snapshot.structure, True), arrays, inputs, ends)[0]
         return _traced(accel, self.converted(arrays, threads, *inputs).between(ends), threads, ANY_HIT_TYPES)[0]
 
-    def _few(self, snapshot: Snapshot, any_hit: bool, arrays: tuple[np.ndarray, ...], inputs: tuple[object, ...],
+    def few_counts(self, snapshot: Snapshot, arrays: tuple[np.ndarray, ...], *inputs: object) -> np.ndarray | None:
+        """Convert at most SMALL rays and return their numbers of crossings and of other hits, (N, 2); None without all_hits.counter_of."""
+        counter = counter_of(snapshot) if len(arrays[0]) <= SMALL else None
+        return None if counter is None else self._few(snapshot, counter, arrays, inputs)[0]
+
+    def _few(self, snapshot: Snapshot, tracer: Tracer, arrays: tuple[np.ndarray, ...], inputs: tuple[object, ...],
              ends: Ends | None = None) -> list[np.ndarray]:
-        free: FreeList[_FewQueries] = self._few_queries(tracer(snapshot.structure, any_hit))
+        free: FreeList[_FewQueries] = self._few_queries(tracer)
         return free.run(lambda few: few.trace(snapshot, arrays, inputs, ends))
 
 

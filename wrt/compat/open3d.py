@@ -137,7 +137,7 @@ class RaycastingScene:
     def count_intersections(self, rays: ArrayLike, nthreads: int = 0) -> Answer:
         """Count the intersections of each ray with surfaces, (...) int32. An intersection at an edge or a corner counts once."""
         threads, (shape, rows) = _threads(nthreads), _rows(rays, "rays", 6)
-        return _answer(hit_counts(self._scene().accel, SPLIT.converted((rows,), threads), threads).astype(np.int32), shape)
+        return _answer(hit_counts(self._scene().accel, SPLIT, (rows,), threads).astype(np.int32), shape)
 
     def list_intersections(self, rays: ArrayLike, nthreads: int = 0) -> dict[str, Answer]:
         """List the M intersections that `count_intersections` counts, ray by ray in order of distance.

@@ -6,7 +6,7 @@ from wrt.accel.points.contains import open_edges_of
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.all_hits import ALL, ListQuery, first_hits
 from wrt.accel.queries.answers import Hits
-from wrt.compat.given_rays import GivenRays
+from wrt.compat.given_rays import GivenRays, RayFormat
 
 
 def every_hit(accel: Accelerator, rays: GivenRays, threads: int, limit: int = ALL) -> tuple[np.ndarray, ...]:
@@ -28,12 +28,16 @@ def every_hit(accel: Accelerator, rays: GivenRays, threads: int, limit: int = AL
     return tuple(found)
 
 
-def hit_counts(accel: Accelerator, rays: GivenRays, threads: int) -> np.ndarray:
-    """Return the number of hits of each ray in `every_hit`, (N,) int64."""
-    query = ListQuery(accel, threads, crossings=True).of_valid(rays.rays)
-    counts = query.counts()
-    if len(rest := np.flatnonzero(query.touches)):
-        counts[rest] = (_touched(accel, rays.of(rest), threads).prim_id >= 0).sum(axis=1)
+def hit_counts(accel: Accelerator, form: RayFormat, arrays: tuple[np.ndarray, ...], threads: int, *inputs: object) -> np.ndarray:
+    """Return the number of hits of each ray in `every_hit`, (N,) of integers. arrays, inputs: see RayFormat.converted."""
+    if (few := form.few_counts(accel.snapshot, arrays, *inputs)) is not None:
+        counts, touches = few[:, 0], (few[:, 0] == 0) & (few[:, 1] > 0)
+    else:
+        query = ListQuery(accel, threads, crossings=True).of_valid(form.converted(arrays, threads, *inputs).rays)
+        counts, touches = query.counts(), query.touches
+    if touches.any():
+        rays = form.converted(tuple(array[touches] for array in arrays), threads, *inputs)
+        counts[touches] = (_touched(accel, rays, threads).prim_id >= 0).sum(axis=1)
     return counts
 
 

@@ -243,8 +243,8 @@ class _Counter(NamedTuple):
     def intersects_location(self, origins: np.ndarray, directions: np.ndarray,
                             multiple_hits: bool = True) -> tuple[None, np.ndarray, None]:  # trimesh 4.5 does not pass multiple_hits
         """Return the ray of each hit, (M,) int64, in the second place."""
-        rays = PLACED.converted((origins, directions), self.scaled.threads, self.scaled.placement)
-        counts = np.minimum(hit_counts(self.scaled.accel, rays, self.scaled.threads), MAX_HITS)
+        scaled = self.scaled
+        counts = np.minimum(hit_counts(scaled.accel, PLACED, (origins, directions), scaled.threads, scaled.placement), MAX_HITS)
         return None, np.repeat(np.arange(len(counts)), counts), None
 
 

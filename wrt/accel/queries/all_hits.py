@@ -13,6 +13,7 @@ import warp as wp
 from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.queries.accelerator import Accelerator, WorldOptions, snapshot_of
 from wrt.accel.queries.answers import Hits
+from wrt.accel.queries.batches import Query, Tracer, counter
 from wrt.accel.queries.few_lists import MOST, FewLists, Mesh, begins
 from wrt.accel.queries.hit_points import device_scene
 from wrt.accel.queries.part_faces import part_faces
@@ -20,6 +21,7 @@ from wrt.accel.queries.raw_kernel import RawKernel, kernel_memory
 from wrt.accel.queries.rays import Rays, are_rows, arrays_on, host_arrays, rays_of
 from wrt.accel.queries.shapes import Shape, shaped_rays, worlds_of_each
 from wrt.accel.queries.world_ids import roots_of
+from wrt.accel.snapshot import Snapshot
 from wrt.accel.structure import Structure
 from wrt.core.arrays import given_like, to_numpy, to_tensor_like
 from wrt.core.checks import as_integer, as_one
@@ -32,6 +34,7 @@ from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import Hit
 
 ALL = (1 << 30) - 1
+FEW_COUNTED = 64  # Up to this number of rays, lists of buffers that are kept are faster than a tracer.
 RAYS_AT_ONCE = 1 << 18  # rays per batch; their hit lists take 32 MiB in the first traversal
 HIT_KINDS = wp.float32, wp.float32, wp.float32, wp.int32  # of HitArrays
 T = TypeVar("T")
@@ -173,12 +176,18 @@ class ListQuery:
         return Hits(*(self.give(array.reshape((*shape, k))) for array in hits))
 
     def counts(self) -> np.ndarray:
-        """Count the hits of each ray, (N,) int64. If no triangle is in several leaves, the first traversal is enough."""
+        """Count the hits of each ray, (N,) int64. If no triangle is in several leaves, one traversal is enough."""
+        if self.n > FEW_COUNTED and (tracer := counter_of(self.snapshot)) is not None:
+            found = np.empty((self.n, 2), np.int32)
+            tracer.trace(self.snapshot, Query(self.rays, [found], self.threads))
+            crossed, others = found.T
+            if not self.crossings:
+                return crossed.astype(np.int64) + others
+            self.touches = (crossed == 0) & (others > 0)
+            return crossed.astype(np.int64)
         if (few := self._few(ALL, lambda lists, counts: counts)) is not None:
             return few
-        geometry = self.snapshot.geometry
-        stored = sum(map(len, geometry.parts)) if isinstance(geometry, InstancedGeometry) else len(geometry)
-        counting = self.snapshot.stats.references == stored
+        counting = stores_once(self.snapshot)
         return np.concatenate([np.zeros(0, np.int64), *(of_each for _, _, of_each in self._listed(ALL, counting))])
 
     def converted(self, values: np.ndarray) -> Array:
@@ -243,6 +252,18 @@ def rows_of(hits: int) -> int:
     if hits > MOST_ROWS:
         raise InputError(f"{hits} hits do not fit into an array of at most 2^31 - 1", hint="query fewer rays at a time")
     return int(hits)
+
+
+def stores_once(snapshot: Snapshot) -> bool:
+    """Return whether each triangle is in one leaf only."""
+    geometry = snapshot.geometry
+    stored = sum(map(len, geometry.parts)) if isinstance(geometry, InstancedGeometry) else len(geometry)
+    return bool(snapshot.stats.references == stored)
+
+
+def counter_of(snapshot: Snapshot) -> Tracer | None:
+    """Return the tracer that counts hits for many rays at a time (batches.counter), or None if hits must be listed to count them."""
+    return counter(snapshot.structure) if snapshot.device.is_cpu and stores_once(snapshot) else None
 
 
 @made_once

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from wrt.accel.queries.answers import ANY_HIT_TYPES, HIT_TYPES
+from wrt.accel.queries.answers import ANY_HIT_TYPES, COUNT_TYPES, HIT_TYPES
 from wrt.accel.queries.raw_launches import raw_launch
 from wrt.accel.queries.rays import Rays, rays_on
 from wrt.accel.queries.tiles import SIDE, copy_from_tiles, copy_to_tiles
@@ -87,7 +87,7 @@ class Tracer:
         self.kernel = self.stream or (any_hit_kernel if any_hit else closest_hit_kernel)(structure)
         self.block = stream.stream_block if self.stream else 1
         self.sizes = stream.stream_sizes if self.stream else ()
-        self.types = ANY_HIT_TYPES if any_hit else HIT_TYPES
+        self.types = COUNT_TYPES if structure.units.lists else ANY_HIT_TYPES if any_hit else HIT_TYPES
         self.inputs = structure.struct(), Surfaces(), self.rays(), None if any_hit else HitArrays()
         self.workers = FreeList(lambda: Worker(self))
 
@@ -130,6 +130,14 @@ class Tracer:
 
 
 tracer, world_tracer = made_once(Tracer), made_once(partial(Tracer, rays=WorldRays))
+
+
+@made_once
+def counter(structure: Structure) -> Tracer | None:
+    """Return a tracer that counts all hits on the CPU, or None if the structure has no kernel that counts for many rays at a time."""
+    counting = structure._replace(units=structure.units._replace(lists=True))
+    stream: KernelModule = structure.accel.stream
+    return tracer(counting, True) if stream and stream.make_stream(counting.units, True) else None
 
 
 @made_once

@@ -16,6 +16,7 @@ from tests.refused import Refusal, refused
 from tests.structures import families_first
 from tests.wrt.accel.test_structures_agree import mixed_rays
 from wrt.accel.geometry import Geometry
+from wrt.accel.queries.all_hits import ListQuery
 from wrt.accel.queries.few_lists import MOST
 from wrt.accel.scenes.build import build
 from wrt.kernels.query import RayArrays
@@ -201,6 +202,42 @@ def check_even(mesh: wrt.Mesh, n: int) -> None:
         assert 0.5 < counts.mean() < 10.0, name
         met = (counts < wrt.count_hits(accel, *asked)).mean()
         assert met > 0.1 or name == "edges", name  # rounding to float32 moves a ray beside most edges
+
+
+def shuffled(asked: tuple[np.ndarray, ...], rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+    order = rng.permutation(len(asked[0]))
+    return tuple(array[order] for array in asked)
+
+
+def from_one_point(asked: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
+    """Return rays from the first origin to where the given rays go, in the order of their directions."""
+    to = asked[0] + asked[1]
+    to = to[np.lexsort(np.round(to - asked[0][0], 1).T)]
+    return np.tile(asked[0][:1], (len(to), 1)), to - asked[0][0]
+
+
+@pytest.mark.parametrize("mesh", [shapes.torus(1.0, 0.4, 32, 16), shapes.box(), soup(np.random.default_rng(6))],
+                         ids=["torus", "box", "soup"])
+@pytest.mark.parametrize("crossings", [False, True])
+def test_counts_are_the_lengths_of_lists(mesh: wrt.Mesh, crossings: bool) -> None:
+    """Rays are counted together, in packets or interleaved, and listed one by one; "brute_force" has no packets at all."""
+    rng = np.random.default_rng(8)
+    accel, oracle = wrt.build(mesh), wrt.build(mesh, "brute_force")
+    touching = 0
+    for asked in at_edges(mesh, 400, rng).values():
+        for some in (asked, shuffled(asked, rng), from_one_point(asked)):
+            hits = wrt.all_hits(oracle, *some)
+            here = hits.first[:-1] < hits.first[1:]
+            begin, end = np.zeros(len(here), np.float32), np.full(len(here), np.inf, np.float32)
+            begin[here], end[here] = hits.t[hits.first[:-1][here]], hits.t[hits.first[1:][here] - 1]
+            for t_min, t_max in ((0.0, np.inf), (begin, end), (np.nextafter(begin, np.float32(np.inf)), end)):
+                listed = ListQuery(oracle, 1, crossings).of(*some, t_min, t_max)
+                counted = ListQuery(accel, 2, crossings).of(*some, t_min, t_max)
+                assert np.array_equal(counted.counts(), listed.all().counts)
+                if crossings:
+                    assert np.array_equal(counted.touches, listed.touches)
+                    touching += np.count_nonzero(counted.touches)
+    assert touching > 50 or not crossings
 
 
 CLOSED = [shapes.box(), shapes.icosphere(3), shapes.torus(1.0, 0.4, 64, 32), shapes.teapot(8),
