@@ -23,6 +23,7 @@ from wrt.core.types import Kernel, WarpType
 from wrt.core.warp_private import struct_record
 from wrt.kernels.placed_rays import FAR
 
+FAR_AWAY = np.float32(FAR)  # a constant of Warp would make NumPy compare objects one by one
 Ends: TypeAlias = tuple[np.ndarray, np.ndarray]  # t_min and t_max of each ray, (N,) float32
 
 class GivenRays(NamedTuple):
@@ -102,7 +103,7 @@ class RayFormat:
 
     def check(self, arrays: tuple[np.ndarray, ...], t_max: np.ndarray) -> None:
         """Raise the error of `refuse` if a converted ray has the t_max FAR."""
-        if self._refuse is not None and np.count_nonzero(t_max == float(FAR)):
+        if self._refuse is not None and np.count_nonzero(t_max == FAR_AWAY):
             self._refuse(*arrays)
 
     def closest_hits(self, accel: Accelerator, arrays: tuple[np.ndarray, ...], threads: int, *inputs: object) -> list[np.ndarray]:

@@ -21,7 +21,7 @@ from wrt.accel.queries.all_hits import ListQuery
 from wrt.accel.queries.few_lists import begins
 from wrt.accel.queries.rays import segment_ends, vectors
 from wrt.accel.scenes.build import build
-from wrt.compat.given_rays import RayFormat
+from wrt.compat.given_rays import Ends, RayFormat
 from wrt.compat.surfaces import every_hit, hit_counts, scatter
 from wrt.core.arrays import float32, real_numbers
 from wrt.core.checks import as_integer, shown
@@ -131,8 +131,11 @@ class RaycastingScene:
             Ends of the segment in units of the direction's length.
         """
         shape, rows = _rows(rays, "rays", 6)
-        t_min, t_max = (float32(np.asarray(segment_ends(end, len(rows), name))) for end, name in ((tnear, "t_min"), (tfar, "t_max")))
-        return _answer(SPLIT.any_hits(self._scene().accel, (rows,), _threads(nthreads), ends=(t_min, t_max)), shape)
+        ends: Ends | None = None
+        if not (type(tnear) is type(tfar) is float and tnear == 0.0 and tfar == math.inf):  # these need no arrays
+            t_min, t_max = segment_ends(tnear, len(rows), "t_min"), segment_ends(tfar, len(rows), "t_max")
+            ends = float32(np.asarray(t_min)), float32(np.asarray(t_max))
+        return _answer(SPLIT.any_hits(self._scene().accel, (rows,), _threads(nthreads), ends=ends), shape)
 
     def count_intersections(self, rays: ArrayLike, nthreads: int = 0) -> Answer:
         """Count the intersections of each ray with surfaces, (...) int32. An intersection at an edge or a corner counts once."""

@@ -31,13 +31,14 @@ def every_hit(accel: Accelerator, rays: GivenRays, threads: int, limit: int = AL
 def hit_counts(accel: Accelerator, form: RayFormat, arrays: tuple[np.ndarray, ...], threads: int, *inputs: object) -> np.ndarray:
     """Return the number of hits of each ray in `every_hit`, (N,) of integers. arrays, inputs: see RayFormat.converted."""
     if (few := form.few_counts(accel.snapshot, arrays, *inputs)) is not None:
-        counts, touches = few[:, 0], (few[:, 0] == 0) & (few[:, 1] > 0)
+        counts, rest = few[:, 0], np.flatnonzero(few[:, 1])
     else:
         query = ListQuery(accel, threads, crossings=True).of_valid(form.converted(arrays, threads, *inputs).rays)
-        counts, touches = query.counts(), query.touches
-    if touches.any():
-        rays = form.converted(tuple(array[touches] for array in arrays), threads, *inputs)
-        counts[touches] = (_touched(accel, rays, threads).prim_id >= 0).sum(axis=1)
+        counts, rest = query.counts(), np.flatnonzero(query.touches)
+    if len(rest):
+        rest = rest[counts[rest] == 0]
+        rays = form.converted(tuple(array[rest] for array in arrays), threads, *inputs)
+        counts[rest] = (_touched(accel, rays, threads).prim_id >= 0).sum(axis=1)
     return counts
 
 
