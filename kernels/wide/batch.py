@@ -186,7 +186,7 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
     contiguous."""
     walk_packet = make_packet_walk(units, any_hit, accepts)
     interleaved = make_interleaved(units, any_hit, accepts)
-    set_up = make_set_up(rays_struct, may_mix=any_hit)
+    set_up = make_set_up(rays_struct, any_hit)
     write, out_type = (write_occluded, wp.array(dtype=wp.bool)) if any_hit else (write_hits, HitArrays)
     if units.lists:
         write, out_type = write_counts, wp.array(dtype=wp.vec2i)

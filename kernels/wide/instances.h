@@ -131,7 +131,7 @@ template <int N> struct PlacedRays {
 
 // Set up N rays in the space of a placed structure, as local_ray does; `local` gets the fields of store_rays and, in SCALE, the exponents of
 // local_scale.
-template <int N, class Placement>
+template <int N, bool ANY_HIT, class Placement>
 WRT_INLINE PlacedRays<N> place_rays(const SomeRays<N>& world, const Placement& place, float far_pad, const SomeRays<N>& local) {
     typedef typename Lanes<N>::Floats Floats;
     typedef typename Lanes<N>::Doubles Doubles;
@@ -161,20 +161,21 @@ WRT_INLINE PlacedRays<N> place_rays(const SomeRays<N>& world, const Placement& p
     out.rays.exclude = world.bits(EXCLUDE) - place.first_prim;
     out.rays.t_max = no_hit(out.rays);
     local.put_bits(SCALE, exponent);
-    out.inv_dir = store_rays<N>(local, out.rays, far_pad);
+    out.inv_dir = store_rays<N, ANY_HIT>(local, out.rays, far_pad);
     return out;
 }
 
 // Set up the rays of a packet that are in `mask`; return as set_up.
-template <class Placement> WRT_CALLED int place_packet(float* world, const Placement& place, int mask, float far_pad, float* local) {
-    const auto placed = place_rays<LANES>({world}, place, far_pad, {local});
+template <bool ANY_HIT, class Placement>
+WRT_CALLED int place_packet(float* world, const Placement& place, int mask, float far_pad, float* local) {
+    const auto placed = place_rays<LANES, ANY_HIT>({world}, place, far_pad, {local});
     const int active = mask & mask_of(placed.rays.t_max >= placed.rays.t_min);
     return active | store_beam<false>(local, placed.rays, placed.inv_dir, active, far_pad);
 }
 
 // As place_packet, for one ray.
 template <class Placement> WRT_CALLED void place_ray(float* world, const Placement& place, float far_pad, float* local) {
-    place_rays<1>({world}, place, far_pad, {local});
+    place_rays<1, false>({world}, place, far_pad, {local});
 }
 
 // Store the hits of rays in a placed structure that are better than their best hits so far: closer or, at equal t, of a lower prim_id.

@@ -135,16 +135,18 @@ template <bool ANY_HIT> WRT_INLINE int pop(const float* nodes, float reach, unsi
 }
 
 // Test the triangles of a row that are in the mask. Store the nearest hit in the ray's column; return its lane, or -1 on a miss. For an
-// any-hit ray that hits, store only t = -inf and prim_id = 0, and return 0. If hits are counted, return -1.
-template <int GOAL> WRT_INLINE int ray_triangles_here(const float* row, int mask, float* column) {
+// any-hit ray that hits, store only t = -inf and prim_id = 0, and return 0. If hits are counted, return -1. SURE: look for sure_hits first.
+template <int GOAL, bool SURE = false> WRT_INLINE int ray_triangles_here(const float* row, int mask, float* column) {
     const OneRay ray = {column};
     const LeafRow triangles = {{row}};
     const int axes = ray.bits(AXES);
     if ((mask &= mask_of(candidates<WIDTH>(triangles, ray, axes))) == 0) return -1;
-    const Hits<WIDTH> hit = ray_triangle<WIDTH>(triangles, ray, axes, mask);
-    if (hit.mask == 0) return -1;
+    const int sure = SURE ? mask & mask_of(sure_hits(triangles, ray, axes)) : 0;
+    Hits<WIDTH> hit = {};
+    if (GOAL == COUNT_ALL ? sure != mask : sure == 0) hit = ray_triangle<WIDTH>(triangles, ray, axes, mask & ~sure);
+    if ((hit.mask | sure) == 0) return -1;
     if constexpr (GOAL == COUNT_ALL) {
-        const int crossings = crossed<WIDTH>(triangles, triangle_ray(ray, axes), hit);
+        const int crossings = sure | crossed<WIDTH>(triangles, triangle_ray(ray, axes), hit);
         ray.put_bits(CROSSED, ray.bits(CROSSED) + __builtin_popcount(crossings));
         ray.put_bits(TOUCHED, ray.bits(TOUCHED) + __builtin_popcount(hit.mask & ~crossings));
         return -1;
@@ -168,9 +170,9 @@ template <int GOAL> WRT_INLINE int ray_triangles_here(const float* row, int mask
     return j;
 }
 
-// Call ray_triangles_here, without inlining.
+// Call ray_triangles_here, without inlining, for a ray of a packet. It looks for sure_hits; interleaved rays would be 0.8 to 1.0 times as fast.
 template <int GOAL> WRT_CALLED int ray_triangles(const float* row, int mask, float* column) {
-    return ray_triangles_here<GOAL>(row, mask, column);
+    return ray_triangles_here<GOAL, GOAL != FIND_CLOSEST>(row, mask, column);
 }
 
 }  // namespace wrt

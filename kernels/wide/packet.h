@@ -74,6 +74,37 @@ WRT_INLINE typename Lanes<N>::Ints candidates(const Triangles& triangles, const 
     return accepted(triangles, triangle_ray(ray, axes)) & (triangles.prim_id() + 1 != all<typename Lanes<N>::Ints>(ray.bits(EXCLUDE)));
 }
 
+constexpr float SMALLEST_COMPONENT = 0x1p-40f, LEAST_MARGIN = 0x1p-60f;
+
+// Return the largest absolute value among the components.
+template <class T> WRT_INLINE T greatest(const Vec3<T>& v) {
+    const T x = absolute(v[0]), y = absolute(v[1]), z = absolute(v[2]), longer = y > x ? y : x;
+    return z > longer ? z : longer;
+}
+
+// Return the lanes in which float32 proves that `ray_triangle` finds a hit. An any-hit ray needs no more, nor does a count: such a
+// hit is a crossing. The exact test takes three times as long. The proof:
+// - Rounding is monotone, so areas that are not 0 have the signs of the exact areas.
+// - t is a mean of the corners' t, whose least and greatest are the slab interval of axis kz, bit for bit. So t, also if it is clamped to the
+//   triangle's box, lies between them. It may pass them by the rounding of t and, if it is clamped to the padded box, by the pad. `margin`
+//   is more than twice as much: with x and y the largest absolute coordinates of the sheared corners, the box's extent is at most
+//   2 (x + y + |z|), and its largest coordinate along kz is |origin| + |z|.
+// - MARGIN excludes rays whose shear may underflow (units/triangle.py: underflowed). For all others, the padded box contains the hit.
+template <class Triangles, class Ray, class Axes> WRT_INLINE auto sure_hits(const Triangles& triangles, const Ray& ray, Axes axes) {
+    const auto shear = triangle_ray(ray, axes);
+    const auto a = to_ray_space(triangles, 0, shear), b = to_ray_space(triangles, 1, shear), c = to_ray_space(triangles, 2, shear);
+    const auto areas = edge_areas(a, b, c);
+    typedef decltype(areas[0] + areas[1]) Floats;
+    const Floats zero = {}, x = greatest(Vec3<Floats>{{a[0], b[0], c[0]}}), y = greatest(Vec3<Floats>{{a[1], b[1], c[1]}});
+    const Floats s = all<Floats>(ray[SHEAR_Z]), t_a = a[2] * s, t_b = b[2] * s, t_c = c[2] * s;
+    const Floats nearer = t_b < t_a ? t_b : t_a, near = t_c < nearer ? t_c : nearer;
+    const Floats farther = t_b > t_a ? t_b : t_a, far = t_c > farther ? t_c : farther;
+    const Floats margin = 0x1p-18f * ((x + y + all<Floats>(ray[MARGIN])) * absolute(s) + far);
+    auto sure = (near > all<Floats>(ray[T_MIN]) + margin) & (far + margin < all<Floats>(ray[T]));
+    for (int k = 0; k < 3; ++k) sure &= (areas[k] < zero) | (areas[k] > zero);
+    return sure;
+}
+
 // Return the hits that are better than the best hit of each ray: with t in [t_min, T] and, at t = T, a prim_id that is not higher. The
 // steps are those of `watertight`, `within_bounds` and `better` (traverse/common.py) for candidates, in the lanes of `mask`.
 template <int N, class Triangles, class Ray, class Axes>
@@ -215,16 +246,20 @@ WRT_INLINE int rays_meeting_root(const float* root, int mask, float* packet) {
 // Return the mask of the rays whose t is at least t_entry.
 WRT_INLINE int rays_reaching(float t_entry, float* packet) { return mask_of(AllRays{packet}[T] >= t_entry); }
 
-// Test a triangle against N rays of a packet, in the lanes of `mask`, and store hits; return their mask. Counted hits are not in the result.
+// Test a triangle against N rays of a packet, the candidates in the lanes of `mask`, and store hits; return their mask. Counted hits are not
+// in the result.
 template <int N, int GOAL, class Axes>
 WRT_INLINE int test(const Triangle<N>& triangle, const SomeRays<N>& rays, Axes axes, int mask) {
     typedef typename Lanes<N>::Floats Floats;
     typedef typename Lanes<N>::Ints Ints;
-    const Hits<N> hit = ray_triangle<N>(triangle, rays, axes, mask);
-    if (hit.mask == 0) return 0;
-    const Ints on = in_mask<Ints>(hit.mask);
+    const int sure = GOAL == FIND_CLOSEST ? 0 : mask & mask_of(sure_hits(triangle, rays, axes));
+    Hits<N> hit = {};
+    if (sure != mask) hit = ray_triangle<N>(triangle, rays, axes, mask & ~sure);
+    const int found = hit.mask | sure;
+    if (found == 0) return 0;
+    const Ints on = in_mask<Ints>(found);
     if constexpr (GOAL == COUNT_ALL) {
-        const int crossings = crossed<N>(triangle, triangle_ray(rays, axes), hit);
+        const int crossings = sure | crossed<N>(triangle, triangle_ray(rays, axes), hit);
         rays.put_bits(CROSSED, rays.bits(CROSSED) - in_mask<Ints>(crossings));
         rays.put_bits(TOUCHED, rays.bits(TOUCHED) - in_mask<Ints>(hit.mask & ~crossings));
         return 0;
@@ -235,7 +270,7 @@ WRT_INLINE int test(const Triangle<N>& triangle, const SomeRays<N>& rays, Axes a
         rays.put(U, on ? narrowed<N>(hit.areas[1] / hit.area) : rays[U]);
         rays.put(V, on ? narrowed<N>(hit.areas[2] / hit.area) : rays[V]);
     }
-    return hit.mask;
+    return found;
 }
 
 // Test the first `count` triangles of a row, one after another, against the rays of the mask, which have the same axes; return the mask of

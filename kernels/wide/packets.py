@@ -51,15 +51,15 @@ def flag(value: bool) -> str:
 
 
 @cache
-def make_set_up(rays_struct: Any, may_mix: bool = False) -> Any:
+def make_set_up(rays_struct: Any, any_hit: bool = False) -> Any:
     """Return set_up for rays_struct: RayArrays, WorldRays, or RenderRays, whose directions it does not scale.
 
-    may_mix: the walk accepts packets whose directions differ in sign (MIXED)."""
+    any_hit: set up the field `margin`, too; and the walk accepts packets whose directions differ in sign (MIXED)."""
     plain = rays_struct is not RenderRays
     excludes = "nullptr" if plain else "rays.exclude.data + first"
 
     @wp.func_native(f"""
-    return wrt::set_up<{flag(plain)}, {flag(may_mix)}>(wrt::pointers_to(rays, first, {excludes}), count, pad, mixes,
+    return wrt::set_up<{flag(plain)}, {flag(any_hit)}>(wrt::pointers_to(rays, first, {excludes}), count, pad, mixes,
                                                        scratch.packets.data + base);
     """)
     def set_up(rays: rays_struct, first: int, count: int, pad: float, mixes: bool, scratch: Scratch, base: int) -> int:

@@ -69,21 +69,16 @@ WRT_INLINE SixteenRays load_rays(const RayPointers& from, int count) {
     return out;
 }
 
-WRT_INLINE Rays longest(const Vec3<Rays>& v) {
-    const Rays x = absolute(v[0]), y = absolute(v[1]), z = absolute(v[2]), longer = y > x ? y : x;
-    return z > longer ? z : longer;
-}
-
 // Return the mask of invalid rays, which a query rejects (wrt.accel.queries.rays).
 WRT_INLINE int refused(const SixteenRays& rays) {
-    RayInts good = (longest(rays.direction) > 0.0f) & (rays.t_min >= 0.0f) & (rays.t_max == rays.t_max);
+    RayInts good = (greatest(rays.direction) > 0.0f) & (rays.t_min >= 0.0f) & (rays.t_max == rays.t_max);
     for (int k = 0; k < 3; ++k) good &= (absolute(rays.origin[k]) <= FARTHEST) & (absolute(rays.direction[k]) <= LARGEST);
     return mask_of(~good);
 }
 
 // Scale directions so that their reciprocals neither over- nor underflow, as query.py does; return the factors. A t_min of -0 becomes 0.
 template <bool SCALED> WRT_INLINE Rays scale_rays(SixteenRays& rays) {
-    const Rays one = all<Rays>(1.0f), largest = all<Rays>(LARGEST), length = longest(rays.direction);
+    const Rays one = all<Rays>(1.0f), largest = all<Rays>(LARGEST), length = greatest(rays.direction);
     Rays scale = one, inverse = one;
     if constexpr (SCALED) {
         scale = length > LONGEST ? all<Rays>(SHORTEN) : (length < SHORTEST ? all<Rays>(LENGTHEN) : one);
@@ -125,6 +120,14 @@ template <int N, class T> WRT_INLINE void store_triangle_ray(const SomeRays<N>& 
     store_vector(packet, SHEAR_X, Vec3<T>{{component(d, kx) / d_z, component(d, ky) / d_z, 1.0f / d_z}});
 }
 
+// Store MARGIN (packet.h: sure_hits). It is infinite if a component of the direction is so small that the shear may underflow.
+template <int N, class T> WRT_INLINE void store_margin(const SomeRays<N>& packet, const Vec3<T>& d) {
+    const T least = SMALLEST_COMPONENT * greatest(d);
+    auto steady = (d[0] == 0.0f) | (absolute(d[0]) > least);
+    for (int k = 1; k < 3; ++k) steady &= (d[k] == 0.0f) | (absolute(d[k]) > least);
+    packet.put(MARGIN, steady ? absolute(packet[TURNED_X + 2 * LANES]) + LEAST_MARGIN : all<T>(__builtin_inff()));
+}
+
 // Return the index of an axis's near planes in a node.
 template <int N> WRT_INLINE auto near_row(typename Lanes<N>::Floats inv_dir, int lo, int hi) {
     typedef typename Lanes<N>::Ints Ints;
@@ -132,7 +135,7 @@ template <int N> WRT_INLINE auto near_row(typename Lanes<N>::Floats inv_dir, int
 }
 
 // Store the fields of N rays that have no hit yet, except SCALE; return their reciprocal directions.
-template <int N> WRT_INLINE auto store_rays(const SomeRays<N>& packet, const RayBlock<N>& rays, float far_pad) {
+template <int N, bool ANY_HIT> WRT_INLINE auto store_rays(const SomeRays<N>& packet, const RayBlock<N>& rays, float far_pad) {
     typedef typename Lanes<N>::Floats Floats;
     typedef Vec3<Floats> Vector;
     const Vector &o = rays.origin, &d = rays.direction;
@@ -145,6 +148,7 @@ template <int N> WRT_INLINE auto store_rays(const SomeRays<N>& packet, const Ray
     packet.put_bits(NEAR_Y, near_row<N>(i[1], LO_Y, HI_Y));
     packet.put_bits(NEAR_Z, near_row<N>(i[2], LO_Z, HI_Z));
     store_triangle_ray<N>(packet, o, d);
+    if constexpr (ANY_HIT) store_margin<N>(packet, d);
     packet.put(T_MIN, rays.t_min);
     packet.put_bits(EXCLUDE, rays.exclude);
     packet.put(T, rays.t_max);
@@ -208,17 +212,18 @@ WRT_INLINE int store_beam(float* packet, const SixteenRays& rays, const Vec3<Ray
     return kind;
 }
 
-// Set up `count` rays; return the mask of rays whose segments are not empty, plus the result of store_beam.
-template <bool SCALED, bool MAY_MIX>
+// Set up `count` rays; return the mask of rays whose segments are not empty, plus the result of store_beam. Only packets of any-hit rays may
+// be MIXED.
+template <bool SCALED, bool ANY_HIT>
 WRT_CALLED int set_up(const RayPointers& from, int count, float far_pad, bool mixes, float* numbers) {
     SixteenRays rays = load_rays(from, count);
     const AllRays packet = {numbers};
     store(numbers + REFUSED, refused(rays));
     packet.put(SCALE, scale_rays<SCALED>(rays));
     rays.t_max = no_hit(rays);
-    const Vec3<Rays> i = store_rays<LANES>(packet, rays, far_pad);
+    const Vec3<Rays> i = store_rays<LANES, ANY_HIT>(packet, rays, far_pad);
     const int active = mask_of(rays.t_max >= rays.t_min) & ((1 << count) - 1);
-    return active | store_beam<MAY_MIX>(numbers, rays, i, active, far_pad, mixes);
+    return active | store_beam<ANY_HIT>(numbers, rays, i, active, far_pad, mixes);
 }
 
 }  // namespace wrt
