@@ -27,9 +27,16 @@ def no_attribute(thing: object, name: str, known: Iterable[str]) -> AttributeErr
     return AttributeError(f"{type(thing).__name__} has no attribute {name!r}{near}")
 
 
-def no_argument(function: str, name: str, known: Collection[str]) -> TypeError:
-    """Return the error about an unknown keyword of a function."""
-    return TypeError(f"{function}() got an unexpected keyword argument {name!r}{other_name(name, known)}")
+def check_keywords(function: str, keywords: Iterable[str], known: Collection[str]) -> None:
+    """Raise TypeError for a keyword that a function does not know, with the known one that means the same or is most similar."""
+    for name in keywords:
+        if name not in known:
+            raise TypeError(f"{function}() got an unexpected keyword argument {name!r}{other_name(name, known)}")
+
+
+def parameters_of(function: Callable[..., object], *more: str) -> list[str]:
+    """Return the names of the keywords of a function: its parameters, with `more` in place of `**`."""
+    return [*more, *(name for name, each in signature(function).parameters.items() if each.kind is not Parameter.VAR_KEYWORD)]
 
 
 def other_name(name: str, known: Collection[str]) -> str:
@@ -44,9 +51,7 @@ def suggest_fields(cls: type[T]) -> type[T]:
 
     @wraps(init)
     def __init__(self: T, *args: Any, **keywords: Any) -> None:
-        for name in keywords:
-            if name not in known:
-                raise no_argument(cls.__name__, name, known)
+        check_keywords(cls.__name__, keywords, known)
         init(self, *args, **keywords)
 
     cls.__init__ = __init__  # type: ignore[method-assign, assignment]
@@ -55,8 +60,7 @@ def suggest_fields(cls: type[T]) -> type[T]:
 
 def suggest_keywords(function: F) -> F:
     """Let a function, or a class method that passes its other keywords to a dataclass, answer an unknown keyword as suggest_fields does."""
-    form = signature(function)
-    own = [each.name for each in form.parameters.values() if each.kind is not Parameter.VAR_KEYWORD]
+    form, own = signature(function), parameters_of(function)
 
     @wraps(function)
     def with_suggestions(*args: Any, **keywords: Any) -> Any:
@@ -64,9 +68,7 @@ def suggest_keywords(function: F) -> F:
         name, known = function.__name__, own
         if cls:
             name, known = f"{cls.__name__}.{name}", [*own[1:], *(each.name for each in fields(cls))]
-        for keyword in keywords:
-            if keyword not in known:
-                raise no_argument(name, keyword, known)
+        check_keywords(name, keywords, known)
         try:
             form.bind(*args, **keywords)
         except TypeError as error:

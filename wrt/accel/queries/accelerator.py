@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
-from inspect import signature
 from typing import TYPE_CHECKING, Any, NoReturn, Self, TypedDict, Unpack, overload
 
 import numpy as np
@@ -30,7 +28,7 @@ from wrt.core.checks import shown
 from wrt.core.device import start, upload
 from wrt.core.errors import InputError
 from wrt.core.other_names import same_name
-from wrt.core.suggestions import no_argument, no_attribute
+from wrt.core.suggestions import check_keywords, no_attribute, parameters_of
 from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike, NumpyLike, TensorT, WarpArray, WarpStruct
 from wrt.core.warp_private import recording_tape
@@ -183,7 +181,7 @@ class Accelerator:
         """
         threads, shape, callers = thread_count(threads), None, None if out is None else arrays_of(out)
         if costs:
-            checked_names(costs, Accelerator.closest_hit, CostOptions)
+            check_keywords("closest_hit", costs, CLOSEST_HIT)
         if are_rows(origins, directions) and invalid == "raise":  # the usual case, whose arrays need no other shape
             rays = rays_of(origins, directions, t_min, t_max, True)  # type: ignore[arg-type]
         else:
@@ -241,7 +239,7 @@ class Accelerator:
         threads, shape, callers = thread_count(threads), None, None if out is None else [out]
         world, invalid = None, "raise"
         if options:
-            checked_names(options, Accelerator.any_hit, RayOptions)
+            check_keywords("any_hit", options, ANY_HIT)
             world, invalid = options.get("world"), options.get("invalid", invalid)
         if are_rows(origins, directions) and invalid == "raise":
             rays = rays_of(origins, directions, t_min, t_max)  # type: ignore[arg-type]
@@ -257,11 +255,9 @@ class Accelerator:
         return found if give is None else give(found)
 
 
-def checked_names(options: Mapping[str, object], query: Callable[..., object], kind: type) -> None:
-    """Raise TypeError for an option that is none of a TypedDict's (`kind`)."""
-    for name in options:
-        if name not in kind.__annotations__:
-            raise no_argument(query.__name__, name, [*signature(query).parameters, *kind.__annotations__])
+# Keywords of the queries.
+CLOSEST_HIT = parameters_of(Accelerator.closest_hit, *CostOptions.__annotations__)
+ANY_HIT = parameters_of(Accelerator.any_hit, *RayOptions.__annotations__)
 
 
 def snapshot_of(accel: Accelerator, instances: bool = False) -> Snapshot:

@@ -173,6 +173,9 @@ def test_typing_errors_are_answered_with_the_name(ball: Any) -> None:
         for name in ("tmax", "tfar", "max_distance"):
             with pytest.raises(TypeError, match=f"'{name}'; did you mean 't_max'"):
                 method(*some_rays(4), **{name: 1.0})
+        for name in ("costs", "options"):  # names of the code, not of the interface
+            with pytest.raises(TypeError, match=f"unexpected keyword argument '{name}'(?!; did you mean '{name}')"):
+                method(*some_rays(4), **{name: None})
     with pytest.raises(TypeError, match="'env_ids'; did you mean 'world'"):  # not that `world` is missing
         wrt.build([icosphere(1), icosphere(1)]).closest_hit(*some_rays(4), env_ids=0)
     assert not hasattr(hits, "__array__") and not hasattr(hits, "wheels")
