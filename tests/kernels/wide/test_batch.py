@@ -1,9 +1,13 @@
 """Batches of rays: the hits have the bits of the kernel for one ray, for any mixture of rays."""
 
+import ctypes
+import mmap
+
 import numpy as np
 import pytest
 
 from tests.data import data_path
+from tests.refused import refused
 
 from tests.kernel_tools import DEVICE, cpu_only, launch, vec3s, zeros  # isort: skip (starts Warp)
 import warp as wp
@@ -80,6 +84,36 @@ def test_any_number_of_rays(sphere, n):
     assert n < 1000 or 0.2 < (prim_id >= 0).mean() < 0.9
 
 
+def before_a_gap(array):
+    """Return a copy. Reading or writing behind its end ends the process."""
+    size = -(-array.nbytes // mmap.PAGESIZE) * mmap.PAGESIZE
+    pages = mmap.mmap(-1, size + mmap.PAGESIZE)
+    end = ctypes.addressof(ctypes.c_char.from_buffer(pages)) + size
+    assert ctypes.CDLL(None).mprotect(ctypes.c_void_p(end), ctypes.c_size_t(mmap.PAGESIZE), 0) == 0  # PROT_NONE
+    out = np.frombuffer(pages, array.dtype, array.size, size - array.nbytes).reshape(array.shape)
+    out[:] = array
+    return out
+
+
+def rays_before_a_gap():
+    """Return 65 blocks of 16 rays and another ray, in arrays that kernels read in place."""
+    o, d, t_min, t_max = mixed_rays(1041)
+    return [before_a_gap(each.astype(np.float32)) for each in (o, d, t_min, np.maximum(t_max, t_min))]
+
+
+def test_nothing_behind_the_arrays_is_read_or_written(sphere):
+    rays = rays_before_a_gap()
+    assert_same(sphere, *rays)
+    sphere.any_hit(*rays, out=before_a_gap(np.zeros(len(rays[0]), bool)))
+
+
+def test_an_invalid_ray_that_is_the_first_of_its_packet_is_refused(sphere):
+    o, d, _, _ = mixed_rays(4 * LANES)
+    o[::LANES] = np.nan
+    with refused("origins"):
+        sphere.closest_hit(o, d)
+
+
 @cpu_only
 @pytest.mark.parametrize("threads", [1, 2, 3])
 def test_more_rays_than_a_launch(sphere, threads):
@@ -132,11 +166,14 @@ def soup(corners):
 
 
 def crowd(seed=1):
-    """Return many triangles in few places: leaves of several rows, ties in t, thin triangles and triangles without area."""
+    """Return many triangles in few places: leaves of several rows, ties in t, thin triangles, triangles without area, and fans, whose
+    triangles all have the same box."""
     rng = np.random.default_rng(seed)
-    place = rng.normal(size=(6, 3, 3))
-    corners = np.concatenate([np.repeat(place, 60, axis=0), place[:, :1] + [[[0, 0, 0], [1, 0, 0], [2, 0, 0]]],
-                              rng.normal(size=(200, 1, 3)) + 1e-6 * rng.normal(size=(200, 3, 3)), rng.normal(size=(300, 3, 3))])
+    place, fan = rng.normal(size=(6, 3, 3)), rng.random((36, 3, 3))
+    fan[:, 0], fan[:, 1] = 0.0, 1.0
+    flat = place[:, :1] + [[[0, 0, 0], [1, 0, 0], [2, 0, 0]]]
+    thin = rng.normal(size=(200, 1, 3)) + 1e-6 * rng.normal(size=(200, 3, 3))
+    corners = np.concatenate([np.repeat(place, 60, axis=0), flat, thin, rng.normal(size=(300, 3, 3)), fan - 2.0, fan])
     return soup(corners)
 
 

@@ -7,7 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.kernel_tools import cpu_only, launch, zeros
-from tests.kernels.wide.test_batch import assert_same, mixed_rays, new_hits
+from tests.kernels.wide.test_batch import assert_same, before_a_gap, mixed_rays, new_hits, rays_before_a_gap
+from tests.refused import refused
 
 import wrt  # isort: skip (after Warp is started)
 import warp as wp
@@ -136,12 +137,27 @@ def test_rays_of_several_worlds(together):
         assert world_tracer(accel.structure, types is ANY_HIT_TYPES).stream is not None
         expected = answer_arrays(types, None, 4000, None, False)
         trace_worlds(accel.snapshot, Query(rays, expected, 1, worlds), worlds)
-        for threads, some in ((1, slice(None)), (2, slice(None)), (1, slice(700))):
+        for threads, some in ((1, slice(None)), (2, slice(None)), (1, slice(705))):  # 705: the last packet has one ray
             found = query(o[some], d[some], t_min[some], np.maximum(t_max, t_min)[some], threads, world=ids[some])
             found = [found.t, found.u, found.v, found.prim_id] if types is HIT_TYPES else [found]
             for mine, theirs in zip(found, expected, strict=True):
                 np.testing.assert_array_equal(mine, np.asarray(theirs)[some])
     np.testing.assert_array_equal(accel.any_hit(o, d, world=3), accel.any_hit(o, d, world=np.full(4000, 3)))
+
+
+def test_nothing_behind_the_arrays_is_read_or_written():
+    accel, rays = wrt.build([scene(5, 0), icosphere(1)], threads=1), rays_before_a_gap()
+    assert_same(one_world(7), *rays)
+    ids = np.random.default_rng(0).integers(0, 2, len(rays[0])).astype(np.int32)
+    found = accel.closest_hit(*rays, world=wp.array(before_a_gap(ids), device="cpu", copy=False))
+    np.testing.assert_array_equal(found.t, accel.closest_hit(*rays, world=ids).t)
+
+
+def test_an_invalid_ray_that_is_the_first_of_its_packet_is_refused():
+    o, d, _, _ = mixed_rays(64)
+    o[::16] = np.nan
+    with refused("origins"):
+        one_world(7).closest_hit(o, d)
 
 
 def test_an_empty_world_is_missed():

@@ -47,7 +47,7 @@ def both_kernel(width, compressed):
             entries, entered = children(nodes, node, lanes, ray.t_max)
             out.entries[i] = entries
             out.entered[i] = entered
-            out.candidates[i] = cull(rows, first, (1 << width) - 1, lanes)
+            out.candidates[i] = cull(rows, first, i & wp.static((1 << width) - 1), lanes)  # every mask
 
         return run
 

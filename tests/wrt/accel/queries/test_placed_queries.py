@@ -129,6 +129,23 @@ def test_closest_points_equal_those_of_the_flat_mesh(accel: str) -> None:
                 assert getattr(found, name)[world == w].tobytes() == getattr(expected, name).tobytes(), name
 
 
+@pytest.mark.parametrize("swapped", [False, True])
+def test_of_instances_at_the_same_distance_the_first_has_the_closest_point(swapped: bool) -> None:
+    """Two objects have the same square. One has another triangle, which is far away: its box is closer to all points, and visited first.
+    From far points, distances in the space of an object are rounded by more than the margin of its corners."""
+    square = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+    faces, far = [[0, 1, 2], [0, 2, 3]], [[1e5, 0, 1], [1e5, 1, 1], [1e5, 0, 0]]
+    meshes = [Mesh(square, faces), Mesh([*square, *far], [*faces, [4, 5, 6]])]
+    place = np.diag([0.3, 0.3, 0.3, 1.0])
+    place[:3, 3] = 1.7, -2.3, 0.9
+    accel = wrt.build([Scene(tuple(Object(mesh, (GREY,), place) for mesh in meshes[:: -1 if swapped else 1]))])
+    rng = np.random.default_rng(0)
+    above = np.concatenate([rng.uniform(0.1, 0.9, (1000, 2)), 10.0 ** rng.uniform(0.0, 7.0, (1000, 1))], axis=1)
+    found = wrt.closest_points(accel, above * 0.3 + place[:3, 3], world=0)
+    assert (found.prim_id < 2).all()
+    np.testing.assert_allclose(found.distance, 0.3 * above[:, 2], rtol=1e-6)
+
+
 def test_inside_by_parity_over_instances() -> None:
     worlds, flat = structures()
     points, _, world = rays(2000)
