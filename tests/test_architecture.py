@@ -86,7 +86,7 @@ BELOW_KERNELS = {
     "wide": {"headers", "memory", "query", "traverse", "units", "structs"},
     "shade": {"warp_private", "headers", "memory", "rows", "query", "traverse", "units", "structs"},
     "loops": {"shade", "launches", "memory", "rows", "query", "traverse", "units", "structs"},
-    "build": {"memory", "wide", "traverse", "units", "structs"},
+    "build": {"headers", "wide", "traverse", "units", "structs"},
     "study": {"headers", "query", "shade", "wide", "build", "traverse", "units", "structs"},
 }
 LIBRARIES_OF_KERNELS = {"warp", "dataclasses", "functools", "re", "typing", "collections", "math", "pathlib"}

@@ -3,17 +3,24 @@ The results equal those of the host's functions to the last bit (Geometry.bounds
 is for CPUs.
 A launch of size dim processes the primitives or records first .. first + dim - 1."""
 
+from typing import TYPE_CHECKING
+
 import warp as wp
 
-from wrt.kernels.memory import prefetch
+from wrt.kernels.headers import with_headers
 from wrt.kernels.structs import Primitive, kernel, noinline
 from wrt.kernels.units.box import box_pad, padded_hi, padded_lo
 from wrt.kernels.units.triangle import lower, upper
 
 SPLIT = wp.constant(wp.float64(2.0**27 + 1.0))  # Dekker's factor that splits a float64 into two halves
 DOUBT = wp.constant(wp.float64(2.0**-50))  # bound on the relative error of a float64 area, as in wrt.scene.clean.corners_have_area
-FACES_AHEAD, CORNERS_AHEAD = wp.constant(32), wp.constant(12)  # primitives between a prefetch and the use of its cache line
 Terms = wp.types.vector(16, wp.float64)
+
+if TYPE_CHECKING:  # type checkers skip device code (structs.py)
+    from typing import no_type_check as rows_kernel
+else:
+    def rows_kernel(function):
+        return kernel(function, extra_build_options=with_headers("build/rows.h"))
 
 
 @wp.struct
@@ -167,25 +174,26 @@ def write_corners(shape: Shape, order: wp.array(dtype=wp.int32), out: wp.array(d
 def store_lane(rows: wp.array(dtype=wp.float32), row: int, lane: int, width: int, record: Primitive) -> None: ...
 
 
-@kernel
+@wp.func_native("""
+    float* to = out.data + (long long)row * 10 * width;
+    return width == 8 ? wrt::store_triangles<8>(shape, order, begin, count, to) : wrt::store_triangles<4>(shape, order, begin, count, to);
+""")
+def store_triangles(shape: Shape, order: wp.array(dtype=wp.int32), begin: int, count: int, out: wp.array(dtype=wp.float32), row: int,
+                    width: int) -> bool: ...
+
+
+@rows_kernel
 def write_rows(shape: Shape, order: wp.array(dtype=wp.int32), start: wp.array(dtype=wp.int32), width: int,
                out: wp.array(dtype=wp.float32), first: int):
     """Write the rows first .. first + dim - 1 of `width` records with corners: a row has `width` values for each number of a record.
     Row r holds the primitives order[start[r] .. start[r + 1] - 1], at least one. Its unused lanes repeat the last of them.
-    The shape has at least one face."""
+    The shape has at least one face. Width: 4 or 8."""
     row = first + wp.tid()
     begin = start[row]
     count = start[row + 1] - begin
-    last = order.shape[0] - 1
-    record = Primitive()
-    for lane in range(width):
-        if lane < count:
-            prefetch(shape.faces, order[wp.min(begin + lane + FACES_AHEAD, last)])
-            face = shape.faces[wp.min(order[wp.min(begin + lane + CORNERS_AHEAD, last)], shape.faces.shape[0] - 1)]
-            for corner in range(3):
-                prefetch(shape.vertices, face[corner])
-            record = corners_of(shape, order[begin + lane])
-        store_lane(out, row, lane, width, record)
+    if not store_triangles(shape, order, begin, count, out, row, width):
+        for lane in range(width):
+            store_lane(out, row, lane, width, corners_of(shape, order[begin + wp.min(lane, count - 1)]))
 
 
 @kernel

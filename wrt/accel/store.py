@@ -25,7 +25,7 @@ from wrt.accel.structures import ACCELERATORS
 from wrt.core.checked_file import read_checked, write_checked
 from wrt.core.checks import as_one
 from wrt.core.default_device import DEFAULT_DEVICE
-from wrt.core.device import row_type
+from wrt.core.device import aligned, row_type
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count, verifying
 from wrt.core.types import JsonObject, PathLike
@@ -178,7 +178,7 @@ def read_arrays(cls: type[Any], header: JsonObject, body: memoryview) -> Built:
         size = header["bytes"][name]
         if not isinstance(size, int) or size < 0 or size % dtype.itemsize or at + size > len(body):
             raise InputError(f"is damaged: array {name!r} does not fit")
-        arrays[name] = np.frombuffer(body[at:at + size], dtype.base).reshape((-1, *dtype.shape)).copy()
+        arrays[name] = aligned(np.frombuffer(body[at:at + size], dtype.base).reshape((-1, *dtype.shape)))
         at += size
     if len(body) - at != 4 * header["order"]:
         raise InputError("is damaged: the order does not fit")

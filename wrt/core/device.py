@@ -274,6 +274,15 @@ def empty_aligned(shape: int | tuple[int, ...], dtype: npt.DTypeLike) -> np.ndar
     return memory[first : first + size].view(dtype).reshape(shape)
 
 
+def aligned(array: np.ndarray) -> np.ndarray:
+    """Return an array that begins at a cache line: the same array, or a copy."""
+    if array.ctypes.data % 64 == 0:
+        return array
+    out = empty_aligned(array.shape, array.dtype)
+    out[...] = array
+    return out
+
+
 @made_once
 def record_dtype(struct: WarpType) -> np.dtype:
     """Return the memory layout of a Warp struct as a NumPy type.

@@ -90,7 +90,7 @@ def load_mesh(path: PathLike, parts: Sequence[tuple[int, int]] = ()) -> Mesh:
     if len(cleaned.faces) == 0:
         raise InputError(f"none of its {len(raw.faces)} triangles has an area", path=path)
     normals = _finite(cleaned.normals, "normals", path)
-    return Mesh(
+    mesh = Mesh(
         vertices=cleaned.vertices,
         faces=cleaned.faces,
         normals=normals if normals is None or raw.exact else unit_rows(normals),
@@ -100,6 +100,9 @@ def load_mesh(path: PathLike, parts: Sequence[tuple[int, int]] = ()) -> Mesh:
         dropped=cleaned.dropped + raw.incomplete,
         name=os.fspath(path),
     )
+    if not raw.exact:
+        mesh.__dict__["is_clean"] = True  # known, so that it need not be computed
+    return mesh
 
 
 def mesh_of(value: Mesh | PathLike) -> Mesh:

@@ -32,12 +32,14 @@ def clean(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None = 
     vertices = np.asarray(vertices, dtype=np.float32).reshape(-1, 3)
     faces = np.asarray(faces).reshape(-1, 3)
     require_indices(faces, len(vertices))
-    faces, source, without = _flipped(vertices, faces)
-    dropped = int(np.count_nonzero(without))
-    if dropped:
+    with_area = has_area(vertices, faces)
+    dropped = 0
+    if not with_area.all():
+        faces, source, without = _flipped(vertices, faces, ~with_area)
+        dropped = int(np.count_nonzero(without))
         kept = np.flatnonzero(~without)
         faces, source = faces.take(kept, axis=0), source.take(kept)
-    face_group = face_group[source] if face_group is not None else None
+        face_group = face_group[source] if face_group is not None else None
 
     used = np.zeros(len(vertices), dtype=bool)
     used[faces] = True
@@ -107,13 +109,13 @@ def flip_collinear(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray,
     vertices: (V, 3) float32; faces: (F, 3). Returns faces (F, 3) of the same dtype, and source (F,). Returned face i lies in input
     face source[i], whose material and group apply to it. Faces with two equal corners stay as they are, and so do faces whose
     longest edge does not belong to exactly two faces."""
-    return _flipped(vertices, faces)[:2]
+    return _flipped(vertices, faces, ~has_area(vertices, faces))[:2]
 
 
-def _flipped(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return faces and source of `flip_collinear`, and (F,) bool: True for faces that still have no area."""
+def _flipped(vertices: np.ndarray, faces: np.ndarray, without: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return faces and source of `flip_collinear`, and (F,) bool: True for faces that still have no area. without: the same of `faces`."""
     faces, source = faces.copy(), np.arange(len(faces))
-    suspects, without = source.copy(), ~has_area(vertices, faces)
+    suspects, without = source.copy(), without.copy()
     for _ in range(ROUNDS if without.any() else 0):
         flat, ends, middle = _longest_edges(vertices, faces, suspects[without[suspects]])
         if not len(flat):

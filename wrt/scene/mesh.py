@@ -15,7 +15,7 @@ from wrt.core.packages import needed_by
 from wrt.core.suggestions import suggest_fields
 from wrt.core.types import PathLike
 from wrt.core.write_file import write_bytes
-from wrt.scene.clean import require_indices
+from wrt.scene.clean import has_area, require_indices
 
 if TYPE_CHECKING:
     import trimesh
@@ -152,6 +152,11 @@ class Mesh:
     def reach(self) -> float:
         """Largest absolute coordinate of the vertices."""
         return float(np.abs(self.vertices).max(initial=0.0))
+
+    @cached_property
+    def is_clean(self) -> bool:
+        """Whether every face has an area, in exact arithmetic. `wrt.load_mesh` drops other faces."""
+        return bool(has_area(self.vertices, self.faces).all())
 
     def __repr__(self) -> str:
         parts = [repr(self.name)] if self.name else []

@@ -10,8 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.refused import refused
+from wrt.accel.scenes.flatten import flatten
+from wrt.io.mesh_file import load_mesh
 from wrt.lab.hard_cases.common import sphere
 from wrt.scene.clean import clean, flip_collinear, has_area
+from wrt.scene.mesh import Mesh
+from wrt.scene.model import Object, Scene
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
 
@@ -109,6 +113,22 @@ def test_flips_remove_corners_on_a_line_and_nothing_else():
     assert (source[~changed] == np.flatnonzero(~changed)).all() and 500 < changed.sum() < 10_000
     before, after = (area(rough.vertices, f) for f in (rough.faces, faces))
     np.testing.assert_allclose(np.bincount(source, after, len(faces)), before, rtol=1e-9, atol=1e-16)
+
+
+def test_a_mesh_knows_whether_it_is_clean(tmp_path):
+    """A loaded mesh is clean; a scene flips the faces of any other mesh."""
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [1, 1, 0], [1, -1, 0]], np.float32)
+    rough = Mesh(vertices, np.array([[0, 1, 2], [0, 2, 3], [0, 4, 1], [1, 4, 2]]))
+    path = tmp_path / "rough.obj"
+    path.write_text("".join(f"v {x} {y} {z}\n" for x, y, z in vertices) + "".join("f {} {} {}\n".format(*face) for face in rough.faces + 1))
+    loaded = load_mesh(path)
+    rough.save(tmp_path / "rough.npz")
+    assert [each.is_clean for each in (rough, loaded, load_mesh(tmp_path / "rough.npz"))] == [False, True, False]
+    assert has_area(loaded.vertices, loaded.faces).all() and not has_area(rough.vertices, rough.faces).all()
+    for mesh in (rough, loaded):
+        flat = flatten(Scene(objects=(Object(mesh),)))
+        np.testing.assert_array_equal(flat.faces, flip_collinear(mesh.vertices, mesh.faces)[0])
+        assert has_area(flat.vertices, flat.faces).all() and not np.shares_memory(flat.faces, mesh.faces)
 
 
 def test_a_chain_of_faces_on_one_line_is_flipped_from_its_outer_end():

@@ -21,7 +21,7 @@ from wrt.accel.bvh.wide_tree import WideTree, check_wide, collapse, collapse_ker
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.raw_kernel import launch_raw
 from wrt.core.building import report, report_parts
-from wrt.core.device import empty_aligned, preloading, record_dtype, start
+from wrt.core.device import aligned, empty_aligned, preloading, record_dtype, start
 from wrt.core.errors import InputError
 from wrt.core.threads import run_all
 from wrt.core.types import Kernel, WarpStruct
@@ -160,8 +160,8 @@ class WideBvh(CollapsedBvh):
     def _arrays(self, tree: WideTree) -> dict[str, np.ndarray]:
         """Return the nodes in the layout of kernels.wide.nodes, as one array of floats."""
         n, size, first = len(tree.children), node_size(self.width, self.compressed), first_reference(self.width, self.compressed)
-        nodes = np.zeros((n, size), np.float32)
-        nodes[:, first : first + self.width] = tree.children.view(np.float32)
+        nodes = empty_aligned((n, size), np.float32)
+        nodes[:, first : first + self.width], nodes[:, first + self.width :] = tree.children.view(np.float32), 0.0
         if self.compressed:
             nodes[:, first : first + self.width] = packed(tree.children, 1).view(np.float32)
             nodes[:, :first] = compress(tree.lo, tree.hi, tree.children != EMPTY)
@@ -189,7 +189,7 @@ class WideBvh(CollapsedBvh):
         rows = empty_aligned((len(starts) - 1, floats, width), np.float32)
         if self._rows_by_kernel():
             launch_raw(rows_kernel(), len(rows), self.geometry.on(start("cpu")), order, starts, width, rows.reshape(-1), None,
-                       threads=self.threads, step=ROWS_PER_JOB)
+                       threads=self.threads, step=4 * ROWS_PER_JOB)
             return rows.reshape(-1)
 
         def fill(first: int) -> None:
@@ -207,9 +207,7 @@ class WideBvh(CollapsedBvh):
                 and self.geometry.n_triangles >= ROWS_BY_KERNEL)
 
     def _upload(self, built: Built) -> WarpStruct:
-        nodes = empty_aligned(built.arrays["nodes"].shape, np.float32)
-        nodes[...] = built.arrays["nodes"]
-        return super()._upload(replace(built, arrays={"nodes": nodes}))
+        return super()._upload(replace(built, arrays={"nodes": aligned(built.arrays["nodes"])}))
 
     def _check(self, built: Built) -> None:
         if len(built.arrays["nodes"]) % node_size(self.width, self.compressed):
@@ -219,10 +217,11 @@ class WideBvh(CollapsedBvh):
         if self.compressed and (existing_children(self._nodes(built), self.width) != (references != EMPTY)).any():
             raise InputError("is damaged: a node's mask of children differs from its references")
         if not self.compressed:
-            node, child = np.divmod(np.flatnonzero(references == EMPTY), self.width)
-            boxes = self._nodes(built)[:, : first_reference(self.width, False)].reshape(-1, 3, 2, self.width)[node, :, :, child]
-            if (boxes[..., 0] != np.inf).any() or (boxes[..., 1] != -np.inf).any():
-                raise InputError("is damaged: a child that does not exist has a box")
+            missing = np.flatnonzero(references == EMPTY)
+            low = missing + missing // self.width * (node_size(self.width, False) - self.width)  # place of the child's first plane
+            for k in range(len(PLANES)):
+                if (built.arrays["nodes"].take(low + k * self.width) != (-np.inf if k % 2 else np.inf)).any():
+                    raise InputError("is damaged: a child that does not exist has a box")
 
 
 class Bvh4(WideBvh):

@@ -1,6 +1,6 @@
 """Scenes as arrays: joined triangles in world space, and instanced meshes in their own space."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -121,13 +121,14 @@ def _check_size(vertices: int, faces: int) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Joined:
-    """Arrays of joined objects, or of one mesh. source: (F,), index of the original face in which each face lies (flip_collinear)."""
+    """Arrays of joined objects, or of one mesh. source: (F,), index of the original face in which each face lies (flip_collinear),
+    or all faces if none was flipped."""
 
     vertices: np.ndarray
     faces: np.ndarray
     normals: np.ndarray
     uvs: np.ndarray
-    source: np.ndarray
+    source: np.ndarray | slice
     material: np.ndarray
 
 
@@ -136,21 +137,27 @@ def _joined(objects: tuple[Object, ...], index: dict[int, int]) -> _Joined:
     parts, material, first = [], [np.zeros(0, np.int32)], 0
     for thing in objects:
         v, f, n, t = _transformed(thing)
-        parts.append((v, f + np.int32(first), n, t))
+        parts.append((v, f + np.int32(first) if first else f, n, t))
         table = np.array([index[id(m)] for m in thing.materials], np.int32)
         material.append(np.full(len(f), table[0]) if thing.face_material is None else table[thing.face_material])
         first += len(v)
         _check_size(first, 0)
     empty = [np.zeros((0, width), dtype) for width, dtype in ((3, np.float32), (3, np.int32), (3, np.float32), (2, np.float32))]
     vertices, faces, normals, uvs = map(np.concatenate, zip(*parts, strict=True)) if parts else empty
+    joined = _Joined(vertices, faces, normals, uvs, slice(None), np.concatenate(material))
+    if len(objects) == 1 and _is_unmoved(objects[0]) and objects[0].mesh.is_clean:
+        return joined
     # Far from the origin, rounding puts corners on a line. One call for all objects is faster than a call for each.
     faces, source = flip_collinear(vertices, faces)
-    return _Joined(vertices, faces, normals, uvs, source, np.concatenate(material)[source])
+    return replace(joined, faces=faces, source=source, material=joined.material[source])
 
 
 def _own_space(mesh: Mesh) -> _Joined:
+    joined = _Joined(mesh.vertices, mesh.faces, *_attributes(mesh), slice(None), np.zeros(0, np.int32))
+    if mesh.is_clean:
+        return joined
     faces, source = flip_collinear(mesh.vertices, mesh.faces)
-    return _Joined(mesh.vertices, faces, *_attributes(mesh), source, np.zeros(0, np.int32))
+    return replace(joined, faces=faces, source=source)
 
 
 def _attributes(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
@@ -159,11 +166,15 @@ def _attributes(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
             np.zeros((len(mesh.vertices), 2), np.float32) if mesh.uvs is None else mesh.uvs)
 
 
+def _is_unmoved(thing: Object) -> bool:
+    return np.array_equal(thing.transform, np.eye(4))
+
+
 def _transformed(thing: Object) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     mesh, matrix = thing.mesh, thing.transform
     faces = mesh.faces
     normals, uvs = _attributes(mesh)
-    if np.array_equal(matrix, np.eye(4)):
+    if _is_unmoved(thing):
         return mesh.vertices, faces, normals, uvs
     linear = matrix[:3, :3]
     vertices = (mesh.vertices.astype(np.float64) @ linear.T + matrix[:3, 3]).astype(np.float32)

@@ -69,21 +69,21 @@ def read(path: Path) -> RawMesh:
         corners, counts = np.concatenate([corners, strips]), np.concatenate([counts, np.full(len(strips) // 3, 3)])
         texcoord = None  # strips have none
 
-    referenced = np.zeros(len(vertices), dtype=bool)
-    referenced[corners] = True
     finite = np.isfinite(vertices)
-    if not finite.all() and len(bad := np.flatnonzero(referenced & ~finite.all(axis=1))):
+    referenced = np.zeros(len(vertices), dtype=bool)
+    if not finite.all():
+        referenced[corners] = True
+    if len(bad := np.flatnonzero(referenced & ~finite.all(axis=1))):
         raise InputError(f"position {vertices[bad[0]].tolist()} is not finite ({len(bad)} in all)", place=f"vertex {bad[0]}")
 
     normals = _columns(vertex, ("nx", "ny", "nz"))
     uvs = next((uv for names in _UV_NAMES if (uv := _columns(vertex, names)) is not None), None)
-    triangles, _ = triangulate(corners, counts, vertices)
     if uvs is None and texcoord is not None:
         origin, corners, uvs = _split(corners, texcoord)
         vertices, normals = vertices[origin], normals[origin] if normals is not None else None
     return RawMesh(
         vertices=vertices,
-        faces=corners[triangles],
+        faces=corners.reshape(-1, 3) if (counts == 3).all() else corners[triangulate(corners, counts, vertices)[0]],
         normals=normals,
         uvs=np.stack([uvs[:, 0], 1.0 - uvs[:, 1]], axis=1) if uvs is not None else None,
         incomplete=int(np.count_nonzero(counts < 3)),
@@ -133,6 +133,8 @@ def _within(values: np.ndarray, counts: np.ndarray, vertices: int, element: str)
     """Return values as integers. Raises InputError, with the element and the row, for a value that is no index of a vertex."""
     with np.errstate(invalid="ignore"):
         indices: np.ndarray = values.astype(np.int32 if vertices < 1 << 31 else np.int64)
+    if values.dtype.kind in "iu" and values.itemsize <= 4 and indices.min(initial=0) >= 0 and indices.max(initial=-1) < vertices:
+        return indices
     wrong = (indices < 0) | (indices >= vertices) | (indices != values)
     if wrong.any():
         where = int(np.argmax(wrong))
