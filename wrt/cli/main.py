@@ -87,7 +87,8 @@ def main() -> None:
         code = 2
     except SystemExit as error:
         code = error.code
-    if sys.getprofile() or sys.gettrace():
+    monitoring = getattr(sys, "monitoring", None)  # used by profilers from Python 3.12 on, and by tools that measure coverage
+    if sys.getprofile() or sys.gettrace() or (monitoring and any(map(monitoring.get_tool, range(6)))):
         sys.exit(code)  # a profiler writes its result at exit
     _leave(code if isinstance(code, int) else 1 if code else 0)
 
