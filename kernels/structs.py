@@ -37,7 +37,7 @@ else:
         return kernel(function, registers=80)
 
     def noinline(function):
-        """Make a Warp function that is called, never inlined."""
+        """Make a Warp function that is called, never inlined. Functions that run once per block or wave then compile faster."""
         return wp.func(function, inline=False)
 
 

@@ -32,7 +32,7 @@ from wrt.kernels.shade.sampling import LANES
 from wrt.kernels.shade.shading import make_shading
 from wrt.kernels.shade.shadows import make_advance_shadow
 from wrt.kernels.shade.step import DirectLight, Sample, add_light, add_surface_light
-from wrt.kernels.structs import AovFilm, Film, Surfaces, kernel
+from wrt.kernels.structs import AovFilm, Film, Surfaces, kernel, noinline
 
 FRESH = 2048  # Number of camera rays that are made, traced and shaded together, so that they stay in the cache.
 
@@ -69,7 +69,7 @@ def make_shadow_kernel(features: Features) -> Any:
 def make_add_direct_light(transparent_shadows: bool) -> Any:
     """Return add_direct_light(wave, lights): add each receiver's light to its sample, after the shadow rays are traced."""
 
-    @wp.func
+    @noinline
     def add_direct_light(wave: Wave, lights: int):
         for a in range(wave.progress[0].receivers):
             direct = DirectLight()
@@ -101,7 +101,7 @@ def add_to_pixels(film: Film, pixels: wp.array(dtype=wp.int32), done: wp.array(d
     """Add `samples` samples to each of LANES pixels, with film indices pixels[p], pixels[p + 1] ...; done[p * samples] is the first."""
 
 
-@wp.func
+@noinline
 def add_to_film(wave: Wave, film: Film):
     """Add the samples of a wave to their pixels, in the order of the samples' indices."""
     task = wave.task[0]

@@ -16,7 +16,7 @@ from wrt.kernels.shade.lights import LightSample, choose_emitter, emitter_corner
 from wrt.kernels.shade.sampling import triangle_numbers
 from wrt.kernels.shade.shading import Shading
 from wrt.kernels.shade.surface import Surface, make_place_of, triangle_point, triangle_point_error
-from wrt.kernels.structs import Lighting, Surfaces
+from wrt.kernels.structs import Lighting, Surfaces, noinline
 
 MESH = list(kinds.LIGHTS).index("mesh")
 
@@ -225,7 +225,7 @@ def make_wave_lights(features: Features, shading: Shading, hit_surface: Any, sam
     sky = sampled.cosine or sampled.by_kind is not None or sampled.points
     sample_sky, sample_mesh = make_sample_sky(features, sampled), make_sample_mesh(features)
 
-    @wp.func
+    @noinline
     def sample(wave: Wave, surfaces: Surfaces, lighting: Lighting, first: int, end: int):
         if wp.static(features.spheres and (sampled.cosine or sampled.mesh)):
             store_spheres(wave, surfaces, first, end)

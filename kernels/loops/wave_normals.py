@@ -12,7 +12,7 @@ from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.sampling import where_vec3
 from wrt.kernels.shade.shading import Texels, bump
 from wrt.kernels.shade.surface import Surface, visible_normal
-from wrt.kernels.structs import Surfaces
+from wrt.kernels.structs import Surfaces, noinline
 
 
 def normal_rows(features: Features) -> Rows | None:
@@ -27,7 +27,7 @@ def make_compute_normals(features: Features) -> Any:
     load_hit, load_surface, load_normal = HITS.load(), SURFACES.load(), TEXELS.field("normal").load()
     store_normal = NORMALS.store()
 
-    @wp.func
+    @noinline
     def compute_normals(rows: wp.array(dtype=wp.float32), count: int):
         i = int(0)
         while i < count:

@@ -6,6 +6,7 @@ import warp as wp
 
 from wrt.kernels.loops.state import Wave
 from wrt.kernels.loops.wave_rows import FACETS, KEYS, Key
+from wrt.kernels.structs import noinline
 
 store_key = KEYS.store()
 
@@ -18,7 +19,7 @@ def key_at(wave: Wave, s: int) -> wp.uint32:
     return wave.samples.paths[wave.samples.pending[s] * wave.capacity + s].key
 
 
-@wp.func
+@noinline
 def store_keys(wave: Wave, first: int, end: int):
     """Store the keys of the hits first .. end - 1, at most BLOCK, in the rows KEYS."""
     task = wave.task[0]
@@ -34,7 +35,7 @@ def make_sample_facets(choose_facet: Any) -> Any:
     """Return sample_facets(wave, count): store the results of choose_facet for `count` hits in the rows FACETS."""
     load_key, store_facet = KEYS.load(), FACETS.store()
 
-    @wp.func
+    @noinline
     def sample_facets(wave: Wave, count: int):
         rows = wave.block.rows
         i = int(0)

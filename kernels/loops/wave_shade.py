@@ -157,7 +157,7 @@ def make_block_functions(features: Features, shading: Shading, step: Step) -> Bl
             store_keys(wave, first, end)
         if wp.static(features.rough):
             sample_facets(wave, end - first)
-        if wp.static(features.direct_light):
+        if wp.static(lights.needs_keys):
             lights.sample(wave, surfaces, lighting, first, end)
 
     @wp.func

@@ -9,7 +9,7 @@ from wrt.kernels.loops.wave_rows import HITS, SURFACES, TEXELS
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.shading import TEXTURES, MaterialTexture, Texels, textures_of
 from wrt.kernels.shade.surface import Surface
-from wrt.kernels.structs import Surfaces
+from wrt.kernels.structs import Surfaces, noinline
 
 
 def textures_vectorised(features: Features) -> bool:
@@ -40,7 +40,7 @@ def make_sample_texture(name: str, texture: MaterialTexture) -> Any:
 def make_link(sample: Any, sample_others: Any) -> Any:
     """Return the function that calls `sample_others` and then `sample`."""
 
-    @wp.func
+    @noinline
     def sample_all(surfaces: Surfaces, rows: wp.array(dtype=wp.float32), count: int):
         sample_others(surfaces, rows, count)
         sample(surfaces, rows, count)

@@ -13,6 +13,7 @@ from hashlib import sha256
 from inspect import signature
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import warp as wp
@@ -218,6 +219,7 @@ def prepare() -> None:
     _mark_own_modules()
     _drop_unused_helpers()
     _compile_well()
+    _share_hashes()
 
 
 def _own() -> bool:
@@ -283,6 +285,25 @@ def _compile_well() -> None:
 
     build.build_cpu = build_cpu
     context.runtime.get_clang_pch_dir = lambda: None if _own() else own_headers()  # it makes a folder in each thread
+
+
+def _share_hashes() -> None:
+    """Hash each function of wrt once, and not with each kernel that calls it (saves 0.05 s of a warm start). The hashes stay the same.
+
+    If Warp's hasher has another form, it stays as it is."""
+    hasher = getattr(context, "ModuleHasher", None)
+    compute, known = getattr(hasher, "hash_function", None), WeakKeyDictionary[Any, bytes]()
+    if compute is None or tuple(signature(compute).parameters) != ("self", "func"):
+        return
+
+    @wraps(compute)
+    def hash_function(self: Any, func: Any) -> bytes:
+        found: bytes = known.get(func) or compute(self, func)
+        if is_own(func):
+            known[func] = found
+        return found
+
+    context.ModuleHasher.hash_function = hash_function
 
 
 def processor_features() -> frozenset[str]:

@@ -1,5 +1,5 @@
 """Private parts of Warp: another Warp is refused; the changes of its compiler act on wrt's modules alone and change no kernel; headers
-are precompiled once."""
+are precompiled once, and functions hashed once."""
 
 import os
 import shutil
@@ -24,8 +24,11 @@ from wrt.core import kernel_cache, warp_private
 from wrt.core.device import preloading, start
 from wrt.core.errors import InputError
 from wrt.core.warp_private import WORKS_WITH
+from wrt.io.load import load_scene
 from wrt.kernels.structs import kernel
 from wrt.kernels.warp_private import fields_of
+from wrt.renderer.options import Options
+from wrt.renderer.plan import plan_of
 
 pytestmark = cpu_only
 DIFFER = f"Warp {wp.config.version} is not supported, its insides differ"
@@ -92,6 +95,17 @@ def test_a_warp_without_a_name_is_one_message_of_the_command_line(tmp_path: Path
     assert done.stderr.endswith(f"); install '{WORKS_WITH}'\n")
 
 
+@pytest.mark.parametrize("parameters", ["self, func, depth", "self", None])
+def test_a_hasher_of_another_form_stays_as_it_is(parameters: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    hasher = SimpleNamespace()
+    if parameters:
+        exec(f"def hash_function({parameters}): ...", vars(hasher))
+    before = dict(vars(hasher))
+    monkeypatch.setattr(warp_private, "context", SimpleNamespace(ModuleHasher=hasher))
+    warp_private._share_hashes()
+    assert vars(hasher) == before
+
+
 # --- structs ----------------------------------------------------------------------------------------------------------
 
 
@@ -141,6 +155,17 @@ def test_a_kernel_of_bfloat16_has_headers_with_it(monkeypatch: pytest.MonkeyPatc
     numbers, sums = wp.array([1.0, 2.0, -4.0], dtype=wp.bfloat16, device="cpu"), zeros(3)
     launch(ours(add_halves, monkeypatch), 3, numbers, sums)
     assert sums.numpy().tolist() == [1.5, 2.5, -3.5]
+
+
+@pytest.mark.parametrize("scene", ["whitted", "textures"])
+def test_shared_hashes_are_those_of_warp(scene: str, monkeypatch: pytest.MonkeyPatch):
+    """A kernel's name in the cache contains its hash."""
+    start("cpu")
+    made = plan_of(load_scene(ROOT / "scenes" / f"{scene}.toml"), Options()).kernels
+    shared = [kernel.module.hash_module() for kernel in made]
+    hasher = warp_private.context.ModuleHasher
+    monkeypatch.setattr(hasher, "hash_function", hasher.hash_function.__wrapped__)
+    assert len(made) > 4 and [kernel.module.hash_module() for kernel in made] == shared
 
 
 MINE = """
