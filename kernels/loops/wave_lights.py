@@ -14,7 +14,6 @@ from wrt.kernels.shade.direct import make_light_points
 from wrt.kernels.shade.features import Features
 from wrt.kernels.shade.lights import LightSample, choose_emitter, emitter_corners, from_emitter
 from wrt.kernels.shade.sampling import triangle_numbers
-from wrt.kernels.shade.shading import Shading
 from wrt.kernels.shade.surface import Surface, make_place_of, triangle_point, triangle_point_error
 from wrt.kernels.structs import Lighting, Surfaces, noinline
 
@@ -41,25 +40,6 @@ class BlockSamples:
         # Samples of the background by a function of its kind, for hits that may need one.
         self.by_kind = kind.make_block_samples(SKY_POINTS, SKY) if features.sky_light and kind.make_block_samples else None
         self.points = by_cosine and self.normals is None  # Of the background's samples, only the result of sky_point.
-
-
-def make_store_spheres(features: Features, sampled: BlockSamples, shading: Shading, hit_surface: Any) -> Any:
-    """Return store_spheres(wave, surfaces, first, end): store points and normals of hits on spheres in rows, for the light samples."""
-    store_point, store_normal = SURFACES.field("point").store(), (sampled.normals or SURFACES.field("shading")).store()
-    look_up, shading_normal = shading.look_up, shading.shading_normal
-
-    @wp.func
-    def store_spheres(wave: Wave, surfaces: Surfaces, first: int, end: int):
-        for j in range(first, end):
-            k = wave.outcomes.hit_rays[j]
-            if wave.queue.hits.prim_id[k] >= surfaces.n_triangles:
-                s = hit_surface(wave, surfaces, j - first, k)
-                store_point(wave.block.rows, j - first, s.point)
-                if wp.static(sampled.cosine):
-                    wo = -wave.queue.rays.direction[k]
-                    store_normal(wave.block.rows, j - first, shading_normal(surfaces, s, look_up(surfaces, s), wo))
-
-    return store_spheres
 
 
 def make_keep_diffuse(features: Features) -> Any:
@@ -218,17 +198,14 @@ class WaveLights(NamedTuple):
     needs_keys: bool  # True if `sample` reads the rows KEYS (wave_numbers.py).
 
 
-def make_wave_lights(features: Features, shading: Shading, hit_surface: Any, sample_light: Any) -> WaveLights:
-    """Return the WaveLights of a scene. `hit_surface` comes from make_wave_surfaces, sample_light from make_step."""
+def make_wave_lights(features: Features, sample_light: Any) -> WaveLights:
+    """Return the WaveLights of a scene. sample_light comes from make_step."""
     sampled = BlockSamples(features)
-    store_spheres = make_store_spheres(features, sampled, shading, hit_surface)
     sky = sampled.cosine or sampled.by_kind is not None or sampled.points
     sample_sky, sample_mesh = make_sample_sky(features, sampled), make_sample_mesh(features)
 
     @noinline
     def sample(wave: Wave, surfaces: Surfaces, lighting: Lighting, first: int, end: int):
-        if wp.static(features.spheres and (sampled.cosine or sampled.mesh)):
-            store_spheres(wave, surfaces, first, end)
         if wp.static(sky):
             sample_sky(wave, surfaces, lighting, first, end)
         if wp.static(sampled.mesh):

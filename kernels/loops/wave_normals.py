@@ -45,7 +45,7 @@ def make_compute_normals(features: Features) -> Any:
 def make_wave_normals(features: Features, shading_normal: Any) -> tuple[Any, Any]:
     """Return compute_normals or None, and normal_at(wave, surfaces, surface, texels, wo, i) -> vec3 for hit i of the block.
 
-    normal_at loads the result of compute_normals. If this is None, or for a sphere, it calls `shading_normal` (from make_shading)."""
+    normal_at loads the result of compute_normals. If this is None, it calls `shading_normal` (from make_shading)."""
     vectorised = normal_rows(features) == NORMALS
     load_normal = NORMALS.load()
 
@@ -53,9 +53,6 @@ def make_wave_normals(features: Features, shading_normal: Any) -> tuple[Any, Any
     def normal_at(wave: Wave, surfaces: Surfaces, s: Surface, texels: Texels, wo: wp.vec3, i: int) -> wp.vec3:
         if wp.static(not vectorised):
             return shading_normal(surfaces, s, texels, wo)
-        if wp.static(features.spheres):
-            if s.exclude_plus_one == 0:
-                return shading_normal(surfaces, s, texels, wo)
         return load_normal(wave.block.rows, i)
 
     return make_compute_normals(features) if vectorised else None, normal_at

@@ -12,15 +12,24 @@ from wrt.kernels.structs import Emitter
 
 @wp.struct
 class TriangleHit:
-    """A hit on a triangle, with the data for its Surface and shading normal."""
+    """A hit, with the data of its triangle for its Surface and shading normal. If it is on a sphere, the triangle is any triangle."""
 
     triangle: Triangle
     u: float  # Barycentric of corner v1.
     v: float  # Barycentric of corner v2.
     direction: wp.vec3  # The ray's direction.
-    material: int  # Material of the triangle; -1 if the ray hit a sphere.
+    material: int  # Material of the triangle or sphere.
     is_mapped: int  # 1 if the material has a normal map.
     normal_scale: float  # Material.normal_scale.
+
+
+@wp.struct
+class SphereHit:
+    """A sphere and a hit point, with the data for its Surface."""
+
+    sphere: wp.vec4  # Centre and radius, in world space.
+    point: wp.vec3  # The ray's point at the hit.
+    is_hit: int  # 1 if the ray hit this sphere; 0 if it hit a triangle.
 
 
 @wp.struct
@@ -49,7 +58,8 @@ class Drawn:
 
 
 HITS = Rows(TriangleHit, BLOCK)
-SURFACES = Rows(Surface, BLOCK, HITS.end)
+SPHERES = Rows(SphereHit, BLOCK, HITS.end)
+SURFACES = Rows(Surface, BLOCK, SPHERES.end)
 TEXELS = Rows(Texels, BLOCK, SURFACES.end)
 NORMALS = Rows(wp.vec3, BLOCK, TEXELS.end)  # Shading normals on the viewer's side.
 KEYS = Rows(Key, BLOCK, NORMALS.end)

@@ -141,7 +141,7 @@ def make_block_functions(features: Features, shading: Shading, step: Step) -> Bl
     compute_surfaces, hit_surface = make_wave_surfaces(features, shading.surface_at)
     sample_textures, texels_at = make_wave_textures(features, shading.look_up)
     compute_normals, normal_at = make_wave_normals(features, shading.shading_normal)
-    lights = make_wave_lights(features, shading, hit_surface, step.sample_light)
+    lights = make_wave_lights(features, step.sample_light)
     sample_facets, load_facet = make_sample_facets(step.choose_facet), FACETS.load()
     needs_keys = features.rough or lights.needs_keys
 

@@ -27,7 +27,7 @@ def make_sample_texture(name: str, texture: MaterialTexture) -> Any:
     int wanted[{BLOCK}];
     for (int i = 0; i < {BLOCK}; ++i) {{
         int material = -1;
-        if (i < count && surfaces.n_triangles > 0) memcpy(&material, rows.data + {material} + i, sizeof(material));
+        if (i < count) memcpy(&material, rows.data + {material} + i, sizeof(material));
         wanted[i] = material < 0 ? -1 : surfaces.materials.data[material].{name};
     }}
     wrt::sample_texture<{BLOCK}>(surfaces, wanted, rows.data + {u}, rows.data + {v}, count, {channels}, rows.data + {to});
@@ -51,7 +51,7 @@ def make_link(sample: Any, sample_others: Any) -> Any:
 def make_wave_textures(features: Features, look_up: Any) -> tuple[Any, Any]:
     """Return sample(surfaces, rows, count) or None, and texels_at(wave, surfaces, surface, i) -> Texels of hit i of the block.
 
-    texels_at loads the result of `sample`. If `sample` is None, or for a sphere, it calls `look_up` (from make_shading)."""
+    texels_at loads the result of `sample`. If `sample` is None, it calls `look_up` (from make_shading)."""
     textures = textures_of(features) if textures_vectorised(features) else {}
     sample = None
     for name, texture in textures.items():
@@ -63,9 +63,6 @@ def make_wave_textures(features: Features, look_up: Any) -> tuple[Any, Any]:
     def texels_at(wave: Wave, surfaces: Surfaces, s: Surface, i: int) -> Texels:
         if wp.static(not textures):
             return look_up(surfaces, s)
-        if wp.static(features.spheres):
-            if s.exclude_plus_one == 0:
-                return look_up(surfaces, s)
         return load(wave.block.rows, i)
 
     return sample, texels_at

@@ -288,16 +288,16 @@ def with_normal(s: Surface, normal: wp.vec3) -> Surface:
 
 
 def make_on_sphere(uvs: bool, tangents: bool) -> Any:
-    """Return on_sphere(surfaces, ray, hit) -> Surface of a sphere, in world space."""
+    """Return on_sphere(sphere, hit_point) -> Surface, in world space. Like on_triangle, it is branch-free.
+
+    The point is projected onto the sphere, so that its error does not grow with the ray's length."""
 
     @wp.func
-    def on_sphere(surfaces: Surfaces, ray: Ray, hit: Hit) -> Surface:
+    def on_sphere(sphere: wp.vec4, hit_point: wp.vec3) -> Surface:
         s = Surface()
-        sphere = surfaces.spheres[hit.prim_id - surfaces.n_triangles]
         center = wp.vec3(sphere[0], sphere[1], sphere[2])
-        # The point is projected onto the sphere, so that its error does not grow with the ray's length.
-        from_center = ray.origin + hit.t * ray.direction - center
-        s.geometric = wp.normalize(lift(from_center) * from_center)
+        from_center = hit_point - center
+        s.geometric = unit(lift(from_center) * from_center)
         s.shading = s.geometric
         s.point = center + sphere[3] * s.geometric
         s.error = gamma(6.0) * (wp.vec3(sphere[3], sphere[3], sphere[3]) + wp.abs(center))
@@ -309,7 +309,7 @@ def make_on_sphere(uvs: bool, tangents: bool) -> Any:
             s.bitangent_sign = 1.0
             along_u = wp.vec3(s.geometric[2], 0.0, -s.geometric[0])
             length = wp.length(along_u)
-            s.tangent = wp.where(length > 0.0, along_u / length, wp.vec3(1.0, 0.0, 0.0))
+            s.tangent = where_vec3(length > 0.0, along_u / length, wp.vec3(1.0, 0.0, 0.0))
         return s
 
     return on_sphere
@@ -348,7 +348,7 @@ def make_surface_at(spheres: bool, smooth: bool, uvs: bool, tangents: bool, inst
         s = Surface()
         if wp.static(spheres):
             if hit.prim_id >= surfaces.n_triangles:
-                s = on_sphere(surfaces, ray, hit)
+                s = on_sphere(surfaces.spheres[hit.prim_id - surfaces.n_triangles], ray.origin + hit.t * ray.direction)
             else:
                 s = on_triangle(surfaces, hit, place)
         else:
