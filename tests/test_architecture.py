@@ -83,7 +83,7 @@ BELOW_KERNELS = {
     "placed_rays": {"query", "structs"},
     "ray_query": {"query", "structs"},
     "winding": {"traverse", "structs"},
-    "wide": {"headers", "memory", "query", "traverse", "units", "structs"},
+    "wide": {"headers", "memory", "hit_lists", "query", "traverse", "units", "structs"},
     "shade": {"warp_private", "headers", "memory", "rows", "query", "traverse", "units", "structs"},
     "loops": {"shade", "launches", "memory", "rows", "query", "traverse", "units", "structs"},
     "build": {"headers", "wide", "traverse", "units", "structs"},

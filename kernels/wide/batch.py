@@ -10,6 +10,7 @@ from typing import Any
 
 import warp as wp
 
+from wrt.kernels.hit_lists import HitLists
 from wrt.kernels.memory import put_int
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import Surfaces, noinline
@@ -29,7 +30,7 @@ from wrt.kernels.wide.packets import (
     REPORT_SIZE,
     Scratch,
     WideBvh,
-    clear_counts,
+    begin_lists,
     count_of,
     key_at,
     lowest_of_all,
@@ -43,8 +44,8 @@ from wrt.kernels.wide.packets import (
     rays_reaching,
     slot_at,
     store_bits,
-    write_counts,
     write_hits,
+    write_lists,
     write_occluded,
 )
 from wrt.kernels.wide.references import EMPTY, leaf_count, leaf_first
@@ -55,7 +56,7 @@ MIN_VISITS = 6  # Mean number of rays per node from which a packet is faster tha
 # Numbers of nodes between which the walk of a MIXED packet stops if it is below MIN_VISITS.
 FIRST_STOP, LAST_STOP = 6, 16
 # Results of a packet's walk: all rays are finished, and their visits reached or did not reach MIN_VISITS; or the walk has stopped, and the
-# rays begin again one by one. The hits found so far shorten them; counts begin at 0.
+# rays begin again one by one. The hits found so far shorten them; lists begin empty.
 TOGETHER, APART, STOPPED = (wp.constant(result) for result in range(3))
 # A packet below MIN_VISITS has failed. After MAX_FAILED failures in succession, the rays of the next PAUSE packets are interleaved, or of
 # the next MIXED_PAUSE packets of the kind MIXED.
@@ -70,7 +71,7 @@ def make_packet_walk(units: Units, any_hit: bool, accepts: Any) -> Any:
     mixed_children = make_children(any_hit, True) if any_hit else children
 
     @wp.func
-    def walk(accel: WideBvh, surfaces: Surfaces, scratch: Scratch, base: int, active: int) -> int:
+    def walk(accel: WideBvh, surfaces: Any, scratch: Scratch, base: int, active: int) -> int:
         """Trace the active rays; active: the result of set_up. Return TOGETHER, APART or STOPPED."""
         result = int(APART)
         nodes = int(0)
@@ -124,6 +125,7 @@ def make_interleaved(units: Units, any_hit: bool, accepts: Any) -> Any:
     The mask `waiting` has a bit for each ray to trace: bit LANES * packet + lane."""
     test_row = make_row_test(units, any_hit, accepts, True)  # Inlining makes closest hits 1.02 times, any hits 1.05 times as fast.
     begin, step, pop = make_steps(any_hit)
+    surfaces_type: Any = HitLists if units.lists else Surfaces
 
     @wp.func
     def start(accel: WideBvh, scratch: Scratch, slot: int, ray: int):
@@ -132,7 +134,7 @@ def make_interleaved(units: Units, any_hit: bool, accepts: Any) -> Any:
         prefetch_next(accel, begin(accel, scratch, slot, column))
 
     @wp.func
-    def turn(accel: WideBvh, surfaces: Surfaces, scratch: Scratch, slot: int) -> bool:
+    def turn(accel: WideBvh, surfaces: Any, scratch: Scratch, slot: int) -> bool:
         """Visit the node or leaf of a slot's ray, and choose the next one. Return False if the ray is finished."""
         words = slot * SLOT_SIZE
         reference = slot_at(scratch.slots, words + wp.static(SLOT["next"]))
@@ -154,7 +156,7 @@ def make_interleaved(units: Units, any_hit: bool, accepts: Any) -> Any:
         return True
 
     @noinline
-    def interleaved(accel: WideBvh, surfaces: Surfaces, scratch: Scratch, waiting: wp.uint64):
+    def interleaved(accel: WideBvh, surfaces: surfaces_type, scratch: Scratch, waiting: wp.uint64):
         live = int(0)
         slot = int(0)
         while slot < SLOTS and waiting != wp.uint64(0):
@@ -181,15 +183,13 @@ def make_interleaved(units: Units, any_hit: bool, accepts: Any) -> Any:
 def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accepts: Any = None) -> Any:
     """Return the kernel that traces the rays first .. end - 1 in a single thread, PACKETS packets at a time.
 
-    The kernel writes to `out` and to scratch.report. `out` is HitArrays or, with any_hit, an array of bool. With units.lists, which needs
-    any_hit, it is an array of two numbers for each ray: of crossings (units.triangle.is_crossed) and of other hits. All arrays must be
-    contiguous."""
+    The kernel writes to `out` and to scratch.report. `out` is HitArrays or, with any_hit, an array of bool. With units.lists it is
+    HitLists: these need any_hit, whose walk sorts no children, and HitLists.limit ends no walk. All arrays must be contiguous."""
     walk_packet = make_packet_walk(units, any_hit, accepts)
     interleaved = make_interleaved(units, any_hit, accepts)
     set_up = make_set_up(rays_struct, any_hit)
-    write, out_type = (write_occluded, wp.array(dtype=wp.bool)) if any_hit else (write_hits, HitArrays)
-    if units.lists:
-        write, out_type = write_counts, wp.array(dtype=wp.vec2i)
+    write = write_lists if units.lists else write_occluded if any_hit else write_hits
+    out_type: Any = HitLists if units.lists else wp.array(dtype=wp.bool) if any_hit else HitArrays
 
     @packet_kernel
     def trace(accel: WideBvh, surfaces: Surfaces, rays: rays_struct, out: out_type, scratch: Scratch, first: int, end: int):
@@ -204,6 +204,8 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
                 count = wp.min(end - block - LANES * p, LANES)
                 active = set_up(rays, block + LANES * p, count, wp.static(far_pad(units.box)), mixes, scratch, base)
                 store_bits(scratch.packets, base + ACTIVE, active)
+                if wp.static(units.lists):
+                    begin_lists(block + LANES * p, scratch, base)
                 if bits(scratch.packets, base + REFUSED) != 0:
                     put_int(scratch.report, ANY_REFUSED, 1)
             for p in range(packets):
@@ -213,16 +215,22 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
                 paused = slot_at(scratch.report, failed_at + wp.static(PAUSED - FAILED))
                 result = int(STOPPED)
                 if active >= COHERENT and paused == 0 and (mixes or active < MIXED):
-                    result = walk_packet(accel, surfaces, scratch, base, active)
+                    if wp.static(units.lists):
+                        result = walk_packet(accel, out, scratch, base, active)
+                    else:
+                        result = walk_packet(accel, surfaces, scratch, base, active)
                     count_walk(scratch, failed_at, result == TOGETHER)
                 else:
                     put_int(scratch.report, failed_at + wp.static(PAUSED - FAILED), wp.max(paused - 1, 0))
                 if result == STOPPED:
                     if wp.static(units.lists):
-                        clear_counts(scratch, base)  # the rays begin again
+                        begin_lists(block + LANES * p, scratch, base)  # the rays begin again
                     active = rays_meeting_root(accel, scratch, base, active & wp.static(COHERENT - 1))
                     single_rays = single_rays | (wp.uint64(active) << wp.uint64(LANES * p))
-            interleaved(accel, surfaces, scratch, single_rays)
+            if wp.static(units.lists):
+                interleaved(accel, out, scratch, single_rays)
+            else:
+                interleaved(accel, surfaces, scratch, single_rays)
             for p in range(packets):
                 write(out, block + LANES * p, wp.min(end - block - LANES * p, LANES), scratch, PACKET_SIZE * p)
 

@@ -135,20 +135,28 @@ template <bool ANY_HIT> WRT_INLINE int pop(const float* nodes, float reach, unsi
 }
 
 // Test the triangles of a row that are in the mask. Store the nearest hit in the ray's column; return its lane, or -1 on a miss. For an
-// any-hit ray that hits, store only t = -inf and prim_id = 0, and return 0. If hits are counted, return -1. SURE: look for sure_hits first.
-template <int GOAL, bool SURE = false> WRT_INLINE int ray_triangles_here(const float* row, int mask, float* column) {
+// any-hit ray that hits, store only t = -inf and prim_id = 0, and return 0. If hits are listed, return -1. SURE: look for sure_hits first.
+template <int GOAL, bool SURE = false, class Lists = NoLists>
+WRT_INLINE int ray_triangles_here(const float* row, int mask, float* column, const Lists& lists = {}) {
     const OneRay ray = {column};
     const LeafRow triangles = {{row}};
     const int axes = ray.bits(AXES);
     if ((mask &= mask_of(candidates<WIDTH>(triangles, ray, axes))) == 0) return -1;
-    const int sure = SURE ? mask & mask_of(sure_hits(triangles, ray, axes)) : 0;
+    const int sure = SURE && !needs_t<GOAL>(lists) ? mask & mask_of(sure_hits(triangles, ray, axes)) : 0;
     Hits<WIDTH> hit = {};
-    if (GOAL == COUNT_ALL ? sure != mask : sure == 0) hit = ray_triangle<WIDTH>(triangles, ray, axes, mask & ~sure);
+    if (GOAL == LIST_ALL ? sure != mask : sure == 0) hit = ray_triangle<WIDTH>(triangles, ray, axes, mask & ~sure);
     if ((hit.mask | sure) == 0) return -1;
-    if constexpr (GOAL == COUNT_ALL) {
-        const int crossings = sure | crossed<WIDTH>(triangles, triangle_ray(ray, axes), hit);
-        ray.put_bits(CROSSED, ray.bits(CROSSED) + __builtin_popcount(crossings));
-        ray.put_bits(TOUCHED, ray.bits(TOUCHED) + __builtin_popcount(hit.mask & ~crossings));
+    if constexpr (GOAL == LIST_ALL) {
+        const int listed = sure | (lists.crossings ? crossed<WIDTH>(triangles, triangle_ray(ray, axes), hit) : hit.mask);
+        int n = ray.bits(LISTED);
+        ray.put_bits(LISTED, n + __builtin_popcount(listed));
+        ray.put_bits(TOUCHED, ray.bits(TOUCHED) | (hit.mask & ~listed));
+        if (!needs_t<GOAL>(lists)) return -1;
+        for (int left = listed; left; left &= left - 1) {
+            const int k = lowest(left);
+            const double area = hit.area[k], area_1 = hit.areas[1][k], area_2 = hit.areas[2][k];
+            append(lists, column, n++, hit.t[k], (float)(area_1 / area), (float)(area_2 / area), triangles.prim_id()[k]);
+        }
         return -1;
     }
     if constexpr (GOAL == FIND_ANY) {
@@ -171,8 +179,9 @@ template <int GOAL, bool SURE = false> WRT_INLINE int ray_triangles_here(const f
 }
 
 // Call ray_triangles_here, without inlining, for a ray of a packet. It looks for sure_hits; interleaved rays would be 0.8 to 1.0 times as fast.
-template <int GOAL> WRT_CALLED int ray_triangles(const float* row, int mask, float* column) {
-    return ray_triangles_here<GOAL, GOAL != FIND_CLOSEST>(row, mask, column);
+template <int GOAL, class Lists = NoLists>
+WRT_CALLED int ray_triangles(const float* row, int mask, float* column, const Lists& lists = {}) {
+    return ray_triangles_here<GOAL, GOAL != FIND_CLOSEST>(row, mask, column, lists);
 }
 
 }  // namespace wrt

@@ -70,17 +70,18 @@ LINES = 5  # Number of cache lines to prefetch: a row of triangles has 5, a node
 
 # A packet is a block of floats. It begins with a vector of sixteen lanes for each field of a ray. The fields `turned` are the origin in
 # the axis order kx, ky, kz. The field `axes` has kx, ky, kz, with AXIS_BITS each. The fields `near` are indices of near planes in a node.
-# The field `margin` is only for any-hit rays (packet.h: sure_hits), `root` only for rays of several worlds (wide/instances.py).
+# The field `margin` is only for any-hit rays and lists (packet.h: sure_hits), `root` only for rays of several worlds (wide/instances.py) and
+# for lists, where it has the indices of the rays.
 FIELDS = ("origin_x", "origin_y", "origin_z", "inverse_x", "inverse_y", "inverse_z", "far_x", "far_y", "far_z", "t_min", "t",
           "direction_x", "direction_y", "direction_z", "turned_x", "turned_y", "turned_z", "shear_x", "shear_y", "shear_z",
           "axes", "u", "v", "prim_id", "scale", "near_x", "near_y", "near_z", "exclude", "margin", "root")
 FIELD = {name: LANES * i for i, name in enumerate(FIELDS)}  # Index in a packet of each field's first lane.
 AXIS_BITS = 2
 
-# The goal of a traversal: find each ray's closest hit, find any hit, or count all hits. A count stores in place of u and v the number of
-# crossings (units.triangle.is_crossed) and the number of other hits, as int32.
-FIND_CLOSEST, FIND_ANY, COUNT_ALL = range(3)
-CROSSED, TOUCHED = FIELD["u"], FIELD["v"]
+# The goal of a traversal: find each ray's closest hit, find any hit, or list all hits (kernels.hit_lists). In place of u and v, a packet
+# then has the number of listed hits, and a number that is not 0 if the ray touches triangles without crossing them.
+FIND_CLOSEST, FIND_ANY, LIST_ALL = range(3)
+LISTED, TOUCHED = FIELD["u"], FIELD["v"]
 
 # After the fields comes the beam: intervals that contain the origins and the reciprocal directions of all rays. Each entry has three
 # values, for x, y and z. Of all origins, near_origin is closest to the near planes, and far_origin to the far planes. Of all reciprocals,
@@ -125,7 +126,7 @@ _NUMBERS = {
     "LEAF_BITS": LEAF_BITS, "CACHE_LINE": CACHE_LINE, "LINES": LINES, "LEVEL": LEVEL, "LEVEL_REFERENCES": LEVEL_REFERENCES,
     "LEVEL_LEFT": LEVEL_LEFT, "KEY_MASK": KEY_MASK, "STACK_WORDS": STACK_WORDS, "SLOT_SIZE": SLOT_SIZE,
     "NODE_SIZE": node_size(WIDTH, False), "REFERENCES": first_reference(WIDTH, False),
-    "CROSSED": CROSSED, "TOUCHED": TOUCHED, "FIND_CLOSEST": FIND_CLOSEST, "FIND_ANY": FIND_ANY, "COUNT_ALL": COUNT_ALL,
+    "LISTED": LISTED, "TOUCHED": TOUCHED, "FIND_CLOSEST": FIND_CLOSEST, "FIND_ANY": FIND_ANY, "LIST_ALL": LIST_ALL,
     "PRIM_ID_ROW": PRIM_ID_ROW, "ROW_SIZE": ROW_SIZE, "NO_HIT": NO_HIT,
     "LARGEST": LARGEST, "FARTHEST": FARTHEST, "SHORTEST": SHORTEST, "LONGEST": LONGEST, "LENGTHEN": LENGTHEN, "SHORTEN": SHORTEN,
     "LENGTHEN_EXPONENT": math.frexp(LENGTHEN)[1] - 1,

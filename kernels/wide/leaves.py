@@ -1,7 +1,7 @@
 """Tests of a leaf's triangles and spheres, for packets and for interleaved rays (batch.py).
 
-A leaf has rows of up to WIDTH primitives. For one ray, all triangles of a row are tested at once. For a packet, each triangle is tested
-against all rays at once."""
+With Units.lists, the tests list all hits; their argument `surfaces` is then HitLists. A leaf has rows of up to WIDTH primitives. For one
+ray, all triangles of a row are tested at once. For a packet, each triangle is tested against all rays at once."""
 
 from typing import Any
 
@@ -12,12 +12,14 @@ from wrt.kernels.structs import NO_HIT, Hit, Surfaces
 from wrt.kernels.traverse.common import Probe, Units, make_better, sphere_hit
 from wrt.kernels.wide.lanes import bits, lowest
 from wrt.kernels.wide.lanes import value as number
-from wrt.kernels.wide.layout import COUNT_ALL, FIELD, FIND_ANY, FIND_CLOSEST, LANES, PRIM_ID_ROW, ROW_SIZE, WIDTH
+from wrt.kernels.wide.layout import FIELD, LANES, PRIM_ID_ROW, ROW_SIZE, WIDTH
 from wrt.kernels.wide.packets import (
     Scratch,
     WideBvh,
     count_of,
     keep_best,
+    list_triangles,
+    make_list_ray_triangles,
     make_ray_triangles,
     make_triangles,
     restore_best,
@@ -66,11 +68,6 @@ def store_best(packet: wp.array(dtype=wp.float32), ray: int, best: Hit):
     put_number(packet, ray + wp.static(FIELD["u"]), best.u)
     put_number(packet, ray + wp.static(FIELD["v"]), best.v)
     store_bits(packet, ray + wp.static(FIELD["prim_id"]), best.prim_id)
-
-
-def goal_of(units: Units, any_hit: bool) -> int:
-    """Return the goal of a traversal. Counting all hits (Units.lists) takes a traversal for any-hit rays, whose order is free."""
-    return COUNT_ALL if units.lists else FIND_ANY if any_hit else FIND_CLOSEST
 
 
 def make_sphere_test(units: Units, any_hit: bool, accepts: Any) -> Any:
@@ -122,11 +119,12 @@ def make_accepted(any_hit: bool, accepts: Any, ray_triangles: Any) -> Any:
 def make_row_test(units: Units, any_hit: bool, accepts: Any, inlined: bool) -> Any:
     """Return test_row, which tests the first `count` primitives of a row against one ray.
     It returns whether the ray is finished: for any-hit rays, whether the ray hits a primitive; else False."""
-    ray_triangles = make_ray_triangles(goal_of(units, any_hit and accepts is None), inlined)
+    ray_triangles = make_ray_triangles(any_hit and accepts is None, inlined)
+    list_ray_triangles = make_list_ray_triangles(inlined)
     test_spheres, nearest_accepted = make_sphere_test(units, any_hit, accepts), make_accepted(any_hit, accepts, ray_triangles)
 
     @wp.func
-    def test_row(accel: WideBvh, first: int, count: int, surfaces: Surfaces, scratch: Scratch, ray: int) -> bool:
+    def test_row(accel: WideBvh, first: int, count: int, surfaces: Any, scratch: Scratch, ray: int) -> bool:
         mask = (2 << (count - 1)) - 1
         if wp.static(units.spheres):
             spheres = spheres_of(accel, first, mask, surfaces.n_triangles)
@@ -134,7 +132,10 @@ def make_row_test(units: Units, any_hit: bool, accepts: Any, inlined: bool) -> A
                 if test_spheres(accel, first, spheres, surfaces, scratch, ray):
                     return True
                 mask = mask & ~spheres
-        if wp.static(accepts is None):
+        if wp.static(units.lists):
+            list_ray_triangles(accel, first, mask, surfaces, scratch, ray)
+            return False
+        elif wp.static(accepts is None):
             return ray_triangles(accel, first, mask, scratch, ray) >= 0 and wp.static(any_hit)
         else:
             return nearest_accepted(accel, first, mask, surfaces, scratch, ray)
@@ -174,10 +175,10 @@ def make_accepted_in_lanes(any_hit: bool, accepts: Any, test_row: Any) -> Any:
 def make_packet_leaf(units: Units, any_hit: bool, accepts: Any) -> Any:
     """Return test_leaf, which tests a leaf against the packet's rays in its argument `mask`: all at once, or one by one (FEW_RAYS)."""
     test_row = make_row_test(units, any_hit, accepts, False)
-    triangles, accepted_in_lanes = make_triangles(goal_of(units, any_hit)), make_accepted_in_lanes(any_hit, accepts, test_row)
+    triangles, accepted_in_lanes = make_triangles(any_hit), make_accepted_in_lanes(any_hit, accepts, test_row)
 
     @wp.func
-    def test_leaf(accel: WideBvh, surfaces: Surfaces, reference: int, mask: int, scratch: Scratch, base: int):
+    def test_leaf(accel: WideBvh, surfaces: Any, reference: int, mask: int, scratch: Scratch, base: int):
         left = leaf_count(reference)
         first = leaf_first(reference) * ROW_SIZE
         while left > 0 and mask != 0:
@@ -187,7 +188,9 @@ def make_packet_leaf(units: Units, any_hit: bool, accepts: Any) -> Any:
                 lanes = lanes and spheres_of(accel, first, (2 << (n - 1)) - 1, surfaces.n_triangles) == 0
             if lanes:
                 found = int(0)
-                if wp.static(accepts is None):
+                if wp.static(units.lists):
+                    list_triangles(accel, first, n, mask, surfaces, scratch, base)
+                elif wp.static(accepts is None):
                     found = triangles(accel, first, n, mask, scratch, base)
                 else:
                     found = accepted_in_lanes(accel, surfaces, first, n, mask, scratch, base)

@@ -246,22 +246,47 @@ WRT_INLINE int rays_meeting_root(const float* root, int mask, float* packet) {
 // Return the mask of the rays whose t is at least t_entry.
 WRT_INLINE int rays_reaching(float t_entry, float* packet) { return mask_of(AllRays{packet}[T] >= t_entry); }
 
-// Test a triangle against N rays of a packet, the candidates in the lanes of `mask`, and store hits; return their mask. Counted hits are not
+struct NoLists {};
+
+// Return whether the traversal needs t of hits, and not only their number.
+template <int GOAL, class Lists> WRT_INLINE bool needs_t(const Lists& lists) {
+    if constexpr (GOAL == LIST_ALL) return lists.rows.data != nullptr;
+    return GOAL == FIND_CLOSEST;
+}
+
+// Store hit n of a ray in the list of the ray, if it has room (hit_lists.py: HitLists); column: where the ray's fields begin.
+template <class Lists> WRT_INLINE void append(const Lists& lists, const float* column, int n, float t, float u, float v, int prim_id) {
+    const int ray = load<int>(column + ROOT), row = lists.first.data[ray] + n;
+    if (row >= lists.first.data[ray + 1]) return;
+    lists.rows.data[row].t = t;
+    lists.rows.data[row].u = u;
+    lists.rows.data[row].v = v;
+    lists.rows.data[row].prim_id = prim_id;
+}
+
+// Test a triangle against N rays of a packet, the candidates in the lanes of `mask`, and store hits; return their mask. Listed hits are not
 // in the result.
-template <int N, int GOAL, class Axes>
-WRT_INLINE int test(const Triangle<N>& triangle, const SomeRays<N>& rays, Axes axes, int mask) {
+template <int N, int GOAL, class Axes, class Lists>
+WRT_INLINE int test(const Triangle<N>& triangle, const SomeRays<N>& rays, Axes axes, int mask, const Lists& lists) {
     typedef typename Lanes<N>::Floats Floats;
     typedef typename Lanes<N>::Ints Ints;
-    const int sure = GOAL == FIND_CLOSEST ? 0 : mask & mask_of(sure_hits(triangle, rays, axes));
+    const int sure = needs_t<GOAL>(lists) ? 0 : mask & mask_of(sure_hits(triangle, rays, axes));
     Hits<N> hit = {};
     if (sure != mask) hit = ray_triangle<N>(triangle, rays, axes, mask & ~sure);
     const int found = hit.mask | sure;
     if (found == 0) return 0;
     const Ints on = in_mask<Ints>(found);
-    if constexpr (GOAL == COUNT_ALL) {
-        const int crossings = sure | crossed<N>(triangle, triangle_ray(rays, axes), hit);
-        rays.put_bits(CROSSED, rays.bits(CROSSED) - in_mask<Ints>(crossings));
-        rays.put_bits(TOUCHED, rays.bits(TOUCHED) - in_mask<Ints>(hit.mask & ~crossings));
+    if constexpr (GOAL == LIST_ALL) {
+        const int listed = sure | (lists.crossings ? crossed<N>(triangle, triangle_ray(rays, axes), hit) : hit.mask);
+        const Ints before = rays.bits(LISTED);
+        rays.put_bits(LISTED, before - in_mask<Ints>(listed));
+        rays.put_bits(TOUCHED, rays.bits(TOUCHED) | in_mask<Ints>(hit.mask & ~listed));
+        if (!needs_t<GOAL>(lists)) return 0;
+        const auto u = narrowed<N>(hit.areas[1] / hit.area), v = narrowed<N>(hit.areas[2] / hit.area);
+        for (int left = listed; left; left &= left - 1) {
+            const int k = lowest(left);
+            append(lists, rays.rows + k, before[k], hit.t[k], u[k], v[k], triangle.id());
+        }
         return 0;
     }
     rays.put(T, on ? (GOAL == FIND_ANY ? all<Floats>(-__builtin_inff()) : hit.t) : rays[T]);
@@ -275,8 +300,8 @@ WRT_INLINE int test(const Triangle<N>& triangle, const SomeRays<N>& rays, Axes a
 
 // Test the first `count` triangles of a row, one after another, against the rays of the mask, which have the same axes; return the mask of
 // the rays that hit a triangle. The rays of one register are tested at a time: the values of more do not fit into sixteen registers.
-template <int GOAL, class Axes>
-WRT_INLINE int triangles_along(Axes axes, const float* row, int count, int mask, float* numbers) {
+template <int GOAL, class Axes, class Lists>
+WRT_INLINE int triangles_along(Axes axes, const float* row, int count, int mask, float* numbers, const Lists& lists) {
     constexpr int PARTS = LANES / REGISTER, FULL = (1 << REGISTER) - 1;
     int found = 0;
     for (int j = 0; j < count; ++j) {
@@ -285,7 +310,7 @@ WRT_INLINE int triangles_along(Axes axes, const float* row, int count, int mask,
         for (int k = 0; k < PARTS; ++k) {
             const SomeRays<REGISTER> rays = {numbers + REGISTER * k};
             const int left = mask_of(candidates<REGISTER>(triangle, rays, axes)) & mask >> REGISTER * k & FULL;
-            if (left) hits |= test<REGISTER, GOAL>(triangle, rays, axes, left) << REGISTER * k;
+            if (left) hits |= test<REGISTER, GOAL>(triangle, rays, axes, left, lists) << REGISTER * k;
         }
         found |= hits;
         if (GOAL == FIND_ANY && (mask &= ~hits) == 0) break;
@@ -295,14 +320,15 @@ WRT_INLINE int triangles_along(Axes axes, const float* row, int count, int mask,
 
 // Test the first `count` triangles of a row against the rays of the mask; return the mask of the rays that hit a triangle. In any-hit rays
 // that hit, t becomes -inf. Rays with the same axes are tested together, so that corners need no selection by ray: mostly, these are all.
-template <int GOAL> WRT_CALLED int triangles(const float* row, int count, int mask, float* numbers) {
+template <int GOAL, class Lists = NoLists>
+WRT_CALLED int triangles(const float* row, int count, int mask, float* numbers, const Lists& lists = {}) {
     const AllRays packet = {numbers};
-    if constexpr (REGISTER == LANES) return triangles_along<GOAL>(packet.bits(AXES), row, count, mask, numbers);
+    if constexpr (REGISTER == LANES) return triangles_along<GOAL>(packet.bits(AXES), row, count, mask, numbers, lists);
     int found = 0;
     while (mask) {
         const int axes = load<int>(numbers + AXES + lowest(mask));
         const int along = mask & mask_of(packet.bits(AXES) == axes);
-        found |= triangles_along<GOAL>(axes, row, count, along, numbers);
+        found |= triangles_along<GOAL>(axes, row, count, along, numbers, lists);
         mask &= ~along;
     }
     return found;
@@ -340,15 +366,11 @@ template <class HitArrays> WRT_INLINE void write_hits(const HitArrays& hits, int
     }
 }
 
-// Set the counts of hits of all rays to 0.
-WRT_INLINE void clear_counts(float* numbers) {
-    store(numbers + CROSSED, RayInts{});
+// Make the lists of all rays of a packet empty; first: index of its first ray.
+WRT_INLINE void begin_lists(int first, float* numbers) {
+    store(numbers + LISTED, RayInts{});
     store(numbers + TOUCHED, RayInts{});
-}
-
-// Write the numbers of crossings and of touches of `count` rays.
-template <class Pair> WRT_INLINE void write_counts(Pair* counts, int count, float* numbers) {
-    for (int j = 0; j < count; ++j) counts[j] = {load<int>(numbers + CROSSED + j), load<int>(numbers + TOUCHED + j)};
+    for (int j = 0; j < LANES; ++j) store(numbers + ROOT + j, first + j);
 }
 
 WRT_INLINE void write_occluded(bool* occluded, int count, float* numbers) {

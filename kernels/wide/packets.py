@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import warp as wp
 
 from wrt.kernels.headers import with_headers
+from wrt.kernels.hit_lists import TOUCHES, HitLists, sort_and_trim
 from wrt.kernels.query import HitArrays, RenderRays
 from wrt.kernels.structs import Primitive, kernel
-from wrt.kernels.wide.layout import ENTRY, ENTRY_RAYS, LAYOUT_H, SLOT_SIZE, STACK_WORDS
+from wrt.kernels.wide.lanes import bits
+from wrt.kernels.wide.layout import ENTRY, ENTRY_RAYS, LAYOUT_H, LISTED, SLOT_SIZE, STACK_WORDS, TOUCHED
 from wrt.kernels.wide.traverse import make_struct
 
 WideBvh = make_struct(Primitive)
@@ -103,9 +105,14 @@ def make_triangles(goal: int) -> Any:
     def triangles(accel: WideBvh, first: int, count: int, mask: int, scratch: Scratch, base: int) -> int:
         """Test the first `count` triangles of a row against the rays of the mask; return the mask of rays that hit a triangle.
 
-        goal FIND_ANY: t of rays that hit a triangle becomes -inf. COUNT_ALL: the result is 0."""
+        goal FIND_ANY: t of rays that hit a triangle becomes -inf."""
 
     return triangles
+
+
+@wp.func_native("wrt::triangles<wrt::LIST_ALL>(accel.primitives.data + first, count, mask, scratch.packets.data + base, lists);")
+def list_triangles(accel: WideBvh, first: int, count: int, mask: int, lists: HitLists, scratch: Scratch, base: int) -> None:
+    """List all hits of the first `count` triangles of a row by the rays of the mask."""
 
 
 @wp.func_native("wrt::keep_best(scratch.packets.data + base, (float*)scratch.slots.data);")
@@ -126,12 +133,22 @@ def write_hits(hits: HitArrays, first: int, count: int, scratch: Scratch, base: 
 def write_occluded(occluded: wp.array(dtype=wp.bool), first: int, count: int, scratch: Scratch, base: int) -> None: ...
 
 
-@wp.func_native("wrt::clear_counts(scratch.packets.data + base);")
-def clear_counts(scratch: Scratch, base: int) -> None: ...
+@wp.func_native("wrt::begin_lists(first, scratch.packets.data + base);")
+def begin_lists(first: int, scratch: Scratch, base: int) -> None:
+    """Make the lists of a packet's rays empty; first: index of its first ray in HitLists."""
 
 
-@wp.func_native("wrt::write_counts(counts.data + first, count, scratch.packets.data + base);")
-def write_counts(counts: wp.array(dtype=wp.vec2i), first: int, count: int, scratch: Scratch, base: int) -> None: ...
+@wp.func
+def write_lists(lists: HitLists, first: int, count: int, scratch: Scratch, base: int):
+    """Sort the lists of `count` rays that have room for all hits, and store HitLists.count."""
+    for j in range(count):
+        n = bits(scratch.packets, base + j + LISTED)
+        if n == 0 and bits(scratch.packets, base + j + TOUCHED) != 0:
+            n = TOUCHES
+        row = lists.first[first + j]
+        if n > 1 and n <= lists.first[first + j + 1] - row:
+            n = sort_and_trim(lists.rows, row, n, lists.limit)
+        lists.count[first + j] = n
 
 
 @wp.func_native(f"return wrt::load<wp::uint64>(stacks.data + {ENTRY} * i);")
@@ -186,9 +203,20 @@ def make_ray_triangles(goal: int, inlined: bool) -> Any:
     def ray_triangles(accel: WideBvh, first: int, mask: int, scratch: Scratch, ray: int) -> int:
         """Test the triangles in the mask of a row. Store the nearest hit in the ray's column; return the triangle's lane, or -1 on a miss.
 
-        goal FIND_ANY: the result tells only hit (0) or miss (-1), and u and v are not set. COUNT_ALL: the result is -1."""
+        goal FIND_ANY: the result tells only hit (0) or miss (-1), and u and v are not set."""
 
     return ray_triangles
+
+
+@cache
+def make_list_ray_triangles(inlined: bool) -> Any:
+    name = "ray_triangles_here" if inlined else "ray_triangles"
+
+    @wp.func_native(f"wrt::{name}<wrt::LIST_ALL>(accel.primitives.data + first, mask, scratch.packets.data + ray, lists);")
+    def list_ray_triangles(accel: WideBvh, first: int, mask: int, lists: HitLists, scratch: Scratch, ray: int) -> None:
+        """List all hits of the triangles in the mask of a row by one ray."""
+
+    return list_ray_triangles
 
 
 @wp.func_native("wrt::prefetch(accel.nodes.data, accel.primitives.data, reference);")

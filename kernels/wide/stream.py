@@ -24,7 +24,7 @@ class BatchTraversal(WideTraversal):
 
     def make_stream(self, units: Units, any_hit: bool, rays_struct: Any = RayArrays, accepts: Any = None) -> Any:
         """Return the kernel of batch.make_kernel or instances.make_kernel, or None if the units have no vectorised form.
-        Instances have none for cut-outs and counts. They have none for other box tests, whose rounding kernels.traverse.instances.enter
+        Instances have none for cut-outs and lists. They have none for other box tests, whose rounding kernels.traverse.instances.enter
         does not cover."""
         if units.triangle != "watertight" or units.box not in ROW_PADS or units.counters or units.resumes:
             return None

@@ -33,8 +33,15 @@ struct HitArrays {
     Array<int> prim_id;
 };
 
-struct Pair {
-    int crossings, others;
+struct Hit {
+    float t, u, v;
+    int prim_id;
+};
+
+struct HitLists {
+    bool crossings;
+    Array<int> first;
+    Array<Hit> rows;
 };
 
 struct Case {
@@ -51,13 +58,14 @@ int leaf_count(int reference) { return ((-1 - reference) & ((1 << LEAF_BITS) - 1
 
 template <int GOAL> class Walk {
 public:
-    explicit Walk(Case& c) : given(c), packet(PACKET_SIZE), stack(STACK_WORDS), slot(SLOT_SIZE) {}
+    explicit Walk(Case& c, HitLists out = {}) : given(c), lists(out), packet(PACKET_SIZE), stack(STACK_WORDS), slot(SLOT_SIZE) {}
 
     // Trace the rays first .. first + count - 1: as one packet if `together` and their bounds form a beam, else one by one.
     void trace(int first, int count, bool together) {
         RayArrays rays = {{(Vector*)given.origins.data(), {12}}, {(Vector*)given.directions.data(), {12}},
                           {given.t_mins.data(), {given.t_mins.size() == 1 ? 0 : 4}}, {given.t_maxs.data(), {4}}};
         const int state = set_up<true, UNORDERED>(pointers_to(rays, first, given.excludes.data() + first), count, FAR, true, packet.data());
+        if (GOAL == LIST_ALL) begin_lists(first, packet.data());
         if (state >= COHERENT && together) {
             walk_packet(state);
         } else {
@@ -68,7 +76,7 @@ public:
 
     void write(HitArrays hits, int first, int count) { write_hits(hits, first, count, packet.data()); }
     void write(bool* occluded, int count) { write_occluded(occluded, count, packet.data()); }
-    void write(Pair* counts, int count) { write_counts(counts, count, packet.data()); }
+    void write(int* listed, int count) { memcpy(listed, packet.data() + LISTED, count * sizeof(int)); }
 
 private:
     static constexpr bool UNORDERED = GOAL != FIND_CLOSEST;
@@ -99,10 +107,10 @@ private:
         for (int left = leaf_count(reference); left > 0; left -= WIDTH, row += ROW_SIZE) {
             const int n = left < WIDTH ? left : WIDTH;
             if (mask & 1) {  // cover both forms: rays in lanes, and ray by ray
-                mask &= ~(triangles<GOAL>(row, n, mask, packet.data()) & (GOAL == FIND_ANY ? ~0 : 0));
+                mask &= ~(triangles<GOAL>(row, n, mask, packet.data(), lists) & (GOAL == FIND_ANY ? ~0 : 0));
             } else {
                 for (int rays = mask; rays; rays &= rays - 1)
-                    ray_triangles<GOAL>(row, (2 << (n - 1)) - 1, packet.data() + lowest(rays));
+                    ray_triangles<GOAL>(row, (2 << (n - 1)) - 1, packet.data() + lowest(rays), lists);
             }
         }
     }
@@ -117,7 +125,8 @@ private:
             }
             const float* row = given.primitives.data() + leaf_first(next) * ROW_SIZE;
             for (int left = leaf_count(next); left > 0; left -= WIDTH, row += ROW_SIZE) {
-                const int lane = ray_triangles_here<GOAL>(row, (2 << ((left < WIDTH ? left : WIDTH) - 1)) - 1, packet.data() + ray);
+                const int n = left < WIDTH ? left : WIDTH;
+                const int lane = ray_triangles_here<GOAL>(row, (2 << (n - 1)) - 1, packet.data() + ray, lists);
                 if (GOAL == FIND_ANY && lane >= 0) return;
             }
             next = pop<UNORDERED>(given.nodes.data(), packet[ray + T], stack.data(), 0, slot.data());
@@ -125,6 +134,7 @@ private:
     }
 
     Case& given;
+    HitLists lists;
     std::vector<float> packet;
     std::vector<unsigned> stack;
     std::vector<int> slot;
@@ -134,28 +144,32 @@ private:
 bool agrees(Case& c, int most, bool together) {
     std::vector<float> t(c.rays), u(c.rays), v(c.rays);
     std::vector<int> prim_id(c.rays);
-    std::vector<Pair> counts(c.rays);
+    std::vector<int> crossings(c.rays), hits(c.rays), no_room(c.rays + 1), first_row(c.rays + 1);
+    for (int i = 0; i <= c.rays; ++i) first_row[i] = 2 * i;
+    std::vector<Hit> rows(2 * c.rays);
     bool* const occluded = new bool[c.rays];
     Walk<FIND_CLOSEST> closest(c);
     Walk<FIND_ANY> any(c);
-    Walk<COUNT_ALL> all(c);
+    Walk<LIST_ALL> crossed(c, {true, {no_room.data(), {4}}, {nullptr, {16}}}), all(c, {false, {first_row.data(), {4}}, {rows.data(), {16}}});
     for (int first = 0; first < c.rays; first += most) {
         const int count = c.rays - first < most ? c.rays - first : most;
         closest.trace(first, count, together);
         closest.write({{t.data(), {4}}, {u.data(), {4}}, {v.data(), {4}}, {prim_id.data(), {4}}}, first, count);
         any.trace(first, count, together);
         any.write(occluded + first, count);
+        crossed.trace(first, count, together);
+        crossed.write(crossings.data() + first, count);
         all.trace(first, count, together);
-        all.write(counts.data() + first, count);
+        all.write(hits.data() + first, count);
     }
     int wrong = 0;
     for (int i = 0; i < c.rays; ++i) {
         const bool same = !memcmp(&t[i], &c.t[i], 4) && !memcmp(&u[i], &c.u[i], 4) && !memcmp(&v[i], &c.v[i], 4)
                           && prim_id[i] == c.prim_id[i] && occluded[i] == (c.occluded[i] != 0)
-                          && counts[i].crossings == c.crossings[i] && counts[i].crossings + counts[i].others == c.hits[i];
+                          && crossings[i] == c.crossings[i] && hits[i] == c.hits[i];
         if (!same && wrong++ < 3)
-            printf("    ray %d: triangle %d at %.9g, any %d, %d and %d hits; one ray at a time: %d at %.9g, any %d, %d of %d hits\n", i,
-                   prim_id[i], t[i], occluded[i], counts[i].crossings, counts[i].others, c.prim_id[i], c.t[i], c.occluded[i],
+            printf("    ray %d: triangle %d at %.9g, any %d, %d of %d hits; one ray at a time: %d at %.9g, any %d, %d of %d hits\n", i,
+                   prim_id[i], t[i], occluded[i], crossings[i], hits[i], c.prim_id[i], c.t[i], c.occluded[i],
                    c.crossings[i], c.hits[i]);
     }
     delete[] occluded;

@@ -120,7 +120,7 @@ class RayFormat:
         return _traced(accel, self.converted(arrays, threads, *inputs).between(ends), threads, ANY_HIT_TYPES)[0]
 
     def few_counts(self, snapshot: Snapshot, arrays: tuple[np.ndarray, ...], *inputs: object) -> np.ndarray | None:
-        """Convert at most SMALL rays and return their numbers of crossings and of other hits, (N, 2); None without all_hits.counter_of."""
+        """Convert at most SMALL rays and return HitLists.count for crossings, (N,) int32; None without all_hits.counter_of."""
         counter = counter_of(snapshot) if len(arrays[0]) <= SMALL else None
         return None if counter is None else self._few(snapshot, counter, arrays, inputs)[0]
 

@@ -30,13 +30,13 @@ def every_hit(accel: Accelerator, rays: GivenRays, threads: int, limit: int = AL
 
 def hit_counts(accel: Accelerator, form: RayFormat, arrays: tuple[np.ndarray, ...], threads: int, *inputs: object) -> np.ndarray:
     """Return the number of hits of each ray in `every_hit`, (N,) of integers. arrays, inputs: see RayFormat.converted."""
-    if (few := form.few_counts(accel.snapshot, arrays, *inputs)) is not None:
-        counts, rest = few[:, 0], np.flatnonzero(few[:, 1])
+    counts = form.few_counts(accel.snapshot, arrays, *inputs)
+    if counts is not None:
+        rest = np.flatnonzero(counts < 0)
     else:
         query = ListQuery(accel, threads, crossings=True).of_valid(form.converted(arrays, threads, *inputs).rays)
         counts, rest = query.counts(), np.flatnonzero(query.touches)
     if len(rest):
-        rest = rest[counts[rest] == 0]
         rays = form.converted(tuple(array[rest] for array in arrays), threads, *inputs)
         counts[rest] = (_touched(accel, rays, threads).prim_id >= 0).sum(axis=1)
     return counts

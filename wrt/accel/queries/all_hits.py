@@ -13,8 +13,8 @@ import warp as wp
 from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.queries.accelerator import Accelerator, WorldOptions, snapshot_of
 from wrt.accel.queries.answers import Hits
-from wrt.accel.queries.batches import Query, Tracer, counter
-from wrt.accel.queries.few_lists import MOST, FewLists, Mesh, begins
+from wrt.accel.queries.batches import Tracer, lister
+from wrt.accel.queries.few_lists import ALL, MOST, FewLists, Mesh, begins
 from wrt.accel.queries.hit_points import device_scene
 from wrt.accel.queries.part_faces import part_faces
 from wrt.accel.queries.raw_kernel import RawKernel, kernel_memory
@@ -33,8 +33,6 @@ from wrt.kernels.hit_lists import FEW, HitLists, copy_hits, make_list_hit, make_
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import Hit
 
-ALL = (1 << 30) - 1
-FEW_COUNTED = 64  # Up to this number of rays, lists of buffers that are kept are faster than a tracer.
 RAYS_AT_ONCE = 1 << 18  # rays per batch; their hit lists take 32 MiB in the first traversal
 HIT_KINDS = wp.float32, wp.float32, wp.float32, wp.int32  # of HitArrays
 T = TypeVar("T")
@@ -96,7 +94,7 @@ class _Lists(NamedTuple):
     first_face: WarpArray | None
     first: Array
     counts: Array
-    rows: Array
+    rows: Array | None
     root: Array | None = None
     scale: Array | None = None
     to_face: Array | None = None
@@ -177,18 +175,9 @@ class ListQuery:
 
     def counts(self) -> np.ndarray:
         """Count the hits of each ray, (N,) int64. If no triangle is in several leaves, one traversal is enough."""
-        if self.n > FEW_COUNTED and (tracer := counter_of(self.snapshot)) is not None:
-            found = np.empty((self.n, 2), np.int32)
-            tracer.trace(self.snapshot, Query(self.rays, [found], self.threads))
-            crossed, others = found.T
-            if not self.crossings:
-                return crossed.astype(np.int64) + others
-            self.touches = (crossed == 0) & (others > 0)
-            return crossed.astype(np.int64)
         if (few := self._few(ALL, lambda lists, counts: counts)) is not None:
             return few
-        counting = stores_once(self.snapshot)
-        return np.concatenate([np.zeros(0, np.int64), *(of_each for _, _, of_each in self._listed(ALL, counting))])
+        return np.concatenate([np.zeros(0, np.int64), *(of_each for _, _, of_each in self._listed(ALL, stores_once(self.snapshot)))])
 
     def converted(self, values: np.ndarray) -> Array:
         """Convert int64 values to an array of the caller's library."""
@@ -221,7 +210,7 @@ class ListQuery:
             n = min(RAYS_AT_ONCE, self.n - begin)
             rays = self.memory.struct(RayArrays, *(array[begin:begin + n] for array in self.rays))
             roots = None if self.roots is None else self.memory.array(self.roots[begin:begin + n], wp.int32)
-            few = self._filled(rays, roots, (1 if counting else FEW) * np.arange(n + 1), limit, counting)
+            few = self._first_filled(rays, roots, n, limit, counting)
             lists, counts = [few], self._noted(self.memory.numpy(few.counts), begin)
             if counts.max() > FEW and not counting:
                 many = counts > FEW
@@ -229,6 +218,17 @@ class ListQuery:
                 lists.append(self._filled(rays, roots, begins(np.where(many, np.minimum(counts, 2 * limit), 0)), limit))
                 counts = np.where(many, self.memory.numpy(lists[1].counts), counts)
             yield rays, lists, counts
+
+    def _first_filled(self, rays: object, roots: Array | None, n: int, limit: int, counting: bool) -> _Lists:
+        """Return lists of n rays with room for FEW hits each or, if `counting`, for as few as possible."""
+        tracer = lister(self.snapshot.structure) if limit == ALL and self.device.is_cpu else None
+        if tracer is None:
+            return self._filled(rays, roots, (1 if counting else FEW) * np.arange(n + 1), limit, counting)
+        first = np.arange(0, FEW * n + 1, FEW, dtype=np.int32) if not counting else np.zeros(n + 1, np.int32)
+        rows = None if counting else self.memory.empty(FEW * n, Hit)
+        lists = _Lists(limit, self.crossings, *self.mesh, first, np.empty(n, np.int32), rows)
+        tracer.launch(self.snapshot, (rays, self.memory.struct(HitLists, *lists)), n, self.threads)
+        return lists
 
     def _filled(self, rays: object, roots: Array | None, first: np.ndarray, limit: int, counting: bool = False) -> _Lists:
         """Traverse the structure and return lists of hits. The list of ray i has the rows first[i] .. first[i + 1] - 1."""
@@ -262,8 +262,8 @@ def stores_once(snapshot: Snapshot) -> bool:
 
 
 def counter_of(snapshot: Snapshot) -> Tracer | None:
-    """Return the tracer that counts hits for many rays at a time (batches.counter), or None if hits must be listed to count them."""
-    return counter(snapshot.structure) if snapshot.device.is_cpu and stores_once(snapshot) else None
+    """Return the tracer that counts hits without room for them (batches.lister), or None if the structure has none."""
+    return lister(snapshot.structure) if snapshot.device.is_cpu and stores_once(snapshot) else None
 
 
 @made_once
@@ -279,7 +279,7 @@ def list_hits(structure: Structure, ordered: bool) -> RawKernel:
 @made_once
 def few_lists(structure: Structure) -> FreeList[FewLists]:
     """Return the FewLists of a structure that no thread uses now."""
-    return FreeList(lambda: FewLists(list_hits(structure, True), COPY_HITS))
+    return FreeList(lambda: FewLists(list_hits(structure, True), COPY_HITS, lister(structure)))
 
 
 @overload

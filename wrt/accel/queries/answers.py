@@ -25,7 +25,7 @@ from wrt.core.types import Array, ArrayT, Device, PathLike, TensorT, WarpArray
 
 HIT_TYPES = {"out.t": np.float32, "out.u": np.float32, "out.v": np.float32, "out.prim_id": np.int32}
 ANY_HIT_TYPES = {"out": np.bool_}
-COUNT_TYPES = {"out": np.dtype((np.int32, 2))}  # of each ray: numbers of crossings and of other hits
+COUNT_TYPES = {"out.count": np.int32}  # of kernels.hit_lists.HitLists
 
 
 @dataclass(frozen=True, eq=False)

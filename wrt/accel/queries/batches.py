@@ -19,6 +19,7 @@ from wrt.core.device import empty_aligned, launch_on, made_once, memory_of
 from wrt.core.threads import FreeList, run_all
 from wrt.core.types import Array, Device, Kernel, KernelModule, WarpStruct, WarpType
 from wrt.core.warp_private import array_record, record_of, struct_record
+from wrt.kernels.hit_lists import HitLists
 from wrt.kernels.query import HitArrays, RayArrays, WorldRays
 from wrt.kernels.structs import Surfaces
 from wrt.kernels.warp_private import fields_of
@@ -33,6 +34,7 @@ BYTES_OF_RAY = 48  # A ray and its hit.
 FITS_ANY_GPU = 1 << 20  # Up to this number of rays, the free memory of the GPU is not queried.
 MOST_PACKED = (1 << 31) - 64  # rays: kernels index in int32, and their last block may exceed the range.
 BUFFERED = 16384  # Rays in a worker's buffers, and in a launch of tiles: 640 KB, which stay in the core's cache.
+NO_ROOM = np.zeros(BUFFERED + 1, np.int32)  # HitLists.first, for lists that only count
 SMALL = 1024  # Up to this number of rays, a copy is faster than kernel records of the caller's arrays.
 
 
@@ -88,8 +90,18 @@ class Tracer:
         self.block = stream.stream_block if self.stream else 1
         self.sizes = stream.stream_sizes if self.stream else ()
         self.types = COUNT_TYPES if structure.units.lists else ANY_HIT_TYPES if any_hit else HIT_TYPES
-        self.inputs = structure.struct(), Surfaces(), self.rays(), None if any_hit else HitArrays()
+        self.out = HitLists if structure.units.lists else None if any_hit else HitArrays
+        self.inputs = structure.struct(), Surfaces(), self.rays(), self.out and self.out()
         self.workers = FreeList(lambda: Worker(self))
+
+    def launch(self, snapshot: Snapshot, packed: tuple[Any, Any], n: int, threads: int) -> None:
+        """Trace n valid rays. packed: kernel records of the rays and of the results. The caller keeps the arrays."""
+        def job(first: int, end: int) -> None:
+            worker = self.workers.take()
+            worker.launch(snapshot, packed, first, end)
+            self.workers.give(worker)
+
+        run_all([partial(job, *each) for each in parts(n, threads, self.block)], threads)
 
     def trace(self, snapshot: Snapshot, query: Query) -> None:
         """Trace on the CPU, as trace_query does. The rays are checked before tracing, or by a kernel that traces many rays at a time."""
@@ -133,11 +145,11 @@ tracer, world_tracer = made_once(Tracer), made_once(partial(Tracer, rays=WorldRa
 
 
 @made_once
-def counter(structure: Structure) -> Tracer | None:
-    """Return a tracer that counts all hits on the CPU, or None if the structure has no kernel that counts for many rays at a time."""
-    counting = structure._replace(units=structure.units._replace(lists=True))
+def lister(structure: Structure) -> Tracer | None:
+    """Return a tracer that lists all hits on the CPU, or None if the structure has no kernel that lists for many rays at a time."""
+    listing = structure._replace(units=structure.units._replace(lists=True))
     stream: KernelModule = structure.accel.stream
-    return tracer(counting, True) if stream and stream.make_stream(counting.units, True) else None
+    return tracer(listing, True) if stream and stream.make_stream(listing.units, True) else None
 
 
 @made_once
@@ -166,6 +178,8 @@ class Worker:
         if tracer.rays is WorldRays:
             self.rays.append(np.empty(BUFFERED, np.int32))
         self.packed = pack(tracer.rays, self.rays, self.results)
+        if tracer.out is HitLists:  # of crossings, without room
+            self.packed = self.packed[0], struct_record(HitLists, [0, True, None, None, None, NO_ROOM, *self.results])
         self.block, self.scratch = tracer.block, new_scratch(tracer.sizes)
         self.report = self.scratch.report.numpy() if tracer.stream else np.zeros(REPORT_SIZE, np.int32)
         own = [self.scratch, 0] if tracer.stream else []

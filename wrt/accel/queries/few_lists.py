@@ -5,7 +5,7 @@ from typing import TypeAlias
 import numpy as np
 
 from wrt.accel.queries.answers import HIT_TYPES
-from wrt.accel.queries.batches import SMALL
+from wrt.accel.queries.batches import SMALL, Tracer, Worker
 from wrt.accel.queries.raw_kernel import HostMemory, RawKernel
 from wrt.accel.queries.raw_launches import raw_launch
 from wrt.accel.queries.rays import Rays
@@ -17,6 +17,8 @@ from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import Hit
 
 MOST = SMALL  # rays
+SINGLE = 16  # Up to this number of rays, the kernel for one ray at a time is faster.
+ALL = (1 << 30) - 1  # HitLists.limit for all hits
 Mesh: TypeAlias = tuple[WarpArray | None, WarpArray | None, WarpArray | None]  # vertices, faces and first_face of HitLists
 
 
@@ -33,10 +35,13 @@ class FewLists:
     Parameters
     ----------
     fill, copy : RawKernel
-        Kernels of kernels.hit_lists: one that fills the lists, and copy_hits.
+        Kernels of kernels.hit_lists: one that fills the lists for one ray at a time, and copy_hits.
+    tracer : Tracer, optional
+        See batches.lister.
     """
 
-    def __init__(self, fill: RawKernel, copy: RawKernel) -> None:
+    def __init__(self, fill: RawKernel, copy: RawKernel, tracer: Tracer | None) -> None:
+        self.worker = tracer and Worker(tracer)
         self.rays = [np.empty((MOST, 3), np.float32), np.empty((MOST, 3), np.float32), *np.empty((2, MOST), np.float32)]
         self.indices = np.arange(MOST + 1, dtype=np.int32)
         self.first, self.capacity = FEW * self.indices, FEW
@@ -45,7 +50,7 @@ class FewLists:
         self.rows = HostMemory().empty(FEW * MOST, Hit)
         self.out = [np.empty(FEW * MOST, dtype) for dtype in HIT_TYPES.values()]
         self.lists = struct_record(HitLists, [0, False, None, None, None, self.first, self.counts, self.rows, self.root, *self.walk])
-        rays = struct_record(RayArrays, self.rays)
+        self.given = rays = struct_record(RayArrays, self.rays)
         self.fill, self.copy = raw_launch(fill.kernel, *fill.inputs, 0), raw_launch(copy.kernel, *copy.inputs, 0)
         self.fill.set(1, rays)
         for i, record in enumerate((rays, self.lists, array_record(self.begin), struct_record(HitArrays, self.out))):
@@ -69,11 +74,15 @@ class FewLists:
             self.lists.vertices, self.lists.faces = record_of(vertices), record_of(faces)
         if roots is not None and first_face is not None:
             self.root[:n], self.lists.first_face = roots, record_of(first_face)
+        counts = self.counts[:n]
+        if self.worker and n > SINGLE and limit == ALL:
+            self.worker.inputs[3] = None  # so that the changed record is copied
+            self.worker.launch(snapshot, (self.given, self.lists), 0, n)
+            return counts if counts.max() <= capacity else None
         self.fill.set(0, record_of(snapshot.data))
         self.fill.set(2, self.lists)
         self.fill.set_dim(n)
         self.fill.launch()
-        counts = self.counts[:n]
         return counts if counts.max(initial=0) <= capacity else None
 
     def hits_of(self, counts: np.ndarray) -> list[np.ndarray]:
