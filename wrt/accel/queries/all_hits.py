@@ -14,7 +14,7 @@ from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.queries.accelerator import Accelerator, WorldOptions, snapshot_of
 from wrt.accel.queries.answers import Hits
 from wrt.accel.queries.batches import Tracer, lister
-from wrt.accel.queries.few_lists import ALL, MOST, FewLists, Mesh, begins
+from wrt.accel.queries.few_lists import MOST, FewLists, Mesh, begins
 from wrt.accel.queries.hit_points import device_scene
 from wrt.accel.queries.part_faces import part_faces
 from wrt.accel.queries.raw_kernel import RawKernel, kernel_memory
@@ -33,6 +33,7 @@ from wrt.kernels.hit_lists import FEW, HitLists, copy_hits, make_list_hit, make_
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import Hit
 
+ALL = (1 << 30) - 1
 RAYS_AT_ONCE = 1 << 18  # rays per batch; their hit lists take 32 MiB in the first traversal
 HIT_KINDS = wp.float32, wp.float32, wp.float32, wp.int32  # of HitArrays
 T = TypeVar("T")
@@ -221,7 +222,7 @@ class ListQuery:
 
     def _first_filled(self, rays: object, roots: Array | None, n: int, limit: int, counting: bool) -> _Lists:
         """Return lists of n rays with room for FEW hits each or, if `counting`, for as few as possible."""
-        tracer = lister(self.snapshot.structure) if limit == ALL and self.device.is_cpu else None
+        tracer = lister(self.snapshot.structure) if limit > FEW and self.device.is_cpu else None
         if tracer is None:
             return self._filled(rays, roots, (1 if counting else FEW) * np.arange(n + 1), limit, counting)
         first = np.arange(0, FEW * n + 1, FEW, dtype=np.int32) if not counting else np.zeros(n + 1, np.int32)

@@ -17,8 +17,6 @@ from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import Hit
 
 MOST = SMALL  # rays
-SINGLE = 16  # Up to this number of rays, the kernel for one ray at a time is faster.
-ALL = (1 << 30) - 1  # HitLists.limit for all hits
 Mesh: TypeAlias = tuple[WarpArray | None, WarpArray | None, WarpArray | None]  # vertices, faces and first_face of HitLists
 
 
@@ -37,7 +35,7 @@ class FewLists:
     fill, copy : RawKernel
         Kernels of kernels.hit_lists: one that fills the lists for one ray at a time, and copy_hits.
     tracer : Tracer, optional
-        See batches.lister.
+        See batches.lister. It is faster than `fill`, but no limit ends its walks.
     """
 
     def __init__(self, fill: RawKernel, copy: RawKernel, tracer: Tracer | None) -> None:
@@ -75,7 +73,7 @@ class FewLists:
         if roots is not None and first_face is not None:
             self.root[:n], self.lists.first_face = roots, record_of(first_face)
         counts = self.counts[:n]
-        if self.worker and n > SINGLE and limit == ALL:
+        if self.worker and limit > FEW:
             self.worker.inputs[3] = None  # so that the changed record is copied
             self.worker.launch(snapshot, (self.given, self.lists), 0, n)
             return counts if counts.max() <= capacity else None
