@@ -5,10 +5,10 @@ sheared so that the ray becomes the z axis. The signs of three areas around the 
 the same area with opposite signs, so no ray passes between them. The other tests serve for comparison. A test takes the ray's set-up and
 one record, and returns the `Hit` on the infinite line: the caller compares t with the segment.
 
-**What runs.** This file tests one triangle and one ray. On a CPU, pictures and the queries closest_hit and any_hit through bvh8 (the
-default) run the same steps vectorised, in `kernels/wide/triangle.h`, with the same bits (tests/kernels/wide/test_packets.py). The traversal
-of bvh4, bvh8 and bvh8c for one ray first rejects most triangles of a row with vector instructions (`wide/lanes.py`), and tests the other
-triangles here. The table of all cases is in kernels/README.md.
+**What runs.** This file tests one triangle and one ray. On a CPU, pictures and the queries closest_hit, any_hit and all_hits through bvh8
+(the default) run the same steps vectorised, in `kernels/wide/triangle.h`, with the same bits (tests/kernels/wide/test_packets.py). The
+traversal of bvh4, bvh8 and bvh8c for one ray first rejects most triangles of a row with vector instructions (`wide/lanes.py`), and tests
+the other triangles here. The table of all cases is in kernels/README.md.
 """
 
 from typing import Any, NamedTuple

@@ -70,8 +70,8 @@ LINES = 5  # Number of cache lines to prefetch: a row of triangles has 5, a node
 
 # A packet is a block of floats. It begins with a vector of sixteen lanes for each field of a ray. The fields `turned` are the origin in
 # the axis order kx, ky, kz. The field `axes` has kx, ky, kz, with AXIS_BITS each. The fields `near` are indices of near planes in a node.
-# The field `margin` is only for any-hit rays and lists (packet.h: sure_hits), `root` only for rays of several worlds (wide/instances.py) and
-# for lists, where it has the indices of the rays.
+# The field `margin` is only for any-hit rays and counts (packet.h: sure_hits). The field `root` is only for rays of several worlds
+# (wide/instances.py) and for lists, where it has the indices of the rays.
 FIELDS = ("origin_x", "origin_y", "origin_z", "inverse_x", "inverse_y", "inverse_z", "far_x", "far_y", "far_z", "t_min", "t",
           "direction_x", "direction_y", "direction_z", "turned_x", "turned_y", "turned_z", "shear_x", "shear_y", "shear_z",
           "axes", "u", "v", "prim_id", "scale", "near_x", "near_y", "near_z", "exclude", "margin", "root")
