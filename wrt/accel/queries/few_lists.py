@@ -72,15 +72,15 @@ class FewLists:
             self.lists.vertices, self.lists.faces = record_of(vertices), record_of(faces)
         if roots is not None and first_face is not None:
             self.root[:n], self.lists.first_face = roots, record_of(first_face)
-        counts = self.counts[:n]
         if self.worker and limit > FEW:
             self.worker.inputs[3] = None  # so that the changed record is copied
             self.worker.launch(snapshot, (self.given, self.lists), 0, n)
-            return counts if counts.max() <= capacity else None
-        self.fill.set(0, record_of(snapshot.data))
-        self.fill.set(2, self.lists)
-        self.fill.set_dim(n)
-        self.fill.launch()
+        else:
+            self.fill.set(0, record_of(snapshot.data))
+            self.fill.set(2, self.lists)
+            self.fill.set_dim(n)
+            self.fill.launch()
+        counts = self.counts[:n]
         return counts if counts.max(initial=0) <= capacity else None
 
     def hits_of(self, counts: np.ndarray) -> list[np.ndarray]:
