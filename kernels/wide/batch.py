@@ -13,7 +13,7 @@ import warp as wp
 from wrt.kernels.hit_lists import HitLists
 from wrt.kernels.memory import put_int
 from wrt.kernels.query import HitArrays, RayArrays
-from wrt.kernels.structs import Surfaces, noinline
+from wrt.kernels.structs import Surfaces
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.traverse.stack import reference_of, t_of
 from wrt.kernels.wide.lanes import bits, lowest
@@ -155,7 +155,7 @@ def make_interleaved(units: Units, any_hit: bool, accepts: Any) -> Any:
         prefetch_next(accel, next)
         return True
 
-    @noinline
+    @wp.func
     def interleaved(accel: WideBvh, surfaces: surfaces_type, scratch: Scratch, waiting: wp.uint64):
         live = int(0)
         slot = int(0)

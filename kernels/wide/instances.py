@@ -12,7 +12,7 @@ import warp as wp
 from wrt.kernels.headers import with_headers
 from wrt.kernels.memory import put_int
 from wrt.kernels.query import HitArrays, RayArrays, WorldRays
-from wrt.kernels.structs import Surfaces, kernel, noinline
+from wrt.kernels.structs import Surfaces, kernel
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.traverse.instances import make_struct
 from wrt.kernels.traverse.stack import reference_of, t_of
@@ -282,7 +282,7 @@ def make_top_interleaved(units: Units, any_hit: bool, worlds: bool) -> Any:
     descend, start = make_start(any_hit, place_ray, worlds)
     turn = make_turn(units, any_hit, take_hit, descend)
 
-    @noinline
+    @wp.func
     def interleaved(accel: Instances, surfaces: Surfaces, scratch: Scratch, waiting: wp.uint64):
         live = int(0)
         todo = int(wp.static((1 << SLOTS) - 1))  # Slots that are free, or whose ray takes its next step.
