@@ -120,7 +120,12 @@ SLOT_WORDS = ("ray", "next", "place", "placement")
 SLOT = {name: i for i, name in enumerate(SLOT_WORDS)}
 SLOT_SIZE = 4
 
+# Numbers of sure_hits (packet.h): the factor of its margin, the least `margin` of a ray, and the least component, as a fraction of the
+# largest, of a direction with a finite `margin`.
+MARGIN_FACTOR, LEAST_MARGIN, SMALLEST_COMPONENT = 2.0**-18, 2.0**-60, 2.0**-40
+
 _NUMBERS = {
+    "MARGIN_FACTOR": MARGIN_FACTOR, "LEAST_MARGIN": LEAST_MARGIN, "SMALLEST_COMPONENT": SMALLEST_COMPONENT,
     "WIDTH": WIDTH, "LANES": LANES, "COHERENT": COHERENT, "MIXED": MIXED, "AXIS_BITS": AXIS_BITS, "AXIS_MASK": (1 << AXIS_BITS) - 1,
     "REFUSED": REFUSED, "ROOT_ENTRIES": ROOT_ENTRIES, "PACKET_SIZE": PACKET_SIZE, "ENTRY": ENTRY, "ENTRY_RAYS": ENTRY_RAYS,
     "LEAF_BITS": LEAF_BITS, "CACHE_LINE": CACHE_LINE, "LINES": LINES, "LEVEL": LEVEL, "LEVEL_REFERENCES": LEVEL_REFERENCES,

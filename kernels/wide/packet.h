@@ -74,8 +74,6 @@ WRT_INLINE typename Lanes<N>::Ints candidates(const Triangles& triangles, const 
     return accepted(triangles, triangle_ray(ray, axes)) & (triangles.prim_id() + 1 != all<typename Lanes<N>::Ints>(ray.bits(EXCLUDE)));
 }
 
-constexpr float SMALLEST_COMPONENT = 0x1p-40f, LEAST_MARGIN = 0x1p-60f;
-
 // Return the largest absolute value among the components.
 template <class T> WRT_INLINE T greatest(const Vec3<T>& v) {
     const T x = absolute(v[0]), y = absolute(v[1]), z = absolute(v[2]), longer = y > x ? y : x;
@@ -99,7 +97,7 @@ template <class Triangles, class Ray, class Axes> WRT_INLINE auto sure_hits(cons
     const Floats s = all<Floats>(ray[SHEAR_Z]), t_a = a[2] * s, t_b = b[2] * s, t_c = c[2] * s;
     const Floats nearer = t_b < t_a ? t_b : t_a, near = t_c < nearer ? t_c : nearer;
     const Floats farther = t_b > t_a ? t_b : t_a, far = t_c > farther ? t_c : farther;
-    const Floats margin = 0x1p-18f * ((x + y + all<Floats>(ray[MARGIN])) * absolute(s) + far);
+    const Floats margin = MARGIN_FACTOR * ((x + y + all<Floats>(ray[MARGIN])) * absolute(s) + far);
     auto sure = (near > all<Floats>(ray[T_MIN]) + margin) & (far + margin < all<Floats>(ray[T]));
     for (int k = 0; k < 3; ++k) sure &= (areas[k] < zero) | (areas[k] > zero);
     return sure;
