@@ -101,7 +101,7 @@ def load_mesh(path: PathLike, parts: Sequence[tuple[int, int]] = ()) -> Mesh:
         name=os.fspath(path),
     )
     if not raw.exact:
-        mesh.__dict__["is_clean"] = True  # known, so that it need not be computed
+        mesh.note_clean()
     return mesh
 
 

@@ -6,6 +6,7 @@ import io
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
+from zlib import crc32
 
 import numpy as np
 
@@ -153,10 +154,24 @@ class Mesh:
         """Largest absolute coordinate of the vertices."""
         return float(np.abs(self.vertices).max(initial=0.0))
 
-    @cached_property
+    @property
     def is_clean(self) -> bool:
-        """Whether every face has an area, in exact arithmetic. `wrt.load_mesh` drops other faces."""
-        return bool(has_area(self.vertices, self.faces).all())
+        """Whether every face has an area, in exact arithmetic. `wrt.load_mesh` drops other faces.
+
+        It is tested again after the caller has written to the arrays; their checksum takes a fifth of the test's time."""
+        checksum, (tested, clean) = self._checksum(), self.__dict__.get("_clean", (None, False))
+        if tested != checksum:
+            clean = bool(has_area(self.vertices, self.faces).all())
+            self.__dict__["_clean"] = checksum, clean
+        return clean
+
+    def note_clean(self) -> None:
+        """Note that every face has an area, so that it need not be tested."""
+        self.__dict__["_clean"] = self._checksum(), True
+
+    def _checksum(self) -> int:
+        vertices, faces = (np.ascontiguousarray(array).reshape(-1).view(np.uint8).data for array in (self.vertices, self.faces))
+        return crc32(faces, crc32(vertices))
 
     def __repr__(self) -> str:
         parts = [repr(self.name)] if self.name else []

@@ -131,6 +131,23 @@ def test_a_mesh_knows_whether_it_is_clean(tmp_path):
         assert has_area(flat.vertices, flat.faces).all() and not np.shares_memory(flat.faces, mesh.faces)
 
 
+@pytest.mark.parametrize("is_loaded", [False, True])
+def test_faces_are_flipped_after_the_caller_has_written_to_the_arrays(is_loaded, tmp_path):
+    mesh = Mesh(np.array([[0, 0, 0], [2, 0, 0], [1, 1, 0], [1, -1, 0]], np.float32), np.array([[0, 1, 2], [1, 0, 3]]))
+    if is_loaded:
+        path = tmp_path / "mesh.obj"
+        path.write_text("".join("v {} {} {}\n".format(*row) for row in mesh.vertices) + "f 1 2 3\nf 2 1 4\n")
+        mesh = load_mesh(path)
+    scene = Scene(objects=(Object(mesh),))
+    np.testing.assert_array_equal(flatten(scene).faces, mesh.faces)
+    mesh.vertices[2, 1] = 0.0  # onto the edge between both faces
+    flat = flatten(scene)
+    np.testing.assert_array_equal(flat.faces, flip_collinear(mesh.vertices, mesh.faces)[0])
+    assert has_area(flat.vertices, flat.faces).all()
+    mesh.faces[:] = mesh.faces[:, ::-1]
+    np.testing.assert_array_equal(flatten(scene).faces, flip_collinear(mesh.vertices, mesh.faces)[0])
+
+
 def test_a_chain_of_faces_on_one_line_is_flipped_from_its_outer_end():
     # 0 to 4 on the x axis; below it a fan of flat faces that leads to one longest edge; 5 and 6 close it to the sides.
     vertices = np.array([[x, 0, 0] for x in range(5)] + [[2, 1, 0], [2, -1, 0]], np.float32)
