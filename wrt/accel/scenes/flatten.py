@@ -153,10 +153,11 @@ def _joined(objects: tuple[Object, ...], index: dict[int, int]) -> _Joined:
 
 
 def _own_space(mesh: Mesh) -> _Joined:
-    joined = _Joined(mesh.vertices, mesh.faces, *_attributes(mesh), slice(None), np.zeros(0, np.int32))
+    vertices, faces = mesh.vertices.copy(), mesh.faces.copy()  # because the caller may write to its arrays
+    joined = _Joined(vertices, faces, *_attributes(mesh), slice(None), np.zeros(0, np.int32))
     if mesh.is_clean:
         return joined
-    faces, source = flip_collinear(mesh.vertices, mesh.faces)
+    faces, source = flip_collinear(vertices, faces)
     return replace(joined, faces=faces, source=source)
 
 

@@ -146,6 +146,14 @@ def test_of_instances_at_the_same_distance_the_first_has_the_closest_point(swapp
     np.testing.assert_allclose(found.distance, 0.3 * above[:, 2], rtol=1e-6)
 
 
+def test_a_structure_keeps_its_mesh_when_the_caller_writes_to_the_arrays() -> None:
+    mesh = icosphere(2)
+    accel = wrt.build(Scene((Object(mesh, (GREY,)),)), movable=True)
+    mesh.vertices[:], mesh.faces[:] = 7.0, 0
+    inside = np.random.default_rng(0).uniform(-0.5, 0.5, (100, 3))
+    np.testing.assert_allclose(wrt.winding_number(accel, inside), 1.0, atol=1e-3)
+
+
 def test_inside_by_parity_over_instances() -> None:
     worlds, flat = structures()
     points, _, world = rays(2000)
