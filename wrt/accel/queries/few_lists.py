@@ -1,5 +1,6 @@
 """Lists of all hits of a few rays: buffers and launches that later calls reuse. Records for new arrays take longer than a ray."""
 
+from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
@@ -11,7 +12,7 @@ from wrt.accel.queries.raw_launches import raw_launch
 from wrt.accel.queries.rays import Rays
 from wrt.accel.snapshot import Snapshot
 from wrt.core.types import WarpArray
-from wrt.core.warp_private import array_record, record_of, struct_record
+from wrt.core.warp_private import RawLaunch, array_record, record_of, struct_record
 from wrt.kernels.hit_lists import FEW, HitLists
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.structs import Hit
@@ -39,7 +40,7 @@ class FewLists:
     """
 
     def __init__(self, fill: RawKernel, copy: RawKernel, tracer: Tracer | None) -> None:
-        self.worker = tracer and Worker(tracer)
+        self.kernel, self.tracer = fill, tracer
         self.rays = [np.empty((MOST, 3), np.float32), np.empty((MOST, 3), np.float32), *np.empty((2, MOST), np.float32)]
         self.indices = np.arange(MOST + 1, dtype=np.int32)
         self.first, self.capacity = FEW * self.indices, FEW
@@ -48,11 +49,22 @@ class FewLists:
         self.rows = HostMemory().empty(FEW * MOST, Hit)
         self.out = [np.empty(FEW * MOST, dtype) for dtype in HIT_TYPES.values()]
         self.lists = struct_record(HitLists, [0, False, None, None, None, self.first, self.counts, self.rows, self.root, *self.walk])
-        self.given = rays = struct_record(RayArrays, self.rays)
-        self.fill, self.copy = raw_launch(fill.kernel, *fill.inputs, 0), raw_launch(copy.kernel, *copy.inputs, 0)
-        self.fill.set(1, rays)
-        for i, record in enumerate((rays, self.lists, array_record(self.begin), struct_record(HitArrays, self.out))):
+        self.given = struct_record(RayArrays, self.rays)
+        self.copy = raw_launch(copy.kernel, *copy.inputs, 0)
+        for i, record in enumerate((self.given, self.lists, array_record(self.begin), struct_record(HitArrays, self.out))):
             self.copy.set(i, record)
+
+    @cached_property
+    def fill(self) -> RawLaunch:
+        """Launch of the kernel for one ray at a time, compiled when it is needed."""
+        launch = raw_launch(self.kernel.kernel, *self.kernel.inputs, 0)
+        launch.set(1, self.given)
+        return launch
+
+    @cached_property
+    def worker(self) -> Worker | None:
+        """Worker of the tracer, whose kernel is compiled when it is needed."""
+        return Worker(self.tracer) if self.tracer else None
 
     def find(self, snapshot: Snapshot, rays: Rays, roots: np.ndarray | None, limit: int, mesh: Mesh) -> np.ndarray | None:
         """Fill the lists. Return HitLists.count of the rays, (N,) int32, until the next call; None if a list is too short.
@@ -72,7 +84,7 @@ class FewLists:
             self.lists.vertices, self.lists.faces = record_of(vertices), record_of(faces)
         if roots is not None and first_face is not None:
             self.root[:n], self.lists.first_face = roots, record_of(first_face)
-        if self.worker and limit > FEW:
+        if limit > FEW and self.worker:
             self.worker.inputs[3] = None  # so that the changed record is copied
             self.worker.launch(snapshot, (self.given, self.lists), 0, n)
         else:
