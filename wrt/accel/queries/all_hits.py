@@ -211,7 +211,9 @@ class ListQuery:
             n = min(RAYS_AT_ONCE, self.n - begin)
             rays = self.memory.struct(RayArrays, *(array[begin:begin + n] for array in self.rays))
             roots = None if self.roots is None else self.memory.array(self.roots[begin:begin + n], wp.int32)
-            few = self._first_filled(rays, roots, n, limit, counting)
+            tracer = lister(self.snapshot.structure) if limit > FEW and self.device.is_cpu else None
+            room = FEW if not counting else 1 if tracer is None else 0  # hits of each ray
+            few = self._filled(rays, roots, room * np.arange(n + 1), limit, counting, tracer)
             lists, counts = [few], self._noted(self.memory.numpy(few.counts), begin)
             if counts.max() > FEW and not counting:
                 many = counts > FEW
@@ -220,26 +222,23 @@ class ListQuery:
                 counts = np.where(many, self.memory.numpy(lists[1].counts), counts)
             yield rays, lists, counts
 
-    def _first_filled(self, rays: object, roots: Array | None, n: int, limit: int, counting: bool) -> _Lists:
-        """Return lists of n rays with room for FEW hits each or, if `counting`, for as few as possible."""
-        tracer = lister(self.snapshot.structure) if limit > FEW and self.device.is_cpu else None
-        if tracer is None:
-            return self._filled(rays, roots, (1 if counting else FEW) * np.arange(n + 1), limit, counting)
-        first = np.arange(0, FEW * n + 1, FEW, dtype=np.int32) if not counting else np.zeros(n + 1, np.int32)
-        rows = None if counting else self.memory.empty(FEW * n, Hit)
-        lists = _Lists(limit, self.crossings, *self.mesh, first, np.empty(n, np.int32), rows)
-        tracer.launch(self.snapshot, (rays, self.memory.struct(HitLists, *lists)), n, self.threads)
-        return lists
+    def _filled(self, rays: object, roots: Array | None, first: np.ndarray, limit: int, counting: bool = False,
+                tracer: Tracer | None = None) -> _Lists:
+        """Traverse the structure, by means of `tracer` if there is one, and return lists of hits.
 
-    def _filled(self, rays: object, roots: Array | None, first: np.ndarray, limit: int, counting: bool = False) -> _Lists:
-        """Traverse the structure and return lists of hits. The list of ray i has the rows first[i] .. first[i + 1] - 1."""
+        The list of ray i has the rows first[i] .. first[i + 1] - 1. No rows: only count hits, which needs a tracer.
+        """
         rows, n = rows_of(first[-1]), len(first) - 1
         lists = _Lists(limit, self.crossings, *self.mesh, self.memory.array(first, wp.int32),
-                       self.memory.array(np.zeros(n, np.int32), wp.int32), self.memory.empty(rows, Hit))
+                       self.memory.array(np.zeros(n, np.int32), wp.int32), self.memory.empty(rows, Hit) if rows else None)
         if roots is not None:
             lists = _Lists(*lists[:8], roots, *(self.memory.empty(n, kind) for kind in (wp.float64, wp.int32, wp.float32)))
-        self.memory.launch(list_hits(self.snapshot.structure, not counting), n, self.snapshot.data, rays,
-                           self.memory.struct(HitLists, *lists), threads=self.threads)
+        record = self.memory.struct(HitLists, *lists)
+        if tracer:
+            tracer.launch(self.snapshot, (rays, record), n, self.threads)
+        else:
+            kernel = list_hits(self.snapshot.structure, not counting)
+            self.memory.launch(kernel, n, self.snapshot.data, rays, record, threads=self.threads)
         return lists
 
     def _copy(self, rays: object, lists: list[_Lists], begin: np.ndarray, hits: list[Array]) -> None:

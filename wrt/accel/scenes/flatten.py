@@ -1,6 +1,6 @@
 """Scenes as arrays: joined triangles in world space, and instanced meshes in their own space."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -144,21 +144,16 @@ def _joined(objects: tuple[Object, ...], index: dict[int, int]) -> _Joined:
         _check_size(first, 0)
     empty = [np.zeros((0, width), dtype) for width, dtype in ((3, np.float32), (3, np.int32), (3, np.float32), (2, np.float32))]
     vertices, faces, normals, uvs = map(np.concatenate, zip(*parts, strict=True)) if parts else empty
-    joined = _Joined(vertices, faces, normals, uvs, slice(None), np.concatenate(material))
-    if len(objects) == 1 and _is_unmoved(objects[0]) and objects[0].mesh.is_clean:
-        return joined
+    is_clean = len(objects) == 1 and _is_unmoved(objects[0]) and objects[0].mesh.is_clean
     # Far from the origin, rounding puts corners on a line. One call for all objects is faster than a call for each.
-    faces, source = flip_collinear(vertices, faces)
-    return replace(joined, faces=faces, source=source, material=joined.material[source])
+    faces, source = (faces, slice(None)) if is_clean else flip_collinear(vertices, faces)
+    return _Joined(vertices, faces, normals, uvs, source, np.concatenate(material)[source])
 
 
 def _own_space(mesh: Mesh) -> _Joined:
     vertices, faces = mesh.vertices.copy(), mesh.faces.copy()  # because the caller may write to its arrays
-    joined = _Joined(vertices, faces, *_attributes(mesh), slice(None), np.zeros(0, np.int32))
-    if mesh.is_clean:
-        return joined
-    faces, source = flip_collinear(vertices, faces)
-    return replace(joined, faces=faces, source=source)
+    faces, source = (faces, slice(None)) if mesh.is_clean else flip_collinear(vertices, faces)
+    return _Joined(vertices, faces, *_attributes(mesh), source, np.zeros(0, np.int32))
 
 
 def _attributes(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
