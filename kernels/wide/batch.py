@@ -204,8 +204,6 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
                 count = wp.min(end - block - LANES * p, LANES)
                 active = set_up(rays, block + LANES * p, count, wp.static(far_pad(units.box)), mixes, scratch, base)
                 store_bits(scratch.packets, base + ACTIVE, active)
-                if wp.static(units.lists):
-                    begin_lists(block + LANES * p, scratch, base)
                 if bits(scratch.packets, base + REFUSED) != 0:
                     put_int(scratch.report, ANY_REFUSED, 1)
             for p in range(packets):
@@ -216,6 +214,7 @@ def make_kernel(units: Units, any_hit: bool, rays_struct: Any = RayArrays, accep
                 result = int(STOPPED)
                 if active >= COHERENT and paused == 0 and (mixes or active < MIXED):
                     if wp.static(units.lists):
+                        begin_lists(block + LANES * p, scratch, base)
                         result = walk_packet(accel, out, scratch, base, active)
                     else:
                         result = walk_packet(accel, surfaces, scratch, base, active)

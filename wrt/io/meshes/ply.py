@@ -70,10 +70,7 @@ def read(path: Path) -> RawMesh:
         texcoord = None  # strips have none
 
     finite = np.isfinite(vertices)
-    referenced = np.zeros(len(vertices), dtype=bool)
-    if not finite.all():
-        referenced[corners] = True
-    if len(bad := np.flatnonzero(referenced & ~finite.all(axis=1))):
+    if not finite.all() and len(bad := np.intersect1d(np.flatnonzero(~finite.all(axis=1)), corners)):
         raise InputError(f"position {vertices[bad[0]].tolist()} is not finite ({len(bad)} in all)", place=f"vertex {bad[0]}")
 
     normals = _columns(vertex, ("nx", "ny", "nz"))
