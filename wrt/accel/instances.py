@@ -56,6 +56,8 @@ class Instances(Accelerator):
         self, begin, units = cls.__new__(cls), build_clock(), bottoms[0].structure.units
         Accelerator.__init__(self, Structure(type(bottoms[0]), units._replace(instances=True)), geometry, attributes, device, threads)
         self._place(bottoms, geometry, begin)
+        if not within_reach(self._top.low, self._top.high, 2.0 * MAX_REACH):  # a saved box's pad may pass MAX_REACH
+            raise InputError(f"is damaged: an instance is farther than {MAX_REACH:g} from the origin")
         return self
 
     def _place(self, bottoms: list[OneMesh], geometry: InstancedGeometry, begin: float) -> None:
@@ -153,7 +155,7 @@ class Instances(Accelerator):
             if "boxes" not in self._cache:
                 self._cache["boxes"] = self._boxes(geometry, MOVED_BOXES)
             low, high = world_boxes(geometry, rows, self._cache["boxes"])
-            if not (np.maximum(np.abs(low), np.abs(high))[low[:, 0] <= high[:, 0]] <= MAX_REACH).all():
+            if not within_reach(low, high, MAX_REACH):
                 raise InputError(f"puts an instance farther than {MAX_REACH:g} from the origin", argument="matrix")
             top, cost = refit_top(self._top, geometry, rows, low, high), before.built_cost
             growth = top.cost / cost if cost > 0.0 else 1.0
@@ -188,6 +190,11 @@ class Instances(Accelerator):
         assert isinstance(geometry, InstancedGeometry)
         return (f"Instances({len(geometry)} primitives in {len(geometry.part)} instances of "
                 f"{len(self.bottoms)} {self.structure.accel.name}, {s.bytes / 1e6:.1f} MB, built in {s.build_seconds:.3f} s)")
+
+
+def within_reach(low: np.ndarray, high: np.ndarray, reach: float) -> bool:
+    """Return whether all coordinates of the boxes are at most `reach`. low, high: (R, 3); boxes with low > high are empty."""
+    return bool(((np.maximum(np.abs(low), np.abs(high)) <= reach) | (low > high)).all())
 
 
 def is_named(instance: object) -> TypeGuard[str | list[str]]:

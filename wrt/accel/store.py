@@ -129,7 +129,7 @@ def read(path: PathLike, geometry: Geometry | None, attributes: FlatScene | None
 def read_scene(header: JsonObject, body: memoryview) -> tuple[dict[str, np.ndarray], memoryview]:
     """Return the arrays at the begin of the body, and the rest of the body. Raises InputError if they do not fit."""
     arrays, at = {}, 0
-    for name, (kind, *shape) in header.get("arrays", {}).items():
+    for name, (kind, *shape) in dict(header.get("arrays", {})).items():
         dtype = np.dtype({SIZES: "<i8", OF_PARTS: "<f8"}.get(name) or KINDS[name][0])
         size = dtype.itemsize * prod(shape)
         if kind != dtype.str or not all(type(n) is int and n >= 0 for n in shape) or at + size > len(body):

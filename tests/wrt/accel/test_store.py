@@ -209,6 +209,7 @@ def test_another_mesh_is_refused(saved: Path, threads: int) -> None:
     (lambda data: signed(MAGIC + b"[]\n"), (None, "no acceleration structure")),
     (lambda data: signed(MAGIC + b"{}\n"), (None, "not a structure")),
     (lambda data: signed(MAGIC + b"{" * 100000), (None, "damaged")),
+    (lambda data: signed(data[:-CHECKSUM_BYTES].replace(b'"accel": ', b'"arrays": 7, "accel": ', 1)), (None, "not a structure")),
     (lambda data: signed(MAGIC + b"[" * 60000 + b"\n"), (None, "no acceleration")),
 ])
 def test_a_damaged_or_foreign_file_is_refused(saved: Path, spoil, message: Refusal) -> None:
@@ -299,6 +300,18 @@ def test_numbers_of_any_size_in_instances_are_read_without_a_word(threads: int, 
                 with contextlib.suppress(InputError):
                     load_accel(path, threads=threads)
         at += number.itemsize * math.prod(shape)
+
+
+@pytest.mark.parametrize("value", [1.8e38, -1.8e38, np.inf, np.nan])
+def test_an_instance_in_a_file_is_within_reach(value: float, tmp_path: Path) -> None:
+    """Else the widened boxes of the upper level are not finite, and rays enter children that do not exist."""
+    path = tmp_path / "x.accel"
+    build([BALL]).save(path)
+    data = path.read_bytes()[:-CHECKSUM_BYTES]
+    at = data.index(b"\n", len(MAGIC)) + 1
+    path.write_bytes(signed(data[:at] + np.float32(value).tobytes() + data[at + 4:]))  # the first vertex
+    with refused(what="farther than 1e+18", path=path):
+        load_accel(path)
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
