@@ -275,19 +275,25 @@ def accel_seeds() -> list[Seed]:
                 path = Path(name) / "a.accel"
                 build(ball(), accel, threads=1, triangle=triangle).save(path)
                 found.append(Seed(".accel", path.read_bytes()))
+        for accel in ("bvh2", "bvh8"):
+            build(ball(), accel, threads=1).save(path, mesh=True)
+            found.append(Seed(".accel", path.read_bytes()))
+            build([ball(), ball()], accel, threads=1).save(path)
+            found.append(Seed(".accel", path.read_bytes()))
     return found
 
 
 def read_accel(path: Path) -> object:
     """Load the structure, and trace rays: only a traversal shows a bad reference."""
     accel = load_accel_only(path)
-    return accel.closest_hit(*rays())
+    return accel.closest_hit(*rays(), **({"world": 0} if accel.snapshot.roots is not None else {}))
 
 
 def load_accel_only(path: Path) -> Any:
     from wrt.accel.scenes.build import load_accel
 
-    return load_accel(path, ball(), threads=1)
+    holds_scene = b'"arrays"' in path.read_bytes()
+    return load_accel(path, None if holds_scene else ball(), threads=1)
 
 
 IDENTITY = {"seed": 0, "crop": [0, 0, 6, 4], "scene": "x", "kernels": "y"}
