@@ -131,8 +131,8 @@ def read_scene(header: JsonObject, body: memoryview) -> tuple[dict[str, np.ndarr
     arrays, at = {}, 0
     for name, (kind, *shape) in dict(header.get("arrays", {})).items():
         dtype = np.dtype({SIZES: "<i8", OF_PARTS: "<f8"}.get(name) or KINDS[name][0])
-        size = dtype.itemsize * prod(shape)
-        if kind != dtype.str or not all(type(n) is int and n >= 0 for n in shape) or at + size > len(body):
+        sound = kind == dtype.str and all(type(n) is int and n >= 0 for n in shape)  # a list times a number would be a long list
+        if not sound or at + (size := dtype.itemsize * prod(shape)) > len(body):
             raise InputError(f"is damaged: array {name!r} does not fit")
         arrays[name] = np.frombuffer(body[at:at + size], dtype).reshape(shape).copy()
         at += size

@@ -56,6 +56,11 @@ def signed(data: bytes) -> bytes:
     return data + crc32(data).to_bytes(CHECKSUM_BYTES, "big")
 
 
+def with_arrays(data: bytes, arrays: bytes) -> bytes:
+    """Return a file of a structure whose header lists these arrays, in JSON."""
+    return signed(data[:-CHECKSUM_BYTES].replace(b'"accel": ', b'"arrays": ' + arrays + b', "accel": ', 1))
+
+
 @pytest.mark.parametrize("name", STRUCTURES)
 def test_a_structure_goes_through_pickle(name: str) -> None:
     """Pickled and deep copies have the same options and hits, also after a refit."""
@@ -209,7 +214,8 @@ def test_another_mesh_is_refused(saved: Path, threads: int) -> None:
     (lambda data: signed(MAGIC + b"[]\n"), (None, "no acceleration structure")),
     (lambda data: signed(MAGIC + b"{}\n"), (None, "not a structure")),
     (lambda data: signed(MAGIC + b"{" * 100000), (None, "damaged")),
-    (lambda data: signed(data[:-CHECKSUM_BYTES].replace(b'"accel": ', b'"arrays": 7, "accel": ', 1)), (None, "not a structure")),
+    (lambda data: with_arrays(data, b"7"), (None, "not a structure")),
+    (lambda data: with_arrays(data, b'{"vertices": ["<f4", [0], 1%s]}' % (b"0" * 30)), (None, "'vertices' does not fit")),
     (lambda data: signed(MAGIC + b"[" * 60000 + b"\n"), (None, "no acceleration")),
 ])
 def test_a_damaged_or_foreign_file_is_refused(saved: Path, spoil, message: Refusal) -> None:
