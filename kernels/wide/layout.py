@@ -120,8 +120,8 @@ SLOT_WORDS = ("ray", "next", "place", "placement")
 SLOT = {name: i for i, name in enumerate(SLOT_WORDS)}
 SLOT_SIZE = 4
 
-# Numbers of sure_hits (packet.h): the factor of its margin, the least `margin` of a ray, and the least component, as a fraction of the
-# largest, of a direction with a finite `margin`.
+# Numbers of sure_hits (packet.h): the factor of its margin; the least `margin` of a ray. If a component of the direction is not 0, and
+# smaller than this fraction of the largest, the field `margin` is infinite.
 MARGIN_FACTOR, LEAST_MARGIN, SMALLEST_COMPONENT = 2.0**-18, 2.0**-60, 2.0**-40
 
 _NUMBERS = {
