@@ -95,5 +95,6 @@ def test_missing_mitsuba_is_told_as_that(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_python_integrators_are_for_the_scalar_variant() -> None:
+    pytest.importorskip("mitsuba", reason='needs Mitsuba 3: pip install "wrt[peers]"')
     with pytest.raises(NotAvailable, match="whitted"):
         MitsubaProcess(JOB._replace(variant="llvm_ad_rgb", integrator="whitted"))
