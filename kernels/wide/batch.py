@@ -55,8 +55,8 @@ SLOTS = 24  # Number of interleaved rays in progress.
 MIN_VISITS = 6  # Mean number of rays per node from which a packet is faster than interleaving its rays.
 # Numbers of nodes between which the walk of a MIXED packet stops if it is below MIN_VISITS.
 FIRST_STOP, LAST_STOP = 6, 16
-# Results of a packet's walk: all rays are finished, and their visits reached or did not reach MIN_VISITS; or the walk has stopped, and the
-# rays begin again one by one. The hits found so far shorten them; lists begin empty.
+# Results of a packet's walk. All rays are finished, and their visits reached MIN_VISITS (TOGETHER) or did not (APART). Or the walk has
+# STOPPED: the rays begin again one by one. The hits found so far shorten them; lists begin empty.
 TOGETHER, APART, STOPPED = (wp.constant(result) for result in range(3))
 # A packet below MIN_VISITS has failed. After MAX_FAILED failures in succession, the rays of the next PAUSE packets are interleaved, or of
 # the next MIXED_PAUSE packets of the kind MIXED.

@@ -122,7 +122,7 @@ class Changes(NamedTuple):
 def make_changes(any_hit: bool, pad: float) -> Changes:
     place, packets, hits = "accel.placements.data[placement]", "scratch.packets.data", flag(any_hit)
 
-    @wp.func_native(f"return wrt::place_packet<{flag(any_hit)}>({packets} + base, {place}, mask, {pad!r}, {packets});")
+    @wp.func_native(f"return wrt::place_packet<{hits}>({packets} + base, {place}, mask, {pad!r}, {packets});")
     def place_packet(accel: Instances, placement: int, scratch: Scratch, base: int, mask: int) -> int: ...
 
     @wp.func_native(f"wrt::take_hits<{LANES}, {hits}>({{{packets} + base}}, {place}, {{{packets}}});")

@@ -69,8 +69,8 @@ def counts(accel: Any, rays: RayArrays, n: int, crossings: bool) -> np.ndarray:
 
 
 def answers(accel: Any, rays: tuple[np.ndarray, ...]) -> list[np.ndarray]:
-    """Return t, u, v and prim_id of the closest hits, any_hit as int32, and the numbers of crossings and of hits, by the kernels that
-    trace one ray at a time."""
+    """Return the answers of the kernels that trace one ray at a time: t, u, v and prim_id of the closest hits; any_hit as int32; and the
+    numbers of crossings and of hits."""
     origin, direction, t_min, t_max = rays
     n = len(origin)
     arrays, hits = RayArrays(), HitArrays()

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from zlib import crc32
 
 import numpy as np
 import warp as wp
 
 from wrt.accel.triangle_data import LAYOUTS
+from wrt.core.checked_file import checksum_of
 from wrt.core.device import records, upload
 from wrt.core.threads import run_all
 from wrt.core.types import Device, WarpArray, WarpStruct
@@ -51,12 +51,8 @@ class Geometry:
         return len(self.vertices)
 
     def checksum(self) -> str:
-        """Return the CRC-32 of the arrays: of their shapes, types and bytes."""
-        checksum = 0
-        for array in (self.vertices, self.faces, self.spheres):
-            checksum = crc32(f"{array.shape}{array.dtype.str}".encode(), checksum)
-            checksum = crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data, checksum)
-        return f"{checksum:08x}"
+        """Return `checksum_of` the arrays, in hexadecimal."""
+        return f"{checksum_of(self.vertices, self.faces, self.spheres):08x}"
 
     def on(self, device: Device, faces: WarpArray | None = None) -> WarpStruct:
         """Upload to a device, as kernels.build.shape.Shape. faces: the faces, if they are on the device already."""

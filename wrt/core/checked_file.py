@@ -20,6 +20,15 @@ CHECKSUM_BYTES = 4
 MAX_HEADER = 1 << 16
 
 
+def checksum_of(*arrays: np.ndarray) -> int:
+    """Return the CRC-32 of arrays: of their shapes, types and bytes."""
+    checksum = 0
+    for array in arrays:
+        head = f"{array.shape}{array.dtype.str}".encode()
+        checksum = crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data, crc32(head, checksum))
+    return checksum
+
+
 def write_checked(file: BinaryIO, magic: bytes, header: JsonObject, parts: Iterable[bytes | np.ndarray]) -> None:
     """Write a checked file. magic: the first line with its line end; header: at most MAX_HEADER bytes as JSON."""
     checksum = 0

@@ -6,10 +6,10 @@ import io
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
-from zlib import crc32
 
 import numpy as np
 
+from wrt.core.checked_file import checksum_of
 from wrt.core.checks import LARGEST, as_array, as_path, shown
 from wrt.core.errors import InputError
 from wrt.core.packages import needed_by
@@ -159,7 +159,7 @@ class Mesh:
         """Whether every face has an area, in exact arithmetic. `wrt.load_mesh` drops other faces.
 
         It is tested again after the caller has written to the arrays; their checksum takes a fifth of the test's time."""
-        checksum, (tested, clean) = self._checksum(), self.__dict__.get("_clean", (None, False))
+        checksum, (tested, clean) = checksum_of(self.vertices, self.faces), self.__dict__.get("_clean", (None, False))
         if tested != checksum:
             clean = bool(has_area(self.vertices, self.faces).all())
             self.__dict__["_clean"] = checksum, clean
@@ -167,11 +167,7 @@ class Mesh:
 
     def note_clean(self) -> None:
         """Note that every face has an area, so that it need not be tested."""
-        self.__dict__["_clean"] = self._checksum(), True
-
-    def _checksum(self) -> int:
-        vertices, faces = (np.ascontiguousarray(array).reshape(-1).view(np.uint8).data for array in (self.vertices, self.faces))
-        return crc32(faces, crc32(vertices))
+        self.__dict__["_clean"] = checksum_of(self.vertices, self.faces), True
 
     def __repr__(self) -> str:
         parts = [repr(self.name)] if self.name else []

@@ -256,9 +256,8 @@ def rows_of(hits: int) -> int:
 
 def stores_once(snapshot: Snapshot) -> bool:
     """Return whether each triangle is in one leaf only."""
-    geometry = snapshot.geometry
-    stored = sum(map(len, geometry.parts)) if isinstance(geometry, InstancedGeometry) else len(geometry)
-    return bool(snapshot.stats.references == stored)
+    parts = snapshot.geometry.parts if isinstance(snapshot.geometry, InstancedGeometry) else [snapshot.geometry]
+    return bool(snapshot.stats.references == sum(map(len, parts)))
 
 
 def counter_of(snapshot: Snapshot) -> Tracer | None:

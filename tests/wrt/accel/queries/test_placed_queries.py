@@ -131,7 +131,7 @@ def test_closest_points_equal_those_of_the_flat_mesh(accel: str) -> None:
 
 @pytest.mark.parametrize("swapped", [False, True])
 def test_of_instances_at_the_same_distance_the_first_has_the_closest_point(swapped: bool) -> None:
-    """Two objects have the same square. One has another triangle, which is far away: its box is closer to all points, and visited first.
+    """Two objects have the same square. The second also has a far triangle, so its box is closer to all points, and visited first.
     From far points, distances in the space of an object are rounded by more than the margin of its corners."""
     square = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
     faces, far = [[0, 1, 2], [0, 2, 3]], [[1e5, 0, 1], [1e5, 1, 1], [1e5, 0, 0]]
