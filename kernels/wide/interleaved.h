@@ -22,11 +22,11 @@ WRT_INLINE Level level_at(const unsigned* stacks, int at) { return {at, stacks[a
 WRT_INLINE unsigned least_key(const unsigned* stacks, int at) { return least_of(load<Lanes<WIDTH>::Keys>(stacks + at)); }
 
 // Take the last child of an any-hit ray's last level, which begins at stacks[at]. With AVX-512, no branch asks whether the stack is empty:
-// it would be mispredicted late. With AVX2, the branch is faster.
+// it would be mispredicted late. With AVX2, the branch is faster. At the bottom, LEVEL_LEFT may be 0, which has no last bit: `| 1` gives bit 0.
 WRT_INLINE int take_last(const float* nodes, unsigned* stacks, int bottom, int at, int* slot) {
     if (REGISTER < LANES && at == bottom) return 0;
     unsigned* const level = stacks + at;
-    const int child = 31 - __builtin_clz(level[LEVEL_LEFT]);
+    const int child = 31 - __builtin_clz(level[LEVEL_LEFT] | 1);
     const unsigned left = level[LEVEL_LEFT] ^ 1u << child;
     level[LEVEL_LEFT] = left;
     const int found = load<int>(nodes + (long long)level[LEVEL_REFERENCES] + child);

@@ -4,6 +4,11 @@
 #define WRT_INLINE static inline __attribute__((always_inline))
 #define WRT_MEMBER inline __attribute__((always_inline))
 #define WRT_CALLED static __attribute__((noinline))  // For large functions, which the compiler would inline at each call.
+#if defined(WRT_CHECK)  // a flag of debugging builds and of tests/sanitize
+#define WRT_ASSERT(condition) ((condition) ? (void)0 : __builtin_trap())
+#else
+#define WRT_ASSERT(condition) ((void)0)
+#endif
 
 namespace wrt {
 
@@ -80,7 +85,11 @@ template <class Ints> WRT_INLINE Ints in_mask(int mask) {
     return (all<Ints>(mask) >> lane & 1) != 0;
 }
 
-WRT_INLINE int lowest(unsigned mask) { return __builtin_ctz(mask); }
+// Return the index of the lowest bit set in a mask. It must not be 0: the result would depend on the processor.
+WRT_INLINE int lowest(unsigned mask) {
+    WRT_ASSERT(mask != 0);
+    return __builtin_ctz(mask);
+}
 
 // Return the pointer, of which the compiler then does not know that it stays the same in a loop. What is read through it is an operand in
 // memory, where a copy in a register would push others out.

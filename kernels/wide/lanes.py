@@ -42,10 +42,13 @@ def lanes_only(body: str, otherwise: str = "0") -> str:
     return f"\n#if defined(WRT_INLINE)\n{body}\n#else\n    return {otherwise};\n#endif\n"
 
 
-@wp.func_native("""
+CHECK_MASK = "\n#if defined(WRT_CHECK)\n    if (mask == 0) __builtin_trap();\n#endif\n"  # as WRT_ASSERT in lanes.h
+
+
+@wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
     return __ffs(mask) - 1;
-#else
+#else{CHECK_MASK}
     return __builtin_ctz(mask);
 #endif
 """)

@@ -13,7 +13,7 @@ from wrt.kernels.headers import with_headers
 from wrt.kernels.hit_lists import TOUCHES, HitLists, sort_and_trim
 from wrt.kernels.query import HitArrays, RenderRays
 from wrt.kernels.structs import Primitive, kernel
-from wrt.kernels.wide.lanes import bits
+from wrt.kernels.wide.lanes import CHECK_MASK, bits
 from wrt.kernels.wide.layout import ENTRY, ENTRY_RAYS, LAYOUT_H, LISTED, SLOT_SIZE, STACK_WORDS, TOUCHED
 from wrt.kernels.wide.traverse import make_struct
 
@@ -224,7 +224,7 @@ def prefetch_next(accel: WideBvh, reference: int) -> None:
     """Prefetch the first cache lines of the node or leaf that `reference` points to."""
 
 
-@wp.func_native("return __builtin_ctzll(mask);")
+@wp.func_native(f"{CHECK_MASK}    return __builtin_ctzll(mask);")
 def lowest_of_all(mask: wp.uint64) -> int: ...
 
 

@@ -25,7 +25,7 @@ from wrt.kernels.wide.layout import LAYOUT_H
 HERE = Path(__file__).parent
 COMPILERS = "g++", "clang++"
 # -Wno-psabi: a program is one file, so the ABI of vector arguments does not matter.
-PLAIN = "-std=c++17", "-ffp-contract=off", "-Wall", "-Wextra", "-Wno-psabi"
+PLAIN = "-std=c++17", "-ffp-contract=off", "-DWRT_CHECK", "-Wall", "-Wextra", "-Wno-psabi"
 SANITIZED = "-O1", "-g1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"
 
 LIMIT = 120  # seconds for a program: a broken traversal may never end

@@ -161,6 +161,8 @@ class Server:
         except Refused as refused:
             self.report(refused.kind, f"refused {refused}")
             return _response(HTTPStatus.FORBIDDEN)
+        if getattr(request, "method", "GET") != "GET":  # up to 16, the library closes such connections
+            return _response(HTTPStatus.METHOD_NOT_ALLOWED, {"Allow": "GET"})
         if [value.lower() for value in headers.get_all("Upgrade")] == ["websocket"]:
             return None
         if location:

@@ -48,7 +48,7 @@ class Client:
         parts = urlsplit(url)
         settings = {"origin": f"http://{parts.netloc}", **settings}
         self.socket = connect(f"ws://{parts.netloc}{parts.path}?{parts.query}", compression=None, max_size=None,
-                              max_queue=None, ping_interval=None, open_timeout=PATIENCE, **settings)
+                              max_queue=None, ping_interval=None, open_timeout=PATIENCE, **settings).__enter__()
         self.messages: list[dict[str, Any]] = []
 
     def send(self, kind: str, /, **fields: Any) -> None:

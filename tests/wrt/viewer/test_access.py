@@ -144,7 +144,8 @@ def test_requests_without_access_get_nothing(served: Served, capfd: pytest.Captu
     for target, headers in tries:
         for more in ([], upgrade()):
             came = answer(served.port, target, headers + more)
-            assert came.startswith(b"HTTP/1.1 403 ") and came.endswith(b"\r\n\r\n"), (target, headers, came[:80])
+            if target.isascii() or came:  # from 17, the library closes a connection whose target is not ASCII
+                assert came.startswith(b"HTTP/1.1 403 ") and came.endswith(b"\r\n\r\n"), (target, headers, came[:80])
             assert served.token.encode() not in came and b"websockets" not in came and b"Python" not in came
     assert served.page.server.browsers == ()
     assert len(served.warnings) == 3 and all("\n" not in line for line in served.warnings)
@@ -188,7 +189,7 @@ def test_other_origins_can_be_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_malformed_requests_print_nothing(served: Served, capfd: pytest.CaptureFixture[str]) -> None:
-    """Malformed requests print nothing on stdout, and no traceback on stderr."""
+    """Malformed requests get an error of HTTP or, by older versions of the library, nothing. They print nothing."""
     port, token = served.port, served.token
     host = [f"Host: 127.0.0.1:{port}"]
     for request in (b"", b"\r\n\r\n", b"GET\r\n\r\n", b"\x16\x03\x01\x02\x00\x01\x00\x01", b"GET / HTTP/2\r\n\r\n",
@@ -198,13 +199,16 @@ def test_malformed_requests_print_nothing(served: Served, capfd: pytest.CaptureF
         with socket.create_connection(("127.0.0.1", port), timeout=30.0) as connection:
             connection.sendall(request)
             connection.shutdown(socket.SHUT_WR)
-            try:
-                assert connection.recv(100) == b"", request
-            except ConnectionResetError:
-                pass
+            with contextlib.suppress(ConnectionResetError):
+                came = connection.recv(1 << 16)
+                assert came == b"" or came.startswith(b"HTTP/1.1 4"), (request, came)
+                assert token.encode() not in came and b"websockets" not in came and b"Python" not in came
+    for method in ("POST", "PUT", "HEAD"):
+        came = raw_answer(port, "\r\n".join([f"{method} /{token}/ HTTP/1.1", *host, "", ""]).encode())
+        assert came == b"" or came.startswith(b"HTTP/1.1 405 "), (method, came[:60])
     for target in ("a" * 5000, "a" * 150, "..", "../__init__.py", "%2e%2e/%2e%2e/__init__.py", "%00", "\udcff", "con", ".", "a//b"):
         came = answer(port, f"/{token}/{target}", host)
-        assert came.startswith(b"HTTP/1.1 404 "), (target, came[:60])
+        assert came.startswith(b"HTTP/1.1 404 ") or (came == b"" and not target.isascii()), (target, came[:60])
     for more in (["Upgrade: websocket"], [*upgrade()[:3], "Sec-WebSocket-Version: 7"], [*upgrade(), "Upgrade: websocket"],
                  [*upgrade(), "Accept-Encoding: gzip", "Accept-Encoding: br"]):
         assert answer(port, f"/{token}/", host + more)[9:12] in (b"400", b"426", b"101", b"200")
