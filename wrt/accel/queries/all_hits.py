@@ -135,10 +135,11 @@ class ListQuery:
     def of(self, origins: ArrayLike, directions: ArrayLike | None, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
            world: ArrayLike | None = None) -> ListQuery:
         """Set the rays. Raises InputError that names the argument."""
+        zero = self.snapshot.geometry.origin
         if are_rows(origins, directions):
-            rays = rays_of(origins, directions, t_min, t_max)  # type: ignore[arg-type]
+            rays = rays_of(origins, directions, t_min, t_max, origin=zero)  # type: ignore[arg-type]
         else:
-            rays, self.shape = shaped_rays(origins, directions, t_min, t_max)
+            rays, self.shape = shaped_rays(origins, directions, t_min, t_max, origin=zero)
             world = worlds_of_each(world, self.shape)
         self.n, self.rays = len(rays.origins), host_arrays(rays) if self.device.is_cpu else arrays_on(self.device, rays)
         self.roots = roots_of(self.snapshot, world, self.n)

@@ -12,7 +12,7 @@ from wrt.accel.flat_scene import FlatScene, Placed, flat_scene_of, placed_now, r
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.queries.gradients import ONE_MESH, Cotangents, Gradients, adjoint, check_recorded, record
-from wrt.accel.queries.rays import Rays, rays_on
+from wrt.accel.queries.rays import Rays, rays_on, to_origin
 from wrt.accel.queries.shapes import in_shape
 from wrt.accel.queries.world_ids import WorldIds, over_worlds
 from wrt.accel.snapshot import Snapshot, once
@@ -81,6 +81,8 @@ class HitPoints(Generic[ArrayT]):
     @property
     def point(self) -> ArrayT:
         """Point where each ray meets its primitive, in world space, to within `point_error`: (..., 3) float32, NaN on a miss.
+
+        It is float64 (Warp: vec3d) if the structure is far from 0 (`Accelerator.origin`).
 
         It is computed from the ray in float64 and rounded once, because u and v are inaccurate on needle-shaped triangles. If the
         exact ray misses the triangle by a rounding error, the point is moved onto the triangle, and `point_error` includes the
@@ -209,9 +211,13 @@ class HitPoints(Generic[ArrayT]):
         if isinstance(self.t, wp.array):
             if name == "point":
                 record(self._flat(), point=array)
+                array = to_origin(array, snapshot.geometry.origin)
             return in_shape(array, shape)
         give: Any = to_tensor_like(self.t)
-        return in_shape(array.numpy(), shape) if give is None else give(in_shape(array if device.is_cuda else array.numpy(), shape))
+        values = array if give is not None and device.is_cuda else array.numpy()
+        if name == "point":
+            values = to_origin(values, snapshot.geometry.origin)
+        return in_shape(values, shape) if give is None else give(in_shape(values, shape))
 
 
 def _require(scene: FlatScene, name: str) -> None:

@@ -11,6 +11,7 @@ from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.scenes.flatten import flatten
 from wrt.accel.scenes.instancing import is_invertible
 from wrt.core.errors import InputError
+from wrt.scene.far import moved_by, scene_origin
 from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene
@@ -32,11 +33,14 @@ def worlds_over(worlds: Sequence[Mesh | Scene]) -> FlatScene:
     if not together:
         raise InputError("must have at least one object in all its worlds together", argument="mesh")
     joined = Scene(together)
+    origin = scene_origin(joined)
+    joined = moved_by(joined, origin)
+    together = joined.objects
     flat = flatten(joined, frozenset(id(thing.mesh) for thing in together))
     geometry = flat.geometry
     assert isinstance(geometry, InstancedGeometry)
     places = {id(material): i for i, material in enumerate(joined.materials)}
     own = [(world, places[id(material)], i) for world, scene in enumerate(worlds)
            for i, material in enumerate(scene.materials if isinstance(scene, Scene) else grey)]
-    return replace(flat, geometry=replace(geometry, worlds=np.cumsum([0, *map(len, objects)])), objects=None,
+    return replace(flat, geometry=replace(geometry, origin=origin, worlds=np.cumsum([0, *map(len, objects)])), objects=None,
                    own_materials=np.array(sorted(own), np.int64).reshape(-1, 3))
