@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import warp as wp
 
+from wrt.accel.points.closest_points import closest_points
 from wrt.accel.points.contains import contains, open_edges_of
 from wrt.accel.queries.batches import SMALL
 from wrt.accel.queries.raw_kernel import RawKernel
@@ -30,6 +31,7 @@ from wrt.scene.mesh import Mesh
 with needed_by("wrt.compat.trimesh"):
     from trimesh.caching import Cache, cache_decorator
     from trimesh.ray.ray_util import contains_points
+    from trimesh.triangles import closest_point
 
 if TYPE_CHECKING:
     import trimesh
@@ -204,6 +206,16 @@ class _ScaledStructure:
         arrays = origins, directions, self.vertices, self.faces, *map(np.ascontiguousarray, hits), points
         LOCATE_HITS.launch(len(points), struct_record(HitPoints64, arrays), threads=self.threads)
         return points
+
+    def face_at(self, point: np.ndarray, reach: float) -> int:
+        """Return a face with area at a distance of at most `reach` from a point (3,), computed in float64; -1 if there is none."""
+        if not len(self.faces) or not ((point >= self.low - reach) & (point <= self.high + reach)).all():
+            return -1
+        face = int(closest_points(self.accel, self.to_local(point)[None], self.threads).prim_id[0])
+        corners = self.vertices[self.faces[face]]
+        on_face = closest_point(corners[None], point[None])[0]
+        has_area = np.cross(corners[1] - corners[0], corners[2] - corners[0]).any()
+        return face if has_area and np.linalg.norm(on_face - point) <= reach else -1
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         return contains(self.accel, self.to_local(points), threads=self.threads)
