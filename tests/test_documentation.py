@@ -239,7 +239,8 @@ def test_calls_in_the_tables_for_other_libraries_run(theirs: str, folder: Path, 
         "np": np, "wrt": wrt, "mesh": ball, "vertices": ball.vertices, "faces": ball.faces, "moved": ball.vertices, "points": origins,
         "origins": origins, "directions": directions, "rays": np.concatenate([origins, directions], axis=1), "pose": np.eye(4),
         "K": np.diag([500.0, 500.0, 1.0]), "colors": np.zeros((10_000, 3)), "scene": wrt.Scene.of([ball, ball]),
-        "trimesh_mesh": ball.to_trimesh(), "matrix": np.eye(4), "locations": origins, "index_ray": np.arange(50), "theirs": np.zeros((640 * 480, 3)),
+        "trimesh_mesh": ball.to_trimesh(), "matrix": np.eye(4), "locations": origins, "index_ray": np.arange(50),
+        "theirs": np.zeros((640 * 480, 3)),
         "query": wrt.ray_query("bvh")}
     theirs_names = {**names, "trimesh": trimesh, "mesh": ball.to_trimesh(), "scene": trimesh.Scene(ball.to_trimesh())}
     names["accel"] = wrt.build(ball)

@@ -128,8 +128,7 @@ class RaycastingScene:
         Parameters
         ----------
         tnear, tfar
-            Ends of the segment in units of the direction's length. A segment that ends below 0, or has a NaN, hits nothing; if it only
-            begins below 0, it includes what is behind the origin, as in Open3D.
+            Ends of the segment in units of the direction's length. As in Open3D, tnear may be below 0; tfar < 0 and NaN hit nothing.
         """
         (shape, rows), threads, accel = _rows(rays, "rays", 6), _threads(nthreads), self._scene().accel
         if type(tnear) is type(tfar) is float and tnear == 0.0 and tfar == math.inf:  # these need no arrays
@@ -139,7 +138,7 @@ class RaycastingScene:
         hit = SPLIT.any_hits(accel, (rows,), threads, ends=(np.fmax(near, np.float32(0.0)), far))
         if (near < 0.0).any():
             behind = np.zeros_like(near), np.where(far >= 0.0, -near, far)
-            hit |= SPLIT.any_hits(accel, (rows * np.float32([1, 1, 1, -1, -1, -1]),), threads, ends=behind)
+            hit |= SPLIT.any_hits(accel, (rows * np.array([1, 1, 1, -1, -1, -1], np.float32),), threads, ends=behind)
         return _answer(hit, shape)
 
     def count_intersections(self, rays: ArrayLike, nthreads: int = 0) -> Answer:

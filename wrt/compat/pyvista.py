@@ -80,7 +80,7 @@ class RayTracer:
         first_point
             Return only the point nearest to `origin`, (3,); the cells remain.
         plot, off_screen
-            Of PyVista; `plot` must be False, because nothing is drawn here.
+            `plot` must be False: nothing is drawn.
 
         Returns
         -------
@@ -95,19 +95,15 @@ class RayTracer:
             raise InputError("must be False: this class draws nothing", argument="plot", hint="pass the points to a plotter of PyVista")
         tracer = self._intersector("ray_trace")
         where, _, cells = tracer.intersects_location(start[None], (end - start)[None], max_hits=ALL)
-        dtype = self.mesh.points.dtype
-        scaled = tracer._scaled
+        scaled, dtype = tracer.scaled, self.mesh.points.dtype
         reach = max(float(np.finfo(dtype).eps), END) * np.abs([scaled.low, scaled.high]).max()
         near = reach + NEAR_END * (scaled.high - scaled.low).max()
         kept = (where - start) @ (end - start) <= (1.0 + END) * ((end - start) @ (end - start))
-        faces = scaled.face_at(start, reach), scaled.face_at(end, reach)
-        for point, face in zip((start, end), faces, strict=True):
-            if face >= 0:
-                kept &= np.linalg.norm(where - point, axis=1) > near
-        rows = [start[None]] * (faces[0] >= 0), [end[None]] * (faces[1] >= 0)
-        points = np.concatenate([*rows[0], where[kept], *rows[1]]).astype(dtype)
-        cells = np.concatenate([faces[:1], cells[kept], faces[1:]])
-        cells = cells[cells >= 0]
+        first, last = scaled.face_at(start, reach), scaled.face_at(end, reach)
+        for point, face in ((start, first), (end, last)):
+            kept &= (face < 0) | (np.linalg.norm(where - point, axis=1) > near)
+        kept = np.concatenate([[first >= 0], kept, [last >= 0]])
+        points, cells = np.vstack([start, where, end])[kept].astype(dtype), np.concatenate([[first], cells, [last]])[kept]
         kept = np.append(True, (points[1:] != points[:-1]).any(axis=1))[:len(points)]
         points = points[kept]
         return points[0] if first_point and len(points) else points, cells[kept]

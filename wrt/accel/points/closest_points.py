@@ -39,8 +39,6 @@ SIGNS = ("crossings", "winding")
 class ClosestPoints(HitIds[np.ndarray], Suggests):
     """Closest points on a mesh. For a mesh without faces, `distance` is inf, `prim_id` -1, and the rest 0.
 
-    `face`, `object`, `instance` and `material` are the ids of `Hits`.
-
     Attributes
     ----------
     distance : (...) float32
@@ -50,7 +48,7 @@ class ClosestPoints(HitIds[np.ndarray], Suggests):
     u, v : (...) float32
         Barycentric coordinates: the closest point is (1 - u - v) v0 + u v1 + v v2.
     prim_id : (...) int32
-        Index of the face that the closest point is on; over a scene, among the faces of all its objects.
+        Index of the face that the closest point is on. `face`, `object`, `instance` and `material` are ids as those of `Hits`.
     source : tuple or None
         Snapshot from which ids are computed. Pickled points have none.
     """

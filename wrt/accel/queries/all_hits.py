@@ -50,8 +50,6 @@ class ListOptions(WorldOptions, total=False):
 class AllHits(HitIds[ArrayT]):
     """M hits of N rays, ray by ray (in C order), in order of t and, at equal t, of prim_id. Arrays of NumPy, PyTorch or JAX.
 
-    `face`, `object`, `instance` and `material` are the ids of `Hits`.
-
     Attributes
     ----------
     first : (N + 1,) int64
@@ -59,7 +57,7 @@ class AllHits(HitIds[ArrayT]):
     t, u, v : (M,) float32
         As in `Hits`.
     prim_id : (M,) int32
-        Index of the face; over a scene, among the faces of all its objects.
+        Index of the face. `face`, `object`, `instance` and `material` are ids as those of `Hits`.
     source : tuple or None
         Snapshot from which ids are computed. Pickled hits have none.
     """
@@ -171,11 +169,10 @@ class ListQuery:
         return self._all(first, *hits)
 
     def _all(self, first: np.ndarray, *hits: Array) -> AllHits[Any]:
-        return AllHits(*[self.converted(first), *map(self.give, hits), self._source(lambda: np.diff(first))])
+        return AllHits(*[self.converted(first), *map(self.give, hits), self._source(np.diff(first))])
 
-    def _source(self, counts: Callable[[], ArrayLike]) -> Source:
-        """Return the source of hits. counts: function that returns the number of hits of each ray."""
-        return self.snapshot, None, self.worlds and self.worlds.of(np.repeat(np.arange(self.n), to_numpy(counts())))
+    def _source(self, counts: int | np.ndarray) -> Source:
+        return self.snapshot, None, self.worlds and self.worlds.of(np.repeat(np.arange(self.n), counts))
 
     def first(self, k: int) -> Hits[Any]:
         """Find the first k hits of each ray, in arrays (N, k)."""
@@ -187,7 +184,7 @@ class ListQuery:
             self._copy(rays, lists, begin[:len(of_each)], hits)
             begin = begin[len(of_each):]
         shape = (self.n,) if self.shape is None else self.shape
-        return Hits(*[*(self.give(array.reshape((*shape, k))) for array in hits), None, self._source(lambda: np.full(self.n, k))])
+        return Hits(*[*(self.give(array.reshape((*shape, k))) for array in hits), None, self._source(k)])
 
     def counts(self) -> np.ndarray:
         """Count the hits of each ray, (N,) int64. If no triangle is in several leaves, one traversal is enough."""

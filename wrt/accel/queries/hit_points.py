@@ -40,10 +40,7 @@ class DeviceScene(NamedTuple):
 
 
 class HitIds(Generic[ArrayT]):
-    """Ids of hits or closest points, computed from `prim_id`, as arrays of the same library and shape (...) as `prim_id`.
-
-    Each access computes the ids again. An attribute raises InputError without `source`, or if the structure lacks the data for it.
-    """
+    """Ids of hits or closest points, computed from `prim_id` on each access, as arrays of the same library and shape (...)."""
 
     prim_id: ArrayT
     source: Source | None
@@ -55,10 +52,7 @@ class HitIds(Generic[ArrayT]):
 
     @property
     def face(self) -> ArrayT:
-        """Index of the face within the mesh of its `object`: (...) int32, -1 on a miss and on a sphere.
-
-        `prim_id` counts on over all meshes of a scene; over a single mesh both are the same.
-        """
+        """Index of the face within the mesh of `object` (prim_id counts on over the meshes): (...) int32, -1 on a miss or a sphere."""
         return self._filled("face")
 
     @property
@@ -80,8 +74,7 @@ class HitIds(Generic[ArrayT]):
         return self._filled("material")
 
     def __reduce__(self) -> tuple[Any, ...]:
-        own: Any = self
-        return type(self), tuple(getattr(self, each.name) for each in fields(own) if each.name != "source")
+        return type(self), tuple(getattr(self, each.name) for each in fields(self) if each.name != "source")  # type: ignore[arg-type]
 
     def _source(self, rays: bool = True) -> Source:
         """Return the source. Raises InputError without it, and, if `rays` are needed, without rays."""

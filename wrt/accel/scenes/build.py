@@ -52,12 +52,10 @@ if TYPE_CHECKING:
     MeshLike: TypeAlias = OneMeshLike | SceneLike
     WorldT = TypeVar("WorldT", bound=MeshLike)
 
-# How to build over the meshes and models of other libraries, by package.
-OTHER_MESHES = {
-    "pyvista": "wrt.build(wrt.compat.pyvista.to_mesh(mesh))",
-    "open3d": "wrt.build((mesh.vertices, mesh.triangles)), or of a tensor mesh wrt.build((mesh.vertex.positions, mesh.triangle.indices))",
-    "newton": "wrt.build((mesh.vertices, mesh.indices.reshape(-1, 3))); for a model see docs/compat.md, MuJoCo and Newton",
-    "mujoco": "docs/compat.md, MuJoCo and Newton, makes meshes of a model"}
+OTHER_MESHES = {"pyvista": "wrt.build(wrt.compat.pyvista.to_mesh(mesh))",  # hints, by package
+                "open3d": "wrt.build((mesh.vertices, mesh.triangles)), or (mesh.vertex.positions, mesh.triangle.indices) of a tensor mesh",
+                "newton": "wrt.build((mesh.vertices, mesh.indices.reshape(-1, 3))); a model: docs/compat.md, MuJoCo and Newton",
+                "mujoco": "docs/compat.md, MuJoCo and Newton, has the meshes of a model"}
 
 
 class BuildOptions(TypedDict, total=False):
@@ -175,8 +173,7 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = DEFAULT_
                          hint="vertices and faces are one argument: wrt.build((vertices, faces))")
     ACCELERATORS.check(accel, "accel")
     kind, device = ACCELERATORS[accel], as_one(device, str, "device")
-    unnamed = as_one(movable, bool, "movable") and not isinstance(mesh, list)
-    if unnamed:
+    if unnamed := as_one(movable, bool, "movable") and not isinstance(mesh, list):
         mesh = [mesh]
     flat = (worlds_over([to_mesh_or_scene(each) for each in mesh], unnamed) if isinstance(mesh, list)
              else None if isinstance(mesh, Geometry | InstancedGeometry) else to_flat_scene(mesh))  # a geometry has no attributes

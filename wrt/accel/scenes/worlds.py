@@ -18,8 +18,7 @@ from wrt.scene.model import Object, Scene
 
 def worlds_over(worlds: Sequence[Mesh | Scene], unnamed: bool = False) -> FlatScene:
     """Join several worlds in one geometry; each mesh is stored once. Raises InputError for spheres and flattened objects.
-
-    unnamed: the caller has one scene and named no world, and messages do not, either."""
+    unnamed: the caller has one scene and knows no world, so that messages name none."""
     for index, scene in enumerate(worlds):
         place = "" if unnamed else f"world {index}"
         for thing in scene.objects if isinstance(scene, Scene) else ():
