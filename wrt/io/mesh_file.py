@@ -79,7 +79,8 @@ def load_mesh(path: PathLike, parts: Sequence[tuple[int, int]] = ()) -> Mesh:
     """
     path = as_path(path, "path")
     if path.suffix.lower() not in MESH_FORMATS:
-        hint = "wrt.load_scene and wrt.build read scene files" if path.suffix.lower() in (".toml", ".gltf", ".glb") else None
+        hint = ("wrt.load_scene and wrt.build read scene files" if path.suffix.lower() in (".toml", ".gltf", ".glb")
+                else "docs/compat.md has meshes of MuJoCo's models" if path.suffix.lower() in (".xml", ".urdf", ".usd", ".usda") else None)
         raise InputError(f"is no mesh file: its suffix must be one of {', '.join(MESH_FORMATS)}", path=path, hint=hint)
     require_file(path)
     with at(path=path):

@@ -174,7 +174,7 @@ def tube(points: Sequence[Point] | np.ndarray, radius: float | Point = 0.1, segm
         fan = np.arange(1, segments - 1)
         faces = np.stack([np.zeros_like(fan), fan, fan + 1], axis=1)[:, ::int(outward)]
         flat = np.tile(outward * tangent[end], (segments, 1))
-        parts.append(Mesh(np.float32(rim), faces, normals=flat, uvs=np.zeros((segments, 2))))
+        parts.append(Mesh(np.asarray(rim, np.float32), faces, normals=flat, uvs=np.zeros((segments, 2))))
     return merged(parts, "tube")
 
 

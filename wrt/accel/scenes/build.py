@@ -53,6 +53,11 @@ if TYPE_CHECKING:
     MeshLike: TypeAlias = OneMeshLike | SceneLike
     WorldT = TypeVar("WorldT", bound=MeshLike)
 
+OTHER_MESHES = {"pyvista": "wrt.build(wrt.compat.pyvista.to_mesh(mesh))",  # hints, by package
+                "open3d": "wrt.build((mesh.vertices, mesh.triangles)), or (mesh.vertex.positions, mesh.triangle.indices) of a tensor mesh",
+                "newton": "wrt.build((mesh.vertices, mesh.indices.reshape(-1, 3))); a model: docs/compat.md, MuJoCo and Newton",
+                "mujoco": "docs/compat.md, MuJoCo and Newton, has the meshes of a model"}
+
 
 class BuildOptions(TypedDict, total=False):
     """Options of `build`. A comment names the structures that have an option and the options below it. See docs/acceleration.md."""
@@ -169,9 +174,9 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = DEFAULT_
                          hint="vertices and faces are one argument: wrt.build((vertices, faces))")
     ACCELERATORS.check(accel, "accel")
     kind, device = ACCELERATORS[accel], as_one(device, str, "device")
-    if as_one(movable, bool, "movable") and not isinstance(mesh, list):
+    if unnamed := as_one(movable, bool, "movable") and not isinstance(mesh, list):
         mesh = [mesh]
-    flat = (worlds_over([to_mesh_or_scene(each) for each in mesh]) if isinstance(mesh, list)
+    flat = (worlds_over([to_mesh_or_scene(each) for each in mesh], unnamed) if isinstance(mesh, list)
              else None if isinstance(mesh, Geometry | InstancedGeometry) else to_flat_scene(mesh))  # a geometry has no attributes
     geometry = mesh if flat is None else flat.geometry
     structure: type[Any] | partial[Any] = partial(Instances, kind) if isinstance(geometry, InstancedGeometry) else kind
@@ -288,4 +293,4 @@ def to_mesh_or_scene(mesh: MeshLike) -> Mesh | Scene:
     if isinstance(mesh, Scene | Mesh):
         return mesh
     raise InputError("must be a Mesh, a Scene, the path of a mesh or scene file, a trimesh.Trimesh or trimesh.Scene, a wp.Mesh, or a pair"
-                     f" (vertices, faces), got {shown(mesh)}", argument="mesh")
+                     f" (vertices, faces), got {shown(mesh)}", argument="mesh", hint=OTHER_MESHES.get(type(mesh).__module__.split(".")[0]))

@@ -17,15 +17,17 @@ from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene
 
 
-def worlds_over(worlds: Sequence[Mesh | Scene]) -> FlatScene:
-    """Join several worlds in one geometry; each mesh is stored once. Raises InputError for spheres and flattened objects."""
+def worlds_over(worlds: Sequence[Mesh | Scene], unnamed: bool = False) -> FlatScene:
+    """Join several worlds in one geometry; each mesh is stored once. Raises InputError for spheres and flattened objects.
+    unnamed: the caller has one scene and knows no world, so that messages name none."""
     for index, scene in enumerate(worlds):
+        place = "" if unnamed else f"world {index}"
         for thing in scene.objects if isinstance(scene, Scene) else ():
             if not is_invertible(thing):
                 raise InputError("is flattened or sheared too much to be an instance",
-                                 place=f"world {index}: object {thing.name!r}")
+                                 place=f"{place and place + ': '}object {thing.name!r}")
         if isinstance(scene, Scene) and scene.spheres:
-            raise InputError("has spheres, but worlds must consist of meshes", place=f"world {index}",
+            raise InputError("has spheres, but only meshes move (movable=True) or are in worlds", place=place or "the scene",
                              hint=MESH_OF_A_SPHERE)
     grey = (Material(),)
     objects = [scene.objects if isinstance(scene, Scene) else (Object(scene, grey, name=scene.name),) for scene in worlds]
