@@ -22,7 +22,7 @@ from wrt.accel.snapshot import Snapshot
 from wrt.accel.store import check_order, save
 from wrt.accel.structure import Structure, options_of
 from wrt.accel.tree_exchange import TreeExchange
-from wrt.core.arrays import check_no_gradients, from_tensor
+from wrt.core.arrays import check_no_gradients, from_tensor, real_numbers
 from wrt.core.building import report_parts
 from wrt.core.default_device import DEFAULT_DEVICE
 from wrt.core.device import upload
@@ -31,6 +31,7 @@ from wrt.core.seconds import build_clock
 from wrt.core.types import ArrayLike, KernelModule, PathLike, WarpArray, WarpStruct, WarpType
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.warp_private import fields_of
+from wrt.scene.values import near_zero
 
 MeshT = TypeVar("MeshT", bound="OneMesh")
 
@@ -119,10 +120,10 @@ class OneMesh(TreeExchange, ABC):
 
     def _moved(self, vertices: ArrayLike) -> Geometry:
         """Return the geometry with new vertices. Raises InputError for another shape and for values that are not finite."""
-        moved = vectors(vertices, "vertices").copy()
-        if moved.shape != (self.geometry.n_vertices, 3):
+        near, origin = near_zero(real_numbers(vertices, "vertices", "(V, 3)"))
+        if (moved := vectors(near, "vertices").copy()).shape != (self.geometry.n_vertices, 3):
             raise InputError(f"must be {(self.geometry.n_vertices, 3)}, got {moved.shape}", argument="vertices")
-        return Geometry(moved, self.geometry.faces, self.geometry.spheres)
+        return Geometry(moved, self.geometry.faces, self.geometry.spheres, origin)
 
     def _refit_in_place(self, points: ArrayLike) -> None:
         raise InputError(f"a {self.name} cannot be refitted in place", hint="use bvh2")

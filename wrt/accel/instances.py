@@ -150,7 +150,7 @@ class Instances(Accelerator):
             assert instance is not None
             rows, matrices = checked_moves(rows_of(geometry, before.attributes), instance, matrix)
             to_world = geometry.to_world.copy()
-            to_world[rows] = matrices
+            to_world[rows] = geometry.near_zero(rows, matrices)
             geometry = replace(geometry, to_world=to_world)
             if "boxes" not in self._cache:
                 self._cache["boxes"] = self._boxes(geometry, MOVED_BOXES)

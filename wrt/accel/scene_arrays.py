@@ -16,7 +16,8 @@ from wrt.core.errors import InputError
 ALWAYS: dict[str, tuple[str, int | None]] = {
     "vertices": ("<f4", 3), "faces": ("<i4", 3), "spheres": ("<f4", 4), "uvs": ("<f4", 2), "prim_material": ("<i4", None)}
 OPTIONAL: dict[str, tuple[str, int | None]] = {
-    "normals": ("<f4", 3), "objects": ("<i8", None), "worlds": ("<i8", None), "own_materials": ("<i8", 3), "prim_ids": ("<i4", None)}
+    "normals": ("<f4", 3), "objects": ("<i8", None), "worlds": ("<i8", None), "own_materials": ("<i8", 3), "prim_ids": ("<i4", None),
+    "origin": ("<f8", None), "part_origins": ("<f8", 3)}
 PLACED = "first_prim", "first_face", "first_material", "material_step"
 INSTANCED: dict[str, tuple[str, int | None]] = {
     "part_sizes": ("<i8", 2), "part": ("<i4", None), "to_world": ("<f8", 12), "first_prim": ("<i8", None), "names": ("|u1", None),
@@ -28,12 +29,14 @@ def arrays_of(snapshot: Snapshot) -> dict[str, np.ndarray]:
     """Return the arrays of a structure's scene, with the present vertices and places."""
     geometry, scene = snapshot.geometry, snapshot.attributes or flat_scene_of(snapshot.geometry)
     out: dict[str, Any] = {name: getattr(scene, name) for name in ("vertices", "faces", "uvs", "prim_material", "normals", "objects")}
-    out["spheres"] = geometry.spheres
+    out |= {"spheres": geometry.spheres, "origin": geometry.origin}
     if isinstance(geometry, Geometry):
         out["vertices"] = geometry.vertices
     else:
         placed, first = placed_now(scene, geometry), geometry.parts[0]
         assert placed is not None
+        if any(part.origin is not None for part in geometry.parts):
+            out["part_origins"] = [np.zeros(3) if part.origin is None else part.origin for part in geometry.parts]
         out |= {"part_sizes": [(len(part.vertices), len(part.faces)) for part in geometry.parts], "part": geometry.part,
                 "to_world": geometry.to_world.reshape(-1, 12), "first_prim": geometry.first_prim, "worlds": geometry.worlds,
                 "prim_ids": first.prim_ids if isinstance(first, NumberedGeometry) else None,
@@ -52,9 +55,10 @@ def scene_of(arrays: Mapping[str, np.ndarray]) -> FlatScene:
     a = {name: _shaped(array, name).astype(np.dtype(KINDS[name][0]).newbyteorder("="), copy=False) for name, array in arrays.items()}
     _require(all(name in a for name in ALWAYS), "lacks an array")
     _require("normals" not in a or len(a["normals"]) == len(a["vertices"]), "has wrong normals")
+    _require("origin" not in a or (a["origin"].shape == (3,) and np.isfinite(a["origin"]).all()), "has a wrong origin")
     if "part" not in a:
         _require(_within(a["faces"], len(a["vertices"])), "has a face beyond its vertices")
-        geometry = Geometry(a["vertices"], a["faces"], a["spheres"])
+        geometry = Geometry(a["vertices"], a["faces"], a["spheres"], a.get("origin"))
         return FlatScene(geometry, geometry.vertices, geometry.faces, a.get("normals"), a["uvs"], a["prim_material"],
                          objects=a.get("objects"))
     _require(all(name in a for name in INSTANCED), "lacks an array")
@@ -75,15 +79,18 @@ def _geometry_of(a: Mapping[str, np.ndarray]) -> InstancedGeometry:
     ends = np.cumsum(np.concatenate([np.zeros((1, 2), np.int64), a["part_sizes"]]), axis=0)
     _require((a["part_sizes"] >= 0).all() and (ends[-1] == (len(a["vertices"]), len(a["faces"]))).all(), "has parts of wrong sizes")
     parts: list[Geometry] = []
+    origins = a.get("part_origins")
+    _require(origins is None or (len(origins) == len(a["part_sizes"]) and np.isfinite(origins).all()), "has a wrong origin")
     for (vertex, face), (last_vertex, last_face) in pairwise(ends):
         faces = a["faces"][face:last_face] - np.int32(vertex)
         _require(_within(faces, last_vertex - vertex), "has a face beyond its vertices")
-        parts.append(Geometry(a["vertices"][vertex:last_vertex], faces, a["spheres"] if not parts else a["spheres"][:0]))
+        own = None if origins is None or not origins[len(parts)].any() else origins[len(parts)]
+        parts.append(Geometry(a["vertices"][vertex:last_vertex], faces, a["spheres"] if not parts else a["spheres"][:0], own))
     part, first, count = a["part"], a["first_prim"], np.array([each.n_triangles for each in parts], np.int64)
     _require(len(parts) > 0 and _within(part, len(parts)) and len(part) == len(first) == len(a["to_world"]), "has a wrong instance")
     n_triangles = int(count[part].sum())
     if "prim_ids" in a:
-        numbered = NumberedGeometry(parts[0].vertices, parts[0].faces, parts[0].spheres, a["prim_ids"])
+        numbered = NumberedGeometry(parts[0].vertices, parts[0].faces, parts[0].spheres, prim_ids=a["prim_ids"])
         parts[0] = numbered
         _require(len(numbered.prim_ids) == len(numbered) and (np.diff(numbered.prim_ids) > 0).all()
                  and _within(numbered.prim_ids, n_triangles + len(numbered.spheres)), "has a wrong prim_id")
@@ -97,7 +104,7 @@ def _geometry_of(a: Mapping[str, np.ndarray]) -> InstancedGeometry:
     worlds = a.get("worlds")
     _require(worlds is None or (len(worlds) > 1 and worlds[0] == 0 and worlds[-1] == len(part) and (np.diff(worlds) >= 0).all()),
              "has wrong worlds")
-    return InstancedGeometry(tuple(parts), part, to_world, first, n_triangles, worlds)
+    return InstancedGeometry(tuple(parts), part, to_world, first, n_triangles, worlds, a.get("origin"))
 
 
 def _within(indices: np.ndarray, count: int) -> bool:

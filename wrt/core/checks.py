@@ -131,12 +131,14 @@ def at_thing(kind: str, name: str) -> str:
 
 
 def shown(value: object) -> str:
-    """Return a value for a message: numbers, text and lists as they are, but short; arrays by shape and type, other objects by type."""
+    """Return a value for a message: numbers, text and lists as they are, but short; arrays by shape and type, other objects by their class,
+    with the package of a class that is not wrt's own."""
     if isinstance(value, str | int | float | tuple | list) or value is None:
         return short(value)
     if isinstance(value, np.ndarray):
         return f"an array {value.shape} of {value.dtype}"
-    return _a(type(value).__name__)
+    package = type(value).__module__.partition(".")[0]
+    return _a(("" if package in ("builtins", "wrt") else f"{package}.") + type(value).__name__)
 
 
 def short(value: object, most: int = 60) -> str:

@@ -13,7 +13,44 @@ WHITE: Color = (1.0, 1.0, 1.0)
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 SMALLEST = 1e-30  # smallest length
 MAX_OBJECTS = 1 << 20  # largest number of objects, of spheres and of lights
+FAR = 32.0  # coordinates of float64 that are larger than this multiple of half their extent lose 5 bits or more in float32
+FAR_IN_FLOAT32 = 256.0  # float32 coordinates this far from 0 have lost 8 bits: a warning
 MAX_REACH = 1e18  # largest coordinate in world space: squared distances must not overflow float32
+
+
+def far_origin(low: np.ndarray, high: np.ndarray, far: float = FAR) -> np.ndarray | None:
+    """Return a point near the middle of a box that is far from 0, (3,) float64, or None for other boxes. low, high: (3,).
+
+    Its coordinates have few bits: subtracting them from a coordinate in the box rounds nothing."""
+    with np.errstate(all="ignore"):
+        half = float((high / 2.0 - low / 2.0).max(initial=0.0))
+        if not (0.0 < half < math.inf and float(np.maximum(-low, high).max()) > far * half):
+            return None
+    step = 2.0 ** (math.frexp(half)[1] - 11)
+    return np.asarray(np.round((low / 2.0 + high / 2.0) / step) * step)
+
+
+def near_zero(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return positions (N, 3) as float32, and the origin (3,) that was subtracted from those of 8 bytes far from 0, or None."""
+    origin = None
+    if positions.dtype.itemsize > 4 and positions.ndim == 2 and len(positions):
+        positions = positions.astype(np.float64, copy=False)
+        origin = far_origin(positions.min(axis=0), positions.max(axis=0))
+    with np.errstate(over="ignore", invalid="ignore"):
+        return (positions if origin is None else positions - origin).astype(np.float32, copy=False), origin
+
+
+def type_of(places: np.ndarray) -> type:
+    """Return np.float64 for places (..., 3) that float32 would round with steps above 1e-4, those beyond 1,024; else np.float32."""
+    return np.float64 if (np.abs(places) > 1024.0).any() and (places.astype(np.float32) != places).any() else np.float32
+
+
+def shift(origin: np.ndarray | None, sign: float = 1.0) -> np.ndarray:
+    """Return the (4, 4) matrix that adds `origin`, or subtracts it with the sign -1."""
+    matrix = np.eye(4)
+    if origin is not None:
+        matrix[:3, 3] = sign * origin
+    return matrix
 
 
 def as_vector(value: object, what: str, *, low: float = -math.inf, high: float = math.inf) -> Color:

@@ -117,7 +117,7 @@ def test_nothing_to_move_and_one_that_is_alone() -> None:
 
 def with_a_part_in_the_world() -> Instances:
     placed = crowd(3)
-    world = NumberedGeometry(*(np.zeros(shape, dtype) for shape, dtype in (((3, 3), "f4"), ((1, 3), "i4"), ((0, 4), "f4"))),
+    world = NumberedGeometry(*(np.zeros(shape, dtype) for shape, dtype in (((3, 3), "f4"), ((1, 3), "i4"), ((0, 4), "f4"))), None,
                              np.array([placed.n_triangles], np.int32))
     return structure(geometry=InstancedGeometry((world, *placed.parts), np.append(0, placed.part + 1),
                                                 np.concatenate([np.eye(4)[None, :3], placed.to_world]),

@@ -86,8 +86,8 @@ def contains(accel: Accelerator, points: ArrayLike, threads: int | None = None, 
     InputError
         For a mesh that is not closed, other structures, and points that are not finite.
     """
-    rows, shape, world = shaped_points(points, world)
     query = ListQuery(accel, threads, crossings=True)
+    rows, shape, world = shaped_points(points, world, query.snapshot.geometry.origin)
     if count := open_edges_of(query.snapshot):
         raise InputError(f"the mesh is not closed: {count} edges have an odd number of faces",
                          hint="for an open mesh, use wrt.winding_number(accel, points) > 0.5, or wrt.signed_distance(..., sign='winding')")

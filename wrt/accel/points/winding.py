@@ -77,7 +77,7 @@ def winding_number(accel: Accelerator, points: ArrayLike, threads: int | None = 
     Schmidt, Levin and Jacobson 2018, "Fast Winding Numbers for Soups and Clouds".
     """
     snapshot, threads = snapshot_of(accel, instances=True), thread_count(threads)
-    rows, shape, world = shaped_points(points, world)
+    rows, shape, world = shaped_points(points, world, snapshot.geometry.origin)
     worlds = check_world(snapshot, world, len(rows))
     if isinstance(snapshot.geometry, InstancedGeometry):
         out = np.zeros(len(rows))

@@ -122,6 +122,14 @@ class Accelerator:
         return self._snapshot.geometry
 
     @property
+    def origin(self) -> np.ndarray:
+        """Point of the world that is 0 in the arrays of `geometry` and for `ray_query`, (3,) float64; not 0 only far from 0.
+
+        Queries subtract it from origins and points in float64, so that float64 rays are as accurate as near 0."""
+        origin = self._snapshot.geometry.origin
+        return np.zeros(3) if origin is None else origin.copy()
+
+    @property
     def data(self) -> WarpStruct:
         """Warp struct of the structure's arrays, an argument of kernels. A refit makes a new one; a refit in place modifies it."""
         return self._snapshot.data
@@ -182,15 +190,15 @@ class Accelerator:
         threads, shape, callers = thread_count(threads), None, None if out is None else arrays_of(out)
         if costs:
             check_keywords("closest_hit", costs, CLOSEST_HIT)
+        snapshot = self._snapshot  # read once, because a refit may replace it during the query
         if are_rows(origins, directions) and invalid == "raise":  # the usual case, whose arrays need no other shape
-            rays = rays_of(origins, directions, t_min, t_max, True)  # type: ignore[arg-type]
+            rays = rays_of(origins, directions, t_min, t_max, True, snapshot.geometry.origin)  # type: ignore[arg-type]
         else:
-            rays, shape = shaped_rays(origins, directions, t_min, t_max, True, invalid)
+            rays, shape = shaped_rays(origins, directions, t_min, t_max, True, invalid, snapshot.geometry.origin)
             callers, world = callers and flat_arrays(callers, shape, HIT_TYPES), worlds_of_each(world, shape)
         give = to_tensor_like(origins, directions)
         t, u, v, prim_id = arrays = answer_arrays(HIT_TYPES, callers, len(rays.origins), self.device if rays.as_warp else None,
                                              give is not None)
-        snapshot = self._snapshot  # read once, because a refit may replace it during the query
         worlds = check_world(snapshot, world, len(t))
         query, counters = Query(rays, arrays, threads, worlds, tiled_width(shape) if shape else 0), None
         if costs and any(costs.values()):
@@ -241,14 +249,14 @@ class Accelerator:
         if options:
             check_keywords("any_hit", options, ANY_HIT)
             world, invalid = options.get("world"), options.get("invalid", invalid)
+        snapshot = self._snapshot
         if are_rows(origins, directions) and invalid == "raise":
-            rays = rays_of(origins, directions, t_min, t_max)  # type: ignore[arg-type]
+            rays = rays_of(origins, directions, t_min, t_max, origin=snapshot.geometry.origin)  # type: ignore[arg-type]
         else:
-            rays, shape = shaped_rays(origins, directions, t_min, t_max, invalid=invalid)
+            rays, shape = shaped_rays(origins, directions, t_min, t_max, invalid=invalid, origin=snapshot.geometry.origin)
             callers, world = callers and flat_arrays(callers, shape, ANY_HIT_TYPES), worlds_of_each(world, shape)
         give = to_tensor_like(origins, directions)
         arrays = answer_arrays(ANY_HIT_TYPES, callers, len(rays.origins), self.device if rays.as_warp else None, give is not None)
-        snapshot = self._snapshot
         worlds = check_world(snapshot, world, len(arrays[0]))
         trace_query(snapshot, Query(rays, arrays, threads, worlds, tiled_width(shape) if shape else 0))
         found = arrays[0] if shape is None else in_shape(arrays[0], shape)

@@ -75,7 +75,7 @@ def record_steps(accel: Accelerator, origins: ArrayLike, directions: ArrayLike, 
         raise InputError("must be a structure over one mesh, not over instances", argument="accel",
                          hint="wrt.build(mesh) over one of the meshes, or wrt.build(wrt.Scene.of(meshes)) over all")
     snapshot = accel.snapshot
-    rays = rays_of(np.asarray(origins), np.asarray(directions), t_min, t_max, True)
+    rays = rays_of(np.asarray(origins), np.asarray(directions), t_min, t_max, True, snapshot.geometry.origin)
     out = answer_arrays(HIT_TYPES, None, len(rays.origins), None, False)
     counts, first, steps = recorded(snapshot, Query(rays, out, thread_count(None)))
     nodes, primitives = (int(counts[name].sum(dtype=np.int64)) for name in ("nodes", "primitives"))

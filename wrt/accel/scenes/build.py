@@ -14,7 +14,7 @@ import warp as wp
 
 from wrt.accel.base import OneMesh
 from wrt.accel.box_tree import BoxTree
-from wrt.accel.flat_scene import FlatScene, flat_scene_of
+from wrt.accel.flat_scene import FlatScene, flat_scene_of, with_origin
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.instances import Instances
@@ -31,6 +31,7 @@ from wrt.core.errors import InputError
 from wrt.core.types import ArrayLike, PathLike
 from wrt.io.load import LOADERS, load_scene
 from wrt.io.mesh_file import load_mesh
+from wrt.scene.far import moved_by, scene_origin
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Scene
 
@@ -51,6 +52,11 @@ if TYPE_CHECKING:
     SceneLike: TypeAlias = Scene | InstancedGeometry | trimesh.Scene | PathLike
     MeshLike: TypeAlias = OneMeshLike | SceneLike
     WorldT = TypeVar("WorldT", bound=MeshLike)
+
+OTHER_MESHES = {"pyvista": "wrt.build(wrt.compat.pyvista.to_mesh(mesh))",  # hints, by package
+                "open3d": "wrt.build((mesh.vertices, mesh.triangles)), or (mesh.vertex.positions, mesh.triangle.indices) of a tensor mesh",
+                "newton": "wrt.build((mesh.vertices, mesh.indices.reshape(-1, 3))); a model: docs/compat.md, MuJoCo and Newton",
+                "mujoco": "docs/compat.md, MuJoCo and Newton, has the meshes of a model"}
 
 
 class BuildOptions(TypedDict, total=False):
@@ -168,9 +174,9 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = DEFAULT_
                          hint="vertices and faces are one argument: wrt.build((vertices, faces))")
     ACCELERATORS.check(accel, "accel")
     kind, device = ACCELERATORS[accel], as_one(device, str, "device")
-    if as_one(movable, bool, "movable") and not isinstance(mesh, list):
+    if unnamed := as_one(movable, bool, "movable") and not isinstance(mesh, list):
         mesh = [mesh]
-    flat = (worlds_over([to_mesh_or_scene(each) for each in mesh]) if isinstance(mesh, list)
+    flat = (worlds_over([to_mesh_or_scene(each) for each in mesh], unnamed) if isinstance(mesh, list)
              else None if isinstance(mesh, Geometry | InstancedGeometry) else to_flat_scene(mesh))  # a geometry has no attributes
     geometry = mesh if flat is None else flat.geometry
     structure: type[Any] | partial[Any] = partial(Instances, kind) if isinstance(geometry, InstancedGeometry) else kind
@@ -261,7 +267,9 @@ def to_flat_scene(mesh: MeshLike) -> FlatScene:
         return flat_scene_of(mesh)
     mesh = to_mesh_or_scene(mesh)
     if isinstance(mesh, Scene):
-        return flatten(mesh, instanced_meshes(mesh))
+        origin = scene_origin(mesh)
+        near = moved_by(mesh, origin)
+        return with_origin(flatten(near, instanced_meshes(near)), origin)
     return flat_scene_of(Geometry.of(mesh), mesh.normals, mesh.uvs)
 
 
@@ -280,7 +288,9 @@ def to_mesh_or_scene(mesh: MeshLike) -> Mesh | Scene:
         mesh = Mesh(mesh.points.numpy(), mesh.indices.numpy().reshape(-1, 3))
     elif type(mesh).__module__.split(".")[0] == "trimesh":
         mesh = Mesh.from_trimesh(mesh)  # type: ignore[arg-type]  # narrowed without an import of trimesh
+    if isinstance(mesh, Mesh):
+        mesh.warn_if_far()
     if isinstance(mesh, Scene | Mesh):
         return mesh
     raise InputError("must be a Mesh, a Scene, the path of a mesh or scene file, a trimesh.Trimesh or trimesh.Scene, a wp.Mesh, or a pair"
-                     f" (vertices, faces), got {shown(mesh)}", argument="mesh")
+                     f" (vertices, faces), got {shown(mesh)}", argument="mesh", hint=OTHER_MESHES.get(type(mesh).__module__.split(".")[0]))

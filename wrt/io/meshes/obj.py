@@ -21,6 +21,7 @@ from wrt.core.files import read_file, utf8
 from wrt.io.mesh_file import RawMesh
 from wrt.io.polygons import triangulate
 from wrt.io.text import as_number, without_comment
+from wrt.scene.values import near_zero
 from wrt.scene.vertex_normals import corner_normals
 
 # Keywords of the parts of a corner `v/vt/vn`, with the count of numbers that wrt reads from a line with that keyword.
@@ -192,8 +193,7 @@ def read(path: Path) -> RawMesh:
         warn(f"{path}: the indices of {' and '.join(text.absent)} in its faces are left out: the file has no such lines")
     counts = np.array(text.counts, dtype=np.int64)
 
-    with np.errstate(over="ignore"):
-        vertices = positions.astype(np.float32)[corner_triples[:, 0]]
+    vertices, origin = near_zero(positions[corner_triples[:, 0]])
     bad = np.nonzero(~np.isfinite(vertices).all(axis=1))[0]
     if len(bad):
         v = int(corner_triples[bad[0], 0])
@@ -218,6 +218,7 @@ def read(path: Path) -> RawMesh:
         face_group=polygon_group[polygon] if polygon_group is not None else None,
         incomplete=int(np.count_nonzero(counts < 3)),
         positions=len(positions),
+        origin=origin,
     )
 
 

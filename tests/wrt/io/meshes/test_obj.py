@@ -214,3 +214,12 @@ def test_one_group_equals_smooth_and_shares_vertices(tmp_path: Path) -> None:
     mesh = load_mesh(path)
     np.testing.assert_array_equal(mesh.faces, ball.faces)
     np.testing.assert_allclose(mesh.normals, smooth(wrt.Mesh(ball.vertices, ball.faces)).normals, atol=1e-7)
+
+
+def test_smoothing_groups_far_from_0(tmp_path: Path) -> None:
+    """Survey coordinates: the normals are those of the same surface near 0."""
+    near = load_mesh(write(tmp_path, RIDGE + "s 1\nf 1 2 3 4\nf 2 5 6 3\n"))
+    lines = [line.split() for line in RIDGE.splitlines()]
+    moved = "".join(f"v {int(x) + 529000.125} {int(y) + 5801000.25} {z}\n" for _, x, y, z in lines)
+    far = load_mesh(write(tmp_path, moved + "s 1\nf 1 2 3 4\nf 2 5 6 3\n"))
+    np.testing.assert_allclose(far.normals, near.normals, atol=1e-6)
