@@ -61,7 +61,8 @@ def load_mesh(path: PathLike, parts: Sequence[tuple[int, int]] = ()) -> Mesh:
 
     Polygons become triangles. Faces without area and vertices without a face are dropped (`Mesh.dropped` counts the faces); nothing is
     merged. Normals are scaled to unit length, and v is flipped so that (0, 0) is the top left of an image. Normals and uvs that are
-    not finite become zero, with one SceneWarning. An .npz file of `Mesh.save` is read bit by bit instead.
+    not finite become zero, with one SceneWarning. Corners without a normal get one if they are in a smoothing group of an .obj file.
+    An .npz file of `Mesh.save` is read bit by bit instead.
 
     Parameters
     ----------

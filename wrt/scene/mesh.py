@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import io
+import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -111,8 +112,9 @@ class Mesh:
     def from_trimesh(cls, mesh: trimesh.Trimesh | trimesh.Scene, smooth: bool = False) -> Mesh:
         """Return the triangles of a trimesh mesh, or of a whole trimesh scene in world space.
 
-        The result has the texture coordinates of the mesh, if there are any, and its vertex normals if `smooth`. Faces without area
-        stay, but rays never hit them. Raises InputError for any other object, and for arrays that `Mesh` refuses."""
+        The result has the texture coordinates of the mesh, if there are any, and its vertex normals, scaled to unit length, if
+        `smooth`. Faces without area stay, but rays never hit them. Raises InputError for any other object, and for arrays that `Mesh`
+        refuses."""
         with needed_by("a mesh of trimesh"):
             import trimesh
 
@@ -123,7 +125,7 @@ class Mesh:
         uv = getattr(mesh.visual, "uv", None)
         uvs = None if uv is None or len(uv) != len(mesh.vertices) else np.asarray(uv)[:, :2] * (1.0, -1.0) + (0.0, 1.0)
         source = getattr(mesh, "source", None)
-        return cls(np.array(mesh.vertices), np.array(mesh.faces), np.array(mesh.vertex_normals) if smooth else None, uvs,
+        return cls(np.array(mesh.vertices), np.array(mesh.faces), unit_rows(np.array(mesh.vertex_normals)) if smooth else None, uvs,
                    name=str(getattr(source, "file_name", None) or ""))
 
     def to_trimesh(self) -> trimesh.Trimesh:
@@ -136,12 +138,15 @@ class Mesh:
         return trimesh.Trimesh(vertices, self.faces, vertex_normals=self.normals, visual=visual, process=False)
 
     def save(self, path: PathLike) -> None:
-        """Write vertices, faces, normals and uvs to a file that `wrt.load_mesh` reads; .npz also has the groups.
+        """Write vertices and faces to a file that `wrt.load_mesh` reads.
+
+        .npz, .ply and .obj also have normals and uvs, and .npz has the groups. .npz keeps all bits; .obj, .off, .ply, .stl and .glb keep
+        those of the vertices. trimesh may round in other formats (.dae: seven digits).
 
         Parameters
         ----------
         path : str or path
-            .npz keeps all bits. Other suffixes are those of trimesh, such as .ply, .obj, .stl and .off; these need trimesh.
+            Suffixes other than .npz are those of trimesh, such as .ply, .obj, .stl and .off; these need trimesh.
 
         Raises
         ------
@@ -157,8 +162,12 @@ class Mesh:
             np.savez(data, exact=np.True_, **{name: array for name, array in arrays.items() if array is not None})
             write_bytes(path, data.getvalue())
             return
+        options: dict[str, Any] = {}
+        if path.suffix.lower() in (".obj", ".off"):  # numbers without an exponent: nine digits of the smallest keep all bits of a float32
+            smallest = np.abs(self.vertices).min(initial=1.0, where=self.vertices != 0.0)
+            options["digits"] = 9 - math.floor(math.log10(smallest))
         try:
-            written = self.to_trimesh().export(file_type=path.suffix.lower()[1:])
+            written = self.to_trimesh().export(file_type=path.suffix.lower()[1:], **options)
         except (ValueError, KeyError) as error:
             raise InputError(f"trimesh does not write this format ({error})", path=path,
                              hint="use .npz, .ply, .obj, .stl or .off") from error

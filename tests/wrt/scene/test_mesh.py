@@ -33,6 +33,13 @@ def test_meshes_come_from_trimesh_and_go_back() -> None:
     np.testing.assert_allclose(back.vertex_normals, smooth.normals, atol=1e-6)
 
 
+def test_normals_from_trimesh_get_unit_length() -> None:
+    trimesh = pytest.importorskip("trimesh")
+    normals = np.array([[0, 0, 127], [0, 3, 4], [0, 0, 0]], np.float32)
+    mesh = Mesh.from_trimesh(trimesh.Trimesh(np.eye(3), [[0, 1, 2]], vertex_normals=normals, process=False), smooth=True)
+    np.testing.assert_allclose(mesh.normals, [[0, 0, 1], [0, 0.6, 0.8], [0, 0, 0]], atol=1e-7)
+
+
 def test_a_trimesh_scene_is_taken_in_its_world() -> None:
     trimesh = pytest.importorskip("trimesh")
     scene = trimesh.Scene()

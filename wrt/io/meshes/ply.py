@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wrt.core.checks import short
 from wrt.core.errors import InputError
 from wrt.core.files import read_file, utf8
 from wrt.io.mesh_file import RawMesh
 from wrt.io.polygons import strip, triangulate
+from wrt.io.text import as_number
 from wrt.scene.values import near_zero
 
 _TYPES = {
@@ -263,11 +263,14 @@ class _Source:
         numbers, stream = array("d"), io.BytesIO(self.data)
         stream.seek(self.at)
         while text := b"".join(stream.readlines(BYTES_AT_ONCE)):
-            before = len(numbers)
+            before, words = len(numbers), text.split()
             try:
-                numbers.extend(map(float, text.split()))
-            except ValueError:
-                bad = next(islice(_WORD.finditer(text), len(numbers) - before, None))  # the numbers before it were appended
+                try:
+                    numbers.extend(map(float, words))
+                except ValueError:  # the numbers before the first odd word were appended
+                    numbers.extend(map(as_number, words[len(numbers) - before:]))
+            except InputError as error:
+                bad = next(islice(_WORD.finditer(text), len(numbers) - before, None))
                 line = self.data.count(b"\n", 0, stream.tell() - len(text) + bad.start()) + 1
-                raise InputError(f"{short(bad[0].decode('latin-1'))} is not a number", place=f"line {line}") from None
+                raise error.at(place=f"line {line}") from None
         return numbers.tobytes()
