@@ -515,3 +515,28 @@ def test_tangents_are_named_where_a_normal_map_would_use_them(tmp_path, mapped):
     file.json["meshes"][0]["primitives"].append(dict(primitive))
     _, told = load_warned(file.write(tmp_path))
     assert sum(text.count("TANGENT") for text in told) == int(mapped)
+
+
+# --- unlit surfaces ---------------------------------------------------------------------------------------------------
+
+
+CARD = {"pbrMetallicRoughness": {"baseColorFactor": [0.2, 0.4, 0.6, 1]}, "extensions": {"KHR_materials_unlit": {}}}
+
+
+@pytest.mark.parametrize("light", [{"type": "directional", "intensity": 0.01}, {"type": "point", "intensity": 9e6}])
+@pytest.mark.parametrize("lit", [False, True])
+def test_unlit_surfaces_keep_their_colours_beside_lights(tmp_path, light, lit):
+    """Lit surfaces beside them are neither black nor white, though lights have any unit."""
+    file = one_material(CARD)
+    file.json["extensions"] = {"KHR_lights_punctual": {"lights": [light]}}
+    file.node(extensions={"KHR_lights_punctual": {"light": 0}}, translation=[0.5, 0.5, 3])
+    if lit:
+        quad = file.json["meshes"][0]["primitives"][0] | {"material": file.add("materials", {"pbrMetallicRoughness": {"metallicFactor": 0}})}
+        file.node(mesh=file.mesh(quad), translation=[2, 0, 0])
+    scene, messages = load_warned(file.write(tmp_path))
+    assert not scene.settings.auto_exposure and ("its lights were multiplied by" in messages[0]) == lit
+    film = wrt.render(scene, spp=4, size=(64, 32))
+    card = np.abs(film.pixels - np.float32([0.2, 0.4, 0.6])).max(axis=2) < 1e-5
+    assert card.sum() > 100 and film.exposure == 0.0
+    rest = film.pixels[~card & (film.pixels.min(axis=2) > 0)]
+    assert not lit or 0.1 < np.median(rest) < 1.01
