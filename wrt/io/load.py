@@ -49,18 +49,8 @@ def load_scene(path: PathLike, *, up: str = "y", studio: bool = True, floor: boo
         If the file cannot be used; it names the file and the place. For TOML it lists all mistakes, each with key, value and expectation.
         If `up` or `floor` is given for a scene file, or `fill` for a file that is not glTF.
     """
-    return _load(as_path(path, "path"), Staging(up, studio, floor, fill))
-
-
-def load_shapes(path: PathLike) -> Scene:
-    """Read a scene file for queries. Of a glTF file only the shapes are read, so that a missing picture or a wrong light refuses no file.
-
-    Raises InputError as `load_scene`."""
-    return _load(as_path(path, "path"), Staging(), shapes_only=True)
-
-
-def _load(path: Path, staging: Staging, shapes_only: bool = False) -> Scene:
-    up, floor, fill = staging.up, staging.floor, staging.fill
+    staging = Staging(up, studio, floor, fill)
+    path = as_path(path, "path")
     known = ", ".join([*LOADERS, *MESH_FORMATS])
     require_file(path, f" (a scene is one of {known})")
     if path.is_dir():
@@ -74,7 +64,7 @@ def _load(path: Path, staging: Staging, shapes_only: bool = False) -> Scene:
     if fill is not None and path.suffix.lower() not in (".gltf", ".glb"):
         raise InputError("is for glTF files alone", argument="fill", path=path, hint="a TOML scene has `ambient`")
     with np.errstate(over="ignore", invalid="ignore"):  # the scene refuses infinite values
-        return load(path, staging, **({"shapes_only": True} if shapes_only and path.suffix.lower() in (".gltf", ".glb") else {}))
+        return load(path, staging)
 
 
 def as_scene(value: Scene | Mesh | PathLike) -> Scene:

@@ -10,7 +10,6 @@ import numpy as np
 from wrt.core.checks import as_choice, as_one, listed
 from wrt.scene.backgrounds import ConstantBackground, GradientBackground
 from wrt.scene.cameras import Camera
-from wrt.scene.kinds import forms
 from wrt.scene.lights import DirectionalLight
 from wrt.scene.materials import MATERIALS, Material
 from wrt.scene.model import Object, Scene
@@ -197,12 +196,11 @@ def expose(scene: Scene) -> tuple[Scene, str]:
     if not lit or not level > 0.0:
         return scene, ""
 
-    def scaled(thing: Any, field: str) -> Any:
-        return replace(thing, **{field: tuple(value / level for value in getattr(thing, field))})
+    def scaled(thing: Any, key: str) -> Any:
+        return replace(thing, **{key: tuple(value / level for value in getattr(thing, key))})
 
     new = {id(each): scaled(each, "emission") for each in lit}
-    lights = tuple(scaled(each, next(key for key, field in forms(type(each)).items() if field.metadata["form"] == "color"))
-                   for each in scene.lights)
+    lights = tuple(scaled(each, "irradiance" if isinstance(each, DirectionalLight) else "intensity") for each in scene.lights)
     objects = tuple(replace(each, materials=tuple(new.get(id(m), m) for m in each.materials)) for each in scene.objects)
     return (scaled(replace(scene, objects=objects, lights=lights), "ambient"),
             f"its lights were multiplied by {1.0 / level:.2g} in place of an automatic exposure, so that unlit surfaces keep their colours")

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
-from wrt.core.checks import LARGEST, as_array, as_choice, as_integer, as_one, as_size, at_thing
+from wrt.core.checks import as_array, as_choice, as_integer, as_one, as_size, at_thing
 from wrt.core.errors import wrong
 from wrt.scene.values import Color, _unit, as_number, as_vector
 
@@ -18,15 +18,10 @@ Limits = dict[str, Any]  # limits of a field: the keywords of `given`
 Record = dict[str, Any]  # values by the field names of a device struct: scalars, tuples, arrays
 
 
-def _limits(limits: Limits, unit: float = 1.0) -> tuple[float, float]:
+def _number(value: Any, what: str, limits: Limits, unit: float = 1.0) -> float:
     low = max(limits.get(each, -math.inf) for each in ("ge", "gt"))
     high = min(limits.get(each, math.inf) for each in ("le", "lt"))
-    return low * unit, high * unit
-
-
-def _number(value: Any, what: str, limits: Limits, unit: float = 1.0) -> float:
-    low, high = _limits(limits, unit)
-    return as_number(value, what, low=low, high=high, unit="" if unit == 1.0 else "radians")
+    return as_number(value, what, low=low * unit, high=high * unit, unit="" if unit == 1.0 else "radians")
 
 
 def _image(value: Any, what: str, limits: Limits) -> np.ndarray:
@@ -65,16 +60,6 @@ def given(form: str, about: str, unit: str = "", **limits: Any) -> dict[str, Any
 def forms(kind: type[object]) -> dict[str, Field[Any]]:
     """Return the fields of a dataclass that `given` describes, by name."""
     return {each.name: each for each in fields(kind) if "form" in each.metadata}  # type: ignore[arg-type]
-
-
-def bounds(kind: type[object]) -> dict[str, tuple[float, float]]:
-    """Return the lowest and the highest value of the fields of a dataclass that hold numbers or colours, by name."""
-    out = {}
-    for name, each in forms(kind).items():
-        form, (low, high) = each.metadata["form"], _limits(each.metadata["limits"])
-        if form in ("number", "color"):
-            out[name] = max(low, 0.0 if form == "color" else -LARGEST), min(high, LARGEST)
-    return out
 
 
 def check_fields(thing: object, at: str) -> None:

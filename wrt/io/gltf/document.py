@@ -123,7 +123,7 @@ class Document:
         if not 0 <= index < len(items):
             raise InputError(f"is {index}, but there are {len(items)} {array}", place=place)
         if (array, index) not in self._items:
-            self._items[array, index] = read_as(item_type(type(self.gltf), array), items[index], f"{array}[{index}]")
+            self._items[array, index] = read_as(item_type(array), items[index], f"{array}[{index}]")
         return self._items[array, index]
 
     def extension(self, holder: GltfObject, name: str, cls: type[T], place: str) -> T | None:

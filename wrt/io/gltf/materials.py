@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from wrt.core.checks import short
+from wrt.core.checks import LARGEST, short
 from wrt.core.errors import InputError, at
 from wrt.io.gltf.document import Document, GltfObject
 from wrt.io.gltf.schema import (
@@ -28,7 +28,7 @@ from wrt.io.gltf.schema import (
     exactly,
 )
 from wrt.picture.decode import decode_rgba8
-from wrt.scene.kinds import bounds
+from wrt.scene.kinds import forms
 from wrt.scene.materials import Material, Texture
 from wrt.scene.values import BLACK, Color
 
@@ -39,7 +39,8 @@ _FULL_REFLECTANCE = 25.0  # factor on the reflectance of the index 1.5, 0.04, th
 _GLOSSY = "KHR_materials_pbrSpecularGlossiness"
 _ALPHA_MODES = {"OPAQUE": "opaque", "MASK": "mask", "BLEND": "blend"}
 
-_LIMITS = bounds(Material)
+_LIMITS = {key: (each.metadata["limits"].get("ge", 0.0), each.metadata["limits"].get("le", LARGEST))
+           for key, each in forms(Material).items() if each.metadata["form"] in ("number", "color")}
 
 # Values with which an unsupported extension has no effect: the warning then leaves it out.
 _NEUTRAL: dict[str, dict[str, Any]] = {

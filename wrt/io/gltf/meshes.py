@@ -102,12 +102,13 @@ class Meshes:
     def _attribute(self, primitive: GltfObject, attribute: str, kind: str, place: str, targets: Targets) -> np.ndarray:
         """Return an attribute, float32, or float64 if morph targets change it. It may hold NaN and infinity."""
         index = primitive.attributes[attribute]
-        array = self._accessors.read(index, kind, f"{place}.attributes.{attribute}", finite=False).astype(np.float32, copy=False)
+        array: np.ndarray = self._accessors.read(index, kind, f"{place}.attributes.{attribute}", finite=False).astype(np.float32, copy=False)
         for weight, target in targets:
             if attribute in target:
-                delta = self._accessors.read(target[attribute], kind, f"{place}.targets: {attribute}", finite=False)
+                where = f"{place}.targets: {attribute}"
+                delta = self._accessors.read(target[attribute], kind, where, finite=False)
                 if len(delta) != len(array):
-                    raise InputError(f"has {len(delta)} elements, but the primitive has {len(array)}", place=f"{place}.targets: {attribute}")
+                    raise InputError(f"has {len(delta)} elements, but the primitive has {len(array)}", place=where)
                 array = array + weight * delta.astype(np.float64)
         return array
 

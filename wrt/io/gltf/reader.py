@@ -38,7 +38,7 @@ def load_gltf(path: PathLike, staging: Staging | None = None, *, staged: bool = 
     file that a scene file includes. shapes_only: read neither materials nor pictures, lights, cameras and animations; every material is
     grey, and nothing is added. One SceneWarning names everything left out or added. Settings are the defaults, except that
     glass_shadows is "tinted" if there is solid glass (KHR_materials_volume). Raises InputError with the file and the place in its JSON."""
-    with at(path=path):
+    with at(path=path), np.errstate(over="ignore", invalid="ignore"):  # the scene refuses infinite values
         document = Document(path, shapes_only)
         scene = _Reader(document, shapes_only).scene()
         notes = (("not supported and left out", document.left_out), ("wrong in the file and left out or changed", document.mistakes))
@@ -60,7 +60,7 @@ def load_gltf(path: PathLike, staging: Staging | None = None, *, staged: bool = 
 LIGHTS: dict[str, Callable[..., Light]] = {
     "point": lambda place, direction, color, cone, name: PointLight(place, color, name),
     "directional": lambda place, direction, color, cone, name: DirectionalLight(direction, color, name),
-    "spot": lambda place, direction, color, cone, name: SpotLight(place, direction, color, *cone, name),
+    "spot": lambda place, direction, color, cone, name: SpotLight(place, direction, color, cone[0], cone[1], name),
 }
 
 
@@ -168,7 +168,8 @@ class _Reader:
         lights = (self.document.extension(self.document.gltf, "KHR_lights_punctual", PunctualLights, "") or PunctualLights()).lights
         if not 0 <= link.light < len(lights):
             raise InputError(f"is {link.light}, but there are {len(lights)} lights", place=here)
-        where, left_out, clamp = f"extensions.KHR_lights_punctual.lights[{link.light}]", self.document.left_out, self.document.mistakes.clamp
+        left_out, clamp = self.document.left_out, self.document.mistakes.clamp
+        where = f"extensions.KHR_lights_punctual.lights[{link.light}]"
         source = read_as(PunctualLight, lights[link.light], where)
         name = node.name or source.name or f"light {link.light}"
         if source.type not in LIGHTS:

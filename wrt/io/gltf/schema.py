@@ -228,9 +228,11 @@ def _fields(cls: Any) -> dict[str, Any]:
 
 
 @functools.cache
-def item_type(document: Any, array: str) -> Any:
-    """Return the class of the items of an array in `document`, the class of pygltflib for a whole file."""
-    return typing.get_args(typing.get_type_hints(document)[array])[0]
+def item_type(array: str) -> Any:
+    """Return the class of pygltflib for the items of an array of a glTF file."""
+    import pygltflib
+
+    return typing.get_args(typing.get_type_hints(pygltflib.GLTF2)[array])[0]
 
 
 @functools.cache

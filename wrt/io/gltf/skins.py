@@ -1,5 +1,7 @@
 """Skinned meshes in the pose of the file's nodes, without animation. Source: Khronos, glTF 2.0 specification, section 3.7.3 (skins)."""
 
+from functools import cached_property
+
 import numpy as np
 
 from wrt.core.errors import InputError
@@ -13,7 +15,6 @@ class Skins:
 
     def __init__(self, document: Document, accessors: Accessors) -> None:
         self._document, self._accessors = document, accessors
-        self._worlds: dict[int, np.ndarray] = {}
         self._matrices: dict[int, np.ndarray] = {}
 
     def blend(self, skin: int, primitive: GltfObject, count: int, place: str) -> np.ndarray:
@@ -50,17 +51,16 @@ class Skins:
             self._matrices[skin] = worlds
         return self._matrices[skin]
 
-    def _world(self, joint: int, place: str) -> np.ndarray:
+    @cached_property
+    def _parents(self) -> dict[int, int]:
+        return parents_of(self._document)
+
+    def _world(self, joint: int | None, place: str) -> np.ndarray:
         """Return the matrix (4, 4) of a node to world space, whether the scene shows the node or not."""
-        self._document.item("nodes", joint, place)
-        parents, path = parents_of(self._document), [joint]
-        while path[-1] in parents and path[-1] not in self._worlds:
-            path.append(parents[path[-1]])
-        world = self._worlds.get(path[-1], np.eye(4))
-        for index in reversed(path):
-            if index not in self._worlds:
-                self._worlds[index] = world @ local_matrix(self._document.item("nodes", index, place), f"nodes[{index}]")
-            world = self._worlds[index]
+        world = np.eye(4)
+        while joint is not None:
+            world = local_matrix(self._document.item("nodes", joint, place), f"nodes[{joint}]") @ world
+            joint = self._parents.get(joint)
         return world
 
 

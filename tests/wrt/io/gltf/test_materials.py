@@ -169,7 +169,8 @@ GLASS = {"KHR_materials_transmission": {"transmissionFactor": 1}}
 
 @pytest.mark.parametrize("source, field, value, named", [
     ({"pbrMetallicRoughness": {"baseColorFactor": [1.00016, 0.5, 0.5, 1]}}, "albedo", (1, 0.5, 0.5), "albedo"),
-    ({"pbrMetallicRoughness": {"baseColorFactor": [1, -0.1, 1.1, 1]}, "extensions": {"KHR_materials_unlit": {}}}, "emission", (1, 0, 1), "albedo"),
+    ({"pbrMetallicRoughness": {"baseColorFactor": [1, -0.1, 1.1, 1]}, "extensions": {"KHR_materials_unlit": {}}}, "emission", (1, 0, 1),
+     "albedo"),
     ({"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1.0000001192]}, "alphaMode": "BLEND"}, "alpha", 1, "alpha"),
     ({"pbrMetallicRoughness": {"roughnessFactor": -1}}, "roughness", 0, "roughness"),
     ({"pbrMetallicRoughness": {"metallicFactor": 1.0000001}}, "metallic", 1, "metallic"),
@@ -531,7 +532,8 @@ def test_unlit_surfaces_keep_their_colours_beside_lights(tmp_path, light, lit):
     file.json["extensions"] = {"KHR_lights_punctual": {"lights": [light]}}
     file.node(extensions={"KHR_lights_punctual": {"light": 0}}, translation=[0.5, 0.5, 3])
     if lit:
-        quad = file.json["meshes"][0]["primitives"][0] | {"material": file.add("materials", {"pbrMetallicRoughness": {"metallicFactor": 0}})}
+        matte = file.add("materials", {"pbrMetallicRoughness": {"metallicFactor": 0}})
+        quad = file.json["meshes"][0]["primitives"][0] | {"material": matte}
         file.node(mesh=file.mesh(quad), translation=[2, 0, 0])
     scene, messages = load_warned(file.write(tmp_path))
     assert not scene.settings.auto_exposure and ("its lights were multiplied by" in messages[0]) == lit

@@ -17,7 +17,8 @@ from wrt.scene.mesh import Mesh
 FIRST = np.array([[1, 0, 0, 0]] * 3, np.float32)
 
 
-def skinned(joints: Any = FIRST * 0, weights: Any = FIRST, inverse: Any = None, poses: tuple[dict[str, Any], ...] = ({"scale": [0.01] * 3},),
+def skinned(joints: Any = FIRST * 0, weights: Any = FIRST, inverse: Any = None,
+            poses: tuple[dict[str, Any], ...] = ({"scale": [0.01] * 3},),
             dtype: str = "float32", normals: Any = None) -> GltfFile:
     """Return a file with a skinned triangle, whose node is moved by 10, and with a joint for each of `poses`, below a common parent."""
     file = one_triangle()
