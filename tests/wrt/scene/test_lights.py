@@ -26,7 +26,8 @@ def test_a_value_that_rounding_takes_past_its_limit_is_the_limit():
     assert Camera(fov_y=math.radians(179.94) * 1.0000001).fov_y == pytest.approx(math.radians(179.94), rel=1e-15)
 
 
-@pytest.mark.parametrize("angles, name", [({"outer": 1.571}, "outer"), ({"inner": 0.301, "outer": 0.3}, "inner"), ({"inner": -1e-9}, "inner")])
+@pytest.mark.parametrize("angles, name", [
+    ({"outer": 1.571}, "outer"), ({"inner": 0.301, "outer": 0.3}, "inner"), ({"inner": -1e-9}, "inner")])
 def test_a_value_further_out_is_refused(angles, name):
     with refused(name):
         spot(**angles)

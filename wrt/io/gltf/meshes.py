@@ -101,8 +101,8 @@ class Meshes:
 
     def _attribute(self, primitive: GltfObject, attribute: str, kind: str, place: str, targets: Targets) -> np.ndarray:
         """Return an attribute, float32, or float64 if morph targets change it. It may hold NaN and infinity."""
-        index = primitive.attributes[attribute]
-        array: np.ndarray = self._accessors.read(index, kind, f"{place}.attributes.{attribute}", finite=False).astype(np.float32, copy=False)
+        where = f"{place}.attributes.{attribute}"
+        array: np.ndarray = self._accessors.read(primitive.attributes[attribute], kind, where, finite=False).astype(np.float32, copy=False)
         for weight, target in targets:
             if attribute in target:
                 where = f"{place}.targets: {attribute}"
