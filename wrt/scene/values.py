@@ -11,6 +11,7 @@ Color = tuple[float, float, float]
 BLACK: Color = (0.0, 0.0, 0.0)
 WHITE: Color = (1.0, 1.0, 1.0)
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+ROUNDING = 2.0**-22  # relative; of a value that float32 arithmetic took past a limit
 SMALLEST = 1e-30  # smallest length
 MAX_OBJECTS = 1 << 20  # largest number of objects, of spheres and of lights
 FAR = 32.0  # coordinates of float64 that are larger than this multiple of half their extent lose 5 bits or more in float32
@@ -53,8 +54,16 @@ def shift(origin: np.ndarray | None, sign: float = 1.0) -> np.ndarray:
     return matrix
 
 
+def rounded(value: float, low: float, high: float) -> float:
+    """Return the value, or a limit that it exceeds by no more than a rounding to float32."""
+    for limit in (low, high):
+        if abs(value - limit) <= ROUNDING * abs(limit):
+            value = min(max(value, low), high)
+    return value
+
+
 def as_vector(value: object, what: str, *, low: float = -math.inf, high: float = math.inf) -> Color:
-    """Return three finite floats in [low, high]; a single number is repeated. Raises InputError that names `what`."""
+    """Return three finite floats in [low, high], `rounded`; a single number is repeated. Raises InputError that names `what`."""
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -64,18 +73,20 @@ def as_vector(value: object, what: str, *, low: float = -math.inf, high: float =
     if array.shape != (3,) or not np.isfinite(array).all():
         raise wrong(what, f"must be three finite numbers, got {shown(value)}")
     low, high = max(low, -LARGEST), min(high, LARGEST)
-    if (array < low).any() or (array > high).any():
+    red, green, blue = (rounded(each, low, high) for each in array.tolist())
+    if min(red, green, blue) < low or max(red, green, blue) > high:
         raise wrong(what, f"must lie in [{low:g}, {high:g}], got {array.tolist()}")
-    return (float(array[0]), float(array[1]), float(array[2]))
+    return (red, green, blue)
 
 
 def as_number(value: object, what: str, *, low: float = -math.inf, high: float = math.inf, unit: str = "") -> float:
-    """Return one finite float in [low, high]. Raises InputError that names `what` and the unit."""
+    """Return one finite float in [low, high], `rounded`. Raises InputError that names `what` and the unit."""
     try:
         number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError) as error:
         raise wrong(what, f"must be a number, got {shown(value)}") from error
     low, high = max(low, -LARGEST), min(high, LARGEST)
+    number = rounded(number, low, high)
     if not math.isfinite(number) or not low <= number <= high:
         raise wrong(what, f"must be finite and in [{low:g}, {high:g}]{unit and ' ' + unit}, got {shown(value)}")
     return number

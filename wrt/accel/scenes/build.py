@@ -28,6 +28,7 @@ from wrt.core.building import reported_to
 from wrt.core.checks import as_one, shown
 from wrt.core.default_device import DEFAULT_DEVICE
 from wrt.core.errors import InputError
+from wrt.core.files import require_file
 from wrt.core.types import ArrayLike, PathLike
 from wrt.io.load import LOADERS, load_scene
 from wrt.io.mesh_file import load_mesh
@@ -277,7 +278,8 @@ def to_mesh_or_scene(mesh: MeshLike) -> Mesh | Scene:
     """Convert the argument `mesh` of `build` to a Mesh or Scene; load it if it is a path.
     Raises InputError for a bad file and for any other type, also for a Geometry and an InstancedGeometry."""
     if isinstance(mesh, str | os.PathLike) and Path(os.fsdecode(mesh)).suffix.lower() in LOADERS:
-        mesh = load_scene(mesh)
+        require_file(path := Path(os.fsdecode(mesh)))
+        mesh = LOADERS[path.suffix.lower()](path, shapes_only=True) if path.suffix.lower() in (".gltf", ".glb") else load_scene(path)
     elif isinstance(mesh, str | os.PathLike):
         mesh = load_mesh(mesh)
     elif isinstance(mesh, tuple) and len(mesh) == 2:
