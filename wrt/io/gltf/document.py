@@ -222,6 +222,8 @@ def _parse_json(data: bytes) -> object:
         raise InputError(f"is not a glTF file: not UTF-8 at byte {error.start}") from None
     except RecursionError:
         raise InputError("is not valid JSON: nested too deeply") from None
+    except InputError:
+        raise
     except ValueError as error:  # JSONDecodeError; an integer of thousands of digits
         raise InputError(f"is not valid JSON: {error}") from None
 

@@ -18,8 +18,7 @@ from wrt.io.gltf.skins import Skins, moved
 from wrt.io.polygons import strip
 from wrt.scene.clean import clean
 from wrt.scene.mesh import Mesh, unit_rows
-from wrt.scene.values import near_zero
-from wrt.scene.values import require_count
+from wrt.scene.values import near_zero, require_count
 
 # Attributes that need no warning here: wrt reads them, another warning names them (textures, TANGENT beside a normal map), or an
 # application defines them (underscore).

@@ -45,9 +45,9 @@ def only(file: GltfFile, folder: Path) -> Mesh:
 def test_the_joints_place_a_skinned_mesh_and_its_own_node_does_not(tmp_path):
     file = skinned()
     expected = TRIANGLE * np.float32(0.01) + [0, 0, 3]
-    assert only(file, tmp_path).vertices == pytest.approx(expected)
+    assert only(file, tmp_path).positions == pytest.approx(expected)
     file.json["nodes"][0]["scale"] = [0, 0, 0]
-    assert only(file, tmp_path).vertices == pytest.approx(expected)
+    assert only(file, tmp_path).positions == pytest.approx(expected)
     hits = wrt.build(file.write(tmp_path)).closest_hit([0.002, 0.002, 9], [0, 0, -1])
     assert hits.t == pytest.approx(6.0)
 
@@ -67,7 +67,7 @@ def test_positions_and_normals_follow_the_mean_of_the_joints(tmp_path, seed, dty
     for i in range(3):
         matrix = sum(w * (parent @ matrix_of(poses[j]) @ inverse[j]) for j, w in zip(joints[i], weights[i], strict=True) if w)
         matrix = matrix / weights[i].sum()
-        assert mesh.vertices[i] == pytest.approx((matrix @ [*TRIANGLE[i], 1])[:3], rel=1e-5, abs=1e-5)
+        assert mesh.positions[i] == pytest.approx((matrix @ [*TRIANGLE[i], 1])[:3], rel=1e-5, abs=1e-5)
         normal = np.linalg.inv(matrix[:3, :3]).T @ normals[i]
         assert mesh.normals[i] == pytest.approx(normal / np.linalg.norm(normal), abs=1e-4)
 
@@ -134,7 +134,7 @@ def test_normals_and_skins_of_a_morphed_mesh(tmp_path):
         TRIANGLE * 0 + [0, 6, 0])}]
     file.json["nodes"][0]["weights"] = [0.5]
     mesh = only(file, tmp_path)
-    assert mesh.vertices == pytest.approx(TRIANGLE * 0.015 + [0, 0, 3])
+    assert mesh.positions == pytest.approx(TRIANGLE * 0.015 + [0, 0, 3])
     assert mesh.normals == pytest.approx(np.array([[0, 3, 1]] * 3) / np.sqrt(10))
 
 
