@@ -16,6 +16,7 @@ import numpy as np
 from wrt.accel.geometry import Geometry
 from wrt.accel.points.closest_points import closest_points
 from wrt.accel.points.contains import odd_crossings
+from wrt.accel.points.enclosing import enclosing
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.all_hits import ListQuery
 from wrt.accel.queries.few_lists import begins
@@ -233,7 +234,7 @@ class RaycastingScene:
     def _inside(self, points: np.ndarray, nthreads: int, nsamples: int) -> np.ndarray:
         if as_integer(nsamples, "nsamples", 1, MOST_SAMPLES) % 2 == 0:
             raise InputError(f"must be odd, got {nsamples}", argument="nsamples")
-        query = ListQuery(self._scene().accel, _threads(nthreads), crossings=True)
+        query = ListQuery(enclosing(self._scene().accel), _threads(nthreads), crossings=True)
         votes = np.zeros(len(points), np.int32)
         for seed in range(nsamples):
             votes += odd_crossings(query, points, seed)

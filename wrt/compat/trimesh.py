@@ -13,6 +13,7 @@ import warp as wp
 
 from wrt.accel.points.closest_points import closest_points
 from wrt.accel.points.contains import contains, open_edges_of
+from wrt.accel.points.enclosing import enclosing
 from wrt.accel.queries.batches import SMALL
 from wrt.accel.queries.raw_kernel import RawKernel
 from wrt.accel.queries.raw_launches import raw_launch
@@ -177,7 +178,7 @@ class _ScaledStructure:
 
     @property
     def closed(self) -> bool:
-        return open_edges_of(self.accel.snapshot) == 0
+        return open_edges_of(enclosing(self.accel).snapshot) == 0
 
     def to_local(self, points: np.ndarray) -> np.ndarray:
         return np.ldexp(points - self.shift, self.exponent)
@@ -255,7 +256,7 @@ class _Counter(NamedTuple):
                             multiple_hits: bool = True) -> tuple[None, np.ndarray, None]:  # trimesh 4.5 does not pass multiple_hits
         """Return the ray of each hit, (M,) int64, in the second place."""
         scaled = self.scaled
-        counts = np.minimum(hit_counts(scaled.accel, PLACED, (origins, directions), scaled.threads, scaled.placement), MAX_HITS)
+        counts = np.minimum(hit_counts(enclosing(scaled.accel), PLACED, (origins, directions), scaled.threads, scaled.placement), MAX_HITS)
         return None, np.repeat(np.arange(len(counts)), counts), None
 
 
