@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
 
@@ -66,8 +67,8 @@ class Geometry:
         return shape
 
     def unshared(self) -> Geometry:
-        """Return the geometry with a copy of each array that the caller may modify."""
-        return self
+        """Return the geometry with copies of its arrays, because the caller may write to its own later."""
+        return deepcopy(self)
 
     def bounds(self, threads: int = 1, out: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Compute the padded box of every primitive: low and high, (N, 3) float32, into `out` if given.

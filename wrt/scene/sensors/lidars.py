@@ -34,6 +34,9 @@ class LidarModel:
     columns: int
     source: str
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "elevations", as_array(self.elevations, np.float64, "elevations"))
+
 
 def _ouster(family: str, fov: float, channels: int) -> LidarModel:
     """Return a model of Ouster with uniform channels: nominal angles, without the calibration of one device."""
