@@ -183,6 +183,10 @@ def ray_class(module: str, method: str, **rays: np.ndarray) -> Any:
     return getattr(scene, method)(*rays.values())
 
 
+def of_tensors(found: Any) -> list[np.ndarray]:
+    return [np.asarray(each) for each in found]
+
+
 def added(vertices: np.ndarray, faces: np.ndarray) -> wrt.compat.open3d.RaycastingScene:
     scene = wrt.compat.open3d.RaycastingScene()
     scene.add_triangles(vertices, faces)
@@ -233,7 +237,8 @@ CALLS: dict[str, Call] = {
     "load_accel": Call(TRIANGLES, loaded, of_structure),
     "OneMesh.refit": Call({"vertices": BALL.vertices * 1.5}, refitted, of_structure),
     "OneMesh.refit to a Warp array": Call({"vertices": BALL.vertices * 1.5}, partial(refitted, kind=vec3s, accel="bvh2"), of_structure),
-    "OneMesh.refit in place": Call({"vertices": BALL.vertices * 1.5}, partial(refitted, kind=vec3s, accel="bvh2", in_place=True), of_structure),
+    "OneMesh.refit in place": Call({"vertices": BALL.vertices * 1.5}, partial(refitted, kind=vec3s, accel="bvh2", in_place=True),
+                                   of_structure),
     "Instances.move": Call(world(), moved, partial(of_structure, world=1)),
     "Accelerator.closest_hit": Call(RAYS | {"t_max": np.float32([9, 9, 9])}, lambda **rays: wrt.build(BALL).closest_hit(**rays), read_now),
     "Accelerator.any_hit": Call(RAYS, lambda **rays: wrt.build(BALL).any_hit(**rays), np.asarray),
@@ -249,7 +254,7 @@ CALLS: dict[str, Call] = {
     "trace": Call(RAYS, lambda **rays: wrt.trace(wrt.build(BALL), **rays), lambda trace: repr(trace)),
     "walk": Call({name: rays[0] for name, rays in RAYS.items()}, lambda origins, directions: wrt.walk(wrt.build(BALL), origins, directions),
                  lambda walk: [str(walk), repr(walk.as_dict())]),
-    "Object": Call(PATTERN | {"transform": PLACE}, lambda **arrays: wrt.Object(SQUARE, (wrt.Material(), wrt.Material()), **arrays), of_object),
+    "Object": Call(PATTERN | {"transform": PLACE}, partial(wrt.Object, SQUARE, (wrt.Material(), wrt.Material())), of_object),
     "Sphere": Call({"center": np.zeros(3)}, lambda center: wrt.Sphere(center, 1.0),
                    lambda sphere: read_now(wrt.build(wrt.Scene(spheres=(sphere,))).closest_hit(*RAYS.values()))),
     "Scene": Call({"ambient": np.full(3, 0.5)}, lambda ambient: scene_of(ambient=ambient), picture),
@@ -295,8 +300,8 @@ CALLS: dict[str, Call] = {
     "sensors.project": Call({"points": np.array([[0.1, 0.2, 1.0]]), "intrinsics": K}, wrt.sensors.project, np.asarray),
     "sensors.unproject": Call({"pixels": np.array([[1.0, 2.0]]), "intrinsics": K}, wrt.sensors.unproject, np.asarray),
     "Mesh.from_trimesh": Call(TRIANGLES, from_trimesh, of_mesh),
-    "torch.closest_hit": Call({"vertices": BALL.vertices * 1.5} | RAYS, partial(tensors, "torch"), lambda found: [np.asarray(each) for each in found]),
-    "jax.closest_hit": Call({"vertices": BALL.vertices * 1.5} | RAYS, partial(tensors, "jax"), lambda found: [np.asarray(each) for each in found]),
+    "torch.closest_hit": Call({"vertices": BALL.vertices * 1.5} | RAYS, partial(tensors, "torch"), of_tensors),
+    "jax.closest_hit": Call({"vertices": BALL.vertices * 1.5} | RAYS, partial(tensors, "jax"), of_tensors),
     "compat.open3d.add_triangles": Call(TRIANGLES, added, lambda scene: scene.cast_rays(RAY6)),
     **{f"compat.open3d.{name}": Call({"rays": RAY6} if "ray" in name or "intersections" in name or "occlusions" in name else
                                      {"query_points": POINTS["points"]}, partial(ray_class, "open3d", name), lambda found: found)
@@ -308,9 +313,9 @@ CALLS: dict[str, Call] = {
     "sensors.with_range_noise": Call(RANGES, partial(wrt.sensors.with_range_noise, seed=0), np.asarray),
 }
 
-NO_ARRAYS = {"ACCELERATORS", "InputError", "SceneWarning", "__version__", "kernel", "load_mesh", "load_scene", "ray_query", "Progress", "LiveView",
-             "inspect", "profile", "tune", "camera_rays", "sensors.LIDARS", "Accelerator.save", "OneMesh.save", "Instances.save",
-             "OneMesh.epo", "OneMesh.tree", "OneMesh.options", "Mesh.save", "Mesh.note_clean", "Mesh.from_trimesh", "Mesh.to_trimesh",
+NO_ARRAYS = {"ACCELERATORS", "InputError", "SceneWarning", "__version__", "kernel", "load_mesh", "load_scene", "ray_query", "Progress",
+             "LiveView", "inspect", "profile", "tune", "camera_rays", "sensors.LIDARS", "Accelerator.save", "OneMesh.save",
+             "Instances.save", "OneMesh.epo", "OneMesh.tree", "OneMesh.options", "Mesh.save", "Mesh.note_clean", "Mesh.to_trimesh",
              "Scene.save", "Scene.bounds", "Scene.camera", "Scene.outlines", "Scene.with_settings", "Camera.lens", "Camera.opened",
              "Camera.record", "Camera.switches", "Mesh.reach", "OneMesh.restore", "Instances.restore"}
 """Public names without an argument that holds arrays, or whose argument is an object of another row: a scene, a camera, a structure."""

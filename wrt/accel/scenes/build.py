@@ -176,9 +176,9 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = DEFAULT_
     kind, device = ACCELERATORS[accel], as_one(device, str, "device")
     if unnamed := as_one(movable, bool, "movable") and not isinstance(mesh, list):
         mesh = [mesh]
-    flat = (worlds_over([to_mesh_or_scene(each) for each in mesh], unnamed) if isinstance(mesh, list)
+    flat: Any = (worlds_over([to_mesh_or_scene(each) for each in mesh], unnamed) if isinstance(mesh, list)
              else None if isinstance(mesh, Geometry | InstancedGeometry) else to_flat_scene(mesh))  # a geometry has no attributes
-    geometry = mesh.unshared() if flat is None else flat.geometry
+    geometry = mesh.unshared() if isinstance(mesh, Geometry | InstancedGeometry) else flat.geometry
     structure: type[Any] | partial[Any] = partial(Instances, kind) if isinstance(geometry, InstancedGeometry) else kind
     if not (progress is None or callable(progress)):
         raise InputError(f"must be a function of one number, got {shown(progress)}", argument="progress")
