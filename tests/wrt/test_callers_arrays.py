@@ -317,7 +317,7 @@ NO_ARRAYS = {"ACCELERATORS", "InputError", "SceneWarning", "__version__", "kerne
              "LiveView", "inspect", "profile", "tune", "camera_rays", "sensors.LIDARS", "Accelerator.save", "OneMesh.save",
              "Instances.save", "OneMesh.epo", "OneMesh.tree", "OneMesh.options", "Mesh.save", "Mesh.note_clean", "Mesh.to_trimesh",
              "Scene.save", "Scene.bounds", "Scene.camera", "Scene.outlines", "Scene.with_settings", "Camera.lens", "Camera.opened",
-             "Camera.record", "Camera.switches", "Mesh.reach", "OneMesh.restore", "Instances.restore"}
+             "Camera.record", "Camera.switches", "Mesh.reach", "Mesh.warn_if_far", "OneMesh.restore", "Instances.restore"}
 """Public names without an argument that holds arrays, or whose argument is an object of another row: a scene, a camera, a structure."""
 KEEP = {"Film", "sensors.Sensor"}
 """Records of results, whose docstrings say that they keep the arrays that they are given."""
