@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Self, TypeVar
 import numpy as np
 import warp as wp
 
-from wrt.accel.built import AccelStats, Built, Refit
+from wrt.accel.built import AccelStats, Built, Refit, check_growth
 from wrt.accel.flat_scene import FlatScene
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.accelerator import Accelerator
@@ -157,6 +157,7 @@ class OneMesh(TreeExchange, ABC):
         """
         if not self.can_refit:
             raise InputError(f"a {self.name} cannot be refitted", hint="build it again, or use bvh2")
+        check_growth(rebuild_at)
         vertices = from_tensor(vertices, "vertices")
         with self._refitting:
             begin, before = build_clock(), self._snapshot

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.base import OneMesh, array_bytes, build_each
-from wrt.accel.built import AccelStats, Refit
+from wrt.accel.built import AccelStats, Refit, check_growth
 from wrt.accel.flat_scene import FlatScene
 from wrt.accel.instance_names import InstanceNames, ObjectId
 from wrt.accel.instanced_geometry import MAX_SPREAD, InstancedGeometry, inverse_of, spread_of
@@ -135,6 +135,7 @@ class Instances(Accelerator):
         InputError
             For other shapes, names and indices, for objects that are not instances, and for matrices that flatten or shear too much.
         """
+        check_growth(rebuild_at)
         with self._refitting:
             begin, before = build_clock(), self._snapshot
             geometry = before.geometry

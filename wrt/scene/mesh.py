@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from wrt.core.checked_file import checksum_of
-from wrt.core.checks import LARGEST, as_array, as_path, shown
+from wrt.core.checks import LARGEST, as_array, as_names, as_path, shown
 from wrt.core.errors import InputError, warn
 from wrt.core.packages import needed_by
 from wrt.core.suggestions import suggest_fields
@@ -74,6 +74,7 @@ class Mesh:
                         object.__setattr__(self, "origin", origin)
         else:
             object.__setattr__(self, "origin", np.array(as_vector(self.origin, "origin")))
+        object.__setattr__(self, "groups", as_names(self.groups, ": ".join(part for part in (self.name, "groups") if part)))
         vertices = self._array("vertices", np.float32, 3)
         faces = self._array("faces", np.int32, 3)
         _require_finite(vertices, self.name, "vertices")
@@ -92,6 +93,9 @@ class Mesh:
             group = as_array(self.face_group, np.int32, "face_group")
             if group.shape != (len(faces),):
                 raise InputError(f"must be ({len(faces)},), got {group.shape}", argument="face_group", place=place)
+            if group.size and (group.min() < 0 or group.max() >= len(self.groups)):
+                raise InputError(f"must be indices of {len(self.groups)} groups, got {group.min()} to {group.max()}",
+                                 argument="face_group", place=place)
             object.__setattr__(self, "face_group", group)
 
     def _array(self, attribute: str, dtype: type, width: int) -> np.ndarray:
