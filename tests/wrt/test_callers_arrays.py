@@ -295,8 +295,6 @@ CALLS: dict[str, Call] = {
     "sensors.rotating_lidar": Call({"elevations": np.linspace(-0.5, 0.5, 4), "pose": np.stack([PLACE] * 8)},
                                    partial(wrt.sensors.rotating_lidar, steps=8, rolling=True), of_sensor),
     "sensors.raster_lidar": Call({"fov": np.array([1.0, 0.5]), "pose": PLACE}, partial(wrt.sensors.raster_lidar, size=(8, 6)), of_sensor),
-    "sensors.LidarModel": Call({"elevations": np.linspace(9.0, -9.0, 4)}, partial(wrt.sensors.LidarModel, columns=8, source=""),
-                               lambda model: model.elevations),
     "sensors.project": Call({"points": np.array([[0.1, 0.2, 1.0]]), "intrinsics": K}, wrt.sensors.project, np.asarray),
     "sensors.unproject": Call({"pixels": np.array([[1.0, 2.0]]), "intrinsics": K}, wrt.sensors.unproject, np.asarray),
     "Mesh.from_trimesh": Call(TRIANGLES, from_trimesh, of_mesh),
@@ -319,7 +317,7 @@ NO_ARRAYS = {"ACCELERATORS", "InputError", "SceneWarning", "__version__", "kerne
              "Scene.save", "Scene.bounds", "Scene.camera", "Scene.outlines", "Scene.with_settings", "Camera.lens", "Camera.opened",
              "Camera.record", "Camera.switches", "Mesh.reach", "Mesh.warn_if_far", "OneMesh.restore", "Instances.restore"}
 """Public names without an argument that holds arrays, or whose argument is an object of another row: a scene, a camera, a structure."""
-KEEP = {"Film", "sensors.Sensor"}
+KEEP = {"Film", "sensors.Sensor", "sensors.LidarModel"}
 """Records of results, whose docstrings say that they keep the arrays that they are given."""
 
 

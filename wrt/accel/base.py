@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Self, TypeVar
 import numpy as np
 import warp as wp
 
-from wrt.accel.built import AccelStats, Built, Refit, check_growth
+from wrt.accel.built import AccelStats, Built, Refit
 from wrt.accel.flat_scene import FlatScene
 from wrt.accel.geometry import Geometry
 from wrt.accel.queries.accelerator import Accelerator
@@ -31,7 +31,7 @@ from wrt.core.seconds import build_clock
 from wrt.core.types import ArrayLike, KernelModule, PathLike, WarpArray, WarpStruct, WarpType
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.warp_private import fields_of
-from wrt.scene.values import near_zero
+from wrt.scene.values import as_number, near_zero
 
 MeshT = TypeVar("MeshT", bound="OneMesh")
 
@@ -157,7 +157,7 @@ class OneMesh(TreeExchange, ABC):
         """
         if not self.can_refit:
             raise InputError(f"a {self.name} cannot be refitted", hint="build it again, or use bvh2")
-        check_growth(rebuild_at)
+        rebuild_at = np.inf if np.array_equal(rebuild_at, np.inf) else as_number(rebuild_at, "rebuild_at", low=0.0)
         vertices = from_tensor(vertices, "vertices")
         with self._refitting:
             begin, before = build_clock(), self._snapshot

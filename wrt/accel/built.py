@@ -3,12 +3,9 @@
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 import warp as wp
 
-from wrt.core.checks import shown
 from wrt.core.device import on_host
-from wrt.core.errors import InputError
 from wrt.core.types import WarpArray
 
 
@@ -84,9 +81,3 @@ class Refit:
     seconds: float
     growth: float
     rebuilt: bool
-
-
-def check_growth(rebuild_at: object) -> None:
-    """Raise InputError unless the argument `rebuild_at` is a number, 0 or more; inf is one."""
-    if not isinstance(rebuild_at, int | float | np.number) or not rebuild_at >= 0.0:
-        raise InputError(f"must be 0 or more, got {shown(rebuild_at)}", argument="rebuild_at")

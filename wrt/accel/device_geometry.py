@@ -69,10 +69,6 @@ class DeviceGeometry(Geometry):
         """Make a geometry from arrays that are known to be valid. indices: (F,) of vec3i; spheres: as in Geometry."""
         return DeviceGeometry.__new__(DeviceGeometry)._set(points, indices, spheres)
 
-    def unshared(self) -> DeviceGeometry:
-        """Return the geometry with copies of its arrays."""
-        return DeviceGeometry.unchecked(wp.clone(self.points), wp.clone(self.indices), self.spheres.copy())
-
     def __reduce__(self) -> tuple[object, ...]:
         """Pickle and deep-copy as a Geometry on the host, because Warp arrays support neither."""
         return Geometry, (self.vertices, self.faces, self.spheres)

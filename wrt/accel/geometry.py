@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
 
@@ -65,10 +64,6 @@ class Geometry:
         shape.faces = upload(self.faces, wp.vec3i, device, read_only=True) if faces is None else faces
         shape.spheres = upload(self.spheres, wp.vec4, device, read_only=True)
         return shape
-
-    def unshared(self) -> Geometry:
-        """Return the geometry with copies of its arrays, because the caller may write to its own later."""
-        return deepcopy(self)
 
     def bounds(self, threads: int = 1, out: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Compute the padded box of every primitive: low and high, (N, 3) float32, into `out` if given.

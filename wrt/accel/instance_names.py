@@ -36,14 +36,13 @@ class InstanceNames:
 
         Raises InputError that names `object` or `world`.
         """
-        things = np.array([None], np.dtype("O"))
-        things[0] = thing
-        things = np.array(thing, "O") if isinstance(thing, list | tuple | range | np.ndarray) else things.reshape(())
+        many = isinstance(thing, list | tuple | range | np.ndarray)
+        things = np.array(thing if many else [thing], np.dtype("O"))
         if things.ndim > 1:
             raise InputError(f"must be a name or an index, or (R,) of them, got {shown(thing)}", argument="object")
         worlds = self._worlds(world)
         try:
-            things, worlds = np.broadcast_arrays(things, worlds)
+            things, worlds = np.broadcast_arrays(things if many else things.reshape(()), worlds)
         except ValueError:
             raise InputError(f"must be one or {len(things)} worlds, one for each object", argument="world") from None
         ids = [self._find(each, int(one)) for each, one in zip(things.flat, worlds.flat, strict=True)]

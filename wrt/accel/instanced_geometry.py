@@ -1,6 +1,5 @@
 """Instances: each mesh is stored once in its own space, and each instance has a transform to world space."""
 
-from copy import deepcopy
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -67,10 +66,6 @@ class InstancedGeometry:
     def spheres(self) -> np.ndarray:
         """Spheres (S, 4) float32, as in Geometry. Spheres have no transforms."""
         return self.parts[0].spheres
-
-    def unshared(self) -> "InstancedGeometry":
-        """Return the geometry with copies of its arrays, because the caller may write to its own later."""
-        return deepcopy(self)
 
     def __len__(self) -> int:
         return self.n_triangles + len(self.spheres)

@@ -74,7 +74,10 @@ def scene_of(arrays: Mapping[str, np.ndarray]) -> FlatScene:
              and len(runs) > 0 and (runs <= (len(instanced), len(a["faces"]), len(a["prim_material"]), 1)).all()
              and (runs[triangles, 1] + length[triangles] <= len(a["faces"])).all(), "has a face beyond its faces")
     placed = Placed(runs[:, 0], runs[:, 1], runs[:, 2], runs[:, 3], a["placed_to_world"].reshape(-1, 3, 4))
-    _check_places(placed.to_world)
+    places = np.concatenate([instanced.to_world, placed.to_world])
+    with np.errstate(all="ignore"):
+        _require(bool(np.isfinite(places).all()) and bool((np.linalg.det(places[:, :, :3]) != 0.0).all())
+                 and bool((spread_of(places, inverse_of(places)) <= MAX_SPREAD).all()), "has a matrix that is no place")
     _check_ids(a, len(instanced))
     if "objects" in a or "own_materials" in a:
         _check_materials(a, instanced, runs[length > 0], length[length > 0])
@@ -130,17 +133,10 @@ def _geometry_of(a: Mapping[str, np.ndarray]) -> InstancedGeometry:
     _require((first >= 0).all() and (first[ordinary] + count[part[ordinary]] <= n_triangles).all() and not first[~ordinary].any(),
              "has a wrong prim_id")
     to_world = a["to_world"].reshape(-1, 3, 4)
-    _check_places(to_world)
     worlds = a.get("worlds")
     _require(worlds is None or (len(worlds) > 1 and worlds[0] == 0 and worlds[-1] == len(part) and (np.diff(worlds) >= 0).all()),
              "has wrong worlds")
     return InstancedGeometry(tuple(parts), part, to_world, first, n_triangles, worlds, a.get("origin"))
-
-
-def _check_places(to_world: np.ndarray) -> None:
-    with np.errstate(all="ignore"):
-        _require(bool(np.isfinite(to_world).all()) and bool((np.linalg.det(to_world[:, :, :3]) != 0.0).all())
-                 and bool((spread_of(to_world, inverse_of(to_world)) <= MAX_SPREAD).all()), "has a matrix that is no place")
 
 
 def _within(indices: np.ndarray, count: int) -> bool:

@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -126,10 +126,9 @@ class Options:
         self.pass_size = None if self.pass_size is None else as_integer(self.pass_size, "pass_size", 1, 1 << 24)
         self.seed = as_integer(self.seed, "seed", 0, 2**32 - 1)
         if self.crop is not None:
-            crop: Any = as_tuple(self.crop, (int, np.integer), "crop")
-            if len(crop) != 4:
+            self.crop = tuple(map(int, as_tuple(self.crop, (int, np.integer), "crop")))  # type: ignore[arg-type, assignment]
+            if len(self.crop or ()) != 4:
                 raise InputError(f"must be x0, y0, x1, y1 in pixels, got {shown(self.crop)}", argument="crop")
-            self.crop = (int(crop[0]), int(crop[1]), int(crop[2]), int(crop[3]))
         if not (self.progress is None or callable(self.progress)):
             raise InputError(f"must be a function that takes a Progress, got {shown(self.progress)}", argument="progress")
         as_one(self.camera, (str, int, np.integer, CameraKind, type(None)), "camera")

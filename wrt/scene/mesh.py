@@ -91,11 +91,9 @@ class Mesh:
                 _require_finite(array, self.name, attribute)
         if self.face_group is not None:
             group = as_array(self.face_group, np.int32, "face_group")
-            if group.shape != (len(faces),):
-                raise InputError(f"must be ({len(faces)},), got {group.shape}", argument="face_group", place=place)
-            if group.size and (group.min() < 0 or group.max() >= len(self.groups)):
-                raise InputError(f"must be indices of {len(self.groups)} groups, got {group.min()} to {group.max()}",
-                                 argument="face_group", place=place)
+            if group.shape != (len(faces),) or (group.size and not 0 <= group.min() <= group.max() < len(self.groups)):
+                what = f"must be ({len(faces)},) indices of {len(self.groups)} groups, got {shown(group)}"
+                raise InputError(what, argument="face_group", place=place)
             object.__setattr__(self, "face_group", group)
 
     def _array(self, attribute: str, dtype: type, width: int) -> np.ndarray:

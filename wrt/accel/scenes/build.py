@@ -14,6 +14,7 @@ import warp as wp
 
 from wrt.accel.base import OneMesh
 from wrt.accel.box_tree import BoxTree
+from wrt.accel.device_geometry import DeviceGeometry
 from wrt.accel.flat_scene import FlatScene, flat_scene_of, with_origin
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry
@@ -178,7 +179,7 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = DEFAULT_
         mesh = [mesh]
     flat: Any = (worlds_over([to_mesh_or_scene(each) for each in mesh], unnamed) if isinstance(mesh, list)
              else None if isinstance(mesh, Geometry | InstancedGeometry) else to_flat_scene(mesh))  # a geometry has no attributes
-    geometry = mesh.unshared() if isinstance(mesh, Geometry | InstancedGeometry) else flat.geometry
+    geometry = own(mesh) if isinstance(mesh, Geometry | InstancedGeometry) else flat.geometry
     structure: type[Any] | partial[Any] = partial(Instances, kind) if isinstance(geometry, InstancedGeometry) else kind
     if not (progress is None or callable(progress)):
         raise InputError(f"must be a function of one number, got {shown(progress)}", argument="progress")
@@ -261,10 +262,17 @@ def accel_from_tree(mesh: MeshLike, tree: BoxTree | Mapping[str, Any] | PathLike
     return out
 
 
+def own(geometry: Geometry | InstancedGeometry) -> Geometry | InstancedGeometry:
+    """Return a geometry with copies of its arrays, because the caller may write to its own later."""
+    if isinstance(geometry, DeviceGeometry):
+        return DeviceGeometry.unchecked(wp.clone(geometry.points), wp.clone(geometry.indices), geometry.spheres.copy())
+    return deepcopy(geometry)
+
+
 def to_flat_scene(mesh: MeshLike) -> FlatScene:
     """Convert the argument `mesh` of `build` to a FlatScene of copied arrays. Raises InputError for other types, and for a bad file."""
     if isinstance(mesh, Geometry | InstancedGeometry):
-        return flat_scene_of(mesh.unshared())
+        return flat_scene_of(own(mesh))
     mesh = to_mesh_or_scene(mesh)
     if isinstance(mesh, Scene):
         origin = scene_origin(mesh)

@@ -18,7 +18,7 @@ TURN = 2.0 * np.pi
 
 @dataclass(frozen=True, eq=False)
 class LidarModel:
-    """Pattern of a rotating LiDAR by its maker's table.
+    """Pattern of a rotating LiDAR by its maker's table. It keeps the arrays that it is given.
 
     Parameters
     ----------
@@ -33,9 +33,6 @@ class LidarModel:
     elevations: np.ndarray
     columns: int
     source: str
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "elevations", as_array(self.elevations, np.float64, "elevations"))
 
 
 def _ouster(family: str, fov: float, channels: int) -> LidarModel:
