@@ -65,10 +65,6 @@ class Geometry:
         shape.spheres = upload(self.spheres, wp.vec4, device, read_only=True)
         return shape
 
-    def unshared(self) -> Geometry:
-        """Return the geometry with a copy of each array that the caller may modify."""
-        return self
-
     def bounds(self, threads: int = 1, out: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Compute the padded box of every primitive: low and high, (N, 3) float32, into `out` if given.
 

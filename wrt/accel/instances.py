@@ -29,7 +29,7 @@ from wrt.core.types import ArrayLike, PathLike, WarpStruct
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.traverse.instances import Placement
 from wrt.kernels.warp_private import fields_of
-from wrt.scene.values import MAX_REACH
+from wrt.scene.values import MAX_REACH, as_number
 
 ALIGNMENT = 64  # bytes, between the addresses of structures
 
@@ -135,6 +135,7 @@ class Instances(Accelerator):
         InputError
             For other shapes, names and indices, for objects that are not instances, and for matrices that flatten or shear too much.
         """
+        rebuild_at = np.inf if np.array_equal(rebuild_at, np.inf) else as_number(rebuild_at, "rebuild_at", low=0.0)
         with self._refitting:
             begin, before = build_clock(), self._snapshot
             geometry = before.geometry

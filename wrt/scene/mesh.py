@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from wrt.core.checked_file import checksum_of
-from wrt.core.checks import LARGEST, as_array, as_path, shown
+from wrt.core.checks import LARGEST, as_array, as_names, as_path, shown
 from wrt.core.errors import InputError, warn
 from wrt.core.packages import needed_by
 from wrt.core.suggestions import suggest_fields
@@ -75,6 +75,7 @@ class Mesh:
                         object.__setattr__(self, "origin", origin)
         else:
             object.__setattr__(self, "origin", np.array(as_vector(self.origin, "origin")))
+        object.__setattr__(self, "groups", as_names(self.groups, ": ".join(part for part in (self.name, "groups") if part)))
         vertices = self._array("vertices", np.float32, 3)
         faces = self._array("faces", np.int32, 3)
         _require_finite(vertices, self.name, "vertices")
@@ -91,8 +92,9 @@ class Mesh:
                 _require_finite(array, self.name, attribute)
         if self.face_group is not None:
             group = as_array(self.face_group, np.int32, "face_group")
-            if group.shape != (len(faces),):
-                raise InputError(f"must be ({len(faces)},), got {group.shape}", argument="face_group", place=place)
+            if group.shape != (len(faces),) or (group.size and not 0 <= group.min() <= group.max() < len(self.groups)):
+                what = f"must be ({len(faces)},) indices of {len(self.groups)} groups, got {shown(group)}"
+                raise InputError(what, argument="face_group", place=place)
             object.__setattr__(self, "face_group", group)
 
     def _array(self, attribute: str, dtype: type, width: int) -> np.ndarray:

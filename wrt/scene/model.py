@@ -82,6 +82,8 @@ class Object:
                 raise wrong(at + "face_material", f"must be ({len(self.mesh.faces)},), got {index.shape}")
             if index.size and (index.min() < 0 or index.max() >= len(self.materials)):
                 raise wrong(at + "face_material", f"must be 0 to {len(self.materials) - 1}, got {index.min()} to {index.max()}")
+            known = vars(self.mesh).get("_face_material")  # the objects of a mesh share a copy
+            index = vars(self.mesh)["_face_material"] = known if known is not None and np.array_equal(known, index) else index
             object.__setattr__(self, "face_material", index)
         if self.motion is not None:
             as_one(self.motion, Motion, at + "motion").check(self.mesh)

@@ -13,10 +13,13 @@ def test_mesh_refuses_what_cannot_be_traced() -> None:
         {"vertices": np.full((3, 3), np.nan)}, {"vertices": np.full((3, 3), 1e39)}, {"vertices": np.eye(2)},
         {"faces": [[0, 1, 3]]}, {"faces": [[0, 1, -1]]}, {"faces": [[0.0, 1.0, 2.0]]}, {"faces": [0, 1, 2]},
         {"normals": np.eye(3)[:2]}, {"uvs": np.zeros((3, 3))}, {"uvs": np.full((3, 2), np.inf)},
-        {"face_group": np.zeros(2, int)},
+        {"face_group": np.zeros(2, int)}, {"face_group": [0]}, {"face_group": [1], "groups": ("a",)},
+        {"face_group": [-1], "groups": ("a",)},
     ):
         with refused(next(iter(bad)), place="thing"):
             Mesh(**{"vertices": vertices, "faces": faces, "name": "thing", **bad})
+    with refused("groups[0]", place="thing"):
+        Mesh(vertices, faces, groups=(1,), name="thing")  # type: ignore[arg-type]
 
 
 def test_meshes_come_from_trimesh_and_go_back() -> None:

@@ -88,7 +88,7 @@ class Accelerator:
         self.structure = structure._replace(units=structure.units._replace(spheres=len(geometry.spheres) > 0))
         surfaces = Surfaces()
         surfaces.n_triangles = geometry.n_triangles
-        surfaces.spheres = upload(geometry.spheres.copy(), wp.vec4, self.device)  # a copy, because the caller may write to its array
+        surfaces.spheres = upload(geometry.spheres, wp.vec4, self.device)
         self._snapshot = Snapshot(self.structure, self.device, surfaces, attributes, geometry)
         self._refitting = threading.Lock()
         self._cache: dict[str, Any] = {}  # arrays that later refits reuse

@@ -79,8 +79,8 @@ class HitIds(Generic[ArrayT]):
     def _source(self, rays: bool = True) -> Source:
         """Return the source. Raises InputError without it, and, if `rays` are needed, without rays."""
         if self.source is None or (rays and self.source[1] is None):
-            raise InputError("these hits have no rays, from which distances, points, normals and ids are computed; copies and pickled"
-                             " hits lose them", hint="ask the result of closest_hit before it is copied")
+            raise InputError("these hits have no rays, from which distances, points, normals and ids are computed: lists of hits have ids"
+                             " alone, copies and pickled hits lose all", hint="ask the result of closest_hit before it is copied")
         return self.source
 
     def _flat(self) -> Any:

@@ -5,15 +5,16 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
+from copy import deepcopy
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict, TypeVar, Unpack, overload
 
-import numpy as np
 import warp as wp
 
 from wrt.accel.base import OneMesh
 from wrt.accel.box_tree import BoxTree
+from wrt.accel.device_geometry import DeviceGeometry
 from wrt.accel.flat_scene import FlatScene, flat_scene_of, with_origin
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry
@@ -145,7 +146,7 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = DEFAULT_
     Parameters
     ----------
     mesh : Mesh, Scene, path, trimesh mesh or scene, wp.Mesh, pair (vertices, faces), geometry, or list of these
-        Surfaces that rays can hit; vertices are copied. A path names a mesh file or a scene file.
+        Surfaces that rays can hit; all arrays are copied. A path names a mesh file or a scene file.
     accel : str
         Name in `wrt.ACCELERATORS`; "bvh" is bvh8.
     device : str
@@ -177,9 +178,9 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = DEFAULT_
     kind, device = ACCELERATORS[accel], as_one(device, str, "device")
     if unnamed := as_one(movable, bool, "movable") and not isinstance(mesh, list):
         mesh = [mesh]
-    flat = (worlds_over([to_mesh_or_scene(each) for each in mesh], unnamed) if isinstance(mesh, list)
+    flat: Any = (worlds_over([to_mesh_or_scene(each) for each in mesh], unnamed) if isinstance(mesh, list)
              else None if isinstance(mesh, Geometry | InstancedGeometry) else to_flat_scene(mesh))  # a geometry has no attributes
-    geometry = mesh if flat is None else flat.geometry
+    geometry = own(mesh) if isinstance(mesh, Geometry | InstancedGeometry) else flat.geometry
     structure: type[Any] | partial[Any] = partial(Instances, kind) if isinstance(geometry, InstancedGeometry) else kind
     if not (progress is None or callable(progress)):
         raise InputError(f"must be a function of one number, got {shown(progress)}", argument="progress")
@@ -262,16 +263,23 @@ def accel_from_tree(mesh: MeshLike, tree: BoxTree | Mapping[str, Any] | PathLike
     return out
 
 
+def own(geometry: Geometry | InstancedGeometry) -> Geometry | InstancedGeometry:
+    """Return a geometry with copies of its arrays, because the caller may write to its own later."""
+    if isinstance(geometry, DeviceGeometry):
+        return DeviceGeometry.unchecked(wp.clone(geometry.points), wp.clone(geometry.indices), geometry.spheres.copy())
+    return deepcopy(geometry)
+
+
 def to_flat_scene(mesh: MeshLike) -> FlatScene:
-    """Convert the argument `mesh` of `build` to a FlatScene. Raises InputError for other types, and for a bad file."""
+    """Convert the argument `mesh` of `build` to a FlatScene of copied arrays. Raises InputError for other types, and for a bad file."""
     if isinstance(mesh, Geometry | InstancedGeometry):
-        return flat_scene_of(mesh)
+        return flat_scene_of(own(mesh))
     mesh = to_mesh_or_scene(mesh)
     if isinstance(mesh, Scene):
         origin = scene_origin(mesh)
         near = moved_by(mesh, origin)
         return with_origin(flatten(near, instanced_meshes(near)), origin)
-    return flat_scene_of(Geometry.of(mesh), mesh.normals, mesh.uvs)
+    return deepcopy(flat_scene_of(Geometry.of(mesh), mesh.normals, mesh.uvs))
 
 
 def to_mesh_or_scene(mesh: MeshLike) -> Mesh | Scene:
@@ -283,7 +291,7 @@ def to_mesh_or_scene(mesh: MeshLike) -> Mesh | Scene:
     elif isinstance(mesh, str | os.PathLike):
         mesh = load_mesh(mesh)
     elif isinstance(mesh, tuple) and len(mesh) == 2:
-        vertices, faces = (np.array(to_numpy(from_tensor(each, name, None))) if is_tensor(each) else each  # copy: the caller may modify it
+        vertices, faces = (to_numpy(from_tensor(each, name, None)) if is_tensor(each) else each
                            for each, name in zip(mesh, ("vertices", "faces"), strict=True))
         mesh = Mesh(vertices, faces)
     elif isinstance(mesh, wp.Mesh):

@@ -144,6 +144,7 @@ class Textures:
                 raise InputError("has neither a uri nor a bufferView", place=place)
             with at(place):
                 self._images[index] = decode_rgba8(data)
+            self._images[index].flags.writeable = False  # so that textures share it
         return self._images[index]
 
 

@@ -35,7 +35,7 @@ class FoundHits(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Sensor(Generic[ArrayT]):
-    """Rays of a sensor, one per pixel, and the shape of its images.
+    """Rays of a sensor, one per pixel, and the shape of its images. It keeps the arrays that it is given.
 
     Images are arrays of NumPy, or of the library of the hits (Warp, PyTorch, JAX), on their device.
 
