@@ -457,8 +457,9 @@ assert not set.intersection(*map(set, best.values()))  # no epsilon of the list 
 # The first picture has acne. In the third, the shadow of the sheet is gone, and the shadow of the ball has moved.
 # A good $\varepsilon$ depends on the size of the scene and on the smallest gap between surfaces. None suits all scenes. With float32
 # coordinates it would also depend on the distance from 0; wrt stores the scene that is 3000 away relative to a place near it
-# (`accel.origin`), and its epsilons are those at 0. wrt uses no epsilon: it bounds the rounding error of *each* hit point (`hits.point_error`), and moves the new origin by that
-# bound (Pharr, Jakob, Humphreys, "Physically Based Rendering", section 6.8). The bound has no parameter, and no point is wrong.
+# (`accel.origin`), and its epsilons are those at 0. wrt uses no epsilon: it bounds the rounding error of *each* hit point
+# (`hits.point_error`), and moves the new origin by that bound (Pharr, Jakob, Humphreys, "Physically Based Rendering", section 6.8). The
+# bound has no parameter, and no point is wrong.
 #
 # ## Exercises
 # **1.** A ray meets glass of $n = 1.5$ at 0 degrees. Which share of the light passes through a pane with two faces, if inner reflections
