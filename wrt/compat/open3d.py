@@ -31,7 +31,7 @@ from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike
 from wrt.kernels.placed_rays import SplitRays, split_rays
 from wrt.kernels.query import FARTHEST
-from wrt.scene.values import LARGEST, as_number
+from wrt.scene.values import LARGEST, as_number, near_zero, type_of, warn_if_far
 
 MOST_SAMPLES = 1 << 16
 WIDEST = 1 << 15  # pixels
@@ -67,9 +67,9 @@ class RaycastingScene:
     device
         "cpu", "cuda:0", or Open3D's names for these.
     rays : (..., 6) array_like
-        In methods: origins and directions of any length, converted to float32.
+        In methods: origins and directions of any length, converted to float32; far from 0, relative to the meshes.
     query_points : (..., 3) array_like
-        In methods: points, converted to float32.
+        In methods: points, converted as rays are.
     """
 
     INVALID_ID: ClassVar[int] = 0xFFFFFFFF
@@ -95,7 +95,7 @@ class RaycastingScene:
             mesh = vertex_positions
         if mesh is not None:
             vertex_positions, triangle_indices = _arrays_of(mesh)
-        vertices = float32(_numbers(vertex_positions, "vertex_positions", "(N, 3)")).copy()
+        vertices = np.array(_numbers(vertex_positions, "vertex_positions", "(N, 3)"))
         indices = _numbers(triangle_indices, "triangle_indices", "(N, 3)")
         with np.errstate(invalid="ignore"):
             faces = indices.astype(np.int64)
@@ -119,7 +119,8 @@ class RaycastingScene:
             t_hit (...), inf on a miss; geometry_ids and primitive_ids (...) uint32, INVALID_ID on a miss; primitive_uvs (..., 2)
             and primitive_normals (..., 3), 0 on a miss.
         """
-        scene, (shape, rows) = self._scene(), _rows(rays, "rays", 6)
+        scene = self._scene()
+        shape, rows = _rows(rays, "rays", 6, scene.origin)
         t, u, v, prim_id = SPLIT.closest_hits(scene.accel, (rows,), _threads(nthreads))
         return _answers({"t_hit": t, **scene.found(prim_id, u, v), "primitive_normals": scene.normals.take(prim_id, 0)}, shape)
 
@@ -131,7 +132,8 @@ class RaycastingScene:
         tnear, tfar
             Ends of the segment in units of the direction's length. As in Open3D, tnear may be below 0; tfar < 0 and NaN hit nothing.
         """
-        (shape, rows), threads, accel = _rows(rays, "rays", 6), _threads(nthreads), self._scene().accel
+        threads, scene = _threads(nthreads), self._scene()
+        accel, (shape, rows) = scene.accel, _rows(rays, "rays", 6, scene.origin)
         if type(tnear) is type(tfar) is float and tnear == 0.0 and tfar == math.inf:  # these need no arrays
             return _answer(SPLIT.any_hits(accel, (rows,), threads), shape)
         near, far = _ends(tnear, len(rows), "tnear"), _ends(tfar, len(rows), "tfar")
@@ -144,8 +146,9 @@ class RaycastingScene:
 
     def count_intersections(self, rays: ArrayLike, nthreads: int = 0) -> Answer:
         """Count the intersections of each ray with surfaces, (...) int32. An intersection at an edge or a corner counts once."""
-        threads, (shape, rows) = _threads(nthreads), _rows(rays, "rays", 6)
-        return _answer(hit_counts(self._scene().accel, SPLIT, (rows,), threads).astype(np.int32), shape)
+        threads, scene = _threads(nthreads), self._scene()
+        shape, rows = _rows(rays, "rays", 6, scene.origin)
+        return _answer(hit_counts(scene.accel, SPLIT, (rows,), threads).astype(np.int32), shape)
 
     def list_intersections(self, rays: ArrayLike, nthreads: int = 0) -> dict[str, Answer]:
         """List the M intersections that `count_intersections` counts, ray by ray in order of distance.
@@ -156,7 +159,8 @@ class RaycastingScene:
             ray_splits (N + 1,): rows ray_splits[i] .. ray_splits[i + 1] - 1 are of ray i; ray_ids, geometry_ids, primitive_ids (M,),
             all uint32; t_hit (M,); primitive_uvs (M, 2).
         """
-        scene, threads, (_, rows) = self._scene(), _threads(nthreads), _rows(rays, "rays", 6)
+        scene, threads = self._scene(), _threads(nthreads)
+        rows = _rows(rays, "rays", 6, scene.origin)[1]
         ray, face, t, u, v = every_hit(scene.accel, SPLIT.converted((rows,), threads), threads)
         splits = begins(np.bincount(ray, minlength=len(rows)))
         return _answers({"ray_splits": splits.astype(np.uint32), "ray_ids": ray.astype(np.uint32), "t_hit": t,
@@ -171,22 +175,23 @@ class RaycastingScene:
             points (..., 3), geometry_ids and primitive_ids (...) uint32, primitive_uvs (..., 2), primitive_normals (..., 3).
             Without a mesh, IDs are INVALID_ID, and all other values are 0.
         """
-        shape, valid, points = _valid_points(query_points)
         scene = self._scene()
+        shape, valid, points = _valid_points(query_points, scene.origin)
         found = closest_points(scene.accel, points, _threads(nthreads))
-        answers = {"points": found.point, **scene.found(found.prim_id, found.u, found.v),
+        points = found.point if scene.origin is None else found.point + scene.origin
+        answers = {"points": points, **scene.found(found.prim_id, found.u, found.v),
                    "primitive_normals": scene.normals.take(found.prim_id, 0)}
         missing = dict.fromkeys(("geometry_ids", "primitive_ids"), self.INVALID_ID)
         return _answers({name: scatter(array, valid, missing.get(name, 0.0)) for name, array in answers.items()}, shape)
 
     def compute_distance(self, query_points: ArrayLike, nthreads: int = 0) -> Answer:
         """Compute the distance of each point to the meshes, (...) float32: inf without a mesh, NaN for points that are not finite."""
-        shape, valid, points = _valid_points(query_points)
+        shape, valid, points = _valid_points(query_points, self._scene().origin)
         return _answer(scatter(closest_points(self._scene()[0], points, _threads(nthreads)).distance, valid, np.nan), shape)
 
     def compute_signed_distance(self, query_points: ArrayLike, nthreads: int = 0, nsamples: int = 1) -> Answer:
         """Compute distances to the meshes, (...) float32; negative for points where `compute_occupancy` with `nsamples` is 1."""
-        shape, valid, points = _valid_points(query_points)
+        shape, valid, points = _valid_points(query_points, self._scene().origin)
         inside = self._inside(points, nthreads, nsamples)
         distance = closest_points(self._scene()[0], points, _threads(nthreads)).distance
         return _answer(scatter(np.where(inside, -distance, distance), valid, np.nan), shape)
@@ -199,12 +204,14 @@ class RaycastingScene:
         nsamples
             Odd number of rays; the majority decides. For closed surfaces one ray is exact (wrt.contains).
         """
-        shape, valid, points = _valid_points(query_points)
+        shape, valid, points = _valid_points(query_points, self._scene().origin)
         return _answer(scatter(self._inside(points, nthreads, nsamples).astype(np.float32), valid, 0.0), shape)
 
     @staticmethod
     def create_rays_pinhole(*given: Any, **named: Any) -> Answer:
         """Make a ray through each pixel's center, (height_px, width_px, 6) float32. Rows go along the camera's y axis.
+
+        Far from 0, where float32 would round the eye by more than 1e-4, they are float64.
 
         Parameters
         ----------
@@ -220,15 +227,18 @@ class RaycastingScene:
     def _scene(self) -> _Built:
         """Return the structure over the present meshes."""
         if self._built is None:
-            vertices, faces = [np.zeros((1, 3), np.float32)], [np.zeros((0, 3), np.int64)]
+            vertices, faces, n = [], [np.zeros((0, 3), np.int64)], 0
             for positions, indices in self._meshes:
-                faces.append(indices + sum(map(len, vertices)))
+                faces.append(indices + n)
                 vertices.append(positions)
-            mesh = Geometry(np.concatenate(vertices), np.concatenate(faces).astype(np.int32), np.zeros((0, 4), np.float32))
+                n += len(positions)
+                warn_if_far(positions, "mesh of add_triangles")
+            positions, origin = near_zero(np.concatenate(vertices) if n else np.zeros((1, 3)))
+            mesh = Geometry(positions, np.concatenate(faces).astype(np.int32), np.zeros((0, 4), np.float32))
             ids = [(np.full(len(indices), i, np.uint32), np.arange(len(indices), dtype=np.uint32))
                    for i, (_, indices) in enumerate(self._meshes)]
             of_face, of_mesh = (np.concatenate(column) for column in zip(*ids, ([np.uint32(self.INVALID_ID)],) * 2, strict=True))
-            self._built = _Built(build(mesh, "bvh8", device=self._device, threads=self._threads), of_face, of_mesh, _normals(mesh))
+            self._built = _Built(build(mesh, "bvh8", device=self._device, threads=self._threads), of_face, of_mesh, _normals(mesh), origin)
         return self._built
 
     def _inside(self, points: np.ndarray, nthreads: int, nsamples: int) -> np.ndarray:
@@ -248,6 +258,7 @@ class _Built(NamedTuple):
     geometry_ids: np.ndarray  # (F + 1,) uint32, as primitive_ids
     primitive_ids: np.ndarray
     normals: np.ndarray  # (F + 1, 3) float32
+    origin: np.ndarray | None  # (3,) float64: subtracted from meshes, rays and points that are far from 0
 
     def found(self, prim_id: np.ndarray, u: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
         """Return the IDs and coordinates of hits, by the names of the answers."""
@@ -284,16 +295,17 @@ def _arrays_of(mesh: Any) -> tuple[Any, Any]:
             return mesh.vertex.positions, mesh.triangle.indices
     for name in ("faces", "triangles"):
         if hasattr(mesh, "vertices") and hasattr(mesh, name):
-            return mesh.vertices, getattr(mesh, name)
+            return getattr(mesh, "positions", mesh.vertices), getattr(mesh, name)  # of a wrt.Mesh: with its origin
     raise InputError(f"must have vertices and triangles, got {shown(mesh)}", argument="mesh")
 
 
-def _rows(value: Any, name: str, width: int) -> tuple[tuple[int, ...], np.ndarray]:
-    """Return the leading shape of `value`, (..., width), and its rows, (N, width) float32."""
+def _rows(value: Any, name: str, width: int, origin: np.ndarray | None) -> tuple[tuple[int, ...], np.ndarray]:
+    """Return the leading shape of `value`, (..., width), and its rows minus `origin`, (N, width) float32."""
     array = _numbers(value, name, f"(..., {width})")
     if array.ndim < 1 or array.shape[-1] != width:
         raise InputError(f"must be (..., {width}), got {array.shape}", argument=name)
-    return array.shape[:-1], float32(array.reshape(-1, width))
+    rows = array.reshape(-1, width)
+    return array.shape[:-1], float32(rows if origin is None else rows - np.append(origin, np.zeros(width - 3)))
 
 
 def _normals(mesh: Geometry) -> np.ndarray:
@@ -306,9 +318,9 @@ def _normals(mesh: Geometry) -> np.ndarray:
     return np.concatenate([unit, np.zeros((1, 3))]).astype(np.float32)
 
 
-def _valid_points(value: Any) -> tuple[tuple[int, ...], np.ndarray | None, np.ndarray]:
-    """Return the leading shape, the mask of finite points (None: all), and the finite points."""
-    shape, points = _rows(value, "query_points", 3)
+def _valid_points(value: Any, origin: np.ndarray | None) -> tuple[tuple[int, ...], np.ndarray | None, np.ndarray]:
+    """Return the leading shape, the mask of finite points (None: all), and the finite points minus `origin`."""
+    shape, points = _rows(value, "query_points", 3, origin)
     if (np.abs(points) <= FARTHEST).all():  # the usual case
         return shape, None, points
     valid = _finite(points, "query_points")
@@ -349,8 +361,9 @@ def _rays_of_matrices(intrinsic_matrix: Any, extrinsic_matrix: Any, width_px: in
     to_camera = _matrix(extrinsic_matrix, "extrinsic_matrix", (4, 4))
     x, y = np.meshgrid(np.arange(width_px) + 0.5, np.arange(height_px) + 0.5)
     to_world = to_camera[:3, :3].T
-    rays = np.empty((height_px, width_px, 6), np.float32)
-    rays[..., :3] = -to_world @ to_camera[:3, 3]
+    eye = -to_world @ to_camera[:3, 3]
+    rays: np.ndarray = np.empty((height_px, width_px, 6), type_of(eye))
+    rays[..., :3] = eye
     rays[..., 3:] = np.stack([x, y, np.ones_like(x)], axis=-1) @ (to_world @ inverse).T
     return rays
 

@@ -17,7 +17,7 @@ from wrt.core.types import PathLike
 from wrt.io.meshes import PLACES
 from wrt.scene.clean import Cleaned, clean
 from wrt.scene.mesh import Mesh, unit_rows
-from wrt.scene.values import near_zero
+from wrt.scene.values import near_zero, warn_if_far
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +108,7 @@ def load_mesh(path: PathLike, parts: Sequence[tuple[int, int]] = ()) -> Mesh:
     )
     if not raw.exact:
         mesh.note_clean()
-    mesh.warn_if_far()
+    warn_if_far(mesh.vertices, mesh.name, mesh.origin)
     return mesh
 
 

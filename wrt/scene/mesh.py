@@ -13,13 +13,13 @@ import numpy as np
 
 from wrt.core.checked_file import checksum_of
 from wrt.core.checks import LARGEST, as_array, as_names, as_path, shown
-from wrt.core.errors import InputError, warn
+from wrt.core.errors import InputError
 from wrt.core.packages import needed_by
 from wrt.core.suggestions import suggest_fields
 from wrt.core.types import PathLike
 from wrt.core.write_file import write_bytes
 from wrt.scene.clean import has_area, require_indices
-from wrt.scene.values import FAR_IN_FLOAT32, as_vector, far_origin, near_zero
+from wrt.scene.values import as_vector, near_zero
 
 if TYPE_CHECKING:
     import trimesh
@@ -182,15 +182,6 @@ class Mesh:
         """Vertices plus `origin`: (V, 3) float64."""
         wide = self.vertices.astype(np.float64)
         return wide if self.origin is None else wide + self.origin
-
-    def warn_if_far(self) -> None:
-        """Warn if float32 vertices without `origin` are so far from 0 that their rounding shows."""
-        if self.origin is None and len(self.vertices):
-            low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
-            if far_origin(low, high, FAR_IN_FLOAT32) is not None:
-                step = np.spacing(np.float32(self.reach))
-                warn(f"{self.name or 'a mesh'}: its float32 vertices lie up to {self.reach:.6g} units from 0, where float32 has steps of"
-                     f" {step:.2g} units; give them as float64, or nearer to 0")
 
     @cached_property
     def reach(self) -> float:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from wrt.core.checks import LARGEST, as_array, shown
-from wrt.core.errors import InputError, wrong
+from wrt.core.errors import InputError, warn, wrong
 
 Color = tuple[float, float, float]
 BLACK: Color = (0.0, 0.0, 0.0)
@@ -39,6 +39,16 @@ def near_zero(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
         origin = far_origin(positions.min(axis=0), positions.max(axis=0))
     with np.errstate(over="ignore", invalid="ignore"):
         return (positions if origin is None else positions - origin).astype(np.float32, copy=False), origin
+
+
+def warn_if_far(vertices: np.ndarray, name: str, origin: np.ndarray | None = None) -> None:
+    """Warn if float32 vertices (V, 3) without `origin` are so far from 0 that their rounding shows. name: of the mesh."""
+    if origin is None and vertices.dtype == np.float32 and len(vertices):
+        low, high = vertices.min(axis=0), vertices.max(axis=0)
+        if far_origin(low, high, FAR_IN_FLOAT32) is not None:
+            reach = np.maximum(-low, high).max()
+            warn(f"{name or 'a mesh'}: its float32 vertices lie up to {reach:.6g} units from 0, where float32 has steps of"
+                 f" {np.spacing(reach):.2g} units; give them as float64, or nearer to 0")
 
 
 def type_of(places: np.ndarray) -> type:

@@ -12,6 +12,7 @@ import trimesh
 
 import wrt
 import wrt.sensors
+from wrt.compat.open3d import RaycastingScene
 from wrt.compat.trimesh import RayMeshIntersector
 from wrt.core.errors import SceneWarning
 from wrt.scene.shapes import icosphere
@@ -119,6 +120,32 @@ def test_points_and_other_queries(name: str) -> None:
     assert np.array_equal(wrt.count_hits(accel, 3.0 * points + place, -points), wrt.count_hits(centred, 3.0 * points, -points))
     theirs = RayMeshIntersector(trimesh.Trimesh(mesh.positions, mesh.faces, process=False))
     assert np.array_equal(theirs.intersects_first(3.0 * points + place, -points), hits.prim_id)
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_open3d_scenes_of_float64(name: str) -> None:
+    place, ball = np.array(PLACES[name]), icosphere(3)
+    points = np.random.default_rng(2).uniform(-1.5, 1.5, (450, 3))
+    found = []
+    for at in (np.zeros(3), place):
+        scene = RaycastingScene()
+        for other in (0.0, 5.0):
+            scene.add_triangles(ball.vertices + (at + other), ball.faces)
+        rays = np.concatenate([3.0 * points + at, -points], axis=1)
+        eye = RaycastingScene.create_rays_pinhole(60.0, at, at + [0.0, 0.5, 4.0], (0, 1, 0), 32, 24)
+        found.append({**scene.cast_rays(rays), "at": scene.compute_closest_points(points + at)["points"] - at,
+                      "lists": scene.list_intersections(rays)["t_hit"], "counts": scene.count_intersections(rays),
+                      "distance": scene.compute_signed_distance(points + at), "inside": scene.compute_occupancy(points + at),
+                      "blocked": scene.test_occlusions(rays), "seen": scene.cast_rays(eye)["t_hit"]})
+    for key, near in found[0].items():
+        assert np.allclose(found[1][key], near, rtol=0.0, atol=2e-5 if key in ("primitive_uvs", "primitive_normals") else 2e-6), key
+
+
+def test_open3d_warns_of_float32_far_away() -> None:
+    scene = RaycastingScene()
+    scene.add_triangles(np.float32(VERTICES + PLACES["UTM"]), FACES)
+    with pytest.warns(SceneWarning, match="float32 has steps of 0.5 units"):
+        scene.cast_rays([[529000.0, 5801000.0, 90.0, 0.0, 0.0, -1.0]])
 
 
 def test_sensors_and_camera_rays_far_away_keep_their_places() -> None:

@@ -97,6 +97,7 @@ def adapters(vertices: Any, faces: Any, origins: Any, directions: Any) -> list[t
     return [(counts, scene.test_occlusions(rays).numpy()), (np.bincount(of, minlength=n), ray.intersects_any(origins, directions))]
 
 
+@pytest.mark.filterwarnings("ignore:mesh of add_triangles. its float32 vertices:wrt.SceneWarning")
 @pytest.mark.parametrize("mesh", MESHES, ids=lambda mesh: mesh.name)
 def test_counts_of_closed_meshes_are_exact(mesh: wrt.Mesh) -> None:
     rng = np.random.default_rng(0)

@@ -36,6 +36,7 @@ from wrt.io.mesh_file import load_mesh
 from wrt.scene.far import moved_by, scene_origin
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Scene
+from wrt.scene.values import warn_if_far
 
 if TYPE_CHECKING:
     import trimesh
@@ -299,7 +300,7 @@ def to_mesh_or_scene(mesh: MeshLike) -> Mesh | Scene:
     elif type(mesh).__module__.split(".")[0] == "trimesh":
         mesh = Mesh.from_trimesh(mesh)  # type: ignore[arg-type]  # narrowed without an import of trimesh
     if isinstance(mesh, Mesh):
-        mesh.warn_if_far()
+        warn_if_far(mesh.vertices, mesh.name, mesh.origin)
     if isinstance(mesh, Scene | Mesh):
         return mesh
     raise InputError("must be a Mesh, a Scene, the path of a mesh or scene file, a trimesh.Trimesh or trimesh.Scene, a wp.Mesh, or a pair"
