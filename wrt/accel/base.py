@@ -29,6 +29,7 @@ from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.core.seconds import build_clock
 from wrt.core.types import ArrayLike, KernelModule, PathLike, WarpArray, WarpStruct, WarpType
+from wrt.core.warp_private import refuse_capture
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.warp_private import fields_of
 
@@ -156,6 +157,7 @@ class OneMesh(TreeExchange, ABC):
         """
         if not self.can_refit:
             raise InputError(f"a {self.name} cannot be refitted", hint="build it again, or use bvh2")
+        refuse_capture(None if in_place else self.device)
         vertices = from_tensor(vertices, "vertices")
         with self._refitting:
             begin, before = build_clock(), self._snapshot
@@ -195,7 +197,7 @@ class OneMesh(TreeExchange, ABC):
         """
         from wrt.accel.epo import end_point_overlap
 
-        geometry, built = self._snapshot.mesh, self._snapshot.arrays
+        geometry, built = self.snapshot.mesh, self.snapshot.arrays
         return end_point_overlap(self._children(built.on_host()), geometry, self.threads)
 
     def _upload(self, built: Built) -> WarpStruct:
@@ -229,7 +231,7 @@ class OneMesh(TreeExchange, ABC):
         InputError
             If the suffix is not .accel, or the file cannot be written.
         """
-        save(self._snapshot, path, mesh)
+        save(self.snapshot, path, mesh)
 
     def __repr__(self) -> str:
         s = self.stats

@@ -12,6 +12,7 @@ from wrt.core.checks import shown
 from wrt.core.device import launch_on
 from wrt.core.errors import InputError
 from wrt.core.types import ArrayLike, Device, WarpArray, WarpStruct
+from wrt.core.warp_private import refuse_capture
 from wrt.kernels.build.shape import Shape, count_outside
 
 
@@ -38,6 +39,7 @@ class DeviceGeometry(Geometry):
     indices: WarpArray
 
     def __init__(self, points: WarpArray, indices: WarpArray) -> None:
+        refuse_capture(points.device if isinstance(points, wp.array) else None)
         points = self.checked_points(points, "points")
         flat = isinstance(indices, wp.array) and indices.dtype == wp.int32 and indices.ndim == 1 and len(indices) % 3 == 0
         if not (flat or (isinstance(indices, wp.array) and indices.dtype == wp.vec3i and indices.ndim == 1)):

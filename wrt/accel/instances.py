@@ -26,6 +26,7 @@ from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.core.seconds import build_clock
 from wrt.core.types import ArrayLike, PathLike, WarpStruct
+from wrt.core.warp_private import refuse_capture
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.traverse.instances import Placement
 from wrt.kernels.warp_private import fields_of
@@ -135,6 +136,7 @@ class Instances(Accelerator):
         InputError
             For other shapes, names and indices, for objects that are not instances, and for matrices that flatten or shear too much.
         """
+        refuse_capture(self.device)
         with self._refitting:
             begin, before = build_clock(), self._snapshot
             geometry = before.geometry
@@ -183,7 +185,7 @@ class Instances(Accelerator):
         InputError
             If the suffix is not .accel, or the file cannot be written.
         """
-        save_instances(self._snapshot, [bottom.built for bottom in self.bottoms], path)
+        save_instances(self.snapshot, [bottom.built for bottom in self.bottoms], path)
 
     def __repr__(self) -> str:
         s, geometry = self.stats, self.geometry

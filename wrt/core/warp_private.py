@@ -4,13 +4,13 @@ Device code uses private parts only in kernels/warp_private.py. All assumptions 
 self-test in wrt.accel.queries.raw_launches refuse a Warp that differs. docs/warp.md lists each assumption and its test."""
 
 import ctypes
+import inspect
 import os
 import re
 import threading
 from collections.abc import Iterable
 from functools import cache, partial, wraps
 from hashlib import sha256
-from inspect import signature
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 from weakref import WeakKeyDictionary
@@ -142,6 +142,22 @@ def recording_tape() -> wp.Tape | None:
     return context.runtime.tape
 
 
+def refuse_capture(device: Device | None = None) -> None:
+    """Raise InputError, which names the called function of wrt, while a graph is captured on the CPU or on `device`.
+
+    On the CPU, Warp then records launches and copies and runs none. wrt's own launches and NumPy would run at once, on old values."""
+    capture = getattr(context.runtime, "_apic_capture", None)  # None before Warp starts
+    if not (capture is not None and capture.device.is_cpu) and not (device is not None and device.is_cuda and device.is_capturing):
+        return
+    name, frame = "a function of wrt", inspect.currentframe()
+    while frame:  # the outermost function of wrt is the one that the user called
+        if str(frame.f_globals.get("__name__")).startswith("wrt.") and "<" not in frame.f_code.co_qualname:
+            name = frame.f_code.co_qualname
+        frame = frame.f_back
+    raise InputError(f"{name} cannot be captured in a graph", hint="call it before or after the capture; a kernel of your own with"
+                     " wrt.ray_query can be captured, and so can, on a GPU, what docs/moving.md lists")
+
+
 # --- kernels and their files ------------------------------------------------------------------------------------------
 
 IN_CACHE = "wp_*"  # folders of modules in the kernel cache
@@ -212,10 +228,11 @@ def prepare() -> None:
     owners = {"Module": context.Module, "codegen": codegen, "build": build, "runtime": context.runtime}
     for (owner, name), parameters in _REPLACED.items():
         found = getattr(owners[owner], name, None)
-        if found is None or tuple(signature(found).parameters) != parameters:
+        if found is None or tuple(inspect.signature(found).parameters) != parameters:
             raise refusal(f"{owner}.{name}")
-    if not hasattr(context.runtime, "tape"):
-        raise refusal("runtime.tape")
+    for name in ("tape", "_apic_capture"):
+        if not hasattr(context.runtime, name):
+            raise refusal(f"runtime.{name}")
     _mark_own_modules()
     _drop_unused_helpers()
     _compile_well()
@@ -293,7 +310,7 @@ def _share_hashes() -> None:
     If Warp's hasher has another form, it stays as it is."""
     hasher = getattr(context, "ModuleHasher", None)
     compute, known = getattr(hasher, "hash_function", None), WeakKeyDictionary[Any, bytes]()
-    if compute is None or tuple(signature(compute).parameters) != ("self", "func"):
+    if compute is None or tuple(inspect.signature(compute).parameters) != ("self", "func"):
         return
 
     @wraps(compute)

@@ -31,7 +31,7 @@ from wrt.core.other_names import same_name
 from wrt.core.suggestions import check_keywords, no_attribute, parameters_of
 from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike, NumpyLike, TensorT, WarpArray, WarpStruct
-from wrt.core.warp_private import recording_tape
+from wrt.core.warp_private import recording_tape, refuse_capture
 from wrt.kernels.structs import Surfaces
 
 # Names of queries that are functions, not methods.
@@ -113,7 +113,8 @@ class Accelerator:
 
     @property
     def snapshot(self) -> Snapshot:
-        """Present state of the structure. A later refit does not change it, unless it is a refit in place."""
+        """Present state of the structure. A later refit does not change it, unless it is a refit in place. Refused in a capture."""
+        refuse_capture()
         return self._snapshot
 
     @property
@@ -179,6 +180,7 @@ class Accelerator:
         InputError
             Names the argument and what was expected. The arrays of `out` may have been overwritten.
         """
+        snapshot = self.snapshot  # read once, because a refit may replace it during the query
         threads, shape, callers = thread_count(threads), None, None if out is None else arrays_of(out)
         if costs:
             check_keywords("closest_hit", costs, CLOSEST_HIT)
@@ -190,7 +192,6 @@ class Accelerator:
         give = to_tensor_like(origins, directions)
         t, u, v, prim_id = arrays = answer_arrays(HIT_TYPES, callers, len(rays.origins), self.device if rays.as_warp else None,
                                              give is not None)
-        snapshot = self._snapshot  # read once, because a refit may replace it during the query
         worlds = check_world(snapshot, world, len(t))
         query, counters = Query(rays, arrays, threads, worlds, tiled_width(shape) if shape else 0), None
         if costs and any(costs.values()):
@@ -236,8 +237,8 @@ class Accelerator:
         InputError
             Names the argument and what was expected.
         """
-        threads, shape, callers = thread_count(threads), None, None if out is None else [out]
-        world, invalid = None, "raise"
+        snapshot, shape, callers = self.snapshot, None, None if out is None else [out]
+        threads, world, invalid = thread_count(threads), None, "raise"
         if options:
             check_keywords("any_hit", options, ANY_HIT)
             world, invalid = options.get("world"), options.get("invalid", invalid)
@@ -248,7 +249,6 @@ class Accelerator:
             callers, world = callers and flat_arrays(callers, shape, ANY_HIT_TYPES), worlds_of_each(world, shape)
         give = to_tensor_like(origins, directions)
         arrays = answer_arrays(ANY_HIT_TYPES, callers, len(rays.origins), self.device if rays.as_warp else None, give is not None)
-        snapshot = self._snapshot
         worlds = check_world(snapshot, world, len(arrays[0]))
         trace_query(snapshot, Query(rays, arrays, threads, worlds, tiled_width(shape) if shape else 0))
         found = arrays[0] if shape is None else in_shape(arrays[0], shape)
@@ -268,4 +268,6 @@ def snapshot_of(accel: Accelerator, instances: bool = False) -> Snapshot:
     if units is None or units.spheres or (units.instances and not instances):
         hint = "build one first: accel = wrt.build(mesh)" if units is None else MESH_OF_A_SPHERE if units.spheres else None
         raise InputError(f"must be a structure{what} without spheres, got {shown(accel)}", argument="accel", hint=hint)
+    if instances:  # the results of such queries go through the host
+        refuse_capture(accel.device)
     return accel.snapshot

@@ -21,6 +21,7 @@ from wrt.core.device import launch_on, records, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike, ArrayT, WarpStruct
+from wrt.core.warp_private import refuse_capture
 from wrt.kernels import structs
 from wrt.kernels.query import HitArrays
 from wrt.kernels.warp_private import fields_of
@@ -171,6 +172,7 @@ class HitPoints(Generic[ArrayT]):
         return self
 
     def _source(self) -> Source:
+        refuse_capture()
         if self.source is None:
             raise InputError("these hits have no rays, from which distances, points, normals and ids are computed; copies and pickled"
                              " hits lose them", hint="ask the result of closest_hit before it is copied")
@@ -193,6 +195,8 @@ class HitPoints(Generic[ArrayT]):
             name = "normal"
         _require(scene, name)
         to_own = own_ids(name, scene, worlds)
+        if to_own is not None or not isinstance(self.t, wp.array):  # computed on the host
+            refuse_capture(device)
         if name in ("instance", "object") and isinstance(scene.geometry, InstancedGeometry):
             name = "instance" if scene.objects is None else "object"
         out: Any = HitPlaces()
