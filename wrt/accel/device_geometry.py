@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.geometry import Geometry
+from wrt.core.arrays import to_numpy
 from wrt.core.checks import shown
 from wrt.core.device import launch_on
 from wrt.core.errors import InputError
@@ -95,12 +96,12 @@ class DeviceGeometry(Geometry):
     @property
     def vertices(self) -> np.ndarray:
         """Copy of the points on the host."""
-        return np.asarray(self.points.numpy())
+        return to_numpy(self.points)
 
     @cached_property
     def faces(self) -> np.ndarray:
         """Copy of the indices on the host, (F, 3)."""
-        return np.asarray(self.indices.numpy())
+        return to_numpy(self.indices)
 
     def on(self, device: Device, faces: WarpArray | None = None) -> WarpStruct:
         """Convert to kernels.build.shape.Shape on `device`; arrays of another device are copied."""

@@ -237,10 +237,10 @@ def upload(array: np.ndarray, dtype: WarpType, device: Device, read_only: bool =
 
     read_only: no kernel writes to the array, so that it may share the memory of an array that is not writeable, such as a scene's.
     Raises InputError for more rows than the int32 indices of kernels can reach, and in a capture."""
-    warp_private.refuse_capture(device if len(array) else None)
     if len(array) > MOST_ROWS:
         raise InputError(f"{len(array)} rows of {dtype.__name__ if isinstance(dtype, type) else dtype.key} are more than an array"
                          f" on a device can have, 2^31 - 1", hint="a binary tree (bvh2) has the fewest")
+    warp_private.refuse_capture(device if len(array) else None)
     if hasattr(dtype, "numpy_dtype"):  # a struct
         assert array.dtype == record_dtype(dtype)
         rows = np.ascontiguousarray(array)

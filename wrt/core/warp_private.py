@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from functools import cache, partial, wraps
 from hashlib import sha256
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple, TypeAlias
 from weakref import WeakKeyDictionary
 
@@ -206,10 +207,46 @@ def is_warps_error(error: BaseException) -> bool:
 
 # --- the compiler -----------------------------------------------------------------------------------------------------
 
+# Settings that change bits or print lines, with Warp's defaults: modules of wrt are compiled with these, whatever wp.config has.
+_CONFIG = {"mode": "release", "optimization_level": None, "verify_fp": False, "verify_autograd_array_access": False, "llvm_cuda": False,
+           "enable_vector_component_overwrites": False, "default_grid_stride": True}
+_OPTIONS = {"max_unroll": 16, "deterministic": wp.config.DeterministicMode.NOT_GUARANTEED, "deterministic_max_records": 0}
+_FLAGS = "%s-mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000 -mllvm=-slp-recursion-max-depth=4"
+# Of the user's flags, modules of wrt keep those that choose a processor, and reports of the compiler.
+_KEPT_FLAG = re.compile(r"(?<!\S)(?:-target-(?:cpu|feature)[ =]|-m(?:arch|cpu|tune)=|-R)\S+")
+
+
+def _is_own_module(module: Any) -> bool:
+    kernels = module._get_live_kernels()
+    return len(kernels) > 0 and all(map(is_own, kernels))
+
+
+def _own_flags(flags: str | None) -> str:
+    """Return the flags for the CPU of wrt's modules. flags: wp.config.cpu_compiler_flags."""
+    kept = _KEPT_FLAG.findall("-march=native" if flags is None else flags)
+    return _FLAGS % "".join(f"{flag} " for flag in kept)
+
+
+def _keep_own_options(resolve: Any) -> Any:
+    """Make Module.resolve_options ignore settings of wp.config for modules of wrt."""
+    @wraps(resolve)
+    def resolved(self: Any, config: Any, block_dim: int | None = None) -> dict[str, Any]:
+        if not _is_own_module(self):
+            return dict(resolve(self, config, block_dim))
+        own = SimpleNamespace(**{**vars(config), **_CONFIG, "cpu_compiler_flags": _own_flags(config.cpu_compiler_flags)})
+        return {**resolve(self, own, block_dim), **_OPTIONS}
+
+    return resolved
+
+
+# Kernels are hashed where they are defined, before Warp starts.
+context.Module.resolve_options = _keep_own_options(context.Module.resolve_options)
+
 # The changes below make Warp's compiler faster, and change no result of a kernel. They act only while a module of wrt is compiled. Each
 # names the processor time that it saves in a first render of scenes/whitted.toml with an empty kernel cache (docs/warp.md).
 
 _REPLACED = {  # replaced functions, with their parameters in Warp 1.19
+    ("Module", "resolve_options"): ("self", "config", "block_dim"),
     ("Module", "_compile"): ("self", "device", "output_dir", "output_name", "output_arch", "use_ptx", "options"),
     ("codegen", "codegen_struct"): ("struct", "device", "indent_size", "include_tile_helpers"),
     ("build", "build_cpu"): (
@@ -249,8 +286,7 @@ def _mark_own_modules() -> None:
 
     @wraps(compile_module)
     def marked(self: Any, *args: Any, **options: Any) -> Any:
-        kernels = self._get_live_kernels()
-        _here.own = len(kernels) > 0 and all(map(is_own, kernels))
+        _here.own = _is_own_module(self)
         try:
             return compile_module(self, *args, **options)
         finally:
