@@ -126,7 +126,7 @@ def build(mesh: SceneLike, accel: str = ..., device: str = ..., threads: int | N
 @overload
 def build(mesh: list[WorldT], accel: str = ..., device: str = ..., threads: int | None = ..., *, movable: bool = ...,
           progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Instances: ...
-def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = DEFAULT_DEVICE, threads: int | None = None, *,
+def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str | None = None, threads: int | None = None, *,
           movable: bool = False, progress: Callable[[float], None] | None = None,
           **options: Unpack[BuildOptions]) -> OneMesh | Instances:
     """Build an acceleration structure over a mesh, a scene or several worlds.
@@ -141,8 +141,9 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = DEFAULT_
         Surfaces that rays can hit; vertices are copied. A path names a mesh file or a scene file.
     accel : str
         Name in `wrt.ACCELERATORS`; "bvh" is bvh8.
-    device : str
-        Device of the structure: "cpu" or "cuda:0".
+    device : str, optional
+        Device of the structure: "cpu" or "cuda:0". By default that of the mesh's arrays if they are on a GPU, else the one that the
+        environment variable WRT_DEVICE names, else "cpu". Warp's current device (`wp.set_device`) has no effect.
     threads : int, optional
         Threads that build and refit; one per core by default.
     movable : bool
@@ -167,10 +168,10 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = DEFAULT_
         raise InputError(f"must be the name of a structure, got {shown(accel)}", argument="accel",
                          hint="vertices and faces are one argument: wrt.build((vertices, faces))")
     ACCELERATORS.check(accel, "accel")
-    kind, device = ACCELERATORS[accel], as_one(device, str, "device")
-    if as_one(movable, bool, "movable") and not isinstance(mesh, list):
+    kind, device = ACCELERATORS[accel], device_of(mesh, device)
+    if single := as_one(movable, bool, "movable") and not isinstance(mesh, list):
         mesh = [mesh]
-    flat = (worlds_over([to_mesh_or_scene(each) for each in mesh]) if isinstance(mesh, list)
+    flat = (worlds_over([to_mesh_or_scene(each) for each in mesh], single) if isinstance(mesh, list)
              else None if isinstance(mesh, Geometry | InstancedGeometry) else to_flat_scene(mesh))  # a geometry has no attributes
     geometry = mesh if flat is None else flat.geometry
     structure: type[Any] | partial[Any] = partial(Instances, kind) if isinstance(geometry, InstancedGeometry) else kind
@@ -185,7 +186,7 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = DEFAULT_
 def load_accel(path: PathLike, mesh: MeshLike, device: str = ..., threads: int | None = ...) -> OneMesh: ...
 @overload
 def load_accel(path: PathLike, mesh: None = ..., device: str = ..., threads: int | None = ...) -> OneMesh | Instances: ...
-def load_accel(path: PathLike, mesh: MeshLike | None = None, device: str = DEFAULT_DEVICE,
+def load_accel(path: PathLike, mesh: MeshLike | None = None, device: str | None = None,
                threads: int | None = None) -> OneMesh | Instances:
     """Read a structure that `OneMesh.save`, `Instances.save` or `wrt build` wrote.
 
@@ -207,15 +208,15 @@ def load_accel(path: PathLike, mesh: MeshLike | None = None, device: str = DEFAU
         If the file is missing, damaged, not a structure, of another version, or over another mesh.
     """
     if mesh is None:
-        loaded: OneMesh | Instances = read(path, None, None, as_one(device, str, "device"), threads, Instances.restore)
+        loaded: OneMesh | Instances = read(path, None, None, device_of(mesh, device), threads, Instances.restore)
         return loaded
     flat = to_flat_scene(mesh)
     if not isinstance(flat.geometry, Geometry):
         raise InputError("must not be a scene with instances: the file of a structure over it holds the scene", argument="mesh")
-    return read(path, flat.geometry, flat, as_one(device, str, "device"), threads)
+    return read(path, flat.geometry, flat, device_of(mesh, device), threads)
 
 
-def accel_from_tree(mesh: MeshLike, tree: BoxTree | Mapping[str, Any] | PathLike, accel: str | None = None, device: str = DEFAULT_DEVICE,
+def accel_from_tree(mesh: MeshLike, tree: BoxTree | Mapping[str, Any] | PathLike, accel: str | None = None, device: str | None = None,
                     threads: int | None = None, *, spatial_splits: bool = False) -> OneMesh:
     """Make a BVH from the tree of another builder, so that wrt's queries, counters and models measure it.
 
@@ -250,9 +251,21 @@ def accel_from_tree(mesh: MeshLike, tree: BoxTree | Mapping[str, Any] | PathLike
         raise InputError("must not be a scene with instances", argument="mesh")
     name = accel or ("bvh2" if read.width <= 2 else "bvh4" if read.width <= 4 else "bvh8")
     ACCELERATORS.check(as_one(name, str, "accel"), "accel")
-    out: OneMesh = ACCELERATORS[name].from_tree(read, flat.geometry, flat, as_one(device, str, "device"), threads,
+    out: OneMesh = ACCELERATORS[name].from_tree(read, flat.geometry, flat, device_of(mesh, device), threads,
                                                 spatial_splits=spatial_splits)
     return out
+
+
+def device_of(mesh: Any, device: str | None) -> str:
+    """Return the argument `device` of `build` for this mesh."""
+    if device is not None:
+        return as_one(device, str, "device")
+    for each in mesh if isinstance(mesh, list) else [mesh]:
+        array = each[0] if isinstance(each, tuple) and each else getattr(each, "points", None)  # of wp.Mesh and DeviceGeometry
+        array = from_tensor(array, "vertices", None)
+        if isinstance(array, wp.array) and array.device.is_cuda:
+            return str(array.device)
+    return DEFAULT_DEVICE
 
 
 def to_flat_scene(mesh: MeshLike) -> FlatScene:

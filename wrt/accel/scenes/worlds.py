@@ -16,21 +16,24 @@ from wrt.scene.mesh import Mesh
 from wrt.scene.model import Object, Scene
 
 
-def worlds_over(worlds: Sequence[Mesh | Scene]) -> FlatScene:
-    """Join several worlds in one geometry; each mesh is stored once. Raises InputError for spheres and flattened objects."""
+def worlds_over(worlds: Sequence[Mesh | Scene], movable: bool = False) -> FlatScene:
+    """Join several worlds in one geometry; each mesh is stored once. Raises InputError for spheres and flattened objects.
+
+    movable: the one world is a scene that the caller wants to move, and messages do not speak of worlds."""
     for index, scene in enumerate(worlds):
+        place = "movable=True" if movable else f"world {index}"
         for thing in scene.objects if isinstance(scene, Scene) else ():
             if not is_invertible(thing):
                 raise InputError("is flattened or sheared too much to be an instance",
-                                 place=f"world {index}: object {thing.name!r}")
+                                 place=f"{place}: object {thing.name!r}")
         if isinstance(scene, Scene) and scene.spheres:
-            raise InputError("has spheres, but worlds must consist of meshes", place=f"world {index}",
-                             hint=MESH_OF_A_SPHERE)
+            raise InputError(f"has spheres, but {'instances' if movable else 'worlds'} must consist of meshes", place=place,
+                             argument="mesh" if movable else None, hint=MESH_OF_A_SPHERE)
     grey = (Material(),)
     objects = [scene.objects if isinstance(scene, Scene) else (Object(scene, grey, name=scene.name),) for scene in worlds]
     together = tuple(thing for each in objects for thing in each)
     if not together:
-        raise InputError("must have at least one object in all its worlds together", argument="mesh")
+        raise InputError(f"must have at least one object{'' if movable else ' in all its worlds together'}", argument="mesh")
     joined = Scene(together)
     flat = flatten(joined, frozenset(id(thing.mesh) for thing in together))
     geometry = flat.geometry
