@@ -135,7 +135,8 @@ def split_rays(rays: SplitRays, first: int):
 def locate_hits(hits: HitPoints64, first: int):
     """Compute where rays hit the planes of their triangles, in float64 (Moeller, Trumbore 1997).
 
-    A ray that misses its triangle in float64 has the point at the u and v from float32.
+    A ray that misses its triangle in float64 has the point at the u and v from float32. Where a direction is 0, the coordinate is the
+    origin's, so that the point does not leave the cell of a grid in which the ray is.
     """
     i = first + wp.tid()
     ray = hits.ray[i]
@@ -152,4 +153,8 @@ def locate_hits(hits: HitPoints64, first: int):
     if not (u >= wp.float64(0.0) and v >= wp.float64(0.0) and u + v <= wp.float64(1.0)):  # also for NaN
         u = wp.float64(hits.u[i])
         v = wp.float64(hits.v[i])
-    hits.point[i] = corner + e * u + f * v
+    point = corner + e * u + f * v
+    for axis in range(3):
+        if hits.directions[ray][axis] == wp.float64(0.0):
+            point[axis] = hits.origins[ray][axis]
+    hits.point[i] = point

@@ -202,3 +202,24 @@ def make_render_rays_kernel(accel_struct: Any, traverse: Any, any_hit: bool) -> 
             store_hit(out, i, hit, 1.0)
 
     return trace_render_rays
+
+
+@kernel
+def subtract_origin_of_doubles(points: wp.array(dtype=wp.vec3d), origin: wp.vec3d, out: wp.array(dtype=wp.vec3)):
+    i = wp.tid()
+    out[i] = wp.vec3(points[i] - origin)
+
+
+@kernel
+def subtract_origin_of_floats(points: wp.array(dtype=wp.vec3), origin: wp.vec3d, out: wp.array(dtype=wp.vec3)):
+    i = wp.tid()
+    out[i] = wp.vec3(wp.vec3d(points[i]) - origin)
+
+
+subtract_origin = {wp.vec3: subtract_origin_of_floats, wp.vec3d: subtract_origin_of_doubles}
+
+
+@kernel
+def add_origin(points: wp.array(dtype=wp.vec3), origin: wp.vec3d, out: wp.array(dtype=wp.vec3d)):
+    i = wp.tid()
+    out[i] = wp.vec3d(points[i]) + origin

@@ -16,7 +16,7 @@ from wrt.core.errors import SceneWarning
 from wrt.io.gltf.reader import load_gltf
 
 COMPONENT = {"int8": 5120, "uint8": 5121, "int16": 5122, "uint16": 5123, "uint32": 5125, "float32": 5126}
-KIND = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+KIND = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
 
 

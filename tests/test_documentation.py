@@ -240,6 +240,7 @@ def test_calls_in_the_tables_for_other_libraries_run(theirs: str, folder: Path, 
         "origins": origins, "directions": directions, "rays": np.concatenate([origins, directions], axis=1), "pose": np.eye(4),
         "K": np.diag([500.0, 500.0, 1.0]), "colors": np.zeros((10_000, 3)), "scene": wrt.Scene.of([ball, ball]),
         "trimesh_mesh": ball.to_trimesh(), "matrix": np.eye(4), "locations": origins, "index_ray": np.arange(50),
+        "theirs": np.zeros((640 * 480, 3)),
         "query": wrt.ray_query("bvh")}
     theirs_names = {**names, "trimesh": trimesh, "mesh": ball.to_trimesh(), "scene": trimesh.Scene(ball.to_trimesh())}
     names["accel"] = wrt.build(ball)
@@ -268,15 +269,20 @@ def test_the_table_for_trimesh_makes_the_rays_of_its_camera() -> None:
     pose[:3, 3] = 1.0, 2.0, 3.0
 
     def difference(row: str) -> float:
-        """Return the largest difference of a unit direction. trimesh has the pixels column by column, each from the top."""
+        """Return the largest difference of a unit direction. A line of the row reorders trimesh's directions."""
         origins, theirs, _ = trimesh.Scene(trimesh.creation.box(), camera=camera, camera_transform=pose).camera_rays()
         names: dict[str, Any] = {"np": np, "wrt": wrt, "K": camera.K, "pose": pose}
         code = next(ours for call, ours in calls("trimesh") if row in call).replace("fov_y=0.6", f"fov_y={np.radians(camera.fov[1])}")
+        names["theirs"] = theirs
         values = [value_of(line, names) for line in code.splitlines()]
-        ours, directions = values[-1] if isinstance(values[-1], tuple) else values[-2:]
+        if isinstance(values[-1], tuple):
+            (ours, directions), reordered = values[-1], theirs.reshape(640, 480, 3).transpose(1, 0, 2).reshape(-1, 3)
+        else:
+            ours, directions, reordered = values[-3:]
         np.testing.assert_allclose(ours, origins, atol=1e-6)
-        unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-        return float(np.abs(unit.reshape(480, 640, 3).transpose(1, 0, 2) - theirs.reshape(640, 480, 3)).max())
+        length = np.linalg.norm(directions, axis=1, keepdims=True)
+        assert np.allclose(length, 1.0, atol=1e-6) == (row == "scene.camera.fov")
+        return float(np.abs(directions / length - reordered).max())
 
     assert difference("scene.camera_rays()") < 2e-7
     camera.fov = 60.0, np.degrees(2.0 * np.arctan(0.75 * np.tan(np.radians(30.0))))

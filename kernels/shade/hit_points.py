@@ -27,6 +27,7 @@ class HitPlaces:
     normal: wp.array(dtype=wp.vec3)  # Unit normal of the flat triangle or the sphere, on the outside.
     shading: wp.array(dtype=wp.vec3)  # Interpolated unit normal, on the outside.
     uv: wp.array(dtype=wp.vec2)  # Texture coordinates.
+    face: wp.array(dtype=wp.int32)  # Index of the face in the object's mesh. Spheres have -1.
     object: wp.array(dtype=wp.int32)  # Index of the object in the scene. Spheres come after the objects.
     instance: wp.array(dtype=wp.int32)  # The user's id of the instance.
     material: wp.array(dtype=wp.int32)  # Index of the material.
@@ -36,7 +37,7 @@ class HitPlaces:
 class ObjectIds:
     """The tables from primitives to the ids of objects and instances that users know."""
 
-    first_prim: wp.array(dtype=wp.int32)  # First prim_id of each object, then of each sphere.
+    first_prim: wp.array(dtype=wp.int32)  # First prim_id of each object or instance, then of each sphere.
     instance: wp.array(dtype=wp.int32)  # The user's id of each entry of Surfaces.instances.
 
 
@@ -250,6 +251,7 @@ def write_miss(out: HitPlaces, i: int):
     write(out.normal, i, nothing)
     write(out.shading, i, nothing)
     write(out.uv, i, wp.vec2(wp.nan, wp.nan))
+    write(out.face, i, -1)
     write(out.object, i, -1)
     write(out.instance, i, -1)
     write(out.material, i, -1)
@@ -257,6 +259,9 @@ def write_miss(out: HitPlaces, i: int):
 
 @wp.func
 def write_ids(surfaces: Surfaces, object_ids: ObjectIds, place: Place, prim_id: int, out: HitPlaces, i: int):
+    if out.face.shape[0] > 0:
+        first = object_ids.first_prim[last_entry(object_ids.first_prim, prim_id)]
+        out.face[i] = wp.where(prim_id < surfaces.n_triangles, prim_id - first, -1)
     if out.object.shape[0] > 0:
         out.object[i] = last_entry(object_ids.first_prim, prim_id)
     if out.instance.shape[0] > 0:

@@ -22,6 +22,7 @@ from tests.fuzz.mutate import BYTES, INTEGERS, TEXT, mutate, mutate_tree
 from tests.fuzz.seeds import Seed
 from tests.gltf_files import pack_glb
 from wrt.core.checked_file import CHECKSUM_BYTES
+from wrt.core.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -199,7 +200,6 @@ def png_of(chunks: list[tuple[bytes, bytes]]) -> bytes:
 
 def read_picture(path: Path) -> object:
     """Read the file as an environment and as a texture; raise InputError if both refuse it, or if memory ran out."""
-    from wrt.core.errors import InputError
     from wrt.picture.decode import decode_rgba8
     from wrt.picture.image import read_image
 
@@ -280,13 +280,34 @@ def accel_seeds() -> list[Seed]:
             found.append(Seed(".accel", path.read_bytes()))
             build([ball(), ball()], accel, threads=1).save(path)
             found.append(Seed(".accel", path.read_bytes()))
+        for mesh, options in ((world_scenes(), {}), (world_scenes()[0], {"movable": True})):
+            build(mesh, threads=1, **options).save(path)
+            found.append(Seed(".accel", path.read_bytes()))
+        build(world_scenes()[0], threads=1).save(path, mesh=True)
+        found.append(Seed(".accel", path.read_bytes()))
     return found
 
 
+def world_scenes() -> list[Any]:
+    """Two worlds with names, normals, texture coordinates, and materials of faces and of their own."""
+    from wrt.scene.materials import Material
+    from wrt.scene.mesh import Mesh
+    from wrt.scene.model import Object, Scene
+
+    vertices, faces = ball().vertices, ball().faces
+    mesh, shared = Mesh(vertices, faces, vertices, vertices[:, :2]), Material()
+    pattern = Object(mesh, (shared, Material()), face_material=np.arange(len(faces)) % 2, name="a")
+    return [Scene((pattern, Object(ball(), (Material(),), name="b"))), Scene((pattern, Object(ball(), (shared,))))]
+
+
 def read_accel(path: Path) -> object:
-    """Load the structure, and trace rays: only a traversal shows a bad reference."""
+    """Load the structure, trace rays and ask for all that hits know: only these show a bad reference."""
     accel = load_accel_only(path)
-    return accel.closest_hit(*rays(), **({"world": 0} if accel.snapshot.roots is not None else {}))
+    hits = accel.closest_hit(*rays(), **({"world": np.arange(24) % accel.geometry.n_worlds} if accel.snapshot.roots is not None else {}))
+    for name in ("point", "normal", "shading_normal", "uv", "object", "instance", "material", "face"):
+        with contextlib.suppress(InputError):  # the scene has none
+            getattr(hits, name)
+    return hits
 
 
 def load_accel_only(path: Path) -> Any:

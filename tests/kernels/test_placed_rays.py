@@ -111,7 +111,8 @@ def test_points_are_where_the_lines_meet_the_planes():
     np.testing.assert_allclose(arrays[-1], expected, rtol=0.0, atol=1e-11)
     # Lines that miss in float64, and lines in the plane, have the point at u and v.
     beside = (origins, np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), *arrays[2:-1], np.empty((200, 3)))
-    LOCATE.launch(200, struct_record(HitPoints64, (origins, np.zeros((200, 3)), *beside[2:])))
+    nowhere = np.full((200, 3), np.nan)
+    LOCATE.launch(200, struct_record(HitPoints64, (origins, nowhere, *beside[2:])))
     np.testing.assert_allclose(beside[-1], targets, rtol=0.0, atol=1e-6)
 
 

@@ -113,6 +113,17 @@ def test_points_are_projected_in_decimal_arithmetic() -> None:
     np.testing.assert_allclose(unproject(found, K, lens), (0.15, -0.2, 1.0), atol=1e-14)
 
 
+def test_a_fisheye_camera_shows_neither_itself_nor_the_point_behind_it() -> None:
+    """At the angle pi every direction in the picture is as good. Beside that, the angle is arctan2."""
+    centre, around = K[:2, 2], [[0.0, 0.0, 1.0], [0.0, 0.0, 1e-300], [1e-12, 0.0, -1.0], [0.0, -1e-12, -1.0], [1.0, 0.0, 0.0]]
+    for lens in ((), (0.01, 0.0, 0.0, 0.0)):
+        assert np.isnan(project([[0.0, 0.0, -1.0], [0.0, 0.0, 0.0], [0.0, -0.0, -1e300], [0.0, 0.0, -0.0]], K, lens, fisheye=True)).all()
+        shown, radius = project(around, K, lens, fisheye=True), np.array([0.0, 0.0, np.pi, np.pi, np.pi / 2])
+        radius += 0.01 * radius**3 if lens else 0.0
+        where = np.array([[0, 0], [0, 0], [1, 0], [0, -1], [1, 0]]) * radius[:, None]
+        np.testing.assert_allclose(shown, centre + where @ np.array(K)[:2, :2].T, rtol=1e-9)
+
+
 @pytest.mark.parametrize("call, said", [
     (lambda: pinhole(K, SIZE, distortion=(-0.6, 0.0, 0.0, 0.0)), ("distortion", "leaves pixel (0, 0) without a ray: it folds over")),
     (lambda: pinhole(K, (640, 480), distortion=(-0.3, 0.0, 0.0, 0.0)), ("distortion", "folds over")),

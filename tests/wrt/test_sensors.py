@@ -240,6 +240,15 @@ def test_noise_has_the_deviation_that_is_asked_for() -> None:
     assert abs(lost - 0.1) < 5.0 * np.sqrt(0.09 / n)
 
 
+def test_no_noise_makes_a_hit_a_miss() -> None:
+    largest = np.float32(3.4028234e38)
+    assert with_range_noise([largest, np.inf], 0).tolist() == [largest, np.inf]
+    for ranges, proportional in (([1.0, 1e300], 0.0), (np.full(100, 3e38), 10.0)):
+        with refused("ranges", "range of float32"):
+            with_range_noise(ranges, 0, proportional=proportional)
+    assert with_range_noise([1e300], 0, dropout=1.0) == np.inf
+
+
 def test_noise_repeats_and_is_each_elements_own() -> None:
     ranges = np.full((4, 6), 5.0, np.float32)
     ranges[1, 2] = np.inf
@@ -250,7 +259,7 @@ def test_noise_repeats_and_is_each_elements_own() -> None:
     other[0, 0], other[1, 2] = np.inf, 1.0
     same = with_range_noise(other, 3, 0.1, dropout=0.2) == noisy
     assert same.sum() >= 22 and same[2:].all()
-    assert with_range_noise(5.0, 0).shape == () and with_range_noise(1e300, 0) == np.inf
+    assert with_range_noise(5.0, 0).shape == ()
     assert np.array_equal(with_range_noise(ranges, 0), ranges) and (with_range_noise(np.zeros(1000), 0, 1.0) >= 0.0).all()
 
 

@@ -22,7 +22,7 @@ from wrt.accel.snapshot import Snapshot
 from wrt.accel.store import check_order, save
 from wrt.accel.structure import Structure, options_of
 from wrt.accel.tree_exchange import TreeExchange
-from wrt.core.arrays import check_no_gradients, from_tensor
+from wrt.core.arrays import check_no_gradients, from_tensor, real_numbers
 from wrt.core.building import report_parts
 from wrt.core.default_device import DEFAULT_DEVICE
 from wrt.core.device import upload
@@ -32,6 +32,7 @@ from wrt.core.types import ArrayLike, KernelModule, PathLike, WarpArray, WarpStr
 from wrt.core.warp_private import refuse_capture
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.warp_private import fields_of
+from wrt.scene.values import as_number, near_zero
 
 MeshT = TypeVar("MeshT", bound="OneMesh")
 
@@ -53,7 +54,7 @@ class OneMesh(TreeExchange, ABC):
 
     def __init__(self, geometry: Geometry, attributes: FlatScene | None = None, /, device: str = DEFAULT_DEVICE,
                  threads: int | None = None, *, triangle: str = "watertight", box: str = "conservative", **options: object) -> None:
-        super().__init__(Structure(type(self), Units(triangle, box)), geometry.unshared(), attributes, device, threads)
+        super().__init__(Structure(type(self), Units(triangle, box)), geometry, attributes, device, threads)
         self.built_with, begin = options_of(self.name, self.options, options), build_clock()
         built = self._build(self.built_with)
         self._install(built, begin, built.sah_cost)
@@ -63,7 +64,7 @@ class OneMesh(TreeExchange, ABC):
                 threads: int | None = None, *, units: Units | None = None, built_with: object = None) -> Self:
         """Make a structure from saved arrays, or raise InputError if they do not fit. units: intersection tests; built_with: options."""
         self = cls.__new__(cls)
-        Accelerator.__init__(self, Structure(cls, units or Units()), geometry.unshared(), attributes, device, threads)
+        Accelerator.__init__(self, Structure(cls, units or Units()), geometry, attributes, device, threads)
         self.built_with = cls.options() if built_with is None else built_with
         begin = build_clock()
         check_order(built.order, len(geometry), cls.name)
@@ -120,10 +121,10 @@ class OneMesh(TreeExchange, ABC):
 
     def _moved(self, vertices: ArrayLike) -> Geometry:
         """Return the geometry with new vertices. Raises InputError for another shape and for values that are not finite."""
-        moved = vectors(vertices, "vertices").copy()
-        if moved.shape != (self.geometry.n_vertices, 3):
+        near, origin = near_zero(real_numbers(vertices, "vertices", "(V, 3)"))
+        if (moved := vectors(near, "vertices").copy()).shape != (self.geometry.n_vertices, 3):
             raise InputError(f"must be {(self.geometry.n_vertices, 3)}, got {moved.shape}", argument="vertices")
-        return Geometry(moved, self.geometry.faces, self.geometry.spheres)
+        return Geometry(moved, self.geometry.faces, self.geometry.spheres, origin)
 
     def _refit_in_place(self, points: ArrayLike) -> None:
         raise InputError(f"a {self.name} cannot be refitted in place", hint="use bvh2")
@@ -158,6 +159,7 @@ class OneMesh(TreeExchange, ABC):
         if not self.can_refit:
             raise InputError(f"a {self.name} cannot be refitted", hint="build it again, or use bvh2")
         refuse_capture(None if in_place else self.device)
+        rebuild_at = np.inf if np.array_equal(rebuild_at, np.inf) else as_number(rebuild_at, "rebuild_at", low=0.0)
         vertices = from_tensor(vertices, "vertices")
         with self._refitting:
             begin, before = build_clock(), self._snapshot
@@ -251,7 +253,7 @@ def build_each(kind: type[MeshT], geometries: Sequence[Geometry], device: str, t
     begin, built_with = build_clock(), options_of(kind.name, kind.options, options)
     structures = [kind.__new__(kind) for _ in geometries]
     for each, geometry in zip(structures, geometries, strict=True):
-        Accelerator.__init__(each, Structure(kind, units), geometry.unshared(), None, device, threads)
+        Accelerator.__init__(each, Structure(kind, units), geometry, None, device, threads)
         each.__dict__.update(built_with=built_with)
     built = kind.build_all(structures, built_with) if kind.build_all else report_parts(structures, lambda each: each._build(built_with))
     for each, arrays in zip(structures, built, strict=True):

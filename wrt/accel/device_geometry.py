@@ -20,8 +20,8 @@ from wrt.kernels.build.shape import Shape, count_outside
 class DeviceGeometry(Geometry):
     """A mesh in Warp arrays, an argument of `wrt.build` in place of a `Mesh`. `vertices` and `faces` are copies on the host.
 
-    A structure copies the points, so that the caller may modify them for a `refit`. Points are not checked: no ray hits a triangle
-    with a point that is not finite.
+    Both arrays are copied, so that the caller may modify them for a `refit`. Points are not checked: no ray hits a triangle with a
+    point that is not finite.
 
     Parameters
     ----------
@@ -47,10 +47,10 @@ class DeviceGeometry(Geometry):
             raise InputError(f"must be a Warp array (3 F,) of int32 or (F,) of vec3i, got {shown(indices)}", argument="indices")
         if indices.device != points.device:
             raise InputError(f"must be on {points.device}, as points are, not on {indices.device}", argument="indices")
-        indices = indices if indices.is_contiguous else indices.contiguous()
+        indices = wp.clone(indices if indices.is_contiguous else indices.contiguous())
         if flat:
             indices = indices.reshape((len(indices) // 3, 3)).view(wp.vec3i)
-        self._set(points, indices, np.zeros((0, 4), np.float32))
+        self._set(wp.clone(points), indices, np.zeros((0, 4), np.float32))
         outside = wp.zeros(1, dtype=wp.int32, device=points.device)
         launch_on(points.device, count_outside, len(self), self.indices, len(points), outside, None)
         if n := int(outside.numpy()[0]):
@@ -71,10 +71,6 @@ class DeviceGeometry(Geometry):
     def unchecked(points: WarpArray, indices: WarpArray, spheres: np.ndarray) -> DeviceGeometry:
         """Make a geometry from arrays that are known to be valid. indices: (F,) of vec3i; spheres: as in Geometry."""
         return DeviceGeometry.__new__(DeviceGeometry)._set(points, indices, spheres)
-
-    def unshared(self) -> DeviceGeometry:
-        """Return the geometry with a copy of the points."""
-        return DeviceGeometry.unchecked(wp.clone(self.points), self.indices, self.spheres)
 
     def __reduce__(self) -> tuple[object, ...]:
         """Pickle and deep-copy as a Geometry on the host, because Warp arrays support neither."""

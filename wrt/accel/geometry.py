@@ -25,17 +25,18 @@ MESH_OF_A_SPHERE = "wrt.scene.shapes.icosphere makes a mesh of a sphere"  # hint
 class Geometry:
     """Triangles and spheres: vertices (V, 3) float32, faces (F, 3) int32, spheres (S, 4) float32 (center, radius).
 
-    prim_ids number the faces first, then the spheres.
+    prim_ids number the faces first, then the spheres. origin: (3,) float64, the point that is 0 in these arrays; None: 0.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     spheres: np.ndarray
+    origin: np.ndarray | None = None
 
     @staticmethod
     def of(mesh: Mesh) -> Geometry:
         """Make the geometry of a mesh, without spheres."""
-        return Geometry(mesh.vertices, mesh.faces, np.zeros((0, 4), np.float32))
+        return Geometry(mesh.vertices, mesh.faces, np.zeros((0, 4), np.float32), mesh.origin)
 
     def __len__(self) -> int:
         return len(self.faces) + len(self.spheres)
@@ -52,7 +53,7 @@ class Geometry:
 
     def checksum(self) -> str:
         """Return `checksum_of` the arrays, in hexadecimal."""
-        return f"{checksum_of(self.vertices, self.faces, self.spheres):08x}"
+        return f"{checksum_of(self.vertices, self.faces, self.spheres, *([] if self.origin is None else [self.origin])):08x}"
 
     def on(self, device: Device, faces: WarpArray | None = None) -> WarpStruct:
         """Upload to a device, as kernels.build.shape.Shape. faces: the faces, if they are on the device already."""
@@ -63,10 +64,6 @@ class Geometry:
         shape.faces = upload(self.faces, wp.vec3i, device, read_only=True) if faces is None else faces
         shape.spheres = upload(self.spheres, wp.vec4, device, read_only=True)
         return shape
-
-    def unshared(self) -> Geometry:
-        """Return the geometry with a copy of each array that the caller may modify."""
-        return self
 
     def bounds(self, threads: int = 1, out: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Compute the padded box of every primitive: low and high, (N, 3) float32, into `out` if given.

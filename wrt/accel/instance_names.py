@@ -36,11 +36,13 @@ class InstanceNames:
 
         Raises InputError that names `object` or `world`.
         """
-        things = np.empty(len(thing) if isinstance(thing, list | tuple | range | np.ndarray) else (), np.dtype("O"))
-        things[...] = thing
+        many = isinstance(thing, list | tuple | range | np.ndarray)
+        things = np.array(thing if many else [thing], np.dtype("O"))
+        if things.ndim > 1:
+            raise InputError(f"must be a name or an index, or (R,) of them, got {shown(thing)}", argument="object")
         worlds = self._worlds(world)
         try:
-            things, worlds = np.broadcast_arrays(things, worlds)
+            things, worlds = np.broadcast_arrays(things if many else things.reshape(()), worlds)
         except ValueError:
             raise InputError(f"must be one or {len(things)} worlds, one for each object", argument="world") from None
         ids = [self._find(each, int(one)) for each, one in zip(things.flat, worlds.flat, strict=True)]
@@ -67,6 +69,6 @@ class InstanceNames:
                                  hint=f"use an index: {', '.join(str(each - int(self.first[world])) for each in found[:5])}")
             return found[0]
         count = int(self.first[world + 1] - self.first[world])
-        if not isinstance(thing, int | np.integer) or not 0 <= thing < count:
+        if not isinstance(thing, int | np.integer) or isinstance(thing, bool) or not 0 <= thing < count:
             raise InputError(f"must be a name, or 0 to {count - 1}, got {shown(thing)}", argument="object", place=place)
         return int(self.first[world] + thing)

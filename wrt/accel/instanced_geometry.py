@@ -1,6 +1,6 @@
 """Instances: each mesh is stored once in its own space, and each instance has a transform to world space."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -16,7 +16,7 @@ MAX_SPREAD = 1e4
 class NumberedGeometry(Geometry):
     """A geometry with other prim_ids in the scene: primitive i has prim_ids[i]. prim_ids: (N,) int32, ascending."""
 
-    prim_ids: np.ndarray
+    prim_ids: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
 
     def primitives(self, units: Units, order: np.ndarray | None = None, threads: int = 1) -> np.ndarray:
         if order is not None and len(order) > len(self):
@@ -28,7 +28,9 @@ class NumberedGeometry(Geometry):
 
 @dataclass(frozen=True, eq=False)
 class InstancedGeometry:
-    """Instances of geometries in world space. Spheres belong to part 0, and their prim_ids come after the triangles."""
+    """Instances of geometries in world space. Spheres belong to part 0, and their prim_ids come after the triangles.
+
+    `to_world` maps the arrays of a part, without the part's origin, to the world minus `origin`."""
 
     parts: tuple[Geometry, ...]  # In their own spaces; their prim_ids begin at 0.
     part: np.ndarray  # (I,) int, index of each instance's part.
@@ -36,6 +38,7 @@ class InstancedGeometry:
     first_prim: np.ndarray  # (I,) int, which an instance adds to the prim_ids of its part.
     n_triangles: int  # Number of triangles of all instances.
     worlds: np.ndarray | None = None  # (W + 1,) int. World w has the instances [worlds[w], worlds[w + 1]); None: one world.
+    origin: np.ndarray | None = None  # (3,) float64, the point of the world that is 0 for the structure; None: 0.
 
     @property
     def first_instance(self) -> np.ndarray:
@@ -71,6 +74,17 @@ class InstancedGeometry:
     def is_placed(self) -> np.ndarray:
         """Mask of instances, (I,) bool: True for one object with its own transform, False for joined objects."""
         return np.array([not isinstance(self.parts[part], NumberedGeometry) for part in self.part], bool)
+
+
+    def near_zero(self, rows: np.ndarray, matrices: np.ndarray) -> np.ndarray:
+        """Convert matrices (R, 3, 4) of the instances `rows` from the caller's mesh and world to those of `to_world`."""
+        origins = [part.origin for part in self.parts]
+        if self.origin is None and all(each is None for each in origins):
+            return matrices
+        own = np.array([np.zeros(3) if each is None else each for each in origins])[self.part[rows]]
+        out = matrices.copy()
+        out[:, :, 3] += (matrices[:, :, :3] @ own[:, :, None])[..., 0] - (0.0 if self.origin is None else self.origin)
+        return out
 
 
 def inverse_of(matrices: np.ndarray) -> np.ndarray:

@@ -30,7 +30,7 @@ from wrt.core.warp_private import refuse_capture
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.traverse.instances import Placement
 from wrt.kernels.warp_private import fields_of
-from wrt.scene.values import MAX_REACH
+from wrt.scene.values import MAX_REACH, as_number
 
 ALIGNMENT = 64  # bytes, between the addresses of structures
 
@@ -137,6 +137,7 @@ class Instances(Accelerator):
             For other shapes, names and indices, for objects that are not instances, and for matrices that flatten or shear too much.
         """
         refuse_capture(self.device)
+        rebuild_at = np.inf if np.array_equal(rebuild_at, np.inf) else as_number(rebuild_at, "rebuild_at", low=0.0)
         with self._refitting:
             begin, before = build_clock(), self._snapshot
             geometry = before.geometry
@@ -152,7 +153,7 @@ class Instances(Accelerator):
             assert instance is not None
             rows, matrices = checked_moves(rows_of(geometry, before.attributes), instance, matrix)
             to_world = geometry.to_world.copy()
-            to_world[rows] = matrices
+            to_world[rows] = geometry.near_zero(rows, matrices)
             geometry = replace(geometry, to_world=to_world)
             if "boxes" not in self._cache:
                 self._cache["boxes"] = self._boxes(geometry, MOVED_BOXES)

@@ -40,8 +40,7 @@ def hits_of(accel: OneMesh, vertices: ArrayLike | None, rays: tuple[Any, ...], r
     """Refit the structure if `vertices` differ from its own; return closest_hit(*rays). Raises InputError that names the argument."""
     snapshot_of(accel)
     if vertices is not None:
-        new, old = to_numpy(vertices), accel.geometry.vertices
-        if np.may_share_memory(new, old) or not np.array_equal(float32(new), old):  # the caller may have modified shared memory
+        if not np.array_equal(float32(to_numpy(vertices)), accel.geometry.vertices):
             accel.refit(vertices, rebuild_at)
     return accel.closest_hit(*rays)
 

@@ -45,7 +45,7 @@ class TreeExchange(Accelerator):
         Raises InputError if the tree is not a tree over the geometry, or the structure cannot hold it.
         """
         self = cls.__new__(cls)
-        Accelerator.__init__(self, Structure(cls, Units()), geometry.unshared(), attributes, device, threads)
+        Accelerator.__init__(self, Structure(cls, Units()), geometry, attributes, device, threads)
         self.built_with = cls.options()
         begin = build_clock()
         built = self._built_of(tree.checked(geometry, spatial_splits))

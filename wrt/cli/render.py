@@ -174,8 +174,8 @@ def require_alone(as_json: bool, options: dict[str, Parsed]) -> None:
     """Raise InputError for an option that writes beside a picture on stdout, and if stdout is closed."""
     if sys.stdout is None:
         raise InputError("is stdout, which is closed", argument="-o -", hint="give -o a file name")
-    for name, given in (("json", as_json), ("aov", options["aov"]), ("checkpoint", options["every"] or options["resume"])):
-        if given and not (name == "checkpoint" and options["checkpoint_file"]):
+    for name, given in (("json", as_json), ("aov", options["aov"]), ("checkpoint", options["every"]), ("resume", options["resume"])):
+        if given and not (name in ("checkpoint", "resume") and options["checkpoint_file"]):
             raise InputError("has no place if the picture goes to stdout", argument=f"--{name}", hint="give -o a file name")
 
 

@@ -16,12 +16,13 @@ import numpy as np
 from wrt.accel.geometry import Geometry
 from wrt.accel.points.closest_points import closest_points
 from wrt.accel.points.contains import odd_crossings
+from wrt.accel.points.enclosing import enclosing
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.all_hits import ListQuery
 from wrt.accel.queries.few_lists import begins
-from wrt.accel.queries.rays import segment_ends, vectors
+from wrt.accel.queries.rays import vectors
 from wrt.accel.scenes.build import build
-from wrt.compat.given_rays import Ends, RayFormat
+from wrt.compat.given_rays import RayFormat
 from wrt.compat.surfaces import every_hit, hit_counts, scatter
 from wrt.core.arrays import float32, real_numbers
 from wrt.core.checks import as_integer, shown
@@ -62,7 +63,7 @@ class RaycastingScene:
     Parameters
     ----------
     nthreads : int
-        Number of threads: in the constructor for the build, in methods for the query. 0: one per core.
+        Number of threads: in the constructor for the build, in methods for the query. 0 and below: one per core.
     device
         "cpu", "cuda:0", or Open3D's names for these.
     rays : (..., 6) array_like
@@ -128,14 +129,18 @@ class RaycastingScene:
         Parameters
         ----------
         tnear, tfar
-            Ends of the segment in units of the direction's length.
+            Ends of the segment in units of the direction's length. As in Open3D, tnear may be below 0; tfar < 0 and NaN hit nothing.
         """
-        shape, rows = _rows(rays, "rays", 6)
-        ends: Ends | None = None
-        if not (type(tnear) is type(tfar) is float and tnear == 0.0 and tfar == math.inf):  # these need no arrays
-            t_min, t_max = segment_ends(tnear, len(rows), "t_min"), segment_ends(tfar, len(rows), "t_max")
-            ends = float32(np.asarray(t_min)), float32(np.asarray(t_max))
-        return _answer(SPLIT.any_hits(self._scene().accel, (rows,), _threads(nthreads), ends=ends), shape)
+        (shape, rows), threads, accel = _rows(rays, "rays", 6), _threads(nthreads), self._scene().accel
+        if type(tnear) is type(tfar) is float and tnear == 0.0 and tfar == math.inf:  # these need no arrays
+            return _answer(SPLIT.any_hits(accel, (rows,), threads), shape)
+        near, far = _ends(tnear, len(rows), "tnear"), _ends(tfar, len(rows), "tfar")
+        far = np.where((near <= far) & (far >= 0.0), far, np.float32(-np.inf))
+        hit = SPLIT.any_hits(accel, (rows,), threads, ends=(np.fmax(near, np.float32(0.0)), far))
+        if (near < 0.0).any():
+            behind = np.zeros_like(near), np.where(far >= 0.0, -near, far)
+            hit |= SPLIT.any_hits(accel, (rows * np.array([1, 1, 1, -1, -1, -1], np.float32),), threads, ends=behind)
+        return _answer(hit, shape)
 
     def count_intersections(self, rays: ArrayLike, nthreads: int = 0) -> Answer:
         """Count the intersections of each ray with surfaces, (...) int32. An intersection at an edge or a corner counts once."""
@@ -229,7 +234,7 @@ class RaycastingScene:
     def _inside(self, points: np.ndarray, nthreads: int, nsamples: int) -> np.ndarray:
         if as_integer(nsamples, "nsamples", 1, MOST_SAMPLES) % 2 == 0:
             raise InputError(f"must be odd, got {nsamples}", argument="nsamples")
-        query = ListQuery(self._scene().accel, _threads(nthreads), crossings=True)
+        query = ListQuery(enclosing(self._scene().accel), _threads(nthreads), crossings=True)
         votes = np.zeros(len(points), np.int32)
         for seed in range(nsamples):
             votes += odd_crossings(query, points, seed)
@@ -252,7 +257,15 @@ class _Built(NamedTuple):
 
 
 def _threads(nthreads: int) -> int:
-    return thread_count(as_integer(nthreads, "nthreads", 0, (1 << 31) - 1) or None)
+    return thread_count(max(as_integer(nthreads, "nthreads", -(1 << 31), (1 << 31) - 1), 0) or None)
+
+
+def _ends(value: Any, n: int, name: str) -> np.ndarray:
+    """Convert an end of the segments of n rays to an array (n,) float32."""
+    ends = float32(_numbers(value, name, f"a number or ({n},)"))
+    if ends.shape not in ((), (n,)):
+        raise InputError(f"must be a number or ({n},), got {ends.shape}", argument=name)
+    return np.ascontiguousarray(np.broadcast_to(ends, n))
 
 
 def _numbers(value: Any, name: str, shape: str) -> np.ndarray:

@@ -21,6 +21,9 @@ from wrt.scene.mesh import Mesh, unit_rows
 if TYPE_CHECKING:
     import pyvista
 
+END = 1e-12  # of a segment's length, or of the largest coordinate: a surface so near to an end is hit
+NEAR_END = 2.0**-21  # of the mesh's size: a hit so near to an end on the surface is the same hit, whose point may be that of float32
+
 
 class RayTracer:
     """The methods `multi_ray_trace` and `ray_trace` of a PolyData. docs/compat.md lists the differences.
@@ -64,8 +67,11 @@ class RayTracer:
         order = np.argsort(ray, kind="stable") if retry else slice(None)
         return points[order], ray[order], cell[order]
 
-    def ray_trace(self, origin: ArrayLike, end_point: ArrayLike, first_point: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    def ray_trace(self, origin: ArrayLike, end_point: ArrayLike, first_point: bool = False, plot: bool = False,
+                  off_screen: bool | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Intersect a segment with the mesh; rows are in the order of distance from `origin`, each point once.
+
+        An end that is on the surface, to within the rounding of the mesh's points, is hit. A segment may have length 0.
 
         Parameters
         ----------
@@ -73,6 +79,8 @@ class RayTracer:
             Ends of the segment in the mesh's units.
         first_point
             Return only the point nearest to `origin`, (3,); the cells remain.
+        plot, off_screen
+            `plot` must be False: nothing is drawn.
 
         Returns
         -------
@@ -83,11 +91,20 @@ class RayTracer:
             (origin, "origin"), (end_point, "end_point")))
         if start.shape != (3,) or end.shape != (3,):
             raise InputError(f"and end_point must both be (3,), got {start.shape} and {end.shape}", argument="origin")
-        along = end - start
-        where, _, cells = self._intersector("ray_trace").intersects_location(start[None], along[None], max_hits=ALL)
-        points = where.astype(self.mesh.points.dtype)
-        kept = (where - start) @ along <= (1.0 + 1e-12) * (along @ along)  # within rounding, a surface at the end is hit
-        kept[1:] &= (points[1:] != points[:-1]).any(axis=1)
+        if plot:
+            raise InputError("must be False: this class draws nothing", argument="plot", hint="pass the points to a plotter of PyVista")
+        tracer = self._intersector("ray_trace")
+        where, _, cells = tracer.intersects_location(start[None], (end - start)[None], max_hits=ALL)
+        scaled, dtype = tracer.scaled, self.mesh.points.dtype
+        reach = max(float(np.finfo(dtype).eps), END) * np.abs([scaled.low, scaled.high]).max()
+        near = reach + NEAR_END * (scaled.high - scaled.low).max()
+        kept = (where - start) @ (end - start) <= (1.0 + END) * ((end - start) @ (end - start))
+        first, last = scaled.face_at(start, reach), scaled.face_at(end, reach)
+        for point, face in ((start, first), (end, last)):
+            kept &= (face < 0) | (np.linalg.norm(where - point, axis=1) > near)
+        kept = np.concatenate([[first >= 0], kept, [last >= 0]])
+        points, cells = np.vstack([start, where, end])[kept].astype(dtype), np.concatenate([[first], cells, [last]])[kept]
+        kept = np.append(True, (points[1:] != points[:-1]).any(axis=1))[:len(points)]
         points = points[kept]
         return points[0] if first_point and len(points) else points, cells[kept]
 
@@ -162,5 +179,5 @@ def _triangles(mesh: pyvista.PolyData, method: str) -> tuple[np.ndarray, np.ndar
     if not mesh.is_all_triangles:
         from pyvista.core.errors import NotAllTrianglesError
 
-        raise NotAllTrianglesError(f"Input mesh for {method} must be all triangles.")
+        raise NotAllTrianglesError(f"Input mesh for {method} must be all triangles." + " It has no cells." * (mesh.n_cells == 0))
     return np.asarray(mesh.points), np.asarray(mesh.regular_faces)

@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import warp as wp
 
+from wrt.accel.points.closest_points import closest_points
 from wrt.accel.points.contains import contains, open_edges_of
+from wrt.accel.points.enclosing import enclosing
 from wrt.accel.queries.batches import SMALL
 from wrt.accel.queries.raw_kernel import RawKernel
 from wrt.accel.queries.raw_launches import raw_launch
@@ -30,6 +32,7 @@ from wrt.scene.mesh import Mesh
 with needed_by("wrt.compat.trimesh"):
     from trimesh.caching import Cache, cache_decorator
     from trimesh.ray.ray_util import contains_points
+    from trimesh.triangles import closest_point
 
 if TYPE_CHECKING:
     import trimesh
@@ -67,7 +70,7 @@ class RayMeshIntersector:
         self._cache = Cache(id_function=self.mesh.__hash__)
 
     @cache_decorator
-    def _scaled(self) -> _ScaledStructure:
+    def scaled(self) -> _ScaledStructure:
         """Structure over the present mesh."""
         return _ScaledStructure(self.mesh.vertices, self.mesh.faces, **self._options)
 
@@ -88,7 +91,7 @@ class RayMeshIntersector:
             Face and ray of each hit, (M,) int64; with return_locations also the point, (M, 3) float64.
         """
         origins, directions = _rays(ray_origins, ray_directions)
-        scaled, most = self._scaled, max_hits if multiple_hits else min(max_hits, 1)
+        scaled, most = self.scaled, max_hits if multiple_hits else min(max_hits, 1)
         ray, face, u, v = scaled.every_hit(origins, directions, most) if most > 1 else scaled.first_hit(origins, directions)
         if most < 1 or (most > 1 and len(origins) > 1):  # the hits of one ray are in order
             order = _first_hits_first(ray) if most > 1 else np.zeros(0, np.int64)
@@ -109,11 +112,11 @@ class RayMeshIntersector:
 
     def intersects_first(self, ray_origins: ArrayLike, ray_directions: ArrayLike) -> np.ndarray:
         """Find the face that each ray hits first, (N,) int32, -1 on a miss. At equal distance, the lowest index wins."""
-        return self._scaled.closest_hits(*_rays(ray_origins, ray_directions))[3]
+        return self.scaled.closest_hits(*_rays(ray_origins, ray_directions))[3]
 
     def intersects_any(self, ray_origins: ArrayLike, ray_directions: ArrayLike) -> np.ndarray:
         """Test whether each ray hits anything: (N,) bool."""
-        scaled = self._scaled
+        scaled = self.scaled
         return PLACED.any_hits(scaled.accel, _rays(ray_origins, ray_directions), scaled.threads, scaled.placement)
 
     def contains_points(self, points: Any) -> np.ndarray:
@@ -124,7 +127,7 @@ class RayMeshIntersector:
         points = _rows(points, "points")
         if points.ndim != 2 or points.shape[1] != 3:
             raise InputError(f"must be (N, 3), got {points.shape}", argument="points")
-        scaled = self._scaled
+        scaled = self.scaled
         inside = ((points >= scaled.low) & (points <= scaled.high)).all(axis=1)
         if inside.any():
             near = points[inside]
@@ -175,7 +178,7 @@ class _ScaledStructure:
 
     @property
     def closed(self) -> bool:
-        return open_edges_of(self.accel.snapshot) == 0
+        return open_edges_of(enclosing(self.accel).snapshot) == 0
 
     def to_local(self, points: np.ndarray) -> np.ndarray:
         return np.ldexp(points - self.shift, self.exponent)
@@ -204,6 +207,15 @@ class _ScaledStructure:
         arrays = origins, directions, self.vertices, self.faces, *map(np.ascontiguousarray, hits), points
         LOCATE_HITS.launch(len(points), struct_record(HitPoints64, arrays), threads=self.threads)
         return points
+
+    def face_at(self, point: np.ndarray, reach: float) -> int:
+        """Return a face with area at a distance of at most `reach` from a point (3,), computed in float64; -1 if there is none."""
+        if not len(self.faces) or not ((point >= self.low - reach) & (point <= self.high + reach)).all():
+            return -1
+        face = int(closest_points(self.accel, self.to_local(point)[None], self.threads).prim_id[0])
+        corners = self.vertices[self.faces[face]]
+        near = np.linalg.norm(closest_point(corners[None], point[None])[0] - point) <= reach
+        return face if near and np.cross(corners[1] - corners[0], corners[2] - corners[0]).any() else -1
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         return contains(self.accel, self.to_local(points), threads=self.threads)
@@ -244,7 +256,7 @@ class _Counter(NamedTuple):
                             multiple_hits: bool = True) -> tuple[None, np.ndarray, None]:  # trimesh 4.5 does not pass multiple_hits
         """Return the ray of each hit, (M,) int64, in the second place."""
         scaled = self.scaled
-        counts = np.minimum(hit_counts(scaled.accel, PLACED, (origins, directions), scaled.threads, scaled.placement), MAX_HITS)
+        counts = np.minimum(hit_counts(enclosing(scaled.accel), PLACED, (origins, directions), scaled.threads, scaled.placement), MAX_HITS)
         return None, np.repeat(np.arange(len(counts)), counts), None
 
 

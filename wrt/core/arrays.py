@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from typing import Any, TypeGuard
 
@@ -84,7 +85,8 @@ def is_tensor(value: object) -> TypeGuard[Tensor]:
 
 def on_cpu(tensor: Tensor) -> bool:
     """Return True if a tensor is in the memory of the host."""
-    return bool(tensor.__dlpack_device__()[0] == DLPACK_CPU)
+    kind = tensor.__dlpack_device__()[0]
+    return bool(getattr(kind, "value", kind) == DLPACK_CPU)  # Open3D's enumeration is not equal to integers
 
 
 def from_tensor(value: object, name: str, dtype: WarpType = wp.vec3) -> Any:
@@ -98,8 +100,11 @@ def from_tensor(value: object, name: str, dtype: WarpType = wp.vec3) -> Any:
             return np.from_dlpack(value)
         return wp.from_dlpack(value, dtype=dtype)
     except (BufferError, TypeError, RuntimeError, ValueError, AttributeError) as error:  # the last: JAX's, under jit
+        with suppress(BufferError, TypeError, RuntimeError, ValueError, AttributeError):
+            return np.asarray(value.numpy())  # type: ignore[attr-defined]  # for libraries with an incomplete DLPack
+        gradients = getattr(value, "requires_grad", type(value).__module__.startswith("jax"))
         raise InputError(f"{shown(value)} does not share its memory: {error}", argument=name,
-                         hint="closest_hit of wrt.torch and of wrt.jax has gradients") from error
+                         hint="closest_hit of wrt.torch and of wrt.jax has gradients" if gradients else "pass a NumPy array") from error
 
 
 def to_tensor_like(*arguments: object) -> Callable[[Array], Tensor] | None:

@@ -45,10 +45,13 @@ def as_size(value: object, what: str = "size", high: int = 32768) -> tuple[int, 
 
 
 def as_array(value: object, dtype: npt.DTypeLike, what: str) -> np.ndarray:
-    """Return a contiguous NumPy array of a type. Values beyond the range of a float type become infinite."""
+    """Return a contiguous NumPy array of a type, with one axis or more. Values beyond the range of a float type become infinite.
+
+    It is a copy, because the caller may write to its array later. Only read-only arrays that own their memory are shared."""
+    shared = isinstance(value, np.ndarray) and value.base is None and not value.flags.writeable
     try:
         with np.errstate(over="ignore"):
-            return np.ascontiguousarray(value, dtype=dtype)
+            return np.array(value, dtype, copy=None if shared else True, order="C", ndmin=1)
     except (TypeError, ValueError):
         raise wrong(what, f"must be an array of numbers, got {shown(value)}") from None
 
@@ -131,12 +134,14 @@ def at_thing(kind: str, name: str) -> str:
 
 
 def shown(value: object) -> str:
-    """Return a value for a message: numbers, text and lists as they are, but short; arrays by shape and type, other objects by type."""
+    """Return a value for a message: numbers, text and lists as they are, but short; arrays by shape and type, other objects by their class,
+    with the package of a class that is not wrt's own."""
     if isinstance(value, str | int | float | tuple | list) or value is None:
         return short(value)
     if isinstance(value, np.ndarray):
         return f"an array {value.shape} of {value.dtype}"
-    return _a(type(value).__name__)
+    package = type(value).__module__.partition(".")[0]
+    return _a(("" if package in ("builtins", "wrt") else f"{package}.") + type(value).__name__)
 
 
 def short(value: object, most: int = 60) -> str:

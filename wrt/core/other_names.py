@@ -6,7 +6,7 @@ from collections.abc import Collection
 OTHER_NAMES = {
     # Of hits.
     "t_hit": "t", "depth": "distance", "locations": "points", "face_normals": "normals", "primitive_normals": "normals", "p": "point",
-    "n": "normal", "primitive_ids": "prim_id", "face_id": "prim_id", "index_tri": "prim_id", "face": "prim_id", "faces": "prim_id",
+    "n": "normal", "primitive_ids": "face", "face_id": "face", "index_tri": "prim_id", "primID": "face", "faces": "prim_id",
     "triangle": "prim_id", "triangle_id": "prim_id", "geometry_ids": "object", "geom_id": "object", "geomID": "object",
     "instID": "instance", "barycentric": "u", "primitive_uvs": "u", "valid": "hit", "is_valid": "hit", "mask": "hit",
     # Of structures and functions.

@@ -111,7 +111,7 @@ def _bare(mesh: Mesh, name: str, path: PathLike, staging: Staging) -> Scene:
         return _staged(put_on_floor(scene) if staging.floor else scene, path, staging, notes)
 
 
-LOADERS: Registry[Callable[[Path, Staging], Scene]] = Registry("scene format", {
+LOADERS: Registry[Callable[..., Scene]] = Registry("scene format", {
     ".toml": _load_toml, ".gltf": "wrt.io.gltf.reader:load_gltf", ".glb": "wrt.io.gltf.reader:load_gltf"})
 
 

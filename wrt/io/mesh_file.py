@@ -17,6 +17,7 @@ from wrt.core.types import PathLike
 from wrt.io.meshes import PLACES
 from wrt.scene.clean import Cleaned, clean
 from wrt.scene.mesh import Mesh, unit_rows
+from wrt.scene.values import near_zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +33,7 @@ class RawMesh:
     incomplete: int = 0  # number of faces with fewer than three corners
     positions: int = 0  # number of positions in the file
     exact: bool = False  # the arrays are those of a Mesh, and stay as they are
+    origin: np.ndarray | None = None  # which positions far from 0 lack
 
 
 Reader = Callable[[Path], RawMesh]
@@ -59,7 +61,8 @@ def load_mesh(path: PathLike, parts: Sequence[tuple[int, int]] = ()) -> Mesh:
 
     Polygons become triangles. Faces without area and vertices without a face are dropped (`Mesh.dropped` counts the faces); nothing is
     merged. Normals are scaled to unit length, and v is flipped so that (0, 0) is the top left of an image. Normals and uvs that are
-    not finite become zero, with one SceneWarning. An .npz file of `Mesh.save` is read bit by bit instead.
+    not finite become zero, with one SceneWarning. Corners without a normal get one if they are in a smoothing group of an .obj file.
+    An .npz file of `Mesh.save` is read bit by bit instead.
 
     Parameters
     ----------
@@ -77,7 +80,8 @@ def load_mesh(path: PathLike, parts: Sequence[tuple[int, int]] = ()) -> Mesh:
     """
     path = as_path(path, "path")
     if path.suffix.lower() not in MESH_FORMATS:
-        hint = "wrt.load_scene and wrt.build read scene files" if path.suffix.lower() in (".toml", ".gltf", ".glb") else None
+        hint = ("wrt.load_scene and wrt.build read scene files" if path.suffix.lower() in (".toml", ".gltf", ".glb")
+                else "docs/compat.md has meshes of MuJoCo's models" if path.suffix.lower() in (".xml", ".urdf", ".usd", ".usda") else None)
         raise InputError(f"is no mesh file: its suffix must be one of {', '.join(MESH_FORMATS)}", path=path, hint=hint)
     require_file(path)
     with at(path=path):
@@ -85,7 +89,8 @@ def load_mesh(path: PathLike, parts: Sequence[tuple[int, int]] = ()) -> Mesh:
         if len(raw.faces) == 0:
             raise InputError(f"has no triangles ({raw.positions} positions, {raw.incomplete} faces with fewer than 3 corners)")
         groups, face_group = _part_groups(parts, len(raw.faces)) if parts else (raw.groups, raw.face_group)
-    arrays = raw.vertices, raw.faces, raw.normals, raw.uvs, face_group
+    vertices, origin = (raw.vertices, raw.origin) if raw.exact or raw.origin is not None else near_zero(np.asarray(raw.vertices))
+    arrays = vertices, raw.faces, raw.normals, raw.uvs, face_group
     cleaned = Cleaned(*arrays, 0) if raw.exact else clean(*arrays)
     if len(cleaned.faces) == 0:
         raise InputError(f"none of its {len(raw.faces)} triangles has an area", path=path)
@@ -99,9 +104,11 @@ def load_mesh(path: PathLike, parts: Sequence[tuple[int, int]] = ()) -> Mesh:
         face_group=cleaned.face_group,
         dropped=cleaned.dropped + raw.incomplete,
         name=os.fspath(path),
+        origin=origin,
     )
     if not raw.exact:
         mesh.note_clean()
+    mesh.warn_if_far()
     return mesh
 
 

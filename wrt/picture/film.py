@@ -22,7 +22,7 @@ LETTERS = {"variance": "RGB", "depth": "Z", "normal": "XYZ", "albedo": "RGB"}
 
 @dataclass(eq=False)
 class Film(Suggests):
-    """The result of `render`.
+    """The result of `render`. A film keeps the arrays that it is given.
 
     The results of `np.asarray(film)`, of any library's `from_dlpack(film)`, of `numpy()` and of `warp()` share the memory of the pixels.
 

@@ -125,8 +125,10 @@ class Options:
         self.tile_size = None if self.tile_size is None else as_integer(self.tile_size, "tile_size", 1, 1 << 15)
         self.pass_size = None if self.pass_size is None else as_integer(self.pass_size, "pass_size", 1, 1 << 24)
         self.seed = as_integer(self.seed, "seed", 0, 2**32 - 1)
-        if self.crop is not None and len(as_tuple(self.crop, (int, np.integer), "crop")) != 4:
-            raise InputError(f"must be x0, y0, x1, y1 in pixels, got {shown(self.crop)}", argument="crop")
+        if self.crop is not None:
+            self.crop = tuple(map(int, as_tuple(self.crop, (int, np.integer), "crop")))  # type: ignore[arg-type, assignment]
+            if len(self.crop or ()) != 4:
+                raise InputError(f"must be x0, y0, x1, y1 in pixels, got {shown(self.crop)}", argument="crop")
         if not (self.progress is None or callable(self.progress)):
             raise InputError(f"must be a function that takes a Progress, got {shown(self.progress)}", argument="progress")
         as_one(self.camera, (str, int, np.integer, CameraKind, type(None)), "camera")

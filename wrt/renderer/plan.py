@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any, Unpack
 
+import numpy as np
+
 from wrt.accel.scenes.instancing import instanced_meshes
 from wrt.accel.structure import Structure
 from wrt.accel.structures import ACCELERATORS, stack_on
@@ -21,6 +23,7 @@ from wrt.renderer.film_arrays import BYTES_OF_AOVS, BYTES_OF_FILM, BYTES_OF_GROU
 from wrt.renderer.options import Options
 from wrt.renderer.waves import WaveKernels, wave_kernels
 from wrt.scene.cameras import CameraKind
+from wrt.scene.far import moved_by, moved_camera, scene_origin
 from wrt.scene.model import Scene
 from wrt.scene.settings import SettingChanges, Settings
 
@@ -45,6 +48,7 @@ class Plan:
     - accel: the acceleration structure's real name ("bvh" is an alias). structure: a Structure, or a class with the same members.
     - meshes: id()s of the instanced meshes (wrt.accel.scenes.instancing). crop: x0, y0, x1, y1 in pixels.
     - deepest: largest max_depth for which the kernels' stacks suffice.
+    - origin: (3,) float64, which the places of the scene and the camera lack, because the scene is far from 0; or None.
     """
 
     scene: Scene
@@ -56,6 +60,7 @@ class Plan:
     structure: Any
     crop: tuple[int, int, int, int]
     deepest: int
+    origin: np.ndarray | None = None
 
     @property
     def groups(self) -> int:
@@ -119,10 +124,11 @@ class Plan:
             ("other settings than " + ", ".join(AIMED), bool(settings.keys() - AIMED), False)) if needed and not has]
         if lacks:
             raise InputError(f"this renderer was not made for {lacks[0]}")
-        return replace(self, scene=scene, camera=camera, crop=_crop(scene.settings, self.options))
+        return replace(self, scene=scene, camera=moved_camera(camera, self.origin), crop=_crop(scene.settings, self.options))
 
     def moved(self, scene: Scene) -> "Plan":
         """Return the plan for a scene with the same objects in other places."""
+        scene = moved_by(scene, self.origin)
         return replace(self, scene=scene, meshes=instanced_meshes(scene, self.options.instancing))
 
 
@@ -130,11 +136,13 @@ def plan_of(scene: Scene, options: Options) -> Plan:
     """Resolve options for a scene. Raises InputError for an unknown camera, and for a crop outside the picture."""
     accel = "bvh8" if options.accel == "bvh" else options.accel
     camera = options.camera if isinstance(options.camera, CameraKind) else scene.camera(options.camera)
+    origin = scene_origin(scene)
+    scene, camera = moved_by(scene, origin), moved_camera(camera, origin)
     meshes = instanced_meshes(scene, options.instancing)
     features = features_of(scene, camera, meshes)
     units = Units(options.triangle, options.box, features.spheres, instances=features.instances, stack=stack_on(options.device))
     return Plan(scene, options, camera, accel, meshes, features, Structure(ACCELERATORS[accel], units),
-                _crop(scene.settings, options), scene.settings.max_depth)
+                _crop(scene.settings, options), scene.settings.max_depth, origin)
 
 
 def _crop(settings: Settings, options: Options) -> tuple[int, int, int, int]:

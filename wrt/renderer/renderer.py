@@ -65,7 +65,7 @@ class Renderer:
         plan = old.plan.moved(scene)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", SceneWarning)  # the constructor has reported the warnings
-            arrays = upload_scene(scene, old.device, plan.meshes)
+            arrays = upload_scene(plan.scene, old.device, plan.meshes)
         geometry: Any = arrays.world.geometry
         self.prepared = replace(old, plan=plan, arrays=arrays)
         if isinstance(old.accel, OneMesh) and old.accel.can_refit and same_faces(old.accel.geometry, geometry):

@@ -1,6 +1,6 @@
 """Clean a mesh for tracing: remove faces without area and vertices without a face."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,6 +26,7 @@ def clean(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None = 
           face_group: np.ndarray | None = None) -> Cleaned:
     """Flip collinear faces (`flip_collinear`), drop faces whose area is exactly zero, then drop unused vertices.
 
+    Here, neighbours of a collinear face are found by equal coordinates, and all copies of a neighbour are split.
     vertices: (V, 3), converted to float32; faces: (F, 3) integers; normals (V, 3), uvs (V, 2) and face_group (F,) or None.
     Remaining faces and vertices keep their order. Faces with a NaN or infinite corner stay, and `Mesh` refuses them. Raises InputError
     that names the first face with an index outside [0, V)."""
@@ -35,10 +36,12 @@ def clean(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None = 
     with_area = has_area(vertices, faces)
     dropped = 0
     if not with_area.all():
-        faces, source, without = _flipped(vertices, faces, ~with_area)
-        dropped = int(np.count_nonzero(without))
-        kept = np.flatnonzero(~without)
-        faces, source = faces.take(kept, axis=0), source.take(kept)
+        source, dropped = np.flatnonzero(with_area), int(np.count_nonzero(~with_area))
+        if len(_longest_edges(vertices, faces, np.flatnonzero(~with_area))[0]):
+            (vertices, *rows), faces, source, dropped = _split([vertices, normals, uvs], faces, with_area)
+            normals, uvs = rows
+        else:
+            faces = faces.take(source, axis=0)
         face_group = face_group[source] if face_group is not None else None
 
     used = np.zeros(len(vertices), dtype=bool)
@@ -97,6 +100,66 @@ def _has_area_exactly(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray
         e, f = ([x - y for x, y in zip(corner, p, strict=True)] for corner in (q, r))
         out[rows] = np.any([e[i] * f[j] != e[j] * f[i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=0)
     return out
+
+
+def merged(vertices: np.ndarray) -> np.ndarray:
+    """Return for each vertex the first vertex with equal coordinates, (V,) int64. vertices: (V, 3) float32; -0 equals 0."""
+    x, y, z = (vertices + np.float32(0.0)).view(np.uint32).T.astype(np.int64)
+    pair = np.unique(x << 32 | y, return_inverse=True)[1]
+    _, first, number = np.unique(pair << 32 | z, return_index=True, return_inverse=True)
+    return first[number]
+
+
+def copies(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first of each set of faces with the same corners, in any order, (G,), and the set of each face, (F,)."""
+    low, middle, high = np.sort(faces, axis=1).T.astype(np.int64)
+    pair = np.unique(low << 32 | middle, return_inverse=True)[1]
+    return np.unique(pair << 32 | high, return_index=True, return_inverse=True)[1:]
+
+
+def windings(faces: np.ndarray) -> np.ndarray:
+    """Return 1 or -1 for each face, (F,): copies with equal winding have the same sign. 0: two corners are equal."""
+    a, b, c = faces.T
+    return np.sign(b - a) * np.sign(c - b) * np.sign(c - a)
+
+
+def _split(rows: list[Any], faces: np.ndarray, with_area: np.ndarray) -> tuple[list[Any], np.ndarray, np.ndarray, int]:
+    """Flip the collinear faces of `clean`. rows: vertices, normals and uvs.
+
+    Returns rows, the parts (K, 3) with area of all faces, the face of each part (K,), and the number of dropped faces. A new corner of a
+    part gets normals and uvs of its own, interpolated, unless there is only one vertex at its place."""
+    vertices = rows[0]
+    same = merged(vertices)
+    corners, count, gone = same[faces], with_area.astype(np.int64), ~with_area
+    touched = np.zeros(len(vertices), bool)
+    touched[corners[gone]] = True
+    near = np.flatnonzero((touched[corners].sum(axis=1) > 1) & (with_area | (windings(corners) != 0)))
+    first, kind = copies(corners[near])
+    flipped, parent, without = _flipped(vertices, corners[near[first]], gone[near[first]])
+    gone[near] = without[kind]
+    part = np.flatnonzero(~without)
+    part = part[np.argsort(parent[part], kind="stable")]
+    begin = np.searchsorted(parent[part], np.arange(len(first) + 1))
+    count[near] = np.diff(begin)[kind]
+    source = np.repeat(np.arange(len(faces)), count)
+    parts, cut = faces[source], np.flatnonzero(count[source] > 1)
+    whole, place, begin_of = source[cut], np.searchsorted(near, source[cut]), np.cumsum(count) - count
+    new = flipped[part[begin[kind[place]] + cut - begin_of[whole]]]
+    turned = windings(corners[whole]) != windings(corners[near[first[kind[place]]]])
+    new[turned] = new[turned][:, ::-1]
+    found = new[:, :, None] == corners[whole][:, None, :]
+    parts[cut] = np.where(found.any(axis=2), np.take_along_axis(faces[whole], np.argmax(found, axis=2), axis=1), new)
+    inner = np.nonzero(~found.any(axis=2) & (np.bincount(same)[new] > 1))
+    if len(inner[0]) and not rows[1] is rows[2] is None:
+        p, q, r = (vertices[faces[whole[inner[0]], i]].astype(np.float64) for i in range(3))
+        x = vertices[new[inner]]
+        normal = np.cross(q - p, r - p)
+        weights = [np.einsum("ij,ij->i", np.cross(*edges), normal)[:, None] for edges in ((q - x, r - x), (r - x, p - x), (p - x, q - x))]
+        rows = [None if row is None else np.concatenate([row, (sum(w * row[faces[whole[inner[0]], i]] for i, w in enumerate(weights))
+                / sum(weights)).astype(row.dtype)]) for row in rows]
+        rows[0][len(vertices):] = x
+        parts[cut[inner[0]], inner[1]] = np.arange(len(vertices), len(rows[0]))
+    return rows, parts, source, int(np.count_nonzero(gone))
 
 
 def flip_collinear(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -177,6 +178,32 @@ def add_fill(scene: Scene, fill: float | None) -> tuple[Scene, str]:
         return scene, f"{lamps}surfaces that it does not reach are black" if lamps else ""
     scene = replace(scene, ambient=(fill,) * 3, ambient_occlusion=FILL_REACH * bounding_sphere(scene)[1])
     return scene, f"{lamps}a fill light of radiance {fill:.2g} was added for light between surfaces (fill=0 or --fill 0: none)"
+
+
+def expose(scene: Scene) -> tuple[Scene, str]:
+    """Return a glTF scene that is lit by its own lights, at the exposure that shows it well, and a sentence on it.
+
+    The exposure is automatic, unless there are unlit surfaces, which keep their colours. Lights, emission and ambient term are then
+    multiplied instead, so that a white surface at the centre (one radius away from a light that is nearer) has the radiance 1."""
+    lit = [each for each in scene.materials if not each.is_emissive or each.emits_light]
+    if len(lit) == len(scene.materials):
+        return scene.with_settings(auto_exposure=True), ""
+    center, radius = bounding_sphere(scene)
+    level = _emitted_power(scene) / _integral(scene, lambda material: 1.0)
+    for light in scene.lights:
+        distance = max([radius, *(math.dist(place, center) for place in light.places())]) if light.places() else 1.0
+        level += float(LUMINANCE @ light.record()["color"]) / distance**2 / math.pi
+    if not lit or not level > 0.0:
+        return scene, ""
+
+    def scaled(thing: Any, key: str) -> Any:
+        return replace(thing, **{key: tuple(value / level for value in getattr(thing, key))})
+
+    new = {id(each): scaled(each, "emission") for each in lit}
+    lights = tuple(scaled(each, "irradiance" if isinstance(each, DirectionalLight) else "intensity") for each in scene.lights)
+    objects = tuple(replace(each, materials=tuple(new.get(id(m), m) for m in each.materials)) for each in scene.objects)
+    return (scaled(replace(scene, objects=objects, lights=lights), "ambient"),
+            f"its lights were multiplied by {1.0 / level:.2g} in place of an automatic exposure, so that unlit surfaces keep their colours")
 
 
 def frame_turn(camera: Camera, scene: Scene) -> Camera:

@@ -11,7 +11,7 @@ from wrt.core.checks import at_thing
 from wrt.core.errors import wrong
 from wrt.core.suggestions import suggest_fields
 from wrt.scene.kinds import Kind, Record, given
-from wrt.scene.values import Color, as_number
+from wrt.scene.values import ROUNDING, Color, as_number
 
 
 class Light(Kind):
@@ -68,7 +68,9 @@ class SpotLight(Light):
         super().__post_init__()
         at = at_thing("light", self.name)
         as_number(self.outer, at + "outer", low=1e-4)
-        if self.inner > self.outer:
+        if self.inner <= self.outer * (1.0 + ROUNDING):
+            object.__setattr__(self, "inner", min(self.inner, self.outer))
+        else:
             inner, outer = math.degrees(self.inner), math.degrees(self.outer)
             raise wrong(at + "inner", f"must be at most outer ({outer:.6g} degrees), got {inner:.6g} degrees")
 

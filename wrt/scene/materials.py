@@ -42,7 +42,7 @@ class Texture:
     name: str = ""
 
     def __post_init__(self) -> None:
-        image = np.ascontiguousarray(self.image)
+        image = np.asarray(self.image)
         if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 4 or image.size == 0:
             raise wrong(at_thing("texture", self.name) + "image", f"must be (H, W, 4) uint8, got {image.shape} {image.dtype}")
         for wrap in self.wrap:
@@ -50,6 +50,8 @@ class Texture:
         transform = as_array(self.uv_transform, np.float64, at_thing("texture", self.name) + "uv_transform")
         if transform.shape != (2, 3) or not (np.abs(transform) <= LARGEST).all():
             raise wrong(at_thing("texture", self.name) + "uv_transform", f"must be a 2x3 matrix of numbers up to {LARGEST:g}")
+        image = as_array(image, np.uint8, "image")
+        image.flags.writeable = False  # textures share images that nobody writes to
         object.__setattr__(self, "image", image)
         object.__setattr__(self, "uv_transform", transform)
 

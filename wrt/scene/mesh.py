@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
+import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from wrt.core.checked_file import checksum_of
-from wrt.core.checks import LARGEST, as_array, as_path, shown
-from wrt.core.errors import InputError
+from wrt.core.checks import LARGEST, as_array, as_names, as_path, shown
+from wrt.core.errors import InputError, warn
 from wrt.core.packages import needed_by
 from wrt.core.suggestions import suggest_fields
 from wrt.core.types import PathLike
 from wrt.core.write_file import write_bytes
 from wrt.scene.clean import has_area, require_indices
+from wrt.scene.values import FAR_IN_FLOAT32, as_vector, far_origin, near_zero
 
 if TYPE_CHECKING:
     import trimesh
@@ -30,7 +33,7 @@ class Mesh:
     Parameters
     ----------
     vertices
-        (V, 3), stored as float32; finite, at most 1e30 in absolute value.
+        (V, 3), stored as float32; finite, at most 1e30 in absolute value. From float64 vertices far from 0, `origin` is subtracted first.
     faces
         (F, 3) indices of vertices, stored as int32; counter-clockwise seen from outside.
     normals
@@ -41,6 +44,9 @@ class Mesh:
         Names of the parts of the mesh; and the index of each face's part (F,), or None.
     dropped
         Number of faces that the loader left out: their area is exactly zero, or they have fewer than three corners.
+    origin
+        (3,) float64, which `positions` adds to the vertices, or None: 0. It is chosen for float64 vertices whose distance from 0 is more
+        than 32 times half their extent.
 
     Raises
     ------
@@ -56,8 +62,20 @@ class Mesh:
     face_group: np.ndarray | None = None
     dropped: int = 0
     name: str = ""
+    origin: np.ndarray | None = None
 
     def __post_init__(self) -> None:
+        if self.origin is None:
+            with contextlib.suppress(ValueError, TypeError):
+                raw = np.asarray(self.vertices)
+                if raw.dtype.kind in "fiu" and raw.shape[1:] == (3,):
+                    near, origin = near_zero(raw)
+                    if origin is not None:
+                        object.__setattr__(self, "vertices", near)
+                        object.__setattr__(self, "origin", origin)
+        else:
+            object.__setattr__(self, "origin", np.array(as_vector(self.origin, "origin")))
+        object.__setattr__(self, "groups", as_names(self.groups, ": ".join(part for part in (self.name, "groups") if part)))
         vertices = self._array("vertices", np.float32, 3)
         faces = self._array("faces", np.int32, 3)
         _require_finite(vertices, self.name, "vertices")
@@ -74,8 +92,9 @@ class Mesh:
                 _require_finite(array, self.name, attribute)
         if self.face_group is not None:
             group = as_array(self.face_group, np.int32, "face_group")
-            if group.shape != (len(faces),):
-                raise InputError(f"must be ({len(faces)},), got {group.shape}", argument="face_group", place=place)
+            if group.shape != (len(faces),) or (group.size and not 0 <= group.min() <= group.max() < len(self.groups)):
+                what = f"must be ({len(faces)},) indices of {len(self.groups)} groups, got {shown(group)}"
+                raise InputError(what, argument="face_group", place=place)
             object.__setattr__(self, "face_group", group)
 
     def _array(self, attribute: str, dtype: type, width: int) -> np.ndarray:
@@ -95,8 +114,9 @@ class Mesh:
     def from_trimesh(cls, mesh: trimesh.Trimesh | trimesh.Scene, smooth: bool = False) -> Mesh:
         """Return the triangles of a trimesh mesh, or of a whole trimesh scene in world space.
 
-        The result has the texture coordinates of the mesh, if there are any, and its vertex normals if `smooth`. Faces without area
-        stay, but rays never hit them. Raises InputError for any other object, and for arrays that `Mesh` refuses."""
+        The result has the texture coordinates of the mesh, if there are any, and its vertex normals, scaled to unit length, if
+        `smooth`. Faces without area stay, but rays never hit them. Raises InputError for any other object, and for arrays that `Mesh`
+        refuses."""
         with needed_by("a mesh of trimesh"):
             import trimesh
 
@@ -107,7 +127,7 @@ class Mesh:
         uv = getattr(mesh.visual, "uv", None)
         uvs = None if uv is None or len(uv) != len(mesh.vertices) else np.asarray(uv)[:, :2] * (1.0, -1.0) + (0.0, 1.0)
         source = getattr(mesh, "source", None)
-        return cls(np.array(mesh.vertices), np.array(mesh.faces), np.array(mesh.vertex_normals) if smooth else None, uvs,
+        return cls(np.array(mesh.vertices), np.array(mesh.faces), unit_rows(np.array(mesh.vertex_normals)) if smooth else None, uvs,
                    name=str(getattr(source, "file_name", None) or ""))
 
     def to_trimesh(self) -> trimesh.Trimesh:
@@ -116,15 +136,19 @@ class Mesh:
             import trimesh
 
         visual = None if self.uvs is None else trimesh.visual.TextureVisuals(uv=self.uvs * (1.0, -1.0) + (0.0, 1.0))
-        return trimesh.Trimesh(self.vertices, self.faces, vertex_normals=self.normals, visual=visual, process=False)
+        vertices = self.vertices if self.origin is None else self.positions
+        return trimesh.Trimesh(vertices, self.faces, vertex_normals=self.normals, visual=visual, process=False)
 
     def save(self, path: PathLike) -> None:
-        """Write vertices, faces, normals and uvs to a file that `wrt.load_mesh` reads; .npz also has the groups.
+        """Write vertices and faces to a file that `wrt.load_mesh` reads.
+
+        .npz, .ply and .obj also have normals and uvs, and .npz has the groups. .npz keeps all bits; .obj, .off, .ply, .stl and .glb keep
+        those of the vertices. trimesh may round in other formats (.dae: seven digits).
 
         Parameters
         ----------
         path : str or path
-            .npz keeps all bits. Other suffixes are those of trimesh, such as .ply, .obj, .stl and .off; these need trimesh.
+            Suffixes other than .npz are those of trimesh, such as .ply, .obj, .stl and .off; these need trimesh.
 
         Raises
         ------
@@ -133,21 +157,40 @@ class Mesh:
         """
         path = as_path(path, "path")
         if path.suffix.lower() == ".npz":
-            arrays = {name: getattr(self, name) for name in ("vertices", "faces", "normals", "uvs")}
+            arrays = {name: getattr(self, name) for name in ("vertices", "faces", "normals", "uvs", "origin")}
             if self.face_group is not None:
                 arrays |= {"face_group": self.face_group, "groups": np.array(self.groups, np.str_)}
             data = io.BytesIO()
             np.savez(data, exact=np.True_, **{name: array for name, array in arrays.items() if array is not None})
             write_bytes(path, data.getvalue())
             return
+        options: dict[str, Any] = {}
+        if path.suffix.lower() in (".obj", ".off"):  # numbers without an exponent: nine digits of the smallest keep all bits of a float32
+            smallest = np.abs(self.vertices).min(initial=1.0, where=self.vertices != 0.0)
+            options["digits"] = 9 - math.floor(math.log10(smallest))
         try:
-            written = self.to_trimesh().export(file_type=path.suffix.lower()[1:])
+            written = self.to_trimesh().export(file_type=path.suffix.lower()[1:], **options)
         except (ValueError, KeyError) as error:
             raise InputError(f"trimesh does not write this format ({error})", path=path,
                              hint="use .npz, .ply, .obj, .stl or .off") from error
         if isinstance(written, dict):
             raise InputError("is of a format with several files", path=path, hint="use .npz, .ply, .obj, .stl, .off or .glb")
         write_bytes(path, written.encode() if isinstance(written, str) else written)
+
+    @property
+    def positions(self) -> np.ndarray:
+        """Vertices plus `origin`: (V, 3) float64."""
+        wide = self.vertices.astype(np.float64)
+        return wide if self.origin is None else wide + self.origin
+
+    def warn_if_far(self) -> None:
+        """Warn if float32 vertices without `origin` are so far from 0 that their rounding shows."""
+        if self.origin is None and len(self.vertices):
+            low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
+            if far_origin(low, high, FAR_IN_FLOAT32) is not None:
+                step = np.spacing(np.float32(self.reach))
+                warn(f"{self.name or 'a mesh'}: its float32 vertices lie up to {self.reach:.6g} units from 0, where float32 has steps of"
+                     f" {step:.2g} units; give them as float64, or nearer to 0")
 
     @cached_property
     def reach(self) -> float:
@@ -175,7 +218,8 @@ class Mesh:
         parts += [name for name in ("normals", "uvs") if getattr(self, name) is not None]
         parts += [f"{len(self.groups)} groups"] * bool(self.groups) + [f"{self.dropped} dropped"] * bool(self.dropped)
         if len(self.vertices):
-            parts.append(f"from {_corner(self.vertices.min(axis=0))} to {_corner(self.vertices.max(axis=0))}")
+            low, high = (end(axis=0) + (0.0 if self.origin is None else self.origin) for end in (self.vertices.min, self.vertices.max))
+            parts.append(f"from {_corner(low)} to {_corner(high)}")
         return f"Mesh({', '.join(parts)})"
 
 

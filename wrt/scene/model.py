@@ -29,7 +29,7 @@ from wrt.scene.materials import Material
 from wrt.scene.mesh import Mesh
 from wrt.scene.motion import Motion
 from wrt.scene.settings import DEPTH, GLASS_DEPTH, SETTINGS, SettingChanges, Settings
-from wrt.scene.values import BLACK, MAX_REACH, SMALLEST, Color, as_number, as_transform, as_vector, require_count
+from wrt.scene.values import BLACK, MAX_REACH, SMALLEST, Color, as_number, as_transform, as_vector, require_count, shift
 
 GREY = Material()
 MANY_VERTICES = 1 << 26  # of all objects together; with more, `outlines` replaces repeated meshes by their boxes
@@ -72,7 +72,8 @@ class Object:
             raise wrong(at + "materials", "must hold at least one material")
         object.__setattr__(self, "transform", as_transform(self.transform, at + "transform"))
         with np.errstate(over="ignore"):
-            reach = (np.abs(self.transform[:3, :3]).sum(axis=1) * self.mesh.reach + np.abs(self.transform[:3, 3])).max()
+            place = self.placement
+            reach = (np.abs(place[:3, :3]).sum(axis=1) * self.mesh.reach + np.abs(place[:3, 3])).max()
         if not reach <= MAX_REACH:
             raise InputError(f"reaches {reach:.3g} units from the origin; at most {MAX_REACH:g} are possible", place=at[:-2])
         if self.face_material is not None:
@@ -81,9 +82,17 @@ class Object:
                 raise wrong(at + "face_material", f"must be ({len(self.mesh.faces)},), got {index.shape}")
             if index.size and (index.min() < 0 or index.max() >= len(self.materials)):
                 raise wrong(at + "face_material", f"must be 0 to {len(self.materials) - 1}, got {index.min()} to {index.max()}")
+            known = vars(self.mesh).get("_face_material")  # the objects of a mesh share a copy
+            index = vars(self.mesh)["_face_material"] = known if known is not None and np.array_equal(known, index) else index
             object.__setattr__(self, "face_material", index)
         if self.motion is not None:
             as_one(self.motion, Motion, at + "motion").check(self.mesh)
+
+
+    @property
+    def placement(self) -> np.ndarray:
+        """Matrix from `mesh.vertices` to the world: the transform after the mesh's origin is added. (4, 4) float64."""
+        return self.transform if self.mesh.origin is None else self.transform @ shift(self.mesh.origin)
 
 
 @suggest_fields
@@ -283,9 +292,9 @@ class Scene:
             if many and times[key] > 1:
                 if key not in boxes:
                     boxes[key] = np.array(list(product(*zip(vertices.min(axis=0), vertices.max(axis=0), strict=True))), np.float64)
-                yield boxes[key], thing.transform
+                yield boxes[key], thing.placement
             else:
-                yield vertices.astype(np.float64), thing.transform
+                yield vertices.astype(np.float64), thing.placement
 
     def with_settings(self, **changes: Unpack[SettingChanges]) -> Scene:
         """Return a copy of the scene with changed settings. A setting of None keeps the scene's value; an exposure ends

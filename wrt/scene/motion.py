@@ -75,7 +75,8 @@ class Motion:
         if self.target is None:
             return mesh
         share = 0.5 - 0.5 * math.cos(2.0 * math.pi * time)
-        vertices = ((1.0 - share) * mesh.vertices.astype(np.float64) + share * self.target.vertices).astype(np.float32)
+        target = self.target.positions - (0.0 if mesh.origin is None else mesh.origin)
+        vertices = ((1.0 - share) * mesh.vertices.astype(np.float64) + share * target).astype(np.float32)
         normals = None
         if mesh.normals is not None and self.target.normals is not None:
             mixed = (1.0 - share) * mesh.normals.astype(np.float64) + share * self.target.normals

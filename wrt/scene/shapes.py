@@ -174,7 +174,7 @@ def tube(points: Sequence[Point] | np.ndarray, radius: float | Point = 0.1, segm
         fan = np.arange(1, segments - 1)
         faces = np.stack([np.zeros_like(fan), fan, fan + 1], axis=1)[:, ::int(outward)]
         flat = np.tile(outward * tangent[end], (segments, 1))
-        parts.append(Mesh(rim, faces, normals=flat, uvs=np.zeros((segments, 2))))
+        parts.append(Mesh(np.asarray(rim, np.float32), faces, normals=flat, uvs=np.zeros((segments, 2))))
     return merged(parts, "tube")
 
 
@@ -205,7 +205,7 @@ def merged(parts: Sequence[Mesh], name: str) -> Mesh:
     normals = [part.normals for part in parts if part.normals is not None]
     uvs = [part.uvs for part in parts if part.uvs is not None]
     return Mesh(
-        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([part.vertices if part.origin is None else part.positions for part in parts]),
         np.concatenate([part.faces + offset for part, offset in zip(parts, start, strict=False)]),
         normals=np.concatenate(normals) if len(normals) == len(parts) else None,
         uvs=np.concatenate(uvs) if len(uvs) == len(parts) else None,

@@ -61,4 +61,4 @@ def _points(scene: Scene) -> Iterator[np.ndarray]:
     for thing in scene.objects:
         for i in range(0, len(thing.mesh.faces), FACES_AT_ONCE):
             corners = thing.mesh.vertices[thing.mesh.faces[i:i + FACES_AT_ONCE].reshape(-1)].astype(np.float64)
-            yield corners @ thing.transform[:3, :3].T + thing.transform[:3, 3]
+            yield corners @ thing.placement[:3, :3].T + thing.placement[:3, 3]

@@ -11,13 +11,59 @@ Color = tuple[float, float, float]
 BLACK: Color = (0.0, 0.0, 0.0)
 WHITE: Color = (1.0, 1.0, 1.0)
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+ROUNDING = 2.0**-22  # relative; of a value that float32 arithmetic took past a limit
 SMALLEST = 1e-30  # smallest length
 MAX_OBJECTS = 1 << 20  # largest number of objects, of spheres and of lights
+FAR = 32.0  # coordinates of float64 that are larger than this multiple of half their extent lose 5 bits or more in float32
+FAR_IN_FLOAT32 = 256.0  # float32 coordinates this far from 0 have lost 8 bits: a warning
 MAX_REACH = 1e18  # largest coordinate in world space: squared distances must not overflow float32
 
 
+def far_origin(low: np.ndarray, high: np.ndarray, far: float = FAR) -> np.ndarray | None:
+    """Return a point near the middle of a box that is far from 0, (3,) float64, or None for other boxes. low, high: (3,).
+
+    Its coordinates have few bits: subtracting them from a coordinate in the box rounds nothing."""
+    with np.errstate(all="ignore"):
+        half = float((high / 2.0 - low / 2.0).max(initial=0.0))
+        if not (0.0 < half < math.inf and float(np.maximum(-low, high).max()) > far * half):
+            return None
+    step = 2.0 ** (math.frexp(half)[1] - 11)
+    return np.asarray(np.round((low / 2.0 + high / 2.0) / step) * step)
+
+
+def near_zero(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return positions (N, 3) as float32, and the origin (3,) that was subtracted from those of 8 bytes far from 0, or None."""
+    origin = None
+    if positions.dtype.itemsize > 4 and positions.ndim == 2 and len(positions):
+        positions = positions.astype(np.float64, copy=False)
+        origin = far_origin(positions.min(axis=0), positions.max(axis=0))
+    with np.errstate(over="ignore", invalid="ignore"):
+        return (positions if origin is None else positions - origin).astype(np.float32, copy=False), origin
+
+
+def type_of(places: np.ndarray) -> type:
+    """Return np.float64 for places (..., 3) that float32 would round with steps above 1e-4, those beyond 1,024; else np.float32."""
+    return np.float64 if (np.abs(places) > 1024.0).any() and (places.astype(np.float32) != places).any() else np.float32
+
+
+def shift(origin: np.ndarray | None, sign: float = 1.0) -> np.ndarray:
+    """Return the (4, 4) matrix that adds `origin`, or subtracts it with the sign -1."""
+    matrix = np.eye(4)
+    if origin is not None:
+        matrix[:3, 3] = sign * origin
+    return matrix
+
+
+def rounded(value: float, low: float, high: float) -> float:
+    """Return the value, or a limit that it exceeds by no more than a rounding to float32."""
+    for limit in (low, high):
+        if abs(value - limit) <= ROUNDING * abs(limit):
+            value = min(max(value, low), high)
+    return value
+
+
 def as_vector(value: object, what: str, *, low: float = -math.inf, high: float = math.inf) -> Color:
-    """Return three finite floats in [low, high]; a single number is repeated. Raises InputError that names `what`."""
+    """Return three finite floats in [low, high], `rounded`; a single number is repeated. Raises InputError that names `what`."""
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -27,18 +73,20 @@ def as_vector(value: object, what: str, *, low: float = -math.inf, high: float =
     if array.shape != (3,) or not np.isfinite(array).all():
         raise wrong(what, f"must be three finite numbers, got {shown(value)}")
     low, high = max(low, -LARGEST), min(high, LARGEST)
-    if (array < low).any() or (array > high).any():
+    red, green, blue = (rounded(each, low, high) for each in array.tolist())
+    if min(red, green, blue) < low or max(red, green, blue) > high:
         raise wrong(what, f"must lie in [{low:g}, {high:g}], got {array.tolist()}")
-    return (float(array[0]), float(array[1]), float(array[2]))
+    return (red, green, blue)
 
 
 def as_number(value: object, what: str, *, low: float = -math.inf, high: float = math.inf, unit: str = "") -> float:
-    """Return one finite float in [low, high]. Raises InputError that names `what` and the unit."""
+    """Return one finite float in [low, high], `rounded`. Raises InputError that names `what` and the unit."""
     try:
         number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError) as error:
         raise wrong(what, f"must be a number, got {shown(value)}") from error
     low, high = max(low, -LARGEST), min(high, LARGEST)
+    number = rounded(number, low, high)
     if not math.isfinite(number) or not low <= number <= high:
         raise wrong(what, f"must be finite and in [{low:g}, {high:g}]{unit and ' ' + unit}, got {shown(value)}")
     return number

@@ -302,7 +302,7 @@ def test_a_new_ray_does_not_meet_its_neighbours_in_a_plane(scale, offset, tilt):
     i, j = np.meshgrid(np.arange(-4.0, 5.0), np.arange(-4.0, 5.0), indexing="ij")
     vertices = np.stack([i, j, tilt[0] * i + tilt[1] * j], axis=-1).reshape(-1, 3) * scale + offset
     first = (np.arange(8)[:, None] * 9 + np.arange(8)).reshape(-1, 1)
-    mesh = Mesh(vertices, np.concatenate([first + np.array([0, 9, 10]), first + np.array([0, 10, 1])]))
+    mesh = Mesh(np.float32(vertices), np.concatenate([first + np.array([0, 9, 10]), first + np.array([0, 10, 1])]))
     assert np.array_equal(mesh.vertices, vertices)
     scene = scene_of(mesh)
     rng = np.random.default_rng(10)

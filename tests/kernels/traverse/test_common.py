@@ -227,7 +227,7 @@ def test_rays_that_are_not_finite_miss_and_end(kind, name):
 def edge_points(mesh, rng, per_edge):
     """Return random points on the edges of a mesh, in float64."""
     ends = np.unique(np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
-    a, b = (np.repeat(mesh.vertices[ends[:, i]].astype(np.float64), per_edge, axis=0) for i in range(2))
+    a, b = (np.repeat(mesh.positions[ends[:, i]], per_edge, axis=0) for i in range(2))
     return a + rng.random((len(a), 1)) * (b - a)
 
 
@@ -240,7 +240,7 @@ def test_a_closed_mesh_is_watertight(placed, name):
     scale, move = {"unit": (1.0, 0.0), "stretched": ([3.0, 0.05, 100.0], 0.0), "far": (0.5, [1000.0, -300.0, 77.0]),
                    "tiny": (1e-18, 0.0), "huge": (1e15, 0.0)}[placed]
     mesh = Mesh(ball.vertices.astype(np.float64) * scale + move, ball.faces)
-    targets = np.concatenate([mesh.vertices.astype(np.float64), edge_points(mesh, rng, 1)])
+    targets = np.concatenate([mesh.positions, edge_points(mesh, rng, 1)])
     origin = rounded(np.broadcast_to(0.2 * np.array([0.3, -0.2, 0.1]) * scale + move, targets.shape))
     structure = build(mesh, name)
     hits = structure.closest_hit(origin, targets - origin)
@@ -248,7 +248,7 @@ def test_a_closed_mesh_is_watertight(placed, name):
     assert structure.any_hit(origin, targets - origin).all()
     # From the center, the float32 directions point exactly at the corners.
     center = rounded(np.broadcast_to(np.zeros(3) * scale + move, (2562, 3)))
-    hits = structure.closest_hit(center, mesh.vertices - center)
+    hits = structure.closest_hit(center, mesh.positions - center)
     assert (hits.prim_id >= 0).all() and np.allclose(hits.t, 1.0, rtol=2e-5 if placed == "far" else 2e-6)
 
 

@@ -44,7 +44,7 @@ def crowd():
     # Half of the part's triangles have prim_ids below those of the instances, half above.
     first = placed.first_prim + 30
     numbers = np.concatenate([np.arange(30), np.arange(n + 30, n + 80)]).astype(np.int32)
-    world = NumberedGeometry(corners, np.arange(180, dtype=np.int32).reshape(-1, 3), spheres, numbers)
+    world = NumberedGeometry(corners, np.arange(180, dtype=np.int32).reshape(-1, 3), spheres, prim_ids=numbers)
     return InstancedGeometry((world, *placed.parts), np.concatenate([[0], placed.part + 1]),
                              np.concatenate([np.eye(4)[None, :3], placed.to_world]), np.concatenate([[0], first]), n + 60)
 

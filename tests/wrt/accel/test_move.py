@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import warp as wp
 from scipy.spatial.transform import Rotation
 
 from tests.placed import place
@@ -117,7 +118,7 @@ def test_nothing_to_move_and_one_that_is_alone() -> None:
 
 def with_a_part_in_the_world() -> Instances:
     placed = crowd(3)
-    world = NumberedGeometry(*(np.zeros(shape, dtype) for shape, dtype in (((3, 3), "f4"), ((1, 3), "i4"), ((0, 4), "f4"))),
+    world = NumberedGeometry(*(np.zeros(shape, dtype) for shape, dtype in (((3, 3), "f4"), ((1, 3), "i4"), ((0, 4), "f4"))), None,
                              np.array([placed.n_triangles], np.int32))
     return structure(geometry=InstancedGeometry((world, *placed.parts), np.append(0, placed.part + 1),
                                                 np.concatenate([np.eye(4)[None, :3], placed.to_world]),
@@ -221,6 +222,11 @@ def test_move_by_name() -> None:
             ({"object": "robot", "world": 1}, ("object", "2 objects are called")), ({"object": 2, "world": 0}, ("object", "0 to 1")),
             ({"object": 1.5, "world": 0}, ("object", "0 to 1")), ({"object": "robot", "world": 3}, ("world", "0 to 2")),
             ({"object": ["robot"] * 3, "world": [0, 2]}, ("world", "3 worlds")),
+            ({"object": np.array([[0, 1], [1, 0]]), "world": 0}, ("object", "or (R,) of them")),
+            ({"object": [["robot"]], "world": 0}, ("object", "or (R,) of them")), ({"object": True, "world": 0}, ("object", "0 to 1")),
+            ({"object": [False], "world": 0}, ("object", "0 to 1")), ({"object": {0}, "world": 0}, ("object", "0 to 1")),
+            ({"object": wp.array([0, 1], dtype=wp.int32, device="cpu"), "world": 0}, ("object", "must be a name")),
+            *(({"object": "robot", "world": 0, "rebuild_at": limit}, ("rebuild_at", "must be")) for limit in ("x", np.nan, -1, None)),
             ({"instance": "robt", "world": 0}, ("object", "unknown object 'robt'")), ({"instance": "robot"}, ("world", "3 worlds")),
             ({"instance": "robot", "object": 0}, (None, "instance and matrix")), ({"instance": 99}, ("instance", "0 to 6, got 99")),
             ({"instance": 0, "object": 0}, (None, "instance and matrix")), ({"instance": 0, "world": 0}, (None, "instance and matrix"))):

@@ -9,6 +9,7 @@ import multiprocessing
 import pickle
 from copy import deepcopy
 from pathlib import Path
+from typing import Any
 from zlib import crc32
 
 import numpy as np
@@ -160,6 +161,90 @@ def test_a_scene_in_a_file_leads_no_ray_out_of_bounds(name: str, value: float, t
     arrays[name].reshape(-1)[-1] = value
     with refused(what="damaged"):
         scene_of(arrays)
+
+
+NAMES = ("a\0b", "c", "", "caf\udce9.obj", "d", "\n", "日本", "c\0")
+
+
+@pytest.mark.parametrize("names", [("",), ("a",), ("", ""), ("a\0",), NAMES])
+@pytest.mark.parametrize("worlds", [0, 1, 2])
+def test_a_file_keeps_every_name_of_its_objects(names: tuple[str, ...], worlds: int, tmp_path: Path) -> None:
+    """A name may hold any character: NUL, and the bytes of a file's name that are no text, as os.fsdecode gives them."""
+    places = [np.array([[1, 0, 0, 10.0 * i], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) for i in range(len(names) + 1)]
+    scene = wrt.Scene(tuple(wrt.Object(BALL, transform=place, name=name) for place, name in zip(places, names, strict=False)))
+    accel = build([scene] * worlds, accel="bvh2") if worlds else build(scene, movable=True)
+    accel.save(tmp_path / "x.accel")
+    again = load_accel(tmp_path / "x.accel")
+    assert again.snapshot.attributes.names == names * max(worlds, 1)
+    for name in set(names):
+        if names.count(name) == 1:
+            again.move(object=name, matrix=places[-1], world=worlds - 1 if worlds else None)
+            hits = again.closest_hit([10.0 * names.index(name), 0.0, 5.0], [0.0, 0.0, -1.0], world=worlds - 1 if worlds else None)
+            assert hits.t == np.inf, name
+            again.move(object=name, matrix=places[names.index(name)], world=worlds - 1 if worlds else None)
+
+
+def small_worlds() -> list[wrt.Scene]:
+    """Worlds whose objects have one material or several, shared and their own; one world is empty."""
+    red, grey, own = wrt.Material(albedo=(1.0, 0.0, 0.0)), wrt.Material(), wrt.Material(albedo=(0.0, 0.0, 1.0))
+    square = Mesh(np.float32([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]), [[0, 1, 2], [0, 2, 3]])
+    pattern = wrt.Object(square, (red, grey), face_material=np.array([1, 0]), name="pattern")
+    return [wrt.Scene((pattern,)), wrt.Scene(()), wrt.Scene((wrt.Object(square, (own,), name="own"), pattern)), wrt.Scene((pattern,))]
+
+
+def everything(accel: Any) -> list[np.ndarray]:
+    """Ask a structure over any scene for all that its arrays decide."""
+    out: list[np.ndarray] = []
+    rays = [[0.3, 0.2, 5.0], [0.2, 0.3, 5.0], [9.0, 0.0, 5.0], [0.0, 0.0, -5.0]], [[0.0, 0.0, -1.0]] * 3 + [[0.0, 0.0, 1.0]]
+    for world in range(accel.geometry.n_worlds) if isinstance(accel, Instances) else [None]:
+        hits = accel.closest_hit(*rays, world=None if world == 0 and accel.geometry.n_worlds == 1 else world)
+        for name in ("point", "normal", "shading_normal", "uv", "object", "instance", "material", "face"):
+            with contextlib.suppress(InputError):  # the scene has none
+                out.append(getattr(hits, name))
+    if isinstance(accel, Instances):
+        names = {name for name in accel.snapshot.attributes.names if accel.snapshot.attributes.names.count(name) == 1}
+        for name in names:
+            with contextlib.suppress(InputError):
+                accel.move(object=name, matrix=np.eye(4), world=None if accel.geometry.n_worlds == 1 else 0)
+    return out
+
+
+@pytest.mark.parametrize("kind", ["worlds", "scene", "mesh", "geometry"])
+def test_a_forged_array_of_a_scene_is_refused_or_harmless(kind: str, tmp_path: Path) -> None:
+    """Every number of every array, one at a time: an InputError when the file is read, or answers without any other error."""
+    before: Any
+    if kind == "worlds":
+        before = build(small_worlds())
+    elif kind == "scene":
+        flat = flatten(crowd(spheres=True), instanced_meshes(crowd(spheres=True), "always"))
+        before = Instances(ACCELERATORS["bvh"], flat.geometry, flat)
+    else:
+        before = build(small_worlds()[2] if kind == "mesh" else Geometry.of(BALL), "bvh2")
+    path, rng, refused_count = tmp_path / "x.accel", np.random.default_rng(0), 0
+    before.save(path, **({} if isinstance(before, Instances) else {"mesh": True}))
+    data = path.read_bytes()[:-CHECKSUM_BYTES]
+    at = data.index(b"\n", len(MAGIC)) + 1
+    good = everything(load_accel(path))
+    assert [each.tobytes() for each in good] == [each.tobytes() for each in everything(before)]
+    for kind, *shape in json.loads(data[len(MAGIC):at])["arrays"].values():
+        dtype, count = np.dtype(kind), math.prod(shape)
+        places = range(count) if count <= 12 else rng.integers(0, count, 12).tolist()
+        values = [-1, 0, 1, 2, 7, 10**6] if dtype.kind == "i" else [0, 34, 93, 255] if dtype.kind == "u" else [0.0, np.nan, 3e38]
+        if dtype == np.int64:
+            values += [2**31, 2**40, -2**63]
+        for place in places:
+            for value in values:
+                first = at + place * dtype.itemsize
+                forged = data[:first] + np.array(value, dtype).tobytes() + data[first + dtype.itemsize:]
+                path.write_bytes(signed(forged))
+                try:
+                    accel = load_accel(path)
+                except InputError:
+                    refused_count += 1
+                else:
+                    everything(accel)
+        at += dtype.itemsize * count
+    assert refused_count > 50
 
 
 def test_a_file_without_its_mesh(saved: Path) -> None:

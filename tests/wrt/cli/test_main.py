@@ -204,6 +204,7 @@ HUGE = "9" * 5000  # more digits than Python converts to an integer
 WRONG = [
     (["--size", "0x0"], "size must be 1x1 to 32768x32768"), (["--size", "100000x100000"], "size must be"),
     (["--size", "640x"], "write 640x360"), (["--size", "0"], "size must be"), (["-o", "-", "--json"], "--json"),
+    (["-o", "-", "--resume"], "--resume has no place"), (["-o", "-", "--checkpoint", "5s"], "--checkpoint has no place"),
     (["-o", "-", "--aov", "depth"], "--aov"), (["-o", "-", "--bits", "32"], "bits"), (["--size", "-1x3"], "write 640x360"),
     (["--size", HUGE + "x1"], "write 640x360"),
     (["--spp", "0"], "spp must be 1 to"), (["--spp", "-1"], "spp must be"), (["--spp", "1000000000"], "spp must be"),

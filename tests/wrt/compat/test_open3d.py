@@ -94,6 +94,26 @@ def test_segments_of_occlusion() -> None:
         assert scene.test_occlusions(rays, **ends).numpy().tolist() == [seen, False]
 
 
+NEARS = 0.0, 2.5, 5.0, -1e-6, -1, -5.0, -np.inf, np.nan
+FARS = np.inf, 9, 2.5, 0.5, -1.0, -4.0, -np.inf, np.nan
+
+
+@pytest.mark.parametrize("of_each", [False, True])
+@pytest.mark.parametrize("other", [False, True])
+def test_segments_may_begin_below_0(of_each: bool, other: bool) -> None:
+    """As in Open3D: what is behind the origin is seen, unless the segment ends below 0. The wall is at t = 2, 2, -3, -3."""
+    wall = np.float32([[-9, -9, 0], [9, -9, 0], [0, 9, 0]]), np.uint32([[0, 1, 2]])
+    scene: Any = pytest.importorskip("open3d").t.geometry.RaycastingScene() if other else RaycastingScene()
+    scene.add_triangles(*wall)
+    rays = np.float32([[0, 0, 2, 0, 0, -1], [0, 1, 4, 0, 0, -2], [0, 0, -3, 0, 0, -1], [0, 0, 3, 0, 0, 1]])
+    t = np.array([2, 2, -3, -3])
+    for near in NEARS:
+        for far in FARS if not other else [each for each in FARS if each != -np.inf]:  # Open3D marks hits by tfar = -inf
+            ends = {"tnear": near, "tfar": far} if not of_each or other else {"tnear": np.full(4, near), "tfar": np.full(4, far)}
+            expected = (near <= t) & (t <= far) & (far >= 0)
+            assert np.array_equal(scene.test_occlusions(rays, **ends, nthreads=-1).numpy(), expected), ends
+
+
 def test_what_is_no_ray_hits_nothing() -> None:
     rays = np.repeat(down([[0.1, 0.2]]), 6, axis=0)
     rays[0, 3:] = 0.0
@@ -234,7 +254,9 @@ def test_what_is_refused() -> None:
                         ("query_points", "row 1")),
                        (lambda: scene.cast_rays([[0, -1e38, 0, 0, 1, 0]]), ("rays", "row 0")),
                        (lambda: scene.compute_occupancy(np.zeros(3), nsamples=2), ("nsamples", "odd")),
-                       (lambda: scene.cast_rays(np.zeros((3, 6)), nthreads=-1), ("nthreads",)),
+                       (lambda: scene.cast_rays(np.zeros((3, 6)), nthreads=1.5), ("nthreads",)),
+                       (lambda: scene.test_occlusions(np.zeros((3, 6)), tnear="a"), ("tnear", "real numbers")),
+                       (lambda: scene.test_occlusions(np.zeros((3, 6)), tfar=[1, 2]), ("tfar", "(3,)")),
                        (lambda: scene.add_triangles(np.zeros((3, 3)), [[0, 1, 3]]), ("triangle_indices", "0 to 2")),
                        (lambda: scene.add_triangles(np.zeros((3, 2)), [[0, 1, 2]]), ("vertex_positions", "(N, 3)")),
                        (lambda: scene.add_triangles(), ("vertex_positions", "(N, 3)")),

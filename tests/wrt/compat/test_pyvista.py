@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import wrt
 from tests.data import data_path
 from tests.refused import refused
 from wrt.compat.pyvista import RayTracer, to_mesh, to_polydata
@@ -77,6 +78,62 @@ def test_edges_and_corners_count_once_and_equal_points_are_one() -> None:
         found = RayTracer(mesh).ray_trace([-1, 0, 0], [1, 0, 0])[0]  # through a diagonal
         assert found.tolist() == [[-0.5, 0, 0], [0.5, 0, 0]]
     assert RayTracer(box).ray_trace([-1, 0.1, 0.2], [0.4, 0.1, 0.2])[0].tolist() == pytest.approx(np.array([[-0.5, 0.1, 0.2]]))
+
+
+@pytest.mark.parametrize("shape", ["cube", "ball", "plane"])
+@pytest.mark.parametrize("move", [0.0, 1e3, 2.6e6])
+def test_a_segment_with_an_end_on_the_mesh_has_a_hit_there(shape: str, move: float) -> None:
+    """Both ends, on corners, edges and faces, also where the line leaves the mesh or grazes its outline."""
+    mesh = {"cube": pv.Cube, "ball": pv.Sphere, "plane": pv.Plane}[shape]().triangulate()
+    mesh = pv.PolyData.from_regular_faces(np.array(mesh.points, np.float64) + move, mesh.regular_faces)
+    tracer, rng = RayTracer(mesh), np.random.default_rng(0)
+    corners = np.array(mesh.points)[mesh.regular_faces]
+    weights = np.array([[1, 0, 0], [0.5, 0.5, 0], [0.7, 0, 0.3], [0.2, 0.5, 0.3]])
+    targets = np.einsum("kc,fcx->fkx", weights, corners)[:60].reshape(-1, 3)
+    for target, away in zip(targets, rng.normal(size=targets.shape), strict=True):
+        for start, end in ((target + away, target), (target, target + away)):
+            points, cells = tracer.ray_trace(start, end)
+            assert len(points) == len(cells) and (np.abs(points - target).max(axis=1) <= 1e-12 * move).sum() == 1
+            along = (points - start) @ (end - start)
+            assert (np.diff(along) > 0.0).all() and len(points) <= 3
+
+
+def test_segments_that_end_short_of_the_mesh_and_those_without_length() -> None:
+    plate = pv.Plane(i_resolution=1, j_resolution=1).triangulate()
+    tracer, point = RayTracer(plate), [0.1, 0.2, 0.0]
+    for end, hits in ((0.0, 1), (-1e-3, 1), (1e-6, 0), (1e-3, 0)):
+        found, other = (each.ray_trace([0.1, 0.2, 1.0], [0.1, 0.2, end])[1] for each in (tracer, plate))
+        assert len(found) == len(other) == hits
+        assert len(tracer.ray_trace([0.1, 0.2, end], [0.1, 0.2, 1.0])[1]) == (end <= 0.0)
+    mine, other = tracer.ray_trace(point, point), plate.ray_trace(point, point)
+    assert np.array_equal(mine[0], other[0]) and np.array_equal(mine[1], other[1]) and len(mine[1]) == 1
+    assert len(tracer.ray_trace([0.1, 0.2, 1.0], [0.1, 0.2, 1.0])[1]) == 0
+    for ends in (([np.nan, 0, 0], [0, 0, 1]), ([0, 0, 1], [np.inf, 0, 0])):
+        assert tracer.ray_trace(*ends)[0].shape == (0, 3)
+
+
+def test_points_stay_on_rays_along_an_axis() -> None:
+    ball = pv.PolyData.from_regular_faces(np.array(pv.Sphere().points, np.float64), pv.Sphere().regular_faces)
+    grid = np.stack(np.meshgrid(np.arange(-4, 5) * 0.1, np.arange(-4, 5) * 0.1), axis=-1).reshape(-1, 2)
+    origins = np.column_stack([np.full(len(grid), -5.0), grid])
+    points, ray, _ = RayTracer(ball).multi_ray_trace(origins, np.tile([1.0, 0.0, 0.0], (len(grid), 1)))
+    assert len(points) > 80 and np.array_equal(points[:, 1:], origins[ray, 1:])
+    for origin in origins[::7]:
+        assert (RayTracer(ball).ray_trace(origin, origin * [-1, 1, 1])[0][:, 1:] == origin[1:]).all()
+
+
+def test_arguments_of_plots_and_meshes_without_cells() -> None:
+    plate = pv.Plane().triangulate()
+    assert len(RayTracer(plate).ray_trace([0.1, 0.2, 1], [0.1, 0.2, -1], False, False, None)[1]) == 1
+    with refused("plot", "draws nothing"):
+        RayTracer(plate).ray_trace([0, 0, 1], [0, 0, -1], plot=True)
+    with pytest.raises(pv.NotAllTrianglesError, match="It has no cells"):
+        RayTracer(pv.PolyData()).ray_trace([0, 0, 1], [0, 0, -1])
+
+
+def test_wrt_build_names_the_function() -> None:
+    with refused("mesh", "got a pyvista.PolyData", hint="to_mesh"):
+        wrt.build(pv.Cube())
 
 
 @pytest.mark.parametrize("change", [

@@ -249,3 +249,20 @@ def test_copies_and_pickles_answer_the_same() -> None:
     mesh = trimesh.creation.icosphere(2)
     wrt_hits = wrt.build(wrt.Mesh.from_trimesh(mesh)).closest_hit(*rays)  # such a mesh is not shifted: hits have the bits of wrt.build
     assert np.array_equal(wrt_hits.prim_id, expected)
+
+
+@pytest.mark.parametrize("move", [0.0, 3.7])
+def test_points_stay_on_rays_along_an_axis_or_in_a_plane(move: float) -> None:
+    """Where a direction is 0, the coordinate of each point is the origin's, so that floor(point / cell) is the ray's cell."""
+    mesh = trimesh.creation.icosphere(3)
+    mesh.apply_translation([0.0, 0.0, move])
+    x, y = (each.ravel() for each in np.meshgrid(np.arange(-9, 10) * 0.1, np.arange(-9, 10) * 0.1))
+    origins = np.stack([x, y, np.full(len(x), move + 5.0)], axis=1)
+    for directions in (np.tile([0.0, 0.0, -2.0], (len(x), 1)), np.tile([0.0, 0.07, -1.0], (len(x), 1))):
+        fixed = directions[0] == 0.0
+        for chosen in (slice(None), slice(100, 101)):  # many rays and one
+            ray = RayMeshIntersector(mesh)
+            for found in (ray.intersects_location(origins[chosen], directions[chosen]),
+                          ray.intersects_location(origins[chosen], directions[chosen], multiple_hits=False),
+                          ray.intersects_id(origins[chosen], directions[chosen], return_locations=True)[::-1]):
+                assert len(found[0]) and np.array_equal(found[0][:, fixed], origins[chosen][found[1]][:, fixed])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from wrt.accel.queries.answers import Hits
 from wrt.accel.queries.rays import rays_of, rays_on
 from wrt.core.arrays import to_numpy, to_warp
 from wrt.picture.film import Film
-from wrt.scene.shapes import box
+from wrt.scene.shapes import box, icosphere
 
 ORIGINS = np.full((5, 3), (0.1, 0.2, 5.0), np.float32)
 DIRECTIONS = np.array([(0, 0, -1), (0, 0, 1), (0, 1, 0), (0.05, 0, -1), (0, 0.05, -1)], np.float32)
@@ -201,3 +202,45 @@ def test_read_only_arrays_are_copied() -> None:
     fixed.flags.writeable = False
     there = to_warp(fixed)
     assert address(there) != address(fixed) and np.array_equal(to_numpy(there), fixed)
+
+
+class ForeignTensor:
+    """A tensor on the CPU whose DLPack has another enumeration, or does not work, as in several libraries."""
+
+    def __init__(self, values: np.ndarray, works: bool) -> None:
+        self.values, self.works = values, works
+
+    def __dlpack_device__(self) -> tuple[Any, int]:
+        return SimpleNamespace(value=1), 0  # an enumeration whose members are not equal to integers
+
+    def __dlpack__(self, **_: Any) -> Any:
+        if not self.works:
+            raise TypeError("no exchange of memory")
+        return self.values.__dlpack__()
+
+    def numpy(self) -> np.ndarray:
+        return self.values
+
+
+class NoNumpy(ForeignTensor):
+    def numpy(self) -> np.ndarray:
+        raise RuntimeError("this tensor is elsewhere")
+
+
+@pytest.mark.parametrize("works", [True, False])
+def test_foreign_tensors_are_read_like_arrays(works: bool) -> None:
+    ball = icosphere(1)
+    rays = np.random.default_rng(0).normal(size=(30, 6)).astype(np.float32)
+    given, accel = ForeignTensor(rays, works), wrt.build((ForeignTensor(ball.vertices, works), ForeignTensor(ball.faces, works)))
+    assert np.array_equal(accel.closest_hit(given).prim_id, accel.closest_hit(rays).prim_id)
+    assert np.array_equal(accel.any_hit(given), accel.any_hit(rays))
+    assert np.array_equal(wrt.all_hits(accel, given).prim_id, wrt.all_hits(accel, rays).prim_id)
+    assert np.array_equal(wrt.count_hits(accel, given), wrt.count_hits(accel, rays))
+    points = ForeignTensor(rays[:, :3].copy(), works)
+    assert np.array_equal(wrt.closest_points(accel, points).distance, wrt.closest_points(accel, points.values).distance)
+    assert np.array_equal(wrt.contains(accel, points), wrt.contains(accel, points.values))
+    split = ForeignTensor(rays[:, 3:].copy(), works)
+    assert np.array_equal(accel.closest_hit(points, split, t_max=ForeignTensor(rays[:, 0].copy(), works)).t,
+                          accel.closest_hit(points.values, split.values, t_max=rays[:, 0].copy()).t)
+    with refused("origins", "a tests.NoNumpy does not share its memory: no exchange", hint="pass a NumPy array"):
+        accel.closest_hit(NoNumpy(rays, False))

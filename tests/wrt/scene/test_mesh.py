@@ -13,10 +13,13 @@ def test_mesh_refuses_what_cannot_be_traced() -> None:
         {"vertices": np.full((3, 3), np.nan)}, {"vertices": np.full((3, 3), 1e39)}, {"vertices": np.eye(2)},
         {"faces": [[0, 1, 3]]}, {"faces": [[0, 1, -1]]}, {"faces": [[0.0, 1.0, 2.0]]}, {"faces": [0, 1, 2]},
         {"normals": np.eye(3)[:2]}, {"uvs": np.zeros((3, 3))}, {"uvs": np.full((3, 2), np.inf)},
-        {"face_group": np.zeros(2, int)},
+        {"face_group": np.zeros(2, int)}, {"face_group": [0]}, {"face_group": [1], "groups": ("a",)},
+        {"face_group": [-1], "groups": ("a",)},
     ):
         with refused(next(iter(bad)), place="thing"):
             Mesh(**{"vertices": vertices, "faces": faces, "name": "thing", **bad})
+    with refused("groups[0]", place="thing"):
+        Mesh(vertices, faces, groups=(1,), name="thing")  # type: ignore[arg-type]
 
 
 def test_meshes_come_from_trimesh_and_go_back() -> None:
@@ -31,6 +34,13 @@ def test_meshes_come_from_trimesh_and_go_back() -> None:
     assert back.is_watertight and back.volume == pytest.approx(6.0)
     np.testing.assert_array_equal(back.faces, mesh.faces)
     np.testing.assert_allclose(back.vertex_normals, smooth.normals, atol=1e-6)
+
+
+def test_normals_from_trimesh_get_unit_length() -> None:
+    trimesh = pytest.importorskip("trimesh")
+    normals = np.array([[0, 0, 127], [0, 3, 4], [0, 0, 0]], np.float32)
+    mesh = Mesh.from_trimesh(trimesh.Trimesh(np.eye(3), [[0, 1, 2]], vertex_normals=normals, process=False), smooth=True)
+    np.testing.assert_allclose(mesh.normals, [[0, 0, 1], [0, 0.6, 0.8], [0, 0, 0]], atol=1e-7)
 
 
 def test_a_trimesh_scene_is_taken_in_its_world() -> None:

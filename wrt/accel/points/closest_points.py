@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,11 +13,12 @@ from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.points.contains import contains
 from wrt.accel.points.winding import winding_number
 from wrt.accel.queries.accelerator import Accelerator, snapshot_of
-from wrt.accel.queries.hit_points import device_scene
+from wrt.accel.queries.hit_points import HitIds, Source, device_scene
 from wrt.accel.queries.part_faces import part_faces
 from wrt.accel.queries.raw_kernel import RawKernel, kernel_memory
+from wrt.accel.queries.rays import to_origin
 from wrt.accel.queries.shapes import in_shape, shaped_points
-from wrt.accel.queries.world_ids import roots_of
+from wrt.accel.queries.world_ids import check_world, roots_at
 from wrt.accel.snapshot import Snapshot, once
 from wrt.core.checks import require_known
 from wrt.core.device import upload
@@ -36,7 +37,7 @@ SIGNS = ("crossings", "winding")
 
 
 @dataclass(frozen=True, eq=False)
-class ClosestPoints(Suggests):
+class ClosestPoints(HitIds[np.ndarray], Suggests):
     """Closest points on a mesh. For a mesh without faces, `distance` is inf, `prim_id` -1, and the rest 0.
 
     Attributes
@@ -44,11 +45,13 @@ class ClosestPoints(Suggests):
     distance : (...) float32
         Distance from the query point.
     point : (..., 3) float32
-        Closest point.
+        Closest point; float64 if the structure is far from 0 (`Accelerator.origin`).
     u, v : (...) float32
         Barycentric coordinates: the closest point is (1 - u - v) v0 + u v1 + v v2.
     prim_id : (...) int32
-        Index of the face that the closest point is on.
+        Index of the face that the closest point is on. `face`, `object`, `instance` and `material` are ids as those of `Hits`.
+    source : tuple or None
+        Snapshot from which ids are computed. Pickled points have none.
     """
 
     distance: np.ndarray
@@ -56,6 +59,7 @@ class ClosestPoints(Suggests):
     u: np.ndarray
     v: np.ndarray
     prim_id: np.ndarray
+    source: Source | None = None
 
     def __len__(self) -> int:
         return len(self.distance)
@@ -101,8 +105,10 @@ def closest_points(accel: Accelerator, points: ArrayLike, threads: int | None = 
     if not isinstance(kernels, WideTraversal) or structure.units.triangle != "watertight":
         raise InputError("closest points need a bvh4, bvh8 or bvh8c with the watertight triangle test, got a"
                          f" {structure.accel.name} with {structure.units.triangle!r}")
-    (rows, shape, world), device = shaped_points(points, world), snapshot.device
-    n, memory, roots = len(rows), kernel_memory(device), roots_of(snapshot, world, len(rows))
+    origin = snapshot.geometry.origin
+    (rows, shape, world), device = shaped_points(points, world, origin), snapshot.device
+    n, memory, worlds = len(rows), kernel_memory(device), check_world(snapshot, world, len(rows))
+    roots = roots_at(snapshot, worlds, n)
     out: list[Any] = [memory.empty(n, kind) for kind in POINT_KINDS]
     points_and_roots: list[Any] = [memory.array(rows, wp.vec3)]
     if roots is None:
@@ -112,7 +118,8 @@ def closest_points(accel: Accelerator, points: ArrayLike, threads: int | None = 
         points_and_roots.append(memory.array(roots, wp.int32))
     memory.launch(RawKernel(kernel, step=POINTS_PER_LAUNCH), n, snapshot.data, scene, *points_and_roots,
                   memory.struct(PointArrays, *out), threads=thread_count(threads))
-    return ClosestPoints(*(in_shape(memory.numpy(array), shape) for array in out))
+    found = ClosestPoints(*[*(in_shape(memory.numpy(array), shape) for array in out), (snapshot, None, worlds)])
+    return found if origin is None else replace(found, point=found.point + origin)
 
 
 @once
@@ -155,7 +162,9 @@ def signed_distance(accel: Accelerator, points: ArrayLike, threads: int | None =
     """
     require_known(sign, SIGNS, "rule of signs", "sign")
     accel = copy(accel)  # a refit by another thread does not change the copy
-    rows, shape, world = shaped_points(points, world)  # NumPy arrays: queries return tensors for tensors
+    origin = snapshot_of(accel, instances=True).geometry.origin
+    rows, shape, world = shaped_points(points, world, origin)  # NumPy arrays: queries return tensors for tensors
+    rows = to_origin(rows, origin)
     if sign == "crossings":
         inside = contains(accel, rows, threads, world=world)
     else:

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry
+from wrt.accel.points.enclosing import enclosing, finite_faces, open_edges
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.all_hits import ListQuery
 from wrt.accel.queries.rays import Rays, constant
@@ -19,21 +19,6 @@ from wrt.accel.snapshot import Snapshot, once
 from wrt.core.arrays import given_like
 from wrt.core.errors import InputError
 from wrt.core.types import ArrayLike, NumpyLike, TensorT, WarpArray
-
-
-def finite_faces(geometry: Geometry) -> np.ndarray:
-    """Return the indices of the faces whose corners are all finite, (F,); no ray hits the others."""
-    return np.flatnonzero(np.isfinite(geometry.vertices).all(axis=1)[geometry.faces].all(axis=1))
-
-
-def open_edges(geometry: Geometry) -> int:
-    """Count the edges that an odd number of finite faces share; 0: a closed mesh. Vertices with equal coordinates are merged."""
-    _, corner = np.unique(geometry.vertices + np.float32(0.0), axis=0, return_inverse=True)  # -0 becomes 0
-    faces = corner.reshape(-1)[geometry.faces[finite_faces(geometry)]]
-    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    edges = edges[edges[:, 0] != edges[:, 1]]
-    _, count = np.unique(edges, axis=0, return_counts=True)
-    return int((count % 2 == 1).sum())
 
 
 @once
@@ -86,8 +71,8 @@ def contains(accel: Accelerator, points: ArrayLike, threads: int | None = None, 
     InputError
         For a mesh that is not closed, other structures, and points that are not finite.
     """
-    rows, shape, world = shaped_points(points, world)
-    query = ListQuery(accel, threads, crossings=True)
+    query = ListQuery(enclosing(accel), threads, crossings=True)
+    rows, shape, world = shaped_points(points, world, query.snapshot.geometry.origin)
     if count := open_edges_of(query.snapshot):
         raise InputError(f"the mesh is not closed: {count} edges have an odd number of faces",
                          hint="for an open mesh, use wrt.winding_number(accel, points) > 0.5, or wrt.signed_distance(..., sign='winding')")

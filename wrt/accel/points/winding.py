@@ -11,8 +11,9 @@ import warp as wp
 
 from wrt.accel.instanced_geometry import InstancedGeometry, inverse_of
 from wrt.accel.points.contains import open_edges_of
+from wrt.accel.points.enclosing import enclosing
 from wrt.accel.points.winding_tree import winding_tree
-from wrt.accel.queries.accelerator import Accelerator, snapshot_of
+from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.queries.hit_points import device_scene
 from wrt.accel.queries.shapes import in_shape, shaped_points
 from wrt.accel.queries.world_ids import check_world
@@ -76,8 +77,9 @@ def winding_number(accel: Accelerator, points: ArrayLike, threads: int | None = 
     Jacobson, Kavan and Sorkine-Hornung 2013, "Robust Inside-Outside Segmentation using Generalized Winding Numbers". Barill, Dickson,
     Schmidt, Levin and Jacobson 2018, "Fast Winding Numbers for Soups and Clouds".
     """
-    snapshot, threads = snapshot_of(accel, instances=True), thread_count(threads)
-    rows, shape, world = shaped_points(points, world)
+    accel, threads = enclosing(accel), thread_count(threads)
+    snapshot = accel.snapshot
+    rows, shape, world = shaped_points(points, world, snapshot.geometry.origin)
     worlds = check_world(snapshot, world, len(rows))
     if isinstance(snapshot.geometry, InstancedGeometry):
         out = np.zeros(len(rows))

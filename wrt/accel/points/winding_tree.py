@@ -7,7 +7,7 @@ import warp as wp
 
 from wrt.accel.bvh.builders import BvhOptions, build_binary
 from wrt.accel.geometry import Geometry
-from wrt.accel.points.contains import finite_faces
+from wrt.accel.points.enclosing import finite_faces
 from wrt.accel.queries.hit_points import device_scene
 from wrt.accel.snapshot import Snapshot, once
 from wrt.core.device import launch_on, records, upload

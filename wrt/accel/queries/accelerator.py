@@ -88,7 +88,7 @@ class Accelerator:
         self.structure = structure._replace(units=structure.units._replace(spheres=len(geometry.spheres) > 0))
         surfaces = Surfaces()
         surfaces.n_triangles = geometry.n_triangles
-        surfaces.spheres = upload(geometry.spheres.copy(), wp.vec4, self.device)  # a copy, because the caller may write to its array
+        surfaces.spheres = upload(geometry.spheres, wp.vec4, self.device)
         self._snapshot = Snapshot(self.structure, self.device, surfaces, attributes, geometry)
         self._refitting = threading.Lock()
         self._cache: dict[str, Any] = {}  # arrays that later refits reuse
@@ -121,6 +121,14 @@ class Accelerator:
     def geometry(self) -> Geometry | InstancedGeometry:
         """Triangles and spheres in the structure, as of the last refit."""
         return self._snapshot.geometry
+
+    @property
+    def origin(self) -> np.ndarray:
+        """Point of the world that is 0 in the arrays of `geometry` and for `ray_query`, (3,) float64; not 0 only far from 0.
+
+        Queries subtract it from origins and points in float64, so that float64 rays are as accurate as near 0."""
+        origin = self._snapshot.geometry.origin
+        return np.zeros(3) if origin is None else origin.copy()
 
     @property
     def data(self) -> WarpStruct:
@@ -184,10 +192,11 @@ class Accelerator:
         threads, shape, callers = thread_count(threads), None, None if out is None else arrays_of(out)
         if costs:
             check_keywords("closest_hit", costs, CLOSEST_HIT)
+        snapshot = self._snapshot  # read once, because a refit may replace it during the query
         if are_rows(origins, directions) and invalid == "raise":  # the usual case, whose arrays need no other shape
-            rays = rays_of(origins, directions, t_min, t_max, True)  # type: ignore[arg-type]
+            rays = rays_of(origins, directions, t_min, t_max, True, snapshot.geometry.origin)  # type: ignore[arg-type]
         else:
-            rays, shape = shaped_rays(origins, directions, t_min, t_max, True, invalid)
+            rays, shape = shaped_rays(origins, directions, t_min, t_max, True, invalid, snapshot.geometry.origin)
             callers, world = callers and flat_arrays(callers, shape, HIT_TYPES), worlds_of_each(world, shape)
         give = to_tensor_like(origins, directions)
         t, u, v, prim_id = arrays = answer_arrays(HIT_TYPES, callers, len(rays.origins), self.device if rays.as_warp else None,
@@ -242,10 +251,11 @@ class Accelerator:
         if options:
             check_keywords("any_hit", options, ANY_HIT)
             world, invalid = options.get("world"), options.get("invalid", invalid)
+        snapshot = self._snapshot
         if are_rows(origins, directions) and invalid == "raise":
-            rays = rays_of(origins, directions, t_min, t_max)  # type: ignore[arg-type]
+            rays = rays_of(origins, directions, t_min, t_max, origin=snapshot.geometry.origin)  # type: ignore[arg-type]
         else:
-            rays, shape = shaped_rays(origins, directions, t_min, t_max, invalid=invalid)
+            rays, shape = shaped_rays(origins, directions, t_min, t_max, invalid=invalid, origin=snapshot.geometry.origin)
             callers, world = callers and flat_arrays(callers, shape, ANY_HIT_TYPES), worlds_of_each(world, shape)
         give = to_tensor_like(origins, directions)
         arrays = answer_arrays(ANY_HIT_TYPES, callers, len(rays.origins), self.device if rays.as_warp else None, give is not None)

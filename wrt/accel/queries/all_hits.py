@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Generic, NamedTuple, TypeVar, Unpack, overload
+from typing import Any, NamedTuple, TypeVar, Unpack, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -15,12 +15,12 @@ from wrt.accel.queries.accelerator import Accelerator, WorldOptions, snapshot_of
 from wrt.accel.queries.answers import Hits
 from wrt.accel.queries.batches import Tracer, lister
 from wrt.accel.queries.few_lists import MOST, FewLists, Mesh, begins
-from wrt.accel.queries.hit_points import device_scene
+from wrt.accel.queries.hit_points import HitIds, Source, device_scene
 from wrt.accel.queries.part_faces import part_faces
 from wrt.accel.queries.raw_kernel import RawKernel, kernel_memory
 from wrt.accel.queries.rays import Rays, are_rows, arrays_on, host_arrays, rays_of
 from wrt.accel.queries.shapes import Shape, shaped_rays, worlds_of_each
-from wrt.accel.queries.world_ids import roots_of
+from wrt.accel.queries.world_ids import WorldIds, check_world, roots_at
 from wrt.accel.snapshot import Snapshot
 from wrt.accel.structure import Structure
 from wrt.core.arrays import given_like, to_numpy, to_tensor_like
@@ -47,7 +47,7 @@ class ListOptions(WorldOptions, total=False):
 
 
 @dataclass(frozen=True, eq=False)
-class AllHits(Generic[ArrayT]):
+class AllHits(HitIds[ArrayT]):
     """M hits of N rays, ray by ray (in C order), in order of t and, at equal t, of prim_id. Arrays of NumPy, PyTorch or JAX.
 
     Attributes
@@ -57,7 +57,9 @@ class AllHits(Generic[ArrayT]):
     t, u, v : (M,) float32
         As in `Hits`.
     prim_id : (M,) int32
-        Index of the face.
+        Index of the face. `face`, `object`, `instance` and `material` are ids as those of `Hits`.
+    source : tuple or None
+        Snapshot from which ids are computed. Pickled hits have none.
     """
 
     first: ArrayT
@@ -65,6 +67,7 @@ class AllHits(Generic[ArrayT]):
     u: ArrayT
     v: ArrayT
     prim_id: ArrayT
+    source: Source | None = None
 
     def __len__(self) -> int:
         return len(self.first) - 1
@@ -108,6 +111,7 @@ class ListQuery:
     n = 0
     shape: Shape | None = None  # Of the rays; None: (n,).
     rays: Rays
+    worlds: WorldIds | None = None
     roots: np.ndarray | None = None  # (N,) int32, root node of each ray's world, or -1; None without instances.
     touches: np.ndarray  # (N,) bool, if crossings are found: the ray hits triangles, but crosses none.
     give: Any  # Converts arrays to those of the caller's library.
@@ -129,26 +133,29 @@ class ListQuery:
     def of_valid(self, rays: Rays, world: ArrayLike | None = None) -> ListQuery:
         """Set rays that are valid: contiguous NumPy arrays of float32. world: see `of`."""
         self.n, self.rays = len(rays.origins), rays if self.device.is_cpu else arrays_on(self.device, rays)
-        self.roots = roots_of(self.snapshot, world, self.n)
+        self.worlds = check_world(self.snapshot, world, self.n)
+        self.roots = roots_at(self.snapshot, self.worlds, self.n)
         return self
 
     def of(self, origins: ArrayLike, directions: ArrayLike | None, t_min: ArrayLike = 0.0, t_max: ArrayLike = np.inf,
            world: ArrayLike | None = None) -> ListQuery:
         """Set the rays. Raises InputError that names the argument."""
+        zero = self.snapshot.geometry.origin
         if are_rows(origins, directions):
-            rays = rays_of(origins, directions, t_min, t_max)  # type: ignore[arg-type]
+            rays = rays_of(origins, directions, t_min, t_max, origin=zero)  # type: ignore[arg-type]
         else:
-            rays, self.shape = shaped_rays(origins, directions, t_min, t_max)
+            rays, self.shape = shaped_rays(origins, directions, t_min, t_max, origin=zero)
             world = worlds_of_each(world, self.shape)
         self.n, self.rays = len(rays.origins), host_arrays(rays) if self.device.is_cpu else arrays_on(self.device, rays)
-        self.roots = roots_of(self.snapshot, world, self.n)
+        self.worlds = check_world(self.snapshot, world, self.n)
+        self.roots = roots_at(self.snapshot, self.worlds, self.n)
         self.give = to_tensor_like(origins, directions) or to_numpy
         return self
 
     def all(self, limit: int = ALL) -> AllHits[Any]:
         """Find the first `limit` hits of each ray."""
         if (few := self._few(min(limit, ALL), lambda lists, counts: lists.hits_of(counts))) is not None:
-            return AllHits(self.converted(few[0]), *map(self.give, few[1:]))
+            return self._all(*few)
         counts, parts = [np.zeros(0, np.int64)], []
         for rays, lists, of_each in self._listed(limit):
             first = begins(of_each)
@@ -156,11 +163,17 @@ class ListQuery:
             counts.append(of_each)
             self._copy(rays, lists, first, parts[-1])
         if len(parts) == 1:
-            return AllHits(self.converted(first), *map(self.give, parts[0]))
+            return self._all(first, *parts[0])
         first = begins(np.concatenate(counts))
         rows_of(first[-1])
         hits = [self.memory.joined(arrays, kind) for kind, *arrays in zip(HIT_KINDS, *parts, strict=True)]
-        return AllHits(self.converted(first), *map(self.give, hits))
+        return self._all(first, *hits)
+
+    def _all(self, first: np.ndarray, *hits: Array) -> AllHits[Any]:
+        return AllHits(*[self.converted(first), *map(self.give, hits), self._source(np.diff(first))])
+
+    def _source(self, counts: int | np.ndarray) -> Source:
+        return self.snapshot, None, self.worlds and self.worlds.of(np.repeat(np.arange(self.n), counts))
 
     def first(self, k: int) -> Hits[Any]:
         """Find the first k hits of each ray, in arrays (N, k)."""
@@ -172,7 +185,7 @@ class ListQuery:
             self._copy(rays, lists, begin[:len(of_each)], hits)
             begin = begin[len(of_each):]
         shape = (self.n,) if self.shape is None else self.shape
-        return Hits(*(self.give(array.reshape((*shape, k))) for array in hits))
+        return Hits(*[*(self.give(array.reshape((*shape, k))) for array in hits), None, self._source(k)])
 
     def counts(self) -> np.ndarray:
         """Count the hits of each ray, (N,) int64. If no triangle is in several leaves, one traversal is enough."""
@@ -372,7 +385,7 @@ def first_hits(accel: Accelerator, k: int, origins: ArrayLike, directions: Array
     Returns
     -------
     Hits
-        Arrays (..., k); a ray with fewer hits has misses at the end. These Hits have no points and normals.
+        Arrays (..., k); a ray with fewer hits has misses at the end. These Hits have ids, but no points and normals.
 
     Raises
     ------

@@ -84,11 +84,12 @@ class Hits(HitPoints[ArrayT], Suggests):
     u, v : (...) float32
         Barycentric coordinates: the point is (1 - u - v) v0 + u v1 + v v2. Both are 0 on a miss and on a sphere.
     prim_id : (...) int32
-        Index of the face, or number of faces plus index of the sphere; -1 on a miss.
+        Index of the face, or number of faces plus index of the sphere; -1 on a miss. It counts on over all meshes of a scene: `face` is
+        the index within the mesh of `object`.
     counters : Counters or None
         Costs of each ray, if the query had `counters=True` or `trace=True`.
     source : tuple or None
-        Snapshot and rays from which points, normals and ids are computed. Pickled hits have none.
+        Snapshot and rays from which points, normals and ids are computed. Pickled hits have none; those of `first_hits` have only ids.
     """
 
     t: ArrayT
@@ -97,9 +98,6 @@ class Hits(HitPoints[ArrayT], Suggests):
     prim_id: ArrayT
     counters: Counters | None = None
     source: Source | None = None
-
-    def __reduce__(self) -> tuple[object, ...]:
-        return Hits, (self.t, self.u, self.v, self.prim_id, self.counters)
 
     def __len__(self) -> int:
         return len(self.t)
@@ -120,7 +118,8 @@ class Hits(HitPoints[ArrayT], Suggests):
             return replace(some, counters=self.counters and self.counters.of(rays))
         snapshot, own, worlds = self.source
         flat = rays.reshape(-1)
-        return replace(some, counters=self.counters and self.counters.of(rays), source=(snapshot, own.of(flat), worlds and worlds.of(flat)))
+        source = snapshot, own and own.of(flat), worlds and worlds.of(flat)
+        return replace(some, counters=self.counters and self.counters.of(rays), source=source)
 
     def _repr_html_(self) -> str:
         hits = self.numpy()
@@ -148,7 +147,7 @@ class Hits(HitPoints[ArrayT], Suggests):
         """
         hits = self.numpy()
         columns = {"index": np.arange(hits.t.size), "t": hits.t, "u": hits.u, "v": hits.v, "prim_id": hits.prim_id}
-        if hits.source is not None:
+        if hits.source is not None and hits.source[1] is not None:
             columns |= dict(zip("xyz", np.moveaxis(hits.point, -1, 0), strict=True))
         if hits.counters is not None:
             columns |= {name: hits.counters.counts[name] for name in hits.counters.counts.dtype.names or ()}

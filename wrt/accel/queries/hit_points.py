@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import fields
 from typing import Any, Generic, NamedTuple, TypeAlias
 
 import numpy as np
@@ -12,7 +13,7 @@ from wrt.accel.flat_scene import FlatScene, Placed, flat_scene_of, placed_now, r
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.queries.gradients import ONE_MESH, Cotangents, Gradients, adjoint, check_recorded, record
-from wrt.accel.queries.rays import Rays, rays_on
+from wrt.accel.queries.rays import rays_on, to_origin
 from wrt.accel.queries.shapes import in_shape
 from wrt.accel.queries.world_ids import WorldIds, over_worlds
 from wrt.accel.snapshot import Snapshot, once
@@ -23,11 +24,12 @@ from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike, ArrayT, WarpStruct
 from wrt.core.warp_private import refuse_capture
 from wrt.kernels import structs
-from wrt.kernels.query import HitArrays
+from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.warp_private import fields_of
 
 HITS_PER_LAUNCH = 65536
-Source: TypeAlias = tuple[Snapshot, Rays, WorldIds | None]
+FROM_RAYS = "point", "error", "normal", "shading", "uv"  # arrays of HitPlaces that need the rays
+Source: TypeAlias = tuple[Snapshot, Any, WorldIds | None]  # the second: Rays, or None for answers that have ids, but no points
 
 
 class DeviceScene(NamedTuple):
@@ -38,7 +40,101 @@ class DeviceScene(NamedTuple):
     object_ids: WarpStruct
 
 
-class HitPoints(Generic[ArrayT]):
+class HitIds(Generic[ArrayT]):
+    """Ids of hits or closest points, computed from `prim_id` on each access, as arrays of the same library and shape (...)."""
+
+    prim_id: ArrayT
+    source: Source | None
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of `prim_id`."""
+        return tuple(from_tensor(self.prim_id, "prim_id", None).shape)
+
+    @property
+    def face(self) -> ArrayT:
+        """Index of the face within the mesh of `object` (prim_id counts on over the meshes): (...) int32, -1 on a miss or a sphere."""
+        return self._filled("face")
+
+    @property
+    def object(self) -> ArrayT:
+        """Index into `scene.objects`, or len(scene.objects) plus the index into `scene.spheres`: (...) int32, -1 on a miss.
+
+        Over worlds, `scene` is that of the ray's world; a mesh is its only object.
+        """
+        return self._filled("object")
+
+    @property
+    def instance(self) -> ArrayT:
+        """Index for `Instances.move`: `object` over a scene, else the row of `accel.geometry.to_world`. (...) int32, -1 on a miss."""
+        return self._filled("instance")
+
+    @property
+    def material(self) -> ArrayT:
+        """Index into `scene.materials`, over worlds those of the ray's world: (...) int32, -1 on a miss."""
+        return self._filled("material")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), tuple(getattr(self, each.name) for each in fields(self) if each.name != "source")  # type: ignore[arg-type]
+
+    def _source(self, rays: bool = True) -> Source:
+        """Return the source. Raises InputError without it, and, if `rays` are needed, without rays."""
+        refuse_capture()
+        if self.source is None or (rays and self.source[1] is None):
+            raise InputError("these hits have no rays, from which distances, points, normals and ids are computed: lists of hits have ids"
+                             " alone, copies and pickled hits lose all", hint="ask the result of closest_hit before it is copied")
+        return self.source
+
+    def _flat(self) -> Any:
+        """Return the hits (N,)."""
+        return self
+
+    def _given(self, values: np.ndarray) -> ArrayT:
+        """Return NumPy values as an array of the hits' library."""
+        given: ArrayT = given_like(self.prim_id, values)
+        return given
+
+    def _filled(self, name: str) -> ArrayT:
+        from wrt.kernels.shade.hit_points import HitPlaces, hit_places  # not at the top: pictures do not need it
+
+        snapshot, rays, worlds = self._source(name in FROM_RAYS)
+        shape, device = self.shape, snapshot.device
+        n = int(np.prod(shape))
+        if name in ("error", "normal", "shading", "uv"):
+            check_recorded(self, name)
+        scene, surfaces, object_ids = device_scene(snapshot)
+        if name == "shading" and scene.normals is None:
+            name = "normal"
+        _require(scene, name)
+        to_own = own_ids(name, scene, worlds)
+        if to_own is not None or not isinstance(self.prim_id, wp.array):  # computed on the host
+            refuse_capture(device)
+        if name in ("instance", "object") and isinstance(scene.geometry, InstancedGeometry):
+            name = "instance" if scene.objects is None else "object"
+        out: Any = HitPlaces()
+        setattr(out, name, array := wp.empty(n, dtype=fields_of(HitPlaces)[name].dtype, device=device))
+        hits: Any = HitArrays()
+        for each in fields_of(HitArrays) if name in FROM_RAYS else ("prim_id",):
+            setattr(hits, each, in_shape(to_warp(getattr(self, each)).to(device), (n,)))
+        if worlds is not None:
+            hits.prim_id = upload(worlds.over_all(hits.prim_id), wp.int32, device)
+        inputs = [surfaces, object_ids, rays_on(device, rays) if name in FROM_RAYS else RayArrays(), hits, out]
+        launch_on(device, hit_places, n, *inputs, None, threads=thread_count(None), step=HITS_PER_LAUNCH)
+        if to_own is not None:
+            array = upload(to_own(array.numpy()), wp.int32, device)
+        if isinstance(self.prim_id, wp.array):
+            if name == "point":
+                record(self._flat(), point=array)
+                array = to_origin(array, snapshot.geometry.origin)
+            return in_shape(array, shape)
+        give: Any = to_tensor_like(self.prim_id)
+        values = array if give is not None and device.is_cuda else array.numpy()
+        if name == "point":
+            values = to_origin(values, snapshot.geometry.origin)
+        return in_shape(values, shape) if give is None else give(in_shape(values, shape))
+
+
+class HitPoints(HitIds[ArrayT]):
     """Properties of hits that `closest_hit` found, as arrays of the same library and leading shape (...) as the hits.
 
     Each access computes the property again from the arrays of hits and rays. These arrays are not copied: do not modify them.
@@ -48,13 +144,6 @@ class HitPoints(Generic[ArrayT]):
     t: ArrayT
     u: ArrayT
     v: ArrayT
-    prim_id: ArrayT
-    source: Source | None
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Shape of `t`: of the rays."""
-        return tuple(from_tensor(self.t, "t", None).shape)
 
     @property
     def hit(self) -> ArrayT:
@@ -64,8 +153,9 @@ class HitPoints(Generic[ArrayT]):
     @property
     def distance(self) -> ArrayT:
         """Distance of each hit from the ray's origin in scene units, t times the direction's length: (...) float32, inf on a miss."""
+        _, rays, _ = self._source()
         check_recorded(self, "distance")
-        length = np.linalg.norm(to_numpy(self._source()[1].directions).astype(np.float64), axis=1).reshape(self.shape)
+        length = np.linalg.norm(to_numpy(rays.directions).astype(np.float64), axis=1).reshape(self.shape)
         t = to_numpy(self.t)
         return self._given(np.multiply(t, length, out=np.full(t.shape, np.inf), where=np.isfinite(t)).astype(np.float32))
 
@@ -82,6 +172,8 @@ class HitPoints(Generic[ArrayT]):
     @property
     def point(self) -> ArrayT:
         """Point where each ray meets its primitive, in world space, to within `point_error`: (..., 3) float32, NaN on a miss.
+
+        It is float64 (Warp: vec3d) if the structure is far from 0 (`Accelerator.origin`).
 
         It is computed from the ray in float64 and rounded once, because u and v are inaccurate on needle-shaped triangles. If the
         exact ray misses the triangle by a rounding error, the point is moved onto the triangle, and `point_error` includes the
@@ -114,24 +206,6 @@ class HitPoints(Generic[ArrayT]):
         In a scene they are (0, 0) on objects without texture coordinates.
         """
         return self._filled("uv")
-
-    @property
-    def object(self) -> ArrayT:
-        """Index into `scene.objects`, or len(scene.objects) plus the index into `scene.spheres`: (...) int32, -1 on a miss.
-
-        Over worlds, `scene` is that of the ray's world; a mesh is its only object.
-        """
-        return self._filled("object")
-
-    @property
-    def instance(self) -> ArrayT:
-        """Index for `Instances.move`: `object` over a scene, else the row of `accel.geometry.to_world`. (...) int32, -1 on a miss."""
-        return self._filled("instance")
-
-    @property
-    def material(self) -> ArrayT:
-        """Index into `scene.materials`, over worlds those of the ray's world: (...) int32, -1 on a miss."""
-        return self._filled("material")
 
     def gradients(self, t: ArrayLike | None = None, u: ArrayLike | None = None, v: ArrayLike | None = None,
                   point: ArrayLike | None = None) -> Gradients[ArrayT]:
@@ -166,56 +240,6 @@ class HitPoints(Generic[ArrayT]):
         if give is not None:
             found = Gradients(*map(give, found))
         return found
-
-    def _flat(self) -> HitPoints[ArrayT]:
-        """Return the hits (N,)."""
-        return self
-
-    def _source(self) -> Source:
-        refuse_capture()
-        if self.source is None:
-            raise InputError("these hits have no rays, from which distances, points, normals and ids are computed; copies and pickled"
-                             " hits lose them", hint="ask the result of closest_hit before it is copied")
-        return self.source
-
-    def _given(self, values: np.ndarray) -> ArrayT:
-        """Return NumPy values as an array of the hits' library."""
-        given: ArrayT = given_like(self.t, values)
-        return given
-
-    def _filled(self, name: str) -> ArrayT:
-        from wrt.kernels.shade.hit_points import HitPlaces, hit_places  # not at the top: pictures do not need it
-
-        snapshot, rays, worlds = self._source()
-        n, device, shape = len(rays.origins), snapshot.device, self.shape
-        if name in ("error", "normal", "shading", "uv"):
-            check_recorded(self, name)
-        scene, surfaces, object_ids = device_scene(snapshot)
-        if name == "shading" and scene.normals is None:
-            name = "normal"
-        _require(scene, name)
-        to_own = own_ids(name, scene, worlds)
-        if to_own is not None or not isinstance(self.t, wp.array):  # computed on the host
-            refuse_capture(device)
-        if name in ("instance", "object") and isinstance(scene.geometry, InstancedGeometry):
-            name = "instance" if scene.objects is None else "object"
-        out: Any = HitPlaces()
-        setattr(out, name, array := wp.empty(n, dtype=fields_of(HitPlaces)[name].dtype, device=device))
-        hits: Any = HitArrays()
-        for each in fields_of(HitArrays):
-            setattr(hits, each, in_shape(to_warp(getattr(self, each)).to(device), (n,)))
-        if worlds is not None:
-            hits.prim_id = upload(worlds.over_all(hits.prim_id), wp.int32, device)
-        inputs = [surfaces, object_ids, rays_on(device, rays), hits, out]
-        launch_on(device, hit_places, n, *inputs, None, threads=thread_count(None), step=HITS_PER_LAUNCH)
-        if to_own is not None:
-            array = upload(to_own(array.numpy()), wp.int32, device)
-        if isinstance(self.t, wp.array):
-            if name == "point":
-                record(self._flat(), point=array)
-            return in_shape(array, shape)
-        give: Any = to_tensor_like(self.t)
-        return in_shape(array.numpy(), shape) if give is None else give(in_shape(array if device.is_cuda else array.numpy(), shape))
 
 
 def _require(scene: FlatScene, name: str) -> None:
@@ -265,8 +289,8 @@ def device_scene(snapshot: Snapshot) -> DeviceScene:
     surfaces.spheres = snapshot.surfaces.spheres
     surfaces.prim_material = upload(scene.prim_material, wp.int32, device)
     object_ids = ObjectIds()
-    if scene.objects is not None:
-        object_ids.first_prim = upload(scene.objects, wp.int32, device)
+    first = geometry.first_prim if isinstance(geometry, InstancedGeometry) else np.zeros(1)
+    object_ids.first_prim = upload(first if scene.objects is None else scene.objects, wp.int32, device)
     if placed is not None and isinstance(geometry, InstancedGeometry):
         surfaces.instances = upload(instance_records(placed), structs.Instance, device)
         instance = np.zeros(len(placed.first_prim), np.int32)  # of each run; 0 for joined objects and spheres

@@ -8,11 +8,11 @@ import numpy as np
 import warp as wp
 
 from wrt.core.arrays import check_no_gradients, float32, from_tensor, real_numbers
-from wrt.core.device import upload
+from wrt.core.device import launch_on, upload
 from wrt.core.errors import InputError
-from wrt.core.types import Array, ArrayLike, Device, WarpArray
+from wrt.core.types import Array, ArrayLike, Device, Kernel, WarpArray, WarpType
 from wrt.core.warp_private import keep
-from wrt.kernels.query import FARTHEST, RayArrays
+from wrt.kernels.query import FARTHEST, RayArrays, add_origin, subtract_origin
 from wrt.kernels.warp_private import fields_of
 
 MISS = 'with invalid="miss", closest_hit and any_hit let such rays miss'
@@ -59,19 +59,45 @@ class Rays(NamedTuple):
         return Rays(origins, directions, _checked_ends(self.t_min, "t_min"), _checked_ends(self.t_max, "t_max"))
 
 
-def rays_of(origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike, t_max: ArrayLike, gradients: bool = False) -> Rays:
+def from_origin(points: Any, origin: np.ndarray | None) -> Any:
+    """Return points minus `origin`, subtracted in float64 before they are rounded: NumPy's (N, 3), or Warp's (N,) of vec3 or vec3d."""
+    if isinstance(points, wp.array) and (origin is not None or points.dtype == wp.vec3d):
+        check_no_gradients("a structure far from 0", origins=points)
+        return _converted(subtract_origin, points.contiguous(), origin, wp.vec3)
+    return points if origin is None else points - origin
+
+
+def to_origin(points: Any, origin: np.ndarray | None) -> Any:
+    """Return points plus `origin` in float64: NumPy's (N, 3), or Warp's (N,) of vec3d. Without an origin, the points themselves."""
+    if isinstance(points, wp.array) and origin is not None:
+        return _converted(add_origin, points, origin, wp.vec3d)
+    return points if origin is None else points + origin
+
+
+def _converted(kernel: Kernel, points: WarpArray, origin: np.ndarray | None, kind: WarpType) -> WarpArray:
+    out = wp.empty(points.shape, dtype=kind, device=points.device)
+    flat = [array.reshape((array.size,)) for array in (points, out)] if points.ndim > 1 else [points, out]
+    launch_on(points.device, kernel[points.dtype] if isinstance(kernel, dict) else kernel, out.size, flat[0],
+              wp.vec3d(*(np.zeros(3) if origin is None else origin)), flat[1])
+    return out
+
+
+def rays_of(origins: ArrayLike, directions: ArrayLike, t_min: ArrayLike, t_max: ArrayLike, gradients: bool = False,
+            origin: np.ndarray | None = None) -> Rays:
     """Check shapes and types of a query's arguments. gradients: origins and directions may require gradients.
 
-    Raises InputError that names the argument.
+    origin: of the structure's geometry; the rays are relative to it. Raises InputError that names the argument.
     """
     without: dict[str, Any] = {} if gradients else {"origins": origins, "directions": directions}
     check_no_gradients(t_min=t_min, t_max=t_max, **without)
     rays: list[Any] = [from_tensor(origins, "origins"), from_tensor(directions, "directions")]
     if any(isinstance(array, wp.array) for array in rays):
+        if isinstance(rays[0], wp.array) and rays[0].dtype in (wp.vec3, wp.vec3d):
+            rays[0] = from_origin(rays[0], origin)
         if any(not isinstance(array, wp.array) or array.dtype != wp.vec3 for array in rays):
             raise InputError("and directions must both be Warp arrays of vec3, or both NumPy arrays", argument="origins")
     else:
-        rays = [_rows(rays[0], "origins", "(..., 3)"), _rows(rays[1], "directions", "(..., 3)")]
+        rays = [from_origin(_rows(rays[0], "origins", "(..., 3)"), origin), _rows(rays[1], "directions", "(..., 3)")]
     n = len(rays[0])
     if len(rays[1]) != n:
         raise InputError(f"must have as many rows as origins ({n}), got {len(rays[1])}", argument="directions")

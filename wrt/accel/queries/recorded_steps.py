@@ -75,7 +75,7 @@ def record_steps(accel: Accelerator, origins: ArrayLike, directions: ArrayLike, 
         raise InputError("must be a structure over one mesh, not over instances", argument="accel",
                          hint="wrt.build(mesh) over one of the meshes, or wrt.build(wrt.Scene.of(meshes)) over all")
     snapshot = accel.snapshot
-    rays = rays_of(np.asarray(origins), np.asarray(directions), t_min, t_max, True)
+    rays = rays_of(np.asarray(origins), np.asarray(directions), t_min, t_max, True, snapshot.geometry.origin)
     out = answer_arrays(HIT_TYPES, None, len(rays.origins), None, False)
     counts, first, steps = recorded(snapshot, Query(rays, out, thread_count(None)))
     nodes, primitives = (int(counts[name].sum(dtype=np.int64)) for name in ("nodes", "primitives"))
@@ -83,7 +83,7 @@ def record_steps(accel: Accelerator, origins: ArrayLike, directions: ArrayLike, 
     if found[of.NODE] != nodes or found[of.TEST] != primitives:
         raise InputError(f"records {found[of.NODE]} nodes and {found[of.TEST]} primitives, but counts {nodes} and {primitives}",
                          argument="accel", hint="test its leaves with kernels.traverse.leaf")
-    origin, direction = np.asarray(rays.origins, np.float32), np.asarray(rays.directions, np.float32)
+    origin, direction = np.array(rays.origins, np.float32), np.array(rays.directions, np.float32)
     t, u, v, prim_id = map(np.asarray, out)
     return RecordedSteps(snapshot.structure.accel.name, origin, direction, t, u, v, prim_id, counts, first, steps,
                          int(counts["node_bytes"].sum(dtype=np.int64)) // max(nodes, 1),

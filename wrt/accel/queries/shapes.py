@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wrt.accel.queries.rays import Rays, is_valid, rays_of, vectors
+from wrt.accel.queries.rays import Rays, from_origin, is_valid, rays_of, vectors
 from wrt.core.arrays import from_tensor, real_numbers
 from wrt.core.checks import as_choice
 from wrt.core.errors import InputError
@@ -20,10 +20,10 @@ ONE_ARRAY = "without directions, origins holds both: (..., 6)"
 
 
 def shaped_rays(origins: ArrayLike, directions: ArrayLike | None, t_min: ArrayLike, t_max: ArrayLike, gradients: bool = False,
-                invalid: str = "raise") -> tuple[Rays, Shape]:
+                invalid: str = "raise", origin: np.ndarray | None = None) -> tuple[Rays, Shape]:
     """Return the rays in C order, and their shape. Origins and directions broadcast, t_min and t_max to the shape of both.
 
-    Without directions, the last axis of `origins` holds origin and direction. invalid: see `Accelerator.closest_hit`.
+    Without directions, the last axis of `origins` holds origin and direction. invalid: see `Accelerator.closest_hit`; origin: `rays_of`.
     Raises InputError that names the argument.
     """
     as_choice(invalid, INVALID, "invalid")
@@ -36,7 +36,7 @@ def shaped_rays(origins: ArrayLike, directions: ArrayLike | None, t_min: ArrayLi
         raise InputError("and directions must both be Warp arrays, or both NumPy arrays", argument="origins")
     flat, shape = _broadcast(arrays, ("origins", "directions"))
     ends = [_of_each(end, shape, name) for end, name in ((t_min, "t_min"), (t_max, "t_max"))]
-    rays = rays_of(flat[0], flat[1], ends[0], ends[1], gradients)
+    rays = rays_of(flat[0], flat[1], ends[0], ends[1], gradients, origin)
     return rays if invalid == "raise" else _without_invalid(rays), shape
 
 
@@ -45,15 +45,16 @@ def shaped_pairs(a: ArrayLike, b: ArrayLike) -> tuple[list[Array], Shape]:
     return _broadcast([_vectors(a, "a", 3), _vectors(b, "b", 3)], ("a", "b"))
 
 
-def shaped_points(points: ArrayLike, world: ArrayLike | None) -> tuple[np.ndarray, Shape, ArrayLike | None]:
-    """Return points as rows (N, 3) float32 in C order, their shape, and the world of each row.
+def shaped_points(points: ArrayLike, world: ArrayLike | None,
+                  origin: np.ndarray | None = None) -> tuple[np.ndarray, Shape, ArrayLike | None]:
+    """Return points minus `origin` as rows (N, 3) float32 in C order, their shape, and the world of each row.
 
     Raises InputError that names the argument.
     """
     array: Any = _vectors(points, "points", 3)
     shape = array.shape if isinstance(array, wp.array) else array.shape[:-1]
     rows = (array.numpy() if isinstance(array, wp.array) else array).reshape(-1, 3)
-    return vectors(rows, "points", FARTHEST), shape, worlds_of_each(world, shape)
+    return vectors(from_origin(rows, origin), "points", FARTHEST), shape, worlds_of_each(world, shape)
 
 
 def _vectors(value: ArrayLike, name: str, columns: int) -> Array:
@@ -66,7 +67,7 @@ def _vectors(value: ArrayLike, name: str, columns: int) -> Array:
             raise InputError(f"must be (..., {columns}), got {array.shape}", argument=name,
                              hint=hint or ("pass it alone for origins and directions in one array" if array.shape[-1:] == (6,) else None))
         return array
-    if columns == 3 and array.dtype == wp.vec3:
+    if columns == 3 and array.dtype in (wp.vec3, wp.vec3d):
         return array
     if array.dtype != wp.float32 or array.shape[-1] != columns:
         kinds = "(..., 6) float32" if columns == 6 else "of vec3, or (..., 3) float32"

@@ -15,8 +15,9 @@ from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.queries.accelerator import Accelerator, WorldOptions
 from wrt.accel.queries.all_hits import first_hits
 from wrt.accel.queries.answers import ANY_HIT_TYPES, answer_arrays
+from wrt.accel.queries.batches import Query, trace_query
 from wrt.accel.queries.hit_points import device_scene
-from wrt.accel.queries.rays import vectors
+from wrt.accel.queries.rays import Rays, from_origin, to_origin, vectors
 from wrt.accel.queries.shapes import flat_array, in_shape, shaped_pairs, worlds_of_each
 from wrt.accel.queries.world_ids import check_world
 from wrt.core.arrays import check_no_gradients, real_numbers, to_numpy, to_tensor_like
@@ -87,13 +88,13 @@ def visible(accel: Accelerator, a: ArrayLike, b: ArrayLike, on_a: ArrayLike | No
     threads, device = thread_count(threads), accel.device
     check_no_gradients(a=a, b=b)
     flat, shape = shaped_pairs(a, b)
-    p, q = (_points(value, name, device) for value, name in zip(flat, "ab", strict=True))
+    p, q = (_points(value, name, device, accel.snapshot.geometry.origin) for value, name in zip(flat, "ab", strict=True))
     n, as_warp, give = len(p), isinstance(flat[0], wp.array), to_tensor_like(a, b)
     given = None if out is None else [flat_array(out, shape, "out")]
     array: Any = answer_arrays(ANY_HIT_TYPES, given, n, device if as_warp else None, give is not None)[0]
     world = worlds_of_each(world, shape)
     snapshot, has_ids, surfaces = accel.snapshot, on_a is not None or on_b is not None, Surfaces()
-    check_world(snapshot, world, n)
+    worlds = check_world(snapshot, world, n)
     if has_ids:
         if accel.structure.units.instances:
             raise InputError("is for structures without instances", argument="on_a" if on_a is not None else "on_b")
@@ -112,7 +113,8 @@ def visible(accel: Accelerator, a: ArrayLike, b: ArrayLike, on_a: ArrayLike | No
     pairs.a, pairs.b, pairs.on_a, pairs.on_b = p, q, *(upload(each, wp.int32, device) for each in ids)
     run(segments, surfaces, pairs, size, rays)
     arrays = rays.origin, rays.direction, rays.t_min, rays.t_max
-    seen = accel.any_hit(*arrays, threads=threads, world=world)
+    seen = wp.empty(n, dtype=wp.bool, device=device)
+    trace_query(snapshot, Query(Rays(*arrays), [seen], threads, worlds))
     run(to_visible, p, q, seen)
     result = np.array(to_numpy(seen)) if has_ids else seen
     if has_ids and not accel.structure.units.spheres:
@@ -153,13 +155,15 @@ def _ignore_own_triangles(accel: Accelerator, rays: tuple[WarpArray, ...], ids: 
                           threads: int) -> None:
     """Set `seen` to True for pairs that only the triangles under the two points hide. ids: prim_ids of these triangles."""
     origin, way, t_min, t_max = (each.numpy() for each in rays)
+    origin = to_origin(origin, accel.snapshot.geometry.origin)
     rows = np.nonzero(~seen & (t_max > 0.0))[0]
     prim_id = first_hits(accel, 3, origin[rows], way[rows], t_min[rows], t_max[rows], threads).prim_id
     seen[rows] = ((prim_id < 0) | (prim_id == ids[0][rows, None]) | (prim_id == ids[1][rows, None])).all(axis=1)
 
 
-def _points(value: Array, name: str, device: Device) -> WarpArray:
+def _points(value: Array, name: str, device: Device, origin: np.ndarray | None) -> WarpArray:
     """Return points, (N, 3) or Warp's (N,) of vec3, as a Warp array on the device. Raises InputError that names the argument."""
+    value = from_origin(value, origin)
     if isinstance(value, wp.array):
         if value.device.is_cpu:
             vectors(value.numpy(), name, FARTHEST)

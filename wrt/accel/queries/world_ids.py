@@ -57,7 +57,11 @@ def roots_of(snapshot: Snapshot, world: ArrayLike | None, n: int) -> np.ndarray 
 
     Raises InputError that names `world`.
     """
-    worlds = check_world(snapshot, world, n)
+    return roots_at(snapshot, check_world(snapshot, world, n), n)
+
+
+def roots_at(snapshot: Snapshot, worlds: WorldIds | None, n: int) -> np.ndarray | None:
+    """Return the roots of `roots_of` for worlds that `check_world` converted."""
     if snapshot.roots is None:
         return None
     roots = np.append(snapshot.roots.numpy(), np.int32(-1))

@@ -5,16 +5,17 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
+from copy import deepcopy
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict, TypeVar, Unpack, overload
 
-import numpy as np
 import warp as wp
 
 from wrt.accel.base import OneMesh
 from wrt.accel.box_tree import BoxTree
-from wrt.accel.flat_scene import FlatScene, flat_scene_of
+from wrt.accel.device_geometry import DeviceGeometry
+from wrt.accel.flat_scene import FlatScene, flat_scene_of, with_origin
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.instances import Instances
@@ -28,9 +29,11 @@ from wrt.core.building import reported_to
 from wrt.core.checks import as_one, shown
 from wrt.core.default_device import DEFAULT_DEVICE
 from wrt.core.errors import InputError
+from wrt.core.files import require_file
 from wrt.core.types import ArrayLike, PathLike
 from wrt.io.load import LOADERS, load_scene
 from wrt.io.mesh_file import load_mesh
+from wrt.scene.far import moved_by, scene_origin
 from wrt.scene.mesh import Mesh
 from wrt.scene.model import Scene
 
@@ -51,6 +54,11 @@ if TYPE_CHECKING:
     SceneLike: TypeAlias = Scene | InstancedGeometry | trimesh.Scene | PathLike
     MeshLike: TypeAlias = OneMeshLike | SceneLike
     WorldT = TypeVar("WorldT", bound=MeshLike)
+
+OTHER_MESHES = {"pyvista": "wrt.build(wrt.compat.pyvista.to_mesh(mesh))",  # hints, by package
+                "open3d": "wrt.build((mesh.vertices, mesh.triangles)), or (mesh.vertex.positions, mesh.triangle.indices) of a tensor mesh",
+                "newton": "wrt.build((mesh.vertices, mesh.indices.reshape(-1, 3))); a model: docs/compat.md, MuJoCo and Newton",
+                "mujoco": "docs/compat.md, MuJoCo and Newton, has the meshes of a model"}
 
 
 class BuildOptions(TypedDict, total=False):
@@ -138,7 +146,7 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str | None = N
     Parameters
     ----------
     mesh : Mesh, Scene, path, trimesh mesh or scene, wp.Mesh, pair (vertices, faces), geometry, or list of these
-        Surfaces that rays can hit; vertices are copied. A path names a mesh file or a scene file.
+        Surfaces that rays can hit; all arrays are copied. A path names a mesh file or a scene file.
     accel : str
         Name in `wrt.ACCELERATORS`; "bvh" is bvh8.
     device : str, optional
@@ -169,11 +177,11 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str | None = N
                          hint="vertices and faces are one argument: wrt.build((vertices, faces))")
     ACCELERATORS.check(accel, "accel")
     kind, device = ACCELERATORS[accel], device_of(mesh, device)
-    if single := as_one(movable, bool, "movable") and not isinstance(mesh, list):
+    if unnamed := as_one(movable, bool, "movable") and not isinstance(mesh, list):
         mesh = [mesh]
-    flat = (worlds_over([to_mesh_or_scene(each) for each in mesh], single) if isinstance(mesh, list)
+    flat: Any = (worlds_over([to_mesh_or_scene(each) for each in mesh], unnamed) if isinstance(mesh, list)
              else None if isinstance(mesh, Geometry | InstancedGeometry) else to_flat_scene(mesh))  # a geometry has no attributes
-    geometry = mesh if flat is None else flat.geometry
+    geometry = own(mesh) if isinstance(mesh, Geometry | InstancedGeometry) else flat.geometry
     structure: type[Any] | partial[Any] = partial(Instances, kind) if isinstance(geometry, InstancedGeometry) else kind
     if not (progress is None or callable(progress)):
         raise InputError(f"must be a function of one number, got {shown(progress)}", argument="progress")
@@ -268,32 +276,44 @@ def device_of(mesh: Any, device: str | None) -> str:
     return DEFAULT_DEVICE
 
 
+def own(geometry: Geometry | InstancedGeometry) -> Geometry | InstancedGeometry:
+    """Return a geometry with copies of its arrays, because the caller may write to its own later."""
+    if isinstance(geometry, DeviceGeometry):
+        return DeviceGeometry.unchecked(wp.clone(geometry.points), wp.clone(geometry.indices), geometry.spheres.copy())
+    return deepcopy(geometry)
+
+
 def to_flat_scene(mesh: MeshLike) -> FlatScene:
-    """Convert the argument `mesh` of `build` to a FlatScene. Raises InputError for other types, and for a bad file."""
+    """Convert the argument `mesh` of `build` to a FlatScene of copied arrays. Raises InputError for other types, and for a bad file."""
     if isinstance(mesh, Geometry | InstancedGeometry):
-        return flat_scene_of(mesh)
+        return flat_scene_of(own(mesh))
     mesh = to_mesh_or_scene(mesh)
     if isinstance(mesh, Scene):
-        return flatten(mesh, instanced_meshes(mesh))
-    return flat_scene_of(Geometry.of(mesh), mesh.normals, mesh.uvs)
+        origin = scene_origin(mesh)
+        near = moved_by(mesh, origin)
+        return with_origin(flatten(near, instanced_meshes(near)), origin)
+    return deepcopy(flat_scene_of(Geometry.of(mesh), mesh.normals, mesh.uvs))
 
 
 def to_mesh_or_scene(mesh: MeshLike) -> Mesh | Scene:
     """Convert the argument `mesh` of `build` to a Mesh or Scene; load it if it is a path.
     Raises InputError for a bad file and for any other type, also for a Geometry and an InstancedGeometry."""
     if isinstance(mesh, str | os.PathLike) and Path(os.fsdecode(mesh)).suffix.lower() in LOADERS:
-        mesh = load_scene(mesh)
+        require_file(path := Path(os.fsdecode(mesh)))
+        mesh = LOADERS[path.suffix.lower()](path, shapes_only=True) if path.suffix.lower() in (".gltf", ".glb") else load_scene(path)
     elif isinstance(mesh, str | os.PathLike):
         mesh = load_mesh(mesh)
     elif isinstance(mesh, tuple) and len(mesh) == 2:
-        vertices, faces = (np.array(to_numpy(from_tensor(each, name, None))) if is_tensor(each) else each  # copy: the caller may modify it
+        vertices, faces = (to_numpy(from_tensor(each, name, None)) if is_tensor(each) else each
                            for each, name in zip(mesh, ("vertices", "faces"), strict=True))
         mesh = Mesh(vertices, faces)
     elif isinstance(mesh, wp.Mesh):
         mesh = Mesh(mesh.points.numpy(), mesh.indices.numpy().reshape(-1, 3))
     elif type(mesh).__module__.split(".")[0] == "trimesh":
         mesh = Mesh.from_trimesh(mesh)  # type: ignore[arg-type]  # narrowed without an import of trimesh
+    if isinstance(mesh, Mesh):
+        mesh.warn_if_far()
     if isinstance(mesh, Scene | Mesh):
         return mesh
     raise InputError("must be a Mesh, a Scene, the path of a mesh or scene file, a trimesh.Trimesh or trimesh.Scene, a wp.Mesh, or a pair"
-                     f" (vertices, faces), got {shown(mesh)}", argument="mesh")
+                     f" (vertices, faces), got {shown(mesh)}", argument="mesh", hint=OTHER_MESHES.get(type(mesh).__module__.split(".")[0]))

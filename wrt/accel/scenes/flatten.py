@@ -60,7 +60,7 @@ def flatten_instanced(scene: Scene, meshes: frozenset[int]) -> FlatScene:
                 each = table[:1] if thing.face_material is None else table[thing.face_material][part.source]
                 materials[key] = (n_material, each)
                 n_material += len(each)
-            rows.append((first_prim, id(thing.mesh), materials[key][0], int(thing.face_material is not None), thing.transform))
+            rows.append((first_prim, id(thing.mesh), materials[key][0], int(thing.face_material is not None), thing.placement))
         first_prim += count
     _check_size(sum(len(part.vertices) for part in parts.values()), first_prim)
     return _placed_scene(scene, index, parts, rows, materials, prim_ids, first_prim)
@@ -77,8 +77,8 @@ def _placed_scene(scene: Scene, index: dict[int, int], parts: "dict[int, _Joined
     first_face = np.cumsum([0, *(len(part.faces) for part in parts.values())])
     joined = list(parts.values())
     flat = joined[0]
-    geometries = (NumberedGeometry(flat.vertices, flat.faces, spheres, np.concatenate(prim_ids).astype(np.int32)),
-                  *(Geometry(part.vertices, part.faces, spheres[:0]) for part in joined[1:]))
+    geometries = (NumberedGeometry(flat.vertices, flat.faces, spheres, prim_ids=np.concatenate(prim_ids).astype(np.int32)),
+                  *(Geometry(part.vertices, part.faces, spheres[:0], part.origin) for part in joined[1:]))
     instances = [(place[key], matrix[:3], first) for first, key, _, _, matrix in rows if key]
     if len(geometries[0]):
         instances.insert(0, (0, np.eye(4)[:3], 0))
@@ -130,6 +130,7 @@ class _Joined:
     uvs: np.ndarray
     source: np.ndarray | slice
     material: np.ndarray
+    origin: np.ndarray | None = None  # of the mesh
 
 
 def _joined(objects: tuple[Object, ...], index: dict[int, int]) -> _Joined:
@@ -153,7 +154,7 @@ def _joined(objects: tuple[Object, ...], index: dict[int, int]) -> _Joined:
 def _own_space(mesh: Mesh) -> _Joined:
     vertices, faces = mesh.vertices.copy(), mesh.faces.copy()  # because the caller may write to its arrays
     faces, source = (faces, slice(None)) if mesh.is_clean else flip_collinear(vertices, faces)
-    return _Joined(vertices, faces, *_attributes(mesh), source, np.zeros(0, np.int32))
+    return _Joined(vertices, faces, *_attributes(mesh), source, np.zeros(0, np.int32), mesh.origin)
 
 
 def _attributes(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
@@ -163,11 +164,11 @@ def _attributes(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _is_unmoved(thing: Object) -> bool:
-    return np.array_equal(thing.transform, np.eye(4))
+    return np.array_equal(thing.placement, np.eye(4))
 
 
 def _transformed(thing: Object) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    mesh, matrix = thing.mesh, thing.transform
+    mesh, matrix = thing.mesh, thing.placement
     faces = mesh.faces
     normals, uvs = _attributes(mesh)
     if _is_unmoved(thing):

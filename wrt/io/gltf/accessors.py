@@ -24,17 +24,20 @@ class Accessors:
         self._document = document
         self._arrays: dict[int, np.ndarray] = {}
 
-    def read(self, index: int, kind: str, place: str) -> np.ndarray:
+    def read(self, index: int, kind: str, place: str, finite: bool = True) -> np.ndarray:
         """Return accessor `index` as an array (count, components of `kind`): float32 for floats and normalised integers, else integers.
 
-        kind: "SCALAR", "VEC2", "VEC3" or "VEC4". Raises InputError at `place` if the accessor has another kind, does not fit into its
-        buffer view, or holds a float that is not finite."""
+        kind: "SCALAR", "VEC2", "VEC3", "VEC4" or "MAT4". Raises InputError at `place` if the accessor has another kind, does not fit into
+        its buffer view, or, if `finite`, holds a float that is not finite."""
         accessor = self._document.item("accessors", index, place)
         if accessor.type != kind:
             raise InputError(f"must be of type {kind}, but accessors[{index}] is {short(accessor.type)}", place=place)
         if index not in self._arrays:
             with at(place):
                 self._arrays[index] = self._decode(accessor, f"accessors[{index}]")
+        if finite:
+            with at(place):
+                require_finite(self._arrays[index], f"accessors[{index}]")
         return self._arrays[index]
 
     def put(self, index: int, values: np.ndarray, place: str) -> None:
@@ -61,11 +64,6 @@ class Accessors:
             array = self._with_sparse(array, accessor.sparse, f"{where}.sparse")
         if accessor.normalized:
             array = _normalised(array, where)
-        if array.dtype.kind == "f":
-            bad = ~np.isfinite(array).all(axis=1)
-            if bad.any():
-                row = int(np.nonzero(bad)[0][0])
-                raise InputError(f"must be finite, but element {row} is {array[row].tolist()} ({bad.sum()} such elements)", place=where)
         array.flags.writeable = False
         return array
 
@@ -98,6 +96,14 @@ class Accessors:
         array[rows] = self._elements(values.bufferView, values.byteOffset or 0, array.dtype.newbyteorder("<"),
                                      (sparse.count, array.shape[1]), f"{where}.values")
         return array
+
+
+def require_finite(array: np.ndarray, where: str, rows: np.ndarray | None = None) -> None:
+    """Raise InputError, with the first wrong row, unless the elements of an array, or only its `rows`, are finite."""
+    bad = ~np.isfinite(array).all(axis=1)
+    wrong = np.flatnonzero(bad) if rows is None else np.unique(rows[bad[rows]])
+    if len(wrong):
+        raise InputError(f"must be finite, but element {wrong[0]} is {array[wrong[0]].tolist()} ({len(wrong)} such elements)", place=where)
 
 
 def _dtype(component_type: int, where: str) -> np.dtype:

@@ -20,7 +20,7 @@ from wrt.core.files import read_file, utf8
 from wrt.core.packages import needed_by
 from wrt.core.types import JsonObject, PathLike
 from wrt.io.gltf import meshopt
-from wrt.io.gltf.schema import MeshoptView, read_as
+from wrt.io.gltf.schema import MeshoptView, item_type, read_as
 
 T = TypeVar("T")
 GltfObject: TypeAlias = Any  # a dataclass of pygltflib, which has no types
@@ -31,7 +31,7 @@ SUPPORTED_EXTENSIONS = frozenset({
     "KHR_lights_punctual", "KHR_draco_mesh_compression", "KHR_texture_transform", "KHR_mesh_quantization", "EXT_mesh_gpu_instancing",
     "KHR_materials_transmission", "KHR_materials_volume", "KHR_materials_ior", "KHR_materials_emissive_strength",
     "KHR_materials_unlit", "KHR_materials_specular", "KHR_materials_clearcoat", "KHR_materials_pbrSpecularGlossiness",
-    "EXT_texture_webp", "EXT_texture_avif", *meshopt.NAMES,
+    "KHR_node_visibility", "EXT_texture_webp", "EXT_texture_avif", *meshopt.NAMES,
 })
 # Extensions that describe the file or its use, and change no pixel.
 METADATA_EXTENSIONS = frozenset({
@@ -42,11 +42,12 @@ METADATA_EXTENSIONS = frozenset({
     "VRMC_vrm",  # unlike VRM, whose version 0 has materials
 })
 DEFAULT_LOOK = frozenset({"KHR_materials_variants"})  # wrt shows the default look
+_LOOKS = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "EXT_texture_", "EXT_lights_", "MSFT_texture_")  # shapes do not need them
 _CODECS = frozenset({"KHR_texture_basisu", "MSFT_texture_dds"})
 
 
 class LeftOut:
-    """Features of a file that wrt leaves out of the picture, each with the objects that have it."""
+    """Features of a file that wrt leaves out of the picture or changes, each with the objects that have it."""
 
     def __init__(self) -> None:
         self._places: dict[str, dict[str, dict[str, None]]] = {}
@@ -60,6 +61,14 @@ class LeftOut:
         for extension in extensions or ():
             if extension not in SUPPORTED_EXTENSIONS and extension not in METADATA_EXTENSIONS:
                 self.add(extension, kind, name)
+
+    def clamp(self, value: Any, low: float, high: float, what: str, kind: str, name: str) -> Any:
+        """Return a number or a list of numbers in [low, high], and record a value outside, because exporters write colours of 1.0001."""
+        clamped = np.clip(value, low, high)
+        if np.array_equal(clamped, value):
+            return value
+        self.add(f"{what} outside of [{low:g}, {high:g}]", kind, name)
+        return clamped.tolist()
 
     def __contains__(self, feature: str) -> bool:
         return feature in self._places
@@ -78,9 +87,12 @@ class LeftOut:
 
 
 class Document:
-    """Typed JSON of a file (`gltf`, a pygltflib.GLTF2) and the bytes that it refers to. The caller adds the path to each InputError."""
+    """JSON of a file, typed where it is read, and the bytes that it refers to. The caller adds the path to each InputError.
 
-    def __init__(self, path: PathLike) -> None:
+    gltf: a pygltflib.GLTF2 without its arrays, whose items `item` returns. shapes_only: accept files that require extensions of
+    materials, textures and lights. left_out: what wrt does not support; mistakes: what is wrong in the file and is left out or changed."""
+
+    def __init__(self, path: PathLike, shapes_only: bool = False) -> None:
         with needed_by("a glTF file"):
             import pygltflib
 
@@ -89,18 +101,30 @@ class Document:
         if not isinstance(raw, dict):
             raise InputError("is not a glTF file: its JSON is not an object")
         _check_version(raw)
+        self._raw, self._items = raw, dict[tuple[str, int], GltfObject]()
         self.gltf: Any = read_as(pygltflib.GLTF2, raw, "")
-        _check_required_extensions(self.gltf.extensionsRequired)
-        self.left_out = LeftOut()
+        _check_required_extensions(each for each in self.gltf.extensionsRequired if not (shapes_only and each.startswith(_LOOKS)))
+        self.left_out, self.mistakes = LeftOut(), LeftOut()
         self._buffers: dict[int, np.ndarray] = {}
         self._decoded: dict[int, np.ndarray] = {}  # compressed buffer views
 
+    def raw(self, array: str) -> list[Any]:
+        """Return the unchecked items of an array of the file; [] if it has none."""
+        items = self._raw.get(array)
+        if not isinstance(items, list | None):
+            raise InputError(f"must be an array, got {short(items)}", place=array)
+        return items or []
+
     def item(self, array: str, index: int, place: str) -> GltfObject:
-        """Return `gltf.<array>[index]`. Raises InputError at `place` if the index is out of range."""
-        items = getattr(self.gltf, array)
+        """Return item `index` of an array of the file. Raises InputError at `place` if the index is out of range, and for a wrong item.
+
+        Items are checked when they are first used, so that a mistake in an unused one refuses no file."""
+        items = self.raw(array)
         if not 0 <= index < len(items):
             raise InputError(f"is {index}, but there are {len(items)} {array}", place=place)
-        return items[index]
+        if (array, index) not in self._items:
+            self._items[array, index] = read_as(item_type(array), items[index], f"{array}[{index}]")
+        return self._items[array, index]
 
     def extension(self, holder: GltfObject, name: str, cls: type[T], place: str) -> T | None:
         """Return the extension `name` of a glTF object as an instance of `cls`, or None."""
@@ -192,11 +216,8 @@ def _read_glb(data: bytes) -> tuple[object, bytes | memoryview | None]:
 
 
 def _parse_json(data: bytes) -> object:
-    def refuse(constant: str) -> None:
-        raise InputError(f"is not valid JSON: it holds {constant}")
-
     try:
-        return json.loads(utf8(data).decode(), parse_constant=refuse)
+        return json.loads(utf8(data).decode())  # with NaN and Infinity, which `read_as` refuses where they are used
     except UnicodeDecodeError as error:
         raise InputError(f"is not a glTF file: not UTF-8 at byte {error.start}") from None
     except RecursionError:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from wrt.core.checks import short
+from wrt.core.checks import LARGEST, short
 from wrt.core.errors import InputError, at
 from wrt.io.gltf.document import Document, GltfObject
 from wrt.io.gltf.schema import (
@@ -28,8 +28,9 @@ from wrt.io.gltf.schema import (
     exactly,
 )
 from wrt.picture.decode import decode_rgba8
+from wrt.scene.kinds import forms
 from wrt.scene.materials import Material, Texture
-from wrt.scene.values import BLACK, Color, as_number, as_vector
+from wrt.scene.values import BLACK, Color
 
 _WRAPS = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 _NEAREST = 9728
@@ -37,6 +38,9 @@ _DARKEST = 1e-6  # channel of an attenuation colour; 0 would need infinite absor
 _FULL_REFLECTANCE = 25.0  # factor on the reflectance of the index 1.5, 0.04, that makes it 1
 _GLOSSY = "KHR_materials_pbrSpecularGlossiness"
 _ALPHA_MODES = {"OPAQUE": "opaque", "MASK": "mask", "BLEND": "blend"}
+
+_LIMITS = {key: (each.metadata["limits"].get("ge", 0.0), each.metadata["limits"].get("le", LARGEST))
+           for key, each in forms(Material).items() if each.metadata["form"] in ("number", "color")}
 
 # Values with which an unsupported extension has no effect: the warning then leaves it out.
 _NEUTRAL: dict[str, dict[str, Any]] = {
@@ -58,9 +62,15 @@ class Textures:
         self._roughness: dict[tuple[int, float], Texture] = {}
 
     def texture(self, info: GltfObject, srgb: bool, material: str, place: str) -> Texture | None:
-        """Return the texture of a textureInfo. None: there is no textureInfo or no image, or it uses coordinates other than TEXCOORD_0."""
-        if info is None:
+        """Return the texture of a textureInfo. None: there is no textureInfo, or the texture cannot be read, which is recorded."""
+        try:
+            return self._texture(info, srgb, material, place) if info is not None else None
+        except InputError as error:
+            self._document.mistakes.add(f"a texture, because {error}", "material", material)
             return None
+
+    def _texture(self, info: GltfObject, srgb: bool, material: str, place: str) -> Texture | None:
+        """Return the texture of a textureInfo. None: there is no image, or it uses coordinates other than TEXCOORD_0."""
         document = self._document
         texture = document.item("textures", info.index, f"{place}.index")
         document.left_out.add_extensions(info.extensions, "material", material)
@@ -79,7 +89,7 @@ class Textures:
             return None
         key = (source, srgb, wrap, matrix.tobytes())
         if key not in self._textures:
-            image = document.gltf.images[source]
+            image = document.item("images", source, place)
             file = image.uri if image.uri and image.uri[:5] != "data:" else ""
             name = texture.name or image.name or file or f"image {source}"
             self._textures[key] = Texture(self._image(source), srgb=srgb, wrap=wrap, uv_transform=matrix, name=name)
@@ -97,13 +107,17 @@ class Textures:
     def _wrap(self, texture: GltfObject, material: str, place: str) -> tuple[str, str]:
         if texture.sampler is None:
             return ("repeat", "repeat")
-        sampler = self._document.item("samplers", texture.sampler, f"{place}.sampler")
+        try:
+            sampler = self._document.item("samplers", texture.sampler, f"{place}.sampler")
+            for axis in ("wrapS", "wrapT"):
+                if getattr(sampler, axis) not in _WRAPS:
+                    raise InputError(f"must be one of {', '.join(map(str, _WRAPS))}, got {getattr(sampler, axis)}",
+                                     place=f"samplers[{texture.sampler}].{axis}")
+        except InputError as error:
+            self._document.mistakes.add(f"a sampler, because {error}", "material", material)
+            return ("repeat", "repeat")
         if sampler.magFilter == _NEAREST:
             self._document.left_out.add("nearest-neighbour sampling", "material", material)
-        for axis in ("wrapS", "wrapT"):
-            if getattr(sampler, axis) not in _WRAPS:
-                raise InputError(f"must be one of {', '.join(map(str, _WRAPS))}, got {getattr(sampler, axis)}",
-                                 place=f"samplers[{texture.sampler}].{axis}")
         return (_WRAPS[sampler.wrapS], _WRAPS[sampler.wrapT])
 
     def _source(self, texture: GltfObject, place: str) -> int | None:
@@ -119,8 +133,8 @@ class Textures:
 
     def _image(self, index: int) -> np.ndarray:
         if index not in self._images:
-            image = self._document.gltf.images[index]
             place = f"images[{index}]"
+            image = self._document.item("images", index, place)
             if image.uri is not None:
                 data: Any = self._document.resource(image.uri, f"{place}.uri")
                 place = f"{place}.uri" if image.uri[:5] == "data:" else f"{place}.uri ({image.uri})"
@@ -130,6 +144,7 @@ class Textures:
                 raise InputError("has neither a uri nor a bufferView", place=place)
             with at(place):
                 self._images[index] = decode_rgba8(data)
+            self._images[index].flags.writeable = False  # so that textures share it
         return self._images[index]
 
 
@@ -173,7 +188,7 @@ class Materials:
         glossy = self._document.extension(source, _GLOSSY, SpecularGlossiness, place)
         if source.pbrMetallicRoughness is None or glossy is not None:
             source.pbrMetallicRoughness = pygltflib.PbrMetallicRoughness()
-        fields = self._base(source, glossy, name, place)
+        fields = self._clamped(self._base(source, glossy, name, place), name)
         if self._document.extension(source, "KHR_materials_unlit", Unlit, place) is not None:
             fields = _unlit(fields)
         else:
@@ -182,7 +197,12 @@ class Materials:
             fields |= self._transmission(source, name, place) | self._emission(source, name, place)
             fields |= self._glossy(glossy, name, f"{place}.extensions.{_GLOSSY}") if glossy is not None else {}
         with at(place):
-            return Material(**fields)
+            return Material(**self._clamped(fields, name))
+
+    def _clamped(self, fields: dict[str, Any], name: str) -> dict[str, Any]:
+        """Return fields of a Material, with numbers and colours clamped to their limits."""
+        return {key: self._document.mistakes.clamp(value, *_LIMITS[key], key, "material", name) if key in _LIMITS else value
+                for key, value in fields.items()}
 
     def _base(self, source: GltfObject, glossy: SpecularGlossiness | None, name: str, place: str) -> dict[str, Any]:
         """Return the fields that lit and unlit materials share: name, base colour or diffuse colour, alpha and sides."""
@@ -222,8 +242,11 @@ class Materials:
             transmission.transmissionTexture, False, name, f"{place}.extensions.KHR_materials_transmission.transmissionTexture")
         volume = self._document.extension(source, "KHR_materials_volume", Volume, place)
         if volume is not None and volume.thicknessFactor > 0.0:
-            with at(f"{place}.extensions.KHR_materials_volume"):
-                fields |= {"thin": False, "absorption": absorption(volume)}
+            color, clamp = f"{place}.extensions.KHR_materials_volume.attenuationColor", self._document.mistakes.clamp
+            volume.attenuationColor = clamp(exactly(volume.attenuationColor, 3, color), 0.0, 1.0, "attenuationColor", "material", name)
+            if volume.attenuationDistance <= 0.0:
+                self._document.mistakes.add("attenuationDistance of 0, now infinite", "material", name)
+            fields |= {"thin": False, "absorption": absorption(volume)}
         return fields
 
     def _specular(self, source: GltfObject, name: str, place: str) -> dict[str, Any]:
@@ -244,9 +267,9 @@ class Materials:
 
         Where the specification multiplies the diffuse colour by 1 - max(specular), wrt multiplies it by 1 - F, F being the largest
         channel of the reflectance at each angle: the same at normal incidence."""
-        with at(place):
-            specular = as_vector(glossy.specularFactor, "specularFactor", low=0.0, high=1.0)
-            glossiness = as_number(glossy.glossinessFactor, "glossinessFactor", low=0.0, high=1.0)
+        clamp = self._document.mistakes.clamp
+        specular = clamp(exactly(glossy.specularFactor, 3, f"{place}.specularFactor"), 0.0, 1.0, "specularFactor", "material", name)
+        glossiness = clamp(glossy.glossinessFactor, 0.0, 1.0, "glossinessFactor", "material", name)
         texture = self._textures.texture(glossy.specularGlossinessTexture, True, name, f"{place}.specularGlossinessTexture")
         return {
             "metallic": 0.0, "ior": 1.5, "specular_factor": 1.0, "specular_texture": None, "specular_color_texture": texture,
@@ -285,11 +308,9 @@ class Materials:
 
 def absorption(volume: Volume) -> Color:
     """Return the coefficient a (Beer-Lambert) per unit of world length: exp(-a attenuationDistance) is the attenuationColor."""
-    color = as_vector(volume.attenuationColor, "attenuationColor", low=0.0, high=1.0)
-    if math.isinf(volume.attenuationDistance):
+    if math.isinf(volume.attenuationDistance) or volume.attenuationDistance <= 0.0:
         return BLACK
-    distance = as_number(volume.attenuationDistance, "attenuationDistance", low=1e-30)
-    red, green, blue = (-math.log(max(channel, _DARKEST)) / distance for channel in color)
+    red, green, blue = (-math.log(max(channel, _DARKEST)) / volume.attenuationDistance for channel in volume.attenuationColor)
     return (red, green, blue)
 
 

@@ -4,21 +4,23 @@ Source: Khronos, glTF 2.0 specification, section 3.7; EXT_mesh_gpu_instancing, K
 """
 
 from collections.abc import Callable
+from typing import TypeAlias
 
 import numpy as np
 
 from wrt.core.errors import InputError, at
-from wrt.io.gltf.accessors import Accessors
+from wrt.io.gltf.accessors import Accessors, require_finite
 from wrt.io.gltf.document import Document, GltfObject
 from wrt.io.gltf.draco import decode
 from wrt.io.gltf.nodes import compose
 from wrt.io.gltf.schema import Instancing
+from wrt.io.gltf.skins import Skins, moved
 from wrt.io.polygons import strip
 from wrt.scene.clean import clean
 from wrt.scene.mesh import Mesh, unit_rows
-from wrt.scene.values import require_count
+from wrt.scene.values import near_zero, require_count
 
-# Attributes that need no warning here: wrt reads them, another warning names them (skins, textures, TANGENT beside a normal map), or an
+# Attributes that need no warning here: wrt reads them, another warning names them (textures, TANGENT beside a normal map), or an
 # application defines them (underscore).
 _NO_WARNING = ("POSITION", "NORMAL", "TANGENT", "TEXCOORD_", "JOINTS_", "WEIGHTS_", "_")
 # Attributes of a node's instances, with their types and defaults.
@@ -38,21 +40,25 @@ def _fan(indices: np.ndarray) -> np.ndarray:
     return indices[np.stack([i + 1, i + 2, np.zeros_like(i)], axis=1)]
 
 
+Targets: TypeAlias = list[tuple[float, dict[str, int]]]  # morph targets with their weights
 TRIANGULATE: dict[int, Callable[[np.ndarray], np.ndarray]] = {4: _list_of_triangles, 5: strip, 6: _fan}
 _NOT_TRIANGLES = {0: "points", 1: "lines", 2: "lines", 3: "lines"}
 
 
 class Meshes:
-    """Cache of meshes: primitives with the same accessors and mode share a Mesh."""
+    """Cache of meshes: primitives with the same accessors, mode, weights of morph targets and skin share a Mesh."""
 
     def __init__(self, document: Document) -> None:
         self._document = document
         self._accessors = Accessors(document)
+        self._skins = Skins(document, self._accessors)
         self._meshes: dict[tuple[object, ...], Mesh | None] = {}
         self._instances = 0
 
-    def mesh(self, primitive: GltfObject, name: str, place: str) -> Mesh | None:
-        """Return the mesh of a primitive, or None if it has no triangle with an area."""
+    def mesh(self, primitive: GltfObject, name: str, place: str, weights: tuple[float, ...] = (), skin: int | None = None) -> Mesh | None:
+        """Return the mesh of a primitive, or None if it has no triangle with an area.
+
+        weights: of the morph targets, 0 for missing ones; skin: index of a skin that moves the vertices to world space, or None."""
         left_out, attributes = self._document.left_out, primitive.attributes
         if primitive.mode not in TRIANGULATE and primitive.mode not in _NOT_TRIANGLES:
             raise InputError(f"must be 0 to 6, got {primitive.mode}", place=f"{place}.mode")
@@ -62,39 +68,67 @@ class Meshes:
         for attribute in sorted(attributes):
             if not attribute.startswith(_NO_WARNING):
                 left_out.add(attribute, "mesh", name)
-        if primitive.targets:
-            left_out.add("morph targets", "mesh", name)
-        key = (*(attributes.get(a) for a in ("POSITION", "NORMAL", "TEXCOORD_0")), primitive.indices, primitive.mode)
+        targets = [(weight, target) for weight, target in zip(weights, primitive.targets or (), strict=False) if weight]
+        key = (*(attributes.get(a) for a in ("POSITION", "NORMAL", "TEXCOORD_0")), primitive.indices, primitive.mode,
+               *((weight, *sorted(target.items())) for weight, target in targets),
+               *((skin, *sorted(attributes.items())) if skin is not None else ()))
         if key not in self._meshes:
-            self._meshes[key] = self._make(primitive, name, place)
+            self._meshes[key] = self._make(primitive, name, place, targets, skin)
         if self._meshes[key] is None:
             left_out.add("primitives without a triangle that has an area", "mesh", name)
         return self._meshes[key]
 
-    def _make(self, primitive: GltfObject, name: str, place: str) -> Mesh | None:
-        decode(self._document, self._accessors, primitive, place)
-        positions = self._attribute(primitive, "POSITION", "VEC3", place)
-        normals = self._attribute(primitive, "NORMAL", "VEC3", place)
-        uvs = self._attribute(primitive, "TEXCOORD_0", "VEC2", place)
-        assert positions is not None
-        for attribute, array in (("NORMAL", normals), ("TEXCOORD_0", uvs)):
-            if array is not None and len(array) != len(positions):
-                raise InputError(f"has {len(array)} elements, but POSITION has {len(positions)}", place=f"{place}.attributes.{attribute}")
+    def _make(self, primitive: GltfObject, name: str, place: str, targets: Targets, skin: int | None) -> Mesh | None:
+        mode = decode(self._document, self._accessors, primitive, place)
+        positions = self._attribute(primitive, "POSITION", "VEC3", place, targets)
         indices = self._indices(primitive, len(positions), place)
-        if primitive.mode == 4 and len(indices) % 3:
+        require_finite(positions, f"{place}.attributes.POSITION: accessors[{primitive.attributes['POSITION']}]", indices)
+        normals, uvs = (self._optional(primitive, *each, place, targets, name, len(positions))
+                        for each in (("NORMAL", "VEC3"), ("TEXCOORD_0", "VEC2")))
+        if mode == 4 and len(indices) % 3:
             self._document.left_out.add("incomplete last triangles", "mesh", name)
+        faces = TRIANGULATE[mode](indices)
+        if skin is not None:
+            blend = self._skins.blend(skin, primitive, len(positions), place)
+            positions, normals, mirrored = moved(blend, positions, normals)
+            faces = faces[:, ::-1] if mirrored else faces
         with at(place):
-            cleaned = clean(positions, TRIANGULATE[primitive.mode](indices), normals, uvs)
+            near, origin = near_zero(positions)  # a skin may move the mesh far from 0
+            cleaned = clean(near, faces, normals, uvs)
             if not len(cleaned.faces):
                 return None
             normals = None if cleaned.normals is None else unit_rows(cleaned.normals)  # the length of quantised ones is off by 1 %
-            return Mesh(cleaned.vertices, cleaned.faces, normals, cleaned.uvs, dropped=cleaned.dropped, name=name)
+            return Mesh(cleaned.vertices, cleaned.faces, normals, cleaned.uvs, dropped=cleaned.dropped, name=name, origin=origin)
 
-    def _attribute(self, primitive: GltfObject, attribute: str, kind: str, place: str) -> np.ndarray | None:
-        index = primitive.attributes.get(attribute)
-        if index is None:
+    def _attribute(self, primitive: GltfObject, attribute: str, kind: str, place: str, targets: Targets) -> np.ndarray:
+        """Return an attribute, float32, or float64 if morph targets change it. It may hold NaN and infinity."""
+        where = f"{place}.attributes.{attribute}"
+        array: np.ndarray = self._accessors.read(primitive.attributes[attribute], kind, where, finite=False).astype(np.float32, copy=False)
+        for weight, target in targets:
+            if attribute in target:
+                where = f"{place}.targets: {attribute}"
+                delta = self._accessors.read(target[attribute], kind, where, finite=False)
+                if len(delta) != len(array):
+                    raise InputError(f"has {len(delta)} elements, but the primitive has {len(array)}", place=where)
+                array = array + weight * delta.astype(np.float64)
+        return array
+
+    def _optional(self, primitive: GltfObject, attribute: str, kind: str, place: str, targets: Targets, name: str,
+                  count: int) -> np.ndarray | None:
+        """Return an attribute that the shape does not need. Mistakes are recorded: it is then None, or 0 where it is not finite."""
+        if attribute not in primitive.attributes:
             return None
-        return self._accessors.read(index, kind, f"{place}.attributes.{attribute}").astype(np.float32, copy=False)
+        try:
+            array = self._attribute(primitive, attribute, kind, place, targets)
+            if len(array) != count:
+                raise InputError(f"has {len(array)} elements, but POSITION has {count}", place=f"{place}.attributes.{attribute}")
+        except InputError as error:
+            self._document.mistakes.add(f"{attribute}, because {error}", "mesh", name)
+            return None
+        bad = ~np.isfinite(array).all(axis=1)
+        if bad.any():
+            self._document.mistakes.add(f"{attribute} that is not finite, now 0", "mesh", name)
+        return np.where(bad[:, None], np.float32(0.0), array) if bad.any() else array
 
     def _indices(self, primitive: GltfObject, count: int, place: str) -> np.ndarray:
         if primitive.indices is None:

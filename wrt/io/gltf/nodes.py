@@ -6,15 +6,16 @@ import numpy as np
 
 from wrt.core.errors import InputError, at
 from wrt.io.gltf.document import Document, GltfObject
-from wrt.io.gltf.schema import exactly
+from wrt.io.gltf.schema import Children, Visibility, exactly, read_as
 from wrt.scene.values import as_transform
 
 
 def walk(document: Document) -> Iterator[tuple[int, GltfObject, np.ndarray]]:
-    """Yield index, node and matrix to world space, (4, 4) float64, of each node of the default scene, parents before children.
+    """Yield index, node and matrix to world space, (4, 4) float64, of each visible node of the default scene, parents before children.
 
+    KHR_node_visibility hides a node with all nodes below it.
     Raises InputError if any node of the file has two parents or is its own ancestor."""
-    _check_forest(document)
+    parents_of(document)
     stack = [(index, place, np.eye(4)) for index, place in reversed(_roots(document))]
     seen: set[int] = set()
     while stack:
@@ -25,29 +26,32 @@ def walk(document: Document) -> Iterator[tuple[int, GltfObject, np.ndarray]]:
         seen.add(index)
         with np.errstate(over="ignore", invalid="ignore"):  # `Object` refuses infinite matrices
             world = parent @ local_matrix(node, f"nodes[{index}]")
+        if not (document.extension(node, "KHR_node_visibility", Visibility, f"nodes[{index}]") or Visibility()).visible:
+            continue
         yield index, node, world
         children = [(child, f"nodes[{index}].children[{i}]", world) for i, child in enumerate(node.children)]
         stack += reversed(children)
 
 
 def _roots(document: Document) -> list[tuple[int, str]]:
-    gltf = document.gltf
-    if gltf.scene is None and not gltf.scenes:
-        children = {child for node in gltf.nodes for child in node.children}
-        return [(index, "nodes") for index in range(len(gltf.nodes)) if index not in children]
-    first = gltf.scene or 0
+    if document.gltf.scene is None and not document.raw("scenes"):
+        parents = parents_of(document)
+        return [(index, "nodes") for index in range(len(document.raw("nodes"))) if index not in parents]
+    first = document.gltf.scene or 0
     scene = document.item("scenes", first, "scene")
     document.left_out.add_extensions(scene.extensions, "scene", scene.name or str(first))
     return [(index, f"scenes[{first}].nodes[{i}]") for i, index in enumerate(scene.nodes)]
 
 
-def _check_forest(document: Document) -> None:
-    nodes = document.gltf.nodes
+def parents_of(document: Document) -> dict[int, int]:
+    """Return the parent of each node that has one. Raises InputError if a node has two parents or is its own ancestor."""
+    nodes = [read_as(Children, raw, f"nodes[{index}]") for index, raw in enumerate(document.raw("nodes"))]
     parent: dict[int, int] = {}
     for index, node in enumerate(nodes):
         for i, child in enumerate(node.children):
             place = f"nodes[{index}].children[{i}]"
-            document.item("nodes", child, place)
+            if not 0 <= child < len(nodes):
+                raise InputError(f"is {child}, but there are {len(nodes)} nodes", place=place)
             if child in parent:
                 raise InputError(f"nodes[{child}] has two parents, the first is nodes[{parent[child]}]", place=place)
             parent[child] = index
@@ -58,6 +62,7 @@ def _check_forest(document: Document) -> None:
     if len(reached) < len(nodes):
         first = min(set(range(len(nodes))) - set(reached))
         raise InputError("the node graph has a cycle", place=f"nodes[{first}]")
+    return parent
 
 
 def local_matrix(node: GltfObject, place: str) -> np.ndarray:

@@ -112,7 +112,7 @@ class PunctualLight:
 
 @dataclass
 class PunctualLights:
-    lights: list[PunctualLight] = field(default_factory=list)
+    lights: list[dict[str, Any]] = field(default_factory=list)  # a light that no node shows cannot refuse the file
 
 
 @dataclass
@@ -142,6 +142,24 @@ class Instancing:
     attributes: dict[str, int] = field(default_factory=dict)
 
 
+@dataclass
+class Visibility:
+    visible: bool = True
+
+
+# --- parts of a node that are read by themselves ----------------------------------------------------------------------
+
+
+@dataclass
+class Children:
+    children: list[int] = field(default_factory=list)
+
+
+@dataclass
+class Weights:
+    weights: list[float] = field(default_factory=list)
+
+
 # --- checking ---------------------------------------------------------------------------------------------------------
 
 # Fields that the specification requires, although pygltflib gives them the default None.
@@ -152,6 +170,14 @@ _REQUIRED = {
     "Orthographic": ("xmag", "ymag"),
     "Primitive": ("attributes",), "TextureInfo": ("index",), "NormalMaterialTexture": ("index",), "Asset": ("version",),
     "GLTF2": ("asset",),
+}
+# Fields that wrt never reads, so that no mistake in them refuses a file. `Document.item` reads the arrays of GLTF2, item by item.
+_UNREAD = {
+    "Accessor": ("min", "max"), "BufferView": ("target",), "Image": ("mimeType",), "Material": ("occlusionTexture",),
+    "Mesh": ("weights",), "Orthographic": ("xmag", "zfar", "znear"), "Perspective": ("aspectRatio", "zfar", "znear"),
+    "Sampler": ("input", "interpolation", "minFilter", "output"), "Skin": ("skeleton",),
+    "GLTF2": ("accessors", "animations", "asset", "bufferViews", "buffers", "cameras", "extensionsUsed", "images", "materials", "meshes",
+              "nodes", "samplers", "scenes", "skins", "textures"),
 }
 _SCALARS: dict[Any, tuple[str, tuple[type, ...]]] = {
     int: ("an integer", (int,)), float: ("a number", (int, float)), str: ("a string", (str,)),
@@ -198,7 +224,15 @@ def _object(cls: Any, raw: dict[str, Any], place: str) -> Any:
 @functools.cache
 def _fields(cls: Any) -> dict[str, Any]:
     hints = typing.get_type_hints(cls)
-    return {f.name: hints[f.name] for f in dataclasses.fields(cls) if f.name != "extras"}
+    return {f.name: hints[f.name] for f in dataclasses.fields(cls) if f.name not in ("extras", *_UNREAD.get(cls.__name__, ()))}
+
+
+@functools.cache
+def item_type(array: str) -> Any:
+    """Return the class of pygltflib for the items of an array of a glTF file."""
+    import pygltflib
+
+    return typing.get_args(typing.get_type_hints(pygltflib.GLTF2)[array])[0]
 
 
 @functools.cache

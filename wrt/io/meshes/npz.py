@@ -19,7 +19,7 @@ def read(path: Path) -> RawMesh:
     """Read the arrays of a mesh. uvs: (0, 0) is the top left of an image. Raises InputError for other arrays; nothing is unpickled."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            arrays = {name: np.asarray(file[name]) for name in (*SHAPES, "groups", "face_group") if name in file}
+            arrays = {name: np.asarray(file[name]) for name in (*SHAPES, "groups", "face_group", "origin") if name in file}
             exact = "exact" in file
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"is no NumPy archive of arrays of numbers ({error})") from error
@@ -42,5 +42,8 @@ def read(path: Path) -> RawMesh:
     if face_group is not None and not (face_group.shape == faces.shape[:1] and face_group.dtype.kind in "iu"
                                        and (face_group >= 0).all() and (face_group < len(groups)).all()):
         raise InputError(f"face_group must be ({len(faces)},) indices of {len(groups)} groups, got {shown(face_group)}")
+    origin = arrays.get("origin")
+    if origin is not None and not (origin.shape == (3,) and origin.dtype == np.float64 and np.isfinite(origin).all()):
+        raise InputError(f"origin must be (3,) finite float64, got {shown(origin)}")
     return RawMesh(vertices, faces.astype(np.int64), arrays.get("normals"), arrays.get("uvs"), tuple(groups.tolist()), face_group,
-                   positions=len(vertices), exact=exact)
+                   positions=len(vertices), exact=exact, origin=origin)

@@ -6,6 +6,7 @@ separate indices, it keeps one normal for each position.
 """
 
 import io
+import re
 from array import array
 from collections import defaultdict
 from itertools import count
@@ -15,13 +16,19 @@ from typing import NoReturn
 import numpy as np
 
 from wrt.core.checks import short
-from wrt.core.errors import InputError, warn
+from wrt.core.errors import InputError, at, warn
 from wrt.core.files import read_file, utf8
 from wrt.io.mesh_file import RawMesh
 from wrt.io.polygons import triangulate
+from wrt.io.text import as_number, without_comment
+from wrt.scene.values import near_zero
+from wrt.scene.vertex_normals import corner_normals
 
 # Keywords of the parts of a corner `v/vt/vn`, with the count of numbers that wrt reads from a line with that keyword.
 _WIDTHS = {"v": 3, "vt": 2, "vn": 3}
+# A comment after a name. "Material #25" of 3ds Max and "#FF0000" are names.
+_NAME_COMMENT = re.compile(r"(?:^#(?!\S)|\s#(?!\d)).*", re.DOTALL)
+_GROUPS = ("usemtl", "g", "o")
 _CORNER = "face corner {} is not v, v/vt, v//vn or v/vt/vn"
 
 
@@ -38,7 +45,7 @@ class _Text:
         # For each keyword: the index of each distinct name ("" is 0); and for each span of polygons the first polygon and the index of
         # its name. If several spans begin at one polygon, the last one counts.
         self.names: dict[str, dict[str, int]] = {
-            key: defaultdict(count(1).__next__, {"": 0}) for key in ("usemtl", "g", "o")}
+            key: defaultdict(count(1).__next__, {"": 0}) for key in (*_GROUPS, "s")}
         self.spans = {key: (array("q"), array("i")) for key in self.names}
         self.absent: dict[str, None] = {}  # vt or vn, if faces refer to it and the file has no such lines
 
@@ -48,6 +55,8 @@ class _Text:
     def read(self, data: bytes) -> None:
         pending, number = "", 0  # pending: the lines before that end in a backslash
         for number, line in enumerate(io.TextIOWrapper(io.BytesIO(data), "utf-8", "replace"), 1):
+            if "#" in line:
+                line = self._without_comment(pending, line)
             if line.endswith(("\\\n", "\\")):
                 pending += line.removesuffix("\n")[:-1] + " "
                 continue
@@ -55,8 +64,15 @@ class _Text:
             pending = ""
         self._line(pending, number)
 
+    def _without_comment(self, pending: str, line: str) -> str:
+        """Return a line without its comment, so that a backslash at the end of the comment continues nothing."""
+        key, *rest = (pending + line).split(None, 1)
+        if key not in self.names:
+            return without_comment(line)
+        return _NAME_COMMENT.sub(" ", line) if pending.strip() else f"{key} {_NAME_COMMENT.sub(' ', rest[0])}"
+
     def _line(self, line: str, number: int) -> None:
-        words = (line.partition("#")[0] if "#" in line else line).split()
+        words = line.split()
         if not words:
             return
         key = words[0]
@@ -65,7 +81,8 @@ class _Text:
         elif key == "f":
             self._corners(words[1:], number)
         elif key in self.names:
-            self._span(key, line.split(None, 1)[1].strip() if len(words) > 1 else "")
+            name = line.split(None, 1)[1].strip() if len(words) > 1 else ""
+            self._span(key, "" if key == "s" and name.lower() in ("off", "0") else name)
 
     def _numbers(self, key: str, words: list[str], line: int) -> None:
         width = _WIDTHS[key]
@@ -77,9 +94,9 @@ class _Text:
         self.lines[key].append(line)
         try:
             self.numbers[key].extend(map(float, values))
-        except ValueError:
-            bad = values[len(self.numbers[key]) % width]  # the numbers before it were appended
-            self.fail(line, f"{key} holds {short(bad)}, which is not a number")
+        except ValueError:  # the numbers before the first odd word were appended
+            with at(f"line {line}"):
+                self.numbers[key].extend(map(as_number, values[len(self.numbers[key]) % width:]))
 
     def _corners(self, corners: list[str], line: int) -> None:
         if "-" in "".join(corners):
@@ -144,22 +161,27 @@ class _Text:
 
     def groups(self) -> tuple[tuple[str, ...], np.ndarray | None]:
         """Return the groups by `usemtl`, else by `g`, else by `o`: their names, and the group's index of each polygon (None: no groups)."""
-        key = next((key for key, (starts, _) in self.spans.items() if starts), None)
+        key = next((key for key in _GROUPS if self.spans[key][0]), None)
         if key is None:
             return (), None
-        starts, name_index = self.spans[key]
-        names, of_span = list(self.names[key]), np.concatenate([[0], np.frombuffer(name_index, np.int32)])
-        polygon_group = of_span[np.searchsorted(starts, np.arange(len(self.counts)), side="right")]
-        used, polygon_group = np.unique(polygon_group, return_inverse=True)
+        names = list(self.names[key])
+        used, polygon_group = np.unique(self.of_polygon(key), return_inverse=True)
         return tuple(names[i] for i in used), polygon_group
+
+    def of_polygon(self, key: str) -> np.ndarray:
+        """Return the index of each polygon's name by `key` lines, (P,); 0 if there is none."""
+        starts, name_index = self.spans[key]
+        of_span = np.concatenate([np.zeros(1, np.int32), np.frombuffer(name_index, np.int32)])
+        return of_span[np.searchsorted(starts, np.arange(len(self.counts)), side="right")]
 
 
 def read(path: Path) -> RawMesh:
     """Read the faces of an OBJ file in the order of the file; nothing is merged.
 
-    Each distinct combination of position, texture coordinate and normal becomes a vertex. A corner without a normal gets a zero normal
-    (flat shading), a corner without a texture coordinate gets (0, 0). If faces refer to vt or vn lines and the file has none, these
-    indices are left out with a SceneWarning. Groups are the spans of `usemtl`, else of `g`, else of `o`; faces before the first span
+    Each distinct combination of position, texture coordinate and normal becomes a vertex. A corner without a normal in a smoothing group
+    (`s 1`) gets the average normal of the group's faces at its position, weighted by their angle; others get a zero normal (flat
+    shading). A corner without a texture coordinate gets (0, 0). If faces refer to vt or vn lines and the file has none, these indices are
+    left out with a SceneWarning. Groups are the spans of `usemtl`, else of `g`, else of `o`; faces before the first span
     are in the group "". Vertex colours, lines, points and curves are not read. Raises InputError with the line for words that are no
     numbers, indices out of range and positions that are not finite."""
     text = _Text()
@@ -171,14 +193,18 @@ def read(path: Path) -> RawMesh:
         warn(f"{path}: the indices of {' and '.join(text.absent)} in its faces are left out: the file has no such lines")
     counts = np.array(text.counts, dtype=np.int64)
 
-    with np.errstate(over="ignore"):
-        vertices = positions.astype(np.float32)[corner_triples[:, 0]]
+    vertices, origin = near_zero(positions[corner_triples[:, 0]])
     bad = np.nonzero(~np.isfinite(vertices).all(axis=1))[0]
     if len(bad):
         v = int(corner_triples[bad[0], 0])
         text.fail(text.lines["v"][v], f"position {positions[v].tolist()} is not finite ({len(bad)} in all)")
 
     triangles, polygon = triangulate(corners, counts, vertices)
+    vn = text.array("vn")
+    if len(text.names["s"]) > 1 and (corner_triples[:, 2] < 0).any():
+        smoothing = np.repeat(text.of_polygon("s"), counts)
+        source, corners, corner_triples, vn = _smoothed(smoothing, corners, corner_triples, triangles, vertices[corners[triangles]], vn)
+        vertices = vertices[source]
     groups, polygon_group = text.groups()
     uvs, flipped = _gather(text.array("vt"), corner_triples[:, 1]), corner_triples[:, 1] >= 0
     if uvs is not None:
@@ -186,13 +212,29 @@ def read(path: Path) -> RawMesh:
     return RawMesh(
         vertices=vertices,
         faces=corners[triangles],
-        normals=_gather(text.array("vn"), corner_triples[:, 2]),
+        normals=_gather(vn, corner_triples[:, 2]),
         uvs=uvs,
         groups=groups,
         face_group=polygon_group[polygon] if polygon_group is not None else None,
         incomplete=int(np.count_nonzero(counts < 3)),
         positions=len(positions),
+        origin=origin,
     )
+
+
+def _smoothed(group: np.ndarray, corners: np.ndarray, triples: np.ndarray, triangles: np.ndarray, points: np.ndarray,
+              vn: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Give corners of smoothing groups without a normal the normal of their position in their group.
+
+    group: (C,), 0 is none; triangles: (T, 3) indices of corners; points: their positions. Returns the old index of each new vertex, the
+    corners as indices of these vertices, the triples of these vertices, and the normals."""
+    places, place = np.unique(group.astype(np.int64) * (triples[:, 0].max(initial=0) + 1) + triples[corners, 0], return_inverse=True)
+    normal = triples[corners, 2]
+    normal = np.where((normal < 0) & (group > 0), len(vn) + place, normal)
+    vn = np.concatenate([vn, corner_normals(points, place[triangles], len(places))])
+    _, first, renumbered = np.unique(corners.astype(np.int64) * (len(vn) + 1) + normal, return_index=True, return_inverse=True)
+    triples = np.column_stack([triples[corners[first], :2], normal[first]])
+    return corners[first], renumbered, triples, vn
 
 
 def _gather(values: np.ndarray, index: np.ndarray) -> np.ndarray | None:

@@ -1,5 +1,6 @@
 """OFF files: text, with the keyword OFF, or with colours (C), normals (N) and texture coordinates (ST) of vertices, which are not read."""
 
+import io
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,27 +13,29 @@ from wrt.core.errors import InputError
 from wrt.core.files import read_file, utf8
 from wrt.io.mesh_file import RawMesh
 from wrt.io.polygons import triangulate
+from wrt.io.text import as_number, without_comment
 
 T = TypeVar("T", int, float)
-Lines: TypeAlias = Iterator[tuple[int, list[bytes]]]  # number of a line, and its words
-_KEYWORD = re.compile(rb"(ST)?C?N?OFF")
+Lines: TypeAlias = Iterator[tuple[int, list[str]]]  # number of a line, and its words
+_KEYWORD = re.compile(r"(?:(?:ST)?C?N?OFF|off)?(\d*)")  # it may be missing; in ModelNet's files the first count follows without a space
 
 
 def read(path: Path) -> RawMesh:
-    """Read the vertices and faces of an OFF file in the order of the file. Colours are not read.
+    """Read the vertices and faces of an OFF file in the order of the file. Colours, normals and texture coordinates are not read.
 
     Raises InputError with the line for a file that is truncated or no text, words that are no numbers, indices out of range and
     positions that are not finite."""
-    texts = enumerate(utf8(read_file(path)).splitlines(), 1)
-    lines = [(number, words) for number, line in texts if (words := line.partition(b"#")[0].split())]
-    if not lines or not _KEYWORD.fullmatch(lines[0][1][0]):
-        raise InputError("is no OFF file: its first word must be OFF", hint="binary OFF and 4OFF are not read")
-    number, words = lines[0]
-    rest = iter([*([(number, words[1:])] if words[1:] else []), *lines[1:]])
+    texts = enumerate(io.TextIOWrapper(io.BytesIO(utf8(read_file(path))), "utf-8", "replace"), 1)
+    lines = [(number, words) for number, line in texts if (words := without_comment(line).split())]
+    keyword = _KEYWORD.fullmatch(lines[0][1][0]) if lines else None
+    if keyword is None or "BINARY" in lines[0][1]:
+        raise InputError("is no OFF file: its first word must be OFF", hint="binary OFF, 4OFF and nOFF are not read")
+    number, words = lines[0][0], [*filter(None, keyword.groups()), *lines[0][1][1:]]
+    rest = iter([*([(number, words)] if words else []), *lines[1:]])
     n_vertices, n_faces = _numbers(rest, 2, "the numbers of vertices and faces", int)
     if not (0 <= n_vertices and 0 <= n_faces and n_vertices + n_faces <= len(lines)):
         raise InputError(f"ends too early: {short(n_vertices)} vertices and {short(n_faces)} faces in {len(lines)} lines")
-    vertices = np.array([_numbers(rest, 3, "a vertex", float) for _ in range(n_vertices)], np.float64).reshape(-1, 3)
+    vertices = np.array([_numbers(rest, 3, "a vertex", as_number) for _ in range(n_vertices)], np.float64).reshape(-1, 3)
     corners: list[int] = []
     counts: list[int] = []
     for _ in range(n_faces):
@@ -43,13 +46,13 @@ def read(path: Path) -> RawMesh:
     return RawMesh(vertices, np.array(corners, np.int64)[triangles], incomplete=sum(count < 3 for count in counts), positions=n_vertices)
 
 
-def _numbers(lines: Lines, count: int, what: str, kind: Callable[[bytes], T]) -> list[T]:
+def _numbers(lines: Lines, count: int, what: str, kind: Callable[[str], T]) -> list[T]:
     """Return the first `count` numbers of the next line."""
     number, words = _next(lines, what)
     try:
         values = [kind(word) for word in words[:count]]
     except ValueError:
-        raise InputError(f"{what} must be numbers", place=f"line {number}") from None
+        raise InputError(f"{what} must be numbers with a decimal point, got {short(' '.join(words))}", place=f"line {number}") from None
     if len(values) < count or not np.isfinite(np.asarray(values, np.float64).astype(np.float32)).all():
         raise InputError(f"{what} must be {count} finite numbers", place=f"line {number}")
     return values
@@ -69,7 +72,7 @@ def _face(lines: Lines, n_vertices: int) -> list[int]:
     return corners
 
 
-def _next(lines: Lines, what: str) -> tuple[int, list[bytes]]:
+def _next(lines: Lines, what: str) -> tuple[int, list[str]]:
     """Return the number and the words of the next line."""
     line = next(lines, None)
     if line is None:

@@ -14,11 +14,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wrt.core.checks import short
 from wrt.core.errors import InputError
 from wrt.core.files import read_file, utf8
 from wrt.io.mesh_file import RawMesh
 from wrt.io.polygons import strip, triangulate
+from wrt.io.text import as_number
+from wrt.scene.values import near_zero
 
 _TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
@@ -61,8 +62,7 @@ def read(path: Path) -> RawMesh:
     if "vertex" not in elements or not {"x", "y", "z"} <= elements["vertex"].values.keys():
         raise InputError(f"has no vertices with x, y and z (its elements: {', '.join(elements) or 'none'})")
     vertex = elements["vertex"].values
-    with np.errstate(over="ignore", invalid="ignore"):
-        vertices = np.stack([vertex[axis] for axis in "xyz"], axis=1).astype(np.float32)
+    vertices, shifted = near_zero(np.stack([vertex[axis] for axis in "xyz"], axis=1))
     corners, counts, texcoord = _faces(elements.get("face"), len(vertices))
     if "tristrips" in elements:
         strips = _strips(elements["tristrips"], len(vertices))
@@ -85,6 +85,7 @@ def read(path: Path) -> RawMesh:
         uvs=np.stack([uvs[:, 0], 1.0 - uvs[:, 1]], axis=1) if uvs is not None else None,
         incomplete=int(np.count_nonzero(counts < 3)),
         positions=len(vertices),
+        origin=shifted,
     )
 
 
@@ -262,11 +263,14 @@ class _Source:
         numbers, stream = array("d"), io.BytesIO(self.data)
         stream.seek(self.at)
         while text := b"".join(stream.readlines(BYTES_AT_ONCE)):
-            before = len(numbers)
+            before, words = len(numbers), text.split()
             try:
-                numbers.extend(map(float, text.split()))
-            except ValueError:
-                bad = next(islice(_WORD.finditer(text), len(numbers) - before, None))  # the numbers before it were appended
+                try:
+                    numbers.extend(map(float, words))
+                except ValueError:  # the numbers before the first odd word were appended
+                    numbers.extend(map(as_number, words[len(numbers) - before:]))
+            except InputError as error:
+                bad = next(islice(_WORD.finditer(text), len(numbers) - before, None))
                 line = self.data.count(b"\n", 0, stream.tell() - len(text) + bad.start()) + 1
-                raise InputError(f"{short(bad[0].decode('latin-1'))} is not a number", place=f"line {line}") from None
+                raise error.at(place=f"line {line}") from None
         return numbers.tobytes()

@@ -199,6 +199,7 @@ class _Builder:
         if path not in self._images:
             with at(path=path):
                 self._images[path] = decode_rgba8(read_file(path))
+            self._images[path].flags.writeable = False  # so that textures share it
         return self._images[path]
 
     def background(self, table: tables.SceneTable) -> Background:

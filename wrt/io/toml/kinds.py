@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import numpy as np
 from pydantic import Field, create_model
 
-from wrt.io.toml.values import Angle, Annotation, Point, Radiance, Share, Size, Table, TypedTable, Vector, unit
+from wrt.io.toml.values import Angle, Annotation, Point, Radiance, Share, Size, Table, TypedTable, Vector, unit, within
 from wrt.scene.kinds import Kind, Limits, forms
 from wrt.scene.values import SMALLEST
 
@@ -32,6 +32,8 @@ def described(kind: type, types: Mapping[str, Callable[[Limits], Annotation]] = 
         if bounds.get("ge") == SMALLEST:
             bounds = {**bounds, "ge": None, "gt": 0.0}
         value: Any = types[form](limits)
+        if form in ("number", "angle") and bounds:
+            value = Annotated[value, within(bounds)]
         if each.metadata["unit"]:
             value = Annotated[value, unit(each.metadata["unit"])]
         default = ... if each.default is MISSING else _written(form, each.default)

@@ -167,7 +167,8 @@ class MeshTable(Table):
     materials: dict[str, str] | None = Field(
         None, description="material of each group of the file (OBJ: usemtl, else g, else o; STL: solid)")
     parts: list[PartTable] | None = Field(None, description="materials by ranges of triangles; later ranges override earlier ones")
-    smooth: bool | None = Field(None, description="true: compute missing vertex normals; false: flat (default: as in the file)")
+    smooth: bool | None = Field(
+        None, description="true: compute missing vertex normals; false: flat (default: as in the file, by its normals or smoothing groups)")
     transform: TransformTable | None = Field(None, description="object to world")
     instances: Annotated[list[TransformTable], Field(min_length=1)] | None = Field(
         None, description="transforms, each of one copy of the mesh, applied before `transform`; the mesh is stored once")

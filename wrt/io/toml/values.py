@@ -7,6 +7,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationIn
 
 from wrt.core.types import JsonObject
 from wrt.scene.materials import WRAPS
+from wrt.scene.values import rounded
 
 Annotation: TypeAlias = Any  # a type, or metadata of a type, made at run time
 
@@ -26,6 +27,12 @@ def unit(name: str) -> Annotation:
     return Field(json_schema_extra={"unit": name})
 
 
+def within(bounds: dict[str, Any]) -> BeforeValidator:
+    """Return metadata that rounds a number to its limits ge and le: 90.0000025 degrees are pi / 2 in float32."""
+    return BeforeValidator(lambda value: rounded(
+        value, bounds.get("ge") or 0.0, bounds.get("le", value)) if isinstance(value, float) else value)
+
+
 LENGTH, DEGREES = unit("length"), unit("degrees")
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 Matrix = Annotated[list[float], Field(min_length=16, max_length=16)]
@@ -35,7 +42,8 @@ Length = Annotated[float, Field(gt=0.0), LENGTH]
 Angle = Annotated[float, DEGREES]
 Angles = Annotated[list[float], Field(min_length=3, max_length=3), DEGREES]
 Share = Annotated[  # a colour that reflects or transmits
-    list[Annotated[float, Field(ge=0.0, le=1.0)]], Field(min_length=3, max_length=3), BeforeValidator(_repeated(3)),
+    list[Annotated[float, within({"ge": 0.0, "le": 1.0}), Field(ge=0.0, le=1.0)]], Field(min_length=3, max_length=3),
+    BeforeValidator(_repeated(3)),
     _or_one({"type": "number", "minimum": 0, "maximum": 1}, 3)]
 Radiance = Annotated[  # a colour without an upper bound
     list[Annotated[float, Field(ge=0.0)]], Field(min_length=3, max_length=3), BeforeValidator(_repeated(3)),

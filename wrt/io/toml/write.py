@@ -169,7 +169,7 @@ class _Writer:
             saved = replace(mesh, groups=tuple(map(str, range(len(first)))), face_group=group)
         else:
             saved = mesh
-        arrays = [saved.vertices, saved.faces, saved.normals, saved.uvs, saved.face_group, np.array(saved.groups, np.str_)]
+        arrays = [saved.vertices, saved.faces, saved.normals, saved.uvs, saved.face_group, np.array(saved.groups, np.str_), saved.origin]
         return self.file("mesh", ".npz", mesh, arrays, saved.save)
 
 

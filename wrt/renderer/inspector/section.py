@@ -72,7 +72,7 @@ def outlines(scene: Scene, plane: Plane) -> list[Outline]:
     """Return the outlines of all shapes that the plane cuts."""
     found = []
     for i, thing in enumerate(scene.objects):
-        vertices = thing.mesh.vertices.astype(np.float64) @ thing.transform[:3, :3].T + thing.transform[:3, 3]
+        vertices = thing.mesh.vertices.astype(np.float64) @ thing.placement[:3, :3].T + thing.placement[:3, 3]
         segments = cut(vertices[thing.mesh.faces], plane)
         if len(segments):
             found.append(Outline(thing.name or f"object {i}", thing.materials[0], chains(segments)))

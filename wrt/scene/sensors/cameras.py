@@ -106,7 +106,8 @@ def project(points: ArrayLike, intrinsics: ArrayLike, distortion: ArrayLike = ()
     Returns
     -------
     (..., 2) float64
-        Column and row, also outside the picture; NaN for points that a pinhole camera does not see, with z <= 0.
+        Column and row, also outside the picture; NaN for points that a pinhole camera does not see, with z <= 0, and for those that a
+        fisheye camera shows at no pixel: the camera itself and points exactly behind it.
 
     Raises
     ------
@@ -118,7 +119,7 @@ def project(points: ArrayLike, intrinsics: ArrayLike, distortion: ArrayLike = ()
     with np.errstate(all="ignore"):
         if fisheye:
             across = np.hypot(x, y)
-            scale = np.where(across > 0.0, Fisheye(distortion).radius(np.arctan2(across, z)) / across, 0.0)
+            scale = np.where(across > 0.0, Fisheye(distortion).radius(np.arctan2(across, z)) / across, np.where(z > 0.0, 0.0, np.nan))
             x, y = x * scale, y * scale
         else:
             ahead = np.where(z > 0.0, z, np.nan)

@@ -18,7 +18,7 @@ TURN = 2.0 * np.pi
 
 @dataclass(frozen=True, eq=False)
 class LidarModel:
-    """Pattern of a rotating LiDAR by its maker's table.
+    """Pattern of a rotating LiDAR by its maker's table. It keeps the arrays that it is given.
 
     Parameters
     ----------

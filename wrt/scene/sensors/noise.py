@@ -38,7 +38,7 @@ def with_range_noise(ranges: ArrayLike, seed: int, constant: float = 0.0, propor
     Raises
     ------
     InputError
-        If a range is NaN or negative, or an argument is out of range.
+        If a range is NaN, negative or, with its noise, beyond float32, or an argument is out of range.
     """
     given, ranges = ranges, as_doubles(ranges, "ranges")
     if not (ranges >= 0.0).all():
@@ -51,4 +51,7 @@ def with_range_noise(ranges: ArrayLike, seed: int, constant: float = 0.0, propor
     hit = np.isfinite(ranges) & ~lost
     r = np.where(hit, ranges, 0.0)
     noisy = np.where(hit, np.maximum(r + np.hypot(constant, proportional * r) * normal, 0.0), np.inf)
-    return given_like(given, as_array(noisy, np.float32, "ranges").reshape(ranges.shape))
+    out = as_array(noisy, np.float32, "ranges").reshape(ranges.shape)
+    if (hit & np.isinf(out)).any():
+        raise InputError("must be within the range of float32, with their noise, or inf for a miss", argument="ranges")
+    return given_like(given, out)

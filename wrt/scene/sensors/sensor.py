@@ -16,6 +16,7 @@ from wrt.core.device import empty_aligned
 from wrt.core.errors import InputError
 from wrt.core.threads import run_all, thread_count
 from wrt.core.types import ArrayLike, ArrayT
+from wrt.scene.values import type_of
 
 MAX_ROTATION_ERROR = 1e-5  # largest entry of |R R^T - I| for the rotation matrix R of a pose
 RAYS_PER_JOB = 1 << 16
@@ -34,14 +35,15 @@ class FoundHits(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Sensor(Generic[ArrayT]):
-    """Rays of a sensor, one per pixel, and the shape of its images.
+    """Rays of a sensor, one per pixel, and the shape of its images. It keeps the arrays that it is given.
 
     Images are arrays of NumPy, or of the library of the hits (Warp, PyTorch, JAX), on their device.
 
     Parameters
     ----------
     origins, directions
-        (N, 3) float32 each, or Warp arrays (N,) of vec3, in world space: one image row after another, one image after another.
+        (N, 3) float32 each, or Warp arrays (N,) of vec3, in world space: one image row after another, one image after another. Origins
+        farther than 1,024 from 0 are float64 (vec3d), if float32 would round them.
     shape
         (rows, columns) of an image, or (B, rows, columns) for B poses; N is the product.
     axis
@@ -116,7 +118,8 @@ class Sensor(Generic[ArrayT]):
         ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
         places = np.full(ways.shape, np.nan)
         np.multiply(ranges, ways, out=places, where=np.isfinite(ranges))
-        return given_like(hits, (places + to_numpy(self.origins).reshape(ways.shape)).astype(np.float32))
+        origins = to_numpy(self.origins).reshape(ways.shape)
+        return given_like(hits, (places + origins).astype(origins.dtype))
 
     def _directions(self) -> np.ndarray:
         return to_numpy(self.directions).reshape(*self.shape, 3)
@@ -167,7 +170,7 @@ def make_sensor(local: np.ndarray, pose: ArrayLike | None, axis: int, rolling: i
                          argument="intrinsics") from None
     shape = (*batch, *size[:2])
     images = int(np.prod(batch))
-    origins, directions = (empty_aligned((images, *size), np.float32) for _ in range(2))
+    origins, directions = (empty_aligned((images, *size), kind) for kind in (type_of(poses[..., :3, 3]), np.float32))
     each = np.broadcast_to(poses, (*batch, *own, 4, 4)).reshape(images, *own, 4, 4)
     frame_rays = np.broadcast_to(local, (images, *size))
 
@@ -258,9 +261,10 @@ def _conditions(poses: np.ndarray) -> Iterator[tuple[np.ndarray, str]]:
 
 def _of_library(rays: np.ndarray, like: object) -> Any:
     """Return vectors (N, 3) as an array of the library and device of `like`, without a copy on the CPU."""
+    kind = wp.vec3d if rays.dtype == np.float64 else wp.vec3
     if isinstance(like, wp.array):
-        return to_warp(rays, wp.vec3).to(like.device)
+        return to_warp(rays, kind).to(like.device)
     give = to_tensor_like(like)
     if give is None:
         return rays
-    return give(rays if not is_tensor(like) or on_cpu(like) else to_warp(rays, wp.vec3).to(to_warp(like).device))
+    return give(rays if not is_tensor(like) or on_cpu(like) else to_warp(rays, kind).to(to_warp(like).device))

@@ -56,6 +56,9 @@ def test_cost_grows_as_the_motion_mixes_and_a_new_tree_is_built_past_the_thresho
     done = accel.refit(mixed)
     assert done.growth > 2.0 and not done.rebuilt and accel.stats.sah_cost == pytest.approx(done.growth * built_cost)
     assert accel.refit(BALL.vertices).growth == pytest.approx(1.0)  # relative to the last build
+    for limit in ("x", np.nan, -1.0, None):
+        with refused("rebuild_at", "must be"):
+            accel.refit(mixed, rebuild_at=limit)  # type: ignore[arg-type]
     done = accel.refit(mixed, rebuild_at=1.5)
     assert done.rebuilt and done.growth > 2.0 and accel.stats.sah_cost < done.growth * built_cost
     assert accel.refit(mixed, rebuild_at=1.5).rebuilt is False

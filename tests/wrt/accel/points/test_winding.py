@@ -45,7 +45,7 @@ def soup(n: int, size: float, seed: int) -> wrt.Mesh:
     """Make n loose triangles of that size in a cube."""
     rng = np.random.default_rng(seed)
     corners = rng.uniform(-1.0, 1.0, (n, 1, 3)) + size * rng.normal(size=(n, 3, 3))
-    return wrt.Mesh(corners.reshape(-1, 3), np.arange(3 * n).reshape(-1, 3))
+    return wrt.Mesh(np.float32(corners.reshape(-1, 3)), np.arange(3 * n).reshape(-1, 3))
 
 
 @pytest.mark.parametrize("mesh", [soup(n, size, n) for n in (0, 1, 2, 8, 9, 17, 2000) for size in (0.02, 1.0)]

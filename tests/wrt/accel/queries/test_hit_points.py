@@ -99,6 +99,7 @@ def worst(hits: Any, corners_of: Any, origin: np.ndarray, direction: np.ndarray)
     return found, most
 
 
+@pytest.mark.filterwarnings("ignore:.* float32 vertices lie up to")
 @pytest.mark.parametrize("kind", ["plain", "needles", "far", "tiny", "huge", "grazing"])
 def test_the_true_point_is_within_the_bound(kind: str) -> None:
     rng = np.random.default_rng(0)

@@ -206,7 +206,7 @@ def test_names_of_other_libraries_are_answered_with_ours(ball: Any) -> None:
         with pytest.raises(AttributeError) as error:
             getattr(ball, name)
         assert said in str(error.value)
-    for thing, name, ours in ((hits, "t_hit", "t"), (hits, "primitive_ids", "prim_id"), (hits, "geom_id", "object"),
+    for thing, name, ours in ((hits, "t_hit", "t"), (hits, "primitive_ids", "face"), (hits, "geom_id", "object"),
                               (hits, "faces", "prim_id"), (hits, "cpu", "numpy"), (ball, "num_triangles", "geometry"),
                               (ball, "raycast", "closest_hit"), (ball, "cast_rays", "closest_hit"),
                               (ball, "intersects_any", "any_hit"), (movable, "set_transform", "move")):

@@ -73,6 +73,7 @@ def test_whoever_is_seen_sees(name: str) -> None:
     assert known[::7].all() and 0.1 < known.mean() < 0.9
 
 
+@pytest.mark.filterwarnings("ignore:.* float32 vertices lie up to")
 def test_points_on_a_convex_surface_see_all_outside_that_is_in_front_of_them() -> None:
     """Each point is a hit point; the other end is in front of the triangle's plane, often near the plane. Nothing may block."""
     ball = shapes.icosphere(3)

@@ -91,3 +91,17 @@ def test_a_path_is_built_as_its_mesh_is(tmp_path: Path) -> None:
 def test_anything_else_is_refused_by_name(arguments: tuple[Any, ...], message: Refusal) -> None:
     with refused(*message):
         wrt.build(*arguments)
+
+
+@pytest.mark.parametrize(("package", "hint"), [
+    ("pyvista", "wrt.compat.pyvista.to_mesh"), ("open3d", "mesh.triangles"), ("newton", "reshape(-1, 3)"), ("mujoco", "compat.md")])
+def test_a_mesh_of_another_library_has_a_way_on(package: str, hint: str) -> None:
+    mesh = type("Mesh", (), {"__module__": f"{package}._src.inside"})()
+    with refused("mesh", f"got a{'n' if package == 'open3d' else ''} {package}.Mesh", hint=hint):
+        wrt.build(mesh)
+
+
+@pytest.mark.parametrize("name", ["robot.xml", "robot.urdf", "stage.usda"])
+def test_a_file_of_a_robot_leads_to_the_page(name: str) -> None:
+    with refused(None, "is no mesh file", path=name, hint="docs/compat.md"):
+        wrt.build(name)

@@ -170,5 +170,9 @@ def test_what_is_no_world() -> None:
                         ([Scene((flat,))], (None, "flattened", "world 0: object 'flat'")), ([BALL, 5], ("mesh", "Mesh, a Scene"))):
         with refused(*told):
             wrt.build(given)
+    ball = Scene(spheres=(Sphere((0, 0, 0), 1.0, Material()),))
+    for scene, where in ((ball, "the scene"), (Scene((flat,)), "object 'flat'")):  # the caller has named no world
+        with refused(None, place=where):
+            wrt.build(scene, movable=True)
     with refused("world", "structures over worlds"):
         wrt.build(BALL).closest_hit(np.zeros((1, 3)), np.ones((1, 3)), world=0)

@@ -38,7 +38,7 @@ def patched(data: bytes, offset: int, value: int) -> bytes:
     ("a.gltf", b"\xff\x00", (None, "is not a glTF file: not UTF-8")),
     ("a.gltf", b"[" * 100000, (None, "is not valid JSON: nested too deeply")),
     ("a.gltf", b"[]", (None, "is not an object")),
-    ("a.gltf", b'{"asset": {"version": "2.0"}, "scene": NaN}', (None, "holds NaN")),
+    ("a.gltf", b'{"asset": {"version": "2.0"}, "scene": NaN}', (None, "must be an integer, got nan", "scene")),
     ("a.gltf", b'{"asset": {"version": "2.0"}, "scene": ' + b"9" * 5000 + b"}", (None, "is not valid JSON")),
     ("a.gltf", b"{}", (None, "must be a string", "asset.version")),
     ("a.gltf", b'{"asset": {"version": "1.0"}}', (None, "is '1.0'; wrt reads 2.0", "asset.version")),

@@ -42,6 +42,14 @@ def test_a_compressed_mesh_is_the_mesh_within_its_quantization(tmp_path) -> None
     assert np.abs(mesh.normals - BALL.vertices).max() < 0.02
 
 
+def test_a_strip_holds_the_triangles_of_its_data(tmp_path) -> None:
+    """The accessor of the indices counts the corners of a strip; Draco itself holds triangles."""
+    file = compressed()
+    file.json["meshes"][0]["primitives"][0]["mode"] = 5
+    file.json["accessors"][1]["count"] = 400
+    assert np.array_equal(load_gltf(file.write(tmp_path), staged=False).objects[0].mesh.faces, BALL.faces)
+
+
 def test_plain_accessors_are_read_if_the_file_has_them(tmp_path) -> None:
     mesh = load_gltf(compressed(required=False).write(tmp_path), staged=False).objects[0].mesh
     assert np.array_equal(mesh.vertices, BALL.vertices)
@@ -55,7 +63,7 @@ def broken(change: Any) -> GltfFile:
 
 @pytest.mark.parametrize("change, what", [
     (lambda primitive, accessors: accessors[0].update(count=7), "decodes to (162, 3) numbers, but accessors[0] has (7, 3)"),
-    (lambda primitive, accessors: primitive.update(mode=5), "mode 4"),
+    (lambda primitive, accessors: primitive.update(mode=6), "mode 4 or 5"),
     (lambda primitive, accessors: primitive["extensions"]["KHR_draco_mesh_compression"]["attributes"].update(NORMAL=77),
      "an attribute of the primitive and of the compressed mesh"),
     (lambda primitive, accessors: primitive["extensions"]["KHR_draco_mesh_compression"].update(bufferView=77), "there are"),

@@ -28,6 +28,7 @@ from wrt.scene.model import Scene
 from wrt.scene.settings import Settings
 from wrt.scene.values import BLACK
 
+GLOSSY = "KHR_materials_pbrSpecularGlossiness"
 PIXELS = np.arange(4 * 6 * 4, dtype=np.uint8).reshape(4, 6, 4) * 2
 
 
@@ -151,21 +152,50 @@ def test_each_slot_has_its_encoding(tmp_path):
 @pytest.mark.parametrize("source, message", [
     ({"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1]}},
      (None, "hold 4 numbers", "materials[0].pbrMetallicRoughness.baseColorFactor")),
-    ({"pbrMetallicRoughness": {"baseColorFactor": [2, 1, 1, 1]}}, ("albedo", "lie", "materials[0]: material 'material 0'")),
     ({"pbrMetallicRoughness": {"metallicFactor": "shiny"}}, (None, "number", "materials[0].pbrMetallicRoughness.metallicFactor")),
-    ({"pbrMetallicRoughness": {"roughnessFactor": -1}}, ("roughness", "finite", "materials[0]: material 'material 0'")),
     ({"pbrMetallicRoughness": {"baseColorTexture": {}}}, (None, "required", "materials[0].pbrMetallicRoughness.baseColorTexture.index")),
-    (base(), (None, "0, but there", "materials[0].pbrMetallicRoughness.baseColorTexture.index")),
     ({"alphaMode": "GLASS"}, (None, "OPAQUE, MASK, BLEND", "materials[0].alphaMode")),
-    ({"emissiveFactor": [-1, 0, 0]}, ("emission", "lie", "materials[0]: material 'material 0'")),
-    ({"extensions": {"KHR_materials_ior": {"ior": 0.5}}}, ("ior", "finite", "materials[0]: material 'material 0'")),
+    ({"pbrMetallicRoughness": {"roughnessFactor": math.nan}}, (None, "finite", "materials[0].pbrMetallicRoughness.roughnessFactor")),
     ({"extensions": {"KHR_materials_ior": 3}}, (None, "object", "materials[0].extensions.KHR_materials_ior")),
-    ({"extensions": {"KHR_materials_transmission": {"transmissionFactor": 1}, "KHR_materials_volume": {
-        "thicknessFactor": 1, "attenuationDistance": 0}}}, ("attenuationDistance", "", "materials[0].extensions.KHR_materials_volume")),
 ])
 def test_wrong_materials_are_refused(tmp_path, source, message):
     with refused(*message):
         material_of(source, tmp_path)
+    assert load_gltf(one_material(source).write(tmp_path), shapes_only=True).objects  # rays need no material
+
+
+GLASS = {"KHR_materials_transmission": {"transmissionFactor": 1}}
+
+
+@pytest.mark.parametrize("source, field, value, named", [
+    ({"pbrMetallicRoughness": {"baseColorFactor": [1.00016, 0.5, 0.5, 1]}}, "albedo", (1, 0.5, 0.5), "albedo"),
+    ({"pbrMetallicRoughness": {"baseColorFactor": [1, -0.1, 1.1, 1]}, "extensions": {"KHR_materials_unlit": {}}}, "emission", (1, 0, 1),
+     "albedo"),
+    ({"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1.0000001192]}, "alphaMode": "BLEND"}, "alpha", 1, "alpha"),
+    ({"pbrMetallicRoughness": {"roughnessFactor": -1}}, "roughness", 0, "roughness"),
+    ({"pbrMetallicRoughness": {"metallicFactor": 1.0000001}}, "metallic", 1, "metallic"),
+    ({"emissiveFactor": [-1, 0, 2]}, "emission", (0, 0, 2), "emission"),
+    ({"emissiveFactor": [1, 1, 0], "extensions": {"KHR_materials_emissive_strength": {"emissiveStrength": 1e300}}}, "emission",
+     (1e30, 1e30, 0), "emission"),
+    ({"extensions": {"KHR_materials_ior": {"ior": 0.9999}}}, "ior", 1, "ior"),
+    ({"extensions": {"KHR_materials_transmission": {"transmissionFactor": 1.1}}}, "transmission", 1, "transmission"),
+    ({"extensions": {"KHR_materials_clearcoat": {"clearcoatFactor": 2, "clearcoatRoughnessFactor": 0.5}}}, "clearcoat", 1, "clearcoat"),
+    ({"extensions": {"KHR_materials_clearcoat": {"clearcoatFactor": 1, "clearcoatRoughnessFactor": 1.5}}}, "clearcoat_roughness", 1,
+     "clearcoat_roughness"),
+    ({"extensions": {"KHR_materials_specular": {"specularFactor": 1.0001}}}, "specular_factor", 1, "specular_factor"),
+    ({"extensions": {"KHR_materials_specular": {"specularColorFactor": [-0.1, 1, 2]}}}, "specular_color", (0, 1, 2), "specular_color"),
+    ({"extensions": {GLOSSY: {"specularFactor": [1, 2, 1]}}}, "specular_color", (25, 25, 25), "specularFactor"),
+    ({"extensions": {GLOSSY: {"glossinessFactor": 1.01}}}, "roughness", 0, "glossinessFactor"),
+    ({"extensions": {GLOSSY: {"diffuseFactor": [1.01, 1, 1, 1]}}}, "albedo", (1, 1, 1), "albedo"),
+    ({"extensions": GLASS | {"KHR_materials_volume": {"thicknessFactor": 1, "attenuationDistance": 0}}}, "absorption", (0, 0, 0),
+     "attenuationDistance"),
+    ({"extensions": GLASS | {"KHR_materials_volume": {"thicknessFactor": 1, "attenuationDistance": 2, "attenuationColor": [1.1, 1, 1]}}},
+     "absorption", (0, 0, 0), "attenuationColor"),
+])
+def test_factors_outside_of_their_limits_are_clamped_and_named(tmp_path, source, field, value, named):
+    scene, messages = load_warned(one_material(source).write(tmp_path), staged=False)
+    assert getattr(scene.materials[0], field) == value
+    assert len(messages) == 1 and f": {named}" in messages[0] and "(material 'material 0')" in messages[0]
 
 
 @pytest.mark.parametrize("extension, value, named", [
@@ -212,7 +242,6 @@ def test_textures_of_clear_coat_and_specular(tmp_path):
 
 
 @pytest.mark.parametrize("source, message", [
-    ({"KHR_materials_clearcoat": {"clearcoatFactor": 2}}, ("clearcoat", "finite", "materials[0]: material 'material 0'")),
     ({"KHR_materials_clearcoat": {"clearcoatFactor": "thick"}},
      (None, "number", "materials[0].extensions.KHR_materials_clearcoat.clearcoatFactor")),
     ({"KHR_materials_specular": {"specularColorFactor": [1, 1]}},
@@ -223,7 +252,6 @@ def test_wrong_coats_are_refused(tmp_path, source, message):
         material_of({"extensions": source}, tmp_path)
 
 
-GLOSSY = "KHR_materials_pbrSpecularGlossiness"
 
 
 def glossy(**fields: Any) -> dict[str, Any]:
@@ -271,10 +299,7 @@ def test_an_index_of_0_means_the_specular_colour_itself(tmp_path):
 
 @pytest.mark.parametrize("fields, message", [
     ({"diffuseFactor": [1, 1, 1]}, (None, "hold 4 numbers", f"materials[0].extensions.{GLOSSY}.diffuseFactor")),
-    ({"specularFactor": [1, 2, 1]}, ("specularFactor", "lie in [0, 1]", f"materials[0].extensions.{GLOSSY}")),
-    ({"glossinessFactor": 2}, ("glossinessFactor", "1", f"materials[0].extensions.{GLOSSY}")),
-    ({"specularGlossinessTexture": {"index": 9}},
-     (None, "is 9, but there are", f"materials[0].extensions.{GLOSSY}.specularGlossinessTexture.index")),
+    ({"specularFactor": [1, 1]}, (None, "hold 3 numbers", f"materials[0].extensions.{GLOSSY}.specularFactor")),
 ])
 def test_wrong_specular_glossiness_is_refused(tmp_path, fields, message):
     with refused(*message):
@@ -292,9 +317,12 @@ def test_wrap_modes(tmp_path, code, wrap):
     assert texture.wrap == ("repeat", wrap)
 
 
-def test_unknown_wrap_mode(tmp_path):
-    with refused(what="must be one", place="samplers[0].wrapS"):
-        load(textured(base(), wrapS=1), tmp_path)
+def test_a_wrong_sampler_is_named_and_the_texture_repeats(tmp_path):
+    file = textured(base(), wrapS=1)
+    for error in ("samplers[0].wrapS: must be one of", "textures[0].sampler: is 3, but there are"):
+        scene, messages = load_warned(file.write(tmp_path), staged=False)
+        assert scene.materials[0].albedo_texture.wrap == ("repeat", "repeat") and f"a sampler, because {error}" in messages[0]
+        file.json["textures"][0]["sampler"] = 3
 
 
 def uv_transform(folder: Any, **transform: Any) -> np.ndarray:
@@ -351,15 +379,18 @@ def test_webp_by_its_extension(tmp_path):
     assert np.abs(image.astype(int) - pixels).max() <= 8  # a lossy format
 
 
-@pytest.mark.parametrize("texture, message", [
-    ({"source": 4}, (None, "4, but there", "textures[0].source")),
-    ({"source": 0, "sampler": 1}, (None, "1, but there", "textures[0].sampler")),
+@pytest.mark.parametrize("texture, error", [
+    (None, "materials[0].pbrMetallicRoughness.baseColorTexture.index: is 0, but there are 0 textures"),
+    ({"source": 4}, "textures[0].source: is 4, but there are 0 images"),
+    ({"source": "4"}, "textures[0].source: must be an integer"),
 ])
-def test_textures_whose_parts_are_not_there(tmp_path, texture, message):
-    file = one_material(base())
-    file.add("textures", texture)
-    with refused(*message):
-        load(file, tmp_path)
+def test_textures_whose_parts_are_not_there_are_named_and_left_out(tmp_path, texture, error):
+    file = one_material({**base(), "emissiveFactor": [1, 1, 1], "emissiveTexture": {"index": 0}})
+    if texture:
+        file.add("textures", texture)
+    scene, messages = load_warned(file.write(tmp_path), staged=False)
+    assert scene.materials[0].albedo_texture is None and not scene.materials[0].is_emissive
+    assert error in messages[0] and "(material 'material 0')" in messages[0]
 
 
 @pytest.mark.parametrize("texture, message", [
@@ -437,16 +468,24 @@ def test_an_unsound_image_is_named(tmp_path):
     file = one_material(base())
     file.add("textures", {"source": file.add("images", {"uri": "picture.png"})})
     path = file.write(tmp_path)
-    with refused(what="cannot read 'picture", place="images[0].uri"):
-        load_gltf(path)
+
+    def assert_named(error):
+        scene, messages = load_warned(path, staged=False)
+        assert scene.materials[0].albedo_texture is None and f"a texture, because {error}" in messages[0]
+        load_gltf(path, shapes_only=True)  # without a warning
+        wrt.build(path)
+
+    assert_named("images[0].uri: cannot read 'picture")
     (tmp_path / "picture.png").write_bytes(encode(PIXELS)[:40])
-    with refused(what="image", place="images[0].uri (picture.png)"):
-        load_gltf(path)
+    assert_named("images[0].uri (picture.png)")
     (tmp_path / "picture.png").write_bytes(encode(PIXELS))
     assert load_gltf(path, staged=False).materials[0].albedo_texture.name == "picture.png"
     file.json["images"] = [{"mimeType": "image/png"}]
-    with refused(what="neither a uri", place="images[0]"):
-        load_gltf(file.write(tmp_path))
+    path = file.write(tmp_path)
+    assert_named("images[0]: has neither a uri")
+    file.json["images"] = [{"uri": "../secret.png"}]
+    path = file.write(tmp_path)
+    assert_named("images[0].uri: '../secret.png' leaves the folder")
 
 
 def test_materials_and_textures_that_nothing_shows_are_not_read(tmp_path):
@@ -477,3 +516,29 @@ def test_tangents_are_named_where_a_normal_map_would_use_them(tmp_path, mapped):
     file.json["meshes"][0]["primitives"].append(dict(primitive))
     _, told = load_warned(file.write(tmp_path))
     assert sum(text.count("TANGENT") for text in told) == int(mapped)
+
+
+# --- unlit surfaces ---------------------------------------------------------------------------------------------------
+
+
+CARD = {"pbrMetallicRoughness": {"baseColorFactor": [0.2, 0.4, 0.6, 1]}, "extensions": {"KHR_materials_unlit": {}}}
+
+
+@pytest.mark.parametrize("light", [{"type": "directional", "intensity": 0.01}, {"type": "point", "intensity": 9e6}])
+@pytest.mark.parametrize("lit", [False, True])
+def test_unlit_surfaces_keep_their_colours_beside_lights(tmp_path, light, lit):
+    """Lit surfaces beside them are neither black nor white, though lights have any unit."""
+    file = one_material(CARD)
+    file.json["extensions"] = {"KHR_lights_punctual": {"lights": [light]}}
+    file.node(extensions={"KHR_lights_punctual": {"light": 0}}, translation=[0.5, 0.5, 3])
+    if lit:
+        matte = file.add("materials", {"pbrMetallicRoughness": {"metallicFactor": 0}})
+        quad = file.json["meshes"][0]["primitives"][0] | {"material": matte}
+        file.node(mesh=file.mesh(quad), translation=[2, 0, 0])
+    scene, messages = load_warned(file.write(tmp_path))
+    assert not scene.settings.auto_exposure and ("its lights were multiplied by" in messages[0]) == lit
+    film = wrt.render(scene, spp=4, size=(64, 32))
+    card = np.abs(film.pixels - np.float32([0.2, 0.4, 0.6])).max(axis=2) < 1e-5
+    assert card.sum() > 100 and film.exposure == 0.0
+    rest = film.pixels[~card & (film.pixels.min(axis=2) > 0)]
+    assert not lit or 0.1 < np.median(rest) < 1.01

@@ -125,7 +125,7 @@ def test_a_node_that_the_scene_reaches_twice(tmp_path):
     ({"scale": [1, 1]}, (None, "hold 3 numbers", "nodes[0].scale")),
     ({"scale": [1, "1", 1]}, (None, "number", "nodes[0].scale[1]")),
     ({"rotation": [0, 0, 0, 0]}, (None, "unit quaternion", "nodes[0].rotation")),
-    ({"translation": [1e400, 0, 0]}, (None, "Infinity")),
+    ({"translation": [1e400, 0, 0]}, (None, "finite number", "nodes[0].translation[0]")),
     ({"mesh": 3}, (None, "3, but there", "nodes[0].mesh")),
     ({"mesh": True}, (None, "integer", "nodes[0].mesh")),
     ({"camera": 0}, (None, "0, but there", "nodes[0].camera")),
@@ -334,10 +334,6 @@ def test_wrong_instances(tmp_path, attributes, message):
     (lambda f, p: p.update(attributes="POSITION"), (None, "object", "meshes[0].primitives[0].attributes")),
     (lambda f, p: p["attributes"].update(POSITION="0"), (None, "integer", "meshes[0].primitives[0].attributes.POSITION")),
     (lambda f, p: p["attributes"].update(POSITION=4), (None, "4, but", "meshes[0].primitives[0].attributes.POSITION")),
-    (lambda f, p: p["attributes"].update(NORMAL=f.accessor(SQUARE)),
-     (None, "4 elements, but POSITION", "meshes[0].primitives[0].attributes.NORMAL")),
-    (lambda f, p: p["attributes"].update(TEXCOORD_0=f.accessor(TRIANGLE)),
-     (None, "type VEC2", "meshes[0].primitives[0].attributes.TEXCOORD_0")),
     (lambda f, p: p["attributes"].update(POSITION=f.accessor([[0, 0, 0], [np.nan, 0, 0], [0, 1, 0]])),
      (None, "element 1", "meshes[0].primitives[0].attributes.POSITION: accessors[1]")),
     (lambda f, p: f.json["accessors"][0].update(count=4),
@@ -424,15 +420,102 @@ def test_light_defaults_and_range(tmp_path):
     ({"type": "area"}, (None, "point, directional, spot", "extensions.KHR_lights_punctual.lights[0].type")),
     ({}, (None, "required", "extensions.KHR_lights_punctual.lights[0].type")),
     ({"type": "point", "color": [1, 1]}, (None, "hold 3 numbers", "extensions.KHR_lights_punctual.lights[0].color")),
-    ({"type": "point", "intensity": -1}, ("intensity", "lie", "extensions.KHR_lights_punctual.lights[0]: light 'light 0'")),
-    ({"type": "spot", "spot": {"outerConeAngle": 2}}, ("outer", "", "extensions.KHR_lights_punctual.lights[0]: light 'light 0'")),
-    ({"type": "spot", "spot": {"innerConeAngle": 1, "outerConeAngle": 0.5}},
-     ("inner", "at most outer", "extensions.KHR_lights_punctual.lights[0]: light 'light 0'")),
     (3, (None, "object", "extensions.KHR_lights_punctual.lights[0]")),
 ])
 def test_wrong_lights(tmp_path, light, message):
     with refused(*message):
         load(with_light(light), tmp_path)
+    assert load_gltf(with_light(light).write(tmp_path), shapes_only=True).objects  # rays need no light
+    unused = with_light(light)
+    unused.json["nodes"].pop()
+    load(unused, tmp_path)
+
+
+@pytest.mark.parametrize("light, fields, named", [
+    ({"type": "spot", "spot": {"outerConeAngle": 1.5707963705062866}}, {"outer": math.pi / 2}, None),  # pi / 2 in float32
+    ({"type": "spot", "spot": {"innerConeAngle": 0.50000001, "outerConeAngle": 0.5}}, {"inner": 0.5}, None),
+    ({"type": "spot", "spot": {"innerConeAngle": 1, "outerConeAngle": 0.5}}, {"inner": 0.5, "outer": 0.5}, "innerConeAngle"),
+    ({"type": "spot", "spot": {"outerConeAngle": 3.14}}, {"outer": math.pi / 2}, "outerConeAngle"),
+    ({"type": "spot", "spot": {"innerConeAngle": -0.1, "outerConeAngle": 0}}, {"inner": 0, "outer": 1e-4}, "outerConeAngle"),
+    ({"type": "point", "intensity": -1}, {"intensity": (0, 0, 0)}, "color"),
+])
+def test_values_of_lights_are_clamped_and_named(tmp_path, light, fields, named):
+    scene, messages = load_warned(with_light(light).write(tmp_path), staged=False)
+    assert {key: getattr(scene.lights[0], key) for key in fields} == fields
+    assert len(messages) == bool(named) and (not named or f"{named} outside of" in messages[0])
+
+
+@pytest.mark.parametrize("scale, light, camera", [
+    ([0, 0, 0], {"type": "point"}, False), ([0, 0, 0], {"type": "spot"}, False), ([1, 1, 0], {"type": "directional"}, False),
+    ([1, 1, 0], {"type": "point"}, True), ([0, 0, 1], {"type": "spot"}, True), ([0, 1, 1], {"type": "directional"}, True)])
+def test_lights_and_cameras_below_a_scale_of_0_are_left_out(tmp_path, scale, light, camera):
+    """A light stays where its own direction and position are known: a scale changes nothing else of it."""
+    file = with_light(light, camera=0)
+    file.add("cameras", {"type": "perspective", "perspective": {"yfov": 1, "znear": 1}})
+    file.node(children=[1], scale=scale)
+    scene, messages = load_warned(file.write(tmp_path), staged=False)
+    kept = camera
+    assert len(scene.lights) == kept and ("lights scaled to no volume" in str(messages)) != kept
+    assert len(scene.cameras) == (scale == [0, 1, 1]) and ("cameras scaled" in str(messages)) == (scale != [0, 1, 1])
+
+
+def test_what_a_mesh_does_not_need_cannot_refuse_it(tmp_path):
+    rows = np.full((3, 3), np.nan, np.float32)
+    for attribute, values, problem in (("NORMAL", rows, "not finite, now 0"), ("TEXCOORD_0", rows[:, :2], "not finite, now 0"),
+                                       ("NORMAL", SQUARE, "has 4 elements"), ("TEXCOORD_0", TRIANGLE, "must be of type VEC2"),
+                                       ("TANGENT", rows, "TANGENT"), ("COLOR_0", rows, "COLOR_0")):
+        file = one_triangle()
+        file.json["meshes"][0]["primitives"][0]["attributes"][attribute] = file.accessor(values)
+        scene, messages = load_warned(file.write(tmp_path), staged=False)
+        assert len(scene.objects) == 1 and (attribute == "TANGENT" or problem in messages[0])
+    for found in (scene.objects[0].mesh.normals, scene.objects[0].mesh.uvs):
+        assert found is None
+
+
+def test_normals_that_are_no_numbers_are_zero(tmp_path):
+    file = one_triangle()
+    file.json["meshes"][0]["primitives"][0]["attributes"]["NORMAL"] = file.accessor([[np.nan, 0, 1], [0, 0, 2], [0, np.inf, 0]])
+    scene, _ = load_warned(file.write(tmp_path), staged=False)
+    assert scene.objects[0].mesh.normals.tolist() == [[0, 0, 0], [0, 0, 1], [0, 0, 0]]
+
+
+def test_a_position_that_no_triangle_uses_may_be_anything(tmp_path):
+    file = one_triangle(vertices=[*TRIANGLE, [np.nan, np.inf, 0]], indices=[0, 1, 2])
+    assert load(file, tmp_path).objects[0].mesh.vertices.tolist() == TRIANGLE.tolist()
+
+
+def test_numbers_that_nothing_uses_may_be_nan(tmp_path):
+    file = one_triangle()
+    file.json["accessors"][0] |= {"min": [math.nan, 0, 0], "max": [math.inf, 0, 0]}
+    file.json["nodes"][0]["extras"] = {"weight": math.nan}
+    file.add("materials", {"pbrMetallicRoughness": {"metallicFactor": math.nan}})
+    file.add("animations", {"channels": [math.nan], "samplers": 3})
+    file.node(translation=[math.nan, 0, 0])
+    file.json |= {"scenes": [{"nodes": [0]}], "cameras": [{"type": "perspective", "perspective": {"yfov": math.inf}}]}
+    scene, messages = load_warned(file.write(tmp_path), staged=False)
+    assert len(scene.objects) == 1 and messages[0].endswith("left out: motion (animation 'animation 0')")
+
+
+def test_shapes_need_no_cameras_and_no_extensions_of_materials(tmp_path):
+    file = one_triangle()
+    file.node(camera=file.add("cameras", {"type": "perspective", "perspective": {"yfov": -7}}))
+    file.json["extensionsRequired"] = ["KHR_texture_basisu", "KHR_materials_sheen"]
+    assert len(load_gltf(file.write(tmp_path), shapes_only=True).objects) == 1
+    with refused(what="KHR_texture_basisu"):
+        load(file, tmp_path)
+
+
+@pytest.mark.parametrize("required", [True, False])
+def test_hidden_nodes_hide_all_below_them(tmp_path, required):
+    file = with_light({"type": "point"}, camera=0)
+    file.add("cameras", {"type": "perspective", "perspective": {"yfov": 1, "znear": 1}})
+    hide = {"KHR_node_visibility": {"visible": False}}
+    file.node(children=[1, file.node(mesh=0, name="below", extensions={"KHR_node_visibility": {"visible": True}})], extensions=hide)
+    file.node(mesh=0, name="shown", extensions={"KHR_node_visibility": {}})
+    if required:
+        file.json["extensionsRequired"] = ["KHR_node_visibility"]
+    scene = load(file, tmp_path)
+    assert [thing.name for thing in scene.objects] == ["place", "shown"] and not scene.lights and not scene.cameras
 
 
 def test_a_light_that_is_not_there(tmp_path):

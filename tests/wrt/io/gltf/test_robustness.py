@@ -30,7 +30,7 @@ from wrt.io.gltf.reader import load_gltf
 def test_one_warning_names_everything_once(tmp_path):
     file = one_triangle(extensions={"KHR_materials_variants": {"mappings": []}})
     primitive = file.json["meshes"][0]["primitives"][0]
-    primitive["attributes"] |= {"COLOR_0": file.accessor(TRIANGLE), "_TEMPERATURE": 0, "JOINTS_0": 0, "WEIGHTS_0": 0}
+    primitive["attributes"] |= {"COLOR_0": file.accessor(TRIANGLE), "_TEMPERATURE": 0}
     primitive["targets"] = [{"POSITION": 0}]
     file.json["nodes"][0] |= {"skin": 0, "extensions": {"ACME_wind": {}, "MSFT_lod": {"ids": []}}}
     file.node(mesh=0, name="again")
@@ -39,8 +39,8 @@ def test_one_warning_names_everything_once(tmp_path):
                   "extensions": {"KHR_materials_variants": {"variants": []}, "ACME_fog": {}, "KHR_xmp": {}}}
     scene, messages = load_warned(file.write(tmp_path), staged=False)
     assert len(scene.objects) == 2 and len(messages) == 1
-    things = ["ACME_wind (node 'place')", "skins (node 'place')", "KHR_materials_variants (mesh 'thing')",
-              "COLOR_0 (mesh 'thing')", "morph targets (mesh 'thing')", "motion (animation 'walk')",
+    things = ["ACME_wind (node 'place')", "KHR_materials_variants (mesh 'thing')",
+              "skins without JOINTS_0 and WEIGHTS_0 (mesh 'thing')", "COLOR_0 (mesh 'thing')", "motion (animation 'walk')",
               "ACME_fog (file 'file.glb')"]
     assert messages[0].endswith("not supported and left out: " + ", ".join(things))
 
@@ -228,6 +228,6 @@ def named_in(tree: ast.AST) -> Iterator[str]:
 def test_the_page_on_materials_names_all_that_is_left_out_and_all_extensions_that_are_read():
     page = (ROOT / "docs" / "materials.md").read_text().replace("`", "")
     named = {text for path in Path(gltf.__path__[0]).glob("*.py") for text in named_in(ast.parse(path.read_text()))}
-    assert {"morph targets", "nearest-neighbour sampling", "textures without an image"} <= named
+    assert {"motion", "nearest-neighbour sampling", "textures without an image"} <= named
     assert [text for text in sorted(named | set(_NOT_TRIANGLES.values())) if text not in page] == []
     assert [name for name in sorted(SUPPORTED_EXTENSIONS | DEFAULT_LOOK) if name not in page] == []

@@ -42,20 +42,53 @@ def test_off(tmp_path: Path) -> None:
             wrt.load_mesh(tmp_path / "b.off")
 
 
-@pytest.mark.parametrize("suffix", [".npz", ".ply", ".stl", ".off", ".obj"])
-def test_saved_meshes_are_read_again(suffix: str, tmp_path: Path) -> None:
-    ball = icosphere(2)
-    mesh = Mesh(ball.vertices, ball.faces, ball.vertices, ball.vertices[:, :2] * 0.5 + 0.5)
+@pytest.mark.parametrize(("old", "new"), [
+    ("COFF 5 5 0", "COFF5 5 0"), ("COFF 5 5 0", "OFF5 5 0"), ("COFF 5 5 0", "STCNOFF5 5"), ("COFF 5 5 0", "off\n# counts\n5 5 0 # of all"),
+    ("COFF 5 5 0", "5 5 0"), ("COFF", "COFF# 3 1 0\n"), ("0.5 0.5 1 ", "5.0D-01 5d-1 1D0 1.#IND "), ("\n", "\r\n"),
+])
+def test_variants_of_off(old: str, new: str, tmp_path: Path) -> None:
+    for name, text in (("a.off", PYRAMID), ("b.off", PYRAMID.replace(old, new))):
+        (tmp_path / name).write_bytes(text.encode())
+    plain, other = (wrt.load_mesh(tmp_path / name) for name in ("a.off", "b.off"))
+    assert plain.vertices.tolist() == other.vertices.tolist() and plain.faces.tolist() == other.faces.tolist()
+
+
+@pytest.mark.parametrize("first", ["nOFF 3\n5 5 0", "4OFF 5 5 0", "OFF BINARY", "OFFX 5 5 0", "OFF-5 5 0", "x"])
+def test_other_keywords_are_refused(first: str, tmp_path: Path) -> None:
+    (tmp_path / "a.off").write_text(PYRAMID.replace("COFF 5 5 0", first))
+    with refused(None, "no OFF file", path="a.off"):
+        wrt.load_mesh(tmp_path / "a.off")
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".ply", ".stl", ".off", ".obj", ".OBJ"])
+@pytest.mark.parametrize("shading", [(), ("normals",), ("uvs",), ("normals", "uvs")])
+def test_saved_meshes_are_read_again(suffix: str, shading: tuple[str, ...], tmp_path: Path) -> None:
     if suffix != ".npz":
         pytest.importorskip("trimesh")
+    ball = icosphere(2)
+    corners = {"normals": ball.vertices, "uvs": ball.vertices[:, :2] * 0.5 + 0.5}
+    for scale in (1.0, 1e-6, 5e-9, 1e-30, 1e30):
+        mesh = Mesh(ball.vertices * np.float32(scale), ball.faces, **{name: corners[name] for name in shading})
+        mesh.save(tmp_path / f"a{suffix}")
+        again = wrt.load_mesh(tmp_path / f"a{suffix}")
+        assert (again.vertices + 0.0)[again.faces].tobytes() == (mesh.vertices + 0.0)[mesh.faces].tobytes()
+        if suffix in (".stl", ".off"):
+            continue
+        for name in corners:
+            assert (getattr(again, name) is not None) == (name in shading)
+            if name in shading:
+                np.testing.assert_allclose(getattr(again, name)[again.faces], corners[name][mesh.faces], atol=2e-7)
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".off"])
+def test_other_readers_find_the_saved_bits(suffix: str, tmp_path: Path) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    rng = np.random.default_rng(2)
+    vertices = (rng.normal(size=(300, 3)) * 10.0 ** rng.integers(-38, 30, (300, 3))).astype(np.float32)
+    mesh = Mesh(vertices, np.arange(300).reshape(-1, 3), icosphere(3).vertices[:300], rng.random((300, 2)))
     mesh.save(tmp_path / f"a{suffix}")
-    again = wrt.load_mesh(tmp_path / f"a{suffix}")
-    corners = again.vertices[again.faces]
-    np.testing.assert_allclose(corners, mesh.vertices[mesh.faces], atol=1e-6)
-    if suffix == ".npz":
-        assert corners.tobytes() == mesh.vertices[mesh.faces].tobytes()
-        assert again.uvs is not None and again.normals is not None
-        np.testing.assert_array_equal(again.uvs, mesh.uvs)
+    theirs = trimesh.load(tmp_path / f"a{suffix}", process=False, maintain_order=True)
+    assert theirs.vertices[theirs.faces].astype(np.float32).tobytes() == (vertices + 0.0)[mesh.faces].tobytes()
 
 
 def test_what_npz_refuses(tmp_path: Path) -> None:

@@ -5,11 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import wrt
 from tests.data import data_path
 from tests.refused import refused
 from wrt.core.errors import SceneWarning
 from wrt.io.mesh_file import load_mesh
 from wrt.io.meshes.obj import read as read_obj
+from wrt.scene.shapes import icosphere
+from wrt.scene.vertex_normals import smooth
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 
@@ -147,7 +150,7 @@ def test_many_corners_and_relative_ones(tmp_path: Path) -> None:
     relative = " ".join(f"-{i % 4 + 1}" for i in range(300))
     raw = read_obj(write(tmp_path, f"{SQUARE}vn 0 0 1\nvn 0 1 0\ng a\nf {corners}\ng b\nf {relative} # {corners}\nf 1 2 3\n"))
     assert raw.groups == ("a", "b") and len(raw.faces) == 298 + 298 + 1
-    for bad, message in (("v 1 x 0\n", (None, "v holds 'x'", "line 5")), ("f 1 2 -9 4\n", (None, "face corner '-9'", "line 5"))):
+    for bad, message in (("v 1 x 0\n", (None, "'x' is not a number", "line 5")), ("f 1 2 -9 4\n", (None, "face corner '-9'", "line 5"))):
         with refused(*message):
             load_mesh(write(tmp_path, SQUARE + bad + SQUARE))
 
@@ -156,3 +159,67 @@ def test_groups_without_faces(tmp_path: Path) -> None:
     """Groups without faces get no index; other groups keep the order in which the file first names them."""
     raw = read_obj(write(tmp_path, SQUARE + "g late\ng x\ng first\nf 1 2 3\ng late\nf 1 3 4\ng x\n"))
     assert raw.groups == ("late", "first") and raw.face_group is not None and raw.face_group.tolist() == [1, 0]
+
+
+@pytest.mark.parametrize("text", ["# C:\\models\\\n" + SQUARE, SQUARE.replace("0 1 0", "0 1 0 # C:\\\\", 1), SQUARE + "g a # C:\\\n",
+                                  SQUARE.replace("v 1 0 0", "v 1 \\\n0 0# C:\\"), SQUARE + "# a\n#\\\r\n", SQUARE + "v 5 5 5 \\# x\n"])
+def test_a_comment_that_ends_in_a_backslash_continues_nothing(text: str, tmp_path: Path) -> None:
+    raw = read_obj(write(tmp_path, text + "f 1 2 3 4\n"))
+    assert raw.vertices[raw.faces].tolist() == [[[0, 0, 0], [1, 0, 0], [1, 1, 0]], [[0, 0, 0], [1, 1, 0], [0, 1, 0]]]
+
+
+@pytest.mark.parametrize("key", ["usemtl", "g", "o"])
+@pytest.mark.parametrize(("written", "name"), [
+    ("red  # again", "red"), ("red\t#again", "red"), ("red#1", "red#1"), ("#FF0000 # red", "#FF0000"), ("Material #25", "Material #25"),
+    ("a b #", "a b"), ("# none", ""), ("a#b \\\n c # d", "a#b   c"), ("a \\\n # C:\\", "a"),
+])
+def test_names_lose_comments_but_keep_their_hash(key: str, written: str, name: str, tmp_path: Path) -> None:
+    assert read_obj(write(tmp_path, f"{SQUARE}{key} {written}\nf 1 2 3\n")).groups == (name,)
+
+
+RIDGE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 2 0 1\nv 2 1 1\n"
+LEFT, RIGHT, BETWEEN = [0, 0, 1], [-(0.5**0.5), 0, 0.5**0.5], [-0.38268343, 0, 0.92387953]
+
+
+@pytest.mark.parametrize(("lines", "first", "second"), [
+    ("s 1\nf 1 2 3 4\nf 2 5 6 3\n", BETWEEN, BETWEEN), ("s 1\nf 1 2 3 4\ns 2\nf 2 5 6 3\n", LEFT, RIGHT),
+    ("s 1 # one\nf 1 2 3 4\ns off\nf 2 5 6 3\n", LEFT, [0, 0, 0]), ("f 1 2 3 4\ns on\nf 2 5 6 3\n", [0, 0, 0], RIGHT),
+    ("s 1\nf 1 2 3 4\ns 0\ns 1\ng b\nf 2 5 6 3\n", BETWEEN, BETWEEN),
+    ("vn 1 0 0\ns 7\nf 1//1 2//1 3//1 4//1\nf 2 5 6 3\n", [1, 0, 0], BETWEEN),
+    ("vt 0 0\nvt 1 1\ns 1\nf 1/1 2/1 3/1 4/1\nf 2/2 5/2 6/2 3/2\n", BETWEEN, BETWEEN),
+    ("s 3\nf 1 2\nf 1 2 3 4\nf 2 5 6 3\n", BETWEEN, BETWEEN),
+])
+def test_smoothing_groups(lines: str, first: list[float], second: list[float], tmp_path: Path) -> None:
+    """The normals of both faces at their common edge: the average within a group (two squares: equal angles), except where vn are given."""
+    mesh = load_mesh(write(tmp_path, RIDGE + lines))
+    assert mesh.normals is not None and len(mesh.faces) == 4
+    at_edge = (mesh.vertices[mesh.faces] == [1, 0, 0]).all(axis=2)
+    for faces, expected in ((slice(0, 2), first), (slice(2, 4), second)):
+        found = mesh.normals[mesh.faces[faces]][at_edge[faces]]
+        np.testing.assert_allclose(found, [expected] * len(found), atol=1e-6)
+    plain = load_mesh(write(tmp_path, RIDGE + "".join(line + "\n" for line in lines.splitlines() if line[0] != "s")))
+    np.testing.assert_array_equal(mesh.vertices[mesh.faces], plain.vertices[plain.faces])
+
+
+@pytest.mark.parametrize("lines", ["f 1 2 3 4\n", "s off\nf 1 2 3 4\ns 0\nf 2 5 6 3\n", "s\nf 1 2 3 4\n", "s 1\ns off\nf 1 2 3 4\n"])
+def test_no_smoothing_group_leaves_facets(lines: str, tmp_path: Path) -> None:
+    normals = load_mesh(write(tmp_path, RIDGE + lines)).normals
+    assert normals is None or not normals.any()
+
+
+def test_one_group_equals_smooth_and_shares_vertices(tmp_path: Path) -> None:
+    ball = icosphere(2)
+    wrt.Mesh(ball.vertices, ball.faces).save(path := tmp_path / "a.obj")
+    path.write_text(path.read_text().replace("f ", "s 1\nf ", 1))
+    mesh = load_mesh(path)
+    np.testing.assert_array_equal(mesh.faces, ball.faces)
+    np.testing.assert_allclose(mesh.normals, smooth(wrt.Mesh(ball.vertices, ball.faces)).normals, atol=1e-7)
+
+
+def test_smoothing_groups_far_from_0(tmp_path: Path) -> None:
+    """Survey coordinates: the normals are those of the same surface near 0."""
+    near = load_mesh(write(tmp_path, RIDGE + "s 1\nf 1 2 3 4\nf 2 5 6 3\n"))
+    lines = [line.split() for line in RIDGE.splitlines()]
+    moved = "".join(f"v {int(x) + 529000.125} {int(y) + 5801000.25} {z}\n" for _, x, y, z in lines)
+    far = load_mesh(write(tmp_path, moved + "s 1\nf 1 2 3 4\nf 2 5 6 3\n"))
+    np.testing.assert_allclose(far.normals, near.normals, atol=1e-6)

@@ -1,0 +1,143 @@
+"""The surface that encloses space: what decides on inside and outside, without copies of faces."""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from wrt.accel.geometry import Geometry
+from wrt.accel.instanced_geometry import InstancedGeometry, NumberedGeometry
+from wrt.accel.instances import Instances
+from wrt.accel.queries.accelerator import Accelerator, snapshot_of
+from wrt.accel.snapshot import Snapshot, once
+from wrt.scene.clean import copies, flip_collinear, has_area, merged, windings
+
+
+def finite_faces(geometry: Geometry) -> np.ndarray:
+    """Return the indices of the faces whose corners are all finite, (F,); no ray hits the others."""
+    return np.flatnonzero(np.isfinite(geometry.vertices).all(axis=1)[geometry.faces].all(axis=1))
+
+
+def edges_of(faces: np.ndarray) -> np.ndarray:
+    """Return a number for each edge of faces (F, 3), (F, 3) int64: of the corners 0 and 1, 1 and 2, 0 and 2. -1: an edge of length 0."""
+    p, q = faces[:, [0, 1, 0]].astype(np.int64), faces[:, [1, 2, 2]].astype(np.int64)
+    number = np.unique(np.minimum(p, q) << 32 | np.maximum(p, q), return_inverse=True)[1].reshape(-1, 3)
+    return np.where(p == q, -1, number)
+
+
+def open_edges(geometry: Geometry) -> int:
+    """Count the edges that an odd number of finite faces share; 0: a closed mesh. Vertices with equal coordinates are merged."""
+    edges = edges_of(merged(geometry.vertices)[geometry.faces[finite_faces(geometry)]])
+    return int(np.count_nonzero(np.bincount(edges[edges >= 0]) % 2))
+
+
+def enclosing(accel: Accelerator) -> Accelerator:
+    """Return a structure over the surface that decides on inside (`enclosing_faces`) of a mesh, or of the meshes of instances.
+
+    A mesh without copies of faces and without collinear faces is that surface: the result is a copy of `accel`, which a refit does not
+    change. Raises InputError for structures with spheres."""
+    accel = copy(accel)
+    other = _enclosing(snapshot_of(accel, instances=True), accel)
+    return accel if other is None else other
+
+
+@once
+def _enclosing(snapshot: Snapshot, accel: Any) -> Accelerator | None:
+    geometry: Any = snapshot.geometry
+    units = snapshot.structure.units
+    if isinstance(geometry, InstancedGeometry):
+        parts: list[Any] = [enclosing(bottom) for bottom in accel.bottoms]
+        if all(new.snapshot is old.snapshot for new, old in zip(parts, accel.bottoms, strict=True)):
+            return None
+        geometry = replace(geometry, parts=tuple(part.geometry for part in parts))
+        return Instances.restore(parts, geometry, None, str(accel.device), accel.threads)
+    if (found := enclosing_faces(geometry)) is None:
+        return None
+    rest = geometry.vertices, found[0], geometry.spheres, geometry.origin
+    inside = NumberedGeometry(*rest, geometry.prim_ids[found[1]]) if isinstance(geometry, NumberedGeometry) else Geometry(*rest)
+    return type(accel)(inside, device=str(accel.device), threads=accel.threads, triangle=units.triangle, box=units.box,
+                       **vars(accel.built_with))
+
+
+def enclosing_faces(geometry: Geometry) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the faces (K, 3) that decide on inside, and the face from which each comes, ascending (K,); None: all faces decide.
+
+    Copies of a face have its corners, by coordinates, in any order. They count once, with the winding of most of them; an equal number
+    of both windings takes the winding of the faces around. If the whole mesh is there several times, so is each face. Two copies that close
+    the surface as they are, a wall between parts that touch, count twice. A collinear face counts if it closes a joint; it is flipped."""
+    used = finite_faces(geometry)
+    corners = merged(geometry.vertices)[geometry.faces[used]]
+    solid = windings(corners) != 0
+    used, corners = used[solid], corners[solid]
+    first, kind = copies(corners)
+    flat, count = ~has_area(geometry.vertices, corners[first]), np.bincount(kind)
+    if len(first) == len(used) and not flat.any():
+        return None
+    distinct = np.sort(corners[first], axis=1)
+    even = flat | (count // max(np.gcd.reduce(count[~flat]), 1) % 2 == 0)
+    single = ~even | _closing(edges_of(distinct), even)
+    sign = windings(corners)
+    total = np.bincount(kind, sign)
+    turn = np.where(total == 0, sign[first], np.sign(total))
+    if len(unsure := np.flatnonzero(single & ~flat & (total == 0))):
+        a, b, c = ((geometry.vertices[distinct[:, i]] - geometry.vertices[distinct[0, 0]]).astype(np.float64) for i in range(3))
+        volume = np.einsum("ij,ij->i", a, np.cross(b, c))
+        turn[unsure] = _turned(edges_of(distinct), single, np.where(flat | (total == 0), 0, turn), volume, turn)[unsure]
+    kept = np.flatnonzero(np.where(single[kind], first[kind] == np.arange(len(kind)), ~flat[kind]))
+    faces, wrong = corners[kept], single[kind[kept]] & (sign[kept] != turn[kind[kept]])
+    faces[wrong] = faces[wrong][:, ::-1]
+    return flip_collinear(geometry.vertices, faces.astype(np.int32))[0], used[kept]
+
+
+def _closing(edges: np.ndarray, even: np.ndarray) -> np.ndarray:
+    """Return which faces with an even number of copies count once, (N,) bool. edges: (N, 3), from `edges_of`.
+
+    Faces that share an edge of just two of them form a patch. It counts once if its border would be open without it, or if it has none."""
+    faces_at, odd_at, even_at = (np.bincount(edges[which].reshape(-1), minlength=edges.max(initial=-1) + 1) for which in (..., ~even, even))
+    inner = (faces_at == 2) & (even_at == 2)
+    x, y = _neighbours(edges, inner)
+    label = _connected(len(edges), x // 3, y // 3)
+    border, alone, open_ = even[:, None] & ~inner[edges], faces_at[edges] == 1, odd_at[edges] % 2 == 1
+    walls, ends, gaps = ((np.bincount(label, which.any(axis=1), len(label)) > 0)[label]
+                         for which in (border & ~alone & ~open_, border & alone, border & open_))
+    return np.asarray(even & ~walls & (gaps | ~ends))
+
+
+def _turned(edges: np.ndarray, single: np.ndarray, known: np.ndarray, volume: np.ndarray, default: np.ndarray) -> np.ndarray:
+    """Return the winding of each face that fits to known ones, else the one around a positive volume, else the default, (N,) of 1 and -1.
+
+    edges: (N, 3), of faces whose corners ascend. single: faces that count once. known: windings, or 0. volume: of each face, times 6."""
+    x, y = _neighbours(edges, np.bincount(edges[single].reshape(-1), minlength=edges.max() + 1) == 2, single)
+    turns = np.array([0, 0, 1])  # an edge from corner 2 to 0 descends
+    same = turns[x % 3] == turns[y % 3]
+    nodes = 2 * np.arange(len(edges))  # 2 i: face i with winding 1, 2 i + 1: with winding -1
+    label = _connected(2 * len(edges), np.append(nodes[x // 3], nodes[x // 3] + 1), np.append(nodes[y // 3] + same, nodes[y // 3] + ~same))
+    votes = []
+    for weight in (known, volume):
+        sums = np.bincount(label, np.stack([weight, -weight], axis=1).reshape(-1) * np.repeat(single, 2), len(label))[label]
+        votes.append(np.sign(sums[::2] - sums[1::2]))
+    return np.where(votes[0] != 0, votes[0], np.where(votes[1] != 0, votes[1], default))
+
+
+def _neighbours(edges: np.ndarray, of_two: np.ndarray, used: np.ndarray | slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
+    """Return both sides of each edge in `of_two`, as 3 times the face plus the side, (M,) each. used: faces."""
+    chosen = np.zeros(edges.shape, bool)
+    chosen[used] = of_two[edges[used]]
+    sides = np.flatnonzero(chosen)
+    x, y = sides[np.argsort(edges.reshape(-1)[sides], kind="stable")].reshape(-1, 2).T
+    return x, y
+
+
+def _connected(n: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the smallest index in the component of each of n nodes, (n,); nodes a[i] and b[i] are connected."""
+    label = np.arange(n)
+    while (label[a] != label[b]).any():
+        low = np.minimum(label[a], label[b])
+        for side in (a, b):
+            np.minimum.at(label, label[side], low)
+        while (label[label] != label).any():
+            label = label[label]
+    return label
