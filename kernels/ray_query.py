@@ -49,18 +49,20 @@ def query_ray(origin: wp.vec3, direction: wp.vec3) -> QueryRay:
 #if !defined(WRT_INLINE) && !defined(__CUDA_ARCH__)
     return true;  // a kernel made by wp.kernel lacks the headers of wide/
 #endif
-    static int known;
+#if defined(__CUDA_ARCH__)
+    volatile float x = 1.000244140625f;
+    const float y = x;
+    return y * y - 1.00048828125f != 0.0f || y * 0x1p-100f * 0x1p-40f == 0.0f;
+#else
+    static int known;  // 1: exact, 2: inexact
     if (known == 0) {
         volatile float one = 1.000244140625f, zero = -0.0f, inf = INFINITY, nan = NAN;
         const float y = one, z = zero, i = inf, n = nan;
-        bool wrong = y * y - 1.00048828125f != 0.0f || (y + 0x1p24f) - 0x1p24f != 2.0f || y / 3.0f != 0x1.556aaap-2f || n == n
-                     || i != INFINITY || 1.0f / (z + 0.0f) < 0.0f;
-#if defined(__CUDA_ARCH__)
-        wrong = wrong || y * 0x1p-100f * 0x1p-40f == 0.0f;
-#endif
-        known = wrong ? 2 : 1;
+        known = y * y - 1.00048828125f != 0.0f || (y + 0x1p24f) - 0x1p24f != 2.0f || y / 3.0f != 0x1.556aaap-2f || n == n
+                || i != INFINITY || 1.0f / (z + 0.0f) < 0.0f ? 2 : 1;
     }
     return known == 2;
+#endif
 """)
 def inexact() -> bool:
     """Test whether this kernel is compiled with fused multiply-add or fast maths, which let rays slip between neighbouring triangles.

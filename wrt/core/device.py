@@ -22,7 +22,7 @@ import warp as wp
 
 from wrt.core import cuda, warp_private
 from wrt.core.compiling import WATCH
-from wrt.core.errors import InputError
+from wrt.core.errors import InputError, warn
 from wrt.core.kernel_cache import is_intact, remove
 from wrt.core.seconds import loading
 from wrt.core.threads import run_all, submit, thread_count, with_stack
@@ -251,6 +251,15 @@ def upload(array: np.ndarray, dtype: WarpType, device: Device, read_only: bool =
     if read_only and device.is_cpu:
         return _array_at(array.ctypes.data, dtype, array.shape[:1], device, array)
     return wp.array(array, dtype=dtype, device=device, copy=not array.flags.writeable)
+
+
+def to_device(array: WarpArray, device: Device) -> WarpArray:
+    """Return an array of a query on the structure's device. A copy from another device gets a SceneWarning, and is refused in a capture."""
+    if array.device != device:
+        warp_private.refuse_capture(device if device.is_cuda else array.device)
+        warn(f"each call copies arrays from {array.device} to {device}, where the structure and its hits are: pass arrays on {device},"
+             f" or build the structure with device={str(array.device)!r}")
+    return array.to(device)
 
 
 def on_host(array: WarpArray) -> np.ndarray:

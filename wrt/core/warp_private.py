@@ -212,8 +212,8 @@ _CONFIG = {"mode": "release", "optimization_level": None, "verify_fp": False, "v
            "enable_vector_component_overwrites": False, "default_grid_stride": True}
 _OPTIONS = {"max_unroll": 16, "deterministic": wp.config.DeterministicMode.NOT_GUARANTEED, "deterministic_max_records": 0}
 _FLAGS = "%s-mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000 -mllvm=-slp-recursion-max-depth=4"
-# Of the user's flags, modules of wrt keep those that choose a processor, and reports of the compiler.
-_KEPT_FLAG = re.compile(r"(?<!\S)(?:-target-(?:cpu|feature)[ =]|-m(?:arch|cpu|tune)=|-R)\S+")
+# Of the user's flags, modules of wrt keep those that choose a processor, reports of the compiler, and WRT_CHECK (kernels/wide/lanes.h).
+_KEPT_FLAG = re.compile(r"(?<!\S)(?:(?:-target-(?:cpu|feature)[ =]|-m(?:arch|cpu|tune)=|-R)\S+|-DWRT_CHECK)")
 
 
 def _is_own_module(module: Any) -> bool:

@@ -192,7 +192,6 @@ class Accelerator:
         threads, shape, callers = thread_count(threads), None, None if out is None else arrays_of(out)
         if costs:
             check_keywords("closest_hit", costs, CLOSEST_HIT)
-        snapshot = self._snapshot  # read once, because a refit may replace it during the query
         if are_rows(origins, directions) and invalid == "raise":  # the usual case, whose arrays need no other shape
             rays = rays_of(origins, directions, t_min, t_max, True, snapshot.geometry.origin)  # type: ignore[arg-type]
         else:
@@ -251,7 +250,6 @@ class Accelerator:
         if options:
             check_keywords("any_hit", options, ANY_HIT)
             world, invalid = options.get("world"), options.get("invalid", invalid)
-        snapshot = self._snapshot
         if are_rows(origins, directions) and invalid == "raise":
             rays = rays_of(origins, directions, t_min, t_max, origin=snapshot.geometry.origin)  # type: ignore[arg-type]
         else:

@@ -87,52 +87,52 @@ class BuildOptions(TypedDict, total=False):
 
 
 @overload
-def build(mesh: OneMeshLike, accel: Literal["bvh", "bvh8"] = ..., device: str = ..., threads: int | None = ...,
+def build(mesh: OneMeshLike, accel: Literal["bvh", "bvh8"] = ..., device: str | None = ..., threads: int | None = ...,
           *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bvh8: ...
 @overload
-def build(mesh: OneMeshLike, accel: Literal["bvh4"], device: str = ..., threads: int | None = ...,
+def build(mesh: OneMeshLike, accel: Literal["bvh4"], device: str | None = ..., threads: int | None = ...,
           *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bvh4: ...
 @overload
-def build(mesh: OneMeshLike, accel: Literal["bvh6"], device: str = ..., threads: int | None = ...,
+def build(mesh: OneMeshLike, accel: Literal["bvh6"], device: str | None = ..., threads: int | None = ...,
           *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bvh6: ...
 @overload
-def build(mesh: OneMeshLike, accel: Literal["bvh8c"], device: str = ..., threads: int | None = ...,
+def build(mesh: OneMeshLike, accel: Literal["bvh8c"], device: str | None = ..., threads: int | None = ...,
           *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bvh8c: ...
 @overload
-def build(mesh: OneMeshLike, accel: Literal["bvh2"], device: str = ..., threads: int | None = ...,
+def build(mesh: OneMeshLike, accel: Literal["bvh2"], device: str | None = ..., threads: int | None = ...,
           *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bvh2: ...
 @overload
-def build(mesh: OneMeshLike, accel: Literal["bvh2_sphere"], device: str = ..., threads: int | None = ...,
+def build(mesh: OneMeshLike, accel: Literal["bvh2_sphere"], device: str | None = ..., threads: int | None = ...,
           *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bvh2Sphere: ...
 @overload
-def build(mesh: OneMeshLike, accel: Literal["bvh2_kdop"], device: str = ..., threads: int | None = ...,
+def build(mesh: OneMeshLike, accel: Literal["bvh2_kdop"], device: str | None = ..., threads: int | None = ...,
           *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bvh2Kdop: ...
 @overload
-def build(mesh: OneMeshLike, accel: Literal["kdtree"], device: str = ..., threads: int | None = ...,
+def build(mesh: OneMeshLike, accel: Literal["kdtree"], device: str | None = ..., threads: int | None = ...,
           *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> KdTree: ...
 @overload
-def build(mesh: OneMeshLike, accel: Literal["bsp"], device: str = ..., threads: int | None = ...,
+def build(mesh: OneMeshLike, accel: Literal["bsp"], device: str | None = ..., threads: int | None = ...,
           *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bsp: ...
 @overload
-def build(mesh: OneMeshLike, accel: Literal["brute_force"], device: str = ..., threads: int | None = ...,
+def build(mesh: OneMeshLike, accel: Literal["brute_force"], device: str | None = ..., threads: int | None = ...,
           *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> BruteForce: ...
 @overload
-def build(mesh: OneMeshLike, accel: Literal["grid"], device: str = ..., threads: int | None = ...,
+def build(mesh: OneMeshLike, accel: Literal["grid"], device: str | None = ..., threads: int | None = ...,
           *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Grid: ...
 @overload
-def build(mesh: OneMeshLike, accel: Literal["octree"], device: str = ..., threads: int | None = ...,
+def build(mesh: OneMeshLike, accel: Literal["octree"], device: str | None = ..., threads: int | None = ...,
           *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Octree: ...
 @overload
-def build(mesh: OneMeshLike, accel: str, device: str = ..., threads: int | None = ...,
+def build(mesh: OneMeshLike, accel: str, device: str | None = ..., threads: int | None = ...,
           *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> OneMesh: ...
 @overload
-def build(mesh: MeshLike, accel: str = ..., device: str = ..., threads: int | None = ..., *, movable: Literal[True],
+def build(mesh: MeshLike, accel: str = ..., device: str | None = ..., threads: int | None = ..., *, movable: Literal[True],
           progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Instances: ...
 @overload
-def build(mesh: SceneLike, accel: str = ..., device: str = ..., threads: int | None = ..., *, movable: bool = ...,
+def build(mesh: SceneLike, accel: str = ..., device: str | None = ..., threads: int | None = ..., *, movable: bool = ...,
           progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> OneMesh | Instances: ...
 @overload
-def build(mesh: list[WorldT], accel: str = ..., device: str = ..., threads: int | None = ..., *, movable: bool = ...,
+def build(mesh: list[WorldT], accel: str = ..., device: str | None = ..., threads: int | None = ..., *, movable: bool = ...,
           progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Instances: ...
 def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str | None = None, threads: int | None = None, *,
           movable: bool = False, progress: Callable[[float], None] | None = None,
@@ -191,9 +191,9 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str | None = N
 
 
 @overload
-def load_accel(path: PathLike, mesh: MeshLike, device: str = ..., threads: int | None = ...) -> OneMesh: ...
+def load_accel(path: PathLike, mesh: MeshLike, device: str | None = ..., threads: int | None = ...) -> OneMesh: ...
 @overload
-def load_accel(path: PathLike, mesh: None = ..., device: str = ..., threads: int | None = ...) -> OneMesh | Instances: ...
+def load_accel(path: PathLike, mesh: None = ..., device: str | None = ..., threads: int | None = ...) -> OneMesh | Instances: ...
 def load_accel(path: PathLike, mesh: MeshLike | None = None, device: str | None = None,
                threads: int | None = None) -> OneMesh | Instances:
     """Read a structure that `OneMesh.save`, `Instances.save` or `wrt build` wrote.
@@ -265,15 +265,12 @@ def accel_from_tree(mesh: MeshLike, tree: BoxTree | Mapping[str, Any] | PathLike
 
 
 def device_of(mesh: Any, device: str | None) -> str:
-    """Return the argument `device` of `build` for this mesh."""
-    if device is not None:
-        return as_one(device, str, "device")
-    for each in mesh if isinstance(mesh, list) else [mesh]:
-        array = each[0] if isinstance(each, tuple) and each else getattr(each, "points", None)  # of wp.Mesh and DeviceGeometry
-        array = from_tensor(array, "vertices", None)
-        if isinstance(array, wp.array) and array.device.is_cuda:
-            return str(array.device)
-    return DEFAULT_DEVICE
+    """Return the argument `device` of `build`; None stands for the GPU of the mesh's arrays, else for the default."""
+    for each in () if device is not None else mesh if isinstance(mesh, list) else [mesh]:
+        points = each[0] if isinstance(each, tuple) and each else getattr(each, "points", None)  # of wp.Mesh and DeviceGeometry
+        if isinstance(points := from_tensor(points, "vertices", None), wp.array) and points.device.is_cuda:
+            return str(points.device)
+    return DEFAULT_DEVICE if device is None else as_one(device, str, "device")
 
 
 def own(geometry: Geometry | InstancedGeometry) -> Geometry | InstancedGeometry:
