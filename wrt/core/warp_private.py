@@ -35,7 +35,9 @@ def refusal(what: str) -> InputError:
 try:
     from warp._src import build, codegen, context
     from warp._src.types import array_t
-except ImportError as error:
+
+    _resolve_options = context.Module.resolve_options
+except (ImportError, AttributeError) as error:
     raise refusal(str(error)) from error
 
 # --- structs and arrays as kernel arguments ---------------------------------------------------------------------------
@@ -211,7 +213,7 @@ def is_warps_error(error: BaseException) -> bool:
 _CONFIG = {"mode": "release", "optimization_level": None, "verify_fp": False, "verify_autograd_array_access": False, "llvm_cuda": False,
            "enable_vector_component_overwrites": False, "default_grid_stride": True}
 _OPTIONS = {"max_unroll": 16, "deterministic": wp.config.DeterministicMode.NOT_GUARANTEED, "deterministic_max_records": 0}
-_FLAGS = "%s-mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000 -mllvm=-slp-recursion-max-depth=4"
+_FLAGS = "-mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000 -mllvm=-slp-recursion-max-depth=4"
 # Of the user's flags, modules of wrt keep those that choose a processor, reports of the compiler, and WRT_CHECK (kernels/wide/lanes.h).
 _KEPT_FLAG = re.compile(r"(?<!\S)(?:(?:-target-(?:cpu|feature)[ =]|-m(?:arch|cpu|tune)=|-R)\S+|-DWRT_CHECK)")
 
@@ -223,24 +225,18 @@ def _is_own_module(module: Any) -> bool:
 
 def _own_flags(flags: str | None) -> str:
     """Return the flags for the CPU of wrt's modules. flags: wp.config.cpu_compiler_flags."""
-    kept = _KEPT_FLAG.findall("-march=native" if flags is None else flags)
-    return _FLAGS % "".join(f"{flag} " for flag in kept)
+    return " ".join([*_KEPT_FLAG.findall("-march=native" if flags is None else flags), _FLAGS])
 
 
-def _keep_own_options(resolve: Any) -> Any:
-    """Make Module.resolve_options ignore settings of wp.config for modules of wrt."""
-    @wraps(resolve)
-    def resolved(self: Any, config: Any, block_dim: int | None = None) -> dict[str, Any]:
-        if not _is_own_module(self):
-            return dict(resolve(self, config, block_dim))
-        own = SimpleNamespace(**{**vars(config), **_CONFIG, "cpu_compiler_flags": _own_flags(config.cpu_compiler_flags)})
-        return {**resolve(self, own, block_dim), **_OPTIONS}
-
-    return resolved
+@wraps(_resolve_options)
+def _own_options(self: Any, config: Any, block_dim: int | None = None) -> dict[str, Any]:
+    if not _is_own_module(self):
+        return dict(_resolve_options(self, config, block_dim))
+    own = SimpleNamespace(**{**vars(config), **_CONFIG, "cpu_compiler_flags": _own_flags(config.cpu_compiler_flags)})
+    return {**_resolve_options(self, own, block_dim), **_OPTIONS}
 
 
-# Kernels are hashed where they are defined, before Warp starts.
-context.Module.resolve_options = _keep_own_options(context.Module.resolve_options)
+context.Module.resolve_options = _own_options  # at once, because kernels are hashed where they are defined, before Warp starts
 
 # The changes below make Warp's compiler faster, and change no result of a kernel. They act only while a module of wrt is compiled. Each
 # names the processor time that it saves in a first render of scenes/whitted.toml with an empty kernel cache (docs/warp.md).
