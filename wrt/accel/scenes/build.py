@@ -301,7 +301,7 @@ def to_mesh_or_scene(mesh: MeshLike) -> Mesh | Scene:
     elif isinstance(mesh, str | os.PathLike):
         mesh = load_mesh(mesh)
     elif isinstance(mesh, tuple) and len(mesh) == 2:
-        vertices, faces = (to_numpy(from_tensor(each, name, None)) if is_tensor(each) else each
+        vertices, faces = (to_numpy(from_tensor(each, name, None)) if is_tensor(each) or isinstance(each, wp.array) else each
                            for each, name in zip(mesh, ("vertices", "faces"), strict=True))
         mesh = Mesh(vertices, faces)
     elif isinstance(mesh, wp.Mesh):
