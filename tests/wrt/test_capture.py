@@ -69,7 +69,8 @@ class Things:
 
 
 Call = Callable[["Things"], Any]
-OF_HITS = ("distance", "face", "hit", "instance", "material", "normal", "normals", "object", "point", "point_error", "points", "shading_normal")
+OF_HITS = ("distance", "face", "hit", "instance", "material", "normal", "normals", "object", "point", "point_error", "points",
+           "shading_normal")
 FUNCTIONS: dict[str, Call] = {
     "build": lambda s: wrt.build(BALL),
     "load_accel": lambda s: wrt.load_accel(s.file, BALL),
@@ -134,7 +135,8 @@ OTHERS: dict[str, Call] = {  # more forms of the same calls
 }
 # Names whose work is done in NumPy alone, or that own kernels need.
 AT_ONCE = {"__version__", *"""
-    ray_query kernel ACCELERATORS InputError SceneWarning load_scene load_mesh Film Options Progress ConstantBackground EnvironmentBackground
+    ray_query kernel ACCELERATORS InputError SceneWarning
+    load_scene load_mesh Film Options Progress ConstantBackground EnvironmentBackground
     GradientBackground Camera FisheyeCamera OrthographicCamera PanoramaCamera DirectionalLight PointLight SpotLight Checkerboard Material
     Texture Mesh Object Scene Sphere Motion Settings LiveView side_by_side""".split()}
 AT_ONCE |= {f"{kind}.{name}" for kind, names in {
@@ -197,7 +199,7 @@ def test_adapters_are_refused(library: str) -> None:
     arguments = {"ray_trace": (rays[0][0], rays[1][0])}
     six = np.concatenate(RAYS, axis=1)
     for name in dir(kind):
-        if name.startswith("_") or name in ("INVALID_ID", "add_triangles", "create_rays_pinhole", "scaled"):  # these launch nothing, or need no rays
+        if name.startswith("_") or name in ("INVALID_ID", "add_triangles", "create_rays_pinhole", "scaled"):  # launch nothing, or have no rays
             continue
         takes_rays = any(word in name for word in ("rays", "intersect", "occlusion"))
         given = (six if takes_rays else RAYS[0],) if library == "open3d" else arguments.get(name, rays)

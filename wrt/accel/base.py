@@ -199,8 +199,7 @@ class OneMesh(TreeExchange, ABC):
         """
         from wrt.accel.epo import end_point_overlap
 
-        geometry, built = self.snapshot.mesh, self.snapshot.arrays
-        return end_point_overlap(self._children(built.on_host()), geometry, self.threads)
+        return end_point_overlap(self._children(self.snapshot.arrays.on_host()), self.snapshot.mesh, self.threads)
 
     def _upload(self, built: Built) -> WarpStruct:
         def on_device(array: np.ndarray | WarpArray, dtype: WarpType) -> WarpArray:
