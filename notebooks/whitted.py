@@ -379,12 +379,12 @@ wrt.side_by_side({f"{title}, {film.stats['rays_per_sample']:.2f} rays a sample":
 # large, the ray starts behind a thin object close to the surface, and light leaks under it.
 #
 # The test scene has a floor, a ball, and a sheet that hovers 0.02 above the floor; the light is parallel. Which points are in shadow is
-# known exactly. The scene is tested at three places and sizes.
+# known exactly. The scene is tested at four places and sizes.
 
 # %%
 LIGHT = np.array([0.45, 0.8, 0.4]) / np.linalg.norm([0.45, 0.8, 0.4])
 HEIGHT, SHEET = 0.02, np.array([[-1.9, -0.7], [0.9, 1.9]])  # of the sheet: height, and ranges of x and z
-PLACES = {"size 1, at 0": (1, 0), "size 1, 3000 away from 0": (1, 3000), "size 0.01, at 0": (0.01, 0)}
+PLACES = {"size 1": (1, 0), "size 1, 3000 away from 0": (1, 3000), "size 0.001": (0.001, 0), "size 1000": (1000, 0)}
 
 
 def test_scene(scale, away):
@@ -431,7 +431,7 @@ for place, (scale, away) in PLACES.items():
     starts = {eps: rounded + np.float32(eps) * n for eps in EPSILONS} | {"bound": outside(p, error, n)}
     found = {name: accel.any_hit(start, np.tile(LIGHT, (len(p), 1))) for name, start in starts.items()}
     wrong[place] = {name: ((result != dark) & certain).sum() / certain.sum() for name, result in found.items()}
-    if place == "size 1, at 0":
+    if place == "size 1":
         for name in (EPSILONS[2], EPSILONS[8], EPSILONS[14], "bound"):
             shade = np.full(len(o), 0.75)
             shade[seen] = 0.15 + 0.8 * np.maximum(n @ LIGHT, 0) * ~found[name]
@@ -451,13 +451,15 @@ plt.show()
 best = {place: [eps for eps in EPSILONS if shares[eps] == 0] for place, shares in wrong.items()}
 for place, good in best.items():
     print(f"{place}: no wrong point for epsilons from {min(good):.1e} to {max(good):.1e}")
-assert not set.intersection(*map(set, best.values()))  # no epsilon of the list suits all three
+assert not set.intersection(*map(set, best.values()))  # no epsilon of the list suits all
 
 # %% [markdown]
 # The first picture has acne. In the third, the shadow of the sheet is gone, and the shadow of the ball has moved.
-# A good $\varepsilon$ depends on the size of the scene, on the distance from 0, and on the smallest gap between surfaces. None suits all
-# three scenes. wrt uses none: it bounds the rounding error of *each* hit point (`hits.point_error`), and moves the new origin by that
-# bound (Pharr, Jakob, Humphreys, "Physically Based Rendering", section 6.8). The bound has no parameter, and no point is wrong.
+# A good $\varepsilon$ depends on the size of the scene and on the smallest gap between surfaces. None suits all scenes. With float32
+# coordinates it would also depend on the distance from 0; wrt stores the scene that is 3000 away relative to a place near it
+# (`accel.origin`), and its epsilons are those at 0. wrt uses no epsilon: it bounds the rounding error of *each* hit point
+# (`hits.point_error`), and moves the new origin by that bound (Pharr, Jakob, Humphreys, "Physically Based Rendering", section 6.8). The
+# bound has no parameter, and no point is wrong.
 #
 # ## Exercises
 # **1.** A ray meets glass of $n = 1.5$ at 0 degrees. Which share of the light passes through a pane with two faces, if inner reflections
@@ -490,10 +492,9 @@ assert not set.intersection(*map(set, best.values()))  # no epsilon of the list 
 # `film.stats["lost_throughput_per_sample"]` has the sum of the throughputs themselves.
 # </details>
 #
-# **5.** Predict which epsilons are right at size 1000, at 0, and at size 1, 300 away from 0. Then add both to `PLACES`.
+# **5.** Predict which epsilons are right at size 100, and at size 1, 3 million away from 0. Then add both to `PLACES`.
 # <details><summary>Solution</summary>
 #
-# With the scene, all rounding errors and all gaps grow by the same factor: at size 1000 the range of size 1 begins and ends 1000 times
-# higher, at $10^{-3}$ and 3. At a distance of 300, coordinates have a tenth of the rounding error that they have at 3000: the range
-# begins at $3\cdot 10^{-5}$ and ends where it ends at 0. The error bound is right in both scenes.
+# With the scene, all rounding errors and all gaps grow by the same factor: at size 100 the range of size 1 begins and ends 100 times
+# higher. Far from 0, the range of size 1 stays, because coordinates are relative to `accel.origin`. The error bound is right in both.
 # </details>

@@ -65,8 +65,7 @@ class OneMesh(TreeExchange, ABC):
         """Make a structure from saved arrays, or raise InputError if they do not fit. units: intersection tests; built_with: options."""
         self = cls.__new__(cls)
         Accelerator.__init__(self, Structure(cls, units or Units()), geometry, attributes, device, threads)
-        self.built_with = cls.options() if built_with is None else built_with
-        begin = build_clock()
+        self.built_with, begin = cls.options() if built_with is None else built_with, build_clock()
         check_order(built.order, len(geometry), cls.name)
         self._check(built)
         self._install(built, begin, built.sah_cost)

@@ -98,16 +98,14 @@ def _check_materials(a: Mapping[str, np.ndarray], geometry: InstancedGeometry, r
     """Check that all primitives of runs, none of which is empty, have a material; over worlds one of their world's own materials."""
     last = runs[:, 2] + runs[:, 3] * (length - 1)
     _require((last < len(a["prim_material"])).all() and ("objects" in a) == (geometry.worlds is None), "lacks materials")
-    if geometry.worlds is None:
-        return
-    own, begins = a["own_materials"], geometry.world_first_prim
-    keys = own[:, 0] * 2**32 + own[:, 1]
-    spans = np.unique(np.stack([np.searchsorted(begins, runs[:, 0], "right") - 1, runs[:, 2], last], axis=1), axis=0).tolist()
-    used = {span: np.unique(a["prim_material"][span[0]:span[1] + 1]).astype(np.int64) for span in {(first, end) for _, first, end in spans}}
-    wanted = [used[first, end] + world * 2**32 for world, first, end in spans]
-    _require(len(begins) > own[:, 0].max(initial=0) and (own >= 0).all() and (own < 2**31).all() and (np.diff(keys) > 0).all()
-             and np.isin(begins, np.append(runs[:, 0], len(geometry))).all() and np.isin(np.concatenate([keys[:0], *wanted]), keys).all(),
-             "has wrong materials of worlds")
+    if geometry.worlds is not None:
+        own, begins = a["own_materials"], geometry.world_first_prim
+        world, rows = (np.searchsorted(begins, runs[:, 0], "right") - 1).tolist(), list(map(tuple, own[:, :2].tolist()))
+        spans = list(zip(runs[:, 2].tolist(), (last + 1).tolist(), strict=True))
+        used = {span: np.unique(a["prim_material"][slice(*span)]).tolist() for span in set(spans)}
+        needed = {(each, material) for each, span in set(zip(world, spans, strict=True)) for material in used[span]}
+        _require(needed <= set(rows) and rows == sorted(set(rows)) and (own >= 0).all() and (own < 2**31).all()
+                 and np.isin(begins, np.append(runs[:, 0], len(geometry))).all(), "has wrong materials of worlds")
 
 
 def _geometry_of(a: Mapping[str, np.ndarray]) -> InstancedGeometry:

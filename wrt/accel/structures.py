@@ -18,7 +18,8 @@ class Structures(Registry[type[Any]]):
         kind = super().__getitem__(name)
         for field in FIELDS:
             if not hasattr(kind, field):
-                raise InputError(f"class {kind.__name__} has no field {field!r}", place=f"structure {name!r}")
+                of = f"; it is {self.added[name]}" if name in self.added else ""
+                raise InputError(f"class {kind.__name__} has no field {field!r}{of}", place=f"structure {name!r}")
         return kind
 
 
@@ -36,7 +37,7 @@ ACCELERATORS = Structures("structure", {
     "brute_force": "wrt.accel.brute_force:BruteForce",
     "grid": "wrt.accel.cells.grid:Grid",
     "octree": "wrt.accel.cells.octree:Octree",
-}, "wrt.structures")
+}, "wrt.structures", type)
 
 
 def stack_on(device: str) -> str:

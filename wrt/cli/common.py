@@ -73,6 +73,10 @@ class Names(click.ParamType):
 class Commands(click.Group):
     """A group of commands that suggests a similar option for an unknown option. It compares the names without their dashes."""
 
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        with warnings_reported(False):
+            return sorted(name for name, _ in self.commands.items())
+
     def invoke(self, ctx: click.Context) -> object:
         try:
             return super().invoke(ctx)

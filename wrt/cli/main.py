@@ -42,7 +42,7 @@ COMMANDS: Registry[click.Command] = Registry("command", {
     "view": "wrt.cli.view:view",
     "walk": "wrt.cli.inspect:walk",
     "whatif": "wrt.cli.measure:whatif",
-}, "wrt.commands")
+}, "wrt.commands", click.Command)
 
 
 GC_THRESHOLD = 500_000  # New objects between two garbage collections. Starting wrt makes 300,000 objects, which stay.

@@ -13,7 +13,7 @@ from wrt.core.registry import Registry
 from wrt.lab import plans
 from wrt.lab.plans import Error, Mitsuba, Stability
 
-BENCHES: Registry[click.Command] = Registry("bench", {}, "wrt.benches")
+BENCHES: Registry[click.Command] = Registry("bench", {}, "wrt.benches", click.Command)
 
 
 @click.group(cls=Commands, commands=BENCHES, invoke_without_command=True, no_args_is_help=True)

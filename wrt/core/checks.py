@@ -45,9 +45,8 @@ def as_size(value: object, what: str = "size", high: int = 32768) -> tuple[int, 
 
 
 def as_array(value: object, dtype: npt.DTypeLike, what: str) -> np.ndarray:
-    """Return a contiguous NumPy array of a type, with one axis or more. Values beyond the range of a float type become infinite.
-
-    It is a copy, because the caller may write to its array later. Only read-only arrays that own their memory are shared."""
+    """Return a contiguous array of a type, with one axis or more. Values beyond the range of a float type become infinite.
+    It is a copy, because the caller may write to its array later; only read-only arrays that own their memory are shared."""
     shared = isinstance(value, np.ndarray) and value.base is None and not value.flags.writeable
     try:
         with np.errstate(over="ignore"):

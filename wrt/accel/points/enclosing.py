@@ -10,7 +10,6 @@ import numpy as np
 
 from wrt.accel.geometry import Geometry
 from wrt.accel.instanced_geometry import InstancedGeometry, NumberedGeometry
-from wrt.accel.instances import Instances
 from wrt.accel.queries.accelerator import Accelerator, snapshot_of
 from wrt.accel.snapshot import Snapshot, once
 from wrt.scene.clean import copies, flip_collinear, has_area, merged, windings
@@ -53,7 +52,7 @@ def _enclosing(snapshot: Snapshot, accel: Any) -> Accelerator | None:
         if all(new.snapshot is old.snapshot for new, old in zip(parts, accel.bottoms, strict=True)):
             return None
         geometry = replace(geometry, parts=tuple(part.geometry for part in parts))
-        return Instances.restore(parts, geometry, None, str(accel.device), accel.threads)
+        return type(accel).restore(parts, geometry, None, str(accel.device), accel.threads)
     if (found := enclosing_faces(geometry)) is None:
         return None
     rest = geometry.vertices, found[0], geometry.spheres, geometry.origin

@@ -24,6 +24,7 @@ def nothing(vertices: np.ndarray, faces: np.ndarray, origins: np.ndarray, direct
 CASES = ("B_jittered_vertices", "D_published", "G_coincident_uniform", "I_rays_not_finite")
 
 
+@pytest.mark.filterwarnings("ignore:a mesh. its float32 vertices lie up to")  # D_published is far from 0
 def test_wrt_loses_nothing() -> None:
     report = hard_cases(own, CASES, rays=100)
     assert report.ok and [result.case for result in report.results] == list(CASES)
