@@ -199,7 +199,7 @@ def test_adapters_are_refused(library: str) -> None:
     arguments = {"ray_trace": (rays[0][0], rays[1][0])}
     six = np.concatenate(RAYS, axis=1)
     for name in dir(kind):
-        if name.startswith("_") or name in ("INVALID_ID", "add_triangles", "create_rays_pinhole", "scaled"):  # launch nothing, or have no rays
+        if name.startswith("_") or name in ("INVALID_ID", "add_triangles", "create_rays_pinhole", "scaled"):  # need no launch
             continue
         takes_rays = any(word in name for word in ("rays", "intersect", "occlusion"))
         given = (six if takes_rays else RAYS[0],) if library == "open3d" else arguments.get(name, rays)

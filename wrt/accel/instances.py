@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Self, TypeGuard, overload
+from typing import Any, Self, TypeGuard, cast, overload
 
 import numpy as np
 import warp as wp
@@ -139,8 +139,7 @@ class Instances(Accelerator):
         refuse_capture(self.device)
         rebuild_at = np.inf if np.array_equal(rebuild_at, np.inf) else as_number(rebuild_at, "rebuild_at", low=0.0)
         with self._refitting:
-            begin, before = build_clock(), self._snapshot
-            geometry: Any = before.geometry
+            begin, before, geometry = build_clock(), self._snapshot, cast(Any, self._snapshot.geometry)
             if is_named(instance):
                 instance, object = object, instance
             if (instance is None) == (object is None) or matrix is None or (object is None and world is not None):
