@@ -42,23 +42,36 @@ def query_ray(origin: wp.vec3, direction: wp.vec3) -> QueryRay:
     return ray
 
 
-# y = 1 + 2^-12: in float32, y * y rounds to 1 + 2^-11, so y * y - (1 + 2^-11) is 0. A fused multiply-add returns 2^-24. Constant folding
-# never fuses; volatile prevents the folding.
+# y = 1 + 2^-12: in float32, y * y rounds to 1 + 2^-11, so y * y - (1 + 2^-11) is 0. A fused multiply-add returns 2^-24. The other terms are
+# true if the compiler may reassociate, divide by reciprocals, assume that no NaN or infinity exists, or ignore signs of zeros; on a GPU, if
+# it replaces 2^-140 by 0. Constant folding never fuses; volatile prevents the folding. The result is the same in each call.
 @wp.func_native("""
 #if !defined(WRT_INLINE) && !defined(__CUDA_ARCH__)
     return true;  // a kernel made by wp.kernel lacks the headers of wide/
 #endif
+#if defined(__CUDA_ARCH__)
     volatile float x = 1.000244140625f;
     const float y = x;
-    return y * y - 1.00048828125f != 0.0f;
+    return y * y - 1.00048828125f != 0.0f || y * 0x1p-100f * 0x1p-40f == 0.0f;
+#else
+    static int known;  // 1: exact, 2: inexact
+    if (known == 0) {
+        volatile float one = 1.000244140625f, zero = -0.0f, inf = INFINITY, nan = NAN;
+        const float y = one, z = zero, i = inf, n = nan;
+        known = y * y - 1.00048828125f != 0.0f || (y + 0x1p24f) - 0x1p24f != 2.0f || y / 3.0f != 0x1.556aaap-2f || n == n
+                || i != INFINITY || 1.0f / (z + 0.0f) < 0.0f ? 2 : 1;
+    }
+    return known == 2;
+#endif
 """)
-def fused() -> bool:
-    """Test whether this kernel is compiled with fused multiply-add, which lets rays slip between neighbouring triangles.
+def inexact() -> bool:
+    """Test whether this kernel is compiled with fused multiply-add or fast maths, which let rays slip between neighbouring triangles.
     Also True on a CPU if the kernel was made by wp.kernel."""
 
 
 @wp.func_native("""
-    static const char* const why[] = {"the rays of a kernel hit nothing, because a kernel with ray queries must be made with wrt.kernel",
+    static const char* const why[] = {"the rays of a kernel hit nothing, because a kernel with ray queries must be made with wrt.kernel,"
+                                      " and without fast_math and flags such as -ffast-math in wp.config.cpu_compiler_flags",
                                       "the rays of a kernel hit nothing, because accel.world is of another structure or triangle test"
                                       " than the kernel's functions: make them with wrt.ray_query(accel)"};
     static bool warned[2];
@@ -70,9 +83,9 @@ def warn_once(reason: int) -> None: ...
 
 @wp.func
 def traversal_ray(ray: QueryRay, is_other: bool) -> Ray:
-    """Make the ray for the traversal. In a kernel with fused multiply-add, or if is_other (World of another type), it hits nothing."""
+    """Make the ray for the traversal. In a kernel with inexact arithmetic, or if is_other (World of another type), it hits nothing."""
     out = scaled_ray(ray.origin, ray.direction, ray.t_min, ray.t_max)
-    if is_other or fused():
+    if is_other or inexact():
         warn_once(wp.where(is_other, 1, 0))
         out.direction = wp.vec3(wp.nan, wp.nan, wp.nan)
     return out

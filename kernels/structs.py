@@ -16,7 +16,7 @@ EPSILON = wp.constant(2.0**-24)  # unit roundoff u of float32
 # The headers contain vectorised box and edge tests for the traversal of wide BVHs on a CPU.
 MODULE_OPTIONS = {"fuse_fp": False, "enable_backward": False,
                   "extra_build_options": wp.ModuleBuildOptions(extra_cpu_preamble=text_of("wide/triangle.h"))}
-OWN_OPTIONS = {"mode": "release", "extra_build_options": with_headers("wide/triangle.h")}
+OWN_OPTIONS = {"extra_build_options": with_headers("wide/triangle.h")}
 
 
 if TYPE_CHECKING:  # type checkers skip device code, because Warp's annotations are not Python types
@@ -26,8 +26,7 @@ if TYPE_CHECKING:  # type checkers skip device code, because Warp's annotations 
 else:
     def kernel(function, registers=None, **options):
         """Make a Warp kernel in a module of its own, without fused multiply-add and without code for gradients.
-        Kernels of wrt are compiled in release mode, whatever wp.config.mode is: in debug mode, a kernel of Warp 1.19 ends the process if
-        several threads launch it. Kernels of a user follow wp.config.mode. registers: most registers of a CUDA thread."""
+        registers: most registers of a CUDA thread."""
         own = OWN_OPTIONS if str(function.__module__).startswith("wrt.") else {}  # __module__ is None in code made by exec
         return wp.kernel(function, module="unique", module_options=MODULE_OPTIONS | own | options, enable_backward=False,
                          cuda_max_registers=registers)

@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
+import warnings
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -73,14 +74,51 @@ def test_rays_on_other_devices_are_copied_and_answers_there_are_refused() -> Non
         accel = build(mesh, "bvh8", device=mine)
         there = [wp.array(array, dtype=kind, device=other) for array, kind in arrays]
         for rays in (there, [there[0].to(mine), there[1], there[2]], [origins, directions, there[2]]):
-            hits = accel.closest_hit(*rays[:2], 0.0, rays[2])
+            with pytest.warns(wrt.SceneWarning, match=f"arrays from {other} to {mine}.*device='{other}'") as warned:
+                hits = accel.closest_hit(*rays[:2], 0.0, rays[2])
+            assert {warning.filename for warning in warned} == {__file__}
             assert hits.t.device == wp.get_device(mine) if isinstance(hits.t, wp.array) else rays[0] is origins
             for name in ("t", "u", "v", "prim_id"):
                 assert to_numpy(getattr(hits, name)).tobytes() == getattr(expected, name).tobytes()
+        with pytest.warns(wrt.SceneWarning, match=f"to {mine}"):
+            seen = wrt.visible(accel, *there[:2])
+        assert seen.device == wp.get_device(mine)
+        with pytest.warns(wrt.SceneWarning, match=f"to {mine}"):
+            assert np.array_equal(to_numpy(wrt.count_hits(accel, *there[:2])), wrt.count_hits(accel, origins, directions))
         with refused("out"):
             accel.any_hit(*there[:2], out=wp.zeros(len(origins), dtype=wp.bool, device=other))
-        with refused("t_max") if "cpu" in (mine, other) else nullcontext():
+        with warnings.catch_warnings(action="ignore"), refused("t_max") if "cpu" in (mine, other) else nullcontext():
             accel.closest_hit(*there[:2], 0.0, wp.full(len(origins), np.nan, dtype=float, device=other))
+
+
+@pytest.mark.parametrize("default", ["cpu", "cuda:0"])
+def test_the_gpu_of_a_meshs_arrays_decides(default: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("wrt.accel.scenes.build.DEFAULT_DEVICE", default)
+    mesh = shapes.icosphere(1)
+    host = mesh.vertices, mesh.faces
+
+    def on(name: str) -> tuple[wp.array, wp.array]:
+        return wp.array(mesh.vertices, dtype=wp.vec3, device=name), wp.array(mesh.faces.reshape(-1), dtype=wp.int32, device=name)
+
+    there = on("cuda:1")
+    pair, geometry, tree = (there[0], mesh.faces), wrt.DeviceGeometry(*there), build(mesh, "bvh2", device="cpu").tree()
+    for given, expected in ((pair, "cuda:1"), (geometry, "cuda:1"), (host, default), (mesh, default),
+                            ((on("cpu")[0], mesh.faces), default)):
+        assert str(build(given, "bvh2").device) == str(wrt.accel_from_tree(given, tree).device) == expected
+        assert str(build(given, "bvh2", device="cpu").device) == str(wrt.accel_from_tree(given, tree, device="cpu").device) == "cpu"
+        assert str(build(given, "bvh2", device="cuda:0").device) == "cuda:0"
+    assert [str(build(given, movable=movable).device) for given, movable in (([mesh, pair], False), (pair, True), ([mesh], False))] == [
+        "cuda:1", "cuda:1", default]
+    with wp.ScopedDevice("cuda:1"):
+        assert str(build(mesh).device) == default
+
+
+def test_a_file_is_loaded_on_the_gpu_of_its_meshs_arrays(tmp_path: Path) -> None:
+    mesh = shapes.icosphere(1)
+    build(mesh, "bvh2", device="cpu").save(tmp_path / "a.accel")
+    pair = wp.array(mesh.vertices, dtype=wp.vec3, device="cuda:1"), mesh.faces
+    assert [str(wrt.load_accel(tmp_path / "a.accel", *more).device) for more in ((pair,), (pair, "cpu"), (mesh,))] == [
+        "cuda:1", "cpu", device.NAME]
 
 
 # A defect in a branch for CUDA only: it clears one bit of the mask of triangles that a ray may hit.

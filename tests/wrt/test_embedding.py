@@ -48,22 +48,29 @@ def expected() -> str:
     return printed("work()")[0]
 
 
-def test_debug_mode_is_not_for_kernels_of_wrt(expected: str) -> None:
-    """Warp 1.19 crashes if several threads launch a kernel that was compiled in debug mode."""
-    assert printed("import warp as wp; wp.config.mode = 'debug'; work(4)") == [expected]
+# Settings of wp.config that change bits, or print lines for each value that is not finite.
+SETTINGS = {"mode": "debug", "optimization_level": 0, "verify_fp": True, "verify_autograd_array_access": True, "max_unroll": 1,
+            "cpu_compiler_flags": "-march=native -O1 -ffast-math", "enable_vector_component_overwrites": True}
+
+
+def test_settings_of_warp_are_not_for_kernels_of_wrt(expected: str) -> None:
+    assert printed(f"import warp as wp; vars(wp.config).update({SETTINGS}); work(1)") == [expected]
 
 
 @pytest.mark.parametrize("decorator", [wp.kernel, wrt.kernel])
-def test_debug_mode_is_for_kernels_of_the_user(decorator: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    query = wrt.ray_query("bvh2")
+def test_settings_of_warp_are_for_kernels_of_the_user(decorator: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    query, before = wrt.ray_query("bvh2"), fit_kdops.module.resolve_options(wp.config)
+    for name, value in SETTINGS.items():
+        monkeypatch.setattr(wp.config, name, value)
 
     @decorator  # type: ignore[untyped-decorator]
     def mine(world: query.World, t: wp.array(dtype=float)) -> None:  # type: ignore[name-defined, valid-type]
         t[0] = query.closest_hit(world, query.ray(wp.vec3(0.0, 0.0, 3.0), wp.vec3(0.0, 0.0, -1.0))).t
 
-    monkeypatch.setattr(wp.config, "mode", "debug")
-    assert mine.module.resolve_options(wp.config)["mode"] == "debug"
-    assert fit_kdops.module.resolve_options(wp.config)["mode"] == "release"
+    options = mine.module.resolve_options(wp.config)
+    assert "-ffast-math" in options.pop("cpu_compiler_flags") and SETTINGS.items() - options.items() == {
+        ("cpu_compiler_flags", SETTINGS["cpu_compiler_flags"])}
+    assert fit_kdops.module.resolve_options(wp.config) == before
 
 
 @pytest.mark.parametrize("kib", [64, 512])

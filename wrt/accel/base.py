@@ -29,6 +29,7 @@ from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.core.seconds import build_clock
 from wrt.core.types import ArrayLike, KernelModule, PathLike, WarpArray, WarpStruct, WarpType
+from wrt.core.warp_private import refuse_capture
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.warp_private import fields_of
 from wrt.scene.values import as_number, near_zero
@@ -156,6 +157,7 @@ class OneMesh(TreeExchange, ABC):
         """
         if not self.can_refit:
             raise InputError(f"a {self.name} cannot be refitted", hint="build it again, or use bvh2")
+        refuse_capture(None if in_place else self.device)
         rebuild_at = np.inf if np.array_equal(rebuild_at, np.inf) else as_number(rebuild_at, "rebuild_at", low=0.0)
         vertices = from_tensor(vertices, "vertices")
         with self._refitting:
@@ -196,8 +198,7 @@ class OneMesh(TreeExchange, ABC):
         """
         from wrt.accel.epo import end_point_overlap
 
-        geometry, built = self._snapshot.mesh, self._snapshot.arrays
-        return end_point_overlap(self._children(built.on_host()), geometry, self.threads)
+        return end_point_overlap(self._children(self.snapshot.arrays.on_host()), self.snapshot.mesh, self.threads)
 
     def _upload(self, built: Built) -> WarpStruct:
         def on_device(array: np.ndarray | WarpArray, dtype: WarpType) -> WarpArray:
@@ -230,7 +231,7 @@ class OneMesh(TreeExchange, ABC):
         InputError
             If the suffix is not .accel, or the file cannot be written.
         """
-        save(self._snapshot, path, mesh)
+        save(self.snapshot, path, mesh)
 
     def __repr__(self) -> str:
         s = self.stats

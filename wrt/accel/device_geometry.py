@@ -8,10 +8,12 @@ import numpy as np
 import warp as wp
 
 from wrt.accel.geometry import Geometry
+from wrt.core.arrays import to_numpy
 from wrt.core.checks import shown
 from wrt.core.device import launch_on
 from wrt.core.errors import InputError
 from wrt.core.types import ArrayLike, Device, WarpArray, WarpStruct
+from wrt.core.warp_private import refuse_capture
 from wrt.kernels.build.shape import Shape, count_outside
 
 
@@ -38,6 +40,7 @@ class DeviceGeometry(Geometry):
     indices: WarpArray
 
     def __init__(self, points: WarpArray, indices: WarpArray) -> None:
+        refuse_capture(points.device if isinstance(points, wp.array) else None)
         points = self.checked_points(points, "points")
         flat = isinstance(indices, wp.array) and indices.dtype == wp.int32 and indices.ndim == 1 and len(indices) % 3 == 0
         if not (flat or (isinstance(indices, wp.array) and indices.dtype == wp.vec3i and indices.ndim == 1)):
@@ -89,12 +92,12 @@ class DeviceGeometry(Geometry):
     @property
     def vertices(self) -> np.ndarray:
         """Copy of the points on the host."""
-        return np.asarray(self.points.numpy())
+        return to_numpy(self.points)
 
     @cached_property
     def faces(self) -> np.ndarray:
         """Copy of the indices on the host, (F, 3)."""
-        return np.asarray(self.indices.numpy())
+        return to_numpy(self.indices)
 
     def on(self, device: Device, faces: WarpArray | None = None) -> WarpStruct:
         """Convert to kernels.build.shape.Shape on `device`; arrays of another device are copied."""

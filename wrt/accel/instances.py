@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Self, TypeGuard, overload
+from typing import Any, Self, TypeGuard, cast, overload
 
 import numpy as np
 import warp as wp
@@ -26,6 +26,7 @@ from wrt.core.device import upload
 from wrt.core.errors import InputError
 from wrt.core.seconds import build_clock
 from wrt.core.types import ArrayLike, PathLike, WarpStruct
+from wrt.core.warp_private import refuse_capture
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.traverse.instances import Placement
 from wrt.kernels.warp_private import fields_of
@@ -135,10 +136,10 @@ class Instances(Accelerator):
         InputError
             For other shapes, names and indices, for objects that are not instances, and for matrices that flatten or shear too much.
         """
+        refuse_capture(self.device)
         rebuild_at = np.inf if np.array_equal(rebuild_at, np.inf) else as_number(rebuild_at, "rebuild_at", low=0.0)
         with self._refitting:
-            begin, before = build_clock(), self._snapshot
-            geometry: Any = before.geometry
+            begin, before, geometry = build_clock(), self._snapshot, cast(Any, self._snapshot.geometry)
             if is_named(instance):
                 instance, object = object, instance
             if (instance is None) == (object is None) or matrix is None or (object is None and world is not None):
@@ -183,7 +184,7 @@ class Instances(Accelerator):
         InputError
             If the suffix is not .accel, or the file cannot be written.
         """
-        save_instances(self._snapshot, [bottom.built for bottom in self.bottoms], path)
+        save_instances(self.snapshot, [bottom.built for bottom in self.bottoms], path)
 
     def __repr__(self) -> str:
         s, geometry = self.stats, self.geometry

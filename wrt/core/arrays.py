@@ -12,7 +12,7 @@ import warp as wp
 from wrt.core.checks import shown
 from wrt.core.errors import InputError
 from wrt.core.types import Array, ArrayLike, Tensor, WarpArray, WarpType
-from wrt.core.warp_private import recording_tape
+from wrt.core.warp_private import recording_tape, refuse_capture
 
 DLPACK_CPU = 1
 REAL = "iufO"  # NumPy's kinds of real numbers, and objects such as fractions: no bool, complex, text or date
@@ -23,7 +23,13 @@ def to_numpy(array: ArrayLike) -> np.ndarray:
     if type(array) is np.ndarray:
         return array
     array = from_tensor(array, "an array", None)
-    return array.numpy() if isinstance(array, wp.array) else np.asarray(array)
+    return _on_host(array) if isinstance(array, wp.array) else np.asarray(array)
+
+
+def _on_host(array: WarpArray) -> np.ndarray:
+    """Return the values of a Warp array. Raises InputError in a capture, because launches that would write them have not run."""
+    refuse_capture(array.device)
+    return np.asarray(array.numpy())
 
 
 def to_warp(array: ArrayLike, dtype: WarpType = None) -> WarpArray:
@@ -34,6 +40,7 @@ def to_warp(array: ArrayLike, dtype: WarpType = None) -> WarpArray:
         array = from_tensor(array, "an array", dtype)
     if isinstance(array, wp.array):
         return array
+    refuse_capture()
     array = np.ascontiguousarray(array)
     return wp.array(array, dtype=dtype or wp.dtype_from_numpy(array.dtype), device="cpu", copy=not array.flags.writeable)
 
@@ -46,7 +53,7 @@ def real_numbers(value: object, name: str, shape: str) -> np.ndarray:
         raise InputError("must not be a masked array", hint="leave masked rows out, or fill them", argument=name)
     value = from_tensor(value, name, None)
     try:
-        array = value.numpy() if isinstance(value, wp.array) else np.asarray(value)
+        array = _on_host(value) if isinstance(value, wp.array) else np.asarray(value)
         if array.dtype.kind in REAL:
             return float32(array) if array.dtype.kind == "O" else array
     except (TypeError, ValueError, OverflowError):

@@ -22,7 +22,7 @@ import warp as wp
 
 from wrt.core import cuda, warp_private
 from wrt.core.compiling import WATCH
-from wrt.core.errors import InputError
+from wrt.core.errors import InputError, warn
 from wrt.core.kernel_cache import is_intact, remove
 from wrt.core.seconds import loading
 from wrt.core.threads import run_all, submit, thread_count, with_stack
@@ -95,11 +95,17 @@ def _start_warp() -> None:
         warp_private.prepare()
 
 
-@made_once
 def start(device: str) -> Device:
     """Start Warp and return the device with a name such as "cpu" or "cuda:0".
 
-    Raises InputError for an unknown name, with the known names, and if the folder of the kernel cache cannot be made."""
+    Raises InputError for an unknown name, with the known names, if the folder of the kernel cache cannot be made, and in a capture."""
+    found = _device(device)
+    warp_private.refuse_capture(found)
+    return found
+
+
+@made_once
+def _device(device: str) -> Device:
     _start_warp()
     try:
         with _stderr_without(warp_private.CUDA_ERROR):  # the InputError below reports it
@@ -230,10 +236,11 @@ def upload(array: np.ndarray, dtype: WarpType, device: Device, read_only: bool =
     """Return a Warp array of `dtype` with the rows of a NumPy array; on the CPU without a copy if type and layout allow it.
 
     read_only: no kernel writes to the array, so that it may share the memory of an array that is not writeable, such as a scene's.
-    Raises InputError for more rows than the int32 indices of kernels can reach."""
+    Raises InputError for more rows than the int32 indices of kernels can reach, and in a capture."""
     if len(array) > MOST_ROWS:
         raise InputError(f"{len(array)} rows of {dtype.__name__ if isinstance(dtype, type) else dtype.key} are more than an array"
                          f" on a device can have, 2^31 - 1", hint="a binary tree (bvh2) has the fewest")
+    warp_private.refuse_capture(device if len(array) else None)
     if hasattr(dtype, "numpy_dtype"):  # a struct
         assert array.dtype == record_dtype(dtype)
         rows = np.ascontiguousarray(array)
@@ -246,8 +253,18 @@ def upload(array: np.ndarray, dtype: WarpType, device: Device, read_only: bool =
     return wp.array(array, dtype=dtype, device=device, copy=not array.flags.writeable)
 
 
+def to_device(array: WarpArray, device: Device) -> WarpArray:
+    """Return an array of a query on the structure's device. A copy from another device gets a SceneWarning, and is refused in a capture."""
+    if array.device != device:
+        warp_private.refuse_capture(device if device.is_cuda else array.device)
+        warn(f"each call copies arrays from {array.device} to {device}, where the structure and its hits are: pass arrays on {device},"
+             f" or build the structure with device={str(array.device)!r}")
+    return array.to(device)
+
+
 def on_host(array: WarpArray) -> np.ndarray:
     """Return a Warp array, also one of structs, as a NumPy array: the same memory on the CPU, a copy from a GPU."""
+    warp_private.refuse_capture(array.device)
     if not hasattr(array.dtype, "numpy_dtype"):
         return np.asarray(array.numpy())
     layout = record_dtype(array.dtype)
@@ -314,6 +331,7 @@ def launch_on(device: Device, kernel: Kernel, n: int, *inputs: object, threads: 
     by the first index of the range. On a GPU there is one launch, in blocks of wrt.core.cuda.block_dim threads."""
     if n == 0:
         return
+    warp_private.refuse_capture()
     load_kernel(kernel, device)
     step = step if step and device.is_cpu else n
 

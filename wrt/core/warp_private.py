@@ -4,14 +4,15 @@ Device code uses private parts only in kernels/warp_private.py. All assumptions 
 self-test in wrt.accel.queries.raw_launches refuse a Warp that differs. docs/warp.md lists each assumption and its test."""
 
 import ctypes
+import inspect
 import os
 import re
 import threading
 from collections.abc import Iterable
 from functools import cache, partial, wraps
 from hashlib import sha256
-from inspect import signature
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple, TypeAlias
 from weakref import WeakKeyDictionary
 
@@ -34,7 +35,9 @@ def refusal(what: str) -> InputError:
 try:
     from warp._src import build, codegen, context
     from warp._src.types import array_t
-except ImportError as error:
+
+    _resolve_options = context.Module.resolve_options
+except (ImportError, AttributeError) as error:
     raise refusal(str(error)) from error
 
 # --- structs and arrays as kernel arguments ---------------------------------------------------------------------------
@@ -142,6 +145,22 @@ def recording_tape() -> wp.Tape | None:
     return context.runtime.tape
 
 
+def refuse_capture(device: Device | None = None) -> None:
+    """Raise InputError, which names the called function of wrt, while a graph is captured on the CPU or on `device`.
+
+    On the CPU, Warp then records launches and copies and runs none. wrt's own launches and NumPy would run at once, on old values."""
+    capture = getattr(context.runtime, "_apic_capture", None)  # None before Warp starts
+    if not (capture is not None and capture.device.is_cpu) and not (device is not None and device.is_cuda and device.is_capturing):
+        return
+    name, frame = "a function of wrt", inspect.currentframe()
+    while frame:  # the outermost function of wrt is the one that the user called
+        if str(frame.f_globals.get("__name__")).startswith("wrt.") and "<" not in frame.f_code.co_qualname:
+            name = frame.f_code.co_qualname
+        frame = frame.f_back
+    raise InputError(f"{name} cannot be captured in a graph", hint="call it before or after the capture; a kernel of your own with"
+                     " wrt.ray_query can be captured, and so can, on a GPU, what docs/moving.md lists")
+
+
 # --- kernels and their files ------------------------------------------------------------------------------------------
 
 IN_CACHE = "wp_*"  # folders of modules in the kernel cache
@@ -190,10 +209,40 @@ def is_warps_error(error: BaseException) -> bool:
 
 # --- the compiler -----------------------------------------------------------------------------------------------------
 
+# Settings that change bits or print lines, with Warp's defaults: modules of wrt are compiled with these, whatever wp.config has.
+_CONFIG = {"mode": "release", "optimization_level": None, "verify_fp": False, "verify_autograd_array_access": False, "llvm_cuda": False,
+           "enable_vector_component_overwrites": False, "default_grid_stride": True}
+_OPTIONS = {"max_unroll": 16, "deterministic": wp.config.DeterministicMode.NOT_GUARANTEED, "deterministic_max_records": 0}
+_FLAGS = "-mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000 -mllvm=-slp-recursion-max-depth=4"
+# Of the user's flags, modules of wrt keep those that choose a processor, reports of the compiler, and WRT_CHECK (kernels/wide/lanes.h).
+_KEPT_FLAG = re.compile(r"(?<!\S)(?:(?:-target-(?:cpu|feature)[ =]|-m(?:arch|cpu|tune)=|-R)\S+|-DWRT_CHECK)")
+
+
+def _is_own_module(module: Any) -> bool:
+    kernels = module._get_live_kernels()
+    return len(kernels) > 0 and all(map(is_own, kernels))
+
+
+def _own_flags(flags: str | None) -> str:
+    """Return the flags for the CPU of wrt's modules. flags: wp.config.cpu_compiler_flags."""
+    return " ".join([*_KEPT_FLAG.findall("-march=native" if flags is None else flags), _FLAGS])
+
+
+@wraps(_resolve_options)
+def _own_options(self: Any, config: Any, block_dim: int | None = None) -> dict[str, Any]:
+    if not _is_own_module(self):
+        return dict(_resolve_options(self, config, block_dim))
+    own = SimpleNamespace(**{**vars(config), **_CONFIG, "cpu_compiler_flags": _own_flags(config.cpu_compiler_flags)})
+    return {**_resolve_options(self, own, block_dim), **_OPTIONS}
+
+
+context.Module.resolve_options = _own_options  # at once, because kernels are hashed where they are defined, before Warp starts
+
 # The changes below make Warp's compiler faster, and change no result of a kernel. They act only while a module of wrt is compiled. Each
 # names the processor time that it saves in a first render of scenes/whitted.toml with an empty kernel cache (docs/warp.md).
 
 _REPLACED = {  # replaced functions, with their parameters in Warp 1.19
+    ("Module", "resolve_options"): ("self", "config", "block_dim"),
     ("Module", "_compile"): ("self", "device", "output_dir", "output_name", "output_arch", "use_ptx", "options"),
     ("codegen", "codegen_struct"): ("struct", "device", "indent_size", "include_tile_helpers"),
     ("build", "build_cpu"): (
@@ -212,10 +261,11 @@ def prepare() -> None:
     owners = {"Module": context.Module, "codegen": codegen, "build": build, "runtime": context.runtime}
     for (owner, name), parameters in _REPLACED.items():
         found = getattr(owners[owner], name, None)
-        if found is None or tuple(signature(found).parameters) != parameters:
+        if found is None or tuple(inspect.signature(found).parameters) != parameters:
             raise refusal(f"{owner}.{name}")
-    if not hasattr(context.runtime, "tape"):
-        raise refusal("runtime.tape")
+    for name in ("tape", "_apic_capture"):
+        if not hasattr(context.runtime, name):
+            raise refusal(f"runtime.{name}")
     _mark_own_modules()
     _drop_unused_helpers()
     _compile_well()
@@ -232,8 +282,7 @@ def _mark_own_modules() -> None:
 
     @wraps(compile_module)
     def marked(self: Any, *args: Any, **options: Any) -> Any:
-        kernels = self._get_live_kernels()
-        _here.own = len(kernels) > 0 and all(map(is_own, kernels))
+        _here.own = _is_own_module(self)
         try:
             return compile_module(self, *args, **options)
         finally:
@@ -293,7 +342,7 @@ def _share_hashes() -> None:
     If Warp's hasher has another form, it stays as it is."""
     hasher = getattr(context, "ModuleHasher", None)
     compute, known = getattr(hasher, "hash_function", None), WeakKeyDictionary[Any, bytes]()
-    if compute is None or tuple(signature(compute).parameters) != ("self", "func"):
+    if compute is None or tuple(inspect.signature(compute).parameters) != ("self", "func"):
         return
 
     @wraps(compute)

@@ -59,11 +59,11 @@ def test_the_versions_that_work_are_those_that_pip_installs() -> None:
 
 @pytest.mark.parametrize(("owner", "name", "change"), [
     *((*replaced, change) for replaced in warp_private._REPLACED for change in ("gone", "other parameters")),
-    ("runtime", "tape", "gone")])
+    ("runtime", "tape", "gone"), ("runtime", "_apic_capture", "gone")])
 def test_a_warp_that_differs_is_refused(owner: str, name: str, change: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The error comes before any function is replaced."""
     parts = {"Module": SimpleNamespace(), "codegen": SimpleNamespace(), "build": SimpleNamespace(),
-             "runtime": SimpleNamespace(tape=None)}
+             "runtime": SimpleNamespace(tape=None, _apic_capture=None)}
     for (each, function), parameters in warp_private._REPLACED.items():
         made = {}
         exec(f"def {function}({', '.join(parameters)}): ...", made)
@@ -84,14 +84,16 @@ def test_a_warp_that_differs_is_refused(owner: str, name: str, change: str, monk
         assert left == {key: value for key, value in before[each].items() if key != name}
 
 
-def test_a_warp_without_a_name_is_one_message_of_the_command_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("owner", "name", "message"), [("types", "array_t", "cannot import name 'array_t'"), (
+    "context.Module", "resolve_options", "type object 'Module' has no attribute 'resolve_options'")])
+def test_a_warp_without_a_name_is_one_message_of_the_command_line(owner: str, name: str, message: str, tmp_path: Path) -> None:
     scene, picture = ROOT / "scenes" / "whitted.toml", tmp_path / "out.png"
-    code = ("import sys\nfrom warp._src import types\ndel types.array_t\n"
+    code = (f"import sys\nfrom warp._src import context, types\ndel {owner}.{name}\n"
             f"sys.argv = ['wrt', 'render', {str(scene)!r}, '--spp', '1', '--size', '8x8', '-o', {str(picture)!r}]\n"
             "from wrt.cli.main import main\nmain()\n")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=os.environ | {"PYTHONPATH": str(ROOT)})
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1) and not picture.exists()
-    assert done.stderr.startswith(f"error: {DIFFER} (cannot import name 'array_t'")
+    assert done.stderr.startswith(f"error: {DIFFER} ({message}")
     assert done.stderr.endswith(f"); install '{WORKS_WITH}'\n")
 
 
@@ -166,6 +168,15 @@ def test_shared_hashes_are_those_of_warp(scene: str, monkeypatch: pytest.MonkeyP
     hasher = warp_private.context.ModuleHasher
     monkeypatch.setattr(hasher, "hash_function", hasher.hash_function.__wrapped__)
     assert len(made) > 4 and [kernel.module.hash_module() for kernel in made] == shared
+
+
+@pytest.mark.parametrize(("flags", "kept"), [
+    (None, "-march=native"), ("-march=native", "-march=native"), ("-O1 -ffast-math -fno-march=native", ""),
+    ("-ffast-math -target-cpu x86-64-v3 -O0", "-target-cpu x86-64-v3"),
+    ("-march=native -DNDEBUG -DWRT_CHECK -mllvm -x -Rpass=loop-vectorize", "-march=native -DWRT_CHECK -Rpass=loop-vectorize")])
+def test_of_the_users_flags_the_processor_stays(flags: str | None, kept: str) -> None:
+    """The others are Warp's default."""
+    assert warp_private._own_flags(flags) == wp.config.cpu_compiler_flags.replace("-march=native", kept).strip()
 
 
 MINE = """

@@ -146,7 +146,7 @@ class Bvh2(BinaryBvh):
 
     def save(self, path: PathLike, mesh: bool = False) -> None:
         """Write the structure to a file, as OneMesh.save does. After a refit in place, first compute the SAH cost."""
-        snapshot = self._snapshot
+        snapshot = self.snapshot
         built = snapshot.arrays
         if math.isnan(built.sah_cost):
             snapshot = replace(snapshot, built=replace(built, sah_cost=sah_cost(built.on_host().arrays["nodes"])))

@@ -31,7 +31,7 @@ from wrt.core.other_names import same_name
 from wrt.core.suggestions import check_keywords, no_attribute, parameters_of
 from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike, NumpyLike, TensorT, WarpArray, WarpStruct
-from wrt.core.warp_private import recording_tape
+from wrt.core.warp_private import recording_tape, refuse_capture
 from wrt.kernels.structs import Surfaces
 
 # Names of queries that are functions, not methods.
@@ -113,7 +113,8 @@ class Accelerator:
 
     @property
     def snapshot(self) -> Snapshot:
-        """Present state of the structure. A later refit does not change it, unless it is a refit in place."""
+        """Present state of the structure. A later refit does not change it, unless it is a refit in place. Refused in a capture."""
+        refuse_capture()
         return self._snapshot
 
     @property
@@ -187,10 +188,10 @@ class Accelerator:
         InputError
             Names the argument and what was expected. The arrays of `out` may have been overwritten.
         """
+        snapshot = self.snapshot  # read once, because a refit may replace it during the query
         threads, shape, callers = thread_count(threads), None, None if out is None else arrays_of(out)
         if costs:
             check_keywords("closest_hit", costs, CLOSEST_HIT)
-        snapshot = self._snapshot  # read once, because a refit may replace it during the query
         if are_rows(origins, directions) and invalid == "raise":  # the usual case, whose arrays need no other shape
             rays = rays_of(origins, directions, t_min, t_max, True, snapshot.geometry.origin)  # type: ignore[arg-type]
         else:
@@ -244,12 +245,11 @@ class Accelerator:
         InputError
             Names the argument and what was expected.
         """
-        threads, shape, callers = thread_count(threads), None, None if out is None else [out]
-        world, invalid = None, "raise"
+        snapshot, shape, callers = self.snapshot, None, None if out is None else [out]
+        threads, world, invalid = thread_count(threads), None, "raise"
         if options:
             check_keywords("any_hit", options, ANY_HIT)
             world, invalid = options.get("world"), options.get("invalid", invalid)
-        snapshot = self._snapshot
         if are_rows(origins, directions) and invalid == "raise":
             rays = rays_of(origins, directions, t_min, t_max, origin=snapshot.geometry.origin)  # type: ignore[arg-type]
         else:
@@ -276,4 +276,6 @@ def snapshot_of(accel: Accelerator, instances: bool = False) -> Snapshot:
     if units is None or units.spheres or (units.instances and not instances):
         hint = "build one first: accel = wrt.build(mesh)" if units is None else MESH_OF_A_SPHERE if units.spheres else None
         raise InputError(f"must be a structure{what} without spheres, got {shown(accel)}", argument="accel", hint=hint)
+    if instances:  # the results of such queries go through the host
+        refuse_capture(accel.device)
     return accel.snapshot

@@ -8,6 +8,7 @@ from wrt.accel.queries.batches import Query, trace_query
 from wrt.accel.snapshot import Snapshot
 from wrt.core.device import on_host, upload
 from wrt.core.types import WarpStruct
+from wrt.core.warp_private import refuse_capture
 from wrt.kernels.traverse.counters import SIZE_RANGE, Counts
 from wrt.kernels.traverse.steps import Step
 
@@ -15,6 +16,7 @@ from wrt.kernels.traverse.steps import Step
 def counted(snapshot: Snapshot, query: Query, fetches_too: bool) -> Counters:
     """Trace the query and count its costs. fetches_too: record each fetch in a second run, after a first run that counts fetches."""
     n, device = len(query.out[0]), snapshot.device
+    refuse_capture(device)
 
     def run(first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         # A copy of the struct, because each call needs arrays of its own.

@@ -22,6 +22,7 @@ from wrt.core.device import launch_on, records, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
 from wrt.core.types import ArrayLike, ArrayT, WarpStruct
+from wrt.core.warp_private import refuse_capture
 from wrt.kernels import structs
 from wrt.kernels.query import HitArrays, RayArrays
 from wrt.kernels.warp_private import fields_of
@@ -78,6 +79,7 @@ class HitIds(Generic[ArrayT]):
 
     def _source(self, rays: bool = True) -> Source:
         """Return the source. Raises InputError without it, and, if `rays` are needed, without rays."""
+        refuse_capture()
         if self.source is None or (rays and self.source[1] is None):
             raise InputError("these hits have no rays, from which distances, points, normals and ids are computed: lists of hits have ids"
                              " alone, copies and pickled hits lose all", hint="ask the result of closest_hit before it is copied")
@@ -105,6 +107,8 @@ class HitIds(Generic[ArrayT]):
             name = "normal"
         _require(scene, name)
         to_own = own_ids(name, scene, worlds)
+        if to_own is not None or not isinstance(self.prim_id, wp.array):  # computed on the host
+            refuse_capture(device)
         if name in ("instance", "object") and isinstance(scene.geometry, InstancedGeometry):
             name = "instance" if scene.objects is None else "object"
         out: Any = HitPlaces()

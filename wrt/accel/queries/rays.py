@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from wrt.core.arrays import check_no_gradients, float32, from_tensor, real_numbers
-from wrt.core.device import launch_on, upload
+from wrt.core.device import launch_on, to_device, upload
 from wrt.core.errors import InputError
 from wrt.core.types import Array, ArrayLike, Device, Kernel, WarpArray, WarpType
 from wrt.core.warp_private import keep
@@ -37,7 +37,7 @@ class Rays(NamedTuple):
 
     def on(self, device: Device) -> "Rays":
         """Copy Warp arrays of other devices to `device`."""
-        return Rays(*[array.to(device) if isinstance(array, wp.array) else array for array in self])
+        return Rays(*[to_device(array, device) if isinstance(array, wp.array) else array for array in self])
 
     def of(self, rows: np.ndarray) -> "Rays":
         """Return some of the rays. rows: indices (M,)."""

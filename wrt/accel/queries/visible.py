@@ -22,7 +22,7 @@ from wrt.accel.queries.shapes import flat_array, in_shape, shaped_pairs, worlds_
 from wrt.accel.queries.world_ids import check_world
 from wrt.core.arrays import check_no_gradients, real_numbers, to_numpy, to_tensor_like
 from wrt.core.checks import shown
-from wrt.core.device import launch_on, upload
+from wrt.core.device import launch_on, to_device, upload
 from wrt.core.errors import InputError
 from wrt.core.threads import thread_count
 from wrt.core.types import Array, ArrayLike, Device, Kernel, NumpyLike, TensorT, WarpArray, WarpStruct
@@ -167,7 +167,7 @@ def _points(value: Array, name: str, device: Device, origin: np.ndarray | None) 
     if isinstance(value, wp.array):
         if value.device.is_cpu:
             vectors(value.numpy(), name, FARTHEST)
-        return (value if value.is_contiguous else value.contiguous()).to(device)
+        return to_device(value if value.is_contiguous else value.contiguous(), device)
     return upload(vectors(value, name, FARTHEST), wp.vec3, device)
 
 

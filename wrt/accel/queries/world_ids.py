@@ -10,7 +10,7 @@ from wrt.accel.instanced_geometry import InstancedGeometry
 from wrt.accel.snapshot import Snapshot
 from wrt.core.arrays import real_numbers, to_numpy
 from wrt.core.checks import shown
-from wrt.core.device import upload
+from wrt.core.device import to_device, upload
 from wrt.core.errors import InputError
 from wrt.core.types import ArrayLike, Device, WarpArray, WarpStruct
 from wrt.kernels.query import Worlds
@@ -29,7 +29,7 @@ class WorldIds:
         if isinstance(world, wp.array):
             if world.dtype != wp.int32 or world.shape != (n,):
                 raise InputError(f"must be ({n},) int32, got {world.shape} {world.dtype.__name__}", argument="world")
-            return (world if world.is_contiguous else world.contiguous()).to(device)
+            return to_device(world if world.is_contiguous else world.contiguous(), device)
         ids, count = real_numbers(world, "world", f"a number or ({n},)"), len(self.first_prim)
         if ids.shape not in ((), (n,)) or (ids.dtype.kind not in "iu" and ids.size):
             raise InputError(f"must be a whole number or ({n},) of them, got {shown(world)}", argument="world")

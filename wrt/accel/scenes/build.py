@@ -88,54 +88,54 @@ class BuildOptions(TypedDict, total=False):
 
 
 @overload
-def build(mesh: OneMeshLike, accel: Literal["bvh", "bvh8"] = ..., device: str = ..., threads: int | None = ...,
+def build(mesh: OneMeshLike, accel: Literal["bvh", "bvh8"] = ..., device: str | None = ..., threads: int | None = ...,
           *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bvh8: ...
 @overload
-def build(mesh: OneMeshLike, accel: Literal["bvh4"], device: str = ..., threads: int | None = ...,
+def build(mesh: OneMeshLike, accel: Literal["bvh4"], device: str | None = ..., threads: int | None = ...,
           *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bvh4: ...
 @overload
-def build(mesh: OneMeshLike, accel: Literal["bvh6"], device: str = ..., threads: int | None = ...,
+def build(mesh: OneMeshLike, accel: Literal["bvh6"], device: str | None = ..., threads: int | None = ...,
           *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bvh6: ...
 @overload
-def build(mesh: OneMeshLike, accel: Literal["bvh8c"], device: str = ..., threads: int | None = ...,
+def build(mesh: OneMeshLike, accel: Literal["bvh8c"], device: str | None = ..., threads: int | None = ...,
           *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bvh8c: ...
 @overload
-def build(mesh: OneMeshLike, accel: Literal["bvh2"], device: str = ..., threads: int | None = ...,
+def build(mesh: OneMeshLike, accel: Literal["bvh2"], device: str | None = ..., threads: int | None = ...,
           *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bvh2: ...
 @overload
-def build(mesh: OneMeshLike, accel: Literal["bvh2_sphere"], device: str = ..., threads: int | None = ...,
+def build(mesh: OneMeshLike, accel: Literal["bvh2_sphere"], device: str | None = ..., threads: int | None = ...,
           *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bvh2Sphere: ...
 @overload
-def build(mesh: OneMeshLike, accel: Literal["bvh2_kdop"], device: str = ..., threads: int | None = ...,
+def build(mesh: OneMeshLike, accel: Literal["bvh2_kdop"], device: str | None = ..., threads: int | None = ...,
           *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bvh2Kdop: ...
 @overload
-def build(mesh: OneMeshLike, accel: Literal["kdtree"], device: str = ..., threads: int | None = ...,
+def build(mesh: OneMeshLike, accel: Literal["kdtree"], device: str | None = ..., threads: int | None = ...,
           *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> KdTree: ...
 @overload
-def build(mesh: OneMeshLike, accel: Literal["bsp"], device: str = ..., threads: int | None = ...,
+def build(mesh: OneMeshLike, accel: Literal["bsp"], device: str | None = ..., threads: int | None = ...,
           *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Bsp: ...
 @overload
-def build(mesh: OneMeshLike, accel: Literal["brute_force"], device: str = ..., threads: int | None = ...,
+def build(mesh: OneMeshLike, accel: Literal["brute_force"], device: str | None = ..., threads: int | None = ...,
           *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> BruteForce: ...
 @overload
-def build(mesh: OneMeshLike, accel: Literal["grid"], device: str = ..., threads: int | None = ...,
+def build(mesh: OneMeshLike, accel: Literal["grid"], device: str | None = ..., threads: int | None = ...,
           *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Grid: ...
 @overload
-def build(mesh: OneMeshLike, accel: Literal["octree"], device: str = ..., threads: int | None = ...,
+def build(mesh: OneMeshLike, accel: Literal["octree"], device: str | None = ..., threads: int | None = ...,
           *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Octree: ...
 @overload
-def build(mesh: OneMeshLike, accel: str, device: str = ..., threads: int | None = ...,
+def build(mesh: OneMeshLike, accel: str, device: str | None = ..., threads: int | None = ...,
           *, progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> OneMesh: ...
 @overload
-def build(mesh: MeshLike, accel: str = ..., device: str = ..., threads: int | None = ..., *, movable: Literal[True],
+def build(mesh: MeshLike, accel: str = ..., device: str | None = ..., threads: int | None = ..., *, movable: Literal[True],
           progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Instances: ...
 @overload
-def build(mesh: SceneLike, accel: str = ..., device: str = ..., threads: int | None = ..., *, movable: bool = ...,
+def build(mesh: SceneLike, accel: str = ..., device: str | None = ..., threads: int | None = ..., *, movable: bool = ...,
           progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> OneMesh | Instances: ...
 @overload
-def build(mesh: list[WorldT], accel: str = ..., device: str = ..., threads: int | None = ..., *, movable: bool = ...,
+def build(mesh: list[WorldT], accel: str = ..., device: str | None = ..., threads: int | None = ..., *, movable: bool = ...,
           progress: Callable[[float], None] | None = ..., **options: Unpack[BuildOptions]) -> Instances: ...
-def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = DEFAULT_DEVICE, threads: int | None = None, *,
+def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str | None = None, threads: int | None = None, *,
           movable: bool = False, progress: Callable[[float], None] | None = None,
           **options: Unpack[BuildOptions]) -> OneMesh | Instances:
     """Build an acceleration structure over a mesh, a scene or several worlds.
@@ -150,8 +150,9 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = DEFAULT_
         Surfaces that rays can hit; all arrays are copied. A path names a mesh file or a scene file.
     accel : str
         Name in `wrt.ACCELERATORS`; "bvh" is bvh8.
-    device : str
-        Device of the structure: "cpu" or "cuda:0".
+    device : str, optional
+        Device of the structure: "cpu" or "cuda:0". By default that of the mesh's arrays if they are on a GPU, else the one that the
+        environment variable WRT_DEVICE names, else "cpu". Warp's current device (`wp.set_device`) has no effect.
     threads : int, optional
         Threads that build and refit; one per core by default.
     movable : bool
@@ -176,7 +177,7 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = DEFAULT_
         raise InputError(f"must be the name of a structure, got {shown(accel)}", argument="accel",
                          hint="vertices and faces are one argument: wrt.build((vertices, faces))")
     ACCELERATORS.check(accel, "accel")
-    kind, device = ACCELERATORS[accel], as_one(device, str, "device")
+    kind, device = ACCELERATORS[accel], device_of(mesh, device)
     if unnamed := as_one(movable, bool, "movable") and not isinstance(mesh, list):
         mesh = [mesh]
     flat: Any = (worlds_over([to_mesh_or_scene(each) for each in mesh], unnamed) if isinstance(mesh, list)
@@ -191,10 +192,10 @@ def build(mesh: MeshLike | list[Any], accel: str = "bvh", device: str = DEFAULT_
 
 
 @overload
-def load_accel(path: PathLike, mesh: MeshLike, device: str = ..., threads: int | None = ...) -> OneMesh: ...
+def load_accel(path: PathLike, mesh: MeshLike, device: str | None = ..., threads: int | None = ...) -> OneMesh: ...
 @overload
-def load_accel(path: PathLike, mesh: None = ..., device: str = ..., threads: int | None = ...) -> OneMesh | Instances: ...
-def load_accel(path: PathLike, mesh: MeshLike | None = None, device: str = DEFAULT_DEVICE,
+def load_accel(path: PathLike, mesh: None = ..., device: str | None = ..., threads: int | None = ...) -> OneMesh | Instances: ...
+def load_accel(path: PathLike, mesh: MeshLike | None = None, device: str | None = None,
                threads: int | None = None) -> OneMesh | Instances:
     """Read a structure that `OneMesh.save`, `Instances.save` or `wrt build` wrote.
 
@@ -216,15 +217,15 @@ def load_accel(path: PathLike, mesh: MeshLike | None = None, device: str = DEFAU
         If the file is missing, damaged, not a structure, of another version, or over another mesh.
     """
     if mesh is None:
-        loaded: OneMesh | Instances = read(path, None, None, as_one(device, str, "device"), threads, Instances.restore)
+        loaded: OneMesh | Instances = read(path, None, None, device_of(mesh, device), threads, Instances.restore)
         return loaded
     flat = to_flat_scene(mesh)
     if not isinstance(flat.geometry, Geometry):
         raise InputError("must not be a scene with instances: the file of a structure over it holds the scene", argument="mesh")
-    return read(path, flat.geometry, flat, as_one(device, str, "device"), threads)
+    return read(path, flat.geometry, flat, device_of(mesh, device), threads)
 
 
-def accel_from_tree(mesh: MeshLike, tree: BoxTree | Mapping[str, Any] | PathLike, accel: str | None = None, device: str = DEFAULT_DEVICE,
+def accel_from_tree(mesh: MeshLike, tree: BoxTree | Mapping[str, Any] | PathLike, accel: str | None = None, device: str | None = None,
                     threads: int | None = None, *, spatial_splits: bool = False) -> OneMesh:
     """Make a BVH from the tree of another builder, so that wrt's queries, counters and models measure it.
 
@@ -259,9 +260,18 @@ def accel_from_tree(mesh: MeshLike, tree: BoxTree | Mapping[str, Any] | PathLike
         raise InputError("must not be a scene with instances", argument="mesh")
     name = accel or ("bvh2" if read.width <= 2 else "bvh4" if read.width <= 4 else "bvh8")
     ACCELERATORS.check(as_one(name, str, "accel"), "accel")
-    out: OneMesh = ACCELERATORS[name].from_tree(read, flat.geometry, flat, as_one(device, str, "device"), threads,
+    out: OneMesh = ACCELERATORS[name].from_tree(read, flat.geometry, flat, device_of(mesh, device), threads,
                                                 spatial_splits=spatial_splits)
     return out
+
+
+def device_of(mesh: Any, device: str | None) -> str:
+    """Return the argument `device` of `build`; None stands for the GPU of the mesh's arrays, else for the default."""
+    for each in () if device is not None else mesh if isinstance(mesh, list) else [mesh]:
+        points = each[0] if isinstance(each, tuple) and each else getattr(each, "points", None)  # of wp.Mesh and DeviceGeometry
+        if isinstance(points := from_tensor(points, "vertices", None), wp.array) and points.device.is_cuda:
+            return str(points.device)
+    return DEFAULT_DEVICE if device is None else as_one(device, str, "device")
 
 
 def own(geometry: Geometry | InstancedGeometry) -> Geometry | InstancedGeometry:
@@ -292,7 +302,7 @@ def to_mesh_or_scene(mesh: MeshLike) -> Mesh | Scene:
     elif isinstance(mesh, str | os.PathLike):
         mesh = load_mesh(mesh)
     elif isinstance(mesh, tuple) and len(mesh) == 2:
-        vertices, faces = (to_numpy(from_tensor(each, name, None)) if is_tensor(each) else each
+        vertices, faces = (to_numpy(from_tensor(each, name, None)) if is_tensor(each) or isinstance(each, wp.array) else each
                            for each, name in zip(mesh, ("vertices", "faces"), strict=True))
         mesh = Mesh(vertices, faces)
     elif isinstance(mesh, wp.Mesh):

@@ -1,6 +1,8 @@
 """Ray queries inside the user's own kernels."""
 
 import ctypes
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import pytest
@@ -101,17 +103,22 @@ def test_rays_of_a_kernel_see_worlds_and_instances(name: str) -> None:
 
 
 @cpu_only
-def test_a_kernel_that_fuses_says_so_and_hits_nothing(capfd: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("make, flags", [
+    (partial(wp.kernel, enable_backward=False, module="unique"), ""), (wrt.kernel, "-O1"), (wrt.kernel, "-ffp-contract=fast"),
+    (wrt.kernel, "-ffast-math")])
+def test_a_kernel_with_inexact_arithmetic_says_so_and_hits_nothing(make: Callable[..., wp.Kernel], flags: str,
+        monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
     accel = wrt.build(shapes.icosphere(1), "bvh2")
     asked = np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32), np.zeros(1, np.float32), np.full(1, np.inf, np.float32)
-    # By default, Warp compiles CUDA kernels with fused multiply-add; on the CPU this needs an option.
-    options = {"cpu_compiler_flags": f"{wp.config.cpu_compiler_flags} -ffp-contract=fast"}
-    kernel = make_kernel(wrt.ray_query(accel), lambda function: wp.kernel(function, enable_backward=False, module="unique",
-                                                                          module_options=options))
-    t, prim_id, occluded = answers(kernel, accel, asked)
+    monkeypatch.setattr(wp.config, "cpu_compiler_flags", f"{wp.config.cpu_compiler_flags} {flags}")
+    t, prim_id, occluded = answers(make_kernel(wrt.ray_query(accel), make), accel, asked)
     ctypes.CDLL(None).fflush(None)
-    assert "must be made with wrt.kernel" in capfd.readouterr().out
-    assert (t[0], prim_id[0], occluded[0]) == (np.inf, -1, False)
+    printed = capfd.readouterr().out
+    if flags == "-O1":
+        assert printed == "" and np.isfinite(t[0]) and prim_id[0] >= 0 and occluded[0]
+    else:
+        assert "must be made with wrt.kernel, and without fast_math" in printed
+        assert (prim_id[0], occluded[0]) == (-1, False) and (np.isinf(t[0]) or "fast" in flags)  # fast maths has no inf
 
 
 def test_a_world_of_another_kind_is_told_and_hits_nothing(capfd: pytest.CaptureFixture[str]) -> None:
