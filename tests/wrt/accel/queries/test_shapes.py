@@ -272,7 +272,7 @@ def test_copied_hits_say_that_they_have_lost_their_rays(ball: Any) -> None:
     for lost in (copy.copy(hits), copy.deepcopy(hits), pickle.loads(pickle.dumps(hits))):
         assert lost.t == hits.t and lost.hit
         for name in ("distance", "points", "normals", "object"):
-            with refused(what="lose them"):
+            with refused(what="lose all"):
                 getattr(lost, name)
 
 
