@@ -1,4 +1,7 @@
-"""Helpers to launch kernels on the tests' device: arrays, launches, random directions."""
+"""Helpers to launch kernels on the tests' device: arrays, launches, random directions; machine code of kernels."""
+
+from io import BytesIO
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -64,3 +67,13 @@ def sobol_like(n: int, rng: np.random.Generator) -> np.ndarray:
     golden = (np.sqrt(5.0) - 1.0) / 2.0
     points = np.stack([(i + 0.5) / n, np.mod(i * golden, 1.0)], axis=1)
     return np.minimum(np.mod(points + rng.random(2), 1.0), 1.0 - 2.0**-24)
+
+
+def machine_code(kernel, folder: Path) -> tuple[bytes, bytes]:
+    """Compile a kernel for Turing; return its code, and the numbers of registers and of bytes of the stack (.nv.info)."""
+    from elftools.elf.elffile import ELFFile  # other tests need no such package
+
+    (binary,) = wp.compile_aot_module(kernel.module, arch=75, module_dir=folder)
+    sections = {section.name: section.data() for section in ELFFile(BytesIO(Path(binary).read_bytes())).iter_sections()}
+    (code,) = (data for name, data in sections.items() if name.startswith(".text."))
+    return code, sections[".nv.info"]

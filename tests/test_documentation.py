@@ -46,7 +46,7 @@ SLOW = {  # run by `pytest -m slow`
     "stability": ("--rays", "200", "--sample", "50", "--runs", "1"), "bench peers": ("--rays", "500", "--runs", "1"),
     "bench rtcore": ("--rays", "500",), "bench units": ("--rays", "500", "--runs", "1"),
     "bench error": ("--size", "16x9", "--max-spp", "2", "--repeats", "3", "--reference-spp", "4", "--knobs", "max_depth"),
-    "bench bvh": ("--rays", "500", "--builds", "1", "--runs", "1", "--builders", "sweep"), "bench instructions": (),
+    "bench bvh": ("--rays", "500", "--builds", "1", "--runs", "1", "--builders", "sweep"),
     "bench visibility": ("--size", "64", "--max-size", "64", "--max-triangles", "2000", "--runs", "1"),
     "bench claims": ("--side", "16", "repacking"), "bench float64": ("--rays", "500"), "bench hard-cases": ("--rays", "5"),
     "bench closed": ("--points", "500", "--rays", "500", "--others", "100"),

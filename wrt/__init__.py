@@ -8,7 +8,7 @@ Scenes in Python: Scene, Settings, Object, Sphere, Material, Texture, Checkerboa
 FisheyeCamera, PanoramaCamera; PointLight, DirectionalLight, SpotLight; ConstantBackground, GradientBackground,
 EnvironmentBackground.
 Costs of a picture: profile. All rays of a pixel: inspect. Steps of rays through a structure: walk, trace.
-The fastest structure on a device: tune. Errors and warnings: InputError, SceneWarning.
+Errors and warnings: InputError, SceneWarning.
 Further modules: sensors, compat (trimesh, open3d), testing.
 """
 
@@ -52,7 +52,6 @@ if TYPE_CHECKING:
     from wrt.kernels.structs import kernel as kernel
     from wrt.lab.rtcore.profiler import profile as profile
     from wrt.lab.rtcore.trace import trace as trace
-    from wrt.lab.tune import tune as tune
     from wrt.lab.walk.walk import walk as walk
     from wrt.picture.film import Film as Film
     from wrt.renderer.inspector.inspect import inspect as inspect

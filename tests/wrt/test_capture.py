@@ -89,7 +89,6 @@ FUNCTIONS: dict[str, Call] = {
     "render": lambda s: wrt.render(wrt.Scene.of([BALL]), size=(8, 8), spp=1),
     "trace": lambda s: wrt.trace(s.accel, *s.rays),
     "walk": lambda s: wrt.walk(s.bvh2, s.rays[0][0], s.rays[1][0]),
-    "tune": lambda s: wrt.tune(str(DEVICE)),
     "camera_rays": lambda s: wrt.camera_rays(wrt.Camera(), (8, 8)),
 }
 METHODS: dict[str, Call] = {

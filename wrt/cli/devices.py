@@ -1,4 +1,4 @@
-"""The command `devices`, which lists devices, compares a device with the CPU, or finds its fastest structure."""
+"""The command `devices`, which lists devices or compares a device with the CPU."""
 
 from pathlib import Path
 
@@ -11,33 +11,18 @@ from wrt.core.errors import InputError
 @click.command()
 @click.option("--check", is_flag=True, help="Compare a device with the CPU, bit for bit, and measure its speed; exit code 1 if"
                                             " a bit differs. Compiling all kernels takes minutes")
-@click.option("--tune", "tunes", is_flag=True, help="Find the fastest structure on a device, and print the options that select it")
-@click.option("--device", help="Device for --check or --tune: cuda:0 ...  [default: cuda:0; for --check without a GPU: cpu]")
+@click.option("--device", help="Device for --check: cuda:0 ...  [default: cuda:0; without a GPU: cpu]")
 @click.option("--scene", "scenes", type=click.Path(path_type=Path), multiple=True,
               help="Scene file for --check; repeatable  [default: the scenes of wrt]")
 @click.option("--rays", type=int, help="Number of rays for --check, per kind of ray, mesh and structure  [default: 20000]")
 @shared("quiet", "as_json")
-def devices(check: bool, tunes: bool, device: str | None, scenes: tuple[Path, ...], rays: int | None, quiet: bool,
-            as_json: bool) -> None:
-    """List the devices that Warp can compute on; check or tune one. --check compares it with the CPU; --tune finds its best structure."""
+def devices(check: bool, device: str | None, scenes: tuple[Path, ...], rays: int | None, quiet: bool, as_json: bool) -> None:
+    """List the devices of Warp; with --check, compare one with the CPU."""
     from wrt.core.device import describe_devices
 
-    if check and tunes:
-        raise InputError("and --tune exclude each other", argument="--check", hint="give one")
     if not check:
-        if scenes or rays is not None or (device is not None and not tunes):
-            raise InputError("need --check", argument="--device, --scene and --rays", hint="--device also works with --tune")
-    if tunes:
-        from wrt.lab.tune import measured
-
-        with warnings_reported(quiet):
-            tuning = measured(device or "cuda:0")
-        if as_json:
-            say_json(tuning.as_dict())
-        else:
-            click.echo(tuning.text())
-        return
-    if not check:
+        if scenes or rays is not None or device is not None:
+            raise InputError("need --check", argument="--device, --scene and --rays")
         lines = describe_devices()
         if as_json:
             say_json({"devices": lines})

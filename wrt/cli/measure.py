@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from wrt.cli.common import SIZE, Assignments, Commands, Names, Parsed, client_of, load, naming, say, settings_of, shared, warnings_reported
+from wrt.cli.common import SIZE, Assignments, Commands, Parsed, client_of, load, naming, say, settings_of, shared, warnings_reported
 from wrt.cli.reporting import Reporting, measured, planned, reporting
 from wrt.core.registry import Registry
 from wrt.lab import plans
@@ -40,28 +40,6 @@ for plan in (plans.Visibility, plans.Units, plans.Peers, plans.HardCases, plans.
              plans.Pictures, plans.Closed, plans.Claims):
     bench.add_command(measured(plan))
 whatif = measured(plans.WhatIf)
-
-
-@bench.command()
-@click.option("--structures", type=Names(), default=("bvh", "bvh2"), show_default=True, help="Names of structures")
-@click.option("--json", "as_json", is_flag=True, help="Print as JSON")
-def instructions(structures: tuple[str, ...], as_json: bool) -> None:
-    """Count the instructions of each box and triangle test. Machine code is for Turing GPUs. Show registers, stack and code size of
-    traversals on Turing and Hopper GPUs."""
-    from wrt.accel.structures import ACCELERATORS
-    from wrt.lab.bench.report import markdown
-    from wrt.lab.rtcore import instructions as study
-
-    for name in structures:
-        ACCELERATORS.check(name)
-    units, codes = study.units(), study.traversals(structures)
-    Reporting(as_json=as_json).end(markdown(study.tables(units, codes)), {
-        "units": [{"unit": each.unit, "test": each.test, "instructions": each.instructions, **each.classes} for each in units],
-        "traversals": [{"structure": name, "query": query, "stack": stack, "arch": arch, "registers": code.registers,
-                        "local_bytes": code.stack, "shared_bytes": code.shared,
-                        "warps": study.resident_warps(code, arch, study.cuda.block_dim), "instructions": len(code.opcodes()),
-                        "code_bytes": len(code.code), **code.classes()}
-                       for (name, query, stack, arch), code in codes.items()]})
 
 
 @click.command()

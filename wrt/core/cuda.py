@@ -1,4 +1,4 @@
-"""Settings of CUDA launches. They change only the speed; hits and pixels keep their bits. `wrt.tune` measures the alternatives."""
+"""Settings of CUDA launches. They change only the speed; hits and pixels keep their bits."""
 
 BLOCK_DIMS = (64, 32, 128, 256)
 STACKS = ("local", "shared")  # memory of traversal stacks: the names of kernels.traverse.stack.PLACES

@@ -79,7 +79,14 @@ class Registry(UserDict[str, T]):
 
             for each in entry_points(group=self.group):
                 if each.name not in self.data:
-                    self.added[each.name] = f"the entry point {each.value} ({self.group}) of the package {each.dist and each.dist.name}"
+                    self.added[each.name] = f"the entry point {each.value} ({self.group}) of {_package(each)}"
                     self.data[each.name] = each.value  # type: ignore[assignment]
             self.group = ""
         return self.data
+
+
+def _package(entry: Any) -> str:
+    try:
+        return f"the package {entry.dist.name}"
+    except Exception:  # as its metadata can be, which the finder of importlib_metadata refuses
+        return "a package without a name"

@@ -2,14 +2,13 @@
 
 import inspect
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import warp as wp
 
 from tests.data import data_path
-from tests.kernel_tools import rounded
+from tests.kernel_tools import machine_code, rounded
 from tests.rewalk import PRIMITIVE_BYTES, PRIMITIVES, REWALK, prim_ids, rays
 from tests.structures import STRUCTURES, families_first
 from wrt.accel.geometry import Geometry
@@ -22,7 +21,6 @@ from wrt.kernels.structs import NO_HIT, Hit, Ray
 from wrt.kernels.traverse import bvh2 as traverse_bvh2
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.traverse.counters import Counts, Recorder
-from wrt.lab.rtcore.cubin import read_cubin
 from wrt.scene.mesh import Mesh
 from wrt.scene.shapes import icosphere
 
@@ -145,9 +143,7 @@ def test_counting_off_leaves_nothing_in_the_machine_code(name, monkeypatch, tmp_
     for i, counting in enumerate((False, False, True) if name == "bvh2" else (False, False)):
         units = Structure(ACCELERATORS[name], Units(counters=counting))
         kernel = make_closest_hit_kernel(structure.struct, units.traversal(any_hit=False))
-        (binary,) = wp.compile_aot_module(kernel.module, arch=75, module_dir=tmp_path / str(i))
-        (code,) = read_cubin(Path(binary).read_bytes()).values()
-        codes.append((code.code, code.registers, code.stack))
+        codes.append(machine_code(kernel, tmp_path / str(i)))
         if i == 0:
             unit = structure.accel.kernels
             module = unit if inspect.ismodule(unit) else sys.modules[type(unit).__module__]

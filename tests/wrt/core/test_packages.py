@@ -134,7 +134,6 @@ def test_every_imported_package_is_a_dependency_or_in_the_extra_that_its_message
     named = {extra: {re.split(r"[<>=\[]", line)[0] for line in lines} for extra, lines in project["optional-dependencies"].items()}
     default = {re.split(r"[<>=]", line)[0] for line in project["dependencies"]}
     packages = {module: INSTALLED_AS.get(module, module) for module in imported() | EXTRAS.keys()}
-    packages["elftools"] = "pyelftools"
     packages = {module: package for module, package in packages.items() if module not in COME_WITH_OTHERS}
     astray = [module for module, package in packages.items()
               if package not in (named[EXTRAS[module]] if module in EXTRAS else default)]

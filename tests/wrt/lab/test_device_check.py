@@ -131,7 +131,7 @@ def test_the_built_in_scene_has_light_and_glass() -> None:
 
 @pytest.mark.parametrize(("words", "message"), [
     (("--device", "cuda:7", "--check"), "no device 'cuda:7'; there is cpu"),
-    (("--device", "cpu"), "--device, --scene and --rays need --check; --device also works with --tune"),
+    (("--device", "cpu"), "--device, --scene and --rays need --check"),
     (("--check", "--device", "cpu", "--rays", "0"), "rays must be"),
     (("--check", "--device", "cpu", "--scene", "none.toml"), "none.toml"),
 ])

@@ -10,16 +10,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import warp as wp
 
 import wrt
+from tests.kernel_tools import machine_code
 from tests.refused import refused
 from tests.rewalk import REWALK, rays
 from wrt.accel.structure import Structure
 from wrt.accel.structures import ACCELERATORS
 from wrt.kernels.traverse.common import Units
 from wrt.lab.costs import COUNTERS
-from wrt.lab.rtcore.cubin import read_cubin
 from wrt.lab.rtcore.profiler import KINDS, PICTURES, Profile, profile
 from wrt.renderer.features import features_of
 from wrt.renderer.options import Progress
@@ -170,9 +169,7 @@ def test_nothing_of_the_log_is_in_a_render(scene: Scene, tmp_path: Path) -> None
         spec.loader.exec_module(modules[name])
     codes, bare = [], modules["one_ray"].make_render_kernel(features, structure, importlib.import_module(features.camera))
     for kernel in (render_kernel(features, structure), bare):
-        (binary,) = wp.compile_aot_module(kernel.module, arch=75, module_dir=tmp_path / str(len(codes)))
-        (code,) = read_cubin(Path(binary).read_bytes()).values()
-        codes.append((code.code, code.registers, code.stack))
+        codes.append(machine_code(kernel, tmp_path / str(len(codes))))
     assert len(codes[0][0]) > 10_000 and codes[0] == codes[1]
 
 

@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -187,27 +188,35 @@ def test_a_worker_with_another_installation_is_refused(client: Any, change: Any,
 
 
 @contextmanager
-def workers_of_other_code(address: str, folder: Path, **env: str) -> Iterator[str]:
-    """Start a `dask worker` process whose wrt has one more line in io/obj.py; yield the name of its folder."""
+def worker_of_other_code(client: Any, folder: Path) -> Iterator[str]:
+    """Start a `dask worker` process whose wrt has one more line in io/obj.py; yield its address. At the end it is gone."""
     for name in ("wrt", "kernels"):
         shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
     with open(folder / "wrt" / "io" / "obj.py", "a", encoding="utf-8") as file:
         file.write("TILE_SIZE = 31\n")
-    command = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard", "--no-nanny",
-               "--name", "other", "--local-directory", str(folder)]
-    with subprocess.Popen(command, cwd=folder, env={**os.environ, "PYTHONPATH": str(folder), **env},
+
+    def address(found: bool) -> str:
+        for _ in range(600):
+            workers = client.scheduler_info(n_workers=-1)["workers"]
+            (here,) = [address for address, worker in workers.items() if worker["id"] == str(folder)] or [""]
+            if bool(here) == found:
+                return str(here)
+            time.sleep(0.1)
+        raise AssertionError(f"the worker in {folder} does not {'appear' if found else 'leave'}")
+
+    command = [sys.executable, "-m", "distributed.cli.dask_worker", client.scheduler.address, "--nthreads", "1", "--no-dashboard",
+               "--no-nanny", "--name", str(folder), "--local-directory", str(folder)]
+    with subprocess.Popen(command, cwd=folder, env={**os.environ, "PYTHONPATH": str(folder)},
                           stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as worker:
         try:
-            yield str(folder)
+            yield address(True)
         finally:
             worker.terminate()
+    address(False)
 
 
 def test_a_worker_whose_code_differs_in_a_line_is_refused_by_name(threads: Any, mesh: Path) -> None:
-    with distributed.Client(threads, set_as_default=False) as one, workers_of_other_code(threads.scheduler_address,
-                                                                                        mesh.parent / "other"):
-        one.wait_for_workers(2, timeout=60)
-        (address,) = [where for where, worker in one.scheduler_info(n_workers=-1)["workers"].items() if worker["id"] == "other"]
+    with distributed.Client(threads, set_as_default=False) as one, worker_of_other_code(one, mesh.parent / "other") as address:
         said = f"worker {address} has different code of wrt {wrt.__version__} (io/obj.py); install the same everywhere"
         with pytest.raises(InputError, match=f"^{re.escape(said)}$"):
             render(SCENE, executor=one)
@@ -217,13 +226,10 @@ def test_a_worker_whose_code_differs_in_a_line_is_refused_by_name(threads: Any, 
 
 def test_a_worker_that_comes_later_is_compared_too(threads: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A render compares a new worker before it prepares the scene; a sweep compares it at each task."""
-    with distributed.Client(threads, set_as_default=False) as one, workers_of_other_code(threads.scheduler_address,
-                                                                                        tmp_path / "other"):
-        one.wait_for_workers(2, timeout=60)
+    with distributed.Client(threads, set_as_default=False) as one, worker_of_other_code(one, tmp_path / "other") as other:
         monkeypatch.setattr(cluster, "check_workers", lambda client: None)  # the worker connects after the check
         with refused(what="(io/obj.py)"):
             render(SCENE, executor=one, spp=256, tile_size=16, pass_size=4)
-        (other,) = [where for where, worker in one.scheduler_info(n_workers=-1)["workers"].items() if worker["id"] == "other"]
         task = one.submit(sweep.one_at_a_time, installed.DIGEST, os.getpid, workers=[other], pure=False)
         with refused(what="another version of wrt"):
             task.result(timeout=60)
