@@ -17,7 +17,7 @@ from wrt.core.errors import InputError
 @click.option("--rays", type=int, help="Number of rays for --check, per kind of ray, mesh and structure  [default: 20000]")
 @shared("quiet", "as_json")
 def devices(check: bool, device: str | None, scenes: tuple[Path, ...], rays: int | None, quiet: bool, as_json: bool) -> None:
-    """List the devices of Warp; with --check, compare one with the CPU."""
+    """List the devices, or compare one with the CPU."""
     from wrt.core.device import describe_devices
 
     if not check:

@@ -29,9 +29,13 @@ def decode_rgba8(data: bytes, formats: tuple[str, ...] = FORMATS) -> np.ndarray:
 
     16-bit channels keep their high byte; colour profiles are ignored. Raises InputError for a broken, truncated or too large picture."""
     with _opened(data, formats) as picture:
-        if picture.mode.startswith("I"):  # 16-bit grey, which Pillow would clip to 255
-            grey = (np.asarray(picture).astype(np.uint32) >> 8).astype(np.uint8)
-            return np.dstack([grey, grey, grey, np.full_like(grey, 255)])
+        bits, key = data[24] if picture.format == "PNG" else 8, picture.info.get("transparency")
+        if bits == 16 and "A" not in picture.mode:  # Pillow would clip grey to 255, and cut the transparent colour to 8 bits
+            codes = decode_png16(data)
+            alpha = np.full(codes.shape[:2], 255) if key is None else 255 * (codes != np.array(key)).any(axis=2)
+            return np.dstack([codes >> 8, alpha]).astype(np.uint8)
+        if picture.mode == "L" and isinstance(key, int):  # Pillow widens grey of 2 and 4 bits, but not the transparent one
+            picture.info["transparency"] = key % 2**bits * (255 // (2**bits - 1))
         return np.array(picture.convert("RGBA"))
 
 

@@ -10,7 +10,7 @@ import io
 import os
 import struct
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,8 @@ from wrt.core.types import PathLike
 from wrt.core.write_file import replacing
 from wrt.picture.decode import FORMATS as FORMATS_READ
 from wrt.picture.decode import check_size, decode_png16, decode_rgba8
-from wrt.picture.tonemap import decode_srgb, to_codes
+from wrt.picture.radiance import read_hdr
+from wrt.picture.tonemap import REC_709, decode_srgb, to_codes, to_rec_709
 
 Metadata = Mapping[str, object]
 
@@ -221,59 +222,115 @@ def encode_png(codes: np.ndarray, metadata: Metadata | None = None) -> bytes:
 # --- reading ----------------------------------------------------------------------------------------------------------
 
 
-def read_image(path: PathLike) -> np.ndarray:
-    """Read the colours of an image file: (H, W, 3) float32, linear.
+def read_image(path: PathLike, *, environment: bool = False) -> np.ndarray:
+    """Read the colours of an image file: (H, W, 3) float32, linear Rec. 709, row 0 on top, as large as the display window.
 
-    EXR needs channels R, G, B, or one grey channel. PNG, JPEG and similar files are decoded from sRGB, 16-bit PNG at full precision. Alpha
-    is ignored. Raises InputError for a missing, truncated or too large file, and for a file that is no picture."""
+    - environment: replace what no radiance is: negative and NaN by 0, infinite by HALF_MAX. A SceneWarning counts the pixels.
+
+    EXR: the first part with channels R, G and B, or grey Y. PNG, JPEG and similar files are decoded from sRGB, 16-bit PNG at full
+    precision. Alpha is ignored. Raises InputError for a missing, truncated or too large file, and for what is not read."""
     suffix = Path(path).suffix.lower()
-    if suffix in LINEAR_SUFFIXES:
-        return _pick_colors(read_channels(path), path)
-    with at(path=path):
-        data = read_file(path)
-        if suffix not in DISPLAY_SUFFIXES:
+    with at(path=path), np.errstate(over="ignore", invalid="ignore"):  # factors and primaries of the header may be wild
+        if suffix == ".exr":
+            pixels, primaries = _read_exr(path)
+        elif suffix == ".hdr":
+            pixels, primaries = read_hdr(read_file(path), MAX_LINEAR_PIXELS, lambda: _read_runs(path))
+        elif suffix in DISPLAY_SUFFIXES:
+            data, primaries = read_file(path), REC_709
+            formats = ("TGA",) if suffix == ".tga" else FORMATS_READ  # TGA files have no magic number: the suffix decides
+            codes = decode_png16(data) if data[:8] + data[24:25] == PNG_MAGIC + b"\x10" else decode_rgba8(data, formats)[..., :3]
+            pixels = decode_srgb(np.arange(np.iinfo(codes.dtype).max + 1) / np.iinfo(codes.dtype).max).astype(np.float32)[codes]
+        else:
             raise InputError(f"is no image file: its suffix must be one of {', '.join(LINEAR_SUFFIXES + DISPLAY_SUFFIXES)}")
-        deep = data[:8] == PNG_MAGIC and data[24:25] == b"\x10"
-        formats = ("TGA",) if suffix == ".tga" else FORMATS_READ  # TGA files have no magic number: the suffix decides
-        codes = decode_png16(data) if deep else decode_rgba8(data, formats)[..., :3]
-    levels = np.iinfo(codes.dtype).max
-    return decode_srgb(np.arange(levels + 1) / levels).astype(np.float32)[codes]
+        if not environment:
+            return to_rec_709(pixels, primaries)
+        good = np.isfinite(pixels)
+        pixels = to_rec_709(np.nan_to_num(pixels, nan=0.0, posinf=HALF_MAX, neginf=0.0), primaries)
+    _warn_replaced(path, ~good | (pixels < 0.0), f"negative, NaN or infinite, read as 0 (infinite: as {HALF_MAX:g})")
+    return np.maximum(pixels, 0.0)
 
 
 def read_channels(path: PathLike) -> dict[str, np.ndarray]:
-    """Read all channels of the first part of an EXR or HDR file, by name: (H, W) float32.
+    """Read all channels of the first part of an EXR file, by name: (H, W) float32, as large as the display window.
 
     Raises InputError for a missing, truncated or too large file, and for a file that is no such picture."""
-    with _opened(path) as source:
-        spec = source.spec()
-        with at(path=path):
-            check_size(spec.width, spec.height, MAX_LINEAR_PIXELS)
-        if spec.depth > 1 or spec.deep:
-            raise InputError("cannot be read as an image: it must be flat, but has depth samples or slices", path=path)
-        pixels = source.read_image("float")
-        if pixels is None:
-            raise InputError(f"cannot be read as an image: {_reason(source.geterror)}", path=path)
-        return {name: pixels[..., i] for i, name in enumerate(spec.channelnames)}
+    with at(path=path), _opened(path, ".exr") as source:
+        return _channels(source, 0, source.spec().channelnames)
+
+
+def _read_exr(path: PathLike) -> tuple[np.ndarray, Sequence[float]]:
+    """Read the colours of the first part that has some, and their primaries."""
+    with _opened(path, ".exr") as source:
+        others: list[str] = []
+        while source.seek_subimage(len(others), 0):
+            spec = source.spec()
+            if names := _color_names(spec.channelnames):
+                primaries, space = spec.getattribute("chromaticities", _oiio().TypeDesc("float[8]")), spec.getattribute("colorInteropID")
+                if primaries is None and space not in (None, "", "data", "unknown", "lin_rec709_scene"):
+                    raise InputError(f"cannot be read as an image: its colour space is {space}", hint="use linear Rec. 709")
+                channels = _channels(source, len(others), names)
+                return np.stack([channels[name] for name in (names * 3)[:3]], axis=-1), primaries or REC_709
+            others.append(", ".join(spec.channelnames))
+        raise InputError(f"must have channels R, G and B, or grey Y; it has {'; '.join(others)}")
+
+
+def _color_names(names: Sequence[str]) -> list[str]:
+    """Return the names of red, green and blue, or of grey. Y is a coordinate beside X, and has its colour apart beside RY and BY."""
+    known = {name.upper(): name for name in names} | {name: name for name in names}
+    if known.keys() >= {"R", "G", "B"}:
+        return [known[name] for name in "RGB"]
+    return [known["Y"]] if "Y" in known and not known.keys() & {"X", "RY", "BY"} else []
+
+
+def _channels(source: Any, part: int, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Read channels of a part by name, (H, W) float32 in its display window. Pixels outside the data window are 0."""
+    source.seek_subimage(part, 0)
+    spec = source.spec()
+    if spec.depth > 1 or spec.deep:
+        raise InputError("cannot be read as an image: it must be flat, but has depth samples or slices")
+    check_size(max(spec.width, spec.full_width), max(spec.height, spec.full_height), MAX_LINEAR_PIXELS)
+    wanted = [i for i, name in enumerate(spec.channelnames) if name in names]
+    first, last = wanted[0], wanted[-1] + 1
+    block = _read(source, part, 0, first, last, "float")
+    for i in wanted:
+        if str(spec.channelformat(i)) == "uint":  # OpenImageIO divides whole numbers by the largest one if it converts them to float
+            block[..., i - first] = _read(source, part, 0, i, i + 1, "uint")[..., 0]
+    x, y = spec.x - spec.full_x, spec.y - spec.full_y
+    whole = np.zeros((spec.full_height, spec.full_width, last - first), np.float32)
+    whole[max(y, 0): max(y + spec.height, 0), max(x, 0): max(x + spec.width, 0)] = block[
+        max(-y, 0): max(spec.full_height - y, 0), max(-x, 0): max(spec.full_width - x, 0)]
+    return {spec.channelnames[i]: whole[..., i - first] for i in wanted}
+
+
+def _read_runs(path: PathLike) -> np.ndarray:
+    with _opened(path, ".hdr") as source:
+        return _read(source, "float")
+
+
+def _read(source: Any, *where: Any) -> np.ndarray:
+    if (pixels := source.read_image(*where)) is None:
+        raise InputError(f"cannot be read as an image: {_reason(source.geterror)}")
+    return np.asarray(pixels)
 
 
 @contextlib.contextmanager
-def _opened(path: PathLike) -> Iterator[Any]:
+def _opened(path: PathLike, suffix: str) -> Iterator[Any]:
     """Open an EXR or HDR file in OpenImageIO. The first bytes are checked before, because OpenImageIO would try every format."""
     try:
-        with at(path=path), open_regular(path) as file:
+        with open_regular(path) as file:
             first = file.read(16)
     except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror or error}", path=path) from error
-    if not first.startswith(_MAGIC[Path(path).suffix.lower()]):
-        raise InputError(f"cannot be read as an image: it is no {Path(path).suffix.lower()} file", path=path)
+        raise InputError(f"cannot be read: {error.strerror or error}") from error
+    if not first.startswith(_MAGIC[suffix]):
+        raise InputError(f"cannot be read as an image: it is no {suffix} file")
     oiio = _oiio()
     oiio.attribute("try_all_readers", 0)
     try:
         source = oiio.ImageInput.open(os.fspath(path))
     except TypeError:  # not UTF-8
-        raise InputError("cannot be read: OpenImageIO needs a path in UTF-8", path=path) from None
+        raise InputError("cannot be read: OpenImageIO needs a path in UTF-8") from None
     if source is None:
-        raise InputError(f"cannot be read as an image: {_reason(oiio.geterror)}", path=path)
+        raise InputError(f"cannot be read as an image: {_reason(oiio.geterror)}")
     try:
         yield source
     finally:
@@ -286,13 +343,3 @@ def _reason(geterror: Callable[[], str]) -> str:
         return " ".join(geterror().split()) or "unknown error"
     except UnicodeDecodeError:  # it quotes names from the file
         return "its names are not UTF-8"
-
-
-def _pick_colors(channels: Mapping[str, np.ndarray], path: PathLike) -> np.ndarray:
-    upper = {name.upper(): array for name, array in channels.items()}
-    if {"R", "G", "B"} <= upper.keys():
-        return np.stack([upper["R"], upper["G"], upper["B"]], axis=-1)
-    single = [array for name, array in upper.items() if name != "A"]
-    if len(single) != 1:
-        raise InputError(f"must have channels R, G, B, or one grey channel; it has {', '.join(channels)}", path=path)
-    return np.repeat(single[0][..., None], 3, axis=-1)

@@ -1,15 +1,19 @@
-"""Exposure, tone mapping and sRGB encoding: linear radiance to display codes.
+"""Exposure, tone mapping and sRGB encoding: linear radiance to display codes. Other primaries to Rec. 709.
 
 All colours are linear Rec. 709 until `encode_srgb`. "Display-linear" is the light that the display emits, in [0, 1].
 """
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from wrt.core.checks import as_choice
+from wrt.core.errors import InputError
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)  # weights of linear Rec. 709
+REC_709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)  # x and y of red, green, blue and white
+BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])  # XYZ to the cones' responses
 # Radiance that every curve shows as white; its square fits in a float32.
 BRIGHTEST = 1e9
 BRIGHT, BRIGHT_SHARE = 0.8, 0.95  # of auto_exposure
@@ -27,6 +31,23 @@ def decode_srgb(encoded: np.ndarray) -> np.ndarray:
     encoded = np.asarray(encoded)
     low = encoded <= 0.04045
     return np.where(low, encoded / 12.92, np.power((np.where(low, 1.0, encoded) + 0.055) / 1.055, 2.4))
+
+
+def to_rec_709(linear: np.ndarray, primaries: Sequence[float]) -> np.ndarray:
+    """Convert linear colours (..., 3) from other primaries: x and y of red, green, blue and white. White stays white (Bradford).
+
+    Raises InputError if the primaries span no colours. Source: SMPTE RP 177; ImfAcesFile.cpp of OpenEXR, which adapts in the same way."""
+    def cones(space: Sequence[float]) -> np.ndarray:  # responses to red, green and blue in columns; those to white are 1
+        xy = np.array(space, dtype=np.float64).reshape(4, 2)
+        *colors, white = np.column_stack([xy, 1.0 - xy.sum(axis=1)]) @ BRADFORD.T
+        return (columns := np.transpose(colors) / white[:, None]) * np.linalg.solve(columns, np.ones(3))
+    if np.allclose(primaries, REC_709, rtol=0.0, atol=2e-4):
+        return linear
+    with np.errstate(all="ignore"), contextlib.suppress(np.linalg.LinAlgError):
+        matrix = np.linalg.solve(cones(REC_709), cones(primaries))
+        if np.abs(matrix).max() < 1e3:
+            return linear @ matrix.T.astype(linear.dtype)
+    raise InputError(f"cannot be read as an image: its primaries and white span no colours: {', '.join(f'{x:g}' for x in primaries)}")
 
 
 def luminance(linear: np.ndarray) -> np.ndarray:

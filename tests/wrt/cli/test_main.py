@@ -506,6 +506,18 @@ def test_compare_measures_and_fails_past_its_limits() -> None:
     assert broken.code == 1 and [line.split()[0] for line in broken.err.splitlines()] == ["mse", "psnr", "flip"]
 
 
+def test_compare_sees_where_a_crop_lies() -> None:
+    """Two crops with the same pixels, of which one lies two columns further to the right in the picture."""
+    import OpenImageIO as oiio
+
+    for name, x in (("left.exr", 0), ("right.exr", 2)):
+        spec = oiio.ImageSpec(2, 2, 3, "float")
+        spec.x, spec.full_width, spec.full_height = x, 8, 4
+        out = oiio.ImageOutput.create(name)
+        assert out.open(name, spec) and out.write_image(np.ones((2, 2, 3), np.float32)) and out.close()
+    assert strict_json(run("compare", "left.exr", "right.exr", "--json").out)["mse"] == pytest.approx(8 / 32)
+
+
 @pytest.mark.parametrize(("arguments", "message"), [
     (["a.exr", "nothing.png"], "nothing.png: cannot be read"), (["box.obj", "a.exr"], "box.obj: is no image file"),
     (["a.exr", "small.exr"], "different sizes, 30x20 and 8x4"), (["broken.png", "a.exr"], "broken.png: cannot be read"),

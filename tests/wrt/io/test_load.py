@@ -328,6 +328,16 @@ def test_environment(tmp_path: Path) -> None:
     assert scene.background.scale == 2 and scene.background.rotation == pytest.approx(math.pi / 4)
 
 
+def test_bad_pixels_of_an_environment_are_replaced_with_a_warning(tmp_path: Path) -> None:
+    from wrt.picture.image import write_image
+
+    write_image(tmp_path / "sky.exr", np.array([[[1, -0.001, 2], [np.inf, 3, 4]]], np.float32))
+    with pytest.warns(SceneWarning, match=r"sky\.exr: 2 pixels negative, NaN or infinite"):
+        scene = load(tmp_path, CAMERA + '[background]\ntype = "environment"\nfile = "sky.exr"\n')
+    assert isinstance(scene.background, EnvironmentBackground)
+    assert scene.background.image.tolist() == [[[1, 0, 2], [65504, 3, 4]]]
+
+
 def test_mesh_materials(tmp_path: Path) -> None:
     (tmp_path / "m.obj").write_text(TRIANGLES + "usemtl a\nf 1 2 3\nf 1 1 2\nusemtl b\nf 1 2 4\nusemtl c\nf 1 3 4\n")
     scene = load(tmp_path, CAMERA + SUN + """

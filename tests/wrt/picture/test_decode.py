@@ -42,6 +42,35 @@ def test_sixteen_bits_are_read(channels: int, color_type: int, tmp_path: Path) -
         image.read_image(tmp_path / "a.png")
 
 
+def keyed(kind: int, bits: int, key: tuple[int, ...], rows: list[list[tuple[int, ...]]]) -> bytes:
+    """A PNG of grey (kind 0) or RGB (kind 2) with a transparent colour, `bits` a channel, packed without Pillow."""
+    raw = b""
+    for row in rows:
+        digits = "".join(f"{value:0{bits}b}" for pixel in row for value in pixel)
+        digits += "0" * (-len(digits) % 8)
+        raw += b"\0" + int(digits, 2).to_bytes(len(digits) // 8, "big")
+
+    def chunk(name: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    header = struct.pack(">IIBBBBB", len(rows[0]), len(rows), bits, kind, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"tRNS", struct.pack(f">{len(key)}H", *key)) + chunk(
+        b"IDAT", zlib.compress(raw)) + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize(("kind", "bits"), [(0, 1), (0, 2), (0, 4), (0, 8), (0, 16), (2, 8), (2, 16)])
+def test_the_transparent_colour_of_every_depth(kind: int, bits: int) -> None:
+    """Source: W3C, PNG specification (third edition), 11.3.1.1: samples are compared in the file's own bits."""
+    most = 2**bits - 1
+    choice = range(most + 1) if bits < 16 else [0x1234, 0x1235, 0x3412, 0x0034]  # these share bytes
+    values = np.random.default_rng(bits).choice(choice, (9, 41, 1 if kind == 0 else 3))
+    for key in (tuple(values[2, 3].tolist()), tuple(values[0, 0].tolist()), (most,) * values.shape[2]):
+        data = keyed(kind, bits, key, values.tolist())
+        decoded = decode_rgba8(data)
+        assert np.array_equal(decoded[..., 3], np.where((values == key).all(axis=2), 0, 255))
+        assert np.array_equal(decoded[..., :3], np.broadcast_to(values * 255 // most if bits < 16 else values >> 8, (*values.shape[:2], 3)))
+
+
 def png_header(width: int, height: int) -> bytes:
     """A PNG with this size in its header, and a single pixel."""
     data = png(np.zeros((1, 1, 3)), 2)

@@ -162,7 +162,7 @@ def test_exr_without_colours(tmp_path: Path) -> None:
     write_exr(tmp_path / "grey.exr", {"Y": grey})
     assert np.array_equal(read_image(tmp_path / "grey.exr"), np.repeat(grey[..., None], 3, axis=-1))
     write_exr(tmp_path / "normal.exr", {"normal.X": grey, "normal.Y": grey, "normal.Z": grey})
-    with refused(what="channels R, G, B", path="normal.exr"):
+    with refused(what="channels R, G and B", path="normal.exr"):
         read_image(tmp_path / "normal.exr")
 
 

@@ -207,7 +207,7 @@ class _Builder:
 
         if table.background is None:
             return ConstantBackground()
-        return make(BACKGROUNDS[table.background.type], table.background, "", lambda name: read_image(self.file(name)))
+        return make(BACKGROUNDS[table.background.type], table.background, "", lambda name: read_image(self.file(name), environment=True))
 
     def light(self, table: TypedTable, name: str) -> Light | Object:
         """Return a light; for a rectangle light, an emissive object of albedo 0."""
@@ -217,7 +217,7 @@ class _Builder:
         if isinstance(table, RectangleLightTable):
             material = Material(name=name, albedo=BLACK, emission=as_vector(table.radiance, "radiance"), two_sided=table.two_sided)
             return Object(shapes.quad(table.corner, table.edge_u, table.edge_v), (material,), name=name)
-        return make(LIGHTS[table.type], table, name, lambda file: read_image(self.file(file)))
+        return make(LIGHTS[table.type], table, name, lambda file: read_image(self.file(file), environment=True))
 
 
 def settings(table: Table, included: Sequence[Scene]) -> Settings:

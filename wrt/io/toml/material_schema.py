@@ -36,13 +36,13 @@ class _PlacedImage(Table):
 class ImageTable(_PlacedImage):
     """An image file; (u, v) = (0, 0) is its top left."""
 
-    file: str = Field(description="image file, relative to the scene file")
+    file: str = Field(description="image file (8 bits a channel are kept), relative to the scene file")
 
 
 class ColorTextureTable(_PlacedImage):
     """An image file, or a checkerboard."""
 
-    file: str | None = Field(None, description="image file, relative to the scene file")
+    file: str | None = Field(None, description="image file (8 bits a channel are kept), relative to the scene file")
     checkerboard: CheckerboardTable | None = Field(None, description="checkerboard, in place of an image file")
 
     @model_validator(mode="after")
