@@ -65,8 +65,8 @@ def enclosing_faces(geometry: Geometry) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the faces (K, 3) that decide on inside, and the face from which each comes, ascending (K,); None: all faces decide.
 
     Copies of a face have its corners, by coordinates, in any order. They count once, with the winding of most of them; an equal number
-    of both windings takes the winding of the faces around. If the whole mesh is there several times, so is each face. Two copies that close
-    the surface as they are, a wall between parts that touch, count twice. A collinear face counts if it closes a joint; it is flipped."""
+    of both windings takes the winding of the faces around. If the surface is closed without them, they are a wall between two parts that
+    touch, which counts for both parts. A collinear face counts if it closes a joint; it is flipped."""
     used = finite_faces(geometry)
     corners = merged(geometry.vertices)[geometry.faces[used]]
     solid = windings(corners) != 0
@@ -76,33 +76,41 @@ def enclosing_faces(geometry: Geometry) -> tuple[np.ndarray, np.ndarray] | None:
     if len(first) == len(used) and not flat.any():
         return None
     distinct = np.sort(corners[first], axis=1)
-    even = flat | (count // max(np.gcd.reduce(count[~flat]), 1) % 2 == 0)
-    single = ~even | _closing(edges_of(distinct), even)
+    free = flat | (count > max(np.gcd.reduce(count[~flat]), 1))  # if the whole mesh is there several times, each face is there once
+    single = _counted(edges_of(distinct), free, flat)
     sign = windings(corners)
     total = np.bincount(kind, sign)
+    wall = ~single & ~flat & (np.abs(total) == count) & (count % 2 == 0)  # a wall with both windings adds nothing
     turn = np.where(total == 0, sign[first], np.sign(total))
     if len(unsure := np.flatnonzero(single & ~flat & (total == 0))):
         a, b, c = ((geometry.vertices[distinct[:, i]] - geometry.vertices[distinct[0, 0]]).astype(np.float64) for i in range(3))
         volume = np.einsum("ij,ij->i", a, np.cross(b, c))
         turn[unsure] = _turned(edges_of(distinct), single, np.where(flat | (total == 0), 0, turn), volume, turn)[unsure]
-    kept = np.flatnonzero(np.where(single[kind], first[kind] == np.arange(len(kind)), ~flat[kind]))
+    kept = np.flatnonzero(np.where(single[kind], first[kind] == np.arange(len(kind)), wall[kind]))
     faces, wrong = corners[kept], single[kind[kept]] & (sign[kept] != turn[kind[kept]])
     faces[wrong] = faces[wrong][:, ::-1]
     return flip_collinear(geometry.vertices, faces.astype(np.int32))[0], used[kept]
 
 
-def _closing(edges: np.ndarray, even: np.ndarray) -> np.ndarray:
-    """Return which faces with an even number of copies count once, (N,) bool. edges: (N, 3), from `edges_of`.
+def _counted(edges: np.ndarray, free: np.ndarray, flat: np.ndarray) -> np.ndarray:
+    """Return which faces count, (N,) bool: those that are not free, and free ones that close the surface. edges: (N, 3), of `edges_of`.
 
-    Faces that share an edge of just two of them form a patch. It counts once if its border would be open without it, or if it has none."""
-    faces_at, odd_at, even_at = (np.bincount(edges[which].reshape(-1), minlength=edges.max(initial=-1) + 1) for which in (..., ~even, even))
-    inner = (faces_at == 2) & (even_at == 2)
-    x, y = _neighbours(edges, inner)
-    label = _connected(len(edges), x // 3, y // 3)
-    border, alone, open_ = even[:, None] & ~inner[edges], faces_at[edges] == 1, odd_at[edges] % 2 == 1
-    walls, ends, gaps = ((np.bincount(label, which.any(axis=1), len(label)) > 0)[label]
-                         for which in (border & ~alone & ~open_, border & alone, border & open_))
-    return np.asarray(even & ~walls & (gaps | ~ends))
+    Two free faces at an edge that is closed without them form a patch. A patch whose border is open without it counts; a wall does not.
+    The last patches are those without a border: copies count, collinear faces do not."""
+    counted, free, n = ~free, free.copy(), edges.max(initial=-1) + 1
+    lonely = (np.bincount(edges.reshape(-1), minlength=n) == 1)[edges]
+    while free.any():
+        odd, free_at = np.bincount(edges[counted].reshape(-1), minlength=n) % 2 == 1, np.bincount(edges[free].reshape(-1), minlength=n)
+        x, y = _neighbours(edges, (free_at == 2) & ~odd, free)
+        label = _connected(len(edges), x // 3, y // 3)
+        border = free[:, None] & (free_at == 1)[edges]
+        wall, gap, end = ((np.bincount(label, which.any(axis=1), len(label)) > 0)[label] & free
+                          for which in (border & ~lonely & ~odd[edges], border & odd[edges], border & lonely))
+        done, yes = next(((done, yes) for done, yes in ((wall | gap, gap & ~wall), (end, end & False), (free & ~flat, free)) if done.any()),
+                         (free, free & False))
+        counted |= done & yes
+        free &= ~done
+    return counted
 
 
 def _turned(edges: np.ndarray, single: np.ndarray, known: np.ndarray, volume: np.ndarray, default: np.ndarray) -> np.ndarray:
@@ -121,7 +129,7 @@ def _turned(edges: np.ndarray, single: np.ndarray, known: np.ndarray, volume: np
     return np.where(votes[0] != 0, votes[0], np.where(votes[1] != 0, votes[1], default))
 
 
-def _neighbours(edges: np.ndarray, of_two: np.ndarray, used: np.ndarray | slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
+def _neighbours(edges: np.ndarray, of_two: np.ndarray, used: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return both sides of each edge in `of_two`, as 3 times the face plus the side, (M,) each. used: faces."""
     chosen = np.zeros(edges.shape, bool)
     chosen[used] = of_two[edges[used]]
