@@ -125,11 +125,13 @@ def make_ray_query(traversals: Traversals) -> tuple[Any, Any, Any, Any]:
         accel: struct
         surfaces: Surfaces
         roots: wp.array(dtype=wp.int32)  # Index of each world's root; only with instances.
+        origin: wp.vec3d  # The point that is 0 for the structure: Accelerator.origin.
 
     @wp.func
     def prepared(world: World, ray: QueryRay) -> Ray:
         """Make the ray for the traversal."""
         out = traversal_ray(ray, world.kind != kind)
+        out.origin = wp.vec3(wp.vec3d(ray.origin) - world.origin)
         if wp.static(instances):
             if ray.world >= 0 and ray.world < world.roots.shape[0]:
                 out.first_prim = world.roots[ray.world]

@@ -94,7 +94,7 @@ LIBRARIES_OF_KERNELS = {"warp", "dataclasses", "functools", "re", "typing", "col
 LONGEST_FUNCTION = 100  # Lines.
 LONG_FUNCTIONS = 9  # Functions with more than 60 lines.
 LONG_SIGNATURES = 5  # Functions with more than 7 parameters: public queries, all of which take `world`.
-MOST_LINES = 61_424  # of wrt and kernels, with headers
+MOST_LINES = 61_445  # of wrt and kernels, with headers
 
 
 def module(path: Path) -> str:

@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SOURCES = ("*.md", "docs/*.md", "docs/lab_notes/*.md", "kernels/README.md", "docs/images/**/*.png",
            "docs/images/*.jpg", "docs/plots/*.svg", "docs/site/*.css")
 API = {  # title: objects, of wrt unless the module is named
-    "Structures and rays": "build Mesh load_mesh load_accel accel_from_tree ACCELERATORS DeviceGeometry camera_rays tune "
+    "Structures and rays": "build Mesh load_mesh load_accel accel_from_tree ACCELERATORS DeviceGeometry camera_rays "
                            "wrt.accel.base.OneMesh wrt.accel.instances.Instances",
     "Hits": "wrt.accel.queries.answers.Hits wrt.accel.queries.answers.Counters all_hits count_hits first_hits visible",
     "Points": "contains winding_number closest_points signed_distance",

@@ -32,7 +32,7 @@ from wrt.core.types import ArrayLike, KernelModule, PathLike, WarpArray, WarpStr
 from wrt.core.warp_private import refuse_capture
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.warp_private import fields_of
-from wrt.scene.values import as_number, near_zero
+from wrt.scene.values import as_number, near_zero, warn_if_far
 
 MeshT = TypeVar("MeshT", bound="OneMesh")
 
@@ -123,6 +123,7 @@ class OneMesh(TreeExchange, ABC):
         near, origin = near_zero(real_numbers(vertices, "vertices", "(V, 3)"))
         if (moved := vectors(near, "vertices").copy()).shape != (self.geometry.n_vertices, 3):
             raise InputError(f"must be {(self.geometry.n_vertices, 3)}, got {moved.shape}", argument="vertices")
+        warn_if_far(moved, "refit", origin)
         return Geometry(moved, self.geometry.faces, self.geometry.spheres, origin)
 
     def _refit_in_place(self, points: ArrayLike) -> None:
@@ -170,8 +171,7 @@ class OneMesh(TreeExchange, ABC):
             built, built_cost = beside._refit(before.arrays), before.built_cost
             growth = float(built.sah_cost) / float(built_cost) if built_cost > 0.0 else 1.0
             if rebuilt := growth > rebuild_at:
-                built = beside._build(self.built_with)
-                built_cost = built.sah_cost
+                built_cost = (built := beside._build(self.built_with)).sah_cost
             beside._install(built, begin, built_cost)
             followed = vertices if isinstance(vertices, wp.array) and vertices.requires_grad else None
             self._snapshot = replace(beside._snapshot, followed=followed)

@@ -30,7 +30,7 @@ from wrt.core.warp_private import refuse_capture
 from wrt.kernels.traverse.common import Units
 from wrt.kernels.traverse.instances import Placement
 from wrt.kernels.warp_private import fields_of
-from wrt.scene.values import MAX_REACH, as_number
+from wrt.scene.values import MAX_REACH, as_number, far_origin
 
 ALIGNMENT = 64  # bytes, between the addresses of structures
 
@@ -110,6 +110,7 @@ class Instances(Accelerator):
              object: ObjectId | Sequence[ObjectId] | None = None, world: ArrayLike | None = None) -> Refit:
         """Move instances to new matrices and fit the boxes of the upper level. Hits are bit for bit those of a new structure.
 
+        Where a move takes all instances far from 0, the structure's `origin` moves to them, and `world` is to be read again.
         Other threads may query at the same time, as during `OneMesh.refit`.
 
         Parameters
@@ -152,12 +153,7 @@ class Instances(Accelerator):
             rows, matrices = checked_moves(rows_of(geometry, before.attributes), instance, matrix)
             to_world = geometry.to_world.copy()
             to_world[rows] = geometry.near_zero(rows, matrices)
-            geometry = replace(geometry, to_world=to_world)
-            if "boxes" not in self._cache:
-                self._cache["boxes"] = self._boxes(geometry, MOVED_BOXES)
-            low, high = world_boxes(geometry, rows, self._cache["boxes"])
-            if not within_reach(low, high, MAX_REACH):
-                raise InputError(f"puts an instance farther than {MAX_REACH:g} from the origin", argument="matrix")
+            geometry, rows, low, high = self._boxed(replace(geometry, to_world=to_world), rows)
             top, cost = refit_top(self._top, geometry, rows, low, high), before.built_cost
             growth = top.cost / cost if cost > 0.0 else 1.0
             if rebuilt := growth > rebuild_at:
@@ -166,6 +162,23 @@ class Instances(Accelerator):
             self._top = top
             self._install_top(geometry, begin, cost)
             return Refit(self.stats.build_seconds, growth, rebuilt)
+
+    def _boxed(self, geometry: InstancedGeometry, rows: np.ndarray) -> tuple[InstancedGeometry, np.ndarray, np.ndarray, np.ndarray]:
+        """Return the geometry, the moved instances and their boxes: all instances, with another origin, if the move takes them far."""
+        if "boxes" not in self._cache:
+            self._cache["boxes"] = self._boxes(geometry, MOVED_BOXES)
+        low, high = world_boxes(geometry, rows, self._cache["boxes"])
+        if not within_reach(low, high, MAX_REACH):
+            raise InputError(f"puts an instance farther than {MAX_REACH:g} from the origin", argument="matrix")
+        lows, highs = self._top.low.astype(np.float64), self._top.high.astype(np.float64)
+        lows[rows], highs[rows] = low, high
+        some = (lows <= highs).all(axis=1) & (len(geometry.spheres) == 0)
+        if not some.any() or (far := far_origin(lows[some].min(axis=0), highs[some].max(axis=0))) is None:
+            return geometry, rows, low, high
+        to_world, rows = geometry.to_world.copy(), np.arange(len(lows))
+        to_world[:, :, 3] -= far
+        geometry = replace(geometry, to_world=to_world, origin=far if geometry.origin is None else geometry.origin + far)
+        return geometry, rows, *world_boxes(geometry, rows, self._cache["boxes"])
 
     def __reduce__(self) -> tuple[object, ...]:
         """Pickle the structures of all parts and the scene. Unpickling builds the upper level."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+import warp as wp
 
 import wrt
 import wrt.sensors
@@ -80,7 +81,7 @@ def structures(place: np.ndarray, folder: Path) -> dict[str, Any]:
     wrt.build(mesh).save(folder / "one.accel", mesh=True)
     back.save(folder / "many.accel")
     return {"arrays": wrt.build((far, FACES)), "bvh2": wrt.build((far, FACES), "bvh2"), "scene": wrt.build(wrt.Scene.of([mesh])),
-            "placed": wrt.build(wrt.Scene((wrt.Object(wrt.Mesh(VERTICES, FACES), transform=matrix),))), "moved back": back,
+            "placed": wrt.build(wrt.Scene((wrt.Object(wrt.Mesh(VERTICES, FACES), transform=matrix),))), "moved": moved, "moved back": back,
             "refit": refitted, "ply": wrt.build(folder / "far.ply"), "npz": wrt.build(folder / "far.npz"),
             "obj": wrt.build(folder / "far.obj"), "loaded": wrt.load_accel(folder / "one.accel"),
             "loaded with its mesh": wrt.load_accel(folder / "one.accel", mesh), "loaded instances": wrt.load_accel(folder / "many.accel"),
@@ -120,6 +121,29 @@ def test_points_and_other_queries(name: str) -> None:
     assert np.array_equal(wrt.count_hits(accel, 3.0 * points + place, -points), wrt.count_hits(centred, 3.0 * points, -points))
     theirs = RayMeshIntersector(trimesh.Trimesh(mesh.positions, mesh.faces, process=False))
     assert np.array_equal(theirs.intersects_first(3.0 * points + place, -points), hits.prim_id)
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_kernels_take_coordinates_of_the_world(name: str) -> None:
+    place = np.array(PLACES[name])
+    matrix = np.eye(4)
+    matrix[:3, 3] = place
+    moved = wrt.build(wrt.Mesh(VERTICES, FACES), movable=True)
+    moved.move(0, matrix)
+    origins, directions = np.float32(EYES + place), np.float32(WAYS)
+    for accel in (wrt.build((VERTICES + place, FACES)), moved):
+        query = wrt.ray_query(accel)
+
+        @wrt.kernel
+        def trace(world: query.World, o: wp.array(dtype=wp.vec3), d: wp.array(dtype=wp.vec3), t: wp.array(dtype=float)):  # type: ignore
+            i = wp.tid()
+            t[i] = query.closest_hit(world, query.ray(o[i], d[i])).t  # noqa: B023
+
+        t = wp.empty(len(origins), dtype=float, device="cpu")
+        rays = (wp.array(each, dtype=wp.vec3, device="cpu") for each in (origins, directions))
+        wp.launch(trace, len(origins), [accel.world, *rays, t], device="cpu")
+        hits = accel.closest_hit(origins, directions)
+        assert np.array_equal(t.numpy(), hits.t) and hits.hit.any()
 
 
 @pytest.mark.parametrize("name", PLACES)
@@ -189,5 +213,7 @@ def test_float32_far_away_is_warned_about_once_and_near_0_nothing_changes() -> N
     with pytest.warns(SceneWarning, match=r"5.80103e\+06 units from 0, where float32 has steps of 0.5 units") as seen:
         wrt.build((far, FACES))
     assert len(seen) == 1
+    with pytest.warns(SceneWarning, match="refit: its float32 vertices lie up to"):
+        wrt.build((VERTICES, FACES)).refit(far)
     assert not NEAR.origin.any() and NEAR.closest_hit(EYES, WAYS).point.dtype == np.float32
     assert np.array_equal(NEAR.geometry.vertices, np.float32(VERTICES))

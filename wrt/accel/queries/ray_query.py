@@ -5,6 +5,8 @@ from __future__ import annotations
 import zlib
 from typing import NamedTuple
 
+import warp as wp
+
 from wrt.accel.geometry import MESH_OF_A_SPHERE
 from wrt.accel.queries.accelerator import Accelerator
 from wrt.accel.snapshot import Snapshot
@@ -115,6 +117,8 @@ def kernel_argument(snapshot: Snapshot) -> WarpStruct:
     world = query_of(structure)[0]()
     world.kind = kind_of(structure)
     world.accel, world.surfaces = snapshot.data, snapshot.surfaces
+    if snapshot.geometry.origin is not None:
+        world.origin = wp.vec3d(*snapshot.geometry.origin)
     if snapshot.roots is not None:
         world.roots = snapshot.roots
     return world

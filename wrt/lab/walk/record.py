@@ -188,6 +188,8 @@ class WalkRecord:
     def __str__(self) -> str:
         width = len(str(len(self)))
         head = f"{self.structure}: ray from {listed(self.origin)} along {listed(self.direction)}, t from {self.t_min:g} to {self.t_max:g}"
+        if self.geometry.origin is not None:
+            head += f"; all coordinates minus {listed(self.geometry.origin)}"
         lines = [f"{i:{width}}  {'  ' * max(step.depth, 0)}{step.text}" for i, step in enumerate(self.steps)]
         last = self.steps[-1] if len(self) else None
         found = f"hits triangle {last.best_prim} at t = {last.best_t:.6g}" if last is not None and last.best_prim >= 0 else "hits nothing"
