@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from wrt.cli.common import SIZE, Assignments, Commands, Parsed, client_of, load, naming, say, settings_of, shared, warnings_reported
+from wrt.cli.common import SIZE, Assignments, Commands, Parsed, load, naming, say, settings_of, shared, warnings_reported
 from wrt.cli.reporting import Reporting, measured, planned, reporting
 from wrt.core.registry import Registry
 from wrt.lab import plans
@@ -72,10 +72,9 @@ def profile(how: Reporting, scene: Path, assignments: Assignments, gpu: str, **o
 
 @click.command(help=Stability.__doc__)
 @planned(Stability)
-@reporting(Stability.OUTPUT, cluster=True, resume=True, quiet="Print no progress")
+@reporting(Stability.OUTPUT, quiet="Print no progress")
 def stability(how: Reporting, plan: Stability) -> None:
     from wrt.lab.bench.report import cells, csv_file
-    from wrt.lab.bench.resume import text_of
     from wrt.lab.hard_cases import report
     from wrt.lab.hard_cases import stability as study
 
@@ -84,18 +83,12 @@ def stability(how: Reporting, plan: Stability) -> None:
             say("  ".join(cells(study.COLUMNS, row)), err=False)
 
     how.check_report((".json", ".csv"))
-    finished = how.finished(plan, study.CLASSES)
-    client = client_of(how.cluster)
     if not how.as_json:
         say("  ".join(study.COLUMNS), err=False)
     machine = report.machine(plan)
-    if finished.groups:
-        machine += f"; resumed after {len(finished.groups) - 1} rows of: {finished.machine}"
-    finished.machine = machine
-    result = study.run(plan, row_done, how.progress_writer, client, finished.groups)
+    result = study.run(plan, row_done, how.progress_writer)
     data = {"machine": machine, **result.as_dict()}
-    how.write_rows(data, report.text(result, plan, machine), {".csv": lambda: csv_file(result.rows, plan, machine, ".csv")},
-                   text_of(finished, plan) if result.interrupted is not None else "")
+    how.write_rows(data, report.text(result, plan, machine), {".csv": lambda: csv_file(result.rows, plan, machine, ".csv")})
     how.end(f"\n{report.summary(result)}", {**data, "output": how.output}, interrupted=result.interrupted)
 
 
@@ -108,7 +101,7 @@ def stability(how: Reporting, plan: Stability) -> None:
 def error(how: Reporting, plan: Error, scene: Path, assignments: Assignments, size: tuple[int, int],
           **options: Parsed) -> None:
     """Render SCENE with various values of each option. Compare time and error of the pictures with a converged
-    reference. A stopped run cannot be resumed."""
+    reference."""
     from wrt.lab.bench import error as study
     from wrt.lab.bench import error_report as report
     from wrt.renderer.options import Options
@@ -134,7 +127,7 @@ def error(how: Reporting, plan: Error, scene: Path, assignments: Assignments, si
 def mitsuba(how: Reporting, plan: Mitsuba, scene: Path, assignments: Assignments, size: tuple[int, int], matte: bool,
             camera: str | None) -> None:
     """Render SCENE with wrt and with Mitsuba 3. Use scalar_rgb and llvm_ad_rgb, and all threads. Compare the times to equal error,
-    with and without the start of the process. A stopped run cannot be resumed.
+    with and without the start of the process.
 
     llvm_ad_rgb needs an LLVM library (19 works), named in the environment variable DRJIT_LIBLLVM_PATH."""
     from wrt.lab.mitsuba import equal_error

@@ -6,21 +6,19 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import MISSING, dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, get_origin, get_type_hints
+from typing import Any, get_origin, get_type_hints
 
 import click
 from click.core import ParameterSource
 
 from wrt.cli.common import (
     ACCEL,
-    CLUSTER,
     DURATION,
     SHARED,
     Decorator,
     Names,
     OneOf,
     Parsed,
-    client_of,
     json_text,
     names_of,
     option_group,
@@ -36,12 +34,6 @@ from wrt.core.write_file import check_writable, write_bytes
 from wrt.lab.plans import STRUCTURES, Plan
 from wrt.renderer.progress import TimeLeft
 
-if TYPE_CHECKING:
-    from wrt.lab.bench.resume import Finished
-
-T = TypeVar("T")
-RESUME = click.option("--resume", is_flag=True, help="Continue an interrupted run: keep the finished rows in the file of -o (.json or"
-                                                     " .csv), if its options and the version of wrt are the same")
 # The type of an option, by the annotation of the plan's field. Any other annotation means a path.
 TYPES: dict[object, Any] = {int: int, int | None: int, bool: bool, str: str, Sequence[str]: Names(), float: DURATION}
 
@@ -51,10 +43,8 @@ class Reporting:
     """Options of a report, and the functions that write it."""
 
     output: Path | None = None  # file or folder to write, as the command defines
-    cluster: str | None = None  # address of a Dask scheduler
     quiet: bool = False
     as_json: bool = False
-    resume: bool = False
 
     def progress(self, line: str) -> None:
         if not self.quiet:
@@ -78,51 +68,15 @@ class Reporting:
         check_writable(self.output)
         return suffix
 
-    def finished(self, plan: Plan, classes: Sequence[type] = ()) -> "Finished":
-        """Return the groups that the report `output` of an interrupted run has, or none without --resume. classes: see resume.load."""
-        from wrt.lab.bench import resume
-
-        if not self.resume:
-            return resume.Finished()
-        if self.cluster is not None:
-            raise InputError("works on one machine, not with --cluster", argument="--resume")
-        if self.output is None or self.output.suffix.lower() not in resume.SUFFIXES:
-            raise InputError(f"needs the report to resume: -o with a {' or '.join(resume.SUFFIXES)} file", argument="--resume")
-        return resume.load(self.output, plan, classes)
-
-    def rows_of(self, measure: Callable[[Callable[[T], None]], list[T]], line: Callable[[T], str],
-                finished: "Finished", total: int) -> tuple[list[T], int | None]:
-        """Measure, and show each finished row with the time left. Return all rows, and the number of the signal that ended the work.
-
-        measure: function that takes a callback for finished rows. finished: groups of an earlier run; `measure` appends its own. total:
-        number of groups, 0 if unknown. After Ctrl-C the finished rows are returned; without any, KeyboardInterrupt is raised."""
-        before, kept = len(finished.groups), finished.rows
-        left = TimeLeft(total - before)
-
-        def done(row: T) -> None:
-            kept.append(row)
-            left.done = len(finished.groups) - before
-            self.progress(f"{line(row)}{f'  ({len(finished.groups)} of {total}{left})' if len(finished.groups) < total else ''}")
-
-        try:
-            return measure(done), None
-        except KeyboardInterrupt as stop:
-            if not kept:
-                raise
-            return kept, int(getattr(stop, "number", signal.SIGINT))
-
-    def write_rows(self, data: Mapping[str, object], text: str, files: Mapping[str, Callable[[], bytes]], saved: str = "") -> None:
-        """Write the report `output`, if any, in the format of its suffix: one of `files`, `data` as JSON, or `text` as Markdown.
-
-        saved: text for --resume; only JSON and CSV contain it."""
+    def write_rows(self, data: Mapping[str, object], text: str, files: Mapping[str, Callable[[], bytes]]) -> None:
+        """Write the report `output`, if any, in the format of its suffix: one of `files`, `data` as JSON, or `text` as Markdown."""
         if self.output is None:
             return
         suffix = self.output.suffix.lower()
         if suffix == ".json":
-            self.write(json_text({**data, **({"resume": saved} if saved else {})}))
+            self.write(json_text(data))
         elif suffix in files:
-            first = f"# resume: {saved}\n" if saved and suffix == ".csv" else ""
-            write_bytes(self.output, first.encode() + files[suffix]())
+            write_bytes(self.output, files[suffix]())
         else:
             self.write(text)
 
@@ -144,13 +98,10 @@ class Reporting:
             raise SystemExit(exit_code(interrupted))
 
 
-def reporting(report: str = "Write the tables as Markdown (.md)", *, cluster: bool = False, resume: bool = False,
-              quiet: str = "Print no progress and no warnings") -> Decorator:
+def reporting(report: str = "Write the tables as Markdown (.md)", *, quiet: str = "Print no progress and no warnings") -> Decorator:
     """Return a decorator that adds the options of Reporting. The command receives the object as `how`. report, quiet: help of -o and -q."""
     file = click.option("-o", "--output", type=click.Path(path_type=Path), help=report)
-    options: list[Decorator] = [SHARED["as_json"], quiet_option(quiet), file]
-    options += [RESUME] if resume else []
-    return option_group("how", Reporting, names_of(Reporting), [*options, CLUSTER] if cluster else options)
+    return option_group("how", Reporting, names_of(Reporting), [SHARED["as_json"], quiet_option(quiet), file])
 
 
 def planned(plan: type[Plan]) -> Decorator:
@@ -192,40 +143,40 @@ def parameter(each: dataclasses.Field[object], of_type: object) -> Decorator:
 
 
 def measured(plan: type[Plan]) -> click.Command:
-    """Return the command that runs a plan's study (wrt.lab.bench.report.study_of). With --cluster, each worker measures whole meshes."""
+    """Return the command that runs a plan's study (wrt.lab.bench.report.study_of)."""
 
     @click.command(plan.COMMAND.split()[-1], help=plan.__doc__)
     @planned(plan)
-    @reporting(plan.OUTPUT, cluster="meshes" in plan.__annotations__, resume=True)
+    @reporting(plan.OUTPUT)
     def command(how: Reporting, plan: Plan) -> None:
         from wrt.lab.bench import plot, report
-        from wrt.lab.bench.resume import text_of
-        from wrt.lab.bench.sweep import by_mesh
 
         study = report.study_of(plan)
         writers = report.WRITERS | getattr(study, "WRITERS", {})
         suffix = how.check_report((".json", *writers))
         if suffix in (".png", ".svg"):
             plot.new_figure(1.0, 1.0)  # raises InputError if matplotlib is missing
-        finished = how.finished(plan)
-        client = client_of(how.cluster)
-        total = sum(1 for _ in study.groups(plan)) if client is None else 0  # reads all meshes, and so refuses a damaged one at once
+        total = sum(1 for _ in study.groups(plan))  # reads all meshes, and so refuses a damaged one at once
         machine = study.machine(plan) if hasattr(study, "machine") else report.machine_line()
-        if client is not None:
-            from wrt.renderer.distributed.dask import machines
+        rows: list[Any] = []
+        interrupted, left = None, TimeLeft(total)
 
-            machine = f"a cluster, each mesh on one worker: {machines(client)}; started from {machine}"
-        if finished.groups:
-            machine = f"{machine}; resumed after {len(finished.rows)} rows of: {finished.machine}"
-        finished.machine = machine
-        measure = partial(report.run, finished=finished.groups) if client is None else report.run
+        def done(group: list[Any]) -> None:
+            rows.extend(group)
+            left.done += 1
+            for row in group:
+                how.progress(f"{report.line(plan, row)}{f'  ({left.done:.0f} of {total}{left})' if left.done < total else ''}")
+
         with warnings_reported(how.quiet):
-            rows, interrupted = how.rows_of(lambda done: by_mesh(measure, plan, done, client), partial(report.line, plan), finished, total)
-        if interrupted is not None:
-            machine = f"{machine}; interrupted after {len(rows)} row{'s' if len(rows) > 1 else ''}"
+            try:
+                report.run(plan, done)
+            except KeyboardInterrupt as stop:
+                if not rows:
+                    raise
+                interrupted = int(getattr(stop, "number", signal.SIGINT))
+                machine = f"{machine}; interrupted after {len(rows)} row{'s' if len(rows) > 1 else ''}"
         text, data = report.text(rows, plan, machine), {"machine": machine, **report.data(rows, plan)}
-        files = {name: partial(writer, rows, plan, machine, name) for name, writer in writers.items()}
-        how.write_rows(data, text, files, text_of(finished, plan) if interrupted is not None and client is None else "")
+        how.write_rows(data, text, {name: partial(writer, rows, plan, machine, name) for name, writer in writers.items()})
         how.end(text, {**data, "output": how.output}, interrupted=interrupted)
 
     return command

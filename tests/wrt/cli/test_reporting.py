@@ -16,9 +16,7 @@ import pytest
 from click.testing import CliRunner
 
 from wrt.cli.reporting import measured
-from wrt.core.errors import InputError
 from wrt.core.interrupts import Interrupted
-from wrt.lab.bench import resume
 from wrt.lab.bench.report import Columns, Groups, Row
 from wrt.lab.plans import Plan, option
 
@@ -76,7 +74,7 @@ def test_a_table_can_be_read_by_other_programs(tmp_path: Path) -> None:
     data = json.loads((tmp_path / "a.json").read_text())
     assert data["rows"][1] == {"number": 1, "square": 1, "detail": {"halves": [0.5, 0.5], "odd": True}, "pair": [1, 0.1], "share": None,
                                "inner": {"largest": None}}
-    assert data["machine"] and "resume" not in data
+    assert data["machine"]
     refused = run("-o", tmp_path / "a.txt")
     assert refused.exit_code != 0 and not (tmp_path / "a.txt").exists()
 
@@ -90,61 +88,6 @@ def test_ctrl_c_keeps_the_finished_rows(tmp_path: Path) -> None:
     nothing = run("-o", tmp_path / "b.md", stop=0)
     assert isinstance(nothing.exception, KeyboardInterrupt) or nothing.exit_code != 0
     assert not (tmp_path / "b.md").exists()
-
-
-@pytest.mark.parametrize("suffix", [".json", ".csv"])
-def test_a_stopped_run_is_resumed_without_measuring_again(tmp_path: Path, suffix: str) -> None:
-    path, whole = tmp_path / f"a{suffix}", tmp_path / f"whole{suffix}"
-    run("--count", 7, "-o", whole)
-    measured_numbers.clear()
-    assert run("--count", 7, "-o", path, stop=2).exit_code == 128 + 15 and measured_numbers == [0, 1]
-    again = run("--count", 7, "-o", path, "--resume", stop=6)
-    assert again.exit_code == 128 + 15 and measured_numbers == [0, 1, 2, 3, 4, 5] and "(3 of 5" in again.output
-    assert run("--count", 7, "-o", path, "--resume", stop=6).exit_code == 128 + 15  # a signal before any new row loses nothing
-    assert run("--count", 7, "-o", path, "--resume").exit_code == 0 and measured_numbers == list(range(7))
-    assert without_machine(path) == without_machine(whole) and "resumed after 6 rows of" in path.read_text()
-
-
-def without_machine(path: Path) -> object:
-    if path.suffix == ".json":
-        return {name: value for name, value in json.loads(path.read_text()).items() if name != "machine"}
-    return [line for line in path.read_text().splitlines() if not line.startswith("# machine")]
-
-
-def test_a_run_without_a_file_begins_with_resume(tmp_path: Path) -> None:
-    assert run("-o", tmp_path / "a.json", "--resume").exit_code == 0 and measured_numbers == [0, 1, 2]
-
-
-def refusal(*arguments: object) -> str:
-    measured_numbers.clear()
-    done = run(*arguments, "--resume")
-    assert isinstance(done.exception, InputError) and not measured_numbers  # exit code 2 of the whole command line
-    return str(done.exception)
-
-
-def test_what_cannot_be_resumed_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path, named = tmp_path / "a.json", tmp_path / "data.txt"
-    named.write_text("one")
-    files = ("--files", f"name={named}")
-    run("--count", 7, *files, "-o", path, stop=2)
-    before = path.read_bytes()
-    assert "count 7 (here 5)" in refusal("--count", 5, *files, "-o", path)
-    named.write_text("two")
-    assert "is the report of other options: files" in refusal("--count", 7, *files, "-o", path)
-    named.write_text("one")
-    with monkeypatch.context() as patch:
-        patch.setattr(resume, "DIGEST", "another")
-        assert "another version of wrt" in refusal("--count", 7, *files, "-o", path)
-    assert path.read_bytes() == before
-    assert run("--count", 7, *files, "-o", path, "--resume").exit_code == 0
-    for name, text in (("whole.json", path.read_text()), ("b.json", "{"), ("c.json", "[]"), ("d.csv", "a,b\n1,2\n"), ("e.csv", ""),
-                       ("f.json", '{"resume": "{}"}'), ("g.json", '{"resume": 3}'), ("h.json", "[" * 100000),
-                       *((f"{i}.json", json.dumps({"resume": json.dumps({"of": {}, "machine": "", "groups": groups})}))
-                         for i, groups in enumerate((1, [1], [None], {"is": "Row", "of": {}})))):
-        (tmp_path / name).write_text(text)
-        assert "is not the report of an interrupted run" in refusal("--count", 7, *files, "-o", tmp_path / name)
-    for arguments in ((), ("-o", tmp_path / "a.md")):
-        assert "--resume needs the report to resume" in refusal(*arguments)
 
 
 def test_progress_tells_the_time_left() -> None:

@@ -3,7 +3,6 @@
 import csv
 import importlib
 import io
-import itertools
 import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -79,7 +78,7 @@ def study_of(plan: Plan) -> ModuleType:
     """Return the module that measures a plan.
 
     The module has TITLE, LEGEND, and groups(plan). It yields functions; each measures a group of Rows that are compared with each other.
-    A resumed run skips the first functions, so what they share is made on first use. COLUMNS or parts(rows, plan) make the tables.
+    COLUMNS or parts(rows, plan) make the tables.
     Optional are machine(plan) for the report, line(row) for a line of progress, facts(rows, plan) for more JSON fields, and
     WRITERS for -o (see below)."""
     return importlib.import_module(plan.STUDY)
@@ -88,17 +87,13 @@ def study_of(plan: Plan) -> ModuleType:
 Groups = Iterator[Callable[[], list[Row]]]
 
 
-def run(plan: Plan, report: Callable[[Row], None] | None = None, finished: list[list[Row]] | None = None) -> Rows[Row]:
-    """Measure everything and return the rows; `report` receives each row once its group is measured.
-
-    finished: groups that an earlier run has measured; they are not measured again. Each new group is appended to this list."""
-    finished = [] if finished is None else finished
-    for measure in itertools.islice(study_of(plan).groups(plan), len(finished), None):
-        finished.append(measure())
-        if report is not None:
-            for row in finished[-1]:
-                report(row)
-    return Rows[Row](itertools.chain.from_iterable(finished), partial(page, plan))  # a lambda could not be pickled by a worker
+def run(plan: Plan, report: Callable[[list[Row]], None] = lambda rows: None) -> Rows[Row]:
+    """Measure everything and return the rows; `report` receives the rows of each group once it is measured."""
+    rows = []
+    for measure in study_of(plan).groups(plan):
+        rows += (group := measure())
+        report(group)
+    return Rows[Row](rows, partial(page, plan))
 
 
 def parts_of(rows: Sequence[Row], plan: Plan) -> "list[Part]":

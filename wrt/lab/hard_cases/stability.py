@@ -8,8 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
-from itertools import chain
-from typing import Any
+from itertools import product
 
 import numpy as np
 import warp as wp
@@ -25,14 +24,10 @@ from wrt.kernels.structs import Surfaces
 from wrt.kernels.study.respawn import Respawn, make_respawn_kernel
 from wrt.lab.bench.report import Columns
 from wrt.lab.bench.report import Row as Line
-from wrt.lab.bench.sweep import cancel, one_at_a_time, result, submitter
 from wrt.lab.bench.timing import alternate, quartiles
 from wrt.lab.hard_cases.cases import UNKNOWN, HardCase, Verdict, check, chosen, chunks, fewer, generate, judge, judge_all_hits, judge_next
 from wrt.lab.hard_cases.contestants import PEERS, Algorithm, Own, own_algorithms
-from wrt.lab.hard_cases.judge import Errors
 from wrt.lab.plans import Stability as Plan
-from wrt.renderer.distributed.installed import DIGEST
-from wrt.renderer.distributed.workers import worker_name
 from wrt.renderer.progress import TimeLeft
 
 ALL_HITS_TESTS = 20_000_000  # most ray-primitive tests of a case's all-hits check
@@ -65,36 +60,30 @@ class CaseRow:
         return {name: value for name, value in vars(self).items() if name != "verdict"} | self.verdict.as_dict()
 
 
-CLASSES = (CaseRow, Verdict, Errors)  # of the objects that a resumed run restores
-
-
 class Result(Line):
     """Results of `run`. rows: a CaseRow for each case and algorithm; speed: algorithm -> result of `measure_speed`.
     - not_installed: names of missing libraries; undone: names of unfinished cases; interrupted: number of the signal that ended the run."""
 
 
-def run(plan: Plan, report: Callable[[CaseRow], None] = lambda row: None, progress: Callable[[str], None] = lambda line: None,
-        executor: object = None, finished: list[list[Any]] | None = None) -> Result:
+def run(plan: Plan, report: Callable[[CaseRow], None] = lambda row: None, progress: Callable[[str], None] = lambda line: None) -> Result:
     """Run every chosen case with every algorithm, on the same rays.
 
-    - report: receives each finished row; progress: receives lines of text from any thread.
-    - executor: a concurrent.futures.Executor or dask.distributed.Client; its workers trace and judge, and this process measures speed.
-    - finished: the speeds, then the rows of each case and algorithm, as an earlier run measured them. New ones are appended.
-
+    report: receives each finished row; progress: receives lines of text from any thread.
     After Ctrl-C, return the finished rows, or raise KeyboardInterrupt if no row is finished. Raise InputError for an unknown case."""
     begin, names, algorithms = time.perf_counter(), chosen(plan.cases), all_algorithms(plan)
-    finished = [] if finished is None else finished
-    if not finished:
-        progress("measuring the speed")
-        finished.append([measure_speed(algorithms, plan.runs)])
-    found = Result(rows=[], speed=finished[0][0], interrupted=None, undone=[],
+    progress("measuring the speed")
+    found = Result(rows=[], speed=measure_speed(algorithms, plan.runs), interrupted=None, undone=[],
                    not_installed=[peer.name for peer in PEERS.values() if plan.peers and not peer.is_installed()])
-    pool = None if executor is None else submitter(executor)
+    left = TimeLeft(len(names) * len(algorithms))
     try:
-        tasks = [(name, algorithm.name) for name in names for algorithm in algorithms]
-        for rows in chain(finished[1:], _rows(tasks[len(finished) - 1:], algorithms[0].name, plan, progress, pool, finished)):
-            found.rows += rows
-            for row in rows:
+        for name, algorithm in product(names, algorithms):
+            progress(f"{left.done:.0f} of {left.total} rows are done; now {name}, {algorithm.name}{left}")
+            row = run_case(name, fewer(name, min(plan.sample, plan.rays)), algorithm, plan.seed)
+            if row is not None and algorithm is algorithms[0] and row.refused is None:
+                row.verdict = sum(judge_further(name, plan, progress), row.verdict)
+            left.done += 1
+            if row is not None:
+                found.rows.append(row)
                 report(row)
     except KeyboardInterrupt as stop:
         if not found.rows:
@@ -109,39 +98,6 @@ def run(plan: Plan, report: Callable[[CaseRow], None] = lambda row: None, progre
 def all_algorithms(plan: Plan) -> list[Algorithm]:
     """Return wrt's intersection tests, the default first. If plan.peers is True, also return the installed other libraries."""
     return [*own_algorithms(), *(peer() for peer in PEERS.values() if plan.peers and peer.is_installed())]
-
-
-def _rows(tasks: list[tuple[str, str]], default: str, plan: Plan, progress: Callable[[str], None], pool: Any,
-          finished: list[list[Any]]) -> Iterator[list[CaseRow]]:
-    """Yield the row of each case and algorithm, or none if the algorithm does not support the case; append the same to `finished`.
-    A pool gets a task for each row and for each chunk of rays beyond the sample, which only the default algorithm traces."""
-    futures, further = {}, {}
-    if pool is not None:
-        futures = {task: pool.submit(one_at_a_time, DIGEST, case_row, *task, plan) for task in tasks}
-        further = {name: [pool.submit(one_at_a_time, DIGEST, further_chunk, name, plan, index) for index in range(n_chunks(name, plan))]
-                   for name in dict.fromkeys(name for name, _ in tasks)}
-    left = TimeLeft(len(tasks))
-    try:
-        for i, (name, algorithm) in enumerate(tasks):
-            left.done = i
-            progress(f"{i} of {len(tasks)} rows are done; now {name}, {algorithm}{left}")
-            row = result(pool, futures[name, algorithm]) if pool is not None else case_row(name, algorithm, plan)
-            if row is not None and algorithm == default and row.refused is None:
-                rest = (result(pool, part) for part in further[name]) if pool is not None else judge_further(name, plan, progress)
-                row.verdict = sum(rest, row.verdict)
-            finished.append([] if row is None else [row])
-            yield finished[-1]
-    finally:
-        if pool is not None:
-            cancel(pool, chain(futures.values(), *further.values()))
-
-
-def case_row(name: str, algorithm: str, plan: Plan) -> CaseRow | None:
-    """Run a case with the algorithm of this name. Raise InputError if this worker does not have the algorithm."""
-    known = {each.name: each for each in all_algorithms(plan)}
-    if algorithm not in known:
-        raise InputError(f"worker {worker_name()} lacks {algorithm}, which the client has installed")
-    return run_case(name, fewer(name, min(plan.sample, plan.rays)), known[algorithm], plan.seed)
 
 
 def run_case(name: str, rays: int, algorithm: Algorithm, seed: int = 0) -> CaseRow | None:

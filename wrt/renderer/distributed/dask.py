@@ -14,7 +14,6 @@ from concurrent.futures import wait as wait_here
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any, cast
 
-from wrt.core.device import describe_devices
 from wrt.core.errors import InputError
 from wrt.core.version import VERSION
 from wrt.renderer.distributed.installed import INSTALLED, SAME_EVERYWHERE, difference
@@ -84,14 +83,8 @@ def check_workers(client: "Client") -> None:
                 raise InputError(f"worker {worker} has {differs}", hint=SAME_EVERYWHERE)
 
 
-def machines(client: "Client") -> str:
-    """Return the devices of the workers as text, with the number of workers for each device."""
-    devices = [lines[0] for lines in client.run(describe_devices).values()]
-    return "; ".join(f"{devices.count(line)} workers of {line}" for line in dict.fromkeys(devices))
-
-
 class Submitter:
-    """A dask.distributed.Client with the methods of an Executor that wrt.lab.bench.sweep and ClusterWorkers need."""
+    """A dask.distributed.Client with the methods of an Executor that ClusterWorkers needs."""
 
     def __init__(self, client: object) -> None:
         self.client = cast(Any, client)

@@ -28,7 +28,7 @@ def test_every_unit_has_a_row_on_every_mesh() -> None:
     small = [icosphere(2), terrain(8), replace(icosphere(1), name="ball")]
     told: list[Row] = []
     plan = units.Plan(small, rays=500, runs=2)
-    rows = run(plan, told.append)
+    rows = run(plan, told.extend)
     on_meshes = {(row.mesh, row.rays) for row in rows if "no structure" not in row.mesh}
     assert len(on_meshes) == 6 and told == rows
     names = [*RAY_TRIANGLE, *(f"{box} boxes" for box in list(RAY_AABB)[1:])]

@@ -276,7 +276,7 @@ def test_a_run_measures_both_sweeps_and_finds_no_difference_unexplained(tmp_path
                     + "".join(f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in mesh.faces.tolist()))
     told: list[Row] = []
     plan = Plan(meshes=[path], size=48, max_size=130, max_triangles=1280, runs=2)
-    rows = run(plan, told.append)
+    rows = run(plan, told.extend)
     assert rows == told
     assert [(r.sweep, r.triangles, r.pixels) for r in rows] == [
         ("triangles", 320, 48**2), ("triangles", 1280, 48**2), ("pixels", 1280, 64**2), ("pixels", 1280, 128**2)]

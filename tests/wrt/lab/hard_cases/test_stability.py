@@ -182,25 +182,6 @@ def test_ctrl_c_keeps_the_rows_that_are_done(monkeypatch, tmp_path, rows, undone
     assert (told["interrupted"], told["undone"], len(told["rows"])) == (signal.SIGINT, undone, rows)
 
 
-@pytest.mark.parametrize("suffix", [".json", ".csv"])
-def test_a_stopped_run_is_resumed_with_the_rows_that_are_done(monkeypatch, tmp_path, suffix) -> None:
-    path, whole = tmp_path / f"a{suffix}", tmp_path / f"whole{suffix}"
-    count = len(own_algorithms()) + 1
-    assert interrupted_after(count, monkeypatch, "-o", path).code == 130
-    again = interrupted_after(2, monkeypatch, "-o", path, "--resume")  # two rows more, and Ctrl-C
-    assert again.code == 130 and sum(line.startswith(("E_grid", "D_published")) for line in again.out.splitlines()) == count + 2
-    assert interrupted_after(-1, monkeypatch, "-o", path, "--resume").code == 0
-    assert interrupted_after(-1, monkeypatch, "-o", whole).code == 0
-    resumed, other = (rows_in(each) for each in (path, whole))
-    assert resumed == other and f"resumed after {count + 2} rows of" in path.read_text()
-    refused_run = interrupted_after(-1, monkeypatch, "-o", path, "--resume")
-    assert refused_run.code == 2 and "is not the report of an interrupted run" in refused_run.err
-
-
-def rows_in(path) -> object:
-    return json.loads(path.read_text())["rows"] if path.suffix == ".json" else path.read_text().splitlines()[2:]
-
-
 def test_ctrl_c_before_the_first_row_has_nothing_to_keep(monkeypatch) -> None:
     monkeypatch.setattr(stability, "run_case", lambda *arguments: signal.raise_signal(signal.SIGINT))
     monkeypatch.setattr(stability, "SPEED_RAYS", 2000)

@@ -27,12 +27,11 @@ from tests.data import ROOT
 from tests.refused import Refusal, refused
 from tests.wrt.renderer.test_checkpoint import SCENE, same
 from wrt.core.errors import InputError
-from wrt.lab.bench import sweep
 from wrt.picture.film import Film
 from wrt.picture.image import read_channels
 from wrt.renderer import schedule
 from wrt.renderer.distributed import dask as cluster
-from wrt.renderer.distributed import installed, workers
+from wrt.renderer.distributed import workers
 from wrt.renderer.options import Progress
 from wrt.renderer.render import render
 
@@ -225,14 +224,11 @@ def test_a_worker_whose_code_differs_in_a_line_is_refused_by_name(threads: Any, 
 
 
 def test_a_worker_that_comes_later_is_compared_too(threads: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A render compares a new worker before it prepares the scene; a sweep compares it at each task."""
-    with distributed.Client(threads, set_as_default=False) as one, worker_of_other_code(one, tmp_path / "other") as other:
+    """A render compares a new worker before it prepares the scene."""
+    with distributed.Client(threads, set_as_default=False) as one, worker_of_other_code(one, tmp_path / "other"):
         monkeypatch.setattr(cluster, "check_workers", lambda client: None)  # the worker connects after the check
         with refused(what="(io/obj.py)"):
             render(SCENE, executor=one, spp=256, tile_size=16, pass_size=4)
-        task = one.submit(sweep.one_at_a_time, installed.DIGEST, os.getpid, workers=[other], pure=False)
-        with refused(what="another version of wrt"):
-            task.result(timeout=60)
 
 
 def test_a_scene_that_is_lost_is_sent_again(threads: Any, whole: Film, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -292,11 +288,6 @@ def test_commands(threads: Any, mesh: Path) -> None:
     for name in ("there", "devices"):
         other = read_channels(f"{name}.exr")
         assert here.keys() == other.keys() and all(np.array_equal(here[layer], other[layer]) for layer in here)
-    few = ("--kinds", "primary", "--rays", 64, "--cluster", address)
-    done = run("bench", "rtcore", mesh, "--structures", "bvh2", "-q", "--json", *few)
-    assert done.code == 0 and [row["structure"] for row in json.loads(done.out)["rows"]] == ["bvh2"], done.err
-    done = run("bench", "peers", mesh, "--rivals", "warp", "--runs", 1, *few)
-    assert done.code == 0 and "each mesh on one worker: 1 workers of cpu: " in done.out, done.err
     page = (ROOT / "docs" / "cluster.md").read_text(encoding="utf-8")
     block = page.split("```python\n")[1].split("```")[0]
     assert block.count("tcp://scheduler:8786") == 1
