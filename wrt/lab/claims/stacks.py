@@ -1,4 +1,4 @@
-"""Claims about stacks and early ends: short stacks, no stack, prediction of hits, and a bound for the k nearest hits."""
+"""Claims about stacks and early ends: short stacks, prediction of hits, and a bound for the k nearest hits."""
 
 from collections.abc import Iterator
 
@@ -46,17 +46,6 @@ def short_stack(study: Study) -> Iterator[Figure]:
     yield Figure("primitive tests that culling of popped leaves saves, bvh8c", 100.0 * float(1.0 - culled / plain), (0.0, 14.0), "%",
                  f"{said}; published as 'up to 14 %'; ours culls inner nodes too", f"{plain:.2f} tests a ray without, {culled:.2f} with"
                                                                                    " culling")
-
-
-def stackless(study: Study) -> Iterator[Figure]:
-    """Count the nodes a ray of a binary tree without a stack: each pop restarts at the root."""
-    name = "sponza"
-    rays, tree = study.rays(name), study.tree(name, 2, 4)
-    full, none = (float(short_walk(tree, rays, entries)["inner"].mean()) for entries in (FULL, 0))
-    yield Figure("nodes without a stack over a full stack, bvh2", none / full, None, "ratio",
-                 f"{study.differences(name, 'their own scenes')}; no number was at hand to compare with; restart trail; {none:.1f} nodes"
-                 " against"
-                 f" {full:.1f}")
 
 
 TABLE_ENTRIES, CELLS, SECTORS, GO_UP = 1024, 32, 8, 2  # entries of a predictor's table; cells of origins and of directions along an axis
@@ -173,7 +162,6 @@ def k_hits(study: Study) -> Iterator[Figure]:
 
 SHORT_STACK = Claim("Vaidyanathan, Woop, Benthin: Wide BVH Traversal with a Short Stack, HPG 2019, doi 10.2312/hpg.20191190, abstract",
                     "wide and compressed nodes, 5 entries and a restart trail", "abstract", short_stack)
-STACKLESS = Claim("Laine: Restart Trail for Stackless BVH Traversal, HPG 2010", "binary tree, no stack, restart trail", "memory", stackless)
 PREDICTION = Claim("Liu et al.: Intersection Prediction for Accelerated GPU Ray Tracing, MICRO 2021",
                    "ambient occlusion; a table of 5.5 KB for each SM, keyed by a hash of origin and direction; gain in time",
                    "quoted", prediction)
