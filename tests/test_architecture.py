@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
@@ -90,11 +91,17 @@ BELOW_KERNELS = {
     "study": {"headers", "query", "shade", "wide", "build", "traverse", "units", "structs"},
 }
 LIBRARIES_OF_KERNELS = {"warp", "dataclasses", "functools", "re", "typing", "collections", "math", "pathlib"}
-# Limits. Lower them after a change that allows it. Only MOST_LINES may rise, by a commit that says what needs the lines.
+# Limits. Lower them after a change that allows it.
 LONGEST_FUNCTION = 100  # Lines.
 LONG_FUNCTIONS = 9  # Functions with more than 60 lines.
 LONG_SIGNATURES = 5  # Functions with more than 7 parameters: public queries, all of which take `world`.
-MOST_LINES = 61_445  # of wrt and kernels, with headers
+# Lines of each folder of wrt and kernels, with headers. A commit may lower an entry, or raise one and lower others by as much.
+MOST_LINES = {
+    "kernels": 1590, "kernels/build": 3857, "kernels/loops": 1926, "kernels/shade": 4105, "kernels/study": 1494,
+    "kernels/traverse": 2355, "kernels/units": 815, "kernels/wide": 3810, "wrt": 379, "wrt/accel": 9679, "wrt/cli": 1529,
+    "wrt/compat": 1112, "wrt/core": 2268, "wrt/io": 4287, "wrt/lab": 10_745, "wrt/picture": 1196, "wrt/renderer": 4281,
+    "wrt/scene": 3760, "wrt/viewer": 1866,
+}
 
 
 def module(path: Path) -> str:
@@ -356,10 +363,12 @@ def test_functions_are_short() -> None:
     assert len(long) <= LONG_FUNCTIONS, long
 
 
-def test_the_sources_stay_small() -> None:
-    """A change that needs more lines raises MOST_LINES, and its commit message says by how much and for what."""
-    headers = (ROOT / "kernels").rglob("*.h")
-    assert sum(path.read_text("utf-8").count("\n") for path in (*HOST, *KERNELS, *headers)) <= MOST_LINES
+def test_each_folder_keeps_to_its_lines() -> None:
+    lines = Counter[str]()
+    for path in (*HOST, *KERNELS, *(ROOT / "kernels").rglob("*.h")):
+        lines["/".join(path.relative_to(ROOT).parts[:-1][:2])] += path.read_text("utf-8").count("\n")
+    assert lines.keys() == MOST_LINES.keys()
+    assert {folder: count for folder, count in lines.items() if count > MOST_LINES[folder]} == {}, MOST_LINES
 
 
 def test_signatures_are_short() -> None:
